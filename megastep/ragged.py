@@ -1,0 +1,166 @@
+"""Arrays of arrays: subarrays of different lengths laid end to end in one backing array.
+
+``Ragged(vals, widths)`` makes a RaggedTorch of a tensor and a RaggedNumpy of anything else::
+
+    r = Ragged(np.array([0., 1., 2., 3., 4., 5.]), np.array([3, 1, 2]))
+    r[1]    # array([3.])
+    r[:2]   # RaggedNumpy([3 1])
+"""
+import operator
+from functools import cached_property
+
+import numpy as np
+import torch
+
+
+class Ragged:
+    """``vals`` (V, ...) cut along its first axis into D subarrays of ``widths`` (D,) elements each.
+
+    An integer index gives a subarray, a slice gives a Ragged; both share memory with ``vals``, except slices with a
+    step. ``widths`` must be whole numbers, none negative, that add up to V (ValueError if not), and are kept as int64.
+    """
+
+    def __new__(cls, vals, widths):
+        if cls is Ragged:
+            cls = RaggedTorch if isinstance(vals, torch.Tensor) else RaggedNumpy
+        return super().__new__(cls)
+
+    def __init__(self, vals, widths):
+        self.vals = self._asarray(vals)
+        widths = self._asarray_like(widths)
+        _check(self.vals, widths)
+        self.widths = self._int64(widths)
+
+    @cached_property
+    def ends(self):
+        """(D,) index into ``vals`` one past each subarray's last element."""
+        return self.widths.cumsum(0)
+
+    @cached_property
+    def starts(self):
+        """(D,) index into ``vals`` of each subarray's first element."""
+        return self.ends - self.widths
+
+    @cached_property
+    def _host(self):
+        """Starts and ends as lists, so that indexing asks the device only once."""
+        return self.starts.tolist(), self.ends.tolist()
+
+    def __len__(self):
+        return len(self.widths)
+
+    def __getitem__(self, index):
+        starts, ends = self._host
+        if isinstance(index, slice):
+            chosen = range(len(self))[index]
+            if chosen.step == 1 or not chosen:
+                bounds = slice(starts[chosen[0]], ends[chosen[-1]]) if chosen else slice(0, 0)
+                return type(self)(self.vals[bounds], self.widths[chosen.start:max(chosen.start, chosen.stop)])
+            return type(self)(self._cat([self.vals[starts[i]:ends[i]] for i in chosen]), self.widths[list(chosen)])
+        try:
+            i = operator.index(index)
+        except TypeError:
+            raise TypeError(f'a Ragged is indexed with an integer or a slice, not a {type(index).__name__}') from None
+        if not -len(self) <= i < len(self):
+            raise IndexError(f'index {i} is out of range for a Ragged of {len(self)} subarrays')
+        return self.vals[starts[i]:ends[i]]
+
+    def __repr__(self):
+        return f'{type(self).__name__}({np.array(self.widths.tolist(), int)})'
+
+    def __reduce__(self):
+        return Ragged, (self.vals, self.widths)
+
+
+class RaggedNumpy(Ragged):
+    """A Ragged of numpy arrays."""
+    _asarray = staticmethod(np.asarray)
+    _cat = staticmethod(np.concatenate)
+
+    def _asarray_like(self, widths):
+        widths = widths.cpu() if isinstance(widths, torch.Tensor) else widths
+        return np.zeros(0, int) if np.size(widths) == 0 else np.asarray(widths)
+
+    @staticmethod
+    def _int64(widths):
+        return widths.astype(np.int64, copy=False)
+
+    @cached_property
+    def inverse(self):
+        """(V,) the subarray that each element of ``vals`` belongs to."""
+        return np.repeat(np.arange(len(self)), self.widths)
+
+    def torchify(self):
+        """The same Ragged on CPU tensors; float64 becomes float32."""
+        vals = self.vals.astype(np.float32) if self.vals.dtype == np.float64 else self.vals
+        return Ragged(torch.as_tensor(vals), torch.as_tensor(self.widths))
+
+    def numpyify(self):
+        return self
+
+
+class RaggedTorch(Ragged):
+    """A Ragged of tensors, all on the device of ``vals``."""
+    _asarray = staticmethod(torch.as_tensor)
+    _cat = staticmethod(torch.cat)
+
+    def _asarray_like(self, widths):
+        widths = np.zeros(0, int) if len(widths) == 0 else widths
+        return torch.as_tensor(widths, device=self.vals.device)
+
+    @staticmethod
+    def _int64(widths):
+        return widths.to(torch.int64)
+
+    @cached_property
+    def inverse(self):
+        """(V,) the subarray that each element of ``vals`` belongs to."""
+        return torch.repeat_interleave(torch.arange(len(self), device=self.device), self.widths)
+
+    @property
+    def device(self):
+        return self.vals.device
+
+    def torchify(self):
+        return self
+
+    def numpyify(self):
+        """The same Ragged on numpy arrays."""
+        vals = self.vals.detach().cpu()
+        return Ragged((vals.float() if vals.dtype == torch.bfloat16 else vals).numpy(), self.widths.cpu().numpy())
+
+    def to(self, *args, **kwargs):
+        """``vals.to(...)`` and the widths on the same device."""
+        vals = self.vals.to(*args, **kwargs)
+        return Ragged(vals, self.widths.to(vals.device))
+
+    def cpu(self):
+        return self.to('cpu')
+
+    def cuda(self, device='cuda'):
+        return self.to(device)
+
+    def clone(self):
+        return Ragged(self.vals.clone(), self.widths.clone())
+
+
+def _check(vals, widths):
+    if vals.ndim == 0:
+        raise ValueError('the vals of a Ragged need at least one axis, but a single number was given')
+    if widths.ndim != 1:
+        raise ValueError(f'the widths of a Ragged need exactly one axis, but theirs have shape {tuple(widths.shape)}')
+    if not _whole(widths):
+        raise ValueError(f'the widths of a Ragged must be whole numbers, but their dtype is {widths.dtype}')
+    listed = np.array(widths.tolist(), int)
+    if (listed < 0).any():
+        i = int(listed.argmin())
+        raise ValueError(f'the widths of a Ragged must not be negative, but widths[{i}] is {listed[i]}')
+    if listed.sum() != len(vals):
+        raise ValueError(f'the widths of a Ragged must add up to the length of its vals, but they add up to '
+                         f'{listed.sum()} and there are {len(vals)} vals')
+
+
+def _whole(widths):
+    if isinstance(widths, torch.Tensor):
+        return not (widths.is_floating_point() or widths.is_complex() or widths.dtype == torch.bool)
+    return np.issubdtype(widths.dtype, np.integer)
