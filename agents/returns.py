@@ -1,0 +1,76 @@
+"""What an action was worth: GAE and V-trace as pure functions.
+
+Axes: T time, B lanes. Everything is (T, B); row t is the decision taken at time t, and `reward`, `reset`, `terminal`,
+`truncated` at row t belong to the world that followed it, t+1. `value` at row t is V_t, the value of what was seen
+*before* the decision, and `last_value` (B,) is V_T, that of the last observation, so V_{t+1} is the next row.
+
+A decision is *valid* if the world took it: valid_t = not reset_{t+1}. An episode's last observation has `terminal`
+(nothing follows: V counts as 0) or `truncated` (something would have followed: V counts) set; no sum crosses either.
+"""
+import torch
+
+from megastep import arrdict
+
+
+def discounted_sum(terms, discounts):
+    """x_t = terms_t + discounts_t x_{t+1}, x_T = 0, along the first axis.
+
+    Done by doubling, in log2(T) passes over the whole array: after a pass of stride k, x_t holds the first 2k terms of
+    its sum and d_t the product of the discounts up to the term that comes next. Nothing is divided by a product of
+    discounts, so zeros among them, which is how an episode ends, are exact.
+    """
+    total, product = terms, discounts
+    stride = 1
+    while stride < len(terms):
+        head = total[:-stride] + product[:-stride] * total[stride:]
+        total = torch.cat([head, total[-stride:]])
+        product = torch.cat([product[:-stride] * product[stride:], product[-stride:]])
+        stride *= 2
+    return total
+
+
+def _following(value, last_value):
+    return torch.cat([value[1:], last_value[None]])
+
+
+def gae(reward, value, last_value, reset, terminal, truncated, *, gamma, lambda_):
+    """Generalised advantage estimates (Schulman et al. 2016), and the lambda returns A + V for the value to fit.
+
+        delta_t = r_{t+1} + gamma (1 - terminal_{t+1}) V_{t+1} - V_t
+        A_t     = delta_t + gamma lambda (1 - done_{t+1}) A_{t+1},   done = terminal or truncated
+
+    A is 0 where the decision was not valid. Returns arrdict(advantages, targets, valid), each (T, B).
+    """
+    valid = ~reset
+    delta = reward + gamma * torch.where(terminal, 0., _following(value, last_value)) - value
+    delta = torch.where(valid, delta, 0.)
+    discounts = gamma * lambda_ * (~(terminal | truncated | reset)).to(value.dtype)
+    advantages = discounted_sum(delta, discounts)
+    return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=valid)
+
+
+def vtrace(log_ratio, reward, value, last_value, reset, terminal, truncated,
+           *, gamma, lambda_=1., rho_clip=1., c_clip=1.):
+    """V-trace (Espeholt et al. 2018, IMPALA): what a policy pi can learn from what another, mu, did.
+
+    With `log_ratio` = log pi(a_t) - log mu(a_t), rho_t = min(rho_clip, pi/mu), c_t = lambda min(c_clip, pi/mu):
+
+        delta_t   = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) V_{t+1} - V_t)
+        v_t - V_t = delta_t + gamma c_t (1 - done_{t+1}) (v_{t+1} - V_{t+1}),           v_T = V_T
+        A_t       = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) v'_{t+1} - V_t),        v' = V at a truncation, else v
+
+    The targets v are what the value should fit; A weighs the policy's gradient. Where the decision was not valid v = V
+    and A = 0. Returns arrdict(advantages, targets, valid), each (T, B).
+    """
+    valid = ~reset
+    following = _following(value, last_value)
+    ratio = log_ratio.exp()
+    rho = ratio.clamp(max=rho_clip)
+    delta = rho * (reward + gamma * torch.where(terminal, 0., following) - value)
+    delta = torch.where(valid, delta, 0.)
+    discounts = torch.where(terminal | truncated | reset, 0., gamma * lambda_ * ratio.clamp(max=c_clip))
+    targets = value + discounted_sum(delta, discounts)
+
+    beyond = torch.where(truncated, following, _following(targets, last_value))
+    advantages = rho * (reward + gamma * torch.where(terminal, 0., beyond) - value)
+    return arrdict.arrdict(advantages=torch.where(valid, advantages, 0.), targets=targets, valid=valid)
