@@ -115,8 +115,8 @@ def torchify(leaf):
     try:
         return torch.as_tensor(array)
     except TypeError:
-        raise ValueError(f'torchify cannot make a tensor of a value of type {type(leaf).__name__} (dtype {array.dtype}); '
-                         'numbers, bools and arrays of them can be') from None
+        raise ValueError(f'torchify cannot make a tensor of a value of type {type(leaf).__name__} (dtype '
+                         f'{array.dtype}); it takes numbers, bools and arrays of them') from None
 
 
 @mapping

@@ -53,10 +53,11 @@ class Ragged:
         starts, ends = self._host
         if isinstance(index, slice):
             chosen = range(len(self))[index]
-            if chosen.step == 1 or not chosen:
-                bounds = slice(starts[chosen[0]], ends[chosen[-1]]) if chosen else slice(0, 0)
-                return type(self)(self.vals[bounds], self.widths[chosen.start:max(chosen.start, chosen.stop)])
-            return type(self)(self._cat([self.vals[starts[i]:ends[i]] for i in chosen]), self.widths[list(chosen)])
+            if not chosen:
+                return Ragged(self.vals[:0], self.widths[:0])
+            if chosen.step == 1:
+                return Ragged(self.vals[starts[chosen[0]]:ends[chosen[-1]]], self.widths[chosen.start:chosen.stop])
+            return Ragged(self._cat([self.vals[starts[i]:ends[i]] for i in chosen]), self.widths[list(chosen)])
         try:
             i = operator.index(index)
         except TypeError:

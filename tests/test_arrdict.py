@@ -1,0 +1,221 @@
+"""Trees of arrays: indexing, operators, joining, converting, and torch's tree utilities."""
+import copy
+import operator
+import pickle
+
+import loky
+import numpy as np
+import pytest
+import torch
+from torch.utils import _pytree
+
+from megastep import arrdict as module
+from megastep.arrdict import arrdict, cat, clone, leaves, numpyify, stack, torchify
+from megastep.dotdict import dotdict
+from megastep.ragged import Ragged
+
+NAMES = ('add', 'sub', 'mul', 'truediv', 'floordiv', 'mod', 'pow', 'lshift', 'rshift', 'and_', 'or_', 'xor',
+         'lt', 'le', 'eq', 'ne', 'ge', 'gt')
+
+
+@pytest.fixture
+def tensors():
+    return arrdict(a=torch.tensor([1]), b=arrdict(c=torch.tensor([2])))
+
+
+def numbers(tree):
+    """A tree with its arrays as nested lists, so that == is one bool."""
+    return {key: numbers(value) if isinstance(value, dict) else np.asarray(value).tolist()
+            for key, value in tree.items()}
+
+
+def test_printing_shows_shape_and_dtype(tensors):
+    assert repr(tensors) == '\n'.join([
+        'arrdict:',
+        'a    Tensor((1,), torch.int64)',
+        'b    arrdict:',
+        '     c    Tensor((1,), torch.int64)'])
+    assert repr(arrdict(x=np.zeros((2, 3), np.float32))) == 'arrdict:\nx    ndarray((2, 3), float32)'
+
+
+def test_indexing_goes_to_the_leaves():
+    tree = arrdict(a=torch.arange(6).view(2, 3), b=dotdict(c=torch.arange(4).view(2, 2)))
+    assert numbers(tree[1]) == {'a': [3, 4, 5], 'b': {'c': [2, 3]}}
+    assert numbers(tree[:, -1]) == {'a': [2, 5], 'b': {'c': [1, 3]}}
+    assert numbers(tree[torch.tensor([False, True])]) == {'a': [[3, 4, 5]], 'b': {'c': [[2, 3]]}}
+    assert tree[..., None].a.shape == (2, 3, 1)
+    assert type(tree[0]) is arrdict and type(tree[0].b) is dotdict
+
+
+def test_a_tree_of_indices_indexes_leaf_by_leaf():
+    tree = arrdict(a=torch.tensor([1, 2]), b=torch.tensor([3, 4]))
+    assert numbers(tree[arrdict(a=0, b=1)]) == {'a': 1, 'b': 4}
+
+
+def test_assigning_to_an_index_writes_in_place():
+    a, c = torch.zeros(3), torch.zeros(3, 2)
+    tree = arrdict(a=a, b=arrdict(c=c))
+    tree[torch.tensor([True, False, True])] = arrdict(a=torch.tensor([1., 2.]), b=arrdict(c=torch.ones(2, 2)))
+    assert a.tolist() == [1, 0, 2] and c.tolist() == [[1, 1], [0, 0], [1, 1]]
+    tree[1] = 7
+    assert a.tolist() == [1, 7, 2] and c[1].tolist() == [7, 7]
+
+
+def test_assigning_a_tree_of_other_keys_is_refused_before_any_write():
+    tree = arrdict(a=torch.zeros(2), b=torch.zeros(2))
+    with pytest.raises(ValueError, match='one has a, b and the other a'):
+        tree[0] = arrdict(a=1.)
+    assert tree.a.tolist() == [0, 0]
+
+
+def test_string_keys_are_items(tensors):
+    tensors['d'] = 5
+    assert tensors['d'] == tensors.d == 5
+    with pytest.raises(KeyError, match='its keys are a, b, d'):
+        tensors['e']
+
+
+@pytest.mark.parametrize('name', NAMES)
+@pytest.mark.parametrize('kind', [torch.tensor, np.array])
+def test_operators_act_leaf_by_leaf_on_either_side(name, kind):
+    op = getattr(operator, name)
+    x, y = kind([5, 6]), kind([2, 1])
+    left, right = arrdict(a=x, b=arrdict(c=y)), arrdict(a=y, b=arrdict(c=y))
+    assert numbers(op(left, right)) == {'a': op(x, y).tolist(), 'b': {'c': op(y, y).tolist()}}
+    for other in (3, kind([3, 4]), kind(3), np.int64(3)):
+        assert numbers(op(left, other)) == {'a': op(x, other).tolist(), 'b': {'c': op(y, other).tolist()}}, other
+        assert numbers(op(other, left)) == {'a': op(other, x).tolist(), 'b': {'c': op(other, y).tolist()}}, other
+        assert type(op(other, left)) is arrdict
+
+
+def test_matrix_products_and_divmod():
+    tree = arrdict(a=np.array([[1., 2.], [3., 4.]]))
+    swap = np.array([[0., 1.], [1., 0.]])
+    assert (tree @ swap).a.tolist() == [[2, 1], [4, 3]]
+    assert (swap @ tree).a.tolist() == [[3, 4], [1, 2]]
+    assert divmod(arrdict(a=7), 2) == {'a': (3, 1)}
+    assert divmod(7, arrdict(a=2)) == {'a': (3, 1)}
+
+
+def test_signs_and_complements():
+    tree = arrdict(a=torch.tensor([1, -2]))
+    assert (-tree).a.tolist() == [-1, 2]
+    assert (+tree).a.tolist() == [1, -2]
+    assert abs(tree).a.tolist() == [1, 2]
+    assert (~arrdict(a=torch.tensor([True, False]))).a.tolist() == [False, True]
+
+
+def test_updating_operators_rebind_and_leave_the_operand_alone():
+    tree = arrdict(a=torch.tensor([True, False]))
+    before, tree = tree, operator.ior(tree, arrdict(a=torch.tensor([False, True])))
+    assert tree.a.tolist() == [True, True] and before.a.tolist() == [True, False]
+    tree += 1
+    assert tree.a.tolist() == [2, 2]
+
+
+def test_operands_of_other_keys_are_refused(tensors):
+    with pytest.raises(ValueError, match='one has a, b and the other a'):
+        tensors + arrdict(a=1)
+
+
+def test_forwarded_attributes_and_calls(tensors):
+    assert tensors.shape == {'a': (1,), 'b': {'c': (1,)}}
+    assert tensors.float().b.c.dtype == torch.float32
+    assert repr((tensors + tensors)[0].item()) == 'arrdict:\na    2\nb    arrdict:\n     c    4'
+
+
+def test_stack_makes_a_new_axis_and_cat_extends_one():
+    trees = [arrdict(a=torch.full((2, 3), i), b=arrdict(c=np.full(4, i)), n=i) for i in range(5)]
+    stacked = stack(trees)
+    assert stacked.a.shape == (5, 2, 3) and stacked.b.c.shape == (5, 4) and stacked.n.tolist() == [0, 1, 2, 3, 4]
+    assert stacked.b.c[:, 0].tolist() == [0, 1, 2, 3, 4]
+    assert type(stacked) is arrdict and type(stacked.b) is arrdict
+    assert stack([torch.zeros(2), torch.ones(2)], dim=1).tolist() == [[0, 1], [0, 1]]
+    pair = [arrdict(a=torch.full((2, 3), i), b=arrdict(c=np.full((1, 1), i))) for i in range(2)]
+    assert cat(pair).a.shape == (4, 3) and cat(pair, dim=1).a.tolist() == [[0, 0, 0, 1, 1, 1]] * 2
+    assert cat(pair).b.c.tolist() == [[0], [1]]
+
+
+def test_joining_nothing_or_unlike_trees_is_refused():
+    with pytest.raises(ValueError, match='stack was given no trees'):
+        stack([])
+    with pytest.raises(ValueError, match='one has a and the other b'):
+        cat([arrdict(a=torch.zeros(1)), arrdict(b=torch.zeros(1))])
+
+
+def test_torchify_halves_only_float64():
+    tree = torchify(arrdict(d=np.zeros(2), f=np.zeros(2, np.float32), h=np.zeros(2, np.float16), i=np.arange(2),
+                            b=np.array([True]), n=3, r=Ragged(np.arange(3.), [1, 2])))
+    assert {key: leaf.dtype for key, leaf in tree.items() if key != 'r'} == dict(
+        d=torch.float32, f=torch.float32, h=torch.float16, i=torch.int64, b=torch.bool, n=torch.int64)
+    assert tree.r.vals.dtype == torch.float32
+    with pytest.raises(ValueError, match='cannot make a tensor of a value of type str'):
+        torchify(arrdict(s='word'))
+
+
+def test_numpyify_reaches_lists_and_leaves_the_rest():
+    tree = numpyify(dotdict(t=torch.ones(2, requires_grad=True), h=torch.ones(2, dtype=torch.bfloat16), s='word',
+                            n=None, many=(torch.zeros(1), [torch.ones(1)]), r=Ragged(torch.arange(3.), [1, 2])))
+    assert isinstance(tree.t, np.ndarray) and tree.h.dtype == np.float32
+    assert tree.s == 'word' and tree.n is None and tree.r[1].tolist() == [1, 2]
+    assert isinstance(tree.many[0], np.ndarray) and isinstance(tree.many[1][0], np.ndarray)
+
+
+def test_there_and_back_changes_nothing():
+    tree = arrdict(h=torch.rand(3).half(), i=torch.arange(3, dtype=torch.int16), b=arrdict(m=torch.tensor([True])))
+    back = torchify(numpyify(tree))
+    assert all(torch.equal(x, y) and x.dtype == y.dtype for x, y in zip(leaves(tree), leaves(back), strict=True))
+
+
+def test_clones_share_no_memory():
+    tree = arrdict(t=torch.zeros(2), n=np.zeros(2), b=arrdict(r=Ragged(torch.zeros(2), [2])), list=[1])
+    made = clone(tree)
+    made.t[0] = made.n[0] = made.b.r.vals[0] = made['list'][0] = 9
+    assert tree.t[0] == tree.n[0] == tree.b.r.vals[0] == 0 and tree['list'] == [1]
+
+
+@pytest.mark.parametrize('trip', [copy.copy, copy.deepcopy, lambda tree: pickle.loads(pickle.dumps(tree))])
+def test_copies_keep_type_and_values(tensors, trip):
+    made = trip(tensors)
+    assert type(made) is arrdict and type(made.b) is arrdict and numbers(made) == numbers(tensors)
+
+
+def test_worker_processes_send_trees_back_unchanged(tensors):
+    pool = loky.ProcessPoolExecutor(1)
+    try:
+        made = pool.submit(copy.copy, numpyify(tensors)).result()
+    finally:
+        pool.shutdown()
+    assert type(made.b) is arrdict and numbers(made) == numbers(tensors)
+
+
+@pytest.mark.parametrize('kind', [arrdict, dotdict])
+def test_torchs_tree_utilities_keep_the_type(kind):
+    tree = kind(a=torch.tensor([1]), b=kind(c=torch.tensor([2])))
+    made = _pytree.tree_map(lambda x: x + 1, tree)
+    assert type(made) is kind and type(made.b) is kind and made.b.c.tolist() == [3]
+    paths = [_pytree.keystr(path) for path, _ in _pytree.tree_flatten_with_path(tree)[0]]
+    assert paths == ["['a']", "['b']['c']"]
+
+
+@pytest.mark.parametrize('fullgraph', [False, True])
+def test_torch_compile_takes_and_returns_trees(fullgraph):
+    def f(tree):
+        total = tree.a * 2 + tree.b.c
+        return arrdict(total=total, tree=tree, parts=dotdict(x=total[0]))
+
+    torch._dynamo.reset()
+    out = torch.compile(f, backend='eager', fullgraph=fullgraph)(
+        arrdict(a=torch.tensor([1.]), b=arrdict(c=torch.tensor([2.]))))
+    assert type(out) is arrdict and type(out.tree) is arrdict and type(out.parts) is dotdict
+    assert out.total.tolist() == [4] and out.tree.b.c.tolist() == [2] and out.parts.x == 4
+
+
+def test_torch_compile_takes_tree_arithmetic():
+    torch._dynamo.reset()
+    out = torch.compile(lambda tree: (1 + tree * tree)[0].float(), backend='eager')(arrdict(a=torch.tensor([3, 4])))
+    assert type(out) is arrdict and out.a.item() == 10
+
+
+def test_the_module_offers_the_tree_functions():
+    assert set(module.__all__) <= set(dir(module))
