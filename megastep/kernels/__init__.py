@@ -1,0 +1,1 @@
+"""The kernels: C++ and CUDA sources, and :mod:`~megastep.kernels.compile`, which builds them at first use."""

@@ -1,0 +1,11 @@
+// How the GPU spells what math.h and scene.h leave to the backend.
+#define HD static __device__ __forceinline__
+#define DEVICE static __device__ __forceinline__
+#define KERNEL extern "C" __global__ void
+#define SQRT(x) sqrtf(x)
+#define CEIL(x) ceilf(x)
+#define FLOOR(x) floorf(x)
+#define RINT(x) rintf(x)
+#define NAN_VALUE __int_as_float(0x7fc00000)
+#define INFINITE __int_as_float(0x7f800000)
+#define OR_BITS(word, bits) atomicOr(word, bits)

@@ -1,0 +1,222 @@
+// The mathematics of the engine: plain C++ without includes, compiled for the CPU and the GPU alike, and equal on both to the last bit. Hence no
+// fused multiply-add (a compiler flag on either side), IEEE division and square root, and our own sine and cosine.
+// Before it stand, from the backend: HD (how a function is declared), and SQRT, CEIL, FLOOR, RINT, ABS of a float, correctly rounded.
+
+HD float low(float a, float b) { return a < b ? a : b; }
+HD float high(float a, float b) { return a > b ? a : b; }
+HD float clamp(float x, float a, float b) { return low(high(x, a), b); }
+HD int clamp_int(int x, int a, int b) { return x < a ? a : (x > b ? b : x); }
+HD float cross(float ax, float ay, float bx, float by) { return ax * by - ay * bx; }
+HD int is_finite(float x) { return x - x == 0.f; }
+
+// Degrees to sine and cosine. The quarter turns leave exactly in degrees; the rest, within 45 degrees, goes through Cephes' polynomials (1 ulp).
+HD void sincos_degrees(float degrees, float& sine, float& cosine) {
+    float quarters = RINT(degrees * (1.f / 90.f));
+    float x = (degrees - 90.f * quarters) * 0.017453292519943295f, x2 = x * x;
+    float s = x + x * x2 * (-1.6666654611e-1f + x2 * (8.3321608736e-3f + x2 * -1.9515295891e-4f));
+    float c = 1.f - 0.5f * x2 + x2 * x2 * (4.166664568298827e-2f + x2 * (-1.388731625493765e-3f + x2 * 2.443315711809948e-5f));
+    int quadrant = (int)quarters & 3;
+    float swapped_s = quadrant & 1 ? c : s, swapped_c = quadrant & 1 ? s : c;
+    sine = quadrant & 2 ? -swapped_s : swapped_s;
+    cosine = (quadrant + 1) & 2 ? -swapped_c : swapped_c;
+}
+
+// ---- Movement: swept discs ----
+
+constexpr float NO_CONTACT = 2.f;       // beyond the end of the step
+constexpr float INFLATION = 1.001f;     // of the radius, so that a stopped agent's camera stays on its side of the wall
+constexpr float SHORTENING = 0.99f;     // of the free part of a step
+
+// Fraction of the step d after which a point at g, relative to a disc of radius rho about the origin, enters it. Inside already: 0 if it nears the middle.
+HD float sweep_point(float gx, float gy, float dx, float dy, float rho) {
+    float approach = -(gx * dx + gy * dy), outside = gx * gx + gy * gy - rho * rho;
+    if (!(approach > 0.f)) return NO_CONTACT;
+    if (outside < 0.f) return 0.f;
+    float offset = cross(gx, gy, dx, dy);
+    float reach = rho * rho * (dx * dx + dy * dy) - offset * offset;
+    if (reach < 0.f) return NO_CONTACT;
+    return outside / (approach + SQRT(reach));
+}
+
+// Do the bounding boxes of a swept disc and of a segment meet? Cheap, and rules out nearly every wall.
+HD int boxes_meet(float px, float py, float dx, float dy, float ax, float ay, float bx, float by, float rho) {
+    return (low(ax, bx) <= high(px, px + dx) + rho) & (high(ax, bx) >= low(px, px + dx) - rho)
+         & (low(ay, by) <= high(py, py + dy) + rho) & (high(ay, by) >= low(py, py + dy) - rho);
+}
+
+// Fraction of the step d after which a disc of radius rho at p touches the segment ab, or NO_CONTACT. A disc that overlaps it already is held if it comes
+// nearer and free if it leaves: the distance to a convex body along a straight path, once growing, grows for ever.
+HD float sweep_segment(float px, float py, float dx, float dy, float ax, float ay, float bx, float by, float rho) {
+    if (!boxes_meet(px, py, dx, dy, ax, ay, bx, by, rho)) return NO_CONTACT;
+    float ex = bx - ax, ey = by - ay, gx = px - ax, gy = py - ay;
+    float length2 = ex * ex + ey * ey, along = gx * ex + gy * ey;
+    float u = length2 > 0.f ? clamp(along / length2, 0.f, 1.f) : 0.f;
+    float nx = gx - u * ex, ny = gy - u * ey;
+    if (nx * nx + ny * ny < rho * rho) return nx * dx + ny * dy < 0.f ? 0.f : NO_CONTACT;
+    float first = low(sweep_point(gx, gy, dx, dy, rho), sweep_point(px - bx, py - by, dx, dy, rho));
+    float height = cross(ex, ey, gx, gy), climb = cross(ex, ey, dx, dy);
+    if (height < 0.f) { height = -height; climb = -climb; }
+    float gap = height - rho * SQRT(length2);
+    if (gap >= 0.f && climb < 0.f) {
+        float t = gap / -climb, foot = along + t * (dx * ex + dy * ey);
+        if (foot >= 0.f && foot <= length2) first = low(first, t);
+    }
+    return first;
+}
+
+HD float progress_of(float contact) { return contact <= 1.f ? clamp(SHORTENING * contact, 0.f, 1.f) : 1.f; }
+
+HD float wrap_degrees(float angle) {
+    float wrapped = angle - 360.f * FLOOR((angle + 180.f) * (1.f / 360.f));
+    return wrapped >= 180.f ? wrapped - 360.f : (wrapped < -180.f ? wrapped + 360.f : wrapped);
+}
+
+// ---- Light ----
+
+// Does the segment from a light at (lx, ly) along d, short of its last thousandth, meet the wall? Without a division: all sides times the determinant.
+HD int blocks(float lx, float ly, float dx, float dy, float ax, float ay, float bx, float by) {
+    float vx = bx - ax, vy = by - ay, wx = ax - lx, wy = ay - ly;
+    float den = cross(dx, dy, vx, vy), s = cross(wx, wy, vx, vy), u = cross(wx, wy, dx, dy);
+    float sign = den < 0.f ? -1.f : 1.f;
+    den *= sign; s *= sign; u *= sign;
+    return (s > 0.f) & (s < 0.999f * den) & (u >= 0.f) & (u <= den);
+}
+
+HD float glow(float intensity, float dx, float dy) { return 2.f * intensity / high(dx * dx + dy * dy, 1.f); }
+constexpr float AMBIENT = 0.1f;
+
+// ---- Sight: a wall covers an interval of pixels, and along it inverse depth is affine in the pixel's index ----
+
+struct Camera { float x, y, sine, cosine; };
+
+HD Camera camera_at(float x, float y, float degrees) {
+    Camera camera = {x, y, 0.f, 1.f};
+    sincos_degrees(degrees, camera.sine, camera.cosine);
+    return camera;
+}
+
+// Screen of R pixels: pixel r looks along (1, edge - pitch r); a point (x, y) lies at pixel middle - scale y / x.
+struct Screen { float edge, pitch, middle, scale, near, radius; int res; };
+
+HD Screen screen_of(const Sight& sight) {
+    float res = (float)sight.res, w = sight.half_width;
+    Screen screen = {w * (res - 1.f) / res, 2.f * w / res, 0.5f * res - 0.5f, res / (2.f * w), sight.near, sight.world.radius, sight.res};
+    return screen;
+}
+
+HD float slope(const Screen& screen, int r) { return screen.edge - screen.pitch * (float)r; }
+
+// A line in the camera's frame: where it starts, and the way it goes.
+struct Line { float ax, ay, vx, vy; };
+
+struct Span { int first, last; float base, gain; int close; };   // pixels [first, last), 1/depth = base + gain r, does it come within the radius
+
+HD void to_camera(const Camera& camera, float x, float y, float& depth, float& left) {
+    float dx = x - camera.x, dy = y - camera.y;
+    depth = camera.cosine * dx + camera.sine * dy;
+    left = camera.cosine * dy - camera.sine * dx;
+}
+
+HD Line line_in(const Camera& camera, float ax, float ay, float bx, float by) {
+    Line line; float cx, cy;
+    to_camera(camera, ax, ay, line.ax, line.ay);
+    to_camera(camera, bx, by, cx, cy);
+    line.vx = cx - line.ax; line.vy = cy - line.ay;
+    return line;
+}
+
+// The pixels a wall covers. Walls that share a corner compute it from the same bits, and intervals are half open: no ray slips between them, none sees both.
+// What lies nearer than `near` in depth is within the radius for every ray of the screen, so cutting it off loses nothing.
+HD Span span_of(const Camera& camera, const Screen& screen, float wax, float way, float wbx, float wby) {
+    float ax, ay, bx, by;
+    to_camera(camera, wax, way, ax, ay);
+    to_camera(camera, wbx, wby, bx, by);
+    float vx = bx - ax, vy = by - ay, area = cross(ax, ay, vx, vy);
+    float t = (screen.near - ax) / vx;                                  // used only where the wall crosses the near plane: then vx is not 0
+    int behind_a = ax < screen.near, behind_b = bx < screen.near;
+    float cut = ay + t * vy;
+    float pa = screen.middle - screen.scale * ((behind_a ? cut : ay) / (behind_a ? screen.near : ax));
+    float pb = screen.middle - screen.scale * ((behind_b ? cut : by) / (behind_b ? screen.near : bx));
+    float res = (float)screen.res;
+    Span span;
+    span.first = (int)CEIL(clamp(low(pa, pb), 0.f, res));
+    span.last = (behind_a & behind_b) | (area == 0.f) ? 0 : (int)CEIL(clamp(high(pa, pb), 0.f, res));
+    float k = 1.f / area;
+    span.base = (vy - screen.edge * vx) * k;
+    span.gain = screen.pitch * vx * k;
+    span.close = area * area <= screen.radius * screen.radius * (vx * vx + vy * vy) * 1.001f;
+    return span;
+}
+
+// Inverse depth of a span at pixel r; 0, which sees nothing, where that is within the agent's radius.
+HD float inverse_depth(const Span& span, const Screen& screen, int r) {
+    float inverse = span.base + span.gain * (float)r;
+    if (span.close) {
+        float y = slope(screen, r);
+        if (inverse * inverse * (screen.radius * screen.radius) >= 1.f + y * y) return 0.f;
+    }
+    return inverse;
+}
+
+struct Hit { float location, facing; };   // fraction along the line; squared sine between ray and line
+
+HD Hit hit_of(const Line& line, float y) {
+    float across = line.vy - y * line.vx;
+    Hit hit;
+    hit.location = clamp((y * line.ax - line.ay) / across, 0.f, 1.f);
+    hit.facing = across * across / ((1.f + y * y) * (line.vx * line.vx + line.vy * line.vy));
+    return hit;
+}
+
+HD float cosine_of(const Line& line, float y) {
+    return (line.vx + y * line.vy) / (SQRT((1.f + y * y) * (line.vx * line.vx + line.vy * line.vy)) + 1e-6f);
+}
+
+HD float distance_of(float inverse, float y) { return SQRT(1.f + y * y) / inverse; }
+
+HD float depth_reading(float distance, float radius, float max_depth) { return 1.f - clamp((distance - radius) / max_depth, 0.f, 1.f); }
+
+// Linear filtering between texel centres, clamped at the line's ends.
+struct Filter { int left, right; float weight; };
+
+HD Filter filter_at(float location, int width) {
+    float at = location * (float)width - 0.5f, floor = FLOOR(at);
+    Filter filter = {clamp_int((int)floor, 0, width - 1), clamp_int((int)floor + 1, 0, width - 1), at - floor};
+    return filter;
+}
+
+HD int texel_at(float location, int width) { return clamp_int((int)(location * (float)width), 0, width - 1); }
+
+HD float mix(float a, float b, float weight) { return a + weight * (b - a); }
+
+// ---- Half precision: IEEE round to nearest even, on bits, so that it needs no header and no instruction ----
+
+HD unsigned short half_bits(float value) {
+    union { float f; unsigned int u; } in; in.f = value;
+    unsigned int sign = (in.u >> 16) & 0x8000u, magnitude = in.u & 0x7fffffffu;
+    if (magnitude > 0x7f800000u) return (unsigned short)(sign | 0x7e00u);               // NaN
+    if (magnitude >= 0x477ff000u) return (unsigned short)(sign | 0x7c00u);              // rounds beyond 65504
+    if (magnitude < 0x38800000u) {                                                      // subnormal: a float addition does the rounding
+        union { float f; unsigned int u; } small; small.u = magnitude;
+        small.f += 0.5f;
+        return (unsigned short)(sign | (small.u - 0x3f000000u));
+    }
+    return (unsigned short)(sign | ((magnitude - 0x38000000u + 0xfffu + ((magnitude >> 13) & 1u)) >> 13));
+}
+
+// ---- Random numbers: Philox 4x32-10 (Salmon et al. 2011). Key = seed, counter = (lane, draw) ----
+
+struct Four { unsigned int a, b, c, d; };
+
+HD Four philox(unsigned int lane, unsigned int draw, unsigned int key0, unsigned int key1) {
+    Four x = {lane, draw, 0u, 0u};
+    for (int round = 0; round < 10; round++) {
+        unsigned long long p = 0xD2511F53ull * x.a, q = 0xCD9E8D57ull * x.c;
+        Four next = {(unsigned int)(q >> 32) ^ x.b ^ key0, (unsigned int)q, (unsigned int)(p >> 32) ^ x.d ^ key1, (unsigned int)p};
+        x = next;
+        key0 += 0x9E3779B9u; key1 += 0xBB67AE85u;
+    }
+    return x;
+}
+
+HD float uniform(unsigned int bits) { return (float)(bits >> 8) * (1.f / 16777216.f); }

@@ -1,0 +1,33 @@
+// One warp a world: lanes over the walls (and the other agents) for each agent in turn, then the agents move together.
+KERNEL physics(Motion p) {
+    const World& w = p.world;
+    int world = (blockIdx.x * blockDim.x + threadIdx.x) / 32, lane = threadIdx.x % 32, A = w.n_agents;
+    if (world >= w.n_worlds) return;
+    if (p.actions) {
+        for (int a = lane; a < A; a += 32) steer(p, world, a);
+        __syncwarp();
+    }
+    int design = w.design[world];
+    float rho = w.radius * INFLATION;
+    for (int a = 0; a < A; a++) {
+        int i = world * A + a;
+        float px = p.positions[2 * i], py = p.positions[2 * i + 1];
+        float dx = p.velocity[2 * i] * p.seconds, dy = p.velocity[2 * i + 1] * p.seconds;
+        float contact = NO_CONTACT;
+        if (dx != 0.f || dy != 0.f)
+            for (int j = w.wall_starts[design] + lane; j < w.wall_starts[design + 1]; j += 32) {
+                float4 b = ((const float4*)w.walls)[j];
+                contact = low(contact, sweep_segment(px, py, dx, dy, b.x, b.y, b.z, b.w, rho));
+            }
+        for (int other = lane; other < A; other += 32) {
+            int k = world * A + other;
+            if (other != a)
+                contact = low(contact, sweep_point(px - p.positions[2 * k], py - p.positions[2 * k + 1],
+                    dx - p.velocity[2 * k] * p.seconds, dy - p.velocity[2 * k + 1] * p.seconds, 2.f * rho));
+        }
+        for (int step = 16; step; step /= 2) contact = low(contact, __shfl_xor_sync(~0u, contact, step));
+        if (lane == 0) p.progress[i] = progress_of(contact);
+    }
+    __syncwarp();
+    for (int a = lane; a < A; a += 32) advance(p, world, a);
+}

@@ -1,0 +1,178 @@
+// What the operations share beyond single points and lines: one agent's move, its model's place, one pixel's colour. Both backends compile it.
+// Before it stand HD, NAN_VALUE, INFINITE, and OR_BITS(word, bits), which sets bits of a word of `seen` and returns what was there.
+
+HD void notice(int* fault, int world, float x, float y, float angle) {
+    if (!is_finite(x) || !is_finite(y) || !is_finite(angle)) *fault = world + 1;
+}
+
+// An agent takes its action: velocities decay, and the action's are added, turned into the world's frame.
+HD void steer(const Motion& p, int world, int a) {
+    int i = world * p.world.n_agents + a;
+    long long action = p.actions[i];
+    if (action < 0 || action >= p.n_moves) { *p.fault = -(world + 1); action = 0; }
+    const float* move = p.moves + 3 * action;
+    float s, c;
+    sincos_degrees(p.angles[i], s, c);
+    float* velocity = p.velocity + 2 * i;
+    velocity[0] = p.keep * velocity[0] + (c * move[0] - s * move[1]);
+    velocity[1] = p.keep * velocity[1] + (s * move[0] + c * move[1]);
+    p.angvelocity[i] = p.keep * p.angvelocity[i] + move[2];
+}
+
+HD void advance(const Motion& p, int world, int a) {
+    int i = world * p.world.n_agents + a;
+    float progress = p.progress[i];
+    float* position = p.positions + 2 * i; float* velocity = p.velocity + 2 * i;
+    position[0] += progress * (velocity[0] * p.seconds);
+    position[1] += progress * (velocity[1] * p.seconds);
+    p.angles[i] = wrap_degrees(p.angles[i] + progress * (p.angvelocity[i] * p.seconds));
+    notice(p.fault, world, position[0], position[1], p.angles[i]);
+    if (progress < 1.f) { velocity[0] = 0.f; velocity[1] = 0.f; p.angvelocity[i] = 0.f; }
+}
+
+HD void feel(const Sight& p, int agent) {
+    float s, c, x = p.velocity[2 * agent], y = p.velocity[2 * agent + 1];
+    sincos_degrees(p.angles[agent], s, c);
+    unsigned short* imu = p.imu + 3 * (long long)agent;
+    imu[0] = half_bits(p.angvelocity[agent] / 360.f);
+    imu[1] = half_bits((c * x + s * y) / 10.f);
+    imu[2] = half_bits((c * y - s * x) / 10.f);
+}
+
+struct Pose { float x, y, sine, cosine; };
+
+HD Pose pose_at(float x, float y, float degrees) {
+    Pose pose = {x, y, 0.f, 1.f};
+    sincos_degrees(degrees, pose.sine, pose.cosine);
+    return pose;
+}
+
+HD void place_line(const World& w, const Pose& pose, int agent, int m) {
+    float* line = w.agent_lines + 4 * (agent * (long long)w.n_model + m);
+    for (int end = 0; end < 2; end++) {
+        float x = w.model[4 * m + 2 * end], y = w.model[4 * m + 2 * end + 1];
+        line[2 * end] = pose.x + (pose.cosine * x - pose.sine * y);
+        line[2 * end + 1] = pose.y + (pose.sine * x + pose.cosine * y);
+    }
+}
+
+// Where an agent's texel lies, once its lines are placed.
+HD void agent_texel(const World& w, int world, int a, int texel, float& x, float& y) {
+    int l = a * w.n_model;
+    while (texel >= w.model_texels[l + 1]) l++;
+    int first = w.model_texels[l], width = w.model_texels[l + 1] - first;
+    float u = ((float)(texel - first) + 0.5f) / (float)width;
+    const float* line = w.agent_lines + 4 * (world * (long long)(w.n_agents * w.n_model) + l);
+    x = mix(line[0], line[2], u); y = mix(line[1], line[3], u);
+}
+
+// Could the wall hide a light from some part of a disc about an agent? Never says no wrongly: a wall is passed over only if it lies wholly on one
+// side of the light's path to the middle, by more than the disc, or wholly behind the light or behind the disc.
+HD int may_block(float lx, float ly, const Pose& pose, float reach, float ax, float ay, float bx, float by) {
+    float dx = pose.x - lx, dy = pose.y - ly, length = SQRT(dx * dx + dy * dy), margin = reach * length;
+    float sa = cross(dx, dy, ax - lx, ay - ly), sb = cross(dx, dy, bx - lx, by - ly);
+    float ta = dx * (ax - lx) + dy * (ay - ly), tb = dx * (bx - lx) + dy * (by - ly);
+    if (low(sa, sb) > margin || high(sa, sb) < -margin) return 0;
+    return !(high(ta, tb) < -margin || low(ta, tb) > length * length + margin);
+}
+
+// One world's lines and texels.
+struct Scene {
+    const float* walls; const float* agent_lines; const float* agent_textures; const float* agent_light;
+    const int* texel_starts;
+    int n_walls, n_agent_lines, first_texel;
+};
+
+HD Scene scene_of(const World& w, int world) {
+    int design = w.design[world], first = w.wall_starts[design], n = w.n_agents * w.n_model;
+    Scene scene = {w.walls + 4 * (long long)first, w.agent_lines + 4 * (world * (long long)n),
+                   w.agent_textures + 3 * (design * (long long)w.n_agent_texels), w.agent_light + world * (long long)w.n_agent_texels,
+                   w.texel_starts + first, w.wall_starts[design + 1] - first, n, w.texel_starts[first]};
+    return scene;
+}
+
+struct Colour { float red, green, blue; };
+
+HD Colour wall_colour(const World& w, int first, int width, const Hit& hit) {
+    Filter f = filter_at(hit.location, width);
+    const float* l = w.texels + 4 * (long long)(first + f.left);
+    const float* r = w.texels + 4 * (long long)(first + f.right);
+    float light = mix(l[3], r[3], f.weight) * hit.facing;
+    Colour colour = {mix(l[0], r[0], f.weight) * light, mix(l[1], r[1], f.weight) * light, mix(l[2], r[2], f.weight) * light};
+    return colour;
+}
+
+HD Colour agent_colour(const Scene& scene, int first, int width, const Hit& hit) {
+    Filter f = filter_at(hit.location, width);
+    const float* l = scene.agent_textures + 3 * (first + f.left);
+    const float* r = scene.agent_textures + 3 * (first + f.right);
+    float light = mix(scene.agent_light[first + f.left], scene.agent_light[first + f.right], f.weight) * hit.facing;
+    Colour colour = {mix(l[0], r[0], f.weight) * light, mix(l[1], r[1], f.weight) * light, mix(l[2], r[2], f.weight) * light};
+    return colour;
+}
+
+// Marks a texel as seen; 1 if it was not before. Most have been, so a plain look comes first.
+HD int mark(unsigned int* seen, int texel) {
+    unsigned int bit = 1u << (texel & 31);
+    return !(seen[texel >> 5] & bit) && !(OR_BITS(seen + (texel >> 5), bit) & bit);
+}
+
+// One ray, once its line is known: fills what is asked for of the full resolution, adds to the pixel's sums, and says whether its texel is new.
+struct Sums { float red, green, blue, depth; };
+
+HD int shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, int agent, long long ray, int r, float inverse, int l, Sums& sums) {
+    float y = slope(screen, r);
+    int n_agent_lines = scene.n_agent_lines, of_agent = l < n_agent_lines;
+    const float* ends = of_agent ? scene.agent_lines + 4 * l : scene.walls + 4 * (l - n_agent_lines);
+    const int* starts = of_agent ? p.world.model_texels + l : scene.texel_starts + (l - n_agent_lines);
+    int first = starts[0], width = starts[1] - first;
+    Line line = line_in(camera, ends[0], ends[1], ends[2], ends[3]);
+    Hit hit = hit_of(line, y);
+    float distance = distance_of(inverse, y);
+    if (p.depth) sums.depth += depth_reading(distance, screen.radius, p.max_depth);
+    if (p.rgb || p.screen) {
+        Colour colour = of_agent ? agent_colour(scene, first, width, hit) : wall_colour(p.world, first, width, hit);
+        sums.red += colour.red; sums.green += colour.green; sums.blue += colour.blue;
+        if (p.screen) { float* out = p.screen + 3 * ray; out[0] = colour.red; out[1] = colour.green; out[2] = colour.blue; }
+    }
+    if (p.locations) p.locations[ray] = hit.location;
+    if (p.dots) p.dots[ray] = cosine_of(line, y);
+    if (p.distances) p.distances[ray] = distance;
+    if (!p.seen || of_agent) return 0;
+    return mark(p.seen + agent * (long long)p.n_words, first - scene.first_texel + texel_at(hit.location, width));
+}
+
+HD void miss_ray(const Sight& p, long long ray) {
+    if (p.locations) p.locations[ray] = NAN_VALUE;
+    if (p.dots) p.dots[ray] = NAN_VALUE;
+    if (p.distances) p.distances[ray] = INFINITE;
+    if (p.screen) { float* out = p.screen + 3 * ray; out[0] = 0.f; out[1] = 0.f; out[2] = 0.f; }
+}
+
+// One pixel: the mean of its rays, which are summed in order. Returns how many texels it sees for the first time.
+HD int shade_pixel(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, int agent, long long view, int pixel,
+                   const float* inverse, const int* index) {
+    Sums sums = {0.f, 0.f, 0.f, 0.f};
+    int fresh = 0, S = p.subsample, n_pixels = p.res / S;
+    for (int k = 0; k < S; k++) {
+        int r = pixel * S + k;
+        long long ray = view * p.res + r;
+        if (p.indices) p.indices[ray] = index[r];
+        if (index[r] < 0) miss_ray(p, ray);
+        else fresh += shade_ray(p, screen, scene, camera, agent, ray, r, inverse[r], index[r], sums);
+    }
+    float n = (float)S;
+    if (p.rgb) {
+        unsigned short* rgb = p.rgb + view * 3 * n_pixels + pixel;
+        rgb[0] = half_bits(sums.red / n); rgb[n_pixels] = half_bits(sums.green / n); rgb[2 * n_pixels] = half_bits(sums.blue / n);
+    }
+    if (p.depth) p.depth[view * n_pixels + pixel] = half_bits(sums.depth / n);
+    return fresh;
+}
+
+HD void draw_lane(const Draw& p, int lane) {
+    if (!p.mask[lane]) return;
+    Four bits = philox((unsigned int)lane, (unsigned int)p.counts[lane], p.seed_low, p.seed_high);
+    float* out = p.out + 4 * (long long)lane;
+    out[0] = uniform(bits.a); out[1] = uniform(bits.b); out[2] = uniform(bits.c); out[3] = uniform(bits.d);
+}
