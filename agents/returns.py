@@ -41,12 +41,11 @@ def gae(reward, value, last_value, reset, terminal, truncated, *, gamma, lambda_
 
     A is 0 where the decision was not valid. Returns arrdict(advantages, targets, valid), each (T, B).
     """
-    valid = ~reset
-    delta = reward + gamma * torch.where(terminal, 0., _following(value, last_value)) - value
-    delta = torch.where(valid, delta, 0.)
-    discounts = gamma * lambda_ * (~(terminal | truncated | reset)).to(value.dtype)
+    delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.) - value
+    delta = delta.masked_fill(reset, 0.)
+    discounts = torch.full_like(value, gamma * lambda_).masked_fill_(terminal | truncated | reset, 0.)
     advantages = discounted_sum(delta, discounts)
-    return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=valid)
+    return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=~reset)
 
 
 def vtrace(log_ratio, reward, value, last_value, reset, terminal, truncated,
@@ -62,15 +61,14 @@ def vtrace(log_ratio, reward, value, last_value, reset, terminal, truncated,
     The targets v are what the value should fit; A weighs the policy's gradient. Where the decision was not valid v = V
     and A = 0. Returns arrdict(advantages, targets, valid), each (T, B).
     """
-    valid = ~reset
     following = _following(value, last_value)
     ratio = log_ratio.exp()
     rho = ratio.clamp(max=rho_clip)
-    delta = rho * (reward + gamma * torch.where(terminal, 0., following) - value)
-    delta = torch.where(valid, delta, 0.)
-    discounts = torch.where(terminal | truncated | reset, 0., gamma * lambda_ * ratio.clamp(max=c_clip))
+    delta = rho * (reward + gamma * following.masked_fill(terminal, 0.) - value)
+    delta = delta.masked_fill(reset, 0.)
+    discounts = (gamma * lambda_ * ratio.clamp(max=c_clip)).masked_fill(terminal | truncated | reset, 0.)
     targets = value + discounted_sum(delta, discounts)
 
-    beyond = torch.where(truncated, following, _following(targets, last_value))
-    advantages = rho * (reward + gamma * torch.where(terminal, 0., beyond) - value)
-    return arrdict.arrdict(advantages=torch.where(valid, advantages, 0.), targets=targets, valid=valid)
+    beyond = torch.where(truncated, following, _following(targets, last_value)).masked_fill(terminal, 0.)
+    advantages = rho * (reward + gamma * beyond - value)
+    return arrdict.arrdict(advantages=advantages.masked_fill(reset, 0.), targets=targets, valid=~reset)

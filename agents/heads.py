@@ -1,0 +1,242 @@
+"""Network layers made from spaces: intakes turn observations into a vector, outputs turn a vector into actions.
+
+Axes: `...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A the agents one lane controls.
+
+    intake = heads.intake(env.obs_space, width)        # (..., A, C, H, W) and (..., A, D)  ->  (..., width)
+    output = heads.output(env.action_space, width)     # (..., width)  ->  log-probabilities (..., A, n)
+    logits = nn.Sequential(intake, output)(world.obs)
+    actions = output.sample(logits)                    # (..., A) whole numbers
+
+Nested dicts of spaces give nested dicts of logits and actions. Nothing here asks the GPU a question.
+"""
+import math
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from megastep import spaces
+from megastep.arrdict import arrdict
+
+_TINY = 1e-20  # below the smallest exponential draw that float32 makes, and far from its underflow
+
+
+def compute_dtype(weight):
+    """The dtype a matrix product with `weight` runs in: autocast's where that is on, else the weight's own."""
+    device = weight.device.type
+    return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else weight.dtype
+
+
+class Flat(nn.Module):
+    """A vector or a picture as it is, unrolled: (..., *shape) -> (..., n_features)."""
+
+    def __init__(self, space):
+        super().__init__()
+        self.axes = len(space.shape)
+        self.n_features = math.prod(space.shape)
+
+    def forward(self, obs):
+        return obs.flatten(-self.axes)
+
+
+class OneHot(nn.Module):
+    """Whole numbers as indicators: (..., A) -> (..., A n)."""
+
+    def __init__(self, space):
+        super().__init__()
+        self.n_features = space.n_agents * space.n_actions
+        self.register_buffer('values', torch.arange(space.n_actions), persistent=False)
+
+    def forward(self, obs):
+        return (obs[..., None] == self.values).flatten(-2)
+
+
+class Conv(nn.Module):
+    """A picture through two convolutions along its rows: (..., A, C, H, W) -> (..., n_features).
+
+    The picture's rows count as channels, since pictures here are one pixel high or a few. Agents share the weights.
+    """
+
+    def __init__(self, space, channels=32):
+        super().__init__()
+        self.first = nn.Conv1d(space.C * space.H, channels, kernel_size=8, stride=4, padding=4)
+        self.second = nn.Conv1d(channels, channels, kernel_size=4, stride=2, padding=2)
+        columns = (space.W // 4 + 1) // 2 + 1
+        self.n_features = space.n_agents * channels * columns
+
+    def forward(self, obs):
+        lead = obs.shape[:-4]
+        rows = obs.reshape(-1, obs.shape[-3] * obs.shape[-2], obs.shape[-1]).to(compute_dtype(self.first.weight))
+        return F.relu(self.second(F.relu(self.first(rows)))).reshape(*lead, self.n_features)
+
+
+ENCODERS = {'linear': Flat, 'conv': Conv}
+
+
+def _encoder(space, pictures, path):
+    if isinstance(space, spaces.MultiImage):
+        return ENCODERS[pictures](space)
+    if isinstance(space, spaces.MultiVector):
+        return Flat(space)
+    if isinstance(space, spaces.MultiDiscrete):
+        return OneHot(space)
+    raise ValueError(f'no intake is known for the observation space {path or "itself"} = {space!r}; '
+                     'there are MultiVector, MultiImage, MultiDiscrete and dicts of them')
+
+
+def _paths(space, path=()):
+    """(path, space) for every leaf of a tree of spaces that has anything in it."""
+    if isinstance(space, dict):
+        for key, child in space.items():
+            yield from _paths(child, (*path, key))
+    elif not isinstance(space, spaces.MultiEmpty):
+        yield path, space
+
+
+class ConcatIntake(nn.Module):
+    """Encodes every leaf of an observation, joins what comes out, and projects it to one vector (..., width), relu'd.
+
+    At the start every leaf has the same say, however many numbers it has: a weight's variance is 2 / (leaves x leaf's
+    features), which keeps the vector's size that of the inputs (He et al. 2015).
+    """
+
+    def __init__(self, space, width, encoder='linear'):
+        super().__init__()
+        if encoder not in ENCODERS:
+            raise ValueError(f'encoder is {encoder!r}; it can be {" or ".join(ENCODERS)}')
+        leaves = list(_paths(space))
+        if not leaves:
+            raise ValueError(f'the observation space {space!r} has nothing in it to see')
+        self.paths = [path for path, _ in leaves]
+        self.encoders = nn.ModuleList(_encoder(leaf, encoder, '.'.join(path)) for path, leaf in leaves)
+        sizes = [e.n_features for e in self.encoders]
+        self.project = nn.Linear(sum(sizes), width)
+        with torch.no_grad():
+            self.project.bias.zero_()
+            for block, size in zip(self.project.weight.split(sizes, dim=1), sizes, strict=True):
+                block.normal_(std=math.sqrt(2 / (len(sizes) * size)))
+
+    def forward(self, obs):
+        dtype = compute_dtype(self.project.weight)
+        features = []
+        for path, encoder in zip(self.paths, self.encoders, strict=True):
+            leaf = obs
+            for key in path:
+                leaf = leaf[key]
+            features.append(encoder(leaf))
+        joined = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
+        return F.relu(self.project(joined.to(dtype)))
+
+
+def intake(space, width, encoder='linear'):
+    """A module from observations of this space, or dict of spaces, to vectors (..., width).
+
+    Observations may be of any dtype; they are cast to the weights'. `encoder` says how pictures are looked at:
+    'linear', as so many numbers, or 'conv', by convolutions. ValueError if the space is of no known kind.
+    """
+    return ConcatIntake(space, width, encoder)
+
+
+class MultiDiscreteOutput(nn.Module):
+    """One choice out of n for every agent. Logits are log-probabilities (..., A, n), actions (..., A) int64.
+
+    `logprob` and `entropy` are those of the lane's joint action, (...,): the sum over its agents.
+    """
+
+    def __init__(self, space, width):
+        super().__init__()
+        self.shape = (space.n_agents, space.n_actions)
+        self.core = nn.Linear(width, math.prod(self.shape))
+        # A hundredth of the usual size, so that the first policy is close to uniform (Andrychowicz et al. 2021)
+        nn.init.orthogonal_(self.core.weight, gain=.01)
+        nn.init.zeros_(self.core.bias)
+
+    def forward(self, x):
+        scores = self.core(x.to(compute_dtype(self.core.weight))).float()
+        return scores.unflatten(-1, self.shape).log_softmax(-1)
+
+    def sample(self, logits, generator=None):
+        """Draws actions: the maximum of log-probability plus Gumbel noise is distributed as the probabilities."""
+        noise = torch.empty_like(logits).exponential_(generator=generator).clamp_(min=_TINY).log_()
+        return (logits - noise).argmax(-1)
+
+    def greedy(self, logits):
+        return logits.argmax(-1)
+
+    def logprob(self, logits, actions):
+        return logits.gather(-1, actions.long()[..., None]).squeeze(-1).sum(-1)
+
+    def entropy(self, logits):
+        return -(logits.exp() * logits).sum((-1, -2))
+
+
+class DictOutput(nn.Module):
+    """A dict of choices, made independently; `logprob` and `entropy` (...,) are summed over it."""
+
+    def __init__(self, space, width):
+        super().__init__()
+        self.outputs = nn.ModuleDict({key: output(child, width) for key, child in space.items()})
+
+    def _each(self, f):
+        return arrdict({key: f(key, child) for key, child in self.outputs.items()})
+
+    def forward(self, x):
+        return self._each(lambda key, child: child(x))
+
+    def sample(self, logits, generator=None):
+        return self._each(lambda key, child: child.sample(logits[key], generator))
+
+    def greedy(self, logits):
+        return self._each(lambda key, child: child.greedy(logits[key]))
+
+    def logprob(self, logits, actions):
+        return sum(self._each(lambda key, child: child.logprob(logits[key], actions[key])).values())
+
+    def entropy(self, logits):
+        return sum(self._each(lambda key, child: child.entropy(logits[key])).values())
+
+
+def output(space, width):
+    """A module from vectors (..., width) to logits of this action space, or dict of spaces, that can also `sample`
+    them, pick the likeliest (`greedy`) and tell `logprob` and `entropy`. ValueError if the space is of no known kind.
+    """
+    if isinstance(space, dict) and space:
+        return DictOutput(space, width)
+    if isinstance(space, spaces.MultiDiscrete):
+        return MultiDiscreteOutput(space, width)
+    raise ValueError(f'no output is known for the action space {space!r}; there are MultiDiscrete and dicts of it')
+
+
+class ValueOutput(nn.Module):
+    """The expected return, (..., width) -> (...,) float32, in units of reward.
+
+    The layer itself predicts returns less their running mean, over their running deviation, so that its error is about
+    1 whatever an environment pays. `rescale` moves mean and deviation and corrects the layer so that no prediction
+    changes (PopArt, van Hasselt et al. 2016).
+    """
+
+    def __init__(self, width, least_scale=1e-3):
+        super().__init__()
+        self.core = nn.Linear(width, 1)
+        nn.init.orthogonal_(self.core.weight, gain=.1)
+        nn.init.zeros_(self.core.bias)
+        self.least_scale = least_scale  # returns that vary less than this are taken for constant
+        for name, start in dict(mean=0., square=1., scale=1., count=0.).items():
+            self.register_buffer(name, torch.tensor(start))
+
+    def forward(self, x):
+        return self.core(x.to(compute_dtype(self.core.weight))).float().squeeze(-1) * self.scale + self.mean
+
+    @torch.no_grad()
+    def rescale(self, targets, weights, rate=.05):
+        """Takes returns (...,) into account, each with its weight >= 0. The n-th call weighs max(rate, 1/n)."""
+        total = weights.sum().clamp(min=1)
+        self.count += 1
+        rate = torch.clamp(1 / self.count, min=rate)
+        mean = self.mean.lerp((targets * weights).sum() / total, rate)
+        self.square.lerp_((targets.square() * weights).sum() / total, rate)
+        scale = (self.square - mean.square()).clamp(min=self.least_scale ** 2).sqrt()
+        self.core.weight.mul_(self.scale / scale)
+        self.core.bias.mul_(self.scale).add_(self.mean - mean).div_(scale)
+        self.mean.copy_(mean)
+        self.scale.copy_(scale)
