@@ -48,19 +48,23 @@ class Explorer:
 
     def _observe(self, reset):
         self.spawner(reset)
-        view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True, seen=self.seen, forget=reset[:, None])
-        fresh = view.fresh[:, 0]
+        obs, fresh = self._look(seen=self.seen, forget=reset[:, None])
         self.n_seen.masked_fill_(reset, 0).add_(fresh)
         self.length.add_(1).masked_fill_(reset, 0)
         self.ended.copy_((self.length >= self.n_seen + self.patience) & ~reset)
         reward = (fresh / TEXELS_A_POINT).masked_fill(reset, 0.)
-        pictures = arrdict(rgb=view.rgb, d=view.depth, imu=view.imu)
-        self.obs = arrdict({key: pictures[key].view(self.n_envs, *space.shape) for key, space in self.obs_space.items()})
-        return arrdict(obs=self.obs, reward=reward, reset=reset, terminal=torch.zeros_like(reset), truncated=self.ended.clone())
+        return arrdict(obs=obs, reward=reward, reset=reset, terminal=torch.zeros_like(reset), truncated=self.ended.clone())
+
+    def _look(self, **seen):
+        """The observation, and if ``seen`` is given how many texels were new (N,)."""
+        view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True, **seen)
+        pictures = {'rgb': view.rgb, 'd': view.depth, 'imu': view.imu}
+        obs = arrdict({key: pictures[key].view(self.n_envs, *space.shape) for key, space in self.obs_space.items()})
+        return obs, view.fresh[:, 0] if seen else None
 
     def state(self, e=0):
         """What :meth:`plot_state` draws of world ``e``."""
-        return arrdict(core=self.core.state(e), obs=self.obs[e].clone(), seen=self._seen_texels(e), length=self.length[e].clone(), n_seen=self.n_seen[e].clone())
+        return arrdict(core=self.core.state(e), obs=self._look()[0][e], seen=self._seen_texels(e), length=self.length[e].clone(), n_seen=self.n_seen[e].clone())
 
     def _seen_texels(self, e):
         """(T,) bool: which of the static texels of world ``e`` have been seen in this episode."""

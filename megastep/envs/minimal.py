@@ -38,13 +38,15 @@ class Minimal:
     def _observe(self, reset):
         self.spawner(reset)
         self.ended.copy_(self.lifespans(reset) & ~reset)
+        return arrdict(obs=self._look(), reward=self._reward.clone(), reset=reset, terminal=torch.zeros_like(reset), truncated=self.ended.clone())
+
+    def _look(self):
         view = engine.observe(self.core.scenery, self.core.agents, depth=False)
-        self.obs = view.rgb.view(self.n_envs, *self.obs_space.shape)
-        return arrdict(obs=self.obs, reward=self._reward.clone(), reset=reset, terminal=torch.zeros_like(reset), truncated=self.ended.clone())
+        return view.rgb.view(self.n_envs, *self.obs_space.shape)
 
     def state(self, e=0):
         """What :meth:`plot_state` draws of world ``e``."""
-        return arrdict(core=self.core.state(e), obs=self.obs[e].clone(), lifespans=self.lifespans.state(e))
+        return arrdict(core=self.core.state(e), obs=self._look()[e], lifespans=self.lifespans.state(e))
 
     @classmethod
     def plot_state(cls, state):
