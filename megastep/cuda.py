@@ -2,8 +2,8 @@
 
 The name is historical. The tensors' device decides where the work is done, so this runs without a GPU too.
 """
-from megastep import engine
-from megastep.core import Core
+from . import engine
+from .core import Core
 
 
 def __getattr__(name):

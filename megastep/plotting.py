@@ -8,7 +8,7 @@ A agents, C channels, H and W rows and columns, L lines, K lights, R rays.
 """
 import numpy as np
 
-from megastep.colour import gamma_decode, gamma_encode
+from .colour import gamma_decode, gamma_encode
 
 __all__ = ['gamma_decode', 'gamma_encode', 'panels', 'plot_images', 'plot_lines', 'plot_scenery', 'plot_sight',
            'rasterise']

@@ -24,7 +24,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from megastep.arrdict import clone, numpyify
+from .arrdict import clone, numpyify
 
 MAX_WORKERS = 16    # one process encodes what the others draw, and cannot keep up with more
 QUALITY = '20'      # x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines want more
@@ -261,7 +261,7 @@ def _draw(plot_state, state):
     if not hasattr(drawn, 'savefig'):
         raise TypeError(f'plot_state must return a matplotlib figure or an array, but it returned a '
                         f'{type(drawn).__name__}')
-    from megastep import plotting
+    from . import plotting
     try:
         return plotting.rasterise(drawn)
     finally:
