@@ -69,13 +69,13 @@ class Rollout:
             reset=self.reset, terminal=self.terminal, truncated=self.truncated)
 
     def lanes(self, rows):
-        """Whole sequences of some lanes, rows (M,) int64: arrdict(obs, starts, actions, logprobs, values), (T, M, ...),
+        """Whole sequences of some lanes, rows (M,) int64: arrdict(obs, starts, actions, logprobs, value), (T, M, ...),
         and their state (M, ...). A copy.
         """
         select = mapping(lambda leaf: leaf[:self.n_steps].index_select(1, rows))
         return arrdict(
             obs=select(self.obs), starts=select(self.starts), actions=select(self.actions),
-            logprobs=select(self.logprobs), values=select(self.values),
+            logprobs=select(self.logprobs), value=select(self.values),
             state=self.state.map(lambda leaf: leaf.index_select(0, rows)))
 
 

@@ -123,9 +123,9 @@ class ConcatIntake(nn.Module):
             leaf = obs
             for key in path:
                 leaf = leaf[key]
-            features.append(encoder(leaf))
+            features.append(encoder(leaf).to(dtype))
         joined = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
-        return F.relu(self.project(joined.to(dtype)))
+        return F.relu(self.project(joined))
 
 
 def intake(space, width, encoder='linear'):
@@ -221,21 +221,23 @@ class ValueOutput(nn.Module):
         nn.init.orthogonal_(self.core.weight, gain=.1)
         nn.init.zeros_(self.core.bias)
         self.least_scale = least_scale  # returns that vary less than this are taken for constant
-        for name, start in dict(mean=0., square=1., scale=1., count=0.).items():
+        for name, start in dict(mean=0., scale=1., count=0.).items():
             self.register_buffer(name, torch.tensor(start))
 
     def forward(self, x):
         return self.core(x.to(compute_dtype(self.core.weight))).float().squeeze(-1) * self.scale + self.mean
 
     @torch.no_grad()
-    def rescale(self, targets, weights, rate=.05):
-        """Takes returns (...,) into account, each with its weight >= 0. The n-th call weighs max(rate, 1/n)."""
-        total = weights.sum().clamp(min=1)
-        self.count += 1
-        rate = torch.clamp(1 / self.count, min=rate)
-        mean = self.mean.lerp((targets * weights).sum() / total, rate)
-        self.square.lerp_((targets.square() * weights).sum() / total, rate)
-        scale = (self.square - mean.square()).clamp(min=self.least_scale ** 2).sqrt()
+    def rescale(self, targets, valid, rate=.05):
+        """Takes returns (...,) into account where `valid`. The n-th call weighs max(rate, 1/n), 0 if nothing is."""
+        n_valid = valid.sum()
+        self.count += n_valid > 0
+        rate = (1 / self.count).clamp(min=rate, max=1.) * (n_valid > 0)
+        seen = targets.masked_fill(~valid, 0.).sum() / n_valid.clamp(min=1)
+        spread = (targets - seen).square().masked_fill(~valid, 0.).sum() / n_valid.clamp(min=1)
+        variance = self.scale.square().lerp(spread, rate) + rate * (1 - rate) * (seen - self.mean).square()
+
+        mean, scale = self.mean.lerp(seen, rate), variance.clamp(min=self.least_scale ** 2).sqrt()
         self.core.weight.mul_(self.scale / scale)
         self.core.bias.mul_(self.scale).add_(self.mean - mean).div_(scale)
         self.mean.copy_(mean)
