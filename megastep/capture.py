@@ -1,8 +1,10 @@
 """Any environment's step as a CUDA graph, and the walk over all that can change in it.
 
-Whatever changes in an environment is a tensor or a generator reachable from its attributes. :func:`state_tree` finds them, for capture, checkpoints and resume alike;
-:func:`capture` records a function of such state once and replays it without Python.
+Whatever changes in an environment is a tensor or a generator reachable from its attributes. :func:`state_tree` finds
+them, for capture, checkpoints and resume alike; :func:`capture` records a function of such state once and replays it
+without Python.
 """
+
 import traceback
 import types
 import warnings
@@ -11,7 +13,15 @@ import torch
 from torch.utils import _pytree
 
 SCALARS = (bool, int, float, str, type(None))
-OPAQUE = (types.ModuleType, types.FunctionType, types.MethodType, types.BuiltinFunctionType, type, torch.dtype, torch.device)
+OPAQUE = (
+    types.ModuleType,
+    types.FunctionType,
+    types.MethodType,
+    types.BuiltinFunctionType,
+    type,
+    torch.dtype,
+    torch.device,
+)
 
 
 def _children(node):
@@ -21,8 +31,11 @@ def _children(node):
     if isinstance(node, (list, tuple)):
         return [(f'[{i}]', child) for i, child in enumerate(node)]
     if isinstance(node, torch.nn.Module):
-        return [(f'.{key}', child) for group in ('_parameters', '_buffers', '_modules') for key, child in getattr(node, group).items()] + \
-               [(f'.{key}', child) for key, child in vars(node).items() if not key.startswith('_')]
+        return [
+            (f'.{key}', child)
+            for group in ('_parameters', '_buffers', '_modules')
+            for key, child in getattr(node, group).items()
+        ] + [(f'.{key}', child) for key, child in vars(node).items() if not key.startswith('_')]
     return [(f'.{key}', child) for key, child in vars(node).items()] if hasattr(node, '__dict__') else []
 
 
@@ -40,13 +53,18 @@ def _walk(root, wanted):
 
 
 def state_tree(env):
-    """{path: tensor or generator} of everything in ``env`` that can change; paths read as attributes do, ``.core.agents.positions``."""
+    """{path: tensor or generator} of everything in ``env`` that can change; paths read as attributes do,
+    ``.core.agents.positions``.
+    """
     return {path: leaf for path, (_, _, leaf) in _walk(env, (torch.Tensor, torch.Generator)).items()}
 
 
 def snapshot(env):
     """A copy of what :func:`state_tree` finds, for :func:`restore`."""
-    return {path: leaf.detach().clone() if isinstance(leaf, torch.Tensor) else leaf.get_state() for path, leaf in state_tree(env).items()}
+    return {
+        path: leaf.detach().clone() if isinstance(leaf, torch.Tensor) else leaf.get_state()
+        for path, leaf in state_tree(env).items()
+    }
 
 
 @torch.no_grad()
@@ -55,13 +73,19 @@ def restore(env, saved):
     tree = state_tree(env)
     missing = sorted(saved.keys() - tree.keys())
     if missing:
-        raise ValueError(f'the state holds {missing[0][1:]}, which this {type(env).__name__} does not have: it belongs to another environment or version')
+        raise ValueError(
+            f'the state holds {missing[0][1:]}, which this {type(env).__name__} does not have: it belongs to '
+            f'another environment or version'
+        )
     for path, value in saved.items():
         leaf = tree[path]
         if isinstance(leaf, torch.Generator):
             leaf.set_state(value)
         elif leaf.shape != value.shape or leaf.dtype != value.dtype:
-            raise ValueError(f'the state\'s {path[1:]} is {tuple(value.shape)} {value.dtype}, but this {type(env).__name__} needs {tuple(leaf.shape)} {leaf.dtype}')
+            raise ValueError(
+                f'the state\'s {path[1:]} is {tuple(value.shape)} {value.dtype}, but this {type(env).__name__} '
+                f'needs {tuple(leaf.shape)} {leaf.dtype}'
+            )
         else:
             leaf.copy_(value)
 
@@ -95,18 +119,26 @@ class _State:
         for path in scalars.keys() & self.scalars.keys():
             old, new = self.scalars[path][2], scalars[path][2]
             if old != new and not (old != old and new != new):
-                raise CaptureError(f'{_readable(path)} changed from {old!r} to {new!r} during the call, but a graph replays tensors only: make it a tensor on the device.')
+                raise CaptureError(
+                    f'{_readable(path)} changed from {old!r} to {new!r} during the call, but a graph replays '
+                    f'tensors only: make it a tensor on the device.'
+                )
         for path, (parent, step, new) in _walk(self.roots, torch.Tensor).items():
             old = self.tensors.get(path, (None, None, None))[2]
             if old is None or new is old:
                 continue
             if old.shape != new.shape or old.dtype != new.dtype:
-                raise CaptureError(f'{_readable(path)} changed its shape or dtype during the call, from {tuple(old.shape)} {old.dtype} to {tuple(new.shape)} {new.dtype}: keep them fixed.')
+                raise CaptureError(
+                    f'{_readable(path)} changed its shape or dtype during the call, from {tuple(old.shape)} '
+                    f'{old.dtype} to {tuple(new.shape)} {new.dtype}: keep them fixed.'
+                )
             try:
                 old.copy_(new)
                 _rebind(parent, step, old)
             except (TypeError, AttributeError) as fault:
-                raise CaptureError(f'{_readable(path)} was replaced where it cannot be put back ({fault}): change it in place.') from None
+                raise CaptureError(
+                    f'{_readable(path)} was replaced where it cannot be put back ({fault}): change it in place.'
+                ) from None
 
 
 def _readable(path):
@@ -114,7 +146,9 @@ def _readable(path):
 
 
 class Graph:
-    """A captured function. Calling it copies the arguments' tensors in, replays, and returns the outputs, which are valid until the next call."""
+    """A captured function. Calling it copies the arguments' tensors in, replays, and returns the outputs, which are
+    valid until the next call.
+    """
 
     def __init__(self, function, args, roots, warmup=3):
         leaves, self._spec = _pytree.tree_flatten(args)
@@ -122,7 +156,11 @@ class Graph:
         inputs = _pytree.tree_unflatten(self._leaves, self._spec)
         roots = dict(enumerate(roots))
         saved = snapshot(roots)
-        generators = [leaf for leaf in state_tree(roots).values() if isinstance(leaf, torch.Generator) and leaf.device.type == 'cuda']
+        generators = [
+            leaf
+            for leaf in state_tree(roots).values()
+            if isinstance(leaf, torch.Generator) and leaf.device.type == 'cuda'
+        ]
         self._graph = torch.cuda.CUDAGraph()
         for generator in generators:
             self._graph.register_generator_state(generator)
@@ -146,7 +184,9 @@ class Graph:
     def __call__(self, *args):
         leaves, spec = _pytree.tree_flatten(args)
         if spec != self._spec:
-            raise ValueError(f'the captured function was recorded with arguments {self._spec}, but was called with {spec}')
+            raise ValueError(
+                f'the captured function was recorded with arguments {self._spec}, but was called with {spec}'
+            )
         for inside, given in zip(self._leaves, leaves):
             if isinstance(inside, torch.Tensor):
                 inside.copy_(given)
@@ -155,22 +195,31 @@ class Graph:
 
 
 def capture(function, args, roots, warmup=3):
-    """``function`` recorded as a CUDA graph on the current device, or ``function`` itself, with one warning that names the line, if it cannot be.
+    """``function`` recorded as a CUDA graph on the current device, or ``function`` itself, with one warning that
+    names the line, if it cannot be.
 
-    Args: ``args`` a tuple of example arguments, trees of tensors of fixed shapes; ``roots`` the objects whose tensors and generators the function changes. Their state is as
-    before afterwards: warming up does not advance the world.
+    Args: ``args`` a tuple of example arguments, trees of tensors of fixed shapes; ``roots`` the objects whose tensors
+    and generators the function changes. Their state is as before afterwards: warming up does not advance the world.
     """
     try:
         return Graph(function, args, roots, warmup)
     except (CaptureError, RuntimeError) as fault:
-        frames = [f for f in traceback.extract_tb(fault.__traceback__) if '/torch/' not in f.filename and f.filename != __file__]
-        where = f' at {frames[-1].filename}:{frames[-1].lineno}' if frames and not isinstance(fault, CaptureError) else ''
+        frames = [
+            f
+            for f in traceback.extract_tb(fault.__traceback__)
+            if '/torch/' not in f.filename and f.filename != __file__
+        ]
+        where = (
+            f' at {frames[-1].filename}:{frames[-1].lineno}' if frames and not isinstance(fault, CaptureError) else ''
+        )
         warnings.warn(f'running without a CUDA graph, slower: {str(fault).splitlines()[0]}{where}', stacklevel=2)
         return function
 
 
 class Captured:
-    """An environment whose ``step`` is replayed as a CUDA graph, recorded at the first step; on the CPU the environment as it is. Everything else is the environment's own."""
+    """An environment whose ``step`` is replayed as a CUDA graph, recorded at the first step; on the CPU the
+    environment as it is. Everything else is the environment's own.
+    """
 
     def __init__(self, env):
         self.env, self._step = env, None
@@ -179,7 +228,9 @@ class Captured:
         return getattr(self.env, name)
 
     def step(self, decision):
-        """As the environment's; on a GPU the world returned is valid until the next step. Only ``decision.actions`` reaches it."""
+        """As the environment's; on a GPU the world returned is valid until the next step. Only ``decision.actions``
+        reaches it.
+        """
         decision = type(decision)(actions=decision['actions'])
         if self._step is None:
             on_gpu = torch.device(self.env.device).type == 'cuda'

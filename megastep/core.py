@@ -1,4 +1,5 @@
 """Core: scenery, agents, and their cameras' settings, in one bag."""
+
 import numpy as np
 import torch
 
@@ -12,16 +13,19 @@ __all__ = ['AGENT_RADIUS', 'AGENT_WIDTH', 'TEXEL', 'Core', 'gamma_decode', 'gamm
 
 
 class Core:
-    """What an environment is built around. All attributes are public: ``scenery``, ``agents``, ``n_envs``, ``n_agents``, ``device``, ``res``, ``fov``, ``fps``, ``seed``.
+    """What an environment is built around. All attributes are public: ``scenery``, ``agents``, ``n_envs``,
+    ``n_agents``, ``device``, ``res``, ``fov``, ``fps``, ``seed``.
 
-    Args: ``res`` rays a camera; ``fov`` degrees; ``fps`` steps a second; ``cameras`` yaw offsets in degrees, one camera ahead by default; ``seed`` of everything drawn
-    by the modules built on this core.
+    Args: ``res`` rays a camera; ``fov`` degrees; ``fps`` steps a second; ``cameras`` yaw offsets in degrees, one
+    camera ahead by default; ``seed`` of everything drawn by the modules built on this core.
     """
 
-    def __init__(self, scenery, res=64, fov=130., fps=10., cameras=None, seed=1):
+    def __init__(self, scenery, res=64, fov=130.0, fps=10.0, cameras=None, seed=1):
         self.scenery, self.seed = scenery, seed
         self.n_envs, self.n_agents, self.device = scenery.n_envs, scenery.n_agents, scenery.device
-        self.agents = engine.Agents(self.n_envs, self.n_agents, res=res, fov=fov, fps=fps, cameras=cameras, device=self.device)
+        self.agents = engine.Agents(
+            self.n_envs, self.n_agents, res=res, fov=fov, fps=fps, cameras=cameras, device=self.device
+        )
         self.res, self.fov, self.fps = self.agents.res, self.agents.fov, self.agents.fps
 
     def agent_full(self, value):
@@ -33,22 +37,35 @@ class Core:
         return torch.full((self.n_envs,), value, device=self.device)
 
     def state(self, e=0):
-        """World ``e`` as :meth:`plot_state` draws it, in tensors: its lines, their lit texels end to end, lights, and where the agents stand and look."""
+        """World ``e`` as :meth:`plot_state` draws it, in tensors: its lines, their lit texels end to end, lights, and
+        where the agents stand and look.
+        """
         engine.place(self.scenery, self.agents)
         lines, colours, lights = self.scenery.world(e)
         agents = self.agents
-        return arrdict(lines=lines, texels=torch.cat(colours), widths=torch.tensor([len(texels) for texels in colours]), lights=lights.clone(),
-                       n_agent_lines=torch.tensor(self.scenery.agent_lines.shape[1]), positions=agents.positions[e].clone(), angles=agents.angles[e].clone(),
-                       yaws=agents.yaws.clone(), fov=torch.tensor(agents.fov))
+        return arrdict(
+            lines=lines,
+            texels=torch.cat(colours),
+            widths=torch.tensor([len(texels) for texels in colours]),
+            lights=lights.clone(),
+            n_agent_lines=torch.tensor(self.scenery.agent_lines.shape[1]),
+            positions=agents.positions[e].clone(),
+            angles=agents.angles[e].clone(),
+            yaws=agents.yaws.clone(),
+            fov=torch.tensor(agents.fov),
+        )
 
     @staticmethod
     def plot_state(state, ax=None, seen=None):
-        """Draws a numpyified :meth:`state` from above, with each camera's field of view. ``seen`` (T,) bools dims static texels that are False. Returns the axes."""
+        """Draws a numpyified :meth:`state` from above, with each camera's field of view. ``seen`` (T,) bools dims
+        static texels that are False. Returns the axes.
+        """
         from . import plotting
+
         ends = state.widths.cumsum()
         colours = np.split(state.texels, ends[:-1])
         if seen is not None:
-            agents = int(state.widths[:int(state.n_agent_lines)].sum())
+            agents = int(state.widths[: int(state.n_agent_lines)].sum())
             seen = np.split(np.concatenate([np.ones(agents, bool), seen]), ends[:-1])
         ax = plotting.plot_scenery(state.lines, colours, state.lights, seen=seen, ax=ax)
         for position, angle in zip(state.positions, state.angles):

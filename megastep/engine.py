@@ -1,7 +1,10 @@
-"""The engine: ``bake``, ``physics``, ``render``, ``observe``. Each checks, allocates and launches, on the CPU or the GPU, whichever its tensors are on.
+"""The engine: ``bake``, ``physics``, ``render``, ``observe``. Each checks, allocates and launches, on the CPU or the
+GPU, whichever its tensors are on.
 
-N worlds, A agents a world, C cameras an agent (the axis is dropped if there is one), R rays a camera, P = R / subsample pixels. Metres, degrees, seconds.
+N worlds, A agents a world, C cameras an agent (the axis is dropped if there is one), R rays a camera, P = R /
+subsample pixels. Metres, degrees, seconds.
 """
+
 import math
 from typing import NamedTuple
 
@@ -11,29 +14,49 @@ from .kernels import compile
 from .kernels.compile import EngineError
 from .scenery import Designs, Scenery
 
-__all__ = ['Agents', 'Designs', 'EngineError', 'Observation', 'Physics', 'Render', 'Scenery', 'bake', 'check', 'device', 'draw', 'fit', 'observe', 'physics', 'render']
+__all__ = [
+    'Agents',
+    'Designs',
+    'EngineError',
+    'Observation',
+    'Physics',
+    'Render',
+    'Scenery',
+    'bake',
+    'check',
+    'device',
+    'draw',
+    'fit',
+    'observe',
+    'physics',
+    'render',
+]
 
-AGENT_WIDTH = .15
-AGENT_RADIUS = AGENT_WIDTH / 2**.5      # the disc about a square of that width
+AGENT_WIDTH = 0.15
+AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # the disc about a square of that width
 MAX_RES = 1024
 
 
 class Agents:
     """Where the agents are, how they move, and what their cameras are like.
 
-    ``positions`` (N, A, 2), ``angles`` (N, A), ``velocity`` (N, A, 2) a second, ``angvelocity`` (N, A) a second; an angle of 0 looks along +x. ``cameras`` are yaw offsets in
-    degrees. ValueError unless 1 <= res <= 1024, 0 < fov < 180, fps > 0.
+    ``positions`` (N, A, 2), ``angles`` (N, A), ``velocity`` (N, A, 2) a second, ``angvelocity`` (N, A) a second; an
+    angle of 0 looks along +x. ``cameras`` are yaw offsets in degrees. ValueError unless 1 <= res <= 1024, 0 < fov <
+    180, fps > 0.
     """
 
-    def __init__(self, n_envs, n_agents, res=64, fov=130., fps=10., cameras=None, radius=AGENT_RADIUS, device='cpu'):
+    def __init__(self, n_envs, n_agents, res=64, fov=130.0, fps=10.0, cameras=None, radius=AGENT_RADIUS, device='cpu'):
         if not (isinstance(res, int) and 1 <= res <= MAX_RES):
             raise ValueError(f'res must be a whole number of rays from 1 to {MAX_RES}, but {res} was given')
         if not 0 < fov < 180:
-            raise ValueError(f'fov must be more than 0 and less than 180 degrees, but {fov} was given; for a wider view use several cameras')
+            raise ValueError(
+                f'fov must be more than 0 and less than 180 degrees, but {fov} was given; for a wider view use '
+                f'several cameras'
+            )
         if not 0 < fps < math.inf:
             raise ValueError(f'fps must be a positive number of steps a second, but {fps} was given')
         self.res, self.fov, self.fps, self.radius = res, float(fov), float(fps), float(radius)
-        self.yaws = torch.tensor([0.] if cameras is None else list(cameras), dtype=torch.float32, device=device)
+        self.yaws = torch.tensor([0.0] if cameras is None else list(cameras), dtype=torch.float32, device=device)
         if not len(self.yaws):
             raise ValueError('an agent needs at least one camera, but an empty list was given')
         self.positions = torch.zeros((n_envs, n_agents, 2), device=device)
@@ -45,25 +68,30 @@ class Agents:
 
 class Render(NamedTuple):
     """What the cameras see, ray by ray. A miss is -1, NaN, NaN, inf, black."""
-    indices: torch.Tensor       # (N, A, C, R) int32: the line hit, counted within its world, the agents' first
-    locations: torch.Tensor     # (N, A, C, R): where along the line, 0 to 1
-    dots: torch.Tensor          # (N, A, C, R): cosine between ray and line
-    distances: torch.Tensor     # (N, A, C, R): metres
-    screen: torch.Tensor        # (N, A, C, R, 3): linear light; gamma_encode it before showing it
+
+    indices: torch.Tensor  # (N, A, C, R) int32: the line hit, counted within its world, the agents' first
+    locations: torch.Tensor  # (N, A, C, R): where along the line, 0 to 1
+    dots: torch.Tensor  # (N, A, C, R): cosine between ray and line
+    distances: torch.Tensor  # (N, A, C, R): metres
+    screen: torch.Tensor  # (N, A, C, R, 3): linear light; gamma_encode it before showing it
 
 
 class Physics(NamedTuple):
-    """``progress`` (N, A): the fraction of the step that was free; below 1 the agent met something and its velocities are now 0."""
+    """``progress`` (N, A): the fraction of the step that was free; below 1 the agent met something and its velocities
+    are now 0.
+    """
+
     progress: torch.Tensor
 
 
 class Observation(NamedTuple):
     """What a policy needs of a view; None where not asked for."""
-    rgb: torch.Tensor           # (N, A, C, 3, P) fp16, linear light
-    depth: torch.Tensor         # (N, A, C, P) fp16: 1 at the agent's radius, falling to 0 at max_depth beyond it
-    middle: torch.Tensor        # (N, A, C) int32: the line in the middle of the screen, as Render.indices
-    imu: torch.Tensor           # (N, A, 3) fp16: angular velocity / 360, own velocity ahead and left / 10
-    fresh: torch.Tensor         # (N, A) int32: static texels now marked in `seen` that were not before
+
+    rgb: torch.Tensor  # (N, A, C, 3, P) fp16, linear light
+    depth: torch.Tensor  # (N, A, C, P) fp16: 1 at the agent's radius, falling to 0 at max_depth beyond it
+    middle: torch.Tensor  # (N, A, C) int32: the line in the middle of the screen, as Render.indices
+    imu: torch.Tensor  # (N, A, 3) fp16: angular velocity / 360, own velocity ahead and left / 10
+    fresh: torch.Tensor  # (N, A) int32: static texels now marked in `seen` that were not before
 
 
 def device(name='auto'):
@@ -79,24 +107,38 @@ def device(name='auto'):
     if chosen.type == 'cuda':
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         if (chosen.index or 0) >= count:
-            why = f'there are {count} GPUs' if count else 'no GPU is to be seen' + ('' if torch.version.cuda else ' and this PyTorch is built for the CPU only')
+            why = (
+                f'there are {count} GPUs'
+                if count
+                else 'no GPU is to be seen'
+                + ('' if torch.version.cuda else ' and this PyTorch is built for the CPU only')
+            )
             raise EngineError(f'device={name} was asked for, but {why}: use device=auto or device=cpu.')
         return torch.device('cuda', chosen.index or 0)
     return chosen
 
 
 def fit(n_envs, bytes_each, device, what='environments'):
-    """EngineError, with the number that fits, if ``n_envs`` things of ``bytes_each`` bytes are too many for the memory that is free on ``device``."""
+    """EngineError, with the number that fits, if ``n_envs`` things of ``bytes_each`` bytes are too many for the
+    memory that is free on ``device``.
+    """
     free = free_memory(device)
-    if n_envs * bytes_each > .95 * free:
-        raise EngineError(f'{n_envs:,} {what} need {n_envs * bytes_each / 1e9:.1f} GB, but {free / 1e9:.1f} GB are free on {device}: at most {int(.95 * free / bytes_each):,} fit.')
+    if n_envs * bytes_each > 0.95 * free:
+        raise EngineError(
+            f'{n_envs:,} {what} need {n_envs * bytes_each / 1e9:.1f} GB, but {free / 1e9:.1f} GB are free on '
+            f'{device}: at most {int(0.95 * free / bytes_each):,} fit.'
+        )
 
 
 def free_memory(device):
     """Bytes that can still be allocated on ``device``."""
     device = torch.device(device)
     if device.type == 'cuda':
-        return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return (
+            torch.cuda.mem_get_info(device)[0]
+            + torch.cuda.memory_reserved(device)
+            - torch.cuda.memory_allocated(device)
+        )
     try:
         with open('/proc/meminfo') as file:
             return next(int(line.split()[1]) * 1024 for line in file if line.startswith('MemAvailable'))
@@ -106,40 +148,75 @@ def free_memory(device):
 
 # ---- From tensors to the params of a launch ----
 
+
 def _pointer(name, tensor, shape, dtype, device):
     """A checked tensor's address; 0 for None."""
     if tensor is None:
         return 0
-    if tensor.dtype != dtype or tensor.device != device or tuple(tensor.shape) != tuple(shape) or not tensor.is_contiguous():
+    if (
+        tensor.dtype != dtype
+        or tensor.device != device
+        or tuple(tensor.shape) != tuple(shape)
+        or not tensor.is_contiguous()
+    ):
         layout = '' if tensor.is_contiguous() else ' that is not contiguous'
-        raise ValueError(f'{name} must be a contiguous {dtype} tensor of shape {tuple(shape)} on {device}, but it is a {tensor.dtype} one of shape '
-                         f'{tuple(tensor.shape)} on {tensor.device}{layout}')
+        raise ValueError(
+            f'{name} must be a contiguous {dtype} tensor of shape {tuple(shape)} on {device}, but it is a '
+            f'{tensor.dtype} one of shape '
+            f'{tuple(tensor.shape)} on {tensor.device}{layout}'
+        )
     return tensor.data_ptr()
 
 
 def _world(scenery, radius):
     designs = scenery.designs
     return compile.STRUCTS['World'](
-        designs.lines.vals.data_ptr(), designs.wall_starts.data_ptr(), designs.texel_starts.data_ptr(), designs.texels.data_ptr(), designs.lights.vals.data_ptr(),
-        designs.light_starts.data_ptr(), _pointer('scenery.design', scenery.design, (scenery.n_envs,), torch.int32, scenery.device), scenery.model.data_ptr(),
-        scenery.model_texels.data_ptr(), designs.agent_textures.data_ptr(), scenery.agent_lines.data_ptr(), scenery.agent_light.data_ptr(),
-        scenery.n_envs, scenery.n_agents, len(scenery.model), scenery.agent_light.shape[1], torch.get_num_threads(), radius, 1.001 * scenery.reach)
+        designs.lines.vals.data_ptr(),
+        designs.wall_starts.data_ptr(),
+        designs.texel_starts.data_ptr(),
+        designs.texels.data_ptr(),
+        designs.lights.vals.data_ptr(),
+        designs.light_starts.data_ptr(),
+        _pointer('scenery.design', scenery.design, (scenery.n_envs,), torch.int32, scenery.device),
+        scenery.model.data_ptr(),
+        scenery.model_texels.data_ptr(),
+        designs.agent_textures.data_ptr(),
+        scenery.agent_lines.data_ptr(),
+        scenery.agent_light.data_ptr(),
+        scenery.n_envs,
+        scenery.n_agents,
+        len(scenery.model),
+        scenery.agent_light.shape[1],
+        torch.get_num_threads(),
+        radius,
+        1.001 * scenery.reach,
+    )
 
 
 def _state(scenery, agents, *names):
     n, a = scenery.n_envs, scenery.n_agents
     shapes = {'positions': (n, a, 2), 'angles': (n, a), 'velocity': (n, a, 2), 'angvelocity': (n, a)}
-    return [_pointer(f'agents.{name}', getattr(agents, name), shapes[name], torch.float32, scenery.device) for name in names]
+    return [
+        _pointer(f'agents.{name}', getattr(agents, name), shapes[name], torch.float32, scenery.device) for name in names
+    ]
 
 
 def check(agents):
-    """EngineError if an agent's position, angle or velocity has stopped being a finite number, or it was given an unknown action. Asks the device, so not for inside a step."""
+    """EngineError if an agent's position, angle or velocity has stopped being a finite number, or it was given an
+    unknown action. Asks the device, so not for inside a step.
+    """
     world = int(agents.fault)
     if world:
         agents.fault.zero_()
         if world < 0:
-            raise EngineError(f'An agent of environment {-world - 1} was given an action that is none of its action space: actions count from 0.')
-        raise EngineError(f'An agent of environment {world - 1} has a position, angle or velocity that is not a finite number: look at what was last written to it.')
+            raise EngineError(
+                f'An agent of environment {-world - 1} was given an action that is none of its action space: '
+                f'actions count from 0.'
+            )
+        raise EngineError(
+            f'An agent of environment {world - 1} has a position, angle or velocity that is not a finite number: '
+            f'look at what was last written to it.'
+        )
 
 
 def _checked(agents):
@@ -149,26 +226,45 @@ def _checked(agents):
 
 # ---- The operations ----
 
+
 def bake(scenery):
-    """Fills ``scenery.designs.baked``: min(1, 0.1 + sum of 2 I / max(d^2, 1)) over the lights that no wall of the design hides."""
+    """Fills ``scenery.designs.baked``: min(1, 0.1 + sum of 2 I / max(d^2, 1)) over the lights that no wall of the
+    design hides.
+    """
     designs = scenery.designs
-    texel_wall = torch.repeat_interleave(torch.arange(len(designs.textures), dtype=torch.int32, device=scenery.device), designs.textures.widths)
-    wall_design = torch.repeat_interleave(torch.arange(len(designs), dtype=torch.int32, device=scenery.device), designs.lines.widths)
-    params = compile.STRUCTS['Bake'](_world(scenery, 0.), texel_wall.data_ptr(), wall_design.data_ptr(), len(texel_wall))
+    texel_wall = torch.repeat_interleave(
+        torch.arange(len(designs.textures), dtype=torch.int32, device=scenery.device), designs.textures.widths
+    )
+    wall_design = torch.repeat_interleave(
+        torch.arange(len(designs), dtype=torch.int32, device=scenery.device), designs.lines.widths
+    )
+    params = compile.STRUCTS['Bake'](
+        _world(scenery, 0.0), texel_wall.data_ptr(), wall_design.data_ptr(), len(texel_wall)
+    )
     compile.launch('bake', params, scenery.device, len(texel_wall))
 
 
-def physics(scenery, agents, actions=None, moves=None, keep=0.):
-    """Moves the agents by their velocities for 1 / fps seconds, each short of what it meets first: a wall, or another agent. Returns a :class:`Physics`.
+def physics(scenery, agents, actions=None, moves=None, keep=0.0):
+    """Moves the agents by their velocities for 1 / fps seconds, each short of what it meets first: a wall, or another
+    agent. Returns a :class:`Physics`.
 
-    If ``actions`` (N, A) int64 are given, each first multiplies its agent's velocities by ``keep`` and adds row ``action`` of ``moves`` (n_moves, 3): m/s ahead and left, deg/s.
+    If ``actions`` (N, A) int64 are given, each first multiplies its agent's velocities by ``keep`` and adds row
+    ``action`` of ``moves`` (n_moves, 3): m/s ahead and left, deg/s.
     """
     n, a = scenery.n_envs, scenery.n_agents
     progress = torch.empty((scenery.n_envs, scenery.n_agents), device=scenery.device)
     state = _state(scenery, agents, 'positions', 'angles', 'velocity', 'angvelocity')
-    params = compile.STRUCTS['Motion'](_world(scenery, agents.radius), *state, progress.data_ptr(), agents.fault.data_ptr(),
-                                       _pointer('actions', actions, (n, a), torch.int64, scenery.device), 0 if moves is None else moves.data_ptr(),
-                                       0 if moves is None else len(moves), keep, 1 / agents.fps)
+    params = compile.STRUCTS['Motion'](
+        _world(scenery, agents.radius),
+        *state,
+        progress.data_ptr(),
+        agents.fault.data_ptr(),
+        _pointer('actions', actions, (n, a), torch.int64, scenery.device),
+        0 if moves is None else moves.data_ptr(),
+        0 if moves is None else len(moves),
+        keep,
+        1 / agents.fps,
+    )
     compile.launch('physics', params, scenery.device, 32 * scenery.n_envs)
     _checked(agents)
     return Physics(progress)
@@ -176,16 +272,25 @@ def physics(scenery, agents, actions=None, moves=None, keep=0.):
 
 def place(scenery, agents, lit=True):
     """Carries the agents' models to where the agents are, and lights their texels."""
-    params = compile.STRUCTS['Placing'](_world(scenery, agents.radius), *_state(scenery, agents, 'positions', 'angles'), int(lit))
+    params = compile.STRUCTS['Placing'](
+        _world(scenery, agents.radius), *_state(scenery, agents, 'positions', 'angles'), int(lit)
+    )
     compile.launch('place', params, scenery.device, 32 * scenery.n_envs * scenery.n_agents)
 
 
 def _look(scenery, agents, **fields):
     half = math.radians(agents.fov / 2)
     params = compile.STRUCTS['Sight'](
-        _world(scenery, agents.radius), *_state(scenery, agents, 'positions', 'angles'), agents.yaws.data_ptr(), agents.fault.data_ptr(),
-        len(agents.yaws), agents.res, math.tan(half), .99 * agents.radius * math.cos(half))
-    params.subsample, params.max_depth = 1, 10.
+        _world(scenery, agents.radius),
+        *_state(scenery, agents, 'positions', 'angles'),
+        agents.yaws.data_ptr(),
+        agents.fault.data_ptr(),
+        len(agents.yaws),
+        agents.res,
+        math.tan(half),
+        0.99 * agents.radius * math.cos(half),
+    )
+    params.subsample, params.max_depth = 1, 10.0
     for name, value in fields.items():
         setattr(params, name, value.data_ptr() if isinstance(value, torch.Tensor) else value)
     compile.launch('sight', params, scenery.device, 32 * scenery.n_envs * scenery.n_agents, shared=8 * agents.res)
@@ -201,16 +306,24 @@ def render(scenery, agents):
     place(scenery, agents)
     shape = _cameras(scenery, agents) + (agents.res,)
     floats = {name: torch.empty(shape, device=scenery.device) for name in ('locations', 'dots', 'distances')}
-    out = Render(indices=torch.empty(shape, dtype=torch.int32, device=scenery.device), screen=torch.empty((*shape, 3), device=scenery.device), **floats)
+    out = Render(
+        indices=torch.empty(shape, dtype=torch.int32, device=scenery.device),
+        screen=torch.empty((*shape, 3), device=scenery.device),
+        **floats,
+    )
     _look(scenery, agents, **out._asdict())
     return out
 
 
-def observe(scenery, agents, subsample=1, rgb=True, depth=True, imu=False, middle=False, seen=None, forget=None, max_depth=10.):
-    """What training needs of a view, in one pass: a fused form of :func:`render` and the sensors of :mod:`~megastep.modules`.
+def observe(
+    scenery, agents, subsample=1, rgb=True, depth=True, imu=False, middle=False, seen=None, forget=None, max_depth=10.0
+):
+    """What training needs of a view, in one pass: a fused form of :func:`render` and the sensors of
+    :mod:`~megastep.modules`.
 
-    Args: ``subsample`` rays to a pixel, a divisor of res; ``seen`` (N, A, n_words) int32, a bit for each static texel of the world's design, updated in place;
-    ``forget`` (N, A) bool, clears ``seen`` first; ``max_depth`` metres. With one agent a world, ``scenery.lines`` is left as it was. Returns an :class:`Observation`.
+    Args: ``subsample`` rays to a pixel, a divisor of res; ``seen`` (N, A, n_words) int32, a bit for each static texel
+    of the world's design, updated in place; ``forget`` (N, A) bool, clears ``seen`` first; ``max_depth`` metres. With
+    one agent a world, ``scenery.lines`` is left as it was. Returns an :class:`Observation`.
     """
     if subsample < 1 or agents.res % subsample:
         raise ValueError(f'subsample must divide the {agents.res} rays of a camera, but {subsample} was given')
@@ -218,29 +331,52 @@ def observe(scenery, agents, subsample=1, rgb=True, depth=True, imu=False, middl
     if a > 1:
         place(scenery, agents, lit=rgb)
     shape, pixels = _cameras(scenery, agents), agents.res // subsample
-    out = Observation(rgb=torch.empty((*shape, 3, pixels), dtype=torch.float16, device=where) if rgb else None,
-                      depth=torch.empty((*shape, pixels), dtype=torch.float16, device=where) if depth else None,
-                      middle=torch.empty(shape, dtype=torch.int32, device=where) if middle else None,
-                      imu=torch.empty((n, a, 3), dtype=torch.float16, device=where) if imu else None,
-                      fresh=torch.empty((n, a), dtype=torch.int32, device=where) if seen is not None else None)
+    out = Observation(
+        rgb=torch.empty((*shape, 3, pixels), dtype=torch.float16, device=where) if rgb else None,
+        depth=torch.empty((*shape, pixels), dtype=torch.float16, device=where) if depth else None,
+        middle=torch.empty(shape, dtype=torch.int32, device=where) if middle else None,
+        imu=torch.empty((n, a, 3), dtype=torch.float16, device=where) if imu else None,
+        fresh=torch.empty((n, a), dtype=torch.int32, device=where) if seen is not None else None,
+    )
     words = 0 if seen is None else seen.shape[-1]
     most = scenery.designs.most_texels
     if seen is not None and 32 * words < most:
-        raise ValueError(f'seen must have a bit for each of a design\'s texels, so at least {-(-most // 32)} words an agent, but it has {words}')
+        raise ValueError(
+            f'seen must have a bit for each of a design\'s texels, so at least {-(-most // 32)} words an agent, '
+            f'but it has {words}'
+        )
     velocity, angvelocity = _state(scenery, agents, 'velocity', 'angvelocity')
-    _look(scenery, agents, subsample=subsample, max_depth=max_depth, n_words=words, velocity=velocity, angvelocity=angvelocity, seen=_pointer('seen', seen, (n, a, words), torch.int32, where),
-          forget=_pointer('forget', forget, (n, a), torch.bool, where), **{name: tensor for name, tensor in out._asdict().items() if tensor is not None})
+    _look(
+        scenery,
+        agents,
+        subsample=subsample,
+        max_depth=max_depth,
+        n_words=words,
+        velocity=velocity,
+        angvelocity=angvelocity,
+        seen=_pointer('seen', seen, (n, a, words), torch.int32, where),
+        forget=_pointer('forget', forget, (n, a), torch.bool, where),
+        **{name: tensor for name, tensor in out._asdict().items() if tensor is not None},
+    )
     return out
 
 
 def draw(counts, mask, seed, out):
     """Uniform numbers in [0, 1), four a lane: Philox 4x32-10 with key ``seed`` and counter (lane, count).
 
-    Args: ``counts`` (B,) int32, draws each lane has made, advanced by one where ``mask`` (B,) bool; ``out`` (B, 4), written where ``mask``.
+    Args: ``counts`` (B,) int32, draws each lane has made, advanced by one where ``mask`` (B,) bool; ``out`` (B, 4),
+    written where ``mask``.
     """
     n, where = len(counts), out.device
-    params = compile.STRUCTS['Draw'](_pointer('counts', counts, (n,), torch.int32, where), _pointer('mask', mask, (n,), torch.bool, where),
-                                     _pointer('out', out, (n, 4), torch.float32, where), seed & 0xffffffff, seed >> 32 & 0xffffffff, n, torch.get_num_threads())
+    params = compile.STRUCTS['Draw'](
+        _pointer('counts', counts, (n,), torch.int32, where),
+        _pointer('mask', mask, (n,), torch.bool, where),
+        _pointer('out', out, (n, 4), torch.float32, where),
+        seed & 0xFFFFFFFF,
+        seed >> 32 & 0xFFFFFFFF,
+        n,
+        torch.get_num_threads(),
+    )
     compile.launch('draw', params, where, n)
     counts.add_(mask)
     return out

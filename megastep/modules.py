@@ -1,7 +1,10 @@
-"""What environments are made of: movement, sensors, spawning, lifespans. Callables with a ``.space`` where there is one to declare.
+"""What environments are made of: movement, sensors, spawning, lifespans. Callables with a ``.space`` where there is
+one to declare.
 
-N worlds, A agents a world, C cameras an agent, R rays, B = N A lanes. A mask of lanes or agents may be given as (B,) or (N, A).
+N worlds, A agents a world, C cameras an agent, R rays, B = N A lanes. A mask of lanes or agents may be given as (B,)
+or (N, A).
 """
+
 import numpy as np
 import torch
 
@@ -9,7 +12,8 @@ from . import engine, spaces
 from .arrdict import arrdict
 from .geometry import centers
 
-# Velocity of each action in the agent's frame, and its turn: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
+# Velocity of each action in the agent's frame, and its turn: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn
+# left, 6 turn right.
 MOVES = [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0), (0, 0), (0, 0)]
 TURNS = [0, 0, 0, 0, 0, 1, -1]
 
@@ -32,30 +36,41 @@ class _Movement:
 
     def __init__(self, core, speed, ang_speed, keep):
         self.core, self.keep = core, keep
-        self.moves = torch.tensor([(speed * x, speed * y, ang_speed * turn) for (x, y), turn in zip(MOVES, TURNS)], dtype=torch.float32, device=core.device)
+        self.moves = torch.tensor(
+            [(speed * x, speed * y, ang_speed * turn) for (x, y), turn in zip(MOVES, TURNS)],
+            dtype=torch.float32,
+            device=core.device,
+        )
         self.space = spaces.MultiDiscrete(core.n_agents, len(MOVES))
 
     def __call__(self, decision):
-        """Takes ``decision.actions``, ints (B, 1), (N, A) or (B,), moves the agents and returns :class:`~megastep.engine.Physics`."""
+        """Takes ``decision.actions``, ints (B, 1), (N, A) or (B,), moves the agents and returns
+        :class:`~megastep.engine.Physics`.
+        """
         actions = decision['actions'].reshape(self.core.n_envs, self.core.n_agents).long().contiguous()
         return engine.physics(self.core.scenery, self.core.agents, actions, self.moves, self.keep)
 
 
 class SimpleMovement(_Movement):
-    """Velocity is what the action says: ``speed`` m/s along an axis of the agent, ``ang_speed`` deg/s about it, for one step."""
+    """Velocity is what the action says: ``speed`` m/s along an axis of the agent, ``ang_speed`` deg/s about it, for
+    one step.
+    """
 
-    def __init__(self, core, speed=10., ang_speed=180.):
-        super().__init__(core, speed, ang_speed, keep=0.)
+    def __init__(self, core, speed=10.0, ang_speed=180.0):
+        super().__init__(core, speed, ang_speed, keep=0.0)
 
 
 class MomentumMovement(_Movement):
-    """Actions accelerate: ``accel`` m/s^2 and ``ang_accel`` deg/s^2, against a ``decay`` of both velocities by that fraction each step."""
+    """Actions accelerate: ``accel`` m/s^2 and ``ang_accel`` deg/s^2, against a ``decay`` of both velocities by that
+    fraction each step.
+    """
 
-    def __init__(self, core, accel=5., ang_accel=180., decay=.125):
+    def __init__(self, core, accel=5.0, ang_accel=180.0, decay=0.125):
         super().__init__(core, accel / core.fps, ang_accel / core.fps, keep=1 - decay)
 
 
 # ---- Sensors ----
+
 
 def render(core):
     """:func:`~megastep.engine.render` of a core."""
@@ -63,14 +78,18 @@ def render(core):
 
 
 def downsample(screen, subsample):
-    """(..., R) to (..., R / subsample, subsample): neighbouring rays grouped, ready for a mean or a minimum over the last axis."""
+    """(..., R) to (..., R / subsample, subsample): neighbouring rays grouped, ready for a mean or a minimum over the
+    last axis.
+    """
     if subsample < 1 or screen.shape[-1] % subsample:
         raise ValueError(f'subsample must divide the {screen.shape[-1]} rays of the screen, but {subsample} was given')
     return screen.reshape(*screen.shape[:-1], screen.shape[-1] // subsample, subsample)
 
 
 class RGB:
-    """Colour: float32 (N, A, 3, 1, R / subsample) in linear light, the mean over ``subsample`` rays. Several cameras an agent become (N, A, 3, C, R / subsample)."""
+    """Colour: float32 (N, A, 3, 1, R / subsample) in linear light, the mean over ``subsample`` rays. Several cameras
+    an agent become (N, A, 3, C, R / subsample).
+    """
 
     def __init__(self, core, subsample=1):
         self.core, self.subsample = core, subsample
@@ -88,9 +107,11 @@ class RGB:
 
 
 class Depth:
-    """Depth: float32 (N, A, 1, C, R / subsample), the mean over ``subsample`` rays of 1 - clamp((distance - radius) / max_depth, 0, 1); ``max_depth`` metres."""
+    """Depth: float32 (N, A, 1, C, R / subsample), the mean over ``subsample`` rays of 1 - clamp((distance - radius) /
+    max_depth, 0, 1); ``max_depth`` metres.
+    """
 
-    def __init__(self, core, subsample=1, max_depth=10.):
+    def __init__(self, core, subsample=1, max_depth=10.0):
         self.core, self.subsample, self.max_depth = core, subsample, max_depth
         downsample(torch.empty(core.res), subsample)
         self.space = spaces.MultiImage(core.n_agents, 1, len(core.agents.yaws), core.res // subsample)
@@ -116,8 +137,11 @@ class IMU:
 
 # ---- Random events ----
 
+
 class Draws:
-    """Random numbers by lane: the k-th draw of a lane depends on the seed, the lane and k alone, so it is the same on every device, captured or not."""
+    """Random numbers by lane: the k-th draw of a lane depends on the seed, the lane and k alone, so it is the same on
+    every device, captured or not.
+    """
 
     def __init__(self, n_lanes, seed, device):
         self.seed = seed
@@ -125,7 +149,9 @@ class Draws:
         self.values = torch.zeros((n_lanes, 4), device=device)
 
     def __call__(self, mask):
-        """Four uniform numbers in [0, 1) a lane, (B, 4); fresh where ``mask`` (B,) bool, elsewhere what was drawn last."""
+        """Four uniform numbers in [0, 1) a lane, (B, 4); fresh where ``mask`` (B,) bool, elsewhere what was drawn
+        last.
+        """
         return engine.draw(self.counts, mask.reshape(-1), self.seed, self.values)
 
 
@@ -137,7 +163,10 @@ def _spawn_points(g, n, radius, random):
     found = np.empty((0, 2))
     for _ in range(20):
         choice = random.integers(len(i), size=4 * n)
-        points = centers(np.stack([i[choice], j[choice]], 1), g.masks.shape, g.res) + random.uniform(-.5, .5, (4 * n, 2)) * g.res
+        points = (
+            centers(np.stack([i[choice], j[choice]], 1), g.masks.shape, g.res)
+            + random.uniform(-0.5, 0.5, (4 * n, 2)) * g.res
+        )
         found = np.concatenate([found, points[_clearance(points, g.walls) > radius]])
         if len(found) >= n:
             return found[:n]
@@ -157,15 +186,21 @@ def _clearance(points, walls):
 class RandomSpawns:
     """Puts agents somewhere random in the rooms of their world's design, at rest, looking anywhere.
 
-    ``n_spawns`` points a design are found once, 5 cm clear of the collision disc; each respawn picks one by :class:`Draws`. Agents of one world take distinct points.
-    ``geometries`` are those the scenery was made from.
+    ``n_spawns`` points a design are found once, 5 cm clear of the collision disc; each respawn picks one by
+    :class:`Draws`. Agents of one world take distinct points. ``geometries`` are those the scenery was made from.
     """
 
     def __init__(self, geometries, core, n_spawns=128, seed=None):
         self.core = core
         seed = core.seed if seed is None else seed
-        points = np.stack([_spawn_points(g, n_spawns, engine.AGENT_RADIUS + .05, np.random.Generator(np.random.Philox(key=[seed, d])))
-                           for d, g in enumerate(geometries[:len(core.scenery.designs)])])
+        points = np.stack(
+            [
+                _spawn_points(
+                    g, n_spawns, engine.AGENT_RADIUS + 0.05, np.random.Generator(np.random.Philox(key=[seed, d]))
+                )
+                for d, g in enumerate(geometries[: len(core.scenery.designs)])
+            ]
+        )
         self.points = torch.as_tensor(points, dtype=torch.float32, device=core.device)
         self.draws = Draws(core.n_envs * core.n_agents, seed, core.device)
         self._offset = torch.arange(core.n_agents, device=core.device)[None] * (n_spawns // max(core.n_agents, 1))
@@ -180,12 +215,14 @@ class RandomSpawns:
         points = self.points[core.scenery.design.long()[:, None], choice]
         agents.positions.copy_(torch.where(reset[..., None], points, agents.positions))
         agents.angles.copy_(torch.where(reset, 360 * chance[..., 1] - 180, agents.angles))
-        agents.velocity.masked_fill_(reset[..., None], 0.)
-        agents.angvelocity.masked_fill_(reset, 0.)
+        agents.velocity.masked_fill_(reset[..., None], 0.0)
+        agents.angvelocity.masked_fill_(reset, 0.0)
 
 
 class RandomLifespans:
-    """Ends episodes after a random number of steps, from ``shortest`` to ``longest``. ``lifespans`` (B,) and ``ages`` (B,) are in steps."""
+    """Ends episodes after a random number of steps, from ``shortest`` to ``longest``. ``lifespans`` (B,) and ``ages``
+    (B,) are in steps.
+    """
 
     def __init__(self, core, shortest=128, longest=256, seed=None):
         if not 0 < shortest <= longest:
@@ -204,7 +241,8 @@ class RandomLifespans:
         self.ages.masked_fill_(reset, 0)
 
     def __call__(self, reset):
-        """One step: lanes of ``reset`` (B,) begin a life, the others age. Returns (B,) bool, who has reached the end."""
+        """One step: lanes of ``reset`` (B,) begin a life, the others age. Returns (B,) bool, who has reached the end.
+        """
         self.ages.add_(1)
         self.begin(reset)
         return self.ages >= self.lifespans

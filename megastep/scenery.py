@@ -1,8 +1,10 @@
 """Scenery: what the engine renders and collides with.
 
-Walls, their textures and baked light, and lights belong to a *design*; a world points at a design, so a million worlds share a few thousand homes. Each world adds only its
-agents' lines and the light on them. N worlds, D designs, A agents a world, M lines of the agent model, K texels of one world's agents, W walls and T texels of all designs.
+Walls, their textures and baked light, and lights belong to a *design*; a world points at a design, so a million
+worlds share a few thousand homes. Each world adds only its agents' lines and the light on them. N worlds, D designs,
+A agents a world, M lines of the agent model, K texels of one world's agents, W walls and T texels of all designs.
 """
+
 from functools import cached_property
 
 import torch
@@ -17,9 +19,11 @@ def _expand(starts, widths):
 
 
 class Pieced:
-    """A read-only Ragged whose subarrays are pieces of two tensors, joined when asked for: the agents' part first, then the design's.
+    """A read-only Ragged whose subarrays are pieces of two tensors, joined when asked for: the agents' part first,
+    then the design's.
 
-    ``vals``, ``starts``, ``ends``, ``widths``, ``inverse`` and indexing are those of a :class:`~megastep.ragged.Ragged`; all are copies.
+    ``vals``, ``starts``, ``ends``, ``widths``, ``inverse`` and indexing are those of a
+    :class:`~megastep.ragged.Ragged`; all are copies.
     """
 
     def __init__(self, vals, starts, widths):
@@ -60,7 +64,12 @@ class Pieced:
             return Ragged(torch.cat([self[i] for i in chosen] or [self._vals[0][:0]]), self.widths[list(chosen)])
         if not -len(self) <= index < len(self):
             raise IndexError(f'index {index} is out of range for {len(self)} subarrays')
-        return torch.cat([vals[int(s[index]):int(s[index]) + int(w[index])] for vals, s, w in zip(self._vals, self._starts, self._widths)])
+        return torch.cat(
+            [
+                vals[int(s[index]) : int(s[index]) + int(w[index])]
+                for vals, s, w in zip(self._vals, self._starts, self._widths)
+            ]
+        )
 
     def torchify(self):
         return Ragged(self.vals, self.widths)
@@ -75,20 +84,28 @@ class Pieced:
 class Designs:
     """The static part of scenery, shared by the worlds that show it.
 
-    Args: ``lines`` Ragged (W, 2, 2) metres; ``textures`` Ragged (T, 3), one subarray a wall, linear light in [0, 1]; ``lights`` Ragged (l, 3), x, y, intensity;
-    ``agent_textures`` (D, K, 3). ``lines.vals``, ``textures.vals``, ``baked.vals`` and ``lights.vals`` may be edited in place; call ``bake`` after moving walls or lights.
+    Args: ``lines`` Ragged (W, 2, 2) metres; ``textures`` Ragged (T, 3), one subarray a wall, linear light in [0, 1];
+    ``lights`` Ragged (l, 3), x, y, intensity; ``agent_textures`` (D, K, 3). ``lines.vals``, ``textures.vals``,
+    ``baked.vals`` and ``lights.vals`` may be edited in place; call ``bake`` after moving walls or lights.
     """
 
     def __init__(self, lines, textures, lights, agent_textures, device):
         self.lines = Ragged(_floats(lines.vals, device), lines.widths.to(device))
         self.lights = Ragged(_floats(lights.vals, device), lights.widths.to(device))
-        self.texels = torch.cat([_floats(textures.vals, device), torch.ones((len(textures.vals), 1), device=device)], 1).contiguous()
+        self.texels = torch.cat(
+            [_floats(textures.vals, device), torch.ones((len(textures.vals), 1), device=device)], 1
+        ).contiguous()
         self.textures = Ragged(self.texels[:, :3], textures.widths.to(device))
         self.baked = Ragged(self.texels[:, 3], textures.widths.to(device))
         self.agent_textures = _floats(agent_textures, device)
-        self.wall_starts, self.light_starts, self.texel_starts = (_bounds(r.widths) for r in (self.lines, self.lights, self.textures))
-        for name, wanted, given in [('texture for each wall', len(self.lines.vals), len(self.textures)), ('set of lights for each design', len(self.lines), len(self.lights)),
-                                    ('set of agent textures for each design', len(self.lines), len(self.agent_textures))]:
+        self.wall_starts, self.light_starts, self.texel_starts = (
+            _bounds(r.widths) for r in (self.lines, self.lights, self.textures)
+        )
+        for name, wanted, given in [
+            ('texture for each wall', len(self.lines.vals), len(self.textures)),
+            ('set of lights for each design', len(self.lines), len(self.lights)),
+            ('set of agent textures for each design', len(self.lines), len(self.agent_textures)),
+        ]:
             if wanted != given:
                 raise ValueError(f'scenery needs one {name}, so {wanted} of them, but {given} were given')
         if len(textures.widths) and int(textures.widths.min()) < 1:
@@ -106,9 +123,10 @@ class Designs:
 class Scenery:
     """N worlds of A agents each.
 
-    ``Scenery(n_agents, lights, lines, textures, model)`` takes what every world has of its own: raggeds of ``lights`` (l, 3) and ``lines`` (L, 2, 2) by world, each world's
-    agents' lines first, ``textures`` (T, 3) by line, and the agents' ``model`` (M, 2, 2) in metres about their origin. :meth:`of_designs` shares designs between worlds.
-    The agents' texture widths must be the same in every world. ValueError if the parts do not fit.
+    ``Scenery(n_agents, lights, lines, textures, model)`` takes what every world has of its own: raggeds of ``lights``
+    (l, 3) and ``lines`` (L, 2, 2) by world, each world's agents' lines first, ``textures`` (T, 3) by line, and the
+    agents' ``model`` (M, 2, 2) in metres about their origin. :meth:`of_designs` shares designs between worlds. The
+    agents' texture widths must be the same in every world. ValueError if the parts do not fit.
     """
 
     def __init__(self, n_agents, lights, lines, textures, model, device=None):
@@ -116,16 +134,28 @@ class Scenery:
         device = torch.device(device or lines.vals.device)
         n, own = len(lines), n_agents * len(model)
         if int(lines.widths.min()) < own:
-            raise ValueError(f'every world must begin with the {own} lines of its {n_agents} agents, but one has {int(lines.widths.min())} lines in all')
+            raise ValueError(
+                f'every world must begin with the {own} lines of its {n_agents} agents, but one has '
+                f'{int(lines.widths.min())} lines in all'
+            )
         is_agent = torch.arange(len(lines.vals), device=lines.vals.device) - lines.starts[lines.inverse] < own
         if len(textures) != len(lines.vals):
-            raise ValueError(f'scenery needs one texture for each line, so {len(lines.vals)} of them, but {len(textures)} were given')
+            raise ValueError(
+                f'scenery needs one texture for each line, so {len(lines.vals)} of them, but {len(textures)} were given'
+            )
         agent_widths = textures.widths[is_agent].view(n, own)
         if not bool((agent_widths == agent_widths[0]).all()):
-            raise ValueError('the texture widths of the agents\' lines must be the same in every world, but they differ')
+            raise ValueError(
+                'the texture widths of the agents\' lines must be the same in every world, but they differ'
+            )
         of_agent = is_agent[textures.inverse]
-        designs = Designs(Ragged(lines.vals[~is_agent], lines.widths - own), Ragged(textures.vals[~of_agent], textures.widths[~is_agent]), lights,
-                          textures.vals[of_agent].view(n, -1, 3), device)
+        designs = Designs(
+            Ragged(lines.vals[~is_agent], lines.widths - own),
+            Ragged(textures.vals[~of_agent], textures.widths[~is_agent]),
+            lights,
+            textures.vals[of_agent].view(n, -1, 3),
+            device,
+        )
         self._fill(n_agents, designs, model, agent_widths[0], torch.arange(n), device)
 
     @classmethod
@@ -141,12 +171,17 @@ class Scenery:
         self.model_texels = _bounds(torch.as_tensor(model_widths, device=device))
         self.design = torch.as_tensor(design, dtype=torch.int32, device=device).contiguous()
         if int(self.model_texels[-1]) != designs.agent_textures.shape[1]:
-            raise ValueError(f'the agents\' textures have {designs.agent_textures.shape[1]} texels a world, but their lines need {int(self.model_texels[-1])}')
+            raise ValueError(
+                f'the agents\' textures have {designs.agent_textures.shape[1]} texels a world, but their lines '
+                f'need {int(self.model_texels[-1])}'
+            )
         if len(self.design) and not 0 <= int(self.design.min()) <= int(self.design.max()) < len(designs):
-            raise ValueError(f'worlds must show designs 0 to {len(designs) - 1}, but one shows {int(self.design.max())}')
+            raise ValueError(
+                f'worlds must show designs 0 to {len(designs) - 1}, but one shows {int(self.design.max())}'
+            )
         self.agent_lines = self.model.repeat(self.n_envs, n_agents, 1, 1)
         self.agent_light = torch.ones((self.n_envs, designs.agent_textures.shape[1]), device=device)
-        self.reach = float(self.model.norm(dim=-1).max()) if len(self.model) else 0.
+        self.reach = float(self.model.norm(dim=-1).max()) if len(self.model) else 0.0
 
     @property
     def n_envs(self):
@@ -160,7 +195,11 @@ class Scenery:
         design, static = self.design.long(), self.designs.lines
         n = self.agent_lines.shape[1]
         own = torch.arange(self.n_envs, device=self.device) * n
-        return Pieced((self.agent_lines.flatten(0, 1), static.vals), (own, static.starts[design]), (torch.full_like(own, n), static.widths[design]))
+        return Pieced(
+            (self.agent_lines.flatten(0, 1), static.vals),
+            (own, static.starts[design]),
+            (torch.full_like(own, n), static.widths[design]),
+        )
 
     @property
     def lights(self):
@@ -179,15 +218,22 @@ class Scenery:
     def baked(self):
         """Per line of all worlds, the light on its texels (w,)."""
         own = self.agent_light
-        return self._by_line((own.flatten(), self.designs.baked.vals), torch.arange(self.n_envs, device=self.device) * own.shape[1])
+        return self._by_line(
+            (own.flatten(), self.designs.baked.vals), torch.arange(self.n_envs, device=self.device) * own.shape[1]
+        )
 
     def _by_line(self, vals, agent_starts):
         static, design = self.designs.textures, self.design.long()
         walls = self.designs.lines
         n = len(self.model_texels) - 1
-        order = Pieced((torch.arange(self.n_envs * n, device=self.device), self.n_envs * n + torch.arange(len(walls.vals), device=self.device)),
-                       (torch.arange(self.n_envs, device=self.device) * n, walls.starts[design]),
-                       (torch.full_like(design, n), walls.widths[design])).vals
+        order = Pieced(
+            (
+                torch.arange(self.n_envs * n, device=self.device),
+                self.n_envs * n + torch.arange(len(walls.vals), device=self.device),
+            ),
+            (torch.arange(self.n_envs, device=self.device) * n, walls.starts[design]),
+            (torch.full_like(design, n), walls.widths[design]),
+        ).vals
         is_agent = order < self.n_envs * n
         bounds = self.model_texels.long()
         world, line = order // max(n, 1), order % max(n, 1)
@@ -200,16 +246,22 @@ class Scenery:
         widths = torch.where(is_agent, (bounds[1:] - bounds[:-1])[line], zero)
         if not len(walls.vals):
             return Pieced(vals, (starts, zero), (widths, zero))
-        return Pieced(vals, (starts, torch.where(is_agent, zero, static.starts[wall])), (widths, torch.where(is_agent, zero, static.widths[wall])))
+        return Pieced(
+            vals,
+            (starts, torch.where(is_agent, zero, static.starts[wall])),
+            (widths, torch.where(is_agent, zero, static.widths[wall])),
+        )
 
     def world(self, e):
-        """World ``e`` alone: (lines (L, 2, 2), a tuple of lit textures (w, 3) one a line, lights (l, 3)), the agents' first. Cheap however many worlds there are."""
+        """World ``e`` alone: (lines (L, 2, 2), a tuple of lit textures (w, 3) one a line, lights (l, 3)), the agents'
+        first. Cheap however many worlds there are.
+        """
         designs, d = self.designs, int(self.design[e])
         lines = torch.cat([self.agent_lines[e], designs.lines[d]])
         first, last = int(designs.wall_starts[d]), int(designs.wall_starts[d + 1])
-        bounds, own = designs.texel_starts[first:last + 1].tolist(), self.model_texels.tolist()
+        bounds, own = designs.texel_starts[first : last + 1].tolist(), self.model_texels.tolist()
         agents = designs.agent_textures[d] * self.agent_light[e, :, None]
-        walls = designs.texels[bounds[0]:bounds[-1], :3] * designs.texels[bounds[0]:bounds[-1], 3:]
+        walls = designs.texels[bounds[0] : bounds[-1], :3] * designs.texels[bounds[0] : bounds[-1], 3:]
         return lines, (*agents.split(_widths(own)), *walls.split(_widths(bounds))), designs.lights[d]
 
 
@@ -225,5 +277,8 @@ def _bounds(widths):
     """(n + 1,) int32: where each subarray starts, and where the last ends."""
     ends = widths.cumsum(0)
     if len(ends) and int(ends[-1]) >= 2**31:
-        raise ValueError(f'scenery holds at most 2,147,483,647 walls and texels of each kind, but {int(ends[-1])} were given: use fewer designs')
+        raise ValueError(
+            f'scenery holds at most 2,147,483,647 walls and texels of each kind, but {int(ends[-1])} were given: '
+            f'use fewer designs'
+        )
     return torch.cat([ends.new_zeros(1), ends]).to(torch.int32)

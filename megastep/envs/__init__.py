@@ -1,4 +1,5 @@
 """The environments: one file, one environment. ``ENVS`` names them."""
+
 from .explorer import Explorer
 from .minimal import Minimal
 

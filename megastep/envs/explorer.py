@@ -1,34 +1,64 @@
 """Explorer: see as much of a home as you can."""
+
 import torch
 
-from .. import engine, geometries as sources, modules, plotting, spaces
+from .. import engine, modules, plotting, spaces
+from .. import geometries as sources
 from ..arrdict import arrdict
 from ..core import Core
 from ..dotdict import dotdict
 from ..scene import scenery
 
-TEXELS_A_POINT = 64     # newly seen texels that earn a reward of 1
-PATIENCE = 200          # steps an episode lasts beyond one for each texel seen
+TEXELS_A_POINT = 64  # newly seen texels that earn a reward of 1
+PATIENCE = 200  # steps an episode lasts beyond one for each texel seen
 
 
 class Explorer:
     """Reward for wall texels seen for the first time in an episode, / 64; what the first view shows pays nothing.
 
-    Observation: RGB and depth of 64 pixels, each the mean of 4 rays over 130 degrees, and IMU, all fp16. Seven actions, with momentum. Truncated when the episode's length in
-    steps reaches the number of texels seen, the first view's included, + 200.
+    Observation: RGB and depth of 64 pixels, each the mean of 4 rays over 130 degrees, and IMU, all fp16. Seven
+    actions, with momentum. Truncated when the episode's length in steps reaches the number of texels seen, the first
+    view's included, + 200.
 
-    Args: ``geometries`` to live in, generated homes by default; ``res`` rays and ``subsample`` rays a pixel; ``fov`` degrees; ``patience`` steps.
+    Args: ``geometries`` to live in, generated homes by default; ``res`` rays and ``subsample`` rays a pixel; ``fov``
+    degrees; ``patience`` steps.
     """
+
     n_agents = 1
 
-    def __init__(self, n_envs=128, geometries=None, *, seed=1, device=None, res=256, subsample=4, fov=130., fps=10., patience=PATIENCE):
+    def __init__(
+        self,
+        n_envs=128,
+        geometries=None,
+        *,
+        seed=1,
+        device=None,
+        res=256,
+        subsample=4,
+        fov=130.0,
+        fps=10.0,
+        patience=PATIENCE,
+    ):
         geometries = sources.sample('homes', min(n_envs, 512), seed=seed) if geometries is None else geometries
-        self.core = Core(scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device), res=res, fov=fov, fps=fps, seed=seed)
-        self.n_envs, self.device, self.subsample, self.patience = self.core.n_envs, self.core.device, subsample, patience
+        self.core = Core(
+            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
+            res=res,
+            fov=fov,
+            fps=fps,
+            seed=seed,
+        )
+        self.n_envs, self.device, self.subsample, self.patience = (
+            self.core.n_envs,
+            self.core.device,
+            subsample,
+            patience,
+        )
         self.spawner = modules.RandomSpawns(geometries, self.core)
         self.movement = modules.MomentumMovement(self.core)
         pixels = modules.RGB(self.core, subsample).space.W
-        self.obs_space = dotdict(rgb=spaces.MultiImage(1, 3, 1, pixels), d=spaces.MultiImage(1, 1, 1, pixels), imu=spaces.MultiVector(1, 3))
+        self.obs_space = dotdict(
+            rgb=spaces.MultiImage(1, 3, 1, pixels), d=spaces.MultiImage(1, 1, 1, pixels), imu=spaces.MultiVector(1, 3)
+        )
         self.action_space = self.movement.space
         words = -(-self.core.scenery.designs.most_texels // 32)
         engine.fit(n_envs, 4 * words + 8 * pixels + 64, self.device)
@@ -52,8 +82,10 @@ class Explorer:
         self.n_seen.masked_fill_(reset, 0).add_(fresh)
         self.length.add_(1).masked_fill_(reset, 0)
         self.ended.copy_((self.length >= self.n_seen + self.patience) & ~reset)
-        reward = (fresh / TEXELS_A_POINT).masked_fill(reset, 0.)
-        return arrdict(obs=obs, reward=reward, reset=reset, terminal=torch.zeros_like(reset), truncated=self.ended.clone())
+        reward = (fresh / TEXELS_A_POINT).masked_fill(reset, 0.0)
+        return arrdict(
+            obs=obs, reward=reward, reset=reset, terminal=torch.zeros_like(reset), truncated=self.ended.clone()
+        )
 
     def _look(self, **seen):
         """The observation, and if ``seen`` is given how many texels were new (N,)."""
@@ -64,19 +96,29 @@ class Explorer:
 
     def state(self, e=0):
         """What :meth:`plot_state` draws of world ``e``."""
-        return arrdict(core=self.core.state(e), obs=self._look()[0][e], seen=self._seen_texels(e), length=self.length[e].clone(), n_seen=self.n_seen[e].clone())
+        return arrdict(
+            core=self.core.state(e),
+            obs=self._look()[0][e],
+            seen=self._seen_texels(e),
+            length=self.length[e].clone(),
+            n_seen=self.n_seen[e].clone(),
+        )
 
     def _seen_texels(self, e):
         """(T,) bool: which of the static texels of world ``e`` have been seen in this episode."""
         bits = self.seen[e, 0, :, None] >> torch.arange(32, dtype=torch.int32, device=self.device) & 1
         designs, d = self.core.scenery.designs, int(self.core.scenery.design[e])
-        first, last = designs.texel_starts[designs.wall_starts[d:d + 2].long()].tolist()
-        return bits.flatten()[:last - first].bool()
+        first, last = designs.texel_starts[designs.wall_starts[d : d + 2].long()].tolist()
+        return bits.flatten()[: last - first].bool()
 
     @classmethod
     def plot_state(cls, state):
-        """A matplotlib figure of a numpyified :meth:`state`: the plan, bright where it has been seen, and what the agent sees."""
-        figure, plan, strips = plotting.panels(2, title=f'step {state.length}, {state.n_seen} of {len(state.seen)} texels seen')
+        """A matplotlib figure of a numpyified :meth:`state`: the plan, bright where it has been seen, and what the
+        agent sees.
+        """
+        figure, plan, strips = plotting.panels(
+            2, title=f'step {state.length}, {state.n_seen} of {len(state.seen)} texels seen'
+        )
         Core.plot_state(state.core, plan, seen=state.seen)
         plotting.plot_images({'rgb': state.obs.rgb, 'depth': state.obs.d}, aspect=plotting.STRIP, axes=strips)
         return figure

@@ -1,4 +1,5 @@
 """Minimal: an agent that moves and sees. Nothing is rewarded; episodes end at a random lifespan."""
+
 import torch
 
 from .. import engine, modules, plotting, toys
@@ -8,15 +9,36 @@ from ..scene import scenery
 
 
 class Minimal:
-    """Seed of every other environment: RGB of 64 pixels, seven actions, no reward, truncated after a random 128 to 256 steps.
+    """Seed of every other environment: RGB of 64 pixels, seven actions, no reward, truncated after a random 128 to
+    256 steps.
 
-    Args: ``geometries`` to live in, boxes by default; ``res`` rays; ``fov`` degrees; ``shortest`` and ``longest`` lifespan in steps.
+    Args: ``geometries`` to live in, boxes by default; ``res`` rays; ``fov`` degrees; ``shortest`` and ``longest``
+    lifespan in steps.
     """
+
     n_agents = 1
 
-    def __init__(self, n_envs=128, geometries=None, *, seed=1, device=None, res=64, fov=130., fps=10., shortest=128, longest=256):
+    def __init__(
+        self,
+        n_envs=128,
+        geometries=None,
+        *,
+        seed=1,
+        device=None,
+        res=64,
+        fov=130.0,
+        fps=10.0,
+        shortest=128,
+        longest=256,
+    ):
         geometries = [toys.box()] if geometries is None else geometries
-        self.core = Core(scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device), res=res, fov=fov, fps=fps, seed=seed)
+        self.core = Core(
+            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
+            res=res,
+            fov=fov,
+            fps=fps,
+            seed=seed,
+        )
         self.n_envs, self.device = self.core.n_envs, self.core.device
         self.spawner = modules.RandomSpawns(geometries, self.core)
         self.lifespans = modules.RandomLifespans(self.core, shortest, longest)
@@ -38,7 +60,13 @@ class Minimal:
     def _observe(self, reset):
         self.spawner(reset)
         self.ended.copy_(self.lifespans(reset) & ~reset)
-        return arrdict(obs=self._look(), reward=self._reward.clone(), reset=reset, terminal=torch.zeros_like(reset), truncated=self.ended.clone())
+        return arrdict(
+            obs=self._look(),
+            reward=self._reward.clone(),
+            reset=reset,
+            terminal=torch.zeros_like(reset),
+            truncated=self.ended.clone(),
+        )
 
     def _look(self):
         view = engine.observe(self.core.scenery, self.core.agents, depth=False)

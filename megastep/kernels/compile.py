@@ -1,10 +1,12 @@
 """Builds the kernels at first use and keeps what was built.
 
-The CPU library comes from the system's C++ compiler, the GPU's cubin from NVRTC, which PyTorch's CUDA wheels bring along: no nvcc. Either is kept in
-``$MEGASTEP_CACHE`` (else ``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``) under a hash of sources, flags, compiler and processor. A kept file ends in its own
-SHA-256, so a damaged one is seen and built again; it is written beside its place and renamed, so that two processes cannot harm each other; where the folder cannot be
-written a temporary one serves.
+The CPU library comes from the system's C++ compiler, the GPU's cubin from NVRTC, which PyTorch's CUDA wheels bring
+along: no nvcc. Either is kept in ``$MEGASTEP_CACHE`` (else ``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``)
+under a hash of sources, flags, compiler and processor. A kept file ends in its own SHA-256, so a damaged one is seen
+and built again; it is written beside its place and renamed, so that two processes cannot harm each other; where the
+folder cannot be written a temporary one serves.
 """
+
 import atexit
 import ctypes
 import functools
@@ -21,14 +23,26 @@ import torch
 
 HERE = Path(__file__).parent
 OPERATIONS = ('bake', 'physics', 'place', 'sight', 'draw')
-CPU_FLAGS = ('-std=c++17', '-O3', '-march=native', '-ffp-contract=off', '-fno-math-errno', '-fno-trapping-math', '-fopenmp', '-shared', '-fPIC')
+CPU_FLAGS = (
+    '-std=c++17',
+    '-O3',
+    '-march=native',
+    '-ffp-contract=off',
+    '-fno-math-errno',
+    '-fno-trapping-math',
+    '-fopenmp',
+    '-shared',
+    '-fPIC',
+)
 CUDA_FLAGS = ('--std=c++17', '--fmad=false', '--prec-div=true', '--prec-sqrt=true', '--ftz=false')
 BLOCK = 128
 DIGEST = 32
 
 
 class EngineError(RuntimeError):
-    """The machine cannot do what was asked: no compiler, no GPU, no memory, a position that is not a number. The message is one sentence with the cure."""
+    """The machine cannot do what was asked: no compiler, no GPU, no memory, a position that is not a number. The
+    message is one sentence with the cure.
+    """
 
 
 def _structs():
@@ -49,6 +63,7 @@ STRUCTS = _structs()
 
 
 # ---- The cache ----
+
 
 def _folder():
     chosen = os.environ.get('MEGASTEP_CACHE')
@@ -97,6 +112,7 @@ def _key(*parts):
 
 # ---- The CPU ----
 
+
 def _compiler():
     """The C++ compiler's command, and its version as text."""
     asked = os.environ.get('CXX')
@@ -105,7 +121,9 @@ def _compiler():
         if found:
             return found, subprocess.run([found, '--version'], capture_output=True, text=True).stdout
     what = f'CXX={asked} is not a program' if asked else 'none of c++, g++ and clang++ is there'
-    raise EngineError(f'The CPU engine needs a C++ compiler and {what}: install one (Debian: apt install g++) or set CXX to yours.')
+    raise EngineError(
+        f'The CPU engine needs a C++ compiler and {what}: install one (Debian: apt install g++) or set CXX to yours.'
+    )
 
 
 def _processor():
@@ -119,10 +137,15 @@ def _processor():
 def _build_cpu(compiler):
     with tempfile.TemporaryDirectory(prefix='megastep-') as folder:
         out = Path(folder) / 'engine.so'
-        done = subprocess.run([compiler, *CPU_FLAGS, str(HERE / 'cpu.cpp'), '-o', str(out)], capture_output=True, text=True)
+        done = subprocess.run(
+            [compiler, *CPU_FLAGS, str(HERE / 'cpu.cpp'), '-o', str(out)], capture_output=True, text=True
+        )
         if done.returncode:
-            raise EngineError(f'{compiler} could not build the CPU engine; it needs a C++17 compiler with OpenMP (Debian: apt install g++). It said: '
-                              f'{" ".join(done.stderr.split())[:500]}')
+            raise EngineError(
+                f'{compiler} could not build the CPU engine; it needs a C++17 compiler with OpenMP (Debian: apt '
+                f'install g++). It said: '
+                f'{" ".join(done.stderr.split())[:500]}'
+            )
         return out.read_bytes()
 
 
@@ -141,11 +164,15 @@ def cpu():
 
 # ---- The GPU ----
 
+
 def _bindings():
     try:
         from cuda.bindings import driver, nvrtc
     except ImportError:
-        raise EngineError('The GPU engine needs the package cuda-bindings, which comes with PyTorch for CUDA 13: pip install cuda-bindings.') from None
+        raise EngineError(
+            'The GPU engine needs the package cuda-bindings, which comes with PyTorch for CUDA 13: pip install '
+            'cuda-bindings.'
+        ) from None
     return driver, nvrtc
 
 
@@ -153,14 +180,17 @@ def _checked(result, what):
     """What a call of cuda.bindings returned beside its status, or an EngineError."""
     status, *values = result
     if int(status):
-        raise EngineError(f'{what} failed with {getattr(status, "name", status)}; is the NVIDIA driver as new as PyTorch\'s CUDA {torch.version.cuda}?')
+        raise EngineError(
+            f'{what} failed with {getattr(status, "name", status)}; is the NVIDIA driver as new as PyTorch\'s '
+            f'CUDA {torch.version.cuda}?'
+        )
     return values[0] if len(values) == 1 else values
 
 
 def _build_cuda(source, flags):
     _, nvrtc = _bindings()
     program = _checked(nvrtc.nvrtcCreateProgram(source.encode(), b'engine.cu', 0, [], []), 'NVRTC')
-    status, = nvrtc.nvrtcCompileProgram(program, len(flags), [flag.encode() for flag in flags])
+    (status,) = nvrtc.nvrtcCompileProgram(program, len(flags), [flag.encode() for flag in flags])
     if int(status):
         log = bytearray(_checked(nvrtc.nvrtcGetProgramLogSize(program), 'NVRTC'))
         nvrtc.nvrtcGetProgramLog(program, log)
@@ -182,20 +212,32 @@ def cuda(index):
     try:
         version = _checked(nvrtc.nvrtcVersion(), 'NVRTC')
     except (RuntimeError, OSError) as fault:
-        raise EngineError(f'The GPU engine needs NVRTC, which comes with PyTorch\'s CUDA wheels, and it could not be loaded ({fault}): reinstall torch.') from None
+        raise EngineError(
+            f'The GPU engine needs NVRTC, which comes with PyTorch\'s CUDA wheels, and it could not be loaded '
+            f'({fault}): reinstall torch.'
+        ) from None
     path = kept(f'cuda-{_key(source, *flags, str(version))}.cubin', lambda: _build_cuda(source, flags))
     with torch.cuda.device(index):
-        torch.cuda.current_stream().synchronize()       # makes the device's primary context current
+        torch.cuda.current_stream().synchronize()  # makes the device's primary context current
         module = _checked(driver.cuModuleLoadData(_intact(path)), 'Loading the GPU engine')
-        functions = {operation: _checked(driver.cuModuleGetFunction(module, operation.encode()), 'Loading the GPU engine') for operation in OPERATIONS}
-        most = _checked(driver.cuDeviceGetAttribute(driver.CUdevice_attribute.CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN, index), 'Loading the GPU engine')
+        functions = {
+            operation: _checked(driver.cuModuleGetFunction(module, operation.encode()), 'Loading the GPU engine')
+            for operation in OPERATIONS
+        }
+        most = _checked(
+            driver.cuDeviceGetAttribute(
+                driver.CUdevice_attribute.CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN, index
+            ),
+            'Loading the GPU engine',
+        )
         attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
         _checked(driver.cuFuncSetAttribute(functions['sight'], attribute, most), 'Loading the GPU engine')
     return functions
 
 
 def launch(operation, params, device, threads, shared=0):
-    """Runs ``operation`` on ``params`` (a struct of STRUCTS): on the CPU at once, on a GPU in ``threads`` threads on the device's current stream.
+    """Runs ``operation`` on ``params`` (a struct of STRUCTS): on the CPU at once, on a GPU in ``threads`` threads on
+    the device's current stream.
 
     ``shared`` is dynamic shared memory in bytes a warp.
     """
@@ -211,4 +253,9 @@ def launch(operation, params, device, threads, shared=0):
     arguments = (ctypes.c_void_p * 1)(ctypes.addressof(params))
     with torch.cuda.device(index):
         stream = torch.cuda.current_stream(index).cuda_stream
-        _checked(driver.cuLaunchKernel(function, blocks, 1, 1, BLOCK, 1, 1, shared * (BLOCK // 32), stream, ctypes.addressof(arguments), 0), f'Launching {operation}')
+        _checked(
+            driver.cuLaunchKernel(
+                function, blocks, 1, 1, BLOCK, 1, 1, shared * (BLOCK // 32), stream, ctypes.addressof(arguments), 0
+            ),
+            f'Launching {operation}',
+        )

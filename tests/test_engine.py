@@ -1,0 +1,377 @@
+"""The engine against the laws: the original's golden outputs, the brute-force twin on random worlds, and the CPU
+against the GPU bit by bit.
+"""
+
+import math
+
+import compare
+import numpy as np
+import pytest
+import torch
+import worlds
+
+from megastep import cuda, engine, scene, toys
+from megastep.geometries import sample
+from megastep.modules import RGB, Depth, RandomSpawns
+
+DEVICES = ['cpu', pytest.param('cuda', marks=pytest.mark.cuda)]
+HAS_GPU = torch.cuda.is_available()
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    if request.param == 'cuda' and not HAS_GPU:
+        pytest.skip('needs a GPU')
+    return request.param
+
+
+def core_of(world, device, **settings):
+    """A Core that holds a test's world."""
+    core = cuda.Core(cuda.Scenery(**world.scenery_arguments(), device=device), **settings)
+    for name in ('positions', 'angles', 'velocity', 'angvelocity'):
+        getattr(core.agents, name).copy_(getattr(world, name))
+    return core
+
+
+def poison():
+    """Fills the allocator's next blocks with NaN, so that an output that is not written shows."""
+    for size in (1 << 10, 1 << 14, 1 << 18):
+        torch.full((size,), math.nan)
+
+
+def state_of(core, physics):
+    agents = core.agents
+    return dict(
+        progress=physics.progress,
+        positions=agents.positions,
+        angles=agents.angles,
+        velocity=agents.velocity,
+        angvelocity=agents.angvelocity,
+    )
+
+
+# ---- Golden: what the original computed, within the tolerances its README gives ----
+
+
+def share(condition):
+    return float(condition.float().mean())
+
+
+@pytest.mark.parametrize('case', worlds.CASES)
+def test_golden(case, device):
+    world, settings, golden = worlds.golden(case)
+    core = core_of(world, device, **settings)
+    cuda.bake(core.scenery)
+    r = cuda.render(core.scenery, core.agents)
+    r = {k: v.cpu() for k, v in r._asdict().items()}
+
+    assert torch.allclose(core.scenery.lines.vals.cpu(), world.lines, atol=1e-5), 'lines'
+    n_agents = world.n_agents * len(world.model)
+    line = torch.repeat_interleave(torch.arange(len(world.texture_widths)), world.texture_widths)
+    starts = world.line_widths.cumsum(0) - world.line_widths
+    env = torch.repeat_interleave(torch.arange(world.n_envs), world.line_widths)
+    static = (line - starts[env[line]]) >= n_agents
+    baked = core.scenery.baked.vals.cpu()
+    assert share((baked - golden['baked_vals']).abs()[static] <= 2e-3) >= 0.995, 'baked'
+
+    same = r['indices'] == golden['indices']
+    assert share(same) >= 0.999, 'indices'
+    hit = same & (golden['indices'] >= 0)
+    assert share(((r['distances'] - golden['distances']).abs() <= 1e-4 * (1 + golden['distances']))[hit]) >= 0.998, (
+        'distances'
+    )
+    assert share(((r['locations'] - golden['locations']).abs() <= 1e-3)[hit]) >= 0.998, 'locations'
+    assert share(((r['dots'] - golden['dots']).abs() <= 1e-3)[hit]) >= 0.998, 'dots'
+    miss = same & (golden['indices'] < 0)
+    assert bool(
+        (r['distances'][miss] == math.inf).all()
+        and r['locations'][miss].isnan().all()
+        and (r['screen'][miss] == 0).all()
+    ), 'misses'
+    difference = (r['screen'] - golden['screen']).abs().mean(-1)
+    wall, agent = hit & (golden['indices'] >= n_agents), hit & (golden['indices'] < n_agents)
+    assert float(difference[wall].mean()) <= 2e-3, 'screen'
+    assert not agent.any() or float(difference[agent].mean()) <= 2e-2, 'screen of agents'
+
+    progress = cuda.physics(core.scenery, core.agents).progress.cpu()
+    agents = {k: getattr(core.agents, k).cpu() for k in ('positions', 'angles', 'velocity', 'angvelocity')}
+    right = (progress - golden['progress']).abs() <= 2e-3
+    assert share(right) >= 0.995, 'progress'
+    step = world.velocity.norm(dim=-1) / settings['fps']
+    assert bool(((agents['positions'] - golden['positions_after']).norm(dim=-1) <= 5e-3 + 4e-3 * step)[right].all()), (
+        'positions'
+    )
+    turned = ((agents['angles'] - golden['angles_after'] + 180) % 360 - 180).abs()
+    assert bool((turned <= 0.1 + 4e-3 * world.angvelocity.abs() / settings['fps'])[right].all()), 'angles'
+    for name in ('velocity', 'angvelocity'):
+        assert share(agents[name] == golden[f'{name}_after']) >= 0.99, name
+
+
+# ---- The twin: random worlds, all degenerate cases ----
+
+VIEWS = [
+    dict(res=1, fov=130.0),
+    dict(res=64, fov=20.0),
+    dict(res=63, fov=130.0),
+    dict(res=256, fov=170.0),
+    dict(res=1024, fov=90.0),
+    dict(res=64, fov=70.0, cameras=(0.0, 120.0, 240.0)),
+]
+
+
+@pytest.mark.parametrize('n_agents', [1, 4])
+@pytest.mark.parametrize('view', VIEWS, ids=str)
+@pytest.mark.parametrize('degenerate', [(), worlds.EVERYTHING], ids=['plain', 'degenerate'])
+def test_twin_sight(view, n_agents, degenerate, device):
+    for seed in range(2):
+        world = worlds.random_world(
+            seed,
+            n_agents=n_agents,
+            degenerate=degenerate,
+            res=view['res'],
+            fov=view['fov'],
+            origin=190.0 if seed else 1.0,
+        )
+        core = core_of(world, device, **view)
+        cuda.bake(core.scenery)
+        poison()
+        r = cuda.render(core.scenery, core.agents)._asdict()
+        compare.check_render(r, world, **view)
+        compare.check_baked(core.scenery.baked.vals, world, static_only=False)
+
+
+@pytest.mark.parametrize('n_agents', [1, 4])
+@pytest.mark.parametrize('name', [None, *worlds.DEGENERATE, 'overlap'])
+def test_twin_physics(name, n_agents, device):
+    for seed in range(6):
+        world = worlds.random_world(
+            seed, n_envs=16, n_agents=n_agents, degenerate=(name,) if name else (), origin=190.0 if seed % 2 else 1.0
+        )
+        core = core_of(world, device)
+        poison()
+        physics = cuda.physics(core.scenery, core.agents)
+        compare.check_physics(state_of(core, physics), world)
+
+
+# ---- The fused pass is the composition of the public pieces ----
+
+
+@pytest.mark.parametrize('n_agents', [1, 3])
+@pytest.mark.parametrize('subsample', [1, 4])
+def test_observe_composes(n_agents, subsample, device):
+    world = worlds.random_world(5, n_envs=8, n_agents=n_agents, degenerate=worlds.EVERYTHING, res=64)
+    core = core_of(world, device, res=64)
+    cuda.bake(core.scenery)
+    seen = torch.zeros((8, n_agents, -(-core.scenery.designs.most_texels // 32)), dtype=torch.int32, device=device)
+    o = engine.observe(core.scenery, core.agents, subsample, imu=True, middle=True, seen=seen)
+    r = cuda.render(core.scenery, core.agents)
+    # half a unit of fp16's last place, and the mean's rounding
+    assert torch.allclose(o.rgb.float(), RGB(core, subsample)(r)[:, :, :, 0], atol=6e-4), 'rgb'
+    assert torch.allclose(o.depth.float(), Depth(core, subsample)(r)[:, :, 0, 0], atol=6e-4), 'depth'
+    assert torch.equal(o.middle, r.indices[..., 32]), 'middle'
+    assert torch.equal(bits_seen(core, r), seen), 'seen'
+    assert torch.equal(
+        torch.tensor([[bin(int(w) & 0xFFFFFFFF).count('1') for w in a] for e in seen.tolist() for a in e])
+        .sum(1)
+        .view(8, n_agents),
+        o.fresh.cpu().long(),
+    ), 'fresh'
+    again = engine.observe(core.scenery, core.agents, subsample, seen=seen)
+    assert not again.fresh.any(), 'a texel is new only once'
+    forgot = engine.observe(core.scenery, core.agents, subsample, seen=seen, forget=core.agent_full(True))
+    assert torch.equal(forgot.fresh, o.fresh), 'forgetting starts anew'
+
+
+def bits_seen(core, r):
+    """What `seen` must hold after one look, from a full render, agent by agent."""
+    scenery, designs = core.scenery, core.scenery.designs
+    out = torch.zeros((core.n_envs, core.n_agents, -(-designs.most_texels // 32)), dtype=torch.int64)
+    own, starts = scenery.agent_lines.shape[1], designs.texel_starts.tolist()
+    for e in range(core.n_envs):
+        first = int(designs.wall_starts[int(scenery.design[e])])
+        for a in range(core.n_agents):
+            for line, location in zip(r.indices[e, a].tolist(), r.locations[e, a].tolist()):
+                if line >= own:
+                    wall = first + line - own
+                    width = starts[wall + 1] - starts[wall]
+                    texel = starts[wall] - starts[first] + min(int(np.float32(location) * np.float32(width)), width - 1)
+                    out[e, a, texel // 32] |= 1 << (texel % 32)
+    return torch.where(out >= 1 << 31, out - (1 << 32), out).int().to(core.device)
+
+
+# ---- CPU = GPU, and 1 thread = 2 threads, on every bit ----
+
+
+def trajectory(device, n_agents, **settings):
+    """All tensors of a few steps in generated homes."""
+    homes = sample('homes', 8)
+    core = cuda.Core(scene.scenery(homes, n_agents, n_envs=24, device=device), **settings)
+    spawn, seen = RandomSpawns(homes, core), None
+    seen = torch.zeros((24, n_agents, -(-core.scenery.designs.most_texels // 32)), dtype=torch.int32, device=device)
+    random = torch.Generator().manual_seed(1)
+    moves = torch.tensor([(0, 0, 0), (3, 0, 0), (0, 3, 40), (9, 1, -40)], dtype=torch.float32, device=device)
+    out = [core.scenery.designs.baked.vals]
+    for step in range(12):
+        spawn(torch.rand((24, n_agents), generator=random).to(device) < (1 if step == 0 else 0.1))
+        actions = torch.randint(4, (24, n_agents), generator=random).to(device)
+        out += engine.physics(core.scenery, core.agents, actions, moves, 0.9)
+        out += engine.observe(core.scenery, core.agents, imu=True, middle=True, seen=seen)
+    out += [
+        *engine.render(core.scenery, core.agents),
+        core.agents.positions,
+        core.agents.angles,
+        core.scenery.agent_light,
+        seen,
+    ]
+    return [tensor.cpu() for tensor in out]
+
+
+def differing(a, b):
+    return [int(((x != y) & ~((x != x) & (y != y))).sum()) for x, y in zip(a, b, strict=True)]
+
+
+SETTINGS = [
+    dict(n_agents=1, res=64),
+    dict(n_agents=4, res=128, fov=70.0),
+    dict(n_agents=2, res=32, fov=90.0, cameras=[0, 120, 240]),
+]
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize('settings', SETTINGS, ids=str)
+def test_cpu_and_gpu_agree_on_every_bit(settings):
+    if not HAS_GPU:
+        pytest.skip('needs a GPU')
+    assert not any(differing(trajectory('cpu', **settings), trajectory('cuda', **settings)))
+
+
+@pytest.mark.parametrize('settings', SETTINGS, ids=str)
+def test_threads_do_not_matter(settings):
+    before = torch.get_num_threads()
+    runs = []
+    try:
+        for n in (1, 2, 4):
+            torch.set_num_threads(n)
+            runs.append(trajectory('cpu', **settings))
+    finally:
+        torch.set_num_threads(before)
+    assert not any(differing(runs[0], runs[1])) and not any(differing(runs[0], runs[2]))
+
+
+# ---- Facts to check on paper ----
+
+
+def box(device, **settings):
+    core = cuda.Core(scene.scenery(2 * [toys.box()], n_agents=1, device=device), **settings)
+    core.agents.positions[:] = 3.0
+    return core
+
+
+def test_two_metres_from_a_wall_depth_reads_two_metres(device):
+    core = box(device, res=63)
+    core.agents.positions[:, :, 0] = 4.0
+    r = cuda.render(core.scenery, core.agents)
+    assert torch.allclose(r.distances[:, 0, 31].cpu(), torch.tensor(2.0), atol=1e-6)
+    o = engine.observe(core.scenery, core.agents)
+    assert abs(float(o.depth[0, 0, 31]) - (1 - (2 - engine.AGENT_RADIUS) / 10)) < 5e-4
+
+
+def test_the_tutorials_wall(device):
+    core = box(device)
+    core.agents.velocity[:] = torch.tensor([1000.0, 0.0])
+    p = cuda.physics(core.scenery, core.agents)
+    assert torch.allclose(core.agents.positions.cpu(), torch.tensor([5.8649, 3.0]), atol=1e-3)
+    assert not core.agents.velocity.any() and bool((p.progress < 1).all())
+
+
+@pytest.mark.parametrize('speed', [1.0, 10.0, 1000.0])
+def test_no_agent_leaves_a_closed_box(speed, device):
+    core = cuda.Core(scene.scenery([toys.box()], n_agents=1, n_envs=512, device=device))
+    core.agents.positions[:] = 3.5
+    random = torch.Generator().manual_seed(2)
+    for _ in range(200):
+        core.agents.velocity.copy_(speed * torch.randn((512, 1, 2), generator=random))
+        cuda.physics(core.scenery, core.agents)
+    clearance = torch.minimum(core.agents.positions - 1, 6 - core.agents.positions).amin()
+    assert float(clearance) >= engine.AGENT_RADIUS, 'cameras stay on their side of the wall'
+
+
+def test_two_cores_live_side_by_side(device):
+    narrow, wide = box(device, res=16, fov=30.0), box(device, res=64, fov=150.0, cameras=[0, 180])
+    before = cuda.render(narrow.scenery, narrow.agents)
+    assert cuda.render(wide.scenery, wide.agents).screen.shape == (2, 1, 2, 64, 3)
+    after = cuda.render(narrow.scenery, narrow.agents)
+    assert before.screen.shape == (2, 1, 16, 3) and torch.equal(before.screen, after.screen)
+
+
+def test_designs_are_shared(device):
+    scenery = scene.scenery([toys.box(), toys.column()], n_agents=1, n_envs=6, device=device)
+    assert scenery.design.tolist() == [0, 1, 0, 1, 0, 1] and len(scenery.designs) == 2
+    lines, textures, baked = scenery.lines, scenery.textures, scenery.baked
+    assert (
+        len(lines) == 6
+        and torch.equal(lines[1], lines[3])
+        and torch.equal(lines.vals[lines.starts[2] : lines.ends[2]], lines[2])
+    )
+    assert len(textures) == len(lines.vals) == len(baked) and torch.equal(lines[-1], lines[5])
+    wall = int(lines.starts[3]) + 8  # after the agent's eight
+    assert torch.equal(textures[wall], textures[int(lines.starts[1]) + 8]) and len(baked[wall]) == len(textures[wall])
+    assert torch.equal(textures.vals[textures.inverse == wall], textures[wall]) and len(lines[1:3]) == 2
+
+
+def test_draws_are_philox(device):
+    """Against the published vector for key 0, counter 0 (Random123's kat_vectors)."""
+    counts = torch.zeros(1, dtype=torch.int32, device=device)
+    out = engine.draw(counts, torch.ones(1, dtype=torch.bool, device=device), 0, torch.zeros((1, 4), device=device))
+    words = (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)
+    assert out[0].tolist() == [(word >> 8) / 2**24 for word in words] and counts.tolist() == [1]
+
+
+# ---- Bad input ----
+
+
+@pytest.mark.parametrize(
+    'settings', [dict(res=0), dict(res=1025), dict(fov=180.0), dict(fov=0.0), dict(fps=0.0), dict(cameras=[])], ids=str
+)
+def test_bad_settings_are_refused(settings):
+    with pytest.raises(ValueError, match='but'):
+        box('cpu', **settings)
+
+
+def test_a_position_that_is_no_number_is_named(device):
+    core = box(device)
+    core.agents.positions[1, 0, 0] = math.nan
+    with pytest.raises(engine.EngineError, match='environment 1 .* not a finite number'):
+        cuda.render(core.scenery, core.agents)
+        engine.check(core.agents)
+    core.agents.positions[:] = 3.0
+    cuda.render(core.scenery, core.agents)
+    engine.check(core.agents)
+
+
+def test_wrong_tensors_are_named():
+    core = box('cpu')
+    for broken in (
+        core.agents.positions.double(),
+        core.agents.positions[:1],
+        core.agents.positions.expand(2, 1, 2).transpose(0, 0)[:, :, [1, 0]].flip(2).mT.contiguous().mT,
+    ):
+        core.agents.positions = broken
+        if broken.is_contiguous() and broken.dtype == torch.float32 and broken.shape == (2, 1, 2):
+            continue
+        with pytest.raises(ValueError, match='agents.positions must be'):
+            cuda.render(core.scenery, core.agents)
+
+
+def test_unknown_devices_are_refused():
+    with pytest.raises(engine.EngineError, match='device=tpu is unknown'):
+        engine.device('tpu')
+    if not HAS_GPU:
+        with pytest.raises(engine.EngineError, match='no GPU'):
+            engine.device('cuda')
+
+
+def test_too_many_environments_are_counted(monkeypatch):
+    monkeypatch.setattr(engine, 'free_memory', lambda device: 10**6)
+    with pytest.raises(engine.EngineError, match='at most [0-9,]+ fit'):
+        scene.scenery([toys.box()], n_agents=1, n_envs=10**6, device='cpu')
