@@ -1,0 +1,136 @@
+"""PPO learns: small worlds, each of which only a learner with one particular virtue can solve, in seconds."""
+import pytest
+import torch
+
+from agents import buffers
+from agents.policy import Policy
+from agents.ppo import PPO
+from megastep import spaces
+from megastep.arrdict import arrdict
+
+B = 64
+
+
+class World:
+    """Lanes whose episodes are at step `age`; subclasses say what is seen, paid, and when it ends."""
+    n_shown, n_actions = 1, 4
+
+    def __init__(self, seed=0):
+        self.obs_space = spaces.MultiVector(1, self.n_shown)
+        self.action_space = spaces.MultiDiscrete(1, self.n_actions)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.age, self.over = torch.zeros(B, dtype=torch.int64), torch.zeros(B, dtype=torch.bool)
+
+    def _world(self, reward, reset, terminal, truncated):
+        self.over = terminal | truncated
+        return arrdict(obs=self.show()[:, None], reward=reward, reset=reset, terminal=terminal, truncated=truncated)
+
+    def reset(self):
+        return self._begin(torch.ones(B, dtype=torch.bool))
+
+    def _begin(self, which):
+        self.age[which] = 0
+        self.begin(which)
+        none = torch.zeros(B, dtype=torch.bool)
+        return self._world(torch.zeros(B), which, none, none)
+
+    def step(self, decision):
+        fresh, action = self.over, decision.actions[:, 0]
+        reward, terminal, truncated = (x.masked_fill(fresh, 0) for x in self.judge(action))
+        self.age += 1
+        self._begin(fresh)
+        return self._world(reward, fresh, terminal, truncated)
+
+    def begin(self, which):
+        pass
+
+    def show(self):
+        return torch.zeros(B, self.n_shown)
+
+
+class Cue(World):
+    """Shows one of four cues on an episode's first observation and then nothing; doing what it said pays 1 at age 5."""
+    n_shown, lag = 4, 5
+
+    def begin(self, which):
+        fresh = torch.randint(self.n_actions, (B,), generator=self.generator)
+        self.cue = torch.where(which, fresh, getattr(self, 'cue', fresh))
+
+    def show(self):
+        return torch.nn.functional.one_hot(self.cue, 4).float() * (self.age == 0)[:, None]
+
+    def judge(self, action):
+        due = self.age == self.lag
+        return (due & (action == self.cue)).float(), due, torch.zeros_like(due)
+
+
+class Clock(World):
+    """Shows nothing at all, ever. At age k the action PATTERN[k] pays 1, and an episode may be cut after any step.
+
+    Only who starts counting anew with each episode can know k.
+    """
+    PATTERN = torch.tensor([2, 0, 3, 1, 1])
+
+    def judge(self, action):
+        right = (action == self.PATTERN[self.age % len(self.PATTERN)]).float()
+        cut = (torch.rand(B, generator=self.generator) < .25) | (self.age == len(self.PATTERN) - 1)
+        return right, torch.zeros_like(cut), cut
+
+
+class Wage(World):
+    """Pays 1 for every step, whatever one does; an episode ends after each with probability 1/8, in one way."""
+
+    def __init__(self, ends):
+        super().__init__()
+        self.ends = ends
+
+    def judge(self, action):
+        ended, none = torch.rand(B, generator=self.generator) < 1 / 8, torch.zeros(B, dtype=torch.bool)
+        return torch.ones(B), *((ended, none) if self.ends == 'terminal' else (none, ended))
+
+
+def learn(world, n_updates, policy=None, n_steps=16, **how):
+    """Trains a small policy and counts what happened in the last ten rollouts: (policy, rewards, ends, valid steps)."""
+    policy = policy or Policy(world.obs_space, world.action_space, width=32)
+    rollout = buffers.Rollout(n_steps, B, world.obs_space, world.action_space)
+    learner = PPO(policy, **{**dict(lr=5e-3, n_epochs=2, n_minibatches=4), **how})
+    carry, counts = buffers.start(world, policy), torch.zeros(3)
+    for i in range(n_updates):
+        buffers.collect(world, policy, rollout, carry)
+        if i >= n_updates - 10:
+            counts += torch.stack([rollout.reward.sum(), rollout.terminal.sum(), (~rollout.reset).sum()])
+        learner.update(rollout)
+    return policy, *counts.tolist()
+
+
+class Forgetless(Policy):
+    """A policy whose memory leaks from one episode into the next."""
+
+    def unroll(self, obs, reset, state):
+        return super().unroll(obs, torch.zeros_like(reset), state)
+
+
+def test_a_cue_is_remembered():
+    # Guessing earns 1/4, and so does any policy without a memory
+    _, rewards, ends, _ = learn(Cue(), n_updates=60, lr=3e-3)
+    assert rewards / ends > .9
+
+
+def test_memory_starts_anew_with_every_episode():
+    how, world = dict(n_updates=60, lr=1e-2, entropy=.03), Clock()
+    _, rewards, _, valid = learn(world, **how)
+    assert rewards / valid > .9
+    leaky = Forgetless(world.obs_space, world.action_space, width=32)
+    _, rewards, _, valid = learn(world, policy=leaky, **how)
+    assert rewards / valid < .5  # nothing it sees tells it when an episode begins
+
+
+@pytest.mark.parametrize('ends, worth', [
+    ('truncated', 1 / (1 - .9)),  # a time limit takes nothing away: 1 + .9 + .81 + ...
+    ('terminal', 1 / (1 - .9 * 7 / 8))])  # a death does: 1 + .9 (7/8) + ...
+def test_a_time_limit_is_not_a_death(ends, worth):
+    world = Wage(ends)
+    policy, *_ = learn(world, n_updates=60, gamma=.9, lambda_=.8)
+    obs, reset = torch.zeros(12, 1, 1, 1), torch.zeros(12, 1, dtype=torch.bool)
+    value = policy.unroll(obs, reset, policy.initial(1)).value[:, 0]
+    torch.testing.assert_close(value, torch.full((12,), worth), rtol=.1, atol=0)
