@@ -181,9 +181,11 @@ MISJUDGED = {
 def golden_figures(case, ours):
     """{name: (figure, the most it may be)}: shares of values out of tolerance, or mean errors where the name says so.
 
-    `ours` holds what `worlds.golden` gives: lines, baked, the fields of a render, those of a step; or some of the four.
+    `ours` holds some of these: `lines` (L, 2, 2) after render, `baked` (T,), the fields of a render (N, A, R[, 3]), and
+    of a step of physics `progress` with the `positions`, `angles`, `velocity`, `angvelocity` after it.
     """
     world, settings, right = worlds.golden(case)
+    right = {k.removesuffix('_after').removesuffix('_vals').removesuffix('_after_render'): v for k, v in right.items()}
     ours, right, figures = double(ours), double(right), {}
     n_own, widths = world.n_agents*len(world.model), world.line_widths.tolist()
     own = torch.cat([torch.arange(w) < n_own for w in widths])

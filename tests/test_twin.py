@@ -38,7 +38,7 @@ def golden_light(w, baked):
 def test_sight_of_the_original(case):
     world, settings, right = worlds.golden(case)
     seen = []
-    for e, baked in enumerate(right['baked'].split(world.texels().tolist())):
+    for e, baked in enumerate(right['baked_vals'].split(world.texels().tolist())):
         w = world.one(e)
         hits = twin.cast(placed(w), w['positions'], twin.rays(w['angles'], [0.], settings['res'], settings['fov']))
         hits['screen'] = twin.shade(hits, w['textures'], w['widths'], golden_light(w, baked))
@@ -52,7 +52,7 @@ def test_sight_of_the_original(case):
 def test_light_of_the_original(case):
     world, _, right = worlds.golden(case)
     errors = []
-    for e, baked in enumerate(right['baked'].split(world.texels().tolist())):
+    for e, baked in enumerate(right['baked_vals'].split(world.texels().tolist())):
         w = world.one(e)
         n_own = int(w['widths'][:world.n_agents*8].sum())
         points = twin.texel_positions(placed(w), w['widths'])[n_own::11]  # all of them take a quarter of a minute

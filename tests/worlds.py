@@ -72,23 +72,17 @@ def unplaced(model, n_agents, walls):
 
 
 def golden(case):
-    """A golden case: its World, its settings (res, fov, fps), and what the original computed.
-
-    That is dict(lines, baked, indices, locations, dots, distances, screen, progress) and the state after physics:
-    positions, angles, velocity, angvelocity. Shapes as in the data's README.
-    """
+    """A golden case: its World, its settings (res, fov, fps), what the original computed (named as in its README)."""
     with np.load(GOLDEN) as arrays:
         g = {k.split('/')[1]: torch.as_tensor(arrays[k]) for k in arrays if k.split('/')[0] == case}
     _, n_agents, res, fov, fps = g.pop('meta').tolist()
-    g['lines'] = g.pop('lines_after_render')
-    walls = [lines[8*int(n_agents):] for lines in g['lines'].split(g['line_widths'].tolist())]
+    walls = [lines[8*int(n_agents):] for lines in g['lines_after_render'].split(g['line_widths'].tolist())]
     world = World(
         model=g['model'], lines=unplaced(g.pop('model'), int(n_agents), walls), line_widths=g.pop('line_widths'),
         lights=g.pop('light_vals'), light_widths=g.pop('light_widths'),
         textures=g.pop('texture_vals'), texture_widths=g.pop('texture_widths'),
         **{k: g.pop(k) for k in ('positions', 'angles', 'velocity', 'angvelocity')})
-    outputs = {k.removesuffix('_after').removesuffix('_vals'): v for k, v in g.items()}
-    return world, dict(res=int(res), fov=fov, fps=fps), outputs
+    return world, dict(res=int(res), fov=fov, fps=fps), g
 
 
 # Random worlds
