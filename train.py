@@ -36,7 +36,8 @@ class Trainer:
 
     def __init__(self, cfg, folder, device):
         self.cfg, self.folder = cfg, folder
-        self.env = runs.make_env(cfg.env, runs.homes(cfg.geometry, "training"), cfg.seed, device)
+        homes = runs.homes(cfg.geometry, "training")
+        self.env = runs.make_env(cfg.env, homes, cfg.seed, device, lambda env: runs.rollout_bytes(cfg, env))
         self.policy = runs.make_policy(cfg.agent, self.env, cfg.seed)
         self.learner = runs.make_learner(cfg.learner, self.policy, cfg.seed)
         self.rollout = runs.make_rollout(cfg, self.env)
@@ -120,10 +121,10 @@ class Trainer:
         except OSError as error:
             needed = 3 * sum(p.numel() * p.element_size() for p in self.policy.parameters())    # Adam's two as well
             free = shutil.disk_usage(self.folder).free
-            first, self.unsaved = self.unsaved is None, (
+            again, self.unsaved = self.unsaved, (
                 f"The checkpoint at {self.samples:,} samples could not be saved ({error.strerror}): it needs about "
                 f"{needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free in {self.folder}")
-            if first:
+            if not again:
                 warn(f"{self.unsaved}; training goes on and tries again in {self.cfg.checkpoint:.0f} s")
 
     def state(self):
@@ -140,7 +141,7 @@ class Trainer:
 
 
 def run(cfg):
-    """Trains as `cfg`, a settings.Train, says. Returns the run folder; raises Interrupted once saved, after a signal."""
+    """Trains as `cfg`, a settings.Train, says. Returns the run folder; after a signal, saves and raises Interrupted."""
     folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
     device = runs.make_device(cfg.device)
     with Interruptions() as stop:

@@ -132,7 +132,7 @@ def _read(path):
         manifest = json.loads((path / "manifest.json").read_bytes())
         version, entries = manifest["format"], {name: manifest["files"][name]["sha256"] for name in FILES}
     except (OSError, ValueError, KeyError, TypeError):
-        raise Damaged(f"Checkpoint {path} is damaged: its manifest.json cannot be read") from None
+        raise Damaged(f"Checkpoint {path} is damaged: manifest.json cannot be read") from None
     if version != FORMAT:
         raise CheckpointError(f"Checkpoint {path} has format {version} and this megastep reads format {FORMAT}; "
                               f"use the megastep that wrote it, with torch {manifest.get('torch')}")

@@ -1,1 +1,1 @@
-"""What train.py, evaluate.py and record.py share: the command line (the only place that knows Hydra), settings, run folders."""
+"""What train.py, evaluate.py and record.py share: command line (alone in knowing Hydra), settings, runs."""

@@ -60,7 +60,7 @@ class Door:
         return [(list(job), self.tree(list(job))) for job in batches]
 
     def tree(self, overrides):
-        """Nested dicts for one list of overrides. Faults names every unknown key and group member and every bad value."""
+        """Nested dicts for one list of overrides. Faults names every unknown key and group member, and bad value."""
         faults, fine, groups = [], [], self.groups()
         choices = [o for o in self._parsed(overrides) if o.key_or_group in groups]
         for choice in choices:
@@ -100,13 +100,13 @@ class Door:
             config.pop("hydra")
         return config
 
-    def _parsed(self, overrides, multirun=True):
+    def _parsed(self, overrides, multirun=False):
         faults, parsed = [], []
         for text in overrides:
             try:
                 override = OverridesParser.create().parse_override(text)
             except HydraException:
-                faults.append((text, "is not understood; write key=value, and quote blanks and brackets: 'key=\"a b\"'"))
+                faults.append((text, "is not understood; write key=value, quote blanks and brackets: 'key=\"a b\"'"))
                 continue
             if override.type.name != "CHANGE" or override.package is not None:
                 faults.append((text, "keys and groups are fixed; write key=value or group=member"))

@@ -1,4 +1,4 @@
-"""Lines, warnings, tables and progress for whoever watches, on a terminal or not, and for nobody once they stop reading."""
+"""Lines, warnings, tables and progress for whoever watches, on a terminal or not, and for nobody once they leave."""
 import os
 import sys
 import time

@@ -15,6 +15,8 @@ from app.settings import Fault, Train, as_tree, build
 
 RUNS = Path("runs")
 SWEEPS = Path("sweeps")
+#: Environments in the small one that tells how much memory an environment takes.
+PROBE = 65
 
 
 # ---- Folders ----
@@ -133,12 +135,26 @@ def homes(geometry, split, most=None):
     return list({id(home): home for home in found}.values())[:most]
 
 
-def make_env(settings, homes, seed, device):
-    """The environment that `settings` (such as settings.Explorer) describe, in these homes."""
-    from megastep import envs
+def make_env(settings, homes, seed, device, bytes_beside=lambda env: 0):
+    """The environment that `settings` (such as settings.Explorer) describe, in these homes.
+
+    Fault that says how many environments fit, if these are too many for the memory; `bytes_beside(env)` is what each
+    needs beside its own, in a rollout. Before a large one is made, two small ones tell what one environment takes.
+    """
+    from megastep import engine, envs
+    from megastep.capture import state_tree
     arguments = {k: v for k, v in dataclasses.asdict(settings).items() if k not in ("name", "n_envs")}
+
+    def made(n_envs, homes):
+        return envs.ENVS[settings.name](n_envs, homes, seed=seed, device=device, **arguments)
+
     with faults():
-        return envs.ENVS[settings.name](settings.n_envs, homes, seed=seed, device=device, **arguments)
+        if settings.n_envs > PROBE:
+            few, many = made(1, homes[:1]), made(PROBE, homes[:1])
+            sizes = [sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values()) for env in (few, many)]
+            each = (sizes[1] - sizes[0]) / (PROBE - 1) + bytes_beside(few)
+            engine.fit(settings.n_envs, each, device)
+        return made(settings.n_envs, homes)
 
 
 def make_policy(agent, env, seed=1):
@@ -154,17 +170,18 @@ def make_learner(learner, policy, seed=1):
 
 
 def make_rollout(cfg, env):
-    """The rollout buffer of a settings.Train. Fault that says how many environments fit, if it is too large."""
     from agents.buffers import Rollout
-    from megastep import engine
+    with faults():
+        return Rollout(cfg.learner.n_steps, env.n_envs * env.n_agents, env.obs_space, env.action_space, env.device)
+
+
+def rollout_bytes(cfg, env):
+    """About how many bytes a settings.Train learns from at once for each of env's worlds."""
     from megastep.dotdict import leaves
     numbers = sum(math.prod(space.shape) for space in leaves(env.obs_space))
     steps, width, parts = cfg.learner.n_steps + 1, cfg.agent.width, cfg.learner.n_minibatches
     # observations of 2 bytes and about 64 of the rest, a minibatch's share of those and of some 16 activations a unit
-    each = env.n_agents * steps * ((2 * numbers + 64) * (1 + 1 / parts) + 64 * width / parts)
-    with faults():
-        engine.fit(env.n_envs, each, env.device)
-        return Rollout(cfg.learner.n_steps, env.n_envs * env.n_agents, env.obs_space, env.action_space, env.device)
+    return env.n_agents * steps * ((2 * numbers + 64) * (1 + 1 / parts) + 64 * width / parts)
 
 
 def load(path, device="cpu"):

@@ -1,4 +1,4 @@
-"""The settings of a run as frozen dataclasses, checked in one pass. Knows no Hydra, no torch, no defaults (configs/ does).
+"""The settings of a run as frozen dataclasses, checked in one pass. Knows no Hydra, and no defaults: configs/ does.
 
 `build(Train, tree)` turns nested dicts into settings, or raises `Faults` with every fault of the tree by key path.
 Errors meant for whoever started the program are `Fault`s: one sentence, exit code 2, no traceback.

@@ -1,0 +1,164 @@
+"""Metrics: episode statistics against a slow count, files a crash cannot spoil, sinks that fail and do no harm."""
+import builtins
+import json
+import sys
+import types
+
+import pytest
+import torch
+
+from agents import metrics
+from agents.metrics import Episodes, Metrics
+
+
+def counted(reward, reset, done, carry):
+    """Return and length of each episode that ends, one lane and one step at a time; `carry` holds them by lane."""
+    finished = []
+    for t in range(len(reward)):
+        for lane in range(reward.shape[1]):
+            total, length = carry[lane]
+            total, length = total + float(reward[t, lane]), length + (not reset[t, lane])
+            if done[t, lane]:
+                finished.append((total, length))
+                total, length = 0., 0
+            carry[lane] = total, length
+    return finished
+
+
+def test_two_steps_and_an_end_are_an_episode_of_length_two():
+    episodes = Episodes(1, "cpu")
+    reset, done = torch.tensor([[False], [False], [True], [False]]), torch.tensor([[False], [True], [False], [False]])
+    episodes.add(torch.tensor([[1.], [2.], [0.], [5.]]), reset, done)
+    assert episodes.take() == {"episode/count": 1, "episode/return": 3., "episode/length": 2., "episode/deviation": 0.}
+    assert episodes.returns.tolist() == [5.] and episodes.lengths.tolist() == [1.]
+    assert episodes.take() == {"episode/count": 0}
+
+
+def test_episodes_run_across_rollouts_as_if_there_were_one():
+    torch.manual_seed(1)
+    n_lanes, carry, episodes, finished = 5, {lane: (0., 0) for lane in range(5)}, Episodes(5, "cpu"), []
+    before = torch.zeros(n_lanes, dtype=torch.bool)
+    for _ in range(6):
+        done = torch.rand(7, n_lanes) < .2
+        reset = torch.cat([before[None], done[:-1]])
+        done &= ~reset      # a lane on its first observation has not ended
+        reset = torch.cat([before[None], done[:-1]])
+        before = done[-1]
+        reward = torch.rand(7, n_lanes) * ~reset
+        episodes.add(reward, reset, done)
+        finished += counted(reward, reset, done, carry)
+    found = episodes.take()
+    returns = torch.tensor([total for total, _ in finished])
+    assert found["episode/count"] == len(finished) > 20
+    assert found["episode/return"] == pytest.approx(float(returns.mean()), rel=1e-6)
+    assert found["episode/deviation"] == pytest.approx(float(returns.std(correction=0)), rel=1e-5)
+    assert found["episode/length"] == pytest.approx(sum(length for _, length in finished) / len(finished))
+    assert episodes.returns.tolist() == pytest.approx([carry[lane][0] for lane in range(n_lanes)], rel=1e-6)
+
+
+def test_files_hold_what_was_written(tmp_path):
+    sinks = Metrics(tmp_path)
+    sinks.write(64, {"loss/value": .25, "episode/count": 3, "bad": float("nan")}, {"perf/rate": 1e6})
+    sinks.close()
+    row, = metrics.read(tmp_path / "metrics.jsonl")
+    assert row == {"samples": 64, "loss/value": .25, "episode/count": 3, "bad": None}
+    assert metrics.read(tmp_path / "perf.jsonl") == [{"samples": 64, "perf/rate": 1e6}]
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [(e.step, e.value) for e in events.Scalars("loss/value")] == [(64, .25)]
+
+
+def test_a_resumed_run_writes_again_what_came_after_its_checkpoint(tmp_path):
+    sinks = Metrics(tmp_path)
+    for step in (10, 20, 30):
+        sinks.write(step, {"x": step}, {})
+    sinks.close()
+    with open(tmp_path / "metrics.jsonl", "a") as file:
+        file.write('{"samples": 40, "x"')     # the line that a kill cut short
+    sinks = Metrics(tmp_path, step=20)
+    sinks.write(30, {"x": -1}, {})
+    sinks.close()
+    assert [row["x"] for row in metrics.read(tmp_path / "metrics.jsonl")] == [10, 20, -1]
+
+
+def without(monkeypatch, package):
+    """As if the package were not installed."""
+    real = builtins.__import__
+
+    def refuse(name, *args, **kwargs):
+        if name.split(".")[0] == package:
+            raise ImportError(f"No module named {name!r}")
+        return real(name, *args, **kwargs)
+
+    for name in [n for n in sys.modules if n.split(".")[0] == package or n.startswith("torch.utils.tensorboard")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    monkeypatch.setattr("importlib.import_module", lambda name, package=None: refuse(name))
+
+
+@pytest.mark.filterwarnings("ignore:Weights")
+@pytest.mark.parametrize("package", ["tensorboard", "wandb"])
+def test_a_package_that_is_missing_is_named_with_the_line_that_installs_it(tmp_path, monkeypatch, package):
+    without(monkeypatch, package)
+    with pytest.warns(UserWarning, match=f"pip install {package}"):
+        sinks = Metrics(tmp_path, wandb=dict(project="p", mode="online", name="n", config={}))
+    sinks.write(1, {"x": 1}, {})
+    sinks.close()
+    assert metrics.read(tmp_path / "metrics.jsonl") == [{"samples": 1, "x": 1}]
+
+
+def fake_wandb(monkeypatch, key="key", init=None, log=None):
+    """A stand-in for the package, to fail where it is told to."""
+    logged = []
+    room = types.SimpleNamespace
+    run = room(log=log or (lambda values, step: logged.append((step, values))), finish=lambda quiet: None)
+    module = room(api=room(api_key=key), Settings=dict, init=init or (lambda **_: run))
+    monkeypatch.setitem(sys.modules, "wandb", module)
+    return logged
+
+
+def failing(*_, **__):
+    raise ConnectionError("the network is unreachable\nand more lines")
+
+
+WANDB = dict(project="p", mode="online", name="n", config={})
+
+
+def test_wandb_gets_what_the_files_get(tmp_path, monkeypatch):
+    logged = fake_wandb(monkeypatch)
+    sinks = Metrics(tmp_path, wandb=WANDB)
+    sinks.write(5, {"a": 1}, {"b": 2})
+    assert logged == [(5, {"samples": 5, "a": 1, "b": 2})]
+
+
+@pytest.mark.parametrize("fault, sentence", [
+    (dict(key=None), "no key"), (dict(init=failing), "did not start .the network is unreachable.$"),
+    (dict(log=failing), "Wandb failed and is left out from here on .the network is unreachable.$")])
+def test_wandb_failing_is_one_warning_and_the_run_goes_on(tmp_path, monkeypatch, fault, sentence):
+    fake_wandb(monkeypatch, **fault)
+    with pytest.warns(UserWarning, match=sentence) as caught:
+        sinks = Metrics(tmp_path, wandb=WANDB)
+        for step in range(3):
+            sinks.write(step, {"x": step}, {})
+        sinks.close()
+    assert len(caught) == 1
+    assert len(metrics.read(tmp_path / "metrics.jsonl")) == 3
+
+
+def test_a_full_disk_is_one_warning(tmp_path):
+    sinks = Metrics(tmp_path)
+    sinks.metrics.file.close()
+    sinks.metrics.file = open("/dev/full", "a")
+    with pytest.warns(UserWarning, match="metrics.jsonl cannot be written .*No space left.*the run goes on") as caught:
+        sinks.write(1, {"x": 1}, {"y": 2})
+        sinks.write(2, {"x": 1}, {"y": 2})
+    assert len(caught) == 1 and len(metrics.read(tmp_path / "perf.jsonl")) == 2
+
+
+def test_the_curves_are_a_picture_of_the_files(tmp_path):
+    from matplotlib.image import imread
+    rows = [{"samples": n, "episode/return": n, "loss/value": None} for n in range(3)]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (tmp_path / "perf.jsonl").write_text("")
+    metrics.curves(tmp_path)
+    assert imread(tmp_path / "curves.png").shape[1] > 500
