@@ -199,7 +199,8 @@ class _naming:
 
     def __exit__(self, kind, error, trace):
         if isinstance(error, Exception):
-            raise RuntimeError(f'frame {self.number} could not be recorded: {kind.__name__}: {error}') from error
+            said = next(iter(str(error).splitlines()), '')
+            raise RuntimeError(f'frame {self.number} could not be recorded: {kind.__name__}: {said}') from error
 
 
 def _payload(plot_state):

@@ -148,4 +148,6 @@ def test_files_are_small(path):
 
 
 def test_the_house_is_small():
-    assert sum(map(code_lines, [*SOURCES, *KERNELS])) <= MAX_TOTAL
+    """The simulator, its kernels, the learner and the entry scripts; not the command line about them, which is app/."""
+    counts = {path: code_lines(path) for path in [*SOURCES, *KERNELS] if 'app' not in path.relative_to(ROOT).parts}
+    assert sum(counts.values()) <= MAX_TOTAL

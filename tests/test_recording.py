@@ -40,6 +40,10 @@ def plot_badly(state):
     return 1 / state.x
 
 
+def plot_fatally(state):
+    os._exit(3)
+
+
 class Env:
     def __init__(self):
         self.pids = []
@@ -181,6 +185,11 @@ def test_a_fault_in_a_worker_names_the_frame():
         record(plot_badly, states, n_workers=1)
     with pytest.raises(RuntimeError, match='frame 0 could not be recorded: ZeroDivisionError: division by zero'):
         record(plot_badly, states[1:], n_workers=1)
+
+
+def test_a_worker_that_dies_names_the_frame():
+    with pytest.raises(RuntimeError, match='^frame 0 could not be recorded: TerminatedWorkerError: .*'):
+        record(plot_fatally, [arrdict()], n_workers=1)
 
 
 def test_a_fault_in_this_process_names_the_frame():

@@ -1,35 +1,25 @@
-"""The code of the two documents that this library was built from, run as its users type it, on the CPU.
-
-"Concepts" is seed 002, "A Minimal Env" seed 003. Where a document shows what is printed, and was right, it is compared:
-by words in seed 002, whose line breaks and columns are lost, and to the letter in seed 003.
+"""The code of seed 003, "A Minimal Env", run as its users type it, on the CPU, and what it prints and promises.
 
 Names that moved, all through: `rebar` and `megastep.demo` are `megastep`, `megastep.demo.heads` is `agents.heads`.
-
 Repairs, each as small as could be:
 
-| seed | as typed | why it cannot run | here |
-| --- | --- | --- | --- |
-| 002 | `cpu_tensors.cuda()` | no GPU | `.cpu()` |
-| 002 | `.starmap(float.__add__, d)` | `d` is not defined | `objs`, as two lines before |
-| 002 | `r[0]` prints `array([0, 1, 2])` | the values were given as floats | `array([0., 1., 2.])` |
-| 002 | `spaces.intake(env.observation_space)`, `spaces.output` | never existed | `heads.intake(env.obs_space, width)` |
-| 003 | positions printed for two environments, on `cuda:0` | there are 128; no GPU | the first two |
-| 003 | `n_envs` is not defined; `Minimal()` without it | undefined | `n_envs = 2`; `n_envs=2` by default |
-| 003 | `while True:` | never ends | three rounds |
-| 003 | `return world`, `agent(world)` in the skeleton | undefined | a world of the screen; no movement |
-| 003 | `self.core.render(...)` | Core has no such method | `cuda.render(...)` |
-| 003 | `reset = self.core.agent_full(True)` and no more | the call is announced but not typed | `self.spawner(reset)` |
-| 003 | "calling the movement module" and no more | the call is not typed | `self.movement(decision)` |
-| 003 | `self.reset()` prints `obs Tensor((128, 1, 1, 1, 64)...` | three channels; the first line is missing | both |
-| 003 | `arrdict(obs=...)` in `step`, which does not move | `arrdict` is the module; announced but not typed | both |
-| 003 | `Agent(nn.Module)` | `super().__init__()` is missing | added |
-| 003 | `Agent(env).cuda()` | no GPU | without `.cuda()` |
-| 003 | `state`: `arrdict.arrdict(` | the bracket is never closed | the states of core and camera |
-| 003 | `plot_state` makes a grid and returns nothing | must return a figure | plan and strip in the grid |
-| 003 | the loop under `ParallelEncoder` | the state is announced but not fed | `encoder(env.state())` |
+| as typed | why it cannot run | here |
+| --- | --- | --- |
+| positions printed for two environments, on `cuda:0` | there are 128; no GPU | the first two |
+| `n_envs` is not defined; `Minimal()` without it | undefined | `n_envs = 2`; `n_envs=2` by default |
+| `while True:` | never ends | three rounds |
+| `return world`, `agent(world)` in the skeleton | undefined | a world of the screen; no movement |
+| `self.core.render(...)` | Core has no such method | `cuda.render(...)` |
+| `reset = self.core.agent_full(True)` and no more | the call is announced but not typed | `self.spawner(reset)` |
+| "calling the movement module" and no more | the call is not typed | `self.movement(decision)` |
+| `self.reset()` prints `obs Tensor((128, 1, 1, 1, 64)...` | three channels; the first line is missing | both |
+| `arrdict(obs=...)` in `step`, which does not move | `arrdict` is the module; announced but not typed | both |
+| `Agent(nn.Module)` | `super().__init__()` is missing | added |
+| `Agent(env).cuda()` | no GPU | without `.cuda()` |
+| `state`: `arrdict.arrdict(` | the bracket is never closed | the states of core and camera |
+| `plot_state` makes a grid and returns nothing | must return a figure | plan and strip in the grid |
+| the loop under `ParallelEncoder` | the state is announced but not fed | `encoder(env.state())` |
 """
-import doctest
-
 import numpy as np
 import pytest
 import torch
@@ -37,9 +27,7 @@ from matplotlib import pyplot as plt
 from torch import nn
 
 from agents import heads
-from megastep import arrdict, core, cuda, geometry, modules, plotting, recording, scene, spaces, toys
-from megastep import dotdict as dotdict_module
-from megastep.ragged import Ragged
+from megastep import arrdict, core, cuda, dotdict, modules, plotting, recording, scene, toys
 
 
 @pytest.fixture(autouse=True)
@@ -53,203 +41,6 @@ def _on_the_cpu(monkeypatch):
     torch.set_num_threads(threads)
     plt.close('all')
 
-
-def session(text, **names):
-    """Runs an interactive session and compares what it prints, any white space being like any other."""
-    parsed = doctest.DocTestParser().get_doctest(text, names, 'session', None, 0)
-    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE, verbose=False)
-    complaints = []
-    runner.run(parsed, out=complaints.append, clear_globs=False)
-    assert runner.tries and not runner.failures, ''.join(complaints)
-    return parsed.globs
-
-
-# ---- Concepts (seed 002) ----
-
-def concepts():
-    from megastep.arrdict import arrdict
-    from megastep.dotdict import dotdict
-    return session('''
-        >>> objs = dotdict(
-        ...     a=dotdict(
-        ...         b=1,
-        ...         c=2),
-        ...     d=3)
-        >>>
-        >>> tensors = arrdict(
-        ...     a=torch.tensor([1]),
-        ...     b=arrdict(
-        ...         c=torch.tensor([2])))
-        ''', torch=torch, dotdict=dotdict, arrdict=arrdict)
-
-
-def test_concepts_attribute_access():
-    names = session('''
-        >>> tensors['a'] is tensors.a
-        True
-        >>> tensors['e'] = 5
-        >>> tensors.e
-        5
-        ''', **concepts())
-    assert set(names['tensors']) == {'a', 'b', 'e'}
-
-
-def test_concepts_forwarded_attributes():
-    names = session('>>> gpu_tensors = cpu_tensors.cpu()', cpu_tensors=concepts()['tensors'])
-    assert names['gpu_tensors'].b.c.tolist() == [2]
-
-
-def test_concepts_method_chaining():
-    session('''
-        >>> objs.pipe(list)
-        ['a', 'd']
-        >>> objs.map(float)
-        dotdict:
-        a    dotdict:
-             b    1.0
-             c    2.0
-        d    3.0
-        >>> objs.starmap(int.__add__, objs)
-        dotdict:
-        a    dotdict:
-             b    2
-             c    4
-        d    6
-        >>> (objs
-        ...     .map(float)
-        ...     .starmap(float.__add__, objs)
-        ...     .pipe(list))
-        ['a', 'd']
-        ''', **concepts())
-
-
-def test_concepts_pretty_printing():
-    session('''
-        >>> objs
-        dotdict:
-        a    dotdict:
-             b    1
-             c    2
-        d    3
-        >>> tensors
-        arrdict:
-        a    Tensor((1,), torch.int64)
-        b    arrdict:
-             c    Tensor((1,), torch.int64)
-        ''', **concepts())
-
-
-def test_concepts_indexing():
-    session('''
-        >>> tensors[0]
-        arrdict:
-        a    Tensor((), torch.int64)
-        b    arrdict:
-             c    Tensor((), torch.int64)
-        >>> tensors[0].item() # the .item() call is needed to get it to print nicely
-        arrdict:
-        a    1
-        b    arrdict:
-             c    2
-        ''', **concepts())
-
-
-def test_concepts_binary_operations():
-    session('''
-        >>> tensors + tensors
-        arrdict:
-        a    Tensor((1,), torch.int64)
-        b    arrdict:
-             c    Tensor((1,), torch.int64)
-        >>> (tensors + tensors)[0].item() # the [0].item() call is needed to get it to print nicely
-        arrdict:
-        a    2
-        b    arrdict:
-             c    4
-        >>> {'__add__', '__rsub__', '__matmul__', '__and__', '__lt__'} <= set(dir(arrdict))
-        True
-        ''', **concepts())
-
-
-def test_concepts_raggeds():
-    # Subarrays are [0., 1., 2.], [3.], [4., 5.]
-    vals = np.array([0., 1., 2., 3., 4., 5.])
-    widths = np.array([3, 1, 2])
-    r = Ragged(vals, widths)
-    names = session('''
-        >>> r[0]
-        array([0., 1., 2.])
-        >>> r[1]
-        array([3.])
-        >>> r[2]
-        array([4., 5.])
-        >>> r[:2]
-        RaggedNumpy([3 1])
-        >>> there = r.torchify()
-        >>> back = r.torchify().numpyify()
-        >>> r.vals # the backing array
-        array([0., 1., 2., 3., 4., 5.])
-        >>> r.widths # the subarray widths
-        array([3, 1, 2])
-        >>> r.starts # indices of the start of each subarray
-        array([0, 3, 4])
-        >>> r.ends # indices of the end of each subarray
-        array([3, 4, 6])
-        >>> r.inverse
-        array([0, 0, 0, 1, 2, 2])
-        ''', r=r)
-    assert isinstance(names['there'][2], torch.Tensor) and names['back'][2].tolist() == [4, 5]
-
-
-def test_concepts_geometries():
-    g = toys.box()
-    assert geometry.display(g).get_xlabel() == 'x, m'
-    assert isinstance(g.id, int) and g.walls.shape == (4, 2, 2) and g.lights.shape == (1, 2) and g.masks.ndim == 2
-    assert (g.walls > 0).all() and (g.lights > 0).all() and isinstance(g.res, float)
-    middle = geometry.indices(np.array([3.5, 3.5]), g.masks.shape, g.res)
-    assert g.masks[tuple(middle)] == 1 and g.masks[tuple(geometry.indices([1., 3.5], g.masks.shape, g.res))] == -1
-    assert np.abs(geometry.centers(middle, g.masks.shape, g.res) - 3.5).max() <= g.res / 2 + 1e-6
-
-
-def test_concepts_scenery():
-    scenery = scene.scenery(3 * [toys.box()], n_agents=2)
-    n_model = 2 * len(scenery.model)
-    lines = scenery.lines[1]
-    assert lines.shape == (n_model + 4, 2, 2)       # the agents' lines come first
-    assert np.allclose(lines[n_model:].numpy(), toys.box().walls)
-    wall = int(scenery.lines.starts[1]) + n_model
-    assert scenery.textures[wall].shape == (100, 3)     # 5 m of 5 cm texels
-    assert scenery.baked[wall].shape == (100,) and (scenery.baked[wall] > 0).all()
-
-
-def test_concepts_decision_and_world():
-    dotdict = dotdict_module
-    action_space = dotdict.dotdict(
-        movement=spaces.MultiDiscrete(2, 7),
-        fire=spaces.MultiDiscrete(2, 2))
-
-    decision = arrdict.arrdict(
-        actions=arrdict.arrdict(
-            movement=torch.as_tensor([[5, 6]]),
-            fire=torch.as_tensor([[0, 1]])))
-
-    for name, space in action_space.items():
-        assert decision.actions[name].shape == (1, *space.shape) and (decision.actions[name] < space.n_actions).all()
-    sampled = heads.output(action_space, 8)
-    sampled = sampled.sample(sampled(torch.zeros(1, 8)))
-    assert sampled.shape == decision.actions.shape
-
-
-def test_concepts_spaces_and_heads():
-    env, width = TutorialMinimal(), 16
-    intake = heads.intake(env.obs_space, width)
-    output = heads.output(env.action_space, width)
-    world = env.reset()
-    assert intake(world.obs).shape == (2, width)
-    assert output(intake(world.obs)).exp().sum(-1).allclose(torch.ones(2, 1))
-
-
-# ---- A Minimal Env (seed 003) ----
 
 @pytest.fixture
 def boxes():
@@ -266,7 +57,7 @@ def agent_centre(c, e):
     return c.scenery.lines[e][:len(c.scenery.model)].mean((0, 1)).tolist()
 
 
-def test_minimal_scenery_is_displayed():
+def test_scenery_is_displayed():
     geometries = 128*[toys.box()]
     scenery = scene.scenery(geometries, n_agents=1)
 
@@ -280,7 +71,7 @@ def test_minimal_scenery_is_displayed():
     assert not torch.equal(*colours)                # each with a randomly-chosen colour scheme
 
 
-def test_minimal_agents_start_at_the_origin():
+def test_agents_start_at_the_origin():
     c = core.Core(scene.scenery(128*[toys.box()], n_agents=1))
     assert c.agents.positions.shape == (128, 1, 2)
     assert str(c.agents.positions[:2]) == ('tensor([[[0., 0.]],\n'
@@ -288,7 +79,7 @@ def test_minimal_agents_start_at_the_origin():
                                            '        [[0., 0.]]])')
 
 
-def test_minimal_agents_see(boxes):
+def test_agents_see(boxes):
     c = boxes
     assert np.allclose(agent_centre(c, 0), [0, 0], atol=1e-6)
 
@@ -307,7 +98,7 @@ def test_minimal_agents_see(boxes):
     assert np.allclose(agent_centre(c, 0), [3, 3], atol=1e-3)       # the model has moved to where the agent is
 
 
-def test_minimal_agents_stop_at_the_wall(boxes):
+def test_agents_stop_at_the_wall(boxes):
     c = boxes
     cuda.render(c.scenery, c.agents)
     c.agents.velocity[:] = torch.as_tensor([1000., 0.], device=c.device)
@@ -324,7 +115,7 @@ def test_minimal_agents_stop_at_the_wall(boxes):
     assert np.allclose(agent_centre(c, 0), [5.8649, 3], atol=2e-3)
 
 
-def test_minimal_the_basic_loop():
+def test_the_basic_loop():
     n_envs = 2
 
     g = toys.box()
@@ -347,7 +138,7 @@ def test_minimal_the_basic_loop():
     assert torch.allclose(c.agents.positions, torch.tensor([3., 3.3]))      # three steps of 0.1 s at 1 m/s
 
 
-def test_minimal_the_skeleton():
+def test_the_skeleton():
     class Minimal:
 
         def __init__(self, n_envs=2):
@@ -382,7 +173,7 @@ def test_minimal_the_skeleton():
     assert torch.equal(world.obs, first.obs) and world.obs.max() > 0    # nothing moves yet
 
 
-def test_minimal_the_finished_class_is_part_of_the_library():
+def test_the_finished_class_is_part_of_the_library():
     names = {}
     exec('from megastep.envs.minimal import *', names)
     self = names['Minimal']()
@@ -390,9 +181,9 @@ def test_minimal_the_finished_class_is_part_of_the_library():
     assert self.core.n_envs == 128 and world.obs.shape == (128, 1, 3, 1, 64)
 
 
-def test_minimal_spawning():
+def test_spawning():
     geometries = 128*[toys.box()]
-    self = dotdict_module.dotdict(core=core.Core(scene.scenery(geometries, n_agents=1)))
+    self = dotdict.dotdict(core=core.Core(scene.scenery(geometries, n_agents=1)))
 
     self['spawner'] = modules.RandomSpawns(geometries, self.core)
     reset = self.core.agent_full(True)
@@ -407,8 +198,8 @@ def test_minimal_spawning():
     assert agent_centre(self.core, 5) == pytest.approx(positions[5, 0].tolist(), abs=1e-3)
 
 
-def test_minimal_observations(boxes):
-    self = dotdict_module.dotdict(core=boxes)
+def test_observations(boxes):
+    self = dotdict.dotdict(core=boxes)
     self['rgb'] = modules.RGB(self.core)
     obs = self.rgb()
     assert obs.shape == (128, 1, 3, 1, 64) and self.rgb.space.shape == (1, 3, 1, 64)
@@ -421,8 +212,8 @@ def test_minimal_observations(boxes):
     assert repr(reset(self)) == 'arrdict:\nobs    Tensor((128, 1, 3, 1, 64), torch.float32)'
 
 
-def test_minimal_movement(boxes):
-    self = dotdict_module.dotdict(core=boxes)
+def test_movement(boxes):
+    self = dotdict.dotdict(core=boxes)
     self['movement'] = modules.SimpleMovement(self.core)
     decision = arrdict.arrdict(actions=self.core.agent_full(3))
     self.movement(decision)
@@ -478,7 +269,7 @@ class Agent(nn.Module):
         return arrdict.arrdict(logits=logits, actions=actions)
 
 
-def test_minimal_heads():
+def test_heads():
     env, width = TutorialMinimal(), 32
     world = env.reset()
     intake = heads.intake(env.obs_space, width)
@@ -494,7 +285,7 @@ def test_minimal_heads():
     assert decision.actions.shape == (2, 1) and ((actions >= 0) & (actions < 7)).all()
 
 
-def test_minimal_trying_it_out():
+def test_trying_it_out():
     env = TutorialMinimal()
     agent = Agent(env)
 
@@ -508,7 +299,7 @@ def test_minimal_trying_it_out():
     assert ((env.core.agents.positions - before).norm(dim=-1) <= 1 + 1e-4).all()
 
 
-def test_minimal_recording(tmp_path):
+def test_recording(tmp_path):
     env = TutorialMinimal()
     agent = Agent(env)
 
