@@ -142,8 +142,8 @@ class Trainer:
 
 def run(cfg):
     """Trains as `cfg`, a settings.Train, says. Returns the run folder; after a signal, saves and raises Interrupted."""
-    folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
     device = runs.make_device(cfg.device)
+    folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
     with Interruptions() as stop:
         with nullcontext() if cfg.resume else runs.vanishing(folder):
             trainer = Trainer(cfg, folder, device)

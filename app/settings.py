@@ -249,7 +249,10 @@ def _settings(kind, tree, path, faults):
             faults.append((path + key, f"no such key; {closest(key, fields)}"))
     for name, field in fields.items():
         if name not in tree:
-            faults.append((path + name, "is missing"))
+            if hints[name] == Geometry | None:      # a group that was not chosen is absent
+                values[name] = None
+            else:
+                faults.append((path + name, "is missing"))
             continue
         values[name] = _value(hints[name], tree[name], path + name, faults)
         check = field.metadata.get("check")

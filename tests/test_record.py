@@ -1,0 +1,65 @@
+"""Videos of trained agents."""
+import builtins
+import sys
+
+import pytest
+
+import record
+import train
+from app import commandline
+from app.settings import Train, build
+from megastep import recording
+
+TINY = ["env=minimal", "geometry=box", "agent=small", "env.n_envs=4", "env.res=8", "learner.n_steps=8",
+        "learner.n_minibatches=2", "agent.width=8", "device=cpu", "samples=1"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    with commandline.Door("train", Train) as door, pytest.MonkeyPatch.context() as patch:
+        base = tmp_path_factory.mktemp("trained")
+        patch.chdir(base)
+        return base / train.run(build(Train, door.tree(TINY)))
+
+
+def test_a_video_has_a_frame_for_every_step(trained):
+    import av
+    assert record.main([f"run={trained}", "steps=3", "device=cpu"]) == 0
+    with av.open(str(trained / "video.mp4")) as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+        assert video.streams.video[0].average_rate == 10      # the environment's
+    assert len(frames) == 3 and frames[0].std() > 10
+    assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
+
+
+def test_a_place_that_cannot_be_written_is_one_sentence(trained, capsys):
+    assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=/proc/video.mp4"]) == 2
+    assert "/proc/video.mp4 could not be made" in capsys.readouterr().err
+
+
+def failing(*_, **__):
+    raise RuntimeError("Frame 0 could not be drawn: by chance")
+
+
+def test_training_survives_a_video_that_fails(trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(recording.ParallelEncoder, "__call__", failing)
+    assert train.main([*TINY, "finish.record=true"]) == 0
+    assert "Frame 0 could not be drawn" in capsys.readouterr().err
+    assert not list(tmp_path.glob("runs/*/*.mp4"))
+
+
+def test_without_the_encoder_training_goes_on_and_the_package_is_named(tmp_path, monkeypatch, capsys):
+    real = builtins.__import__
+
+    def refuse(name, *arguments, **options):
+        if name == "av":
+            raise ImportError("No module named 'av'")
+        return real(name, *arguments, **options)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "av", raising=False)
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    assert train.main([*TINY, "finish.record=true"]) == 0
+    assert "pip install av" in capsys.readouterr().err
+    assert len(list(tmp_path.glob("runs/*/curves.png"))) == 1
