@@ -59,6 +59,8 @@ class Agents:
         self.yaws = torch.tensor([0.0] if cameras is None else list(cameras), dtype=torch.float32, device=device)
         if not len(self.yaws):
             raise ValueError('an agent needs at least one camera, but an empty list was given')
+        sideways = math.tan(math.radians(fov / 2)) * (1 - (2 * torch.arange(res, dtype=torch.float64) + 1) / res)
+        self.ray_lengths = (1 + sideways**2).sqrt().float().to(device)      # (R,), per unit of depth
         self.positions = torch.zeros((n_envs, n_agents, 2), device=device)
         self.angles = torch.zeros((n_envs, n_agents), device=device)
         self.velocity = torch.zeros((n_envs, n_agents, 2), device=device)
@@ -284,6 +286,7 @@ def _look(scenery, agents, **fields):
         _world(scenery, agents.radius),
         *_state(scenery, agents, 'positions', 'angles'),
         agents.yaws.data_ptr(),
+        agents.ray_lengths.data_ptr(),
         agents.fault.data_ptr(),
         len(agents.yaws),
         agents.res,
@@ -325,8 +328,10 @@ def observe(
     of the world's design, updated in place; ``forget`` (N, A) bool, clears ``seen`` first; ``max_depth`` metres. With
     one agent a world, ``scenery.lines`` is left as it was. Returns an :class:`Observation`.
     """
-    if subsample < 1 or agents.res % subsample:
-        raise ValueError(f'subsample must divide the {agents.res} rays of a camera, but {subsample} was given')
+    if not 1 <= subsample <= 32 or agents.res % subsample:
+        raise ValueError(
+            f'subsample must be at most 32 and divide the {agents.res} rays of a camera, but {subsample} was given'
+        )
     n, a, where = scenery.n_envs, scenery.n_agents, scenery.device
     if a > 1:
         place(scenery, agents, lit=rgb)

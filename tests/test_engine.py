@@ -52,59 +52,15 @@ def state_of(core, physics):
 
 # ---- Golden: what the original computed, within the tolerances its README gives ----
 
-
-def share(condition):
-    return float(condition.float().mean())
-
-
 @pytest.mark.parametrize('case', worlds.CASES)
 def test_golden(case, device):
-    world, settings, golden = worlds.golden(case)
+    world, settings, _ = worlds.golden(case)
     core = core_of(world, device, **settings)
     cuda.bake(core.scenery)
-    r = cuda.render(core.scenery, core.agents)
-    r = {k: v.cpu() for k, v in r._asdict().items()}
-
-    assert torch.allclose(core.scenery.lines.vals.cpu(), world.lines, atol=1e-5), 'lines'
-    n_agents = world.n_agents * len(world.model)
-    line = torch.repeat_interleave(torch.arange(len(world.texture_widths)), world.texture_widths)
-    starts = world.line_widths.cumsum(0) - world.line_widths
-    env = torch.repeat_interleave(torch.arange(world.n_envs), world.line_widths)
-    static = (line - starts[env[line]]) >= n_agents
-    baked = core.scenery.baked.vals.cpu()
-    assert share((baked - golden['baked_vals']).abs()[static] <= 2e-3) >= 0.995, 'baked'
-
-    same = r['indices'] == golden['indices']
-    assert share(same) >= 0.999, 'indices'
-    hit = same & (golden['indices'] >= 0)
-    assert share(((r['distances'] - golden['distances']).abs() <= 1e-4 * (1 + golden['distances']))[hit]) >= 0.998, (
-        'distances'
-    )
-    assert share(((r['locations'] - golden['locations']).abs() <= 1e-3)[hit]) >= 0.998, 'locations'
-    assert share(((r['dots'] - golden['dots']).abs() <= 1e-3)[hit]) >= 0.998, 'dots'
-    miss = same & (golden['indices'] < 0)
-    assert bool(
-        (r['distances'][miss] == math.inf).all()
-        and r['locations'][miss].isnan().all()
-        and (r['screen'][miss] == 0).all()
-    ), 'misses'
-    difference = (r['screen'] - golden['screen']).abs().mean(-1)
-    wall, agent = hit & (golden['indices'] >= n_agents), hit & (golden['indices'] < n_agents)
-    assert float(difference[wall].mean()) <= 2e-3, 'screen'
-    assert not agent.any() or float(difference[agent].mean()) <= 2e-2, 'screen of agents'
-
-    progress = cuda.physics(core.scenery, core.agents).progress.cpu()
-    agents = {k: getattr(core.agents, k).cpu() for k in ('positions', 'angles', 'velocity', 'angvelocity')}
-    right = (progress - golden['progress']).abs() <= 2e-3
-    assert share(right) >= 0.995, 'progress'
-    step = world.velocity.norm(dim=-1) / settings['fps']
-    assert bool(((agents['positions'] - golden['positions_after']).norm(dim=-1) <= 5e-3 + 4e-3 * step)[right].all()), (
-        'positions'
-    )
-    turned = ((agents['angles'] - golden['angles_after'] + 180) % 360 - 180).abs()
-    assert bool((turned <= 0.1 + 4e-3 * world.angvelocity.abs() / settings['fps'])[right].all()), 'angles'
-    for name in ('velocity', 'angvelocity'):
-        assert share(agents[name] == golden[f'{name}_after']) >= 0.99, name
+    poison()
+    r = cuda.render(core.scenery, core.agents)._asdict()
+    compare.check_golden(case, dict(r, lines=core.scenery.lines.vals, baked=core.scenery.baked.vals))
+    compare.check_golden(case, state_of(core, cuda.physics(core.scenery, core.agents)))
 
 
 # ---- The twin: random worlds, all degenerate cases ----

@@ -224,14 +224,6 @@ def cuda(index):
             operation: _checked(driver.cuModuleGetFunction(module, operation.encode()), 'Loading the GPU engine')
             for operation in OPERATIONS
         }
-        most = _checked(
-            driver.cuDeviceGetAttribute(
-                driver.CUdevice_attribute.CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN, index
-            ),
-            'Loading the GPU engine',
-        )
-        attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
-        _checked(driver.cuFuncSetAttribute(functions['sight'], attribute, most), 'Loading the GPU engine')
     return functions
 
 

@@ -1,6 +1,7 @@
 // The CPU backend: each operation as a loop over worlds or agents, shared among threads; inner loops over walls and pixels are written so that compilers vectorise them.
 #include <vector>
 #define HD static inline
+#define ALIGNED
 #define SQRT(x) __builtin_sqrtf(x)
 #define CEIL(x) __builtin_ceilf(x)
 #define FLOOR(x) __builtin_floorf(x)
@@ -108,7 +109,8 @@ struct Bench {
     std::vector<int> index;
 };
 
-static void raster_lines(const Camera& camera, const Screen& screen, const float* lines, int n, int offset, int skip_first, int skip_last, Bench& bench) {
+static void raster_lines(const Camera& camera, const Screen& screen, const float* lengths, const float* lines, int n, int offset, int skip_first, int skip_last,
+                         Bench& bench) {
     if ((int)bench.spans.size() < n) bench.spans.resize(n);
     Span* spans = bench.spans.data();
     float* inverse = bench.inverse.data();
@@ -120,7 +122,7 @@ static void raster_lines(const Camera& camera, const Screen& screen, const float
         if (span.first >= span.last || (l >= skip_first && l < skip_last)) continue;
         if (span.close) {
             for (int r = span.first; r < span.last; r++) {
-                float here = inverse_depth(span, screen, r);
+                float here = inverse_depth(span, screen, r, lengths[r]);
                 if (here > inverse[r]) { inverse[r] = here; index[r] = offset + l; }
             }
             continue;
@@ -155,12 +157,20 @@ extern "C" void sight(const Sight* given) {
                 bench.inverse.assign(p.res, 0.f);
                 bench.index.assign(p.res, -1);
                 if (w.n_agents > 1)
-                    raster_lines(camera, screen, scene.agent_lines, scene.n_agent_lines, 0, a * w.n_model, (a + 1) * w.n_model, bench);
-                raster_lines(camera, screen, scene.walls, scene.n_walls, scene.n_agent_lines, 0, 0, bench);
+                    raster_lines(camera, screen, p.ray_lengths, scene.agent_lines, scene.n_agent_lines, 0, a * w.n_model, (a + 1) * w.n_model, bench);
+                raster_lines(camera, screen, p.ray_lengths, scene.walls, scene.n_walls, scene.n_agent_lines, 0, 0, bench);
                 long long view = (long long)agent * p.n_cameras + c;
                 if (p.middle) p.middle[view] = bench.index[p.res / 2];
-                for (int pixel = 0; pixel < p.res / p.subsample; pixel++)
-                    fresh += shade_pixel(p, screen, scene, camera, agent, view, pixel, bench.inverse.data(), bench.index.data());
+                const float* inverse = bench.inverse.data();
+                const int* index = bench.index.data();
+                for (int r = 0; r < p.res; r += p.subsample) {
+                    Ray sum = shade_ray(p, screen, scene, camera, agent, view, r, inverse[r], index[r], fresh);
+                    for (int k = r + 1; k < r + p.subsample; k++) {
+                        Ray ray = shade_ray(p, screen, scene, camera, agent, view, k, inverse[k], index[k], fresh);
+                        sum.red += ray.red; sum.green += ray.green; sum.blue += ray.blue; sum.depth += ray.depth;
+                    }
+                    write_pixel(p, view, r / p.subsample, sum);
+                }
             }
             if (p.fresh) p.fresh[agent] = fresh;
         }

@@ -2,6 +2,8 @@
 #define HD static __device__ __forceinline__
 #define DEVICE static __device__ __forceinline__
 #define KERNEL extern "C" __global__ void
+#define ALIGNED __align__(16)
+#define BOUNDS __launch_bounds__(128, 8)
 #define SQRT(x) sqrtf(x)
 #define CEIL(x) ceilf(x)
 #define FLOOR(x) floorf(x)

@@ -132,9 +132,8 @@ HD Span span_of(const Camera& camera, const Screen& screen, float wax, float way
     to_camera(camera, wax, way, ax, ay);
     to_camera(camera, wbx, wby, bx, by);
     float vx = bx - ax, vy = by - ay, area = cross(ax, ay, vx, vy);
-    float t = (screen.near - ax) / vx;                                  // used only where the wall crosses the near plane: then vx is not 0
     int behind_a = ax < screen.near, behind_b = bx < screen.near;
-    float cut = ay + t * vy;
+    float cut = behind_a | behind_b ? ay + (screen.near - ax) / vx * vy : 0.f;      // where the wall crosses the near plane, if it does
     float pa = screen.middle - screen.scale * ((behind_a ? cut : ay) / (behind_a ? screen.near : ax));
     float pb = screen.middle - screen.scale * ((behind_b ? cut : by) / (behind_b ? screen.near : bx));
     float res = (float)screen.res;
@@ -148,31 +147,27 @@ HD Span span_of(const Camera& camera, const Screen& screen, float wax, float way
     return span;
 }
 
-// Inverse depth of a span at pixel r; 0, which sees nothing, where that is within the agent's radius.
-HD float inverse_depth(const Span& span, const Screen& screen, int r) {
+// Inverse depth of a span at pixel r, whose ray is `length` long at unit depth; 0, which sees nothing, where that is within the agent's radius.
+HD float inverse_depth(const Span& span, const Screen& screen, int r, float length) {
     float inverse = span.base + span.gain * (float)r;
-    if (span.close) {
-        float y = slope(screen, r);
-        if (inverse * inverse * (screen.radius * screen.radius) >= 1.f + y * y) return 0.f;
-    }
-    return inverse;
+    return span.close && inverse * screen.radius >= length ? 0.f : inverse;
 }
 
 struct Hit { float location, facing; };   // fraction along the line; squared sine between ray and line
 
-HD Hit hit_of(const Line& line, float y) {
-    float across = line.vy - y * line.vx;
+// One division serves both.
+HD Hit hit_of(const Line& line, float y, float length) {
+    float across = line.vy - y * line.vx, size = length * length * (line.vx * line.vx + line.vy * line.vy);
+    float inverse = 1.f / (across * size);
     Hit hit;
-    hit.location = clamp((y * line.ax - line.ay) / across, 0.f, 1.f);
-    hit.facing = across * across / ((1.f + y * y) * (line.vx * line.vx + line.vy * line.vy));
+    hit.location = clamp((y * line.ax - line.ay) * size * inverse, 0.f, 1.f);
+    hit.facing = across * across * (across * inverse);
     return hit;
 }
 
-HD float cosine_of(const Line& line, float y) {
-    return (line.vx + y * line.vy) / (SQRT((1.f + y * y) * (line.vx * line.vx + line.vy * line.vy)) + 1e-6f);
+HD float cosine_of(const Line& line, float y, float length) {
+    return (line.vx + y * line.vy) / (length * SQRT(line.vx * line.vx + line.vy * line.vy) + 1e-6f);
 }
-
-HD float distance_of(float inverse, float y) { return SQRT(1.f + y * y) / inverse; }
 
 HD float depth_reading(float distance, float radius, float max_depth) { return 1.f - clamp((distance - radius) / max_depth, 0.f, 1.f); }
 

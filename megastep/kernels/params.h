@@ -58,6 +58,7 @@ struct Sight {
     const float* positions;        // (N, A, 2)
     const float* angles;           // (N, A)
     const float* yaws;             // (C) degrees, added to the agent's angle
+    const float* ray_lengths;      // (R) length of each ray per unit of depth
     int* fault;                    // (1) as in Motion
     int n_cameras;                 // C
     int res;                       // R

@@ -91,55 +91,38 @@ HD Scene scene_of(const World& w, int world) {
     return scene;
 }
 
+// Sixteen bytes that move as one.
+struct ALIGNED Four_floats { float x, y, z, w; };
+
 struct Colour { float red, green, blue; };
+
+HD Colour lit(const Four_floats& l, const Four_floats& r, float weight, float facing) {
+    float light = mix(l.w, r.w, weight) * facing;
+    Colour colour = {mix(l.x, r.x, weight) * light, mix(l.y, r.y, weight) * light, mix(l.z, r.z, weight) * light};
+    return colour;
+}
 
 HD Colour wall_colour(const World& w, int first, int width, const Hit& hit) {
     Filter f = filter_at(hit.location, width);
-    const float* l = w.texels + 4 * (long long)(first + f.left);
-    const float* r = w.texels + 4 * (long long)(first + f.right);
-    float light = mix(l[3], r[3], f.weight) * hit.facing;
-    Colour colour = {mix(l[0], r[0], f.weight) * light, mix(l[1], r[1], f.weight) * light, mix(l[2], r[2], f.weight) * light};
-    return colour;
+    const Four_floats* texels = (const Four_floats*)w.texels + first;
+    return lit(texels[f.left], texels[f.right], f.weight, hit.facing);
+}
+
+HD Four_floats agent_texel_colour(const Scene& scene, int texel) {
+    const float* colour = scene.agent_textures + 3 * texel;
+    Four_floats made = {colour[0], colour[1], colour[2], scene.agent_light[texel]};
+    return made;
 }
 
 HD Colour agent_colour(const Scene& scene, int first, int width, const Hit& hit) {
     Filter f = filter_at(hit.location, width);
-    const float* l = scene.agent_textures + 3 * (first + f.left);
-    const float* r = scene.agent_textures + 3 * (first + f.right);
-    float light = mix(scene.agent_light[first + f.left], scene.agent_light[first + f.right], f.weight) * hit.facing;
-    Colour colour = {mix(l[0], r[0], f.weight) * light, mix(l[1], r[1], f.weight) * light, mix(l[2], r[2], f.weight) * light};
-    return colour;
+    return lit(agent_texel_colour(scene, first + f.left), agent_texel_colour(scene, first + f.right), f.weight, hit.facing);
 }
 
 // Marks a texel as seen; 1 if it was not before. Most have been, so a plain look comes first.
 HD int mark(unsigned int* seen, int texel) {
     unsigned int bit = 1u << (texel & 31);
     return !(seen[texel >> 5] & bit) && !(OR_BITS(seen + (texel >> 5), bit) & bit);
-}
-
-// One ray, once its line is known: fills what is asked for of the full resolution, adds to the pixel's sums, and says whether its texel is new.
-struct Sums { float red, green, blue, depth; };
-
-HD int shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, int agent, long long ray, int r, float inverse, int l, Sums& sums) {
-    float y = slope(screen, r);
-    int n_agent_lines = scene.n_agent_lines, of_agent = l < n_agent_lines;
-    const float* ends = of_agent ? scene.agent_lines + 4 * l : scene.walls + 4 * (l - n_agent_lines);
-    const int* starts = of_agent ? p.world.model_texels + l : scene.texel_starts + (l - n_agent_lines);
-    int first = starts[0], width = starts[1] - first;
-    Line line = line_in(camera, ends[0], ends[1], ends[2], ends[3]);
-    Hit hit = hit_of(line, y);
-    float distance = distance_of(inverse, y);
-    if (p.depth) sums.depth += depth_reading(distance, screen.radius, p.max_depth);
-    if (p.rgb || p.screen) {
-        Colour colour = of_agent ? agent_colour(scene, first, width, hit) : wall_colour(p.world, first, width, hit);
-        sums.red += colour.red; sums.green += colour.green; sums.blue += colour.blue;
-        if (p.screen) { float* out = p.screen + 3 * ray; out[0] = colour.red; out[1] = colour.green; out[2] = colour.blue; }
-    }
-    if (p.locations) p.locations[ray] = hit.location;
-    if (p.dots) p.dots[ray] = cosine_of(line, y);
-    if (p.distances) p.distances[ray] = distance;
-    if (!p.seen || of_agent) return 0;
-    return mark(p.seen + agent * (long long)p.n_words, first - scene.first_texel + texel_at(hit.location, width));
 }
 
 HD void miss_ray(const Sight& p, long long ray) {
@@ -149,25 +132,44 @@ HD void miss_ray(const Sight& p, long long ray) {
     if (p.screen) { float* out = p.screen + 3 * ray; out[0] = 0.f; out[1] = 0.f; out[2] = 0.f; }
 }
 
-// One pixel: the mean of its rays, which are summed in order. Returns how many texels it sees for the first time.
-HD int shade_pixel(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, int agent, long long view, int pixel,
-                   const float* inverse, const int* index) {
-    Sums sums = {0.f, 0.f, 0.f, 0.f};
-    int fresh = 0, S = p.subsample, n_pixels = p.res / S;
-    for (int k = 0; k < S; k++) {
-        int r = pixel * S + k;
-        long long ray = view * p.res + r;
-        if (p.indices) p.indices[ray] = index[r];
-        if (index[r] < 0) miss_ray(p, ray);
-        else fresh += shade_ray(p, screen, scene, camera, agent, ray, r, inverse[r], index[r], sums);
+// One ray, once its line is known: fills what is asked for at full resolution, and returns its share of its pixel. Counts in `fresh` a texel seen for the first time.
+struct Ray { float red, green, blue, depth; };
+
+HD Ray shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, int agent, long long view, int r, float inverse, int l, int& fresh) {
+    Ray out = {0.f, 0.f, 0.f, 0.f};
+    long long ray = view * p.res + r;
+    if (p.indices) p.indices[ray] = l;
+    if (l < 0) { miss_ray(p, ray); return out; }
+    float y = slope(screen, r), length = p.ray_lengths[r];
+    int n_agent_lines = scene.n_agent_lines, of_agent = l < n_agent_lines;
+    Four_floats ends = ((const Four_floats*)(of_agent ? scene.agent_lines : scene.walls))[of_agent ? l : l - n_agent_lines];
+    const int* starts = of_agent ? p.world.model_texels + l : scene.texel_starts + (l - n_agent_lines);
+    int first = starts[0], width = starts[1] - first;
+    Line line = line_in(camera, ends.x, ends.y, ends.z, ends.w);
+    Hit hit = hit_of(line, y, length);
+    float distance = length / inverse;
+    out.depth = depth_reading(distance, screen.radius, p.max_depth);
+    if (p.rgb || p.screen) {
+        Colour colour = of_agent ? agent_colour(scene, first, width, hit) : wall_colour(p.world, first, width, hit);
+        out.red = colour.red; out.green = colour.green; out.blue = colour.blue;
+        if (p.screen) { float* rgb = p.screen + 3 * ray; rgb[0] = colour.red; rgb[1] = colour.green; rgb[2] = colour.blue; }
     }
-    float n = (float)S;
+    if (p.locations) p.locations[ray] = hit.location;
+    if (p.dots) p.dots[ray] = cosine_of(line, y, length);
+    if (p.distances) p.distances[ray] = distance;
+    if (p.seen && !of_agent) fresh += mark(p.seen + agent * (long long)p.n_words, first - scene.first_texel + texel_at(hit.location, width));
+    return out;
+}
+
+// A pixel is the mean of its rays, which are summed in order.
+HD void write_pixel(const Sight& p, long long view, int pixel, const Ray& sum) {
+    int n_pixels = p.res / p.subsample;
+    float n = (float)p.subsample;
     if (p.rgb) {
         unsigned short* rgb = p.rgb + view * 3 * n_pixels + pixel;
-        rgb[0] = half_bits(sums.red / n); rgb[n_pixels] = half_bits(sums.green / n); rgb[2 * n_pixels] = half_bits(sums.blue / n);
+        rgb[0] = half_bits(sum.red / n); rgb[n_pixels] = half_bits(sum.green / n); rgb[2 * n_pixels] = half_bits(sum.blue / n);
     }
-    if (p.depth) p.depth[view * n_pixels + pixel] = half_bits(sums.depth / n);
-    return fresh;
+    if (p.depth) p.depth[view * n_pixels + pixel] = half_bits(sum.depth / n);
 }
 
 HD void draw_lane(const Draw& p, int lane) {
