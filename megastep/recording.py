@@ -26,7 +26,7 @@ import numpy as np
 
 from .arrdict import clone, numpyify
 
-MAX_WORKERS = 16    # one process encodes what the others draw, and cannot keep up with more
+MAX_WORKERS = 8     # some 80 figures a second; each has torch in memory, about half a gigabyte
 QUALITY = '20'      # x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines want more
 
 # Workers draw on one thread each, never on a screen, and see no GPU: even an idle CUDA context is half a gigabyte.
@@ -42,7 +42,7 @@ class ParallelEncoder:
             classmethods and staticmethods run in worker processes. A method of an object would drag the object along,
             so it is called in this process instead, with a warning.
         fps: frames a second of the video.
-        n_workers: how many processes draw; by default as many as there are cores, 16 at most.
+        n_workers: how many processes draw; by default as many as there are cores, 8 at most.
 
     Inside its ``with`` block, call it with a state, or :meth:`frame` with a finished picture; after the block, use
     :meth:`save` or :meth:`notebook`. RuntimeError, from any of them, names the first frame that could not be drawn.
