@@ -143,8 +143,8 @@ def _coordinates(g, key, shape, limit):
 def checked(g):
     """A copy of geometry `g` with the documented dtypes and without walls of no length.
 
-    Raises ValueError, saying what is wrong and what is allowed, unless it is finite, positive, has a wall and a room and
-    respects the limits at the head of this file.
+    Raises ValueError, saying what is wrong and what is allowed, unless it is finite, positive, has a wall and a room,
+    and respects the limits at the head of this file.
     """
     walls = _coordinates(g, "walls", (None, 2, 2), MAX_WALLS)
     walls = walls[(walls[:, 0] != walls[:, 1]).any(-1)]

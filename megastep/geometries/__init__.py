@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry import centers, indices, masks
-from . import files, toys
+from . import files, homes, toys
+from .homes import database
 
-__all__ = ["SOURCES", "SPLITS", "centers", "files", "indices", "masks", "sample", "toys"]
+__all__ = ["SOURCES", "SPLITS", "centers", "files", "homes", "indices", "masks", "sample", "toys"]
 
 SPLITS = ("training", "test", "all")
 BENCH = Path(__file__).parent/"data"/"bench_homes.npz"
@@ -53,12 +54,17 @@ def _files(n, split, seed, path):
     return [database[i] for i in _selected(len(database), n, split, seed)]
 
 
+def _homes(n, split, seed, outer=True):
+    """From the 5,000 homes; without the outer face of their envelopes if not `outer`."""
+    return [database.home(index, outer) for index in _selected(database.COUNT, n, split, seed)]
+
+
 def _bench(n, split, seed):
     """The 512 dense homes every benchmark runs on."""
     return _files(n, split, seed, BENCH)
 
 
-SOURCES = {"box": _box, "column": _column, "bench": _bench, "files": _files}
+SOURCES = {"box": _box, "column": _column, "homes": _homes, "bench": _bench, "files": _files}
 
 
 def _known(kind, given, allowed):
@@ -72,8 +78,8 @@ def _known(kind, given, allowed):
 def sample(name, n, split="training", seed=1, **options):
     """A list of n geometries from the source `name`, the same for the same arguments.
 
-    `options` are the source's own: `width` of "box", `width` and `pillar` of "column", `path` of "files". Raises
-    ValueError for an unknown name, split or option, and for what the source cannot use.
+    `options` are the source's own: `width` of "box", `width` and `pillar` of "column", `outer` of "homes", `path` of
+    "files". Raises ValueError for an unknown name, split or option, and for what the source cannot use.
     """
     _known("geometry source", name, SOURCES)
     _known("split", split, SPLITS)

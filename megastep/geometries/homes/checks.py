@@ -1,0 +1,96 @@
+"""What every home must be, looked at from its walls and masks alone, on a raster of 5 cm."""
+import numpy as np
+
+from ... import geometry
+
+FINE = .05          # metres a cell
+RADIUS = .15/2**.5  # metres; an agent's
+GAP = .55           # metres; the least width of any passage
+SPAWN = .15         # metres; in each room some point is this far from all walls
+MOST_WALLS, LARGEST = 400, 40.
+LIT = .05           # metres; the least distance of a light from any wall
+LEAST_CELLS = 4     # of the masks, a room
+
+
+def components(free):
+    """Labels (H, W) of the 4-connected components of bool (H, W) cells, 0 where not free, and how many there are."""
+    edges = np.diff(np.pad(free, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    (row, start), end = np.nonzero(edges == 1), np.nonzero(edges == -1)[1]
+    first = np.searchsorted(row, np.arange(len(free) + 1))      # the runs of free cells, and each row's first one
+    parents = list(range(len(row)))
+
+    def root(run):
+        while parents[run] != run:
+            parents[run] = run = parents[parents[run]]
+        return run
+
+    for i in range(1, len(free)):
+        a, b = first[i - 1], first[i]
+        while a < first[i] and b < first[i + 1]:
+            if start[a] < end[b] and start[b] < end[a]:
+                parents[root(b)] = root(a)
+            a, b = (a + 1, b) if end[a] < end[b] else (a, b + 1)
+    _, labels = np.unique([root(run) for run in range(len(row))], return_inverse=True)
+    result = np.zeros(free.shape, int)
+    result[free] = np.repeat(labels + 1, end - start)
+    return result, labels.max(initial=-1) + 1
+
+
+def clearance(g, most=.3):
+    """The distance in metres, up to `most`, from each cell's centre on the fine raster to the nearest wall."""
+    ratio = round(g.res/FINE)
+    height, width = g.masks.shape[0]*ratio, g.masks.shape[1]*ratio
+    distance = np.full((height, width), most)
+    x, y = (np.arange(width) + .5)*FINE, (height - np.arange(height) - .5)*FINE
+    for (ax, ay), (bx, by) in g.walls.astype(float):
+        columns = slice(*np.searchsorted(x, (min(ax, bx) - most, max(ax, bx) + most)))
+        rows = slice(*np.searchsorted(-y, (-max(ay, by) - most, -min(ay, by) + most)))
+        px, py = x[None, columns] - ax, y[rows, None] - ay
+        dx, dy = bx - ax, by - ay
+        along = np.clip((px*dx + py*dy)/(dx*dx + dy*dy), 0, 1)
+        distance[rows, columns] = np.minimum(distance[rows, columns], np.hypot(px - along*dx, py - along*dy))
+    return distance
+
+
+def _reaches(labels, rooms):
+    """Whether one component enters every one of rooms 1..n."""
+    seen = [np.unique(labels[(rooms == room) & (labels > 0)]) for room in range(1, rooms.max() + 1)]
+    return any(all(label in there for there in seen) for label in seen[0])
+
+
+def faults(g):
+    """Sentences on what is wrong with a home, none if it is as it must be."""
+    found = []
+    walls = g.walls.reshape(-1, 4)
+    canonical = np.where((walls[:, :2] > walls[:, 2:]).any(-1)[:, None] & (walls[:, 0] >= walls[:, 2])[:, None],
+                         walls[:, [2, 3, 0, 1]], walls)
+    if not np.isfinite(walls).all() or (walls[:, :2] == walls[:, 2:]).all(-1).any():
+        found.append("a wall is not finite or has no length")
+    if len(np.unique(canonical, axis=0)) < len(walls):
+        found.append("two walls are the same")
+    if np.abs(g.walls.min((0, 1)) - 1).max() > 1e-3 and not g.get("n_outer") == 0:
+        found.append(f"coordinates start at {g.walls.min((0, 1))} and not at 1 m")
+    if np.ptp(g.walls, axis=(0, 1)).max() > LARGEST or len(walls) > MOST_WALLS:
+        found.append("it is too large")
+
+    rooms = g.masks.max()
+    if min(np.bincount(g.masks[g.masks > 0], minlength=rooms + 1)[1:], default=0) < LEAST_CELLS:
+        found.append("a room has too few cells")
+    labels, _ = components(g.masks >= 0)
+    if (g.masks[labels == labels[0, 0]] > 0).any():
+        found.append("the envelope is open")
+
+    distance = clearance(g)
+    ratio = round(g.res/FINE)
+    fine = np.maximum(g.masks, 0).repeat(ratio, 0).repeat(ratio, 1)
+    for radius, what in (RADIUS, "an agent"), (GAP/2, "a disc as wide as the narrowest passage"):
+        if not _reaches(components(distance > radius - 1e-3)[0], fine):
+            found.append(f"{what} cannot reach every room")
+    if any(not (distance[fine == room] >= SPAWN).any() for room in range(1, rooms + 1)):
+        found.append("a room has no point to spawn at")
+    at = tuple(geometry.indices(g.lights, g.masks.shape, g.res).T)
+    if not (g.masks[at] == np.arange(1, rooms + 1)).all():
+        found.append("a light is not in its room")
+    if (distance[tuple(geometry.indices(g.lights, distance.shape, FINE).T)] < LIT).any():
+        found.append("a light is in a wall")
+    return found

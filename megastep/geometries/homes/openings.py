@@ -1,0 +1,131 @@
+"""Where rooms meet, and which of those walls have a door or an opening. Whole centimetres."""
+from itertools import combinations
+from typing import NamedTuple
+
+DOORS = {60: .06, 65: .12, 70: .16, 75: .18, 80: .24, 85: .14, 90: .10}     # widths and how often
+SMALL = ("bath", "closet", "lobby", "storage")      # rooms with doors of at most 80 cm
+WIDEST_SMALL = 80
+STUB = 5            # cm of wall beside a door in a corner
+IN_CORNER = .70     # of the doors; the others stand anywhere
+LEAST_CONTACT = 95  # cm of clear wall a door needs
+LOOPS = .45         # of the cheap contacts that the tree of doors leaves out become doors too
+OPEN = {frozenset(pair): share for pair, share in {     # how often a connection has no door
+    ("living", "kitchen"): .7, ("living", "entry"): .6, ("kitchen", "entry"): .6, ("living", "room"): .6,
+    ("kitchen", "room"): .6, ("entry", "room"): .4, ("entry", "lobby"): .4, ("bedroom", "closet"): .2,
+    ("entry", "closet"): .2, ("bedroom", "room"): .2}.items()}
+FULL = .45          # of the connections without a door take the whole wall between the rooms
+OPENING = (100, 240)        # cm; the others
+REACH = 25          # cm; walls that come this near to the end of another narrow what can be opened there
+
+# What a connection costs in the spanning tree: cheap ones become doors. Pairs before single kinds before the default.
+COSTS = {frozenset(pair): cost for pair, cost in {
+    ("living", "kitchen"): .05, ("bedroom", "closet"): .25, ("bath", "living"): .7, ("bedroom",): 1.5, ("closet",): 2.,
+    ("closet", "storage"): 2., ("storage",): 2., ("closet", "bath"): 2., ("storage", "bath"): 2., ("bath",): 3.,
+    ("bath", "kitchen"): 3., ("bath", "bedroom"): .8}.items()}
+COST_ENTRY, COST_LIVING, COST = .15, .3, 1.
+CHEAP = .8          # the most a loop may cost
+
+
+class Contact(NamedTuple):
+    """A straight piece of wall between rooms a and b, on the line `at` of `axis`, from low to high along it."""
+    axis: int
+    at: int
+    low: int
+    high: int
+    a: int
+    b: int
+
+
+class Opening(NamedTuple):
+    """A gap in the wall of a contact from low to high; it has a door or not."""
+    contact: Contact
+    low: int
+    high: int
+    door: bool
+
+
+def contacts(rooms):
+    """Every Contact between two of the rooms, collinear pieces merged."""
+    pieces = []
+    for (i, room), (j, other) in combinations(enumerate(rooms), 2):
+        for r in room.region:
+            for s in other.region:
+                for axis in (0, 1):
+                    low, high = max(r[1 - axis], s[1 - axis]), min(r[3 - axis], s[3 - axis])
+                    if low < high and (r[axis + 2] == s[axis] or s[axis + 2] == r[axis]):
+                        at = r[axis + 2] if r[axis + 2] == s[axis] else r[axis]
+                        pieces.append((i, j, axis, at, low, high))
+    merged = []
+    for i, j, axis, at, low, high in sorted(pieces):
+        if merged and merged[-1][:4] == (i, j, axis, at) and merged[-1][5] == low:
+            merged[-1] = (i, j, axis, at, merged[-1][4], high)
+        else:
+            merged.append((i, j, axis, at, low, high))
+    return [Contact(axis, at, low, high, i, j) for i, j, axis, at, low, high in merged]
+
+
+def clear(contact, others, depth):
+    """The part (low, high) of a contact that no other wall meets; `depth` as from `walls.depths`."""
+    low, high = contact.low, contact.high
+    for other in others:
+        if other.axis != contact.axis and other.low - REACH <= contact.at <= other.high + REACH:
+            before, after = depth(other)
+            if abs(other.at - contact.low) <= REACH:
+                low = max(low, other.at + after)
+            elif abs(other.at - contact.high) <= REACH:
+                high = min(high, other.at - before)
+    return low, high
+
+
+def _cost(a, b):
+    """The cost of a connection between rooms of kinds a and b."""
+    pair = frozenset((a, b))
+    return COSTS.get(pair, COST_ENTRY if "entry" in pair else COST_LIVING if "living" in pair else COST)
+
+
+def connections(rooms, spans, draws):
+    """The contacts to open: a cheapest tree over the rooms and some loops.
+
+    `spans` has the clear (low, high) of every contact. Returns (mean cost of the tree, [contact]), or None when no tree
+    reaches every room.
+    """
+    longest = {}
+    for contact, (low, high) in spans.items():
+        pair = contact.a, contact.b
+        if high - low >= LEAST_CONTACT and high - low > longest.get(pair, (0, None))[0]:
+            longest[pair] = high - low, contact
+    edges = sorted((_cost(rooms[a].kind, rooms[b].kind) + draws.uniform(0, .15), contact)
+                   for (a, b), (_, contact) in longest.items())
+    parts = list(range(len(rooms)))
+    chosen, rest, total = [], [], 0.
+    for cost, contact in edges:
+        a, b = parts[contact.a], parts[contact.b]
+        if a == b:
+            rest += [contact] if cost < CHEAP else []
+            continue
+        parts = [b if part == a else part for part in parts]
+        chosen.append(contact)
+        total += cost
+    if len(set(parts)) > 1:
+        return None
+    return total/(len(rooms) - 1), chosen + [contact for contact in rest if draws.chance(LOOPS)]
+
+
+def opening(contact, span, kinds, draws):
+    """The Opening made in a contact between rooms of two kinds, somewhere within the clear span (low, high)."""
+    low, high = span
+    open_plan = draws.chance(OPEN.get(frozenset(kinds), 0.))
+    if open_plan:
+        if draws.chance(FULL):
+            return Opening(contact, low, high, False)
+        width = draws.between(OPENING[0]//5, OPENING[1]//5)*5
+    else:
+        widths = list(DOORS)
+        if any(kind in SMALL for kind in kinds):
+            widths = [width for width in widths if width <= WIDEST_SMALL]
+        width = widths[draws.pick([DOORS[width] for width in widths])]
+    spare = high - low - width - 2*STUB
+    if spare < 0:
+        return Opening(contact, low, high, False)
+    offset = draws.below(2)*spare if draws.chance(IN_CORNER) else draws.between(0, spare)
+    return Opening(contact, low + STUB + offset, low + STUB + offset + width, not open_plan)

@@ -1,0 +1,122 @@
+"""What a home is to hold, and the outline it gets: rooms with areas, and a rectilinear footprint.
+
+The figures are calibrated on real homes: CubiCasa5k (Kalervo et al. 2019), the room graphs of CubiGraph5K (Lu et al.
+2021) and the annotations of Raster-to-Vector (Liu et al. 2017). Lengths are whole centimetres, areas cm2.
+"""
+from math import sqrt
+from typing import NamedTuple
+
+from . import regions
+
+
+class Kind(NamedTuple):
+    """A kind of room: median and log-deviation of its area in m2, least clear width in cm, how often it is added."""
+    median: float
+    sigma: float
+    width: int
+    weight: float = 0.
+    aspect: float = 2.6
+
+
+KINDS = {
+    "living": Kind(17., .30, 280),
+    "bath": Kind(3.1, .28, 115, .55),
+    "entry": Kind(5., .38, 115, aspect=4.6),
+    "bedroom": Kind(10.8, .18, 220, 1.),
+    "kitchen": Kind(9.5, .40, 190),
+    "closet": Kind(2.2, .35, 90, 1.55),
+    "storage": Kind(2.7, .50, 90, .75),
+    "lobby": Kind(1.2, .25, 90, .45),
+    "utility": Kind(5., .50, 140, .45),
+    "room": Kind(10., .35, 220, .55),
+}
+CORE = ("living", "bath", "entry", "bedroom", "kitchen")    # what the first five rooms of every home are
+
+MEDIAN_ROOMS, SIGMA_ROOMS, FEWEST_ROOMS, MOST_ROOMS = 8.3, .40, 3, 18
+MEDIAN_ASPECT, SIGMA_ASPECT, MOST_ASPECT = 1.42, .24, 2.4
+SCALE = .78         # of the areas: rooms that come out too small for their width are rejected, which favours large ones
+FIT = 1.5           # no room is smaller than this many squares of its least width
+ALLOWANCE = 12      # cm of a room's width that walls take
+WALLS = 1.07        # walls take 7 % of a footprint
+NOTCHES = (.10, .38, .34, .18)      # how often an outline has 0, 1, 2 or 3 notches
+AT_CORNER = .75     # of the notches; the others are bays in one side
+LEAST_NOTCH = 80    # cm a side
+LEAST_NECK = 220    # cm between two notches, or a notch and the side across
+STEP = 10           # cm; the lattice of outlines
+
+
+def room_count(draws):
+    """How many rooms a home has."""
+    count = int(draws.lognormal(MEDIAN_ROOMS, SIGMA_ROOMS) + .5)
+    return min(max(count, FEWEST_ROOMS), MOST_ROOMS)
+
+
+def programme(count, draws):
+    """`count` rooms as a list of (kind, area in cm2)."""
+    kinds = list(CORE[:count])
+    most = {"bedroom": 1 + count//4, "bath": 1 + count//6, "lobby": 1, "utility": 1}
+    while len(kinds) < count:
+        allowed = [kind for kind in KINDS if kinds.count(kind) < most.get(kind, count)]
+        kinds.append(allowed[draws.pick([KINDS[kind].weight for kind in allowed])])
+    scale = 10_000*draws.lognormal(SCALE, .15)
+    drawn = [int(draws.lognormal(KINDS[kind].median, KINDS[kind].sigma)*scale) for kind in kinds]
+    return [(kind, max(size, int(FIT*(KINDS[kind].width + ALLOWANCE)**2))) for kind, size in zip(kinds, drawn)]
+
+
+def _notch(width, height, share, at_corner, draws):
+    """A rectangle of about `share` of the bounding box cut from a corner or from the middle of a side, or None."""
+    ratio = draws.uniform(.6, 1.7)
+    across = int(sqrt(share*width*height*ratio))//STEP*STEP
+    down = int(sqrt(share*width*height/ratio))//STEP*STEP
+    if min(across, down) < LEAST_NOTCH or across > width - LEAST_NECK or down > height - LEAST_NECK:
+        return None
+    left, low = draws.below(2)*(width - across), draws.below(2)*(height - down)
+    if not at_corner:
+        room = width - across - 2*LEAST_NECK
+        if room < 0:
+            return None
+        left = LEAST_NECK + draws.between(0, room//STEP)*STEP
+    return left, low, left + across, low + down
+
+
+def _apart(a, b):
+    """The larger of the gaps along x and y between two rectangles, in cm."""
+    return max(max(a[0], b[0]) - min(a[2], b[2]), max(a[1], b[1]) - min(a[3], b[3]))
+
+
+def footprint(total, draws):
+    """The inner outline, as a region, of a home whose rooms have `total` cm2: a box less up to three notches."""
+    aspect = min(max(draws.lognormal(MEDIAN_ASPECT, SIGMA_ASPECT), 1.), MOST_ASPECT)
+    shares = [draws.uniform(.03, .15) for _ in range(draws.pick(NOTCHES))]
+    left = 1.
+    for share in shares:
+        left -= share
+    long = sqrt(total*WALLS/left*aspect)
+    sides = [max(int(side)//STEP*STEP, LEAST_NECK) for side in (long, long/aspect)]
+    width, height = sides if draws.chance(.5) else sides[::-1]
+
+    notches = []
+    for share in shares:
+        at_corner = draws.chance(AT_CORNER)
+        for _ in range(6):
+            notch = _notch(width, height, share, at_corner, draws)
+            if notch and all(_apart(notch, other) >= LEAST_NECK for other in notches):
+                notches.append(notch)
+                break
+    region = _without(width, height, notches)
+    return region if draws.chance(.5) else _without(height, width, [(b, a, d, c) for a, b, c, d in notches])
+
+
+def _without(width, height, notches):
+    """The box from (0, 0) less the notches, as a region."""
+    lines = sorted({0, width, *(x for notch in notches for x in (notch[0], notch[2]))})
+    region = []
+    for x0, x1 in zip(lines, lines[1:]):
+        low = max([0, *(n[3] for n in notches if n[0] <= x0 and n[2] >= x1 and n[1] == 0)])
+        high = min([height, *(n[1] for n in notches if n[0] <= x0 and n[2] >= x1 and n[3] == height)])
+        if region and region[-1][1] == low and region[-1][3] == high:
+            region[-1] = (region[-1][0], low, x1, high)
+        else:
+            region.append((x0, low, x1, high))
+    assert regions.connected(region, LEAST_NECK)
+    return region

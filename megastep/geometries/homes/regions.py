@@ -1,0 +1,110 @@
+"""Rectilinear regions: lists of disjoint rectangles (x0, y0, x1, y1) in whole centimetres, side by side.
+
+`footprint` makes them so that no two of their rectangles are stacked, and cuts keep it so: each rectangle is as tall as
+the region is there. Axis 0 is x, axis 1 is y.
+"""
+LATTICE = 5     # centimetres; where cuts may be
+
+
+def area(region):
+    """In cm2."""
+    return sum((x1 - x0)*(y1 - y0) for x0, y0, x1, y1 in region)
+
+
+def bounds(region):
+    """The bounding box (x0, y0, x1, y1)."""
+    x0, y0, x1, y1 = zip(*region)
+    return min(x0), min(y0), max(x1), max(y1)
+
+
+def cut(region, axis, at):
+    """The parts of a region below and above a line."""
+    lower, upper = [], []
+    for rectangle in region:
+        if rectangle[axis + 2] <= at:
+            lower.append(rectangle)
+        elif rectangle[axis] >= at:
+            upper.append(rectangle)
+        else:
+            x0, y0, x1, y1 = rectangle
+            lower.append((x0, y0, at, y1) if axis == 0 else (x0, y0, x1, at))
+            upper.append((at, y0, x1, y1) if axis == 0 else (x0, at, x1, y1))
+    return lower, upper
+
+
+def bands(region, axis):
+    """The region in slices across an axis, between all of its lines: a list of (low, high, length across)."""
+    if len(region) == 1:
+        r = region[0]
+        return [(r[axis], r[axis + 2], r[3 - axis] - r[1 - axis])]
+    lines = sorted({line for r in region for line in r[axis::2]})
+    return [(low, high, sum(r[3 - axis] - r[1 - axis] for r in region if r[axis] <= low and r[axis + 2] >= high))
+            for low, high in zip(lines, lines[1:])]
+
+
+def position(slices, wanted):
+    """The lattice line nearest to having `wanted` cm2 of a region's `bands` below it."""
+    for low, high, length in slices:
+        if wanted <= (high - low)*length:
+            break
+        wanted -= (high - low)*length
+    return (low + wanted//max(length, 1) + LATTICE//2)//LATTICE*LATTICE
+
+
+def corners(region, axis):
+    """{line: side} for the lines through the region's inner corners; the world outside is on side -1 (below) or +1."""
+    if len(region) == 1:
+        return {}
+    low, high = bounds(region)[axis::2]
+    lengths = {}
+    for r in region:
+        for line, side in (r[axis], 1), (r[axis + 2], -1):
+            below, above = lengths.get(line, (0, 0))
+            length = r[3 - axis] - r[1 - axis]
+            lengths[line] = (below + length, above) if side < 0 else (below, above + length)
+    return {line: 1 if above < below else -1 for line, (below, above) in lengths.items() if low < line < high}
+
+
+def connected(region, portal):
+    """Whether one can get everywhere in a region through contacts of at least `portal` cm."""
+    if len(region) == 1:
+        return True
+    reached, rest = [region[0]], list(region[1:])
+    for a in reached:
+        near = [b for b in rest if (a[2] == b[0] or b[2] == a[0]) and min(a[3], b[3]) - max(a[1], b[1]) >= portal]
+        reached += near
+        rest = [b for b in rest if b not in near]
+    return not rest
+
+
+def narrowest(region):
+    """The shortest line along x or y, in cm, from boundary to boundary of a region."""
+    shortest = min(y1 - y0 for _, y0, _, y1 in region)
+    levels = sorted({y for r in region for y in (r[1], r[3])})
+    for low, high in zip(levels, levels[1:]):
+        row = sorted((r[0], r[2]) for r in region if r[1] <= low and r[3] >= high)
+        runs = []
+        for x0, x1 in row:
+            if runs and runs[-1][1] == x0:
+                runs[-1][1] = x1
+            else:
+                runs.append([x0, x1])
+        shortest = min([shortest, *(x1 - x0 for x0, x1 in runs)])
+    return shortest
+
+
+def widest(region):
+    """The rectangle in a region that has the longest short side (the larger one when two do)."""
+    best = max(region, key=_breadth)
+    ordered = sorted(region)
+    for i, (x0, y0, x1, y1) in enumerate(ordered):
+        for other in ordered[i + 1:]:
+            if other[0] == x1 and min(y1, other[3]) > max(y0, other[1]):
+                x1, y0, y1 = other[2], max(y0, other[1]), min(y1, other[3])
+                best = max(best, (x0, y0, x1, y1), key=_breadth)
+    return best
+
+
+def _breadth(rectangle):
+    x0, y0, x1, y1 = rectangle
+    return min(x1 - x0, y1 - y0), (x1 - x0)*(y1 - y0)
