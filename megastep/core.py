@@ -56,9 +56,11 @@ class Core:
         )
 
     @staticmethod
-    def plot_state(state, ax=None, seen=None):
-        """Draws a numpyified :meth:`state` from above, with each camera's field of view. ``seen`` (T,) bools dims
-        static texels that are False. Returns the axes.
+    def plot_state(state, ax=None, seen=None, distances=None):
+        """Draws a numpyified :meth:`state` from above, with each camera's field of view. Returns the axes.
+
+        Args: ``seen`` (T,) bools, dims static texels that are False; ``distances`` (A, C, R) metres, to draw what is in
+        view instead of a wedge.
         """
         from . import plotting
 
@@ -68,7 +70,8 @@ class Core:
             agents = int(state.widths[: int(state.n_agent_lines)].sum())
             seen = np.split(np.concatenate([np.ones(agents, bool), seen]), ends[:-1])
         ax = plotting.plot_scenery(state.lines, colours, state.lights, seen=seen, ax=ax)
-        for position, angle in zip(state.positions, state.angles):
-            for yaw in state.yaws:
-                plotting.plot_sight(ax, position, angle + yaw, float(state.fov))
+        for a, (position, angle) in enumerate(zip(state.positions, state.angles, strict=True)):
+            for c, yaw in enumerate(state.yaws):
+                in_view = None if distances is None else distances[a, c]
+                plotting.plot_sight(ax, position, angle + yaw, float(state.fov), in_view)
         return ax

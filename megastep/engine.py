@@ -176,6 +176,8 @@ def _world(scenery, radius):
         designs.lines.vals.data_ptr(),
         designs.wall_starts.data_ptr(),
         designs.texel_starts.data_ptr(),
+        designs.boxes.data_ptr(),
+        designs.box_starts.data_ptr(),
         designs.texels.data_ptr(),
         designs.lights.vals.data_ptr(),
         designs.light_starts.data_ptr(),
@@ -234,6 +236,7 @@ def bake(scenery):
     design hides.
     """
     designs = scenery.designs
+    designs.bound()
     texel_wall = torch.repeat_interleave(
         torch.arange(len(designs.textures), dtype=torch.int32, device=scenery.device), designs.textures.widths
     )
@@ -296,7 +299,8 @@ def _look(scenery, agents, **fields):
     params.subsample, params.max_depth = 1, 10.0
     for name, value in fields.items():
         setattr(params, name, value.data_ptr() if isinstance(value, torch.Tensor) else value)
-    compile.launch('sight', params, scenery.device, 32 * scenery.n_envs * scenery.n_agents, shared=8 * agents.res)
+    threads = 32 * scenery.n_envs * scenery.n_agents
+    compile.launch('sight', params, scenery.device, threads, shared=8 * (agents.res + agents.res % 2))
     _checked(agents)
 
 

@@ -101,9 +101,9 @@ class RGB:
         screen = r.screen.reshape(self.core.n_envs, self.core.n_agents, -1, self.core.res, 3)
         return downsample(screen.permute(0, 1, 4, 2, 3), self.subsample).mean(-1)
 
-    def state(self, obs, e=0):
-        """The picture of world ``e`` in ``obs``, for plotting."""
-        return obs[e]
+    def state(self, e=0):
+        """What the agents of world ``e`` see now, (A, ...)."""
+        return self()[e]
 
 
 class Depth:
@@ -122,6 +122,10 @@ class Depth:
         depth = 1 - ((distances - self.core.agents.radius) / self.max_depth).clamp(0, 1)
         return downsample(depth, self.subsample).mean(-1)
 
+    def state(self, e=0):
+        """What the agents of world ``e`` see now, (A, ...)."""
+        return self()[e]
+
 
 class IMU:
     """Inertia: float32 (N, A, 3), angular velocity / 360 and the agent's own velocity, ahead and left, / 10."""
@@ -133,6 +137,10 @@ class IMU:
     def __call__(self):
         agents = self.core.agents
         return torch.cat([agents.angvelocity[..., None] / 360, to_local(agents.angles, agents.velocity) / 10], -1)
+
+    def state(self, e=0):
+        """What the agents of world ``e`` feel now, (A, ...)."""
+        return self()[e]
 
 
 # ---- Random events ----

@@ -71,6 +71,13 @@ def wall_textures(widths, random):
     return np.where(striped[:, None], stripe[wall], base[wall]).astype(np.float32)
 
 
+def _near_together(walls):
+    """Walls (M, 2, 2) along a Z-order curve through 1 m cells, so that each 32 of them lie in one part of the home."""
+    cells = walls.mean(1).astype(np.int64)
+    order = sum(((cells >> bit & 1) << np.array([2 * bit, 2 * bit + 1])).sum(-1) for bit in range(8))
+    return walls[np.argsort(order, kind='stable')]
+
+
 def scenery(geometries, n_agents=1, n_envs=None, seed=1, device=None):
     """Baked :class:`~megastep.scenery.Scenery` of ``n_envs`` worlds (default: one a geometry); world e shows geometry
     ``e % len(geometries)``.
@@ -93,7 +100,7 @@ def scenery(geometries, n_agents=1, n_envs=None, seed=1, device=None):
     engine.fit(n_envs, 20 * n_agents * len(model) + 4 * len(agent_textures) + 64, device)
 
     random = np.random.Generator(np.random.Philox(seed))
-    walls = np.concatenate([g.walls for g in geometries]).astype(np.float32).reshape(-1, 2, 2)
+    walls = np.concatenate([_near_together(np.reshape(g.walls, (-1, 2, 2))) for g in geometries]).astype(np.float32)
     widths = texel_widths(walls)
     positions = np.concatenate([np.reshape(g.lights, (-1, 2)) for g in geometries])
     lights = np.concatenate([positions, random.uniform(*INTENSITY, (len(positions), 1))], 1).astype(np.float32)

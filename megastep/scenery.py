@@ -110,9 +110,23 @@ class Designs:
                 raise ValueError(f'scenery needs one {name}, so {wanted} of them, but {given} were given')
         if len(textures.widths) and int(textures.widths.min()) < 1:
             raise ValueError('every wall needs at least one texel, but a texture of width 0 was given')
+        self.bound()
 
     def __len__(self):
         return len(self.lines)
+
+    def bound(self):
+        """Draws ``boxes`` around every 32 walls of a design, which let the GPU leave out what cannot be seen."""
+        groups = (self.lines.widths + 31) // 32
+        self.box_starts = _bounds(groups)
+        first = self.lines.starts[self.lines.inverse]
+        within = torch.arange(len(first), device=first.device) - first
+        group = self.box_starts.long()[self.lines.inverse] + within // 32
+        ends, where = self.lines.vals, group[:, None, None].expand(-1, 2, 2)
+        low = torch.full((int(groups.sum()), 2), torch.inf, device=first.device)
+        low.scatter_reduce_(0, where.reshape(-1, 2), ends.reshape(-1, 2), 'amin')
+        high = torch.full_like(low, -torch.inf).scatter_reduce_(0, where.reshape(-1, 2), ends.reshape(-1, 2), 'amax')
+        self.boxes = torch.cat([low, high], 1)
 
     @cached_property
     def most_texels(self):
@@ -166,7 +180,8 @@ class Scenery:
         return self
 
     def _fill(self, n_agents, designs, model, model_widths, design, device):
-        self.n_agents, self.designs, self.device = n_agents, designs, device
+        self.n_agents, self.designs, self.device = n_agents, designs, designs.texels.device
+        device = self.device
         self.model = _floats(model, device)
         self.model_texels = _bounds(torch.as_tensor(model_widths, device=device))
         self.design = torch.as_tensor(design, dtype=torch.int32, device=device).contiguous()

@@ -119,6 +119,7 @@ class Explorer:
         figure, plan, strips = plotting.panels(
             2, title=f'step {state.length}, {state.n_seen} of {len(state.seen)} texels seen'
         )
-        Core.plot_state(state.core, plan, seen=state.seen)
+        distances = engine.AGENT_RADIUS + 10 * (1 - state.obs.d[0].astype('float32'))
+        Core.plot_state(state.core, plan, seen=state.seen, distances=distances)
         plotting.plot_images({'rgb': state.obs.rgb, 'depth': state.obs.d}, aspect=plotting.STRIP, axes=strips)
         return figure

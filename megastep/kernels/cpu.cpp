@@ -10,6 +10,20 @@
 #define INFINITE __builtin_inff()
 static inline unsigned int or_bits(unsigned int* word, unsigned int bits) { unsigned int old = *word; *word = old | bits; return old; }
 #define OR_BITS(word, bits) or_bits(word, bits)
+// IEEE round to nearest even, on bits, so that it needs no instruction that some processors lack.
+static inline unsigned short half_bits(float value) {
+    union { float f; unsigned int u; } in; in.f = value;
+    unsigned int sign = (in.u >> 16) & 0x8000u, magnitude = in.u & 0x7fffffffu;
+    if (magnitude > 0x7f800000u) return (unsigned short)(sign | 0x7e00u);               // NaN
+    if (magnitude >= 0x477ff000u) return (unsigned short)(sign | 0x7c00u);              // rounds beyond 65504
+    if (magnitude < 0x38800000u) {                                                      // subnormal: a float addition does the rounding
+        union { float f; unsigned int u; } small; small.u = magnitude;
+        small.f += 0.5f;
+        return (unsigned short)(sign | (small.u - 0x3f000000u));
+    }
+    return (unsigned short)(sign | ((magnitude - 0x38000000u + 0xfffu + ((magnitude >> 13) & 1u)) >> 13));
+}
+#define HALF_BITS(x) half_bits(x)
 #include "params.h"
 #include "math.h"
 #include "scene.h"

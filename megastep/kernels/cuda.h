@@ -3,7 +3,7 @@
 #define DEVICE static __device__ __forceinline__
 #define KERNEL extern "C" __global__ void
 #define ALIGNED __align__(16)
-#define BOUNDS __launch_bounds__(128, 8)
+#define BOUNDS __launch_bounds__(128, 10)
 #define SQRT(x) sqrtf(x)
 #define CEIL(x) ceilf(x)
 #define FLOOR(x) floorf(x)
@@ -11,3 +11,5 @@
 #define NAN_VALUE __int_as_float(0x7fc00000)
 #define INFINITE __int_as_float(0x7f800000)
 #define OR_BITS(word, bits) atomicOr(word, bits)
+DEVICE unsigned short half_bits(float x) { unsigned short bits; asm("cvt.rn.f16.f32 %0, %1;" : "=h"(bits) : "f"(x)); return bits; }
+#define HALF_BITS(x) half_bits(x)

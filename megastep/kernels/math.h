@@ -147,6 +147,23 @@ HD Span span_of(const Camera& camera, const Screen& screen, float wax, float way
     return span;
 }
 
+// Squared distance from the camera to a box, or -1 if nothing in it can cover a pixel: all of it lies behind, or beyond one edge of the screen. The slack is
+// more than rounding can make of 200 m.
+HD float box_distance(const Camera& camera, float half_width, float lx, float ly, float hx, float hy) {
+    float slack = 1e-3f * (1.f + half_width);
+    int ahead = 0, rightwards = 0, leftwards = 0;
+    for (int corner = 0; corner < 4; corner++) {
+        float x, y;
+        to_camera(camera, corner & 1 ? hx : lx, corner & 2 ? hy : ly, x, y);
+        ahead |= x >= -1e-3f;
+        leftwards |= y - half_width * x <= slack;
+        rightwards |= y + half_width * x >= -slack;
+    }
+    if (!(ahead & leftwards & rightwards)) return -1.f;
+    float dx = high(high(lx - camera.x, camera.x - hx), 0.f), dy = high(high(ly - camera.y, camera.y - hy), 0.f);
+    return dx * dx + dy * dy;
+}
+
 // Inverse depth of a span at pixel r, whose ray is `length` long at unit depth; 0, which sees nothing, where that is within the agent's radius.
 HD float inverse_depth(const Span& span, const Screen& screen, int r, float length) {
     float inverse = span.base + span.gain * (float)r;
@@ -183,21 +200,6 @@ HD Filter filter_at(float location, int width) {
 HD int texel_at(float location, int width) { return clamp_int((int)(location * (float)width), 0, width - 1); }
 
 HD float mix(float a, float b, float weight) { return a + weight * (b - a); }
-
-// ---- Half precision: IEEE round to nearest even, on bits, so that it needs no header and no instruction ----
-
-HD unsigned short half_bits(float value) {
-    union { float f; unsigned int u; } in; in.f = value;
-    unsigned int sign = (in.u >> 16) & 0x8000u, magnitude = in.u & 0x7fffffffu;
-    if (magnitude > 0x7f800000u) return (unsigned short)(sign | 0x7e00u);               // NaN
-    if (magnitude >= 0x477ff000u) return (unsigned short)(sign | 0x7c00u);              // rounds beyond 65504
-    if (magnitude < 0x38800000u) {                                                      // subnormal: a float addition does the rounding
-        union { float f; unsigned int u; } small; small.u = magnitude;
-        small.f += 0.5f;
-        return (unsigned short)(sign | (small.u - 0x3f000000u));
-    }
-    return (unsigned short)(sign | ((magnitude - 0x38000000u + 0xfffu + ((magnitude >> 13) & 1u)) >> 13));
-}
 
 // ---- Random numbers: Philox 4x32-10 (Salmon et al. 2011). Key = seed, counter = (lane, draw) ----
 

@@ -6,6 +6,8 @@ struct World {
     const float* walls;            // (W, 4) ax ay bx by, metres: the static walls of all designs, one design after the other
     const int* wall_starts;        // (D + 1) first wall of each design
     const int* texel_starts;       // (W + 1) first texel of each wall
+    const float* boxes;            // (sum of ceil(walls / 32) over designs, 4) low x, low y, high x, high y of each 32 walls of a design
+    const int* box_starts;         // (D + 1) first box of each design
     float* texels;                 // (T, 4) red green blue light of each static texel
     const float* lights;           // (l, 3) x y intensity
     const int* light_starts;       // (D + 1)

@@ -1,5 +1,5 @@
 // What the operations share beyond single points and lines: one agent's move, its model's place, one pixel's colour. Both backends compile it.
-// Before it stand HD, NAN_VALUE, INFINITE, and OR_BITS(word, bits), which sets bits of a word of `seen` and returns what was there.
+// Before it stand HD, NAN_VALUE, INFINITE, HALF_BITS(x), the bits of x in half precision rounded to nearest even, and OR_BITS(word, bits), which sets bits of a word of `seen` and returns what was there.
 
 HD void notice(int* fault, int world, float x, float y, float angle) {
     if (!is_finite(x) || !is_finite(y) || !is_finite(angle)) *fault = world + 1;
@@ -34,9 +34,9 @@ HD void feel(const Sight& p, int agent) {
     float s, c, x = p.velocity[2 * agent], y = p.velocity[2 * agent + 1];
     sincos_degrees(p.angles[agent], s, c);
     unsigned short* imu = p.imu + 3 * (long long)agent;
-    imu[0] = half_bits(p.angvelocity[agent] / 360.f);
-    imu[1] = half_bits((c * x + s * y) / 10.f);
-    imu[2] = half_bits((c * y - s * x) / 10.f);
+    imu[0] = HALF_BITS(p.angvelocity[agent] / 360.f);
+    imu[1] = HALF_BITS((c * x + s * y) / 10.f);
+    imu[2] = HALF_BITS((c * y - s * x) / 10.f);
 }
 
 struct Pose { float x, y, sine, cosine; };
@@ -164,12 +164,12 @@ HD Ray shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const
 // A pixel is the mean of its rays, which are summed in order.
 HD void write_pixel(const Sight& p, long long view, int pixel, const Ray& sum) {
     int n_pixels = p.res / p.subsample;
-    float n = (float)p.subsample;
+    float share = 1.f / (float)p.subsample;
     if (p.rgb) {
         unsigned short* rgb = p.rgb + view * 3 * n_pixels + pixel;
-        rgb[0] = half_bits(sum.red / n); rgb[n_pixels] = half_bits(sum.green / n); rgb[2 * n_pixels] = half_bits(sum.blue / n);
+        rgb[0] = HALF_BITS(sum.red * share); rgb[n_pixels] = HALF_BITS(sum.green * share); rgb[2 * n_pixels] = HALF_BITS(sum.blue * share);
     }
-    if (p.depth) p.depth[view * n_pixels + pixel] = half_bits(sum.depth / n);
+    if (p.depth) p.depth[view * n_pixels + pixel] = HALF_BITS(sum.depth * share);
 }
 
 HD void draw_lane(const Draw& p, int lane) {
