@@ -27,6 +27,40 @@ def compute_dtype(weight):
     return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else weight.dtype
 
 
+class Standard(nn.Module):
+    """Pictures less their channels' running mean, over their running deviation; vectors likewise, number by number.
+
+    A picture's numbers may well be .87 plus or minus .1, of which a network that starts at random sees mostly the .87.
+    """
+
+    def __init__(self, space, least_scale=1e-2):
+        super().__init__()
+        is_picture = isinstance(space, spaces.MultiImage)
+        shape = (*space.shape[:2], 1, 1) if is_picture else space.shape
+        self.pooled = (0, -2, -1) if is_picture else (0,)
+        self.least_scale = least_scale  # what varies less than this is not worth looking at more closely
+        self.register_buffer('mean', torch.zeros(shape))
+        self.register_buffer('scale', torch.ones(shape))
+        self.register_buffer('count', torch.tensor(0.))
+
+    def forward(self, obs):
+        return (obs - self.mean) / self.scale
+
+    @torch.no_grad()
+    def rescale(self, obs):
+        """Takes observations (B, ...) into account, the n-th call with weight 1/n."""
+        self.count += 1
+        spread, seen = torch.var_mean(obs.float(), self.pooled, correction=0, keepdim=True)
+        mean, variance = _moments(self.mean, self.scale.square(), seen[0], spread[0], 1 / self.count)
+        self.mean.copy_(mean)
+        self.scale.copy_(variance.sqrt().clamp(min=self.least_scale))
+
+
+def _moments(mean, variance, seen, spread, rate):
+    """Mean and variance of a mixture: what they were, with weight 1 - rate, and what was seen now, with weight rate."""
+    return mean.lerp(seen, rate), variance.lerp(spread, rate) + rate * (1 - rate) * (seen - mean).square()
+
+
 class Flat(nn.Module):
     """A vector or a picture as it is, unrolled: (..., *shape) -> (..., n_features)."""
 
@@ -109,6 +143,8 @@ class ConcatIntake(nn.Module):
             raise ValueError(f'the observation space {space!r} has nothing in it to see')
         self.paths = [path for path, _ in leaves]
         self.encoders = nn.ModuleList(_encoder(leaf, encoder, '.'.join(path)) for path, leaf in leaves)
+        self.standards = nn.ModuleList(
+            nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else Standard(leaf) for _, leaf in leaves)
         sizes = [e.n_features for e in self.encoders]
         self.project = nn.Linear(sum(sizes), width)
         with torch.no_grad():
@@ -118,14 +154,22 @@ class ConcatIntake(nn.Module):
 
     def forward(self, obs):
         dtype = compute_dtype(self.project.weight)
-        features = []
-        for path, encoder in zip(self.paths, self.encoders, strict=True):
+        features = [encoder(standard(leaf)).to(dtype) for leaf, standard, encoder in self._leaves(obs)]
+        joined = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
+        return F.relu(self.project(joined))
+
+    def rescale(self, obs):
+        """Takes observations (B, ...) into account in how they are standardised from now on."""
+        for leaf, standard, _ in self._leaves(obs):
+            if isinstance(standard, Standard):
+                standard.rescale(leaf)
+
+    def _leaves(self, obs):
+        for path, standard, encoder in zip(self.paths, self.standards, self.encoders, strict=True):
             leaf = obs
             for key in path:
                 leaf = leaf[key]
-            features.append(encoder(leaf).to(dtype))
-        joined = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
-        return F.relu(self.project(joined))
+            yield leaf, standard, encoder
 
 
 def intake(space, width, encoder='linear'):
@@ -235,9 +279,8 @@ class ValueOutput(nn.Module):
         rate = (1 / self.count).clamp(min=rate, max=1.) * (n_valid > 0)
         seen = targets.masked_fill(~valid, 0.).sum() / n_valid.clamp(min=1)
         spread = (targets - seen).square().masked_fill(~valid, 0.).sum() / n_valid.clamp(min=1)
-        variance = self.scale.square().lerp(spread, rate) + rate * (1 - rate) * (seen - self.mean).square()
-
-        mean, scale = self.mean.lerp(seen, rate), variance.clamp(min=self.least_scale ** 2).sqrt()
+        mean, variance = _moments(self.mean, self.scale.square(), seen, spread, rate)
+        scale = variance.sqrt().clamp(min=self.least_scale)
         self.core.weight.mul_(self.scale / scale)
         self.core.bias.mul_(self.scale).add_(self.mean - mean).div_(scale)
         self.mean.copy_(mean)

@@ -92,6 +92,8 @@ class PPO:
                 batch = arrdict({**rollout.lanes(rows), **judged.map(torch.index_select, 1, rows)})
                 row, stopped = self._step(batch, stopped)
                 totals = totals + row
+        # Only now: a rollout is learned from as it was seen. One row is plenty, B lanes again with every rollout.
+        self.policy.intake.rescale(rollout.obs[-1])
         *sums, n_taken, n_skipped = totals.unbind()
         means = {key: total / n_taken for key, total in zip(_AVERAGED, sums, strict=True)}
         return {**means, 'explained_variance': explained, 'skipped_steps': n_skipped}

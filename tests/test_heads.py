@@ -178,3 +178,27 @@ def test_returns_that_never_vary_do_not_divide_by_zero():
     for _ in range(5):
         value.rescale(torch.zeros(64), EVERY)
     assert value.scale.item() == pytest.approx(1e-3) and value(torch.randn(8, WIDTH)).isfinite().all()
+
+
+def test_pictures_are_standardised_by_channel_and_vectors_by_number():
+    space = arrdict(rgb=spaces.MultiImage(1, 2, 1, 3), imu=spaces.MultiVector(1, 2))
+    intake = heads.intake(space, WIDTH)
+    rgb = torch.tensor([[1., 2., 3.], [10., 10., 40.]]).view(1, 1, 2, 1, 3).expand(4, -1, -1, -1, -1)
+    imu = torch.tensor([[5., 0.], [7., 0.], [5., 0.], [7., 0.]])[:, None]
+    intake.rescale(arrdict(rgb=rgb.half(), imu=imu.half()))
+    of_rgb, of_imu = intake.standards
+    torch.testing.assert_close(of_rgb(rgb)[0, 0, 0, 0], torch.tensor([-1.5 ** .5, 0., 1.5 ** .5]))  # deviation sqrt 2/3
+    torch.testing.assert_close(of_rgb(rgb)[0, 0, 1, 0], torch.tensor([-.5 ** .5, -.5 ** .5, 2 ** .5]))
+    torch.testing.assert_close(of_imu(imu)[:, 0, 0], torch.tensor([-1., 1., -1., 1.]))
+    assert not of_imu(imu)[..., 1].any()  # what never varies divides by no zero
+
+    # A second call weighs a half: mean (6 + 10) / 2, mean square (37 + 100) / 2
+    intake.rescale(arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.)))
+    assert of_imu.mean[0, 0].item() == 8 and of_imu.scale[0, 0].item() == pytest.approx((137 / 2 - 64) ** .5)
+
+
+def test_what_was_learned_about_observations_is_saved_with_the_weights():
+    intake, other, obs = heads.intake(TREE, WIDTH), heads.intake(TREE, WIDTH), draw(TREE, 6)
+    intake.rescale(obs)
+    other.load_state_dict(intake.state_dict())
+    assert torch.equal(other(obs), intake(obs))

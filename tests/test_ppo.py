@@ -137,6 +137,15 @@ def test_an_update_stops_once_the_policy_has_gone_too_far():
     assert torch.equal(stopped, once) and not torch.equal(four_times, once)
 
 
+def test_an_update_learns_how_observations_are_spread():
+    policy, rollout = made_up()
+    rollout.obs += 5
+    ppo.PPO(policy).update(rollout)
+    standard, last = policy.intake.standards[0], rollout.obs[-1]
+    torch.testing.assert_close(standard.mean, last.mean(0))
+    torch.testing.assert_close(standard(last).std(0, correction=0), torch.ones(1, 4))
+
+
 def test_the_learning_rate_can_be_changed():
     policy, rollout = made_up()
     learner, before = ppo.PPO(policy, lr=1e-2), weights(policy)
