@@ -7,6 +7,7 @@ import os
 import re
 import struct
 import tempfile
+import tokenize
 import zipfile
 import zlib
 from math import prod
@@ -22,9 +23,10 @@ MAX_GEOMETRIES = 16_384
 MAX_DIRECTORY = 8 << 20     # bytes of the zip's table of contents: five entries each of the most geometries
 MAX_UNPACKED = 96 << 20     # bytes of all arrays; twice that once masks are int16, so under 500 MB with Python itself
 MAX_ARRAY = 32 << 20        # bytes of one array: the most cells in the widest type
-MAX_HEADER = 4_096          # bytes of an array's own header; numpy writes 128
+MAX_HEADER = 1_024          # bytes of an array's own header, which is parsed as Python; numpy writes 118
 
-UNREADABLE = (ValueError, EOFError, OSError, NotImplementedError, SyntaxError, zipfile.BadZipFile, zlib.error)
+UNREADABLE = (ValueError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile, zlib.error,
+              SyntaxError, tokenize.TokenError, RecursionError, MemoryError)    # these by way of an array's header
 NAME = re.compile(r"(0|[1-9][0-9]{0,5})/([A-Za-z_][A-Za-z0-9_]{0,63})\.npy")
 
 

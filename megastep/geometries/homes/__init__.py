@@ -55,7 +55,7 @@ def _layout(draws):
 
 
 def generate(seed, outer=True):
-    """The home of a seed, any integer; if not `outer`, without its envelope's outer face, which nobody indoors sees.
+    """The home of a seed, any integer; if not `outer`, less its envelope's outer face, which nobody indoors sees.
 
     A geometry with further keys: `rooms`, the kind of each room in the order of the masks' numbers; `areas`, their
     clear areas in m2; `doors` and `openings`, the widths in metres of the gaps with and without a door; `n_outer`, how
@@ -73,9 +73,8 @@ def generate(seed, outer=True):
         for room, ring in zip(rooms, rings):
             ring += [triangle] if walls.holds(room.region, triangle) else []
 
-    lines = np.concatenate([inside, outside])
-    shift = START - lines.reshape(-1, 2).min(0)
-    lines = (lines + shift)/100
+    shift = START - outside.min((0, 1))
+    lines = (np.concatenate([inside, outside]) + shift)/100
     masks = geometry.masks(lines, [[(np.array(ring) + shift)/100 for ring in room] for room in rings])
     doors = [[(g.high - g.low)/100 for g in gaps if g.door is kind] for kind in (True, False)]
     return dotdict(

@@ -47,7 +47,7 @@ def clearance(g, most=.3):
         rows = slice(*np.searchsorted(-y, (-max(ay, by) - most, -min(ay, by) + most)))
         px, py = x[None, columns] - ax, y[rows, None] - ay
         dx, dy = bx - ax, by - ay
-        along = np.clip((px*dx + py*dy)/(dx*dx + dy*dy), 0, 1)
+        along = np.clip((px*dx + py*dy)/max(dx*dx + dy*dy, 1e-12), 0, 1)
         distance[rows, columns] = np.minimum(distance[rows, columns], np.hypot(px - along*dx, py - along*dy))
     return distance
 
@@ -68,7 +68,7 @@ def faults(g):
         found.append("a wall is not finite or has no length")
     if len(np.unique(canonical, axis=0)) < len(walls):
         found.append("two walls are the same")
-    if np.abs(g.walls.min((0, 1)) - 1).max() > 1e-3 and not g.get("n_outer") == 0:
+    if np.abs(g.walls.min((0, 1)) - 1).max() > 1e-3 and g.n_outer:
         found.append(f"coordinates start at {g.walls.min((0, 1))} and not at 1 m")
     if np.ptp(g.walls, axis=(0, 1)).max() > LARGEST or len(walls) > MOST_WALLS:
         found.append("it is too large")
@@ -89,7 +89,7 @@ def faults(g):
     if any(not (distance[fine == room] >= SPAWN).any() for room in range(1, rooms + 1)):
         found.append("a room has no point to spawn at")
     at = tuple(geometry.indices(g.lights, g.masks.shape, g.res).T)
-    if not (g.masks[at] == np.arange(1, rooms + 1)).all():
+    if not np.array_equal(g.masks[at], np.arange(1, rooms + 1)):
         found.append("a light is not in its room")
     if (distance[tuple(geometry.indices(g.lights, distance.shape, FINE).T)] < LIT).any():
         found.append("a light is in a wall")

@@ -65,7 +65,7 @@ def _arrays(path):
 
 @functools.lru_cache(maxsize=COUNT)
 def home(index, outer=True, path=PATH):
-    """The home of seed `index` as a geometry with `n_outer`; `outer` as for `generate`, except that nothing moves."""
+    """The home of seed `index` as a geometry with `n_outer`; `outer` as for `generate`."""
     arrays, starts = _arrays(path)
     _, n_outer, _, height, width = arrays["widths"][index]
     walls, lights, cells = (arrays[key][a:b] for key, a, b in

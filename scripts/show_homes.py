@@ -1,0 +1,54 @@
+"""Draws a sheet of homes, all at one scale, as a picture.
+
+    python scripts/show_homes.py homes.png --first 0 --count 20
+"""
+import argparse
+import sys
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from matplotlib import pyplot as plt
+
+from megastep import geometry
+from megastep.geometries import homes
+
+COLUMNS = 5
+LABELS = {"living": "living", "bath": "bath", "entry": "entry", "bedroom": "bed", "kitchen": "kitchen", "lobby": "lob",
+          "closet": "clo", "storage": "sto", "utility": "util", "room": "room"}
+
+
+def sheet(seeds):
+    """A figure with the plans of the homes of these seeds, each room named and the corner at the same place."""
+    made = [homes.generate(seed) for seed in seeds]
+    rows = -(-len(made)//COLUMNS)
+    figure, axes = plt.subplots(rows, COLUMNS, figsize=(4*COLUMNS, 4*rows), squeeze=False, layout="constrained")
+    side = max(np.ptp(g.walls, axis=(0, 1)).max() for g in made) + 1
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for g, ax in zip(made, axes.flat):
+        geometry.display(g, ax)
+        ax.set(xlim=(.5, side + .5), ylim=(.5, side + .5))
+        ax.set_title(f"home {g.id}: {sum(g.areas):.0f} m², {len(g.rooms)} rooms, {len(g.walls)} walls", fontsize=9)
+        for kind, (x, y), area in zip(g.rooms, g.lights, g.areas):
+            ax.text(x, y - .2, LABELS[kind], ha="center", va="top", fontsize=5 + 2*(area > 4))
+    return figure
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("path", help="the picture to write, say homes.png")
+    parser.add_argument("--first", type=int, default=0, help="the seed of the first home")
+    parser.add_argument("--count", type=int, default=20)
+    args = parser.parse_args()
+    if args.count < 1:
+        raise SystemExit(f"--count {args.count} is not allowed: take 1 or more.")
+    sheet(range(args.first, args.first + args.count)).savefig(args.path, dpi=70)
+
+
+if __name__ == "__main__":
+    main()
