@@ -29,7 +29,8 @@ def test_the_column_is_a_pillar_in_a_box():
 
 @pytest.mark.parametrize("make, message", [
     (lambda: toys.box(0), "width=0 m is not allowed: take 1 to 199"), (lambda: toys.box(500), "width=500 m"),
-    (lambda: toys.column(5, 5), "pillar=5 m does not fit a box 5 m wide"), (lambda: toys.box(np.nan), "width=nan")])
+    (lambda: toys.column(5, 5), "pillar=5 m does not fit a box 5 m wide"), (lambda: toys.box(np.nan), "width=nan"),
+    (lambda: toys.box("5"), "width='5' m"), (lambda: toys.column(pillar=None), "pillar=None m")])
 def test_toys_of_impossible_size_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
@@ -64,7 +65,7 @@ def test_options_reach_the_source():
     (("homes", 1, "train"), {}, "no split 'train'; did you mean 'training'"),
     (("homes", 0), {}, "n=0 geometries"), (("homes", 1.5), {}, "n=1.5 geometries"),
     (("column", 1), {"pilar": 1}, "called 'pilar'; did you mean 'pillar'"),
-    (("files", 1), {}, "needs its option path"),
+    (("files", 1), {}, "needs its option path"), (("files", 1), {"path": None}, "needs its option path"),
     (("files", 1), {"path": "nowhere.npz"}, "no geometry file 'nowhere.npz'")])
 def test_sample_names_what_it_does_not_know(arguments, options, message):
     with pytest.raises(ValueError, match=message):

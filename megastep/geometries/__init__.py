@@ -88,6 +88,6 @@ def sample(name, n, split="training", seed=1, **options):
         _known(f"option of geometry source {name!r} called", option, allowed)
     if not isinstance(n, (int, np.integer)) or isinstance(n, bool) or n < 1:
         raise ValueError(f"n={n!r} geometries cannot be sampled; ask for a whole number of 1 or more.")
-    if name == "files" and "path" not in options:
+    if name == "files" and options.get("path") is None:
         raise ValueError("Geometry source 'files' needs its option path, an .npz file of geometries.")
     return SOURCES[name](int(n), split, int(seed), **options)

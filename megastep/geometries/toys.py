@@ -1,4 +1,6 @@
 """Geometries small enough to know by heart."""
+from numbers import Real
+
 import numpy as np
 
 from .. import geometry
@@ -24,7 +26,7 @@ def _toy(rings, lights):
 
 
 def _checked_width(width, least):
-    if not least <= width <= geometry.MAX_EXTENT - CORNER:
+    if not isinstance(width, Real) or not least <= width <= geometry.MAX_EXTENT - CORNER:
         raise ValueError(f"width={width!r} m is not allowed: take {least:g} to {geometry.MAX_EXTENT - CORNER:g}")
 
 
@@ -37,7 +39,7 @@ def box(width=5):
 def column(width=5, pillar=1):
     """A box with a square pillar of side `pillar` metres in its middle, and a light in two opposite corners."""
     _checked_width(width, 2)
-    if not 0 < pillar <= width - 1:
+    if not isinstance(pillar, Real) or not 0 < pillar <= width - 1:
         raise ValueError(f"pillar={pillar!r} m does not fit a box {width} m wide: take above 0 and up to {width - 1:g}")
     rings = [_square(CORNER, width), _square(CORNER + (width - pillar)/2, pillar)[::-1]]
     near = (width - pillar)/4

@@ -7,7 +7,6 @@ and its masks' height and width.
 import functools
 import hashlib
 import io
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -18,32 +17,6 @@ from ...dotdict import dotdict
 COUNT = 5_000
 PATH = Path(__file__).parents[1]/"data"/"homes.npz"
 REMEDY = "install megastep again, or run scripts/make_homes.py"
-
-
-def packed(homes):
-    """The bytes of a database of homes as `generate` makes them."""
-    arrays = {
-        "walls": np.concatenate([np.rint(g.walls*100) for g in homes]).astype("<i2"),
-        "lights": np.concatenate([np.rint(g.lights*100) for g in homes]).astype("<i2"),
-        "masks": np.concatenate([g.masks.ravel() for g in homes]).astype("i1"),
-        "widths": np.array([(len(g.walls), g.n_outer, len(g.lights), *g.masks.shape) for g in homes], "<i4")}
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, values in arrays.items():
-            entry = zipfile.ZipInfo(f"{name}.npy")      # dated 1980: the same homes give the same bytes
-            entry.compress_type = zipfile.ZIP_LZMA
-            with archive.open(entry, "w") as file:
-                np.lib.format.write_array(file, values, allow_pickle=False)
-    return buffer.getvalue()
-
-
-def write(homes, path=PATH):
-    """Writes a database and, beside it, its sha256 in the form of the command sha256sum. Returns the digest."""
-    content = packed(homes)
-    digest = hashlib.sha256(content).hexdigest()
-    Path(path).write_bytes(content)
-    Path(path).with_suffix(".sha256").write_text(f"{digest}  {Path(path).name}\n")
-    return digest
 
 
 @functools.lru_cache(maxsize=1)

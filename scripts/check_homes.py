@@ -1,7 +1,7 @@
-"""What every home must be, looked at from its walls and masks alone, on a raster of 5 cm."""
+"""What every home must be, by its walls and masks alone, on a raster of 5 cm; `make_homes.py` asks for it."""
 import numpy as np
 
-from ... import geometry
+from megastep import geometry
 
 FINE = .05          # metres a cell
 RADIUS = .15/2**.5  # metres; an agent's
@@ -83,7 +83,7 @@ def faults(g):
     distance = clearance(g)
     ratio = round(g.res/FINE)
     fine = np.maximum(g.masks, 0).repeat(ratio, 0).repeat(ratio, 1)
-    for radius, what in (RADIUS, "an agent"), (GAP/2, "a disc as wide as the narrowest passage"):
+    for radius, what in (RADIUS, "an agent"), (GAP/2, "a disc as wide as the least gap"):
         if not _reaches(components(distance > radius - 1e-3)[0], fine):
             found.append(f"{what} cannot reach every room")
     if any(not (distance[fine == room] >= SPAWN).any() for room in range(1, rooms + 1)):
