@@ -147,10 +147,12 @@ HD Span span_of(const Camera& camera, const Screen& screen, float wax, float way
     return span;
 }
 
-// Squared distance from the camera to a box, or -1 if nothing in it can cover a pixel: all of it lies behind, or beyond one edge of the screen. The slack is
-// more than rounding can make of 200 m.
-HD float box_distance(const Camera& camera, float half_width, float lx, float ly, float hx, float hy) {
-    float slack = 1e-3f * (1.f + half_width);
+// What a box may cover: pixels [first, last], inverse depths up to `most`; its squared distance from the camera, or -1 if nothing in it can cover a pixel: all of it
+// lies behind, or beyond one edge of the screen. The slack is more than rounding can make of 200 m.
+struct Cover { float distance, most; int first, last; };
+
+HD Cover cover_of(const Camera& camera, const Screen& screen, float half_width, float lx, float ly, float hx, float hy) {
+    float slack = 1e-3f * (1.f + half_width), nearest = 1e9f, low_pixel = 1e9f, high_pixel = -1e9f;
     int ahead = 0, rightwards = 0, leftwards = 0;
     for (int corner = 0; corner < 4; corner++) {
         float x, y;
@@ -158,10 +160,20 @@ HD float box_distance(const Camera& camera, float half_width, float lx, float ly
         ahead |= x >= -1e-3f;
         leftwards |= y - half_width * x <= slack;
         rightwards |= y + half_width * x >= -slack;
+        nearest = low(nearest, x);
+        float pixel = screen.middle - screen.scale * (y / x);
+        low_pixel = low(low_pixel, pixel); high_pixel = high(high_pixel, pixel);
     }
-    if (!(ahead & leftwards & rightwards)) return -1.f;
     float dx = high(high(lx - camera.x, camera.x - hx), 0.f), dy = high(high(ly - camera.y, camera.y - hy), 0.f);
-    return dx * dx + dy * dy;
+    Cover cover = {dx * dx + dy * dy, 1e9f, 0, screen.res - 1};
+    if (!(ahead & leftwards & rightwards)) cover.distance = -1.f;
+    if (nearest > 0.01f) {                                       // wholly ahead: then its corners bound what it covers
+        float last = (float)(screen.res - 1);
+        cover.most = 1.01f / (nearest - 1e-3f);
+        cover.first = (int)clamp(low_pixel - 1.f, 0.f, last);
+        cover.last = (int)clamp(high_pixel + 2.f, 0.f, last);
+    }
+    return cover;
 }
 
 // Inverse depth of a span at pixel r, whose ray is `length` long at unit depth; 0, which sees nothing, where that is within the agent's radius.

@@ -1,4 +1,5 @@
-// One warp a world: lanes over the walls (and the other agents) for each agent in turn, then the agents move together.
+// One warp a world: for each agent in turn lanes over boxes around 32 walls each, then over the walls of those that its path meets, and over the other agents; then
+// the agents move together.
 KERNEL physics(Motion p) {
     const World& w = p.world;
     int world = (blockIdx.x * blockDim.x + threadIdx.x) / 32, lane = threadIdx.x % 32, A = w.n_agents;
@@ -14,11 +15,19 @@ KERNEL physics(Motion p) {
         float px = p.positions[2 * i], py = p.positions[2 * i + 1];
         float dx = p.velocity[2 * i] * p.seconds, dy = p.velocity[2 * i + 1] * p.seconds;
         float contact = NO_CONTACT;
-        if (dx != 0.f || dy != 0.f)
-            for (int j = w.wall_starts[design] + lane; j < w.wall_starts[design + 1]; j += 32) {
+        for (int start = w.box_starts[design]; start < w.box_starts[design + 1]; start += 32) {
+            int meets = 0;
+            if (start + lane < w.box_starts[design + 1] && (dx != 0.f || dy != 0.f)) {
+                float4 b = ((const float4*)w.boxes)[start + lane];
+                meets = boxes_meet(px, py, dx, dy, b.x, b.y, b.z, b.w, rho);
+            }
+            for (unsigned int some = __ballot_sync(~0u, meets); some; some &= some - 1) {
+                int j = w.wall_starts[design] + 32 * (start - w.box_starts[design] + __ffs(some) - 1) + lane;
+                if (j >= w.wall_starts[design + 1]) continue;
                 float4 b = ((const float4*)w.walls)[j];
                 contact = low(contact, sweep_segment(px, py, dx, dy, b.x, b.y, b.z, b.w, rho));
             }
+        }
         for (int other = lane; other < A; other += 32) {
             int k = world * A + other;
             if (other != a)

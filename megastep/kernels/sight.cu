@@ -50,14 +50,19 @@ DEVICE void raster_walls(View& v, const World& w, const Scene& scene, int design
     int end = w.box_starts[design + 1];
     for (int start = w.box_starts[design]; start < end; start += 32) {
         unsigned int key = ~0u;
+        Cover cover = {-1.f, 0.f, 0, 0};
         if (start + v.lane < end) {
             float4 b = ((const float4*)w.boxes)[start + v.lane];
-            float distance = box_distance(v.camera, half_width, b.x, b.y, b.z, b.w);
-            if (distance >= 0.f) key = __float_as_uint(distance);
+            cover = cover_of(v.camera, v.screen, half_width, b.x, b.y, b.z, b.w);
+            if (cover.distance >= 0.f) key = __float_as_uint(cover.distance);
         }
+        int blocks = cover.first / 32 | cover.last / 32 << 16;
         for (unsigned int nearest = __reduce_min_sync(~0u, key); nearest != ~0u; nearest = __reduce_min_sync(~0u, key)) {
             int k = __ffs(__ballot_sync(~0u, key == nearest)) - 1;
             if (v.lane == k) key = ~0u;
+            int both = __shfl_sync(~0u, blocks, k);
+            float most = __shfl_sync(~0u, cover.most, k), floor = v.lane >= (both & 0xffff) && v.lane <= both >> 16 ? v.floor : INFINITE;
+            if (__all_sync(~0u, floor > most)) continue;         // all of it is behind what is already there
             int l = 32 * (start - w.box_starts[design] + k) + v.lane;
             raster_group(v, scene.walls + 4 * l, scene.n_agent_lines + l, l < scene.n_walls);
         }
