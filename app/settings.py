@@ -99,9 +99,10 @@ class Minimal:
 class Explorer:
     """Arguments of `envs.Explorer`."""
     name: str
+    resample: bool
     n_envs: int = within(1, MOST_ENVS)
     res: int = within(1, 1024)
-    subsample: int = within(1, 1024)
+    subsample: int = within(1, 32)
     fov: float = within(0, 180, low_open=True, high_open=True)
     fps: float = within(1, 1000)
     patience: int = within(1, 10**6)

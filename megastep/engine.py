@@ -30,6 +30,7 @@ __all__ = [
     'observe',
     'physics',
     'render',
+    'spawn',
 ]
 
 AGENT_WIDTH = 0.15
@@ -368,6 +369,31 @@ def observe(
         **{name: tensor for name, tensor in out._asdict().items() if tensor is not None},
     )
     return out
+
+
+def spawn(scenery, agents, mask, points, counts, seed, resample=False):
+    """Puts agents at random points of their world's design, at rest, looking anywhere: one Philox draw each.
+
+    Args: ``mask`` (N, A) bool, who; ``points`` (D, n, 2), of which the agents of one world have n / A each; ``counts``
+    (N, A) int32, draws made so far, advanced here; ``resample``: a world all of whose agents respawn moves to a random
+    design first.
+    """
+    where, lanes = scenery.device, (scenery.n_envs, scenery.n_agents)
+    n_designs, n_points = len(scenery.designs), points.shape[1]
+    if n_points < scenery.n_agents:
+        raise ValueError(f'{scenery.n_agents} agents need at least as many points, but {n_points} a design were given')
+    params = compile.STRUCTS['Spawn'](
+        _world(scenery, agents.radius),
+        *_state(scenery, agents, 'positions', 'angles', 'velocity', 'angvelocity'),
+        _pointer('mask', mask, lanes, torch.bool, where),
+        _pointer('points', points, (n_designs, n_points, 2), torch.float32, where),
+        _pointer('counts', counts, lanes, torch.int32, where),
+        seed & 0xFFFFFFFF,
+        seed >> 32 & 0xFFFFFFFF,
+        n_points,
+        n_designs if resample else 0,
+    )
+    compile.launch('spawn', params, where, scenery.n_envs)
 
 
 def draw(counts, mask, seed, out):

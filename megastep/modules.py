@@ -194,37 +194,25 @@ def _clearance(points, walls):
 class RandomSpawns:
     """Puts agents somewhere random in the rooms of their world's design, at rest, looking anywhere.
 
-    ``n_spawns`` points a design are found once, 5 cm clear of the collision disc; each respawn picks one by
-    :class:`Draws`. Agents of one world take distinct points. ``geometries`` are those the scenery was made from.
+    ``n_spawns`` points a design are found once, 5 cm clear of the collision disc; each respawn picks one, and agents of
+    one world have points of their own. With ``resample`` a world whose agents all respawn moves to another design
+    first. ``geometries`` are those the scenery was made from.
     """
 
-    def __init__(self, geometries, core, n_spawns=128, seed=None):
-        self.core = core
-        seed = core.seed if seed is None else seed
-        points = np.stack(
-            [
-                _spawn_points(
-                    g, n_spawns, engine.AGENT_RADIUS + 0.05, np.random.Generator(np.random.Philox(key=[seed, d]))
-                )
-                for d, g in enumerate(geometries[: len(core.scenery.designs)])
-            ]
-        )
-        self.points = torch.as_tensor(points, dtype=torch.float32, device=core.device)
-        self.draws = Draws(core.n_envs * core.n_agents, seed, core.device)
-        self._offset = torch.arange(core.n_agents, device=core.device)[None] * (n_spawns // max(core.n_agents, 1))
+    def __init__(self, geometries, core, n_spawns=128, resample=False, seed=None):
+        self.core, self.resample = core, resample
+        self.seed = core.seed if seed is None else seed
+        points = [
+            _spawn_points(g, n_spawns, engine.AGENT_RADIUS + .05, np.random.Generator(np.random.Philox([self.seed, d])))
+            for d, g in enumerate(geometries[: len(core.scenery.designs)])
+        ]
+        self.points = torch.as_tensor(np.stack(points), dtype=torch.float32, device=core.device)
+        self.counts = torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
 
     def __call__(self, reset):
         """Respawns the agents marked in ``reset``, (N, A) or (B,) bool."""
-        core, agents = self.core, self.core.agents
-        reset = reset.reshape(core.n_envs, core.n_agents)
-        chance = self.draws(reset).view(core.n_envs, core.n_agents, 4)
-        n, stride = self.points.shape[1], max(self.points.shape[1] // max(core.n_agents, 1), 1)
-        choice = (self._offset + (chance[..., 0] * stride).long()) % n
-        points = self.points[core.scenery.design.long()[:, None], choice]
-        agents.positions.copy_(torch.where(reset[..., None], points, agents.positions))
-        agents.angles.copy_(torch.where(reset, 360 * chance[..., 1] - 180, agents.angles))
-        agents.velocity.masked_fill_(reset[..., None], 0.0)
-        agents.angvelocity.masked_fill_(reset, 0.0)
+        reset = reset.reshape(self.core.n_envs, self.core.n_agents)
+        engine.spawn(self.core.scenery, self.core.agents, reset, self.points, self.counts, self.seed, self.resample)
 
 
 class RandomLifespans:

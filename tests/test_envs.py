@@ -217,3 +217,16 @@ def test_minimal_forward_moves_a_metre_a_step():
     assert np.allclose(env.core.agents.positions.tolist(), [[[3.0, 4.0]]], atol=1e-5), (
         '10 m/s for a tenth of a second, along +y'
     )
+
+
+def test_explorer_resamples_homes_at_respawn_alone(device):
+    env, generator, moved = make('explorer', device, resample=True), torch.Generator().manual_seed(1), 0
+    env.reset()
+    for _ in range(60):
+        before = env.core.scenery.design.clone()
+        world = env.step(arrdict.arrdict(actions=contract.random_actions(env, generator)))
+        changed = before != env.core.scenery.design
+        assert not bool((changed & ~world.reset).any()), 'homes change at respawns alone'
+        moved += int(changed.sum())
+    assert moved and set(env.core.scenery.design.tolist()) <= {0, 1, 2, 3}
+    assert int(env.state(0).seen.sum()) == int(env.n_seen[0]), 'what was seen belongs to the new home'

@@ -27,33 +27,15 @@ class Explorer:
     n_agents = 1
 
     def __init__(
-        self,
-        n_envs=128,
-        geometries=None,
-        *,
-        seed=1,
-        device=None,
-        res=256,
-        subsample=4,
-        fov=130.0,
-        fps=10.0,
-        patience=PATIENCE,
+        self, n_envs=128, geometries=None, *, seed=1, device=None,
+        res=256, subsample=4, fov=130., fps=10., patience=PATIENCE, resample=False,
     ):
         geometries = sources.sample('homes', min(n_envs, 512), seed=seed) if geometries is None else geometries
         self.core = Core(
-            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
-            res=res,
-            fov=fov,
-            fps=fps,
-            seed=seed,
+            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device), res, fov, fps, seed=seed
         )
-        self.n_envs, self.device, self.subsample, self.patience = (
-            self.core.n_envs,
-            self.core.device,
-            subsample,
-            patience,
-        )
-        self.spawner = modules.RandomSpawns(geometries, self.core)
+        self.n_envs, self.device, self.subsample, self.patience = n_envs, self.core.device, subsample, patience
+        self.spawner = modules.RandomSpawns(geometries, self.core, resample=resample)
         self.movement = modules.MomentumMovement(self.core)
         pixels = modules.RGB(self.core, subsample).space.W
         self.obs_space = dotdict(

@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 
 HERE = Path(__file__).parent
-OPERATIONS = ('bake', 'physics', 'place', 'sight', 'draw')
+OPERATIONS = ('bake', 'physics', 'place', 'sight', 'spawn', 'draw')
 CPU_FLAGS = (
     '-std=c++17',
     '-O3',

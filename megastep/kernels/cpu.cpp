@@ -196,3 +196,9 @@ extern "C" void draw(const Draw* given) {
     #pragma omp parallel for schedule(static) num_threads(p.n_threads)
     for (int lane = 0; lane < p.n_lanes; lane++) draw_lane(p, lane);
 }
+
+extern "C" void spawn(const Spawn* given) {
+    const Spawn& p = *given;
+    #pragma omp parallel for schedule(static) num_threads(p.world.n_threads)
+    for (int world = 0; world < p.world.n_worlds; world++) spawn_world(p, world);
+}

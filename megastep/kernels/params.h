@@ -11,7 +11,7 @@ struct World {
     float* texels;                 // (T, 4) red green blue light of each static texel
     const float* lights;           // (l, 3) x y intensity
     const int* light_starts;       // (D + 1)
-    const int* design;             // (N) which design a world shows
+    int* design;                   // (N) which design a world shows
     const float* model;            // (M, 4) the agent model about its own origin
     const int* model_texels;       // (A M + 1) first texel of each agent line within its world's K
     const float* agent_textures;   // (D, K, 3)
@@ -83,6 +83,21 @@ struct Sight {
     const unsigned char* forget;   // (N, A) where not 0, seen is cleared first
     int* fresh;                    // (N, A) out: texels seen now that were not in seen
     int n_words;
+};
+
+struct Spawn {
+    World world;
+    float* positions;              // (N, A, 2) out, as all the rest, where mask
+    float* angles;                 // (N, A)
+    float* velocity;               // (N, A, 2)
+    float* angvelocity;            // (N, A)
+    const unsigned char* mask;     // (N, A) agents that respawn
+    const float* points;           // (D, n_points, 2) where agents of each design may stand
+    int* counts;                   // (N, A) how many draws each lane has made
+    unsigned int seed_low;
+    unsigned int seed_high;
+    int n_points;
+    int n_designs;                 // a world all of whose agents respawn moves to one of so many designs; 0: it stays
 };
 
 struct Draw {

@@ -172,6 +172,23 @@ HD void write_pixel(const Sight& p, long long view, int pixel, const Ray& sum) {
     if (p.depth) p.depth[view * n_pixels + pixel] = HALF_BITS(sum.depth * share);
 }
 
+// Respawns a world's agents: each at a point of its own share of the design's points, at rest, looking anywhere.
+HD void spawn_world(const Spawn& p, int world) {
+    int A = p.world.n_agents, all = 1;
+    for (int a = 0; a < A; a++) all &= p.mask[world * A + a] != 0;
+    for (int a = 0; a < A; a++) {
+        int i = world * A + a, share = p.n_points / A;
+        if (!p.mask[i]) continue;
+        Four bits = philox((unsigned int)i, (unsigned int)p.counts[i]++, p.seed_low, p.seed_high);
+        if (a == 0 && all && p.n_designs) p.world.design[world] = (int)(uniform(bits.c) * (float)p.n_designs);
+        int point = a * share + (int)(uniform(bits.a) * (float)share);
+        const float* at = p.points + 2 * ((long long)p.world.design[world] * p.n_points + point);
+        p.positions[2 * i] = at[0]; p.positions[2 * i + 1] = at[1];
+        p.angles[i] = 360.f * uniform(bits.b) - 180.f;
+        p.velocity[2 * i] = 0.f; p.velocity[2 * i + 1] = 0.f; p.angvelocity[i] = 0.f;
+    }
+}
+
 HD void draw_lane(const Draw& p, int lane) {
     if (!p.mask[lane]) return;
     Four bits = philox((unsigned int)lane, (unsigned int)p.counts[lane], p.seed_low, p.seed_high);
