@@ -21,7 +21,7 @@ class Explorer:
     view's included, + 200.
 
     Args: ``geometries`` to live in, generated homes by default; ``res`` rays and ``subsample`` rays a pixel; ``fov``
-    degrees; ``patience`` steps.
+    degrees; ``patience`` steps; ``resample``, every episode in a home drawn anew, instead of one home a world for ever.
     """
 
     n_agents = 1
