@@ -15,7 +15,7 @@ from app.interruptions import Interrupted
 from app.settings import Fault, Faults, Train, build
 
 TINY = ["env=minimal", "geometry=box", "agent=small", "env.n_envs=4", "env.res=8", "env.shortest=5", "env.longest=9",
-        "learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8", "device=cpu"]
+        "learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8", "device=cpu", "report=1"]
 UPDATE = 4 * 8     # samples of one update
 
 
@@ -128,7 +128,7 @@ def test_a_signal_finishes_the_step_saves_and_says_how_to_go_on(here, monkeypatc
             os.kill(os.getpid(), number)
 
     monkeypatch.setattr(metrics.Metrics, "write", write)
-    assert train.main(TINY) == code
+    assert train.main([*TINY, "seconds=20"]) == code
     folder = next((here / "runs").iterdir())
     assert checkpoint.load(folder / "checkpoints").step == 2 * UPDATE
     assert f"python train.py resume=runs/{folder.name}" in capsys.readouterr().err
