@@ -286,6 +286,7 @@ def place(scenery, agents, lit=True):
 
 def _look(scenery, agents, **fields):
     half = math.radians(agents.fov / 2)
+    width = math.tan(half)
     params = compile.STRUCTS['Sight'](
         _world(scenery, agents.radius),
         *_state(scenery, agents, 'positions', 'angles'),
@@ -294,12 +295,17 @@ def _look(scenery, agents, **fields):
         agents.fault.data_ptr(),
         len(agents.yaws),
         agents.res,
-        math.tan(half),
+        width,
+        width * (agents.res - 1) / agents.res,
+        2 * width / agents.res,
+        agents.res / 2 - 0.5,
+        agents.res / (2 * width),
         0.99 * agents.radius * math.cos(half),
     )
     params.subsample, params.max_depth = 1, 10.0
     for name, value in fields.items():
         setattr(params, name, value.data_ptr() if isinstance(value, torch.Tensor) else value)
+    params.n_pixels, params.share = agents.res // params.subsample, 1 / params.subsample
     threads = 32 * scenery.n_envs * scenery.n_agents
     compile.launch('sight', params, scenery.device, threads, shared=8 * (agents.res + agents.res % 2))
     _checked(agents)

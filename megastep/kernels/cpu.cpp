@@ -163,7 +163,7 @@ extern "C" void sight(const Sight* given) {
             int world = agent / w.n_agents, a = agent % w.n_agents, fresh = 0;
             Scene scene = scene_of(w, world);
             notice(p.fault, world, p.positions[2 * agent], p.positions[2 * agent + 1], p.angles[agent]);
-            if (p.imu) feel(p, agent);
+            if (p.imu) for (int k = 0; k < 3; k++) feel(p, agent, k);
             if (p.seen && p.forget && p.forget[agent])
                 for (int i = 0; i < p.n_words; i++) p.seen[agent * (long long)p.n_words + i] = 0u;
             for (int c = 0; c < p.n_cameras; c++) {

@@ -95,12 +95,11 @@ HD Camera camera_at(float x, float y, float degrees) {
     return camera;
 }
 
-// Screen of R pixels: pixel r looks along (1, edge - pitch r); a point (x, y) lies at pixel middle - scale y / x.
-struct Screen { float edge, pitch, middle, scale, near, radius; int res; };
+// A screen as Sight gives it.
+struct Screen { float edge, pitch, centre, scale, near, radius; int res; };
 
-HD Screen screen_of(const Sight& sight) {
-    float res = (float)sight.res, w = sight.half_width;
-    Screen screen = {w * (res - 1.f) / res, 2.f * w / res, 0.5f * res - 0.5f, res / (2.f * w), sight.near, sight.world.radius, sight.res};
+HD Screen screen_of(const Sight& p) {
+    Screen screen = {p.edge, p.pitch, p.centre, p.scale, p.near, p.world.radius, p.res};
     return screen;
 }
 
@@ -134,8 +133,8 @@ HD Span span_of(const Camera& camera, const Screen& screen, float wax, float way
     float vx = bx - ax, vy = by - ay, area = cross(ax, ay, vx, vy);
     int behind_a = ax < screen.near, behind_b = bx < screen.near;
     float cut = behind_a | behind_b ? ay + (screen.near - ax) / vx * vy : 0.f;      // where the wall crosses the near plane, if it does
-    float pa = screen.middle - screen.scale * ((behind_a ? cut : ay) / (behind_a ? screen.near : ax));
-    float pb = screen.middle - screen.scale * ((behind_b ? cut : by) / (behind_b ? screen.near : bx));
+    float pa = screen.centre - screen.scale * ((behind_a ? cut : ay) / (behind_a ? screen.near : ax));
+    float pb = screen.centre - screen.scale * ((behind_b ? cut : by) / (behind_b ? screen.near : bx));
     float res = (float)screen.res;
     Span span;
     span.first = (int)CEIL(clamp(low(pa, pb), 0.f, res));
@@ -161,7 +160,7 @@ HD Cover cover_of(const Camera& camera, const Screen& screen, float half_width, 
         leftwards |= y - half_width * x <= slack;
         rightwards |= y + half_width * x >= -slack;
         nearest = low(nearest, x);
-        float pixel = screen.middle - screen.scale * (y / x);
+        float pixel = screen.centre - screen.scale * (y / x);
         low_pixel = low(low_pixel, pixel); high_pixel = high(high_pixel, pixel);
     }
     float dx = high(high(lx - camera.x, camera.x - hx), 0.f), dy = high(high(ly - camera.y, camera.y - hy), 0.f);

@@ -65,6 +65,10 @@ struct Sight {
     int n_cameras;                 // C
     int res;                       // R
     float half_width;              // tan(fov / 2): the edge of the screen at unit depth
+    float edge;                    // ray r looks along (1, edge - pitch r)
+    float pitch;
+    float centre;                  // a point (x, y) lies at ray centre - scale y / x
+    float scale;
     float near;                    // depth nearer than which nothing on the screen lies beyond the radius
     int* indices;                  // (N, A, C, R) out: line hit within its world, agents' first; -1 a miss
     float* locations;              // (N, A, C, R) out: fraction along the line
@@ -72,9 +76,11 @@ struct Sight {
     float* distances;              // (N, A, C, R) out: metres
     float* screen;                 // (N, A, C, R, 3) out
     int subsample;                 // rays a pixel
+    int n_pixels;                  // R / subsample
+    float share;                   // 1 / subsample
     float max_depth;               // metres
-    unsigned short* rgb;           // (N, A, C, 3, R / subsample) out: fp16
-    unsigned short* depth;         // (N, A, C, R / subsample) out: fp16, 1 at the radius, 0 at max_depth beyond it
+    unsigned short* rgb;           // (N, A, C, 3, n_pixels) out: fp16
+    unsigned short* depth;         // (N, A, C, n_pixels) out: fp16, 1 at the radius, 0 at max_depth beyond it
     int* middle;                   // (N, A, C) out: line at the middle of the screen
     const float* velocity;         // (N, A, 2) for imu
     const float* angvelocity;      // (N, A) for imu

@@ -30,13 +30,12 @@ HD void advance(const Motion& p, int world, int a) {
     if (progress < 1.f) { velocity[0] = 0.f; velocity[1] = 0.f; p.angvelocity[i] = 0.f; }
 }
 
-HD void feel(const Sight& p, int agent) {
+// Number k of an agent's three of inertia.
+HD void feel(const Sight& p, int agent, int k) {
     float s, c, x = p.velocity[2 * agent], y = p.velocity[2 * agent + 1];
     sincos_degrees(p.angles[agent], s, c);
-    unsigned short* imu = p.imu + 3 * (long long)agent;
-    imu[0] = HALF_BITS(p.angvelocity[agent] / 360.f);
-    imu[1] = HALF_BITS((c * x + s * y) / 10.f);
-    imu[2] = HALF_BITS((c * y - s * x) / 10.f);
+    float value = k == 0 ? p.angvelocity[agent] : (k == 1 ? c * x + s * y : c * y - s * x);
+    p.imu[3 * (long long)agent + k] = HALF_BITS(value / (k == 0 ? 360.f : 10.f));
 }
 
 struct Pose { float x, y, sine, cosine; };
@@ -163,8 +162,8 @@ HD Ray shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const
 
 // A pixel is the mean of its rays, which are summed in order.
 HD void write_pixel(const Sight& p, long long view, int pixel, const Ray& sum) {
-    int n_pixels = p.res / p.subsample;
-    float share = 1.f / (float)p.subsample;
+    int n_pixels = p.n_pixels;
+    float share = p.share;
     if (p.rgb) {
         unsigned short* rgb = p.rgb + view * 3 * n_pixels + pixel;
         rgb[0] = HALF_BITS(sum.red * share); rgb[n_pixels] = HALF_BITS(sum.green * share); rgb[2 * n_pixels] = HALF_BITS(sum.blue * share);

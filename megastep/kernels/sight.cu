@@ -31,12 +31,15 @@ DEVICE void raster_group(View& v, const float* ends, int line, int on) {
     int n_covered = __popc(some);
     for (int i = 0; i < n_covered; i++) {
         Covered one = v.covered[i];
-        int first = one.bounds & 0xffff, last = one.bounds >> 16, r = (first & ~31) + v.lane;
-        for (float at = (float)r; r < last; r += 32, at += 32.f) {
+        int first = one.bounds & 0xffff, last = one.bounds >> 16, close = one.line < 0, r = (first & ~31) + v.lane;
+        one.line &= 0x7fffffff;
+        float at = (float)r;
+        #pragma unroll 1
+        for (; r < last; r += 32, at += 32.f) {                 // most spans take one or two rounds
             float inverse = one.base + one.gain * at;
-            if (one.line < 0 && inverse * v.screen.radius >= v.lengths[r]) continue;
-            Nearest here = v.nearest[r], mine = {inverse, one.line & 0x7fffffff};
-            if (r >= first && (inverse > here.inverse || (inverse == here.inverse && mine.line < here.line))) v.nearest[r] = mine;
+            if (close && inverse * v.screen.radius >= v.lengths[r]) continue;
+            Nearest here = v.nearest[r], mine = {inverse, one.line};
+            if (r >= first && (inverse > here.inverse || (inverse == here.inverse && one.line < here.line))) v.nearest[r] = mine;
         }
     }
     for (int k = 0; k < n_blocks; k++) {
@@ -75,15 +78,15 @@ KERNEL BOUNDS sight(Sight p) {
     const World& w = p.world;
     int warp = threadIdx.x / 32, lane = threadIdx.x % 32, agent = blockIdx.x * (blockDim.x / 32) + warp;
     if (agent >= w.n_worlds * w.n_agents) return;
-    int world = agent / w.n_agents, a = agent % w.n_agents, R = p.res, S = p.subsample;
+    int world = w.n_agents == 1 ? agent : agent / w.n_agents, a = agent - world * w.n_agents, R = p.res, S = p.subsample;
     Nearest* nearest = shared + (R + R % 2) * warp;
     Screen screen = screen_of(p);
     Scene scene = scene_of(w, world);
     if (lane == 0) notice(p.fault, world, p.positions[2 * agent], p.positions[2 * agent + 1], p.angles[agent]);
-    if (p.imu && lane == 1) feel(p, agent);
+    if (p.imu && lane < 3) feel(p, agent, lane);
     if (p.seen && p.forget && p.forget[agent])
         for (int i = lane; i < p.n_words; i += 32) p.seen[agent * (long long)p.n_words + i] = 0u;
-    int fresh = 0, batch = 32 / S * S;
+    int fresh = 0, batch = 32 / S * S, leads = lane < batch && lane % S == 0;
     for (int c = 0; c < p.n_cameras; c++) {
         Camera camera = camera_at(p.positions[2 * agent], p.positions[2 * agent + 1], p.angles[agent] + p.yaws[c]);
         View v = {camera, screen, p.ray_lengths, all_covered + 32 * warp, nearest, lane, 0.f};
@@ -109,14 +112,14 @@ KERNEL BOUNDS sight(Sight p) {
                 sum.blue += __shfl_down_sync(~0u, ray.blue, j); sum.depth += __shfl_down_sync(~0u, ray.depth, j);
             }
             if (S == 1) { if (on) write_pixel(p, view, r, sum); }
-            else if (on && lane % S == 0) {         // over the pixel's own rays, which are done with: two of them take a Ray
+            else if (on && leads) {         // over the pixel's own rays, which are done with: two of them take a Ray
                 Nearest one = {sum.red, __float_as_int(sum.green)}, two = {sum.blue, __float_as_int(sum.depth)};
                 nearest[r] = one; nearest[r + 1] = two;
             }
         }
         __syncwarp();
         if (S > 1)
-            for (int pixel = lane; pixel < R / S; pixel += 32) {
+            for (int pixel = lane; pixel < p.n_pixels; pixel += 32) {
                 Nearest one = nearest[pixel * S], two = nearest[pixel * S + 1];
                 Ray sum = {one.inverse, __int_as_float(one.line), two.inverse, __int_as_float(two.line)};
                 write_pixel(p, view, pixel, sum);
