@@ -36,6 +36,7 @@ __all__ = [
 AGENT_WIDTH = 0.15
 AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # the disc about a square of that width
 MAX_RES = 1024
+MANY = 32_768  # worlds that fill a GPU with a quarter of a warp each
 
 
 class Agents:
@@ -271,7 +272,8 @@ def physics(scenery, agents, actions=None, moves=None, keep=0.0):
         keep,
         1 / agents.fps,
     )
-    compile.launch('physics', params, scenery.device, 32 * scenery.n_envs)
+    params.team = 8 if n > MANY else 32
+    compile.launch('physics', params, scenery.device, params.team * n)
     _checked(agents)
     return Physics(progress)
 

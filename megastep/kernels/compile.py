@@ -35,7 +35,7 @@ CPU_FLAGS = (
     '-fPIC',
 )
 CUDA_FLAGS = ('--std=c++17', '--fmad=false', '--prec-div=true', '--prec-sqrt=true', '--ftz=false')
-BLOCK = 128
+BLOCK = 64  # threads
 DIGEST = 32
 
 

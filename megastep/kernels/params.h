@@ -46,6 +46,7 @@ struct Motion {
     int n_moves;
     float keep;                    // fraction of the old velocities that stays when an action is taken
     float seconds;                 // length of the step
+    int team;                      // GPU only: lanes a world, a power of two up to 32
 };
 
 struct Placing {

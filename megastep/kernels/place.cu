@@ -1,5 +1,5 @@
-// One warp an agent: carries its model to where it stands and, if asked, lights its texels, once each. For every light the walls that
-// could hide it from any part of the agent are found by all lanes, and only those are tried against each texel.
+// One warp an agent: carries its model to where it stands and, if asked, lights its texels, once each. For every light, boxes around 32 walls and then walls that cannot
+// hide it from any part of the agent are passed over by all lanes together; the others are tried against each texel, until all texels are hidden.
 KERNEL place(Placing p) {
     const World& w = p.world;
     int agent = (blockIdx.x * blockDim.x + threadIdx.x) / 32, lane = threadIdx.x % 32;
@@ -17,18 +17,26 @@ KERNEL place(Placing p) {
         for (int l = w.light_starts[design]; l < w.light_starts[design + 1]; l++) {
             const float* light = w.lights + 3 * l;
             float dx = x - light[0], dy = y - light[1];
-            int hidden = 0;
-            for (int j = w.wall_starts[design]; j < w.wall_starts[design + 1]; j += 32) {
-                float4 b = {0.f, 0.f, 0.f, 0.f};
+            int hidden = texel >= last;
+            for (int start = w.box_starts[design]; start < w.box_starts[design + 1]; start += 32) {
                 int may = 0;
-                if (j + lane < w.wall_starts[design + 1]) {
-                    b = ((const float4*)w.walls)[j + lane];
-                    may = may_block(light[0], light[1], pose, w.reach, b.x, b.y, b.z, b.w);
+                if (start + lane < w.box_starts[design + 1]) {
+                    float4 b = ((const float4*)w.boxes)[start + lane];
+                    may = may_block_box(light[0], light[1], pose, w.reach, b.x, b.y, b.z, b.w);
                 }
-                for (unsigned int some = __ballot_sync(~0u, may); some; some &= some - 1) {
-                    int k = __ffs(some) - 1;
-                    hidden |= blocks(light[0], light[1], dx, dy, __shfl_sync(~0u, b.x, k), __shfl_sync(~0u, b.y, k),
-                        __shfl_sync(~0u, b.z, k), __shfl_sync(~0u, b.w, k));
+                for (unsigned int boxes = __ballot_sync(~0u, may); boxes && !__all_sync(~0u, hidden); boxes &= boxes - 1) {
+                    int j = w.wall_starts[design] + 32 * (start - w.box_starts[design] + __ffs(boxes) - 1) + lane;
+                    float4 b = {0.f, 0.f, 0.f, 0.f};
+                    int able = 0;
+                    if (j < w.wall_starts[design + 1]) {
+                        b = ((const float4*)w.walls)[j];
+                        able = may_block(light[0], light[1], pose, w.reach, b.x, b.y, b.z, b.w);
+                    }
+                    for (unsigned int some = __ballot_sync(~0u, able); some; some &= some - 1) {
+                        int k = __ffs(some) - 1;
+                        hidden |= blocks(light[0], light[1], dx, dy, __shfl_sync(~0u, b.x, k), __shfl_sync(~0u, b.y, k),
+                            __shfl_sync(~0u, b.z, k), __shfl_sync(~0u, b.w, k));
+                    }
                 }
             }
             if (!hidden) sum += glow(light[2], dx, dy);

@@ -75,6 +75,17 @@ HD int may_block(float lx, float ly, const Pose& pose, float reach, float ax, fl
     return !(high(ta, tb) < -margin || low(ta, tb) > length * length + margin);
 }
 
+// The same for all walls in a box.
+HD int may_block_box(float lx, float ly, const Pose& pose, float reach, float x0, float y0, float x1, float y1) {
+    float dx = pose.x - lx, dy = pose.y - ly, length = SQRT(dx * dx + dy * dy), margin = reach * length + 1e-3f;
+    float least = 1e9f, most = -1e9f, nearest = 1e9f, furthest = -1e9f;
+    for (int corner = 0; corner < 4; corner++) {
+        float x = (corner & 1 ? x1 : x0) - lx, y = (corner & 2 ? y1 : y0) - ly, side = cross(dx, dy, x, y), along = dx * x + dy * y;
+        least = low(least, side); most = high(most, side); nearest = low(nearest, along); furthest = high(furthest, along);
+    }
+    return !(least > margin || most < -margin || furthest < -margin || nearest > length * length + margin);
+}
+
 // One world's lines and texels.
 struct Scene {
     const float* walls; const float* agent_lines; const float* agent_textures; const float* agent_light;

@@ -74,7 +74,7 @@ DEVICE void raster_walls(View& v, const World& w, const Scene& scene, int design
 
 KERNEL BOUNDS sight(Sight p) {
     extern __shared__ Nearest shared[];
-    __shared__ Covered all_covered[128];
+    __shared__ Covered all_covered[64];
     const World& w = p.world;
     int warp = threadIdx.x / 32, lane = threadIdx.x % 32, agent = blockIdx.x * (blockDim.x / 32) + warp;
     if (agent >= w.n_worlds * w.n_agents) return;
