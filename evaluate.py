@@ -1,4 +1,7 @@
 """Measures a trained policy on unseen homes. `python evaluate.py --help`; `run(cfg)` is the same from Python."""
+import app  # noqa: F401, before torch: see there
+
+# isort: split
 import dataclasses
 import json
 import sys

@@ -1,4 +1,7 @@
 """Films a trained policy. `python record.py --help`; `run(cfg)` is the same from Python."""
+import app  # noqa: F401, before torch: see there
+
+# isort: split
 import dataclasses
 import sys
 from pathlib import Path

@@ -1,4 +1,7 @@
 """Trains a policy. `python train.py --help` lists what can be chosen; `run(cfg)` is the same from Python."""
+import app  # noqa: F401, before torch: see there
+
+# isort: split
 import shutil
 import sys
 import time
