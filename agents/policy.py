@@ -61,5 +61,7 @@ class Policy(nn.Module):
         the sequence where reset. Returns arrdict(logits (T, B, ...), value (T, B), state after the last step).
         """
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16 and self.device.type == 'cuda'):
-            remembered, state = self.memory(self.intake(obs), reset, state)
-            return arrdict(logits=self.output(remembered), value=self.value(remembered), state=state)
+            seen = self.intake(obs)
+            remembered, state = self.memory(seen, reset, state)
+            thought = seen + remembered  # what needs no memory need not wait until the memory lets it through
+            return arrdict(logits=self.output(thought), value=self.value(thought), state=state)
