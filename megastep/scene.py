@@ -93,7 +93,6 @@ def scenery(geometries, n_agents=1, n_envs=None, seed=1, device=None):
             f'scenery needs at least one geometry and one environment, but {len(geometries)} and {n_envs} were '
             f'given (and {n_agents} agents)'
         )
-    geometries = geometries[:n_envs]
     device = engine.device(device or 'auto') if not isinstance(device, torch.device) else device
     model = agent_model()
     agent_textures, model_widths = _agent_textures(n_agents, model)

@@ -31,6 +31,7 @@ class Explorer:
         res=256, subsample=4, fov=130., fps=10., patience=PATIENCE, resample=False,
     ):
         geometries = sources.sample('homes', min(n_envs, 512), seed=seed) if geometries is None else geometries
+        geometries = geometries if resample else geometries[:n_envs]
         self.core = Core(
             scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device), res, fov, fps, seed=seed
         )

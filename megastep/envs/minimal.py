@@ -31,7 +31,7 @@ class Minimal:
         shortest=128,
         longest=256,
     ):
-        geometries = [toys.box()] if geometries is None else geometries
+        geometries = [toys.box()] if geometries is None else geometries[:n_envs]
         self.core = Core(
             scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
             res=res,
