@@ -5,6 +5,7 @@ them, for capture, checkpoints and resume alike; :func:`capture` records a funct
 without Python.
 """
 
+import contextlib
 import traceback
 import types
 import warnings
@@ -141,6 +142,16 @@ class _State:
                 ) from None
 
 
+    def undo(self):
+        """Puts back every tensor and scalar that is another now than it was, as far as it can be put anywhere."""
+        for before in (self.tensors, self.scalars):
+            now = _walk(self.roots, (torch.Tensor, *SCALARS))
+            for path, (parent, step, leaf) in before.items():
+                if path not in now or now[path][2] is not leaf:
+                    with contextlib.suppress(TypeError, AttributeError, KeyError, IndexError):
+                        _rebind(parent, step, leaf)
+
+
 def _readable(path):
     return path.partition(']')[2].lstrip('.')
 
@@ -155,7 +166,7 @@ class Graph:
         self._leaves = [leaf.clone() if isinstance(leaf, torch.Tensor) else leaf for leaf in leaves]
         inputs = _pytree.tree_unflatten(self._leaves, self._spec)
         roots = dict(enumerate(roots))
-        saved = snapshot(roots)
+        saved, original = snapshot(roots), _State(roots.values())
         generators = [
             leaf
             for leaf in state_tree(roots).values()
@@ -179,6 +190,7 @@ class Graph:
                 self._out = function(*inputs)
                 state.settle()
         finally:
+            original.undo()
             restore(roots, saved)
 
     def __call__(self, *args):
@@ -189,6 +201,11 @@ class Graph:
             )
         for inside, given in zip(self._leaves, leaves):
             if isinstance(inside, torch.Tensor):
+                if inside.shape != given.shape:
+                    raise ValueError(
+                        f'the captured function was recorded with an argument of shape {tuple(inside.shape)}, but was '
+                        f'called with {tuple(given.shape)}'
+                    )
                 inside.copy_(given)
         self._graph.replay()
         return self._out
@@ -203,17 +220,20 @@ def capture(function, args, roots, warmup=3):
     """
     try:
         return Graph(function, args, roots, warmup)
-    except (CaptureError, RuntimeError) as fault:
-        frames = [
-            f
-            for f in traceback.extract_tb(fault.__traceback__)
-            if '/torch/' not in f.filename and f.filename != __file__
-        ]
-        where = (
-            f' at {frames[-1].filename}:{frames[-1].lineno}' if frames and not isinstance(fault, CaptureError) else ''
-        )
-        warnings.warn(f'running without a CUDA graph, slower: {str(fault).splitlines()[0]}{where}', stacklevel=2)
+    except RuntimeError as fault:
+        while isinstance(fault.__context__, RuntimeError):      # the end of a failed capture fails once more
+            fault = fault.__context__
+        warnings.warn(f'running without a CUDA graph, slower: {str(fault).splitlines()[0]}{_line(fault)}', stacklevel=2)
         return function
+
+
+def _line(fault):
+    """Where outside PyTorch and this file a fault was raised, to follow a sentence."""
+    if isinstance(fault, CaptureError):
+        return ''
+    frames = traceback.extract_tb(fault.__traceback__)
+    frames = [f for f in frames if '/torch/' not in f.filename and f.filename != __file__]
+    return f' at {frames[-1].filename}:{frames[-1].lineno}' if frames else ''
 
 
 class Captured:

@@ -97,8 +97,8 @@ KERNEL BOUNDS sight(Sight p) {
                 raster_group(v, scene.agent_lines + 4 * l, l, l < scene.n_agent_lines && l / w.n_model != a);
         raster_walls(v, w, scene, w.design[world], p.half_width);
         long long view = (long long)agent * p.n_cameras + c;
+        __syncwarp();
         for (int start = 0; start < R; start += batch) {
-            __syncwarp();
             int r = start + lane, on = lane < batch && r < R;
             Ray ray = {0.f, 0.f, 0.f, 0.f};
             if (on) {
@@ -111,6 +111,7 @@ KERNEL BOUNDS sight(Sight p) {
                 sum.red += __shfl_down_sync(~0u, ray.red, j); sum.green += __shfl_down_sync(~0u, ray.green, j);
                 sum.blue += __shfl_down_sync(~0u, ray.blue, j); sum.depth += __shfl_down_sync(~0u, ray.depth, j);
             }
+            __syncwarp();
             if (S == 1) { if (on) write_pixel(p, view, r, sum); }
             else if (on && leads) {         // over the pixel's own rays, which are done with: two of them take a Ray
                 Nearest one = {sum.red, __float_as_int(sum.green)}, two = {sum.blue, __float_as_int(sum.depth)};
