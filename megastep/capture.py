@@ -103,6 +103,15 @@ def _rebind(parent, step, leaf):
         setattr(parent, step[1:], leaf)
 
 
+def _renew_generators(roots):
+    """Replaces the generators on GPUs: a capture that failed leaves its own believing that it goes on."""
+    renewed = {}
+    for parent, step, old in _walk(roots, torch.Generator).values():
+        if old.device.type == 'cuda':
+            with contextlib.suppress(TypeError, AttributeError):
+                _rebind(parent, step, renewed.setdefault(id(old), torch.Generator(old.device)))
+
+
 class CaptureError(RuntimeError):
     """A function cannot be replayed as a graph. The message is one sentence with the cure."""
 
@@ -189,6 +198,9 @@ class Graph:
             with torch.cuda.graph(self._graph):
                 self._out = function(*inputs)
                 state.settle()
+        except RuntimeError:
+            _renew_generators(roots)
+            raise
         finally:
             original.undo()
             restore(roots, saved)
