@@ -30,6 +30,8 @@ class Explorer:
         self, n_envs=128, geometries=None, *, seed=1, device=None,
         res=256, subsample=4, fov=130., fps=10., patience=PATIENCE, resample=False,
     ):
+        if patience < 1:
+            raise ValueError(f'patience must be at least one step, but {patience} was given')
         geometries = sources.sample('homes', min(n_envs, 512), seed=seed) if geometries is None else geometries
         geometries = geometries if resample else geometries[:n_envs]
         self.core = Core(
@@ -46,9 +48,10 @@ class Explorer:
         words = -(-self.core.scenery.designs.most_texels // 32)
         engine.fit(n_envs, 4 * words + 8 * pixels + 64, self.device)
         self.seen = torch.zeros((n_envs, 1, words), dtype=torch.int32, device=self.device)
-        self.n_seen = torch.zeros(n_envs, dtype=torch.int32, device=self.device)
         self.length = torch.zeros(n_envs, dtype=torch.int32, device=self.device)
+        self.left = torch.zeros(n_envs, dtype=torch.int32, device=self.device)  # steps, if nothing new is seen
         self.ended = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
+        self._never = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
 
     def reset(self):
         """Starts every episode anew. Returns a world."""
@@ -62,13 +65,16 @@ class Explorer:
     def _observe(self, reset):
         self.spawner(reset)
         obs, fresh = self._look(seen=self.seen, forget=reset[:, None])
-        self.n_seen.masked_fill_(reset, 0).add_(fresh)
         self.length.add_(1).masked_fill_(reset, 0)
-        self.ended.copy_((self.length >= self.n_seen + self.patience) & ~reset)
-        reward = (fresh / TEXELS_A_POINT).masked_fill(reset, 0.0)
-        return arrdict(
-            obs=obs, reward=reward, reset=reset, terminal=torch.zeros_like(reset), truncated=self.ended.clone()
-        )
+        self.left.sub_(1).masked_fill_(reset, self.patience).add_(fresh)
+        torch.le(self.left, 0, out=self.ended)
+        reward = (fresh / TEXELS_A_POINT).masked_fill_(reset, 0.0)
+        return arrdict(obs=obs, reward=reward, reset=reset, terminal=self._never, truncated=self.ended.clone())
+
+    @property
+    def n_seen(self):
+        """(N,) texels seen in this episode."""
+        return self.left - self.patience + self.length
 
     def _look(self, **seen):
         """The observation, and if ``seen`` is given how many texels were new (N,)."""

@@ -17,12 +17,13 @@ KERNEL place(Placing p) {
         for (int l = w.light_starts[design]; l < w.light_starts[design + 1]; l++) {
             const float* light = w.lights + 3 * l;
             float dx = x - light[0], dy = y - light[1];
+            Corridor corridor = corridor_of(light[0], light[1], pose, w.reach);
             int hidden = texel >= last;
             for (int start = w.box_starts[design]; start < w.box_starts[design + 1]; start += 32) {
                 int may = 0;
                 if (start + lane < w.box_starts[design + 1]) {
                     float4 b = ((const float4*)w.boxes)[start + lane];
-                    may = may_block_box(light[0], light[1], pose, w.reach, b.x, b.y, b.z, b.w);
+                    may = may_block_box(corridor, b.x, b.y, b.z, b.w);
                 }
                 for (unsigned int boxes = __ballot_sync(~0u, may); boxes && !__all_sync(~0u, hidden); boxes &= boxes - 1) {
                     int j = w.wall_starts[design] + 32 * (start - w.box_starts[design] + __ffs(boxes) - 1) + lane;
@@ -30,7 +31,7 @@ KERNEL place(Placing p) {
                     int able = 0;
                     if (j < w.wall_starts[design + 1]) {
                         b = ((const float4*)w.walls)[j];
-                        able = may_block(light[0], light[1], pose, w.reach, b.x, b.y, b.z, b.w);
+                        able = may_block(corridor, b.x, b.y, b.z, b.w);
                     }
                     for (unsigned int some = __ballot_sync(~0u, able); some; some &= some - 1) {
                         int k = __ffs(some) - 1;

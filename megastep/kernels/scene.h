@@ -67,23 +67,29 @@ HD void agent_texel(const World& w, int world, int a, int texel, float& x, float
 
 // Could the wall hide a light from some part of a disc about an agent? Never says no wrongly: a wall is passed over only if it lies wholly on one
 // side of the light's path to the middle, by more than the disc, or wholly behind the light or behind the disc.
-HD int may_block(float lx, float ly, const Pose& pose, float reach, float ax, float ay, float bx, float by) {
-    float dx = pose.x - lx, dy = pose.y - ly, length = SQRT(dx * dx + dy * dy), margin = reach * length;
-    float sa = cross(dx, dy, ax - lx, ay - ly), sb = cross(dx, dy, bx - lx, by - ly);
-    float ta = dx * (ax - lx) + dy * (ay - ly), tb = dx * (bx - lx) + dy * (by - ly);
-    if (low(sa, sb) > margin || high(sa, sb) < -margin) return 0;
-    return !(high(ta, tb) < -margin || low(ta, tb) > length * length + margin);
+struct Corridor { float x, y, dx, dy, along, aside; };     // from a light by (dx, dy) to a disc: how far along and aside to look, times its length
+
+HD Corridor corridor_of(float lx, float ly, const Pose& pose, float reach) {
+    float dx = pose.x - lx, dy = pose.y - ly, length2 = dx * dx + dy * dy, aside = reach * SQRT(length2) + 1e-3f;
+    Corridor corridor = {lx, ly, dx, dy, length2 + aside, aside};
+    return corridor;
+}
+
+HD int may_block(const Corridor& c, float ax, float ay, float bx, float by) {
+    float sa = cross(c.dx, c.dy, ax - c.x, ay - c.y), sb = cross(c.dx, c.dy, bx - c.x, by - c.y);
+    float ta = c.dx * (ax - c.x) + c.dy * (ay - c.y), tb = c.dx * (bx - c.x) + c.dy * (by - c.y);
+    return !(low(sa, sb) > c.aside || high(sa, sb) < -c.aside || high(ta, tb) < -c.aside || low(ta, tb) > c.along);
 }
 
 // The same for all walls in a box.
-HD int may_block_box(float lx, float ly, const Pose& pose, float reach, float x0, float y0, float x1, float y1) {
-    float dx = pose.x - lx, dy = pose.y - ly, length = SQRT(dx * dx + dy * dy), margin = reach * length + 1e-3f;
+HD int may_block_box(const Corridor& c, float x0, float y0, float x1, float y1) {
     float least = 1e9f, most = -1e9f, nearest = 1e9f, furthest = -1e9f;
     for (int corner = 0; corner < 4; corner++) {
-        float x = (corner & 1 ? x1 : x0) - lx, y = (corner & 2 ? y1 : y0) - ly, side = cross(dx, dy, x, y), along = dx * x + dy * y;
+        float x = (corner & 1 ? x1 : x0) - c.x, y = (corner & 2 ? y1 : y0) - c.y;
+        float side = cross(c.dx, c.dy, x, y), along = c.dx * x + c.dy * y;
         least = low(least, side); most = high(most, side); nearest = low(nearest, along); furthest = high(furthest, along);
     }
-    return !(least > margin || most < -margin || furthest < -margin || nearest > length * length + margin);
+    return !(least > c.aside || most < -c.aside || furthest < -c.aside || nearest > c.along);
 }
 
 // One world's lines and texels.
