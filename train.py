@@ -64,6 +64,8 @@ class Trainer:
         with Progress() as progress:
             while self.left() > 0 and stop.number is None:
                 self.collect(carry)
+                if self.cfg.learner.anneal:
+                    self.learner.set_lr(self.cfg.learner.lr * max(0., self.left()))
                 losses = self.learner.update(self.rollout)
                 self.count()
                 if self.updates % self.cfg.report == 0:

@@ -165,7 +165,7 @@ def make_policy(agent, env, seed=1):
 
 def make_learner(learner, policy, seed=1):
     from agents.ppo import PPO
-    arguments = {k: v for k, v in dataclasses.asdict(learner).items() if k not in ("name", "n_steps")}
+    arguments = {k: v for k, v in dataclasses.asdict(learner).items() if k not in ("name", "n_steps", "anneal")}
     return PPO(policy, graph=True, seed=seed, **arguments)
 
 

@@ -146,6 +146,7 @@ class Learner:
     name: str = among("ppo")
     n_steps: int = within(1, 65_536)
     lr: float = within(0, 1e6, low_open=True)
+    anneal: bool
     gamma: float = within(0, 1)
     lambda_: float = within(0, 1)
     clip: float = within(0, 1e6, low_open=True)
