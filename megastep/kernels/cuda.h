@@ -3,7 +3,7 @@
 #define DEVICE static __device__ __forceinline__
 #define KERNEL extern "C" __global__ void
 #define ALIGNED __align__(16)
-#define BOUNDS __launch_bounds__(64, 20)
+#define BOUNDS __launch_bounds__(64, 24)
 #define SQRT(x) sqrtf(x)
 #define CEIL(x) ceilf(x)
 #define FLOOR(x) floorf(x)

@@ -11,15 +11,17 @@ struct View { const Camera& camera; const Screen& screen; const float* lengths; 
 
 // 32 lines at once, one a lane; `on` where there is one. `line` is its number in the world.
 DEVICE void raster_group(View& v, const float* ends, int line, int on) {
-    int R = v.screen.res, n_blocks = (R + 31) / 32;
+    int R = v.screen.res;
     Span span = {0, 0, 0.f, 0.f, 0};
     if (on) {
         float4 b = *(const float4*)ends;
         span = span_of(v.camera, v.screen, b.x, b.y, b.z, b.w);
     }
-    int visible = span.first < span.last, from = span.first / 32, to = (span.last - 1) / 32;
+    int visible = span.first < span.last, from = visible ? span.first >> 5 : 0, to = visible ? (span.last - 1) >> 5 : 0;
     float most = high(span.base + span.gain * (float)span.first, span.base + span.gain * (float)(span.last - 1)), least = INFINITE;
-    for (int k = 0; k < n_blocks; k++) least = low(least, __shfl_sync(~0u, v.floor, clamp_int(from + k, 0, to < 0 ? 0 : to)));
+    int widest = __reduce_max_sync(~0u, to - from);
+    #pragma unroll 1
+    for (int k = 0; k <= widest; k++) least = low(least, __shfl_sync(~0u, v.floor, from + k < to ? from + k : to));
     unsigned int some = __ballot_sync(~0u, visible && most >= least);
     if (!some) return;
     __syncwarp();
@@ -42,7 +44,9 @@ DEVICE void raster_group(View& v, const float* ends, int line, int on) {
             if (r >= first && (inverse > here.inverse || (inverse == here.inverse && one.line < here.line))) v.nearest[r] = mine;
         }
     }
-    for (int k = 0; k < n_blocks; k++) {
+    int mine = some >> v.lane & 1, last_block = __reduce_max_sync(~0u, mine ? to : 0);
+    #pragma unroll 1
+    for (int k = __reduce_min_sync(~0u, mine ? from : 32); k <= last_block; k++) {
         int r = 32 * k + v.lane;
         unsigned int lowest = __reduce_min_sync(~0u, r < R ? __float_as_uint(v.nearest[r].inverse) : 0x7f800000u);
         if (v.lane == k) v.floor = __uint_as_float(lowest);
@@ -70,6 +74,16 @@ DEVICE void raster_walls(View& v, const World& w, const Scene& scene, int design
             raster_group(v, scene.walls + 4 * l, scene.n_agent_lines + l, l < scene.n_walls);
         }
     }
+}
+
+// A lane's ray and those of the next lanes, `n` in all, in order.
+DEVICE Ray sum_of(const Ray& ray, int n) {
+    Ray sum = ray;
+    for (int j = 1; j < n; j++) {
+        sum.red += __shfl_down_sync(~0u, ray.red, j); sum.green += __shfl_down_sync(~0u, ray.green, j);
+        sum.blue += __shfl_down_sync(~0u, ray.blue, j); sum.depth += __shfl_down_sync(~0u, ray.depth, j);
+    }
+    return sum;
 }
 
 KERNEL BOUNDS sight(Sight p) {
@@ -106,11 +120,7 @@ KERNEL BOUNDS sight(Sight p) {
                 if (p.middle && r == R / 2) p.middle[view] = here.line;
                 ray = shade_ray(p, screen, scene, camera, agent, view, r, here.inverse, here.line, fresh);
             }
-            Ray sum = ray;
-            for (int j = 1; j < S; j++) {
-                sum.red += __shfl_down_sync(~0u, ray.red, j); sum.green += __shfl_down_sync(~0u, ray.green, j);
-                sum.blue += __shfl_down_sync(~0u, ray.blue, j); sum.depth += __shfl_down_sync(~0u, ray.depth, j);
-            }
+            Ray sum = S == 4 ? sum_of(ray, 4) : sum_of(ray, S);     // the usual one unrolls
             __syncwarp();
             if (S == 1) { if (on) write_pixel(p, view, r, sum); }
             else if (on && leads) {         // over the pixel's own rays, which are done with: two of them take a Ray
