@@ -6,6 +6,7 @@ are in `perf.jsonl`. A sink that fails is dropped with one warning; nothing here
 import importlib
 import json
 import math
+import os
 import warnings
 from pathlib import Path
 
@@ -122,11 +123,12 @@ class Wandb:
     """Weights & Biases, online or offline; it never asks at the terminal and waits `PATIENCE` seconds at most."""
 
     def __init__(self, folder, project, mode, name, config):
+        os.environ.setdefault("WANDB_SILENT", "true")
         try:
             wandb = importlib.import_module("wandb")
         except ImportError:
             raise RuntimeError(missing("wandb")) from None
-        if mode == "online" and not wandb.api.api_key:
+        if mode == "online" and not self._has_key(wandb):
             raise RuntimeError("Weights & Biases left out: it has no key here; `wandb login` stores one, "
                                "logger.mode=offline needs none")
         try:
@@ -135,11 +137,19 @@ class Wandb:
         except Exception as error:  # the package raises its own, the network's and the system's
             raise RuntimeError(f"Weights & Biases left out: it did not start ({_first_line(error)})") from None
 
+    @staticmethod
+    def _has_key(wandb):
+        """Whether there is a key, in the environment or a file, without asking for one at the terminal."""
+        try:
+            return os.environ.get("WANDB_API_KEY") or wandb.login(prompt=False)
+        except TypeError:       # older versions have no such argument
+            return wandb.api.api_key
+
     def write(self, step, values):
         self.run.log({"samples": step, **values}, step=step)
 
     def close(self):
-        self.run.finish(quiet=True)
+        self.run.finish()
 
 
 class Metrics:

@@ -111,8 +111,8 @@ def fake_wandb(monkeypatch, key="key", init=None, log=None):
     """A stand-in for the package, to fail where it is told to."""
     logged = []
     room = types.SimpleNamespace
-    run = room(log=log or (lambda values, step: logged.append((step, values))), finish=lambda quiet: None)
-    module = room(api=room(api_key=key), Settings=dict, init=init or (lambda **_: run))
+    run = room(log=log or (lambda values, step: logged.append((step, values))), finish=lambda: None)
+    module = room(login=lambda prompt: key is not None, Settings=dict, init=init or (lambda **_: run))
     monkeypatch.setitem(sys.modules, "wandb", module)
     return logged
 
@@ -162,3 +162,12 @@ def test_the_curves_are_a_picture_of_the_files(tmp_path):
     (tmp_path / "perf.jsonl").write_text("")
     metrics.curves(tmp_path)
     assert imread(tmp_path / "curves.png").shape[1] > 500
+
+
+@pytest.mark.slow
+def test_the_real_wandb_keeps_an_offline_run(tmp_path, recwarn):
+    sinks = Metrics(tmp_path, wandb=dict(project="p", mode="offline", name="n", config={"a": 1}))
+    sinks.write(1, {"x": 1}, {"y": 2})
+    sinks.close()
+    assert not [w for w in recwarn if issubclass(w.category, UserWarning)]
+    assert [path.stat().st_size > 1000 for path in tmp_path.glob("wandb/offline-run-*/*.wandb")] == [True]
