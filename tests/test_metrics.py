@@ -96,12 +96,11 @@ def without(monkeypatch, package):
     monkeypatch.setattr("importlib.import_module", lambda name, package=None: refuse(name))
 
 
-@pytest.mark.filterwarnings("ignore:Weights")
 @pytest.mark.parametrize("package", ["tensorboard", "wandb"])
 def test_a_package_that_is_missing_is_named_with_the_line_that_installs_it(tmp_path, monkeypatch, package):
     without(monkeypatch, package)
     with pytest.warns(UserWarning, match=f"pip install {package}"):
-        sinks = Metrics(tmp_path, wandb=dict(project="p", mode="online", name="n", config={}))
+        sinks = Metrics(tmp_path, wandb=WANDB if package == "wandb" else None)
     sinks.write(1, {"x": 1}, {})
     sinks.close()
     assert metrics.read(tmp_path / "metrics.jsonl") == [{"samples": 1, "x": 1}]
@@ -169,5 +168,5 @@ def test_the_real_wandb_keeps_an_offline_run(tmp_path, recwarn):
     sinks = Metrics(tmp_path, wandb=dict(project="p", mode="offline", name="n", config={"a": 1}))
     sinks.write(1, {"x": 1}, {"y": 2})
     sinks.close()
-    assert not [w for w in recwarn if issubclass(w.category, UserWarning)]
+    assert not [str(w.message) for w in recwarn if issubclass(w.category, UserWarning)]
     assert [path.stat().st_size > 1000 for path in tmp_path.glob("wandb/offline-run-*/*.wandb")] == [True]
