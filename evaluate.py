@@ -1,5 +1,5 @@
 """Measures a trained policy on unseen homes. `python evaluate.py --help`; `run(cfg)` is the same from Python."""
-import app  # noqa: F401, before torch: see there
+import configs  # noqa: F401, before torch: see there
 
 # isort: split
 import dataclasses
@@ -8,9 +8,9 @@ import sys
 import time
 
 from agents import evaluation
-from app import commandline, runs
-from app.console import duration, say, table
-from app.settings import Evaluate, Fault
+from configs import commandline, runs
+from configs.console import duration, say, table
+from configs.settings import Evaluate, Fault
 
 HELP = """Prints and writes what a run's agent earns in the first episode of each lane, with a 95 % interval over homes.
 

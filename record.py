@@ -1,5 +1,5 @@
 """Films a trained policy. `python record.py --help`; `run(cfg)` is the same from Python."""
-import app  # noqa: F401, before torch: see there
+import configs  # noqa: F401, before torch: see there
 
 # isort: split
 import dataclasses
@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 
 from agents.metrics import missing
-from app import commandline, runs
-from app.console import say
-from app.settings import Fault, Record
+from configs import commandline, runs
+from configs.console import say
+from configs.settings import Fault, Record
 
 HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
 

@@ -1,5 +1,5 @@
 """Trains a policy. `python train.py --help` lists what can be chosen; `run(cfg)` is the same from Python."""
-import app  # noqa: F401, before torch: see there
+import configs  # noqa: F401, before torch: see there
 
 # isort: split
 import shutil
@@ -12,10 +12,10 @@ import torch
 import evaluate
 import record
 from agents import buffers, checkpoint, metrics
-from app import commandline, runs
-from app.console import Progress, duration, number, say, warn
-from app.interruptions import Interrupted, Interruptions
-from app.settings import Evaluate, Fault, Faults, Record, Train, as_tree
+from configs import commandline, runs
+from configs.console import Progress, duration, number, say, warn
+from configs.interruptions import Interrupted, Interruptions
+from configs.settings import Evaluate, Fault, Faults, Record, Train, as_tree
 from megastep import capture
 
 HELP = """Trains a policy in an environment.

@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 
-from app import commandline, settings
-from app.settings import Evaluate, Faults, Record, Train, build
+from configs import commandline, settings
+from configs.settings import Evaluate, Faults, Record, Train, build
 from megastep import envs, geometries
 
 SCRIPTS = {"train": Train, "evaluate": Evaluate, "record": Record}

@@ -9,8 +9,8 @@ import torch
 import evaluate
 import train
 from agents import evaluation
-from app import commandline
-from app.settings import Evaluate, Fault, Train, build
+from configs import commandline
+from configs.settings import Evaluate, Fault, Train, build
 from megastep import spaces
 from megastep.arrdict import arrdict
 

@@ -6,7 +6,7 @@ import tokenize
 import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
-PACKAGES = ('megastep', 'agents', 'app')
+PACKAGES = ('megastep', 'agents', 'configs')
 SOURCES = sorted([*ROOT.glob('*.py'), *(path for name in PACKAGES for path in (ROOT / name).rglob('*.py'))])
 KERNELS = sorted(path for path in (ROOT / 'megastep').rglob('*') if path.suffix in ('.h', '.cu', '.cpp'))
 TESTS_AND_TOOLS = sorted([*(ROOT / 'tests').glob('*.py'), *(ROOT / 'scripts').glob('*.py')])
@@ -29,11 +29,11 @@ FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 SHARED = {'megastep', 'megastep.arrdict', 'megastep.dotdict', 'megastep.ragged', 'megastep.spaces', 'megastep.capture'}
 # Packages that only some files may import, directly or through importlib.
 HOMES = {
-    'hydra': ('app/', 'train.py', 'evaluate.py', 'record.py'),
-    'omegaconf': ('app/', 'train.py', 'evaluate.py', 'record.py'),
+    'hydra': ('configs/', 'train.py', 'evaluate.py', 'record.py'),
+    'omegaconf': ('configs/', 'train.py', 'evaluate.py', 'record.py'),
     'wandb': ('agents/metrics.py',),
     'tensorboard': ('agents/metrics.py',),
-    'rich': ('app/', 'train.py', 'evaluate.py', 'record.py'),
+    'rich': ('configs/', 'train.py', 'evaluate.py', 'record.py'),
     'loky': ('megastep/recording.py',),
     'IPython': ('megastep/recording.py',),
 }
@@ -148,6 +148,6 @@ def test_files_are_small(path):
 
 
 def test_the_house_is_small():
-    """The simulator, its kernels, the learner and the entry scripts; not the command line about them, which is app/."""
-    counts = {path: code_lines(path) for path in [*SOURCES, *KERNELS] if 'app' not in path.relative_to(ROOT).parts}
+    """The simulator, its kernels, the learner and the entry scripts; not the settings and command line in configs/."""
+    counts = {path: code_lines(path) for path in [*SOURCES, *KERNELS] if 'configs' not in path.relative_to(ROOT).parts}
     assert sum(counts.values()) <= MAX_TOTAL

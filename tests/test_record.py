@@ -6,8 +6,8 @@ import pytest
 
 import record
 import train
-from app import commandline
-from app.settings import Train, build
+from configs import commandline
+from configs.settings import Train, build
 from megastep import recording
 
 TINY = ["env=minimal", "geometry=box", "agent=small", "env.n_envs=4", "env.res=8", "learner.n_steps=8",

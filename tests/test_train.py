@@ -10,9 +10,9 @@ import yaml
 
 import train
 from agents import checkpoint, metrics
-from app import commandline, settings
-from app.interruptions import Interrupted
-from app.settings import Fault, Faults, Train, build
+from configs import commandline, settings
+from configs.interruptions import Interrupted
+from configs.settings import Fault, Faults, Train, build
 
 TINY = ["env=minimal", "geometry=box", "agent=small", "env.n_envs=4", "env.res=8", "env.shortest=5", "env.longest=9",
         "learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8", "device=cpu", "report=1"]

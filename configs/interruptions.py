@@ -2,7 +2,7 @@
 import os
 import signal
 
-from app.console import say
+from configs.console import say
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

@@ -19,12 +19,12 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from app import runs
-from app.console import say, table, warn
-from app.interruptions import Interrupted
-from app.settings import Fault, Faults, build, closest, closest_key
+from configs import runs
+from configs.console import say, table, warn
+from configs.interruptions import Interrupted
+from configs.settings import Fault, Faults, build, closest, closest_key
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+CONFIGS = Path(__file__).resolve().parent
 
 
 class Door:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import yaml
 
-from app.settings import Fault, Train, as_tree, build
+from configs.settings import Fault, Train, as_tree, build
 
 RUNS = Path("runs")
 SWEEPS = Path("sweeps")
