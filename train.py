@@ -16,7 +16,7 @@ from configs import commandline, runs
 from configs.console import Progress, duration, number, say, warn
 from configs.interruptions import Interrupted, Interruptions
 from configs.settings import Evaluate, Fault, Faults, Record, Train, as_tree
-from megastep import capture
+from megastep import capture, engine
 
 HELP = """Trains a policy in an environment.
 
@@ -110,6 +110,8 @@ class Trainer:
     def report(self, losses, progress):
         """Writes the metrics since the last report, and shows the few that people watch. Waits for the device."""
         names, values = zip(*losses.items())
+        if hasattr(self.env, "core"):
+            engine.check(self.env.core.agents)
         found = {**self.episodes.take(), **dict(zip(names, torch.stack(values).tolist())), "updates": self.updates}
         samples, then = self.reported
         self.reported = self.samples, time.monotonic()
@@ -165,7 +167,11 @@ def run(cfg):
             trainer = Trainer(cfg, folder, device)
             runs.write_config(folder, cfg)
         say(f"Training on {device} in {folder}")
-        trainer.train(stop)
+        try:
+            trainer.train(stop)
+        except (engine.EngineError, torch.OutOfMemoryError) as error:
+            reason = str(error).splitlines()[0].rstrip(".")
+            raise Fault(f"{reason}. What was saved before it is in {folder}") from error
         metrics.curves(folder)
         if stop.number is not None:
             raise Interrupted(stop.number, f"Stopped after {trainer.samples:,} samples. "

@@ -136,6 +136,20 @@ def test_a_signal_finishes_the_step_saves_and_says_how_to_go_on(here, monkeypatc
     assert checkpoint.load(folder / "checkpoints").step == 3 * UPDATE
 
 
+def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_world(here, monkeypatch, capsys):
+    real = train.Trainer.report
+
+    def report(self, *arguments):
+        real(self, *arguments)
+        self.env.core.agents.positions[2] = float("nan")
+
+    monkeypatch.setattr(train.Trainer, "report", report)
+    assert train.main([*TINY, "seconds=20", "folder=run"]) == 2
+    sentence, = capsys.readouterr().err.splitlines()
+    assert "environment 2" in sentence and "not a finite number" in sentence and "run" in sentence
+    assert len(metrics.read(here / "run" / "metrics.jsonl")) == 1
+
+
 def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, monkeypatch):
     def full(*arguments):
         raise OSError(28, "No space left on device")
