@@ -137,6 +137,8 @@ class PPO:
         """`_update` as a CUDA graph, after some for real on the stream a capture would use."""
         if self._warm_ups:
             self._warm_ups -= 1
+            # PyTorch would warn that gradients were first added up on another stream, which this waits for
+            torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)
             side = torch.cuda.Stream(self.device)
             side.wait_stream(torch.cuda.current_stream(self.device))
             with torch.cuda.stream(side):
