@@ -5,6 +5,7 @@ them, for capture, checkpoints and resume alike; :func:`capture` records a funct
 without Python.
 """
 
+import ast
 import contextlib
 import traceback
 import types
@@ -95,8 +96,7 @@ def _rebind(parent, step, leaf):
     if isinstance(parent, tuple):
         raise TypeError('a tensor inside a tuple was replaced')
     if step.startswith('['):
-        key = step[1:-1]
-        parent.__setitem__(int(key) if isinstance(parent, list) else key.strip("'\""), leaf)
+        parent.__setitem__(ast.literal_eval(step[1:-1]), leaf)
     elif isinstance(parent, torch.nn.Module) and step[1:] in parent._parameters:
         parent._parameters[step[1:]] = leaf
     else:

@@ -13,7 +13,21 @@ import numpy as np
 import torch
 
 
-class Ragged:
+class Bounds:
+    """What follows from the ``widths`` (D,) of subarrays that lie end to end."""
+
+    @cached_property
+    def ends(self):
+        """(D,) index into ``vals`` one past each subarray's last element."""
+        return self.widths.cumsum(0)
+
+    @cached_property
+    def starts(self):
+        """(D,) index into ``vals`` of each subarray's first element."""
+        return self.ends - self.widths
+
+
+class Ragged(Bounds):
     """``vals`` (V, ...) cut along its first axis into D subarrays of ``widths`` (D,) elements each.
 
     An integer index gives a subarray, a slice gives a Ragged; both share memory with ``vals``, except slices with a
@@ -30,16 +44,6 @@ class Ragged:
         widths = self._asarray_like(widths)
         _check(self.vals, widths)
         self.widths = self._int64(widths)
-
-    @cached_property
-    def ends(self):
-        """(D,) index into ``vals`` one past each subarray's last element."""
-        return self.widths.cumsum(0)
-
-    @cached_property
-    def starts(self):
-        """(D,) index into ``vals`` of each subarray's first element."""
-        return self.ends - self.widths
 
     @cached_property
     def _host(self):

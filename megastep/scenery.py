@@ -9,7 +9,7 @@ from functools import cached_property
 
 import torch
 
-from .ragged import Ragged
+from .ragged import Bounds, Ragged
 
 
 def _expand(starts, widths):
@@ -18,7 +18,7 @@ def _expand(starts, widths):
     return torch.arange(int(widths.sum()), device=widths.device) + torch.repeat_interleave(starts - offsets, widths)
 
 
-class Pieced:
+class Pieced(Bounds):
     """A read-only Ragged whose subarrays are pieces of two tensors, joined when asked for: the agents' part first,
     then the design's.
 
@@ -32,14 +32,6 @@ class Pieced:
     @cached_property
     def widths(self):
         return self._widths[0] + self._widths[1]
-
-    @cached_property
-    def ends(self):
-        return self.widths.cumsum(0)
-
-    @cached_property
-    def starts(self):
-        return self.ends - self.widths
 
     @cached_property
     def vals(self):

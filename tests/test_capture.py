@@ -17,7 +17,7 @@ class Counter:
 
     def __init__(self, how='in place', device='cpu'):
         self.how, self.device = how, device
-        self.parts = {'total': torch.zeros(4, device=device)}
+        self.parts = {'total': torch.zeros(4, device=device), 7: torch.zeros(4, device=device)}
         self.steps, self.history = 0, [torch.zeros(4, device=device)]
         self.pair = (torch.zeros(4, device=device),)
         self.generator = torch.Generator(device).manual_seed(1)
@@ -27,7 +27,7 @@ class Counter:
         if self.how == 'in place':
             self.parts['total'].copy_(total)
         elif self.how == 'rebound':
-            self.parts['total'], self.history[0] = total, total * 2
+            self.parts['total'], self.parts[7], self.history[0] = total, total * 3, total * 2
         elif self.how == 'scalar':
             self.steps += 1
         elif self.how == 'asks':
@@ -46,7 +46,7 @@ def actions(device, value=1):
 
 def test_the_walk_finds_tensors_and_generators_by_path():
     tree = capture.state_tree(Counter())
-    assert set(tree) == {".parts['total']", '.history[0]', '.pair[0]', '.generator'}
+    assert set(tree) == {".parts['total']", '.parts[7]', '.history[0]', '.pair[0]', '.generator'}
     paths = capture.state_tree(envs.Explorer(2, device='cpu'))
     assert {'.core.agents.positions', '.core.scenery.design', '.seen', '.spawner.counts', '.ended'} <= set(paths)
 
