@@ -304,12 +304,12 @@ def _look(scenery, agents, **fields):
         agents.res / (2 * width),
         0.99 * agents.radius * math.cos(half),
     )
-    params.subsample, params.max_depth = 1, 10.0
+    params.subsample, params.per_depth = 1, 0.1
     for name, value in fields.items():
         setattr(params, name, value.data_ptr() if isinstance(value, torch.Tensor) else value)
     params.n_pixels, params.share = agents.res // params.subsample, 1 / params.subsample
     threads = 32 * scenery.n_envs * scenery.n_agents
-    compile.launch('sight', params, scenery.device, threads, shared=8 * (agents.res + agents.res % 2))
+    compile.launch('sight', params, scenery.device, threads, shared=256 * -(-agents.res // 32))
     _checked(agents)
 
 
@@ -368,7 +368,7 @@ def observe(
         scenery,
         agents,
         subsample=subsample,
-        max_depth=max_depth,
+        per_depth=1 / max_depth,
         n_words=words,
         velocity=velocity,
         angvelocity=angvelocity,

@@ -6,6 +6,8 @@
 #define CEIL(x) __builtin_ceilf(x)
 #define FLOOR(x) __builtin_floorf(x)
 #define RINT(x) __builtin_rintf(x)
+#define RECIPROCAL(x) (1.f / (x))
+#define LOAD(at) (*(at))
 #define NAN_VALUE __builtin_nanf("")
 #define INFINITE __builtin_inff()
 static inline unsigned int or_bits(unsigned int* word, unsigned int bits) { unsigned int old = *word; *word = old | bits; return old; }
@@ -177,13 +179,17 @@ extern "C" void sight(const Sight* given) {
                 if (p.middle) p.middle[view] = bench.index[p.res / 2];
                 const float* inverse = bench.inverse.data();
                 const int* index = bench.index.data();
-                for (int r = 0; r < p.res; r += p.subsample) {
-                    Ray sum = shade_ray(p, screen, scene, camera, agent, view, r, inverse[r], index[r], fresh);
-                    for (int k = r + 1; k < r + p.subsample; k++) {
-                        Ray ray = shade_ray(p, screen, scene, camera, agent, view, k, inverse[k], index[k], fresh);
-                        sum.red += ray.red; sum.green += ray.green; sum.blue += ray.blue; sum.depth += ray.depth;
+                unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;
+                for (int pixel = 0; pixel < p.n_pixels; pixel++) {
+                    Ray rays[32];
+                    for (int k = 0; k < p.subsample; k++) {
+                        int r = pixel * p.subsample + k;
+                        rays[k] = shade_ray<1, 1>(p, screen, scene, camera, view, seen, r, inverse[r], index[r], fresh);
                     }
-                    write_pixel(p, view, r / p.subsample, sum);
+                    Ray sum = rays[0];
+                    if (p.subsample == 4) sum = plus(plus(rays[0], rays[1]), plus(rays[2], rays[3]));
+                    else for (int k = 1; k < p.subsample; k++) sum = plus(sum, rays[k]);
+                    write_pixel(p, view, pixel, sum);
                 }
             }
             if (p.fresh) p.fresh[agent] = fresh;

@@ -8,6 +8,11 @@
 #define CEIL(x) ceilf(x)
 #define FLOOR(x) floorf(x)
 #define RINT(x) rintf(x)
+// The processor's approximation, and one step of Newton with fused multiply-adds, is how IEEE division rounds correctly, less the tests of what floats cannot hold.
+DEVICE float reciprocal(float x) { float r; asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x)); return __fmaf_rn(r, __fmaf_rn(-x, r, 1.f), r); }
+#define RECIPROCAL(x) reciprocal(x)
+template <class T> DEVICE T load(const T* at) { float4 bits = __ldg((const float4*)at); return *(T*)&bits; }
+#define LOAD(at) load(at)
 #define NAN_VALUE __int_as_float(0x7fc00000)
 #define INFINITE __int_as_float(0x7f800000)
 #define OR_BITS(word, bits) atomicOr(word, bits)

@@ -1,11 +1,13 @@
 // The mathematics of the engine: plain C++ without includes, compiled for the CPU and the GPU alike, and equal on both to the last bit. Hence no
 // fused multiply-add (a compiler flag on either side), IEEE division and square root, and our own sine and cosine.
-// Before it stand, from the backend: HD (how a function is declared), and SQRT, CEIL, FLOOR, RINT, ABS of a float, correctly rounded.
+// Before it stand, from the backend: HD (how a function is declared), and SQRT, CEIL, FLOOR, RINT and RECIPROCAL of a float, correctly rounded; RECIPROCAL where
+// both it and its argument lie well within what a float can hold, elsewhere anything.
 
 HD float low(float a, float b) { return a < b ? a : b; }
 HD float high(float a, float b) { return a > b ? a : b; }
 HD float clamp(float x, float a, float b) { return low(high(x, a), b); }
-HD int clamp_int(int x, int a, int b) { return x < a ? a : (x > b ? b : x); }
+HD int lowest(int a, int b) { return a < b ? a : b; }
+HD int highest(int a, int b) { return a > b ? a : b; }
 HD float cross(float ax, float ay, float bx, float by) { return ax * by - ay * bx; }
 HD int is_finite(float x) { return x - x == 0.f; }
 
@@ -132,14 +134,14 @@ HD Span span_of(const Camera& camera, const Screen& screen, float wax, float way
     to_camera(camera, wbx, wby, bx, by);
     float vx = bx - ax, vy = by - ay, area = cross(ax, ay, vx, vy);
     int behind_a = ax < screen.near, behind_b = bx < screen.near;
-    float cut = behind_a | behind_b ? ay + (screen.near - ax) / vx * vy : 0.f;      // where the wall crosses the near plane, if it does
-    float pa = screen.centre - screen.scale * ((behind_a ? cut : ay) / (behind_a ? screen.near : ax));
-    float pb = screen.centre - screen.scale * ((behind_b ? cut : by) / (behind_b ? screen.near : bx));
+    float cut = ay + (screen.near - ax) * RECIPROCAL(vx) * vy;      // where the wall crosses the near plane, if it does
+    float pa = screen.centre - screen.scale * ((behind_a ? cut : ay) * RECIPROCAL(behind_a ? screen.near : ax));
+    float pb = screen.centre - screen.scale * ((behind_b ? cut : by) * RECIPROCAL(behind_b ? screen.near : bx));
     float res = (float)screen.res;
     Span span;
     span.first = (int)CEIL(clamp(low(pa, pb), 0.f, res));
     span.last = (behind_a & behind_b) | (area == 0.f) ? 0 : (int)CEIL(clamp(high(pa, pb), 0.f, res));
-    float k = 1.f / area;
+    float k = RECIPROCAL(area);
     span.base = (vy - screen.edge * vx) * k;
     span.gain = screen.pitch * vx * k;
     span.close = area * area <= screen.radius * screen.radius * (vx * vx + vy * vy) * 1.001f;
@@ -160,7 +162,7 @@ HD Cover cover_of(const Camera& camera, const Screen& screen, float half_width, 
         leftwards |= y - half_width * x <= slack;
         rightwards |= y + half_width * x >= -slack;
         nearest = low(nearest, x);
-        float pixel = screen.centre - screen.scale * (y / x);
+        float pixel = screen.centre - screen.scale * (y * RECIPROCAL(x));
         low_pixel = low(low_pixel, pixel); high_pixel = high(high_pixel, pixel);
     }
     float dx = high(high(lx - camera.x, camera.x - hx), 0.f), dy = high(high(ly - camera.y, camera.y - hy), 0.f);
@@ -168,7 +170,7 @@ HD Cover cover_of(const Camera& camera, const Screen& screen, float half_width, 
     if (!(ahead & leftwards & rightwards)) cover.distance = -1.f;
     if (nearest > 0.01f) {                                       // wholly ahead: then its corners bound what it covers
         float last = (float)(screen.res - 1);
-        cover.most = 1.01f / (nearest - 1e-3f);
+        cover.most = 1.01f * RECIPROCAL(nearest - 1e-3f);
         cover.first = (int)clamp(low_pixel - 1.f, 0.f, last);
         cover.last = (int)clamp(high_pixel + 2.f, 0.f, last);
     }
@@ -186,7 +188,7 @@ struct Hit { float location, facing; };   // fraction along the line; squared si
 // One division serves both.
 HD Hit hit_of(const Line& line, float y, float length) {
     float across = line.vy - y * line.vx, size = length * length * (line.vx * line.vx + line.vy * line.vy);
-    float inverse = 1.f / (across * size);
+    float inverse = RECIPROCAL(across * size);
     Hit hit;
     hit.location = clamp((y * line.ax - line.ay) * size * inverse, 0.f, 1.f);
     hit.facing = across * across * (across * inverse);
@@ -197,18 +199,18 @@ HD float cosine_of(const Line& line, float y, float length) {
     return (line.vx + y * line.vy) / (length * SQRT(line.vx * line.vx + line.vy * line.vy) + 1e-6f);
 }
 
-HD float depth_reading(float distance, float radius, float max_depth) { return 1.f - clamp((distance - radius) / max_depth, 0.f, 1.f); }
+HD float depth_reading(float distance, float radius, float per_depth) { return 1.f - clamp((distance - radius) * per_depth, 0.f, 1.f); }
 
-// Linear filtering between texel centres, clamped at the line's ends.
+// Linear filtering between texel centres, clamped at the line's ends. A location is within [0, 1].
 struct Filter { int left, right; float weight; };
 
 HD Filter filter_at(float location, int width) {
     float at = location * (float)width - 0.5f, floor = FLOOR(at);
-    Filter filter = {clamp_int((int)floor, 0, width - 1), clamp_int((int)floor + 1, 0, width - 1), at - floor};
+    Filter filter = {highest((int)floor, 0), lowest((int)floor + 1, width - 1), at - floor};
     return filter;
 }
 
-HD int texel_at(float location, int width) { return clamp_int((int)(location * (float)width), 0, width - 1); }
+HD int texel_at(float location, int width) { return lowest((int)(location * (float)width), width - 1); }
 
 HD float mix(float a, float b, float weight) { return a + weight * (b - a); }
 

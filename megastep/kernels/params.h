@@ -79,9 +79,9 @@ struct Sight {
     int subsample;                 // rays a pixel
     int n_pixels;                  // R / subsample
     float share;                   // 1 / subsample
-    float max_depth;               // metres
+    float per_depth;               // 1 / metres
     unsigned short* rgb;           // (N, A, C, 3, n_pixels) out: fp16
-    unsigned short* depth;         // (N, A, C, n_pixels) out: fp16, 1 at the radius, 0 at max_depth beyond it
+    unsigned short* depth;         // (N, A, C, n_pixels) out: fp16, 1 at the radius, 0 at 1 / per_depth beyond it
     int* middle;                   // (N, A, C) out: line at the middle of the screen
     const float* velocity;         // (N, A, 2) for imu
     const float* angvelocity;      // (N, A) for imu

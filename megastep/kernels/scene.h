@@ -1,5 +1,5 @@
 // What the operations share beyond single points and lines: one agent's move, its model's place, one pixel's colour. Both backends compile it.
-// Before it stand HD, NAN_VALUE, INFINITE, HALF_BITS(x), the bits of x in half precision rounded to nearest even, and OR_BITS(word, bits), which sets bits of a word of `seen` and returns what was there.
+// Before it stand HD, NAN_VALUE, INFINITE, LOAD(at), which reads what no one writes meanwhile, HALF_BITS(x), the bits of x in half precision rounded to nearest even, and OR_BITS(word, bits), which sets bits of a word of `seen` and returns what was there.
 
 HD void notice(int* fault, int world, float x, float y, float angle) {
     if (!is_finite(x) || !is_finite(y) || !is_finite(angle)) *fault = world + 1;
@@ -112,7 +112,7 @@ struct ALIGNED Four_floats { float x, y, z, w; };
 
 struct Colour { float red, green, blue; };
 
-HD Colour lit(const Four_floats& l, const Four_floats& r, float weight, float facing) {
+HD Colour lit(const Four_floats l, const Four_floats r, float weight, float facing) {
     float light = mix(l.w, r.w, weight) * facing;
     Colour colour = {mix(l.x, r.x, weight) * light, mix(l.y, r.y, weight) * light, mix(l.z, r.z, weight) * light};
     return colour;
@@ -121,7 +121,7 @@ HD Colour lit(const Four_floats& l, const Four_floats& r, float weight, float fa
 HD Colour wall_colour(const World& w, int first, int width, const Hit& hit) {
     Filter f = filter_at(hit.location, width);
     const Four_floats* texels = (const Four_floats*)w.texels + first;
-    return lit(texels[f.left], texels[f.right], f.weight, hit.facing);
+    return lit(LOAD(texels + f.left), LOAD(texels + f.right), f.weight, hit.facing);
 }
 
 HD Four_floats agent_texel_colour(const Scene& scene, int texel) {
@@ -148,36 +148,44 @@ HD void miss_ray(const Sight& p, long long ray) {
     if (p.screen) { float* out = p.screen + 3 * ray; out[0] = 0.f; out[1] = 0.f; out[2] = 0.f; }
 }
 
-// One ray, once its line is known: fills what is asked for at full resolution, and returns its share of its pixel. Counts in `fresh` a texel seen for the first time.
+// One ray, once its line is known: fills what is asked for at full resolution, if `whole`, and returns its share of its pixel. `crowd`: it may have hit an agent.
+// Counts in `fresh` a texel seen for the first time.
 struct Ray { float red, green, blue, depth; };
 
-HD Ray shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, int agent, long long view, int r, float inverse, int l, int& fresh) {
+template <int whole, int crowd>
+HD Ray shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, long long view, unsigned int* seen, int r, float inverse, int l, int& fresh) {
     Ray out = {0.f, 0.f, 0.f, 0.f};
     long long ray = view * p.res + r;
-    if (p.indices) p.indices[ray] = l;
-    if (l < 0) { miss_ray(p, ray); return out; }
+    if (whole && p.indices) p.indices[ray] = l;
+    if (l < 0) { if (whole) miss_ray(p, ray); return out; }
     float y = slope(screen, r), length = p.ray_lengths[r];
-    int n_agent_lines = scene.n_agent_lines, of_agent = l < n_agent_lines;
-    Four_floats ends = ((const Four_floats*)(of_agent ? scene.agent_lines : scene.walls))[of_agent ? l : l - n_agent_lines];
-    const int* starts = of_agent ? p.world.model_texels + l : scene.texel_starts + (l - n_agent_lines);
+    int wall = l - scene.n_agent_lines, of_agent = crowd && wall < 0;
+    Four_floats ends = LOAD((const Four_floats*)(of_agent ? scene.agent_lines : scene.walls) + (of_agent ? l : wall));
+    const int* starts = of_agent ? p.world.model_texels + l : scene.texel_starts + wall;
     int first = starts[0], width = starts[1] - first;
     Line line = line_in(camera, ends.x, ends.y, ends.z, ends.w);
     Hit hit = hit_of(line, y, length);
-    float distance = length / inverse;
-    out.depth = depth_reading(distance, screen.radius, p.max_depth);
-    if (p.rgb || p.screen) {
+    float distance = length * RECIPROCAL(inverse);
+    out.depth = depth_reading(distance, screen.radius, p.per_depth);
+    if (p.rgb || (whole && p.screen)) {
         Colour colour = of_agent ? agent_colour(scene, first, width, hit) : wall_colour(p.world, first, width, hit);
         out.red = colour.red; out.green = colour.green; out.blue = colour.blue;
-        if (p.screen) { float* rgb = p.screen + 3 * ray; rgb[0] = colour.red; rgb[1] = colour.green; rgb[2] = colour.blue; }
     }
+    if (seen && !of_agent) fresh += mark(seen, first - scene.first_texel + texel_at(hit.location, width));
+    if (!whole) return out;
+    if (p.screen) { float* rgb = p.screen + 3 * ray; rgb[0] = out.red; rgb[1] = out.green; rgb[2] = out.blue; }
     if (p.locations) p.locations[ray] = hit.location;
     if (p.dots) p.dots[ray] = cosine_of(line, y, length);
     if (p.distances) p.distances[ray] = distance;
-    if (p.seen && !of_agent) fresh += mark(p.seen + agent * (long long)p.n_words, first - scene.first_texel + texel_at(hit.location, width));
     return out;
 }
 
-// A pixel is the mean of its rays, which are summed in order.
+HD Ray plus(const Ray& a, const Ray& b) {
+    Ray sum = {a.red + b.red, a.green + b.green, a.blue + b.blue, a.depth + b.depth};
+    return sum;
+}
+
+// A pixel is the mean of its rays, which are summed in order; four of them, the usual number, by pairs.
 HD void write_pixel(const Sight& p, long long view, int pixel, const Ray& sum) {
     int n_pixels = p.n_pixels;
     float share = p.share;

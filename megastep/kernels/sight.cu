@@ -1,54 +1,68 @@
 // One warp an agent, its cameras one after the other. Walls stand in groups of 32 with a box around each: groups that cannot be seen are left out, the others come
-// nearest first. Lanes take a wall each and find the pixels it covers; those not wholly behind what is already there stand side by side in shared memory, and
-// the warp walks them, keeping each pixel's largest inverse depth and, of equals, the first line. Pixel r belongs to lane r % 32: no atomics and no barriers
-// between walls. Then each lane shades its rays, and neighbours add theirs up into pixels.
+// nearest first. Lanes take a wall each, find the pixels it covers and lay that down in shared memory; then the warp goes over the blocks of 32 pixels that the group
+// covers, over each block's walls, a pixel a lane, and keeps the largest inverse depth and, of equals, the first line. Walls wholly behind what a block shows already are
+// passed over. Then each lane shades its rays, and neighbours add theirs up into pixels.
 
-struct __align__(16) Covered { int bounds; float base, gain; int line; };      // pixels [first, last) in 16 bits each; the sign bit of line: it comes within the radius
+struct __align__(16) Covered { int first, last; float base, gain; };      // a wall's pixels [first, last), and its inverse depth at pixel r: base + gain r
 struct __align__(8) Nearest { float inverse; int line; };
 
-// A warp's view in the making. Lane k knows `floor`, the smallest inverse depth among pixels 32 k to 32 k + 31.
+// A warp's view in the making. `nearest` has whole blocks: pixels beyond the screen are at INFINITE. Lane k knows `floor`, the smallest inverse depth in block k.
 struct View { const Camera& camera; const Screen& screen; const float* lengths; Covered* covered; Nearest* nearest; int lane; float floor; };
 
-// 32 lines at once, one a lane; `on` where there is one. `line` is its number in the world.
+DEVICE void clear(View& v) {
+    __syncwarp();
+    for (int r = v.lane; r < (v.screen.res + 31 & ~31); r += 32) {
+        Nearest nothing = {r < v.screen.res ? 0.f : INFINITE, -1};
+        v.nearest[r] = nothing;
+    }
+    v.floor = 0.f;
+}
+
+// 32 lines at once, one a lane; `on` where there is one. `line` is the number in the world of the first lane's.
 DEVICE void raster_group(View& v, const float* ends, int line, int on) {
-    int R = v.screen.res;
     Span span = {0, 0, 0.f, 0.f, 0};
     if (on) {
-        float4 b = *(const float4*)ends;
+        Four_floats b = LOAD((const Four_floats*)ends);
         span = span_of(v.camera, v.screen, b.x, b.y, b.z, b.w);
     }
-    int visible = span.first < span.last, from = visible ? span.first >> 5 : 0, to = visible ? (span.last - 1) >> 5 : 0;
-    float most = high(span.base + span.gain * (float)span.first, span.base + span.gain * (float)(span.last - 1)), least = INFINITE;
-    int widest = __reduce_max_sync(~0u, to - from);
+    int visible = span.first < span.last, from = visible ? span.first >> 5 : 32, to = visible ? (span.last - 1) >> 5 : -1;
+    float most = high(span.base + span.gain * (float)span.first, span.base + span.gain * (float)(span.last - 1));
+    unsigned int close = __ballot_sync(~0u, span.close);
+    Covered mine = {span.first, span.last, span.base, span.gain};
+    __syncwarp();
+    v.covered[v.lane] = mine;
+    __syncwarp();
+    int end = __reduce_max_sync(~0u, to);
     #pragma unroll 1
-    for (int k = 0; k <= widest; k++) least = low(least, __shfl_sync(~0u, v.floor, from + k < to ? from + k : to));
-    unsigned int some = __ballot_sync(~0u, visible && most >= least);
-    if (!some) return;
-    __syncwarp();
-    if (some >> v.lane & 1u) {
-        Covered mine = {span.first | span.last << 16, span.base, span.gain, line | (span.close ? 1 << 31 : 0)};
-        v.covered[__popc(some & ((1u << v.lane) - 1u))] = mine;
-    }
-    __syncwarp();
-    int n_covered = __popc(some);
-    for (int i = 0; i < n_covered; i++) {
-        Covered one = v.covered[i];
-        int first = one.bounds & 0xffff, last = one.bounds >> 16, close = one.line < 0, r = (first & ~31) + v.lane;
-        one.line &= 0x7fffffff;
-        float at = (float)r;
+    for (int k = __reduce_min_sync(~0u, from); k <= end; k++) {
+        float floor = __shfl_sync(~0u, v.floor, k);
+        unsigned int some = __ballot_sync(~0u, from <= k && k <= to && most >= floor);
+        if (!some) continue;
+        int r = 32 * k + v.lane, slot = 0;
+        float at = (float)r, inverse = 0.f;
         #pragma unroll 1
-        for (; r < last; r += 32, at += 32.f) {                 // most spans take one or two rounds
-            float inverse = one.base + one.gain * at;
-            if (close && inverse * v.screen.radius >= v.lengths[r]) continue;
-            Nearest here = v.nearest[r], mine = {inverse, one.line};
-            if (r >= first && (inverse > here.inverse || (inverse == here.inverse && one.line < here.line))) v.nearest[r] = mine;
+        for (unsigned int left = some & ~close; left;) {        // downwards, so that of equals the first comes last
+            int i = 31 - __clz(left);
+            Covered one = v.covered[i];
+            float here = one.base + one.gain * at;
+            if (r >= one.first && r < one.last && here >= inverse) { inverse = here; slot = i; }
+            left ^= 1u << i;
         }
-    }
-    int mine = some >> v.lane & 1, last_block = __reduce_max_sync(~0u, mine ? to : 0);
-    #pragma unroll 1
-    for (int k = __reduce_min_sync(~0u, mine ? from : 32); k <= last_block; k++) {
-        int r = 32 * k + v.lane;
-        unsigned int lowest = __reduce_min_sync(~0u, r < R ? __float_as_uint(v.nearest[r].inverse) : 0x7f800000u);
+        #pragma unroll 1
+        for (unsigned int left = some & close; left; left &= left - 1) {       // where they come within the radius they are not seen
+            int i = __ffs(left) - 1;
+            Covered one = v.covered[i];
+            float here = one.base + one.gain * at;
+            if (r >= one.first && r < one.last && here * v.screen.radius < v.lengths[r] && (here > inverse || (here == inverse && i < slot))) {
+                inverse = here; slot = i;
+            }
+        }
+        Nearest there = v.nearest[r];
+        if (inverse > there.inverse || (inverse == there.inverse && line + slot < there.line)) {
+            there.inverse = inverse; there.line = line + slot;
+            v.nearest[r] = there;
+        }
+        unsigned int lowest = __reduce_min_sync(~0u, __float_as_uint(there.inverse));
         if (v.lane == k) v.floor = __uint_as_float(lowest);
     }
 }
@@ -70,8 +84,8 @@ DEVICE void raster_walls(View& v, const World& w, const Scene& scene, int design
             int both = __shfl_sync(~0u, blocks, k);
             float most = __shfl_sync(~0u, cover.most, k), floor = v.lane >= (both & 0xffff) && v.lane <= both >> 16 ? v.floor : INFINITE;
             if (__all_sync(~0u, floor > most)) continue;         // all of it is behind what is already there
-            int l = 32 * (start - w.box_starts[design] + k) + v.lane;
-            raster_group(v, scene.walls + 4 * l, scene.n_agent_lines + l, l < scene.n_walls);
+            int l = 32 * (start - w.box_starts[design] + k);
+            raster_group(v, scene.walls + 4 * (l + v.lane), scene.n_agent_lines + l, l + v.lane < scene.n_walls);
         }
     }
 }
@@ -86,59 +100,75 @@ DEVICE Ray sum_of(const Ray& ray, int n) {
     return sum;
 }
 
-KERNEL BOUNDS sight(Sight p) {
-    extern __shared__ Nearest shared[];
-    __shared__ Covered all_covered[64];
+// The sum over four neighbouring lanes, by pairs. Each is left with one of its numbers: the first lane red, then blue, green, depth.
+DEVICE float quarter_of_sum(const Ray& ray, int lane) {
+    int odd = lane & 1, second = lane & 2;
+    float one = (odd ? ray.blue : ray.red) + __shfl_xor_sync(~0u, odd ? ray.red : ray.blue, 1);
+    float two = (odd ? ray.depth : ray.green) + __shfl_xor_sync(~0u, odd ? ray.green : ray.depth, 1);
+    return (second ? two : one) + __shfl_xor_sync(~0u, second ? one : two, 2);
+}
+
+// Shades a view's rays, a batch of lanes at a time, and adds them up into pixels.
+template <int whole, int crowd>
+DEVICE void shade(const Sight& p, const View& v, const Scene& scene, long long view, unsigned int* seen, int& fresh) {
+    int R = p.res, S = p.subsample, lane = v.lane, batch = S == 4 ? 32 : 32 / S * S, channel = (lane & 1) << 1 | (lane & 2) >> 1;
+    unsigned short* out = channel == 3 ? p.depth + view * p.n_pixels : p.rgb + (view * 3 + channel) * p.n_pixels;
+    int wanted = channel == 3 ? p.depth != 0 : p.rgb != 0;
+    #pragma unroll 1
+    for (int start = 0; start < R; start += batch) {
+        int r = start + lane, on = r < R && lane < batch;
+        Ray ray = {0.f, 0.f, 0.f, 0.f};
+        if (on) {
+            Nearest here = v.nearest[r];
+            ray = shade_ray<whole, crowd>(p, v.screen, scene, v.camera, view, seen, r, here.inverse, here.line, fresh);
+        }
+        if (S == 4) {
+            float sum = quarter_of_sum(ray, lane);
+            if (on && wanted) out[r >> 2] = HALF_BITS(sum * p.share);
+        } else {
+            Ray sum = sum_of(ray, S);
+            if (on && lane % S == 0) write_pixel(p, view, r / S, sum);
+        }
+    }
+}
+
+template <int whole, int crowd>
+DEVICE void look(const Sight& p, int agent, int lane, Covered* covered, Nearest* nearest) {
     const World& w = p.world;
-    int warp = threadIdx.x / 32, lane = threadIdx.x % 32, agent = blockIdx.x * (blockDim.x / 32) + warp;
-    if (agent >= w.n_worlds * w.n_agents) return;
-    int world = w.n_agents == 1 ? agent : agent / w.n_agents, a = agent - world * w.n_agents, R = p.res, S = p.subsample;
-    Nearest* nearest = shared + (R + R % 2) * warp;
+    int world = crowd ? agent / w.n_agents : agent, a = crowd ? agent % w.n_agents : 0, fresh = 0;
+    float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
     Screen screen = screen_of(p);
     Scene scene = scene_of(w, world);
-    if (lane == 0) notice(p.fault, world, p.positions[2 * agent], p.positions[2 * agent + 1], p.angles[agent]);
+    unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : 0;
+    if (lane == 0) notice(p.fault, world, x, y, angle);
     if (p.imu && lane < 3) feel(p, agent, lane);
-    if (p.seen && p.forget && p.forget[agent])
-        for (int i = lane; i < p.n_words; i += 32) p.seen[agent * (long long)p.n_words + i] = 0u;
-    int fresh = 0, batch = 32 / S * S, leads = lane < batch && lane % S == 0;
+    if (seen && p.forget && p.forget[agent])
+        for (int i = lane; i < p.n_words; i += 32) seen[i] = 0u;
     for (int c = 0; c < p.n_cameras; c++) {
-        Camera camera = camera_at(p.positions[2 * agent], p.positions[2 * agent + 1], p.angles[agent] + p.yaws[c]);
-        View v = {camera, screen, p.ray_lengths, all_covered + 32 * warp, nearest, lane, 0.f};
-        Nearest nothing = {0.f, -1};
-        for (int r = lane; r < R; r += 32) nearest[r] = nothing;
-        if (w.n_agents > 1)
-            for (int l = lane; l < (scene.n_agent_lines + 31) / 32 * 32; l += 32)
-                raster_group(v, scene.agent_lines + 4 * l, l, l < scene.n_agent_lines && l / w.n_model != a);
-        raster_walls(v, w, scene, w.design[world], p.half_width);
         long long view = (long long)agent * p.n_cameras + c;
+        Camera camera = camera_at(x, y, angle + p.yaws[c]);
+        View v = {camera, screen, p.ray_lengths, covered, nearest, lane, 0.f};
+        clear(v);
+        if (crowd && w.n_agents > 1)
+            for (int l = 0; l < scene.n_agent_lines; l += 32)
+                raster_group(v, scene.agent_lines + 4 * (l + lane), l, l + lane < scene.n_agent_lines && (l + lane) / w.n_model != a);
+        raster_walls(v, w, scene, w.design[world], p.half_width);
         __syncwarp();
-        for (int start = 0; start < R; start += batch) {
-            int r = start + lane, on = lane < batch && r < R;
-            Ray ray = {0.f, 0.f, 0.f, 0.f};
-            if (on) {
-                Nearest here = nearest[r];
-                if (p.middle && r == R / 2) p.middle[view] = here.line;
-                ray = shade_ray(p, screen, scene, camera, agent, view, r, here.inverse, here.line, fresh);
-            }
-            Ray sum = S == 4 ? sum_of(ray, 4) : sum_of(ray, S);     // the usual one unrolls
-            __syncwarp();
-            if (S == 1) { if (on) write_pixel(p, view, r, sum); }
-            else if (on && leads) {         // over the pixel's own rays, which are done with: two of them take a Ray
-                Nearest one = {sum.red, __float_as_int(sum.green)}, two = {sum.blue, __float_as_int(sum.depth)};
-                nearest[r] = one; nearest[r + 1] = two;
-            }
-        }
-        __syncwarp();
-        if (S > 1)
-            for (int pixel = lane; pixel < p.n_pixels; pixel += 32) {
-                Nearest one = nearest[pixel * S], two = nearest[pixel * S + 1];
-                Ray sum = {one.inverse, __int_as_float(one.line), two.inverse, __int_as_float(two.line)};
-                write_pixel(p, view, pixel, sum);
-            }
-        __syncwarp();
+        if (p.middle && lane == 0) p.middle[view] = nearest[p.res / 2].line;
+        shade<whole, crowd>(p, v, scene, view, seen, fresh);
     }
-    if (p.fresh) {
-        for (int step = 16; step; step /= 2) fresh += __shfl_xor_sync(~0u, fresh, step);
-        if (lane == 0) p.fresh[agent] = fresh;
-    }
+    if (!p.fresh) return;
+    fresh = __reduce_add_sync(~0u, fresh);
+    if (lane == 0) p.fresh[agent] = fresh;
+}
+
+KERNEL BOUNDS sight(Sight p) {
+    extern __shared__ Nearest shared[];
+    __shared__ Covered covered[64];
+    int warp = threadIdx.x / 32, lane = threadIdx.x % 32, agent = blockIdx.x * 2 + warp;
+    if (agent >= p.world.n_worlds * p.world.n_agents) return;
+    Nearest* nearest = shared + (p.res + 31 & ~31) * warp;
+    if (p.indices) look<1, 1>(p, agent, lane, covered + 32 * warp, nearest);
+    else if (p.world.n_agents > 1) look<0, 1>(p, agent, lane, covered + 32 * warp, nearest);
+    else look<0, 0>(p, agent, lane, covered + 32 * warp, nearest);
 }
