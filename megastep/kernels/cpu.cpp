@@ -174,8 +174,8 @@ extern "C" void sight(const Sight* given) {
                 bench.index.assign(p.res, -1);
                 if (w.n_agents > 1)
                     raster_lines(camera, screen, p.ray_lengths, scene.agent_lines, scene.n_agent_lines, 0, a * w.n_model, (a + 1) * w.n_model, bench);
-                raster_lines(camera, screen, p.ray_lengths, scene.walls, scene.n_walls, scene.n_agent_lines, 0, 0, bench);
-                long long view = (long long)agent * p.n_cameras + c;
+                raster_lines(camera, screen, p.ray_lengths, w.walls + 4 * (long long)scene.first_wall, scene.n_walls, scene.n_agent_lines, 0, 0, bench);
+                int view = agent * p.n_cameras + c;
                 if (p.middle) p.middle[view] = bench.index[p.res / 2];
                 const float* inverse = bench.inverse.data();
                 const int* index = bench.index.data();

@@ -32,10 +32,10 @@ HD void advance(const Motion& p, int world, int a) {
 
 // Number k of an agent's three of inertia.
 HD void feel(const Sight& p, int agent, int k) {
-    float s, c, x = p.velocity[2 * agent], y = p.velocity[2 * agent + 1];
+    float s, c, x = p.velocity[2 * agent], y = p.velocity[2 * agent + 1], turn = p.angvelocity[agent];
     sincos_degrees(p.angles[agent], s, c);
-    float value = k == 0 ? p.angvelocity[agent] : (k == 1 ? c * x + s * y : c * y - s * x);
-    p.imu[3 * (long long)agent + k] = HALF_BITS(value / (k == 0 ? 360.f : 10.f));
+    float ahead = c * x + s * y, left = c * y - s * x;
+    p.imu[3 * (long long)agent + k] = HALF_BITS(k == 0 ? turn * (1.f / 360.f) : (k == 1 ? ahead : left) * (1.f / 10.f));
 }
 
 struct Pose { float x, y, sine, cosine; };
@@ -94,16 +94,14 @@ HD int may_block_box(const Corridor& c, float x0, float y0, float x1, float y1) 
 
 // One world's lines and texels.
 struct Scene {
-    const float* walls; const float* agent_lines; const float* agent_textures; const float* agent_light;
-    const int* texel_starts;
-    int n_walls, n_agent_lines, first_texel;
+    const float* agent_lines; const float* agent_textures; const float* agent_light;
+    int first_wall, n_walls, n_agent_lines, first_texel;
 };
 
 HD Scene scene_of(const World& w, int world) {
     int design = w.design[world], first = w.wall_starts[design], n = w.n_agents * w.n_model;
-    Scene scene = {w.walls + 4 * (long long)first, w.agent_lines + 4 * (world * (long long)n),
-                   w.agent_textures + 3 * (design * (long long)w.n_agent_texels), w.agent_light + world * (long long)w.n_agent_texels,
-                   w.texel_starts + first, w.wall_starts[design + 1] - first, n, w.texel_starts[first]};
+    Scene scene = {w.agent_lines + 4 * (world * (long long)n), w.agent_textures + 3 * (design * (long long)w.n_agent_texels),
+                   w.agent_light + world * (long long)w.n_agent_texels, first, w.wall_starts[design + 1] - first, n, w.texel_starts[first]};
     return scene;
 }
 
@@ -120,8 +118,8 @@ HD Colour lit(const Four_floats l, const Four_floats r, float weight, float faci
 
 HD Colour wall_colour(const World& w, int first, int width, const Hit& hit) {
     Filter f = filter_at(hit.location, width);
-    const Four_floats* texels = (const Four_floats*)w.texels + first;
-    return lit(LOAD(texels + f.left), LOAD(texels + f.right), f.weight, hit.facing);
+    const Four_floats* texels = (const Four_floats*)w.texels;
+    return lit(LOAD(texels + (first + f.left)), LOAD(texels + (first + f.right)), f.weight, hit.facing);
 }
 
 HD Four_floats agent_texel_colour(const Scene& scene, int texel) {
@@ -153,15 +151,15 @@ HD void miss_ray(const Sight& p, long long ray) {
 struct Ray { float red, green, blue, depth; };
 
 template <int whole, int crowd>
-HD Ray shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, long long view, unsigned int* seen, int r, float inverse, int l, int& fresh) {
+HD Ray shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, int view, unsigned int* seen, int r, float inverse, int l, int& fresh) {
     Ray out = {0.f, 0.f, 0.f, 0.f};
-    long long ray = view * p.res + r;
+    long long ray = (long long)view * p.res + r;
     if (whole && p.indices) p.indices[ray] = l;
     if (l < 0) { if (whole) miss_ray(p, ray); return out; }
     float y = slope(screen, r), length = p.ray_lengths[r];
-    int wall = l - scene.n_agent_lines, of_agent = crowd && wall < 0;
-    Four_floats ends = LOAD((const Four_floats*)(of_agent ? scene.agent_lines : scene.walls) + (of_agent ? l : wall));
-    const int* starts = of_agent ? p.world.model_texels + l : scene.texel_starts + wall;
+    int of_agent = crowd && l < scene.n_agent_lines, i = of_agent ? l : l + (scene.first_wall - scene.n_agent_lines);
+    Four_floats ends = LOAD((const Four_floats*)(of_agent ? scene.agent_lines : p.world.walls) + i);
+    const int* starts = (of_agent ? p.world.model_texels : p.world.texel_starts) + i;
     int first = starts[0], width = starts[1] - first;
     Line line = line_in(camera, ends.x, ends.y, ends.z, ends.w);
     Hit hit = hit_of(line, y, length);
@@ -186,14 +184,14 @@ HD Ray plus(const Ray& a, const Ray& b) {
 }
 
 // A pixel is the mean of its rays, which are summed in order; four of them, the usual number, by pairs.
-HD void write_pixel(const Sight& p, long long view, int pixel, const Ray& sum) {
+HD void write_pixel(const Sight& p, int view, int pixel, const Ray& sum) {
     int n_pixels = p.n_pixels;
     float share = p.share;
     if (p.rgb) {
-        unsigned short* rgb = p.rgb + view * 3 * n_pixels + pixel;
+        unsigned short* rgb = p.rgb + (long long)view * (3 * n_pixels) + pixel;
         rgb[0] = HALF_BITS(sum.red * share); rgb[n_pixels] = HALF_BITS(sum.green * share); rgb[2 * n_pixels] = HALF_BITS(sum.blue * share);
     }
-    if (p.depth) p.depth[view * n_pixels + pixel] = HALF_BITS(sum.depth * share);
+    if (p.depth) p.depth[(long long)view * n_pixels + pixel] = HALF_BITS(sum.depth * share);
 }
 
 // Respawns a world's agents: each at a point of its own share of the design's points, at rest, looking anywhere.

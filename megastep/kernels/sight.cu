@@ -19,10 +19,10 @@ DEVICE void clear(View& v) {
 }
 
 // 32 lines at once, one a lane; `on` where there is one. `line` is the number in the world of the first lane's.
-DEVICE void raster_group(View& v, const float* ends, int line, int on) {
+DEVICE void raster_group(View& v, const Four_floats* ends, int line, int on) {
     Span span = {0, 0, 0.f, 0.f, 0};
     if (on) {
-        Four_floats b = LOAD((const Four_floats*)ends);
+        Four_floats b = LOAD(ends);
         span = span_of(v.camera, v.screen, b.x, b.y, b.z, b.w);
     }
     int visible = span.first < span.last, from = visible ? span.first >> 5 : 32, to = visible ? (span.last - 1) >> 5 : -1;
@@ -68,12 +68,12 @@ DEVICE void raster_group(View& v, const float* ends, int line, int on) {
 }
 
 DEVICE void raster_walls(View& v, const World& w, const Scene& scene, int design, float half_width) {
-    int end = w.box_starts[design + 1];
-    for (int start = w.box_starts[design]; start < end; start += 32) {
+    int first_box = w.box_starts[design];
+    for (int start = 0; 32 * start < scene.n_walls; start += 32) {
         unsigned int key = ~0u;
         Cover cover = {-1.f, 0.f, 0, 0};
-        if (start + v.lane < end) {
-            float4 b = ((const float4*)w.boxes)[start + v.lane];
+        if (32 * (start + v.lane) < scene.n_walls) {
+            float4 b = ((const float4*)w.boxes)[first_box + start + v.lane];
             cover = cover_of(v.camera, v.screen, half_width, b.x, b.y, b.z, b.w);
             if (cover.distance >= 0.f) key = __float_as_uint(cover.distance);
         }
@@ -84,8 +84,8 @@ DEVICE void raster_walls(View& v, const World& w, const Scene& scene, int design
             int both = __shfl_sync(~0u, blocks, k);
             float most = __shfl_sync(~0u, cover.most, k), floor = v.lane >= (both & 0xffff) && v.lane <= both >> 16 ? v.floor : INFINITE;
             if (__all_sync(~0u, floor > most)) continue;         // all of it is behind what is already there
-            int l = 32 * (start - w.box_starts[design] + k);
-            raster_group(v, scene.walls + 4 * (l + v.lane), scene.n_agent_lines + l, l + v.lane < scene.n_walls);
+            int l = 32 * (start + k);
+            raster_group(v, (const Four_floats*)w.walls + (scene.first_wall + l + v.lane), scene.n_agent_lines + l, l + v.lane < scene.n_walls);
         }
     }
 }
@@ -110,10 +110,11 @@ DEVICE float quarter_of_sum(const Ray& ray, int lane) {
 
 // Shades a view's rays, a batch of lanes at a time, and adds them up into pixels.
 template <int whole, int crowd>
-DEVICE void shade(const Sight& p, const View& v, const Scene& scene, long long view, unsigned int* seen, int& fresh) {
+DEVICE void shade(const Sight& p, const View& v, const Scene& scene, int view, unsigned int* seen, int& fresh) {
     int R = p.res, S = p.subsample, lane = v.lane, batch = S == 4 ? 32 : 32 / S * S, channel = (lane & 1) << 1 | (lane & 2) >> 1;
-    unsigned short* out = channel == 3 ? p.depth + view * p.n_pixels : p.rgb + (view * 3 + channel) * p.n_pixels;
-    int wanted = channel == 3 ? p.depth != 0 : p.rgb != 0;
+    unsigned short* plane = channel == 3 ? p.depth : p.rgb;
+    int wanted = plane != 0;
+    plane += (long long)(channel == 3 ? view : 3 * view + channel) * p.n_pixels;
     #pragma unroll 1
     for (int start = 0; start < R; start += batch) {
         int r = start + lane, on = r < R && lane < batch;
@@ -124,7 +125,7 @@ DEVICE void shade(const Sight& p, const View& v, const Scene& scene, long long v
         }
         if (S == 4) {
             float sum = quarter_of_sum(ray, lane);
-            if (on && wanted) out[r >> 2] = HALF_BITS(sum * p.share);
+            if (on && wanted) plane[r >> 2] = HALF_BITS(sum * p.share);
         } else {
             Ray sum = sum_of(ray, S);
             if (on && lane % S == 0) write_pixel(p, view, r / S, sum);
@@ -145,13 +146,13 @@ DEVICE void look(const Sight& p, int agent, int lane, Covered* covered, Nearest*
     if (seen && p.forget && p.forget[agent])
         for (int i = lane; i < p.n_words; i += 32) seen[i] = 0u;
     for (int c = 0; c < p.n_cameras; c++) {
-        long long view = (long long)agent * p.n_cameras + c;
+        int view = agent * p.n_cameras + c;
         Camera camera = camera_at(x, y, angle + p.yaws[c]);
         View v = {camera, screen, p.ray_lengths, covered, nearest, lane, 0.f};
         clear(v);
         if (crowd && w.n_agents > 1)
             for (int l = 0; l < scene.n_agent_lines; l += 32)
-                raster_group(v, scene.agent_lines + 4 * (l + lane), l, l + lane < scene.n_agent_lines && (l + lane) / w.n_model != a);
+                raster_group(v, (const Four_floats*)scene.agent_lines + (l + lane), l, l + lane < scene.n_agent_lines && (l + lane) / w.n_model != a);
         raster_walls(v, w, scene, w.design[world], p.half_width);
         __syncwarp();
         if (p.middle && lane == 0) p.middle[view] = nearest[p.res / 2].line;
