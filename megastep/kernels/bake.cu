@@ -14,7 +14,7 @@ KERNEL bake(Bake p) {
         int hidden = 0;
         for (int j = w.wall_starts[design]; j < w.wall_starts[design + 1] && !hidden; j++) {
             float4 b = ((const float4*)w.walls)[j];
-            hidden = blocks(light[0], light[1], dx, dy, b.x, b.y, b.z, b.w);
+            hidden = blocks(blind_of(light[0], light[1], b.x, b.y, b.z, b.w), dx, dy);
         }
         if (!hidden) sum += glow(light[2], dx, dy);
     }

@@ -35,7 +35,7 @@ static int hidden_by(const float* walls, int n, float lx, float ly, float dx, fl
     for (int start = 0; start < n; start += 64) {
         int end = start + 64 < n ? start + 64 : n, any = 0;
         #pragma omp simd reduction(| : any)
-        for (int j = start; j < end; j++) any |= blocks(lx, ly, dx, dy, walls[4 * j], walls[4 * j + 1], walls[4 * j + 2], walls[4 * j + 3]);
+        for (int j = start; j < end; j++) any |= blocks(blind_of(lx, ly, walls[4 * j], walls[4 * j + 1], walls[4 * j + 2], walls[4 * j + 3]), dx, dy);
         if (any) return 1;
     }
     return 0;

@@ -75,13 +75,19 @@ HD float wrap_degrees(float angle) {
 
 // ---- Light ----
 
-// Does the segment from a light at (lx, ly) along d, short of its last thousandth, meet the wall? Without a division: all sides times the determinant.
-HD int blocks(float lx, float ly, float dx, float dy, float ax, float ay, float bx, float by) {
-    float vx = bx - ax, vy = by - ay, wx = ax - lx, wy = ay - ly;
-    float den = cross(dx, dy, vx, vy), s = cross(wx, wy, vx, vy), u = cross(wx, wy, dx, dy);
-    float sign = den < 0.f ? -1.f : 1.f;
-    den *= sign; s *= sign; u *= sign;
-    return (s > 0.f) & (s < 0.999f * den) & (u >= 0.f) & (u <= den);
+// A wall as a light at (lx, ly) sees it: its way, its start from there, turned round so that `area`, that of the two, is not negative; 0 if they are in line.
+struct Blind { float vx, vy, wx, wy, area; };
+
+HD Blind blind_of(float lx, float ly, float ax, float ay, float bx, float by) {
+    float vx = bx - ax, vy = by - ay, wx = ax - lx, wy = ay - ly, area = cross(wx, wy, vx, vy), sign = area < 0.f ? -1.f : 1.f;
+    Blind blind = {sign * vx, sign * vy, sign * wx, sign * wy, sign * area};
+    return blind;
+}
+
+// Does the segment from the light along d, short of its last thousandth, meet the wall? Without a division: all sides times the determinant.
+HD int blocks(const Blind& blind, float dx, float dy) {
+    float den = cross(dx, dy, blind.vx, blind.vy), u = cross(blind.wx, blind.wy, dx, dy);
+    return (blind.area > 0.f) & (blind.area < 0.999f * den) & (u >= 0.f) & (u <= den);
 }
 
 HD float glow(float intensity, float dx, float dy) { return 2.f * intensity / high(dx * dx + dy * dy, 1.f); }

@@ -70,7 +70,8 @@ HD void agent_texel(const World& w, int world, int a, int texel, float& x, float
 struct Corridor { float x, y, dx, dy, along, aside; };     // from a light by (dx, dy) to a disc: how far along and aside to look, times its length
 
 HD Corridor corridor_of(float lx, float ly, const Pose& pose, float reach) {
-    float dx = pose.x - lx, dy = pose.y - ly, length2 = dx * dx + dy * dy, aside = reach * SQRT(length2) + 1e-3f;
+    float dx = pose.x - lx, dy = pose.y - ly, length2 = dx * dx + dy * dy, longest = high(dx, -dx), other = high(dy, -dy);
+    float aside = reach * (high(longest, other) + 0.5f * low(longest, other)) + 1e-3f;        // at least the length, at most an eighth more
     Corridor corridor = {lx, ly, dx, dy, length2 + aside, aside};
     return corridor;
 }
