@@ -16,13 +16,7 @@ from torch.utils import _pytree
 
 SCALARS = (bool, int, float, str, type(None))
 OPAQUE = (
-    types.ModuleType,
-    types.FunctionType,
-    types.MethodType,
-    types.BuiltinFunctionType,
-    type,
-    torch.dtype,
-    torch.device,
+    types.ModuleType, types.FunctionType, types.MethodType, types.BuiltinFunctionType, type, torch.dtype, torch.device,
 )
 
 

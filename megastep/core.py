@@ -44,14 +44,9 @@ class Core:
         lines, colours, lights = self.scenery.world(e)
         agents = self.agents
         return arrdict(
-            lines=lines,
-            texels=torch.cat(colours),
-            widths=torch.tensor([len(texels) for texels in colours]),
-            lights=lights.clone(),
-            n_agent_lines=torch.tensor(self.scenery.agent_lines.shape[1]),
-            positions=agents.positions[e].clone(),
-            angles=agents.angles[e].clone(),
-            yaws=agents.yaws.clone(),
+            lines=lines, texels=torch.cat(colours), widths=torch.tensor([len(texels) for texels in colours]),
+            lights=lights.clone(), n_agent_lines=torch.tensor(self.scenery.agent_lines.shape[1]),
+            positions=agents.positions[e].clone(), angles=agents.angles[e].clone(), yaws=agents.yaws.clone(),
             fov=torch.tensor(agents.fov),
         )
 

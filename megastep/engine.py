@@ -15,22 +15,8 @@ from .kernels.compile import EngineError
 from .scenery import Designs, Scenery
 
 __all__ = [
-    'Agents',
-    'Designs',
-    'EngineError',
-    'Observation',
-    'Physics',
-    'Render',
-    'Scenery',
-    'bake',
-    'check',
-    'device',
-    'draw',
-    'fit',
-    'observe',
-    'physics',
-    'render',
-    'spawn',
+    'Agents', 'Designs', 'EngineError', 'Observation', 'Physics', 'Render', 'Scenery', 'bake', 'check', 'device',
+    'draw', 'fit', 'observe', 'physics', 'render', 'spawn',
 ]
 
 AGENT_WIDTH = 0.15
@@ -175,27 +161,13 @@ def _pointer(name, tensor, shape, dtype, device):
 def _world(scenery, radius):
     designs = scenery.designs
     return compile.STRUCTS['World'](
-        designs.lines.vals.data_ptr(),
-        designs.wall_starts.data_ptr(),
-        designs.texel_starts.data_ptr(),
-        designs.boxes.data_ptr(),
-        designs.box_starts.data_ptr(),
-        designs.texels.data_ptr(),
-        designs.lights.vals.data_ptr(),
-        designs.light_starts.data_ptr(),
+        designs.lines.vals.data_ptr(), designs.wall_starts.data_ptr(), designs.texel_starts.data_ptr(),
+        designs.boxes.data_ptr(), designs.box_starts.data_ptr(), designs.texels.data_ptr(),
+        designs.lights.vals.data_ptr(), designs.light_starts.data_ptr(),
         _pointer('scenery.design', scenery.design, (scenery.n_envs,), torch.int32, scenery.device),
-        scenery.model.data_ptr(),
-        scenery.model_texels.data_ptr(),
-        designs.agent_textures.data_ptr(),
-        scenery.agent_lines.data_ptr(),
-        scenery.agent_light.data_ptr(),
-        scenery.n_envs,
-        scenery.n_agents,
-        len(scenery.model),
-        scenery.agent_light.shape[1],
-        torch.get_num_threads(),
-        radius,
-        1.001 * scenery.reach,
+        scenery.model.data_ptr(), scenery.model_texels.data_ptr(), designs.agent_textures.data_ptr(),
+        scenery.agent_lines.data_ptr(), scenery.agent_light.data_ptr(), scenery.n_envs, scenery.n_agents,
+        len(scenery.model), scenery.agent_light.shape[1], torch.get_num_threads(), radius, 1.001 * scenery.reach,
     )
 
 
@@ -262,15 +234,9 @@ def physics(scenery, agents, actions=None, moves=None, keep=0.0):
     progress = torch.empty((scenery.n_envs, scenery.n_agents), device=scenery.device)
     state = _state(scenery, agents, 'positions', 'angles', 'velocity', 'angvelocity')
     params = compile.STRUCTS['Motion'](
-        _world(scenery, agents.radius),
-        *state,
-        progress.data_ptr(),
-        agents.fault.data_ptr(),
-        _pointer('actions', actions, (n, a), torch.int64, scenery.device),
-        0 if moves is None else moves.data_ptr(),
-        0 if moves is None else len(moves),
-        keep,
-        1 / agents.fps,
+        _world(scenery, agents.radius), *state, progress.data_ptr(), agents.fault.data_ptr(),
+        _pointer('actions', actions, (n, a), torch.int64, scenery.device), 0 if moves is None else moves.data_ptr(),
+        0 if moves is None else len(moves), keep, 1 / agents.fps,
     )
     params.team = 8 if n > MANY else 32
     compile.launch('physics', params, scenery.device, params.team * n)
@@ -290,18 +256,9 @@ def _look(scenery, agents, **fields):
     half = math.radians(agents.fov / 2)
     width = math.tan(half)
     params = compile.STRUCTS['Sight'](
-        _world(scenery, agents.radius),
-        *_state(scenery, agents, 'positions', 'angles'),
-        agents.yaws.data_ptr(),
-        agents.ray_lengths.data_ptr(),
-        agents.fault.data_ptr(),
-        len(agents.yaws),
-        agents.res,
-        width,
-        width * (agents.res - 1) / agents.res,
-        2 * width / agents.res,
-        agents.res / 2 - 0.5,
-        agents.res / (2 * width),
+        _world(scenery, agents.radius), *_state(scenery, agents, 'positions', 'angles'), agents.yaws.data_ptr(),
+        agents.ray_lengths.data_ptr(), agents.fault.data_ptr(), len(agents.yaws), agents.res, width,
+        width * (agents.res - 1) / agents.res, 2 * width / agents.res, agents.res / 2 - 0.5, agents.res / (2 * width),
         0.99 * agents.radius * math.cos(half),
     )
     params.subsample, params.per_depth = 1, 0.1
@@ -324,8 +281,7 @@ def render(scenery, agents):
     floats = {name: torch.empty(shape, device=scenery.device) for name in ('locations', 'dots', 'distances')}
     out = Render(
         indices=torch.empty(shape, dtype=torch.int32, device=scenery.device),
-        screen=torch.empty((*shape, 3), device=scenery.device),
-        **floats,
+        screen=torch.empty((*shape, 3), device=scenery.device), **floats,
     )
     _look(scenery, agents, **out._asdict())
     return out
@@ -365,14 +321,8 @@ def observe(
         )
     velocity, angvelocity = _state(scenery, agents, 'velocity', 'angvelocity')
     _look(
-        scenery,
-        agents,
-        subsample=subsample,
-        per_depth=1 / max_depth,
-        n_words=words,
-        velocity=velocity,
-        angvelocity=angvelocity,
-        seen=_pointer('seen', seen, (n, a, words), torch.int32, where),
+        scenery, agents, subsample=subsample, per_depth=1 / max_depth, n_words=words, velocity=velocity,
+        angvelocity=angvelocity, seen=_pointer('seen', seen, (n, a, words), torch.int32, where),
         forget=_pointer('forget', forget, (n, a), torch.bool, where),
         **{name: tensor for name, tensor in out._asdict().items() if tensor is not None},
     )
@@ -391,14 +341,10 @@ def spawn(scenery, agents, mask, points, counts, seed, resample=False):
     if n_points < scenery.n_agents:
         raise ValueError(f'{scenery.n_agents} agents need at least as many points, but {n_points} a design were given')
     params = compile.STRUCTS['Spawn'](
-        _world(scenery, agents.radius),
-        *_state(scenery, agents, 'positions', 'angles', 'velocity', 'angvelocity'),
+        _world(scenery, agents.radius), *_state(scenery, agents, 'positions', 'angles', 'velocity', 'angvelocity'),
         _pointer('mask', mask, lanes, torch.bool, where),
         _pointer('points', points, (n_designs, n_points, 2), torch.float32, where),
-        _pointer('counts', counts, lanes, torch.int32, where),
-        seed & 0xFFFFFFFF,
-        seed >> 32 & 0xFFFFFFFF,
-        n_points,
+        _pointer('counts', counts, lanes, torch.int32, where), seed & 0xFFFFFFFF, seed >> 32 & 0xFFFFFFFF, n_points,
         n_designs if resample else 0,
     )
     compile.launch('spawn', params, where, scenery.n_envs)
@@ -412,12 +358,8 @@ def draw(counts, mask, seed, out):
     """
     n, where = len(counts), out.device
     params = compile.STRUCTS['Draw'](
-        _pointer('counts', counts, (n,), torch.int32, where),
-        _pointer('mask', mask, (n,), torch.bool, where),
-        _pointer('out', out, (n, 4), torch.float32, where),
-        seed & 0xFFFFFFFF,
-        seed >> 32 & 0xFFFFFFFF,
-        n,
+        _pointer('counts', counts, (n,), torch.int32, where), _pointer('mask', mask, (n,), torch.bool, where),
+        _pointer('out', out, (n, 4), torch.float32, where), seed & 0xFFFFFFFF, seed >> 32 & 0xFFFFFFFF, n,
         torch.get_num_threads(),
     )
     compile.launch('draw', params, where, n)

@@ -37,8 +37,7 @@ class _Movement:
     def __init__(self, core, speed, ang_speed, keep):
         self.core, self.keep = core, keep
         self.moves = torch.tensor(
-            [(speed * x, speed * y, ang_speed * turn) for (x, y), turn in zip(MOVES, TURNS)],
-            dtype=torch.float32,
+            [(speed * x, speed * y, ang_speed * turn) for (x, y), turn in zip(MOVES, TURNS)], dtype=torch.float32,
             device=core.device,
         )
         self.space = spaces.MultiDiscrete(core.n_agents, len(MOVES))

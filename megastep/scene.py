@@ -12,17 +12,7 @@ TEXEL = 0.05  # metres a texel
 STRIPE = (0.4, 2.0)  # metres, shortest and longest period of a wall's pattern
 INTENSITY = (0.5, 1.6)  # of lights
 PALETTE = (
-    'd9b08c',
-    'a3c1ad',
-    'e0d5b6',
-    'b7a7c9',
-    '9fb8d0',
-    'c98b8b',
-    'd8c27a',
-    '8fae7d',
-    'b0b0b0',
-    'cf9fb5',
-    '7fb0b0',
+    'd9b08c', 'a3c1ad', 'e0d5b6', 'b7a7c9', '9fb8d0', 'c98b8b', 'd8c27a', '8fae7d', 'b0b0b0', 'cf9fb5', '7fb0b0',
     'e8e0d8',
 )
 AGENT_PALETTE = ('3b6ea5', 'a5523b', '4f8f4f', '8a5ba5', 'a58a3b', '3b9a9a', 'a53b74', '6b6b6b')

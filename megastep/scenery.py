@@ -157,10 +157,8 @@ class Scenery:
         of_agent = is_agent[textures.inverse]
         designs = Designs(
             Ragged(lines.vals[~is_agent], lines.widths - own),
-            Ragged(textures.vals[~of_agent], textures.widths[~is_agent]),
-            lights,
-            textures.vals[of_agent].view(n, -1, 3),
-            device,
+            Ragged(textures.vals[~of_agent], textures.widths[~is_agent]), lights,
+            textures.vals[of_agent].view(n, -1, 3), device,
         )
         self._fill(n_agents, designs, model, agent_widths[0], torch.arange(n), device)
 
@@ -203,8 +201,7 @@ class Scenery:
         n = self.agent_lines.shape[1]
         own = torch.arange(self.n_envs, device=self.device) * n
         return Pieced(
-            (self.agent_lines.flatten(0, 1), static.vals),
-            (own, static.starts[design]),
+            (self.agent_lines.flatten(0, 1), static.vals), (own, static.starts[design]),
             (torch.full_like(own, n), static.widths[design]),
         )
 
@@ -254,8 +251,7 @@ class Scenery:
         if not len(walls.vals):
             return Pieced(vals, (starts, zero), (widths, zero))
         return Pieced(
-            vals,
-            (starts, torch.where(is_agent, zero, static.starts[wall])),
+            vals, (starts, torch.where(is_agent, zero, static.starts[wall])),
             (widths, torch.where(is_agent, zero, static.widths[wall])),
         )
 

@@ -86,10 +86,7 @@ class Explorer:
     def state(self, e=0):
         """What :meth:`plot_state` draws of world ``e``."""
         return arrdict(
-            core=self.core.state(e),
-            obs=self._look()[0][e],
-            seen=self._seen_texels(e),
-            length=self.length[e].clone(),
+            core=self.core.state(e), obs=self._look()[0][e], seen=self._seen_texels(e), length=self.length[e].clone(),
             n_seen=self.n_seen[e].clone(),
         )
 

@@ -19,24 +19,12 @@ class Minimal:
     n_agents = 1
 
     def __init__(
-        self,
-        n_envs=128,
-        geometries=None,
-        *,
-        seed=1,
-        device=None,
-        res=64,
-        fov=130.0,
-        fps=10.0,
-        shortest=128,
+        self, n_envs=128, geometries=None, *, seed=1, device=None, res=64, fov=130.0, fps=10.0, shortest=128,
         longest=256,
     ):
         geometries = [toys.box()] if geometries is None else geometries[:n_envs]
         self.core = Core(
-            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
-            res=res,
-            fov=fov,
-            fps=fps,
+            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device), res=res, fov=fov, fps=fps,
             seed=seed,
         )
         self.n_envs, self.device = self.core.n_envs, self.core.device
@@ -61,10 +49,7 @@ class Minimal:
         self.spawner(reset)
         self.ended.copy_(self.lifespans(reset) & ~reset)
         return arrdict(
-            obs=self._look(),
-            reward=self._reward.clone(),
-            reset=reset,
-            terminal=torch.zeros_like(reset),
+            obs=self._look(), reward=self._reward.clone(), reset=reset, terminal=torch.zeros_like(reset),
             truncated=self.ended.clone(),
         )
 

@@ -19,15 +19,9 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    "living": Kind(17., .30, 280),
-    "bath": Kind(3.1, .28, 115, .55),
-    "entry": Kind(5., .38, 115, aspect=4.6),
-    "bedroom": Kind(10.8, .18, 220, 1.),
-    "kitchen": Kind(9.5, .40, 190),
-    "closet": Kind(2.2, .35, 90, 1.55),
-    "storage": Kind(2.7, .50, 90, .75),
-    "lobby": Kind(1.2, .25, 90, .45),
-    "utility": Kind(5., .50, 140, .45),
+    "living": Kind(17., .30, 280), "bath": Kind(3.1, .28, 115, .55), "entry": Kind(5., .38, 115, aspect=4.6),
+    "bedroom": Kind(10.8, .18, 220, 1.), "kitchen": Kind(9.5, .40, 190), "closet": Kind(2.2, .35, 90, 1.55),
+    "storage": Kind(2.7, .50, 90, .75), "lobby": Kind(1.2, .25, 90, .45), "utility": Kind(5., .50, 140, .45),
     "room": Kind(10., .35, 220, .55),
 }
 CORE = ("living", "bath", "entry", "bedroom", "kitchen")    # what the first five rooms of every home are
