@@ -169,6 +169,12 @@ class Graph:
         self._leaves = [leaf.clone() if isinstance(leaf, torch.Tensor) else leaf for leaf in leaves]
         inputs = _pytree.tree_unflatten(self._leaves, self._spec)
         roots = dict(enumerate(roots))
+        tensors = [leaf for leaf in [*leaves, *state_tree(roots).values()] if isinstance(leaf, torch.Tensor)]
+        self._device = next((leaf.device for leaf in tensors if leaf.device.type == 'cuda'), None)
+        with torch.cuda.device(self._device):
+            self._record(function, inputs, roots, warmup)
+
+    def _record(self, function, inputs, roots, warmup):
         saved, original = snapshot(roots), _State(roots.values())
         generators = [
             leaf
@@ -189,7 +195,7 @@ class Graph:
             torch.cuda.current_stream().wait_stream(side)
             restore(roots, saved)
             state = _State(roots.values())
-            with torch.cuda.graph(self._graph):
+            with torch.cuda.graph(self._graph, stream=side):
                 self._out = function(*inputs)
                 state.settle()
         except RuntimeError:
@@ -213,12 +219,13 @@ class Graph:
                         f'called with {tuple(given.shape)}'
                     )
                 inside.copy_(given)
-        self._graph.replay()
+        with torch.cuda.device(self._device):
+            self._graph.replay()
         return self._out
 
 
 def capture(function, args, roots, warmup=3):
-    """``function`` recorded as a CUDA graph on the current device, or ``function`` itself, with one warning that
+    """``function`` recorded as a CUDA graph on the device of its state, or ``function`` itself, with one warning that
     names the line, if it cannot be.
 
     Args: ``args`` a tuple of example arguments, trees of tensors of fixed shapes; ``roots`` the objects whose tensors

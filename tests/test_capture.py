@@ -1,5 +1,7 @@
 """Capture: the walk over state runs anywhere; the graphs themselves need a GPU."""
 
+from operator import attrgetter
+
 import pytest
 import torch
 
@@ -40,8 +42,8 @@ class Counter:
         return arrdict.arrdict(obs=total.view(4, 1, 1), reward=noise)
 
 
-def actions(device, value=1):
-    return arrdict.arrdict(actions=torch.full((4, 1), value, device=device))
+def actions(device, value=1, n=4):
+    return arrdict.arrdict(actions=torch.full((n, 1), value, device=device))
 
 
 def test_the_walk_finds_tensors_and_generators_by_path():
@@ -157,3 +159,16 @@ class TestOnTheGPU:
                 torch.cuda.current_stream().synchronize()
             results.append(world.obs.rgb)
         assert torch.equal(*results)
+
+    @pytest.mark.skipif(torch.cuda.device_count() < 2, reason='needs two GPUs')
+    def test_any_device_will_do(self):
+        made = [capture.Captured(envs.Explorer(16, device=f'cuda:{i}', resample=True)) for i in (0, 1)]
+        for env in made:
+            env.reset()
+        for k in range(230):
+            here, there = (env.step(actions(env.device, k % 7, 16)) for env in made)
+            assert there.reward.device == torch.device('cuda:1') and torch.cuda.current_device() == 0
+            for name in ('obs.rgb', 'obs.d', 'obs.imu', 'reward', 'reset', 'truncated'):
+                a, b = (attrgetter(name)(world).cpu() for world in (here, there))
+                assert torch.equal(a, b), name
+        assert all(isinstance(env._step, capture.Graph) for env in made)

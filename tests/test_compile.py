@@ -138,3 +138,34 @@ def test_the_gpu_sees_damage_too(tmp_path):
     (path,) = tmp_path.iterdir()
     path.write_bytes(path.read_bytes()[:5000])
     assert run(code, tmp_path)[:2] == (0, out)
+
+
+RECIPROCALS = """
+KERNEL reciprocals(float* values, int n) {
+    int i = blockIdx.x * blockDim.x + threadIdx.x;
+    if (i < n) values[i] = RECIPROCAL(values[i]);
+}
+"""
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a GPU')
+@pytest.mark.parametrize('exponent', [-100, -20, -1, 0, 1, 7, 100])
+def test_the_gpus_reciprocal_rounds_as_division_does(exponent):
+    """Every significand, of either sign."""
+    major, minor = torch.cuda.get_device_capability()
+    source = (compile.HERE / 'cuda.h').read_text() + RECIPROCALS
+    driver, _ = compile._bindings()
+    cubin = compile._build_cuda(source, (*compile.CUDA_FLAGS, f'--gpu-architecture=sm_{major}{minor}'))
+    torch.cuda.current_stream().synchronize()
+    module = compile._checked(driver.cuModuleLoadData(cubin), 'Loading')
+    kernel = compile._checked(driver.cuModuleGetFunction(module, b'reciprocals'), 'Loading')
+    significands = torch.arange(1 << 23, dtype=torch.int32) | 127 + exponent << 23
+    values = torch.cat([significands, significands | -1 << 31]).view(torch.float32)
+    found, n = values.cuda(), len(values)
+    pointer, count = ctypes.c_void_p(found.data_ptr()), ctypes.c_int(n)
+    arguments = (ctypes.c_void_p * 2)(ctypes.addressof(pointer), ctypes.addressof(count))
+    stream = torch.cuda.current_stream().cuda_stream
+    done = driver.cuLaunchKernel(kernel, -(-n // 64), 1, 1, 64, 1, 1, 0, stream, ctypes.addressof(arguments), 0)
+    compile._checked(done, 'Launching')
+    assert torch.equal(found.cpu(), 1 / values)
