@@ -3,10 +3,10 @@
     python scripts/benchmark.py step kernels --json docs/benchmarks.jsonl   # prints a table, appends a line a figure
     python scripts/benchmark.py report                                      # docs/benchmarks.jsonl to table and plot
 
-Works: step, kernels, observe, agents, memory, compile, first, cpu, train. All run in the benchmark's homes, with random
-actions drawn beforehand on the device. A figure is the median of its samples, its spread their 10th and 90th
-percentile. A sample is the mean of as many calls as fill 50 ms after warming up, timed by CUDA events on a GPU and by
-the clock on the CPU.
+Works: step, kernels, counters, observe, agents, memory, compile, first, cpu, train. All run in the benchmark's homes,
+with random actions drawn beforehand on the device. A figure is the median of its samples, its spread their 10th and
+90th percentile. A sample is the mean of as many calls as fill 50 ms after warming up, timed by CUDA events on a GPU and
+by the clock on the CPU.
 """
 import argparse
 import difflib
@@ -28,7 +28,9 @@ os.environ.setdefault('OMP_WAIT_POLICY', 'passive')     # before torch, which wo
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / 'tests')]
+sys.path[:0] = [str(ROOT), str(ROOT / 'tests'), str(ROOT / 'scripts')]
+
+from counters import counters  # noqa: E402
 
 from megastep import arrdict, capture, core, engine, envs, modules, scene  # noqa: E402
 from megastep.geometries import sample  # noqa: E402
@@ -310,7 +312,7 @@ def train(device):
                      [row['perf/rate'] / 1e6 for row in perf if 'perf/rate' in row])
 
 
-WORKS = {work.__name__: work for work in (step, kernels, observe, agents, memory, compile, first, cpu, train)}
+WORKS = {work.__name__: work for work in (step, kernels, counters, observe, agents, memory, compile, first, cpu, train)}
 
 
 # ---- Records ----
@@ -474,16 +476,18 @@ def main(argv=None):
     parser.add_argument('--device', default='auto', help='auto, cpu, cuda, cuda:1')
     parser.add_argument('--commit', help='what is measured, where git cannot tell')
     parser.add_argument('--json', type=Path, help='a file to append records to; report reads docs/benchmarks.jsonl')
-    options = parser.parse_args(argv)
     try:
-        if options.works == ['report']:
-            report(options.json or ROOT / 'docs' / 'benchmarks.jsonl')
-            return 0
-        device = checked(options)
+        run(parser.parse_args(argv))
     except (ValueError, OSError, engine.EngineError) as fault:
         print(f'benchmark.py: {fault}', file=sys.stderr)
         return 2
-    measured = options.commit or commit()
+    return 0
+
+
+def run(options):
+    if options.works == ['report']:
+        return report(options.json or ROOT / 'docs' / 'benchmarks.jsonl')
+    device, measured = checked(options), options.commit or commit()
     print(HEADER, flush=True)
     for name in options.works:
         for record in measure(name, device, measured):
@@ -491,7 +495,6 @@ def main(argv=None):
             if options.json:
                 with options.json.open('a') as file:
                     print(json.dumps(record), file=file)
-    return 0
 
 
 if __name__ == '__main__':

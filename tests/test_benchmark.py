@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from scripts import benchmark
+from scripts import benchmark, counters
 
 ROOT = Path(__file__).resolve().parents[1]
 KEYS = {'work', 'what', 'value', 'unit', 'low', 'high', 'n', 'on', 'driver', 'torch', 'cuda', 'commit', 'date',
@@ -89,6 +89,29 @@ def test_a_work_that_is_not_there_ends_with_one_sentence():
     done = subprocess.run([sys.executable, 'scripts/benchmark.py', 'stpe'], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2 and not done.stdout
     assert done.stderr.count('\n') == 1 and "'stpe'; did you mean 'step'?" in done.stderr
+
+
+def counted(*names):
+    header = ['ID', 'Kernel Name', *counters.METRICS]
+    values = [f'{65_536 * (k + 1):,}' for k in range(len(counters.METRICS))]
+    rows = [[str(i), name, *values] for i, name in enumerate(names)]
+    units = ['', '', *len(counters.METRICS) * ['unit']]
+    return 'a word before\n' + '\n'.join(','.join(f'"{cell}"' for cell in line) for line in [header, units, *rows])
+
+
+def test_counters_are_read_kernel_by_kernel():
+    names = [name for name, _ in counters.KERNELS]
+    found = list(counters.figures(counted(*names[:3], 'void at::add<int>', *names[3:])))
+    assert len(found) == len(counters.KERNELS) * len(counters.METRICS)
+    assert [f['value'] for f in found[:3]] == [1., 2., 3 * 65_536.]
+    assert found[1]['what'] == '`physics`: warp instructions'
+    with pytest.raises(ValueError, match='did not count'):
+        list(counters.figures(counted(*names[:-1])))
+
+
+def test_counters_without_a_gpu_end_with_one_sentence(capsys):
+    assert benchmark.main(['counters', '--device', 'cpu']) == 2
+    assert 'counters needs a GPU' in capsys.readouterr().err
 
 
 # ---- The report ----

@@ -1,6 +1,6 @@
 // A team of lanes a world, 8 where there are many worlds, 32 where there are few: for each agent in turn they go over boxes around 32 walls each, then over the walls
 // of those that its path meets, and over the other agents; then the agents move together.
-KERNEL physics(Motion p) {
+KERNEL BOUNDS physics(Motion p) {
     const World& w = p.world;
     int T = p.team, world = (blockIdx.x * blockDim.x + threadIdx.x) / T, lane = threadIdx.x & (T - 1), A = w.n_agents;
     if (world >= w.n_worlds) return;

@@ -10,7 +10,7 @@ DEVICE int hidden_by_group(const World& w, const Corridor& corridor, int first, 
     if (first + lane < end) {
         Four_floats b = LOAD((const Four_floats*)w.walls + (first + lane));
         mine = blind_of(corridor.x, corridor.y, b.x, b.y, b.z, b.w);
-        able = mine.area > 0.f && may_block(corridor, b.x, b.y, b.z, b.w);
+        able = (mine.area > 0.f) & may_block(corridor, b.x, b.y, b.z, b.w);
     }
     for (unsigned int some = __ballot_sync(~0u, able); some; some &= some - 1) {
         int k = __ffs(some) - 1;

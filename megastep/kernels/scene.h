@@ -79,7 +79,7 @@ HD Corridor corridor_of(float lx, float ly, const Pose& pose, float reach) {
 HD int may_block(const Corridor& c, float ax, float ay, float bx, float by) {
     float sa = cross(c.dx, c.dy, ax - c.x, ay - c.y), sb = cross(c.dx, c.dy, bx - c.x, by - c.y);
     float ta = c.dx * (ax - c.x) + c.dy * (ay - c.y), tb = c.dx * (bx - c.x) + c.dy * (by - c.y);
-    return !(low(sa, sb) > c.aside || high(sa, sb) < -c.aside || high(ta, tb) < -c.aside || low(ta, tb) > c.along);
+    return !((low(sa, sb) > c.aside) | (high(sa, sb) < -c.aside) | (high(ta, tb) < -c.aside) | (low(ta, tb) > c.along));
 }
 
 // The same for all walls in a box.
@@ -90,7 +90,7 @@ HD int may_block_box(const Corridor& c, float x0, float y0, float x1, float y1) 
         float side = cross(c.dx, c.dy, x, y), along = c.dx * x + c.dy * y;
         least = low(least, side); most = high(most, side); nearest = low(nearest, along); furthest = high(furthest, along);
     }
-    return !(least > c.aside || most < -c.aside || furthest < -c.aside || nearest > c.along);
+    return !((least > c.aside) | (most < -c.aside) | (furthest < -c.aside) | (nearest > c.along));
 }
 
 // One world's lines and texels.
