@@ -122,9 +122,15 @@ def faults():
 
 
 def make_device(name):
+    """The device called `name`; a GPU becomes PyTorch's current one, on which graphs are captured."""
+    import torch
+
     from megastep import engine
     with faults():
-        return engine.device(name)
+        chosen = engine.device(name)
+    if chosen.type == "cuda":
+        torch.cuda.set_device(chosen)
+    return chosen
 
 
 def homes(geometry, split, most=None):
