@@ -41,7 +41,11 @@ def arguments():
 
 def main():
     args = arguments()
-    device = engine.device(args.device)
+    try:
+        device = engine.device(args.device)
+    except engine.EngineError as fault:
+        print(f'check_walls.py: {fault}', file=sys.stderr)
+        return 2
     n_agents = args.agents or (2048 if device.type == 'cpu' else 1 << 20)
     share = -(-int(args.steps)//len(walls.COURSES))
     start, sums, stories = time.time(), {}, []

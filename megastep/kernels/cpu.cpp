@@ -82,7 +82,7 @@ extern "C" void physics(const Motion* given) {
             for (int a = 0; a < A; a++) {
                 int i = world * A + a;
                 float px = p.positions[2 * i], py = p.positions[2 * i + 1];
-                float dx = p.velocity[2 * i] * p.seconds, dy = p.velocity[2 * i + 1] * p.seconds, contact = NO_CONTACT;
+                float dx = stride(px, p.velocity[2 * i], p.seconds), dy = stride(py, p.velocity[2 * i + 1], p.seconds), contact = NO_CONTACT;
                 if (dx != 0.f || dy != 0.f) {
                     #pragma omp simd
                     for (int j = 0; j < n; j++)
@@ -93,7 +93,8 @@ extern "C" void physics(const Motion* given) {
                 for (int k = world * A; k < world * A + A; k++)
                     if (k != i)
                         contact = low(contact, sweep_point(px - p.positions[2 * k], py - p.positions[2 * k + 1],
-                            dx - p.velocity[2 * k] * p.seconds, dy - p.velocity[2 * k + 1] * p.seconds, 2.f * rho));
+                            dx - stride(p.positions[2 * k], p.velocity[2 * k], p.seconds),
+                            dy - stride(p.positions[2 * k + 1], p.velocity[2 * k + 1], p.seconds), 2.f * rho));
                 p.progress[i] = progress_of(contact);
             }
             for (int a = 0; a < A; a++) advance(p, world, a);

@@ -29,6 +29,9 @@ constexpr float NO_CONTACT = 2.f;       // beyond the end of the step
 constexpr float INFLATION = 1.001f;     // of the radius, so that a stopped agent's camera stays on its side of the wall
 constexpr float SHORTENING = 0.99f;     // of the free part of a step
 
+// How far a coordinate goes in a step: what is left after rounding, so that the way that is tried is the way that is gone.
+HD float stride(float from, float velocity, float seconds) { return (from + velocity * seconds) - from; }
+
 // Fraction of the step d after which a point at g, relative to a disc of radius rho about the origin, enters it. Inside already: 0 if it nears the middle.
 HD float sweep_point(float gx, float gy, float dx, float dy, float rho) {
     float approach = -(gx * dx + gy * dy), outside = gx * gx + gy * gy - rho * rho;
@@ -50,15 +53,18 @@ HD int boxes_meet(float px, float py, float dx, float dy, float ax, float ay, fl
 // nearer and free if it leaves: the distance to a convex body along a straight path, once growing, grows for ever.
 HD float sweep_segment(float px, float py, float dx, float dy, float ax, float ay, float bx, float by, float rho) {
     if (!boxes_meet(px, py, dx, dy, ax, ay, bx, by, rho)) return NO_CONTACT;
-    float ex = bx - ax, ey = by - ay, gx = px - ax, gy = py - ay;
+    float ex = bx - ax, ey = by - ay, gx = px - ax, gy = py - ay, hx = px - bx, hy = py - by;
     float length2 = ex * ex + ey * ey, along = gx * ex + gy * ey;
-    float u = length2 > 0.f ? clamp(along / length2, 0.f, 1.f) : 0.f;
-    float nx = gx - u * ex, ny = gy - u * ey;
-    if (nx * nx + ny * ny < rho * rho) return nx * dx + ny * dy < 0.f ? 0.f : NO_CONTACT;
-    float first = low(sweep_point(gx, gy, dx, dy, rho), sweep_point(px - bx, py - by, dx, dy, rho));
     float height = cross(ex, ey, gx, gy), climb = cross(ex, ey, dx, dy);
     if (height < 0.f) { height = -height; climb = -climb; }
     float gap = height - rho * SQRT(length2);
+    if (along > 0.f && along < length2) {
+        if (gap < 0.f) return climb < 0.f ? 0.f : NO_CONTACT;
+    } else {
+        float nx = along > 0.f ? hx : gx, ny = along > 0.f ? hy : gy;
+        if (nx * nx + ny * ny < rho * rho) return nx * dx + ny * dy < 0.f ? 0.f : NO_CONTACT;
+    }
+    float first = low(sweep_point(gx, gy, dx, dy, rho), sweep_point(hx, hy, dx, dy, rho));
     if (gap >= 0.f && climb < 0.f) {
         float t = gap / -climb, foot = along + t * (dx * ex + dy * ey);
         if (foot >= 0.f && foot <= length2) first = low(first, t);

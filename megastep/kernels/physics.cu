@@ -16,7 +16,7 @@ KERNEL BOUNDS physics(Motion p) {
     for (int a = 0; a < A; a++) {
         int i = world * A + a;
         float px = p.positions[2 * i], py = p.positions[2 * i + 1];
-        float dx = p.velocity[2 * i] * p.seconds, dy = p.velocity[2 * i + 1] * p.seconds;
+        float dx = stride(px, p.velocity[2 * i], p.seconds), dy = stride(py, p.velocity[2 * i + 1], p.seconds);
         float contact = NO_CONTACT;
         for (int start = first_box; start < last_box; start += T) {
             int meets = 0;
@@ -36,7 +36,8 @@ KERNEL BOUNDS physics(Motion p) {
             int k = world * A + other;
             if (other != a)
                 contact = low(contact, sweep_point(px - p.positions[2 * k], py - p.positions[2 * k + 1],
-                    dx - p.velocity[2 * k] * p.seconds, dy - p.velocity[2 * k + 1] * p.seconds, 2.f * rho));
+                    dx - stride(p.positions[2 * k], p.velocity[2 * k], p.seconds),
+                    dy - stride(p.positions[2 * k + 1], p.velocity[2 * k + 1], p.seconds), 2.f * rho));
         }
         for (int step = T / 2; step; step /= 2) contact = low(contact, __shfl_xor_sync(team, contact, step));
         if (lane == 0) p.progress[i] = progress_of(contact);

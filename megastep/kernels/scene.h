@@ -23,8 +23,8 @@ HD void advance(const Motion& p, int world, int a) {
     int i = world * p.world.n_agents + a;
     float progress = p.progress[i];
     float* position = p.positions + 2 * i; float* velocity = p.velocity + 2 * i;
-    position[0] += progress * (velocity[0] * p.seconds);
-    position[1] += progress * (velocity[1] * p.seconds);
+    position[0] += progress * stride(position[0], velocity[0], p.seconds);
+    position[1] += progress * stride(position[1], velocity[1], p.seconds);
     p.angles[i] = wrap_degrees(p.angles[i] + progress * (p.angvelocity[i] * p.seconds));
     notice(p.fault, world, position[0], position[1], p.angles[i]);
     if (progress < 1.f) { velocity[0] = 0.f; velocity[1] = 0.f; p.angvelocity[i] = 0.f; }
