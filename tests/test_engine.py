@@ -201,6 +201,13 @@ def test_cpu_and_gpu_agree_on_every_bit(settings):
     assert not any(differing(trajectory('cpu', **settings), trajectory('cuda', **settings)))
 
 
+@pytest.mark.cuda
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason='needs two GPUs')
+def test_gpus_agree_on_every_bit_whichever_is_current():
+    here, there = trajectory('cuda:0', n_agents=2, res=64), trajectory('cuda:1', n_agents=2, res=64)
+    assert torch.cuda.current_device() == 0 and not any(differing(here, there))
+
+
 @pytest.mark.parametrize('settings', SETTINGS, ids=str)
 def test_threads_do_not_matter(settings):
     before = torch.get_num_threads()
