@@ -124,6 +124,7 @@ struct Bench {
     std::vector<Span> spans;
     std::vector<float> inverse;
     std::vector<int> index;
+    std::vector<Ray> rays;
 };
 
 static void raster_lines(const Camera& camera, const Screen& screen, const float* lengths, const float* lines, int n, int offset, int skip_first, int skip_last,
@@ -154,6 +155,21 @@ static void raster_lines(const Camera& camera, const Screen& screen, const float
     }
 }
 
+// Shades a view's rays, run by run of those that hit the same line.
+static void shade(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, int view, unsigned int* seen, Bench& bench, int& fresh) {
+    for (int start = 0, end; start < p.res; start = end) {
+        int l = bench.index[start];
+        for (end = start + 1; end < p.res && bench.index[end] == l;) end++;
+        if (p.indices) for (int r = start; r < end; r++) p.indices[(long long)view * p.res + r] = l;
+        if (l < 0)
+            for (int r = start; r < end; r++) { bench.rays[r] = {0.f, 0.f, 0.f, 0.f}; miss_ray(p, (long long)view * p.res + r); }
+        else {
+            Surface surface = surface_of<1>(p.world, scene, camera, l);
+            for (int r = start; r < end; r++) bench.rays[r] = shade_ray<1>(p, screen, scene, surface, view, seen, r, bench.inverse[r], fresh);
+        }
+    }
+}
+
 extern "C" void sight(const Sight* given) {
     const Sight& p = *given;
     const World& w = p.world;
@@ -161,6 +177,7 @@ extern "C" void sight(const Sight* given) {
     #pragma omp parallel num_threads(w.n_threads)
     {
         Bench bench;
+        bench.rays.resize(p.res);
         #pragma omp for schedule(static)
         for (int agent = 0; agent < w.n_worlds * w.n_agents; agent++) {
             int world = agent / w.n_agents, a = agent % w.n_agents, fresh = 0;
@@ -178,15 +195,10 @@ extern "C" void sight(const Sight* given) {
                 raster_lines(camera, screen, p.ray_lengths, w.walls + 4 * (long long)scene.first_wall, scene.n_walls, scene.n_agent_lines, 0, 0, bench);
                 int view = agent * p.n_cameras + c;
                 if (p.middle) p.middle[view] = bench.index[p.res / 2];
-                const float* inverse = bench.inverse.data();
-                const int* index = bench.index.data();
                 unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;
+                shade(p, screen, scene, camera, view, seen, bench, fresh);
                 for (int pixel = 0; pixel < p.n_pixels; pixel++) {
-                    Ray rays[32];
-                    for (int k = 0; k < p.subsample; k++) {
-                        int r = pixel * p.subsample + k;
-                        rays[k] = shade_ray<1, 1>(p, screen, scene, camera, view, seen, r, inverse[r], index[r], fresh);
-                    }
+                    const Ray* rays = bench.rays.data() + pixel * p.subsample;
                     Ray sum = rays[0];
                     if (p.subsample == 4) sum = plus(plus(rays[0], rays[1]), plus(rays[2], rays[3]));
                     else for (int k = 1; k < p.subsample; k++) sum = plus(sum, rays[k]);

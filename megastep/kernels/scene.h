@@ -147,34 +147,36 @@ HD void miss_ray(const Sight& p, long long ray) {
     if (p.screen) { float* out = p.screen + 3 * ray; out[0] = 0.f; out[1] = 0.f; out[2] = 0.f; }
 }
 
-// One ray, once its line is known: fills what is asked for at full resolution, if `whole`, and returns its share of its pixel. `crowd`: it may have hit an agent.
-// Counts in `fresh` a texel seen for the first time.
+// A line that rays hit: how it lies before the camera, and its texels. `crowd`: it may be an agent's.
+struct Surface { Line line; int first, width, of_agent; };
+
+template <int crowd>
+HD Surface surface_of(const World& w, const Scene& scene, const Camera& camera, int l) {
+    int of_agent = crowd && l < scene.n_agent_lines, i = of_agent ? l : l + (scene.first_wall - scene.n_agent_lines);
+    Four_floats ends = LOAD((const Four_floats*)(of_agent ? scene.agent_lines : w.walls) + i);
+    const int* starts = (of_agent ? w.model_texels : w.texel_starts) + i;
+    Surface surface = {line_in(camera, ends.x, ends.y, ends.z, ends.w), starts[0], starts[1] - starts[0], of_agent};
+    return surface;
+}
+
+// One ray that hits a surface: fills what is asked for at full resolution, if `whole`, and returns its share of its pixel. Counts in `fresh` a texel seen for the first time.
 struct Ray { float red, green, blue, depth; };
 
-template <int whole, int crowd>
-HD Ray shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const Camera& camera, int view, unsigned int* seen, int r, float inverse, int l, int& fresh) {
-    Ray out = {0.f, 0.f, 0.f, 0.f};
-    long long ray = (long long)view * p.res + r;
-    if (whole && p.indices) p.indices[ray] = l;
-    if (l < 0) { if (whole) miss_ray(p, ray); return out; }
-    float y = slope(screen, r), length = p.ray_lengths[r];
-    int of_agent = crowd && l < scene.n_agent_lines, i = of_agent ? l : l + (scene.first_wall - scene.n_agent_lines);
-    Four_floats ends = LOAD((const Four_floats*)(of_agent ? scene.agent_lines : p.world.walls) + i);
-    const int* starts = (of_agent ? p.world.model_texels : p.world.texel_starts) + i;
-    int first = starts[0], width = starts[1] - first;
-    Line line = line_in(camera, ends.x, ends.y, ends.z, ends.w);
-    Hit hit = hit_of(line, y, length);
-    float distance = length * RECIPROCAL(inverse);
-    out.depth = depth_reading(distance, screen.radius, p.per_depth);
+template <int whole>
+HD Ray shade_ray(const Sight& p, const Screen& screen, const Scene& scene, const Surface& surface, int view, unsigned int* seen, int r, float inverse, int& fresh) {
+    float y = slope(screen, r), length = p.ray_lengths[r], distance = length * RECIPROCAL(inverse);
+    Hit hit = hit_of(surface.line, y, length);
+    Ray out = {0.f, 0.f, 0.f, depth_reading(distance, screen.radius, p.per_depth)};
     if (p.rgb || (whole && p.screen)) {
-        Colour colour = of_agent ? agent_colour(scene, first, width, hit) : wall_colour(p.world, first, width, hit);
+        Colour colour = surface.of_agent ? agent_colour(scene, surface.first, surface.width, hit) : wall_colour(p.world, surface.first, surface.width, hit);
         out.red = colour.red; out.green = colour.green; out.blue = colour.blue;
     }
-    if (seen && !of_agent) fresh += mark(seen, first - scene.first_texel + texel_at(hit.location, width));
+    if (seen && !surface.of_agent) fresh += mark(seen, surface.first - scene.first_texel + texel_at(hit.location, surface.width));
     if (!whole) return out;
+    long long ray = (long long)view * p.res + r;
     if (p.screen) { float* rgb = p.screen + 3 * ray; rgb[0] = out.red; rgb[1] = out.green; rgb[2] = out.blue; }
     if (p.locations) p.locations[ray] = hit.location;
-    if (p.dots) p.dots[ray] = cosine_of(line, y, length);
+    if (p.dots) p.dots[ray] = cosine_of(surface.line, y, length);
     if (p.distances) p.distances[ray] = distance;
     return out;
 }

@@ -121,7 +121,12 @@ DEVICE void shade(const Sight& p, const View& v, const Scene& scene, int view, u
         Ray ray = {0.f, 0.f, 0.f, 0.f};
         if (on) {
             Nearest here = v.nearest[r];
-            ray = shade_ray<whole, crowd>(p, v.screen, scene, v.camera, view, seen, r, here.inverse, here.line, fresh);
+            long long place = (long long)view * R + r;
+            if (whole) p.indices[place] = here.line;
+            if (here.line >= 0) {
+                Surface surface = surface_of<crowd>(p.world, scene, v.camera, here.line);
+                ray = shade_ray<whole>(p, v.screen, scene, surface, view, seen, r, here.inverse, fresh);
+            } else if (whole) miss_ray(p, place);
         }
         if (S == 4) {
             float sum = quarter_of_sum(ray, lane);
