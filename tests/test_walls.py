@@ -74,6 +74,14 @@ def test_an_agent_a_hair_from_a_wall_does_not_slip_through_along_it():
     assert engine.physics(c.scenery, c.agents).progress.item() == 0
 
 
+def test_a_disc_beside_a_wall_that_rounding_puts_at_its_end_is_held():
+    """Along the wall its centre lies within 1e-6 m of the end; it goes back along the wall, and ever nearer."""
+    c = alone([(2.0, 10.595815658569336), (4.6668243408203125, 2.0)], fps=1.)
+    c.agents.positions[:] = torch.tensor([4.6665940284729, 1.999928593635559])
+    c.agents.velocity[:] = torch.tensor([-11.850244522094727, 38.204341888427734])
+    assert engine.physics(c.scenery, c.agents).progress.item() == 0
+
+
 @pytest.mark.parametrize('side', [1, -1])
 def test_steps_smaller_than_float32_resolves_do_not_add_up_to_a_way_into_a_wall(side):
     """Far from the origin a short step along a slanted wall is rounded to one along an axis."""

@@ -50,24 +50,23 @@ HD int boxes_meet(float px, float py, float dx, float dy, float ax, float ay, fl
 }
 
 // Fraction of the step d after which a disc of radius rho at p touches the segment ab, or NO_CONTACT. A disc that overlaps it already is held if it comes
-// nearer and free if it leaves: the distance to a convex body along a straight path, once growing, grows for ever.
+// nearer and free if it leaves: the distance to a convex body along a straight path, once growing, grows for ever. Where rounding cannot tell whether the
+// disc is beside the segment or beyond its end, it is taken for both.
 HD float sweep_segment(float px, float py, float dx, float dy, float ax, float ay, float bx, float by, float rho) {
     if (!boxes_meet(px, py, dx, dy, ax, ay, bx, by, rho)) return NO_CONTACT;
     float ex = bx - ax, ey = by - ay, gx = px - ax, gy = py - ay, hx = px - bx, hy = py - by;
-    float length2 = ex * ex + ey * ey, along = gx * ex + gy * ey;
+    float length2 = ex * ex + ey * ey, along = gx * ex + gy * ey, slack = 1e-6f * (length2 + high(gx * ex, -gx * ex) + high(gy * ey, -gy * ey));
     float height = cross(ex, ey, gx, gy), climb = cross(ex, ey, dx, dy);
     if (height < 0.f) { height = -height; climb = -climb; }
-    float gap = height - rho * SQRT(length2);
-    if (along > 0.f && along < length2) {
-        if (gap < 0.f) return climb < 0.f ? 0.f : NO_CONTACT;
-    } else {
-        float nx = along > 0.f ? hx : gx, ny = along > 0.f ? hy : gy;
-        if (nx * nx + ny * ny < rho * rho) return nx * dx + ny * dy < 0.f ? 0.f : NO_CONTACT;
-    }
+    float gap = height - rho * SQRT(length2), nx = along > 0.f ? hx : gx, ny = along > 0.f ? hy : gy;
+    int nearing = along > -slack && along < length2 + slack && climb < 0.f, beyond = !(along > 0.f && along < length2);
+    int overlaps_end = beyond && nx * nx + ny * ny < rho * rho, overlaps = overlaps_end || (!beyond && gap < 0.f);
+    if ((nearing && gap < 0.f) || (overlaps_end && nx * dx + ny * dy < 0.f)) return 0.f;
+    if (overlaps && !nearing) return NO_CONTACT;
     float first = low(sweep_point(gx, gy, dx, dy, rho), sweep_point(hx, hy, dx, dy, rho));
     if (gap >= 0.f && climb < 0.f) {
         float t = gap / -climb, foot = along + t * (dx * ex + dy * ey);
-        if (foot >= 0.f && foot <= length2) first = low(first, t);
+        if (foot >= -slack && foot <= length2 + slack) first = low(first, t);
     }
     return first;
 }
