@@ -3,7 +3,7 @@
 #define DEVICE static __device__ __forceinline__
 #define KERNEL extern "C" __global__ void
 #define ALIGNED __align__(16)
-#define BOUNDS __launch_bounds__(64, 24)
+#define BOUNDS __launch_bounds__(64, 24)       // threads a block, as compile.py launches them; blocks a multiprocessor, which leaves a thread 40 registers
 #define SQRT(x) sqrtf(x)
 #define CEIL(x) ceilf(x)
 #define FLOOR(x) floorf(x)
