@@ -30,7 +30,7 @@ class Agents:
 
     ``positions`` (N, A, 2), ``angles`` (N, A), ``velocity`` (N, A, 2) a second, ``angvelocity`` (N, A) a second; an
     angle of 0 looks along +x. ``cameras`` are yaw offsets in degrees. ValueError unless 1 <= res <= 1024, 0 < fov <
-    180, fps > 0.
+    180, fps > 0, radius > 0.
     """
 
     def __init__(self, n_envs, n_agents, res=64, fov=130.0, fps=10.0, cameras=None, radius=AGENT_RADIUS, device='cpu'):
@@ -43,6 +43,8 @@ class Agents:
             )
         if not 0 < fps < math.inf:
             raise ValueError(f'fps must be a positive number of steps a second, but {fps} was given')
+        if not 0 < radius < math.inf:
+            raise ValueError(f'radius must be a positive number of metres, but {radius} was given')
         self.res, self.fov, self.fps, self.radius = res, float(fov), float(fps), float(radius)
         self.yaws = torch.tensor([0.0] if cameras is None else list(cameras), dtype=torch.float32, device=device)
         if not len(self.yaws):

@@ -322,7 +322,8 @@ WORKS = {work.__name__: work for work in (step, kernels, counters, observe, agen
 def said(*words):
     """What a command prints, or nothing if it is not there or fails."""
     try:
-        return subprocess.run(words, cwd=ROOT, capture_output=True, text=True).stdout.strip()
+        done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+        return '' if done.returncode else done.stdout.strip()
     except OSError:
         return ''
 
@@ -385,7 +386,7 @@ ORIGINAL = 16_384, .86e6    # environments and frames a second of the original's
 COLOURS = {'explorer': 'tab:blue', 'minimal': 'tab:orange'}
 LEGEND = """Median and spread of n samples. A sample is the mean over as many calls as fill 50 ms after warming up,
 timed by CUDA events on a GPU; or one process; or one report of a training run. A return is a mean over n homes with its
-95 % interval. Without a spread: counted, not timed; or, without n too, by an older script, the best of three.
+95 % interval. Without a spread: counted, or read once by Nsight Compute.
 `python scripts/benchmark.py WORK --json docs/benchmarks.jsonl` measures, on the CPU with `--device cpu`;
 `python scripts/benchmark.py report` writes this. The works:"""
 

@@ -2,6 +2,8 @@
 
 import ctypes
 import os
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -121,6 +123,16 @@ def test_a_compiler_that_fails_is_quoted(tmp_path, monkeypatch):
     false.chmod(0o755)
     with pytest.raises(compile.EngineError, match='could not build the CPU engine.*no room on device'):
         compile._build_cpu(str(false))
+
+
+@pytest.mark.skipif(shutil.which('objdump') is None, reason='needs objdump')
+def test_nothing_is_fused(tmp_path):
+    """A multiplication fused with an addition rounds once, not twice, and the GPU's kernels have none."""
+    library = tmp_path / 'engine.so'
+    library.write_bytes(compile._build_cpu(compile._compiler()[0]))
+    code = subprocess.run(['objdump', '-d', str(library)], capture_output=True, text=True, check=True).stdout
+    fused = re.findall(r'\t(v?fn?m(?:add|sub|la|ls)\w*)', code)
+    assert 'ret' in code and not fused, f'{len(fused)} fused, among them {fused[:3]}'
 
 
 def test_no_bindings_are_named(monkeypatch):

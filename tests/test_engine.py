@@ -158,7 +158,7 @@ def bits_seen(core, r):
 # ---- CPU = GPU, and 1 thread = 2 threads, on every bit ----
 
 
-def trajectory(device, n_agents, **settings):
+def trajectory(device, n_agents, subsample=1, **settings):
     """All tensors of a few steps in generated homes."""
     homes = sample('homes', 8)
     core = cuda.Core(scene.scenery(homes, n_agents, n_envs=24, device=device), **settings)
@@ -171,13 +171,12 @@ def trajectory(device, n_agents, **settings):
         spawn(torch.rand((24, n_agents), generator=random).to(device) < (1 if step == 0 else 0.1))
         actions = torch.randint(4, (24, n_agents), generator=random).to(device)
         out += engine.physics(core.scenery, core.agents, actions, moves, 0.9)
-        out += engine.observe(core.scenery, core.agents, imu=True, middle=True, seen=seen)
+        out += engine.observe(core.scenery, core.agents, subsample, imu=True, middle=True, seen=seen)
     out += [
         *engine.render(core.scenery, core.agents),
-        core.agents.positions,
-        core.agents.angles,
-        core.scenery.agent_light,
-        seen,
+        *engine.observe(core.scenery, core.agents, subsample, rgb=False)[1:2],
+        *engine.observe(core.scenery, core.agents, subsample, depth=False)[:1],
+        *(core.agents.positions, core.agents.angles, core.scenery.agent_lines, core.scenery.agent_light, seen),
     ]
     return [tensor.cpu() for tensor in out]
 
@@ -190,6 +189,11 @@ SETTINGS = [
     dict(n_agents=1, res=64),
     dict(n_agents=4, res=128, fov=70.0),
     dict(n_agents=2, res=32, fov=90.0, cameras=[0, 120, 240]),
+    dict(n_agents=1, res=256, subsample=4),  # the usual one; then batches that do not fill a warp, or lie across blocks
+    dict(n_agents=1, res=60, subsample=3),
+    dict(n_agents=2, res=160, subsample=5),
+    dict(n_agents=1, res=96, subsample=32),
+    dict(n_agents=1, res=63),
 ]
 
 
@@ -299,6 +303,12 @@ def test_draws_are_philox(device):
 def test_bad_settings_are_refused(settings):
     with pytest.raises(ValueError, match='but'):
         box('cpu', **settings)
+
+
+@pytest.mark.parametrize('radius', [0., -1., math.nan, math.inf])
+def test_a_disc_needs_a_radius(radius):
+    with pytest.raises(ValueError, match='radius must be a positive number'):
+        engine.Agents(1, 1, radius=radius)
 
 
 def test_a_position_that_is_no_number_is_named(device):

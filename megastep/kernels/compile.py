@@ -24,8 +24,8 @@ import torch
 HERE = Path(__file__).parent
 OPERATIONS = ('bake', 'physics', 'place', 'sight', 'spawn', 'draw')
 CPU_FLAGS = (
-    '-std=c++17', '-O3', '-march=native', '-ffp-contract=off', '-fno-math-errno', '-fno-trapping-math', '-fopenmp',
-    '-shared', '-fPIC',
+    '-std=c++17', '-O3', '-march=native', '-ffp-contract=off', '-fno-tree-slp-vectorize', '-fno-math-errno',
+    '-fno-trapping-math', '-fopenmp', '-shared', '-fPIC',
 )
 CUDA_FLAGS = ('--std=c++17', '--fmad=false', '--prec-div=true', '--prec-sqrt=true', '--ftz=false')
 BLOCK = 64  # threads
