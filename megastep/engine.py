@@ -303,6 +303,8 @@ def observe(
         raise ValueError(
             f'subsample must be at most 32 and divide the {agents.res} rays of a camera, but {subsample} was given'
         )
+    if not max_depth > 0:
+        raise ValueError(f'max_depth must be a positive number of metres, but {max_depth} was given')
     n, a, where = scenery.n_envs, scenery.n_agents, scenery.device
     if a > 1:
         place(scenery, agents, lit=rgb)

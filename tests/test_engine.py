@@ -311,6 +311,13 @@ def test_a_disc_needs_a_radius(radius):
         engine.Agents(1, 1, radius=radius)
 
 
+@pytest.mark.parametrize('max_depth', [0., -1., math.nan])
+def test_depth_needs_a_range(max_depth):
+    core = box('cpu')
+    with pytest.raises(ValueError, match='max_depth must be a positive number'):
+        engine.observe(core.scenery, core.agents, max_depth=max_depth)
+
+
 def test_a_position_that_is_no_number_is_named(device):
     core = box(device)
     core.agents.positions[1, 0, 0] = math.nan
