@@ -1,4 +1,7 @@
-"""Measures a trained policy on unseen homes. `python evaluate.py --help`; `run(cfg)` is the same from Python."""
+"""Measures a trained policy on unseen homes. `python evaluate.py --help`; `run(cfg)` is the same
+from Python.
+"""
+
 import configs  # noqa: F401, before torch: see there
 
 # isort: split
@@ -12,7 +15,8 @@ from configs import commandline, runs
 from configs.console import duration, say, table
 from configs.settings import Evaluate, Fault
 
-HELP = """Prints and writes what a run's agent earns in the first episode of each lane, with a 95 % interval over homes.
+HELP = """Prints and writes what a run's agent earns in the first episode of each lane, with a 95 %
+interval over homes.
 
 The commonest:
   run=RUN              a run folder, one of its checkpoints, or latest
@@ -25,7 +29,9 @@ COLUMNS = ("agent", "return", "95 % interval", "length", "episodes", "homes")
 
 
 def run(cfg):
-    """Evaluates as `cfg`, a settings.Evaluate, says. Writes evaluation.json and .md in the run's folder; returns it."""
+    """Evaluates as `cfg`, a settings.Evaluate, says. Writes evaluation.json and .md in the run's
+    folder; returns it.
+    """
     device, path = runs.make_device(cfg.device), runs.find(cfg.run)
     loaded = runs.load(path, device)
     trained = runs.config_of(loaded)
@@ -43,24 +49,40 @@ def run(cfg):
         episodes = evaluation.first_episodes(env, player, cfg.seed, cfg.greedy and player is policy)
         rows.append({"agent": name, **evaluation.summary(episodes, homes_of_lanes)})
     geometry = (cfg.geometry or trained.geometry).name
-    title = f"{trained.env.name} in the {cfg.split} homes of {geometry}, after {loaded.step:,} samples"
+    title = (
+        f"{trained.env.name} in the {cfg.split} homes of {geometry}, after {loaded.step:,} samples"
+    )
     say(table(COLUMNS, [cells(row) for row in rows], title))
     say(f"evaluated in {duration(time.monotonic() - start)}")
     folder = runs.folder_of(path)
-    write(folder, dict(title=title, checkpoint=str(loaded.path), evaluation=dataclasses.asdict(cfg), rows=rows))
+    write(
+        folder,
+        dict(
+            title=title, checkpoint=str(loaded.path), evaluation=dataclasses.asdict(cfg), rows=rows
+        ),
+    )
     return folder
 
 
 def cells(row):
     """A row of the table, as text."""
     cut = f", {row['unfinished']} cut short" if row["unfinished"] else ""
-    return (row["agent"], f"{row['return']:.2f}", f"{row['low']:.2f} to {row['high']:.2f}", f"{row['length']:.0f}",
-            f"{row['lanes']}{cut}", str(row["homes"]))
+    return (
+        row["agent"],
+        f"{row['return']:.2f}",
+        f"{row['low']:.2f} to {row['high']:.2f}",
+        f"{row['length']:.0f}",
+        f"{row['lanes']}{cut}",
+        str(row["homes"]),
+    )
 
 
 def write(folder, result):
     """Writes a result for machines and for people."""
-    lines = ["| " + " | ".join(line) + " |" for line in (COLUMNS, ("---",) * len(COLUMNS), *map(cells, result["rows"]))]
+    lines = [
+        "| " + " | ".join(line) + " |"
+        for line in (COLUMNS, ("---",) * len(COLUMNS), *map(cells, result["rows"]))
+    ]
     try:
         (folder / "evaluation.json").write_text(json.dumps(result, indent=2) + "\n")
         (folder / "evaluation.md").write_text("\n".join([result["title"], "", *lines]) + "\n")

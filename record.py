@@ -1,4 +1,5 @@
 """Films a trained policy. `python record.py --help`; `run(cfg)` is the same from Python."""
+
 import configs  # noqa: F401, before torch: see there
 
 # isort: split
@@ -34,7 +35,9 @@ def run(cfg):
     loaded = runs.load(path, device)
     trained = runs.config_of(loaded)
     homes = runs.homes(cfg.geometry or trained.geometry, cfg.split)
-    env = runs.make_env(dataclasses.replace(trained.env, n_envs=1), [homes[cfg.home % len(homes)]], cfg.seed, device)
+    env = runs.make_env(
+        dataclasses.replace(trained.env, n_envs=1), [homes[cfg.home % len(homes)]], cfg.seed, device
+    )
     policy = runs.make_policy(trained.agent, env)
     runs.load_weights(policy, env, loaded)
 

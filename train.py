@@ -1,4 +1,7 @@
-"""Trains a policy. `python train.py --help` lists what can be chosen; `run(cfg)` is the same from Python."""
+"""Trains a policy. `python train.py --help` lists what can be chosen; `run(cfg)` is the same from
+Python.
+"""
+
 import configs  # noqa: F401, before torch: see there
 
 # isort: split
@@ -31,8 +34,19 @@ The commonest:
   resume=RUN                   continue a run (its folder, or latest) under its own configuration
   init=RUN                     start a new run from its weights
   logger=wandb logger.mode=offline"""
-#: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never what it learns.
-RESUMABLE = ("resume", "samples", "seconds", "device", "report", "checkpoint", "keep", "logger", "finish")
+#: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
+#: what it learns.
+RESUMABLE = (
+    "resume",
+    "samples",
+    "seconds",
+    "device",
+    "report",
+    "checkpoint",
+    "keep",
+    "logger",
+    "finish",
+)
 
 
 class Trainer:
@@ -41,21 +55,29 @@ class Trainer:
     def __init__(self, cfg, folder, device):
         self.cfg, self.folder = cfg, folder
         homes = runs.homes(cfg.geometry, "training")
-        self.env = runs.make_env(cfg.env, homes, cfg.seed, device, lambda env: runs.rollout_bytes(cfg, env))
+        self.env = runs.make_env(
+            cfg.env, homes, cfg.seed, device, lambda env: runs.rollout_bytes(cfg, env)
+        )
         self.policy = runs.make_policy(cfg.agent, self.env, cfg.seed)
         self.learner = runs.make_learner(cfg.learner, self.policy, cfg.seed)
         self.rollout = runs.make_rollout(cfg, self.env)
         self.episodes = metrics.Episodes(self.rollout.n_lanes, device)
-        self.samples = self.updates = 0     # environment steps of all lanes; rollouts learnt from
-        self.seconds = 0.                   # of training, from the end of the first update on
+        self.samples = self.updates = 0  # environment steps of all lanes; rollouts learnt from
+        self.seconds = 0.0  # of training, from the end of the first update on
         if cfg.resume:
             self.restore(runs.load(runs.find(cfg.resume), device))
         elif cfg.init:
             runs.load_weights(self.policy, self.env, runs.load(runs.find(cfg.init), device))
-        wandb = dict(project=cfg.logger.project, mode=cfg.logger.mode, name=folder.name, config=as_tree(cfg))
-        self.metrics = metrics.Metrics(folder, self.samples, wandb if cfg.logger.name == "wandb" else None)
+        wandb = dict(
+            project=cfg.logger.project, mode=cfg.logger.mode, name=folder.name, config=as_tree(cfg)
+        )
+        self.metrics = metrics.Metrics(
+            folder, self.samples, wandb if cfg.logger.name == "wandb" else None
+        )
         self.reported = self.samples, time.monotonic()
-        self.score = self.unsaved = None    # the last reported return; why the last checkpoint is missing
+        self.score = self.unsaved = (
+            None  # the last reported return; why the last checkpoint is missing
+        )
 
     def train(self, stop):
         """Collects, updates, reports, saves, until the budget is spent or `stop.number` is set."""
@@ -65,7 +87,7 @@ class Trainer:
             while self.left() > 0 and stop.number is None:
                 self.collect(carry)
                 if self.cfg.learner.anneal:
-                    self.learner.set_lr(self.cfg.learner.lr * max(0., self.left()))
+                    self.learner.set_lr(self.cfg.learner.lr * max(0.0, self.left()))
                 losses = self.learner.update(self.rollout)
                 self.count()
                 if self.updates % self.cfg.report == 0:
@@ -76,7 +98,9 @@ class Trainer:
         self.metrics.close()
 
     def collect(self, carry):
-        """Fills the rollout. On a GPU from the second time on as a CUDA graph, which replaces this method."""
+        """Fills the rollout. On a GPU from the second time on as a CUDA graph, which replaces this
+        method.
+        """
         parts = self.env, self.policy, self.rollout, carry
         if self.env.device.type == "cuda" and self.updates:
             self.policy.draws.on(self.env.device)
@@ -103,21 +127,30 @@ class Trainer:
 
     def left(self):
         """The fraction of the budget that is left; without a budget, all of it."""
-        spent = [done / budget for done, budget in ((self.samples, self.cfg.samples), (self.now(), self.cfg.seconds))
-                 if budget is not None]
+        spent = [
+            done / budget
+            for done, budget in ((self.samples, self.cfg.samples), (self.now(), self.cfg.seconds))
+            if budget is not None
+        ]
         return 1 - max(spent, default=0)
 
     def report(self, losses, progress):
-        """Writes the metrics since the last report, and shows the few that people watch. Waits for the device."""
+        """Writes the metrics since the last report, and shows the few that people watch. Waits for
+        the device.
+        """
         names, values = zip(*losses.items())
         if hasattr(self.env, "core"):
             engine.check(self.env.core.agents)
-        found = {**self.episodes.take(), **dict(zip(names, torch.stack(values).tolist())), "updates": self.updates}
+        found = {
+            **self.episodes.take(),
+            **dict(zip(names, torch.stack(values).tolist())),
+            "updates": self.updates,
+        }
         samples, then = self.reported
         self.reported = self.samples, time.monotonic()
         perf = {"perf/seconds": self.now()}
         words = [f"{number(self.samples)} samples"]
-        if self.samples > samples:      # the first update, which compiles, says nothing of the rate
+        if self.samples > samples:  # the first update, which compiles, says nothing of the rate
             perf["perf/rate"] = (self.samples - samples) / (self.reported[1] - then)
             words.append(f"{number(perf['perf/rate'])}/s")
         self.metrics.write(self.samples, found, perf)
@@ -134,20 +167,39 @@ class Trainer:
         self.saved = self.now()
         try:
             config = {"train": as_tree(self.cfg), "spaces": runs.spaces_of(self.env)}
-            checkpoint.save(self.folder / "checkpoints", self.samples, self.state(), config, self.cfg.keep, self.score)
+            checkpoint.save(
+                self.folder / "checkpoints",
+                self.samples,
+                self.state(),
+                config,
+                self.cfg.keep,
+                self.score,
+            )
             self.unsaved = None
         except OSError as error:
-            needed = 3 * sum(p.numel() * p.element_size() for p in self.policy.parameters())    # Adam's two as well
+            needed = 3 * sum(
+                p.numel() * p.element_size() for p in self.policy.parameters()
+            )  # Adam's two as well
             free = shutil.disk_usage(self.folder).free
-            again, self.unsaved = self.unsaved, (
-                f"The checkpoint at {self.samples:,} samples could not be saved ({error.strerror}): it needs about "
-                f"{needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free in {self.folder}")
+            again, self.unsaved = (
+                self.unsaved,
+                (
+                    f"The checkpoint at {self.samples:,} samples could not be saved "
+                    f"({error.strerror}): it needs about "
+                    f"{needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free in {self.folder}"
+                ),
+            )
             if not again:
-                warn(f"{self.unsaved}; training goes on and tries again in {self.cfg.checkpoint:.0f} s")
+                warn(
+                    f"{self.unsaved}; training goes on and tries again in "
+                    f"{self.cfg.checkpoint:.0f} s"
+                )
 
     def state(self):
         """All that a checkpoint holds, as plain dicts of tensors and numbers."""
-        parts = {name: getattr(self, name).state_dict() for name in ("policy", "learner", "episodes")}
+        parts = {
+            name: getattr(self, name).state_dict() for name in ("policy", "learner", "episodes")
+        }
         return dict(**parts, samples=self.samples, updates=self.updates, seconds=self.now())
 
     def restore(self, loaded):
@@ -155,11 +207,17 @@ class Trainer:
         runs.load_weights(self.policy, self.env, loaded)
         self.learner.load_state_dict(state["learner"])
         self.episodes.load_state_dict(state["episodes"])
-        self.samples, self.updates, self.seconds = state["samples"], state["updates"], state["seconds"]
+        self.samples, self.updates, self.seconds = (
+            state["samples"],
+            state["updates"],
+            state["seconds"],
+        )
 
 
 def run(cfg):
-    """Trains as `cfg`, a settings.Train, says. Returns the run folder; after a signal, saves and raises Interrupted."""
+    """Trains as `cfg`, a settings.Train, says. Returns the run folder; after a signal, saves and
+    raises Interrupted.
+    """
     device = runs.make_device(cfg.device)
     folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
     with Interruptions() as stop:
@@ -174,18 +232,23 @@ def run(cfg):
             raise Fault(f"{reason}. What was saved before it is in {folder}") from error
         metrics.curves(folder)
         if stop.number is not None:
-            raise Interrupted(stop.number, f"Stopped after {trainer.samples:,} samples. "
-                              f"To go on: python train.py resume={folder}")
+            raise Interrupted(
+                stop.number,
+                f"Stopped after {trainer.samples:,} samples. "
+                f"To go on: python train.py resume={folder}",
+            )
     if trainer.unsaved:
         raise Fault(trainer.unsaved)
-    del trainer     # its memory is the evaluation's now
+    del trainer  # its memory is the evaluation's now
     finish(cfg, folder)
     return folder
 
 
 def finish(cfg, folder):
     """What the run leaves behind beside its checkpoints: a table and a video, if asked for."""
-    common = dict(run=str(folder), geometry=None, split="test", greedy=False, seed=cfg.seed, device=cfg.device)
+    common = dict(
+        run=str(folder), geometry=None, split="test", greedy=False, seed=cfg.seed, device=cfg.device
+    )
     if cfg.finish.evaluate:
         evaluate.run(Evaluate(lanes=cfg.finish.lanes, baseline=True, **common))
     if cfg.finish.record:
@@ -196,12 +259,17 @@ def finish(cfg, folder):
 
 
 def resumed(tree, overrides):
-    """The tree of a run that goes on: its own, but for what `overrides` may change. That of a new run is as it was."""
+    """The tree of a run that goes on: its own, but for what `overrides` may change. That of a new
+    run is as it was.
+    """
     if tree["resume"] is None:
         return tree
     given = [word.split("=", 1)[0] for word in overrides]
-    if refused := [(key, "cannot change when a run goes on; init=RUN starts a new one from its weights")
-                   for key in given if key.split(".")[0] not in RESUMABLE]:
+    if refused := [
+        (key, "cannot change when a run goes on; init=RUN starts a new one from its weights")
+        for key in given
+        if key.split(".")[0] not in RESUMABLE
+    ]:
         raise Faults(refused)
     own = runs.load(runs.find(tree["resume"])).config["train"]
     for path in given:

@@ -1,1 +1,3 @@
-"""The learner: networks from spaces, rollouts, returns, PPO. It knows spaces and the world contract, no one env."""
+"""The learner: networks from spaces, rollouts, returns, PPO. It knows spaces and the world
+contract, no one env.
+"""

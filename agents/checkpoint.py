@@ -1,9 +1,10 @@
 """Checkpoints that are whole or absent, and say so when they are damaged.
 
-A checkpoint is a folder `step_<N>` of state.pt (plain dicts of tensors and numbers), config.json and manifest.json
-(sizes and sha256 of the two). It is written beside its place, forced to the disk, renamed into it and read again; so a
-reader sees all of it or none.
+A checkpoint is a folder `step_<N>` of state.pt (plain dicts of tensors and numbers), config.json
+and manifest.json (sizes and sha256 of the two). It is written beside its place, forced to the disk,
+renamed into it and read again; so a reader sees all of it or none.
 """
+
 import dataclasses
 import hashlib
 import io
@@ -23,7 +24,9 @@ FILES = ("state.pt", "config.json")
 
 
 class CheckpointError(RuntimeError):
-    """No checkpoint can be used; the message says which were tried, what is wrong with each and the cure."""
+    """No checkpoint can be used; the message says which were tried, what is wrong with each and the
+    cure.
+    """
 
 
 class Damaged(CheckpointError):
@@ -32,7 +35,10 @@ class Damaged(CheckpointError):
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint as loaded: its folder, its step (environment steps so far), and what `save` was given."""
+    """A checkpoint as loaded: its folder, its step (environment steps so far), and what `save` was
+    given.
+    """
+
     path: Path
     step: int
     state: dict
@@ -40,9 +46,11 @@ class Checkpoint:
 
 
 def save(folder, step, state, config, keep=2, score=None):
-    """Writes `folder/step_<step>` and deletes older ones: the last `keep` stay, and the one of the highest `score`.
+    """Writes `folder/step_<step>` and deletes older ones: the last `keep` stay, and the one of the
+    highest `score`.
 
-    Raises OSError, with nothing changed, when the disk is full or not writable. Returns the checkpoint's folder.
+    Raises OSError, with nothing changed, when the disk is full or not writable. Returns the
+    checkpoint's folder.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -52,10 +60,24 @@ def save(folder, step, state, config, keep=2, score=None):
         temporary.mkdir()
         buffer = io.BytesIO()
         torch.save(state, buffer)
-        contents = {"state.pt": buffer.getvalue(), "config.json": json.dumps(config, indent=2).encode()}
-        manifest = {"format": FORMAT, "step": step, "score": score, "torch": torch.__version__, "files": {
-            name: {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)} for name, data in contents.items()}}
-        for name, data in [*contents.items(), ("manifest.json", json.dumps(manifest, indent=2).encode())]:
+        contents = {
+            "state.pt": buffer.getvalue(),
+            "config.json": json.dumps(config, indent=2).encode(),
+        }
+        manifest = {
+            "format": FORMAT,
+            "step": step,
+            "score": score,
+            "torch": torch.__version__,
+            "files": {
+                name: {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
+                for name, data in contents.items()
+            },
+        }
+        for name, data in [
+            *contents.items(),
+            ("manifest.json", json.dumps(manifest, indent=2).encode()),
+        ]:
             _write(temporary / name, data)
         _sync(temporary)
         if place.exists():
@@ -71,9 +93,11 @@ def save(folder, step, state, config, keep=2, score=None):
 
 
 def load(folder, device="cpu"):
-    """The newest whole checkpoint of a `checkpoints` folder, or the checkpoint that `folder` is itself.
+    """The newest whole checkpoint of a `checkpoints` folder, or the checkpoint that `folder` is
+    itself.
 
-    A damaged one is named in a warning and the one before it is used; with none left, CheckpointError.
+    A damaged one is named in a warning and the one before it is used; with none left,
+    CheckpointError.
     """
     folder = Path(folder)
     if (folder / "manifest.json").exists():
@@ -115,7 +139,9 @@ def _write(path, data):
 
 
 def _sync(folder):
-    """Forces a folder's entries to the disk; where folders cannot be opened there is nothing to force."""
+    """Forces a folder's entries to the disk; where folders cannot be opened there is nothing to
+    force.
+    """
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:
@@ -130,20 +156,29 @@ def _read(path):
     """`{name: bytes}` of a checkpoint and its manifest, each file compared with its sha256."""
     try:
         manifest = json.loads((path / "manifest.json").read_bytes())
-        version, entries = manifest["format"], {name: manifest["files"][name]["sha256"] for name in FILES}
+        version, entries = (
+            manifest["format"],
+            {name: manifest["files"][name]["sha256"] for name in FILES},
+        )
     except (OSError, ValueError, KeyError, TypeError):
         raise Damaged(f"Checkpoint {path} is damaged: manifest.json cannot be read") from None
     if version != FORMAT:
-        raise CheckpointError(f"Checkpoint {path} has format {version} and this megastep reads format {FORMAT}; "
-                              f"use the megastep that wrote it, with torch {manifest.get('torch')}")
+        raise CheckpointError(
+            f"Checkpoint {path} has format {version} and this megastep reads format {FORMAT}; "
+            f"use the megastep that wrote it, with torch {manifest.get('torch')}"
+        )
     contents = {}
     for name, digest in entries.items():
         try:
             contents[name] = (path / name).read_bytes()
         except OSError as error:
-            raise Damaged(f"Checkpoint {path} is damaged: {name} cannot be read ({error.strerror})") from None
+            raise Damaged(
+                f"Checkpoint {path} is damaged: {name} cannot be read ({error.strerror})"
+            ) from None
         if hashlib.sha256(contents[name]).hexdigest() != digest:
-            raise Damaged(f"Checkpoint {path} is damaged: {name} does not have the sha256 its manifest gives")
+            raise Damaged(
+                f"Checkpoint {path} is damaged: {name} does not have the sha256 its manifest gives"
+            )
     return contents, manifest
 
 
@@ -152,10 +187,14 @@ def _load(path, device):
     try:
         state = torch.load(io.BytesIO(contents["state.pt"]), map_location=device, weights_only=True)
     except pickle.UnpicklingError:
-        raise Damaged(f"Checkpoint {path} is refused: state.pt holds more than tensors and numbers, "
-                      "which could run code of its own") from None
+        raise Damaged(
+            f"Checkpoint {path} is refused: state.pt holds more than tensors and numbers, "
+            "which could run code of its own"
+        ) from None
     except (RuntimeError, EOFError, ValueError) as error:
-        raise Damaged(f"Checkpoint {path} is damaged: state.pt cannot be read ({str(error).splitlines()[0]})") from None
+        raise Damaged(
+            f"Checkpoint {path} is damaged: state.pt cannot be read ({str(error).splitlines()[0]})"
+        ) from None
     return Checkpoint(path, manifest["step"], state, json.loads(contents["config.json"]))
 
 

@@ -1,14 +1,17 @@
 """What a policy earns: the first episode of every lane, and how sure that is.
 
-B lanes, N worlds, A agents. Nothing here asks the device a question more often than every `CHECK` steps.
+B lanes, N worlds, A agents. Nothing here asks the device a question more often than every `CHECK`
+steps.
 """
+
 import numpy as np
 import torch
 
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 
-#: Steps between two looks at whether all lanes are done: a look empties a GPU's queue, a superfluous step costs little.
+#: Steps between two looks at whether all lanes are done: a look empties a GPU's queue, a
+#: superfluous step costs little.
 CHECK = 64
 
 
@@ -26,14 +29,20 @@ class RandomActions:
 
         @mapping
         def draw(space):
-            return torch.randint(space.n_actions, (lanes, *space.shape), device=state.lane.device, generator=generator)
+            return torch.randint(
+                space.n_actions,
+                (lanes, *space.shape),
+                device=state.lane.device,
+                generator=generator,
+            )
 
         return arrdict(actions=draw(self.action_space)), state
 
 
 @torch.no_grad()
 def first_episodes(env, policy, seed=1, greedy=False, max_steps=100_000):
-    """Plays each lane's first episode: arrdict of returns (B,), lengths (B,), done (B,), on the environment's device.
+    """Plays each lane's first episode: arrdict of returns (B,), lengths (B,), done (B,), on the
+    environment's device.
 
     An episode still going after `max_steps` is reported as it stands, with done False.
     """
@@ -47,17 +56,19 @@ def first_episodes(env, policy, seed=1, greedy=False, max_steps=100_000):
             break
         decision, state = policy(world, state, sample=not greedy, generator=generator)
         world = env.step(decision)
-        returns += torch.where(done, 0., world.reward)
+        returns += torch.where(done, 0.0, world.reward)
         lengths += ~done
         done |= world.terminal | world.truncated
     return arrdict(returns=returns, lengths=lengths, done=done)
 
 
-def interval(values, groups, level=.95, draws=2000, seed=1):
-    """The mean of `values` (B,) and a bootstrap interval for it that resamples whole groups: `(mean, low, high)`.
+def interval(values, groups, level=0.95, draws=2000, seed=1):
+    """The mean of `values` (B,) and a bootstrap interval for it that resamples whole groups:
+    `(mean, low, high)`.
 
-    Lanes in one home are alike, so it is homes (`groups`, (B,) whole numbers) that are drawn, with replacement: Efron
-    and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3. With one home, lanes are drawn.
+    Lanes in one home are alike, so it is homes (`groups`, (B,) whole numbers) that are drawn, with
+    replacement: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3. With
+    one home, lanes are drawn.
     """
     values, groups = np.asarray(values, float), np.asarray(groups)
     if len(np.unique(groups)) == 1:
@@ -71,7 +82,16 @@ def interval(values, groups, level=.95, draws=2000, seed=1):
 
 
 def summary(episodes, groups):
-    """A table's row: the mean return with its 95 % interval, the mean length, and what they were taken over."""
+    """A table's row: the mean return with its 95 % interval, the mean length, and what they were
+    taken over.
+    """
     mean, low, high = interval(episodes.returns.cpu().numpy(), groups)
-    return {"return": mean, "low": low, "high": high, "length": float(episodes.lengths.mean()),
-            "lanes": len(episodes.returns), "homes": len(np.unique(groups)), "unfinished": int((~episodes.done).sum())}
+    return {
+        "return": mean,
+        "low": low,
+        "high": high,
+        "length": float(episodes.lengths.mean()),
+        "lanes": len(episodes.returns),
+        "homes": len(np.unique(groups)),
+        "unfinished": int((~episodes.done).sum()),
+    }

@@ -1,14 +1,18 @@
-"""Network layers made from spaces: intakes turn observations into a vector, outputs turn a vector into actions.
+"""Network layers made from spaces: intakes turn observations into a vector, outputs turn a vector
+into actions.
 
-Axes: `...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A the agents one lane controls.
+Axes: `...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A the agents one lane
+controls.
 
-    intake = heads.intake(env.obs_space, width)        # (..., A, C, H, W) and (..., A, D)  ->  (..., width)
-    output = heads.output(env.action_space, width)     # (..., width)  ->  log-probabilities (..., A, n)
-    logits = nn.Sequential(intake, output)(world.obs)
+    intake = heads.intake(env.obs_space, width)        # (..., A, C, H, W) and (..., A, D)  ->
+    (..., width) output = heads.output(env.action_space, width)     # (..., width)  ->
+    log-probabilities (..., A, n) logits = nn.Sequential(intake, output)(world.obs)
     actions = output.sample(logits)                    # (..., A) whole numbers
 
-Nested dicts of spaces give nested dicts of logits and actions. Nothing here asks the GPU a question.
+Nested dicts of spaces give nested dicts of logits and actions. Nothing here asks the GPU a
+question.
 """
+
 import math
 
 import torch
@@ -22,15 +26,19 @@ _TINY = 1e-20  # below the smallest exponential draw that float32 makes, and far
 
 
 def compute_dtype(weight):
-    """The dtype a matrix product with `weight` runs in: autocast's where that is on, else the weight's own."""
+    """The dtype a matrix product with `weight` runs in: autocast's where that is on, else the
+    weight's own.
+    """
     device = weight.device.type
     return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else weight.dtype
 
 
 class Standard(nn.Module):
-    """Pictures less their channels' running mean, over their running deviation; vectors likewise, number by number.
+    """Pictures less their channels' running mean, over their running deviation; vectors likewise,
+    number by number.
 
-    A picture's numbers may well be .87 plus or minus .1, of which a network that starts at random sees mostly the .87.
+    A picture's numbers may well be .87 plus or minus .1, of which a network that starts at random
+    sees mostly the .87.
     """
 
     def __init__(self, space, least_scale=1e-2):
@@ -38,10 +46,12 @@ class Standard(nn.Module):
         is_picture = isinstance(space, spaces.MultiImage)
         shape = (*space.shape[:2], 1, 1) if is_picture else space.shape
         self.pooled = (0, -2, -1) if is_picture else (0,)
-        self.least_scale = least_scale  # what varies less than this is not worth looking at more closely
-        self.register_buffer('mean', torch.zeros(shape))
-        self.register_buffer('scale', torch.ones(shape))
-        self.register_buffer('count', torch.tensor(0.))
+        self.least_scale = (
+            least_scale  # what varies less than this is not worth looking at more closely
+        )
+        self.register_buffer("mean", torch.zeros(shape))
+        self.register_buffer("scale", torch.ones(shape))
+        self.register_buffer("count", torch.tensor(0.0))
 
     def forward(self, obs):
         return (obs - self.mean) / self.scale
@@ -51,14 +61,20 @@ class Standard(nn.Module):
         """Takes observations (B, ...) into account, the n-th call with weight 1/n."""
         self.count += 1
         spread, seen = torch.var_mean(obs.float(), self.pooled, correction=0, keepdim=True)
-        mean, variance = _moments(self.mean, self.scale.square(), seen[0], spread[0], 1 / self.count)
+        mean, variance = _moments(
+            self.mean, self.scale.square(), seen[0], spread[0], 1 / self.count
+        )
         self.mean.copy_(mean)
         self.scale.copy_(variance.sqrt().clamp(min=self.least_scale))
 
 
 def _moments(mean, variance, seen, spread, rate):
-    """Mean and variance of a mixture: what they were, with weight 1 - rate, and what was seen now, with weight rate."""
-    return mean.lerp(seen, rate), variance.lerp(spread, rate) + rate * (1 - rate) * (seen - mean).square()
+    """Mean and variance of a mixture: what they were, with weight 1 - rate, and what was seen now,
+    with weight rate.
+    """
+    return mean.lerp(seen, rate), variance.lerp(spread, rate) + rate * (1 - rate) * (
+        seen - mean
+    ).square()
 
 
 class Flat(nn.Module):
@@ -79,7 +95,7 @@ class OneHot(nn.Module):
     def __init__(self, space):
         super().__init__()
         self.n_features = space.n_agents * space.n_actions
-        self.register_buffer('values', torch.arange(space.n_actions), persistent=False)
+        self.register_buffer("values", torch.arange(space.n_actions), persistent=False)
 
     def forward(self, obs):
         return (obs[..., None] == self.values).flatten(-2)
@@ -88,7 +104,8 @@ class OneHot(nn.Module):
 class Conv(nn.Module):
     """A picture through two convolutions along its rows: (..., A, C, H, W) -> (..., n_features).
 
-    The picture's rows count as channels, since pictures here are one pixel high or a few. Agents share the weights.
+    The picture's rows count as channels, since pictures here are one pixel high or a few. Agents
+    share the weights.
     """
 
     def __init__(self, space, channels=32):
@@ -100,11 +117,13 @@ class Conv(nn.Module):
 
     def forward(self, obs):
         lead = obs.shape[:-4]
-        rows = obs.reshape(-1, obs.shape[-3] * obs.shape[-2], obs.shape[-1]).to(compute_dtype(self.first.weight))
+        rows = obs.reshape(-1, obs.shape[-3] * obs.shape[-2], obs.shape[-1]).to(
+            compute_dtype(self.first.weight)
+        )
         return F.relu(self.second(F.relu(self.first(rows)))).reshape(*lead, self.n_features)
 
 
-ENCODERS = {'linear': Flat, 'conv': Conv}
+ENCODERS = {"linear": Flat, "conv": Conv}
 
 
 def _encoder(space, pictures, path):
@@ -114,8 +133,10 @@ def _encoder(space, pictures, path):
         return Flat(space)
     if isinstance(space, spaces.MultiDiscrete):
         return OneHot(space)
-    raise ValueError(f'no intake is known for the observation space {path or "itself"} = {space!r}; '
-                     'there are MultiVector, MultiImage, MultiDiscrete and dicts of them')
+    raise ValueError(
+        f"no intake is known for the observation space {path or 'itself'} = {space!r}; "
+        "there are MultiVector, MultiImage, MultiDiscrete and dicts of them"
+    )
 
 
 def _paths(space, path=()):
@@ -128,23 +149,28 @@ def _paths(space, path=()):
 
 
 class ConcatIntake(nn.Module):
-    """Encodes every leaf of an observation, joins what comes out, and projects it to one vector (..., width), relu'd.
+    """Encodes every leaf of an observation, joins what comes out, and projects it to one vector
+    (..., width), relu'd.
 
-    At the start every leaf has the same say, however many numbers it has: a weight's variance is 2 / (leaves x leaf's
-    features), which keeps the vector's size that of the inputs (He et al. 2015).
+    At the start every leaf has the same say, however many numbers it has: a weight's variance is 2
+    / (leaves x leaf's features), which keeps the vector's size that of the inputs (He et al. 2015).
     """
 
-    def __init__(self, space, width, encoder='linear'):
+    def __init__(self, space, width, encoder="linear"):
         super().__init__()
         if encoder not in ENCODERS:
-            raise ValueError(f'encoder is {encoder!r}; it can be {" or ".join(ENCODERS)}')
+            raise ValueError(f"encoder is {encoder!r}; it can be {' or '.join(ENCODERS)}")
         leaves = list(_paths(space))
         if not leaves:
-            raise ValueError(f'the observation space {space!r} has nothing in it to see')
+            raise ValueError(f"the observation space {space!r} has nothing in it to see")
         self.paths = [path for path, _ in leaves]
-        self.encoders = nn.ModuleList(_encoder(leaf, encoder, '.'.join(path)) for path, leaf in leaves)
+        self.encoders = nn.ModuleList(
+            _encoder(leaf, encoder, ".".join(path)) for path, leaf in leaves
+        )
         self.standards = nn.ModuleList(
-            nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else Standard(leaf) for _, leaf in leaves)
+            nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else Standard(leaf)
+            for _, leaf in leaves
+        )
         sizes = [e.n_features for e in self.encoders]
         self.project = nn.Linear(sum(sizes), width)
         with torch.no_grad():
@@ -154,7 +180,9 @@ class ConcatIntake(nn.Module):
 
     def forward(self, obs):
         dtype = compute_dtype(self.project.weight)
-        features = [encoder(standard(leaf)).to(dtype) for leaf, standard, encoder in self._leaves(obs)]
+        features = [
+            encoder(standard(leaf)).to(dtype) for leaf, standard, encoder in self._leaves(obs)
+        ]
         joined = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
         return F.relu(self.project(joined))
 
@@ -172,17 +200,19 @@ class ConcatIntake(nn.Module):
             yield leaf, standard, encoder
 
 
-def intake(space, width, encoder='linear'):
+def intake(space, width, encoder="linear"):
     """A module from observations of this space, or dict of spaces, to vectors (..., width).
 
-    Observations may be of any dtype; they are cast to the weights'. `encoder` says how pictures are looked at:
-    'linear', as so many numbers, or 'conv', by convolutions. ValueError if the space is of no known kind.
+    Observations may be of any dtype; they are cast to the weights'. `encoder` says how pictures are
+    looked at: 'linear', as so many numbers, or 'conv', by convolutions. ValueError if the space is
+    of no known kind.
     """
     return ConcatIntake(space, width, encoder)
 
 
 class MultiDiscreteOutput(nn.Module):
-    """One choice out of n for every agent. Logits are log-probabilities (..., A, n), actions (..., A) int64.
+    """One choice out of n for every agent. Logits are log-probabilities (..., A, n), actions (...,
+    A) int64.
 
     `logprob` and `entropy` are those of the lane's joint action, (...,): the sum over its agents.
     """
@@ -191,8 +221,9 @@ class MultiDiscreteOutput(nn.Module):
         super().__init__()
         self.shape = (space.n_agents, space.n_actions)
         self.core = nn.Linear(width, math.prod(self.shape))
-        # A hundredth of the usual size, so that the first policy is close to uniform (Andrychowicz et al. 2021)
-        nn.init.orthogonal_(self.core.weight, gain=.01)
+        # A hundredth of the usual size, so that the first policy is close to uniform (Andrychowicz
+        # et al. 2021)
+        nn.init.orthogonal_(self.core.weight, gain=0.01)
         nn.init.zeros_(self.core.bias)
 
     def forward(self, x):
@@ -200,7 +231,9 @@ class MultiDiscreteOutput(nn.Module):
         return scores.unflatten(-1, self.shape).log_softmax(-1)
 
     def sample(self, logits, generator=None):
-        """Draws actions: the maximum of log-probability plus Gumbel noise is distributed as the probabilities."""
+        """Draws actions: the maximum of log-probability plus Gumbel noise is distributed as the
+        probabilities.
+        """
         noise = torch.empty_like(logits).exponential_(generator=generator).clamp_(min=_TINY).log_()
         return (logits - noise).argmax(-1)
 
@@ -241,44 +274,53 @@ class DictOutput(nn.Module):
 
 
 def output(space, width):
-    """A module from vectors (..., width) to logits of this action space, or dict of spaces, that can also `sample`
-    them, pick the likeliest (`greedy`) and tell `logprob` and `entropy`. ValueError if the space is of no known kind.
+    """A module from vectors (..., width) to logits of this action space, or dict of spaces, that
+    can also `sample` them, pick the likeliest (`greedy`) and tell `logprob` and `entropy`.
+    ValueError if the space is of no known kind.
     """
     if isinstance(space, dict) and space:
         return DictOutput(space, width)
     if isinstance(space, spaces.MultiDiscrete):
         return MultiDiscreteOutput(space, width)
-    raise ValueError(f'no output is known for the action space {space!r}; there are MultiDiscrete and dicts of it')
+    raise ValueError(
+        f"no output is known for the action space {space!r}; there are MultiDiscrete and dicts of "
+        f"it"
+    )
 
 
 class ValueOutput(nn.Module):
     """The expected return, (..., width) -> (...,) float32, in units of reward.
 
-    The layer itself predicts returns less their running mean, over their running deviation, so that its error is about
-    1 whatever an environment pays. `rescale` moves mean and deviation and corrects the layer so that no prediction
-    changes (PopArt, van Hasselt et al. 2016).
+    The layer itself predicts returns less their running mean, over their running deviation, so that
+    its error is about 1 whatever an environment pays. `rescale` moves mean and deviation and
+    corrects the layer so that no prediction changes (PopArt, van Hasselt et al. 2016).
     """
 
     def __init__(self, width, least_scale=1e-3):
         super().__init__()
         self.core = nn.Linear(width, 1)
-        nn.init.orthogonal_(self.core.weight, gain=.1)
+        nn.init.orthogonal_(self.core.weight, gain=0.1)
         nn.init.zeros_(self.core.bias)
         self.least_scale = least_scale  # returns that vary less than this are taken for constant
-        for name, start in dict(mean=0., scale=1., count=0.).items():
+        for name, start in dict(mean=0.0, scale=1.0, count=0.0).items():
             self.register_buffer(name, torch.tensor(start))
 
     def forward(self, x):
-        return self.core(x.to(compute_dtype(self.core.weight))).float().squeeze(-1) * self.scale + self.mean
+        return (
+            self.core(x.to(compute_dtype(self.core.weight))).float().squeeze(-1) * self.scale
+            + self.mean
+        )
 
     @torch.no_grad()
-    def rescale(self, targets, valid, rate=.05):
-        """Takes returns (...,) into account where `valid`. The n-th call weighs max(rate, 1/n), 0 if nothing is."""
+    def rescale(self, targets, valid, rate=0.05):
+        """Takes returns (...,) into account where `valid`. The n-th call weighs max(rate, 1/n), 0
+        if nothing is.
+        """
         n_valid = valid.sum()
         self.count += n_valid > 0
-        rate = (1 / self.count).clamp(min=rate, max=1.) * (n_valid > 0)
-        seen = targets.masked_fill(~valid, 0.).sum() / n_valid.clamp(min=1)
-        spread = (targets - seen).square().masked_fill(~valid, 0.).sum() / n_valid.clamp(min=1)
+        rate = (1 / self.count).clamp(min=rate, max=1.0) * (n_valid > 0)
+        seen = targets.masked_fill(~valid, 0.0).sum() / n_valid.clamp(min=1)
+        spread = (targets - seen).square().masked_fill(~valid, 0.0).sum() / n_valid.clamp(min=1)
         mean, variance = _moments(self.mean, self.scale.square(), seen, spread, rate)
         scale = variance.sqrt().clamp(min=self.least_scale)
         self.core.weight.mul_(self.scale / scale)

@@ -1,8 +1,11 @@
-"""Where the numbers of a run go: JSON lines and TensorBoard always, Weights & Biases if asked, curves at the end.
+"""Where the numbers of a run go: JSON lines and TensorBoard always, Weights & Biases if asked,
+curves at the end.
 
-`metrics.jsonl` holds what the seed determines, so two runs of one configuration write the same bytes; rates and times
-are in `perf.jsonl`. A sink that fails is dropped with one warning; nothing here can stop a run. T time, B lanes.
+`metrics.jsonl` holds what the seed determines, so two runs of one configuration write the same
+bytes; rates and times are in `perf.jsonl`. A sink that fails is dropped with one warning; nothing
+here can stop a run. T time, B lanes.
 """
+
 import importlib
 import json
 import math
@@ -13,19 +16,28 @@ from pathlib import Path
 import torch
 
 #: How each optional part is called, and what installs it.
-FEATURES = {"tensorboard": "TensorBoard events", "wandb": "Weights & Biases", "matplotlib": "curves.png",
-            "av": "video.mp4"}
+FEATURES = {
+    "tensorboard": "TensorBoard events",
+    "wandb": "Weights & Biases",
+    "matplotlib": "curves.png",
+    "av": "video.mp4",
+}
 #: Seconds that Weights & Biases may take to answer before the run goes on without it.
 PATIENCE = 20
 
 
 def missing(package):
     """The sentence for a package that is not installed."""
-    return f"{FEATURES[package]} left out: the package {package} is not installed; pip install {package}"
+    return (
+        f"{FEATURES[package]} left out: the package {package} is not installed; pip install "
+        f"{package}"
+    )
 
 
 class Episodes:
-    """Return and length of episodes, added up lane by lane on the device; only `take` asks it for numbers."""
+    """Return and length of episodes, added up lane by lane on the device; only `take` asks it for
+    numbers.
+    """
 
     def __init__(self, n_lanes, device):
         self.returns = torch.zeros(n_lanes, dtype=torch.float64, device=device)
@@ -33,32 +45,54 @@ class Episodes:
         self.sums = torch.zeros(4, dtype=torch.float64, device=device)
 
     def add(self, reward, reset, done):
-        """Takes T transitions of B lanes; `reward`, `reset`, `done` (T, B) are those of the worlds they led to."""
-        # running totals over all T rows, from which the total at the last end before each row is taken away
-        returns, lengths = self.returns + reward.double().cumsum(0), self.lengths + (~reset).double().cumsum(0)
+        """Takes T transitions of B lanes; `reward`, `reset`, `done` (T, B) are those of the worlds
+        they led to.
+        """
+        # running totals over all T rows, from which the total at the last end before each row is
+        # taken away
+        returns, lengths = (
+            self.returns + reward.double().cumsum(0),
+            self.lengths + (~reset).double().cumsum(0),
+        )
         rows = torch.arange(len(reward), device=reward.device)[:, None]
         last = torch.where(done, rows, -1).cummax(0).values
         before = torch.cat([torch.full_like(last[:1], -1), last[:-1]])
 
         def since(totals, ends):
-            return totals - torch.where(ends >= 0, totals.gather(0, ends.clamp(min=0)), 0.)
+            return totals - torch.where(ends >= 0, totals.gather(0, ends.clamp(min=0)), 0.0)
 
         finished = since(returns, before)
-        self.sums += torch.stack([done.double().sum(), (finished * done).sum(), (finished**2 * done).sum(),
-                                  (since(lengths, before) * done).sum()])
+        self.sums += torch.stack(
+            [
+                done.double().sum(),
+                (finished * done).sum(),
+                (finished**2 * done).sum(),
+                (since(lengths, before) * done).sum(),
+            ]
+        )
         tail = last[-1:]
-        self.returns = (returns[-1:] - torch.where(tail >= 0, returns.gather(0, tail.clamp(min=0)), 0.))[0]
-        self.lengths = (lengths[-1:] - torch.where(tail >= 0, lengths.gather(0, tail.clamp(min=0)), 0.))[0]
+        self.returns = (
+            returns[-1:] - torch.where(tail >= 0, returns.gather(0, tail.clamp(min=0)), 0.0)
+        )[0]
+        self.lengths = (
+            lengths[-1:] - torch.where(tail >= 0, lengths.gather(0, tail.clamp(min=0)), 0.0)
+        )[0]
 
     def take(self):
-        """Of the episodes that ended since the last call: how many, mean and deviation of the return, mean length."""
+        """Of the episodes that ended since the last call: how many, mean and deviation of the
+        return, mean length.
+        """
         n, total, squares, steps = self.sums.tolist()
         self.sums.zero_()
         if not n:
             return {"episode/count": 0}
         mean = total / n
-        return {"episode/count": int(n), "episode/return": mean, "episode/length": steps / n,
-                "episode/deviation": math.sqrt(max(squares / n - mean**2, 0.))}
+        return {
+            "episode/count": int(n),
+            "episode/return": mean,
+            "episode/length": steps / n,
+            "episode/deviation": math.sqrt(max(squares / n - mean**2, 0.0)),
+        }
 
     def state_dict(self):
         return {"returns": self.returns, "lengths": self.lengths, "sums": self.sums}
@@ -76,7 +110,9 @@ class JsonLines:
         self.file = open(self.path, "a", encoding="utf-8")
 
     def write(self, step, values):
-        finite = {k: v if math.isfinite(v) else None for k, v in values.items()}  # JSON knows no nan
+        finite = {
+            k: v if math.isfinite(v) else None for k, v in values.items()
+        }  # JSON knows no nan
         self.file.write(json.dumps({"samples": step, **finite}) + "\n")
         self.file.flush()
 
@@ -85,7 +121,9 @@ class JsonLines:
 
 
 def read(path):
-    """The objects of a file of JSON lines; a line cut short by a crash or a full disk is passed over."""
+    """The objects of a file of JSON lines; a line cut short by a crash or a full disk is passed
+    over.
+    """
     rows = []
     for line in Path(path).read_text(encoding="utf-8").splitlines():
         try:
@@ -120,7 +158,9 @@ class TensorBoard:
 
 
 class Wandb:
-    """Weights & Biases, online or offline; it never asks at the terminal and waits `PATIENCE` seconds at most."""
+    """Weights & Biases, online or offline; it never asks at the terminal and waits `PATIENCE`
+    seconds at most.
+    """
 
     def __init__(self, folder, project, mode, name, config):
         os.environ.setdefault("WANDB_SILENT", "true")
@@ -129,20 +169,32 @@ class Wandb:
         except ImportError:
             raise RuntimeError(missing("wandb")) from None
         if mode == "online" and not self._has_key(wandb):
-            raise RuntimeError("Weights & Biases left out: it has no key here; `wandb login` stores one, "
-                               "logger.mode=offline needs none")
+            raise RuntimeError(
+                "Weights & Biases left out: it has no key here; `wandb login` stores one, "
+                "logger.mode=offline needs none"
+            )
         try:
-            self.run = wandb.init(project=project, mode=mode, name=name, config=config, dir=str(folder),
-                                  settings=wandb.Settings(init_timeout=PATIENCE, silent=True, console="off"))
+            self.run = wandb.init(
+                project=project,
+                mode=mode,
+                name=name,
+                config=config,
+                dir=str(folder),
+                settings=wandb.Settings(init_timeout=PATIENCE, silent=True, console="off"),
+            )
         except Exception as error:  # the package raises its own, the network's and the system's
-            raise RuntimeError(f"Weights & Biases left out: it did not start ({_first_line(error)})") from None
+            raise RuntimeError(
+                f"Weights & Biases left out: it did not start ({_first_line(error)})"
+            ) from None
 
     @staticmethod
     def _has_key(wandb):
-        """Whether there is a key, in the environment or a file, without asking for one at the terminal."""
+        """Whether there is a key, in the environment or a file, without asking for one at the
+        terminal.
+        """
         try:
             return os.environ.get("WANDB_API_KEY") or wandb.login(prompt=False)
-        except TypeError:       # older versions have no such argument
+        except TypeError:  # older versions have no such argument
             return wandb.api.api_key
 
     def write(self, step, values):
@@ -153,13 +205,18 @@ class Wandb:
 
 
 class Metrics:
-    """All sinks of one run folder. `step`: where a resumed run goes on; `wandb`: arguments of `Wandb`, or None."""
+    """All sinks of one run folder. `step`: where a resumed run goes on; `wandb`: arguments of
+    `Wandb`, or None.
+    """
 
     def __init__(self, folder, step=0, wandb=None):
         folder = Path(folder)
         for name in ("metrics.jsonl", "perf.jsonl"):
             rewind(folder / name, step)
-        self.metrics, self.perf = JsonLines(folder / "metrics.jsonl"), JsonLines(folder / "perf.jsonl")
+        self.metrics, self.perf = (
+            JsonLines(folder / "metrics.jsonl"),
+            JsonLines(folder / "perf.jsonl"),
+        )
         self.others = []
         self._open(TensorBoard, folder / "tensorboard", step)
         if wandb is not None:
@@ -189,10 +246,16 @@ class Metrics:
             what = getattr(sink, "path", None) or type(sink).__name__
             if sink in self.others:
                 self.others.remove(sink)
-                warnings.warn(f"{what} failed and is left out from here on ({_first_line(error)})", stacklevel=3)
+                warnings.warn(
+                    f"{what} failed and is left out from here on ({_first_line(error)})",
+                    stacklevel=3,
+                )
             elif not getattr(sink, "warned", False):
                 sink.warned = True
-                warnings.warn(f"{what} cannot be written ({_first_line(error)}); the run goes on", stacklevel=3)
+                warnings.warn(
+                    f"{what} cannot be written ({_first_line(error)}); the run goes on",
+                    stacklevel=3,
+                )
 
 
 def _first_line(error):
@@ -200,16 +263,23 @@ def _first_line(error):
 
 
 def curves(folder):
-    """Draws `curves.png` in a run folder: return, episode length, losses and rate against environment steps."""
+    """Draws `curves.png` in a run folder: return, episode length, losses and rate against
+    environment steps.
+    """
     try:
         from matplotlib.figure import Figure
     except ImportError:
         return warnings.warn(missing("matplotlib"), stacklevel=2)
     folder = Path(folder)
     metrics, perf = read(folder / "metrics.jsonl"), read(folder / "perf.jsonl")
-    panels = {"return": (metrics, ["episode/return"]), "episode length (steps)": (metrics, ["episode/length"]),
-              "entropy": (metrics, ["loss/entropy"]), "value loss": (metrics, ["loss/value"]),
-              "explained variance": (metrics, ["loss/explained_variance"]), "samples / s": (perf, ["perf/rate"])}
+    panels = {
+        "return": (metrics, ["episode/return"]),
+        "episode length (steps)": (metrics, ["episode/length"]),
+        "entropy": (metrics, ["loss/entropy"]),
+        "value loss": (metrics, ["loss/value"]),
+        "explained variance": (metrics, ["loss/explained_variance"]),
+        "samples / s": (perf, ["perf/rate"]),
+    }
     figure = Figure(figsize=(12, 6), layout="constrained")
     for axes, (title, (rows, names)) in zip(figure.subplots(2, 3).flat, panels.items()):
         for name in names:
@@ -217,7 +287,7 @@ def curves(folder):
             axes.plot(*zip(*points) if points else ([], []), label=name)
         axes.set_title(title)
         axes.set_xlabel("samples")
-        axes.grid(alpha=.3)
+        axes.grid(alpha=0.3)
     try:
         figure.savefig(folder / "curves.png", dpi=80)
     except OSError as error:

@@ -1,9 +1,11 @@
-"""A long short-term memory (Hochreiter and Schmidhuber 1997) that forgets inside a sequence where an episode starts.
+"""A long short-term memory (Hochreiter and Schmidhuber 1997) that forgets inside a sequence where
+an episode starts.
 
-Axes: T time, B lanes, W width. Gates are laid out (..., 4 W): input, forget, candidate, output, as PyTorch's own are.
-Matrix products run in the compute dtype (autocast's), the cell and its gates in float32: over hundreds of steps a
-bfloat16 cell would round small additions away.
+Axes: T time, B lanes, W width. Gates are laid out (..., 4 W): input, forget, candidate, output, as
+PyTorch's own are. Matrix products run in the compute dtype (autocast's), the cell and its gates in
+float32: over hundreds of steps a bfloat16 cell would round small additions away.
 """
+
 import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
@@ -14,15 +16,17 @@ from megastep.arrdict import arrdict
 
 
 def _cell(from_input, from_memory, before):
-    """One step of all lanes: the two halves of the gates (B, 4 W) and the cell before it (B, W), float32.
+    """One step of all lanes: the two halves of the gates (B, 4 W) and the cell before it (B, W),
+    float32.
 
-    Returns the output and the cell after it (B, W), and the activated gates (B, 4 W) for `_cell_backward`.
+    Returns the output and the cell after it (B, W), and the activated gates (B, 4 W) for
+    `_cell_backward`.
     """
     if before.is_cuda:
         return torch.ops.aten._thnn_fused_lstm_cell(from_input, from_memory, before)
     gates = from_input + from_memory
     i, f, g, o = gates.chunk(4, -1)
-    gates[:, :2 * f.shape[-1]].sigmoid_()
+    gates[:, : 2 * f.shape[-1]].sigmoid_()
     g.tanh_()
     o.sigmoid_()
     after = (f * before).addcmul_(i, g)
@@ -30,38 +34,49 @@ def _cell(from_input, from_memory, before):
 
 
 def _cell_backward(d_output, d_after, before, after, gates):
-    """Gradients of `_cell` in the gates before their activation (B, 4 W) and in the cell before the step (B, W)."""
+    """Gradients of `_cell` in the gates before their activation (B, 4 W) and in the cell before the
+    step (B, W).
+    """
     if before.is_cuda:
-        return torch.ops.aten._thnn_fused_lstm_cell_backward_impl(d_output, d_after, before, after, gates, False)[:2]
+        return torch.ops.aten._thnn_fused_lstm_cell_backward_impl(
+            d_output, d_after, before, after, gates, False
+        )[:2]
     i, f, g, o = gates.chunk(4, -1)
     squashed = after.tanh()
     d_cell = torch.addcmul(d_after, d_output * o, 1 - squashed * squashed)
-    d_gates = torch.cat([
-        d_cell * g * i * (1 - i),
-        d_cell * before * f * (1 - f),
-        d_cell * i * (1 - g * g),
-        d_output * squashed * o * (1 - o)], -1)
+    d_gates = torch.cat(
+        [
+            d_cell * g * i * (1 - i),
+            d_cell * before * f * (1 - f),
+            d_cell * i * (1 - g * g),
+            d_output * squashed * o * (1 - o),
+        ],
+        -1,
+    )
     return d_gates, d_cell * f
 
 
 class _Sequence(torch.autograd.Function):
     """The recurrence over time, with its gradient written out.
 
-    PyTorch's own tape would add up the weight's gradient step by step; here it is one matrix product for all of time.
+    PyTorch's own tape would add up the weight's gradient step by step; here it is one matrix
+    product for all of time.
     """
 
     @staticmethod
     def forward(ctx, from_input, weight, reset, output, cell):
-        """from_input (T, B, 4 W) and weight (4 W, W) in the compute dtype, reset (T, B, 1), output and cell (B, W)
-        float32. Returns outputs (T, B, W) in the compute dtype and the last cell.
+        """from_input (T, B, 4 W) and weight (4 W, W) in the compute dtype, reset (T, B, 1), output
+        and cell (B, W) float32. Returns outputs (T, B, W) in the compute dtype and the last cell.
         """
         outputs = from_input.new_empty(*reset.shape[:2], weight.shape[1])
         memories = torch.empty_like(outputs)
         ctx.steps = []
         for t in range(len(reset)):
-            memories[t] = output.masked_fill(reset[t], 0.)
-            before = cell.masked_fill(reset[t], 0.)
-            output, cell, gates = _cell(from_input[t].float(), (memories[t] @ weight.T).float(), before)
+            memories[t] = output.masked_fill(reset[t], 0.0)
+            before = cell.masked_fill(reset[t], 0.0)
+            output, cell, gates = _cell(
+                from_input[t].float(), (memories[t] @ weight.T).float(), before
+            )
             outputs[t] = output
             ctx.steps.append((before, cell, gates))
         ctx.save_for_backward(weight, reset, memories)
@@ -76,14 +91,16 @@ class _Sequence(torch.autograd.Function):
         for t in reversed(range(len(reset))):
             d_step, d_cell = _cell_backward(d_output + d_outputs[t], d_cell, *ctx.steps[t])
             d_gates[t] = d_step
-            d_output = (d_gates[t] @ weight).float().masked_fill_(reset[t], 0.)
-            d_cell = d_cell.masked_fill(reset[t], 0.)
+            d_output = (d_gates[t] @ weight).float().masked_fill_(reset[t], 0.0)
+            d_cell = d_cell.masked_fill(reset[t], 0.0)
         d_weight = d_gates.flatten(0, 1).T @ memories.flatten(0, 1)
         return d_gates, d_weight, None, d_output, d_cell
 
 
 class LSTM(nn.Module):
-    """A memory of `width` numbers a lane, kept between calls in a state: arrdict(output, cell), each (B, W) float32."""
+    """A memory of `width` numbers a lane, kept between calls in a state: arrdict(output, cell),
+    each (B, W) float32.
+    """
 
     def __init__(self, width):
         super().__init__()
@@ -93,23 +110,31 @@ class LSTM(nn.Module):
         with torch.no_grad():
             for block in (*self.input.weight.split(width), *self.memory.weight.split(width)):
                 nn.init.orthogonal_(block)
-            # A forget gate that starts open, so that gradients reach back from the start (Jozefowicz et al. 2015)
-            self.input.bias.zero_()[width:2 * width] = 1.
+            # A forget gate that starts open, so that gradients reach back from the start
+            # (Jozefowicz et al. 2015)
+            self.input.bias.zero_()[width : 2 * width] = 1.0
 
     def initial(self, n_lanes, device=None):
         """The state of lanes that remember nothing."""
-        return arrdict({key: torch.zeros(n_lanes, self.width, device=device) for key in ('output', 'cell')})
+        return arrdict(
+            {key: torch.zeros(n_lanes, self.width, device=device) for key in ("output", "cell")}
+        )
 
     def forward(self, x, reset, state):
-        """Runs over x (T, B, W) from a state; what a lane remembers is cleared before each step where reset (T, B).
+        """Runs over x (T, B, W) from a state; what a lane remembers is cleared before each step
+        where reset (T, B).
 
         Returns the outputs (T, B, W) and the state after the last step.
         """
         dtype = compute_dtype(self.memory.weight)
         from_input = F.linear(x.to(dtype), self.input.weight.to(dtype), self.input.bias.to(dtype))
         weight = self.memory.weight.to(dtype)
-        with torch.autocast(x.device.type, enabled=False):  # which would take the fused cell to low precision
-            outputs, cell = _Sequence.apply(from_input, weight, reset[..., None], state['output'], state['cell'])
+        with torch.autocast(
+            x.device.type, enabled=False
+        ):  # which would take the fused cell to low precision
+            outputs, cell = _Sequence.apply(
+                from_input, weight, reset[..., None], state["output"], state["cell"]
+            )
         return outputs, arrdict(output=outputs[-1].float(), cell=cell)
 
     def step(self, x, reset, state):

@@ -1,12 +1,16 @@
 """What an action was worth: GAE and V-trace as pure functions.
 
-Axes: T time, B lanes. Everything is (T, B); row t is the decision taken at time t, and `reward`, `reset`, `terminal`,
-`truncated` at row t belong to the world that followed it, t+1. `value` at row t is V_t, the value of what was seen
-*before* the decision, and `last_value` (B,) is V_T, that of the last observation, so V_{t+1} is the next row.
+Axes: T time, B lanes. Everything is (T, B); row t is the decision taken at time t, and `reward`,
+`reset`, `terminal`, `truncated` at row t belong to the world that followed it, t+1. `value` at row
+t is V_t, the value of what was seen
+*before* the decision, and `last_value` (B,) is V_T, that of the last observation, so V_{t+1} is the
+next row.
 
-A decision is *valid* if the world took it: valid_t = not reset_{t+1}. An episode's last observation has `terminal`
-(nothing follows: V counts as 0) or `truncated` (something would have followed: V counts) set; no sum crosses either.
+A decision is *valid* if the world took it: valid_t = not reset_{t+1}. An episode's last observation
+has `terminal` (nothing follows: V counts as 0) or `truncated` (something would have followed: V
+counts) set; no sum crosses either.
 """
+
 import torch
 
 from megastep import arrdict
@@ -15,9 +19,10 @@ from megastep import arrdict
 def discounted_sum(terms, discounts):
     """x_t = terms_t + discounts_t x_{t+1}, x_T = 0, along the first axis.
 
-    Done by doubling, in log2(T) passes over the whole array: after a pass of stride k, x_t holds the first 2k terms of
-    its sum and d_t the product of the discounts up to the term that comes next. Nothing is divided by a product of
-    discounts, so zeros among them, which is how an episode ends, are exact.
+    Done by doubling, in log2(T) passes over the whole array: after a pass of stride k, x_t holds
+    the first 2k terms of its sum and d_t the product of the discounts up to the term that comes
+    next. Nothing is divided by a product of discounts, so zeros among them, which is how an episode
+    ends, are exact.
     """
     total, product = terms, discounts
     stride = 1
@@ -34,41 +39,66 @@ def _following(value, last_value):
 
 
 def gae(reward, value, last_value, reset, terminal, truncated, *, gamma, lambda_):
-    """Generalised advantage estimates (Schulman et al. 2016), and the lambda returns A + V for the value to fit.
+    """Generalised advantage estimates (Schulman et al. 2016), and the lambda returns A + V for the
+    value to fit.
 
         delta_t = r_{t+1} + gamma (1 - terminal_{t+1}) V_{t+1} - V_t
         A_t     = delta_t + gamma lambda (1 - done_{t+1}) A_{t+1},   done = terminal or truncated
 
-    A is 0 where the decision was not valid. Returns arrdict(advantages, targets, valid), each (T, B).
+    A is 0 where the decision was not valid. Returns arrdict(advantages, targets, valid), each (T,
+    B).
     """
-    delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.) - value
-    delta = delta.masked_fill(reset, 0.)
-    discounts = torch.full_like(value, gamma * lambda_).masked_fill_(terminal | truncated | reset, 0.)
+    delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.0) - value
+    delta = delta.masked_fill(reset, 0.0)
+    discounts = torch.full_like(value, gamma * lambda_).masked_fill_(
+        terminal | truncated | reset, 0.0
+    )
     advantages = discounted_sum(delta, discounts)
     return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=~reset)
 
 
-def vtrace(log_ratio, reward, value, last_value, reset, terminal, truncated,
-           *, gamma, lambda_=1., rho_clip=1., c_clip=1.):
-    """V-trace (Espeholt et al. 2018, IMPALA): what a policy pi can learn from what another, mu, did.
+def vtrace(
+    log_ratio,
+    reward,
+    value,
+    last_value,
+    reset,
+    terminal,
+    truncated,
+    *,
+    gamma,
+    lambda_=1.0,
+    rho_clip=1.0,
+    c_clip=1.0,
+):
+    """V-trace (Espeholt et al. 2018, IMPALA): what a policy pi can learn from what another, mu,
+    did.
 
-    With `log_ratio` = log pi(a_t) - log mu(a_t), rho_t = min(rho_clip, pi/mu), c_t = lambda min(c_clip, pi/mu):
+    With `log_ratio` = log pi(a_t) - log mu(a_t), rho_t = min(rho_clip, pi/mu), c_t = lambda
+    min(c_clip, pi/mu):
 
         delta_t   = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) V_{t+1} - V_t)
         v_t - V_t = delta_t + gamma c_t (1 - done_{t+1}) (v_{t+1} - V_{t+1}),           v_T = V_T
-        A_t       = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) v'_{t+1} - V_t),        v' = V at a truncation, else v
+        A_t       = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) v'_{t+1} - V_t),        v' = V at a
+        truncation, else v
 
-    The targets v are what the value should fit; A weighs the policy's gradient. Where the decision was not valid v = V
-    and A = 0. Returns arrdict(advantages, targets, valid), each (T, B).
+    The targets v are what the value should fit; A weighs the policy's gradient. Where the decision
+    was not valid v = V and A = 0. Returns arrdict(advantages, targets, valid), each (T, B).
     """
     following = _following(value, last_value)
     ratio = log_ratio.exp()
     rho = ratio.clamp(max=rho_clip)
-    delta = rho * (reward + gamma * following.masked_fill(terminal, 0.) - value)
-    delta = delta.masked_fill(reset, 0.)
-    discounts = (gamma * lambda_ * ratio.clamp(max=c_clip)).masked_fill(terminal | truncated | reset, 0.)
+    delta = rho * (reward + gamma * following.masked_fill(terminal, 0.0) - value)
+    delta = delta.masked_fill(reset, 0.0)
+    discounts = (gamma * lambda_ * ratio.clamp(max=c_clip)).masked_fill(
+        terminal | truncated | reset, 0.0
+    )
     targets = value + discounted_sum(delta, discounts)
 
-    beyond = torch.where(truncated, following, _following(targets, last_value)).masked_fill(terminal, 0.)
+    beyond = torch.where(truncated, following, _following(targets, last_value)).masked_fill(
+        terminal, 0.0
+    )
     advantages = rho * (reward + gamma * beyond - value)
-    return arrdict.arrdict(advantages=advantages.masked_fill(reset, 0.), targets=targets, valid=~reset)
+    return arrdict.arrdict(
+        advantages=advantages.masked_fill(reset, 0.0), targets=targets, valid=~reset
+    )

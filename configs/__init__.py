@@ -1,9 +1,11 @@
-"""What train.py, evaluate.py and record.py share: command line (alone in knowing Hydra), settings, runs.
+"""What train.py, evaluate.py and record.py share: command line (alone in knowing Hydra), settings,
+runs.
 
-To be imported before torch: OpenMP reads how to wait when it is loaded. Threads that spin while they wait for others
-take the cores that those others need, wherever anything else runs: with one of two cores taken, training was 100 times
-slower. Asleep, they lose a few microseconds a wait.
+To be imported before torch: OpenMP reads how to wait when it is loaded. Threads that spin while
+they wait for others take the cores that those others need, wherever anything else runs: with one of
+two cores taken, training was 100 times slower. Asleep, they lose a few microseconds a wait.
 """
+
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")

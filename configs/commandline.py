@@ -1,7 +1,10 @@
-"""The door: command line -> Hydra -> checked settings. Everything is composed and checked before anything is written.
+"""The door: command line -> Hydra -> checked settings. Everything is composed and checked before
+anything is written.
 
-Hydra is used through its compose API and its override grammar; `@hydra.main` would make its folder first, and exit 1.
+Hydra is used through its compose API and its override grammar; `@hydra.main` would make its folder
+first, and exit 1.
 """
+
 import argparse
 import dataclasses
 import signal
@@ -28,14 +31,18 @@ CONFIGS = Path(__file__).resolve().parent
 
 
 class Door:
-    """Composes and checks the configuration of one script; a context, as Hydra keeps its state in a global."""
+    """Composes and checks the configuration of one script; a context, as Hydra keeps its state in a
+    global.
+    """
 
     def __init__(self, script, kind):
         self.script, self.kind = script, kind
 
     def __enter__(self):
         GlobalHydra.instance().clear()
-        self._context = initialize_config_dir(str(CONFIGS), version_base="1.3", job_name=self.script)
+        self._context = initialize_config_dir(
+            str(CONFIGS), version_base="1.3", job_name=self.script
+        )
         self._context.__enter__()
         return self
 
@@ -46,7 +53,11 @@ class Door:
         """{group: [members]}; train.yaml and its fellows are no groups."""
         loader = GlobalHydra.instance().config_loader()
         chosen = self._compose([], hydra=True).hydra.runtime.choices
-        return {g: loader.get_group_options(g) for g in loader.get_group_options("", ObjectType.GROUP) if g in chosen}
+        return {
+            g: loader.get_group_options(g)
+            for g in loader.get_group_options("", ObjectType.GROUP)
+            if g in chosen
+        }
 
     def jobs(self, overrides, multirun=False):
         """The composed tree of each job, `[(overrides, nested dict)]`; one job unless multirun."""
@@ -60,13 +71,17 @@ class Door:
         return [(list(job), self.tree(list(job))) for job in batches]
 
     def tree(self, overrides):
-        """Nested dicts for one list of overrides. Faults names every unknown key and group member, and bad value."""
+        """Nested dicts for one list of overrides. Faults names every unknown key and group member,
+        and bad value.
+        """
         faults, fine, groups = [], [], self.groups()
         choices = [o for o in self._parsed(overrides) if o.key_or_group in groups]
         for choice in choices:
             member, members = choice.value(), groups[choice.key_or_group]
             if member is not None and member not in members:
-                faults.append((choice.key_or_group, f"{member!r} is unknown; {closest(member, members)}"))
+                faults.append(
+                    (choice.key_or_group, f"{member!r} is unknown; {closest(member, members)}")
+                )
             else:
                 fine.append(choice.input_line)
         keys = list(_paths(_plain(self._compose(fine))))
@@ -91,7 +106,9 @@ class Door:
         return tree
 
     def _compose(self, overrides, hydra=False):
-        """With a GPU to run on, `agent=auto` is replaced by `agent=large`; without one it is `small` already."""
+        """With a GPU to run on, `agent=auto` is replaced by `agent=large`; without one it is
+        `small` already.
+        """
         config = compose(self.script, overrides, return_hydra_config=True)
         if config.hydra.runtime.choices.get("agent") == "auto" and _has_gpu(config.get("device")):
             config = compose(self.script, [*overrides, "agent=large"], return_hydra_config=True)
@@ -106,7 +123,13 @@ class Door:
             try:
                 override = OverridesParser.create().parse_override(text)
             except HydraException:
-                faults.append((text, "is not understood; write key=value, quote blanks and brackets: 'key=\"a b\"'"))
+                faults.append(
+                    (
+                        text,
+                        "is not understood; write key=value, quote blanks and brackets: 'key=\"a "
+                        "b\"'",
+                    )
+                )
                 continue
             if override.type.name != "CHANGE" or override.package is not None:
                 faults.append((text, "keys and groups are fixed; write key=value or group=member"))
@@ -123,6 +146,7 @@ def _has_gpu(device):
     if device == "cpu":
         return False
     import torch
+
     return torch.cuda.is_available()
 
 
@@ -140,7 +164,8 @@ def _paths(tree, prefix=""):
 def main(script, kind, run, help_text, argv=None, prepare=lambda tree, overrides: tree):
     """Parses, composes, checks, runs; returns the exit code.
 
-    `run(settings)` does the work; `prepare(tree, overrides)` may replace a composed tree before it is built.
+    `run(settings)` does the work; `prepare(tree, overrides)` may replace a composed tree before it
+    is built.
     """
     signal.signal(signal.SIGTERM, _terminate)
     warnings.showwarning = lambda message, *_, **__: warn(message)
@@ -187,7 +212,9 @@ def _options(script, argv):
 
 def _help(script, groups, text):
     width = max(len(g) for g in groups)
-    members = "\n".join(f"  {group:<{width}}  {', '.join(options)}" for group, options in groups.items())
+    members = "\n".join(
+        f"  {group:<{width}}  {', '.join(options)}" for group, options in groups.items()
+    )
     return f"""{text}
 
 python {script}.py [-m] [key=value ...]
@@ -201,7 +228,9 @@ Groups, chosen with group=member:
 
 
 def sweep(run, overrides, settings):
-    """Runs the jobs one after the other, each in its own folder, past those that fail. Returns the exit code."""
+    """Runs the jobs one after the other, each in its own folder, past those that fail. Returns the
+    exit code.
+    """
     base = runs.fresh(Path("sweeps") / time.strftime("%Y-%m-%d_%H-%M-%S"))
     rows = []
     for number, (words, job) in enumerate(zip(overrides, settings)):
@@ -219,6 +248,14 @@ def sweep(run, overrides, settings):
             reason = str(error) if isinstance(error, Fault) else f"{type(error).__name__}: {error}"
             result, state = None, f"FAILED: {reason}"
             say(f"Job {number + 1} {state}", sys.stderr)
-        rows.append((str(number), " ".join(words), state, runs.headline(result), f"{time.monotonic() - start:.0f} s"))
+        rows.append(
+            (
+                str(number),
+                " ".join(words),
+                state,
+                runs.headline(result),
+                f"{time.monotonic() - start:.0f} s",
+            )
+        )
     say(table(("job", "overrides", "state", "return", "time"), rows, title="Sweep"))
     return 2 if any(row[2] != "done" for row in rows) else 0

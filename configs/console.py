@@ -1,4 +1,7 @@
-"""Lines, warnings, tables and progress for whoever watches, on a terminal or not, and for nobody once they leave."""
+"""Lines, warnings, tables and progress for whoever watches, on a terminal or not, and for nobody
+once they leave.
+"""
+
 import os
 import sys
 import time
@@ -14,7 +17,9 @@ QUIET = 10
 
 
 def say(text="", file=None):
-    """Prints a line; if nobody reads any more (`| head`), it and every later line go nowhere, and the work goes on."""
+    """Prints a line; if nobody reads any more (`| head`), it and every later line go nowhere, and
+    the work goes on.
+    """
     file = file or sys.stdout
     try:
         print(text, file=file, flush=True)
@@ -28,7 +33,9 @@ def warn(sentence):
 
 
 def deafen(file):
-    """Points a stream nobody reads at the null device, so that not even the interpreter's last flush fails on it."""
+    """Points a stream nobody reads at the null device, so that not even the interpreter's last
+    flush fails on it.
+    """
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, file.fileno())
     os.close(null)
@@ -58,7 +65,9 @@ def table(head, rows, title=None):
 
 
 class Progress:
-    """A bar with a line of text on a terminal, a plain line every `QUIET` seconds elsewhere. A context."""
+    """A bar with a line of text on a terminal, a plain line every `QUIET` seconds elsewhere. A
+    context.
+    """
 
     def __init__(self):
         self.bars, self.last = None, -QUIET
@@ -96,4 +105,8 @@ def duration(seconds):
     """m:ss, or h:mm:ss."""
     seconds = max(0, round(seconds))
     minutes, seconds = divmod(seconds, 60)
-    return f"{minutes // 60}:{minutes % 60:02}:{seconds:02}" if minutes >= 60 else f"{minutes}:{seconds:02}"
+    return (
+        f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
+        if minutes >= 60
+        else f"{minutes}:{seconds:02}"
+    )

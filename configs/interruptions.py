@@ -1,4 +1,7 @@
-"""Ctrl-C and SIGTERM: the first asks the training loop to stop after its step, the second ends the program at once."""
+"""Ctrl-C and SIGTERM: the first asks the training loop to stop after its step, the second ends the
+program at once.
+"""
+
 import os
 import signal
 
@@ -8,7 +11,9 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(Exception):
-    """A signal stopped the work; the message says what is saved and how to go on. The exit code is 128 + `number`."""
+    """A signal stopped the work; the message says what is saved and how to go on. The exit code is
+    128 + `number`.
+    """
 
     def __init__(self, number, message):
         super().__init__(message)
@@ -16,7 +21,9 @@ class Interrupted(Exception):
 
 
 class Interruptions:
-    """While entered, `number` turns from None to that of the first signal, and nothing else happens."""
+    """While entered, `number` turns from None to that of the first signal, and nothing else
+    happens.
+    """
 
     def __init__(self):
         self.number = None
@@ -34,6 +41,8 @@ class Interruptions:
 
     def _take(self, number, frame):
         if self.number is not None:
-            os._exit(128 + number)  # a checkpoint is renamed into place when it is whole, so nothing is half-written
+            os._exit(
+                128 + number
+            )  # a checkpoint is renamed into place when it is whole, so nothing is half-written
         self.number = number
         say("\nStopping after this step; once more stops at once.")

@@ -1,8 +1,11 @@
-"""The settings of a run as frozen dataclasses, checked in one pass. Knows no Hydra, and no defaults: configs/ does.
+"""The settings of a run as frozen dataclasses, checked in one pass. Knows no Hydra, and no
+defaults: configs/ does.
 
-`build(Train, tree)` turns nested dicts into settings, or raises `Faults` with every fault of the tree by key path.
-Errors meant for whoever started the program are `Fault`s: one sentence, exit code 2, no traceback.
+`build(Train, tree)` turns nested dicts into settings, or raises `Faults` with every fault of the
+tree by key path. Errors meant for whoever started the program are `Fault`s: one sentence, exit code
+2, no traceback.
 """
+
 import dataclasses
 import difflib
 import math
@@ -12,12 +15,15 @@ import typing
 from dataclasses import dataclass
 
 INFINITY = math.inf
-#: 2**26 worlds of the smallest environment fill the largest accelerator there is; more is a typing mistake.
+#: 2**26 worlds of the smallest environment fill the largest accelerator there is; more is a typing
+#: mistake.
 MOST_ENVS = 2**26
 
 
 class Fault(Exception):
-    """Something the user can put right: the message is one sentence with what came, what is allowed and the cure."""
+    """Something the user can put right: the message is one sentence with what came, what is allowed
+    and the cure.
+    """
 
 
 class Faults(Fault):
@@ -26,18 +32,28 @@ class Faults(Fault):
     def __init__(self, faults):
         self.faults = list(faults)
         lines = [f"{path}: {sentence}" for path, sentence in self.faults]
-        head = "1 fault in the configuration" if len(lines) == 1 else f"{len(lines)} faults in the configuration"
+        head = (
+            "1 fault in the configuration"
+            if len(lines) == 1
+            else f"{len(lines)} faults in the configuration"
+        )
         super().__init__("\n  ".join([head, *lines]))
 
 
 def closest(word, words):
     """The sentence part that names the nearest of `words`, or lists them all when none is near."""
     near = difflib.get_close_matches(str(word), [str(w) for w in words], n=1, cutoff=0.5)
-    return f"did you mean {near[0]}?" if near else f"there are {', '.join(sorted(str(w) for w in words))}"
+    return (
+        f"did you mean {near[0]}?"
+        if near
+        else f"there are {', '.join(sorted(str(w) for w in words))}"
+    )
 
 
 def closest_key(key, keys):
-    """As `closest` for dotted paths: `lr` finds learner.lr, `learner.lrr` too. Returns a sentence part."""
+    """As `closest` for dotted paths: `lr` finds learner.lr, `learner.lrr` too. Returns a sentence
+    part.
+    """
     leaf = key.rsplit(".", 1)[-1]
     same = [k for k in keys if k.rsplit(".", 1)[-1] == leaf]
     near = same or difflib.get_close_matches(key, keys, n=1, cutoff=0.6)
@@ -49,13 +65,25 @@ def closest_key(key, keys):
 
 def within(low, high, low_open=False, high_open=False):
     """A number between two limits, which belong to it unless open."""
-    text = f"{'more than' if low_open else 'at least'} {low:,}" if high == INFINITY else (
-        f"{'above' if low_open else 'from'} {low:,} {'and below' if high_open else 'to'} {high:,}")
+    text = (
+        f"{'more than' if low_open else 'at least'} {low:,}"
+        if high == INFINITY
+        else (
+            f"{'above' if low_open else 'from'} {low:,} {'and below' if high_open else 'to'} "
+            f"{high:,}"
+        )
+    )
 
     def check(value):
-        inside = (low < value if low_open else low <= value) and (value < high if high_open else value <= high)
+        inside = (low < value if low_open else low <= value) and (
+            value < high if high_open else value <= high
+        )
         # nan compares false and infinity is never meant
-        return None if inside and math.isfinite(value) else f"{value} is out of range: allowed is {text}"
+        return (
+            None
+            if inside and math.isfinite(value)
+            else f"{value} is out of range: allowed is {text}"
+        )
 
     return dataclasses.field(metadata={"check": check})
 
@@ -67,21 +95,29 @@ def above(low):
 
 def among(*names):
     """One of these words."""
-    return dataclasses.field(metadata={
-        "check": lambda value: None if value in names else f"{value!r} is unknown; {closest(value, names)}"})
+    return dataclasses.field(
+        metadata={
+            "check": lambda value: (
+                None if value in names else f"{value!r} is unknown; {closest(value, names)}"
+            )
+        }
+    )
 
 
 def device_name():
     """auto, cpu, cuda or cuda:<number>."""
+
     def check(value):
         if re.fullmatch(r"auto|cpu|cuda(:\d+)?", value) is None:
             return f"{value!r} is no device: allowed are auto, cpu, cuda and cuda:<number>"
+
     return dataclasses.field(metadata={"check": check})
 
 
 @dataclass(frozen=True)
 class Minimal:
     """Arguments of `envs.Minimal`."""
+
     name: str
     n_envs: int = within(1, MOST_ENVS)
     res: int = within(1, 1024)
@@ -98,6 +134,7 @@ class Minimal:
 @dataclass(frozen=True)
 class Explorer:
     """Arguments of `envs.Explorer`."""
+
     name: str
     resample: bool
     n_envs: int = within(1, MOST_ENVS)
@@ -117,7 +154,10 @@ ENVS = {"minimal": Minimal, "explorer": Explorer}
 
 @dataclass(frozen=True)
 class Geometry:
-    """Arguments of `geometries.sample`: `n` homes of the source `name`, which reads the file `path` if it needs one."""
+    """Arguments of `geometries.sample`: `n` homes of the source `name`, which reads the file `path`
+    if it needs one.
+    """
+
     name: str = among("box", "column", "homes", "bench", "files")
     n: int = within(1, 1_000_000)
     seed: int = within(0, 2**63 - 1)
@@ -136,6 +176,7 @@ class Geometry:
 @dataclass(frozen=True)
 class Agent:
     """Arguments of `agents.policy.Policy`."""
+
     width: int = within(1, 8192)
     encoder: str = among("linear", "conv")
 
@@ -143,6 +184,7 @@ class Agent:
 @dataclass(frozen=True)
 class Learner:
     """Arguments of `agents.ppo.PPO`, and the rollout's length."""
+
     name: str = among("ppo")
     n_steps: int = within(1, 65_536)
     lr: float = within(0, 1e6, low_open=True)
@@ -161,6 +203,7 @@ class Learner:
 @dataclass(frozen=True)
 class Logger:
     """Where metrics go beside TensorBoard and the JSON lines, which are always written."""
+
     name: str = among("none", "wandb")
     project: str
     mode: str = among("online", "offline")
@@ -169,6 +212,7 @@ class Logger:
 @dataclass(frozen=True)
 class Finish:
     """What happens to the trained agent at the end of a run."""
+
     evaluate: bool
     lanes: int = within(1, 1_000_000)
     record: bool
@@ -178,6 +222,7 @@ class Finish:
 @dataclass(frozen=True)
 class Train:
     """A training run."""
+
     env: Minimal | Explorer
     geometry: Geometry
     agent: Agent
@@ -197,14 +242,22 @@ class Train:
 
     def faults(self):
         if self.learner.n_minibatches > self.env.n_envs:
-            yield "learner.n_minibatches", f"{self.learner.n_minibatches} is more than env.n_envs, {self.env.n_envs}"
+            yield (
+                "learner.n_minibatches",
+                f"{self.learner.n_minibatches} is more than env.n_envs, {self.env.n_envs}",
+            )
         if self.resume and self.init:
-            yield "init", "cannot be given together with resume: one starts a new run, the other continues one"
+            yield (
+                "init",
+                "cannot be given together with resume: one starts a new run, the other continues "
+                "one",
+            )
 
 
 @dataclass(frozen=True)
 class Evaluate:
     """An evaluation of a run's checkpoint."""
+
     run: str
     geometry: Geometry | None
     split: str = among("training", "test", "all")
@@ -218,6 +271,7 @@ class Evaluate:
 @dataclass(frozen=True)
 class Record:
     """A video of a run's checkpoint."""
+
     run: str
     geometry: Geometry | None
     split: str = among("training", "test", "all")
@@ -230,7 +284,9 @@ class Record:
 
 
 def build(kind, tree):
-    """The settings of dataclass `kind` from nested dicts; raises `Faults` with all that is wrong, not the first."""
+    """The settings of dataclass `kind` from nested dicts; raises `Faults` with all that is wrong,
+    not the first.
+    """
     faults = []
     settings = _settings(kind, tree, "", faults)
     if faults:
@@ -251,7 +307,7 @@ def _settings(kind, tree, path, faults):
             faults.append((path + key, f"no such key; {closest(key, fields)}"))
     for name, field in fields.items():
         if name not in tree:
-            if hints[name] == Geometry | None:      # a group that was not chosen is absent
+            if hints[name] == Geometry | None:  # a group that was not chosen is absent
                 values[name] = None
             else:
                 faults.append((path + name, "is missing"))
@@ -263,7 +319,7 @@ def _settings(kind, tree, path, faults):
     if len(faults) > before:
         return None
     settings = kind(**values)
-    if hasattr(settings, "faults"):     # what concerns two settings at once
+    if hasattr(settings, "faults"):  # what concerns two settings at once
         faults += [(path + name, sentence) for name, sentence in settings.faults()]
     return settings
 

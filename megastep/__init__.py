@@ -1,19 +1,39 @@
 """megastep: reinforcement learning in thousands of small flat worlds on one device.
 
-Importing the package loads nothing else. Its modules arrive when they are first used, either way round::
+Importing the package loads nothing else. Its modules arrive when they are first used, either way
+round::
 
     from megastep import toys, scene, cuda
     import megastep; megastep.toys.box()
 """
+
 import importlib
 
-_MODULES = ('arrdict', 'capture', 'core', 'cubicasa', 'cuda', 'dotdict', 'engine', 'envs', 'geometries', 'geometry',
-            'kernels', 'modules', 'plotting', 'ragged', 'recording', 'scene', 'spaces', 'toys')
+_MODULES = (
+    "arrdict",
+    "capture",
+    "core",
+    "cubicasa",
+    "cuda",
+    "dotdict",
+    "engine",
+    "envs",
+    "geometries",
+    "geometry",
+    "kernels",
+    "modules",
+    "plotting",
+    "ragged",
+    "recording",
+    "scene",
+    "spaces",
+    "toys",
+)
 
 
 def __getattr__(name):
     if name in _MODULES:
-        return importlib.import_module(f'{__name__}.{name}')
+        return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"megastep has no module '{name}'; its modules are {', '.join(_MODULES)}")
 
 

@@ -1,19 +1,31 @@
-"""Between linear light, which the engine calculates in, and the sRGB values that screens expect (IEC 61966-2-1)."""
+"""Between linear light, which the engine calculates in, and the sRGB values that screens expect
+(IEC 61966-2-1).
+"""
+
 import numpy as np
 import torch
 
-_KNEE = .0031308        # linear light below which sRGB is a straight line
+_KNEE = 0.0031308  # linear light below which sRGB is a straight line
 _SLOPE, _SCALE, _POWER = 12.92, 1.055, 2.4
 
 
 def gamma_encode(light):
-    """sRGB values of linear light, both in [0, 1]: what a picture must go through before it is shown. Any shape."""
-    return _pieces(light, _KNEE, lambda x: _SLOPE * x, lambda x: _SCALE * x**(1 / _POWER) - (_SCALE - 1))
+    """sRGB values of linear light, both in [0, 1]: what a picture must go through before it is
+    shown. Any shape.
+    """
+    return _pieces(
+        light, _KNEE, lambda x: _SLOPE * x, lambda x: _SCALE * x ** (1 / _POWER) - (_SCALE - 1)
+    )
 
 
 def gamma_decode(values):
     """Linear light of sRGB values: the inverse of :func:`gamma_encode`."""
-    return _pieces(values, _SLOPE * _KNEE, lambda x: x / _SLOPE, lambda x: ((x + (_SCALE - 1)) / _SCALE)**_POWER)
+    return _pieces(
+        values,
+        _SLOPE * _KNEE,
+        lambda x: x / _SLOPE,
+        lambda x: ((x + (_SCALE - 1)) / _SCALE) ** _POWER,
+    )
 
 
 def _pieces(x, knee, line, curve):

@@ -9,22 +9,29 @@ from .colour import gamma_decode, gamma_encode
 from .engine import AGENT_RADIUS, AGENT_WIDTH
 from .scene import TEXEL
 
-__all__ = ['AGENT_RADIUS', 'AGENT_WIDTH', 'TEXEL', 'Core', 'gamma_decode', 'gamma_encode']
+__all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "TEXEL", "Core", "gamma_decode", "gamma_encode"]
 
 
 class Core:
-    """What an environment is built around. All attributes are public: ``scenery``, ``agents``, ``n_envs``,
-    ``n_agents``, ``device``, ``res``, ``fov``, ``fps``, ``seed``.
+    """What an environment is built around. All attributes are public: ``scenery``, ``agents``,
+    ``n_envs``, ``n_agents``, ``device``, ``res``, ``fov``, ``fps``, ``seed``.
 
-    Args: ``res`` rays a camera; ``fov`` degrees; ``fps`` steps a second; ``cameras`` yaw offsets in degrees, one
-    camera ahead by default; ``seed`` of everything drawn by the modules built on this core.
+    Args: ``res`` rays a camera; ``fov`` degrees; ``fps`` steps a second; ``cameras`` yaw offsets in
+    degrees, one camera ahead by default; ``seed`` of everything drawn by the modules built on this
+    core.
     """
 
     def __init__(self, scenery, res=64, fov=130.0, fps=10.0, cameras=None, seed=1):
         self.scenery, self.seed = scenery, seed
         self.n_envs, self.n_agents, self.device = scenery.n_envs, scenery.n_agents, scenery.device
         self.agents = engine.Agents(
-            self.n_envs, self.n_agents, res=res, fov=fov, fps=fps, cameras=cameras, device=self.device
+            self.n_envs,
+            self.n_agents,
+            res=res,
+            fov=fov,
+            fps=fps,
+            cameras=cameras,
+            device=self.device,
         )
         self.res, self.fov, self.fps = self.agents.res, self.agents.fov, self.agents.fps
 
@@ -37,25 +44,31 @@ class Core:
         return torch.full((self.n_envs,), value, device=self.device)
 
     def state(self, e=0):
-        """World ``e`` as :meth:`plot_state` draws it, in tensors: its lines, their lit texels end to end, lights, and
-        where the agents stand and look.
+        """World ``e`` as :meth:`plot_state` draws it, in tensors: its lines, their lit texels end
+        to end, lights, and where the agents stand and look.
         """
         engine.place(self.scenery, self.agents)
         lines, colours, lights = self.scenery.world(e)
         agents = self.agents
         return arrdict(
-            lines=lines, texels=torch.cat(colours), widths=torch.tensor([len(texels) for texels in colours]),
-            lights=lights.clone(), n_agent_lines=torch.tensor(self.scenery.agent_lines.shape[1]),
-            positions=agents.positions[e].clone(), angles=agents.angles[e].clone(), yaws=agents.yaws.clone(),
+            lines=lines,
+            texels=torch.cat(colours),
+            widths=torch.tensor([len(texels) for texels in colours]),
+            lights=lights.clone(),
+            n_agent_lines=torch.tensor(self.scenery.agent_lines.shape[1]),
+            positions=agents.positions[e].clone(),
+            angles=agents.angles[e].clone(),
+            yaws=agents.yaws.clone(),
             fov=torch.tensor(agents.fov),
         )
 
     @staticmethod
     def plot_state(state, ax=None, seen=None, distances=None):
-        """Draws a numpyified :meth:`state` from above, with each camera's field of view. Returns the axes.
+        """Draws a numpyified :meth:`state` from above, with each camera's field of view. Returns
+        the axes.
 
-        Args: ``seen`` (T,) bools, dims static texels that are False; ``distances`` (A, C, R) metres, to draw what is in
-        view instead of a wedge.
+        Args: ``seen`` (T,) bools, dims static texels that are False; ``distances`` (A, C, R)
+        metres, to draw what is in view instead of a wedge.
         """
         from . import plotting
 

@@ -1,11 +1,14 @@
-"""Floor plans under the name of the database that the seeds took theirs from: ``cubicasa.sample(64)``.
+"""Floor plans under the name of the database that the seeds took theirs from:
+``cubicasa.sample(64)``.
 
-CubiCasa5k's licence (CC BY-NC) keeps it out of this package. These are the homes of :mod:`megastep.geometries.homes`
-instead: as many, and generated to have the statistics measured on it.
+CubiCasa5k's licence (CC BY-NC) keeps it out of this package. These are the homes of
+:mod:`megastep.geometries.homes` instead: as many, and generated to have the statistics measured on
+it.
 """
+
 from .geometries import sample as _sample
 
 
-def sample(n_geometries, split='training', seed=1):
+def sample(n_geometries, split="training", seed=1):
     """``n_geometries`` homes, a list of geometries. ``split`` is training, test or all."""
-    return _sample('homes', n_geometries, split, seed)
+    return _sample("homes", n_geometries, split, seed)

@@ -1,7 +1,10 @@
-"""The engine under the name that tutorials use: everything in :mod:`megastep.engine`, and :class:`~megastep.core.Core`.
+"""The engine under the name that tutorials use: everything in :mod:`megastep.engine`, and
+:class:`~megastep.core.Core`.
 
-The name is historical. The tensors' device decides where the work is done, so this runs without a GPU too.
+The name is historical. The tensors' device decides where the work is done, so this runs without a
+GPU too.
 """
+
 from . import engine
 from .core import Core
 
@@ -11,7 +14,7 @@ def __getattr__(name):
 
 
 def __dir__():
-    return sorted({*dir(engine), 'Core'})
+    return sorted({*dir(engine), "Core"})
 
 
-__all__ = [*(name for name in dir(engine) if not name.startswith('_')), 'Core']
+__all__ = [*(name for name in dir(engine) if not name.startswith("_")), "Core"]

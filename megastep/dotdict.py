@@ -1,7 +1,9 @@
 """Dictionaries with attribute access whose unknown attributes are looked up on their values.
 
-A *tree* is a dict of dicts of ... of leaves; a leaf is anything that is not a dict. Nothing here needs torch.
+A *tree* is a dict of dicts of ... of leaves; a leaf is anything that is not a dict. Nothing here
+needs torch.
 """
+
 import difflib
 import functools
 
@@ -12,16 +14,18 @@ _WIDTH = 120
 class dotdict(dict):
     """A dict whose items are also attributes: ``d.k`` reads ``d['k']``; assign with ``d['k'] = v``.
 
-    An attribute that is neither a method nor a key is looked up on every value, and the answers come back in a tree
-    with the same keys. That tree can be called, which calls every leaf: ``d.cuda()`` moves a tree of tensors to the
-    GPU. Methods come before keys, keys before the values' attributes. A leading underscore is never forwarded.
+    An attribute that is neither a method nor a key is looked up on every value, and the answers
+    come back in a tree with the same keys. That tree can be called, which calls every leaf:
+    ``d.cuda()`` moves a tree of tensors to the GPU. Methods come before keys, keys before the
+    values' attributes. A leading underscore is never forwarded.
     """
+
     __slots__ = ()
 
     def __getattr__(self, name):
         if name in self:
             return self[name]
-        if name.startswith('_'):
+        if name.startswith("_"):
             raise AttributeError(_absent(self, name))
         try:
             found = {key: _attribute(value, name) for key, value in self.items()}
@@ -32,13 +36,19 @@ class dotdict(dict):
         return type(self)(found)
 
     def __setattr__(self, name, value):
-        raise AttributeError(f"{type(self).__name__}s are assigned by key: write d['{name}'] = ..., not d.{name} = ...")
+        raise AttributeError(
+            f"{type(self).__name__}s are assigned by key: write d['{name}'] = ..., not d.{name} = "
+            f"..."
+        )
 
     def __delattr__(self, name):
-        raise AttributeError(f"{type(self).__name__}s are deleted from by key: write del d['{name}'], not del d.{name}")
+        raise AttributeError(
+            f"{type(self).__name__}s are deleted from by key: write del d['{name}'], not del "
+            f"d.{name}"
+        )
 
     def __missing__(self, key):
-        raise KeyError(f'{key!r} is not a key; {_listing(self, key)}')
+        raise KeyError(f"{key!r} is not a key; {_listing(self, key)}")
 
     def __dir__(self):
         return [*super().__dir__(), *(key for key in self if isinstance(key, str))]
@@ -66,14 +76,16 @@ class dotdict(dict):
         return _map(lambda leaf: f(leaf, *args, **kwargs), self)
 
     def starmap(self, f, *others, **kwargs):
-        """``f(leaf, other leaf, ...)`` at every leaf, the others being trees with the same keys (ValueError if not)."""
+        """``f(leaf, other leaf, ...)`` at every leaf, the others being trees with the same keys
+        (ValueError if not).
+        """
         return _map(functools.partial(f, **kwargs), self, *others)
 
     def __repr__(self):
-        return '\n'.join([f'{type(self).__name__}:', *_rows(self)])
+        return "\n".join([f"{type(self).__name__}:", *_rows(self)])
 
     def _repr_pretty_(self, printer, cycle):
-        printer.text(f'{type(self).__name__}(...)' if cycle else repr(self))
+        printer.text(f"{type(self).__name__}(...)" if cycle else repr(self))
 
 
 def leaves(tree):
@@ -84,10 +96,14 @@ def leaves(tree):
 
 
 def mapping(f):
-    """Turns ``f(leaf, ...)`` into a function of trees that keeps keys and types. Bare leaves go straight to ``f``."""
+    """Turns ``f(leaf, ...)`` into a function of trees that keeps keys and types. Bare leaves go
+    straight to ``f``.
+    """
+
     @functools.wraps(f)
     def mapped(tree, *args, **kwargs):
         return _map(lambda leaf: f(leaf, *args, **kwargs), tree)
+
     return mapped
 
 
@@ -96,14 +112,22 @@ def _map(f, tree, *others):
         return f(tree, *others)
     for other in others:
         _check_keys(tree, other)
-    return type(tree)({key: _map(f, value, *(other[key] for other in others)) for key, value in tree.items()})
+    return type(tree)(
+        {key: _map(f, value, *(other[key] for other in others)) for key, value in tree.items()}
+    )
 
 
 def _check_keys(tree, other):
     if not isinstance(other, dict):
-        raise ValueError(f'a tree with keys {_names(tree)} was matched with one value of type {type(other).__name__}')
+        raise ValueError(
+            f"a tree with keys {_names(tree)} was matched with one value of type "
+            f"{type(other).__name__}"
+        )
     if tree.keys() != other.keys():
-        raise ValueError(f'two trees must have the same keys, but one has {_names(tree)} and the other {_names(other)}')
+        raise ValueError(
+            f"two trees must have the same keys, but one has {_names(tree)} and the other "
+            f"{_names(other)}"
+        )
 
 
 class _Missing(Exception):
@@ -112,7 +136,9 @@ class _Missing(Exception):
 
 
 def _attribute(value, name):
-    """``value.name``, or for a dict its item of that name, or else the tree of its values' attributes."""
+    """``value.name``, or for a dict its item of that name, or else the tree of its values'
+    attributes.
+    """
     if isinstance(value, dict):
         if name in value:
             return value[name]
@@ -124,36 +150,44 @@ def _attribute(value, name):
 
 
 def _names(tree):
-    return ', '.join(map(str, tree)) if tree else 'none'
+    return ", ".join(map(str, tree)) if tree else "none"
 
 
 def _listing(tree, key):
     near = difflib.get_close_matches(str(key), map(str, tree), n=1)
-    return f'its keys are {_names(tree)}' + (f" (did you mean '{near[0]}'?)" if near else '')
+    return f"its keys are {_names(tree)}" + (f" (did you mean '{near[0]}'?)" if near else "")
 
 
 def _absent(tree, name, leaf=None):
-    values = '' if leaf is None else f', nor an attribute of its values (type {type(leaf).__name__})'
+    values = (
+        "" if leaf is None else f", nor an attribute of its values (type {type(leaf).__name__})"
+    )
     return f"'{name}' is not a key of this {type(tree).__name__}{values}; {_listing(tree, name)}"
 
 
 def _rows(tree):
-    """One line an item: the key, a gap, and the value; a tree's own items are indented to start under its name."""
+    """One line an item: the key, a gap, and the value; a tree's own items are indented to start
+    under its name.
+    """
     column = max((len(str(key)) for key in tree), default=0) + _INDENT
     for key, value in tree.items():
         nested = isinstance(value, dict)
-        yield f'{key!s:<{column}}' + (f'{type(value).__name__}:' if nested else _summary(value, column))
+        yield f"{key!s:<{column}}" + (
+            f"{type(value).__name__}:" if nested else _summary(value, column)
+        )
         if nested:
-            yield from (' ' * column + row for row in _rows(value))
+            yield from (" " * column + row for row in _rows(value))
 
 
 def _summary(value, column):
-    """A leaf in one line: arrays by shape and dtype, collections by length, the rest by their text."""
+    """A leaf in one line: arrays by shape and dtype, collections by length, the rest by their
+    text.
+    """
     name = type(value).__name__
-    if hasattr(value, 'shape') and hasattr(value, 'dtype'):
-        return f'{name}({tuple(value.shape)}, {value.dtype})'
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"{name}({tuple(value.shape)}, {value.dtype})"
     if isinstance(value, (list, tuple, set, frozenset)):
-        return f'{name}(({len(value)},))'
-    text = ' '.join(str(value).split())
+        return f"{name}(({len(value)},))"
+    text = " ".join(str(value).split())
     room = max(_WIDTH - column, 16)
-    return text if len(text) <= room else f'{text[:room - 3]}...'
+    return text if len(text) <= room else f"{text[: room - 3]}..."

@@ -1,8 +1,8 @@
-"""The engine: ``bake``, ``physics``, ``render``, ``observe``. Each checks, allocates and launches, on the CPU or the
-GPU, whichever its tensors are on.
+"""The engine: ``bake``, ``physics``, ``render``, ``observe``. Each checks, allocates and launches,
+on the CPU or the GPU, whichever its tensors are on.
 
-N worlds, A agents a world, C cameras an agent (the axis is dropped if there is one), R rays a camera, P = R /
-subsample pixels. Metres, degrees, seconds.
+N worlds, A agents a world, C cameras an agent (the axis is dropped if there is one), R rays a
+camera, P = R / subsample pixels. Metres, degrees, seconds.
 """
 
 import math
@@ -15,8 +15,22 @@ from .kernels.compile import EngineError
 from .scenery import Designs, Scenery
 
 __all__ = [
-    'Agents', 'Designs', 'EngineError', 'Observation', 'Physics', 'Render', 'Scenery', 'bake', 'check', 'device',
-    'draw', 'fit', 'observe', 'physics', 'render', 'spawn',
+    "Agents",
+    "Designs",
+    "EngineError",
+    "Observation",
+    "Physics",
+    "Render",
+    "Scenery",
+    "bake",
+    "check",
+    "device",
+    "draw",
+    "fit",
+    "observe",
+    "physics",
+    "render",
+    "spawn",
 ]
 
 AGENT_WIDTH = 0.15
@@ -28,29 +42,48 @@ MANY = 32_768  # worlds that fill a GPU with a quarter of a warp each
 class Agents:
     """Where the agents are, how they move, and what their cameras are like.
 
-    ``positions`` (N, A, 2), ``angles`` (N, A), ``velocity`` (N, A, 2) a second, ``angvelocity`` (N, A) a second; an
-    angle of 0 looks along +x. ``cameras`` are yaw offsets in degrees. ValueError unless 1 <= res <= 1024, 0 < fov <
-    180, fps > 0, radius > 0.
+    ``positions`` (N, A, 2), ``angles`` (N, A), ``velocity`` (N, A, 2) a second, ``angvelocity`` (N,
+    A) a second; an angle of 0 looks along +x. ``cameras`` are yaw offsets in degrees. ValueError
+    unless 1 <= res <= 1024, 0 < fov < 180, fps > 0, radius > 0.
     """
 
-    def __init__(self, n_envs, n_agents, res=64, fov=130.0, fps=10.0, cameras=None, radius=AGENT_RADIUS, device='cpu'):
+    def __init__(
+        self,
+        n_envs,
+        n_agents,
+        res=64,
+        fov=130.0,
+        fps=10.0,
+        cameras=None,
+        radius=AGENT_RADIUS,
+        device="cpu",
+    ):
         if not (isinstance(res, int) and 1 <= res <= MAX_RES):
-            raise ValueError(f'res must be a whole number of rays from 1 to {MAX_RES}, but {res} was given')
+            raise ValueError(
+                f"res must be a whole number of rays from 1 to {MAX_RES}, but {res} was given"
+            )
         if not 0 < fov < 180:
             raise ValueError(
-                f'fov must be more than 0 and less than 180 degrees, but {fov} was given; for a wider view use '
-                f'several cameras'
+                f"fov must be more than 0 and less than 180 degrees, but {fov} was given; for a "
+                f"wider view use "
+                f"several cameras"
             )
         if not 0 < fps < math.inf:
-            raise ValueError(f'fps must be a positive number of steps a second, but {fps} was given')
+            raise ValueError(
+                f"fps must be a positive number of steps a second, but {fps} was given"
+            )
         if not 0 < radius < math.inf:
-            raise ValueError(f'radius must be a positive number of metres, but {radius} was given')
+            raise ValueError(f"radius must be a positive number of metres, but {radius} was given")
         self.res, self.fov, self.fps, self.radius = res, float(fov), float(fps), float(radius)
-        self.yaws = torch.tensor([0.0] if cameras is None else list(cameras), dtype=torch.float32, device=device)
+        self.yaws = torch.tensor(
+            [0.0] if cameras is None else list(cameras), dtype=torch.float32, device=device
+        )
         if not len(self.yaws):
-            raise ValueError('an agent needs at least one camera, but an empty list was given')
-        sideways = math.tan(math.radians(fov / 2)) * (1 - (2 * torch.arange(res, dtype=torch.float64) + 1) / res)
-        self.ray_lengths = (1 + sideways**2).sqrt().float().to(device)      # (R,), per unit of depth
+            raise ValueError("an agent needs at least one camera, but an empty list was given")
+        sideways = math.tan(math.radians(fov / 2)) * (
+            1 - (2 * torch.arange(res, dtype=torch.float64) + 1) / res
+        )
+        self.ray_lengths = (1 + sideways**2).sqrt().float().to(device)  # (R,), per unit of depth
         self.positions = torch.zeros((n_envs, n_agents, 2), device=device)
         self.angles = torch.zeros((n_envs, n_agents), device=device)
         self.velocity = torch.zeros((n_envs, n_agents, 2), device=device)
@@ -61,7 +94,9 @@ class Agents:
 class Render(NamedTuple):
     """What the cameras see, ray by ray. A miss is -1, NaN, NaN, inf, black."""
 
-    indices: torch.Tensor  # (N, A, C, R) int32: the line hit, counted within its world, the agents' first
+    indices: (
+        torch.Tensor
+    )  # (N, A, C, R) int32: the line hit, counted within its world, the agents' first
     locations: torch.Tensor  # (N, A, C, R): where along the line, 0 to 1
     dots: torch.Tensor  # (N, A, C, R): cosine between ray and line
     distances: torch.Tensor  # (N, A, C, R): metres
@@ -69,8 +104,8 @@ class Render(NamedTuple):
 
 
 class Physics(NamedTuple):
-    """``progress`` (N, A): the fraction of the step that was free; below 1 the agent met something and its velocities
-    are now 0.
+    """``progress`` (N, A): the fraction of the step that was free; below 1 the agent met something
+    and its velocities are now 0.
     """
 
     progress: torch.Tensor
@@ -80,60 +115,73 @@ class Observation(NamedTuple):
     """What a policy needs of a view; None where not asked for."""
 
     rgb: torch.Tensor  # (N, A, C, 3, P) fp16, linear light
-    depth: torch.Tensor  # (N, A, C, P) fp16: 1 at the agent's radius, falling to 0 at max_depth beyond it
+    depth: (
+        torch.Tensor
+    )  # (N, A, C, P) fp16: 1 at the agent's radius, falling to 0 at max_depth beyond it
     middle: torch.Tensor  # (N, A, C) int32: the line in the middle of the screen, as Render.indices
     imu: torch.Tensor  # (N, A, 3) fp16: angular velocity / 360, own velocity ahead and left / 10
     fresh: torch.Tensor  # (N, A) int32: static texels now marked in `seen` that were not before
 
 
-def device(name='auto'):
-    """The device called ``name``: auto (a GPU if there is one), cpu, cuda, cuda:1. EngineError if it is not there."""
-    if name == 'auto':
-        return torch.device('cuda', torch.cuda.current_device()) if torch.cuda.is_available() else torch.device('cpu')
+def device(name="auto"):
+    """The device called ``name``: auto (a GPU if there is one), cpu, cuda, cuda:1. EngineError if
+    it is not there.
+    """
+    if name == "auto":
+        return (
+            torch.device("cuda", torch.cuda.current_device())
+            if torch.cuda.is_available()
+            else torch.device("cpu")
+        )
     try:
         chosen = torch.device(name)
     except RuntimeError:
         chosen = None
-    if chosen is None or chosen.type not in ('cpu', 'cuda'):
-        raise EngineError(f'device={name} is unknown: use auto, cpu, cuda, or cuda: and a number.')
-    if chosen.type == 'cuda':
+    if chosen is None or chosen.type not in ("cpu", "cuda"):
+        raise EngineError(f"device={name} is unknown: use auto, cpu, cuda, or cuda: and a number.")
+    if chosen.type == "cuda":
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         if (chosen.index or 0) >= count:
             why = (
-                f'there are {count} GPUs'
+                f"there are {count} GPUs"
                 if count
-                else 'no GPU is to be seen'
-                + ('' if torch.version.cuda else ' and this PyTorch is built for the CPU only')
+                else "no GPU is to be seen"
+                + ("" if torch.version.cuda else " and this PyTorch is built for the CPU only")
             )
-            raise EngineError(f'device={name} was asked for, but {why}: use device=auto or device=cpu.')
-        return torch.device('cuda', chosen.index or 0)
+            raise EngineError(
+                f"device={name} was asked for, but {why}: use device=auto or device=cpu."
+            )
+        return torch.device("cuda", chosen.index or 0)
     return chosen
 
 
-def fit(n_envs, bytes_each, device, what='environments'):
-    """EngineError, with the number that fits, if ``n_envs`` things of ``bytes_each`` bytes are too many for the
-    memory that is free on ``device``.
+def fit(n_envs, bytes_each, device, what="environments"):
+    """EngineError, with the number that fits, if ``n_envs`` things of ``bytes_each`` bytes are too
+    many for the memory that is free on ``device``.
     """
     free = free_memory(device)
     if n_envs * bytes_each > 0.95 * free:
         raise EngineError(
-            f'{n_envs:,} {what} need {n_envs * bytes_each / 1e9:.1f} GB, but {free / 1e9:.1f} GB are free on '
-            f'{device}: at most {int(0.95 * free / bytes_each):,} fit.'
+            f"{n_envs:,} {what} need {n_envs * bytes_each / 1e9:.1f} GB, but {free / 1e9:.1f} GB "
+            f"are free on "
+            f"{device}: at most {int(0.95 * free / bytes_each):,} fit."
         )
 
 
 def free_memory(device):
     """Bytes that can still be allocated on ``device``."""
     device = torch.device(device)
-    if device.type == 'cuda':
+    if device.type == "cuda":
         return (
             torch.cuda.mem_get_info(device)[0]
             + torch.cuda.memory_reserved(device)
             - torch.cuda.memory_allocated(device)
         )
     try:
-        with open('/proc/meminfo') as file:
-            return next(int(line.split()[1]) * 1024 for line in file if line.startswith('MemAvailable'))
+        with open("/proc/meminfo") as file:
+            return next(
+                int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable")
+            )
     except (OSError, StopIteration):
         return 1 << 62
 
@@ -151,56 +199,81 @@ def _pointer(name, tensor, shape, dtype, device):
         or tuple(tensor.shape) != tuple(shape)
         or not tensor.is_contiguous()
     ):
-        layout = '' if tensor.is_contiguous() else ' that is not contiguous'
+        layout = "" if tensor.is_contiguous() else " that is not contiguous"
         raise ValueError(
-            f'{name} must be a contiguous {dtype} tensor of shape {tuple(shape)} on {device}, but it is a '
-            f'{tensor.dtype} one of shape '
-            f'{tuple(tensor.shape)} on {tensor.device}{layout}'
+            f"{name} must be a contiguous {dtype} tensor of shape {tuple(shape)} on {device}, but "
+            f"it is a "
+            f"{tensor.dtype} one of shape "
+            f"{tuple(tensor.shape)} on {tensor.device}{layout}"
         )
     return tensor.data_ptr()
 
 
 def _world(scenery, radius):
     designs = scenery.designs
-    return compile.STRUCTS['World'](
-        designs.lines.vals.data_ptr(), designs.wall_starts.data_ptr(), designs.texel_starts.data_ptr(),
-        designs.boxes.data_ptr(), designs.box_starts.data_ptr(), designs.texels.data_ptr(),
-        designs.lights.vals.data_ptr(), designs.light_starts.data_ptr(),
-        _pointer('scenery.design', scenery.design, (scenery.n_envs,), torch.int32, scenery.device),
-        scenery.model.data_ptr(), scenery.model_texels.data_ptr(), designs.agent_textures.data_ptr(),
-        scenery.agent_lines.data_ptr(), scenery.agent_light.data_ptr(), scenery.n_envs, scenery.n_agents,
-        len(scenery.model), scenery.agent_light.shape[1], torch.get_num_threads(), radius, 1.001 * scenery.reach,
+    return compile.STRUCTS["World"](
+        designs.lines.vals.data_ptr(),
+        designs.wall_starts.data_ptr(),
+        designs.texel_starts.data_ptr(),
+        designs.boxes.data_ptr(),
+        designs.box_starts.data_ptr(),
+        designs.texels.data_ptr(),
+        designs.lights.vals.data_ptr(),
+        designs.light_starts.data_ptr(),
+        _pointer("scenery.design", scenery.design, (scenery.n_envs,), torch.int32, scenery.device),
+        scenery.model.data_ptr(),
+        scenery.model_texels.data_ptr(),
+        designs.agent_textures.data_ptr(),
+        scenery.agent_lines.data_ptr(),
+        scenery.agent_light.data_ptr(),
+        scenery.n_envs,
+        scenery.n_agents,
+        len(scenery.model),
+        scenery.agent_light.shape[1],
+        torch.get_num_threads(),
+        radius,
+        1.001 * scenery.reach,
     )
 
 
 def _state(scenery, agents, *names):
     n, a = scenery.n_envs, scenery.n_agents
-    shapes = {'positions': (n, a, 2), 'angles': (n, a), 'velocity': (n, a, 2), 'angvelocity': (n, a)}
+    shapes = {
+        "positions": (n, a, 2),
+        "angles": (n, a),
+        "velocity": (n, a, 2),
+        "angvelocity": (n, a),
+    }
     return [
-        _pointer(f'agents.{name}', getattr(agents, name), shapes[name], torch.float32, scenery.device) for name in names
+        _pointer(
+            f"agents.{name}", getattr(agents, name), shapes[name], torch.float32, scenery.device
+        )
+        for name in names
     ]
 
 
 def check(agents):
-    """EngineError if an agent's position, angle or velocity has stopped being a finite number, or it was given an
-    unknown action. Asks the device, so not for inside a step.
+    """EngineError if an agent's position, angle or velocity has stopped being a finite number, or
+    it was given an unknown action. Asks the device, so not for inside a step.
     """
     world = int(agents.fault)
     if world:
         agents.fault.zero_()
         if world < 0:
             raise EngineError(
-                f'An agent of environment {-world - 1} was given an action that is none of its action space: '
-                f'actions count from 0.'
+                f"An agent of environment {-world - 1} was given an action that is none of its "
+                f"action space: "
+                f"actions count from 0."
             )
         raise EngineError(
-            f'An agent of environment {world - 1} has a position, angle or velocity that is not a finite number: '
-            f'look at what was last written to it.'
+            f"An agent of environment {world - 1} has a position, angle or velocity that is not a "
+            f"finite number: "
+            f"look at what was last written to it."
         )
 
 
 def _checked(agents):
-    if agents.fault.device.type == 'cpu' and int(agents.fault):
+    if agents.fault.device.type == "cpu" and int(agents.fault):
         check(agents)
 
 
@@ -208,59 +281,75 @@ def _checked(agents):
 
 
 def bake(scenery):
-    """Fills ``scenery.designs.baked``: min(1, 0.1 + sum of 2 I / max(d^2, 1)) over the lights that no wall of the
-    design hides.
+    """Fills ``scenery.designs.baked``: min(1, 0.1 + sum of 2 I / max(d^2, 1)) over the lights that
+    no wall of the design hides.
     """
     designs = scenery.designs
     designs.bound()
     texel_wall = torch.repeat_interleave(
-        torch.arange(len(designs.textures), dtype=torch.int32, device=scenery.device), designs.textures.widths
+        torch.arange(len(designs.textures), dtype=torch.int32, device=scenery.device),
+        designs.textures.widths,
     )
     wall_design = torch.repeat_interleave(
         torch.arange(len(designs), dtype=torch.int32, device=scenery.device), designs.lines.widths
     )
-    params = compile.STRUCTS['Bake'](
+    params = compile.STRUCTS["Bake"](
         _world(scenery, 0.0), texel_wall.data_ptr(), wall_design.data_ptr(), len(texel_wall)
     )
-    compile.launch('bake', params, scenery.device, len(texel_wall))
+    compile.launch("bake", params, scenery.device, len(texel_wall))
 
 
 def physics(scenery, agents, actions=None, moves=None, keep=0.0):
-    """Moves the agents by their velocities for 1 / fps seconds, each short of what it meets first: a wall, or another
-    agent. Returns a :class:`Physics`.
+    """Moves the agents by their velocities for 1 / fps seconds, each short of what it meets first:
+    a wall, or another agent. Returns a :class:`Physics`.
 
-    If ``actions`` (N, A) int64 are given, each first multiplies its agent's velocities by ``keep`` and adds row
-    ``action`` of ``moves`` (n_moves, 3): m/s ahead and left, deg/s.
+    If ``actions`` (N, A) int64 are given, each first multiplies its agent's velocities by ``keep``
+    and adds row ``action`` of ``moves`` (n_moves, 3): m/s ahead and left, deg/s.
     """
     n, a = scenery.n_envs, scenery.n_agents
     progress = torch.empty((scenery.n_envs, scenery.n_agents), device=scenery.device)
-    state = _state(scenery, agents, 'positions', 'angles', 'velocity', 'angvelocity')
-    params = compile.STRUCTS['Motion'](
-        _world(scenery, agents.radius), *state, progress.data_ptr(), agents.fault.data_ptr(),
-        _pointer('actions', actions, (n, a), torch.int64, scenery.device), 0 if moves is None else moves.data_ptr(),
-        0 if moves is None else len(moves), keep, 1 / agents.fps,
+    state = _state(scenery, agents, "positions", "angles", "velocity", "angvelocity")
+    params = compile.STRUCTS["Motion"](
+        _world(scenery, agents.radius),
+        *state,
+        progress.data_ptr(),
+        agents.fault.data_ptr(),
+        _pointer("actions", actions, (n, a), torch.int64, scenery.device),
+        0 if moves is None else moves.data_ptr(),
+        0 if moves is None else len(moves),
+        keep,
+        1 / agents.fps,
     )
     params.team = 8 if n > MANY else 32
-    compile.launch('physics', params, scenery.device, params.team * n)
+    compile.launch("physics", params, scenery.device, params.team * n)
     _checked(agents)
     return Physics(progress)
 
 
 def place(scenery, agents, lit=True):
     """Carries the agents' models to where the agents are, and lights their texels."""
-    params = compile.STRUCTS['Placing'](
-        _world(scenery, agents.radius), *_state(scenery, agents, 'positions', 'angles'), int(lit)
+    params = compile.STRUCTS["Placing"](
+        _world(scenery, agents.radius), *_state(scenery, agents, "positions", "angles"), int(lit)
     )
-    compile.launch('place', params, scenery.device, 32 * scenery.n_envs * scenery.n_agents)
+    compile.launch("place", params, scenery.device, 32 * scenery.n_envs * scenery.n_agents)
 
 
 def _look(scenery, agents, **fields):
     half = math.radians(agents.fov / 2)
     width = math.tan(half)
-    params = compile.STRUCTS['Sight'](
-        _world(scenery, agents.radius), *_state(scenery, agents, 'positions', 'angles'), agents.yaws.data_ptr(),
-        agents.ray_lengths.data_ptr(), agents.fault.data_ptr(), len(agents.yaws), agents.res, width,
-        width * (agents.res - 1) / agents.res, 2 * width / agents.res, agents.res / 2 - 0.5, agents.res / (2 * width),
+    params = compile.STRUCTS["Sight"](
+        _world(scenery, agents.radius),
+        *_state(scenery, agents, "positions", "angles"),
+        agents.yaws.data_ptr(),
+        agents.ray_lengths.data_ptr(),
+        agents.fault.data_ptr(),
+        len(agents.yaws),
+        agents.res,
+        width,
+        width * (agents.res - 1) / agents.res,
+        2 * width / agents.res,
+        agents.res / 2 - 0.5,
+        agents.res / (2 * width),
         0.99 * agents.radius * math.cos(half),
     )
     params.subsample, params.per_depth = 1, 0.1
@@ -268,43 +357,64 @@ def _look(scenery, agents, **fields):
         setattr(params, name, value.data_ptr() if isinstance(value, torch.Tensor) else value)
     params.n_pixels, params.share = agents.res // params.subsample, 1 / params.subsample
     threads = 32 * scenery.n_envs * scenery.n_agents
-    compile.launch('sight', params, scenery.device, threads, shared=256 * -(-agents.res // 32))
+    compile.launch("sight", params, scenery.device, threads, shared=256 * -(-agents.res // 32))
     _checked(agents)
 
 
 def _cameras(scenery, agents):
-    return (scenery.n_envs, scenery.n_agents) + ((len(agents.yaws),) if len(agents.yaws) > 1 else ())
+    return (scenery.n_envs, scenery.n_agents) + (
+        (len(agents.yaws),) if len(agents.yaws) > 1 else ()
+    )
 
 
 def render(scenery, agents):
-    """Places the agents' models, lights them, and returns a :class:`Render` of what every camera sees."""
+    """Places the agents' models, lights them, and returns a :class:`Render` of what every camera
+    sees.
+    """
     place(scenery, agents)
     shape = _cameras(scenery, agents) + (agents.res,)
-    floats = {name: torch.empty(shape, device=scenery.device) for name in ('locations', 'dots', 'distances')}
+    floats = {
+        name: torch.empty(shape, device=scenery.device)
+        for name in ("locations", "dots", "distances")
+    }
     out = Render(
         indices=torch.empty(shape, dtype=torch.int32, device=scenery.device),
-        screen=torch.empty((*shape, 3), device=scenery.device), **floats,
+        screen=torch.empty((*shape, 3), device=scenery.device),
+        **floats,
     )
     _look(scenery, agents, **out._asdict())
     return out
 
 
 def observe(
-    scenery, agents, subsample=1, rgb=True, depth=True, imu=False, middle=False, seen=None, forget=None, max_depth=10.0
+    scenery,
+    agents,
+    subsample=1,
+    rgb=True,
+    depth=True,
+    imu=False,
+    middle=False,
+    seen=None,
+    forget=None,
+    max_depth=10.0,
 ):
     """What training needs of a view, in one pass: a fused form of :func:`render` and the sensors of
     :mod:`~megastep.modules`.
 
-    Args: ``subsample`` rays to a pixel, a divisor of res; ``seen`` (N, A, n_words) int32, a bit for each static texel
-    of the world's design, updated in place; ``forget`` (N, A) bool, clears ``seen`` first; ``max_depth`` metres. With
-    one agent a world, ``scenery.lines`` is left as it was. Returns an :class:`Observation`.
+    Args: ``subsample`` rays to a pixel, a divisor of res; ``seen`` (N, A, n_words) int32, a bit for
+    each static texel of the world's design, updated in place; ``forget`` (N, A) bool, clears
+    ``seen`` first; ``max_depth`` metres. With one agent a world, ``scenery.lines`` is left as it
+    was. Returns an :class:`Observation`.
     """
     if not 1 <= subsample <= 32 or agents.res % subsample:
         raise ValueError(
-            f'subsample must be at most 32 and divide the {agents.res} rays of a camera, but {subsample} was given'
+            f"subsample must be at most 32 and divide the {agents.res} rays of a camera, but "
+            f"{subsample} was given"
         )
     if not max_depth > 0:
-        raise ValueError(f'max_depth must be a positive number of metres, but {max_depth} was given')
+        raise ValueError(
+            f"max_depth must be a positive number of metres, but {max_depth} was given"
+        )
     n, a, where = scenery.n_envs, scenery.n_agents, scenery.device
     if a > 1:
         place(scenery, agents, lit=rgb)
@@ -320,52 +430,72 @@ def observe(
     most = scenery.designs.most_texels
     if seen is not None and 32 * words < most:
         raise ValueError(
-            f'seen must have a bit for each of a design\'s texels, so at least {-(-most // 32)} words an agent, '
-            f'but it has {words}'
+            f"seen must have a bit for each of a design's texels, so at least {-(-most // 32)} "
+            f"words an agent, "
+            f"but it has {words}"
         )
-    velocity, angvelocity = _state(scenery, agents, 'velocity', 'angvelocity')
+    velocity, angvelocity = _state(scenery, agents, "velocity", "angvelocity")
     _look(
-        scenery, agents, subsample=subsample, per_depth=1 / max_depth, n_words=words, velocity=velocity,
-        angvelocity=angvelocity, seen=_pointer('seen', seen, (n, a, words), torch.int32, where),
-        forget=_pointer('forget', forget, (n, a), torch.bool, where),
+        scenery,
+        agents,
+        subsample=subsample,
+        per_depth=1 / max_depth,
+        n_words=words,
+        velocity=velocity,
+        angvelocity=angvelocity,
+        seen=_pointer("seen", seen, (n, a, words), torch.int32, where),
+        forget=_pointer("forget", forget, (n, a), torch.bool, where),
         **{name: tensor for name, tensor in out._asdict().items() if tensor is not None},
     )
     return out
 
 
 def spawn(scenery, agents, mask, points, counts, seed, resample=False):
-    """Puts agents at random points of their world's design, at rest, looking anywhere: one Philox draw each.
+    """Puts agents at random points of their world's design, at rest, looking anywhere: one Philox
+    draw each.
 
-    Args: ``mask`` (N, A) bool, who; ``points`` (D, n, 2), of which the agents of one world have n / A each; ``counts``
-    (N, A) int32, draws made so far, advanced here; ``resample``: a world all of whose agents respawn moves to a random
-    design first.
+    Args: ``mask`` (N, A) bool, who; ``points`` (D, n, 2), of which the agents of one world have n /
+    A each; ``counts`` (N, A) int32, draws made so far, advanced here; ``resample``: a world all of
+    whose agents respawn moves to a random design first.
     """
     where, lanes = scenery.device, (scenery.n_envs, scenery.n_agents)
     n_designs, n_points = len(scenery.designs), points.shape[1]
     if n_points < scenery.n_agents:
-        raise ValueError(f'{scenery.n_agents} agents need at least as many points, but {n_points} a design were given')
-    params = compile.STRUCTS['Spawn'](
-        _world(scenery, agents.radius), *_state(scenery, agents, 'positions', 'angles', 'velocity', 'angvelocity'),
-        _pointer('mask', mask, lanes, torch.bool, where),
-        _pointer('points', points, (n_designs, n_points, 2), torch.float32, where),
-        _pointer('counts', counts, lanes, torch.int32, where), seed & 0xFFFFFFFF, seed >> 32 & 0xFFFFFFFF, n_points,
+        raise ValueError(
+            f"{scenery.n_agents} agents need at least as many points, but {n_points} a design "
+            f"were given"
+        )
+    params = compile.STRUCTS["Spawn"](
+        _world(scenery, agents.radius),
+        *_state(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+        _pointer("mask", mask, lanes, torch.bool, where),
+        _pointer("points", points, (n_designs, n_points, 2), torch.float32, where),
+        _pointer("counts", counts, lanes, torch.int32, where),
+        seed & 0xFFFFFFFF,
+        seed >> 32 & 0xFFFFFFFF,
+        n_points,
         n_designs if resample else 0,
     )
-    compile.launch('spawn', params, where, scenery.n_envs)
+    compile.launch("spawn", params, where, scenery.n_envs)
 
 
 def draw(counts, mask, seed, out):
-    """Uniform numbers in [0, 1), four a lane: Philox 4x32-10 with key ``seed`` and counter (lane, count).
+    """Uniform numbers in [0, 1), four a lane: Philox 4x32-10 with key ``seed`` and counter (lane,
+    count).
 
-    Args: ``counts`` (B,) int32, draws each lane has made, advanced by one where ``mask`` (B,) bool; ``out`` (B, 4),
-    written where ``mask``.
+    Args: ``counts`` (B,) int32, draws each lane has made, advanced by one where ``mask`` (B,) bool;
+    ``out`` (B, 4), written where ``mask``.
     """
     n, where = len(counts), out.device
-    params = compile.STRUCTS['Draw'](
-        _pointer('counts', counts, (n,), torch.int32, where), _pointer('mask', mask, (n,), torch.bool, where),
-        _pointer('out', out, (n, 4), torch.float32, where), seed & 0xFFFFFFFF, seed >> 32 & 0xFFFFFFFF, n,
+    params = compile.STRUCTS["Draw"](
+        _pointer("counts", counts, (n,), torch.int32, where),
+        _pointer("mask", mask, (n,), torch.bool, where),
+        _pointer("out", out, (n, 4), torch.float32, where),
+        seed & 0xFFFFFFFF,
+        seed >> 32 & 0xFFFFFFFF,
+        n,
         torch.get_num_threads(),
     )
-    compile.launch('draw', params, where, n)
+    compile.launch("draw", params, where, n)
     counts.add_(mask)
     return out

@@ -1,8 +1,8 @@
-"""What environments are made of: movement, sensors, spawning, lifespans. Callables with a ``.space`` where there is
-one to declare.
+"""What environments are made of: movement, sensors, spawning, lifespans. Callables with a
+``.space`` where there is one to declare.
 
-N worlds, A agents a world, C cameras an agent, R rays, B = N A lanes. A mask of lanes or agents may be given as (B,)
-or (N, A).
+N worlds, A agents a world, C cameras an agent, R rays, B = N A lanes. A mask of lanes or agents may
+be given as (B,) or (N, A).
 """
 
 import numpy as np
@@ -12,14 +12,16 @@ from . import engine, spaces
 from .arrdict import arrdict
 from .geometry import centers
 
-# Velocity of each action in the agent's frame, and its turn: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn
-# left, 6 turn right.
+# Velocity of each action in the agent's frame, and its turn: 0 nothing, 1 left, 2 right, 3 forward,
+# 4 back, 5 turn left, 6 turn right.
 MOVES = [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0), (0, 0), (0, 0)]
 TURNS = [0, 0, 0, 0, 0, 1, -1]
 
 
 def to_global(angles, vectors):
-    """Vectors (..., 2) of the agents' frames, turned by ``angles`` (...) degrees into the world's."""
+    """Vectors (..., 2) of the agents' frames, turned by ``angles`` (...) degrees into the
+    world's.
+    """
     radians = torch.deg2rad(angles)
     s, c = radians.sin(), radians.cos()
     x, y = vectors[..., 0], vectors[..., 1]
@@ -37,7 +39,8 @@ class _Movement:
     def __init__(self, core, speed, ang_speed, keep):
         self.core, self.keep = core, keep
         self.moves = torch.tensor(
-            [(speed * x, speed * y, ang_speed * turn) for (x, y), turn in zip(MOVES, TURNS)], dtype=torch.float32,
+            [(speed * x, speed * y, ang_speed * turn) for (x, y), turn in zip(MOVES, TURNS)],
+            dtype=torch.float32,
             device=core.device,
         )
         self.space = spaces.MultiDiscrete(core.n_agents, len(MOVES))
@@ -46,13 +49,15 @@ class _Movement:
         """Takes ``decision.actions``, ints (B, 1), (N, A) or (B,), moves the agents and returns
         :class:`~megastep.engine.Physics`.
         """
-        actions = decision['actions'].reshape(self.core.n_envs, self.core.n_agents).long().contiguous()
+        actions = (
+            decision["actions"].reshape(self.core.n_envs, self.core.n_agents).long().contiguous()
+        )
         return engine.physics(self.core.scenery, self.core.agents, actions, self.moves, self.keep)
 
 
 class SimpleMovement(_Movement):
-    """Velocity is what the action says: ``speed`` m/s along an axis of the agent, ``ang_speed`` deg/s about it, for
-    one step.
+    """Velocity is what the action says: ``speed`` m/s along an axis of the agent, ``ang_speed``
+    deg/s about it, for one step.
     """
 
     def __init__(self, core, speed=10.0, ang_speed=180.0):
@@ -60,8 +65,8 @@ class SimpleMovement(_Movement):
 
 
 class MomentumMovement(_Movement):
-    """Actions accelerate: ``accel`` m/s^2 and ``ang_accel`` deg/s^2, against a ``decay`` of both velocities by that
-    fraction each step.
+    """Actions accelerate: ``accel`` m/s^2 and ``ang_accel`` deg/s^2, against a ``decay`` of both
+    velocities by that fraction each step.
     """
 
     def __init__(self, core, accel=5.0, ang_accel=180.0, decay=0.125):
@@ -77,23 +82,28 @@ def render(core):
 
 
 def downsample(screen, subsample):
-    """(..., R) to (..., R / subsample, subsample): neighbouring rays grouped, ready for a mean or a minimum over the
-    last axis.
+    """(..., R) to (..., R / subsample, subsample): neighbouring rays grouped, ready for a mean or a
+    minimum over the last axis.
     """
     if subsample < 1 or screen.shape[-1] % subsample:
-        raise ValueError(f'subsample must divide the {screen.shape[-1]} rays of the screen, but {subsample} was given')
+        raise ValueError(
+            f"subsample must divide the {screen.shape[-1]} rays of the screen, but {subsample} "
+            f"was given"
+        )
     return screen.reshape(*screen.shape[:-1], screen.shape[-1] // subsample, subsample)
 
 
 class RGB:
-    """Colour: float32 (N, A, 3, 1, R / subsample) in linear light, the mean over ``subsample`` rays. Several cameras
-    an agent become (N, A, 3, C, R / subsample).
+    """Colour: float32 (N, A, 3, 1, R / subsample) in linear light, the mean over ``subsample``
+    rays. Several cameras an agent become (N, A, 3, C, R / subsample).
     """
 
     def __init__(self, core, subsample=1):
         self.core, self.subsample = core, subsample
         downsample(torch.empty(core.res), subsample)
-        self.space = spaces.MultiImage(core.n_agents, 3, len(core.agents.yaws), core.res // subsample)
+        self.space = spaces.MultiImage(
+            core.n_agents, 3, len(core.agents.yaws), core.res // subsample
+        )
 
     def __call__(self, r=None):
         r = render(self.core) if r is None else r
@@ -106,14 +116,16 @@ class RGB:
 
 
 class Depth:
-    """Depth: float32 (N, A, 1, C, R / subsample), the mean over ``subsample`` rays of 1 - clamp((distance - radius) /
-    max_depth, 0, 1); ``max_depth`` metres.
+    """Depth: float32 (N, A, 1, C, R / subsample), the mean over ``subsample`` rays of 1 -
+    clamp((distance - radius) / max_depth, 0, 1); ``max_depth`` metres.
     """
 
     def __init__(self, core, subsample=1, max_depth=10.0):
         self.core, self.subsample, self.max_depth = core, subsample, max_depth
         downsample(torch.empty(core.res), subsample)
-        self.space = spaces.MultiImage(core.n_agents, 1, len(core.agents.yaws), core.res // subsample)
+        self.space = spaces.MultiImage(
+            core.n_agents, 1, len(core.agents.yaws), core.res // subsample
+        )
 
     def __call__(self, r=None):
         r = render(self.core) if r is None else r
@@ -127,7 +139,9 @@ class Depth:
 
 
 class IMU:
-    """Inertia: float32 (N, A, 3), angular velocity / 360 and the agent's own velocity, ahead and left, / 10."""
+    """Inertia: float32 (N, A, 3), angular velocity / 360 and the agent's own velocity, ahead and
+    left, / 10.
+    """
 
     def __init__(self, core):
         self.core = core
@@ -135,7 +149,9 @@ class IMU:
 
     def __call__(self):
         agents = self.core.agents
-        return torch.cat([agents.angvelocity[..., None] / 360, to_local(agents.angles, agents.velocity) / 10], -1)
+        return torch.cat(
+            [agents.angvelocity[..., None] / 360, to_local(agents.angles, agents.velocity) / 10], -1
+        )
 
     def state(self, e=0):
         """What the agents of world ``e`` feel now, (A, ...)."""
@@ -146,8 +162,8 @@ class IMU:
 
 
 class Draws:
-    """Random numbers by lane: the k-th draw of a lane depends on the seed, the lane and k alone, so it is the same on
-    every device, captured or not.
+    """Random numbers by lane: the k-th draw of a lane depends on the seed, the lane and k alone, so
+    it is the same on every device, captured or not.
     """
 
     def __init__(self, n_lanes, seed, device):
@@ -156,8 +172,8 @@ class Draws:
         self.values = torch.zeros((n_lanes, 4), device=device)
 
     def __call__(self, mask):
-        """Four uniform numbers in [0, 1) a lane, (B, 4); fresh where ``mask`` (B,) bool, elsewhere what was drawn
-        last.
+        """Four uniform numbers in [0, 1) a lane, (B, 4); fresh where ``mask`` (B,) bool, elsewhere
+        what was drawn last.
         """
         return engine.draw(self.counts, mask.reshape(-1), self.seed, self.values)
 
@@ -166,7 +182,7 @@ def _spawn_points(g, n, radius, random):
     """(n, 2) points in the rooms of a geometry, further than ``radius`` from every wall."""
     i, j = (g.masks > 0).nonzero()
     if not len(i):
-        raise ValueError(f'geometry {g.id} has no room to spawn in: its masks need cells above 0')
+        raise ValueError(f"geometry {g.id} has no room to spawn in: its masks need cells above 0")
     found = np.empty((0, 2))
     for _ in range(20):
         choice = random.integers(len(i), size=4 * n)
@@ -178,7 +194,9 @@ def _spawn_points(g, n, radius, random):
         if len(found) >= n:
             return found[:n]
     if not len(found):
-        raise ValueError(f'geometry {g.id} has no point in a room that is {radius:.2f} m from every wall')
+        raise ValueError(
+            f"geometry {g.id} has no point in a room that is {radius:.2f} m from every wall"
+        )
     return found[random.integers(len(found), size=n)]
 
 
@@ -193,35 +211,54 @@ def _clearance(points, walls):
 class RandomSpawns:
     """Puts agents somewhere random in the rooms of their world's design, at rest, looking anywhere.
 
-    ``n_spawns`` points a design are found once, 5 cm clear of the collision disc; each respawn picks one, and agents of
-    one world have points of their own. With ``resample`` a world whose agents all respawn moves to another design
-    first. ``geometries`` are those the scenery was made from.
+    ``n_spawns`` points a design are found once, 5 cm clear of the collision disc; each respawn
+    picks one, and agents of one world have points of their own. With ``resample`` a world whose
+    agents all respawn moves to another design first. ``geometries`` are those the scenery was made
+    from.
     """
 
     def __init__(self, geometries, core, n_spawns=128, resample=False, seed=None):
         self.core, self.resample = core, resample
         self.seed = core.seed if seed is None else seed
         points = [
-            _spawn_points(g, n_spawns, engine.AGENT_RADIUS + .05, np.random.Generator(np.random.Philox([self.seed, d])))
+            _spawn_points(
+                g,
+                n_spawns,
+                engine.AGENT_RADIUS + 0.05,
+                np.random.Generator(np.random.Philox([self.seed, d])),
+            )
             for d, g in enumerate(geometries[: len(core.scenery.designs)])
         ]
         self.points = torch.as_tensor(np.stack(points), dtype=torch.float32, device=core.device)
-        self.counts = torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
+        self.counts = torch.zeros(
+            (core.n_envs, core.n_agents), dtype=torch.int32, device=core.device
+        )
 
     def __call__(self, reset):
         """Respawns the agents marked in ``reset``, (N, A) or (B,) bool."""
         reset = reset.reshape(self.core.n_envs, self.core.n_agents)
-        engine.spawn(self.core.scenery, self.core.agents, reset, self.points, self.counts, self.seed, self.resample)
+        engine.spawn(
+            self.core.scenery,
+            self.core.agents,
+            reset,
+            self.points,
+            self.counts,
+            self.seed,
+            self.resample,
+        )
 
 
 class RandomLifespans:
-    """Ends episodes after a random number of steps, from ``shortest`` to ``longest``. ``lifespans`` (B,) and ``ages``
-    (B,) are in steps.
+    """Ends episodes after a random number of steps, from ``shortest`` to ``longest``. ``lifespans``
+    (B,) and ``ages`` (B,) are in steps.
     """
 
     def __init__(self, core, shortest=128, longest=256, seed=None):
         if not 0 < shortest <= longest:
-            raise ValueError(f'lifespans need 0 < shortest <= longest steps, but {shortest} and {longest} were given')
+            raise ValueError(
+                f"lifespans need 0 < shortest <= longest steps, but {shortest} and {longest} were "
+                f"given"
+            )
         self.shortest, self.longest = shortest, longest
         n = core.n_envs * core.n_agents
         self.draws = Draws(n, (core.seed if seed is None else seed) + (1 << 32), core.device)
@@ -236,7 +273,8 @@ class RandomLifespans:
         self.ages.masked_fill_(reset, 0)
 
     def __call__(self, reset):
-        """One step: lanes of ``reset`` (B,) begin a life, the others age. Returns (B,) bool, who has reached the end.
+        """One step: lanes of ``reset`` (B,) begin a life, the others age. Returns (B,) bool, who
+        has reached the end.
         """
         self.ages.add_(1)
         self.begin(reset)

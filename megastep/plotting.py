@@ -1,32 +1,50 @@
-"""Pictures for people: plans in their lit colours, what an agent can see of them, and the strips its camera delivers.
+"""Pictures for people: plans in their lit colours, what an agent can see of them, and the strips
+its camera delivers.
 
-Everything here takes numpy arrays in metres, degrees and linear light: a numpyified ``env.state(e)`` holds them, and no
-GPU is needed. Drawn on axes where some are given, else on a new pyplot figure, which notebooks show; :func:`panels`
-makes a figure that pyplot knows nothing of, for ``plot_state``.
+Everything here takes numpy arrays in metres, degrees and linear light: a numpyified
+``env.state(e)`` holds them, and no GPU is needed. Drawn on axes where some are given, else on a new
+pyplot figure, which notebooks show; :func:`panels` makes a figure that pyplot knows nothing of, for
+``plot_state``.
 
 A agents, C channels, H and W rows and columns, L lines, K lights, R rays.
 """
+
 import numpy as np
 
 from .colour import gamma_decode, gamma_encode
 
-__all__ = ['gamma_decode', 'gamma_encode', 'panels', 'plot_images', 'plot_lines', 'plot_scenery', 'plot_sight',
-           'rasterise']
+__all__ = [
+    "gamma_decode",
+    "gamma_encode",
+    "panels",
+    "plot_images",
+    "plot_lines",
+    "plot_scenery",
+    "plot_sight",
+    "rasterise",
+]
 
-BACKGROUND = .12    # grey of the plan, in sRGB: dark, because the walls are drawn in the light that falls on them
-EXPOSURE = 2.5      # plans are drawn brighter than cameras see them: most walls get well under half of full light
-UNSEEN = .2         # how far texels that have not been seen rise from the background
-STRIP = .09         # height of a strip over its width
+# grey of the plan, in sRGB: dark, because the walls are drawn in the light that falls on them
+BACKGROUND = 0.12
+# plans are drawn brighter than cameras see them: most walls get well under half of full light
+EXPOSURE = 2.5
+UNSEEN = 0.2  # how far texels that have not been seen rise from the background
+STRIP = 0.09  # height of a strip over its width
 
 
-def panels(n_strips=0, width=6., title=None):
-    """A figure with a square for the plan and ``n_strips`` strips under it: (figure, plan axes, list of strip axes).
+def panels(n_strips=0, width=6.0, title=None):
+    """A figure with a square for the plan and ``n_strips`` strips under it: (figure, plan axes,
+    list of strip axes).
 
-    ``width`` is in inches, at 100 pixels an inch. The figure is not pyplot's, so nothing has to be closed.
+    ``width`` is in inches, at 100 pixels an inch. The figure is not pyplot's, so nothing has to be
+    closed.
     """
     from matplotlib.figure import Figure
 
-    margin, gap = .55, .5     # inches: about the plan, and what a strip needs below it for its own labels
+    margin, gap = (
+        0.55,
+        0.5,
+    )  # inches: about the plan, and what a strip needs below it for its own labels
     inner = width - 2 * margin
     strip = STRIP * inner
     height = 2 * margin + inner + n_strips * (strip + gap)
@@ -38,15 +56,22 @@ def panels(n_strips=0, width=6., title=None):
     plan = axes(height - margin - inner, inner)
     if title is not None:
         plan.set_title(title)
-    return figure, plan, [axes(gap + (n_strips - 1 - i) * (strip + gap), strip) for i in range(n_strips)]
+    return (
+        figure,
+        plan,
+        [axes(gap + (n_strips - 1 - i) * (strip + gap), strip) for i in range(n_strips)],
+    )
 
 
 def plot_images(images, transpose=False, aspect=None, axes=None):
-    """Draws pictures side by side, a row of panels for each name. Returns the axes, (names, pictures).
+    """Draws pictures side by side, a row of panels for each name. Returns the axes, (names,
+    pictures).
 
     Args:
-        images: dict of arrays (..., C, H, W) as policies see them, of 1 channel (shown in grey, 0 to 1) or 3 (linear
-            light, gamma encoded here). All axes before the last three are further pictures of that name.
+        images: dict of arrays (..., C, H, W) as policies see them, of 1 channel (shown in grey, 0
+        to 1) or 3 (linear
+            light, gamma encoded here). All axes before the last three are further pictures of that
+            name.
         transpose: the arrays are (..., H, W, C) instead, like ``Render.screen``.
         aspect: height of a panel over its width; by default such that pixels are square.
         axes: as many axes as there are pictures in all, row by row.
@@ -55,15 +80,20 @@ def plot_images(images, transpose=False, aspect=None, axes=None):
     pictures = {name: _pictures(name, image, transpose) for name, image in images.items()}
     shape = len(pictures), max(map(len, pictures.values()), default=0)
     if not all(shape):
-        raise ValueError('plot_images was given no pictures; it needs a dict of arrays with at least one each')
+        raise ValueError(
+            "plot_images was given no pictures; it needs a dict of arrays with at least one each"
+        )
     if axes is None:
         from matplotlib import pyplot
-        axes = pyplot.subplots(*shape, squeeze=False, layout='constrained', figsize=(6 * shape[1], 1.5 * shape[0]))[1]
+
+        axes = pyplot.subplots(
+            *shape, squeeze=False, layout="constrained", figsize=(6 * shape[1], 1.5 * shape[0])
+        )[1]
     axes = np.asarray(axes, dtype=object).reshape(shape)
     for row, (name, stack) in zip(axes, pictures.items(), strict=True):
         for i, ax in enumerate(row):
             if i < len(stack):
-                _plot_image(ax, stack[i], name if len(stack) == 1 else f'{name} {i}', aspect)
+                _plot_image(ax, stack[i], name if len(stack) == 1 else f"{name} {i}", aspect)
             else:
                 ax.set_axis_off()
     return axes
@@ -75,21 +105,27 @@ def _pictures(name, image, transpose):
     if image.ndim >= 3 and not transpose:
         image = np.moveaxis(image, -3, -1)
     if image.ndim < 3 or image.shape[-1] not in (1, 3):
-        wanted = '(..., H, W, C)' if transpose else '(..., C, H, W)'
-        raise ValueError(f"picture '{name}' must have shape {wanted} with 1 or 3 channels C, but with transpose="
-                         f'{bool(transpose)} its shape {np.shape(image)} is read as one of other channels')
+        wanted = "(..., H, W, C)" if transpose else "(..., C, H, W)"
+        raise ValueError(
+            f"picture '{name}' must have shape {wanted} with 1 or 3 channels C, but with transpose="
+            f"{bool(transpose)} its shape {np.shape(image)} is read as one of other channels"
+        )
     image = np.clip(np.nan_to_num(image), 0, 1).reshape(-1, *image.shape[-3:])
     return gamma_encode(image) if image.shape[-1] == 3 else image
 
 
 def _plot_image(ax, image, title, aspect):
-    options = dict(cmap='gray', vmin=0, vmax=1) if image.shape[-1] == 1 else {}
-    ax.imshow(image.squeeze(-1) if image.shape[-1] == 1 else image, interpolation='nearest',
-              aspect='equal' if aspect is None else 'auto', **options)
+    options = dict(cmap="gray", vmin=0, vmax=1) if image.shape[-1] == 1 else {}
+    ax.imshow(
+        image.squeeze(-1) if image.shape[-1] == 1 else image,
+        interpolation="nearest",
+        aspect="equal" if aspect is None else "auto",
+        **options,
+    )
     ax.set_box_aspect(aspect)
-    ax.set_title(title, fontsize='small', loc='left', pad=2)
-    ax.set_xlabel('pixel, from left to right', fontsize='x-small', labelpad=1)
-    ax.tick_params(labelsize='x-small')
+    ax.set_title(title, fontsize="small", loc="left", pad=2)
+    ax.set_xlabel("pixel, from left to right", fontsize="x-small", labelpad=1)
+    ax.tick_params(labelsize="x-small")
     ax.set_yticks([])
 
 
@@ -99,8 +135,8 @@ def plot_lines(ax, lines, colours, seen=None, exposure=EXPOSURE, width=2.5):
     Args:
         lines: (L, 2, 2) endpoints in metres.
         colours: one (w, 3) array a line, its w lit texels in linear light.
-        seen: one (w,) array of bools a line; texels that are False are drawn faintly. All are seen by default.
-        exposure: what the light is multiplied with.
+        seen: one (w,) array of bools a line; texels that are False are drawn faintly. All are seen
+        by default. exposure: what the light is multiplied with.
         width: of the lines, in points.
     """
     from matplotlib.collections import LineCollection
@@ -108,53 +144,70 @@ def plot_lines(ax, lines, colours, seen=None, exposure=EXPOSURE, width=2.5):
     lines = np.asarray(lines, np.float32).reshape(-1, 2, 2)
     widths = np.array([len(texels) for texels in colours], int)
     if len(widths) != len(lines):
-        raise ValueError(f'plot_lines needs one array of colours a line, but {len(lines)} lines and {len(widths)} '
-                         'arrays of colours were given')
+        raise ValueError(
+            f"plot_lines needs one array of colours a line, but {len(lines)} lines and "
+            f"{len(widths)} "
+            "arrays of colours were given"
+        )
     line = np.repeat(np.arange(len(lines)), widths)
     texel = np.arange(len(line)) - (widths.cumsum() - widths)[line]
     fractions = np.stack([texel, texel + 1], 1) / np.maximum(widths[line], 1)[:, None]
     start, along = lines[line, 0], lines[line, 1] - lines[line, 0]
     segments = start[:, None] + fractions[..., None] * along[:, None]
 
-    light = np.concatenate([np.zeros((0, 3)), *(np.asarray(texels, np.float32) for texels in colours)])
+    light = np.concatenate(
+        [np.zeros((0, 3)), *(np.asarray(texels, np.float32) for texels in colours)]
+    )
     shown = gamma_encode(np.clip(exposure * light, 0, 1))
     if seen is not None:
         seen = np.concatenate([np.zeros(0, bool), *(np.asarray(texels, bool) for texels in seen)])
         shown = np.where(seen[:, None], shown, BACKGROUND + UNSEEN * (shown - BACKGROUND))
     # Caps reach into the neighbours, or the background would shine through between texels.
-    return ax.add_collection(LineCollection(segments, colors=shown, linewidths=width, capstyle='projecting'))
+    return ax.add_collection(
+        LineCollection(segments, colors=shown, linewidths=width, capstyle="projecting")
+    )
 
 
 def plot_scenery(lines, colours, lights=None, seen=None, ax=None):
     """Draws one world from above: its lines in their lit colours, and its lights. Returns the axes.
 
-    Args: ``lines``, ``colours`` and ``seen`` as in :func:`plot_lines`; ``lights`` (K, 2 or more), x and y first.
+    Args: ``lines``, ``colours`` and ``seen`` as in :func:`plot_lines`; ``lights`` (K, 2 or more), x
+    and y first.
     """
     if ax is None:
         from matplotlib import pyplot
+
         ax = pyplot.subplots(figsize=(6, 6))[1]
     ax.set_facecolor(str(BACKGROUND))
     plot_lines(ax, lines, colours, seen)
     if lights is not None and len(lights):
-        ax.scatter(np.asarray(lights)[:, 0], np.asarray(lights)[:, 1], s=14, c='gold', marker='*', linewidths=0)
-    ax.set_aspect('equal', adjustable='datalim')
-    ax.margins(.05)
+        ax.scatter(
+            np.asarray(lights)[:, 0],
+            np.asarray(lights)[:, 1],
+            s=14,
+            c="gold",
+            marker="*",
+            linewidths=0,
+        )
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.margins(0.05)
     ax.autoscale_view()
-    ax.set_xlabel('x, m', fontsize='small', labelpad=1)
-    ax.set_ylabel('y, m', fontsize='small', labelpad=1)
-    ax.tick_params(labelsize='x-small')
+    ax.set_xlabel("x, m", fontsize="small", labelpad=1)
+    ax.set_ylabel("y, m", fontsize="small", labelpad=1)
+    ax.tick_params(labelsize="x-small")
     return ax
 
 
-def plot_sight(ax, position, angle, fov, distances=None, reach=1., colour='w'):
-    """Draws where a camera looks: a wedge, or with ``distances`` the area it sees. Returns the matplotlib patch.
+def plot_sight(ax, position, angle, fov, distances=None, reach=1.0, colour="w"):
+    """Draws where a camera looks: a wedge, or with ``distances`` the area it sees. Returns the
+    matplotlib patch.
 
     Args:
         position: (2,) of the camera in metres.
         angle: degrees from +x, anticlockwise.
         fov: degrees between the outermost rays.
-        distances: (R,) metres along each ray, the leftmost first, as in ``Render.distances``; misses may be infinite.
-        reach: metres; how far the wedge goes, and misses.
+        distances: (R,) metres along each ray, the leftmost first, as in ``Render.distances``;
+        misses may be infinite. reach: metres; how far the wedge goes, and misses.
     """
     from matplotlib.patches import Polygon
 
@@ -165,8 +218,10 @@ def plot_sight(ax, position, angle, fov, distances=None, reach=1., colour='w'):
     left = np.tan(np.radians(fov / 2)) * (rays - 1 - 2 * np.arange(rays)) / rays
     angles = np.radians(angle) + np.arctan(left)
     rim = position + distances[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
-    ax.plot(*position, marker='o', markersize=4, color=colour)
-    return ax.add_patch(Polygon(np.concatenate([position[None], rim]), facecolor=colour, alpha=.15, linewidth=0))
+    ax.plot(*position, marker="o", markersize=4, color=colour)
+    return ax.add_patch(
+        Polygon(np.concatenate([position[None], rim]), facecolor=colour, alpha=0.15, linewidth=0)
+    )
 
 
 def rasterise(figure):

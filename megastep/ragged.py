@@ -6,6 +6,7 @@
     r[1]    # array([3.])
     r[:2]   # RaggedNumpy([3 1])
 """
+
 import operator
 from functools import cached_property
 
@@ -30,8 +31,9 @@ class Bounds:
 class Ragged(Bounds):
     """``vals`` (V, ...) cut along its first axis into D subarrays of ``widths`` (D,) elements each.
 
-    An integer index gives a subarray, a slice gives a Ragged; both share memory with ``vals``, except slices with a
-    step. ``widths`` must be whole numbers, none negative, that add up to V (ValueError if not), and are kept as int64.
+    An integer index gives a subarray, a slice gives a Ragged; both share memory with ``vals``,
+    except slices with a step. ``widths`` must be whole numbers, none negative, that add up to V
+    (ValueError if not), and are kept as int64.
     """
 
     def __new__(cls, vals, widths):
@@ -60,18 +62,26 @@ class Ragged(Bounds):
             if not chosen:
                 return Ragged(self.vals[:0], self.widths[:0])
             if chosen.step == 1:
-                return Ragged(self.vals[starts[chosen[0]]:ends[chosen[-1]]], self.widths[chosen.start:chosen.stop])
-            return Ragged(self._cat([self.vals[starts[i]:ends[i]] for i in chosen]), self.widths[list(chosen)])
+                return Ragged(
+                    self.vals[starts[chosen[0]] : ends[chosen[-1]]],
+                    self.widths[chosen.start : chosen.stop],
+                )
+            return Ragged(
+                self._cat([self.vals[starts[i] : ends[i]] for i in chosen]),
+                self.widths[list(chosen)],
+            )
         try:
             i = operator.index(index)
         except TypeError:
-            raise TypeError(f'a Ragged is indexed with an integer or a slice, not a {type(index).__name__}') from None
+            raise TypeError(
+                f"a Ragged is indexed with an integer or a slice, not a {type(index).__name__}"
+            ) from None
         if not -len(self) <= i < len(self):
-            raise IndexError(f'index {i} is out of range for a Ragged of {len(self)} subarrays')
-        return self.vals[starts[i]:ends[i]]
+            raise IndexError(f"index {i} is out of range for a Ragged of {len(self)} subarrays")
+        return self.vals[starts[i] : ends[i]]
 
     def __repr__(self):
-        return f'{type(self).__name__}({np.array(self.widths.tolist(), int)})'
+        return f"{type(self).__name__}({np.array(self.widths.tolist(), int)})"
 
     def __reduce__(self):
         return Ragged, (self.vals, self.widths)
@@ -79,6 +89,7 @@ class Ragged(Bounds):
 
 class RaggedNumpy(Ragged):
     """A Ragged of numpy arrays."""
+
     _asarray = staticmethod(np.asarray)
     _cat = staticmethod(np.concatenate)
 
@@ -106,6 +117,7 @@ class RaggedNumpy(Ragged):
 
 class RaggedTorch(Ragged):
     """A Ragged of tensors, all on the device of ``vals``."""
+
     _asarray = staticmethod(torch.as_tensor)
     _cat = staticmethod(torch.cat)
 
@@ -132,7 +144,10 @@ class RaggedTorch(Ragged):
     def numpyify(self):
         """The same Ragged on numpy arrays."""
         vals = self.vals.detach().cpu()
-        return Ragged((vals.float() if vals.dtype == torch.bfloat16 else vals).numpy(), self.widths.cpu().numpy())
+        return Ragged(
+            (vals.float() if vals.dtype == torch.bfloat16 else vals).numpy(),
+            self.widths.cpu().numpy(),
+        )
 
     def to(self, *args, **kwargs):
         """``vals.to(...)`` and the widths on the same device."""
@@ -140,9 +155,9 @@ class RaggedTorch(Ragged):
         return Ragged(vals, self.widths.to(vals.device))
 
     def cpu(self):
-        return self.to('cpu')
+        return self.to("cpu")
 
-    def cuda(self, device='cuda'):
+    def cuda(self, device="cuda"):
         return self.to(device)
 
     def clone(self):
@@ -151,18 +166,29 @@ class RaggedTorch(Ragged):
 
 def _check(vals, widths):
     if vals.ndim == 0:
-        raise ValueError('the vals of a Ragged need at least one axis, but a single number was given')
+        raise ValueError(
+            "the vals of a Ragged need at least one axis, but a single number was given"
+        )
     if widths.ndim != 1:
-        raise ValueError(f'the widths of a Ragged need exactly one axis, but theirs have shape {tuple(widths.shape)}')
+        raise ValueError(
+            f"the widths of a Ragged need exactly one axis, but theirs have shape "
+            f"{tuple(widths.shape)}"
+        )
     if not _whole(widths):
-        raise ValueError(f'the widths of a Ragged must be whole numbers, but their dtype is {widths.dtype}')
+        raise ValueError(
+            f"the widths of a Ragged must be whole numbers, but their dtype is {widths.dtype}"
+        )
     listed = np.array(widths.tolist(), int)
     if (listed < 0).any():
         i = int(listed.argmin())
-        raise ValueError(f'the widths of a Ragged must not be negative, but widths[{i}] is {listed[i]}')
+        raise ValueError(
+            f"the widths of a Ragged must not be negative, but widths[{i}] is {listed[i]}"
+        )
     if listed.sum() != len(vals):
-        raise ValueError(f'the widths of a Ragged must add up to the length of its vals, but they add up to '
-                         f'{listed.sum()} and there are {len(vals)} vals')
+        raise ValueError(
+            f"the widths of a Ragged must add up to the length of its vals, but they add up to "
+            f"{listed.sum()} and there are {len(vals)} vals"
+        )
 
 
 def _whole(widths):

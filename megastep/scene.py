@@ -12,16 +12,28 @@ TEXEL = 0.05  # metres a texel
 STRIPE = (0.4, 2.0)  # metres, shortest and longest period of a wall's pattern
 INTENSITY = (0.5, 1.6)  # of lights
 PALETTE = (
-    'd9b08c', 'a3c1ad', 'e0d5b6', 'b7a7c9', '9fb8d0', 'c98b8b', 'd8c27a', '8fae7d', 'b0b0b0', 'cf9fb5', '7fb0b0',
-    'e8e0d8',
+    "d9b08c",
+    "a3c1ad",
+    "e0d5b6",
+    "b7a7c9",
+    "9fb8d0",
+    "c98b8b",
+    "d8c27a",
+    "8fae7d",
+    "b0b0b0",
+    "cf9fb5",
+    "7fb0b0",
+    "e8e0d8",
 )
-AGENT_PALETTE = ('3b6ea5', 'a5523b', '4f8f4f', '8a5ba5', 'a58a3b', '3b9a9a', 'a53b74', '6b6b6b')
-FRONT = 'ff3020'
+AGENT_PALETTE = ("3b6ea5", "a5523b", "4f8f4f", "8a5ba5", "a58a3b", "3b9a9a", "a53b74", "6b6b6b")
+FRONT = "ff3020"
 
 
 def _linear(palette):
     """(n, 3) linear light of hexadecimal colours."""
-    return gamma_decode(np.array([[int(colour[i : i + 2], 16) / 255 for i in (0, 2, 4)] for colour in palette]))
+    return gamma_decode(
+        np.array([[int(colour[i : i + 2], 16) / 255 for i in (0, 2, 4)] for colour in palette])
+    )
 
 
 def texel_widths(lines):
@@ -33,12 +45,16 @@ def texel_widths(lines):
 def agent_model(width=engine.AGENT_WIDTH):
     """(8, 2, 2) lines of an octagon in a square of ``width`` metres, its front (+x) the third."""
     w, h = width / 2, width / 4
-    corners = np.array([(-h, -w), (h, -w), (w, -h), (w, h), (h, w), (-h, w), (-w, h), (-w, -h)], dtype=np.float32)
+    corners = np.array(
+        [(-h, -w), (h, -w), (w, -h), (w, h), (h, w), (-h, w), (-w, h), (-w, -h)], dtype=np.float32
+    )
     return np.stack([corners, np.roll(corners, -1, 0)], 1)
 
 
 def _agent_textures(n_agents, model):
-    """(K, 3) colours of a world's agents, and (A M,) texels a line: a colour an agent, and a red front."""
+    """(K, 3) colours of a world's agents, and (A M,) texels a line: a colour an agent, and a red
+    front.
+    """
     widths = texel_widths(model)
     bodies, front = _linear(AGENT_PALETTE), _linear([FRONT])[0]
     colours = np.repeat(bodies[np.arange(n_agents) % len(bodies), None], len(model), 1)
@@ -48,13 +64,17 @@ def _agent_textures(n_agents, model):
 
 
 def wall_textures(widths, random):
-    """(T, 3) texels of walls that have ``widths`` (W,) texels each: two colours a wall, in stripes of random period,
-    phase and share.
+    """(T, 3) texels of walls that have ``widths`` (W,) texels each: two colours a wall, in stripes
+    of random period, phase and share.
     """
     n, palette = len(widths), _linear(PALETTE)
     base = palette[random.integers(len(palette), size=n)] * random.uniform(0.6, 1.0, (n, 1))
     stripe = palette[random.integers(len(palette), size=n)] * random.uniform(0.2, 0.8, (n, 1))
-    period, phase, share = random.uniform(*STRIPE, n), random.uniform(0, 1, n), random.uniform(0.1, 0.5, n)
+    period, phase, share = (
+        random.uniform(*STRIPE, n),
+        random.uniform(0, 1, n),
+        random.uniform(0.1, 0.5, n),
+    )
     wall = np.repeat(np.arange(n), widths)
     along = (np.arange(len(wall)) - (widths.cumsum() - widths)[wall] + 0.5) * TEXEL
     striped = (along / period[wall] + phase[wall]) % 1 < share[wall]
@@ -62,56 +82,77 @@ def wall_textures(widths, random):
 
 
 def _near_together(walls):
-    """Walls (M, 2, 2) along a Z-order curve through 1 m cells, so that each 32 of them lie in one part of the home."""
+    """Walls (M, 2, 2) along a Z-order curve through 1 m cells, so that each 32 of them lie in one
+    part of the home.
+    """
     cells = walls.mean(1).astype(np.int64)
-    order = sum(((cells >> bit & 1) << np.array([2 * bit, 2 * bit + 1])).sum(-1) for bit in range(8))
-    return walls[np.argsort(order, kind='stable')]
+    order = sum(
+        ((cells >> bit & 1) << np.array([2 * bit, 2 * bit + 1])).sum(-1) for bit in range(8)
+    )
+    return walls[np.argsort(order, kind="stable")]
 
 
 def scenery(geometries, n_agents=1, n_envs=None, seed=1, device=None):
-    """Baked :class:`~megastep.scenery.Scenery` of ``n_envs`` worlds (default: one a geometry); world e shows geometry
-    ``e % len(geometries)``.
+    """Baked :class:`~megastep.scenery.Scenery` of ``n_envs`` worlds (default: one a geometry);
+    world e shows geometry ``e % len(geometries)``.
 
-    Each geometry is one design, with textures and light intensities of its own drawn from ``seed``; the same geometry
-    given twice is two designs. ``device`` is as in :func:`~megastep.engine.device`. ValueError without geometries;
-    EngineError if the worlds do not fit into memory.
+    Each geometry is one design, with textures and light intensities of its own drawn from ``seed``;
+    the same geometry given twice is two designs. ``device`` is as in
+    :func:`~megastep.engine.device`. ValueError without geometries; EngineError if the worlds do not
+    fit into memory.
     """
     geometries = list(geometries)
     n_envs = len(geometries) if n_envs is None else n_envs
     if not geometries or n_envs < 1 or n_agents < 0:
         raise ValueError(
-            f'scenery needs at least one geometry and one environment, but {len(geometries)} and {n_envs} were '
-            f'given (and {n_agents} agents)'
+            f"scenery needs at least one geometry and one environment, but {len(geometries)} and "
+            f"{n_envs} were "
+            f"given (and {n_agents} agents)"
         )
-    device = engine.device(device or 'auto') if not isinstance(device, torch.device) else device
+    device = engine.device(device or "auto") if not isinstance(device, torch.device) else device
     model = agent_model()
     agent_textures, model_widths = _agent_textures(n_agents, model)
     engine.fit(n_envs, 20 * n_agents * len(model) + 4 * len(agent_textures) + 64, device)
 
     random = np.random.Generator(np.random.Philox(seed))
-    walls = np.concatenate([_near_together(np.reshape(g.walls, (-1, 2, 2))) for g in geometries]).astype(np.float32)
+    walls = np.concatenate(
+        [_near_together(np.reshape(g.walls, (-1, 2, 2))) for g in geometries]
+    ).astype(np.float32)
     widths = texel_widths(walls)
     positions = np.concatenate([np.reshape(g.lights, (-1, 2)) for g in geometries])
-    lights = np.concatenate([positions, random.uniform(*INTENSITY, (len(positions), 1))], 1).astype(np.float32)
+    lights = np.concatenate([positions, random.uniform(*INTENSITY, (len(positions), 1))], 1).astype(
+        np.float32
+    )
     designs = Designs(
         lines=Ragged(torch.as_tensor(walls), torch.tensor([len(g.walls) for g in geometries])),
         textures=Ragged(torch.as_tensor(wall_textures(widths, random)), torch.as_tensor(widths)),
         lights=Ragged(torch.as_tensor(lights), torch.tensor([len(g.lights) for g in geometries])),
-        agent_textures=torch.as_tensor(agent_textures, dtype=torch.float32).repeat(len(geometries), 1, 1),
+        agent_textures=torch.as_tensor(agent_textures, dtype=torch.float32).repeat(
+            len(geometries), 1, 1
+        ),
         device=device,
     )
     made = Scenery.of_designs(
-        n_agents, designs, torch.as_tensor(model), torch.as_tensor(model_widths), torch.arange(n_envs) % len(geometries)
+        n_agents,
+        designs,
+        torch.as_tensor(model),
+        torch.as_tensor(model_widths),
+        torch.arange(n_envs) % len(geometries),
     )
     engine.bake(made)
     return made
 
 
 def display(scenery, e=0, ax=None):
-    """Draws world ``e`` in its lit colours, with its lights and agents. Returns the matplotlib axes."""
+    """Draws world ``e`` in its lit colours, with its lights and agents. Returns the matplotlib
+    axes.
+    """
     from . import plotting
 
     lines, colours, lights = scenery.world(e)
     return plotting.plot_scenery(
-        lines.cpu().numpy(), [texels.cpu().numpy() for texels in colours], lights.cpu().numpy(), ax=ax
+        lines.cpu().numpy(),
+        [texels.cpu().numpy() for texels in colours],
+        lights.cpu().numpy(),
+        ax=ax,
     )

@@ -1,8 +1,9 @@
 """Scenery: what the engine renders and collides with.
 
-Walls, their textures and baked light, and lights belong to a *design*; a world points at a design, so a million
-worlds share a few thousand homes. Each world adds only its agents' lines and the light on them. N worlds, D designs,
-A agents a world, M lines of the agent model, K texels of one world's agents, W walls and T texels of all designs.
+Walls, their textures and baked light, and lights belong to a *design*; a world points at a design,
+so a million worlds share a few thousand homes. Each world adds only its agents' lines and the light
+on them. N worlds, D designs, A agents a world, M lines of the agent model, K texels of one world's
+agents, W walls and T texels of all designs.
 """
 
 from functools import cached_property
@@ -15,12 +16,14 @@ from .ragged import Bounds, Ragged
 def _expand(starts, widths):
     """Indices of the ranges [start, start + width), end to end."""
     offsets = widths.cumsum(0) - widths
-    return torch.arange(int(widths.sum()), device=widths.device) + torch.repeat_interleave(starts - offsets, widths)
+    return torch.arange(int(widths.sum()), device=widths.device) + torch.repeat_interleave(
+        starts - offsets, widths
+    )
 
 
 class Pieced(Bounds):
-    """A read-only Ragged whose subarrays are pieces of two tensors, joined when asked for: the agents' part first,
-    then the design's.
+    """A read-only Ragged whose subarrays are pieces of two tensors, joined when asked for: the
+    agents' part first, then the design's.
 
     ``vals``, ``starts``, ``ends``, ``widths``, ``inverse`` and indexing are those of a
     :class:`~megastep.ragged.Ragged`; all are copies.
@@ -41,7 +44,9 @@ class Pieced(Bounds):
 
     @property
     def inverse(self):
-        return torch.repeat_interleave(torch.arange(len(self), device=self.widths.device), self.widths)
+        return torch.repeat_interleave(
+            torch.arange(len(self), device=self.widths.device), self.widths
+        )
 
     @property
     def device(self):
@@ -53,9 +58,12 @@ class Pieced(Bounds):
     def __getitem__(self, index):
         if isinstance(index, slice):
             chosen = range(len(self))[index]
-            return Ragged(torch.cat([self[i] for i in chosen] or [self._vals[0][:0]]), self.widths[list(chosen)])
+            return Ragged(
+                torch.cat([self[i] for i in chosen] or [self._vals[0][:0]]),
+                self.widths[list(chosen)],
+            )
         if not -len(self) <= index < len(self):
-            raise IndexError(f'index {index} is out of range for {len(self)} subarrays')
+            raise IndexError(f"index {index} is out of range for {len(self)} subarrays")
         return torch.cat(
             [
                 vals[int(s[index]) : int(s[index]) + int(w[index])]
@@ -70,15 +78,16 @@ class Pieced(Bounds):
         return self.torchify().numpyify()
 
     def __repr__(self):
-        return f'Pieced({self.widths.cpu().numpy()})'
+        return f"Pieced({self.widths.cpu().numpy()})"
 
 
 class Designs:
     """The static part of scenery, shared by the worlds that show it.
 
-    Args: ``lines`` Ragged (W, 2, 2) metres; ``textures`` Ragged (T, 3), one subarray a wall, linear light in [0, 1];
-    ``lights`` Ragged (l, 3), x, y, intensity; ``agent_textures`` (D, K, 3). ``lines.vals``, ``textures.vals``,
-    ``baked.vals`` and ``lights.vals`` may be edited in place; call ``bake`` after moving walls or lights.
+    Args: ``lines`` Ragged (W, 2, 2) metres; ``textures`` Ragged (T, 3), one subarray a wall, linear
+    light in [0, 1]; ``lights`` Ragged (l, 3), x, y, intensity; ``agent_textures`` (D, K, 3).
+    ``lines.vals``, ``textures.vals``, ``baked.vals`` and ``lights.vals`` may be edited in place;
+    call ``bake`` after moving walls or lights.
     """
 
     def __init__(self, lines, textures, lights, agent_textures, device):
@@ -94,21 +103,27 @@ class Designs:
             _bounds(r.widths) for r in (self.lines, self.lights, self.textures)
         )
         for name, wanted, given in [
-            ('texture for each wall', len(self.lines.vals), len(self.textures)),
-            ('set of lights for each design', len(self.lines), len(self.lights)),
-            ('set of agent textures for each design', len(self.lines), len(self.agent_textures)),
+            ("texture for each wall", len(self.lines.vals), len(self.textures)),
+            ("set of lights for each design", len(self.lines), len(self.lights)),
+            ("set of agent textures for each design", len(self.lines), len(self.agent_textures)),
         ]:
             if wanted != given:
-                raise ValueError(f'scenery needs one {name}, so {wanted} of them, but {given} were given')
+                raise ValueError(
+                    f"scenery needs one {name}, so {wanted} of them, but {given} were given"
+                )
         if len(textures.widths) and int(textures.widths.min()) < 1:
-            raise ValueError('every wall needs at least one texel, but a texture of width 0 was given')
+            raise ValueError(
+                "every wall needs at least one texel, but a texture of width 0 was given"
+            )
         self.bound()
 
     def __len__(self):
         return len(self.lines)
 
     def bound(self):
-        """Draws ``boxes`` around every 32 walls of a design, which let the GPU leave out what cannot be seen."""
+        """Draws ``boxes`` around every 32 walls of a design, which let the GPU leave out what
+        cannot be seen.
+        """
         groups = (self.lines.widths + 31) // 32
         self.box_starts = _bounds(groups)
         first = self.lines.starts[self.lines.inverse]
@@ -116,8 +131,10 @@ class Designs:
         group = self.box_starts.long()[self.lines.inverse] + within // 32
         ends, where = self.lines.vals, group[:, None, None].expand(-1, 2, 2)
         low = torch.full((int(groups.sum()), 2), torch.inf, device=first.device)
-        low.scatter_reduce_(0, where.reshape(-1, 2), ends.reshape(-1, 2), 'amin')
-        high = torch.full_like(low, -torch.inf).scatter_reduce_(0, where.reshape(-1, 2), ends.reshape(-1, 2), 'amax')
+        low.scatter_reduce_(0, where.reshape(-1, 2), ends.reshape(-1, 2), "amin")
+        high = torch.full_like(low, -torch.inf).scatter_reduce_(
+            0, where.reshape(-1, 2), ends.reshape(-1, 2), "amax"
+        )
         self.boxes = torch.cat([low, high], 1)
 
     @cached_property
@@ -129,10 +146,11 @@ class Designs:
 class Scenery:
     """N worlds of A agents each.
 
-    ``Scenery(n_agents, lights, lines, textures, model)`` takes what every world has of its own: raggeds of ``lights``
-    (l, 3) and ``lines`` (L, 2, 2) by world, each world's agents' lines first, ``textures`` (T, 3) by line, and the
-    agents' ``model`` (M, 2, 2) in metres about their origin. :meth:`of_designs` shares designs between worlds. The
-    agents' texture widths must be the same in every world. ValueError if the parts do not fit.
+    ``Scenery(n_agents, lights, lines, textures, model)`` takes what every world has of its own:
+    raggeds of ``lights`` (l, 3) and ``lines`` (L, 2, 2) by world, each world's agents' lines first,
+    ``textures`` (T, 3) by line, and the agents' ``model`` (M, 2, 2) in metres about their origin.
+    :meth:`of_designs` shares designs between worlds. The agents' texture widths must be the same in
+    every world. ValueError if the parts do not fit.
     """
 
     def __init__(self, n_agents, lights, lines, textures, model, device=None):
@@ -141,30 +159,40 @@ class Scenery:
         n, own = len(lines), n_agents * len(model)
         if int(lines.widths.min()) < own:
             raise ValueError(
-                f'every world must begin with the {own} lines of its {n_agents} agents, but one has '
-                f'{int(lines.widths.min())} lines in all'
+                f"every world must begin with the {own} lines of its {n_agents} agents, but one "
+                f"has "
+                f"{int(lines.widths.min())} lines in all"
             )
-        is_agent = torch.arange(len(lines.vals), device=lines.vals.device) - lines.starts[lines.inverse] < own
+        is_agent = (
+            torch.arange(len(lines.vals), device=lines.vals.device) - lines.starts[lines.inverse]
+            < own
+        )
         if len(textures) != len(lines.vals):
             raise ValueError(
-                f'scenery needs one texture for each line, so {len(lines.vals)} of them, but {len(textures)} were given'
+                f"scenery needs one texture for each line, so {len(lines.vals)} of them, but "
+                f"{len(textures)} were given"
             )
         agent_widths = textures.widths[is_agent].view(n, own)
         if not bool((agent_widths == agent_widths[0]).all()):
             raise ValueError(
-                'the texture widths of the agents\' lines must be the same in every world, but they differ'
+                "the texture widths of the agents' lines must be the same in every world, but "
+                "they differ"
             )
         of_agent = is_agent[textures.inverse]
         designs = Designs(
             Ragged(lines.vals[~is_agent], lines.widths - own),
-            Ragged(textures.vals[~of_agent], textures.widths[~is_agent]), lights,
-            textures.vals[of_agent].view(n, -1, 3), device,
+            Ragged(textures.vals[~of_agent], textures.widths[~is_agent]),
+            lights,
+            textures.vals[of_agent].view(n, -1, 3),
+            device,
         )
         self._fill(n_agents, designs, model, agent_widths[0], torch.arange(n), device)
 
     @classmethod
     def of_designs(cls, n_agents, designs, model, model_widths, design):
-        """``design`` (N,) ints: the design each world shows; ``model_widths`` (A M,) texels of each agent line."""
+        """``design`` (N,) ints: the design each world shows; ``model_widths`` (A M,) texels of each
+        agent line.
+        """
         self = cls.__new__(cls)
         self._fill(n_agents, designs, model, model_widths, design, designs.texels.device)
         return self
@@ -177,12 +205,16 @@ class Scenery:
         self.design = torch.as_tensor(design, dtype=torch.int32, device=device).contiguous()
         if int(self.model_texels[-1]) != designs.agent_textures.shape[1]:
             raise ValueError(
-                f'the agents\' textures have {designs.agent_textures.shape[1]} texels a world, but their lines '
-                f'need {int(self.model_texels[-1])}'
+                f"the agents' textures have {designs.agent_textures.shape[1]} texels a world, but "
+                f"their lines "
+                f"need {int(self.model_texels[-1])}"
             )
-        if len(self.design) and not 0 <= int(self.design.min()) <= int(self.design.max()) < len(designs):
+        if len(self.design) and not 0 <= int(self.design.min()) <= int(self.design.max()) < len(
+            designs
+        ):
             raise ValueError(
-                f'worlds must show designs 0 to {len(designs) - 1}, but one shows {int(self.design.max())}'
+                f"worlds must show designs 0 to {len(designs) - 1}, but one shows "
+                f"{int(self.design.max())}"
             )
         self.agent_lines = self.model.repeat(self.n_envs, n_agents, 1, 1)
         self.agent_light = torch.ones((self.n_envs, designs.agent_textures.shape[1]), device=device)
@@ -201,7 +233,8 @@ class Scenery:
         n = self.agent_lines.shape[1]
         own = torch.arange(self.n_envs, device=self.device) * n
         return Pieced(
-            (self.agent_lines.flatten(0, 1), static.vals), (own, static.starts[design]),
+            (self.agent_lines.flatten(0, 1), static.vals),
+            (own, static.starts[design]),
             (torch.full_like(own, n), static.widths[design]),
         )
 
@@ -210,20 +243,29 @@ class Scenery:
         """Per world, its lights (l, 3)."""
         design, static = self.design.long(), self.designs.lights
         zero = torch.zeros_like(design)
-        return Pieced((static.vals[:0], static.vals), (zero, static.starts[design]), (zero, static.widths[design]))
+        return Pieced(
+            (static.vals[:0], static.vals),
+            (zero, static.starts[design]),
+            (zero, static.widths[design]),
+        )
 
     @property
     def textures(self):
-        """Per line of all worlds, its texels (w, 3); line l of world e is line ``lines.starts[e] + l``."""
+        """Per line of all worlds, its texels (w, 3); line l of world e is line ``lines.starts[e] +
+        l``.
+        """
         own = self.designs.agent_textures
-        return self._by_line((own.flatten(0, 1), self.designs.textures.vals), self.design.long() * own.shape[1])
+        return self._by_line(
+            (own.flatten(0, 1), self.designs.textures.vals), self.design.long() * own.shape[1]
+        )
 
     @property
     def baked(self):
         """Per line of all worlds, the light on its texels (w,)."""
         own = self.agent_light
         return self._by_line(
-            (own.flatten(), self.designs.baked.vals), torch.arange(self.n_envs, device=self.device) * own.shape[1]
+            (own.flatten(), self.designs.baked.vals),
+            torch.arange(self.n_envs, device=self.device) * own.shape[1],
         )
 
     def _by_line(self, vals, agent_starts):
@@ -251,21 +293,28 @@ class Scenery:
         if not len(walls.vals):
             return Pieced(vals, (starts, zero), (widths, zero))
         return Pieced(
-            vals, (starts, torch.where(is_agent, zero, static.starts[wall])),
+            vals,
+            (starts, torch.where(is_agent, zero, static.starts[wall])),
             (widths, torch.where(is_agent, zero, static.widths[wall])),
         )
 
     def world(self, e):
-        """World ``e`` alone: (lines (L, 2, 2), a tuple of lit textures (w, 3) one a line, lights (l, 3)), the agents'
-        first. Cheap however many worlds there are.
+        """World ``e`` alone: (lines (L, 2, 2), a tuple of lit textures (w, 3) one a line, lights
+        (l, 3)), the agents' first. Cheap however many worlds there are.
         """
         designs, d = self.designs, int(self.design[e])
         lines = torch.cat([self.agent_lines[e], designs.lines[d]])
         first, last = int(designs.wall_starts[d]), int(designs.wall_starts[d + 1])
         bounds, own = designs.texel_starts[first : last + 1].tolist(), self.model_texels.tolist()
         agents = designs.agent_textures[d] * self.agent_light[e, :, None]
-        walls = designs.texels[bounds[0] : bounds[-1], :3] * designs.texels[bounds[0] : bounds[-1], 3:]
-        return lines, (*agents.split(_widths(own)), *walls.split(_widths(bounds))), designs.lights[d]
+        walls = (
+            designs.texels[bounds[0] : bounds[-1], :3] * designs.texels[bounds[0] : bounds[-1], 3:]
+        )
+        return (
+            lines,
+            (*agents.split(_widths(own)), *walls.split(_widths(bounds))),
+            designs.lights[d],
+        )
 
 
 def _widths(bounds):
@@ -281,7 +330,8 @@ def _bounds(widths):
     ends = widths.cumsum(0)
     if len(ends) and int(ends[-1]) >= 2**31:
         raise ValueError(
-            f'scenery holds at most 2,147,483,647 walls and texels of each kind, but {int(ends[-1])} were given: '
-            f'use fewer designs'
+            f"scenery holds at most 2,147,483,647 walls and texels of each kind, but "
+            f"{int(ends[-1])} were given: "
+            f"use fewer designs"
         )
     return torch.cat([ends.new_zeros(1), ends]).to(torch.int32)

@@ -1,7 +1,10 @@
-"""What observations and actions look like: a space, or a dotdict of spaces, says which numbers to expect.
+"""What observations and actions look like: a space, or a dotdict of spaces, says which numbers to
+expect.
 
-A space's ``shape`` is that of one lane, without the leading axis B. Heads turn spaces into network layers.
+A space's ``shape`` is that of one lane, without the leading axis B. Heads turn spaces into network
+layers.
 """
+
 from dataclasses import astuple, dataclass, fields
 
 
@@ -10,12 +13,16 @@ class _Space:
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f'{type(self).__name__} needs a positive whole number for {field.name}, not {value!r}')
+                raise ValueError(
+                    f"{type(self).__name__} needs a positive whole number for {field.name}, not "
+                    f"{value!r}"
+                )
 
 
 @dataclass(frozen=True)
 class MultiVector(_Space):
     """A vector of ``dim`` numbers for every agent: shape (n_agents, dim)."""
+
     n_agents: int
     dim: int
 
@@ -27,6 +34,7 @@ class MultiVector(_Space):
 @dataclass(frozen=True)
 class MultiImage(_Space):
     """A picture of C channels, H rows and W columns for every agent: shape (n_agents, C, H, W)."""
+
     n_agents: int
     C: int
     H: int
@@ -40,6 +48,7 @@ class MultiImage(_Space):
 @dataclass(frozen=True)
 class MultiDiscrete(_Space):
     """A whole number from 0 to ``n_actions`` - 1 for every agent: shape (n_agents,)."""
+
     n_agents: int
     n_actions: int
 

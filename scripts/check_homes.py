@@ -1,22 +1,29 @@
-"""What every home must be, by its walls and masks alone, on a raster of 5 cm; `make_homes.py` asks for it."""
+"""What every home must be, by its walls and masks alone, on a raster of 5 cm; `make_homes.py` asks
+for it.
+"""
+
 import numpy as np
 
 from megastep import geometry
 
-FINE = .05          # metres a cell
-RADIUS = .15/2**.5  # metres; an agent's
-GAP = .55           # metres; the least width of any passage
-SPAWN = .15         # metres; in each room some point is this far from all walls
-MOST_WALLS, LARGEST = 400, 40.
-LIT = .05           # metres; the least distance of a light from any wall
-LEAST_CELLS = 4     # of the masks, a room
+FINE = 0.05  # metres a cell
+RADIUS = 0.15 / 2**0.5  # metres; an agent's
+GAP = 0.55  # metres; the least width of any passage
+SPAWN = 0.15  # metres; in each room some point is this far from all walls
+MOST_WALLS, LARGEST = 400, 40.0
+LIT = 0.05  # metres; the least distance of a light from any wall
+LEAST_CELLS = 4  # of the masks, a room
 
 
 def components(free):
-    """Labels (H, W) of the 4-connected components of bool (H, W) cells, 0 where not free, and how many there are."""
+    """Labels (H, W) of the 4-connected components of bool (H, W) cells, 0 where not free, and how
+    many there are.
+    """
     edges = np.diff(np.pad(free, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     (row, start), end = np.nonzero(edges == 1), np.nonzero(edges == -1)[1]
-    first = np.searchsorted(row, np.arange(len(free) + 1))      # the runs of free cells, and each row's first one
+    first = np.searchsorted(
+        row, np.arange(len(free) + 1)
+    )  # the runs of free cells, and each row's first one
     parents = list(range(len(row)))
 
     def root(run):
@@ -36,19 +43,23 @@ def components(free):
     return result, labels.max(initial=-1) + 1
 
 
-def clearance(g, most=.3):
-    """The distance in metres, up to `most`, from each cell's centre on the fine raster to the nearest wall."""
-    ratio = round(g.res/FINE)
-    height, width = g.masks.shape[0]*ratio, g.masks.shape[1]*ratio
+def clearance(g, most=0.3):
+    """The distance in metres, up to `most`, from each cell's centre on the fine raster to the
+    nearest wall.
+    """
+    ratio = round(g.res / FINE)
+    height, width = g.masks.shape[0] * ratio, g.masks.shape[1] * ratio
     distance = np.full((height, width), most)
-    x, y = (np.arange(width) + .5)*FINE, (height - np.arange(height) - .5)*FINE
+    x, y = (np.arange(width) + 0.5) * FINE, (height - np.arange(height) - 0.5) * FINE
     for (ax, ay), (bx, by) in g.walls.astype(float):
         columns = slice(*np.searchsorted(x, (min(ax, bx) - most, max(ax, bx) + most)))
         rows = slice(*np.searchsorted(-y, (-max(ay, by) - most, -min(ay, by) + most)))
         px, py = x[None, columns] - ax, y[rows, None] - ay
         dx, dy = bx - ax, by - ay
-        along = np.clip((px*dx + py*dy)/max(dx*dx + dy*dy, 1e-12), 0, 1)
-        distance[rows, columns] = np.minimum(distance[rows, columns], np.hypot(px - along*dx, py - along*dy))
+        along = np.clip((px * dx + py * dy) / max(dx * dx + dy * dy, 1e-12), 0, 1)
+        distance[rows, columns] = np.minimum(
+            distance[rows, columns], np.hypot(px - along * dx, py - along * dy)
+        )
     return distance
 
 
@@ -62,8 +73,11 @@ def faults(g):
     """Sentences on what is wrong with a home, none if it is as it must be."""
     found = []
     walls = g.walls.reshape(-1, 4)
-    canonical = np.where((walls[:, :2] > walls[:, 2:]).any(-1)[:, None] & (walls[:, 0] >= walls[:, 2])[:, None],
-                         walls[:, [2, 3, 0, 1]], walls)
+    canonical = np.where(
+        (walls[:, :2] > walls[:, 2:]).any(-1)[:, None] & (walls[:, 0] >= walls[:, 2])[:, None],
+        walls[:, [2, 3, 0, 1]],
+        walls,
+    )
     if not np.isfinite(walls).all() or (walls[:, :2] == walls[:, 2:]).all(-1).any():
         found.append("a wall is not finite or has no length")
     if len(np.unique(canonical, axis=0)) < len(walls):
@@ -81,9 +95,9 @@ def faults(g):
         found.append("the envelope is open")
 
     distance = clearance(g)
-    ratio = round(g.res/FINE)
+    ratio = round(g.res / FINE)
     fine = np.maximum(g.masks, 0).repeat(ratio, 0).repeat(ratio, 1)
-    for radius, what in (RADIUS, "an agent"), (GAP/2, "a disc as wide as the least gap"):
+    for radius, what in (RADIUS, "an agent"), (GAP / 2, "a disc as wide as the least gap"):
         if not _reaches(components(distance > radius - 1e-3)[0], fine):
             found.append(f"{what} cannot reach every room")
     if any(not (distance[fine == room] >= SPAWN).any() for room in range(1, rooms + 1)):

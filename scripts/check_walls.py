@@ -2,16 +2,17 @@
 
     python scripts/check_walls.py --steps 1e9 --device auto
 
-Prints a line a course and a last one with the sums. The exit status is 1 if anyone passed a wall, sank into one or got
-stuck; the first few are then told in full, floats to the last bit.
+Prints a line a course and a last one with the sums. The exit status is 1 if anyone passed a wall,
+sank into one or got stuck; the first few are then told in full, floats to the last bit.
 """
+
 import argparse
 import sys
 import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]/'tests'))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import walls
 
@@ -21,21 +22,34 @@ EVERY = 10  # seconds between lines within a course
 
 
 def sentence(total, seconds):
-    return (f'{total["steps"]:,} steps, {total["collisions"]:,} collisions, {total["crossings"]:,} crossings, '
-            f'{total["sunk"]:,} sunk, {total["stuck"]:,} stuck of {total["tried"]:,} tried '
-            f'({total["held"]:,} more held by geometry), {seconds:.1f} s')
+    return (
+        f"{total['steps']:,} steps, {total['collisions']:,} collisions, {total['crossings']:,} "
+        f"crossings, "
+        f"{total['sunk']:,} sunk, {total['stuck']:,} stuck of {total['tried']:,} tried "
+        f"({total['held']:,} more held by geometry), {seconds:.1f} s"
+    )
 
 
 def arguments():
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
-    parser.add_argument('--steps', type=float, default=1e7, help='agent-steps in all, say 1e9')
-    parser.add_argument('--device', default='auto', help='auto, cpu, cuda')
-    parser.add_argument('--agents', type=int, default=None, help='at once at most; 2,048 on a CPU, 1,048,576 on a GPU')
-    parser.add_argument('--tries', type=int, default=1024, help='stopped agents that try to leave after each 16 steps')
-    parser.add_argument('--seed', type=int, default=0)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--steps", type=float, default=1e7, help="agent-steps in all, say 1e9")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda")
+    parser.add_argument(
+        "--agents",
+        type=int,
+        default=None,
+        help="at once at most; 2,048 on a CPU, 1,048,576 on a GPU",
+    )
+    parser.add_argument(
+        "--tries",
+        type=int,
+        default=1024,
+        help="stopped agents that try to leave after each 16 steps",
+    )
+    parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     if not 1 <= args.steps < 1e15:
-        parser.error(f'--steps {args.steps:g} is not allowed: take 1 to 1e15')
+        parser.error(f"--steps {args.steps:g} is not allowed: take 1 to 1e15")
     return args
 
 
@@ -44,10 +58,10 @@ def main():
     try:
         device = engine.device(args.device)
     except engine.EngineError as fault:
-        print(f'check_walls.py: {fault}', file=sys.stderr)
+        print(f"check_walls.py: {fault}", file=sys.stderr)
         return 2
-    n_agents = args.agents or (2048 if device.type == 'cpu' else 1 << 20)
-    share = -(-int(args.steps)//len(walls.COURSES))
+    n_agents = args.agents or (2048 if device.type == "cpu" else 1 << 20)
+    share = -(-int(args.steps) // len(walls.COURSES))
     start, sums, stories = time.time(), {}, []
     for name in walls.COURSES:
         began = last = time.time()
@@ -56,17 +70,17 @@ def main():
             nonlocal last
             if time.time() - last > EVERY:
                 last = time.time()
-                print(f'{name} so far: {sentence(total, last - began)}', flush=True)
+                print(f"{name} so far: {sentence(total, last - began)}", flush=True)
 
         total = walls.run(name, share, n_agents, device, args.seed, args.tries, report)
-        print(f'{name}: {sentence(total, time.time() - began)}', flush=True)
-        stories += total['stories'][:3]
+        print(f"{name}: {sentence(total, time.time() - began)}", flush=True)
+        stories += total["stories"][:3]
         sums = {key: sums.get(key, 0) + total[key] for key in total if isinstance(total[key], int)}
     for story in stories[:12]:
         print(story)
-    print(f'all on {device}: {sentence(sums, time.time() - start)}')
-    return int(any(sums[key] for key in ('crossings', 'sunk', 'stuck')))
+    print(f"all on {device}: {sentence(sums, time.time() - start)}")
+    return int(any(sums[key] for key in ("crossings", "sunk", "stuck")))
 
 
-if __name__ == '__main__':
+if __name__ == "__main__":
     sys.exit(main())

@@ -1,7 +1,9 @@
 """Every operation of the engine on a small world, for NVIDIA's checkers:
 
-    for tool in memcheck racecheck initcheck; do compute-sanitizer --tool $tool python scripts/sanitize.py; done
+for tool in memcheck racecheck initcheck; do compute-sanitizer --tool $tool python
+scripts/sanitize.py; done
 """
+
 import sys
 from pathlib import Path
 
@@ -15,25 +17,29 @@ from megastep.modules import RandomSpawns
 
 
 def main():
-    homes = sample('bench', 3)
+    homes = sample("bench", 3)
     for n_agents, res, cameras in [(1, 63, None), (4, 96, [0, 120, 240])]:
-        c = core.Core(scene.scenery(homes, n_agents, n_envs=5, device='cuda'), res=res, cameras=cameras)
+        c = core.Core(
+            scene.scenery(homes, n_agents, n_envs=5, device="cuda"), res=res, cameras=cameras
+        )
         spawn = RandomSpawns(homes, c, resample=True)
         words = -(-c.scenery.designs.most_texels // 32)
-        seen = torch.zeros((5, n_agents, words), dtype=torch.int32, device='cuda')
+        seen = torch.zeros((5, n_agents, words), dtype=torch.int32, device="cuda")
         for _ in range(3):
             spawn(c.agent_full(True))
-            c.agents.velocity.fill_(3.)
+            c.agents.velocity.fill_(3.0)
             engine.physics(c.scenery, c.agents)
-            engine.observe(c.scenery, c.agents, 3, imu=True, middle=True, seen=seen, forget=c.agent_full(False))
+            engine.observe(
+                c.scenery, c.agents, 3, imu=True, middle=True, seen=seen, forget=c.agent_full(False)
+            )
             engine.render(c.scenery, c.agents)
-    for env in (envs.Explorer(7, homes, device='cuda'), envs.Minimal(7, homes, device='cuda')):
+    for env in (envs.Explorer(7, homes, device="cuda"), envs.Minimal(7, homes, device="cuda")):
         env.reset()
         for action in range(7):
-            env.step(arrdict.arrdict(actions=torch.full((7, 1), action, device='cuda')))
+            env.step(arrdict.arrdict(actions=torch.full((7, 1), action, device="cuda")))
     torch.cuda.synchronize()
-    print('done')
+    print("done")
 
 
-if __name__ == '__main__':
+if __name__ == "__main__":
     main()

@@ -1,7 +1,8 @@
 """Draws a sheet of homes, all at one scale, as a picture.
 
-    python scripts/show_homes.py homes.png --first 0 --count 20
+python scripts/show_homes.py homes.png --first 0 --count 20
 """
+
 import argparse
 import sys
 from pathlib import Path
@@ -18,24 +19,41 @@ from megastep import geometry
 from megastep.geometries import homes
 
 COLUMNS = 5
-LABELS = {"living": "living", "bath": "bath", "entry": "entry", "bedroom": "bed", "kitchen": "kitchen", "lobby": "lob",
-          "closet": "clo", "storage": "sto", "utility": "util", "room": "room"}
+LABELS = {
+    "living": "living",
+    "bath": "bath",
+    "entry": "entry",
+    "bedroom": "bed",
+    "kitchen": "kitchen",
+    "lobby": "lob",
+    "closet": "clo",
+    "storage": "sto",
+    "utility": "util",
+    "room": "room",
+}
 
 
 def sheet(seeds):
-    """A figure with the plans of the homes of these seeds, each room named and the corner at the same place."""
+    """A figure with the plans of the homes of these seeds, each room named and the corner at the
+    same place.
+    """
     made = [homes.generate(seed) for seed in seeds]
-    rows = -(-len(made)//COLUMNS)
-    figure, axes = plt.subplots(rows, COLUMNS, figsize=(4*COLUMNS, 4*rows), squeeze=False, layout="constrained")
+    rows = -(-len(made) // COLUMNS)
+    figure, axes = plt.subplots(
+        rows, COLUMNS, figsize=(4 * COLUMNS, 4 * rows), squeeze=False, layout="constrained"
+    )
     side = max(np.ptp(g.walls, axis=(0, 1)).max() for g in made) + 1
     for ax in axes.flat:
         ax.set_axis_off()
     for g, ax in zip(made, axes.flat):
         geometry.display(g, ax)
-        ax.set(xlim=(.5, side + .5), ylim=(.5, side + .5))
-        ax.set_title(f"home {g.id}: {sum(g.areas):.0f} m², {len(g.rooms)} rooms, {len(g.walls)} walls", fontsize=9)
+        ax.set(xlim=(0.5, side + 0.5), ylim=(0.5, side + 0.5))
+        ax.set_title(
+            f"home {g.id}: {sum(g.areas):.0f} m², {len(g.rooms)} rooms, {len(g.walls)} walls",
+            fontsize=9,
+        )
         for kind, (x, y), area in zip(g.rooms, g.lights, g.areas):
-            ax.text(x, y - .2, LABELS[kind], ha="center", va="top", fontsize=5 + 2*(area > 4))
+            ax.text(x, y - 0.2, LABELS[kind], ha="center", va="top", fontsize=5 + 2 * (area > 4))
     return figure
 
 

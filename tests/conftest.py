@@ -1,4 +1,5 @@
 """What all tests share: one thread a process, no screen, and no GPU tests where there is no GPU."""
+
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")

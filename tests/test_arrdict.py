@@ -1,4 +1,5 @@
 """Trees of arrays: indexing, operators, joining, converting, and torch's tree utilities."""
+
 import copy
 import operator
 import pickle
@@ -14,8 +15,26 @@ from megastep.arrdict import arrdict, cat, clone, leaves, numpyify, stack, torch
 from megastep.dotdict import dotdict
 from megastep.ragged import Ragged
 
-NAMES = ('add', 'sub', 'mul', 'truediv', 'floordiv', 'mod', 'pow', 'lshift', 'rshift', 'and_', 'or_', 'xor',
-         'lt', 'le', 'eq', 'ne', 'ge', 'gt')
+NAMES = (
+    "add",
+    "sub",
+    "mul",
+    "truediv",
+    "floordiv",
+    "mod",
+    "pow",
+    "lshift",
+    "rshift",
+    "and_",
+    "or_",
+    "xor",
+    "lt",
+    "le",
+    "eq",
+    "ne",
+    "ge",
+    "gt",
+)
 
 
 @pytest.fixture
@@ -25,37 +44,46 @@ def tensors():
 
 def numbers(tree):
     """A tree with its arrays as nested lists, so that == is one bool."""
-    return {key: numbers(value) if isinstance(value, dict) else np.asarray(value).tolist()
-            for key, value in tree.items()}
+    return {
+        key: numbers(value) if isinstance(value, dict) else np.asarray(value).tolist()
+        for key, value in tree.items()
+    }
 
 
 def test_printing_shows_shape_and_dtype(tensors):
-    assert repr(tensors) == '\n'.join([
-        'arrdict:',
-        'a    Tensor((1,), torch.int64)',
-        'b    arrdict:',
-        '     c    Tensor((1,), torch.int64)'])
-    assert repr(arrdict(x=np.zeros((2, 3), np.float32))) == 'arrdict:\nx    ndarray((2, 3), float32)'
+    assert repr(tensors) == "\n".join(
+        [
+            "arrdict:",
+            "a    Tensor((1,), torch.int64)",
+            "b    arrdict:",
+            "     c    Tensor((1,), torch.int64)",
+        ]
+    )
+    assert (
+        repr(arrdict(x=np.zeros((2, 3), np.float32))) == "arrdict:\nx    ndarray((2, 3), float32)"
+    )
 
 
 def test_indexing_goes_to_the_leaves():
     tree = arrdict(a=torch.arange(6).view(2, 3), b=dotdict(c=torch.arange(4).view(2, 2)))
-    assert numbers(tree[1]) == {'a': [3, 4, 5], 'b': {'c': [2, 3]}}
-    assert numbers(tree[:, -1]) == {'a': [2, 5], 'b': {'c': [1, 3]}}
-    assert numbers(tree[torch.tensor([False, True])]) == {'a': [[3, 4, 5]], 'b': {'c': [[2, 3]]}}
+    assert numbers(tree[1]) == {"a": [3, 4, 5], "b": {"c": [2, 3]}}
+    assert numbers(tree[:, -1]) == {"a": [2, 5], "b": {"c": [1, 3]}}
+    assert numbers(tree[torch.tensor([False, True])]) == {"a": [[3, 4, 5]], "b": {"c": [[2, 3]]}}
     assert tree[..., None].a.shape == (2, 3, 1)
     assert type(tree[0]) is arrdict and type(tree[0].b) is dotdict
 
 
 def test_a_tree_of_indices_indexes_leaf_by_leaf():
     tree = arrdict(a=torch.tensor([1, 2]), b=torch.tensor([3, 4]))
-    assert numbers(tree[arrdict(a=0, b=1)]) == {'a': 1, 'b': 4}
+    assert numbers(tree[arrdict(a=0, b=1)]) == {"a": 1, "b": 4}
 
 
 def test_assigning_to_an_index_writes_in_place():
     a, c = torch.zeros(3), torch.zeros(3, 2)
     tree = arrdict(a=a, b=arrdict(c=c))
-    tree[torch.tensor([True, False, True])] = arrdict(a=torch.tensor([1., 2.]), b=arrdict(c=torch.ones(2, 2)))
+    tree[torch.tensor([True, False, True])] = arrdict(
+        a=torch.tensor([1.0, 2.0]), b=arrdict(c=torch.ones(2, 2))
+    )
     assert a.tolist() == [1, 0, 2] and c.tolist() == [[1, 1], [0, 0], [1, 1]]
     tree[1] = 7
     assert a.tolist() == [1, 7, 2] and c[1].tolist() == [7, 7]
@@ -63,38 +91,44 @@ def test_assigning_to_an_index_writes_in_place():
 
 def test_assigning_a_tree_of_other_keys_is_refused_before_any_write():
     tree = arrdict(a=torch.zeros(2), b=torch.zeros(2))
-    with pytest.raises(ValueError, match='one has a, b and the other a'):
-        tree[0] = arrdict(a=1.)
+    with pytest.raises(ValueError, match="one has a, b and the other a"):
+        tree[0] = arrdict(a=1.0)
     assert tree.a.tolist() == [0, 0]
 
 
 def test_string_keys_are_items(tensors):
-    tensors['d'] = 5
-    assert tensors['d'] == tensors.d == 5
-    with pytest.raises(KeyError, match='its keys are a, b, d'):
-        tensors['e']
+    tensors["d"] = 5
+    assert tensors["d"] == tensors.d == 5
+    with pytest.raises(KeyError, match="its keys are a, b, d"):
+        tensors["e"]
 
 
-@pytest.mark.parametrize('name', NAMES)
-@pytest.mark.parametrize('kind', [torch.tensor, np.array])
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kind", [torch.tensor, np.array])
 def test_operators_act_leaf_by_leaf_on_either_side(name, kind):
     op = getattr(operator, name)
     x, y = kind([5, 6]), kind([2, 1])
     left, right = arrdict(a=x, b=arrdict(c=y)), arrdict(a=y, b=arrdict(c=y))
-    assert numbers(op(left, right)) == {'a': op(x, y).tolist(), 'b': {'c': op(y, y).tolist()}}
+    assert numbers(op(left, right)) == {"a": op(x, y).tolist(), "b": {"c": op(y, y).tolist()}}
     for other in (3, kind([3, 4]), kind(3), np.int64(3)):
-        assert numbers(op(left, other)) == {'a': op(x, other).tolist(), 'b': {'c': op(y, other).tolist()}}, other
-        assert numbers(op(other, left)) == {'a': op(other, x).tolist(), 'b': {'c': op(other, y).tolist()}}, other
+        assert numbers(op(left, other)) == {
+            "a": op(x, other).tolist(),
+            "b": {"c": op(y, other).tolist()},
+        }, other
+        assert numbers(op(other, left)) == {
+            "a": op(other, x).tolist(),
+            "b": {"c": op(other, y).tolist()},
+        }, other
         assert type(op(other, left)) is arrdict
 
 
 def test_matrix_products_and_divmod():
-    tree = arrdict(a=np.array([[1., 2.], [3., 4.]]))
-    swap = np.array([[0., 1.], [1., 0.]])
+    tree = arrdict(a=np.array([[1.0, 2.0], [3.0, 4.0]]))
+    swap = np.array([[0.0, 1.0], [1.0, 0.0]])
     assert (tree @ swap).a.tolist() == [[2, 1], [4, 3]]
     assert (swap @ tree).a.tolist() == [[3, 4], [1, 2]]
-    assert divmod(arrdict(a=7), 2) == {'a': (3, 1)}
-    assert divmod(7, arrdict(a=2)) == {'a': (3, 1)}
+    assert divmod(arrdict(a=7), 2) == {"a": (3, 1)}
+    assert divmod(7, arrdict(a=2)) == {"a": (3, 1)}
 
 
 def test_signs_and_complements():
@@ -114,20 +148,24 @@ def test_updating_operators_rebind_and_leave_the_operand_alone():
 
 
 def test_operands_of_other_keys_are_refused(tensors):
-    with pytest.raises(ValueError, match='one has a, b and the other a'):
+    with pytest.raises(ValueError, match="one has a, b and the other a"):
         tensors + arrdict(a=1)
 
 
 def test_forwarded_attributes_and_calls(tensors):
-    assert tensors.shape == {'a': (1,), 'b': {'c': (1,)}}
+    assert tensors.shape == {"a": (1,), "b": {"c": (1,)}}
     assert tensors.float().b.c.dtype == torch.float32
-    assert repr((tensors + tensors)[0].item()) == 'arrdict:\na    2\nb    arrdict:\n     c    4'
+    assert repr((tensors + tensors)[0].item()) == "arrdict:\na    2\nb    arrdict:\n     c    4"
 
 
 def test_stack_makes_a_new_axis_and_cat_extends_one():
     trees = [arrdict(a=torch.full((2, 3), i), b=arrdict(c=np.full(4, i)), n=i) for i in range(5)]
     stacked = stack(trees)
-    assert stacked.a.shape == (5, 2, 3) and stacked.b.c.shape == (5, 4) and stacked.n.tolist() == [0, 1, 2, 3, 4]
+    assert (
+        stacked.a.shape == (5, 2, 3)
+        and stacked.b.c.shape == (5, 4)
+        and stacked.n.tolist() == [0, 1, 2, 3, 4]
+    )
     assert stacked.b.c[:, 0].tolist() == [0, 1, 2, 3, 4]
     assert type(stacked) is arrdict and type(stacked.b) is arrdict
     assert stack([torch.zeros(2), torch.ones(2)], dim=1).tolist() == [[0, 1], [0, 1]]
@@ -137,44 +175,78 @@ def test_stack_makes_a_new_axis_and_cat_extends_one():
 
 
 def test_joining_nothing_or_unlike_trees_is_refused():
-    with pytest.raises(ValueError, match='stack was given no trees'):
+    with pytest.raises(ValueError, match="stack was given no trees"):
         stack([])
-    with pytest.raises(ValueError, match='one has a and the other b'):
+    with pytest.raises(ValueError, match="one has a and the other b"):
         cat([arrdict(a=torch.zeros(1)), arrdict(b=torch.zeros(1))])
 
 
 def test_torchify_halves_only_float64():
-    tree = torchify(arrdict(d=np.zeros(2), f=np.zeros(2, np.float32), h=np.zeros(2, np.float16), i=np.arange(2),
-                            b=np.array([True]), n=3, r=Ragged(np.arange(3.), [1, 2])))
-    assert {key: leaf.dtype for key, leaf in tree.items() if key != 'r'} == dict(
-        d=torch.float32, f=torch.float32, h=torch.float16, i=torch.int64, b=torch.bool, n=torch.int64)
+    tree = torchify(
+        arrdict(
+            d=np.zeros(2),
+            f=np.zeros(2, np.float32),
+            h=np.zeros(2, np.float16),
+            i=np.arange(2),
+            b=np.array([True]),
+            n=3,
+            r=Ragged(np.arange(3.0), [1, 2]),
+        )
+    )
+    assert {key: leaf.dtype for key, leaf in tree.items() if key != "r"} == dict(
+        d=torch.float32,
+        f=torch.float32,
+        h=torch.float16,
+        i=torch.int64,
+        b=torch.bool,
+        n=torch.int64,
+    )
     assert tree.r.vals.dtype == torch.float32
-    with pytest.raises(ValueError, match='cannot make a tensor of a value of type str'):
-        torchify(arrdict(s='word'))
+    with pytest.raises(ValueError, match="cannot make a tensor of a value of type str"):
+        torchify(arrdict(s="word"))
 
 
 def test_numpyify_reaches_lists_and_leaves_the_rest():
-    tree = numpyify(dotdict(t=torch.ones(2, requires_grad=True), h=torch.ones(2, dtype=torch.bfloat16), s='word',
-                            n=None, many=(torch.zeros(1), [torch.ones(1)]), r=Ragged(torch.arange(3.), [1, 2])))
+    tree = numpyify(
+        dotdict(
+            t=torch.ones(2, requires_grad=True),
+            h=torch.ones(2, dtype=torch.bfloat16),
+            s="word",
+            n=None,
+            many=(torch.zeros(1), [torch.ones(1)]),
+            r=Ragged(torch.arange(3.0), [1, 2]),
+        )
+    )
     assert isinstance(tree.t, np.ndarray) and tree.h.dtype == np.float32
-    assert tree.s == 'word' and tree.n is None and tree.r[1].tolist() == [1, 2]
+    assert tree.s == "word" and tree.n is None and tree.r[1].tolist() == [1, 2]
     assert isinstance(tree.many[0], np.ndarray) and isinstance(tree.many[1][0], np.ndarray)
 
 
 def test_there_and_back_changes_nothing():
-    tree = arrdict(h=torch.rand(3).half(), i=torch.arange(3, dtype=torch.int16), b=arrdict(m=torch.tensor([True])))
+    tree = arrdict(
+        h=torch.rand(3).half(),
+        i=torch.arange(3, dtype=torch.int16),
+        b=arrdict(m=torch.tensor([True])),
+    )
     back = torchify(numpyify(tree))
-    assert all(torch.equal(x, y) and x.dtype == y.dtype for x, y in zip(leaves(tree), leaves(back), strict=True))
+    assert all(
+        torch.equal(x, y) and x.dtype == y.dtype
+        for x, y in zip(leaves(tree), leaves(back), strict=True)
+    )
 
 
 def test_clones_share_no_memory():
-    tree = arrdict(t=torch.zeros(2), n=np.zeros(2), b=arrdict(r=Ragged(torch.zeros(2), [2])), list=[1])
+    tree = arrdict(
+        t=torch.zeros(2), n=np.zeros(2), b=arrdict(r=Ragged(torch.zeros(2), [2])), list=[1]
+    )
     made = clone(tree)
-    made.t[0] = made.n[0] = made.b.r.vals[0] = made['list'][0] = 9
-    assert tree.t[0] == tree.n[0] == tree.b.r.vals[0] == 0 and tree['list'] == [1]
+    made.t[0] = made.n[0] = made.b.r.vals[0] = made["list"][0] = 9
+    assert tree.t[0] == tree.n[0] == tree.b.r.vals[0] == 0 and tree["list"] == [1]
 
 
-@pytest.mark.parametrize('trip', [copy.copy, copy.deepcopy, lambda tree: pickle.loads(pickle.dumps(tree))])
+@pytest.mark.parametrize(
+    "trip", [copy.copy, copy.deepcopy, lambda tree: pickle.loads(pickle.dumps(tree))]
+)
 def test_copies_keep_type_and_values(tensors, trip):
     made = trip(tensors)
     assert type(made) is arrdict and type(made.b) is arrdict and numbers(made) == numbers(tensors)
@@ -189,7 +261,7 @@ def test_worker_processes_send_trees_back_unchanged(tensors):
     assert type(made.b) is arrdict and numbers(made) == numbers(tensors)
 
 
-@pytest.mark.parametrize('kind', [arrdict, dotdict])
+@pytest.mark.parametrize("kind", [arrdict, dotdict])
 def test_torchs_tree_utilities_keep_the_type(kind):
     tree = kind(a=torch.tensor([1]), b=kind(c=torch.tensor([2])))
     made = _pytree.tree_map(lambda x: x + 1, tree)
@@ -204,14 +276,18 @@ def test_torch_compile_takes_and_returns_trees():
         return arrdict(total=total, tree=tree, parts=dotdict(x=total[0]))
 
     torch._dynamo.reset()
-    out = torch.compile(f, backend='eager')(arrdict(a=torch.tensor([1.]), b=arrdict(c=torch.tensor([2.]))))
+    out = torch.compile(f, backend="eager")(
+        arrdict(a=torch.tensor([1.0]), b=arrdict(c=torch.tensor([2.0])))
+    )
     assert type(out) is arrdict and type(out.tree) is arrdict and type(out.parts) is dotdict
     assert out.total.tolist() == [4] and out.tree.b.c.tolist() == [2] and out.parts.x == 4
 
 
 def test_torch_compile_takes_tree_arithmetic():
     torch._dynamo.reset()
-    out = torch.compile(lambda tree: (1 + tree * tree)[0].float(), backend='eager')(arrdict(a=torch.tensor([3, 4])))
+    out = torch.compile(lambda tree: (1 + tree * tree)[0].float(), backend="eager")(
+        arrdict(a=torch.tensor([3, 4]))
+    )
     assert type(out) is arrdict and out.a.item() == 10
 
 

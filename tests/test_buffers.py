@@ -1,4 +1,7 @@
-"""Rollouts: a world made of numbers that say which lane, time and key they are, followed through collect and lanes."""
+"""Rollouts: a world made of numbers that say which lane, time and key they are, followed through
+collect and lanes.
+"""
+
 import pytest
 import torch
 
@@ -12,8 +15,13 @@ B, T = 6, 5
 
 
 class Telltale:
-    """Every number is 100 * lane + time, plus a tenth for each key; lane b ends at times divisible by b + 2."""
-    obs_space = arrdict(eye=spaces.MultiImage(1, 1, 1, 2), rest=arrdict(imu=spaces.MultiVector(1, 3)))
+    """Every number is 100 * lane + time, plus a tenth for each key; lane b ends at times divisible
+    by b + 2.
+    """
+
+    obs_space = arrdict(
+        eye=spaces.MultiImage(1, 1, 1, 2), rest=arrdict(imu=spaces.MultiVector(1, 3))
+    )
     action_space = arrdict(move=spaces.MultiDiscrete(1, 7), fire=spaces.MultiDiscrete(1, 2))
 
     def __init__(self):
@@ -33,17 +41,26 @@ class Telltale:
         return torch.tensor([time > 0 and time % (b + 2) == 0 for b in range(B)])
 
     def label(self, time):
-        return 100. * torch.arange(B) + time
+        return 100.0 * torch.arange(B) + time
 
     def _world(self, reset):
         label, ended = self.label(self.time), self.ends(self.time) & ~reset
         if self.obs is None:
-            self.obs = arrdict(eye=torch.zeros(B, 1, 1, 1, 2), rest=arrdict(imu=torch.zeros(B, 1, 3)))
-        self.obs.eye[:] = label.view(B, 1, 1, 1, 1)  # in the same memory every time, as an engine would
-        self.obs.rest.imu[:] = label.view(B, 1, 1) + .5
+            self.obs = arrdict(
+                eye=torch.zeros(B, 1, 1, 1, 2), rest=arrdict(imu=torch.zeros(B, 1, 3))
+            )
+        self.obs.eye[:] = label.view(
+            B, 1, 1, 1, 1
+        )  # in the same memory every time, as an engine would
+        self.obs.rest.imu[:] = label.view(B, 1, 1) + 0.5
         odd = torch.arange(B) % 2 == 1
         return arrdict(
-            obs=self.obs, reset=reset, reward=label + .25, terminal=ended & odd, truncated=ended & ~odd)
+            obs=self.obs,
+            reset=reset,
+            reward=label + 0.25,
+            terminal=ended & odd,
+            truncated=ended & ~odd,
+        )
 
 
 def collected(n_rollouts=1, dtype=torch.float32):
@@ -56,18 +73,20 @@ def collected(n_rollouts=1, dtype=torch.float32):
     return env, policy, rollout, carry
 
 
-@pytest.mark.parametrize('n_rollouts', [1, 3])
+@pytest.mark.parametrize("n_rollouts", [1, 3])
 def test_rows_hold_what_was_seen_and_what_followed(n_rollouts):
     env, _, rollout, _ = collected(n_rollouts)
     first = (n_rollouts - 1) * T
     for row in range(T + 1):
         time = first + row
         assert torch.equal(rollout.obs.eye[row, :, 0, 0, 0, 1], env.label(time))
-        assert torch.equal(rollout.obs.rest.imu[row, :, 0, 2], env.label(time) + .5)
-        assert torch.equal(rollout.starts[row], env.ends(time - 1) if time else torch.ones(B, dtype=torch.bool))
+        assert torch.equal(rollout.obs.rest.imu[row, :, 0, 2], env.label(time) + 0.5)
+        assert torch.equal(
+            rollout.starts[row], env.ends(time - 1) if time else torch.ones(B, dtype=torch.bool)
+        )
     for row in range(T):
         time = first + row
-        assert torch.equal(rollout.reward[row], env.label(time + 1) + .25)
+        assert torch.equal(rollout.reward[row], env.label(time + 1) + 0.25)
         assert torch.equal(rollout.reset[row], env.ends(time))
         ended = env.ends(time + 1) & ~env.ends(time)
         assert torch.equal(rollout.terminal[row] | rollout.truncated[row], ended)
@@ -106,15 +125,15 @@ def test_probabilities_and_values_are_those_of_an_unroll_over_what_was_written()
 
 def test_a_minibatch_joins_the_rows_of_its_lanes():
     _, _, rollout, _ = collected(n_rollouts=2)
-    rollout.logprobs[:] = torch.arange(T)[:, None] + 100. * torch.arange(B)
+    rollout.logprobs[:] = torch.arange(T)[:, None] + 100.0 * torch.arange(B)
     rollout.state.cell[:] = torch.arange(B)[:, None].float()
     rows = torch.tensor([4, 1, 2])
     batch = rollout.lanes(rows)
     for i, b in enumerate(rows.tolist()):
-        lane = 100. * b + T + torch.arange(T)
+        lane = 100.0 * b + T + torch.arange(T)
         assert torch.equal(batch.obs.eye[:, i, 0, 0, 0, 0], lane)
-        assert torch.equal(batch.obs.rest.imu[:, i, 0, 0], lane + .5)
-        assert torch.equal(batch.logprobs[:, i], 100. * b + torch.arange(T))
+        assert torch.equal(batch.obs.rest.imu[:, i, 0, 0], lane + 0.5)
+        assert torch.equal(batch.logprobs[:, i], 100.0 * b + torch.arange(T))
         assert torch.equal(batch.actions.move[:, i], rollout.actions.move[:, b])
         assert torch.equal(batch.starts[:, i], rollout.starts[:-1, b])
         assert torch.equal(batch.value[:, i], rollout.values[:-1, b])
@@ -123,7 +142,7 @@ def test_a_minibatch_joins_the_rows_of_its_lanes():
 
 def test_an_outcome_is_what_returns_are_computed_from():
     env, _, rollout, _ = collected(n_rollouts=2)
-    judged = gae(**rollout.outcome(), gamma=0., lambda_=1.)
+    judged = gae(**rollout.outcome(), gamma=0.0, lambda_=1.0)
     assert torch.equal(judged.valid, ~rollout.reset)
     # With gamma 0 an advantage is the reward that followed less the value before
     expected = (rollout.reward - rollout.values[:-1]) * ~rollout.reset
@@ -132,7 +151,9 @@ def test_an_outcome_is_what_returns_are_computed_from():
 
 def test_the_same_seed_collects_the_same():
     (_, _, first, _), (_, _, second, _) = collected(2), collected(2)
-    assert torch.equal(first.actions.move, second.actions.move) and torch.equal(first.values, second.values)
+    assert torch.equal(first.actions.move, second.actions.move) and torch.equal(
+        first.values, second.values
+    )
 
 
 def test_pictures_are_kept_in_half_precision_and_whole_numbers_whole():
@@ -143,5 +164,5 @@ def test_pictures_are_kept_in_half_precision_and_whole_numbers_whole():
 
 
 def test_a_rollout_of_nothing_is_refused():
-    with pytest.raises(ValueError, match='not 0 and 6'):
+    with pytest.raises(ValueError, match="not 0 and 6"):
         buffers.Rollout(0, B, Telltale.obs_space, Telltale.action_space)

@@ -1,4 +1,7 @@
-"""Checkpoints: whole or absent, and damage is named. The damage here is done for real, to files on the disk."""
+"""Checkpoints: whole or absent, and damage is named. The damage here is done for real, to files on
+the disk.
+"""
+
 import errno
 import json
 import os
@@ -16,7 +19,13 @@ CONFIG = {"env": {"name": "box"}}
 
 
 def state(n):
-    return {"weights": {"w": torch.full((1000,), float(n))}, "samples": n, "rate": .5, "none": None, "list": [1, 2]}
+    return {
+        "weights": {"w": torch.full((1000,), float(n))},
+        "samples": n,
+        "rate": 0.5,
+        "none": None,
+        "list": [1, 2],
+    }
 
 
 @pytest.fixture
@@ -34,8 +43,8 @@ def names(folder):
 def test_what_was_saved_is_loaded(folder):
     loaded = checkpoint.load(folder)
     assert loaded.step == 30 and loaded.config == CONFIG and loaded.path == folder / "step_30"
-    assert torch.equal(loaded.state.pop("weights")["w"], torch.full((1000,), 30.))
-    assert loaded.state == {"samples": 30, "rate": .5, "none": None, "list": [1, 2]}
+    assert torch.equal(loaded.state.pop("weights")["w"], torch.full((1000,), 30.0))
+    assert loaded.state == {"samples": 30, "rate": 0.5, "none": None, "list": [1, 2]}
 
 
 def test_one_checkpoint_can_be_chosen(folder):
@@ -48,7 +57,7 @@ def test_steps_are_ordered_as_numbers(tmp_path):
     assert names(tmp_path) == ["step_9", "step_20", "step_100"]
 
 
-@pytest.mark.parametrize("fraction", [0, .1, .5, .99])
+@pytest.mark.parametrize("fraction", [0, 0.1, 0.5, 0.99])
 @pytest.mark.parametrize("file", ["state.pt", "config.json", "manifest.json"])
 def test_a_truncated_file_is_named_and_the_checkpoint_before_is_used(folder, file, fraction):
     path = folder / "step_30" / file
@@ -64,7 +73,7 @@ def test_a_lost_file_is_named(folder):
 
 
 @pytest.mark.parametrize("file", ["state.pt", "config.json"])
-@pytest.mark.parametrize("where", [0., .3, .9])
+@pytest.mark.parametrize("where", [0.0, 0.3, 0.9])
 def test_a_flipped_bit_is_found(folder, file, where):
     path = folder / "step_30" / file
     data = bytearray(path.read_bytes())
@@ -111,12 +120,16 @@ class Payload:
 
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
-@pytest.mark.parametrize("write", [torch.save, lambda value, file: pickle.dump(value, open(file, "wb"))])
+@pytest.mark.parametrize(
+    "write", [torch.save, lambda value, file: pickle.dump(value, open(file, "wb"))]
+)
 def test_code_in_a_checkpoint_is_refused_and_not_run(folder, tmp_path, write):
     mark, path = tmp_path / "ran", folder / "step_30" / "state.pt"
     write({"weights": Payload(mark)}, path)
     manifest = json.loads((path.parent / "manifest.json").read_text())
-    manifest["files"]["state.pt"]["sha256"] = checkpoint.hashlib.sha256(path.read_bytes()).hexdigest()
+    manifest["files"]["state.pt"]["sha256"] = checkpoint.hashlib.sha256(
+        path.read_bytes()
+    ).hexdigest()
     (path.parent / "manifest.json").write_text(json.dumps(manifest))
     with pytest.warns(UserWarning, match="step_30 is refused"):
         assert checkpoint.load(folder).step == 20
@@ -131,14 +144,14 @@ def test_another_format_is_named(folder):
 
 
 def test_the_last_ones_and_the_best_stay(tmp_path):
-    for n, score in ((1, 5.), (2, 9.), (3, None), (4, 1.), (5, 2.)):
+    for n, score in ((1, 5.0), (2, 9.0), (3, None), (4, 1.0), (5, 2.0)):
         checkpoint.save(tmp_path, n, state(n), CONFIG, keep=2, score=score)
     assert names(tmp_path) == ["step_2", "step_4", "step_5"]
 
 
 def test_nothing_is_deleted_before_the_new_one_is_known_to_be_whole(folder, monkeypatch):
     def write(path, data):
-        path.write_bytes(data[:len(data) // 2])
+        path.write_bytes(data[: len(data) // 2])
 
     monkeypatch.setattr(checkpoint, "_write", write)
     with pytest.raises(CheckpointError, match="step_40"):

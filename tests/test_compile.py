@@ -1,4 +1,6 @@
-"""Building the kernels: what is kept, what is damaged, what is missing. Every fault is injected for real."""
+"""Building the kernels: what is kept, what is damaged, what is missing. Every fault is injected for
+real.
+"""
 
 import ctypes
 import os
@@ -23,21 +25,23 @@ print(round(float(scenery.baked.vals.sum()), 3))
 
 
 def run(code, cache, **env):
-    """Runs code in a new interpreter with a kernel cache of its own; returns (exit status, stdout, stderr)."""
+    """Runs code in a new interpreter with a kernel cache of its own; returns (exit status, stdout,
+    stderr).
+    """
     done = subprocess.run(
-        [sys.executable, '-c', code],
+        [sys.executable, "-c", code],
         capture_output=True,
         text=True,
         cwd=ROOT,
-        env={**os.environ, 'MEGASTEP_CACHE': str(cache), **env},
+        env={**os.environ, "MEGASTEP_CACHE": str(cache), **env},
     )
     return done.returncode, done.stdout.strip(), done.stderr
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope="module")
 def built(tmp_path_factory):
     """A cache after a first use, and what that printed."""
-    cache = tmp_path_factory.mktemp('cache')
+    cache = tmp_path_factory.mktemp("cache")
     status, out, err = run(STEP, cache)
     assert status == 0, err
     return cache, out
@@ -46,23 +50,31 @@ def built(tmp_path_factory):
 def test_structs_match_the_source():
     """The ctypes twins of params.h have the sizes that the compiler gives the structs."""
     names = sorted(compile.STRUCTS)
-    prints = ''.join(f'extern "C" int size_{name}() {{ return sizeof({name}); }}\n' for name in names)
-    source = (compile.HERE / 'params.h').read_text() + prints
+    prints = "".join(
+        f'extern "C" int size_{name}() {{ return sizeof({name}); }}\n' for name in names
+    )
+    source = (compile.HERE / "params.h").read_text() + prints
     compiler, _ = compile._compiler()
-    library = Path(os.environ.get('TMPDIR', '/tmp')) / f'sizes-{os.getpid()}.so'
+    library = Path(os.environ.get("TMPDIR", "/tmp")) / f"sizes-{os.getpid()}.so"
     subprocess.run(
-        [compiler, '-x', 'c++', '-shared', '-fPIC', '-', '-o', str(library)], input=source, text=True, check=True
+        [compiler, "-x", "c++", "-shared", "-fPIC", "-", "-o", str(library)],
+        input=source,
+        text=True,
+        check=True,
     )
     sizes = ctypes.CDLL(str(library))
     library.unlink()
-    assert {n: getattr(sizes, f'size_{n}')() for n in names} == {n: ctypes.sizeof(compile.STRUCTS[n]) for n in names}
+    assert {n: getattr(sizes, f"size_{n}")() for n in names} == {
+        n: ctypes.sizeof(compile.STRUCTS[n]) for n in names
+    }
 
 
 def test_nothing_is_built_at_import(tmp_path):
     status, _, err = run(
-        'import megastep.envs, megastep.cuda, megastep.modules, megastep.recording', tmp_path / 'cache'
+        "import megastep.envs, megastep.cuda, megastep.modules, megastep.recording",
+        tmp_path / "cache",
     )
-    assert status == 0 and not (tmp_path / 'cache').exists(), err
+    assert status == 0 and not (tmp_path / "cache").exists(), err
 
 
 def test_the_library_is_kept_and_used_again(built):
@@ -72,7 +84,7 @@ def test_the_library_is_kept_and_used_again(built):
     assert run(STEP, cache)[:2] == (0, out) and path.stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize('damage', ['truncated', 'flipped', 'empty', 'garbage'])
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "garbage"])
 def test_a_damaged_library_is_built_again(built, damage, tmp_path):
     cache, out = built
     (path,) = cache.iterdir()
@@ -80,69 +92,82 @@ def test_a_damaged_library_is_built_again(built, damage, tmp_path):
     flipped = bytearray(body)
     flipped[len(body) // 2] ^= 1
     copy = tmp_path / path.name
-    copy.write_bytes({'truncated': body[:1000], 'flipped': bytes(flipped), 'empty': b'', 'garbage': b'x' * 500}[damage])
+    copy.write_bytes(
+        {"truncated": body[:1000], "flipped": bytes(flipped), "empty": b"", "garbage": b"x" * 500}[
+            damage
+        ]
+    )
     assert run(STEP, tmp_path)[:2] == (0, out)
     assert compile._intact(copy) is not None
 
 
 def test_a_folder_that_cannot_be_written_is_done_without(built, tmp_path):
-    file = tmp_path / 'file'
-    file.write_text('in the way')
-    assert run(STEP, file / 'cache')[:2] == (0, built[1])
-    assert file.read_text() == 'in the way'
+    file = tmp_path / "file"
+    file.write_text("in the way")
+    assert run(STEP, file / "cache")[:2] == (0, built[1])
+    assert file.read_text() == "in the way"
 
 
 def test_two_processes_may_build_at_once(built, tmp_path):
-    env = {**os.environ, 'MEGASTEP_CACHE': str(tmp_path)}
+    env = {**os.environ, "MEGASTEP_CACHE": str(tmp_path)}
     both = [
-        subprocess.Popen([sys.executable, '-c', STEP], stdout=subprocess.PIPE, text=True, cwd=ROOT, env=env)
+        subprocess.Popen(
+            [sys.executable, "-c", STEP], stdout=subprocess.PIPE, text=True, cwd=ROOT, env=env
+        )
         for _ in range(2)
     ]
     assert [process.communicate()[0].strip() for process in both] == [built[1]] * 2
-    assert len(list(tmp_path.iterdir())) == 1, 'no temporary file is left'
+    assert len(list(tmp_path.iterdir())) == 1, "no temporary file is left"
 
 
 def test_no_compiler_is_one_sentence_with_the_cure(tmp_path, monkeypatch):
-    monkeypatch.setenv('CXX', '/nonexistent')
+    monkeypatch.setenv("CXX", "/nonexistent")
     with pytest.raises(
-        compile.EngineError, match='CXX=/nonexistent is not a program: install one .*or set CXX'
+        compile.EngineError, match="CXX=/nonexistent is not a program: install one .*or set CXX"
     ) as fault:
         compile._compiler()
-    assert '\n' not in str(fault.value)
-    monkeypatch.delenv('CXX')
-    monkeypatch.setenv('PATH', str(tmp_path))
-    with pytest.raises(compile.EngineError, match='needs a C\\+\\+ compiler and none'):
+    assert "\n" not in str(fault.value)
+    monkeypatch.delenv("CXX")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(compile.EngineError, match="needs a C\\+\\+ compiler and none"):
         compile._compiler()
 
 
 def test_a_compiler_that_fails_is_quoted(tmp_path, monkeypatch):
-    false = tmp_path / 'c++'
+    false = tmp_path / "c++"
     false.write_text(
-        '#!/bin/sh\n[ "$1" = --version ] && echo broken 1.0 && exit 0\necho "no room on device" >&2; exit 1\n'
+        '#!/bin/sh\n[ "$1" = --version ] && echo broken 1.0 && exit 0\n'
+        'echo "no room on device" >&2; exit 1\n'
     )
     false.chmod(0o755)
-    with pytest.raises(compile.EngineError, match='could not build the CPU engine.*no room on device'):
+    with pytest.raises(
+        compile.EngineError, match="could not build the CPU engine.*no room on device"
+    ):
         compile._build_cpu(str(false))
 
 
-@pytest.mark.skipif(shutil.which('objdump') is None, reason='needs objdump')
+@pytest.mark.skipif(shutil.which("objdump") is None, reason="needs objdump")
 def test_nothing_is_fused(tmp_path):
-    """A multiplication fused with an addition rounds once, not twice, and the GPU's kernels have none."""
-    library = tmp_path / 'engine.so'
+    """A multiplication fused with an addition rounds once, not twice, and the GPU's kernels have
+    none.
+    """
+    library = tmp_path / "engine.so"
     library.write_bytes(compile._build_cpu(compile._compiler()[0]))
-    code = subprocess.run(['objdump', '-d', str(library)], capture_output=True, text=True, check=True).stdout
-    fused = re.findall(r'\t(v?fn?m(?:add|sub|la|ls)\w*)', code)
-    assert 'ret' in code and not fused, f'{len(fused)} fused, among them {fused[:3]}'
+    code = subprocess.run(
+        ["objdump", "-d", str(library)], capture_output=True, text=True, check=True
+    ).stdout
+    fused = re.findall(r"\t(v?fn?m(?:add|sub|la|ls)\w*)", code)
+    assert "ret" in code and not fused, f"{len(fused)} fused, among them {fused[:3]}"
 
 
 def test_no_bindings_are_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, 'cuda.bindings', None)
-    with pytest.raises(compile.EngineError, match='pip install cuda-bindings'):
+    monkeypatch.setitem(sys.modules, "cuda.bindings", None)
+    with pytest.raises(compile.EngineError, match="pip install cuda-bindings"):
         compile._bindings()
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a GPU')
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_the_gpu_sees_damage_too(tmp_path):
     code = STEP.replace("'cpu'", "'cuda'")
     status, out, err = run(code, tmp_path)
@@ -161,23 +186,27 @@ KERNEL reciprocals(float* values, int n) {
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a GPU')
-@pytest.mark.parametrize('exponent', [-100, -20, -1, 0, 1, 7, 100])
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("exponent", [-100, -20, -1, 0, 1, 7, 100])
 def test_the_gpus_reciprocal_rounds_as_division_does(exponent):
     """Every significand, of either sign."""
     major, minor = torch.cuda.get_device_capability()
-    source = (compile.HERE / 'cuda.h').read_text() + RECIPROCALS
+    source = (compile.HERE / "cuda.h").read_text() + RECIPROCALS
     driver, _ = compile._bindings()
-    cubin = compile._build_cuda(source, (*compile.CUDA_FLAGS, f'--gpu-architecture=sm_{major}{minor}'))
+    cubin = compile._build_cuda(
+        source, (*compile.CUDA_FLAGS, f"--gpu-architecture=sm_{major}{minor}")
+    )
     torch.cuda.current_stream().synchronize()
-    module = compile._checked(driver.cuModuleLoadData(cubin), 'Loading')
-    kernel = compile._checked(driver.cuModuleGetFunction(module, b'reciprocals'), 'Loading')
+    module = compile._checked(driver.cuModuleLoadData(cubin), "Loading")
+    kernel = compile._checked(driver.cuModuleGetFunction(module, b"reciprocals"), "Loading")
     significands = torch.arange(1 << 23, dtype=torch.int32) | 127 + exponent << 23
     values = torch.cat([significands, significands | -1 << 31]).view(torch.float32)
     found, n = values.cuda(), len(values)
     pointer, count = ctypes.c_void_p(found.data_ptr()), ctypes.c_int(n)
     arguments = (ctypes.c_void_p * 2)(ctypes.addressof(pointer), ctypes.addressof(count))
     stream = torch.cuda.current_stream().cuda_stream
-    done = driver.cuLaunchKernel(kernel, -(-n // 64), 1, 1, 64, 1, 1, 0, stream, ctypes.addressof(arguments), 0)
-    compile._checked(done, 'Launching')
+    done = driver.cuLaunchKernel(
+        kernel, -(-n // 64), 1, 1, 64, 1, 1, 0, stream, ctypes.addressof(arguments), 0
+    )
+    compile._checked(done, "Launching")
     assert torch.equal(found.cpu(), 1 / values)

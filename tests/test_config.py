@@ -1,4 +1,5 @@
 """The door: what composes, what is refused, and in which words. Nothing here starts a run."""
+
 import copy
 import dataclasses
 
@@ -22,9 +23,21 @@ def faults(*overrides, script="train"):
     return dict(error.value.faults)
 
 
-@pytest.mark.parametrize("choice", ["env=minimal", "env=explorer", "geometry=homes", "geometry=bench", "geometry=box",
-                                    "geometry=column", "agent=small", "agent=large", "logger=wandb",
-                                    "experiment=newcomer"])
+@pytest.mark.parametrize(
+    "choice",
+    [
+        "env=minimal",
+        "env=explorer",
+        "geometry=homes",
+        "geometry=bench",
+        "geometry=box",
+        "geometry=column",
+        "agent=small",
+        "agent=large",
+        "logger=wandb",
+        "experiment=newcomer",
+    ],
+)
 def test_every_group_member_composes(choice):
     assert isinstance(compose(choice), Train)
 
@@ -50,6 +63,7 @@ def test_what_is_written_can_be_read_again():
 
 def test_the_keys_of_an_environment_are_its_arguments():
     import inspect
+
     for name, kind in settings.ENVS.items():
         arguments = set(inspect.signature(envs.ENVS[name].__init__).parameters)
         assert {field.name for field in dataclasses.fields(kind)} - {"name"} <= arguments
@@ -81,7 +95,9 @@ def test_an_unknown_member_names_the_nearest_one():
 
 
 def test_all_faults_are_listed_at_once():
-    found = faults("env=explorr", "learner.lrr=1", "learner.lr=-1", "learner.gamma=nan", "seed=x", "device=gpu")
+    found = faults(
+        "env=explorr", "learner.lrr=1", "learner.lr=-1", "learner.gamma=nan", "seed=x", "device=gpu"
+    )
     assert set(found) == {"env", "learner.lrr", "learner.lr", "learner.gamma", "seed", "device"}
 
 
@@ -94,14 +110,46 @@ def tree():
 NAN, INFINITY = float("nan"), float("inf")
 
 
-@pytest.mark.parametrize("key, value", [
-    ("env.n_envs", 0), ("env.n_envs", 10**12), ("env.n_envs", 2.5), ("env.n_envs", "many"), ("env.n_envs", None),
-    ("env.n_envs", True), ("env.n_envs", {}), ("env.res", 0), ("env.res", 1025), ("env.fov", 0), ("env.fov", 180),
-    ("env.fov", NAN), ("env.fps", 0), ("learner.lr", -1), ("learner.lr", 0), ("learner.lr", INFINITY),
-    ("learner.lr", 1e300), ("learner.gamma", 1.01), ("learner.n_steps", 0), ("learner.n_minibatches", 0),
-    ("agent.width", 0), ("agent.encoder", "cnv"), ("geometry.n", 0), ("seed", -1), ("samples", 0), ("seconds", 0),
-    ("seconds", NAN), ("checkpoint", -3), ("keep", 1), ("report", 0), ("finish.lanes", 0), ("finish.record", 1),
-    ("logger.mode", "often"), ("env", "explorer"), ("learner.typo", 1)])
+@pytest.mark.parametrize(
+    "key, value",
+    [
+        ("env.n_envs", 0),
+        ("env.n_envs", 10**12),
+        ("env.n_envs", 2.5),
+        ("env.n_envs", "many"),
+        ("env.n_envs", None),
+        ("env.n_envs", True),
+        ("env.n_envs", {}),
+        ("env.res", 0),
+        ("env.res", 1025),
+        ("env.fov", 0),
+        ("env.fov", 180),
+        ("env.fov", NAN),
+        ("env.fps", 0),
+        ("learner.lr", -1),
+        ("learner.lr", 0),
+        ("learner.lr", INFINITY),
+        ("learner.lr", 1e300),
+        ("learner.gamma", 1.01),
+        ("learner.n_steps", 0),
+        ("learner.n_minibatches", 0),
+        ("agent.width", 0),
+        ("agent.encoder", "cnv"),
+        ("geometry.n", 0),
+        ("seed", -1),
+        ("samples", 0),
+        ("seconds", 0),
+        ("seconds", NAN),
+        ("checkpoint", -3),
+        ("keep", 1),
+        ("report", 0),
+        ("finish.lanes", 0),
+        ("finish.record", 1),
+        ("logger.mode", "often"),
+        ("env", "explorer"),
+        ("learner.typo", 1),
+    ],
+)
 def test_values_out_of_range_are_named_with_their_key(tree, key, value):
     *groups, last = key.split(".")
     changed = copy.deepcopy(tree)
@@ -121,7 +169,10 @@ def test_a_missing_key_is_named(tree):
 
 def test_a_range_is_told():
     assert faults("env.res=1025")["env.res"] == "1025 is out of range: allowed is from 1 to 1,024"
-    assert faults("env.fov=180")["env.fov"] == "180.0 is out of range: allowed is above 0 and below 180"
+    assert (
+        faults("env.fov=180")["env.fov"]
+        == "180.0 is out of range: allowed is above 0 and below 180"
+    )
 
 
 def test_settings_that_contradict_each_other_are_named():
@@ -142,8 +193,17 @@ def test_several_values_need_multirun():
 
 def test_a_sweep_is_every_combination():
     with commandline.Door("train", Train) as door:
-        jobs = [overrides for overrides, _ in door.jobs(["env=minimal,explorer", "seed=choice(1,2)", "keep=3"], True)]
-    assert jobs == [[f"env={env}", f"seed={seed}", "keep=3"] for env in ("minimal", "explorer") for seed in (1, 2)]
+        jobs = [
+            overrides
+            for overrides, _ in door.jobs(
+                ["env=minimal,explorer", "seed=choice(1,2)", "keep=3"], True
+            )
+        ]
+    assert jobs == [
+        [f"env={env}", f"seed={seed}", "keep=3"]
+        for env in ("minimal", "explorer")
+        for seed in (1, 2)
+    ]
 
 
 def test_a_sweep_is_checked_before_its_first_job():

@@ -1,5 +1,5 @@
-"""The engine against the laws: the original's golden outputs, the brute-force twin on random worlds, and the CPU
-against the GPU bit by bit.
+"""The engine against the laws: the original's golden outputs, the brute-force twin on random
+worlds, and the CPU against the GPU bit by bit.
 """
 
 import math
@@ -14,21 +14,21 @@ from megastep import cuda, engine, scene, toys
 from megastep.geometries import sample
 from megastep.modules import RGB, Depth, RandomSpawns
 
-DEVICES = ['cpu', pytest.param('cuda', marks=pytest.mark.cuda)]
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 HAS_GPU = torch.cuda.is_available()
 
 
 @pytest.fixture(params=DEVICES)
 def device(request):
-    if request.param == 'cuda' and not HAS_GPU:
-        pytest.skip('needs a GPU')
+    if request.param == "cuda" and not HAS_GPU:
+        pytest.skip("needs a GPU")
     return request.param
 
 
 def core_of(world, device, **settings):
     """A Core that holds a test's world."""
     core = cuda.Core(cuda.Scenery(**world.scenery_arguments(), device=device), **settings)
-    for name in ('positions', 'angles', 'velocity', 'angvelocity'):
+    for name in ("positions", "angles", "velocity", "angvelocity"):
         getattr(core.agents, name).copy_(getattr(world, name))
     return core
 
@@ -52,14 +52,17 @@ def state_of(core, physics):
 
 # ---- Golden: what the original computed, within the tolerances its README gives ----
 
-@pytest.mark.parametrize('case', worlds.CASES)
+
+@pytest.mark.parametrize("case", worlds.CASES)
 def test_golden(case, device):
     world, settings, _ = worlds.golden(case)
     core = core_of(world, device, **settings)
     cuda.bake(core.scenery)
     poison()
     r = cuda.render(core.scenery, core.agents)._asdict()
-    compare.check_golden(case, dict(r, lines=core.scenery.lines.vals, baked=core.scenery.baked.vals))
+    compare.check_golden(
+        case, dict(r, lines=core.scenery.lines.vals, baked=core.scenery.baked.vals)
+    )
     compare.check_golden(case, state_of(core, cuda.physics(core.scenery, core.agents)))
 
 
@@ -75,17 +78,17 @@ VIEWS = [
 ]
 
 
-@pytest.mark.parametrize('n_agents', [1, 4])
-@pytest.mark.parametrize('view', VIEWS, ids=str)
-@pytest.mark.parametrize('degenerate', [(), worlds.EVERYTHING], ids=['plain', 'degenerate'])
+@pytest.mark.parametrize("n_agents", [1, 4])
+@pytest.mark.parametrize("view", VIEWS, ids=str)
+@pytest.mark.parametrize("degenerate", [(), worlds.EVERYTHING], ids=["plain", "degenerate"])
 def test_twin_sight(view, n_agents, degenerate, device):
     for seed in range(2):
         world = worlds.random_world(
             seed,
             n_agents=n_agents,
             degenerate=degenerate,
-            res=view['res'],
-            fov=view['fov'],
+            res=view["res"],
+            fov=view["fov"],
             origin=190.0 if seed else 1.0,
         )
         core = core_of(world, device, **view)
@@ -96,12 +99,16 @@ def test_twin_sight(view, n_agents, degenerate, device):
         compare.check_baked(core.scenery.baked.vals, world, static_only=False)
 
 
-@pytest.mark.parametrize('n_agents', [1, 4])
-@pytest.mark.parametrize('name', [None, *worlds.DEGENERATE, 'overlap'])
+@pytest.mark.parametrize("n_agents", [1, 4])
+@pytest.mark.parametrize("name", [None, *worlds.DEGENERATE, "overlap"])
 def test_twin_physics(name, n_agents, device):
     for seed in range(6):
         world = worlds.random_world(
-            seed, n_envs=16, n_agents=n_agents, degenerate=(name,) if name else (), origin=190.0 if seed % 2 else 1.0
+            seed,
+            n_envs=16,
+            n_agents=n_agents,
+            degenerate=(name,) if name else (),
+            origin=190.0 if seed % 2 else 1.0,
         )
         core = core_of(world, device)
         poison()
@@ -112,36 +119,48 @@ def test_twin_physics(name, n_agents, device):
 # ---- The fused pass is the composition of the public pieces ----
 
 
-@pytest.mark.parametrize('n_agents', [1, 3])
-@pytest.mark.parametrize('subsample', [1, 4])
+@pytest.mark.parametrize("n_agents", [1, 3])
+@pytest.mark.parametrize("subsample", [1, 4])
 def test_observe_composes(n_agents, subsample, device):
-    world = worlds.random_world(5, n_envs=8, n_agents=n_agents, degenerate=worlds.EVERYTHING, res=64)
+    world = worlds.random_world(
+        5, n_envs=8, n_agents=n_agents, degenerate=worlds.EVERYTHING, res=64
+    )
     core = core_of(world, device, res=64)
     cuda.bake(core.scenery)
-    seen = torch.zeros((8, n_agents, -(-core.scenery.designs.most_texels // 32)), dtype=torch.int32, device=device)
+    seen = torch.zeros(
+        (8, n_agents, -(-core.scenery.designs.most_texels // 32)), dtype=torch.int32, device=device
+    )
     o = engine.observe(core.scenery, core.agents, subsample, imu=True, middle=True, seen=seen)
     r = cuda.render(core.scenery, core.agents)
     # half a unit of fp16's last place, and the mean's rounding
-    assert torch.allclose(o.rgb.float(), RGB(core, subsample)(r)[:, :, :, 0], atol=6e-4), 'rgb'
-    assert torch.allclose(o.depth.float(), Depth(core, subsample)(r)[:, :, 0, 0], atol=6e-4), 'depth'
-    assert torch.equal(o.middle, r.indices[..., 32]), 'middle'
-    assert torch.equal(bits_seen(core, r), seen), 'seen'
+    assert torch.allclose(o.rgb.float(), RGB(core, subsample)(r)[:, :, :, 0], atol=6e-4), "rgb"
+    assert torch.allclose(o.depth.float(), Depth(core, subsample)(r)[:, :, 0, 0], atol=6e-4), (
+        "depth"
+    )
+    assert torch.equal(o.middle, r.indices[..., 32]), "middle"
+    assert torch.equal(bits_seen(core, r), seen), "seen"
     assert torch.equal(
-        torch.tensor([[bin(int(w) & 0xFFFFFFFF).count('1') for w in a] for e in seen.tolist() for a in e])
+        torch.tensor(
+            [[bin(int(w) & 0xFFFFFFFF).count("1") for w in a] for e in seen.tolist() for a in e]
+        )
         .sum(1)
         .view(8, n_agents),
         o.fresh.cpu().long(),
-    ), 'fresh'
+    ), "fresh"
     again = engine.observe(core.scenery, core.agents, subsample, seen=seen)
-    assert not again.fresh.any(), 'a texel is new only once'
-    forgot = engine.observe(core.scenery, core.agents, subsample, seen=seen, forget=core.agent_full(True))
-    assert torch.equal(forgot.fresh, o.fresh), 'forgetting starts anew'
+    assert not again.fresh.any(), "a texel is new only once"
+    forgot = engine.observe(
+        core.scenery, core.agents, subsample, seen=seen, forget=core.agent_full(True)
+    )
+    assert torch.equal(forgot.fresh, o.fresh), "forgetting starts anew"
 
 
 def bits_seen(core, r):
     """What `seen` must hold after one look, from a full render, agent by agent."""
     scenery, designs = core.scenery, core.scenery.designs
-    out = torch.zeros((core.n_envs, core.n_agents, -(-designs.most_texels // 32)), dtype=torch.int64)
+    out = torch.zeros(
+        (core.n_envs, core.n_agents, -(-designs.most_texels // 32)), dtype=torch.int64
+    )
     own, starts = scenery.agent_lines.shape[1], designs.texel_starts.tolist()
     for e in range(core.n_envs):
         first = int(designs.wall_starts[int(scenery.design[e])])
@@ -150,7 +169,11 @@ def bits_seen(core, r):
                 if line >= own:
                     wall = first + line - own
                     width = starts[wall + 1] - starts[wall]
-                    texel = starts[wall] - starts[first] + min(int(np.float32(location) * np.float32(width)), width - 1)
+                    texel = (
+                        starts[wall]
+                        - starts[first]
+                        + min(int(np.float32(location) * np.float32(width)), width - 1)
+                    )
                     out[e, a, texel // 32] |= 1 << (texel % 32)
     return torch.where(out >= 1 << 31, out - (1 << 32), out).int().to(core.device)
 
@@ -160,23 +183,35 @@ def bits_seen(core, r):
 
 def trajectory(device, n_agents, subsample=1, **settings):
     """All tensors of a few steps in generated homes."""
-    homes = sample('homes', 8)
+    homes = sample("homes", 8)
     core = cuda.Core(scene.scenery(homes, n_agents, n_envs=24, device=device), **settings)
     spawn, seen = RandomSpawns(homes, core), None
-    seen = torch.zeros((24, n_agents, -(-core.scenery.designs.most_texels // 32)), dtype=torch.int32, device=device)
+    seen = torch.zeros(
+        (24, n_agents, -(-core.scenery.designs.most_texels // 32)), dtype=torch.int32, device=device
+    )
     random = torch.Generator().manual_seed(1)
-    moves = torch.tensor([(0, 0, 0), (3, 0, 0), (0, 3, 40), (9, 1, -40)], dtype=torch.float32, device=device)
+    moves = torch.tensor(
+        [(0, 0, 0), (3, 0, 0), (0, 3, 40), (9, 1, -40)], dtype=torch.float32, device=device
+    )
     out = [core.scenery.designs.baked.vals]
     for step in range(12):
         spawn(torch.rand((24, n_agents), generator=random).to(device) < (1 if step == 0 else 0.1))
         actions = torch.randint(4, (24, n_agents), generator=random).to(device)
         out += engine.physics(core.scenery, core.agents, actions, moves, 0.9)
-        out += engine.observe(core.scenery, core.agents, subsample, imu=True, middle=True, seen=seen)
+        out += engine.observe(
+            core.scenery, core.agents, subsample, imu=True, middle=True, seen=seen
+        )
     out += [
         *engine.render(core.scenery, core.agents),
         *engine.observe(core.scenery, core.agents, subsample, rgb=False)[1:2],
         *engine.observe(core.scenery, core.agents, subsample, depth=False)[:1],
-        *(core.agents.positions, core.agents.angles, core.scenery.agent_lines, core.scenery.agent_light, seen),
+        *(
+            core.agents.positions,
+            core.agents.angles,
+            core.scenery.agent_lines,
+            core.scenery.agent_light,
+            seen,
+        ),
     ]
     return [tensor.cpu() for tensor in out]
 
@@ -189,7 +224,9 @@ SETTINGS = [
     dict(n_agents=1, res=64),
     dict(n_agents=4, res=128, fov=70.0),
     dict(n_agents=2, res=32, fov=90.0, cameras=[0, 120, 240]),
-    dict(n_agents=1, res=256, subsample=4),  # the usual one; then batches that do not fill a warp, or lie across blocks
+    dict(
+        n_agents=1, res=256, subsample=4
+    ),  # the usual one; then batches that do not fill a warp, or lie across blocks
     dict(n_agents=1, res=60, subsample=3),
     dict(n_agents=2, res=160, subsample=5),
     dict(n_agents=1, res=96, subsample=32),
@@ -198,28 +235,28 @@ SETTINGS = [
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize('settings', SETTINGS, ids=str)
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
 def test_cpu_and_gpu_agree_on_every_bit(settings):
     if not HAS_GPU:
-        pytest.skip('needs a GPU')
-    assert not any(differing(trajectory('cpu', **settings), trajectory('cuda', **settings)))
+        pytest.skip("needs a GPU")
+    assert not any(differing(trajectory("cpu", **settings), trajectory("cuda", **settings)))
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason='needs two GPUs')
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 def test_gpus_agree_on_every_bit_whichever_is_current():
-    here, there = trajectory('cuda:0', n_agents=2, res=64), trajectory('cuda:1', n_agents=2, res=64)
+    here, there = trajectory("cuda:0", n_agents=2, res=64), trajectory("cuda:1", n_agents=2, res=64)
     assert torch.cuda.current_device() == 0 and not any(differing(here, there))
 
 
-@pytest.mark.parametrize('settings', SETTINGS, ids=str)
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
 def test_threads_do_not_matter(settings):
     before = torch.get_num_threads()
     runs = []
     try:
         for n in (1, 2, 4):
             torch.set_num_threads(n)
-            runs.append(trajectory('cpu', **settings))
+            runs.append(trajectory("cpu", **settings))
     finally:
         torch.set_num_threads(before)
     assert not any(differing(runs[0], runs[1])) and not any(differing(runs[0], runs[2]))
@@ -251,7 +288,7 @@ def test_the_tutorials_wall(device):
     assert not core.agents.velocity.any() and bool((p.progress < 1).all())
 
 
-@pytest.mark.parametrize('speed', [1.0, 10.0, 1000.0])
+@pytest.mark.parametrize("speed", [1.0, 10.0, 1000.0])
 def test_no_agent_leaves_a_closed_box(speed, device):
     core = cuda.Core(scene.scenery([toys.box()], n_agents=1, n_envs=512, device=device))
     core.agents.positions[:] = 3.5
@@ -260,7 +297,7 @@ def test_no_agent_leaves_a_closed_box(speed, device):
         core.agents.velocity.copy_(speed * torch.randn((512, 1, 2), generator=random))
         cuda.physics(core.scenery, core.agents)
     clearance = torch.minimum(core.agents.positions - 1, 6 - core.agents.positions).amin()
-    assert float(clearance) >= engine.AGENT_RADIUS, 'cameras stay on their side of the wall'
+    assert float(clearance) >= engine.AGENT_RADIUS, "cameras stay on their side of the wall"
 
 
 def test_two_cores_live_side_by_side(device):
@@ -282,14 +319,24 @@ def test_designs_are_shared(device):
     )
     assert len(textures) == len(lines.vals) == len(baked) and torch.equal(lines[-1], lines[5])
     wall = int(lines.starts[3]) + 8  # after the agent's eight
-    assert torch.equal(textures[wall], textures[int(lines.starts[1]) + 8]) and len(baked[wall]) == len(textures[wall])
-    assert torch.equal(textures.vals[textures.inverse == wall], textures[wall]) and len(lines[1:3]) == 2
+    assert torch.equal(textures[wall], textures[int(lines.starts[1]) + 8]) and len(
+        baked[wall]
+    ) == len(textures[wall])
+    assert (
+        torch.equal(textures.vals[textures.inverse == wall], textures[wall])
+        and len(lines[1:3]) == 2
+    )
 
 
 def test_draws_are_philox(device):
     """Against the published vector for key 0, counter 0 (Random123's kat_vectors)."""
     counts = torch.zeros(1, dtype=torch.int32, device=device)
-    out = engine.draw(counts, torch.ones(1, dtype=torch.bool, device=device), 0, torch.zeros((1, 4), device=device))
+    out = engine.draw(
+        counts,
+        torch.ones(1, dtype=torch.bool, device=device),
+        0,
+        torch.zeros((1, 4), device=device),
+    )
     words = (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)
     assert out[0].tolist() == [(word >> 8) / 2**24 for word in words] and counts.tolist() == [1]
 
@@ -298,30 +345,32 @@ def test_draws_are_philox(device):
 
 
 @pytest.mark.parametrize(
-    'settings', [dict(res=0), dict(res=1025), dict(fov=180.0), dict(fov=0.0), dict(fps=0.0), dict(cameras=[])], ids=str
+    "settings",
+    [dict(res=0), dict(res=1025), dict(fov=180.0), dict(fov=0.0), dict(fps=0.0), dict(cameras=[])],
+    ids=str,
 )
 def test_bad_settings_are_refused(settings):
-    with pytest.raises(ValueError, match='but'):
-        box('cpu', **settings)
+    with pytest.raises(ValueError, match="but"):
+        box("cpu", **settings)
 
 
-@pytest.mark.parametrize('radius', [0., -1., math.nan, math.inf])
+@pytest.mark.parametrize("radius", [0.0, -1.0, math.nan, math.inf])
 def test_a_disc_needs_a_radius(radius):
-    with pytest.raises(ValueError, match='radius must be a positive number'):
+    with pytest.raises(ValueError, match="radius must be a positive number"):
         engine.Agents(1, 1, radius=radius)
 
 
-@pytest.mark.parametrize('max_depth', [0., -1., math.nan])
+@pytest.mark.parametrize("max_depth", [0.0, -1.0, math.nan])
 def test_depth_needs_a_range(max_depth):
-    core = box('cpu')
-    with pytest.raises(ValueError, match='max_depth must be a positive number'):
+    core = box("cpu")
+    with pytest.raises(ValueError, match="max_depth must be a positive number"):
         engine.observe(core.scenery, core.agents, max_depth=max_depth)
 
 
 def test_a_position_that_is_no_number_is_named(device):
     core = box(device)
     core.agents.positions[1, 0, 0] = math.nan
-    with pytest.raises(engine.EngineError, match='environment 1 .* not a finite number'):
+    with pytest.raises(engine.EngineError, match="environment 1 .* not a finite number"):
         cuda.render(core.scenery, core.agents)
         engine.check(core.agents)
     core.agents.positions[:] = 3.0
@@ -330,28 +379,32 @@ def test_a_position_that_is_no_number_is_named(device):
 
 
 def test_wrong_tensors_are_named():
-    core = box('cpu')
+    core = box("cpu")
     for broken in (
         core.agents.positions.double(),
         core.agents.positions[:1],
-        core.agents.positions.expand(2, 1, 2).transpose(0, 0)[:, :, [1, 0]].flip(2).mT.contiguous().mT,
+        core.agents.positions.expand(2, 1, 2)
+        .transpose(0, 0)[:, :, [1, 0]]
+        .flip(2)
+        .mT.contiguous()
+        .mT,
     ):
         core.agents.positions = broken
         if broken.is_contiguous() and broken.dtype == torch.float32 and broken.shape == (2, 1, 2):
             continue
-        with pytest.raises(ValueError, match='agents.positions must be'):
+        with pytest.raises(ValueError, match="agents.positions must be"):
             cuda.render(core.scenery, core.agents)
 
 
 def test_unknown_devices_are_refused():
-    with pytest.raises(engine.EngineError, match='device=tpu is unknown'):
-        engine.device('tpu')
+    with pytest.raises(engine.EngineError, match="device=tpu is unknown"):
+        engine.device("tpu")
     if not HAS_GPU:
-        with pytest.raises(engine.EngineError, match='no GPU'):
-            engine.device('cuda')
+        with pytest.raises(engine.EngineError, match="no GPU"):
+            engine.device("cuda")
 
 
 def test_too_many_environments_are_counted(monkeypatch):
-    monkeypatch.setattr(engine, 'free_memory', lambda device: 10**6)
-    with pytest.raises(engine.EngineError, match='at most [0-9,]+ fit'):
-        scene.scenery([toys.box()], n_agents=1, n_envs=10**6, device='cpu')
+    monkeypatch.setattr(engine, "free_memory", lambda device: 10**6)
+    with pytest.raises(engine.EngineError, match="at most [0-9,]+ fit"):
+        scene.scenery([toys.box()], n_agents=1, n_envs=10**6, device="cpu")

@@ -9,39 +9,41 @@ from megastep import arrdict, capture, envs, plotting, spaces, toys
 from megastep.geometries import sample
 
 GPU = torch.cuda.is_available()
-DEVICES = ['cpu', pytest.param('cuda', marks=pytest.mark.cuda)]
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 SHORT = {
-    'minimal': dict(shortest=3, longest=9),
-    'explorer': dict(patience=1, res=1, subsample=1),
+    "minimal": dict(shortest=3, longest=9),
+    "explorer": dict(patience=1, res=1, subsample=1),
 }  # episodes that end within a test
 
 
 @pytest.fixture(params=DEVICES)
 def device(request):
-    if request.param == 'cuda' and not GPU:
-        pytest.skip('needs a GPU')
+    if request.param == "cuda" and not GPU:
+        pytest.skip("needs a GPU")
     return request.param
 
 
-def make(name, device='cpu', n_envs=12, seed=1, **settings):
-    return envs.ENVS[name](n_envs, sample('bench', 4), seed=seed, device=device, **{**SHORT[name], **settings})
+def make(name, device="cpu", n_envs=12, seed=1, **settings):
+    return envs.ENVS[name](
+        n_envs, sample("bench", 4), seed=seed, device=device, **{**SHORT[name], **settings}
+    )
 
 
 # ---- The contract ----
 
 
-@pytest.mark.parametrize('name', envs.ENVS)
+@pytest.mark.parametrize("name", envs.ENVS)
 def test_contract(name, device):
     worlds = contract.rollout(make(name, device), 60)
     ends = sum(int((w.terminal | w.truncated).sum()) for w in worlds)
-    assert ends >= 12, 'the episodes of this test are short enough to see them end'
+    assert ends >= 12, "the episodes of this test are short enough to see them end"
 
 
 class Fake:
-    """The smallest environment: episodes of three steps, observing how old they are. ``fault`` breaks a clause "
-    "of the contract."""
+    """The smallest environment: episodes of three steps, observing how old they are. ``fault``
+    breaks a clause " "of the contract."""
 
-    n_envs, n_agents, device = 2, 1, 'cpu'
+    n_envs, n_agents, device = 2, 1, "cpu"
     obs_space, action_space = spaces.MultiVector(1, 1), spaces.MultiDiscrete(1, 2)
 
     def __init__(self, fault=None):
@@ -57,13 +59,15 @@ class Fake:
             truncated=ends & torch.tensor([False, True]),
         )
         faults = {
-            'late reset': dict(reset=torch.zeros_like(reset)),
-            'both': dict(terminal=ends, truncated=ends),
-            'paid': dict(reward=torch.ones(2)),
-            'shape': dict(obs=world.obs[:, 0]),
-            'dtype': dict(reset=reset.float()),
-            'nan': dict(reward=world.reward / 0 * 0),
-            'ends at once': dict(terminal=reset | world.terminal, truncated=world.truncated & False),
+            "late reset": dict(reset=torch.zeros_like(reset)),
+            "both": dict(terminal=ends, truncated=ends),
+            "paid": dict(reward=torch.ones(2)),
+            "shape": dict(obs=world.obs[:, 0]),
+            "dtype": dict(reset=reset.float()),
+            "nan": dict(reward=world.reward / 0 * 0),
+            "ends at once": dict(
+                terminal=reset | world.terminal, truncated=world.truncated & False
+            ),
         }
         for key, value in faults.get(self.fault, {}).items():
             world[key] = value
@@ -84,15 +88,15 @@ def test_the_checker_accepts_a_world_that_keeps_the_contract():
 
 
 @pytest.mark.parametrize(
-    'fault, clause',
+    "fault, clause",
     [
-        ('late reset', 'reset follows'),
-        ('both', 'exclude'),
-        ('paid', 'pays nothing'),
-        ('shape', 'as its space'),
-        ('dtype', 'flags are bools'),
-        ('nan', 'rewards are finite'),
-        ('ends at once', 'does not end'),
+        ("late reset", "reset follows"),
+        ("both", "exclude"),
+        ("paid", "pays nothing"),
+        ("shape", "as its space"),
+        ("dtype", "flags are bools"),
+        ("nan", "rewards are finite"),
+        ("ends at once", "does not end"),
     ],
 )
 def test_the_checker_names_the_broken_clause(fault, clause):
@@ -100,14 +104,16 @@ def test_the_checker_names_the_broken_clause(fault, clause):
         contract.rollout(Fake(fault), 9)
 
 
-@pytest.mark.parametrize('name', envs.ENVS)
+@pytest.mark.parametrize("name", envs.ENVS)
 def test_a_seed_determines_an_episode(name, device):
-    first, second, other = (contract.rollout(make(name, device, seed=seed), 20, check=False) for seed in (1, 1, 2))
+    first, second, other = (
+        contract.rollout(make(name, device, seed=seed), 20, check=False) for seed in (1, 1, 2)
+    )
     assert contract.same(arrdict.stack(first), arrdict.stack(second))
     assert not contract.same(arrdict.stack(first).obs, arrdict.stack(other).obs)
 
 
-@pytest.mark.parametrize('name', envs.ENVS)
+@pytest.mark.parametrize("name", envs.ENVS)
 def test_an_ended_lane_ignores_its_decision(name):
     a, b = make(name), make(name)
     worlds, generator, ignored = [a.reset(), b.reset()], torch.Generator().manual_seed(3), 0
@@ -121,39 +127,39 @@ def test_an_ended_lane_ignores_its_decision(name):
     assert ignored
 
 
-@pytest.mark.parametrize('name', envs.ENVS)
+@pytest.mark.parametrize("name", envs.ENVS)
 def test_states_are_drawn(name, device):
     env = make(name, device)
     contract.rollout(env, 3, check=False)
     before = contract.rollout(make(name, device), 3)[-1]
     state = arrdict.numpyify(env.state(5))
     picture = plotting.rasterise(type(env).plot_state(state))
-    assert picture.ndim == 3 and picture.std() > 5, 'a figure with something on it'
+    assert picture.ndim == 3 and picture.std() > 5, "a figure with something on it"
     after = env.step(arrdict.arrdict(actions=torch.zeros((12, 1), dtype=torch.long, device=device)))
     contract.check_world(env, after, before)
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not GPU, reason='needs a GPU')
+@pytest.mark.skipif(not GPU, reason="needs a GPU")
 class TestOnTheGPU:
-    @pytest.mark.parametrize('name', envs.ENVS)
+    @pytest.mark.parametrize("name", envs.ENVS)
     def test_no_step_asks_the_gpu_a_question(self, name):
-        env = make(name, 'cuda')
+        env = make(name, "cuda")
         env.reset()
-        decision = arrdict.arrdict(actions=torch.zeros((12, 1), dtype=torch.long, device='cuda'))
+        decision = arrdict.arrdict(actions=torch.zeros((12, 1), dtype=torch.long, device="cuda"))
         env.step(decision)
-        torch.cuda.set_sync_debug_mode('error')
+        torch.cuda.set_sync_debug_mode("error")
         try:
             for _ in range(3):
                 env.step(decision)
         finally:
-            torch.cuda.set_sync_debug_mode('default')
+            torch.cuda.set_sync_debug_mode("default")
 
-    @pytest.mark.parametrize('name', envs.ENVS)
+    @pytest.mark.parametrize("name", envs.ENVS)
     def test_an_episode_is_the_same_on_cpu_and_gpu_captured_or_not(self, name):
         runs = [
             contract.rollout(env, 40, check=False)
-            for env in (make(name), make(name, 'cuda'), capture.Captured(make(name, 'cuda')))
+            for env in (make(name), make(name, "cuda"), capture.Captured(make(name, "cuda")))
         ]
         assert contract.same(arrdict.stack(runs[0]), arrdict.stack(runs[1]))
         assert contract.same(arrdict.stack(runs[0]), arrdict.stack(runs[2]))
@@ -163,7 +169,7 @@ class TestOnTheGPU:
 
 
 def test_explorer_truncates_when_its_length_reaches_what_it_has_seen_and_its_patience():
-    env = make('explorer', patience=5)
+    env = make("explorer", patience=5)
     world, length, seen = env.reset(), torch.zeros(12), None
     generator = torch.Generator().manual_seed(1)
     seen = env.n_seen.clone()
@@ -171,24 +177,26 @@ def test_explorer_truncates_when_its_length_reaches_what_it_has_seen_and_its_pat
         world = env.step(arrdict.arrdict(actions=contract.random_actions(env, generator)))
         length = torch.where(world.reset, 0, length + 1)
         seen = torch.where(world.reset, env.n_seen, seen + (64 * world.reward).round().int())
-        assert torch.equal(seen, env.n_seen) and torch.equal(world.truncated, (length >= seen + 5) & ~world.reset)
+        assert torch.equal(seen, env.n_seen) and torch.equal(
+            world.truncated, (length >= seen + 5) & ~world.reset
+        )
 
 
 def test_explorer_pays_once_for_each_texel():
-    """Turning on the spot in an empty box: after a full turn everything has been seen, and all pay adds up to "
-    "what the first view did not show."""
-    env = envs.Explorer(1, [toys.box()], device='cpu', res=1024, subsample=16)
+    """Turning on the spot in an empty box: after a full turn everything has been seen, and all pay
+    adds up to " "what the first view did not show."""
+    env = envs.Explorer(1, [toys.box()], device="cpu", res=1024, subsample=16)
     env.reset()
     first, paid = int(env.n_seen), 0.0
     turn = arrdict.arrdict(actions=torch.tensor([[5]]))
     for _ in range(60):
         paid += float(env.step(turn).reward)
-    assert round(64 * paid) == 400 - first, 'four walls of 5 m, 5 cm a texel'
+    assert round(64 * paid) == 400 - first, "four walls of 5 m, 5 cm a texel"
     assert not any(float(env.step(turn).reward) for _ in range(30))
 
 
 def test_explorer_state_counts_what_the_bitmap_holds():
-    env = make('explorer')
+    env = make("explorer")
     contract.rollout(env, 10, check=False)
     state = env.state(3)
     assert int(state.seen.sum()) == int(state.n_seen) == int(env.n_seen[3])
@@ -198,35 +206,43 @@ def test_explorer_state_counts_what_the_bitmap_holds():
 
 
 def test_minimal_lifespans_lie_between_their_bounds():
-    env = envs.Minimal(64, device='cpu', shortest=3, longest=5)
+    env = envs.Minimal(64, device="cpu", shortest=3, longest=5)
     ends = [w.truncated for w in contract.rollout(env, 30)]
     ages = [
         [b - a for a, b in zip(e, e[1:])]
         for e in (torch.stack(ends)[:, lane].nonzero().flatten().tolist() for lane in range(64))
     ]
-    spans = {age - 1 for lane in ages for age in lane}  # one step more for the new episode's first view
+    spans = {
+        age - 1 for lane in ages for age in lane
+    }  # one step more for the new episode's first view
     assert spans == {3, 4, 5}
 
 
 def test_minimal_forward_moves_a_metre_a_step():
-    env = envs.Minimal(1, device='cpu')
+    env = envs.Minimal(1, device="cpu")
     env.reset()
     env.core.agents.positions[:] = 3.0
     env.core.agents.angles[:] = 90.0
     env.step(arrdict.arrdict(actions=torch.tensor([[3]])))
     assert np.allclose(env.core.agents.positions.tolist(), [[[3.0, 4.0]]], atol=1e-5), (
-        '10 m/s for a tenth of a second, along +y'
+        "10 m/s for a tenth of a second, along +y"
     )
 
 
 def test_explorer_resamples_homes_at_respawn_alone(device):
-    env, generator, moved = make('explorer', device, resample=True), torch.Generator().manual_seed(1), 0
+    env, generator, moved = (
+        make("explorer", device, resample=True),
+        torch.Generator().manual_seed(1),
+        0,
+    )
     env.reset()
     for _ in range(60):
         before = env.core.scenery.design.clone()
         world = env.step(arrdict.arrdict(actions=contract.random_actions(env, generator)))
         changed = before != env.core.scenery.design
-        assert not bool((changed & ~world.reset).any()), 'homes change at respawns alone'
+        assert not bool((changed & ~world.reset).any()), "homes change at respawns alone"
         moved += int(changed.sum())
     assert moved and set(env.core.scenery.design.tolist()) <= {0, 1, 2, 3}
-    assert int(env.state(0).seen.sum()) == int(env.n_seen[0]), 'what was seen belongs to the new home'
+    assert int(env.state(0).seen.sum()) == int(env.n_seen[0]), (
+        "what was seen belongs to the new home"
+    )

@@ -9,8 +9,14 @@ matplotlib.use("Agg")
 
 
 def test_row_0_of_the_masks_is_at_the_top():
-    assert np.allclose(geometry.centers([[0, 0], [4, 0], [4, 2]], (5, 3), .2), [[.1, .9], [.1, .1], [.5, .1]])
-    assert (geometry.indices([[.1, .9], [.19, .01], [.41, .2]], (5, 3), .2) == [[0, 0], [4, 0], [3, 2]]).all()
+    assert np.allclose(
+        geometry.centers([[0, 0], [4, 0], [4, 2]], (5, 3), 0.2),
+        [[0.1, 0.9], [0.1, 0.1], [0.5, 0.1]],
+    )
+    assert (
+        geometry.indices([[0.1, 0.9], [0.19, 0.01], [0.41, 0.2]], (5, 3), 0.2)
+        == [[0, 0], [4, 0], [3, 2]]
+    ).all()
 
 
 def test_indices_and_centers_are_inverses():
@@ -19,100 +25,138 @@ def test_indices_and_centers_are_inverses():
 
 
 def test_masks_of_a_wall_drawn_by_hand():
-    masks = geometry.masks([[[.3, .5], [.7, .5]]], [], res=.2)
+    masks = geometry.masks([[[0.3, 0.5], [0.7, 0.5]]], [], res=0.2)
     assert masks.dtype == np.int16
-    assert masks.shape == (8, 9)    # the wall's .5 and .7 m, and a metre more
+    assert masks.shape == (8, 9)  # the wall's .5 and .7 m, and a metre more
     expected = np.zeros((8, 9))
-    expected[5, 1:4] = -1           # the third row from below holds y = .4 to .6
+    expected[5, 1:4] = -1  # the third row from below holds y = .4 to .6
     assert (masks == expected).all()
 
 
 def test_a_wall_on_the_edge_of_a_cell_touches_both_sides():
-    masks = geometry.masks([[[1., .5], [1., .9]]], [], res=.2)[::-1]
-    assert [tuple(cell) for cell in np.argwhere(masks == -1)] == [(i, j) for i in (2, 3, 4) for j in (4, 5)]
+    masks = geometry.masks([[[1.0, 0.5], [1.0, 0.9]]], [], res=0.2)[::-1]
+    assert [tuple(cell) for cell in np.argwhere(masks == -1)] == [
+        (i, j) for i in (2, 3, 4) for j in (4, 5)
+    ]
 
 
 def touches(wall, low, high):
     """Whether a segment touches the box low..high: clipped against its sides one after another."""
     start, direction = wall[0], wall[1] - wall[0]
-    first, last = 0., 1.
+    first, last = 0.0, 1.0
     for axis in (0, 1):
         if abs(direction[axis]) < 1e-12:
             if not low[axis] <= start[axis] <= high[axis]:
                 return False
         else:
-            a, b = sorted((edge[axis] - start[axis])/direction[axis] for edge in (low, high))
+            a, b = sorted((edge[axis] - start[axis]) / direction[axis] for edge in (low, high))
             first, last = max(first, a), min(last, b)
     return first <= last
 
 
 def test_walls_take_exactly_the_cells_they_touch():
-    walls = np.random.default_rng(0).uniform(.05, 4.5, (40, 2, 2))
-    masks = geometry.masks(walls, [], res=.25)[::-1]
+    walls = np.random.default_rng(0).uniform(0.05, 4.5, (40, 2, 2))
+    masks = geometry.masks(walls, [], res=0.25)[::-1]
     for (i, j), value in np.ndenumerate(masks):
-        low = np.array([j, i])*.25
-        assert (value == -1) == any(touches(wall, low, low + .25) for wall in walls), (i, j)
+        low = np.array([j, i]) * 0.25
+        assert (value == -1) == any(touches(wall, low, low + 0.25) for wall in walls), (i, j)
 
 
 def test_walls_beyond_one_chunk_are_drawn(monkeypatch):
-    walls = np.random.default_rng(0).uniform(.05, 4.5, (40, 2, 2))
+    walls = np.random.default_rng(0).uniform(0.05, 4.5, (40, 2, 2))
     whole = geometry.masks(walls, [])
     monkeypatch.setattr(geometry, "CHUNK", 7)
     assert (geometry.masks(walls, []) == whole).all()
 
 
 def test_a_room_holds_the_cells_whose_centre_is_in_it():
-    triangle = np.array([[.2, .2], [2.2, .2], [.2, 2.2]])
-    masks = geometry.masks(np.array([[[.05, 2.9], [2.9, 2.9]]]), [triangle], res=.2)
+    triangle = np.array([[0.2, 0.2], [2.2, 0.2], [0.2, 2.2]])
+    masks = geometry.masks(np.array([[[0.05, 2.9], [2.9, 2.9]]]), [triangle], res=0.2)
     x, y = np.moveaxis(geometry.centers(np.argwhere(np.ones_like(masks)), masks.shape), -1, 0)
-    inside = (x > .2) & (y > .2) & (x + y < 2.4 - 1e-6)
-    assert (masks.ravel() == 1).sum() == inside.sum() == 45     # 9 + 8 + ... + 1
+    inside = (x > 0.2) & (y > 0.2) & (x + y < 2.4 - 1e-6)
+    assert (masks.ravel() == 1).sum() == inside.sum() == 45  # 9 + 8 + ... + 1
     assert (masks.ravel()[inside] == 1).all()
 
 
 def test_holes_are_not_in_the_room_and_later_rooms_win():
-    square, hole, other = (np.array([[a, a], [b, a], [b, b], [a, b]]) for a, b in ((.2, 3.), (1., 2.), (2.6, 3.4)))
-    masks = geometry.masks(np.array([[[.05, 3.9], [3.9, 3.9]]]), [[square, hole], other])[::-1]
-    assert (masks[2, 2], masks[7, 7], masks[11, 11], masks[14, 14], masks[15, 15]) == (1, 0, 1, 2, 2)
+    square, hole, other = (
+        np.array([[a, a], [b, a], [b, b], [a, b]]) for a, b in ((0.2, 3.0), (1.0, 2.0), (2.6, 3.4))
+    )
+    masks = geometry.masks(np.array([[[0.05, 3.9], [3.9, 3.9]]]), [[square, hole], other])[::-1]
+    assert (masks[2, 2], masks[7, 7], masks[11, 11], masks[14, 14], masks[15, 15]) == (
+        1,
+        0,
+        1,
+        2,
+        2,
+    )
 
 
 def test_masks_refuses_a_world_of_millimetres():
     with pytest.raises(ValueError, match="5000 m, and 200 m is the limit; check their unit"):
-        geometry.masks([[[1., 1.], [5000., 1.]]], [])
+        geometry.masks([[[1.0, 1.0], [5000.0, 1.0]]], [])
 
 
 def test_checked_gives_the_documented_types():
-    g = dotdict(toys.box(), masks=toys.box().masks.astype(np.int64), walls=toys.box().walls.tolist(), goal=3)
+    g = dotdict(
+        toys.box(), masks=toys.box().masks.astype(np.int64), walls=toys.box().walls.tolist(), goal=3
+    )
     found = geometry.checked(g)
-    assert found.walls.dtype == np.float32 and found.lights.dtype == np.float32 and found.masks.dtype == np.int16
-    assert found.goal == 3 and isinstance(found, dotdict) and isinstance(found.res, float) and isinstance(found.id, int)
+    assert (
+        found.walls.dtype == np.float32
+        and found.lights.dtype == np.float32
+        and found.masks.dtype == np.int16
+    )
+    assert (
+        found.goal == 3
+        and isinstance(found, dotdict)
+        and isinstance(found.res, float)
+        and isinstance(found.id, int)
+    )
 
 
 def test_checked_drops_walls_of_no_length():
     g = toys.box()
-    g["walls"] = np.concatenate([g.walls, [[[2., 2.], [2., 2.]]]])
+    g["walls"] = np.concatenate([g.walls, [[[2.0, 2.0], [2.0, 2.0]]]])
     assert (geometry.checked(g).walls == toys.box().walls).all()
 
 
 WRONG = {
     "has no 'lights'": lambda g: g.pop("lights"),
-    "'walls' is of dtype <U1, and numbers were expected": lambda g: g.update(walls=np.full((3, 2, 2), "a")),
-    "'walls' is of dtype complex64, and numbers": lambda g: g.update(walls=g.walls.astype(np.complex64)),
-    r"'walls' has shape \(4, 4\), and \(n, 2, 2\) was": lambda g: g.update(walls=g.walls.reshape(4, 4)),
+    "'walls' is of dtype <U1, and numbers were expected": lambda g: g.update(
+        walls=np.full((3, 2, 2), "a")
+    ),
+    "'walls' is of dtype complex64, and numbers": lambda g: g.update(
+        walls=g.walls.astype(np.complex64)
+    ),
+    r"'walls' has shape \(4, 4\), and \(n, 2, 2\) was": lambda g: g.update(
+        walls=g.walls.reshape(4, 4)
+    ),
     r"'lights' has shape \(2,\), and \(n, 2\) was": lambda g: g.update(lights=np.ones(2)),
-    "'walls' holds a number that is not finite": lambda g: g.update(walls=g.walls*np.array([1, np.nan])),
-    "'lights' holds a number that is not finite": lambda g: g.update(lights=g.lights*np.inf),
+    "'walls' holds a number that is not finite": lambda g: g.update(
+        walls=g.walls * np.array([1, np.nan])
+    ),
+    "'lights' holds a number that is not finite": lambda g: g.update(lights=g.lights * np.inf),
     "'walls' reaches down to 0 m, and above 0 is": lambda g: g.update(walls=g.walls - 1),
-    "'walls' reaches up to 1e\\+30 m, and the limit is 200": lambda g: g.update(walls=g.walls/g.walls.min()*1e30/6),
+    "'walls' reaches up to 1e\\+30 m, and the limit is 200": lambda g: g.update(
+        walls=g.walls / g.walls.min() * 1e30 / 6
+    ),
     "has no wall of any length": lambda g: g.update(walls=np.ones((5, 2, 2))),
     "has 40,000 walls, and the limit is 32,768": lambda g: g.update(walls=np.ones((40_000, 2, 2))),
     "has no room": lambda g: g.update(masks=np.minimum(g.masks, 0)),
-    "'masks' is of dtype float32, and whole numbers": lambda g: g.update(masks=g.masks.astype(np.float32)),
-    "'masks' holds -2 to 1, and -1 to 32,767 is": lambda g: g.update(masks=np.where(g.masks < 0, -2, g.masks)),
-    "has masks of 4,002,000 cells, and the limit": lambda g: g.update(masks=np.ones((2001, 2000), np.int8)),
-    "'res' is 0 m a cell, and 0.01 to 10 is": lambda g: g.update(res=0.),
+    "'masks' is of dtype float32, and whole numbers": lambda g: g.update(
+        masks=g.masks.astype(np.float32)
+    ),
+    "'masks' holds -2 to 1, and -1 to 32,767 is": lambda g: g.update(
+        masks=np.where(g.masks < 0, -2, g.masks)
+    ),
+    "has masks of 4,002,000 cells, and the limit": lambda g: g.update(
+        masks=np.ones((2001, 2000), np.int8)
+    ),
+    "'res' is 0 m a cell, and 0.01 to 10 is": lambda g: g.update(res=0.0),
     "'res' is nan m a cell": lambda g: g.update(res=np.nan),
-    "'id' is of dtype float64, and whole numbers": lambda g: g.update(id=1.5)}
+    "'id' is of dtype float64, and whole numbers": lambda g: g.update(id=1.5),
+}
 
 
 @pytest.mark.parametrize("message", WRONG)

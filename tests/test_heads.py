@@ -1,4 +1,5 @@
 """Heads: networks made from spaces, and the distributions over actions they stand for."""
+
 import math
 
 import pytest
@@ -9,7 +10,11 @@ from agents import heads
 from megastep import spaces
 from megastep.arrdict import arrdict
 
-IMAGE, DEPTH, VECTOR = spaces.MultiImage(2, 3, 1, 16), spaces.MultiImage(2, 1, 1, 16), spaces.MultiVector(2, 5)
+IMAGE, DEPTH, VECTOR = (
+    spaces.MultiImage(2, 3, 1, 16),
+    spaces.MultiImage(2, 1, 1, 16),
+    spaces.MultiVector(2, 5),
+)
 TREE = arrdict(eyes=arrdict(rgb=IMAGE, d=DEPTH), imu=VECTOR, team=spaces.MultiDiscrete(2, 4))
 MOVES = arrdict(movement=spaces.MultiDiscrete(2, 7), fire=spaces.MultiDiscrete(2, 2))
 WIDTH = 24
@@ -27,16 +32,18 @@ def draw(space, *lead, seed=0, dtype=torch.float32):
     return space.map(leaf) if isinstance(space, dict) else leaf(space)
 
 
-@pytest.mark.parametrize('encoder', heads.ENCODERS)
-@pytest.mark.parametrize('space', [IMAGE, VECTOR, spaces.MultiDiscrete(2, 4), TREE, spaces.MultiImage(1, 3, 4, 1)])
-@pytest.mark.parametrize('lead', [(), (6,), (3, 6)])
+@pytest.mark.parametrize("encoder", heads.ENCODERS)
+@pytest.mark.parametrize(
+    "space", [IMAGE, VECTOR, spaces.MultiDiscrete(2, 4), TREE, spaces.MultiImage(1, 3, 4, 1)]
+)
+@pytest.mark.parametrize("lead", [(), (6,), (3, 6)])
 def test_an_intake_gives_width_numbers_whatever_it_is_shown(space, encoder, lead):
     intake = heads.intake(space, WIDTH, encoder)
     out = intake(draw(space, *lead))
     assert out.shape == (*lead, WIDTH) and out.dtype == torch.float32 and out.isfinite().all()
 
 
-@pytest.mark.parametrize('encoder', heads.ENCODERS)
+@pytest.mark.parametrize("encoder", heads.ENCODERS)
 def test_every_pixel_and_every_leaf_matters(encoder):
     torch.manual_seed(0)
     intake = heads.intake(TREE, 512, encoder)
@@ -46,7 +53,7 @@ def test_every_pixel_and_every_leaf_matters(encoder):
     intake(obs).sum().backward()
     for leaf in (obs.eyes.rgb, obs.eyes.d, obs.imu):
         assert (leaf.grad != 0).all()
-    other = arrdict({**obs, 'team': (obs.team + 1) % 4})
+    other = arrdict({**obs, "team": (obs.team + 1) % 4})
     assert not torch.equal(intake(other), intake(obs))
 
 
@@ -66,19 +73,27 @@ def test_half_precision_pictures_meet_single_precision_weights():
 
 def test_autocast_decides_the_dtype_of_the_products_but_not_of_the_logits():
     intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
-    with torch.autocast('cpu', torch.bfloat16):
+    with torch.autocast("cpu", torch.bfloat16):
         x = intake(draw(TREE, 6, dtype=torch.float16))
         assert x.dtype == torch.bfloat16
-        assert output(x).movement.dtype == torch.float32 and heads.ValueOutput(WIDTH)(x).dtype == torch.float32
+        assert (
+            output(x).movement.dtype == torch.float32
+            and heads.ValueOutput(WIDTH)(x).dtype == torch.float32
+        )
 
 
 def test_leaves_have_the_same_say_at_the_start():
-    # A picture of 3 x 64 numbers and a vector of 3, all 1: each leaf's part of the sum has variance 2/2
+    # A picture of 3 x 64 numbers and a vector of 3, all 1: each leaf's part of the sum has variance
+    # 2/2
     torch.manual_seed(0)
-    intake = heads.intake(arrdict(rgb=spaces.MultiImage(1, 3, 1, 64), imu=spaces.MultiVector(1, 3)), 4096)
+    intake = heads.intake(
+        arrdict(rgb=spaces.MultiImage(1, 3, 1, 64), imu=spaces.MultiVector(1, 3)), 4096
+    )
     of_rgb, of_imu = intake.project.weight.split([192, 3], dim=1)
     for part in (of_rgb, of_imu):
-        assert part.sum(1).var().item() == pytest.approx(1, abs=.1)  # 4096 samples: 4.5 standard errors
+        assert part.sum(1).var().item() == pytest.approx(
+            1, abs=0.1
+        )  # 4096 samples: 4.5 standard errors
 
 
 def test_logits_are_log_probabilities_that_an_env_can_be_given():
@@ -87,7 +102,9 @@ def test_logits_are_log_probabilities_that_an_env_can_be_given():
     assert logits.movement.shape == (6, 2, 7) and logits.fire.shape == (6, 2, 2)
     torch.testing.assert_close(logits.movement.exp().sum(-1), torch.ones(6, 2))
     actions = output.sample(logits)
-    assert actions.movement.shape == actions.fire.shape == (6, 2) and actions.fire.dtype == torch.int64
+    assert (
+        actions.movement.shape == actions.fire.shape == (6, 2) and actions.fire.dtype == torch.int64
+    )
     assert output.logprob(logits, actions).shape == output.entropy(logits).shape == (6,)
 
 
@@ -99,32 +116,41 @@ def test_a_bare_space_gives_bare_actions():
 
 def test_logprob_and_entropy_by_hand():
     output = heads.output(MOVES, WIDTH)
-    even = arrdict(movement=torch.full((1, 2, 7), 1 / 7).log(), fire=torch.tensor([[[.25, .75], [.5, .5]]]).log())
+    even = arrdict(
+        movement=torch.full((1, 2, 7), 1 / 7).log(),
+        fire=torch.tensor([[[0.25, 0.75], [0.5, 0.5]]]).log(),
+    )
     actions = arrdict(movement=torch.tensor([[6, 0]]), fire=torch.tensor([[1, 0]]))
     # two agents move evenly among 7, one fires with 3/4, the other with 1/2
-    assert output.logprob(even, actions).item() == pytest.approx(2 * math.log(1 / 7) + math.log(.75) + math.log(.5))
-    uneven = -.25 * math.log(.25) - .75 * math.log(.75)
+    assert output.logprob(even, actions).item() == pytest.approx(
+        2 * math.log(1 / 7) + math.log(0.75) + math.log(0.5)
+    )
+    uneven = -0.25 * math.log(0.25) - 0.75 * math.log(0.75)
     assert output.entropy(even).item() == pytest.approx(2 * math.log(7) + uneven + math.log(2))
     assert output.greedy(even).fire.tolist() == [[1, 0]]
 
 
 def test_the_first_policy_is_close_to_uniform():
     output = heads.output(spaces.MultiDiscrete(1, 7), WIDTH)
-    assert output.entropy(output(torch.randn(100, WIDTH))).min().item() == pytest.approx(math.log(7), abs=.01)
+    assert output.entropy(output(torch.randn(100, WIDTH))).min().item() == pytest.approx(
+        math.log(7), abs=0.01
+    )
 
 
 def test_actions_are_drawn_as_often_as_they_are_probable():
-    probabilities = torch.tensor([.5, .3, .15, .05])
+    probabilities = torch.tensor([0.5, 0.3, 0.15, 0.05])
     output, n = heads.output(spaces.MultiDiscrete(1, 4), WIDTH), 100_000
     logits = probabilities.log().expand(n, 1, 4)
-    drawn = output.sample(logits, torch.Generator().manual_seed(0)).flatten().bincount(minlength=4) / n
+    drawn = (
+        output.sample(logits, torch.Generator().manual_seed(0)).flatten().bincount(minlength=4) / n
+    )
     error = (probabilities * (1 - probabilities) / n).sqrt()
     assert ((drawn - probabilities).abs() < 4 * error).all()
 
 
 def test_what_is_impossible_is_never_drawn():
     output = heads.output(spaces.MultiDiscrete(1, 3), WIDTH)
-    logits = torch.tensor([0., 1., 0.]).log().expand(100_000, 1, 3)
+    logits = torch.tensor([0.0, 1.0, 0.0]).log().expand(100_000, 1, 3)
     assert (output.sample(logits, torch.Generator().manual_seed(0)) == 1).all()
 
 
@@ -138,13 +164,17 @@ def test_a_generator_decides_all_draws():
     assert torch.equal(before, torch.get_rng_state())
 
 
-@pytest.mark.parametrize('make, words', [
-    (lambda: heads.intake('pictures', WIDTH), "observation space itself = 'pictures'"),
-    (lambda: heads.intake(arrdict(imu=VECTOR, x=3), WIDTH), 'observation space x = 3'),
-    (lambda: heads.intake(arrdict(nothing=spaces.MultiEmpty()), WIDTH), 'nothing in it'),
-    (lambda: heads.intake(IMAGE, WIDTH, 'resnet'), "'resnet'; it can be linear or conv"),
-    (lambda: heads.output(VECTOR, WIDTH), 'there are MultiDiscrete and dicts of it'),
-    (lambda: heads.output(arrdict(), WIDTH), 'there are MultiDiscrete and dicts of it')])
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: heads.intake("pictures", WIDTH), "observation space itself = 'pictures'"),
+        (lambda: heads.intake(arrdict(imu=VECTOR, x=3), WIDTH), "observation space x = 3"),
+        (lambda: heads.intake(arrdict(nothing=spaces.MultiEmpty()), WIDTH), "nothing in it"),
+        (lambda: heads.intake(IMAGE, WIDTH, "resnet"), "'resnet'; it can be linear or conv"),
+        (lambda: heads.output(VECTOR, WIDTH), "there are MultiDiscrete and dicts of it"),
+        (lambda: heads.output(arrdict(), WIDTH), "there are MultiDiscrete and dicts of it"),
+    ],
+)
 def test_what_no_head_is_known_for_is_said(make, words):
     with pytest.raises(ValueError, match=words):
         make()
@@ -156,45 +186,60 @@ EVERY = torch.ones(64, dtype=torch.bool)
 def test_rescaling_a_value_changes_no_prediction():
     value, x = heads.ValueOutput(WIDTH), torch.randn(200, WIDTH)
     before = value(x)
-    for offset in (0., 300., 310.):
+    for offset in (0.0, 300.0, 310.0):
         value.rescale(torch.randn(64) * 20 + offset, EVERY)
         assert value.mean.item() != 0 and value.scale.item() != 1
-        torch.testing.assert_close(value(x), before, rtol=1e-4, atol=1e-4)  # float32 at a mean of 300
+        torch.testing.assert_close(
+            value(x), before, rtol=1e-4, atol=1e-4
+        )  # float32 at a mean of 300
 
 
 def test_a_value_learns_the_mean_and_deviation_of_what_is_valid():
     value = heads.ValueOutput(WIDTH)
-    value.rescale(torch.tensor([1., 5., torch.nan]), torch.tensor([True, True, False]))
+    value.rescale(torch.tensor([1.0, 5.0, torch.nan]), torch.tensor([True, True, False]))
     assert value.mean.item() == pytest.approx(3) and value.scale.item() == pytest.approx(2)
-    value.rescale(torch.full((64,), 9.), EVERY)
-    # The second of two calls weighs a half: mean 6, mean square (13 + 81) / 2 = 47, deviation sqrt(47 - 36)
-    assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11 ** .5)
-    value.rescale(torch.full((64,), 7.), ~EVERY)
-    assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11 ** .5)
+    value.rescale(torch.full((64,), 9.0), EVERY)
+    # The second of two calls weighs a half: mean 6, mean square (13 + 81) / 2 = 47, deviation
+    # sqrt(47 - 36)
+    assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
+    value.rescale(torch.full((64,), 7.0), ~EVERY)
+    assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
 
 
 def test_returns_that_never_vary_do_not_divide_by_zero():
     value = heads.ValueOutput(WIDTH)
     for _ in range(5):
         value.rescale(torch.zeros(64), EVERY)
-    assert value.scale.item() == pytest.approx(1e-3) and value(torch.randn(8, WIDTH)).isfinite().all()
+    assert (
+        value.scale.item() == pytest.approx(1e-3) and value(torch.randn(8, WIDTH)).isfinite().all()
+    )
 
 
 def test_pictures_are_standardised_by_channel_and_vectors_by_number():
     space = arrdict(rgb=spaces.MultiImage(1, 2, 1, 3), imu=spaces.MultiVector(1, 2))
     intake = heads.intake(space, WIDTH)
-    rgb = torch.tensor([[1., 2., 3.], [10., 10., 40.]]).view(1, 1, 2, 1, 3).expand(4, -1, -1, -1, -1)
-    imu = torch.tensor([[5., 0.], [7., 0.], [5., 0.], [7., 0.]])[:, None]
+    rgb = (
+        torch.tensor([[1.0, 2.0, 3.0], [10.0, 10.0, 40.0]])
+        .view(1, 1, 2, 1, 3)
+        .expand(4, -1, -1, -1, -1)
+    )
+    imu = torch.tensor([[5.0, 0.0], [7.0, 0.0], [5.0, 0.0], [7.0, 0.0]])[:, None]
     intake.rescale(arrdict(rgb=rgb.half(), imu=imu.half()))
     of_rgb, of_imu = intake.standards
-    torch.testing.assert_close(of_rgb(rgb)[0, 0, 0, 0], torch.tensor([-1.5 ** .5, 0., 1.5 ** .5]))  # deviation sqrt 2/3
-    torch.testing.assert_close(of_rgb(rgb)[0, 0, 1, 0], torch.tensor([-.5 ** .5, -.5 ** .5, 2 ** .5]))
-    torch.testing.assert_close(of_imu(imu)[:, 0, 0], torch.tensor([-1., 1., -1., 1.]))
+    torch.testing.assert_close(
+        of_rgb(rgb)[0, 0, 0, 0], torch.tensor([-(1.5**0.5), 0.0, 1.5**0.5])
+    )  # deviation sqrt 2/3
+    torch.testing.assert_close(
+        of_rgb(rgb)[0, 0, 1, 0], torch.tensor([-(0.5**0.5), -(0.5**0.5), 2**0.5])
+    )
+    torch.testing.assert_close(of_imu(imu)[:, 0, 0], torch.tensor([-1.0, 1.0, -1.0, 1.0]))
     assert not of_imu(imu)[..., 1].any()  # what never varies divides by no zero
 
     # A second call weighs a half: mean (6 + 10) / 2, mean square (37 + 100) / 2
-    intake.rescale(arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.)))
-    assert of_imu.mean[0, 0].item() == 8 and of_imu.scale[0, 0].item() == pytest.approx((137 / 2 - 64) ** .5)
+    intake.rescale(arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
+    assert of_imu.mean[0, 0].item() == 8 and of_imu.scale[0, 0].item() == pytest.approx(
+        (137 / 2 - 64) ** 0.5
+    )
 
 
 def test_what_was_learned_about_observations_is_saved_with_the_weights():

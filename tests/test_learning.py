@@ -1,4 +1,7 @@
-"""PPO learns: small worlds, each of which only a learner with one particular virtue can solve, in seconds."""
+"""PPO learns: small worlds, each of which only a learner with one particular virtue can solve, in
+seconds.
+"""
+
 import pytest
 import torch
 
@@ -12,7 +15,10 @@ B = 64
 
 
 class World:
-    """Lanes whose episodes are at step `age`; subclasses say what is seen, paid, and when it ends."""
+    """Lanes whose episodes are at step `age`; subclasses say what is seen, paid, and when it
+    ends.
+    """
+
     n_shown, n_actions = 1, 4
 
     def __init__(self, seed=0):
@@ -23,7 +29,13 @@ class World:
 
     def _world(self, reward, reset, terminal, truncated):
         self.over = terminal | truncated
-        return arrdict(obs=self.show()[:, None], reward=reward, reset=reset, terminal=terminal, truncated=truncated)
+        return arrdict(
+            obs=self.show()[:, None],
+            reward=reward,
+            reset=reset,
+            terminal=terminal,
+            truncated=truncated,
+        )
 
     def reset(self):
         return self._begin(torch.ones(B, dtype=torch.bool))
@@ -49,12 +61,15 @@ class World:
 
 
 class Cue(World):
-    """Shows one of four cues on an episode's first observation and then nothing; doing what it said pays 1 at age 5."""
+    """Shows one of four cues on an episode's first observation and then nothing; doing what it said
+    pays 1 at age 5.
+    """
+
     n_shown, lag = 4, 5
 
     def begin(self, which):
         fresh = torch.randint(self.n_actions, (B,), generator=self.generator)
-        self.cue = torch.where(which, fresh, getattr(self, 'cue', fresh))
+        self.cue = torch.where(which, fresh, getattr(self, "cue", fresh))
 
     def show(self):
         return torch.nn.functional.one_hot(self.cue, 4).float() * (self.age == 0)[:, None]
@@ -65,32 +80,41 @@ class Cue(World):
 
 
 class Clock(World):
-    """Shows nothing at all, ever. At age k the action PATTERN[k] pays 1, and an episode may be cut after any step.
+    """Shows nothing at all, ever. At age k the action PATTERN[k] pays 1, and an episode may be cut
+    after any step.
 
     Only who starts counting anew with each episode can know k.
     """
+
     PATTERN = torch.tensor([2, 0, 3, 1, 1])
 
     def judge(self, action):
         right = (action == self.PATTERN[self.age % len(self.PATTERN)]).float()
-        cut = (torch.rand(B, generator=self.generator) < .25) | (self.age == len(self.PATTERN) - 1)
+        cut = (torch.rand(B, generator=self.generator) < 0.25) | (self.age == len(self.PATTERN) - 1)
         return right, torch.zeros_like(cut), cut
 
 
 class Wage(World):
-    """Pays 1 for every step, whatever one does; an episode ends after each with probability 1/8, in one way."""
+    """Pays 1 for every step, whatever one does; an episode ends after each with probability 1/8, in
+    one way.
+    """
 
     def __init__(self, ends):
         super().__init__()
         self.ends = ends
 
     def judge(self, action):
-        ended, none = torch.rand(B, generator=self.generator) < 1 / 8, torch.zeros(B, dtype=torch.bool)
-        return torch.ones(B), *((ended, none) if self.ends == 'terminal' else (none, ended))
+        ended, none = (
+            torch.rand(B, generator=self.generator) < 1 / 8,
+            torch.zeros(B, dtype=torch.bool),
+        )
+        return torch.ones(B), *((ended, none) if self.ends == "terminal" else (none, ended))
 
 
 def learn(world, n_updates, policy=None, n_steps=16, **how):
-    """Trains a small policy and counts what happened in the last ten rollouts: (policy, rewards, ends, valid steps)."""
+    """Trains a small policy and counts what happened in the last ten rollouts: (policy, rewards,
+    ends, valid steps).
+    """
     policy = policy or Policy(world.obs_space, world.action_space, width=32)
     rollout = buffers.Rollout(n_steps, B, world.obs_space, world.action_space)
     learner = PPO(policy, **{**dict(lr=5e-3, n_epochs=2, n_minibatches=4), **how})
@@ -98,7 +122,9 @@ def learn(world, n_updates, policy=None, n_steps=16, **how):
     for i in range(n_updates):
         buffers.collect(world, policy, rollout, carry)
         if i >= n_updates - 10:
-            counts += torch.stack([rollout.reward.sum(), rollout.terminal.sum(), (~rollout.reset).sum()])
+            counts += torch.stack(
+                [rollout.reward.sum(), rollout.terminal.sum(), (~rollout.reset).sum()]
+            )
         learner.update(rollout)
     return policy, *counts.tolist()
 
@@ -113,24 +139,28 @@ class Forgetless(Policy):
 def test_a_cue_is_remembered():
     # Guessing earns 1/4, and so does any policy without a memory
     _, rewards, ends, _ = learn(Cue(), n_updates=60, lr=3e-3)
-    assert rewards / ends > .9
+    assert rewards / ends > 0.9
 
 
 def test_memory_starts_anew_with_every_episode():
-    how, world = dict(n_updates=60, lr=1e-2, entropy=.03), Clock()
+    how, world = dict(n_updates=60, lr=1e-2, entropy=0.03), Clock()
     _, rewards, _, valid = learn(world, **how)
-    assert rewards / valid > .9
+    assert rewards / valid > 0.9
     leaky = Forgetless(world.obs_space, world.action_space, width=32)
     _, rewards, _, valid = learn(world, policy=leaky, **how)
-    assert rewards / valid < .5  # nothing it sees tells it when an episode begins
+    assert rewards / valid < 0.5  # nothing it sees tells it when an episode begins
 
 
-@pytest.mark.parametrize('ends, worth', [
-    ('truncated', 1 / (1 - .9)),  # a time limit takes nothing away: 1 + .9 + .81 + ...
-    ('terminal', 1 / (1 - .9 * 7 / 8))])  # a death does: 1 + .9 (7/8) + ...
+@pytest.mark.parametrize(
+    "ends, worth",
+    [
+        ("truncated", 1 / (1 - 0.9)),  # a time limit takes nothing away: 1 + .9 + .81 + ...
+        ("terminal", 1 / (1 - 0.9 * 7 / 8)),
+    ],
+)  # a death does: 1 + .9 (7/8) + ...
 def test_a_time_limit_is_not_a_death(ends, worth):
     world = Wage(ends)
-    policy, *_ = learn(world, n_updates=60, gamma=.9, lambda_=.8)
+    policy, *_ = learn(world, n_updates=60, gamma=0.9, lambda_=0.8)
     obs, reset = torch.zeros(12, 1, 1, 1), torch.zeros(12, 1, dtype=torch.bool)
     value = policy.unroll(obs, reset, policy.initial(1)).value[:, 0]
-    torch.testing.assert_close(value, torch.full((12,), worth), rtol=.1, atol=0)
+    torch.testing.assert_close(value, torch.full((12,), worth), rtol=0.1, atol=0)

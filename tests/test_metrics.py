@@ -1,4 +1,7 @@
-"""Metrics: episode statistics against a slow count, files a crash cannot spoil, sinks that fail and do no harm."""
+"""Metrics: episode statistics against a slow count, files a crash cannot spoil, sinks that fail and
+do no harm.
+"""
+
 import builtins
 import json
 import pathlib
@@ -14,7 +17,9 @@ from agents.metrics import Episodes, Metrics
 
 
 def counted(reward, reset, done, carry):
-    """Return and length of each episode that ends, one lane and one step at a time; `carry` holds them by lane."""
+    """Return and length of each episode that ends, one lane and one step at a time; `carry` holds
+    them by lane.
+    """
     finished = []
     for t in range(len(reward)):
         for lane in range(reward.shape[1]):
@@ -22,28 +27,41 @@ def counted(reward, reset, done, carry):
             total, length = total + float(reward[t, lane]), length + (not reset[t, lane])
             if done[t, lane]:
                 finished.append((total, length))
-                total, length = 0., 0
+                total, length = 0.0, 0
             carry[lane] = total, length
     return finished
 
 
 def test_two_steps_and_an_end_are_an_episode_of_length_two():
     episodes = Episodes(1, "cpu")
-    reset, done = torch.tensor([[False], [False], [True], [False]]), torch.tensor([[False], [True], [False], [False]])
-    episodes.add(torch.tensor([[1.], [2.], [0.], [5.]]), reset, done)
-    assert episodes.take() == {"episode/count": 1, "episode/return": 3., "episode/length": 2., "episode/deviation": 0.}
-    assert episodes.returns.tolist() == [5.] and episodes.lengths.tolist() == [1.]
+    reset, done = (
+        torch.tensor([[False], [False], [True], [False]]),
+        torch.tensor([[False], [True], [False], [False]]),
+    )
+    episodes.add(torch.tensor([[1.0], [2.0], [0.0], [5.0]]), reset, done)
+    assert episodes.take() == {
+        "episode/count": 1,
+        "episode/return": 3.0,
+        "episode/length": 2.0,
+        "episode/deviation": 0.0,
+    }
+    assert episodes.returns.tolist() == [5.0] and episodes.lengths.tolist() == [1.0]
     assert episodes.take() == {"episode/count": 0}
 
 
 def test_episodes_run_across_rollouts_as_if_there_were_one():
     torch.manual_seed(1)
-    n_lanes, carry, episodes, finished = 5, {lane: (0., 0) for lane in range(5)}, Episodes(5, "cpu"), []
+    n_lanes, carry, episodes, finished = (
+        5,
+        {lane: (0.0, 0) for lane in range(5)},
+        Episodes(5, "cpu"),
+        [],
+    )
     before = torch.zeros(n_lanes, dtype=torch.bool)
     for _ in range(6):
-        done = torch.rand(7, n_lanes) < .2
+        done = torch.rand(7, n_lanes) < 0.2
         reset = torch.cat([before[None], done[:-1]])
-        done &= ~reset      # a lane on its first observation has not ended
+        done &= ~reset  # a lane on its first observation has not ended
         reset = torch.cat([before[None], done[:-1]])
         before = done[-1]
         reward = torch.rand(7, n_lanes) * ~reset
@@ -54,20 +72,27 @@ def test_episodes_run_across_rollouts_as_if_there_were_one():
     assert found["episode/count"] == len(finished) > 20
     assert found["episode/return"] == pytest.approx(float(returns.mean()), rel=1e-6)
     assert found["episode/deviation"] == pytest.approx(float(returns.std(correction=0)), rel=1e-5)
-    assert found["episode/length"] == pytest.approx(sum(length for _, length in finished) / len(finished))
-    assert episodes.returns.tolist() == pytest.approx([carry[lane][0] for lane in range(n_lanes)], rel=1e-6)
+    assert found["episode/length"] == pytest.approx(
+        sum(length for _, length in finished) / len(finished)
+    )
+    assert episodes.returns.tolist() == pytest.approx(
+        [carry[lane][0] for lane in range(n_lanes)], rel=1e-6
+    )
 
 
 def test_files_hold_what_was_written(tmp_path):
     sinks = Metrics(tmp_path)
-    sinks.write(64, {"loss/value": .25, "episode/count": 3, "bad": float("nan")}, {"perf/rate": 1e6})
+    sinks.write(
+        64, {"loss/value": 0.25, "episode/count": 3, "bad": float("nan")}, {"perf/rate": 1e6}
+    )
     sinks.close()
-    row, = metrics.read(tmp_path / "metrics.jsonl")
-    assert row == {"samples": 64, "loss/value": .25, "episode/count": 3, "bad": None}
+    (row,) = metrics.read(tmp_path / "metrics.jsonl")
+    assert row == {"samples": 64, "loss/value": 0.25, "episode/count": 3, "bad": None}
     assert metrics.read(tmp_path / "perf.jsonl") == [{"samples": 64, "perf/rate": 1e6}]
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
-    assert [(e.step, e.value) for e in events.Scalars("loss/value")] == [(64, .25)]
+    assert [(e.step, e.value) for e in events.Scalars("loss/value")] == [(64, 0.25)]
 
 
 def test_a_resumed_run_writes_again_what_came_after_its_checkpoint(tmp_path):
@@ -76,7 +101,7 @@ def test_a_resumed_run_writes_again_what_came_after_its_checkpoint(tmp_path):
         sinks.write(step, {"x": step}, {})
     sinks.close()
     with open(tmp_path / "metrics.jsonl", "a") as file:
-        file.write('{"samples": 40, "x"')     # the line that a kill cut short
+        file.write('{"samples": 40, "x"')  # the line that a kill cut short
     sinks = Metrics(tmp_path, step=20)
     sinks.write(30, {"x": -1}, {})
     sinks.close()
@@ -92,14 +117,20 @@ def without(monkeypatch, package):
             raise ImportError(f"No module named {name!r}")
         return real(name, *args, **kwargs)
 
-    for name in [n for n in sys.modules if n.split(".")[0] == package or n.startswith("torch.utils.tensorboard")]:
+    for name in [
+        n
+        for n in sys.modules
+        if n.split(".")[0] == package or n.startswith("torch.utils.tensorboard")
+    ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(builtins, "__import__", refuse)
     monkeypatch.setattr("importlib.import_module", lambda name, package=None: refuse(name))
 
 
 @pytest.mark.parametrize("package", ["tensorboard", "wandb"])
-def test_a_package_that_is_missing_is_named_with_the_line_that_installs_it(tmp_path, monkeypatch, package):
+def test_a_package_that_is_missing_is_named_with_the_line_that_installs_it(
+    tmp_path, monkeypatch, package
+):
     without(monkeypatch, package)
     with pytest.warns(UserWarning, match=f"pip install {package}"):
         sinks = Metrics(tmp_path, wandb=WANDB if package == "wandb" else None)
@@ -113,7 +144,9 @@ def fake_wandb(monkeypatch, key="key", init=None, log=None):
     logged = []
     room = types.SimpleNamespace
     run = room(log=log or (lambda values, step: logged.append((step, values))), finish=lambda: None)
-    module = room(login=lambda prompt: key is not None, Settings=dict, init=init or (lambda **_: run))
+    module = room(
+        login=lambda prompt: key is not None, Settings=dict, init=init or (lambda **_: run)
+    )
     monkeypatch.setitem(sys.modules, "wandb", module)
     return logged
 
@@ -132,9 +165,17 @@ def test_wandb_gets_what_the_files_get(tmp_path, monkeypatch):
     assert logged == [(5, {"samples": 5, "a": 1, "b": 2})]
 
 
-@pytest.mark.parametrize("fault, sentence", [
-    (dict(key=None), "no key"), (dict(init=failing), "did not start .the network is unreachable.$"),
-    (dict(log=failing), "Wandb failed and is left out from here on .the network is unreachable.$")])
+@pytest.mark.parametrize(
+    "fault, sentence",
+    [
+        (dict(key=None), "no key"),
+        (dict(init=failing), "did not start .the network is unreachable.$"),
+        (
+            dict(log=failing),
+            "Wandb failed and is left out from here on .the network is unreachable.$",
+        ),
+    ],
+)
 def test_wandb_failing_is_one_warning_and_the_run_goes_on(tmp_path, monkeypatch, fault, sentence):
     fake_wandb(monkeypatch, **fault)
     with pytest.warns(UserWarning, match=sentence) as caught:
@@ -150,7 +191,9 @@ def test_a_full_disk_is_one_warning(tmp_path):
     sinks = Metrics(tmp_path)
     sinks.metrics.file.close()
     sinks.metrics.file = open("/dev/full", "a")
-    with pytest.warns(UserWarning, match="metrics.jsonl cannot be written .*No space left.*the run goes on") as caught:
+    with pytest.warns(
+        UserWarning, match="metrics.jsonl cannot be written .*No space left.*the run goes on"
+    ) as caught:
         sinks.write(1, {"x": 1}, {"y": 2})
         sinks.write(2, {"x": 1}, {"y": 2})
     assert len(caught) == 1 and len(metrics.read(tmp_path / "perf.jsonl")) == 2
@@ -158,6 +201,7 @@ def test_a_full_disk_is_one_warning(tmp_path):
 
 def test_the_curves_are_a_picture_of_the_files(tmp_path):
     from matplotlib.image import imread
+
     rows = [{"samples": n, "episode/return": n, "loss/value": None} for n in range(3)]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (tmp_path / "perf.jsonl").write_text("")
@@ -169,10 +213,18 @@ def test_the_curves_are_a_picture_of_the_files(tmp_path):
 def test_the_real_wandb_keeps_an_offline_run(tmp_path):
     script = f"""
 from agents.metrics import Metrics
-sinks = Metrics({str(tmp_path)!r}, wandb=dict(project="p", mode="offline", name="n", config=dict(a=1)))
+wandb = dict(project="p", mode="offline", name="n", config=dict(a=1))
+sinks = Metrics({str(tmp_path)!r}, wandb=wandb)
 sinks.write(1, dict(x=1), dict(y=2))
 sinks.close()"""
-    done = subprocess.run([sys.executable, "-W", "always::UserWarning", "-c", script], text=True, timeout=120,
-                          stderr=subprocess.PIPE, cwd=pathlib.Path(__file__).parents[1])
+    done = subprocess.run(
+        [sys.executable, "-W", "always::UserWarning", "-c", script],
+        text=True,
+        timeout=120,
+        stderr=subprocess.PIPE,
+        cwd=pathlib.Path(__file__).parents[1],
+    )
     assert done.returncode == 0 and "left out" not in done.stderr, done.stderr
-    assert [path.stat().st_size > 1000 for path in tmp_path.glob("wandb/offline-run-*/*.wandb")] == [True]
+    assert [
+        path.stat().st_size > 1000 for path in tmp_path.glob("wandb/offline-run-*/*.wandb")
+    ] == [True]

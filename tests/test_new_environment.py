@@ -1,4 +1,5 @@
 """The code of docs/new-environment.md, run in order, and what its text promises of it."""
+
 import re
 from pathlib import Path
 
@@ -8,40 +9,45 @@ import torch
 
 from megastep import arrdict, capture, plotting
 
-PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'new-environment.md'
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "new-environment.md"
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope="module")
 def names():
     """What the page's code defines."""
     found = {}
-    for block in re.findall(r'```python\n(.*?)```', PAGE.read_text(), re.S):
-        exec(compile(block, str(PAGE), 'exec'), found)
+    for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S):
+        exec(compile(block, str(PAGE), "exec"), found)
     return found
 
 
 def test_the_page_trains(names):
-    assert all(bool(value.isfinite()) for value in names['losses'].values()) and names['rollout'].reward.any()
+    assert (
+        all(bool(value.isfinite()) for value in names["losses"].values())
+        and names["rollout"].reward.any()
+    )
 
 
 def test_rover_pays_metres_and_ends_at_walls(names):
-    env = names['Rover'](n_envs=64, device='cpu', limit=50)
+    env = names["Rover"](n_envs=64, device="cpu", limit=50)
     worlds = contract.rollout(env, 150)
-    assert any(bool(w.terminal.any()) for w in worlds) and any(bool(w.truncated.any()) for w in worlds)
-    assert max(float(w.reward.max()) for w in worlds) < .5, 'at most 4 m/s, a tenth of a second'
+    assert any(bool(w.terminal.any()) for w in worlds) and any(
+        bool(w.truncated.any()) for w in worlds
+    )
+    assert max(float(w.reward.max()) for w in worlds) < 0.5, "at most 4 m/s, a tenth of a second"
 
 
 def test_rover_is_drawn(names):
-    env = names['Rover'](n_envs=2, device='cpu')
+    env = names["Rover"](n_envs=2, device="cpu")
     env.reset()
     assert plotting.rasterise(env.plot_state(arrdict.numpyify(env.state(1)))).std() > 5
 
 
 @pytest.mark.cuda
-@pytest.mark.skipif(not torch.cuda.is_available(), reason='needs a GPU')
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_rover_is_captured(names):
     runs = []
     for wrap in (lambda env: env, capture.Captured):
-        env = wrap(names['Rover'](n_envs=16, device='cuda', limit=10))
+        env = wrap(names["Rover"](n_envs=16, device="cuda", limit=10))
         runs.append(arrdict.stack(contract.rollout(env, 30)))
     assert isinstance(env._step, capture.Graph) and contract.same(*runs)

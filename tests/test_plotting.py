@@ -1,4 +1,5 @@
 """Pictures: the sRGB curve, and what is drawn where."""
+
 import subprocess
 import sys
 
@@ -10,14 +11,15 @@ import torch
 from megastep import core, plotting
 from megastep.plotting import gamma_decode, gamma_encode
 
-matplotlib.use('Agg')
+matplotlib.use("Agg")
 
 
 @pytest.fixture(autouse=True)
 def _closed():
     from matplotlib import pyplot
+
     yield
-    pyplot.close('all')
+    pyplot.close("all")
 
 
 @pytest.fixture
@@ -27,28 +29,35 @@ def ax():
 
 # ---- sRGB ----
 
-@pytest.mark.parametrize(('light', 'value'), [(0, 0), (.001, .01292), (.2140411, .5), (.5, .7353569), (1, 1)])
+
+@pytest.mark.parametrize(
+    ("light", "value"), [(0, 0), (0.001, 0.01292), (0.2140411, 0.5), (0.5, 0.7353569), (1, 1)]
+)
 def test_the_srgb_curve_passes_through_its_published_points(light, value):
     assert gamma_encode(light) == pytest.approx(value, abs=1e-6)
     assert gamma_decode(value) == pytest.approx(light, abs=1e-6)
 
 
-@pytest.mark.parametrize('kind', [np.linspace, torch.linspace])
+@pytest.mark.parametrize("kind", [np.linspace, torch.linspace])
 def test_encoding_and_decoding_undo_each_other(kind):
     light = kind(0, 1, 10_001)
-    tolerance = 1e-14 if kind is np.linspace else 1e-6      # float64 and float32 rounding
+    tolerance = 1e-14 if kind is np.linspace else 1e-6  # float64 and float32 rounding
     assert abs(gamma_decode(gamma_encode(light)) - light).max() < tolerance
     assert abs(gamma_encode(gamma_decode(light)) - light).max() < tolerance
     assert (np.diff(gamma_encode(light)) > 0).all()
 
 
 def test_arrays_and_tensors_agree_and_keep_their_dtype():
-    light = np.linspace(-.1, 1.5, 101, dtype=np.float32)
+    light = np.linspace(-0.1, 1.5, 101, dtype=np.float32)
     for f in (gamma_encode, gamma_decode):
         assert f(light).dtype == np.float32 and f(torch.tensor(light)).dtype == torch.float32
         assert np.abs(f(light) - f(torch.tensor(light)).numpy()).max() < 1e-6
         assert f(torch.tensor(light).half()).dtype == torch.float16
-        assert f(np.array([0, 1])).tolist() == f(torch.tensor([0, 1])).round(decimals=6).tolist() == [0, 1]
+        assert (
+            f(np.array([0, 1])).tolist()
+            == f(torch.tensor([0, 1])).round(decimals=6).tolist()
+            == [0, 1]
+        )
 
 
 def test_core_offers_it_too():
@@ -57,51 +66,74 @@ def test_core_offers_it_too():
 
 # ---- Pictures and strips ----
 
+
 def test_a_screen_is_shown_encoded_left_to_right_as_typed_in_the_tutorial():
     screen = np.zeros((1, 1, 64, 3), np.float32)
-    screen[0, 0, 0] = [.2140411, 1, 0]
-    axes = plotting.plot_images({'rgb': screen}, transpose=True, aspect=.1)
-    assert axes.shape == (1, 1) and axes[0, 0].get_title('left') == 'rgb' and axes[0, 0].get_box_aspect() == .1
+    screen[0, 0, 0] = [0.2140411, 1, 0]
+    axes = plotting.plot_images({"rgb": screen}, transpose=True, aspect=0.1)
+    assert (
+        axes.shape == (1, 1)
+        and axes[0, 0].get_title("left") == "rgb"
+        and axes[0, 0].get_box_aspect() == 0.1
+    )
     shown = axes[0, 0].images[0].get_array()
-    assert shown.shape == (1, 64, 3) and np.allclose(shown[0, 0], [.5, 1, 0], atol=1e-6) and (shown[0, 1:] == 0).all()
+    assert (
+        shown.shape == (1, 64, 3)
+        and np.allclose(shown[0, 0], [0.5, 1, 0], atol=1e-6)
+        and (shown[0, 1:] == 0).all()
+    )
 
 
 def test_observations_are_channels_first_with_a_panel_for_each_agent():
-    rgb, depth = np.random.default_rng(1).random((2, 3, 1, 8)), np.linspace(0, 1, 8).reshape(1, 1, 1, 8)
-    axes = plotting.plot_images({'rgb': rgb, 'depth': depth})
-    assert [[ax.get_title('left') for ax in row] for row in axes] == [['rgb 0', 'rgb 1'], ['depth', '']]
-    assert np.allclose(axes[0, 1].images[0].get_array()[0, 5], gamma_encode(rgb[1, :, 0, 5]), atol=1e-6)
-    assert np.allclose(axes[1, 0].images[0].get_array()[0], depth[0, 0, 0])     # grey is shown as it is
+    rgb, depth = (
+        np.random.default_rng(1).random((2, 3, 1, 8)),
+        np.linspace(0, 1, 8).reshape(1, 1, 1, 8),
+    )
+    axes = plotting.plot_images({"rgb": rgb, "depth": depth})
+    assert [[ax.get_title("left") for ax in row] for row in axes] == [
+        ["rgb 0", "rgb 1"],
+        ["depth", ""],
+    ]
+    assert np.allclose(
+        axes[0, 1].images[0].get_array()[0, 5], gamma_encode(rgb[1, :, 0, 5]), atol=1e-6
+    )
+    assert np.allclose(
+        axes[1, 0].images[0].get_array()[0], depth[0, 0, 0]
+    )  # grey is shown as it is
     assert axes[1, 0].images[0].get_clim() == (0, 1) and not axes[1, 1].axison
 
 
 def test_given_axes_are_used():
     figure, _, strips = plotting.panels(2)
-    axes = plotting.plot_images({'rgb': np.zeros((1, 3, 1, 8)), 'd': np.zeros((1, 1, 1, 8), np.float16)}, axes=strips)
+    axes = plotting.plot_images(
+        {"rgb": np.zeros((1, 3, 1, 8)), "d": np.zeros((1, 1, 1, 8), np.float16)}, axes=strips
+    )
     assert list(axes[:, 0]) == strips and all(ax.figure is figure for ax in strips)
 
 
 @pytest.mark.parametrize(
-    ('shape', 'transpose'), [((3, 1, 64), True), ((2, 64, 3), False), ((64,), False), ((64, 3), True)])
+    ("shape", "transpose"),
+    [((3, 1, 64), True), ((2, 64, 3), False), ((64,), False), ((64, 3), True)],
+)
 def test_other_shapes_are_refused(shape, transpose):
     with pytest.raises(ValueError, match="picture 'rgb' must have shape .* with 1 or 3 channels C"):
-        plotting.plot_images({'rgb': np.zeros(shape)}, transpose=transpose)
+        plotting.plot_images({"rgb": np.zeros(shape)}, transpose=transpose)
 
 
-@pytest.mark.parametrize('images', [{}, {'rgb': np.zeros((0, 3, 1, 8))}])
+@pytest.mark.parametrize("images", [{}, {"rgb": np.zeros((0, 3, 1, 8))}])
 def test_nothing_to_show_is_refused(images):
-    with pytest.raises(ValueError, match='given no pictures'):
+    with pytest.raises(ValueError, match="given no pictures"):
         plotting.plot_images(images)
 
 
 # ---- Plans ----
 
 LINES = np.array([[[1, 1], [3, 1]], [[3, 1], [3, 5]]], np.float32)
-COLOURS = [np.array([[.1, 0, 0], [0, .2, 0]]), np.array([[0, 0, .3]])]
+COLOURS = [np.array([[0.1, 0, 0], [0, 0.2, 0]]), np.array([[0, 0, 0.3]])]
 
 
 def test_lines_are_cut_into_texels_of_their_lit_colours(ax):
-    drawn = plotting.plot_lines(ax, LINES, COLOURS, exposure=2.)
+    drawn = plotting.plot_lines(ax, LINES, COLOURS, exposure=2.0)
     assert np.allclose(drawn.get_segments(), [[[1, 1], [2, 1]], [[2, 1], [3, 1]], [[3, 1], [3, 5]]])
     assert np.allclose(drawn.get_colors()[:, :3], gamma_encode(2 * np.concatenate(COLOURS)))
 
@@ -109,7 +141,9 @@ def test_lines_are_cut_into_texels_of_their_lit_colours(ax):
 def test_unseen_texels_are_nearly_background(ax):
     drawn = plotting.plot_lines(ax, LINES, COLOURS, seen=[[True, False], [True]])
     full = plotting.plot_lines(ax, LINES, COLOURS)
-    contrast = np.abs(np.array([lines.get_colors()[:, :3] - plotting.BACKGROUND for lines in (drawn, full)]))
+    contrast = np.abs(
+        np.array([lines.get_colors()[:, :3] - plotting.BACKGROUND for lines in (drawn, full)])
+    )
     assert np.allclose(contrast[0] / contrast[1], np.array([1, plotting.UNSEEN, 1])[:, None])
 
 
@@ -118,13 +152,13 @@ def test_no_lines_draw_nothing(ax):
 
 
 def test_every_line_needs_its_colours(ax):
-    with pytest.raises(ValueError, match='2 lines and 1 arrays of colours'):
+    with pytest.raises(ValueError, match="2 lines and 1 arrays of colours"):
         plotting.plot_lines(ax, LINES, COLOURS[:1])
 
 
 def test_a_plan_shows_everything_to_scale_with_units():
-    ax = plotting.plot_scenery(LINES, COLOURS, lights=np.array([[2., 3., 1.]]))
-    assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_aspect()) == ('x, m', 'y, m', 1)
+    ax = plotting.plot_scenery(LINES, COLOURS, lights=np.array([[2.0, 3.0, 1.0]]))
+    assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_aspect()) == ("x, m", "y, m", 1)
     ax.figure.canvas.draw()
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     assert left < 1 and right > 3 and bottom < 1 and top > 5
@@ -133,7 +167,7 @@ def test_a_plan_shows_everything_to_scale_with_units():
 
 def test_colours_land_where_the_walls_are():
     figure, plan, _ = plotting.panels()
-    plotting.plot_scenery(LINES, [np.array([[1., 0, 0]]), np.array([[0, 1., 0]])], ax=plan)
+    plotting.plot_scenery(LINES, [np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]])], ax=plan)
     image = plotting.rasterise(figure)
 
     def pixel(x, y):
@@ -145,13 +179,14 @@ def test_colours_land_where_the_walls_are():
 
 
 def test_sight_reaches_each_hit_leftmost_ray_first(ax):
-    # Facing +y with 90 degrees and two rays, these look along (1, 1/2) and (1, -1/2): left of +y is -x.
-    patch = plotting.plot_sight(ax, (1, 1), 90, 90, distances=[5**.5, np.inf], reach=2 * 5**.5)
+    # Facing +y with 90 degrees and two rays, these look along (1, 1/2) and (1, -1/2): left of +y is
+    # -x.
+    patch = plotting.plot_sight(ax, (1, 1), 90, 90, distances=[5**0.5, np.inf], reach=2 * 5**0.5)
     assert np.allclose(patch.get_xy()[:3], [[1, 1], [0, 3], [3, 5]])
 
 
 def test_sight_without_distances_is_a_wedge_of_its_field_of_view(ax):
-    rim = plotting.plot_sight(ax, (0, 0), 0, 60, reach=2.).get_xy()[1:-1]
+    rim = plotting.plot_sight(ax, (0, 0), 0, 60, reach=2.0).get_xy()[1:-1]
     assert np.allclose(np.linalg.norm(rim, axis=1), 2)
     degrees = np.degrees(np.arctan2(rim[:, 1], rim[:, 0]))
     assert 28 < degrees[0] < 30 and -30 < degrees[-1] < -28 and (np.diff(degrees) < 0).all()
@@ -159,27 +194,39 @@ def test_sight_without_distances_is_a_wedge_of_its_field_of_view(ax):
 
 # ---- Figures ----
 
+
 def test_panels_are_unknown_to_pyplot_and_do_not_overlap():
     from matplotlib import pyplot
-    figure, plan, strips = plotting.panels(3, title='a title')
-    assert pyplot.get_fignums() == [] and len(strips) == 3 and plan.get_title() == 'a title'
+
+    figure, plan, strips = plotting.panels(3, title="a title")
+    assert pyplot.get_fignums() == [] and len(strips) == 3 and plan.get_title() == "a title"
     bottoms = [ax.get_position().y0 for ax in (plan, *strips)]
     tops = [ax.get_position().y1 for ax in (plan, *strips)]
-    assert all(top < bottom for top, bottom in zip(tops[1:], bottoms)) and bottoms[-1] > 0 and tops[0] < 1
+    assert (
+        all(top < bottom for top, bottom in zip(tops[1:], bottoms))
+        and bottoms[-1] > 0
+        and tops[0] < 1
+    )
     height, width, channels = plotting.rasterise(figure).shape
     assert (width, channels) == (600, 3) and abs(height - 100 * figure.get_figheight()) < 1
 
 
 def test_rasterising_leaves_a_pyplot_figure_usable():
     from matplotlib import pyplot
-    figure = pyplot.figure(figsize=(2, 1), dpi=50, facecolor='r')
-    assert (plotting.rasterise(figure) == [255, 0, 0]).all() and plotting.rasterise(figure).shape == (50, 100, 3)
+
+    figure = pyplot.figure(figsize=(2, 1), dpi=50, facecolor="r")
+    assert (plotting.rasterise(figure) == [255, 0, 0]).all() and plotting.rasterise(
+        figure
+    ).shape == (50, 100, 3)
     assert pyplot.fignum_exists(figure.number)
 
 
 def test_importing_the_simulator_does_not_import_matplotlib_or_compile():
-    code = ("import sys; import megastep; assert 'torch' not in sys.modules; "
-            "from megastep import core, modules, envs, plotting; "
-            "print([m for m in ('matplotlib', 'av', 'IPython', 'hydra', 'wandb', 'loky') if m in sys.modules])")
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    assert done.stdout == '[]\n', done.stderr
+    code = (
+        "import sys; import megastep; assert 'torch' not in sys.modules; "
+        "from megastep import core, modules, envs, plotting; "
+        "print([m for m in ('matplotlib', 'av', 'IPython', 'hydra', 'wandb', 'loky') if m in "
+        "sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "[]\n", done.stderr

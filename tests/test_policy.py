@@ -1,4 +1,7 @@
-"""The policy: what it does step by step is what it does over a sequence, and a seed decides all of it."""
+"""The policy: what it does step by step is what it does over a sequence, and a seed decides all of
+it.
+"""
+
 import io
 
 import pytest
@@ -17,7 +20,7 @@ MOVES = arrdict(movement=spaces.MultiDiscrete(1, 7), fire=spaces.MultiDiscrete(1
 def worlds(obs_space=OBS, dtype=torch.float16, seed=0):
     generator = torch.Generator().manual_seed(seed)
     obs = obs_space.map(lambda space: torch.rand(T, B, *space.shape, generator=generator).to(dtype))
-    return arrdict(obs=obs, reset=torch.rand(T, B, generator=generator) < .3)
+    return arrdict(obs=obs, reset=torch.rand(T, B, generator=generator) < 0.3)
 
 
 def play(policy, seen, **how):
@@ -28,12 +31,14 @@ def play(policy, seen, **how):
     return stack(decisions), state
 
 
-@pytest.mark.parametrize('encoder', ['linear', 'conv'])
+@pytest.mark.parametrize("encoder", ["linear", "conv"])
 def test_acting_step_by_step_sees_what_an_unroll_sees(encoder):
     policy, seen = Policy(OBS, MOVES, width=32, encoder=encoder), worlds()
     decisions, state = play(policy, seen)
     unrolled = policy.unroll(seen.obs, seen.reset, policy.initial(B))
-    close = dict(rtol=1e-5, atol=1e-5)  # the same float32 products over T rows at once and one at a time
+    close = dict(
+        rtol=1e-5, atol=1e-5
+    )  # the same float32 products over T rows at once and one at a time
     torch.testing.assert_close(decisions.logits.movement, unrolled.logits.movement, **close)
     torch.testing.assert_close(decisions.value, unrolled.value, **close)
     torch.testing.assert_close(state.cell, unrolled.state.cell, **close)
@@ -45,7 +50,10 @@ def test_a_decision_has_the_shapes_of_the_contract():
     policy = Policy(OBS, MOVES, width=32)
     decision, state = policy(worlds()[0], policy.initial(B))
     assert decision.actions.movement.shape == (B, 1) and decision.logits.fire.shape == (B, 1, 2)
-    assert decision.logprobs.shape == decision.value.shape == (B,) and decision.value.dtype == torch.float32
+    assert (
+        decision.logprobs.shape == decision.value.shape == (B,)
+        and decision.value.dtype == torch.float32
+    )
     assert state.cell.shape == (B, 32)
 
 
@@ -58,7 +66,9 @@ def test_bare_spaces_work_too():
 
 def test_a_seed_decides_weights_and_actions_and_leaves_torchs_own_alone():
     before = torch.get_rng_state()
-    first, second, other = (play(Policy(OBS, MOVES, width=32, seed=seed), worlds())[0] for seed in (1, 1, 2))
+    first, second, other = (
+        play(Policy(OBS, MOVES, width=32, seed=seed), worlds())[0] for seed in (1, 1, 2)
+    )
     assert torch.equal(before, torch.get_rng_state())
     assert torch.equal(first.actions.movement, second.actions.movement)
     assert torch.equal(first.logits.movement, second.logits.movement)
@@ -68,29 +78,33 @@ def test_a_seed_decides_weights_and_actions_and_leaves_torchs_own_alone():
 
 def test_a_generator_of_ones_own_decides_the_actions():
     policy, seen = Policy(OBS, MOVES, width=32), worlds()
-    first, second = (play(policy, seen, generator=torch.Generator().manual_seed(5))[0].actions for _ in range(2))
+    first, second = (
+        play(policy, seen, generator=torch.Generator().manual_seed(5))[0].actions for _ in range(2)
+    )
     assert torch.equal(first.movement, second.movement) and torch.equal(first.fire, second.fire)
 
 
 def test_weights_load_from_plain_tensors():
     policy, twin = Policy(OBS, MOVES, width=32, seed=1), Policy(OBS, MOVES, width=32, seed=2)
-    policy.value.rescale(torch.tensor([1., 9.]), torch.tensor([True, True]))
+    policy.value.rescale(torch.tensor([1.0, 9.0]), torch.tensor([True, True]))
     file = io.BytesIO()
     torch.save(policy.state_dict(), file)
     file.seek(0)
     twin.load_state_dict(torch.load(file, weights_only=True))
     seen = worlds()
     ours, theirs = (p.unroll(seen.obs, seen.reset, p.initial(B)) for p in (policy, twin))
-    assert torch.equal(ours.value, theirs.value) and torch.equal(ours.logits.fire, theirs.logits.fire)
+    assert torch.equal(ours.value, theirs.value) and torch.equal(
+        ours.logits.fire, theirs.logits.fire
+    )
 
 
 def test_a_width_of_zero_is_refused():
-    with pytest.raises(ValueError, match='width is 0'):
+    with pytest.raises(ValueError, match="width is 0"):
         Policy(OBS, MOVES, width=0)
 
 
 def test_draws_go_on_where_they_were_saved():
-    draws, cpu = Draws(3), torch.device('cpu')
+    draws, cpu = Draws(3), torch.device("cpu")
     untouched = draws.state_dict()
     start = torch.rand(4, generator=draws.on(cpu))
     saved = draws.state_dict()
@@ -100,7 +114,9 @@ def test_draws_go_on_where_they_were_saved():
     assert torch.equal(torch.rand(4, generator=other.on(cpu)), rest)
     other.load_state_dict(untouched, cpu)
     assert torch.equal(torch.rand(4, generator=other.on(cpu)), start)
-    other.load_state_dict({**saved, 'device': 'cuda'}, cpu)  # a GPU's state means nothing here: from the seed again
+    other.load_state_dict(
+        {**saved, "device": "cuda"}, cpu
+    )  # a GPU's state means nothing here: from the seed again
     assert torch.equal(torch.rand(4, generator=other.on(cpu)), start)
 
 
@@ -111,10 +127,12 @@ def test_on_a_gpu_acting_asks_nothing_and_stays_close_to_single_precision():
         policy = Policy(OBS, MOVES, width=64, bf16=bf16).cuda()
         state = policy.initial(B)
         policy(seen[0], state)
-        torch.cuda.set_sync_debug_mode('error')
+        torch.cuda.set_sync_debug_mode("error")
         try:
             policy(seen[1], state)
             results.append(policy.unroll(seen.obs, seen.reset, state).logits.movement)
         finally:
-            torch.cuda.set_sync_debug_mode('default')
-    torch.testing.assert_close(*results, rtol=0, atol=5e-3)  # logits of a first policy differ by some .01, bf16 by 1 %
+            torch.cuda.set_sync_debug_mode("default")
+    torch.testing.assert_close(
+        *results, rtol=0, atol=5e-3
+    )  # logits of a first policy differ by some .01, bf16 by 1 %

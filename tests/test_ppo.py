@@ -1,4 +1,7 @@
-"""PPO: what one update does, on rollouts made up for the purpose. That it learns is in test_learning.py."""
+"""PPO: what one update does, on rollouts made up for the purpose. That it learns is in
+test_learning.py.
+"""
+
 import io
 import math
 
@@ -14,11 +17,15 @@ T, B, WIDTH = 8, 6, 16
 OBS, MOVES = spaces.MultiVector(1, 4), spaces.MultiDiscrete(1, 3)
 
 
-def made_up(seed=0, device='cpu'):
-    """A policy and a rollout of random worlds, acted in by that policy. Lanes 1 and 4 have resets in the middle."""
+def made_up(seed=0, device="cpu"):
+    """A policy and a rollout of random worlds, acted in by that policy. Lanes 1 and 4 have resets
+    in the middle.
+    """
     policy = Policy(OBS, MOVES, width=WIDTH, seed=seed).to(device)
     with torch.no_grad():
-        policy.output.core.weight.mul_(100)  # a policy with opinions, so that gradients differ by action
+        policy.output.core.weight.mul_(
+            100
+        )  # a policy with opinions, so that gradients differ by action
     rollout = buffers.Rollout(T, B, OBS, MOVES, device, obs_dtype=torch.float32)
     generator = torch.Generator().manual_seed(seed)
 
@@ -40,20 +47,29 @@ def made_up(seed=0, device='cpu'):
 
 def weights(policy):
     """All but the value's own layer, which `rescale` changes without changing what it says."""
-    return torch.cat([p.detach().flatten() for name, p in policy.named_parameters() if not name.startswith('value')])
+    return torch.cat(
+        [
+            p.detach().flatten()
+            for name, p in policy.named_parameters()
+            if not name.startswith("value")
+        ]
+    )
 
 
 def test_means_and_deviations_are_over_the_valid():
-    x, valid = torch.tensor([[1., 5.], [torch.nan, 3.]]), torch.tensor([[True, True], [False, True]])
+    x, valid = (
+        torch.tensor([[1.0, 5.0], [torch.nan, 3.0]]),
+        torch.tensor([[True, True], [False, True]]),
+    )
     assert ppo.masked_mean(x, valid).item() == 3
     deviation = math.sqrt(8 / 3)
-    expected = torch.tensor([[-2 / deviation, 2 / deviation], [0., 0.]])
+    expected = torch.tensor([[-2 / deviation, 2 / deviation], [0.0, 0.0]])
     torch.testing.assert_close(ppo.normalised(x, valid), expected)
     assert ppo.masked_mean(x, torch.zeros_like(valid)).item() == 0
 
 
 def test_explained_variance_of_the_truth_is_one_and_of_a_constant_zero():
-    targets, valid = torch.tensor([[1., 2., 6.]]), torch.tensor([[True, True, True]])
+    targets, valid = torch.tensor([[1.0, 2.0, 6.0]]), torch.tensor([[True, True, True]])
     assert ppo.explained_variance(targets + 4, targets, valid).item() == pytest.approx(1)
     assert ppo.explained_variance(torch.zeros(1, 3), targets, valid).item() == pytest.approx(0)
     assert ppo.explained_variance(-targets, targets, valid).item() == pytest.approx(-3)
@@ -62,33 +78,45 @@ def test_explained_variance_of_the_truth_is_one_and_of_a_constant_zero():
 def test_the_first_pass_finds_the_policy_where_it_was():
     policy, rollout = made_up()
     metrics = ppo.PPO(policy, n_minibatches=1).update(rollout)
-    assert metrics['loss/kl'].item() == pytest.approx(0, abs=1e-6)
-    assert metrics['loss/clip_fraction'].item() == metrics['loss/skipped_steps'].item() == 0
+    assert metrics["loss/kl"].item() == pytest.approx(0, abs=1e-6)
+    assert metrics["loss/clip_fraction"].item() == metrics["loss/skipped_steps"].item() == 0
     # With ratios of 1 the policy's loss is the mean advantage, which normalising made 0
-    assert metrics['loss/policy'].item() == pytest.approx(0, abs=1e-6)
-    assert 0 < metrics['loss/entropy'].item() < math.log(3)
-    assert set(metrics) == {f'loss/{key}' for key in (
-        'policy', 'value', 'entropy', 'kl', 'clip_fraction', 'grad_norm', 'explained_variance', 'skipped_steps')}
+    assert metrics["loss/policy"].item() == pytest.approx(0, abs=1e-6)
+    assert 0 < metrics["loss/entropy"].item() < math.log(3)
+    assert set(metrics) == {
+        f"loss/{key}"
+        for key in (
+            "policy",
+            "value",
+            "entropy",
+            "kl",
+            "clip_fraction",
+            "grad_norm",
+            "explained_variance",
+            "skipped_steps",
+        )
+    }
 
 
 def test_kl_and_clipping_by_hand():
-    # Acting found every action half as probable as the policy does now: ratio 2, so KL = 2 - 1 - log 2 in every row
+    # Acting found every action half as probable as the policy does now: ratio 2, so KL = 2 - 1 -
+    # log 2 in every row
     policy, rollout = made_up()
     rollout.logprobs -= math.log(2)
-    metrics = ppo.PPO(policy, n_minibatches=2, lr=0.).update(rollout)
-    assert metrics['loss/kl'].item() == pytest.approx(1 - math.log(2), abs=1e-5)
-    assert metrics['loss/clip_fraction'].item() == 1
+    metrics = ppo.PPO(policy, n_minibatches=2, lr=0.0).update(rollout)
+    assert metrics["loss/kl"].item() == pytest.approx(1 - math.log(2), abs=1e-5)
+    assert metrics["loss/clip_fraction"].item() == 1
 
 
 def test_good_actions_become_likelier_and_bad_ones_rarer():
     policy, rollout = made_up()
     rollout.reward[:] = (rollout.actions[..., 0] == 2).float()
     before = policy.unroll(rollout.obs, rollout.starts, rollout.state).logits.exp().mean((0, 1, 2))
-    learner = ppo.PPO(policy, lr=3e-3, gamma=0.)
+    learner = ppo.PPO(policy, lr=3e-3, gamma=0.0)
     for _ in range(5):
         learner.update(rollout)
     after = policy.unroll(rollout.obs, rollout.starts, rollout.state).logits.exp().mean((0, 1, 2))
-    assert after[2] > before[2] + .05 and after[0] < before[0] and after[1] < before[1]
+    assert after[2] > before[2] + 0.05 and after[0] < before[0] and after[1] < before[1]
 
 
 def test_what_an_invalid_row_holds_teaches_nothing():
@@ -98,7 +126,7 @@ def test_what_an_invalid_row_holds_teaches_nothing():
         if spoil:
             ignored = rollout.reset.nonzero(as_tuple=True)
             assert len(ignored[0]) == 2
-            rollout.reward[ignored], rollout.logprobs[ignored] = 1e3, -5.
+            rollout.reward[ignored], rollout.logprobs[ignored] = 1e3, -5.0
             rollout.actions[ignored] = (rollout.actions[ignored] + 1) % 3
         learner = ppo.PPO(policy, n_epochs=2, n_minibatches=2)
         results.append((learner.update(rollout), weights(policy)))
@@ -111,18 +139,18 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
     policy, rollout = made_up()
     learner = ppo.PPO(policy, n_minibatches=B, n_epochs=2)
     learner.update(rollout)
-    before = weights(policy), learner.optimizer.state_dict()['state'][0]['exp_avg'].clone()
+    before = weights(policy), learner.optimizer.state_dict()["state"][0]["exp_avg"].clone()
     rollout.logprobs[:] = torch.nan
     metrics = learner.update(rollout)
-    assert metrics['loss/skipped_steps'].item() == 2 * B and metrics['loss/kl'].isnan()
+    assert metrics["loss/skipped_steps"].item() == 2 * B and metrics["loss/kl"].isnan()
     assert torch.equal(weights(policy), before[0])
-    assert torch.equal(learner.optimizer.state_dict()['state'][0]['exp_avg'], before[1])
+    assert torch.equal(learner.optimizer.state_dict()["state"][0]["exp_avg"], before[1])
 
     policy, rollout = made_up()
     rollout.logprobs[2, 3] = torch.nan  # one lane of six, a minibatch of its own
     before = weights(policy)
     metrics = ppo.PPO(policy, n_minibatches=B).update(rollout)
-    assert metrics['loss/skipped_steps'].item() == 1
+    assert metrics["loss/skipped_steps"].item() == 1
     assert not torch.equal(weights(policy), before) and weights(policy).isfinite().all()
     assert all(value.isfinite() for value in metrics.values())
 
@@ -149,7 +177,7 @@ def test_an_update_learns_how_observations_are_spread():
 def test_the_learning_rate_can_be_changed():
     policy, rollout = made_up()
     learner, before = ppo.PPO(policy, lr=1e-2), weights(policy)
-    learner.set_lr(0.)
+    learner.set_lr(0.0)
     learner.update(rollout)
     assert torch.equal(weights(policy), before)
     learner.set_lr(1e-3)
@@ -158,7 +186,7 @@ def test_the_learning_rate_can_be_changed():
     assert 0 < (weights(policy) - before).abs().max() < 4 * 4e-3
 
 
-@pytest.mark.parametrize('n_before', [0, 2])
+@pytest.mark.parametrize("n_before", [0, 2])
 def test_a_saved_learner_goes_on_bit_by_bit(n_before):
     policy, rollout = made_up()
     learner = ppo.PPO(policy, n_epochs=2, n_minibatches=3)
@@ -172,20 +200,22 @@ def test_a_saved_learner_goes_on_bit_by_bit(n_before):
     file.seek(0)
     saved = torch.load(file, weights_only=True)
     other = Policy(OBS, MOVES, width=WIDTH, seed=9)
-    resumed = ppo.PPO(other, n_epochs=2, n_minibatches=3, lr=.5, seed=9)
-    other.load_state_dict(saved['policy'])
-    resumed.load_state_dict(saved['learner'])
+    resumed = ppo.PPO(other, n_epochs=2, n_minibatches=3, lr=0.5, seed=9)
+    other.load_state_dict(saved["policy"])
+    resumed.load_state_dict(saved["learner"])
     resumed.update(rollout)
     assert torch.equal(weights(other), weights(policy))
-    assert torch.equal(other.draws.on(other.device).get_state(), policy.draws.on(policy.device).get_state())
-    resumed.set_lr(0.)  # still reaches the optimizer
+    assert torch.equal(
+        other.draws.on(other.device).get_state(), policy.draws.on(policy.device).get_state()
+    )
+    resumed.set_lr(0.0)  # still reaches the optimizer
     resumed.update(rollout)
     assert torch.equal(weights(other), weights(policy))
 
 
 def test_minibatches_need_lanes():
     policy, rollout = made_up()
-    with pytest.raises(ValueError, match='6 lanes cannot be cut into 7 minibatches'):
+    with pytest.raises(ValueError, match="6 lanes cannot be cut into 7 minibatches"):
         ppo.PPO(policy, n_minibatches=7).update(rollout)
 
 
@@ -198,7 +228,7 @@ def test_nested_actions_learn_together():
     rollout.reward[:] = torch.randn(T, B)
     before = weights(policy)
     metrics = ppo.PPO(policy).update(rollout)
-    assert metrics['loss/entropy'].item() == pytest.approx(math.log(6), abs=1e-3)
+    assert metrics["loss/entropy"].item() == pytest.approx(math.log(6), abs=1e-3)
     assert not torch.equal(weights(policy), before)
 
 
@@ -206,22 +236,24 @@ def test_nested_actions_learn_together():
 def test_a_captured_update_is_the_eager_one():
     ends = []
     for graph in (False, True):
-        policy, rollout = made_up(device='cuda')
+        policy, rollout = made_up(device="cuda")
         learner = ppo.PPO(policy, n_epochs=2, n_minibatches=3, lr=1e-3, graph=graph)
         for i in range(5):
             learner.set_lr(1e-3 / (i + 1))
             metrics = learner.update(rollout)
-        ends.append((weights(policy), metrics['loss/value']))
-    torch.testing.assert_close(ends[1], ends[0], rtol=1e-3, atol=1e-4)  # bf16 products, kernels chosen anew
+        ends.append((weights(policy), metrics["loss/value"]))
+    torch.testing.assert_close(
+        ends[1], ends[0], rtol=1e-3, atol=1e-4
+    )  # bf16 products, kernels chosen anew
 
 
 @pytest.mark.cuda
 def test_an_update_asks_the_gpu_nothing():
-    policy, rollout = made_up(device='cuda')
-    learner = ppo.PPO(policy, n_epochs=2, n_minibatches=2, target_kl=.01)
+    policy, rollout = made_up(device="cuda")
+    learner = ppo.PPO(policy, n_epochs=2, n_minibatches=2, target_kl=0.01)
     learner.update(rollout)
-    torch.cuda.set_sync_debug_mode('error')
+    torch.cuda.set_sync_debug_mode("error")
     try:
         learner.update(rollout)
     finally:
-        torch.cuda.set_sync_debug_mode('default')
+        torch.cuda.set_sync_debug_mode("default")

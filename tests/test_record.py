@@ -1,4 +1,5 @@
 """Videos of trained agents."""
+
 import builtins
 import sys
 
@@ -10,8 +11,18 @@ from configs import commandline
 from configs.settings import Train, build
 from megastep import recording
 
-TINY = ["env=minimal", "geometry=box", "agent=small", "env.n_envs=4", "env.res=8", "learner.n_steps=8",
-        "learner.n_minibatches=2", "agent.width=8", "device=cpu", "samples=1"]
+TINY = [
+    "env=minimal",
+    "geometry=box",
+    "agent=small",
+    "env.n_envs=4",
+    "env.res=8",
+    "learner.n_steps=8",
+    "learner.n_minibatches=2",
+    "agent.width=8",
+    "device=cpu",
+    "samples=1",
+]
 
 
 @pytest.fixture(scope="module")
@@ -24,10 +35,11 @@ def trained(tmp_path_factory):
 
 def test_a_video_has_a_frame_for_every_step(trained):
     import av
+
     assert record.main([f"run={trained}", "steps=3", "device=cpu"]) == 0
     with av.open(str(trained / "video.mp4")) as video:
         frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
-        assert video.streams.video[0].average_rate == 10      # the environment's
+        assert video.streams.video[0].average_rate == 10  # the environment's
     assert len(frames) == 3 and frames[0].std() > 10
     assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
 
@@ -49,7 +61,9 @@ def test_training_survives_a_video_that_fails(trained, tmp_path, monkeypatch, ca
     assert not list(tmp_path.glob("runs/*/*.mp4"))
 
 
-def test_without_the_encoder_training_goes_on_and_the_package_is_named(tmp_path, monkeypatch, capsys):
+def test_without_the_encoder_training_goes_on_and_the_package_is_named(
+    tmp_path, monkeypatch, capsys
+):
     real = builtins.__import__
 
     def refuse(name, *arguments, **options):

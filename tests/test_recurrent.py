@@ -1,4 +1,5 @@
 """The LSTM against PyTorch's own, and its forgetting against sequences cut by hand."""
+
 import pytest
 import torch
 from torch import nn
@@ -10,14 +11,14 @@ T, B, W = 9, 5, 16
 CLOSE = dict(rtol=1e-5, atol=1e-5)  # float32 sums of 16 products, nine steps deep, in another order
 
 
-def case(seed=0, p_reset=.3):
+def case(seed=0, p_reset=0.3):
     """An LSTM, inputs (T, B, W), resets (T, B), and a state that is not zero."""
     torch.manual_seed(seed)
     lstm = LSTM(W)
     with torch.no_grad():
         lstm.input.bias.normal_()
     x = torch.randn(T, B, W, requires_grad=True)
-    state = arrdict({key: torch.randn(B, W, requires_grad=True) for key in ('output', 'cell')})
+    state = arrdict({key: torch.randn(B, W, requires_grad=True) for key in ("output", "cell")})
     return lstm, x, torch.rand(T, B) < p_reset, state
 
 
@@ -45,7 +46,7 @@ def by_hand(cell, x, reset, state):
     return torch.stack(outputs).view(x.shape[1], len(x), W).transpose(0, 1), torch.stack(cells)
 
 
-@pytest.mark.parametrize('p_reset', [0., .3, 1.])
+@pytest.mark.parametrize("p_reset", [0.0, 0.3, 1.0])
 def test_outputs_and_gradients_are_those_of_torchs_own_cell(p_reset):
     lstm, x, reset, state = case(p_reset=p_reset)
     cell = torchs_own(lstm)
@@ -59,12 +60,19 @@ def test_outputs_and_gradients_are_those_of_torchs_own_cell(p_reset):
     of = (x, state.output, state.cell)
     ours = torch.autograd.grad(
         (outputs * weights[0]).sum() + (after.cell * weights[1]).sum(),
-        (*of, lstm.input.weight, lstm.memory.weight, lstm.input.bias))
+        (*of, lstm.input.weight, lstm.memory.weight, lstm.input.bias),
+    )
     theirs = torch.autograd.grad(
         (expected * weights[0]).sum() + (expected_cell * weights[1]).sum(),
-        (*of, cell.weight_ih, cell.weight_hh, cell.bias_ih), materialize_grads=True)
-    for name, a, b in zip(('x', 'output', 'cell', 'input', 'memory', 'bias'), ours, theirs, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4, msg=lambda text, name=name: f'd {name}: {text}')
+        (*of, cell.weight_ih, cell.weight_hh, cell.bias_ih),
+        materialize_grads=True,
+    )
+    for name, a, b in zip(
+        ("x", "output", "cell", "input", "memory", "bias"), ours, theirs, strict=True
+    ):
+        torch.testing.assert_close(
+            a, b, rtol=1e-4, atol=1e-4, msg=lambda text, name=name: f"d {name}: {text}"
+        )
 
 
 def test_steps_and_a_sequence_agree():
@@ -92,19 +100,21 @@ def test_nothing_before_a_reset_is_remembered_not_even_a_nan():
     spoiled = torch.cat([torch.full((4, B, W), torch.nan), x[4:]])
     again, _ = lstm(spoiled, reset, state.map(lambda leaf: leaf * torch.nan))
     assert torch.equal(again[4:], outputs[4:]) and again[:4].isnan().all()
-    d_x, = torch.autograd.grad(outputs[4:].sum(), x)
+    (d_x,) = torch.autograd.grad(outputs[4:].sum(), x)
     assert not d_x[:4].any() and d_x[4:].all()
 
 
 def test_without_a_reset_the_first_input_reaches_the_last_output():
     lstm, x, _, state = case()
-    d_x, = torch.autograd.grad(lstm(x, torch.zeros(T, B, dtype=torch.bool), state)[0][-1].sum(), x)
+    (d_x,) = torch.autograd.grad(
+        lstm(x, torch.zeros(T, B, dtype=torch.bool), state)[0][-1].sum(), x
+    )
     assert d_x[0].all()
 
 
 def test_lanes_do_not_mix():
     lstm, x, reset, state = case()
-    d_x, = torch.autograd.grad(lstm(x, reset, state)[0][:, 2].sum(), x)
+    (d_x,) = torch.autograd.grad(lstm(x, reset, state)[0][:, 2].sum(), x)
     assert d_x[-1, 2].all() and not d_x[:, [0, 1, 3, 4]].any()
 
 
@@ -114,11 +124,17 @@ def test_the_fused_cell_agrees_with_the_written_out_one():
     on_gpu = LSTM(W).cuda()
     on_gpu.load_state_dict(lstm.state_dict())
     results = []
-    for module, device in ((lstm, 'cpu'), (on_gpu, 'cuda')):
-        inputs = [leaf.detach().to(device).requires_grad_() for leaf in (x, state.output, state.cell)]
-        outputs, after = module(inputs[0], reset.to(device), arrdict(output=inputs[1], cell=inputs[2]))
+    for module, device in ((lstm, "cpu"), (on_gpu, "cuda")):
+        inputs = [
+            leaf.detach().to(device).requires_grad_() for leaf in (x, state.output, state.cell)
+        ]
+        outputs, after = module(
+            inputs[0], reset.to(device), arrdict(output=inputs[1], cell=inputs[2])
+        )
         loss = outputs.square().sum() + after.cell.sum()
         grads = torch.autograd.grad(loss, [*inputs, *module.parameters()])
         results.append([leaf.cpu() for leaf in (outputs, after.cell, *grads)])
     for ours, theirs in zip(*results, strict=True):
-        torch.testing.assert_close(theirs, ours, rtol=1e-3, atol=1e-3)  # products may round to TF32 on a GPU
+        torch.testing.assert_close(
+            theirs, ours, rtol=1e-3, atol=1e-3
+        )  # products may round to TF32 on a GPU

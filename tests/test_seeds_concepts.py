@@ -1,17 +1,21 @@
-"""The code of seed 002, "Concepts", run as its users type it, on the CPU, and what it says about geometry and scenery.
+"""The code of seed 002, "Concepts", run as its users type it, on the CPU, and what it says about
+geometry and scenery.
 
-What the seed prints, where it was right, is compared word by word: its line breaks and columns are lost.
+What the seed prints, where it was right, is compared word by word: its line breaks and columns are
+lost.
 
-Names that moved, all through: `rebar` and `megastep.demo` are `megastep`, `megastep.demo.heads` is `agents.heads`.
-Repairs, each as small as could be:
+Names that moved, all through: `rebar` and `megastep.demo` are `megastep`, `megastep.demo.heads` is
+`agents.heads`. Repairs, each as small as could be:
 
 | as typed | why it cannot run | here |
 | --- | --- | --- |
 | `cpu_tensors.cuda()` | no GPU | `.cpu()` |
 | `.starmap(float.__add__, d)` | `d` is not defined | `objs`, as two lines before |
 | `r[0]` prints `array([0, 1, 2])` | the values were given as floats | `array([0., 1., 2.])` |
-| `spaces.intake(env.observation_space)`, `spaces.output` | never existed | `heads.intake(env.obs_space, width)` |
+| `spaces.intake(env.observation_space)`, `spaces.output` | never existed |
+`heads.intake(env.obs_space, width)` |
 """
+
 import doctest
 import importlib
 
@@ -28,22 +32,24 @@ from megastep.ragged import Ragged
 
 @pytest.fixture(autouse=True)
 def _on_the_cpu(monkeypatch):
-    monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 
 def session(text, **names):
-    """Runs an interactive session and compares what it prints, any white space being like any other."""
-    parsed = doctest.DocTestParser().get_doctest(text, names, 'session', None, 0)
+    """Runs an interactive session and compares what it prints, any white space being like any
+    other.
+    """
+    parsed = doctest.DocTestParser().get_doctest(text, names, "session", None, 0)
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE, verbose=False)
     complaints = []
     runner.run(parsed, out=complaints.append, clear_globs=False)
-    assert runner.tries and not runner.failures, ''.join(complaints)
+    assert runner.tries and not runner.failures, "".join(complaints)
     return parsed.globs
 
 
-@pytest.mark.parametrize('name', megastep._MODULES)
+@pytest.mark.parametrize("name", megastep._MODULES)
 def test_every_module_is_an_attribute_of_the_package(name):
-    assert getattr(megastep, name) is importlib.import_module(f'megastep.{name}')
+    assert getattr(megastep, name) is importlib.import_module(f"megastep.{name}")
 
 
 def test_a_module_that_is_not_there_is_named():
@@ -52,15 +58,23 @@ def test_a_module_that_is_not_there_is_named():
 
 
 def test_names_that_the_seeds_use():
-    assert cuda.render is megastep.engine.render and cuda.Agents is megastep.engine.Agents and cuda.Core is core.Core
-    assert {'Agents', 'Scenery', 'Render', 'Physics', 'bake', 'render', 'physics', 'Core'} <= set(dir(cuda))
+    assert (
+        cuda.render is megastep.engine.render
+        and cuda.Agents is megastep.engine.Agents
+        and cuda.Core is core.Core
+    )
+    assert {"Agents", "Scenery", "Render", "Physics", "bake", "render", "physics", "Core"} <= set(
+        dir(cuda)
+    )
     assert len(cubicasa.sample(2)) == 2
 
 
 def concepts():
     from megastep.arrdict import arrdict
     from megastep.dotdict import dotdict
-    return session('''
+
+    return session(
+        """
         >>> objs = dotdict(
         ...     a=dotdict(
         ...         b=1,
@@ -71,27 +85,35 @@ def concepts():
         ...     a=torch.tensor([1]),
         ...     b=arrdict(
         ...         c=torch.tensor([2])))
-        ''', torch=torch, dotdict=dotdict, arrdict=arrdict)
+        """,
+        torch=torch,
+        dotdict=dotdict,
+        arrdict=arrdict,
+    )
 
 
 def test_attribute_access():
-    names = session('''
+    names = session(
+        """
         >>> tensors['a'] is tensors.a
         True
         >>> tensors['e'] = 5
         >>> tensors.e
         5
-        ''', **concepts())
-    assert set(names['tensors']) == {'a', 'b', 'e'}
+        """,
+        **concepts(),
+    )
+    assert set(names["tensors"]) == {"a", "b", "e"}
 
 
 def test_forwarded_attributes():
-    names = session('>>> gpu_tensors = cpu_tensors.cpu()', cpu_tensors=concepts()['tensors'])
-    assert names['gpu_tensors'].b.c.tolist() == [2]
+    names = session(">>> gpu_tensors = cpu_tensors.cpu()", cpu_tensors=concepts()["tensors"])
+    assert names["gpu_tensors"].b.c.tolist() == [2]
 
 
 def test_method_chaining():
-    session('''
+    session(
+        """
         >>> objs.pipe(list)
         ['a', 'd']
         >>> objs.map(float)
@@ -111,11 +133,14 @@ def test_method_chaining():
         ...     .starmap(float.__add__, objs)
         ...     .pipe(list))
         ['a', 'd']
-        ''', **concepts())
+        """,
+        **concepts(),
+    )
 
 
 def test_pretty_printing():
-    session('''
+    session(
+        """
         >>> objs
         dotdict:
         a    dotdict:
@@ -127,11 +152,14 @@ def test_pretty_printing():
         a    Tensor((1,), torch.int64)
         b    arrdict:
              c    Tensor((1,), torch.int64)
-        ''', **concepts())
+        """,
+        **concepts(),
+    )
 
 
 def test_indexing():
-    session('''
+    session(
+        """
         >>> tensors[0]
         arrdict:
         a    Tensor((), torch.int64)
@@ -142,11 +170,14 @@ def test_indexing():
         a    1
         b    arrdict:
              c    2
-        ''', **concepts())
+        """,
+        **concepts(),
+    )
 
 
 def test_binary_operations():
-    session('''
+    session(
+        """
         >>> tensors + tensors
         arrdict:
         a    Tensor((1,), torch.int64)
@@ -159,15 +190,18 @@ def test_binary_operations():
              c    4
         >>> {'__add__', '__rsub__', '__matmul__', '__and__', '__lt__'} <= set(dir(arrdict))
         True
-        ''', **concepts())
+        """,
+        **concepts(),
+    )
 
 
 def test_raggeds():
     # Subarrays are [0., 1., 2.], [3.], [4., 5.]
-    vals = np.array([0., 1., 2., 3., 4., 5.])
+    vals = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
     widths = np.array([3, 1, 2])
     r = Ragged(vals, widths)
-    names = session('''
+    names = session(
+        """
         >>> r[0]
         array([0., 1., 2.])
         >>> r[1]
@@ -188,17 +222,27 @@ def test_raggeds():
         array([3, 4, 6])
         >>> r.inverse
         array([0, 0, 0, 1, 2, 2])
-        ''', r=r)
-    assert isinstance(names['there'][2], torch.Tensor) and names['back'][2].tolist() == [4, 5]
+        """,
+        r=r,
+    )
+    assert isinstance(names["there"][2], torch.Tensor) and names["back"][2].tolist() == [4, 5]
 
 
 def test_geometries():
     g = toys.box()
-    assert geometry.display(g).get_xlabel() == 'x, m'
-    assert isinstance(g.id, int) and g.walls.shape == (4, 2, 2) and g.lights.shape == (1, 2) and g.masks.ndim == 2
+    assert geometry.display(g).get_xlabel() == "x, m"
+    assert (
+        isinstance(g.id, int)
+        and g.walls.shape == (4, 2, 2)
+        and g.lights.shape == (1, 2)
+        and g.masks.ndim == 2
+    )
     assert (g.walls > 0).all() and (g.lights > 0).all() and isinstance(g.res, float)
     middle = geometry.indices(np.array([3.5, 3.5]), g.masks.shape, g.res)
-    assert g.masks[tuple(middle)] == 1 and g.masks[tuple(geometry.indices([1., 3.5], g.masks.shape, g.res))] == -1
+    assert (
+        g.masks[tuple(middle)] == 1
+        and g.masks[tuple(geometry.indices([1.0, 3.5], g.masks.shape, g.res))] == -1
+    )
     assert np.abs(geometry.centers(middle, g.masks.shape, g.res) - 3.5).max() <= g.res / 2 + 1e-6
 
 
@@ -206,26 +250,28 @@ def test_scenery():
     scenery = scene.scenery(3 * [toys.box()], n_agents=2)
     n_model = 2 * len(scenery.model)
     lines = scenery.lines[1]
-    assert lines.shape == (n_model + 4, 2, 2)       # the agents' lines come first
+    assert lines.shape == (n_model + 4, 2, 2)  # the agents' lines come first
     assert sorted(lines[n_model:].tolist()) == sorted(toys.box().walls.tolist())
     wall = int(scenery.lines.starts[1]) + n_model
-    assert scenery.textures[wall].shape == (100, 3)     # 5 m of 5 cm texels
+    assert scenery.textures[wall].shape == (100, 3)  # 5 m of 5 cm texels
     assert scenery.baked[wall].shape == (100,) and (scenery.baked[wall] > 0).all()
 
 
 def test_decision_and_world():
     dotdict = dotdict_module
     action_space = dotdict.dotdict(
-        movement=spaces.MultiDiscrete(2, 7),
-        fire=spaces.MultiDiscrete(2, 2))
+        movement=spaces.MultiDiscrete(2, 7), fire=spaces.MultiDiscrete(2, 2)
+    )
 
     decision = arrdict.arrdict(
-        actions=arrdict.arrdict(
-            movement=torch.as_tensor([[5, 6]]),
-            fire=torch.as_tensor([[0, 1]])))
+        actions=arrdict.arrdict(movement=torch.as_tensor([[5, 6]]), fire=torch.as_tensor([[0, 1]]))
+    )
 
     for name, space in action_space.items():
-        assert decision.actions[name].shape == (1, *space.shape) and (decision.actions[name] < space.n_actions).all()
+        assert (
+            decision.actions[name].shape == (1, *space.shape)
+            and (decision.actions[name] < space.n_actions).all()
+        )
     sampled = heads.output(action_space, 8)
     sampled = sampled.sample(sampled(torch.zeros(1, 8)))
     assert sampled.shape == decision.actions.shape
@@ -253,4 +299,4 @@ def test_the_experience_loop():
         world = env.step(decision)
     # Sixty-four turns of 18 degrees to the left: 180 degrees a second, ten steps a second.
     turned = (env.core.agents.angles - angles - 64 * 18 + 180) % 360 - 180
-    assert turned.abs().max() < .01 and not world.reset.any()
+    assert turned.abs().max() < 0.01 and not world.reset.any()

@@ -1,4 +1,5 @@
 """Spaces are small values with a shape."""
+
 import pickle
 
 import pytest
@@ -16,9 +17,21 @@ def test_shapes():
 def test_equality_hash_and_text_go_by_value():
     assert spaces.MultiVector(2, 3) == spaces.MultiVector(2, 3) != spaces.MultiVector(2, 4)
     assert spaces.MultiVector(2, 3) != spaces.MultiDiscrete(2, 3)
-    assert len({spaces.MultiVector(2, 3), spaces.MultiVector(2, 3), spaces.MultiEmpty(), spaces.MultiEmpty()}) == 2
-    assert repr(spaces.MultiDiscrete(2, 7)) == 'MultiDiscrete(n_agents=2, n_actions=7)'
-    assert pickle.loads(pickle.dumps(spaces.MultiImage(1, 3, 1, 64))) == spaces.MultiImage(1, 3, 1, 64)
+    assert (
+        len(
+            {
+                spaces.MultiVector(2, 3),
+                spaces.MultiVector(2, 3),
+                spaces.MultiEmpty(),
+                spaces.MultiEmpty(),
+            }
+        )
+        == 2
+    )
+    assert repr(spaces.MultiDiscrete(2, 7)) == "MultiDiscrete(n_agents=2, n_actions=7)"
+    assert pickle.loads(pickle.dumps(spaces.MultiImage(1, 3, 1, 64))) == spaces.MultiImage(
+        1, 3, 1, 64
+    )
 
 
 def test_spaces_do_not_change():
@@ -26,7 +39,7 @@ def test_spaces_do_not_change():
         spaces.MultiVector(2, 3).dim = 4
 
 
-@pytest.mark.parametrize('bad', [0, -1, 2.5, True, '3', None])
+@pytest.mark.parametrize("bad", [0, -1, 2.5, True, "3", None])
 def test_sizes_are_positive_whole_numbers(bad):
-    with pytest.raises(ValueError, match='MultiVector needs a positive whole number for dim, not'):
+    with pytest.raises(ValueError, match="MultiVector needs a positive whole number for dim, not"):
         spaces.MultiVector(1, bad)

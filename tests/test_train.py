@@ -1,4 +1,7 @@
-"""Training, in this process: the configuration is composed as the command line does it, the worlds are four boxes."""
+"""Training, in this process: the configuration is composed as the command line does it, the worlds
+are four boxes.
+"""
+
 import json
 import os
 import re
@@ -14,9 +17,21 @@ from configs import commandline, settings
 from configs.interruptions import Interrupted
 from configs.settings import Fault, Faults, Train, build
 
-TINY = ["env=minimal", "geometry=box", "agent=small", "env.n_envs=4", "env.res=8", "env.shortest=5", "env.longest=9",
-        "learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8", "device=cpu", "report=1"]
-UPDATE = 4 * 8     # samples of one update
+TINY = [
+    "env=minimal",
+    "geometry=box",
+    "agent=small",
+    "env.n_envs=4",
+    "env.res=8",
+    "env.shortest=5",
+    "env.longest=9",
+    "learner.n_steps=8",
+    "learner.n_minibatches=2",
+    "agent.width=8",
+    "device=cpu",
+    "report=1",
+]
+UPDATE = 4 * 8  # samples of one update
 
 
 def configured(*overrides, tiny=TINY):
@@ -44,12 +59,21 @@ def test_a_run_leaves_what_it_promises(here):
     folder = train.run(configured(f"samples={3 * UPDATE}"))
     assert folder.parent.name == "runs" and "minimal-box-1" in folder.name
     assert {path.name for path in folder.iterdir()} == {
-        "config.yaml", "checkpoints", "tensorboard", "metrics.jsonl", "perf.jsonl", "curves.png"}
-    assert build(Train, yaml.safe_load((folder / "config.yaml").read_text())) == configured(f"samples={3 * UPDATE}")
+        "config.yaml",
+        "checkpoints",
+        "tensorboard",
+        "metrics.jsonl",
+        "perf.jsonl",
+        "curves.png",
+    }
+    assert build(Train, yaml.safe_load((folder / "config.yaml").read_text())) == configured(
+        f"samples={3 * UPDATE}"
+    )
     rows = metrics.read(folder / "metrics.jsonl")
     assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
     assert [row["updates"] for row in rows] == [1, 2, 3]
-    # lives of 5 to 9 steps, and one step for the reset: two or three episodes end in 24 steps of each of 4 lanes
+    # lives of 5 to 9 steps, and one step for the reset: two or three episodes end in 24 steps of
+    # each of 4 lanes
     assert 8 <= sum(row["episode/count"] for row in rows) <= 16
     assert all(5 <= row["episode/length"] <= 9 for row in rows if row["episode/count"])
     assert not any("perf" in name for row in rows for name in row)
@@ -63,20 +87,22 @@ def test_a_seed_determines_a_run_and_another_changes_it(here):
     folders = [train.run(configured("samples=100", f"seed={seed}")) for seed in (1, 1, 2)]
     one, again, other = [(folder / "metrics.jsonl").read_bytes() for folder in folders]
     assert one == again != other
-    assert same(weights(folders[0]), weights(folders[1])) and not same(weights(folders[0]), weights(folders[2]))
+    assert same(weights(folders[0]), weights(folders[1])) and not same(
+        weights(folders[0]), weights(folders[2])
+    )
 
 
 def test_seconds_stop_a_run_and_a_report_comes_every_so_many_updates(here):
     folder = train.run(configured("seconds=0.5", "report=2"))
     updates = [row["updates"] for row in metrics.read(folder / "metrics.jsonl")]
     assert updates == list(range(2, len(updates) * 2 + 1, 2))
-    assert .5 <= checkpoint.load(folder / "checkpoints").state["seconds"] < 5
+    assert 0.5 <= checkpoint.load(folder / "checkpoints").state["seconds"] < 5
 
 
 def test_a_run_goes_on_under_its_own_configuration(here):
     folder = train.run(configured(f"samples={2 * UPDATE}", "learner.lr=0.123"))
     cfg = configured(f"resume={folder}", f"samples={4 * UPDATE}", tiny=[])
-    assert cfg.learner.lr == .123 and cfg.env.n_envs == 4
+    assert cfg.learner.lr == 0.123 and cfg.env.n_envs == 4
     assert train.run(cfg) == folder
     rows = metrics.read(folder / "metrics.jsonl")
     assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE, 4 * UPDATE]
@@ -95,9 +121,14 @@ def test_what_is_learnt_cannot_change_when_a_run_goes_on(here):
 def test_a_damaged_checkpoint_is_named_and_the_run_goes_on_from_the_one_before(here):
     folder = train.run(configured(f"samples={2 * UPDATE}", "checkpoint=1e-9"))
     os.truncate(folder / "checkpoints" / f"step_{2 * UPDATE}" / "state.pt", 50)
-    with pytest.warns(UserWarning, match=f"step_{2 * UPDATE} is damaged.*using step_{UPDATE} instead"):
+    with pytest.warns(
+        UserWarning, match=f"step_{2 * UPDATE} is damaged.*using step_{UPDATE} instead"
+    ):
         train.run(configured("resume=latest", tiny=[]))
-    assert [row["samples"] for row in metrics.read(folder / "metrics.jsonl")] == [UPDATE, 2 * UPDATE]
+    assert [row["samples"] for row in metrics.read(folder / "metrics.jsonl")] == [
+        UPDATE,
+        2 * UPDATE,
+    ]
     assert checkpoint.load(folder / "checkpoints").step == 2 * UPDATE
 
 
@@ -106,7 +137,7 @@ def test_a_new_run_can_start_from_the_weights_of_another(here):
     second = train.run(configured("samples=1", "learner.lr=1e-12", f"init={first}", "seed=2"))
     name = next(name for name in weights(first) if "weight" in name)
     torch.testing.assert_close(weights(first)[name], weights(second)[name], atol=1e-6, rtol=0)
-    assert checkpoint.load(second / "checkpoints").step == UPDATE      # it counts from zero
+    assert checkpoint.load(second / "checkpoints").step == UPDATE  # it counts from zero
 
 
 def test_weights_of_another_environment_are_refused_with_both_shapes(here):
@@ -115,11 +146,13 @@ def test_weights_of_another_environment_are_refused_with_both_shapes(here):
         train.run(configured("samples=1", f"init={first}", "env.res=16"))
     with pytest.raises(Fault, match="is .*8.* and should be .*16.*; choose the agent"):
         train.run(configured("samples=1", f"init={first}", "agent.width=16"))
-    assert len(list((here / "runs").iterdir())) == 1      # the refused runs left nothing behind
+    assert len(list((here / "runs").iterdir())) == 1  # the refused runs left nothing behind
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_finishes_the_step_saves_and_says_how_to_go_on(here, monkeypatch, capsys, number, code):
+def test_a_signal_finishes_the_step_saves_and_says_how_to_go_on(
+    here, monkeypatch, capsys, number, code
+):
     real = metrics.Metrics.write
 
     def write(self, step, *values):
@@ -132,11 +165,15 @@ def test_a_signal_finishes_the_step_saves_and_says_how_to_go_on(here, monkeypatc
     folder = next((here / "runs").iterdir())
     assert checkpoint.load(folder / "checkpoints").step == 2 * UPDATE
     assert f"python train.py resume=runs/{folder.name}" in capsys.readouterr().err
-    assert train.run(configured("resume=latest", f"samples={3 * UPDATE}", tiny=[])) == folder.relative_to(here)
+    assert train.run(
+        configured("resume=latest", f"samples={3 * UPDATE}", tiny=[])
+    ) == folder.relative_to(here)
     assert checkpoint.load(folder / "checkpoints").step == 3 * UPDATE
 
 
-def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_world(here, monkeypatch, capsys):
+def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_world(
+    here, monkeypatch, capsys
+):
     real = train.Trainer.report
 
     def report(self, *arguments):
@@ -145,7 +182,7 @@ def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_world(he
 
     monkeypatch.setattr(train.Trainer, "report", report)
     assert train.main([*TINY, "seconds=20", "folder=run"]) == 2
-    sentence, = capsys.readouterr().err.splitlines()
+    (sentence,) = capsys.readouterr().err.splitlines()
     assert "environment 2" in sentence and "not a finite number" in sentence and "run" in sentence
     assert len(metrics.read(here / "run" / "metrics.jsonl")) == 1
 
@@ -156,6 +193,7 @@ def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, mo
 
     with monkeypatch.context() as patch, pytest.warns(UserWarning) as caught:
         import warnings
+
         patch.setattr(checkpoint, "save", full)
         patch.setattr(train, "warn", warnings.warn)
         with pytest.raises(Fault, match="could not be saved .No space left on device.*MB are free"):
@@ -188,13 +226,18 @@ def test_an_environment_that_cannot_be_made_leaves_no_folder(here, tmp_path):
 
 def test_too_many_environments_are_refused_with_the_number_that_fits(here, capsys):
     assert train.main([*TINY, f"env.n_envs={settings.MOST_ENVS}", "learner.n_steps=4096"]) == 2
-    told = re.search("67,108,864 environments need .* free on cpu: at most ([0-9,]+) fit", capsys.readouterr().err)
+    told = re.search(
+        "67,108,864 environments need .* free on cpu: at most ([0-9,]+) fit",
+        capsys.readouterr().err,
+    )
     assert 10 < int(told[1].replace(",", "")) < settings.MOST_ENVS
     assert not any((here / "runs").iterdir())
 
 
 @pytest.mark.parametrize("folder", ["file", "file/below", "/proc/run", "full"])
-def test_a_folder_that_cannot_be_used_is_one_sentence_before_anything_is_made(here, monkeypatch, capsys, folder):
+def test_a_folder_that_cannot_be_used_is_one_sentence_before_anything_is_made(
+    here, monkeypatch, capsys, folder
+):
     (here / "file").write_text("")
     (here / "full").mkdir()
     (here / "full" / "mine.txt").write_text("")
@@ -221,8 +264,15 @@ def test_a_sweep_gives_every_job_its_folder(here, capsys):
 
 
 def test_the_end_of_a_run_can_hold_a_table_and_a_video(here, capsys):
-    folder = train.run(configured("samples=1", "finish.evaluate=true", "finish.lanes=4", "finish.record=true",
-                                  "finish.steps=2"))
+    folder = train.run(
+        configured(
+            "samples=1",
+            "finish.evaluate=true",
+            "finish.lanes=4",
+            "finish.record=true",
+            "finish.steps=2",
+        )
+    )
     result = json.loads((folder / "evaluation.json").read_text())
     assert [row["agent"] for row in result["rows"]] == ["trained", "random"]
     assert (folder / "video.mp4").stat().st_size > 1000

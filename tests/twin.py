@@ -1,17 +1,25 @@
-"""The engine's laws by brute force: every ray against every line, every texel and light, every disc and obstacle.
+"""The engine's laws by brute force: every ray against every line, every texel and light, every disc
+and obstacle.
 
-Plain PyTorch, one world at a time, in the dtype and on the device of its arguments (the tests use float64). It shares
-nothing with the kernels and is meant to be read beside Concepts, not to be fast.
+Plain PyTorch, one world at a time, in the dtype and on the device of its arguments (the tests use
+float64). It shares nothing with the kernels and is meant to be read beside Concepts, not to be
+fast.
 
-Axes: A agents, C cameras, R pixels, L lines (the agents' first), W walls (static lines), K lights, P points, T texels.
-Units: metres, degrees, seconds. A line is its two ends, (2, 2). A light is (x, y, intensity).
+Axes: A agents, C cameras, R pixels, L lines (the agents' first), W walls (static lines), K lights,
+P points, T texels. Units: metres, degrees, seconds. A line is its two ends, (2, 2). A light is (x,
+y, intensity).
 """
+
 import math
 
 import torch
 
-RADIUS = 0.15/math.sqrt(2)  # m, the disc around a square agent 0.15 m wide: its body, and how close its camera sees
-INFLATION = 1.001  # collisions happen this much further out, so that a stopped agent does not yet touch
+RADIUS = 0.15 / math.sqrt(
+    2
+)  # m, the disc around a square agent 0.15 m wide: its body, and how close its camera sees
+INFLATION = (
+    1.001  # collisions happen this much further out, so that a stopped agent does not yet touch
+)
 SHORTFALL = 0.99  # the part of the way to a contact that is travelled
 AMBIENT = 0.1  # light where no light reaches
 SHADOW_LIMIT = 0.999  # a line further along the way from light to texel is the texel's own line
@@ -20,23 +28,26 @@ DOT_GUARD = 1e-6  # m, keeps the dot of a very short line finite
 
 def cross(a, b):
     """The z part of a x b for vectors (..., 2)."""
-    return a[..., 0]*b[..., 1] - a[..., 1]*b[..., 0]
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def turn(vectors, degrees):
     """Vectors (..., 2) turned counter-clockwise by degrees (...)."""
     radians = torch.deg2rad(degrees)
     cosine, sine, (x, y) = radians.cos(), radians.sin(), vectors.unbind(-1)
-    return torch.stack([cosine*x - sine*y, sine*x + cosine*y], -1)
+    return torch.stack([cosine * x - sine * y, sine * x + cosine * y], -1)
 
 
 def wrapped(degrees):
     """The same angle in [-180, 180)."""
     turned = (degrees + 180) % 360 - 180
-    return torch.where(turned < 180, turned, -180)  # a tiny negative angle's remainder rounds up to 360
+    return torch.where(
+        turned < 180, turned, -180
+    )  # a tiny negative angle's remainder rounds up to 360
 
 
 # Light
+
 
 def agent_lines(model, positions, angles):
     """The model (M, 2, 2) put where the agents are: (A*M, 2, 2), agent by agent."""
@@ -44,37 +55,49 @@ def agent_lines(model, positions, angles):
 
 
 def texel_positions(lines, widths):
-    """Centres (T, 2) of the texels: texel k of a line of w texels sits at the fraction (k + 1/2)/w."""
-    centres = [((torch.arange(int(w), device=lines.device) + 0.5)/int(w)).to(lines) for w in widths]
-    return torch.cat([lines.new_zeros((0, 2)), *(a + f[:, None]*(b - a) for (a, b), f in zip(lines, centres))])
+    """Centres (T, 2) of the texels: texel k of a line of w texels sits at the fraction (k +
+    1/2)/w.
+    """
+    centres = [
+        ((torch.arange(int(w), device=lines.device) + 0.5) / int(w)).to(lines) for w in widths
+    ]
+    return torch.cat(
+        [lines.new_zeros((0, 2)), *(a + f[:, None] * (b - a) for (a, b), f in zip(lines, centres))]
+    )
 
 
-def light_at(points, walls, lights, slack=0., chunk=2**20):
-    """Light (P,) in [0.1, 1] at points (P, 2): ambient, and 2 I/max(d^2, 1) from each light that no wall blocks."""
+def light_at(points, walls, lights, slack=0.0, chunk=2**20):
+    """Light (P,) in [0.1, 1] at points (P, 2): ambient, and 2 I/max(d^2, 1) from each light that no
+    wall blocks.
+    """
     levels = []
-    for some in points.split(max(chunk//max(len(walls), 1), 1)):
+    for some in points.split(max(chunk // max(len(walls), 1), 1)):
         level = torch.full_like(some[:, 0], AMBIENT)
         for light in lights:
             shadow = blocked(some - light[:2], walls - light[:2], slack).any(-1)
-            level += torch.where(shadow, 0, 2*light[2]/(some - light[:2]).square().sum(-1).clamp(min=1))
+            level += torch.where(
+                shadow, 0, 2 * light[2] / (some - light[:2]).square().sum(-1).clamp(min=1)
+            )
         levels.append(level.clamp(max=1))
     return torch.cat(levels) if levels else points.new_zeros(0)
 
 
-def blocked(ways, walls, slack=0.):
-    """Whether a wall crosses the way (P, 2) from a light at 0 to a point, short of 0.999 of it: (P, W).
+def blocked(ways, walls, slack=0.0):
+    """Whether a wall crosses the way (P, 2) from a light at 0 to a point, short of 0.999 of it: (P,
+    W).
 
-    A wall crosses if its ends are on different sides. `slack` (metres): walls this near to crossing count too; if it is
-    negative, only those that cross with so much to spare. The two bracket the truth for slightly different inputs.
+    A wall crosses if its ends are on different sides. `slack` (metres): walls this near to crossing
+    count too; if it is negative, only those that cross with so much to spare. The two bracket the
+    truth for slightly different inputs.
     """
     along, area = walls[:, 1] - walls[:, 0], cross(ways[:, None], walls[:, 1] - walls[:, 0])
     reach = ways.norm(dim=-1, keepdim=True).clamp(min=1e-9)
-    sides = [cross(ways[:, None], end)/reach for end in walls.unbind(1)]
+    sides = [cross(ways[:, None], end) / reach for end in walls.unbind(1)]
     crosses = (torch.minimum(*sides) <= slack) & (torch.maximum(*sides) >= -slack)
     crosses &= (area != 0) | (slack > 0) & (along.norm(dim=-1) > 0)
     size = area.abs().clamp(min=1e-12)
-    place = cross(walls[:, 0], along)/torch.copysign(size, area)
-    spare = slack*(1/reach + along.norm(dim=-1)/size)
+    place = cross(walls[:, 0], along) / torch.copysign(size, area)
+    spare = slack * (1 / reach + along.norm(dim=-1) / size)
     return crosses & (place > -spare) & (place < SHADOW_LIMIT + spare)
 
 
@@ -85,61 +108,90 @@ def bake(walls, lights, points):
 
 # Sight
 
+
 def rays(angles, cameras, res, fov):
-    """What the pixels look along, (A, C, R, 2): one unit ahead of the camera; pixel 0 is the leftmost."""
+    """What the pixels look along, (A, C, R, 2): one unit ahead of the camera; pixel 0 is the
+    leftmost.
+    """
     pixel = torch.arange(res, dtype=angles.dtype, device=angles.device)
-    sideways = math.tan(math.radians(fov)/2)*(res - 2*pixel - 1)/res
+    sideways = math.tan(math.radians(fov) / 2) * (res - 2 * pixel - 1) / res
     yaws = angles[:, None] + torch.as_tensor(cameras, dtype=angles.dtype, device=angles.device)
     return turn(torch.stack([torch.ones_like(sideways), sideways], -1), yaws[..., None])
 
 
 def cast(lines, positions, looks, radius=RADIUS):
-    """The nearest line beyond the radius along each ray: indices, locations, dots, distances, each (A, C, R).
+    """The nearest line beyond the radius along each ray: indices, locations, dots, distances, each
+    (A, C, R).
 
-    A line is met at the ray parameter s = cross(a, v)/cross(ray, v), v the line and a its start seen from the agent.
-    Distances are metres; of two lines at the same one, the lower index is seen; parallel or zero-length lines are not.
-    An agent does not see itself because its lines lie within its radius.
+    A line is met at the ray parameter s = cross(a, v)/cross(ray, v), v the line and a its start
+    seen from the agent. Distances are metres; of two lines at the same one, the lower index is
+    seen; parallel or zero-length lines are not. An agent does not see itself because its lines lie
+    within its radius.
     """
     along, ray = lines[:, 1] - lines[:, 0], looks[..., None, :]
     start = (lines[:, 0] - positions[:, None])[:, None, None]
     area = cross(ray, along)
     meets = area != 0
     area = torch.where(meets, area, 1)
-    location = cross(start, ray)/area
-    distance = cross(start, along)/area*ray.norm(dim=-1)
+    location = cross(start, ray) / area
+    distance = cross(start, along) / area * ray.norm(dim=-1)
     seen = meets & (location >= 0) & (location <= 1) & (distance > radius)
     distance = torch.where(seen, distance, math.inf)
     nearest = distance.min(-1).values
     index = (distance == nearest[..., None]).int().argmax(-1)  # the first of equals
     hit = nearest < math.inf
     along = along[index]
-    dot = (looks*along).sum(-1)/(looks.norm(dim=-1)*along.norm(dim=-1) + DOT_GUARD)
+    dot = (looks * along).sum(-1) / (looks.norm(dim=-1) * along.norm(dim=-1) + DOT_GUARD)
     location = location.gather(-1, index[..., None])[..., 0]
-    return dict(indices=torch.where(hit, index, -1), locations=torch.where(hit, location, math.nan),
-                dots=torch.where(hit, dot, math.nan), distances=nearest)
+    return dict(
+        indices=torch.where(hit, index, -1),
+        locations=torch.where(hit, location, math.nan),
+        dots=torch.where(hit, dot, math.nan),
+        distances=nearest,
+    )
 
 
 def filtered(values, width, start, location):
-    """Clamped linear filtering: values (T, D) between the texel centres of lines of `width` texels from `start` on."""
-    place = torch.minimum((location*width - 0.5).clamp(min=0), (width - 1).to(location))
+    """Clamped linear filtering: values (T, D) between the texel centres of lines of `width` texels
+    from `start` on.
+    """
+    place = torch.minimum((location * width - 0.5).clamp(min=0), (width - 1).to(location))
     low = place.floor().long()
     high = torch.minimum(low + 1, width - 1)
     share = (place - low)[..., None]
-    return (1 - share)*values[start + low] + share*values[start + high]
+    return (1 - share) * values[start + low] + share * values[start + high]
 
 
 def shade(hits, textures, widths, light):
-    """Colours (A, C, R, 3) of hits: filtered texture (T, 3) x filtered light (T,) x (1 - dot^2); a miss is black."""
-    hit, line = hits['indices'] >= 0, hits['indices'].clamp(min=0).long()
+    """Colours (A, C, R, 3) of hits: filtered texture (T, 3) x filtered light (T,) x (1 - dot^2); a
+    miss is black.
+    """
+    hit, line = hits["indices"] >= 0, hits["indices"].clamp(min=0).long()
     width, start = widths.long()[line], (widths.cumsum(0) - widths).long()[line]
-    location, dot = (torch.where(hit, hits[k], 0) for k in ('locations', 'dots'))
-    colour = filtered(textures, width, start, location)*filtered(light[:, None], width, start, location)
-    return torch.where(hit[..., None], colour*(1 - dot.square())[..., None], 0)
+    location, dot = (torch.where(hit, hits[k], 0) for k in ("locations", "dots"))
+    colour = filtered(textures, width, start, location) * filtered(
+        light[:, None], width, start, location
+    )
+    return torch.where(hit[..., None], colour * (1 - dot.square())[..., None], 0)
 
 
-def render(model, walls, lights, textures, widths, positions, angles, *,
-           res=64, fov=130., cameras=(0.,), radius=RADIUS):
-    """All that `cuda.render` says of one world, the placed `lines` (L, 2, 2) and the `light` (T,) of every texel."""
+def render(
+    model,
+    walls,
+    lights,
+    textures,
+    widths,
+    positions,
+    angles,
+    *,
+    res=64,
+    fov=130.0,
+    cameras=(0.0,),
+    radius=RADIUS,
+):
+    """All that `cuda.render` says of one world, the placed `lines` (L, 2, 2) and the `light` (T,)
+    of every texel.
+    """
     lines = torch.cat([agent_lines(model, positions, angles), walls])
     light = light_at(texel_positions(lines, widths), walls, lights)
     hits = cast(lines, positions, rays(angles, cameras, res, fov), radius)
@@ -148,59 +200,69 @@ def render(model, walls, lights, textures, widths, positions, angles, *,
 
 # Physics
 
-def contact(offset, step, radius, slack=0.):
-    """The fraction (...) of `step` at which a centre at `offset` (..., 2) comes within `radius` of 0; inf if never.
+
+def contact(offset, step, radius, slack=0.0):
+    """The fraction (...) of `step` at which a centre at `offset` (..., 2) comes within `radius` of
+    0; inf if never.
 
     If it is within already: at once if it approaches 0, never if it does not.
     """
-    speed, inward = step.square().sum(-1), -(offset*step).sum(-1)
+    speed, inward = step.square().sum(-1), -(offset * step).sum(-1)
     outside = offset.square().sum(-1) - radius**2
-    root = inward.square() - speed*outside
+    root = inward.square() - speed * outside
     enters = (outside > 0) & (inward > 0) & (root >= 0)
-    later = outside/torch.where(enters, inward + root.clamp(min=0).sqrt(), 1)
-    at_once = (outside <= 0) & (inward > -slack*speed.sqrt())
+    later = outside / torch.where(enters, inward + root.clamp(min=0).sqrt(), 1)
+    at_once = (outside <= 0) & (inward > -slack * speed.sqrt())
     return torch.where(at_once, 0, torch.where(enters, later, math.inf))
 
 
-def wall_contact(start, end, step, radius, slack=0.):
-    """The fraction (A, W) of steps (A, 1, 2) at which a disc at 0 meets walls with ends (A, W, 2); inf if never.
+def wall_contact(start, end, step, radius, slack=0.0):
+    """The fraction (A, W) of steps (A, 1, 2) at which a disc at 0 meets walls with ends (A, W, 2);
+    inf if never.
 
-    A wall's flank is met where the distance to its infinite line falls to the radius between the ends; its ends are
-    met as points. An overlapped wall stops the disc if the wall's nearest point is being approached.
+    A wall's flank is met where the distance to its infinite line falls to the radius between the
+    ends; its ends are met as points. An overlapped wall stops the disc if the wall's nearest point
+    is being approached.
     """
     along = end - start
     length = along.norm(dim=-1)
-    along = along/torch.where(length > 0, length, 1)[..., None]
-    nearest = start + (-(start*along).sum(-1)).clamp(min=0).minimum(length)[..., None]*along
+    along = along / torch.where(length > 0, length, 1)[..., None]
+    nearest = start + (-(start * along).sum(-1)).clamp(min=0).minimum(length)[..., None] * along
     overlaps = nearest.square().sum(-1) <= radius**2
-    approaches = (nearest*step).sum(-1) > -slack*step.norm(dim=-1)
+    approaches = (nearest * step).sum(-1) > -slack * step.norm(dim=-1)
     height, sinking = cross(along, -start), cross(along, step.expand_as(along))
-    meets = (length > 0) & (height.abs() > radius) & (height*sinking < 0)
-    fraction = (height.abs() - radius)/torch.where(meets, sinking.abs(), 1)
-    place = ((fraction[..., None]*step - start)*along).sum(-1)
+    meets = (length > 0) & (height.abs() > radius) & (height * sinking < 0)
+    fraction = (height.abs() - radius) / torch.where(meets, sinking.abs(), 1)
+    place = ((fraction[..., None] * step - start) * along).sum(-1)
     flank = torch.where(meets & (place >= 0) & (place <= length), fraction, math.inf)
     ends = torch.minimum(contact(-start, step, radius), contact(-end, step, radius))
     return torch.where(overlaps, torch.where(approaches, 0, math.inf), torch.minimum(flank, ends))
 
 
-def physics(walls, positions, angles, velocity, angvelocity, *, fps=10., radius=RADIUS, slack=0.):
-    """One step of one world: dict of progress (A,), positions, angles, velocity, angvelocity after it.
+def physics(walls, positions, angles, velocity, angvelocity, *, fps=10.0, radius=RADIUS, slack=0.0):
+    """One step of one world: dict of progress (A,), positions, angles, velocity, angvelocity after
+    it.
 
-    Progress is the part of the step that was travelled. `slack` (metres) makes discs that much larger and more easily
-    stopped: with +slack and -slack the true progress of slightly different inputs is bracketed.
+    Progress is the part of the step that was travelled. `slack` (metres) makes discs that much
+    larger and more easily stopped: with +slack and -slack the true progress of slightly different
+    inputs is bracketed.
     """
-    step = velocity/fps
-    reach = INFLATION*radius + slack
+    step = velocity / fps
+    reach = INFLATION * radius + slack
     start, end = (corner - positions[:, None] for corner in walls.unbind(1))
     times = wall_contact(start, end, step[:, None], reach, slack)
     apart = positions[:, None] - positions[None]
-    pairs = contact(apart, step[:, None] - step[None], 2*INFLATION*radius + slack, slack)
-    pairs = pairs.masked_fill(torch.eye(len(positions), dtype=torch.bool, device=positions.device), math.inf)
+    pairs = contact(apart, step[:, None] - step[None], 2 * INFLATION * radius + slack, slack)
+    pairs = pairs.masked_fill(
+        torch.eye(len(positions), dtype=torch.bool, device=positions.device), math.inf
+    )
     first = torch.cat([times, pairs], -1).min(-1).values
-    progress = torch.where(first <= 1, (SHORTFALL*first).clamp(0, 1), 1).to(positions)
+    progress = torch.where(first <= 1, (SHORTFALL * first).clamp(0, 1), 1).to(positions)
     free = progress == 1
-    return dict(progress=progress,
-                positions=positions + progress[:, None]*step,
-                angles=wrapped(angles + progress*angvelocity/fps),
-                velocity=torch.where(free[:, None], velocity, 0),
-                angvelocity=torch.where(free, angvelocity, 0))
+    return dict(
+        progress=progress,
+        positions=positions + progress[:, None] * step,
+        angles=wrapped(angles + progress * angvelocity / fps),
+        velocity=torch.where(free[:, None], velocity, 0),
+        angvelocity=torch.where(free, angvelocity, 0),
+    )

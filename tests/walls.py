@@ -1,9 +1,11 @@
-"""No agent passes a wall and none is ever stuck: worlds that tempt, walkers that try, and judges that share nothing
-with the kernels.
+"""No agent passes a wall and none is ever stuck: worlds that tempt, walkers that try, and judges
+that share nothing with the kernels.
 
-Axes: B copies of each of D designs (world e shows design e % D, as in `scene.scenery`), A agents a world, W walls of
-the largest design; a smaller one is filled up with NaN, which meets nothing. Metres, degrees, seconds.
+Axes: B copies of each of D designs (world e shows design e % D, as in `scene.scenery`), A agents a
+world, W walls of the largest design; a smaller one is filled up with NaN, which meets nothing.
+Metres, degrees, seconds.
 """
+
 import math
 from dataclasses import dataclass
 
@@ -16,25 +18,45 @@ from megastep.dotdict import dotdict
 from megastep.geometries import sample
 from megastep.modules import MomentumMovement
 
-RADIUS = 0.15/math.sqrt(2)  # m, an agent's
-BODY = 1.001*RADIUS  # m, at which it is stopped
-TOUCH = 1.01*RADIUS  # m, nearer than which it counts as touching
+RADIUS = 0.15 / math.sqrt(2)  # m, an agent's
+BODY = 1.001 * RADIUS  # m, at which it is stopped
+TOUCH = 1.01 * RADIUS  # m, nearer than which it counts as touching
 PINCH = -0.125  # cosine between the ways to two touched walls: they meet at less than 83 degrees
-HAIR = 1e-4  # m, no agent is set down nearer to a wall: 6 units in the last place of float32 at 200 m
+HAIR = (
+    1e-4  # m, no agent is set down nearer to a wall: 6 units in the last place of float32 at 200 m
+)
 SPELL, SPELLS = 16, 2  # steps between changes of mind; and the fewest spells of a walk
-ACCEL, DECAY = 5., 0.125  # MomentumMovement's defaults: m/s^2, and a fraction a step
-TRY, LEAVES = 0.01, 0.001  # m: the way tried from where an agent was stopped, and the least of it that is leaving
-SUNK = 1e-5  # m, deeper than which a wall is within the radius, and no rounding: of the 1e-4 between RADIUS and BODY
-PAIRS = dict(cpu=1 << 16, cuda=1 << 24)  # agents times walls at once: within a core's cache; 128 MB a float64
-SETTINGS = [(1, 1), (1, 100), (3, 30), (10, 1), (10, 100), (30, 10), (60, 100), (200, 1), (200, 100)]  # fps, accel
+ACCEL, DECAY = 5.0, 0.125  # MomentumMovement's defaults: m/s^2, and a fraction a step
+TRY, LEAVES = (
+    0.01,
+    0.001,
+)  # m: the way tried from where an agent was stopped, and the least of it that is leaving
+# m, deeper than which a wall is within the radius, and no rounding: of the 1e-4 between RADIUS and
+# BODY
+SUNK = 1e-5
+PAIRS = dict(
+    cpu=1 << 16, cuda=1 << 24
+)  # agents times walls at once: within a core's cache; 128 MB a float64
+SETTINGS = [
+    (1, 1),
+    (1, 100),
+    (3, 30),
+    (10, 1),
+    (10, 100),
+    (30, 10),
+    (60, 100),
+    (200, 1),
+    (200, 100),
+]  # fps, accel
 
 
 # ---- Worlds: (W, 2, 2) float64 arrays of walls ----
 
+
 def turned(walls, degrees):
     """Walls turned counter-clockwise about the origin."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return np.asarray(walls, float)@np.array([[c, s], [-s, c]])
+    return np.asarray(walls, float) @ np.array([[c, s], [-s, c]])
 
 
 def path(corners):
@@ -43,8 +65,10 @@ def path(corners):
     return np.stack([corners[:-1], corners[1:]], 1)
 
 
-def enclosed(walls, corner=1.):
-    """The walls, in a room that leaves a metre on all sides and whose lower-left corner is at (corner, corner)."""
+def enclosed(walls, corner=1.0):
+    """The walls, in a room that leaves a metre on all sides and whose lower-left corner is at
+    (corner, corner).
+    """
     walls = np.asarray(walls, float)
     walls = walls - walls.min((0, 1)) + corner + 1
     width, height = walls.max((0, 1)) - corner + 1
@@ -52,50 +76,61 @@ def enclosed(walls, corner=1.):
     return np.concatenate([walls, room])
 
 
-def wedge(degrees, turn, arm=9.):
+def wedge(degrees, turn, arm=9.0):
     """Two walls that meet at an angle; a disc wedges RADIUS / sin(angle / 2) from their corner."""
-    return np.concatenate([turned([[(0, 0), (arm, 0)]], turn + side*degrees/2) for side in (-1, 1)])
+    return np.concatenate(
+        [turned([[(0, 0), (arm, 0)]], turn + side * degrees / 2) for side in (-1, 1)]
+    )
 
 
-def sliver(degrees, turn, arm=9.):
+def sliver(degrees, turn, arm=9.0):
     """A closed triangle with two long sides."""
     (a, b), (_, c) = wedge(degrees, turn, arm)
     return path([a, b, c, a])
 
 
-def spokes(n, turn, arm=3.):
+def spokes(n, turn, arm=3.0):
     """Walls from one point in n directions: as many corners of 360 / n degrees."""
-    return np.concatenate([turned([[(0, 0), (arm, 0)]], turn + 360*k/n) for k in range(n)])
+    return np.concatenate([turned([[(0, 0), (arm, 0)]], turn + 360 * k / n) for k in range(n)])
 
 
-def slit(gap, turn, length=3.):
+def slit(gap, turn, length=3.0):
     """Two walls side by side."""
     return turned([[(0, 0), (length, 0)], [(0, gap), (length, gap)]], turn)
 
 
 def zigzag(width, degrees, turn, n=8, leg=0.8):
     """A corridor, `width` across its legs, that turns by 180 minus `degrees` n times."""
-    half = math.radians(degrees)/2
-    corners = np.array([(k*leg*math.sin(half), k % 2*leg*math.cos(half)) for k in range(n + 1)])
-    aside = np.array([width/math.sin(half), 0])
+    half = math.radians(degrees) / 2
+    corners = np.array(
+        [(k * leg * math.sin(half), k % 2 * leg * math.cos(half)) for k in range(n + 1)]
+    )
+    aside = np.array([width / math.sin(half), 0])
     return turned(np.concatenate([path(corners), path(corners + aside)]), turn)
 
 
-def crossing(draw, n=9, size=6.):
+def crossing(draw, n=9, size=6.0):
     """Long walls through one another."""
-    return draw.segments(n, 1., size, size).numpy()
+    return draw.segments(n, 1.0, size, size).numpy()
 
 
 def fragments(seed):
-    """A room of free-standing walls with all that degenerates: of no length, double, tiny, of 400 m."""
-    cases = 'parallel', 'zero_length', 'duplicates', 'touching', 'pixel_ends', 'tiny', 'long'
-    return worlds.random_world(seed, 1, n_walls=6, size=5., degenerate=cases).one(0)['walls'].numpy()
+    """A room of free-standing walls with all that degenerates: of no length, double, tiny, of 400
+    m.
+    """
+    cases = "parallel", "zero_length", "duplicates", "touching", "pixel_ends", "tiny", "long"
+    return (
+        worlds.random_world(seed, 1, n_walls=6, size=5.0, degenerate=cases).one(0)["walls"].numpy()
+    )
 
 
 def remote(draw):
     """Worlds near (190, 190), where a unit in the last place is 15 micrometres."""
-    shapes = [wedge(degrees, draw.uniform(0, 360).item(), 6.) for degrees in (5, 20, 60)]
-    return [enclosed(walls, 190.) for walls in (*shapes, spokes(7, 10.), crossing(draw), slit(2.1*BODY, 33.))]
+    shapes = [wedge(degrees, draw.uniform(0, 360).item(), 6.0) for degrees in (5, 20, 60)]
+    return [
+        enclosed(walls, 190.0)
+        for walls in (*shapes, spokes(7, 10.0), crossing(draw), slit(2.1 * BODY, 33.0))
+    ]
 
 
 def homes(source, n):
@@ -103,58 +138,88 @@ def homes(source, n):
 
 
 COURSES = {  # name: (designs from a draw, agents a world)
-    'box': (lambda draw: [g.walls for g in sample('box', 1)], 1),
-    'column': (lambda draw: [g.walls for g in sample('column', 1)], 4),
-    'wedges': (lambda draw: [enclosed(wedge(degrees, draw.uniform(0, 360).item()))
-                             for degrees in (2, 3, 5, 8, 12, 20, 30, 45, 60, 75, 90, 120)], 1),
-    'slivers': (lambda draw: [enclosed(sliver(degrees, draw.uniform(0, 360).item()))
-                              for degrees in (3, 5, 8, 12, 20, 30, 45, 60)], 1),
-    'spokes': (lambda draw: [enclosed(spokes(n, draw.uniform(0, 90).item())) for n in (4, 5, 7, 8, 12)], 2),
-    'slits': (lambda draw: [enclosed(slit(gap, turn)) for turn in (0, 90, *draw.uniform(0, 180, 2).tolist())
-                            for gap in (0.01, 0.2, 2*BODY + 2e-4, 2*BODY + 2e-3, 0.25)], 1),
-    'zigzags': (lambda draw: [enclosed(zigzag(width, degrees, turn)) for degrees in (30, 60, 90)
-                              for width, turn in zip((0.23, 0.3), draw.uniform(0, 360, 2).tolist())], 1),
-    'crossing': (lambda draw: [enclosed(crossing(draw)) for _ in range(8)], 1),
-    'fragments': (lambda draw: [enclosed(fragments(seed)) for seed in range(8)], 2),
-    'remote': (remote, 1),
-    'homes': (lambda draw: homes('homes', 16), 1),
-    'bench': (lambda draw: homes('bench', 16), 2),
+    "box": (lambda draw: [g.walls for g in sample("box", 1)], 1),
+    "column": (lambda draw: [g.walls for g in sample("column", 1)], 4),
+    "wedges": (
+        lambda draw: [
+            enclosed(wedge(degrees, draw.uniform(0, 360).item()))
+            for degrees in (2, 3, 5, 8, 12, 20, 30, 45, 60, 75, 90, 120)
+        ],
+        1,
+    ),
+    "slivers": (
+        lambda draw: [
+            enclosed(sliver(degrees, draw.uniform(0, 360).item()))
+            for degrees in (3, 5, 8, 12, 20, 30, 45, 60)
+        ],
+        1,
+    ),
+    "spokes": (
+        lambda draw: [enclosed(spokes(n, draw.uniform(0, 90).item())) for n in (4, 5, 7, 8, 12)],
+        2,
+    ),
+    "slits": (
+        lambda draw: [
+            enclosed(slit(gap, turn))
+            for turn in (0, 90, *draw.uniform(0, 180, 2).tolist())
+            for gap in (0.01, 0.2, 2 * BODY + 2e-4, 2 * BODY + 2e-3, 0.25)
+        ],
+        1,
+    ),
+    "zigzags": (
+        lambda draw: [
+            enclosed(zigzag(width, degrees, turn))
+            for degrees in (30, 60, 90)
+            for width, turn in zip((0.23, 0.3), draw.uniform(0, 360, 2).tolist())
+        ],
+        1,
+    ),
+    "crossing": (lambda draw: [enclosed(crossing(draw)) for _ in range(8)], 1),
+    "fragments": (lambda draw: [enclosed(fragments(seed)) for seed in range(8)], 2),
+    "remote": (remote, 1),
+    "homes": (lambda draw: homes("homes", 16), 1),
+    "bench": (lambda draw: homes("bench", 16), 2),
 }
 
 
 def clearances(points, walls):
     """(P, W) distances of points (P, 2) from walls (W, 2, 2), float64."""
     along, offset = walls[:, 1] - walls[:, 0], points[:, None] - walls[:, 0]
-    u = ((offset*along).sum(-1)/along.square().sum(-1).clamp(min=1e-30)).clamp(0, 1)
-    return (offset - u[..., None]*along).norm(dim=-1)
+    u = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-30)).clamp(0, 1)
+    return (offset - u[..., None] * along).norm(dim=-1)
 
 
 def places(walls, n, draw):
-    """Where agents are set down: (n, 2) float32 points within the bounds of walls (W, 2, 2), no nearer than a HAIR to
-    any. Four in ten lie anywhere; the rest at a wall's flank or end: touching it to a few units in the last place,
-    overlapping it, or with the centre a hair from it.
+    """Where agents are set down: (n, 2) float32 points within the bounds of walls (W, 2, 2), no
+    nearer than a HAIR to any. Four in ten lie anywhere; the rest at a wall's flank or end: touching
+    it to a few units in the last place, overlapping it, or with the centre a hair from it.
     """
     found, low, high = torch.zeros((0, 2)), walls.amin((0, 1)), walls.amax((0, 1))
     while len(found) < n:
         a, b = walls[draw.pick(range(len(walls)), n).long()].unbind(1)
         u, aside = draw.uniform(-0.5, 1.5, n, 1).clamp(0, 1), draw.direction(n)
         normal = torch.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], -1)
-        normal = normal/normal.norm(dim=-1, keepdim=True).clamp(min=1e-9)*draw.pick([-1, 1], n, 1)
+        normal = (
+            normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-9) * draw.pick([-1, 1], n, 1)
+        )
         inner = (u > 0) & (u < 1) & (normal.norm(dim=-1, keepdim=True) > 0)
         touching = draw.pick([RADIUS, BODY], n, 1) + draw.pick([-1e-6, -1e-7, 0, 1e-7, 1e-6], n, 1)
-        overlapping = 10**draw.uniform(math.log10(HAIR), math.log10(RADIUS), n, 1)
+        overlapping = 10 ** draw.uniform(math.log10(HAIR), math.log10(RADIUS), n, 1)
         distance = torch.where(draw.uniform(0, 1, n, 1) < 0.5, touching, overlapping)
-        near = a + u*(b - a) + distance*torch.where(inner, normal, aside)
-        anywhere = draw.uniform(0, 1, n, 2)*(high - low) + low
+        near = a + u * (b - a) + distance * torch.where(inner, normal, aside)
+        anywhere = draw.uniform(0, 1, n, 2) * (high - low) + low
         points = torch.where(draw.uniform(0, 1, n, 1) < 0.4, anywhere, near).float()
         inside = ((points > low) & (points < high)).all(-1)
-        found = torch.cat([found, points[inside & (clearances(points.double(), walls).amin(1) > HAIR)]])
+        found = torch.cat(
+            [found, points[inside & (clearances(points.double(), walls).amin(1) > HAIR)]]
+        )
     return found[:n]
 
 
 @dataclass(frozen=True)
 class Ground:
     """A course's designs, ready to be walked on."""
+
     name: str
     n_agents: int
     geometries: list
@@ -164,33 +229,44 @@ class Ground:
     clear: torch.Tensor  # (D, P) bool: where they then overlap no wall
 
 
-def ground(name, seed=0, device='cpu', n_spots=512):
+def ground(name, seed=0, device="cpu", n_spots=512):
     """The ground of the course `name`."""
     make, n_agents = COURSES[name]
     draw = worlds.Draw(seed)
     designs = [torch.as_tensor(np.float32(walls)) for walls in make(draw)]
     walls = torch.full((len(designs), max(map(len, designs)), 2, 2), math.nan)
     for d, w in enumerate(designs):
-        walls[d, :len(w)] = w
+        walls[d, : len(w)] = w
     spots = [places(w.double(), n_spots, draw) for w in designs]
     clear = [clearances(p.double(), w.double()).amin(1) > BODY for p, w in zip(spots, designs)]
     geometries = [dotdict(walls=w.numpy(), lights=np.zeros((0, 2))) for w in designs]
-    return Ground(name, n_agents, geometries, walls.to(device), torch.tensor([len(w) for w in designs], device=device),
-                  torch.stack(spots).to(device), torch.stack(clear).to(device))
+    return Ground(
+        name,
+        n_agents,
+        geometries,
+        walls.to(device),
+        torch.tensor([len(w) for w in designs], device=device),
+        torch.stack(spots).to(device),
+        torch.stack(clear).to(device),
+    )
 
 
 # ---- The judge of paths ----
 
+
 def cross(ax, ay, bx, by):
-    return ax*by - ay*bx
+    return ax * by - ay * bx
 
 
 def boxes_meet(p, q, a, b):
-    """Whether the bounding boxes of segments pq and ab meet, touching included. Exact in any floating type."""
+    """Whether the bounding boxes of segments pq and ab meet, touching included. Exact in any
+    floating type.
+    """
     meet = None
     for i in (0, 1):
-        here = (torch.minimum(p[i], q[i]) <= torch.maximum(a[i], b[i])) \
-            & (torch.maximum(p[i], q[i]) >= torch.minimum(a[i], b[i]))
+        here = (torch.minimum(p[i], q[i]) <= torch.maximum(a[i], b[i])) & (
+            torch.maximum(p[i], q[i]) >= torch.minimum(a[i], b[i])
+        )
         meet = here if meet is None else meet & here
     return meet
 
@@ -203,25 +279,28 @@ def straddles(p, q, a, b):
 
 
 def crossed(before, after, walls, dense=None):
-    """Whether the straight paths from before to after (B, D, A, 2) touch any of walls (D, W, 2, 2): bool (B, D, A).
+    """Whether the straight paths from before to after (B, D, A, 2) touch any of walls (D, W, 2, 2):
+    bool (B, D, A).
 
-    Closed segments meet if their boxes do and each straddles the other's line (true of points and of collinear ones
-    too). Boxes are compared in the given type, which is exact, sides in float64. The CPU tries only the pairs whose
-    boxes meet, a GPU all of them (`dense`), as it would have to wait for their number.
+    Closed segments meet if their boxes do and each straddles the other's line (true of points and
+    of collinear ones too). Boxes are compared in the given type, which is exact, sides in float64.
+    The CPU tries only the pairs whose boxes meet, a GPU all of them (`dense`), as it would have to
+    wait for their number.
     """
-    dense = before.device.type == 'cuda' if dense is None else dense
+    dense = before.device.type == "cuda" if dense is None else dense
     rows, judge = rows_of(before, walls), _crossed_dense if dense else _crossed_sparse
     return torch.cat([judge(p, q, walls) for p, q in zip(before.split(rows), after.split(rows))])
 
 
 def rows_of(points, walls):
     """How many of the copies of points (B, D, A, 2) to judge at once."""
-    return max(PAIRS[points.device.type]//(walls.shape[0]*walls.shape[1]*points.shape[2]), 1)
+    return max(PAIRS[points.device.type] // (walls.shape[0] * walls.shape[1] * points.shape[2]), 1)
 
 
 def _ends(p, q, walls):
-    return [(x[..., 0, None], x[..., 1, None]) for x in (p, q)] + \
-        [(walls[:, None, :, i, 0], walls[:, None, :, i, 1]) for i in (0, 1)]
+    return [(x[..., 0, None], x[..., 1, None]) for x in (p, q)] + [
+        (walls[:, None, :, i, 0], walls[:, None, :, i, 1]) for i in (0, 1)
+    ]
 
 
 def _crossed_dense(p, q, walls):
@@ -241,8 +320,9 @@ def _crossed_sparse(p, q, walls):
 
 
 def surroundings(points, walls):
-    """The nearest wall of each agent at points (B, D, A, 2), how far it is, and whether the agent touches two walls
-    that meet at less than 83 degrees, having them on opposite sides: all (B, D, A).
+    """The nearest wall of each agent at points (B, D, A, 2), how far it is, and whether the agent
+    touches two walls that meet at less than 83 degrees, having them on opposite sides: all (B, D,
+    A).
     """
     some = (_surroundings(p, walls) for p in points.split(rows_of(points, walls)))
     return tuple(map(torch.cat, zip(*some)))
@@ -251,44 +331,61 @@ def surroundings(points, walls):
 def _surroundings(points, walls):
     start, along = walls[:, None, :, 0], (walls[:, :, 1] - walls[:, :, 0])[:, None]
     offset = points[..., None, :] - start
-    u = ((offset*along).sum(-1)/along.square().sum(-1).clamp(min=1e-30)).clamp(0, 1)
-    normal = offset - u[..., None]*along
+    u = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-30)).clamp(0, 1)
+    normal = offset - u[..., None] * along
     distance = normal.norm(dim=-1).nan_to_num(nan=math.inf)
     least, nearest = distance.min(-1)
     first = normal.gather(-2, nearest[..., None, None].expand(*nearest.shape, 1, 2))
-    cosine = (normal*first).sum(-1)/(distance*least[..., None]).clamp(min=1e-12)
+    cosine = (normal * first).sum(-1) / (distance * least[..., None]).clamp(min=1e-12)
     return nearest, least, ((distance < TOUCH) & (cosine < PINCH)).any(-1) & (least < TOUCH)
 
 
 # ---- Walkers ----
 
-COUNTED = 'steps', 'collisions', 'crossings', 'sunk'
-NOTED = 'x before', 'y before', 'x after', 'y after', 'velocity x', 'velocity y', 'angle', 'action', 'step'
+COUNTED = "steps", "collisions", "crossings", "sunk"
+NOTED = (
+    "x before",
+    "y before",
+    "x after",
+    "y after",
+    "velocity x",
+    "velocity y",
+    "angle",
+    "action",
+    "step",
+)
 
 
 class Walk:
-    """Agents on one ground, at one rate and acceleration, that seek walls and corners for spells of 16 steps.
+    """Agents on one ground, at one rate and acceleration, that seek walls and corners for spells of
+    16 steps.
 
-    Before each spell a quarter of them is set down anew. In a spell an agent heads for an end of a wall, for a point of
-    one, along one, or anywhere, at up to the speed that MomentumMovement would give it in the end. If `acting` it does
-    so by MomentumMovement's actions, else its velocity is written.
+    Before each spell a quarter of them is set down anew. In a spell an agent heads for an end of a
+    wall, for a point of one, along one, or anywhere, at up to the speed that MomentumMovement would
+    give it in the end. If `acting` it does so by MomentumMovement's actions, else its velocity is
+    written.
 
-    ``counts`` (4,) int64 are of steps, collisions, crossings, and agents who overlapped no wall when set down but are
-    nearer than their radius to one when a spell ends. ``pinched`` (D,) counts those who then are in an acute corner.
-    ``notes`` (B, D, A, 9) are what each agent's first crossing was like.
+    ``counts`` (4,) int64 are of steps, collisions, crossings, and agents who overlapped no wall
+    when set down but are nearer than their radius to one when a spell ends. ``pinched`` (D,) counts
+    those who then are in an acute corner. ``notes`` (B, D, A, 9) are what each agent's first
+    crossing was like.
     """
 
     def __init__(self, ground, scenery, fps, accel, acting, seed):
         self.ground, self.fps, self.accel, self.acting, self.seed = ground, fps, accel, acting, seed
         self.core = core.Core(scenery, res=1, fps=fps)
         device, walls = self.core.device, ground.walls
-        self.shape = (scenery.n_envs//len(walls), len(walls), ground.n_agents)
+        self.shape = (scenery.n_envs // len(walls), len(walls), ground.n_agents)
         self.generator = torch.Generator(device).manual_seed(seed)
-        self.move = MomentumMovement(self.core, accel=accel*ACCEL)
-        self.speed = accel*ACCEL/fps/DECAY
+        self.move = MomentumMovement(self.core, accel=accel * ACCEL)
+        self.speed = accel * ACCEL / fps / DECAY
         self.design = torch.arange(len(walls), device=device)[None, :, None].expand(self.shape)
-        self.ahead = torch.tensor([(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)], dtype=torch.float32, device=device)
-        self.slants = torch.tensor([0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3, 0.1, -0.1], device=device)
+        self.ahead = torch.tensor(
+            [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)], dtype=torch.float32, device=device
+        )
+        self.slants = torch.tensor(
+            [0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3, 0.1, -0.1], device=device
+        )
         self.counts = torch.zeros(len(COUNTED), dtype=torch.int64, device=device)
         self.pinched = torch.zeros(len(walls), dtype=torch.int64, device=device)
         self.notes = torch.full((*self.shape, len(NOTED)), math.nan, device=device)
@@ -317,40 +414,59 @@ class Walk:
         agents, again = self.core.agents, self.random() < share
         spot = self.pick(self.ground.spots.shape[1])
         flat, wide = again.view(agents.angles.shape), again[..., None]
-        self.positions.copy_(torch.where(wide, self.ground.spots[self.design, spot], self.positions))
+        self.positions.copy_(
+            torch.where(wide, self.ground.spots[self.design, spot], self.positions)
+        )
         self.clear = torch.where(again, self.ground.clear[self.design, spot], self.clear)
-        agents.angles.copy_(torch.where(flat, 360*self.random().view(flat.shape) - 180, agents.angles))
+        agents.angles.copy_(
+            torch.where(flat, 360 * self.random().view(flat.shape) - 180, agents.angles)
+        )
         agents.velocity.masked_fill_(flat[..., None], 0)
         agents.angvelocity.masked_fill_(flat, 0)
 
     def aim(self):
         """Gives each agent a wall, and a goal there, for a spell."""
         nearest = surroundings(self.positions, self.ground.walls)[0]
-        some = (self.random()*self.ground.counts[:, None]).long()
+        some = (self.random() * self.ground.counts[:, None]).long()
         wall = torch.where(self.random() < 0.5, nearest, some)
         a, b = self.ground.walls[self.design, wall].unbind(-2)
         along = b - a
-        foot = (((self.positions - a)*along).sum(-1)/along.square().sum(-1).clamp(min=1e-12)).clamp(0, 1)
+        foot = (
+            ((self.positions - a) * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
+        ).clamp(0, 1)
         kind = self.pick(4)  # to an end, to the foot, to anywhere on it, to anywhere on it
-        u = torch.where(kind == 0, (self.random() < 0.5).float(), torch.where(kind == 1, foot, self.random()))
-        self.goal = a + u[..., None]*along
-        sign, slant = 2*self.pick(2)[..., None] - 1, self.slants[self.pick(len(self.slants))][..., None]
-        self.grazing = sign*along + slant*torch.stack([-along[..., 1], along[..., 0]], -1)
-        self.manner = self.pick(8)[..., None]  # 0: anywhere, 1 and 2: along the wall, else: to the goal
-        self.haste = self.speed*torch.where(self.random() < 0.5, 1, 10**(-4*self.random()))[..., None]
+        u = torch.where(
+            kind == 0, (self.random() < 0.5).float(), torch.where(kind == 1, foot, self.random())
+        )
+        self.goal = a + u[..., None] * along
+        sign, slant = (
+            2 * self.pick(2)[..., None] - 1,
+            self.slants[self.pick(len(self.slants))][..., None],
+        )
+        self.grazing = sign * along + slant * torch.stack([-along[..., 1], along[..., 0]], -1)
+        self.manner = self.pick(8)[
+            ..., None
+        ]  # 0: anywhere, 1 and 2: along the wall, else: to the goal
+        self.haste = (
+            self.speed * torch.where(self.random() < 0.5, 1, 10 ** (-4 * self.random()))[..., None]
+        )
 
     def ways(self):
         """Where each agent wants to go, (B, D, A, 2) of length 1 or, being there, 0."""
         way = torch.where(self.manner == 0, self.random(2) - 0.5, self.goal - self.positions)
         way = torch.where((self.manner == 1) | (self.manner == 2), self.grazing, way)
-        return way/way.norm(dim=-1, keepdim=True).clamp(min=1e-30)
+        return way / way.norm(dim=-1, keepdim=True).clamp(min=1e-30)
 
     def actions(self, ways):
-        """For each agent the action of the first five that takes it furthest along its way; one in ten any."""
+        """For each agent the action of the first five that takes it furthest along its way; one in
+        ten any.
+        """
         radians = torch.deg2rad(self.core.agents.angles.view(self.shape))
         c, s = radians.cos(), radians.sin()
-        local = torch.stack([c*ways[..., 0] + s*ways[..., 1], c*ways[..., 1] - s*ways[..., 0]], -1)
-        best = (local[..., None, :]*self.ahead).sum(-1).argmax(-1)
+        local = torch.stack(
+            [c * ways[..., 0] + s * ways[..., 1], c * ways[..., 1] - s * ways[..., 0]], -1
+        )
+        best = (local[..., None, :] * self.ahead).sum(-1).argmax(-1)
         return torch.where(self.random() < 0.1, self.pick(7), best)
 
     def step(self):
@@ -360,7 +476,7 @@ class Walk:
             action, velocity = self.actions(ways), agents.velocity.clone()
             progress = self.move(dict(actions=action)).progress
         else:
-            action, velocity = self.pick(1) - 1, ways*self.haste
+            action, velocity = self.pick(1) - 1, ways * self.haste
             agents.velocity.copy_(velocity.view(agents.velocity.shape))
             progress = engine.physics(self.core.scenery, agents).progress
         self.progress, self.way = progress.view(self.shape), ways
@@ -378,52 +494,65 @@ class Walk:
         self.notes = torch.where(new, now, self.notes)
 
     def spell(self):
-        self.respawn(1. if self.age == 0 else 0.25)
+        self.respawn(1.0 if self.age == 0 else 0.25)
         self.aim()
         for _ in range(SPELL):
             self.step()
         self.look()
 
     def stopped(self, most):
-        """The (b, d, a) of at most that many agents that the last step stopped, anyhow. Asks the device."""
+        """The (b, d, a) of at most that many agents that the last step stopped, anyhow. Asks the
+        device.
+        """
         b, d, a = (self.progress < 1).nonzero(as_tuple=True)
         some = torch.randperm(len(b), generator=self.generator, device=b.device)[:most]
         return b[some], d[some], a[some]
 
     def story(self, most=3):
-        """Sentences on the first few crossings, from which each can be made again; the walls are those of
-        `ground(name, seed // 1000)`."""
+        """Sentences on the first few crossings, from which each can be made again; the walls are
+        those of `ground(name, seed // 1000)`."""
         told = []
         for b, d, a in (~self.notes[..., 0].isnan()).nonzero()[:most].tolist():
-            note = ', '.join(f'{name} {x!r}' for name, x in zip(NOTED, self.notes[b, d, a].tolist()))
-            told.append(f'{self}: copy {b} of design {d}, agent {a}: {note}')
+            note = ", ".join(
+                f"{name} {x!r}" for name, x in zip(NOTED, self.notes[b, d, a].tolist())
+            )
+            told.append(f"{self}: copy {b} of design {d}, agent {a}: {note}")
         return told
 
     def __str__(self):
-        how = 'acting' if self.acting else 'driven'
-        return f'{self.ground.name} at {self.fps} fps, {self.accel} times the acceleration, {how}, seed {self.seed}'
+        how = "acting" if self.acting else "driven"
+        return (
+            f"{self.ground.name} at {self.fps} fps, {self.accel} times the acceleration, "
+            f"{how}, seed {self.seed}"
+        )
 
 
 # ---- The judge of the stuck ----
 
+
 def directions(n, device):
     """(n, 2) unit vectors, those along the axes exactly so."""
-    turn = 2*math.pi*torch.arange(n, dtype=torch.float64)/n
+    turn = 2 * math.pi * torch.arange(n, dtype=torch.float64) / n
     ways = torch.stack([turn.cos(), turn.sin()], -1)
     return torch.where(ways.abs() < 1e-12, 0, ways).float().to(device)
 
 
 def attempts(scenery, fps, positions, design, agent, ways):
-    """How far (K, n) agent k of each world (K, A, 2) gets by a step of 1 cm in each direction of ways (K, n, 2) while
-    the others rest; 0 if physics says that no progress was made.
+    """How far (K, n) agent k of each world (K, A, 2) gets by a step of 1 cm in each direction of
+    ways (K, n, 2) while the others rest; 0 if physics says that no progress was made.
     """
     k, n, _ = ways.shape
-    copies = engine.Scenery.of_designs(scenery.n_agents, scenery.designs, scenery.model, scenery.model_texels.diff(),
-                                       design.repeat_interleave(n))
-    agents = engine.Agents(k*n, scenery.n_agents, res=1, fps=fps, device=scenery.device)
+    copies = engine.Scenery.of_designs(
+        scenery.n_agents,
+        scenery.designs,
+        scenery.model,
+        scenery.model_texels.diff(),
+        design.repeat_interleave(n),
+    )
+    agents = engine.Agents(k * n, scenery.n_agents, res=1, fps=fps, device=scenery.device)
     agents.positions.copy_(positions.repeat_interleave(n, 0))
-    each, who = torch.arange(k*n, device=scenery.device), agent.repeat_interleave(n)
-    agents.velocity[each, who] = ways.reshape(-1, 2)*TRY*fps
+    each, who = torch.arange(k * n, device=scenery.device), agent.repeat_interleave(n)
+    agents.velocity[each, who] = ways.reshape(-1, 2) * TRY * fps
     start = agents.positions.clone()
     progress = engine.physics(copies, agents).progress
     way = (agents.positions - start)[each, who].norm(dim=-1)
@@ -431,12 +560,13 @@ def attempts(scenery, fps, positions, design, agent, ways):
 
 
 def hemmed(position, others, walls):
-    """Whether all that an agent overlaps or all but touches leaves it no direction, within half a degree, that does
-    not bring it nearer to something: then a disc cannot leave. position (2,), others (A - 1, 2), walls (W, 2, 2).
+    """Whether all that an agent overlaps or all but touches leaves it no direction, within half a
+    degree, that does not bring it nearer to something: then a disc cannot leave. position (2,),
+    others (A - 1, 2), walls (W, 2, 2).
     """
     offset, along = position - walls[:, 0], walls[:, 1] - walls[:, 0]
-    u = ((offset*along).sum(-1)/along.square().sum(-1).clamp(min=1e-30)).clamp(0, 1)
-    away = torch.cat([offset - u[:, None]*along, (position - others)/2])
+    u = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-30)).clamp(0, 1)
+    away = torch.cat([offset - u[:, None] * along, (position - others) / 2])
     away = away[away.norm(dim=-1) < BODY + LEAVES]
     angles = torch.atan2(away[:, 1], away[:, 0]).rad2deg().sort().values
     gaps = torch.cat([angles[1:] - angles[:-1], angles[:1] + 360 - angles[-1:]])
@@ -444,15 +574,18 @@ def hemmed(position, others, walls):
 
 
 def stuck(walk, most):
-    """Tries to leave with at most that many agents that were stopped: 32 directions and the way straight back, and 720
-    if these fail. Returns (how many were tried, how many of them geometry holds, sentences on the others that stay).
+    """Tries to leave with at most that many agents that were stopped: 32 directions and the way
+    straight back, and 720 if these fail. Returns (how many were tried, how many of them geometry
+    holds, sentences on the others that stay).
     """
     scenery, device = walk.core.scenery, walk.core.device
     b, d, a = walk.stopped(most)
     if not len(b):
         return 0, 0, []
     positions = walk.positions[b, d]
-    ways = torch.cat([directions(32, device).expand(len(b), -1, -1), -walk.way[b, d, a][:, None]], 1)
+    ways = torch.cat(
+        [directions(32, device).expand(len(b), -1, -1), -walk.way[b, d, a][:, None]], 1
+    )
     far = attempts(scenery, walk.fps, positions, d, a, ways).amax(1)
     rest, fine = (far < LEAVES).nonzero()[:, 0], directions(720, device)
     for some in rest.split(256):
@@ -460,46 +593,61 @@ def stuck(walk, most):
         far[some] = attempts(scenery, walk.fps, positions[some], d[some], a[some], all_ways).amax(1)
     n_held, told = 0, []
     for k in rest[far[rest] < LEAVES].tolist():
-        world, own = positions[k].double(), torch.arange(walk.ground.n_agents, device=device) == a[k]
-        walls = walk.ground.walls[d[k], :int(walk.ground.counts[d[k]])].double()
+        world, own = (
+            positions[k].double(),
+            torch.arange(walk.ground.n_agents, device=device) == a[k],
+        )
+        walls = walk.ground.walls[d[k], : int(walk.ground.counts[d[k]])].double()
         excusable = walk.ground.n_agents > 1 or not walk.clear[b[k], d[k], a[k]]
         if excusable and hemmed(world[own][0], world[~own], walls):
             n_held += 1
         else:
-            told.append(f'{walk}: copy {b[k]} of design {d[k]}, agent {a[k]}, step {walk.age}: stuck in a world whose '
-                        f'agents are at {positions[k].tolist()!r}')
+            told.append(
+                f"{walk}: copy {b[k]} of design {d[k]}, agent {a[k]}, step {walk.age}: stuck in a "
+                f"world whose "
+                f"agents are at {positions[k].tolist()!r}"
+            )
     return len(b), n_held, told
 
 
 # ---- Runs ----
 
-def run(name, n_steps, n_agents, device='cpu', seed=0, tries=1 << 30, report=None):
-    """Walks a course for at least n_steps agent-steps in all, with up to n_agents at once, at each of the SETTINGS in
-    turn, driven and acting. After each spell up to `tries` of those who were stopped try to leave.
 
-    Returns a dict: the COUNTED; `tried`, `held` and `stuck`; `pinched` (D,), a list; and `stories` of the first
-    crossings and of the stuck. ``report(total)`` is called after each walk.
+def run(name, n_steps, n_agents, device="cpu", seed=0, tries=1 << 30, report=None):
+    """Walks a course for at least n_steps agent-steps in all, with up to n_agents at once, at each
+    of the SETTINGS in turn, driven and acting. After each spell up to `tries` of those who were
+    stopped try to leave.
+
+    Returns a dict: the COUNTED; `tried`, `held` and `stuck`; `pinched` (D,), a list; and `stories`
+    of the first crossings and of the stuck. ``report(total)`` is called after each walk.
     """
     course = ground(name, seed, device)
     modes = [(*setting, acting) for setting in SETTINGS for acting in (False, True)]
-    n_agents = min(n_agents, n_steps//(len(modes)*SPELL*SPELLS))
-    copies = max(n_agents//(len(course.walls)*course.n_agents), 1)
-    scenery = scene.scenery(course.geometries, course.n_agents, copies*len(course.walls), device=torch.device(device))
-    total = dict.fromkeys((*COUNTED, 'tried', 'held', 'stuck'), 0) | dict(pinched=len(course.walls)*[0], stories=[])
-    a_spell = SPELL*scenery.n_envs*course.n_agents
+    n_agents = min(n_agents, n_steps // (len(modes) * SPELL * SPELLS))
+    copies = max(n_agents // (len(course.walls) * course.n_agents), 1)
+    scenery = scene.scenery(
+        course.geometries, course.n_agents, copies * len(course.walls), device=torch.device(device)
+    )
+    total = dict.fromkeys((*COUNTED, "tried", "held", "stuck"), 0) | dict(
+        pinched=len(course.walls) * [0], stories=[]
+    )
+    a_spell = SPELL * scenery.n_envs * course.n_agents
     for i, (fps, accel, acting) in enumerate(modes):
-        walk = Walk(course, scenery, fps, accel, acting, 1000*seed + i)
-        for _ in range(math.ceil((n_steps - total['steps'])/((len(modes) - i)*a_spell))):
+        walk = Walk(course, scenery, fps, accel, acting, 1000 * seed + i)
+        for _ in range(math.ceil((n_steps - total["steps"]) / ((len(modes) - i) * a_spell))):
             walk.spell()
             if tries:
                 tried, held, told = stuck(walk, tries)
-                total['tried'], total['held'] = total['tried'] + tried, total['held'] + held
-                total['stuck'], total['stories'] = total['stuck'] + len(told), total['stories'] + told[:3]
+                total["tried"], total["held"] = total["tried"] + tried, total["held"] + held
+                total["stuck"], total["stories"] = (
+                    total["stuck"] + len(told),
+                    total["stories"] + told[:3],
+                )
         engine.check(walk.core.agents)
         for key, value in zip(COUNTED, walk.counts.tolist()):
             total[key] += value
-        total['pinched'] = [x + y for x, y in zip(total['pinched'], walk.pinched.tolist())]
-        total['stories'] += walk.story()
+        total["pinched"] = [x + y for x, y in zip(total["pinched"], walk.pinched.tolist())]
+        total["stories"] += walk.story()
         if report:
             report(total)
     return total

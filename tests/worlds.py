@@ -1,7 +1,10 @@
-"""Small worlds for the engine's tests: random ones with degenerate cases on demand, and the original's golden ones.
+"""Small worlds for the engine's tests: random ones with degenerate cases on demand, and the
+original's golden ones.
 
-Axes: N worlds, A agents, M model lines, L lines of all worlds (the agents' first in each), K lights, T texels.
+Axes: N worlds, A agents, M model lines, L lines of all worlds (the agents' first in each), K
+lights, T texels.
 """
+
 import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -10,16 +13,21 @@ import numpy as np
 import torch
 import twin
 
-GOLDEN = Path(__file__).parent/'data'/'golden'/'original_engine.npz'
-CASES = 'box_1', 'home_1', 'home_1_fast', 'home_4', 'home_4_near'
+GOLDEN = Path(__file__).parent / "data" / "golden" / "original_engine.npz"
+CASES = "box_1", "home_1", "home_1_fast", "home_4", "home_4_near"
 TEXEL = 0.05  # m
-CORNERS = 0.075*torch.tensor([(-.5, -1), (.5, -1), (1, -.5), (1, .5), (.5, 1), (-.5, 1), (-1, .5), (-1, -.5)])  # m
+CORNERS = 0.075 * torch.tensor(
+    [(-0.5, -1), (0.5, -1), (1, -0.5), (1, 0.5), (0.5, 1), (-0.5, 1), (-1, 0.5), (-1, -0.5)]
+)  # m
 OCTAGON = torch.stack([CORNERS, CORNERS.roll(-1, 0)], 1)  # the original's model
 
 
 @dataclass(frozen=True)
 class World:
-    """N worlds in the form `Scenery(n_agents, lights, lines, textures, model)` takes, and their agents. All float32."""
+    """N worlds in the form `Scenery(n_agents, lights, lines, textures, model)` takes, and their
+    agents. All float32.
+    """
+
     model: torch.Tensor  # (M, 2, 2)
     lines: torch.Tensor  # (L, 2, 2), the agents' own still about the origin
     line_widths: torch.Tensor  # (N,)
@@ -43,49 +51,75 @@ class World:
     def to(self, device):
         return replace(self, **{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
-    def scenery_arguments(self, device='cpu'):
+    def scenery_arguments(self, device="cpu"):
         """The keyword arguments of Scenery's documented constructor."""
         from megastep.ragged import Ragged
+
         world = self.to(device)
-        return dict(n_agents=self.n_agents, model=world.model, lights=Ragged(world.lights, world.light_widths),
-                    lines=Ragged(world.lines, world.line_widths), textures=Ragged(world.textures, world.texture_widths))
+        return dict(
+            n_agents=self.n_agents,
+            model=world.model,
+            lights=Ragged(world.lights, world.light_widths),
+            lines=Ragged(world.lines, world.line_widths),
+            textures=Ragged(world.textures, world.texture_widths),
+        )
 
     def texels(self):
         """How many texels each world has, (N,)."""
         return torch.stack([w.sum() for w in self.texture_widths.split(self.line_widths.tolist())])
 
     def one(self, e, dtype=torch.float64):
-        """World e alone: dict of model, walls (all lines but the agents'), lights, textures, widths (of the lines'
-        textures), positions, angles, velocity, angvelocity."""
+        """World e alone: dict of model, walls (all lines but the agents'), lights, textures, widths
+        (of the lines' textures), positions, angles, velocity, angvelocity."""
         mine = lambda vals, widths: vals.split(widths.tolist())[e]  # noqa: E731
-        state = {k: getattr(self, k)[e].to(dtype) for k in ('positions', 'angles', 'velocity', 'angvelocity')}
-        walls = mine(self.lines, self.line_widths)[self.n_agents*len(self.model):]
-        return dict(state, model=self.model.to(dtype), walls=walls.to(dtype),
-                    lights=mine(self.lights, self.light_widths).to(dtype),
-                    textures=mine(self.textures, self.texels()).to(dtype),
-                    widths=mine(self.texture_widths, self.line_widths))
+        state = {
+            k: getattr(self, k)[e].to(dtype)
+            for k in ("positions", "angles", "velocity", "angvelocity")
+        }
+        walls = mine(self.lines, self.line_widths)[self.n_agents * len(self.model) :]
+        return dict(
+            state,
+            model=self.model.to(dtype),
+            walls=walls.to(dtype),
+            lights=mine(self.lights, self.light_widths).to(dtype),
+            textures=mine(self.textures, self.texels()).to(dtype),
+            widths=mine(self.texture_widths, self.line_widths),
+        )
 
 
 def unplaced(model, n_agents, walls):
-    """The lines of worlds with these walls before anybody has put the agents' lines in their places."""
-    return torch.cat([torch.cat([*n_agents*[model], w]) for w in walls])
+    """The lines of worlds with these walls before anybody has put the agents' lines in their
+    places.
+    """
+    return torch.cat([torch.cat([*n_agents * [model], w]) for w in walls])
 
 
 def golden(case):
-    """A golden case: its World, its settings (res, fov, fps), what the original computed (named as in its README)."""
+    """A golden case: its World, its settings (res, fov, fps), what the original computed (named as
+    in its README).
+    """
     with np.load(GOLDEN) as arrays:
-        g = {k.split('/')[1]: torch.as_tensor(arrays[k]) for k in arrays if k.split('/')[0] == case}
-    _, n_agents, res, fov, fps = g.pop('meta').tolist()
-    walls = [lines[8*int(n_agents):] for lines in g['lines_after_render'].split(g['line_widths'].tolist())]
+        g = {k.split("/")[1]: torch.as_tensor(arrays[k]) for k in arrays if k.split("/")[0] == case}
+    _, n_agents, res, fov, fps = g.pop("meta").tolist()
+    walls = [
+        lines[8 * int(n_agents) :]
+        for lines in g["lines_after_render"].split(g["line_widths"].tolist())
+    ]
     world = World(
-        model=g['model'], lines=unplaced(g.pop('model'), int(n_agents), walls), line_widths=g.pop('line_widths'),
-        lights=g.pop('light_vals'), light_widths=g.pop('light_widths'),
-        textures=g.pop('texture_vals'), texture_widths=g.pop('texture_widths'),
-        **{k: g.pop(k) for k in ('positions', 'angles', 'velocity', 'angvelocity')})
+        model=g["model"],
+        lines=unplaced(g.pop("model"), int(n_agents), walls),
+        line_widths=g.pop("line_widths"),
+        lights=g.pop("light_vals"),
+        light_widths=g.pop("light_widths"),
+        textures=g.pop("texture_vals"),
+        texture_widths=g.pop("texture_widths"),
+        **{k: g.pop(k) for k in ("positions", "angles", "velocity", "angvelocity")},
+    )
     return world, dict(res=int(res), fov=fov, fps=fps), g
 
 
 # Random worlds
+
 
 class Draw:
     """Seeded draws, float64."""
@@ -94,19 +128,21 @@ class Draw:
         self.generator = torch.Generator().manual_seed(seed)
 
     def uniform(self, low, high, *shape):
-        return low + (high - low)*torch.rand(shape, generator=self.generator, dtype=torch.float64)
+        return low + (high - low) * torch.rand(shape, generator=self.generator, dtype=torch.float64)
 
     def pick(self, options, *shape):
         picked = torch.randint(len(options), shape, generator=self.generator)
         return torch.as_tensor(options, dtype=torch.float64)[picked]
 
     def direction(self, *shape):
-        turn = self.uniform(0, 2*math.pi, *shape)
+        turn = self.uniform(0, 2 * math.pi, *shape)
         return torch.stack([turn.cos(), turn.sin()], -1)
 
     def segments(self, n, low, high, size):
         """n segments with centres in a square of `size` and lengths log-uniform in [low, high]."""
-        half = self.direction(n)*(self.uniform(math.log(low), math.log(high), n).exp()/2)[:, None]
+        half = (
+            self.direction(n) * (self.uniform(math.log(low), math.log(high), n).exp() / 2)[:, None]
+        )
         centre = self.uniform(0, size, n, 2)
         return torch.stack([centre - half, centre + half], 1)
 
@@ -118,14 +154,24 @@ def nudged(x, ulps):
 
 
 def parallel(draw, walls, agents, looks):
-    """Walls that lie exactly along a ray: ahead of the agent, behind it, and one that it stands on."""
+    """Walls that lie exactly along a ray: ahead of the agent, behind it, and one that it stands
+    on.
+    """
     p, ray = agents[0], looks[0, 0, draw.pick(range(looks.shape[2]), 3).long()]
-    return torch.stack([p + near*r + torch.stack([0*r, r]) for near, r in zip((1, -2, -0.5), ray)])
+    return torch.stack(
+        [p + near * r + torch.stack([0 * r, r]) for near, r in zip((1, -2, -0.5), ray)]
+    )
 
 
 def zero_length(draw, walls, agents, looks):
     """Points: in the way of an agent, just beside it, and anywhere."""
-    at = torch.stack([agents[0] + 0.5*draw.direction(), agents[-1] + 0.12*draw.direction(), walls.mean((0, 1))])
+    at = torch.stack(
+        [
+            agents[0] + 0.5 * draw.direction(),
+            agents[-1] + 0.12 * draw.direction(),
+            walls.mean((0, 1)),
+        ]
+    )
     return at[:, None].expand(-1, 2, -1)
 
 
@@ -135,46 +181,54 @@ def duplicates(draw, walls, agents, looks):
 
 
 def touching(draw, walls, agents, looks):
-    """Axis-parallel walls at the distance of contact from the first agent: on it, and a few ulps to either side."""
-    p, reach = agents[0], twin.INFLATION*twin.RADIUS
+    """Axis-parallel walls at the distance of contact from the first agent: on it, and a few ulps to
+    either side.
+    """
+    p, reach = agents[0], twin.INFLATION * twin.RADIUS
     made = []
     for side, axis, ulps in ((1, 0, 0), (-1, 0, 1), (1, 1, -1), (-1, 1, 3)):
         wall = torch.stack([p, p])
-        wall[:, axis] = nudged(p[axis] + side*reach, ulps)
+        wall[:, axis] = nudged(p[axis] + side * reach, ulps)
         wall[:, 1 - axis] += torch.tensor([-0.4, 0.7], dtype=p.dtype)
         made.append(wall)
-    return torch.stack(made)[torch.randperm(4, generator=draw.generator)[:2]]  # all four would hold it fast
+    return torch.stack(made)[
+        torch.randperm(4, generator=draw.generator)[:2]
+    ]  # all four would hold it fast
 
 
 def pixel_ends(draw, walls, agents, looks):
     """Walls whose ends lie on the rays of pixels."""
     rays = looks[-1, 0][draw.pick(range(looks.shape[2]), 4, 2).long()]
-    return agents[-1] + rays*draw.uniform(0.5, 3, 4, 2, 1)
+    return agents[-1] + rays * draw.uniform(0.5, 3, 4, 2, 1)
 
 
 def tiny(draw, walls, agents, looks):
     """Walls of 0.01 to 10 mm close to the agents."""
-    centres = agents[draw.pick(range(len(agents)), 6).long()] + draw.direction(6)*draw.uniform(0.15, 1, 6, 1)
+    centres = agents[draw.pick(range(len(agents)), 6).long()] + draw.direction(6) * draw.uniform(
+        0.15, 1, 6, 1
+    )
     return draw.segments(6, 1e-5, 1e-2, 1e-9) + centres[:, None]
 
 
 def long(draw, walls, agents, looks):
     """Walls of 100 to 400 m: past an agent at arm's length, and anywhere."""
-    along = draw.direction(2)*draw.uniform(100, 200, 2, 1)
-    aside = torch.stack([-along[:, 1], along[:, 0]], -1)/along.norm(dim=-1, keepdim=True)
-    middle = torch.stack([agents[0] + 0.3*aside[0], walls.mean((0, 1)) + 2*aside[1]])
-    return torch.stack([middle - along, middle + 0.7*along], 1)
+    along = draw.direction(2) * draw.uniform(100, 200, 2, 1)
+    aside = torch.stack([-along[:, 1], along[:, 0]], -1) / along.norm(dim=-1, keepdim=True)
+    middle = torch.stack([agents[0] + 0.3 * aside[0], walls.mean((0, 1)) + 2 * aside[1]])
+    return torch.stack([middle - along, middle + 0.7 * along], 1)
 
 
-DEGENERATE = {f.__name__: f for f in (parallel, zero_length, duplicates, touching, pixel_ends, tiny, long)}
-EVERYTHING = (*DEGENERATE, 'overlap')  # agents overlapping
+DEGENERATE = {
+    f.__name__: f for f in (parallel, zero_length, duplicates, touching, pixel_ends, tiny, long)
+}
+EVERYTHING = (*DEGENERATE, "overlap")  # agents overlapping
 
 
 def random_walls(draw, n, size, origin):
     """A square room and n walls in it: a third of them axis-parallel, as in homes."""
-    corners = torch.tensor([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=torch.float64)*size
+    corners = torch.tensor([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=torch.float64) * size
     walls = draw.segments(n, 0.05, size, size)
-    upright = walls[:n//3]
+    upright = walls[: n // 3]
     upright[:, 1, 0] = upright[:, 0, 0]
     return torch.cat([torch.stack([corners, corners.roll(-1, 0)], 1), walls]) + origin
 
@@ -184,37 +238,62 @@ def random_agents(draw, n_agents, size, origin, overlap):
     positions = draw.uniform(0.2, size - 0.2, n_agents, 2) + origin
     if overlap:
         for a in range(1, n_agents):
-            positions[a] = positions[a - 1] + draw.direction()*draw.uniform(0.05, 2*twin.RADIUS)
+            positions[a] = positions[a - 1] + draw.direction() * draw.uniform(0.05, 2 * twin.RADIUS)
     return positions.float().double()
 
 
-def random_world(seed, n_envs=4, n_agents=1, n_walls=20, *, size=8., origin=1., degenerate=(),
-                 res=64, fov=130., max_lights=5):
-    """N random worlds: rooms of `size` metres from (origin, origin) on, with walls and the `degenerate` cases named.
+def random_world(
+    seed,
+    n_envs=4,
+    n_agents=1,
+    n_walls=20,
+    *,
+    size=8.0,
+    origin=1.0,
+    degenerate=(),
+    res=64,
+    fov=130.0,
+    max_lights=5,
+):
+    """N random worlds: rooms of `size` metres from (origin, origin) on, with walls and the
+    `degenerate` cases named.
 
-    The names are those of EVERYTHING; `res` and `fov` are the camera whose rays 'parallel' and 'pixel_ends' aim at.
-    Worlds differ in their number of lines and lights. An origin of 190 puts coordinates at 200 m.
+    The names are those of EVERYTHING; `res` and `fov` are the camera whose rays 'parallel' and
+    'pixel_ends' aim at. Worlds differ in their number of lines and lights. An origin of 190 puts
+    coordinates at 200 m.
     """
     draw, lines, lights, agents, angles = Draw(seed), [], [], [], []
     for _ in range(n_envs):
-        positions = random_agents(draw, n_agents, size, origin, 'overlap' in degenerate)
+        positions = random_agents(draw, n_agents, size, origin, "overlap" in degenerate)
         facing = draw.uniform(-180, 180, n_agents).float().double()
         walls = random_walls(draw, n_walls + int(draw.pick(range(4))), size, origin)
-        looks = twin.rays(facing, [0.], res, fov)
-        extra = [DEGENERATE[name](draw, walls, positions, looks) for name in degenerate if name != 'overlap']
-        walls = torch.cat([walls, *extra])[torch.randperm(len(walls) + sum(map(len, extra)), generator=draw.generator)]
+        looks = twin.rays(facing, [0.0], res, fov)
+        extra = [
+            DEGENERATE[name](draw, walls, positions, looks)
+            for name in degenerate
+            if name != "overlap"
+        ]
+        walls = torch.cat([walls, *extra])[
+            torch.randperm(len(walls) + sum(map(len, extra)), generator=draw.generator)
+        ]
         lines.append(unplaced(OCTAGON, n_agents, [walls.float()]))
         n_lights = 1 + int(draw.pick(range(max_lights)))
         places = draw.uniform(0, size, n_lights, 2) + origin
         lights.append(torch.cat([places, draw.uniform(0.2, 2, n_lights, 1)], -1).float())
         agents.append(positions)
         angles.append(facing)
-    widths = [((w[:, 1] - w[:, 0]).norm(dim=-1)/TEXEL).ceil().clamp(min=1).int() for w in lines]
+    widths = [((w[:, 1] - w[:, 0]).norm(dim=-1) / TEXEL).ceil().clamp(min=1).int() for w in lines]
     speed = draw.pick([0, 0.1, 1, 10, 1000], n_envs, n_agents, 1)  # m/s
     return World(
-        model=OCTAGON, lines=torch.cat(lines), line_widths=torch.tensor([len(x) for x in lines], dtype=torch.int32),
-        lights=torch.cat(lights), light_widths=torch.tensor([len(x) for x in lights], dtype=torch.int32),
-        textures=draw.uniform(0, 1, int(torch.cat(widths).sum()), 3).float(), texture_widths=torch.cat(widths),
-        positions=torch.stack(agents).float(), angles=torch.stack(angles).float(),
-        velocity=(draw.direction(n_envs, n_agents)*speed).float(),
-        angvelocity=draw.uniform(-300, 300, n_envs, n_agents).float())
+        model=OCTAGON,
+        lines=torch.cat(lines),
+        line_widths=torch.tensor([len(x) for x in lines], dtype=torch.int32),
+        lights=torch.cat(lights),
+        light_widths=torch.tensor([len(x) for x in lights], dtype=torch.int32),
+        textures=draw.uniform(0, 1, int(torch.cat(widths).sum()), 3).float(),
+        texture_widths=torch.cat(widths),
+        positions=torch.stack(agents).float(),
+        angles=torch.stack(angles).float(),
+        velocity=(draw.direction(n_envs, n_agents) * speed).float(),
+        angvelocity=draw.uniform(-300, 300, n_envs, n_agents).float(),
+    )

@@ -3,4 +3,4 @@
 from .explorer import Explorer
 from .minimal import Minimal
 
-ENVS = {'minimal': Minimal, 'explorer': Explorer}
+ENVS = {"minimal": Minimal, "explorer": Explorer}

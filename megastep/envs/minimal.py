@@ -9,22 +9,34 @@ from ..scene import scenery
 
 
 class Minimal:
-    """Seed of every other environment: RGB of 64 pixels, seven actions, no reward, truncated after a random 128 to
-    256 steps.
+    """Seed of every other environment: RGB of 64 pixels, seven actions, no reward, truncated after
+    a random 128 to 256 steps.
 
-    Args: ``geometries`` to live in, boxes by default; ``res`` rays; ``fov`` degrees; ``shortest`` and ``longest``
-    lifespan in steps.
+    Args: ``geometries`` to live in, boxes by default; ``res`` rays; ``fov`` degrees; ``shortest``
+    and ``longest`` lifespan in steps.
     """
 
     n_agents = 1
 
     def __init__(
-        self, n_envs=128, geometries=None, *, seed=1, device=None, res=64, fov=130.0, fps=10.0, shortest=128,
+        self,
+        n_envs=128,
+        geometries=None,
+        *,
+        seed=1,
+        device=None,
+        res=64,
+        fov=130.0,
+        fps=10.0,
+        shortest=128,
         longest=256,
     ):
         geometries = [toys.box()] if geometries is None else geometries[:n_envs]
         self.core = Core(
-            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device), res=res, fov=fov, fps=fps,
+            scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
+            res=res,
+            fov=fov,
+            fps=fps,
             seed=seed,
         )
         self.n_envs, self.device = self.core.n_envs, self.core.device
@@ -49,7 +61,10 @@ class Minimal:
         self.spawner(reset)
         self.ended.copy_(self.lifespans(reset) & ~reset)
         return arrdict(
-            obs=self._look(), reward=self._reward.clone(), reset=reset, terminal=torch.zeros_like(reset),
+            obs=self._look(),
+            reward=self._reward.clone(),
+            reset=reset,
+            terminal=torch.zeros_like(reset),
             truncated=self.ended.clone(),
         )
 
@@ -59,12 +74,16 @@ class Minimal:
 
     def state(self, e=0):
         """What :meth:`plot_state` draws of world ``e``."""
-        return arrdict(core=self.core.state(e), obs=self._look()[e], lifespans=self.lifespans.state(e))
+        return arrdict(
+            core=self.core.state(e), obs=self._look()[e], lifespans=self.lifespans.state(e)
+        )
 
     @classmethod
     def plot_state(cls, state):
         """A matplotlib figure of a numpyified :meth:`state`: the plan, and what the agent sees."""
-        figure, plan, strips = plotting.panels(1, title=f'step {state.lifespans.age} of {state.lifespans.lifespan}')
+        figure, plan, strips = plotting.panels(
+            1, title=f"step {state.lifespans.age} of {state.lifespans.lifespan}"
+        )
         Core.plot_state(state.core, plan)
-        plotting.plot_images({'rgb': state.obs}, aspect=plotting.STRIP, axes=strips)
+        plotting.plot_images({"rgb": state.obs}, aspect=plotting.STRIP, axes=strips)
         return figure

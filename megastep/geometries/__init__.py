@@ -1,9 +1,12 @@
-"""Where geometries come from: `sample("homes", 64)` gives a list of 64 homes; `SOURCES` holds the names there are.
+"""Where geometries come from: `sample("homes", 64)` gives a list of 64 homes; `SOURCES` holds the
+names there are.
 
-A source is a function `(n, split, seed, **options) -> list` of n geometries, the same for the same arguments. Sources
-that hold many different worlds keep a tenth of them for `split="test"`; `"training"` is the rest and `"all"` both. When
-more are asked for than a split holds, its geometries come again in the same order (the same objects, not copies).
+A source is a function `(n, split, seed, **options) -> list` of n geometries, the same for the same
+arguments. Sources that hold many different worlds keep a tenth of them for `split="test"`;
+`"training"` is the rest and `"all"` both. When more are asked for than a split holds, its
+geometries come again in the same order (the same objects, not copies).
 """
+
 import difflib
 import functools
 import inspect
@@ -18,28 +21,38 @@ from .homes import database
 __all__ = ["SOURCES", "SPLITS", "centers", "files", "homes", "indices", "masks", "sample", "toys"]
 
 SPLITS = ("training", "test", "all")
-BENCH = Path(__file__).parent/"data"/"bench_homes.npz"
+BENCH = Path(__file__).parent / "data" / "bench_homes.npz"
 
 
 def _held(count, split):
-    """The range of a database of `count` worlds that `split` holds; a database of one serves every split."""
-    training = count - max(1, round(count/10)) if count > 1 else 1
-    return {"training": range(training), "test": range(training if count > 1 else 0, count), "all": range(count)}[split]
+    """The range of a database of `count` worlds that `split` holds; a database of one serves every
+    split.
+    """
+    training = count - max(1, round(count / 10)) if count > 1 else 1
+    return {
+        "training": range(training),
+        "test": range(training if count > 1 else 0, count),
+        "all": range(count),
+    }[split]
 
 
 def _selected(count, n, split, seed):
-    """n indices into a database of `count`: the split in an order drawn from `seed`, over and over."""
+    """n indices into a database of `count`: the split in an order drawn from `seed`, over and
+    over.
+    """
     held = _held(count, split)
-    order = np.random.RandomState(seed % 2**32).permutation(len(held))   # a stream numpy promises never to change
+    order = np.random.RandomState(seed % 2**32).permutation(
+        len(held)
+    )  # a stream numpy promises never to change
     return [held[order[i % len(held)]] for i in range(n)]
 
 
 def _box(n, split, seed, width=5):
-    return [toys.box(width)]*n
+    return [toys.box(width)] * n
 
 
 def _column(n, split, seed, width=5, pillar=1):
-    return [toys.column(width, pillar)]*n
+    return [toys.column(width, pillar)] * n
 
 
 @functools.lru_cache(maxsize=2)
@@ -72,14 +85,17 @@ def _known(kind, given, allowed):
     if given not in allowed:
         near = difflib.get_close_matches(str(given), allowed, 1, 0)
         hint = f"did you mean {near[0]!r}? " if near else ""
-        raise ValueError(f"There is no {kind} {given!r}; {hint}There are: {', '.join(allowed) or 'none'}.")
+        raise ValueError(
+            f"There is no {kind} {given!r}; {hint}There are: {', '.join(allowed) or 'none'}."
+        )
 
 
 def sample(name, n, split="training", seed=1, **options):
     """A list of n geometries from the source `name`, the same for the same arguments.
 
-    `options` are the source's own: `width` of "box", `width` and `pillar` of "column", `outer` of "homes", `path` of
-    "files". Raises ValueError for an unknown name, split or option, and for what the source cannot use.
+    `options` are the source's own: `width` of "box", `width` and `pillar` of "column", `outer` of
+    "homes", `path` of "files". Raises ValueError for an unknown name, split or option, and for what
+    the source cannot use.
     """
     _known("geometry source", name, SOURCES)
     _known("split", split, SPLITS)
@@ -87,7 +103,11 @@ def sample(name, n, split="training", seed=1, **options):
     for option in options:
         _known(f"option of geometry source {name!r} called", option, allowed)
     if not isinstance(n, (int, np.integer)) or isinstance(n, bool) or n < 1:
-        raise ValueError(f"n={n!r} geometries cannot be sampled; ask for a whole number of 1 or more.")
+        raise ValueError(
+            f"n={n!r} geometries cannot be sampled; ask for a whole number of 1 or more."
+        )
     if name == "files" and options.get("path") is None:
-        raise ValueError("Geometry source 'files' needs its option path, an .npz file of geometries.")
+        raise ValueError(
+            "Geometry source 'files' needs its option path, an .npz file of geometries."
+        )
     return SOURCES[name](int(n), split, int(seed), **options)

@@ -1,8 +1,11 @@
-"""Lists of geometries as one `.npz` file: arrays `<i>/walls`, `lights`, `masks`, `res`, `id` for i = 0, 1, ...
+"""Lists of geometries as one `.npz` file: arrays `<i>/walls`, `lights`, `masks`, `res`, `id` for i
+= 0, 1, ...
 
-A file may come from anyone, so nothing in it is believed: sizes are checked before anything is unpacked, nothing is
-written to disk, pickled objects are refused, and every fault is a ValueError of one sentence naming file and geometry.
+A file may come from anyone, so nothing in it is believed: sizes are checked before anything is
+unpacked, nothing is written to disk, pickled objects are refused, and every fault is a ValueError
+of one sentence naming file and geometry.
 """
+
 import os
 import re
 import struct
@@ -20,13 +23,27 @@ from ..dotdict import dotdict
 
 KEYS = ("walls", "lights", "masks", "res", "id")
 MAX_GEOMETRIES = 16_384
-MAX_DIRECTORY = 8 << 20     # bytes of the zip's table of contents: five entries each of the most geometries
-MAX_UNPACKED = 96 << 20     # bytes of all arrays; twice that once masks are int16, so under 500 MB with Python itself
-MAX_ARRAY = 32 << 20        # bytes of one array: the most cells in the widest type
-MAX_HEADER = 1_024          # bytes of an array's own header, which is parsed as Python; numpy writes 118
+MAX_DIRECTORY = (
+    8 << 20
+)  # bytes of the zip's table of contents: five entries each of the most geometries
+MAX_UNPACKED = (
+    96 << 20
+)  # bytes of all arrays; twice that once masks are int16, so under 500 MB with Python itself
+MAX_ARRAY = 32 << 20  # bytes of one array: the most cells in the widest type
+MAX_HEADER = 1_024  # bytes of an array's own header, which is parsed as Python; numpy writes 118
 
-UNREADABLE = (ValueError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile, zlib.error,
-              SyntaxError, tokenize.TokenError, RecursionError, MemoryError)    # these by way of an array's header
+UNREADABLE = (
+    ValueError,
+    EOFError,
+    OSError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+    SyntaxError,
+    tokenize.TokenError,
+    RecursionError,
+    MemoryError,
+)  # these by way of an array's header
 NAME = re.compile(r"(0|[1-9][0-9]{0,5})/([A-Za-z_][A-Za-z0-9_]{0,63})\.npy")
 
 
@@ -34,24 +51,30 @@ def _opened(path):
     """The zip file at `path`, its table of contents no larger than we are willing to read."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        file.seek(max(0, size - (22 + 65_535)))     # the end record and the longest comment after it
+        file.seek(max(0, size - (22 + 65_535)))  # the end record and the longest comment after it
         tail = file.read()
     at = tail.rfind(b"PK\5\6")
     if at < 0 or len(tail) < at + 22:
         raise ValueError("is not an .npz file, or it is cut short")
-    directory, = struct.unpack_from("<I", tail, at + 12)
+    (directory,) = struct.unpack_from("<I", tail, at + 12)
     if directory > MAX_DIRECTORY:
-        raise ValueError(f"lists more arrays than {MAX_GEOMETRIES:,} geometries have, which is the limit")
+        raise ValueError(
+            f"lists more arrays than {MAX_GEOMETRIES:,} geometries have, which is the limit"
+        )
     return zipfile.ZipFile(path)
 
 
 def _contents(archive):
-    """{geometry index: {key: zip entry}} of an archive that holds the indices from 0 up and nothing else."""
+    """{geometry index: {key: zip entry}} of an archive that holds the indices from 0 up and nothing
+    else.
+    """
     found = {}
     for entry in archive.infolist():
         match = NAME.fullmatch(entry.filename)
         if not match:
-            raise ValueError(f"holds {entry.filename[:80]!r}, and only '<number>/<name>.npy' is expected")
+            raise ValueError(
+                f"holds {entry.filename[:80]!r}, and only '<number>/<name>.npy' is expected"
+            )
         if match[2] in found.setdefault(int(match[1]), {}):
             raise ValueError(f"holds {entry.filename!r} twice")
         found[int(match[1])][match[2]] = entry
@@ -63,7 +86,9 @@ def _contents(archive):
         for entry in entries.values():
             if entry.file_size > MAX_ARRAY:
                 size = f"{entry.file_size:,} bytes"
-                raise ValueError(f"holds {entry.filename!r} of {size}, and the limit is {MAX_ARRAY:,}")
+                raise ValueError(
+                    f"holds {entry.filename!r} of {size}, and the limit is {MAX_ARRAY:,}"
+                )
     unpacked = sum(entry.file_size for entries in found.values() for entry in entries.values())
     if unpacked > MAX_UNPACKED:
         raise ValueError(f"unpacks to {unpacked:,} bytes, and the limit is {MAX_UNPACKED:,}")
@@ -79,7 +104,10 @@ def _array(archive, entry):
         raise ValueError("is encrypted")
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)
-        reader = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+        reader = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }.get(version)
         if reader is None:
             raise ValueError(f"has an array format {version} that is not known")
         shape, fortran, dtype = reader(file, max_header_size=MAX_HEADER)
@@ -87,8 +115,10 @@ def _array(archive, entry):
             raise ValueError("is a pickled object, which is never loaded")
         if dtype.kind not in "fiub":
             raise ValueError(f"is of dtype {dtype}, which is not a number")
-        if prod(shape)*dtype.itemsize != entry.file_size - file.tell():
-            raise ValueError(f"claims shape {shape} of {dtype} but holds {entry.file_size - file.tell():,} bytes")
+        if prod(shape) * dtype.itemsize != entry.file_size - file.tell():
+            raise ValueError(
+                f"claims shape {shape} of {dtype} but holds {entry.file_size - file.tell():,} bytes"
+            )
         values = np.frombuffer(file.read(), dtype)
     return values.reshape(shape, order="F" if fortran else "C")
 
@@ -110,8 +140,8 @@ def _clause(error):
 def load(path):
     """The list of geometries in the `.npz` file at `path`; walls of no length are dropped.
 
-    Raises ValueError, one sentence with the file, the geometry and what is allowed, for a file that is missing, broken,
-    too large or holds what `geometry.checked` refuses.
+    Raises ValueError, one sentence with the file, the geometry and what is allowed, for a file that
+    is missing, broken, too large or holds what `geometry.checked` refuses.
     """
     path = Path(path)
     if not path.is_file():
@@ -129,20 +159,28 @@ def load(path):
 
 
 def save(path, geometries):
-    """Writes a list of geometries to `path` as `.npz`, all or nothing; of further keys those that are numbers.
+    """Writes a list of geometries to `path` as `.npz`, all or nothing; of further keys those that
+    are numbers.
 
     Raises ValueError, naming the geometry, for what `load` would refuse.
     """
     path, arrays = Path(path), {}
     if not 0 < len(geometries) <= MAX_GEOMETRIES:
-        raise ValueError(f"{len(geometries):,} geometries cannot be saved: take 1 to {MAX_GEOMETRIES:,}.")
+        raise ValueError(
+            f"{len(geometries):,} geometries cannot be saved: take 1 to {MAX_GEOMETRIES:,}."
+        )
     for index, g in enumerate(geometries):
         try:
             g = geometry.checked(g)
         except ValueError as error:
             raise ValueError(f"Geometry {index} cannot be saved: {error}.") from error
-        arrays.update({f"{index}/{key}": np.asarray(value) for key, value in g.items()
-                       if key in KEYS or np.asarray(value).dtype.kind in "fiub"})
+        arrays.update(
+            {
+                f"{index}/{key}": np.asarray(value)
+                for key, value in g.items()
+                if key in KEYS or np.asarray(value).dtype.kind in "fiub"
+            }
+        )
     handle, partial = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
     try:
         with os.fdopen(handle, "wb") as file:

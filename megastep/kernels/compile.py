@@ -1,10 +1,11 @@
 """Builds the kernels at first use and keeps what was built.
 
-The CPU library comes from the system's C++ compiler, the GPU's cubin from NVRTC, which PyTorch's CUDA wheels bring
-along: no nvcc. Either is kept in ``$MEGASTEP_CACHE`` (else ``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``)
-under a hash of sources, flags, compiler and processor. A kept file ends in its own SHA-256, so a damaged one is seen
-and built again; it is written beside its place and renamed, so that two processes cannot harm each other; where the
-folder cannot be written a temporary one serves.
+The CPU library comes from the system's C++ compiler, the GPU's cubin from NVRTC, which PyTorch's
+CUDA wheels bring along: no nvcc. Either is kept in ``$MEGASTEP_CACHE`` (else
+``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``) under a hash of sources, flags, compiler
+and processor. A kept file ends in its own SHA-256, so a damaged one is seen and built again; it is
+written beside its place and renamed, so that two processes cannot harm each other; where the folder
+cannot be written a temporary one serves.
 """
 
 import atexit
@@ -22,33 +23,41 @@ from pathlib import Path
 import torch
 
 HERE = Path(__file__).parent
-OPERATIONS = ('bake', 'physics', 'place', 'sight', 'spawn', 'draw')
+OPERATIONS = ("bake", "physics", "place", "sight", "spawn", "draw")
 CPU_FLAGS = (
-    '-std=c++17', '-O3', '-march=native', '-ffp-contract=off', '-fno-tree-slp-vectorize', '-fno-math-errno',
-    '-fno-trapping-math', '-fopenmp', '-shared', '-fPIC',
+    "-std=c++17",
+    "-O3",
+    "-march=native",
+    "-ffp-contract=off",
+    "-fno-tree-slp-vectorize",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fopenmp",
+    "-shared",
+    "-fPIC",
 )
-CUDA_FLAGS = ('--std=c++17', '--fmad=false', '--prec-div=true', '--prec-sqrt=true', '--ftz=false')
+CUDA_FLAGS = ("--std=c++17", "--fmad=false", "--prec-div=true", "--prec-sqrt=true", "--ftz=false")
 BLOCK = 64  # threads
 DIGEST = 32
 
 
 class EngineError(RuntimeError):
-    """The machine cannot do what was asked: no compiler, no GPU, no memory, a position that is not a number. The
-    message is one sentence with the cure.
+    """The machine cannot do what was asked: no compiler, no GPU, no memory, a position that is not
+    a number. The message is one sentence with the cure.
     """
 
 
 def _structs():
     """The structs of params.h as ctypes classes, by name."""
-    source = re.sub(r'//.*', '', (HERE / 'params.h').read_text())
-    scalars = {'int': ctypes.c_int, 'float': ctypes.c_float, 'unsigned int': ctypes.c_uint}
+    source = re.sub(r"//.*", "", (HERE / "params.h").read_text())
+    scalars = {"int": ctypes.c_int, "float": ctypes.c_float, "unsigned int": ctypes.c_uint}
     made = {}
-    for name, body in re.findall(r'struct (\w+) \{(.*?)\};', source, re.S):
+    for name, body in re.findall(r"struct (\w+) \{(.*?)\};", source, re.S):
         fields = []
-        for kind, star, field in re.findall(r'([\w ]+?)\s*(\*?)\s+(\w+);', body):
-            kind = kind.replace('const', '').strip()
+        for kind, star, field in re.findall(r"([\w ]+?)\s*(\*?)\s+(\w+);", body):
+            kind = kind.replace("const", "").strip()
             fields.append((field, ctypes.c_void_p if star else made.get(kind) or scalars[kind]))
-        made[name] = type(name, (ctypes.Structure,), {'_fields_': fields})
+        made[name] = type(name, (ctypes.Structure,), {"_fields_": fields})
     return made
 
 
@@ -59,8 +68,12 @@ STRUCTS = _structs()
 
 
 def _folder():
-    chosen = os.environ.get('MEGASTEP_CACHE')
-    base = Path(chosen) if chosen else Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'megastep'
+    chosen = os.environ.get("MEGASTEP_CACHE")
+    base = (
+        Path(chosen)
+        if chosen
+        else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "megastep"
+    )
     try:
         base.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=base):
@@ -81,26 +94,28 @@ def _intact(path):
 
 @functools.cache
 def _temporary():
-    folder = Path(tempfile.mkdtemp(prefix='megastep-'))
+    folder = Path(tempfile.mkdtemp(prefix="megastep-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
 
 def kept(name, build):
-    """The path of ``name`` in the cache, built by ``build() -> bytes`` unless an intact one is there."""
+    """The path of ``name`` in the cache, built by ``build() -> bytes`` unless an intact one is
+    there.
+    """
     folder = _folder() or _temporary()
     path = folder / name
     if _intact(path) is None:
         body = build()
         handle, temporary = tempfile.mkstemp(dir=folder, prefix=name)
-        with os.fdopen(handle, 'wb') as file:
+        with os.fdopen(handle, "wb") as file:
             file.write(body + hashlib.sha256(body).digest())
         os.replace(temporary, path)
     return path
 
 
 def _key(*parts):
-    return hashlib.sha256('\0'.join(parts).encode()).hexdigest()[:20]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
 
 
 # ---- The CPU ----
@@ -108,36 +123,44 @@ def _key(*parts):
 
 def _compiler():
     """The C++ compiler's command, and its version as text."""
-    asked = os.environ.get('CXX')
-    for command in [asked] if asked else ['c++', 'g++', 'clang++']:
+    asked = os.environ.get("CXX")
+    for command in [asked] if asked else ["c++", "g++", "clang++"]:
         found = shutil.which(command)
         if found:
-            return found, subprocess.run([found, '--version'], capture_output=True, text=True).stdout
-    what = f'CXX={asked} is not a program' if asked else 'none of c++, g++ and clang++ is there'
+            return found, subprocess.run(
+                [found, "--version"], capture_output=True, text=True
+            ).stdout
+    what = f"CXX={asked} is not a program" if asked else "none of c++, g++ and clang++ is there"
     raise EngineError(
-        f'The CPU engine needs a C++ compiler and {what}: install one (Debian: apt install g++) or set CXX to yours.'
+        f"The CPU engine needs a C++ compiler and {what}: install one (Debian: apt install g++) "
+        f"or set CXX to yours."
     )
 
 
 def _processor():
     try:
-        lines = Path('/proc/cpuinfo').read_text().splitlines()
-        return next((line for line in lines if line.startswith(('flags', 'Features'))), platform.machine())
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(
+            (line for line in lines if line.startswith(("flags", "Features"))), platform.machine()
+        )
     except OSError:
         return platform.machine() + platform.processor()
 
 
 def _build_cpu(compiler):
-    with tempfile.TemporaryDirectory(prefix='megastep-') as folder:
-        out = Path(folder) / 'engine.so'
+    with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
+        out = Path(folder) / "engine.so"
         done = subprocess.run(
-            [compiler, *CPU_FLAGS, str(HERE / 'cpu.cpp'), '-o', str(out)], capture_output=True, text=True
+            [compiler, *CPU_FLAGS, str(HERE / "cpu.cpp"), "-o", str(out)],
+            capture_output=True,
+            text=True,
         )
         if done.returncode:
             raise EngineError(
-                f'{compiler} could not build the CPU engine; it needs a C++17 compiler with OpenMP (Debian: apt '
-                f'install g++). It said: '
-                f'{" ".join(done.stderr.split())[:500]}'
+                f"{compiler} could not build the CPU engine; it needs a C++17 compiler with "
+                f"OpenMP (Debian: apt "
+                f"install g++). It said: "
+                f"{' '.join(done.stderr.split())[:500]}"
             )
         return out.read_bytes()
 
@@ -146,8 +169,8 @@ def _build_cpu(compiler):
 def cpu():
     """The CPU backend: operation name -> function of a pointer to its params."""
     compiler, version = _compiler()
-    sources = [(HERE / name).read_text() for name in ('cpu.cpp', 'params.h', 'math.h', 'scene.h')]
-    name = f'cpu-{_key(*sources, *CPU_FLAGS, compiler, version, _processor())}.so'
+    sources = [(HERE / name).read_text() for name in ("cpu.cpp", "params.h", "math.h", "scene.h")]
+    name = f"cpu-{_key(*sources, *CPU_FLAGS, compiler, version, _processor())}.so"
     library = ctypes.CDLL(str(kept(name, lambda: _build_cpu(compiler))))
     functions = {operation: getattr(library, operation) for operation in OPERATIONS}
     for function in functions.values():
@@ -163,8 +186,9 @@ def _bindings():
         from cuda.bindings import driver, nvrtc
     except ImportError:
         raise EngineError(
-            'The GPU engine needs the package cuda-bindings, which comes with PyTorch for CUDA 13: pip install '
-            'cuda-bindings.'
+            "The GPU engine needs the package cuda-bindings, which comes with PyTorch for CUDA "
+            "13: pip install "
+            "cuda-bindings."
         ) from None
     return driver, nvrtc
 
@@ -174,22 +198,25 @@ def _checked(result, what):
     status, *values = result
     if int(status):
         raise EngineError(
-            f'{what} failed with {getattr(status, "name", status)}; is the NVIDIA driver as new as PyTorch\'s '
-            f'CUDA {torch.version.cuda}?'
+            f"{what} failed with {getattr(status, 'name', status)}; is the NVIDIA driver as new "
+            f"as PyTorch's "
+            f"CUDA {torch.version.cuda}?"
         )
     return values[0] if len(values) == 1 else values
 
 
 def _build_cuda(source, flags):
     _, nvrtc = _bindings()
-    program = _checked(nvrtc.nvrtcCreateProgram(source.encode(), b'engine.cu', 0, [], []), 'NVRTC')
+    program = _checked(nvrtc.nvrtcCreateProgram(source.encode(), b"engine.cu", 0, [], []), "NVRTC")
     (status,) = nvrtc.nvrtcCompileProgram(program, len(flags), [flag.encode() for flag in flags])
     if int(status):
-        log = bytearray(_checked(nvrtc.nvrtcGetProgramLogSize(program), 'NVRTC'))
+        log = bytearray(_checked(nvrtc.nvrtcGetProgramLogSize(program), "NVRTC"))
         nvrtc.nvrtcGetProgramLog(program, log)
-        raise EngineError(f'NVRTC could not build the GPU engine: {bytes(log).decode(errors="replace")[:2000]}')
-    cubin = bytearray(_checked(nvrtc.nvrtcGetCUBINSize(program), 'NVRTC'))
-    _checked(nvrtc.nvrtcGetCUBIN(program, cubin), 'NVRTC')
+        raise EngineError(
+            f"NVRTC could not build the GPU engine: {bytes(log).decode(errors='replace')[:2000]}"
+        )
+    cubin = bytearray(_checked(nvrtc.nvrtcGetCUBINSize(program), "NVRTC"))
+    _checked(nvrtc.nvrtcGetCUBIN(program, cubin), "NVRTC")
     nvrtc.nvrtcDestroyProgram(program)
     return bytes(cubin)
 
@@ -199,34 +226,45 @@ def cuda(index):
     """The GPU backend on device ``index``: operation name -> CUfunction."""
     driver, nvrtc = _bindings()
     major, minor = torch.cuda.get_device_capability(index)
-    names = ('cuda.h', 'params.h', 'math.h', 'scene.h', *(f'{operation}.cu' for operation in OPERATIONS))
-    source = '\n'.join((HERE / name).read_text() for name in names)
-    flags = (*CUDA_FLAGS, f'--gpu-architecture=sm_{major}{minor}')
+    names = (
+        "cuda.h",
+        "params.h",
+        "math.h",
+        "scene.h",
+        *(f"{operation}.cu" for operation in OPERATIONS),
+    )
+    source = "\n".join((HERE / name).read_text() for name in names)
+    flags = (*CUDA_FLAGS, f"--gpu-architecture=sm_{major}{minor}")
     try:
-        version = _checked(nvrtc.nvrtcVersion(), 'NVRTC')
+        version = _checked(nvrtc.nvrtcVersion(), "NVRTC")
     except (RuntimeError, OSError) as fault:
         raise EngineError(
-            f'The GPU engine needs NVRTC, which comes with PyTorch\'s CUDA wheels, and it could not be loaded '
-            f'({fault}): reinstall torch.'
+            f"The GPU engine needs NVRTC, which comes with PyTorch's CUDA wheels, and it could "
+            f"not be loaded "
+            f"({fault}): reinstall torch."
         ) from None
-    path = kept(f'cuda-{_key(source, *flags, str(version))}.cubin', lambda: _build_cuda(source, flags))
+    path = kept(
+        f"cuda-{_key(source, *flags, str(version))}.cubin", lambda: _build_cuda(source, flags)
+    )
     with torch.cuda.device(index):
         torch.cuda.current_stream().synchronize()  # makes the device's primary context current
-        module = _checked(driver.cuModuleLoadData(_intact(path)), 'Loading the GPU engine')
+        module = _checked(driver.cuModuleLoadData(_intact(path)), "Loading the GPU engine")
         functions = {
-            operation: _checked(driver.cuModuleGetFunction(module, operation.encode()), 'Loading the GPU engine')
+            operation: _checked(
+                driver.cuModuleGetFunction(module, operation.encode()), "Loading the GPU engine"
+            )
             for operation in OPERATIONS
         }
     return functions
 
 
 def launch(operation, params, device, threads, shared=0):
-    """Runs ``operation`` on ``params`` (a struct of STRUCTS): on the CPU at once, on a GPU in ``threads`` threads on
-    the device's current stream.
+    """Runs ``operation`` on ``params`` (a struct of STRUCTS): on the CPU at once, on a GPU in
+    ``threads`` threads on the device's current stream.
 
     ``shared`` is dynamic shared memory in bytes a warp.
     """
-    if device.type == 'cpu':
+    if device.type == "cpu":
         cpu()[operation](ctypes.byref(params))
         return
     driver, _ = _bindings()
@@ -240,7 +278,17 @@ def launch(operation, params, device, threads, shared=0):
         stream = torch.cuda.current_stream(index).cuda_stream
         _checked(
             driver.cuLaunchKernel(
-                function, blocks, 1, 1, BLOCK, 1, 1, shared * (BLOCK // 32), stream, ctypes.addressof(arguments), 0
+                function,
+                blocks,
+                1,
+                1,
+                BLOCK,
+                1,
+                1,
+                shared * (BLOCK // 32),
+                stream,
+                ctypes.addressof(arguments),
+                0,
             ),
-            f'Launching {operation}',
+            f"Launching {operation}",
         )

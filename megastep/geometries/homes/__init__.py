@@ -1,8 +1,10 @@
 """Homes: floor plans like those of real flats and houses.
 
-`generate(seed)` makes the home of a seed, the same on every machine (see `draws`): a number of rooms, what they are, an
-outline, a partition, doors and openings, walls. `database` holds 5,000 ready ones, those of seeds 0 to 4,999.
+`generate(seed)` makes the home of a seed, the same on every machine (see `draws`): a number of
+rooms, what they are, an outline, a partition, doors and openings, walls. `database` holds 5,000
+ready ones, those of seeds 0 to 4,999.
 """
+
 import numpy as np
 
 from ... import geometry
@@ -10,15 +12,20 @@ from ...dotdict import dotdict
 from . import openings, partition, plan, walls
 from .draws import Draws
 
-ATTEMPTS = 60       # layouts tried before a home is given one room less
-ENOUGH, FEW = 3, 10     # the best of three layouts is taken, and with more than ten rooms, as those are dear, the first
-THIN, THICK = (10, 11, 12, 14), (20, 24, 30)    # cm; the thickness of inner walls and of the envelope
-SLANTED = .08       # of the homes have a corner cut off at 45 degrees
-START = 100         # cm; the least coordinate of a home
+ATTEMPTS = 60  # layouts tried before a home is given one room less
+ENOUGH, FEW = (
+    3,
+    10,
+)  # the best of three layouts is taken, and with more than ten rooms, as those are dear, the first
+THIN, THICK = (10, 11, 12, 14), (20, 24, 30)  # cm; the thickness of inner walls and of the envelope
+SLANTED = 0.08  # of the homes have a corner cut off at 45 degrees
+START = 100  # cm; the least coordinate of a home
 
 
 def _attempt(count, draws):
-    """A layout of `count` rooms as [(cost, footprint, rooms, contacts, depth, gaps)], or [] if it does not work out."""
+    """A layout of `count` rooms as [(cost, footprint, rooms, contacts, depth, gaps)], or [] if it
+    does not work out.
+    """
     rooms = plan.programme(count, draws)
     footprint = plan.footprint(sum(size for _, size in rooms), draws)
     try:
@@ -32,15 +39,17 @@ def _attempt(count, draws):
     if not found:
         return []
     cost, chosen = found
-    gaps = [openings.opening(c, spans[c], (rooms[c.a].kind, rooms[c.b].kind), draws) for c in chosen]
+    gaps = [
+        openings.opening(c, spans[c], (rooms[c.a].kind, rooms[c.b].kind), draws) for c in chosen
+    ]
     return [(cost, footprint, rooms, meetings, depth, gaps)]
 
 
 def _layout(draws):
     """The best of a few layouts: (cost, footprint, rooms, contacts, depth, gaps).
 
-    The number of rooms is drawn once, before any layout is rejected: small homes work out more often, so drawing it
-    anew each time would make the homes small.
+    The number of rooms is drawn once, before any layout is rejected: small homes work out more
+    often, so drawing it anew each time would make the homes small.
     """
     count = plan.room_count(draws)
     while True:
@@ -55,30 +64,46 @@ def _layout(draws):
 
 
 def generate(seed, outer=True):
-    """The home of a seed, any integer; if not `outer`, less its envelope's outer face, which nobody indoors sees.
+    """The home of a seed, any integer; if not `outer`, less its envelope's outer face, which nobody
+    indoors sees.
 
-    A geometry with further keys: `rooms`, the kind of each room in the order of the masks' numbers; `areas`, their
-    clear areas in m2; `doors` and `openings`, the widths in metres of the gaps with and without a door; `n_outer`, how
-    many of the walls, the last ones, are the envelope's outer face.
+    A geometry with further keys: `rooms`, the kind of each room in the order of the masks' numbers;
+    `areas`, their clear areas in m2; `doors` and `openings`, the widths in metres of the gaps with
+    and without a door; `n_outer`, how many of the walls, the last ones, are the envelope's outer
+    face.
     """
     draws = Draws(seed)
     _, footprint, rooms, meetings, depth, gaps = _layout(draws)
     thickness = THICK[draws.below(len(THICK))]
-    grid = walls.paint(footprint, walls.solids(meetings, depth), [walls.gap(g, depth) for g in gaps], thickness)
+    grid = walls.paint(
+        footprint, walls.solids(meetings, depth), [walls.gap(g, depth) for g in gaps], thickness
+    )
     inside, outside = walls.segments(*grid, walls.INDOORS), walls.segments(*grid, walls.OUTDOORS)
     lights = [walls.light(room.region, inside) for room in rooms]
-    rings = [[[(x0, y0), (x1, y0), (x1, y1), (x0, y1)] for x0, y0, x1, y1 in room.region] for room in rooms]
+    rings = [
+        [[(x0, y0), (x1, y0), (x1, y1), (x0, y1)] for x0, y0, x1, y1 in room.region]
+        for room in rooms
+    ]
     if draws.chance(SLANTED):
         inside, outside, triangle = walls.slanted(inside, outside, *grid, thickness, draws)
         for room, ring in zip(rooms, rings):
             ring += [triangle] if walls.holds(room.region, triangle) else []
 
     shift = START - outside.min((0, 1))
-    lines = (np.concatenate([inside, outside]) + shift)/100
-    masks = geometry.masks(lines, [[(np.array(ring) + shift)/100 for ring in room] for room in rings])
-    doors = [[(g.high - g.low)/100 for g in gaps if g.door is kind] for kind in (True, False)]
+    lines = (np.concatenate([inside, outside]) + shift) / 100
+    masks = geometry.masks(
+        lines, [[(np.array(ring) + shift) / 100 for ring in room] for room in rings]
+    )
+    doors = [[(g.high - g.low) / 100 for g in gaps if g.door is kind] for kind in (True, False)]
     return dotdict(
-        id=seed, walls=lines[:len(lines) if outer else len(inside)].astype(np.float32),
-        lights=((np.array(lights) + shift)/100).astype(np.float32), masks=masks, res=geometry.RES,
-        rooms=[room.kind for room in rooms], areas=walls.areas(grid, [room.region for room in rooms]),
-        doors=doors[0], openings=doors[1], n_outer=len(outside) if outer else 0)
+        id=seed,
+        walls=lines[: len(lines) if outer else len(inside)].astype(np.float32),
+        lights=((np.array(lights) + shift) / 100).astype(np.float32),
+        masks=masks,
+        res=geometry.RES,
+        rooms=[room.kind for room in rooms],
+        areas=walls.areas(grid, [room.region for room in rooms]),
+        doors=doors[0],
+        openings=doors[1],
+        n_outer=len(outside) if outer else 0,
+    )

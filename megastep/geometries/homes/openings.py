@@ -1,33 +1,70 @@
 """Where rooms meet, and which of those walls have a door or an opening. Whole centimetres."""
+
 from itertools import combinations
 from typing import NamedTuple
 
-DOORS = {60: .06, 65: .12, 70: .16, 75: .18, 80: .24, 85: .14, 90: .10}     # widths and how often
-SMALL = ("bath", "closet", "lobby", "storage")      # rooms with doors of at most 80 cm
+DOORS = {
+    60: 0.06,
+    65: 0.12,
+    70: 0.16,
+    75: 0.18,
+    80: 0.24,
+    85: 0.14,
+    90: 0.10,
+}  # widths and how often
+SMALL = ("bath", "closet", "lobby", "storage")  # rooms with doors of at most 80 cm
 WIDEST_SMALL = 80
-STUB = 5            # cm of wall beside a door in a corner
-IN_CORNER = .70     # of the doors; the others stand anywhere
+STUB = 5  # cm of wall beside a door in a corner
+IN_CORNER = 0.70  # of the doors; the others stand anywhere
 LEAST_CONTACT = 95  # cm of clear wall a door needs
-LOOPS = .45         # of the cheap contacts that the tree of doors leaves out become doors too
-OPEN = {frozenset(pair): share for pair, share in {     # how often a connection has no door
-    ("living", "kitchen"): .7, ("living", "entry"): .6, ("kitchen", "entry"): .6, ("living", "room"): .6,
-    ("kitchen", "room"): .6, ("entry", "room"): .4, ("entry", "lobby"): .4, ("bedroom", "closet"): .2,
-    ("entry", "closet"): .2, ("bedroom", "room"): .2}.items()}
-FULL = .45          # of the connections without a door take the whole wall between the rooms
-OPENING = (100, 240)        # cm; the others
-REACH = 25          # cm; walls that come this near to the end of another narrow what can be opened there
+LOOPS = 0.45  # of the cheap contacts that the tree of doors leaves out become doors too
+OPEN = {
+    frozenset(pair): share
+    for pair, share in {  # how often a connection has no door
+        ("living", "kitchen"): 0.7,
+        ("living", "entry"): 0.6,
+        ("kitchen", "entry"): 0.6,
+        ("living", "room"): 0.6,
+        ("kitchen", "room"): 0.6,
+        ("entry", "room"): 0.4,
+        ("entry", "lobby"): 0.4,
+        ("bedroom", "closet"): 0.2,
+        ("entry", "closet"): 0.2,
+        ("bedroom", "room"): 0.2,
+    }.items()
+}
+FULL = 0.45  # of the connections without a door take the whole wall between the rooms
+OPENING = (100, 240)  # cm; the others
+REACH = 25  # cm; walls that come this near to the end of another narrow what can be opened there
 
-# What a connection costs in the spanning tree: cheap ones become doors. Pairs before single kinds before the default.
-COSTS = {frozenset(pair): cost for pair, cost in {
-    ("living", "kitchen"): .05, ("bedroom", "closet"): .25, ("bath", "living"): .7, ("bedroom",): 1.5, ("closet",): 2.,
-    ("closet", "storage"): 2., ("storage",): 2., ("closet", "bath"): 2., ("storage", "bath"): 2., ("bath",): 3.,
-    ("bath", "kitchen"): 3., ("bath", "bedroom"): .8}.items()}
-COST_ENTRY, COST_LIVING, COST = .15, .3, 1.
-CHEAP = .8          # the most a loop may cost
+# What a connection costs in the spanning tree: cheap ones become doors. Pairs before single kinds
+# before the default.
+COSTS = {
+    frozenset(pair): cost
+    for pair, cost in {
+        ("living", "kitchen"): 0.05,
+        ("bedroom", "closet"): 0.25,
+        ("bath", "living"): 0.7,
+        ("bedroom",): 1.5,
+        ("closet",): 2.0,
+        ("closet", "storage"): 2.0,
+        ("storage",): 2.0,
+        ("closet", "bath"): 2.0,
+        ("storage", "bath"): 2.0,
+        ("bath",): 3.0,
+        ("bath", "kitchen"): 3.0,
+        ("bath", "bedroom"): 0.8,
+    }.items()
+}
+COST_ENTRY, COST_LIVING, COST = 0.15, 0.3, 1.0
+CHEAP = 0.8  # the most a loop may cost
 
 
 class Contact(NamedTuple):
-    """A straight piece of wall between rooms a and b, on the line `at` of `axis`, from low to high along it."""
+    """A straight piece of wall between rooms a and b, on the line `at` of `axis`, from low to high
+    along it.
+    """
+
     axis: int
     at: int
     low: int
@@ -38,6 +75,7 @@ class Contact(NamedTuple):
 
 class Opening(NamedTuple):
     """A gap in the wall of a contact from low to high; it has a door or not."""
+
     contact: Contact
     low: int
     high: int
@@ -65,7 +103,9 @@ def contacts(rooms):
 
 
 def clear(contact, others, depth):
-    """The part (low, high) of a contact that no other wall meets; `depth` as from `walls.depths`."""
+    """The part (low, high) of a contact that no other wall meets; `depth` as from
+    `walls.depths`.
+    """
     low, high = contact.low, contact.high
     for other in others:
         if other.axis != contact.axis and other.low - REACH <= contact.at <= other.high + REACH:
@@ -80,24 +120,28 @@ def clear(contact, others, depth):
 def _cost(a, b):
     """The cost of a connection between rooms of kinds a and b."""
     pair = frozenset((a, b))
-    return COSTS.get(pair, COST_ENTRY if "entry" in pair else COST_LIVING if "living" in pair else COST)
+    return COSTS.get(
+        pair, COST_ENTRY if "entry" in pair else COST_LIVING if "living" in pair else COST
+    )
 
 
 def connections(rooms, spans, draws):
     """The contacts to open: a cheapest tree over the rooms and some loops.
 
-    `spans` has the clear (low, high) of every contact. Returns (mean cost of the tree, [contact]), or None when no tree
-    reaches every room.
+    `spans` has the clear (low, high) of every contact. Returns (mean cost of the tree, [contact]),
+    or None when no tree reaches every room.
     """
     longest = {}
     for contact, (low, high) in spans.items():
         pair = contact.a, contact.b
         if high - low >= LEAST_CONTACT and high - low > longest.get(pair, (0, None))[0]:
             longest[pair] = high - low, contact
-    edges = sorted((_cost(rooms[a].kind, rooms[b].kind) + draws.uniform(0, .15), contact)
-                   for (a, b), (_, contact) in longest.items())
+    edges = sorted(
+        (_cost(rooms[a].kind, rooms[b].kind) + draws.uniform(0, 0.15), contact)
+        for (a, b), (_, contact) in longest.items()
+    )
     parts = list(range(len(rooms)))
-    chosen, rest, total = [], [], 0.
+    chosen, rest, total = [], [], 0.0
     for cost, contact in edges:
         a, b = parts[contact.a], parts[contact.b]
         if a == b:
@@ -108,24 +152,26 @@ def connections(rooms, spans, draws):
         total += cost
     if len(set(parts)) > 1:
         return None
-    return total/(len(rooms) - 1), chosen + [contact for contact in rest if draws.chance(LOOPS)]
+    return total / (len(rooms) - 1), chosen + [contact for contact in rest if draws.chance(LOOPS)]
 
 
 def opening(contact, span, kinds, draws):
-    """The Opening made in a contact between rooms of two kinds, somewhere within the clear span (low, high)."""
+    """The Opening made in a contact between rooms of two kinds, somewhere within the clear span
+    (low, high).
+    """
     low, high = span
-    open_plan = draws.chance(OPEN.get(frozenset(kinds), 0.))
+    open_plan = draws.chance(OPEN.get(frozenset(kinds), 0.0))
     if open_plan:
         if draws.chance(FULL):
             return Opening(contact, low, high, False)
-        width = draws.between(OPENING[0]//5, OPENING[1]//5)*5
+        width = draws.between(OPENING[0] // 5, OPENING[1] // 5) * 5
     else:
         widths = list(DOORS)
         if any(kind in SMALL for kind in kinds):
             widths = [width for width in widths if width <= WIDEST_SMALL]
         width = widths[draws.pick([DOORS[width] for width in widths])]
-    spare = high - low - width - 2*STUB
+    spare = high - low - width - 2 * STUB
     if spare < 0:
         return Opening(contact, low, high, False)
-    offset = draws.below(2)*spare if draws.chance(IN_CORNER) else draws.between(0, spare)
+    offset = draws.below(2) * spare if draws.chance(IN_CORNER) else draws.between(0, spare)
     return Opening(contact, low + STUB + offset, low + STUB + offset + width, not open_plan)

@@ -1,8 +1,10 @@
 """What a home is to hold, and the outline it gets: rooms with areas, and a rectilinear footprint.
 
-The figures are calibrated on real homes: CubiCasa5k (Kalervo et al. 2019), the room graphs of CubiGraph5K (Lu et al.
-2021) and the annotations of Raster-to-Vector (Liu et al. 2017). Lengths are whole centimetres, areas cm2.
+The figures are calibrated on real homes: CubiCasa5k (Kalervo et al. 2019), the room graphs of
+CubiGraph5K (Lu et al. 2021) and the annotations of Raster-to-Vector (Liu et al. 2017). Lengths are
+whole centimetres, areas cm2.
 """
+
 from math import sqrt
 from typing import NamedTuple
 
@@ -10,66 +12,87 @@ from . import regions
 
 
 class Kind(NamedTuple):
-    """A kind of room: median and log-deviation of its area in m2, least clear width in cm, how often it is added."""
+    """A kind of room: median and log-deviation of its area in m2, least clear width in cm, how
+    often it is added.
+    """
+
     median: float
     sigma: float
     width: int
-    weight: float = 0.
+    weight: float = 0.0
     aspect: float = 2.6
 
 
 KINDS = {
-    "living": Kind(17., .30, 280), "bath": Kind(3.1, .28, 115, .55), "entry": Kind(5., .38, 115, aspect=4.6),
-    "bedroom": Kind(10.8, .18, 220, 1.), "kitchen": Kind(9.5, .40, 190), "closet": Kind(2.2, .35, 90, 1.55),
-    "storage": Kind(2.7, .50, 90, .75), "lobby": Kind(1.2, .25, 90, .45), "utility": Kind(5., .50, 140, .45),
-    "room": Kind(10., .35, 220, .55),
+    "living": Kind(17.0, 0.30, 280),
+    "bath": Kind(3.1, 0.28, 115, 0.55),
+    "entry": Kind(5.0, 0.38, 115, aspect=4.6),
+    "bedroom": Kind(10.8, 0.18, 220, 1.0),
+    "kitchen": Kind(9.5, 0.40, 190),
+    "closet": Kind(2.2, 0.35, 90, 1.55),
+    "storage": Kind(2.7, 0.50, 90, 0.75),
+    "lobby": Kind(1.2, 0.25, 90, 0.45),
+    "utility": Kind(5.0, 0.50, 140, 0.45),
+    "room": Kind(10.0, 0.35, 220, 0.55),
 }
-CORE = ("living", "bath", "entry", "bedroom", "kitchen")    # what the first five rooms of every home are
+CORE = (
+    "living",
+    "bath",
+    "entry",
+    "bedroom",
+    "kitchen",
+)  # what the first five rooms of every home are
 
-MEDIAN_ROOMS, SIGMA_ROOMS, FEWEST_ROOMS, MOST_ROOMS = 8.3, .40, 3, 18
-MEDIAN_ASPECT, SIGMA_ASPECT, MOST_ASPECT = 1.42, .24, 2.4
-SCALE = .78         # of the areas: rooms that come out too small for their width are rejected, which favours large ones
-FIT = 1.5           # no room is smaller than this many squares of its least width
-ALLOWANCE = 12      # cm of a room's width that walls take
-WALLS = 1.07        # walls take 7 % of a footprint
-NOTCHES = (.10, .38, .34, .18)      # how often an outline has 0, 1, 2 or 3 notches
-AT_CORNER = .75     # of the notches; the others are bays in one side
-LEAST_NOTCH = 80    # cm a side
-LEAST_NECK = 220    # cm between two notches, or a notch and the side across
-STEP = 10           # cm; the lattice of outlines
+MEDIAN_ROOMS, SIGMA_ROOMS, FEWEST_ROOMS, MOST_ROOMS = 8.3, 0.40, 3, 18
+MEDIAN_ASPECT, SIGMA_ASPECT, MOST_ASPECT = 1.42, 0.24, 2.4
+# of the areas: rooms that come out too small for their width are rejected, which favours large ones
+SCALE = 0.78
+FIT = 1.5  # no room is smaller than this many squares of its least width
+ALLOWANCE = 12  # cm of a room's width that walls take
+WALLS = 1.07  # walls take 7 % of a footprint
+NOTCHES = (0.10, 0.38, 0.34, 0.18)  # how often an outline has 0, 1, 2 or 3 notches
+AT_CORNER = 0.75  # of the notches; the others are bays in one side
+LEAST_NOTCH = 80  # cm a side
+LEAST_NECK = 220  # cm between two notches, or a notch and the side across
+STEP = 10  # cm; the lattice of outlines
 
 
 def room_count(draws):
     """How many rooms a home has."""
-    count = int(draws.lognormal(MEDIAN_ROOMS, SIGMA_ROOMS) + .5)
+    count = int(draws.lognormal(MEDIAN_ROOMS, SIGMA_ROOMS) + 0.5)
     return min(max(count, FEWEST_ROOMS), MOST_ROOMS)
 
 
 def programme(count, draws):
     """`count` rooms as a list of (kind, area in cm2)."""
     kinds = list(CORE[:count])
-    most = {"bedroom": 1 + count//4, "bath": 1 + count//6, "lobby": 1, "utility": 1}
+    most = {"bedroom": 1 + count // 4, "bath": 1 + count // 6, "lobby": 1, "utility": 1}
     while len(kinds) < count:
         allowed = [kind for kind in KINDS if kinds.count(kind) < most.get(kind, count)]
         kinds.append(allowed[draws.pick([KINDS[kind].weight for kind in allowed])])
-    scale = 10_000*draws.lognormal(SCALE, .15)
-    drawn = [int(draws.lognormal(KINDS[kind].median, KINDS[kind].sigma)*scale) for kind in kinds]
-    return [(kind, max(size, int(FIT*(KINDS[kind].width + ALLOWANCE)**2))) for kind, size in zip(kinds, drawn)]
+    scale = 10_000 * draws.lognormal(SCALE, 0.15)
+    drawn = [int(draws.lognormal(KINDS[kind].median, KINDS[kind].sigma) * scale) for kind in kinds]
+    return [
+        (kind, max(size, int(FIT * (KINDS[kind].width + ALLOWANCE) ** 2)))
+        for kind, size in zip(kinds, drawn)
+    ]
 
 
 def _notch(width, height, share, at_corner, draws):
-    """A rectangle of about `share` of the bounding box cut from a corner or from the middle of a side, or None."""
-    ratio = draws.uniform(.6, 1.7)
-    across = int(sqrt(share*width*height*ratio))//STEP*STEP
-    down = int(sqrt(share*width*height/ratio))//STEP*STEP
+    """A rectangle of about `share` of the bounding box cut from a corner or from the middle of a
+    side, or None.
+    """
+    ratio = draws.uniform(0.6, 1.7)
+    across = int(sqrt(share * width * height * ratio)) // STEP * STEP
+    down = int(sqrt(share * width * height / ratio)) // STEP * STEP
     if min(across, down) < LEAST_NOTCH or across > width - LEAST_NECK or down > height - LEAST_NECK:
         return None
-    left, low = draws.below(2)*(width - across), draws.below(2)*(height - down)
+    left, low = draws.below(2) * (width - across), draws.below(2) * (height - down)
     if not at_corner:
-        room = width - across - 2*LEAST_NECK
+        room = width - across - 2 * LEAST_NECK
         if room < 0:
             return None
-        left = LEAST_NECK + draws.between(0, room//STEP)*STEP
+        left = LEAST_NECK + draws.between(0, room // STEP) * STEP
     return left, low, left + across, low + down
 
 
@@ -79,15 +102,17 @@ def _apart(a, b):
 
 
 def footprint(total, draws):
-    """The inner outline, as a region, of a home whose rooms have `total` cm2: a box less up to three notches."""
-    aspect = min(max(draws.lognormal(MEDIAN_ASPECT, SIGMA_ASPECT), 1.), MOST_ASPECT)
-    shares = [draws.uniform(.03, .15) for _ in range(draws.pick(NOTCHES))]
-    left = 1.
+    """The inner outline, as a region, of a home whose rooms have `total` cm2: a box less up to
+    three notches.
+    """
+    aspect = min(max(draws.lognormal(MEDIAN_ASPECT, SIGMA_ASPECT), 1.0), MOST_ASPECT)
+    shares = [draws.uniform(0.03, 0.15) for _ in range(draws.pick(NOTCHES))]
+    left = 1.0
     for share in shares:
         left -= share
-    long = sqrt(total*WALLS/left*aspect)
-    sides = [max(int(side)//STEP*STEP, LEAST_NECK) for side in (long, long/aspect)]
-    width, height = sides if draws.chance(.5) else sides[::-1]
+    long = sqrt(total * WALLS / left * aspect)
+    sides = [max(int(side) // STEP * STEP, LEAST_NECK) for side in (long, long / aspect)]
+    width, height = sides if draws.chance(0.5) else sides[::-1]
 
     notches = []
     for share in shares:
@@ -98,7 +123,11 @@ def footprint(total, draws):
                 notches.append(notch)
                 break
     region = _without(width, height, notches)
-    return region if draws.chance(.5) else _without(height, width, [(b, a, d, c) for a, b, c, d in notches])
+    return (
+        region
+        if draws.chance(0.5)
+        else _without(height, width, [(b, a, d, c) for a, b, c, d in notches])
+    )
 
 
 def _without(width, height, notches):
@@ -107,7 +136,9 @@ def _without(width, height, notches):
     region = []
     for x0, x1 in zip(lines, lines[1:]):
         low = max([0, *(n[3] for n in notches if n[0] <= x0 and n[2] >= x1 and n[1] == 0)])
-        high = min([height, *(n[1] for n in notches if n[0] <= x0 and n[2] >= x1 and n[3] == height)])
+        high = min(
+            [height, *(n[1] for n in notches if n[0] <= x0 and n[2] >= x1 and n[3] == height)]
+        )
         if region and region[-1][1] == low and region[-1][3] == high:
             region[-1] = (region[-1][0], low, x1, high)
         else:

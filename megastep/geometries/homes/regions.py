@@ -1,14 +1,16 @@
-"""Rectilinear regions: lists of disjoint rectangles (x0, y0, x1, y1) in whole centimetres, side by side.
+"""Rectilinear regions: lists of disjoint rectangles (x0, y0, x1, y1) in whole centimetres, side by
+side.
 
-`footprint` makes them so that no two of their rectangles are stacked, and cuts keep it so: each rectangle is as tall as
-the region is there. Axis 0 is x, axis 1 is y.
+`footprint` makes them so that no two of their rectangles are stacked, and cuts keep it so: each
+rectangle is as tall as the region is there. Axis 0 is x, axis 1 is y.
 """
-LATTICE = 5     # centimetres; where cuts may be
+
+LATTICE = 5  # centimetres; where cuts may be
 
 
 def area(region):
     """In cm2."""
-    return sum((x1 - x0)*(y1 - y0) for x0, y0, x1, y1 in region)
+    return sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in region)
 
 
 def bounds(region):
@@ -33,26 +35,38 @@ def cut(region, axis, at):
 
 
 def bands(region, axis):
-    """The region in slices across an axis, between all of its lines: a list of (low, high, length across)."""
+    """The region in slices across an axis, between all of its lines: a list of (low, high, length
+    across).
+    """
     if len(region) == 1:
         r = region[0]
         return [(r[axis], r[axis + 2], r[3 - axis] - r[1 - axis])]
     lines = sorted({line for r in region for line in r[axis::2]})
-    return [(low, high, sum(r[3 - axis] - r[1 - axis] for r in region if r[axis] <= low and r[axis + 2] >= high))
-            for low, high in zip(lines, lines[1:])]
+    return [
+        (
+            low,
+            high,
+            sum(
+                r[3 - axis] - r[1 - axis] for r in region if r[axis] <= low and r[axis + 2] >= high
+            ),
+        )
+        for low, high in zip(lines, lines[1:])
+    ]
 
 
 def position(slices, wanted):
     """The lattice line nearest to having `wanted` cm2 of a region's `bands` below it."""
     for low, high, length in slices:
-        if wanted <= (high - low)*length:
+        if wanted <= (high - low) * length:
             break
-        wanted -= (high - low)*length
-    return (low + wanted//max(length, 1) + LATTICE//2)//LATTICE*LATTICE
+        wanted -= (high - low) * length
+    return (low + wanted // max(length, 1) + LATTICE // 2) // LATTICE * LATTICE
 
 
 def corners(region, axis):
-    """{line: side} for the lines through the region's inner corners; the world outside is on side -1 (below) or +1."""
+    """{line: side} for the lines through the region's inner corners; the world outside is on side
+    -1 (below) or +1.
+    """
     if len(region) == 1:
         return {}
     low, high = bounds(region)[axis::2]
@@ -62,7 +76,11 @@ def corners(region, axis):
             below, above = lengths.get(line, (0, 0))
             length = r[3 - axis] - r[1 - axis]
             lengths[line] = (below + length, above) if side < 0 else (below, above + length)
-    return {line: 1 if above < below else -1 for line, (below, above) in lengths.items() if low < line < high}
+    return {
+        line: 1 if above < below else -1
+        for line, (below, above) in lengths.items()
+        if low < line < high
+    }
 
 
 def connected(region, portal):
@@ -71,7 +89,11 @@ def connected(region, portal):
         return True
     reached, rest = [region[0]], list(region[1:])
     for a in reached:
-        near = [b for b in rest if (a[2] == b[0] or b[2] == a[0]) and min(a[3], b[3]) - max(a[1], b[1]) >= portal]
+        near = [
+            b
+            for b in rest
+            if (a[2] == b[0] or b[2] == a[0]) and min(a[3], b[3]) - max(a[1], b[1]) >= portal
+        ]
         reached += near
         rest = [b for b in rest if b not in near]
     return not rest
@@ -98,7 +120,7 @@ def widest(region):
     best = max(region, key=_breadth)
     ordered = sorted(region)
     for i, (x0, y0, x1, y1) in enumerate(ordered):
-        for other in ordered[i + 1:]:
+        for other in ordered[i + 1 :]:
             if other[0] == x1 and min(y1, other[3]) > max(y0, other[1]):
                 x1, y0, y1 = other[2], max(y0, other[1]), min(y1, other[3])
                 best = max(best, (x0, y0, x1, y1), key=_breadth)
@@ -107,4 +129,4 @@ def widest(region):
 
 def _breadth(rectangle):
     x0, y0, x1, y1 = rectangle
-    return min(x1 - x0, y1 - y0), (x1 - x0)*(y1 - y0)
+    return min(x1 - x0, y1 - y0), (x1 - x0) * (y1 - y0)

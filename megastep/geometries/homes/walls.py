@@ -1,19 +1,30 @@
-"""Solid walls of a partition with openings, the segments that bound them, and lights. Whole centimetres.
+"""Solid walls of a partition with openings, the segments that bound them, and lights. Whole
+centimetres.
 
-Everything is painted on a grid whose lines are the coordinates that occur: a cell is wholly outdoors, wall or indoors.
+Everything is painted on a grid whose lines are the coordinates that occur: a cell is wholly
+outdoors, wall or indoors.
 """
+
 import numpy as np
 
 from . import regions
 
 OUTDOORS, WALL, INDOORS = 0, 1, 2
-CLEAR = 21              # cm, along x or y, between a light and any wall: then its cell of the masks touches none
-SHORTEST, LONGEST = 60, 150     # cm; what a slanted corner takes off either side
+CLEAR = (
+    21  # cm, along x or y, between a light and any wall: then its cell of the masks touches none
+)
+SHORTEST, LONGEST = 60, 150  # cm; what a slanted corner takes off either side
 
 
 def depths(sides, thickness):
-    """A function from a contact to how far its wall reaches (before, after) its line; `sides` as from `partition`."""
-    around = {0: (thickness//2, thickness - thickness//2), 1: (0, thickness), -1: (thickness, 0)}
+    """A function from a contact to how far its wall reaches (before, after) its line; `sides` as
+    from `partition`.
+    """
+    around = {
+        0: (thickness // 2, thickness - thickness // 2),
+        1: (0, thickness),
+        -1: (thickness, 0),
+    }
     return lambda contact: around[sides.get((contact.axis, contact.at), 0)]
 
 
@@ -24,7 +35,9 @@ def _rectangle(axis, across, along):
 
 
 def solids(meetings, depth):
-    """The rectangle of the wall on every contact, long enough to fill the corners it makes with others."""
+    """The rectangle of the wall on every contact, long enough to fill the corners it makes with
+    others.
+    """
     rectangles = []
     for contact in meetings:
         low, high = contact.low, contact.high
@@ -36,7 +49,9 @@ def solids(meetings, depth):
                 elif other.at == contact.high:
                     high = contact.high + after
         before, after = depth(contact)
-        rectangles.append(_rectangle(contact.axis, (contact.at - before, contact.at + after), (low, high)))
+        rectangles.append(
+            _rectangle(contact.axis, (contact.at - before, contact.at + after), (low, high))
+        )
     return rectangles
 
 
@@ -48,23 +63,31 @@ def gap(opening, depth):
 
 
 def paint(floor, walls, gaps, envelope):
-    """The grid of a home from rectangles of floor, inner walls and gaps, the envelope so many cm thick.
+    """The grid of a home from rectangles of floor, inner walls and gaps, the envelope so many cm
+    thick.
 
-    Returns the lines' coordinates xs and ys, and the cells' states (len(ys) - 1, len(xs) - 1), row 0 at the bottom.
+    Returns the lines' coordinates xs and ys, and the cells' states (len(ys) - 1, len(xs) - 1), row
+    0 at the bottom.
     """
-    layers = [((x0 - envelope, y0 - envelope, x1 + envelope, y1 + envelope), WALL) for x0, y0, x1, y1 in floor]
-    layers += [(r, INDOORS) for r in floor] + [(r, WALL) for r in walls] + [(r, INDOORS) for r in gaps]
+    layers = [
+        ((x0 - envelope, y0 - envelope, x1 + envelope, y1 + envelope), WALL)
+        for x0, y0, x1, y1 in floor
+    ]
+    layers += (
+        [(r, INDOORS) for r in floor] + [(r, WALL) for r in walls] + [(r, INDOORS) for r in gaps]
+    )
     xs = sorted({x for r, _ in layers for x in r[::2]})
     ys = sorted({y for r, _ in layers for y in r[1::2]})
     column, row = ({line: k for k, line in enumerate(lines)} for lines in (xs, ys))
     cells = np.zeros((len(ys) - 1, len(xs) - 1), np.int8)
     for (x0, y0, x1, y1), state in layers:
-        cells[row[y0]:row[y1], column[x0]:column[x1]] = state
+        cells[row[y0] : row[y1], column[x0] : column[x1]] = state
     return np.array(xs), np.array(ys), cells
 
 
 def _faces(lines, along, cells, beside):
-    """Segments where a wall has `beside` on one side, across rows: (n, 2, 2) of (along, line); the longest possible.
+    """Segments where a wall has `beside` on one side, across rows: (n, 2, 2) of (along, line); the
+    longest possible.
 
     A face with the wall above it and one with the wall below it are never joined.
     """
@@ -75,11 +98,15 @@ def _faces(lines, along, cells, beside):
     changes = edges[:, 1:] != edges[:, :-1]
     row, start = np.nonzero(changes & (edges[:, 1:] != 0))
     _, end = np.nonzero(changes & (edges[:, :-1] != 0))
-    return np.stack([np.stack([along[start], lines[row]], -1), np.stack([along[end], lines[row]], -1)], 1)
+    return np.stack(
+        [np.stack([along[start], lines[row]], -1), np.stack([along[end], lines[row]], -1)], 1
+    )
 
 
 def segments(xs, ys, cells, beside):
-    """All the segments (n, 2, 2) of (x, y) between walls and cells in the state `beside`, joined where collinear."""
+    """All the segments (n, 2, 2) of (x, y) between walls and cells in the state `beside`, joined
+    where collinear.
+    """
     level = _faces(ys, xs, cells, beside)
     upright = _faces(xs, ys, cells.T, beside)[..., ::-1]
     return np.concatenate([level, upright])
@@ -88,50 +115,63 @@ def segments(xs, ys, cells, beside):
 def areas(grid, parts):
     """The indoor area in m2 of each of some regions of a painted grid."""
     xs, ys, cells = grid
-    indoors = np.outer(np.diff(ys), np.diff(xs))*(cells == INDOORS)
+    indoors = np.outer(np.diff(ys), np.diff(xs)) * (cells == INDOORS)
     found = []
     for part in parts:
         boxes = [(np.searchsorted(ys, r[1::2]), np.searchsorted(xs, r[::2])) for r in part]
-        found.append(sum(int(indoors[slice(*rows), slice(*columns)].sum()) for rows, columns in boxes)/10_000)
+        found.append(
+            sum(int(indoors[slice(*rows), slice(*columns)].sum()) for rows, columns in boxes)
+            / 10_000
+        )
     return found
 
 
 def light(region, inside):
-    """Where the light of a room is: at its centroid if that is clear of walls, else amid its widest rectangle.
+    """Where the light of a room is: at its centroid if that is clear of walls, else amid its widest
+    rectangle.
 
     `inside` are the segments (n, 2, 2) indoors, all of them along an axis.
     """
-    total = 2*regions.area(region)
-    x = sum((x1 - x0)*(y1 - y0)*(x0 + x1) for x0, y0, x1, y1 in region)//total
-    y = sum((x1 - x0)*(y1 - y0)*(y0 + y1) for x0, y0, x1, y1 in region)//total
+    total = 2 * regions.area(region)
+    x = sum((x1 - x0) * (y1 - y0) * (x0 + x1) for x0, y0, x1, y1 in region) // total
+    y = sum((x1 - x0) * (y1 - y0) * (y0 + y1) for x0, y0, x1, y1 in region) // total
     apart = np.maximum(inside.min(1) - (x, y), (x, y) - inside.max(1)).max(-1).min()
     if apart >= CLEAR and any(x0 <= x <= x1 and y0 <= y <= y1 for x0, y0, x1, y1 in region):
         return x, y
     x0, y0, x1, y1 = regions.widest(region)
-    return (x0 + x1)//2, (y0 + y1)//2
+    return (x0 + x1) // 2, (y0 + y1) // 2
 
 
 def slanted(inside, outside, xs, ys, cells, thickness, draws):
-    """A home with one outer corner cut off at 45 degrees: the new segments inside and outside, and the triangle lost.
+    """A home with one outer corner cut off at 45 degrees: the new segments inside and outside, and
+    the triangle lost.
 
-    Both faces of the envelope are cut, so that it stays `thickness` thick to a centimetre. The triangle's first corner
-    is the corner it was; it is empty when the walls there are too short.
+    Both faces of the envelope are cut, so that it stays `thickness` thick to a centimetre. The
+    triangle's first corner is the corner it was; it is empty when the walls there are too short.
     """
     outdoors = np.pad(cells == OUTDOORS, 1, constant_values=True)
-    around = outdoors[:-1, :-1].astype(int) + outdoors[1:, :-1] + outdoors[:-1, 1:] + outdoors[1:, 1:]
-    corners = [(int(xs[j]), int(ys[i])) + tuple(int(outdoors[i + k, j + l]) for k in (0, 1) for l in (0, 1))
-               for i, j in zip(*np.nonzero(around == 3))]
+    around = (
+        outdoors[:-1, :-1].astype(int) + outdoors[1:, :-1] + outdoors[:-1, 1:] + outdoors[1:, 1:]
+    )
+    corners = [
+        (int(xs[j]), int(ys[i]))
+        + tuple(int(outdoors[i + k, j + l]) for k in (0, 1) for l in (0, 1))
+        for i, j in zip(*np.nonzero(around == 3))
+    ]
     x, y, *quadrants = corners[draws.below(len(corners))]
-    k, l = divmod(quadrants.index(0), 2)        # the quadrant that is wall
-    right, up = 2*l - 1, 2*k - 1
-    inner = x + right*thickness, y + up*thickness
-    leg = min([LONGEST, *(_reach(inside, inner)[axis]//2 for axis in (0, 1))])//5*5
+    k, l = divmod(quadrants.index(0), 2)  # the quadrant that is wall
+    right, up = 2 * l - 1, 2 * k - 1
+    inner = x + right * thickness, y + up * thickness
+    leg = min([LONGEST, *(_reach(inside, inner)[axis] // 2 for axis in (0, 1))]) // 5 * 5
     if leg < SHORTEST:
         return inside, outside, []
-    outer_leg = leg + thickness*586//1000       # 2 - sqrt 2
-    triangle = [inner, (inner[0] + right*leg, inner[1]), (inner[0], inner[1] + up*leg)]
-    return (_chamfered(inside, inner, right*leg, up*leg),
-            _chamfered(outside, (x, y), right*outer_leg, up*outer_leg), triangle)
+    outer_leg = leg + thickness * 586 // 1000  # 2 - sqrt 2
+    triangle = [inner, (inner[0] + right * leg, inner[1]), (inner[0], inner[1] + up * leg)]
+    return (
+        _chamfered(inside, inner, right * leg, up * leg),
+        _chamfered(outside, (x, y), right * outer_leg, up * outer_leg),
+        triangle,
+    )
 
 
 def _reach(lines, corner):
@@ -140,7 +180,9 @@ def _reach(lines, corner):
 
 
 def _chamfered(lines, corner, dx, dy):
-    """Segments with the two that end in a corner cut back by (dx, dy), and a new one between their new ends."""
+    """Segments with the two that end in a corner cut back by (dx, dy), and a new one between their
+    new ends.
+    """
     x, y = corner
     lines = lines.copy()
     for line in lines:
@@ -152,4 +194,6 @@ def _chamfered(lines, corner, dx, dy):
 
 def holds(region, triangle):
     """Whether a corner of one of a region's rectangles is the triangle's first."""
-    return bool(triangle) and any(triangle[0] in ((x0, y0), (x1, y0), (x1, y1), (x0, y1)) for x0, y0, x1, y1 in region)
+    return bool(triangle) and any(
+        triangle[0] in ((x0, y0), (x1, y0), (x1, y1), (x0, y1)) for x0, y0, x1, y1 in region
+    )
