@@ -19,6 +19,7 @@ test-all: $(SETUP)         ## every test
 
 lint: $(SETUP)
 	$(PYTHON) -m ruff check .
+	$(PYTHON) -m ruff format --check .
 
 setup: $(SETUP)
 

@@ -62,7 +62,7 @@ def first_episodes(env, policy, seed=1, greedy=False, max_steps=100_000):
     return arrdict(returns=returns, lengths=lengths, done=done)
 
 
-def interval(values, groups, level=0.95, draws=2000, seed=1):
+def interval(values, groups, level=0.95, n_resamples=2000, seed=1):
     """The mean of `values` (B,) and a bootstrap interval for it that resamples whole groups:
     `(mean, low, high)`.
 
@@ -75,7 +75,7 @@ def interval(values, groups, level=0.95, draws=2000, seed=1):
         groups = np.arange(len(values))
     _, groups = np.unique(groups, return_inverse=True)
     sums, counts = np.bincount(groups, values), np.bincount(groups)
-    chosen = np.random.default_rng(seed).integers(len(sums), size=(draws, len(sums)))
+    chosen = np.random.default_rng(seed).integers(len(sums), size=(n_resamples, len(sums)))
     means = sums[chosen].sum(1) / counts[chosen].sum(1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return float(values.mean()), float(low), float(high)

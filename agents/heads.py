@@ -33,7 +33,7 @@ def compute_dtype(weight):
     return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else weight.dtype
 
 
-class Standard(nn.Module):
+class RunningNorm(nn.Module):
     """Pictures less their channels' running mean, over their running deviation; vectors likewise,
     number by number.
 
@@ -57,7 +57,7 @@ class Standard(nn.Module):
         return (obs - self.mean) / self.scale
 
     @torch.no_grad()
-    def rescale(self, obs):
+    def update_stats(self, obs):
         """Takes observations (B, ...) into account, the n-th call with weight 1/n."""
         self.count += 1
         spread, seen = torch.var_mean(obs.float(), self.pooled, correction=0, keepdim=True)
@@ -167,8 +167,8 @@ class ConcatIntake(nn.Module):
         self.encoders = nn.ModuleList(
             _encoder(leaf, encoder, ".".join(path)) for path, leaf in leaves
         )
-        self.standards = nn.ModuleList(
-            nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else Standard(leaf)
+        self.norms = nn.ModuleList(
+            nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else RunningNorm(leaf)
             for _, leaf in leaves
         )
         sizes = [e.n_features for e in self.encoders]
@@ -180,24 +180,22 @@ class ConcatIntake(nn.Module):
 
     def forward(self, obs):
         dtype = compute_dtype(self.project.weight)
-        features = [
-            encoder(standard(leaf)).to(dtype) for leaf, standard, encoder in self._leaves(obs)
-        ]
+        features = [encoder(norm(leaf)).to(dtype) for leaf, norm, encoder in self._leaves(obs)]
         joined = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
         return F.relu(self.project(joined))
 
-    def rescale(self, obs):
+    def update_stats(self, obs):
         """Takes observations (B, ...) into account in how they are standardised from now on."""
-        for leaf, standard, _ in self._leaves(obs):
-            if isinstance(standard, Standard):
-                standard.rescale(leaf)
+        for leaf, norm, _ in self._leaves(obs):
+            if isinstance(norm, RunningNorm):
+                norm.update_stats(leaf)
 
     def _leaves(self, obs):
-        for path, standard, encoder in zip(self.paths, self.standards, self.encoders, strict=True):
+        for path, norm, encoder in zip(self.paths, self.norms, self.encoders, strict=True):
             leaf = obs
             for key in path:
                 leaf = leaf[key]
-            yield leaf, standard, encoder
+            yield leaf, norm, encoder
 
 
 def intake(space, width, encoder="linear"):
@@ -231,8 +229,8 @@ class MultiDiscreteOutput(nn.Module):
         return scores.unflatten(-1, self.shape).log_softmax(-1)
 
     def sample(self, logits, generator=None):
-        """Draws actions: the maximum of log-probability plus Gumbel noise is distributed as the
-        probabilities.
+        """Draws actions: the maximum of log-probability plus Gumbel noise is distributed as
+        the probabilities.
         """
         noise = torch.empty_like(logits).exponential_(generator=generator).clamp_(min=_TINY).log_()
         return (logits - noise).argmax(-1)
@@ -292,7 +290,7 @@ class ValueOutput(nn.Module):
     """The expected return, (..., width) -> (...,) float32, in units of reward.
 
     The layer itself predicts returns less their running mean, over their running deviation, so that
-    its error is about 1 whatever an environment pays. `rescale` moves mean and deviation and
+    its error is about 1 whatever an environment pays. `update_stats` moves mean and deviation and
     corrects the layer so that no prediction changes (PopArt, van Hasselt et al. 2016).
     """
 
@@ -312,7 +310,7 @@ class ValueOutput(nn.Module):
         )
 
     @torch.no_grad()
-    def rescale(self, targets, valid, rate=0.05):
+    def update_stats(self, targets, valid, rate=0.05):
         """Takes returns (...,) into account where `valid`. The n-th call weighs max(rate, 1/n), 0
         if nothing is.
         """

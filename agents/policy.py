@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from agents import heads
-from agents.draws import Draws
+from agents.random_stream import RandomStream
 from agents.recurrent import LSTM
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
@@ -19,7 +19,7 @@ class Policy(nn.Module):
     `policy.initial(B)`.
 
     `seed` decides the first weights and, where no generator is given, the actions drawn. The
-    weights are in `state_dict()`; how far the drawing has come is `draws.state_dict()`, which a
+    weights are in `state_dict()`; how far the drawing has come is `random.state_dict()`, which a
     learner saves.
     """
 
@@ -28,7 +28,7 @@ class Policy(nn.Module):
         if width < 1:
             raise ValueError(f"width is {width}; a policy needs at least 1")
         self.bf16 = bf16
-        self.draws = Draws(seed)
+        self.random = RandomStream(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.intake = heads.intake(obs_space, width, encoder)
@@ -56,7 +56,7 @@ class Policy(nn.Module):
         logits = mapping(torch.squeeze)(seen["logits"], 0)
         if sample:
             actions = self.output.sample(
-                logits, self.draws.on(self.device) if generator is None else generator
+                logits, self.random.on(self.device) if generator is None else generator
             )
         else:
             actions = self.output.greedy(logits)

@@ -8,7 +8,7 @@ flag on the device.
 import torch
 
 from agents import returns
-from agents.draws import Draws
+from agents.random_stream import RandomStream
 from megastep.arrdict import arrdict
 
 _AVERAGED = ("policy", "value", "entropy", "kl", "clip_fraction", "grad_norm")
@@ -46,8 +46,8 @@ class PPO:
     gamma, lambda_  discount per step, and how far GAE looks before it trusts the value
     clip            how far the probability of an action may move, as a ratio, before the gradient
     stops
-    entropy         what a nat of entropy is worth, in standard deviations of advantage
-    value_weight    weight of the value's squared error, the value measured in its own scale
+    entropy         what a nat of entropy is worth, in norm deviations of advantage
+    value_coef    weight of the value's squared error, the value measured in its own scale
     max_grad_norm   longer gradients are shortened to this
     n_epochs, n_minibatches  passes over a rollout, and the parts each is cut into by lanes
     target_kl       once a minibatch finds the policy further than this (nats) from the one that
@@ -65,8 +65,8 @@ class PPO:
         gamma=0.99,
         lambda_=0.95,
         clip=0.2,
-        entropy=0.01,
-        value_weight=0.5,
+        entropy_coef=0.01,
+        value_coef=0.5,
         max_grad_norm=0.5,
         n_epochs=1,
         n_minibatches=4,
@@ -75,8 +75,8 @@ class PPO:
         seed=1,
     ):
         self.policy, self.device = policy, policy.device
-        self.gamma, self.lambda_, self.clip, self.entropy = gamma, lambda_, clip, entropy
-        self.value_weight, self.max_grad_norm = value_weight, max_grad_norm
+        self.gamma, self.lambda_, self.clip, self.entropy_coef = gamma, lambda_, clip, entropy_coef
+        self.value_coef, self.max_grad_norm = value_coef, max_grad_norm
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
         self.target_kl = float("inf") if target_kl is None else target_kl
         on_gpu = self.device.type == "cuda"
@@ -85,7 +85,7 @@ class PPO:
         # on the device
         self._fixed = dict(lr=self._lr, fused=True, capturable=on_gpu)
         self.optimizer = torch.optim.Adam(policy.parameters(), eps=1e-5, **self._fixed)
-        self.draws = Draws(seed)
+        self.random = RandomStream(seed)
         self.graph, self._captured = graph and on_gpu, None
         self._warm_ups = _WARM_UPS
 
@@ -108,9 +108,9 @@ class PPO:
         return {f"loss/{key}": value for key, value in metrics.items()}
 
     def _update(self, rollout):
-        outcome = rollout.outcome()
+        outcome = rollout.transitions()
         judged = returns.gae(**outcome, gamma=self.gamma, lambda_=self.lambda_)
-        self.policy.value.rescale(judged.targets, judged.valid)
+        self.policy.value.update_stats(judged.targets, judged.valid)
         explained = explained_variance(outcome["value"], judged.targets, judged.valid)
         judged["advantages"] = normalised(judged.advantages, judged.valid)
 
@@ -118,7 +118,7 @@ class PPO:
         stopped = torch.zeros((), dtype=torch.bool, device=self.device)
         for _ in range(self.n_epochs):
             order = torch.rand(
-                rollout.n_lanes, generator=self.draws.on(self.device), device=self.device
+                rollout.n_lanes, generator=self.random.on(self.device), device=self.device
             ).argsort()
             for rows in order.tensor_split(self.n_minibatches):
                 batch = arrdict({**rollout.lanes(rows), **judged.map(torch.index_select, 1, rows)})
@@ -126,7 +126,7 @@ class PPO:
                 totals = totals + row
         # Only now: a rollout is learned from as it was seen. One row is plenty, B lanes again with
         # every rollout.
-        self.policy.intake.rescale(rollout.obs[-1])
+        self.policy.intake.update_stats(rollout.obs[-1])
         *sums, n_taken, n_skipped = totals.unbind()
         means = {key: total / n_taken for key, total in zip(_AVERAGED, sums, strict=True)}
         return {**means, "explained_variance": explained, "skipped_steps": n_skipped}
@@ -149,7 +149,7 @@ class PPO:
                 ratio - 1 - log_ratio, valid
             )  # >= 0 term by term, unlike the mean log ratio
             clip_fraction = masked_mean((ratio != clipped).float(), valid)
-        loss = policy + self.value_weight * value - self.entropy * entropy
+        loss = policy + self.value_coef * value - self.entropy_coef * entropy
         return loss, dict(
             policy=policy, value=value, entropy=entropy, kl=kl, clip_fraction=clip_fraction
         )
@@ -190,7 +190,7 @@ class PPO:
             return metrics
         if self._captured is None or self._captured[0] is not rollout:
             graph = torch.cuda.CUDAGraph()
-            graph.register_generator_state(self.draws.on(self.device))
+            graph.register_generator_state(self.random.on(self.device))
             with torch.cuda.graph(graph):
                 metrics = self._update(rollout)
             self._captured = rollout, graph, metrics
@@ -205,8 +205,8 @@ class PPO:
         return dict(
             optimizer=self.optimizer.state_dict(),
             lr=self._lr.clone(),
-            draws=self.draws.state_dict(),
-            policy_draws=self.policy.draws.state_dict(),
+            random=self.random.state_dict(),
+            policy_random=self.policy.random.state_dict(),
         )
 
     def load_state_dict(self, state):
@@ -215,6 +215,6 @@ class PPO:
         self._lr.copy_(state["lr"])
         for group in self.optimizer.param_groups:
             group.update(self._fixed)
-        self.draws.load_state_dict(state["draws"], self.device)
-        self.policy.draws.load_state_dict(state["policy_draws"], self.device)
+        self.random.load_state_dict(state["random"], self.device)
+        self.policy.random.load_state_dict(state["policy_random"], self.device)
         self._captured, self._warm_ups = None, _WARM_UPS

@@ -168,9 +168,9 @@ class _State:
             try:
                 old.copy_(new)
                 _rebind(parent, step, old)
-            except (TypeError, AttributeError) as fault:
+            except (TypeError, AttributeError) as error:
                 raise CaptureError(
-                    f"{_readable(path)} was replaced where it cannot be put back ({fault}): "
+                    f"{_readable(path)} was replaced where it cannot be put back ({error}): "
                     f"change it in place."
                 ) from None
 
@@ -271,23 +271,23 @@ def capture(function, args, roots, warmup=3):
     """
     try:
         return Graph(function, args, roots, warmup)
-    except RuntimeError as fault:
+    except RuntimeError as error:
         while isinstance(
-            fault.__context__, RuntimeError
+            error.__context__, RuntimeError
         ):  # the end of a failed capture fails once more
-            fault = fault.__context__
+            error = error.__context__
         warnings.warn(
-            f"running without a CUDA graph, slower: {str(fault).splitlines()[0]}{_line(fault)}",
+            f"running without a CUDA graph, slower: {str(error).splitlines()[0]}{_line(error)}",
             stacklevel=2,
         )
         return function
 
 
-def _line(fault):
-    """Where outside PyTorch and this file a fault was raised, to follow a sentence."""
-    if isinstance(fault, CaptureError):
+def _line(error):
+    """Where outside PyTorch and this file a error was raised, to follow a sentence."""
+    if isinstance(error, CaptureError):
         return ""
-    frames = traceback.extract_tb(fault.__traceback__)
+    frames = traceback.extract_tb(error.__traceback__)
     frames = [f for f in frames if "/torch/" not in f.filename and f.filename != __file__]
     return f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
 

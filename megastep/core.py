@@ -47,8 +47,8 @@ class Core:
         """World ``e`` as :meth:`plot_state` draws it, in tensors: its lines, their lit texels end
         to end, lights, and where the agents stand and look.
         """
-        engine.place(self.scenery, self.agents)
-        lines, colours, lights = self.scenery.world(e)
+        engine.update_agent_geometry(self.scenery, self.agents)
+        lines, colours, lights = self.scenery.env(e)
         agents = self.agents
         return arrdict(
             lines=lines,
@@ -81,5 +81,5 @@ class Core:
         for a, (position, angle) in enumerate(zip(state.positions, state.angles, strict=True)):
             for c, yaw in enumerate(state.yaws):
                 in_view = None if distances is None else distances[a, c]
-                plotting.plot_sight(ax, position, angle + yaw, float(state.fov), in_view)
+                plotting.plot_view(ax, position, angle + yaw, float(state.fov), in_view)
         return ax

@@ -12,11 +12,11 @@ import torch
 
 from .kernels import compile
 from .kernels.compile import EngineError
-from .scenery import Designs, Scenery
+from .scenery import Layouts, Scenery
 
 __all__ = [
     "Agents",
-    "Designs",
+    "Layouts",
     "EngineError",
     "Observation",
     "Physics",
@@ -25,7 +25,7 @@ __all__ = [
     "bake",
     "check",
     "device",
-    "draw",
+    "uniform",
     "fit",
     "observe",
     "physics",
@@ -88,7 +88,7 @@ class Agents:
         self.angles = torch.zeros((n_envs, n_agents), device=device)
         self.velocity = torch.zeros((n_envs, n_agents, 2), device=device)
         self.angvelocity = torch.zeros((n_envs, n_agents), device=device)
-        self.fault = torch.zeros(1, dtype=torch.int32, device=device)
+        self.error_flag = torch.zeros(1, dtype=torch.int32, device=device)
 
 
 class Render(NamedTuple):
@@ -120,7 +120,9 @@ class Observation(NamedTuple):
     )  # (N, A, C, P) fp16: 1 at the agent's radius, falling to 0 at max_depth beyond it
     middle: torch.Tensor  # (N, A, C) int32: the line in the middle of the screen, as Render.indices
     imu: torch.Tensor  # (N, A, 3) fp16: angular velocity / 360, own velocity ahead and left / 10
-    fresh: torch.Tensor  # (N, A) int32: static texels now marked in `seen` that were not before
+    newly_seen: (
+        torch.Tensor
+    )  # (N, A) int32: static texels now marked in `seen` that were not before
 
 
 def device(name="auto"):
@@ -210,20 +212,20 @@ def _pointer(name, tensor, shape, dtype, device):
 
 
 def _world(scenery, radius):
-    designs = scenery.designs
+    layouts = scenery.layouts
     return compile.STRUCTS["World"](
-        designs.lines.vals.data_ptr(),
-        designs.wall_starts.data_ptr(),
-        designs.texel_starts.data_ptr(),
-        designs.boxes.data_ptr(),
-        designs.box_starts.data_ptr(),
-        designs.texels.data_ptr(),
-        designs.lights.vals.data_ptr(),
-        designs.light_starts.data_ptr(),
-        _pointer("scenery.design", scenery.design, (scenery.n_envs,), torch.int32, scenery.device),
+        layouts.lines.vals.data_ptr(),
+        layouts.wall_starts.data_ptr(),
+        layouts.texel_starts.data_ptr(),
+        layouts.boxes.data_ptr(),
+        layouts.box_starts.data_ptr(),
+        layouts.texels.data_ptr(),
+        layouts.lights.vals.data_ptr(),
+        layouts.light_starts.data_ptr(),
+        _pointer("scenery.layout", scenery.layout, (scenery.n_envs,), torch.int32, scenery.device),
         scenery.model.data_ptr(),
         scenery.model_texels.data_ptr(),
-        designs.agent_textures.data_ptr(),
+        layouts.agent_textures.data_ptr(),
         scenery.agent_lines.data_ptr(),
         scenery.agent_light.data_ptr(),
         scenery.n_envs,
@@ -256,9 +258,9 @@ def check(agents):
     """EngineError if an agent's position, angle or velocity has stopped being a finite number, or
     it was given an unknown action. Asks the device, so not for inside a step.
     """
-    world = int(agents.fault)
+    world = int(agents.error_flag)
     if world:
-        agents.fault.zero_()
+        agents.error_flag.zero_()
         if world < 0:
             raise EngineError(
                 f"An agent of environment {-world - 1} was given an action that is none of its "
@@ -273,7 +275,7 @@ def check(agents):
 
 
 def _checked(agents):
-    if agents.fault.device.type == "cpu" and int(agents.fault):
+    if agents.error_flag.device.type == "cpu" and int(agents.error_flag):
         check(agents)
 
 
@@ -281,20 +283,20 @@ def _checked(agents):
 
 
 def bake(scenery):
-    """Fills ``scenery.designs.baked``: min(1, 0.1 + sum of 2 I / max(d^2, 1)) over the lights that
-    no wall of the design hides.
+    """Fills ``scenery.layouts.baked``: min(1, 0.1 + sum of 2 I / max(d^2, 1)) over the lights that
+    no wall of the layout hides.
     """
-    designs = scenery.designs
-    designs.bound()
+    layouts = scenery.layouts
+    layouts.bound()
     texel_wall = torch.repeat_interleave(
-        torch.arange(len(designs.textures), dtype=torch.int32, device=scenery.device),
-        designs.textures.widths,
+        torch.arange(len(layouts.textures), dtype=torch.int32, device=scenery.device),
+        layouts.textures.widths,
     )
-    wall_design = torch.repeat_interleave(
-        torch.arange(len(designs), dtype=torch.int32, device=scenery.device), designs.lines.widths
+    wall_layout = torch.repeat_interleave(
+        torch.arange(len(layouts), dtype=torch.int32, device=scenery.device), layouts.lines.widths
     )
     params = compile.STRUCTS["Bake"](
-        _world(scenery, 0.0), texel_wall.data_ptr(), wall_design.data_ptr(), len(texel_wall)
+        _world(scenery, 0.0), texel_wall.data_ptr(), wall_layout.data_ptr(), len(texel_wall)
     )
     compile.launch("bake", params, scenery.device, len(texel_wall))
 
@@ -313,7 +315,7 @@ def physics(scenery, agents, actions=None, moves=None, keep=0.0):
         _world(scenery, agents.radius),
         *state,
         progress.data_ptr(),
-        agents.fault.data_ptr(),
+        agents.error_flag.data_ptr(),
         _pointer("actions", actions, (n, a), torch.int64, scenery.device),
         0 if moves is None else moves.data_ptr(),
         0 if moves is None else len(moves),
@@ -326,7 +328,7 @@ def physics(scenery, agents, actions=None, moves=None, keep=0.0):
     return Physics(progress)
 
 
-def place(scenery, agents, lit=True):
+def update_agent_geometry(scenery, agents, lit=True):
     """Carries the agents' models to where the agents are, and lights their texels."""
     params = compile.STRUCTS["Placing"](
         _world(scenery, agents.radius), *_state(scenery, agents, "positions", "angles"), int(lit)
@@ -342,7 +344,7 @@ def _look(scenery, agents, **fields):
         *_state(scenery, agents, "positions", "angles"),
         agents.yaws.data_ptr(),
         agents.ray_lengths.data_ptr(),
-        agents.fault.data_ptr(),
+        agents.error_flag.data_ptr(),
         len(agents.yaws),
         agents.res,
         width,
@@ -353,8 +355,13 @@ def _look(scenery, agents, **fields):
         0.99 * agents.radius * math.cos(half),
     )
     params.subsample, params.per_depth = 1, 0.1
+    spelt = {"newly_seen": "fresh", "clear_mask": "forget"}
     for name, value in fields.items():
-        setattr(params, name, value.data_ptr() if isinstance(value, torch.Tensor) else value)
+        setattr(
+            params,
+            spelt.get(name, name),
+            value.data_ptr() if isinstance(value, torch.Tensor) else value,
+        )
     params.n_pixels, params.share = agents.res // params.subsample, 1 / params.subsample
     threads = 32 * scenery.n_envs * scenery.n_agents
     compile.launch("sight", params, scenery.device, threads, shared=256 * -(-agents.res // 32))
@@ -371,7 +378,7 @@ def render(scenery, agents):
     """Places the agents' models, lights them, and returns a :class:`Render` of what every camera
     sees.
     """
-    place(scenery, agents)
+    update_agent_geometry(scenery, agents)
     shape = _cameras(scenery, agents) + (agents.res,)
     floats = {
         name: torch.empty(shape, device=scenery.device)
@@ -395,14 +402,14 @@ def observe(
     imu=False,
     middle=False,
     seen=None,
-    forget=None,
+    clear_mask=None,
     max_depth=10.0,
 ):
     """What training needs of a view, in one pass: a fused form of :func:`render` and the sensors of
     :mod:`~megastep.modules`.
 
     Args: ``subsample`` rays to a pixel, a divisor of res; ``seen`` (N, A, n_words) int32, a bit for
-    each static texel of the world's design, updated in place; ``forget`` (N, A) bool, clears
+    each static texel of the world's layout, updated in place; ``clear_mask`` (N, A) bool, clears
     ``seen`` first; ``max_depth`` metres. With one agent a world, ``scenery.lines`` is left as it
     was. Returns an :class:`Observation`.
     """
@@ -417,20 +424,22 @@ def observe(
         )
     n, a, where = scenery.n_envs, scenery.n_agents, scenery.device
     if a > 1:
-        place(scenery, agents, lit=rgb)
+        update_agent_geometry(scenery, agents, lit=rgb)
     shape, pixels = _cameras(scenery, agents), agents.res // subsample
     out = Observation(
         rgb=torch.empty((*shape, 3, pixels), dtype=torch.float16, device=where) if rgb else None,
         depth=torch.empty((*shape, pixels), dtype=torch.float16, device=where) if depth else None,
         middle=torch.empty(shape, dtype=torch.int32, device=where) if middle else None,
         imu=torch.empty((n, a, 3), dtype=torch.float16, device=where) if imu else None,
-        fresh=torch.empty((n, a), dtype=torch.int32, device=where) if seen is not None else None,
+        newly_seen=torch.empty((n, a), dtype=torch.int32, device=where)
+        if seen is not None
+        else None,
     )
     words = 0 if seen is None else seen.shape[-1]
-    most = scenery.designs.most_texels
+    most = scenery.layouts.max_texels
     if seen is not None and 32 * words < most:
         raise ValueError(
-            f"seen must have a bit for each of a design's texels, so at least {-(-most // 32)} "
+            f"seen must have a bit for each of a layout's texels, so at least {-(-most // 32)} "
             f"words an agent, "
             f"but it has {words}"
         )
@@ -444,42 +453,42 @@ def observe(
         velocity=velocity,
         angvelocity=angvelocity,
         seen=_pointer("seen", seen, (n, a, words), torch.int32, where),
-        forget=_pointer("forget", forget, (n, a), torch.bool, where),
+        clear_mask=_pointer("clear_mask", clear_mask, (n, a), torch.bool, where),
         **{name: tensor for name, tensor in out._asdict().items() if tensor is not None},
     )
     return out
 
 
 def spawn(scenery, agents, mask, points, counts, seed, resample=False):
-    """Puts agents at random points of their world's design, at rest, looking anywhere: one Philox
+    """Puts agents at random points of their world's layout, at rest, looking anywhere: one Philox
     draw each.
 
     Args: ``mask`` (N, A) bool, who; ``points`` (D, n, 2), of which the agents of one world have n /
     A each; ``counts`` (N, A) int32, draws made so far, advanced here; ``resample``: a world all of
-    whose agents respawn moves to a random design first.
+    whose agents respawn moves to a random layout first.
     """
     where, lanes = scenery.device, (scenery.n_envs, scenery.n_agents)
-    n_designs, n_points = len(scenery.designs), points.shape[1]
+    n_layouts, n_points = len(scenery.layouts), points.shape[1]
     if n_points < scenery.n_agents:
         raise ValueError(
-            f"{scenery.n_agents} agents need at least as many points, but {n_points} a design "
+            f"{scenery.n_agents} agents need at least as many points, but {n_points} a layout "
             f"were given"
         )
     params = compile.STRUCTS["Spawn"](
         _world(scenery, agents.radius),
         *_state(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
         _pointer("mask", mask, lanes, torch.bool, where),
-        _pointer("points", points, (n_designs, n_points, 2), torch.float32, where),
+        _pointer("points", points, (n_layouts, n_points, 2), torch.float32, where),
         _pointer("counts", counts, lanes, torch.int32, where),
         seed & 0xFFFFFFFF,
         seed >> 32 & 0xFFFFFFFF,
         n_points,
-        n_designs if resample else 0,
+        n_layouts if resample else 0,
     )
     compile.launch("spawn", params, where, scenery.n_envs)
 
 
-def draw(counts, mask, seed, out):
+def uniform(counts, mask, seed, out):
     """Uniform numbers in [0, 1), four a lane: Philox 4x32-10 with key ``seed`` and counter (lane,
     count).
 

@@ -161,7 +161,7 @@ class IMU:
 # ---- Random events ----
 
 
-class Draws:
+class RandomStream:
     """Random numbers by lane: the k-th draw of a lane depends on the seed, the lane and k alone, so
     it is the same on every device, captured or not.
     """
@@ -175,7 +175,7 @@ class Draws:
         """Four uniform numbers in [0, 1) a lane, (B, 4); fresh where ``mask`` (B,) bool, elsewhere
         what was drawn last.
         """
-        return engine.draw(self.counts, mask.reshape(-1), self.seed, self.values)
+        return engine.uniform(self.counts, mask.reshape(-1), self.seed, self.values)
 
 
 def _spawn_points(g, n, radius, random):
@@ -209,11 +209,11 @@ def _clearance(points, walls):
 
 
 class RandomSpawns:
-    """Puts agents somewhere random in the rooms of their world's design, at rest, looking anywhere.
+    """Puts agents somewhere random in the rooms of their world's layout, at rest, looking anywhere.
 
-    ``n_spawns`` points a design are found once, 5 cm clear of the collision disc; each respawn
+    ``n_spawns`` points a layout are found once, 5 cm clear of the collision disc; each respawn
     picks one, and agents of one world have points of their own. With ``resample`` a world whose
-    agents all respawn moves to another design first. ``geometries`` are those the scenery was made
+    agents all respawn moves to another layout first. ``geometries`` are those the scenery was made
     from.
     """
 
@@ -227,7 +227,7 @@ class RandomSpawns:
                 engine.AGENT_RADIUS + 0.05,
                 np.random.Generator(np.random.Philox([self.seed, d])),
             )
-            for d, g in enumerate(geometries[: len(core.scenery.designs)])
+            for d, g in enumerate(geometries[: len(core.scenery.layouts)])
         ]
         self.points = torch.as_tensor(np.stack(points), dtype=torch.float32, device=core.device)
         self.counts = torch.zeros(
@@ -261,13 +261,15 @@ class RandomLifespans:
             )
         self.shortest, self.longest = shortest, longest
         n = core.n_envs * core.n_agents
-        self.draws = Draws(n, (core.seed if seed is None else seed) + (1 << 32), core.device)
+        self.random = RandomStream(
+            n, (core.seed if seed is None else seed) + (1 << 32), core.device
+        )
         self.ages = torch.zeros(n, dtype=torch.int32, device=core.device)
         self.lifespans = torch.zeros(n, dtype=torch.int32, device=core.device)
 
     def begin(self, reset):
         """A new life for the lanes of ``reset`` (B,)."""
-        chance = self.draws(reset)[:, 0]
+        chance = self.random(reset)[:, 0]
         lifespans = self.shortest + (chance * (self.longest - self.shortest + 1)).int()
         self.lifespans.copy_(torch.where(reset, lifespans, self.lifespans))
         self.ages.masked_fill_(reset, 0)

@@ -20,7 +20,7 @@ __all__ = [
     "plot_images",
     "plot_lines",
     "plot_scenery",
-    "plot_sight",
+    "plot_view",
     "rasterise",
 ]
 
@@ -198,7 +198,7 @@ def plot_scenery(lines, colours, lights=None, seen=None, ax=None):
     return ax
 
 
-def plot_sight(ax, position, angle, fov, distances=None, reach=1.0, colour="w"):
+def plot_view(ax, position, angle, fov, distances=None, reach=1.0, colour="w"):
     """Draws where a camera looks: a wedge, or with ``distances`` the area it sees. Returns the
     matplotlib patch.
 

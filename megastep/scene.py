@@ -6,7 +6,7 @@ import torch
 from . import engine
 from .colour import gamma_decode
 from .ragged import Ragged
-from .scenery import Designs, Scenery
+from .scenery import Layouts, Scenery
 
 TEXEL = 0.05  # metres a texel
 STRIPE = (0.4, 2.0)  # metres, shortest and longest period of a wall's pattern
@@ -96,8 +96,8 @@ def scenery(geometries, n_agents=1, n_envs=None, seed=1, device=None):
     """Baked :class:`~megastep.scenery.Scenery` of ``n_envs`` worlds (default: one a geometry);
     world e shows geometry ``e % len(geometries)``.
 
-    Each geometry is one design, with textures and light intensities of its own drawn from ``seed``;
-    the same geometry given twice is two designs. ``device`` is as in
+    Each geometry is one layout, with textures and light intensities of its own drawn from ``seed``;
+    the same geometry given twice is two layouts. ``device`` is as in
     :func:`~megastep.engine.device`. ValueError without geometries; EngineError if the worlds do not
     fit into memory.
     """
@@ -123,7 +123,7 @@ def scenery(geometries, n_agents=1, n_envs=None, seed=1, device=None):
     lights = np.concatenate([positions, random.uniform(*INTENSITY, (len(positions), 1))], 1).astype(
         np.float32
     )
-    designs = Designs(
+    layouts = Layouts(
         lines=Ragged(torch.as_tensor(walls), torch.tensor([len(g.walls) for g in geometries])),
         textures=Ragged(torch.as_tensor(wall_textures(widths, random)), torch.as_tensor(widths)),
         lights=Ragged(torch.as_tensor(lights), torch.tensor([len(g.lights) for g in geometries])),
@@ -132,9 +132,9 @@ def scenery(geometries, n_agents=1, n_envs=None, seed=1, device=None):
         ),
         device=device,
     )
-    made = Scenery.of_designs(
+    made = Scenery.of_layouts(
         n_agents,
-        designs,
+        layouts,
         torch.as_tensor(model),
         torch.as_tensor(model_widths),
         torch.arange(n_envs) % len(geometries),
@@ -149,7 +149,7 @@ def display(scenery, e=0, ax=None):
     """
     from . import plotting
 
-    lines, colours, lights = scenery.world(e)
+    lines, colours, lights = scenery.env(e)
     return plotting.plot_scenery(
         lines.cpu().numpy(),
         [texels.cpu().numpy() for texels in colours],

@@ -1,9 +1,9 @@
 """Scenery: what the engine renders and collides with.
 
-Walls, their textures and baked light, and lights belong to a *design*; a world points at a design,
+Walls, their textures and baked light, and lights belong to a *layout*; a world points at a layout,
 so a million worlds share a few thousand homes. Each world adds only its agents' lines and the light
-on them. N worlds, D designs, A agents a world, M lines of the agent model, K texels of one world's
-agents, W walls and T texels of all designs.
+on them. N worlds, D layouts, A agents a world, M lines of the agent model, K texels of one world's
+agents, W walls and T texels of all layouts.
 """
 
 from functools import cached_property
@@ -23,7 +23,7 @@ def _expand(starts, widths):
 
 class Pieced(Bounds):
     """A read-only Ragged whose subarrays are pieces of two tensors, joined when asked for: the
-    agents' part first, then the design's.
+    agents' part first, then the layout's.
 
     ``vals``, ``starts``, ``ends``, ``widths``, ``inverse`` and indexing are those of a
     :class:`~megastep.ragged.Ragged`; all are copies.
@@ -81,7 +81,7 @@ class Pieced(Bounds):
         return f"Pieced({self.widths.cpu().numpy()})"
 
 
-class Designs:
+class Layouts:
     """The static part of scenery, shared by the worlds that show it.
 
     Args: ``lines`` Ragged (W, 2, 2) metres; ``textures`` Ragged (T, 3), one subarray a wall, linear
@@ -104,8 +104,8 @@ class Designs:
         )
         for name, wanted, given in [
             ("texture for each wall", len(self.lines.vals), len(self.textures)),
-            ("set of lights for each design", len(self.lines), len(self.lights)),
-            ("set of agent textures for each design", len(self.lines), len(self.agent_textures)),
+            ("set of lights for each layout", len(self.lines), len(self.lights)),
+            ("set of agent textures for each layout", len(self.lines), len(self.agent_textures)),
         ]:
             if wanted != given:
                 raise ValueError(
@@ -121,7 +121,7 @@ class Designs:
         return len(self.lines)
 
     def bound(self):
-        """Draws ``boxes`` around every 32 walls of a design, which let the GPU leave out what
+        """Draws ``boxes`` around every 32 walls of a layout, which let the GPU leave out what
         cannot be seen.
         """
         groups = (self.lines.widths + 31) // 32
@@ -138,8 +138,8 @@ class Designs:
         self.boxes = torch.cat([low, high], 1)
 
     @cached_property
-    def most_texels(self):
-        """The most static texels that any design has."""
+    def max_texels(self):
+        """The most static texels that any layout has."""
         return int(self.texel_starts[self.wall_starts.long()].diff().max())
 
 
@@ -149,7 +149,7 @@ class Scenery:
     ``Scenery(n_agents, lights, lines, textures, model)`` takes what every world has of its own:
     raggeds of ``lights`` (l, 3) and ``lines`` (L, 2, 2) by world, each world's agents' lines first,
     ``textures`` (T, 3) by line, and the agents' ``model`` (M, 2, 2) in metres about their origin.
-    :meth:`of_designs` shares designs between worlds. The agents' texture widths must be the same in
+    :meth:`of_layouts` shares layouts between worlds. The agents' texture widths must be the same in
     every world. ValueError if the parts do not fit.
     """
 
@@ -179,74 +179,74 @@ class Scenery:
                 "they differ"
             )
         of_agent = is_agent[textures.inverse]
-        designs = Designs(
+        layouts = Layouts(
             Ragged(lines.vals[~is_agent], lines.widths - own),
             Ragged(textures.vals[~of_agent], textures.widths[~is_agent]),
             lights,
             textures.vals[of_agent].view(n, -1, 3),
             device,
         )
-        self._fill(n_agents, designs, model, agent_widths[0], torch.arange(n), device)
+        self._fill(n_agents, layouts, model, agent_widths[0], torch.arange(n), device)
 
     @classmethod
-    def of_designs(cls, n_agents, designs, model, model_widths, design):
-        """``design`` (N,) ints: the design each world shows; ``model_widths`` (A M,) texels of each
+    def of_layouts(cls, n_agents, layouts, model, model_widths, layout):
+        """``layout`` (N,) ints: the layout each world shows; ``model_widths`` (A M,) texels of each
         agent line.
         """
         self = cls.__new__(cls)
-        self._fill(n_agents, designs, model, model_widths, design, designs.texels.device)
+        self._fill(n_agents, layouts, model, model_widths, layout, layouts.texels.device)
         return self
 
-    def _fill(self, n_agents, designs, model, model_widths, design, device):
-        self.n_agents, self.designs, self.device = n_agents, designs, designs.texels.device
+    def _fill(self, n_agents, layouts, model, model_widths, layout, device):
+        self.n_agents, self.layouts, self.device = n_agents, layouts, layouts.texels.device
         device = self.device
         self.model = _floats(model, device)
         self.model_texels = _bounds(torch.as_tensor(model_widths, device=device))
-        self.design = torch.as_tensor(design, dtype=torch.int32, device=device).contiguous()
-        if int(self.model_texels[-1]) != designs.agent_textures.shape[1]:
+        self.layout = torch.as_tensor(layout, dtype=torch.int32, device=device).contiguous()
+        if int(self.model_texels[-1]) != layouts.agent_textures.shape[1]:
             raise ValueError(
-                f"the agents' textures have {designs.agent_textures.shape[1]} texels a world, but "
+                f"the agents' textures have {layouts.agent_textures.shape[1]} texels a world, but "
                 f"their lines "
                 f"need {int(self.model_texels[-1])}"
             )
-        if len(self.design) and not 0 <= int(self.design.min()) <= int(self.design.max()) < len(
-            designs
+        if len(self.layout) and not 0 <= int(self.layout.min()) <= int(self.layout.max()) < len(
+            layouts
         ):
             raise ValueError(
-                f"worlds must show designs 0 to {len(designs) - 1}, but one shows "
-                f"{int(self.design.max())}"
+                f"worlds must show layouts 0 to {len(layouts) - 1}, but one shows "
+                f"{int(self.layout.max())}"
             )
         self.agent_lines = self.model.repeat(self.n_envs, n_agents, 1, 1)
-        self.agent_light = torch.ones((self.n_envs, designs.agent_textures.shape[1]), device=device)
+        self.agent_light = torch.ones((self.n_envs, layouts.agent_textures.shape[1]), device=device)
         self.reach = float(self.model.norm(dim=-1).max()) if len(self.model) else 0.0
 
     @property
     def n_envs(self):
-        return len(self.design)
+        return len(self.layout)
 
     # Per-world views, as seed 002's users know them.
 
     @property
     def lines(self):
         """Per world, all its lines (L, 2, 2): the agents' first, as last placed."""
-        design, static = self.design.long(), self.designs.lines
+        layout, static = self.layout.long(), self.layouts.lines
         n = self.agent_lines.shape[1]
         own = torch.arange(self.n_envs, device=self.device) * n
         return Pieced(
             (self.agent_lines.flatten(0, 1), static.vals),
-            (own, static.starts[design]),
-            (torch.full_like(own, n), static.widths[design]),
+            (own, static.starts[layout]),
+            (torch.full_like(own, n), static.widths[layout]),
         )
 
     @property
     def lights(self):
         """Per world, its lights (l, 3)."""
-        design, static = self.design.long(), self.designs.lights
-        zero = torch.zeros_like(design)
+        layout, static = self.layout.long(), self.layouts.lights
+        zero = torch.zeros_like(layout)
         return Pieced(
             (static.vals[:0], static.vals),
-            (zero, static.starts[design]),
-            (zero, static.widths[design]),
+            (zero, static.starts[layout]),
+            (zero, static.widths[layout]),
         )
 
     @property
@@ -254,9 +254,9 @@ class Scenery:
         """Per line of all worlds, its texels (w, 3); line l of world e is line ``lines.starts[e] +
         l``.
         """
-        own = self.designs.agent_textures
+        own = self.layouts.agent_textures
         return self._by_line(
-            (own.flatten(0, 1), self.designs.textures.vals), self.design.long() * own.shape[1]
+            (own.flatten(0, 1), self.layouts.textures.vals), self.layout.long() * own.shape[1]
         )
 
     @property
@@ -264,21 +264,21 @@ class Scenery:
         """Per line of all worlds, the light on its texels (w,)."""
         own = self.agent_light
         return self._by_line(
-            (own.flatten(), self.designs.baked.vals),
+            (own.flatten(), self.layouts.baked.vals),
             torch.arange(self.n_envs, device=self.device) * own.shape[1],
         )
 
     def _by_line(self, vals, agent_starts):
-        static, design = self.designs.textures, self.design.long()
-        walls = self.designs.lines
+        static, layout = self.layouts.textures, self.layout.long()
+        walls = self.layouts.lines
         n = len(self.model_texels) - 1
         order = Pieced(
             (
                 torch.arange(self.n_envs * n, device=self.device),
                 self.n_envs * n + torch.arange(len(walls.vals), device=self.device),
             ),
-            (torch.arange(self.n_envs, device=self.device) * n, walls.starts[design]),
-            (torch.full_like(design, n), walls.widths[design]),
+            (torch.arange(self.n_envs, device=self.device) * n, walls.starts[layout]),
+            (torch.full_like(layout, n), walls.widths[layout]),
         ).vals
         is_agent = order < self.n_envs * n
         bounds = self.model_texels.long()
@@ -298,22 +298,22 @@ class Scenery:
             (widths, torch.where(is_agent, zero, static.widths[wall])),
         )
 
-    def world(self, e):
+    def env(self, e):
         """World ``e`` alone: (lines (L, 2, 2), a tuple of lit textures (w, 3) one a line, lights
         (l, 3)), the agents' first. Cheap however many worlds there are.
         """
-        designs, d = self.designs, int(self.design[e])
-        lines = torch.cat([self.agent_lines[e], designs.lines[d]])
-        first, last = int(designs.wall_starts[d]), int(designs.wall_starts[d + 1])
-        bounds, own = designs.texel_starts[first : last + 1].tolist(), self.model_texels.tolist()
-        agents = designs.agent_textures[d] * self.agent_light[e, :, None]
+        layouts, d = self.layouts, int(self.layout[e])
+        lines = torch.cat([self.agent_lines[e], layouts.lines[d]])
+        first, last = int(layouts.wall_starts[d]), int(layouts.wall_starts[d + 1])
+        bounds, own = layouts.texel_starts[first : last + 1].tolist(), self.model_texels.tolist()
+        agents = layouts.agent_textures[d] * self.agent_light[e, :, None]
         walls = (
-            designs.texels[bounds[0] : bounds[-1], :3] * designs.texels[bounds[0] : bounds[-1], 3:]
+            layouts.texels[bounds[0] : bounds[-1], :3] * layouts.texels[bounds[0] : bounds[-1], 3:]
         )
         return (
             lines,
             (*agents.split(_widths(own)), *walls.split(_widths(bounds))),
-            designs.lights[d],
+            layouts.lights[d],
         )
 
 
@@ -332,6 +332,6 @@ def _bounds(widths):
         raise ValueError(
             f"scenery holds at most 2,147,483,647 walls and texels of each kind, but "
             f"{int(ends[-1])} were given: "
-            f"use fewer designs"
+            f"use fewer layouts"
         )
     return torch.cat([ends.new_zeros(1), ends]).to(torch.int32)

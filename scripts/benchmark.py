@@ -176,13 +176,13 @@ def operations(n, device):
     env, _ = stepper("explorer", n, device)
     scenery, seers, actions = env.core.scenery, env.core.agents, random_actions(n, 1, device)
     some = torch.rand((n, 1), device=device) < 1 / 256  # about as many as end an episode in a step
-    draws = modules.Draws(n, 1, device)
+    draws = modules.RandomStream(n, 1, device)
     yield "`physics`", lambda i: env.movement(actions[i])
     yield "`spawn` of 1 in 256", lambda i: env.spawner(some)
     yield "`draw` of 1 in 256", lambda i: draws(some)
     yield (
         "`observe` as Explorer does, 256 rays to 64 pixels",
-        lambda i: engine.observe(scenery, seers, 4, imu=True, seen=env.seen, forget=some),
+        lambda i: engine.observe(scenery, seers, 4, imu=True, seen=env.seen, clear_mask=some),
     )
     yield "`render`, 256 rays, all fields", lambda i: engine.render(scenery, seers)
     minimal, _ = stepper("minimal", n, device)
@@ -191,7 +191,7 @@ def operations(n, device):
         lambda i: engine.observe(minimal.core.scenery, minimal.core.agents, depth=False),
     )
     c, _ = four_agents(n // 4, device)
-    yield "`place`, lit, 4 a home", lambda i: engine.place(c.scenery, c.agents)
+    yield "`place`, lit, 4 a home", lambda i: engine.update_agent_geometry(c.scenery, c.agents)
 
 
 # ---- The works: generators of figures ----
@@ -315,7 +315,9 @@ def fresh(code, device, n):
 def compile(device):
     """The kernels built with nothing kept: by NVRTC for a GPU, by the C++ compiler for the CPU."""
     yield figure(
-        "build of all kernels, cold cache", "s", [fresh(BUILD, device, 1)[0] for _ in range(FRESH)]
+        "build of all kernels, cold cache",
+        "s",
+        [fresh(BUILD, device, 1)[0] for _ in range(FRESH)],
     )
 
 
@@ -357,14 +359,14 @@ def twin_frame(c, e):
     """What a frame of world ``e`` takes the twin: physics, rays, shading."""
     import twin
 
-    designs, seers, d = c.scenery.designs, c.agents, int(c.scenery.design[e])
-    walls, first_wall = designs.lines[d], int(designs.wall_starts[d])
+    layouts, seers, d = c.scenery.layouts, c.agents, int(c.scenery.layout[e])
+    walls, first_wall = layouts.lines[d], int(layouts.wall_starts[d])
     twin.physics(
         walls, seers.positions[e], seers.angles[e], seers.velocity[e], seers.angvelocity[e]
     )
     hits = twin.cast(walls, seers.positions[e], twin.rays(seers.angles[e], [0.0], 256, 130.0))
-    bounds = designs.texel_starts[first_wall : first_wall + len(walls) + 1].long()
-    texels = designs.texels[int(bounds[0]) : int(bounds[-1])]
+    bounds = layouts.texel_starts[first_wall : first_wall + len(walls) + 1].long()
+    texels = layouts.texels[int(bounds[0]) : int(bounds[-1])]
     twin.shade(hits, texels[:, :3], bounds.diff(), texels[:, 3])
 
 
@@ -634,8 +636,8 @@ def main(argv=None):
     )
     try:
         run(parser.parse_args(argv))
-    except (ValueError, OSError, engine.EngineError) as fault:
-        print(f"benchmark.py: {fault}", file=sys.stderr)
+    except (ValueError, OSError, engine.EngineError) as error:
+        print(f"benchmark.py: {error}", file=sys.stderr)
         return 2
     return 0
 

@@ -69,7 +69,7 @@ def _reaches(labels, rooms):
     return any(all(label in there for there in seen) for label in seen[0])
 
 
-def faults(g):
+def errors(g):
     """Sentences on what is wrong with a home, none if it is as it must be."""
     found = []
     walls = g.walls.reshape(-1, 4)

@@ -1,4 +1,4 @@
-"""Has agents try to pass walls and, when stopped, to leave, in the worlds of tests/walls.py:
+"""Has agents try to pass walls and, when stopped, to leave, in the environments of tests/walls.py:
 
     python scripts/check_walls.py --steps 1e9 --device auto
 
@@ -57,8 +57,8 @@ def main():
     args = arguments()
     try:
         device = engine.device(args.device)
-    except engine.EngineError as fault:
-        print(f"check_walls.py: {fault}", file=sys.stderr)
+    except engine.EngineError as error:
+        print(f"check_walls.py: {error}", file=sys.stderr)
         return 2
     n_agents = args.agents or (2048 if device.type == "cpu" else 1 << 20)
     share = -(-int(args.steps) // len(walls.COURSES))

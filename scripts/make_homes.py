@@ -128,7 +128,7 @@ def made(seed):
     start = time.process_time()
     g = homes.generate(seed)
     took = time.process_time() - start
-    return g, check_homes.faults(g), took
+    return g, check_homes.errors(g), took
 
 
 def packed(plans):
@@ -176,7 +176,7 @@ def main(argv=None):
     with futures.ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         results = list(pool.map(made, range(args.count), chunksize=50))
     plans = [g for g, _, _ in results]
-    wrong = [f"home {g.id}: {fault}" for g, found, _ in results for fault in found]
+    wrong = [f"home {g.id}: {error}" for g, found, _ in results for error in found]
     values = statistics(plans)
     print(
         f"{args.count} homes, {1e3 * np.mean([took for *_, took in results]):.1f} ms each; "

@@ -23,14 +23,20 @@ def main():
             scene.scenery(homes, n_agents, n_envs=5, device="cuda"), res=res, cameras=cameras
         )
         spawn = RandomSpawns(homes, c, resample=True)
-        words = -(-c.scenery.designs.most_texels // 32)
+        words = -(-c.scenery.layouts.max_texels // 32)
         seen = torch.zeros((5, n_agents, words), dtype=torch.int32, device="cuda")
         for _ in range(3):
             spawn(c.agent_full(True))
             c.agents.velocity.fill_(3.0)
             engine.physics(c.scenery, c.agents)
             engine.observe(
-                c.scenery, c.agents, 3, imu=True, middle=True, seen=seen, forget=c.agent_full(False)
+                c.scenery,
+                c.agents,
+                3,
+                imu=True,
+                middle=True,
+                seen=seen,
+                clear_mask=c.agent_full(False),
             )
             engine.render(c.scenery, c.agents)
     for env in (envs.Explorer(7, homes, device="cuda"), envs.Minimal(7, homes, device="cuda")):

@@ -9,9 +9,9 @@ be. Golden data is judged by its own tolerances.
 
 import math
 
+import random_scenery
 import torch
 import twin
-import worlds
 
 COORDINATE_SLACK = (
     3e-7  # of the largest coordinate: two roundings of float32 when an agent's lines are placed
@@ -201,8 +201,8 @@ def light_bracket(w, lines):
 
 
 def check_baked(baked, world, static_only=True):
-    """Checks the light (T,) of all worlds' texels, or of their static ones only; returns the worst
-    ratio.
+    """Checks the light (T,) of all environments' texels, or of their static ones only; returns the
+    worst ratio.
     """
     report, each = Report(), double(dict(baked=baked))["baked"].split(world.texels().tolist())
     n_lines = world.n_agents * len(world.model)
@@ -287,7 +287,7 @@ def golden_figures(case, ours):
     (N, A, R[, 3]), and of a step of physics `progress` with the `positions`, `angles`, `velocity`,
     `angvelocity` after it.
     """
-    world, settings, right = worlds.golden(case)
+    world, settings, right = random_scenery.golden(case)
     right = {
         k.removesuffix("_after").removesuffix("_vals").removesuffix("_after_render"): v
         for k, v in right.items()

@@ -52,7 +52,7 @@ def test_the_walk_finds_tensors_and_generators_by_path():
     paths = capture.state_tree(envs.Explorer(2, device="cpu"))
     assert {
         ".core.agents.positions",
-        ".core.scenery.design",
+        ".core.scenery.layout",
         ".seen",
         ".spawner.counts",
         ".ended",
@@ -117,7 +117,7 @@ class TestOnTheGPU:
         for value in (1, 2, 0, 2):
             a, b = eager.step(actions("cuda", value)), env.step(actions("cuda", value))
             assert torch.equal(a.obs, b.obs) and torch.equal(a.reward, b.reward), (
-                "the same numbers, fresh with each replay"
+                "the same numbers, newly_seen with each replay"
             )
         assert (
             isinstance(env._step, capture.Graph)

@@ -48,7 +48,7 @@ def test_a_typo_is_exit_code_2_and_leaves_nothing(tmp_path):
     code, out, err = finished("train", "env=explorr", "learner.lrr=1", "env.n_envs=0", cwd=tmp_path)
     assert code == 2 and out == ""
     assert err.splitlines() == [
-        "train.py: 3 faults in the configuration",
+        "train.py: 3 errors in the configuration",
         "  env: 'explorr' is unknown; did you mean explorer?",
         "  learner.lrr: no such key; did you mean learner.lr?",
         "  env.n_envs: 0 is out of range: allowed is from 1 to 67,108,864",

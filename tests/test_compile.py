@@ -124,9 +124,9 @@ def test_no_compiler_is_one_sentence_with_the_cure(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", "/nonexistent")
     with pytest.raises(
         compile.EngineError, match="CXX=/nonexistent is not a program: install one .*or set CXX"
-    ) as fault:
+    ) as error:
         compile._compiler()
-    assert "\n" not in str(fault.value)
+    assert "\n" not in str(error.value)
     monkeypatch.delenv("CXX")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(compile.EngineError, match="needs a C\\+\\+ compiler and none"):

@@ -5,22 +5,25 @@ import dataclasses
 
 import pytest
 
-from configs import commandline, settings
-from configs.settings import Evaluate, Faults, Record, Train, build
+from agents.cli import compose as compose_module
+from agents.cli import settings
+from agents.cli.command import run_command
+from agents.cli.compose import ConfigLoader
+from agents.cli.settings import ConfigErrors, Evaluate, Record, Train, build
 from megastep import envs, geometries
 
 SCRIPTS = {"train": Train, "evaluate": Evaluate, "record": Record}
 
 
 def compose(*overrides, script="train"):
-    with commandline.Door(script, SCRIPTS[script]) as door:
+    with ConfigLoader(script, SCRIPTS[script]) as door:
         return build(SCRIPTS[script], door.tree(list(overrides)))
 
 
-def faults(*overrides, script="train"):
-    with pytest.raises(Faults) as error:
+def errors(*overrides, script="train"):
+    with pytest.raises(ConfigErrors) as error:
         compose(*overrides, script=script)
-    return dict(error.value.faults)
+    return dict(error.value.errors)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +46,7 @@ def test_every_group_member_composes(choice):
 
 
 def test_every_member_of_every_group_is_tested_above_or_needs_more():
-    with commandline.Door("train", Train) as door:
+    with ConfigLoader("train", Train) as door:
         groups = door.groups()
     assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "experiment"}
     assert set(groups["env"]) == set(envs.ENVS) == set(settings.ENVS)
@@ -71,7 +74,7 @@ def test_the_keys_of_an_environment_are_its_arguments():
 
 def test_sizes_follow_the_device(monkeypatch):
     small = compose("agent=small")
-    monkeypatch.setattr(commandline, "_has_gpu", lambda device: device != "cpu")
+    monkeypatch.setattr(compose_module, "_has_gpu", lambda device: device != "cpu")
     assert compose() == compose("agent=large") != small
     assert compose("experiment=newcomer").env.n_envs == compose("agent=large").env.n_envs
     assert compose("device=cpu") == dataclasses.replace(small, device="cpu")
@@ -79,23 +82,23 @@ def test_sizes_follow_the_device(monkeypatch):
 
 
 def test_a_typo_names_the_nearest_key():
-    assert "learner.lr?" in faults("learner.lrr=1")["learner.lrr"]
-    assert "learner.lr?" in faults("lr=1")["lr"]
-    assert "env.n_envs?" in faults("n_envs=8")["n_envs"]
-    assert "device?" in faults("devise=cpu")["devise"]
-    assert "geometry?" in faults("geometri=box")["geometri"]
+    assert "learner.lr?" in errors("learner.lrr=1")["learner.lrr"]
+    assert "learner.lr?" in errors("lr=1")["lr"]
+    assert "env.n_envs?" in errors("n_envs=8")["n_envs"]
+    assert "device?" in errors("devise=cpu")["devise"]
+    assert "geometry?" in errors("geometri=box")["geometri"]
 
 
 def test_an_unknown_member_names_the_nearest_one():
-    assert "explorer?" in faults("env=explorr")["env"]
-    assert "homes?" in faults("geometry=home")["geometry"]
-    assert "newcomer?" in faults("experiment=newcomr")["experiment"]
-    assert "test?" in faults("run=x", "split=tset", script="evaluate")["split"]
-    assert "minimal" in faults("env.name=zzz")["env.name"]
+    assert "explorer?" in errors("env=explorr")["env"]
+    assert "homes?" in errors("geometry=home")["geometry"]
+    assert "newcomer?" in errors("experiment=newcomr")["experiment"]
+    assert "test?" in errors("run=x", "split=tset", script="evaluate")["split"]
+    assert "minimal" in errors("env.name=zzz")["env.name"]
 
 
 def test_all_faults_are_listed_at_once():
-    found = faults(
+    found = errors(
         "env=explorr", "learner.lrr=1", "learner.lr=-1", "learner.gamma=nan", "seed=x", "device=gpu"
     )
     assert set(found) == {"env", "learner.lrr", "learner.lr", "learner.gamma", "seed", "device"}
@@ -103,7 +106,7 @@ def test_all_faults_are_listed_at_once():
 
 @pytest.fixture(scope="module")
 def tree():
-    with commandline.Door("train", Train) as door:
+    with ConfigLoader("train", Train) as door:
         return door.tree([])
 
 
@@ -157,42 +160,42 @@ def test_values_out_of_range_are_named_with_their_key(tree, key, value):
     for group in groups:
         target = target[group]
     target[last] = value
-    with pytest.raises(Faults) as error:
+    with pytest.raises(ConfigErrors) as error:
         build(Train, changed)
-    assert [path for path, _ in error.value.faults] == [key]
+    assert [path for path, _ in error.value.errors] == [key]
 
 
 def test_a_missing_key_is_named(tree):
-    with pytest.raises(Faults, match="seed: is missing"):
+    with pytest.raises(ConfigErrors, match="seed: is missing"):
         build(Train, {key: value for key, value in tree.items() if key != "seed"})
 
 
 def test_a_range_is_told():
-    assert faults("env.res=1025")["env.res"] == "1025 is out of range: allowed is from 1 to 1,024"
+    assert errors("env.res=1025")["env.res"] == "1025 is out of range: allowed is from 1 to 1,024"
     assert (
-        faults("env.fov=180")["env.fov"]
+        errors("env.fov=180")["env.fov"]
         == "180.0 is out of range: allowed is above 0 and below 180"
     )
 
 
 def test_settings_that_contradict_each_other_are_named():
-    assert "256" in faults("env.subsample=3")["env.subsample"]
-    assert "2" in faults("env.n_envs=2")["learner.n_minibatches"]
-    assert "path" in faults("geometry=files")["geometry.path"]
-    assert "resume" in faults("resume=a", "init=b")["init"]
+    assert "256" in errors("env.subsample=3")["env.subsample"]
+    assert "2" in errors("env.n_envs=2")["learner.n_minibatches"]
+    assert "path" in errors("geometry=files")["geometry.path"]
+    assert "resume" in errors("resume=a", "init=b")["init"]
 
 
 @pytest.mark.parametrize("override", ["+x=1", "~env", "a=[", "env@x=minimal"])
 def test_what_is_no_override_is_refused(override):
-    assert set(faults(override)) == {override}
+    assert set(errors(override)) == {override}
 
 
 def test_several_values_need_multirun():
-    assert "add -m" in faults("seed=1,2")["seed"]
+    assert "add -m" in errors("seed=1,2")["seed"]
 
 
 def test_a_sweep_is_every_combination():
-    with commandline.Door("train", Train) as door:
+    with ConfigLoader("train", Train) as door:
         jobs = [
             overrides
             for overrides, _ in door.jobs(
@@ -207,18 +210,18 @@ def test_a_sweep_is_every_combination():
 
 
 def test_a_sweep_is_checked_before_its_first_job():
-    with commandline.Door("train", Train) as door, pytest.raises(Faults, match="learner.lr"):
+    with ConfigLoader("train", Train) as door, pytest.raises(ConfigErrors, match="learner.lr"):
         door.jobs(["learner.lr=1e-3,-1"], True)
 
 
 def test_help_lists_groups_and_members(capsys):
-    assert commandline.main("train", Train, None, "Trains.", ["--help"]) == 0
+    assert run_command("train", Train, None, "Trains.", ["--help"]) == 0
     text = capsys.readouterr().out
     assert "explorer, minimal" in text and "newcomer" in text and "--multirun" in text
 
 
 def test_the_composed_configuration_is_printed(capsys):
-    assert commandline.main("train", Train, None, "", ["--cfg", "job", "learner.lr=0.5"]) == 0
+    assert run_command("train", Train, None, "", ["--cfg", "job", "learner.lr=0.5"]) == 0
     assert "lr: 0.5" in capsys.readouterr().out
 
 
@@ -229,6 +232,6 @@ def test_a_sweep_goes_past_a_failing_job(capsys, tmp_path, monkeypatch):
         if cfg.seed == 1:
             raise ZeroDivisionError("by chance")
 
-    assert commandline.main("train", Train, run, "", ["-m", "seed=1,2"]) == 2
+    assert run_command("train", Train, run, "", ["-m", "seed=1,2"]) == 2
     out = capsys.readouterr().out
     assert "FAILED: ZeroDivisionError: by chance" in out and "done" in out

@@ -1,5 +1,5 @@
 """The engine against the laws: the original's golden outputs, the brute-force twin on random
-worlds, and the CPU against the GPU bit by bit.
+environments, and the CPU against the GPU bit by bit.
 """
 
 import math
@@ -7,8 +7,8 @@ import math
 import compare
 import numpy as np
 import pytest
+import random_scenery
 import torch
-import worlds
 
 from megastep import cuda, engine, scene, toys
 from megastep.geometries import sample
@@ -53,9 +53,9 @@ def state_of(core, physics):
 # ---- Golden: what the original computed, within the tolerances its README gives ----
 
 
-@pytest.mark.parametrize("case", worlds.CASES)
+@pytest.mark.parametrize("case", random_scenery.CASES)
 def test_golden(case, device):
-    world, settings, _ = worlds.golden(case)
+    world, settings, _ = random_scenery.golden(case)
     core = core_of(world, device, **settings)
     cuda.bake(core.scenery)
     poison()
@@ -66,7 +66,7 @@ def test_golden(case, device):
     compare.check_golden(case, state_of(core, cuda.physics(core.scenery, core.agents)))
 
 
-# ---- The twin: random worlds, all degenerate cases ----
+# ---- The twin: random environments, all degenerate cases ----
 
 VIEWS = [
     dict(res=1, fov=130.0),
@@ -80,10 +80,10 @@ VIEWS = [
 
 @pytest.mark.parametrize("n_agents", [1, 4])
 @pytest.mark.parametrize("view", VIEWS, ids=str)
-@pytest.mark.parametrize("degenerate", [(), worlds.EVERYTHING], ids=["plain", "degenerate"])
+@pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
 def test_twin_sight(view, n_agents, degenerate, device):
     for seed in range(2):
-        world = worlds.random_world(
+        world = random_scenery.random_world(
             seed,
             n_agents=n_agents,
             degenerate=degenerate,
@@ -100,10 +100,10 @@ def test_twin_sight(view, n_agents, degenerate, device):
 
 
 @pytest.mark.parametrize("n_agents", [1, 4])
-@pytest.mark.parametrize("name", [None, *worlds.DEGENERATE, "overlap"])
+@pytest.mark.parametrize("name", [None, *random_scenery.DEGENERATE, "overlap"])
 def test_twin_physics(name, n_agents, device):
     for seed in range(6):
-        world = worlds.random_world(
+        world = random_scenery.random_world(
             seed,
             n_envs=16,
             n_agents=n_agents,
@@ -122,13 +122,13 @@ def test_twin_physics(name, n_agents, device):
 @pytest.mark.parametrize("n_agents", [1, 3])
 @pytest.mark.parametrize("subsample", [1, 4])
 def test_observe_composes(n_agents, subsample, device):
-    world = worlds.random_world(
-        5, n_envs=8, n_agents=n_agents, degenerate=worlds.EVERYTHING, res=64
+    world = random_scenery.random_world(
+        5, n_envs=8, n_agents=n_agents, degenerate=random_scenery.EVERYTHING, res=64
     )
     core = core_of(world, device, res=64)
     cuda.bake(core.scenery)
     seen = torch.zeros(
-        (8, n_agents, -(-core.scenery.designs.most_texels // 32)), dtype=torch.int32, device=device
+        (8, n_agents, -(-core.scenery.layouts.max_texels // 32)), dtype=torch.int32, device=device
     )
     o = engine.observe(core.scenery, core.agents, subsample, imu=True, middle=True, seen=seen)
     r = cuda.render(core.scenery, core.agents)
@@ -145,25 +145,23 @@ def test_observe_composes(n_agents, subsample, device):
         )
         .sum(1)
         .view(8, n_agents),
-        o.fresh.cpu().long(),
-    ), "fresh"
+        o.newly_seen.cpu().long(),
+    ), "newly_seen"
     again = engine.observe(core.scenery, core.agents, subsample, seen=seen)
-    assert not again.fresh.any(), "a texel is new only once"
+    assert not again.newly_seen.any(), "a texel is new only once"
     forgot = engine.observe(
-        core.scenery, core.agents, subsample, seen=seen, forget=core.agent_full(True)
+        core.scenery, core.agents, subsample, seen=seen, clear_mask=core.agent_full(True)
     )
-    assert torch.equal(forgot.fresh, o.fresh), "forgetting starts anew"
+    assert torch.equal(forgot.newly_seen, o.newly_seen), "forgetting starts anew"
 
 
 def bits_seen(core, r):
     """What `seen` must hold after one look, from a full render, agent by agent."""
-    scenery, designs = core.scenery, core.scenery.designs
-    out = torch.zeros(
-        (core.n_envs, core.n_agents, -(-designs.most_texels // 32)), dtype=torch.int64
-    )
-    own, starts = scenery.agent_lines.shape[1], designs.texel_starts.tolist()
+    scenery, layouts = core.scenery, core.scenery.layouts
+    out = torch.zeros((core.n_envs, core.n_agents, -(-layouts.max_texels // 32)), dtype=torch.int64)
+    own, starts = scenery.agent_lines.shape[1], layouts.texel_starts.tolist()
     for e in range(core.n_envs):
-        first = int(designs.wall_starts[int(scenery.design[e])])
+        first = int(layouts.wall_starts[int(scenery.layout[e])])
         for a in range(core.n_agents):
             for line, location in zip(r.indices[e, a].tolist(), r.locations[e, a].tolist()):
                 if line >= own:
@@ -187,13 +185,13 @@ def trajectory(device, n_agents, subsample=1, **settings):
     core = cuda.Core(scene.scenery(homes, n_agents, n_envs=24, device=device), **settings)
     spawn, seen = RandomSpawns(homes, core), None
     seen = torch.zeros(
-        (24, n_agents, -(-core.scenery.designs.most_texels // 32)), dtype=torch.int32, device=device
+        (24, n_agents, -(-core.scenery.layouts.max_texels // 32)), dtype=torch.int32, device=device
     )
     random = torch.Generator().manual_seed(1)
     moves = torch.tensor(
         [(0, 0, 0), (3, 0, 0), (0, 3, 40), (9, 1, -40)], dtype=torch.float32, device=device
     )
-    out = [core.scenery.designs.baked.vals]
+    out = [core.scenery.layouts.baked.vals]
     for step in range(12):
         spawn(torch.rand((24, n_agents), generator=random).to(device) < (1 if step == 0 else 0.1))
         actions = torch.randint(4, (24, n_agents), generator=random).to(device)
@@ -310,7 +308,7 @@ def test_two_cores_live_side_by_side(device):
 
 def test_designs_are_shared(device):
     scenery = scene.scenery([toys.box(), toys.column()], n_agents=1, n_envs=6, device=device)
-    assert scenery.design.tolist() == [0, 1, 0, 1, 0, 1] and len(scenery.designs) == 2
+    assert scenery.layout.tolist() == [0, 1, 0, 1, 0, 1] and len(scenery.layouts) == 2
     lines, textures, baked = scenery.lines, scenery.textures, scenery.baked
     assert (
         len(lines) == 6
@@ -331,7 +329,7 @@ def test_designs_are_shared(device):
 def test_draws_are_philox(device):
     """Against the published vector for key 0, counter 0 (Random123's kat_vectors)."""
     counts = torch.zeros(1, dtype=torch.int32, device=device)
-    out = engine.draw(
+    out = engine.uniform(
         counts,
         torch.ones(1, dtype=torch.bool, device=device),
         0,

@@ -237,12 +237,12 @@ def test_explorer_resamples_homes_at_respawn_alone(device):
     )
     env.reset()
     for _ in range(60):
-        before = env.core.scenery.design.clone()
+        before = env.core.scenery.layout.clone()
         world = env.step(arrdict.arrdict(actions=contract.random_actions(env, generator)))
-        changed = before != env.core.scenery.design
+        changed = before != env.core.scenery.layout
         assert not bool((changed & ~world.reset).any()), "homes change at respawns alone"
         moved += int(changed.sum())
-    assert moved and set(env.core.scenery.design.tolist()) <= {0, 1, 2, 3}
+    assert moved and set(env.core.scenery.layout.tolist()) <= {0, 1, 2, 3}
     assert int(env.state(0).seen.sum()) == int(env.n_seen[0]), (
         "what was seen belongs to the new home"
     )

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-import evaluate
-import train
 from agents import evaluation
-from configs import commandline
-from configs.settings import Evaluate, Fault, Train, build
+from agents.cli import evaluate, train
+from agents.cli.compose import ConfigLoader
+from agents.cli.settings import Evaluate, Train, UserError, build
 from megastep import spaces
 from megastep.arrdict import arrdict
 
@@ -115,7 +114,7 @@ def test_in_one_home_lanes_are_drawn():
 
 
 def configured(**changes):
-    with commandline.Door("evaluate", Evaluate) as door:
+    with ConfigLoader("evaluate", Evaluate) as door:
         return dataclasses.replace(
             build(Evaluate, door.tree(["run=latest", "lanes=6", "device=cpu"])), **changes
         )
@@ -124,7 +123,7 @@ def configured(**changes):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A run folder, and the folder it was trained from."""
-    with commandline.Door("train", Train) as door, pytest.MonkeyPatch.context() as patch:
+    with ConfigLoader("train", Train) as door, pytest.MonkeyPatch.context() as patch:
         base = tmp_path_factory.mktemp("trained")
         patch.chdir(base)
         return base / train.run(build(Train, door.tree(TINY)))
@@ -157,7 +156,7 @@ def test_it_is_reproducible_and_other_homes_can_be_chosen(trained):
             row["length"] for row in json.loads((trained / "evaluation.json").read_text())["rows"]
         ]
 
-    with commandline.Door("evaluate", Evaluate) as door:
+    with ConfigLoader("evaluate", Evaluate) as door:
         bench = build(Evaluate, door.tree(["run=x", "geometry=bench", "geometry.n=3"])).geometry
     assert lengths() == lengths() != lengths(seed=2)
     evaluate.run(
@@ -179,7 +178,7 @@ def test_a_checkpoint_of_another_environment_is_refused_with_both_shapes(trained
     loaded = checkpoint.load(trained / "checkpoints")
     loaded.config["train"]["env"]["res"] = 16
     checkpoint.save(tmp_path / "checkpoints", 32, loaded.state, loaded.config)
-    with pytest.raises(Fault, match=r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)"):
+    with pytest.raises(UserError, match=r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)"):
         evaluate.run(configured(run=str(tmp_path)))
 
 

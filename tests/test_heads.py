@@ -93,7 +93,7 @@ def test_leaves_have_the_same_say_at_the_start():
     for part in (of_rgb, of_imu):
         assert part.sum(1).var().item() == pytest.approx(
             1, abs=0.1
-        )  # 4096 samples: 4.5 standard errors
+        )  # 4096 samples: 4.5 norm errors
 
 
 def test_logits_are_log_probabilities_that_an_env_can_be_given():
@@ -187,7 +187,7 @@ def test_rescaling_a_value_changes_no_prediction():
     value, x = heads.ValueOutput(WIDTH), torch.randn(200, WIDTH)
     before = value(x)
     for offset in (0.0, 300.0, 310.0):
-        value.rescale(torch.randn(64) * 20 + offset, EVERY)
+        value.update_stats(torch.randn(64) * 20 + offset, EVERY)
         assert value.mean.item() != 0 and value.scale.item() != 1
         torch.testing.assert_close(
             value(x), before, rtol=1e-4, atol=1e-4
@@ -196,20 +196,20 @@ def test_rescaling_a_value_changes_no_prediction():
 
 def test_a_value_learns_the_mean_and_deviation_of_what_is_valid():
     value = heads.ValueOutput(WIDTH)
-    value.rescale(torch.tensor([1.0, 5.0, torch.nan]), torch.tensor([True, True, False]))
+    value.update_stats(torch.tensor([1.0, 5.0, torch.nan]), torch.tensor([True, True, False]))
     assert value.mean.item() == pytest.approx(3) and value.scale.item() == pytest.approx(2)
-    value.rescale(torch.full((64,), 9.0), EVERY)
+    value.update_stats(torch.full((64,), 9.0), EVERY)
     # The second of two calls weighs a half: mean 6, mean square (13 + 81) / 2 = 47, deviation
     # sqrt(47 - 36)
     assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
-    value.rescale(torch.full((64,), 7.0), ~EVERY)
+    value.update_stats(torch.full((64,), 7.0), ~EVERY)
     assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
 
 
 def test_returns_that_never_vary_do_not_divide_by_zero():
     value = heads.ValueOutput(WIDTH)
     for _ in range(5):
-        value.rescale(torch.zeros(64), EVERY)
+        value.update_stats(torch.zeros(64), EVERY)
     assert (
         value.scale.item() == pytest.approx(1e-3) and value(torch.randn(8, WIDTH)).isfinite().all()
     )
@@ -224,8 +224,8 @@ def test_pictures_are_standardised_by_channel_and_vectors_by_number():
         .expand(4, -1, -1, -1, -1)
     )
     imu = torch.tensor([[5.0, 0.0], [7.0, 0.0], [5.0, 0.0], [7.0, 0.0]])[:, None]
-    intake.rescale(arrdict(rgb=rgb.half(), imu=imu.half()))
-    of_rgb, of_imu = intake.standards
+    intake.update_stats(arrdict(rgb=rgb.half(), imu=imu.half()))
+    of_rgb, of_imu = intake.norms
     torch.testing.assert_close(
         of_rgb(rgb)[0, 0, 0, 0], torch.tensor([-(1.5**0.5), 0.0, 1.5**0.5])
     )  # deviation sqrt 2/3
@@ -236,7 +236,7 @@ def test_pictures_are_standardised_by_channel_and_vectors_by_number():
     assert not of_imu(imu)[..., 1].any()  # what never varies divides by no zero
 
     # A second call weighs a half: mean (6 + 10) / 2, mean square (37 + 100) / 2
-    intake.rescale(arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
+    intake.update_stats(arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
     assert of_imu.mean[0, 0].item() == 8 and of_imu.scale[0, 0].item() == pytest.approx(
         (137 / 2 - 64) ** 0.5
     )
@@ -244,6 +244,6 @@ def test_pictures_are_standardised_by_channel_and_vectors_by_number():
 
 def test_what_was_learned_about_observations_is_saved_with_the_weights():
     intake, other, obs = heads.intake(TREE, WIDTH), heads.intake(TREE, WIDTH), draw(TREE, 6)
-    intake.rescale(obs)
+    intake.update_stats(obs)
     other.load_state_dict(intake.state_dict())
     assert torch.equal(other(obs), intake(obs))

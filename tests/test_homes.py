@@ -10,7 +10,7 @@ import pytest
 from megastep import geometry
 from megastep.dotdict import dotdict
 from megastep.geometries import homes
-from megastep.geometries.homes import database, draws, openings, partition, plan, regions
+from megastep.geometries.homes import database, openings, partition, plan, random_stream, regions
 from scripts import check_homes, make_homes, show_homes
 
 matplotlib.use("Agg")
@@ -34,22 +34,24 @@ def ready():
 def test_draws_are_those_of_splitmix64():
     # The first outputs of the published generator from state 0, which is `mixed` of multiples of
     # its increment.
-    outputs = [draws.mixed(k * draws.GOLDEN & draws.MASK) for k in (1, 2, 3)]
+    outputs = [
+        random_stream.mixed(k * random_stream.GOLDEN & random_stream.MASK) for k in (1, 2, 3)
+    ]
     assert outputs == [0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F]
 
 
 def test_draws_differ_between_seeds_and_not_between_runs():
-    assert draws.Draws(5).bits() == 0x4000795F8E33B2A8
-    assert len({draws.Draws(seed).bits() for seed in range(-100, 1000)}) == 1100
+    assert random_stream.RandomStream(5).bits() == 0x4000795F8E33B2A8
+    assert len({random_stream.RandomStream(seed).bits() for seed in range(-100, 1000)}) == 1100
 
 
 def test_exp_is_the_exponential():
     for x in np.linspace(-19, 19, 77):
-        assert draws.exp(float(x)) == pytest.approx(math.exp(x), rel=1e-11)
+        assert random_stream.exp(float(x)) == pytest.approx(math.exp(x), rel=1e-11)
 
 
 def test_draws_have_the_moments_they_claim():
-    stream, n = draws.Draws(1), 20_000
+    stream, n = random_stream.RandomStream(1), 20_000
     uniform, normal = (
         np.array([draw() for _ in range(n)]) for draw in (stream.uniform, stream.normal)
     )
@@ -82,7 +84,7 @@ def test_regions_of_an_l():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_partition_covers_its_footprint_once(seed):
-    stream = draws.Draws(seed)
+    stream = random_stream.RandomStream(seed)
     for _ in range(60):
         rooms = plan.programme(7, stream)
         footprint = plan.footprint(sum(size for _, size in rooms), stream)
@@ -141,16 +143,16 @@ def test_the_ready_homes_are_the_generated_ones(made):
 
 
 def test_every_fresh_home_passes_the_checks(made):
-    assert [(g.id, fault) for g in made for fault in check_homes.faults(g)] == []
+    assert [(g.id, error) for g in made for error in check_homes.errors(g)] == []
 
 
 def test_ready_homes_pass_the_checks(ready):
-    assert [(g.id, fault) for g in ready[::50] for fault in check_homes.faults(g)] == []
+    assert [(g.id, error) for g in ready[::50] for error in check_homes.errors(g)] == []
 
 
 @pytest.mark.slow
 def test_all_ready_homes_pass_the_checks(ready):
-    assert [(g.id, fault) for g in ready for fault in check_homes.faults(g)] == []
+    assert [(g.id, error) for g in ready for error in check_homes.errors(g)] == []
 
 
 def open_envelope(g):
@@ -183,15 +185,15 @@ def room(walls=None):
 
 
 def test_the_checks_know_a_passage_from_a_wall():
-    assert check_homes.faults(room()) == [] and check_homes.faults(room(shut(room(), 0.6))) == []
-    assert check_homes.faults(room(shut(room(), 0.4))) == [
+    assert check_homes.errors(room()) == [] and check_homes.errors(room(shut(room(), 0.6))) == []
+    assert check_homes.errors(room(shut(room(), 0.4))) == [
         "a disc as wide as the least gap cannot reach every room"
     ]
-    assert check_homes.faults(room(shut(room(), 0.1)))[0] == "an agent cannot reach every room"
+    assert check_homes.errors(room(shut(room(), 0.1)))[0] == "an agent cannot reach every room"
 
 
 @pytest.mark.parametrize(
-    "fault, change",
+    "error, change",
     [
         ("a wall is not finite", lambda g: g.walls.__setitem__((0, 1), g.walls[0, 0])),
         ("two walls are the same", lambda g: g.walls.__setitem__(1, g.walls[0, ::-1])),
@@ -216,10 +218,10 @@ def test_the_checks_know_a_passage_from_a_wall():
         ("a light is in a wall", lambda g: g.lights.__setitem__((0, 0), 1.04)),
     ],
 )
-def test_the_checks_see(fault, change):
+def test_the_checks_see(error, change):
     g = room()
     change(g)
-    assert any(fault in found for found in check_homes.faults(g)), check_homes.faults(g)
+    assert any(error in found for found in check_homes.errors(g)), check_homes.errors(g)
 
 
 def test_components_are_those_of_a_flood_fill():

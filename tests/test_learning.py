@@ -5,9 +5,9 @@ seconds.
 import pytest
 import torch
 
-from agents import buffers
 from agents.policy import Policy
 from agents.ppo import PPO
+from agents.rollout import Rollout, collect, initial_actor_state
 from megastep import spaces
 from megastep.arrdict import arrdict
 
@@ -116,11 +116,11 @@ def learn(world, n_updates, policy=None, n_steps=16, **how):
     ends, valid steps).
     """
     policy = policy or Policy(world.obs_space, world.action_space, width=32)
-    rollout = buffers.Rollout(n_steps, B, world.obs_space, world.action_space)
+    rollout = Rollout(n_steps, B, world.obs_space, world.action_space)
     learner = PPO(policy, **{**dict(lr=5e-3, n_epochs=2, n_minibatches=4), **how})
-    carry, counts = buffers.start(world, policy), torch.zeros(3)
+    actor_state, counts = initial_actor_state(world, policy), torch.zeros(3)
     for i in range(n_updates):
-        buffers.collect(world, policy, rollout, carry)
+        collect(world, policy, rollout, actor_state)
         if i >= n_updates - 10:
             counts += torch.stack(
                 [rollout.reward.sum(), rollout.terminal.sum(), (~rollout.reset).sum()]
@@ -143,7 +143,7 @@ def test_a_cue_is_remembered():
 
 
 def test_memory_starts_anew_with_every_episode():
-    how, world = dict(n_updates=60, lr=1e-2, entropy=0.03), Clock()
+    how, world = dict(n_updates=60, lr=1e-2, entropy_coef=0.03), Clock()
     _, rewards, _, valid = learn(world, **how)
     assert rewards / valid > 0.9
     leaky = Forgetless(world.obs_space, world.action_space, width=32)

@@ -181,12 +181,12 @@ def test_colours_land_where_the_walls_are():
 def test_sight_reaches_each_hit_leftmost_ray_first(ax):
     # Facing +y with 90 degrees and two rays, these look along (1, 1/2) and (1, -1/2): left of +y is
     # -x.
-    patch = plotting.plot_sight(ax, (1, 1), 90, 90, distances=[5**0.5, np.inf], reach=2 * 5**0.5)
+    patch = plotting.plot_view(ax, (1, 1), 90, 90, distances=[5**0.5, np.inf], reach=2 * 5**0.5)
     assert np.allclose(patch.get_xy()[:3], [[1, 1], [0, 3], [3, 5]])
 
 
 def test_sight_without_distances_is_a_wedge_of_its_field_of_view(ax):
-    rim = plotting.plot_sight(ax, (0, 0), 0, 60, reach=2.0).get_xy()[1:-1]
+    rim = plotting.plot_view(ax, (0, 0), 0, 60, reach=2.0).get_xy()[1:-1]
     assert np.allclose(np.linalg.norm(rim, axis=1), 2)
     degrees = np.degrees(np.arctan2(rim[:, 1], rim[:, 0]))
     assert 28 < degrees[0] < 30 and -30 < degrees[-1] < -28 and (np.diff(degrees) < 0).all()

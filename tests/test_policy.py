@@ -7,8 +7,8 @@ import io
 import pytest
 import torch
 
-from agents.draws import Draws
 from agents.policy import Policy
+from agents.random_stream import RandomStream
 from megastep import spaces
 from megastep.arrdict import arrdict, stack
 
@@ -86,7 +86,7 @@ def test_a_generator_of_ones_own_decides_the_actions():
 
 def test_weights_load_from_plain_tensors():
     policy, twin = Policy(OBS, MOVES, width=32, seed=1), Policy(OBS, MOVES, width=32, seed=2)
-    policy.value.rescale(torch.tensor([1.0, 9.0]), torch.tensor([True, True]))
+    policy.value.update_stats(torch.tensor([1.0, 9.0]), torch.tensor([True, True]))
     file = io.BytesIO()
     torch.save(policy.state_dict(), file)
     file.seek(0)
@@ -104,12 +104,12 @@ def test_a_width_of_zero_is_refused():
 
 
 def test_draws_go_on_where_they_were_saved():
-    draws, cpu = Draws(3), torch.device("cpu")
-    untouched = draws.state_dict()
-    start = torch.rand(4, generator=draws.on(cpu))
-    saved = draws.state_dict()
-    rest = torch.rand(4, generator=draws.on(cpu))
-    other = Draws(8)
+    stream, cpu = RandomStream(3), torch.device("cpu")
+    untouched = stream.state_dict()
+    start = torch.rand(4, generator=stream.on(cpu))
+    saved = stream.state_dict()
+    rest = torch.rand(4, generator=stream.on(cpu))
+    other = RandomStream(8)
     other.load_state_dict(saved, cpu)
     assert torch.equal(torch.rand(4, generator=other.on(cpu)), rest)
     other.load_state_dict(untouched, cpu)

@@ -8,8 +8,9 @@ import math
 import pytest
 import torch
 
-from agents import buffers, ppo
+from agents import ppo
 from agents.policy import Policy
+from agents.rollout import Rollout
 from megastep import spaces
 from megastep.arrdict import arrdict
 
@@ -26,7 +27,7 @@ def made_up(seed=0, device="cpu"):
         policy.output.core.weight.mul_(
             100
         )  # a policy with opinions, so that gradients differ by action
-    rollout = buffers.Rollout(T, B, OBS, MOVES, device, obs_dtype=torch.float32)
+    rollout = Rollout(T, B, OBS, MOVES, device, obs_dtype=torch.float32)
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape):
@@ -36,17 +37,17 @@ def made_up(seed=0, device="cpu"):
     rollout.starts[3, 1] = rollout.starts[5, 4] = True
     rollout.terminal[1, 1] = rollout.truncated[3, 4] = True
     rollout.reward[:] = normal(T, B)
-    rollout.remember(policy.initial(B))
+    rollout.store_memory(policy.initial(B))
     with torch.no_grad():
         seen = policy.unroll(rollout.obs, rollout.starts, rollout.state)
         rollout.values[:] = seen.value
-        rollout.actions[:] = policy.output.sample(seen.logits[:-1], policy.draws.on(policy.device))
+        rollout.actions[:] = policy.output.sample(seen.logits[:-1], policy.random.on(policy.device))
         rollout.logprobs[:] = policy.output.logprob(seen.logits[:-1], rollout.actions)
     return policy, rollout
 
 
 def weights(policy):
-    """All but the value's own layer, which `rescale` changes without changing what it says."""
+    """All but the value's own layer, which `update_stats` changes without changing what it says."""
     return torch.cat(
         [
             p.detach().flatten()
@@ -169,9 +170,9 @@ def test_an_update_learns_how_observations_are_spread():
     policy, rollout = made_up()
     rollout.obs += 5
     ppo.PPO(policy).update(rollout)
-    standard, last = policy.intake.standards[0], rollout.obs[-1]
-    torch.testing.assert_close(standard.mean, last.mean(0))
-    torch.testing.assert_close(standard(last).std(0, correction=0), torch.ones(1, 4))
+    norm, last = policy.intake.norms[0], rollout.obs[-1]
+    torch.testing.assert_close(norm.mean, last.mean(0))
+    torch.testing.assert_close(norm(last).std(0, correction=0), torch.ones(1, 4))
 
 
 def test_the_learning_rate_can_be_changed():
@@ -206,7 +207,7 @@ def test_a_saved_learner_goes_on_bit_by_bit(n_before):
     resumed.update(rollout)
     assert torch.equal(weights(other), weights(policy))
     assert torch.equal(
-        other.draws.on(other.device).get_state(), policy.draws.on(policy.device).get_state()
+        other.draws.on(other.device).get_state(), policy.random.on(policy.device).get_state()
     )
     resumed.set_lr(0.0)  # still reaches the optimizer
     resumed.update(rollout)
@@ -222,8 +223,8 @@ def test_minibatches_need_lanes():
 def test_nested_actions_learn_together():
     moves = arrdict(move=MOVES, fire=spaces.MultiDiscrete(1, 2))
     policy = Policy(OBS, moves, width=WIDTH)
-    rollout = buffers.Rollout(T, B, OBS, moves)
-    rollout.remember(policy.initial(B))
+    rollout = Rollout(T, B, OBS, moves)
+    rollout.store_memory(policy.initial(B))
     rollout.logprobs[:] = math.log(1 / 6)
     rollout.reward[:] = torch.randn(T, B)
     before = weights(policy)

@@ -5,10 +5,9 @@ import sys
 
 import pytest
 
-import record
-import train
-from configs import commandline
-from configs.settings import Train, build
+from agents.cli import record, train
+from agents.cli.compose import ConfigLoader
+from agents.cli.settings import Train, build
 from megastep import recording
 
 TINY = [
@@ -27,7 +26,7 @@ TINY = [
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    with commandline.Door("train", Train) as door, pytest.MonkeyPatch.context() as patch:
+    with ConfigLoader("train", Train) as door, pytest.MonkeyPatch.context() as patch:
         base = tmp_path_factory.mktemp("trained")
         patch.chdir(base)
         return base / train.run(build(Train, door.tree(TINY)))

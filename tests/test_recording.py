@@ -1,4 +1,4 @@
-"""Videos: order, sizes, workers, faults, files."""
+"""Videos: order, sizes, workers, errors, files."""
 
 import os
 import subprocess
@@ -245,7 +245,7 @@ def test_frames_of_another_size_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("array", "fault"),
+    ("array", "error"),
     [
         (np.zeros((4, 4)), r"shape \(H, W, 3\), but this one has \(4, 4\)"),
         (np.zeros((4, 4, 4)), r"has \(4, 4, 4\)"),
@@ -253,8 +253,8 @@ def test_frames_of_another_size_are_refused():
         (np.zeros((4, 4, 3), int), "uint8 or floats from 0 to 1, but this one holds int"),
     ],
 )
-def test_what_is_no_picture_is_refused(array, fault):
-    with pytest.raises(ValueError, match=fault), ParallelEncoder(plot_grey) as encoder:
+def test_what_is_no_picture_is_refused(array, error):
+    with pytest.raises(ValueError, match=error), ParallelEncoder(plot_grey) as encoder:
         encoder.frame(array)
 
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 import yaml
 
-import train
 from agents import checkpoint, metrics
-from configs import commandline, settings
-from configs.interruptions import Interrupted
-from configs.settings import Fault, Faults, Train, build
+from agents.cli import settings, train
+from agents.cli.compose import ConfigLoader
+from agents.cli.settings import ConfigErrors, Train, UserError, build
+from agents.cli.signals import Interrupted
 
 TINY = [
     "env=minimal",
@@ -37,7 +37,7 @@ UPDATE = 4 * 8  # samples of one update
 def configured(*overrides, tiny=TINY):
     """The settings as train.main makes them."""
     overrides = [*tiny, *overrides]
-    with commandline.Door("train", Train) as door:
+    with ConfigLoader("train", Train) as door:
         return build(Train, train.resumed(door.tree(overrides), overrides))
 
 
@@ -112,9 +112,9 @@ def test_a_run_goes_on_under_its_own_configuration(here):
 
 def test_what_is_learnt_cannot_change_when_a_run_goes_on(here):
     folder = train.run(configured("samples=1"))
-    with pytest.raises(Faults) as error:
+    with pytest.raises(ConfigErrors) as error:
         configured(f"resume={folder}", "learner.lr=1", "env=explorer", "finish.lanes=3", tiny=[])
-    assert {key for key, _ in error.value.faults} == {"learner.lr", "env"}
+    assert {key for key, _ in error.value.errors} == {"learner.lr", "env"}
     assert "init=RUN" in str(error.value)
 
 
@@ -142,9 +142,9 @@ def test_a_new_run_can_start_from_the_weights_of_another(here):
 
 def test_weights_of_another_environment_are_refused_with_both_shapes(here):
     first = train.run(configured("samples=1"))
-    with pytest.raises(Fault, match=r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)"):
+    with pytest.raises(UserError, match=r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)"):
         train.run(configured("samples=1", f"init={first}", "env.res=16"))
-    with pytest.raises(Fault, match="is .*8.* and should be .*16.*; choose the agent"):
+    with pytest.raises(UserError, match="is .*8.* and should be .*16.*; choose the agent"):
         train.run(configured("samples=1", f"init={first}", "agent.width=16"))
     assert len(list((here / "runs").iterdir())) == 1  # the refused runs left nothing behind
 
@@ -196,7 +196,9 @@ def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, mo
 
         patch.setattr(checkpoint, "save", full)
         patch.setattr(train, "warn", warnings.warn)
-        with pytest.raises(Fault, match="could not be saved .No space left on device.*MB are free"):
+        with pytest.raises(
+            UserError, match="could not be saved .No space left on device.*MB are free"
+        ):
             train.run(configured(f"samples={3 * UPDATE}", "checkpoint=1e-9"))
     assert len([w for w in caught if "could not be saved" in str(w.message)]) == 1
     assert len(metrics.read(next((here / "runs").iterdir()) / "metrics.jsonl")) == 3

@@ -6,9 +6,9 @@ import math
 
 import compare
 import pytest
+import random_scenery
 import torch
 import twin
-import worlds
 
 torch.set_num_threads(1)
 EXACT = 1e-12  # float64 and a handful of operations
@@ -38,9 +38,9 @@ def golden_light(w, baked):
     return torch.cat([twin.light_at(points, w["walls"], w["lights"]), baked[n_own:].double()])
 
 
-@pytest.mark.parametrize("case", worlds.CASES)
+@pytest.mark.parametrize("case", random_scenery.CASES)
 def test_sight_of_the_original(case):
-    world, settings, right = worlds.golden(case)
+    world, settings, right = random_scenery.golden(case)
     seen = []
     for e, baked in enumerate(right["baked_vals"].split(world.texels().tolist())):
         w = world.one(e)
@@ -56,9 +56,9 @@ def test_sight_of_the_original(case):
     assert {"indices", "distances", "screen, mean on walls"} <= set(figures)
 
 
-@pytest.mark.parametrize("case", worlds.CASES)
+@pytest.mark.parametrize("case", random_scenery.CASES)
 def test_light_of_the_original(case):
-    world, _, right = worlds.golden(case)
+    world, _, right = random_scenery.golden(case)
     errors = []
     for e, baked in enumerate(right["baked_vals"].split(world.texels().tolist())):
         w = world.one(e)
@@ -73,7 +73,7 @@ def test_light_of_the_original(case):
 
 
 def golden_step(case):
-    world, settings, right = worlds.golden(case)
+    world, settings, right = random_scenery.golden(case)
     ws = [world.one(e) for e in range(world.n_envs)]
     return (
         stacked([twin.physics(*(w[k] for k in MOVING), fps=settings["fps"]) for w in ws]),
@@ -83,7 +83,7 @@ def golden_step(case):
     )
 
 
-@pytest.mark.parametrize("case", worlds.CASES)
+@pytest.mark.parametrize("case", random_scenery.CASES)
 def test_physics_of_the_original(case):
     compare.check_golden(case, golden_step(case)[0])
 
@@ -107,7 +107,7 @@ def original_progress(walls, offsets, steps, position, step):
     return (torch.cat(times) * twin.SHORTFALL).clamp(0, 1).min()
 
 
-@pytest.mark.parametrize("case", worlds.CASES)
+@pytest.mark.parametrize("case", random_scenery.CASES)
 def test_the_original_misjudges_the_agents_that_we_excuse_and_no_others(case):
     ours, settings, right, ws = golden_step(case)
     off = ((ours["progress"] - right["progress"]).abs() > 2e-3).nonzero().tolist()
@@ -190,7 +190,7 @@ def test_lines_along_a_ray_and_lines_without_length_are_unseen():
 
 
 def test_agents_see_each_other_but_not_themselves():
-    lines = twin.agent_lines(worlds.OCTAGON.double(), t([1, 1], [3, 1]), t(0, 45))
+    lines = twin.agent_lines(random_scenery.OCTAGON.double(), t([1, 1], [3, 1]), t(0, 45))
     seen = twin.cast(lines, t([1, 1], [3, 1]), twin.rays(t(0, 180), [0.0], 1, 60))
     assert seen["indices"].flatten().tolist() == [
         13,
@@ -323,9 +323,11 @@ def test_angles_wrap(before, speed, after):
     assert step["angles"].item() == pytest.approx(after, abs=EXACT)
 
 
-# Random worlds, and comparing
+# Random environments, and comparing
 
-HARD = dict(n_envs=2, n_agents=3, n_walls=12, degenerate=worlds.EVERYTHING, res=48, fov=100.0)
+HARD = dict(
+    n_envs=2, n_agents=3, n_walls=12, degenerate=random_scenery.EVERYTHING, res=48, fov=100.0
+)
 
 
 def rounded(world, res, fov, cameras=(0.0,)):
@@ -354,7 +356,7 @@ def rounded(world, res, fov, cameras=(0.0,)):
     ],
 )
 def test_rounding_is_no_mistake(seed, origin, camera):
-    world = worlds.random_world(seed, **{**HARD, "origin": origin})
+    world = random_scenery.random_world(seed, **{**HARD, "origin": origin})
     render, step, light = rounded(world, **camera)
     compare.check_render(render, world, **camera)
     compare.check_physics(step, world)
@@ -381,7 +383,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_in_rendering_is_named(mistake):
-    world = worlds.random_world(4, **HARD)
+    world = random_scenery.random_world(4, **HARD)
     render = rounded(world, 48, 100.0)[0]
     with pytest.raises(
         AssertionError, match=rf"{mistake.split()[0]} at env \d+, agent \d+, camera 0, ray \d+"
@@ -391,7 +393,7 @@ def test_a_mistake_in_rendering_is_named(mistake):
 
 @pytest.mark.parametrize("field", ["progress", "positions", "angles", "velocity", "angvelocity"])
 def test_a_mistake_in_physics_is_named(field):
-    world = worlds.random_world(5, **HARD)
+    world = random_scenery.random_world(5, **HARD)
     step = rounded(world, 48, 100.0)[1]
     step[field][:, 1] -= 0.01
     with pytest.raises(AssertionError, match=rf"{field} at env \d+, agent 1"):
@@ -399,7 +401,7 @@ def test_a_mistake_in_physics_is_named(field):
 
 
 def test_a_mistake_in_one_texel_is_named():
-    world = worlds.random_world(6, **HARD)
+    world = random_scenery.random_world(6, **HARD)
     light = rounded(world, 48, 100.0)[2]
     light[-7] += 0.01
     with pytest.raises(AssertionError, match="baked at env 1, texel"):
@@ -414,7 +416,7 @@ def test_golden_mistakes_are_named():
 
 
 def test_random_worlds_repeat_and_differ_by_seed():
-    same, again, other = (worlds.random_world(seed, **HARD) for seed in (7, 7, 8))
+    same, again, other = (random_scenery.random_world(seed, **HARD) for seed in (7, 7, 8))
     assert torch.equal(same.lines, again.lines) and torch.equal(same.velocity, again.velocity)
     assert not torch.equal(same.angles, other.angles)
     assert int(same.line_widths.sum()) == len(same.lines) == len(same.texture_widths)
@@ -424,7 +426,7 @@ def test_random_worlds_repeat_and_differ_by_seed():
 
 
 def test_random_worlds_hold_the_degenerate_cases_asked_for():
-    world = worlds.random_world(9, **HARD)
+    world = random_scenery.random_world(9, **HARD)
     for e in range(world.n_envs):
         w = world.one(e)
         walls, lengths = w["walls"], (w["walls"][:, 1] - w["walls"][:, 0]).norm(dim=-1)

@@ -8,9 +8,9 @@ from itertools import product
 
 import numpy as np
 import pytest
+import random_scenery
 import torch
 import walls
-import worlds
 
 from megastep import core, engine, scene
 from megastep.dotdict import dotdict
@@ -22,11 +22,11 @@ SHARE = -(-STEPS // len(walls.COURSES))
 STOPPED = 0.5
 ACUTE = dict(
     wedges=10, slivers=8, spokes=4, zigzags=4, crossing=8, fragments=8
-)  # designs with acute corners
+)  # layouts with acute corners
 
 
 def alone(*ends, n_envs=1, fps=10.0):
-    """A Core of worlds with one agent each and walls (W, 2, 2) alone."""
+    """A Core of environments with one agent each and walls (W, 2, 2) alone."""
     g = dotdict(walls=np.float32(ends), lights=np.zeros((0, 2)))
     return core.Core(scene.scenery([g], 1, n_envs, device=torch.device("cpu")), res=1, fps=fps)
 
@@ -50,7 +50,7 @@ def test_no_agent_passes_a_wall_and_none_is_stuck(name):
     assert total["tried"] > 10_000 and total["held"] < 0.1 * total["tried"]
     reached = sum(n > 0 for n in total["pinched"])
     assert reached >= ACUTE.get(name, 0), (
-        f"agents wedged themselves into the corners of {reached} designs only"
+        f"agents wedged themselves into the corners of {reached} layouts only"
     )
 
 
@@ -189,7 +189,7 @@ def test_paths_are_judged_as_by_fractions(dense):
     """On a grid of four by four points they touch, lie in line and shrink to points; off it they
     cross or do not.
     """
-    draw = worlds.Draw(0)
+    draw = random_scenery.Draw(0)
     grid = draw.pick(range(4), 3000, 4, 2)
     fine = draw.uniform(0, 4, 1000, 4, 2).float().double()
     cases = torch.cat(
@@ -232,15 +232,15 @@ def test_chunks_do_not_matter(monkeypatch):
 def test_agents_are_set_down_touching_overlapping_and_clear():
     for name in walls.COURSES:
         course = walls.ground(name)
-        for design in range(len(course.walls)):
-            mine = course.walls[design, : course.counts[design]].double()
-            gap = walls.clearances(course.spots[design].double(), mine).amin(1)
+        for layout in range(len(course.walls)):
+            mine = course.walls[layout, : course.counts[layout]].double()
+            gap = walls.clearances(course.spots[layout].double(), mine).amin(1)
             touching = (gap - walls.RADIUS).abs() < 2e-4
             assert (
                 gap.min() > walls.HAIR and (gap < walls.RADIUS - 1e-3).any() and touching.any()
             ), name
             assert (
-                torch.equal(course.clear[design], gap > walls.BODY) and course.clear[design].any()
+                torch.equal(course.clear[layout], gap > walls.BODY) and course.clear[layout].any()
             ), name
 
 

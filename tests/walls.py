@@ -1,8 +1,8 @@
-"""No agent passes a wall and none is ever stuck: worlds that tempt, walkers that try, and judges
-that share nothing with the kernels.
+"""No agent passes a wall and none is ever stuck: environments that tempt, walkers that try, and
+judges that share nothing with the kernels.
 
-Axes: B copies of each of D designs (world e shows design e % D, as in `scene.scenery`), A agents a
-world, W walls of the largest design; a smaller one is filled up with NaN, which meets nothing.
+Axes: B copies of each of D layouts (world e shows layout e % D, as in `scene.scenery`), A agents a
+world, W walls of the largest layout; a smaller one is filled up with NaN, which meets nothing.
 Metres, degrees, seconds.
 """
 
@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import random_scenery
 import torch
-import worlds
 
 from megastep import core, engine, scene
 from megastep.dotdict import dotdict
@@ -120,7 +120,9 @@ def fragments(seed):
     """
     cases = "parallel", "zero_length", "duplicates", "touching", "pixel_ends", "tiny", "long"
     return (
-        worlds.random_world(seed, 1, n_walls=6, size=5.0, degenerate=cases).one(0)["walls"].numpy()
+        random_scenery.random_world(seed, 1, n_walls=6, size=5.0, degenerate=cases)
+        .one(0)["walls"]
+        .numpy()
     )
 
 
@@ -137,7 +139,7 @@ def homes(source, n):
     return [enclosed(g.walls) for g in sample(source, n)]
 
 
-COURSES = {  # name: (designs from a draw, agents a world)
+COURSES = {  # name: (layouts from a draw, agents a world)
     "box": (lambda draw: [g.walls for g in sample("box", 1)], 1),
     "column": (lambda draw: [g.walls for g in sample("column", 1)], 4),
     "wedges": (
@@ -218,13 +220,13 @@ def places(walls, n, draw):
 
 @dataclass(frozen=True)
 class Ground:
-    """A course's designs, ready to be walked on."""
+    """A course's layouts, ready to be walked on."""
 
     name: str
     n_agents: int
     geometries: list
     walls: torch.Tensor  # (D, W, 2, 2) float32
-    counts: torch.Tensor  # (D,) how many walls each design has
+    counts: torch.Tensor  # (D,) how many walls each layout has
     spots: torch.Tensor  # (D, P, 2) float32: where agents are set down
     clear: torch.Tensor  # (D, P) bool: where they then overlap no wall
 
@@ -232,20 +234,20 @@ class Ground:
 def ground(name, seed=0, device="cpu", n_spots=512):
     """The ground of the course `name`."""
     make, n_agents = COURSES[name]
-    draw = worlds.Draw(seed)
-    designs = [torch.as_tensor(np.float32(walls)) for walls in make(draw)]
-    walls = torch.full((len(designs), max(map(len, designs)), 2, 2), math.nan)
-    for d, w in enumerate(designs):
+    draw = random_scenery.Draw(seed)
+    layouts = [torch.as_tensor(np.float32(walls)) for walls in make(draw)]
+    walls = torch.full((len(layouts), max(map(len, layouts)), 2, 2), math.nan)
+    for d, w in enumerate(layouts):
         walls[d, : len(w)] = w
-    spots = [places(w.double(), n_spots, draw) for w in designs]
-    clear = [clearances(p.double(), w.double()).amin(1) > BODY for p, w in zip(spots, designs)]
-    geometries = [dotdict(walls=w.numpy(), lights=np.zeros((0, 2))) for w in designs]
+    spots = [places(w.double(), n_spots, draw) for w in layouts]
+    clear = [clearances(p.double(), w.double()).amin(1) > BODY for p, w in zip(spots, layouts)]
+    geometries = [dotdict(walls=w.numpy(), lights=np.zeros((0, 2))) for w in layouts]
     return Ground(
         name,
         n_agents,
         geometries,
         walls.to(device),
-        torch.tensor([len(w) for w in designs], device=device),
+        torch.tensor([len(w) for w in layouts], device=device),
         torch.stack(spots).to(device),
         torch.stack(clear).to(device),
     )
@@ -379,7 +381,7 @@ class Walk:
         self.generator = torch.Generator(device).manual_seed(seed)
         self.move = MomentumMovement(self.core, accel=accel * ACCEL)
         self.speed = accel * ACCEL / fps / DECAY
-        self.design = torch.arange(len(walls), device=device)[None, :, None].expand(self.shape)
+        self.layout = torch.arange(len(walls), device=device)[None, :, None].expand(self.shape)
         self.ahead = torch.tensor(
             [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0)], dtype=torch.float32, device=device
         )
@@ -415,9 +417,9 @@ class Walk:
         spot = self.pick(self.ground.spots.shape[1])
         flat, wide = again.view(agents.angles.shape), again[..., None]
         self.positions.copy_(
-            torch.where(wide, self.ground.spots[self.design, spot], self.positions)
+            torch.where(wide, self.ground.spots[self.layout, spot], self.positions)
         )
-        self.clear = torch.where(again, self.ground.clear[self.design, spot], self.clear)
+        self.clear = torch.where(again, self.ground.clear[self.layout, spot], self.clear)
         agents.angles.copy_(
             torch.where(flat, 360 * self.random().view(flat.shape) - 180, agents.angles)
         )
@@ -429,7 +431,7 @@ class Walk:
         nearest = surroundings(self.positions, self.ground.walls)[0]
         some = (self.random() * self.ground.counts[:, None]).long()
         wall = torch.where(self.random() < 0.5, nearest, some)
-        a, b = self.ground.walls[self.design, wall].unbind(-2)
+        a, b = self.ground.walls[self.layout, wall].unbind(-2)
         along = b - a
         foot = (
             ((self.positions - a) * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
@@ -516,7 +518,7 @@ class Walk:
             note = ", ".join(
                 f"{name} {x!r}" for name, x in zip(NOTED, self.notes[b, d, a].tolist())
             )
-            told.append(f"{self}: copy {b} of design {d}, agent {a}: {note}")
+            told.append(f"{self}: copy {b} of layout {d}, agent {a}: {note}")
         return told
 
     def __str__(self):
@@ -537,17 +539,17 @@ def directions(n, device):
     return torch.where(ways.abs() < 1e-12, 0, ways).float().to(device)
 
 
-def attempts(scenery, fps, positions, design, agent, ways):
+def attempts(scenery, fps, positions, layout, agent, ways):
     """How far (K, n) agent k of each world (K, A, 2) gets by a step of 1 cm in each direction of
     ways (K, n, 2) while the others rest; 0 if physics says that no progress was made.
     """
     k, n, _ = ways.shape
-    copies = engine.Scenery.of_designs(
+    copies = engine.Scenery.of_layouts(
         scenery.n_agents,
-        scenery.designs,
+        scenery.layouts,
         scenery.model,
         scenery.model_texels.diff(),
-        design.repeat_interleave(n),
+        layout.repeat_interleave(n),
     )
     agents = engine.Agents(k * n, scenery.n_agents, res=1, fps=fps, device=scenery.device)
     agents.positions.copy_(positions.repeat_interleave(n, 0))
@@ -603,7 +605,7 @@ def stuck(walk, most):
             n_held += 1
         else:
             told.append(
-                f"{walk}: copy {b[k]} of design {d[k]}, agent {a[k]}, step {walk.age}: stuck in a "
+                f"{walk}: copy {b[k]} of layout {d[k]}, agent {a[k]}, step {walk.age}: stuck in a "
                 f"world whose "
                 f"agents are at {positions[k].tolist()!r}"
             )

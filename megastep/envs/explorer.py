@@ -72,7 +72,7 @@ class Explorer:
             imu=spaces.MultiVector(1, 3),
         )
         self.action_space = self.movement.space
-        words = -(-self.core.scenery.designs.most_texels // 32)
+        words = -(-self.core.scenery.layouts.max_texels // 32)
         engine.fit(n_envs, 4 * words + 8 * pixels + 64, self.device)
         self.seen = torch.zeros((n_envs, 1, words), dtype=torch.int32, device=self.device)
         self.length = torch.zeros(n_envs, dtype=torch.int32, device=self.device)
@@ -93,11 +93,11 @@ class Explorer:
 
     def _observe(self, reset):
         self.spawner(reset)
-        obs, fresh = self._look(seen=self.seen, forget=reset[:, None])
+        obs, newly_seen = self._look(seen=self.seen, clear_mask=reset[:, None])
         self.length.add_(1).masked_fill_(reset, 0)
-        self.left.sub_(1).masked_fill_(reset, self.patience).add_(fresh)
+        self.left.sub_(1).masked_fill_(reset, self.patience).add_(newly_seen)
         torch.le(self.left, 0, out=self.ended)
-        reward = (fresh / TEXELS_A_POINT).masked_fill_(reset, 0.0)
+        reward = (newly_seen / TEXELS_A_POINT).masked_fill_(reset, 0.0)
         return arrdict(
             obs=obs, reward=reward, reset=reset, terminal=self._never, truncated=self.ended.clone()
         )
@@ -117,7 +117,7 @@ class Explorer:
                 for key, space in self.obs_space.items()
             }
         )
-        return obs, view.fresh[:, 0] if seen else None
+        return obs, view.newly_seen[:, 0] if seen else None
 
     def state(self, e=0):
         """What :meth:`plot_state` draws of world ``e``."""
@@ -134,8 +134,8 @@ class Explorer:
         bits = (
             self.seen[e, 0, :, None] >> torch.arange(32, dtype=torch.int32, device=self.device) & 1
         )
-        designs, d = self.core.scenery.designs, int(self.core.scenery.design[e])
-        first, last = designs.texel_starts[designs.wall_starts[d : d + 2].long()].tolist()
+        layouts, d = self.core.scenery.layouts, int(self.core.scenery.layout[e])
+        first, last = layouts.texel_starts[layouts.wall_starts[d : d + 2].long()].tolist()
         return bits.flatten()[: last - first].bool()
 
     @classmethod

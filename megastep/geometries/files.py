@@ -2,7 +2,7 @@
 = 0, 1, ...
 
 A file may come from anyone, so nothing in it is believed: sizes are checked before anything is
-unpacked, nothing is written to disk, pickled objects are refused, and every fault is a ValueError
+unpacked, nothing is written to disk, pickled objects are refused, and every error is a ValueError
 of one sentence naming file and geometry.
 """
 

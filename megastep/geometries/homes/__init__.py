@@ -10,7 +10,7 @@ import numpy as np
 from ... import geometry
 from ...dotdict import dotdict
 from . import openings, partition, plan, walls
-from .draws import Draws
+from .random_stream import RandomStream
 
 ATTEMPTS = 60  # layouts tried before a home is given one room less
 ENOUGH, FEW = (
@@ -72,7 +72,7 @@ def generate(seed, outer=True):
     and without a door; `n_outer`, how many of the walls, the last ones, are the envelope's outer
     face.
     """
-    draws = Draws(seed)
+    draws = RandomStream(seed)
     _, footprint, rooms, meetings, depth, gaps = _layout(draws)
     thickness = THICK[draws.below(len(THICK))]
     grid = walls.paint(

@@ -6,8 +6,8 @@ from itertools import accumulate
 from typing import NamedTuple
 
 from . import regions
-from .draws import exp
 from .plan import ALLOWANCE, KINDS
+from .random_stream import exp
 
 PORTAL = 120  # cm; the least neck between the parts of a region that is still to be cut
 LEAST_FILL = 0.55  # of a room's bounding box

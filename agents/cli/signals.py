@@ -5,7 +5,7 @@ program at once.
 import os
 import signal
 
-from configs.console import say
+from agents.cli.console import say
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

@@ -1,7 +1,6 @@
-"""What train.py, evaluate.py and record.py share: command line (alone in knowing Hydra), settings,
-runs.
+"""The command line of train.py, evaluate.py and record.py; alone in knowing Hydra.
 
-To be imported before torch: OpenMP reads how to wait when it is loaded. Threads that spin while
+Importing it comes before torch: OpenMP reads how to wait when it is loaded. Threads that spin while
 they wait for others take the cores that those others need, wherever anything else runs: with one of
 two cores taken, training was 100 times slower. Asleep, they lose a few microseconds a wait.
 """

@@ -59,7 +59,7 @@ class Rollout:
         """(T, B) bool: whether row t's decision was ignored because an episode started instead."""
         return self.starts[1:]
 
-    def see(self, t, world):
+    def store_world(self, t, world):
         """Writes down the world at time t, and gives it back as it was written, for the policy to
         act on.
         """
@@ -67,14 +67,14 @@ class Rollout:
         self.starts[t] = world["reset"]
         return arrdict(obs=self.obs[t], reset=self.starts[t])
 
-    def remember(self, state):
+    def store_memory(self, state):
         """Writes down what the policy remembers before row 0."""
         if self.state is None:
             self.state = clone(state)
         else:
             self.state[:] = state
 
-    def outcome(self):
+    def transitions(self):
         """The arguments of `returns.gae`, each (T, B), the last value (B,)."""
         return dict(
             value=self.values[:-1],
@@ -100,8 +100,8 @@ class Rollout:
         )
 
 
-def start(env, policy):
-    """Resets an environment and gives the carry that `collect` begins with:
+def initial_actor_state(env, policy):
+    """Resets an environment and gives the actor_state that `collect` begins with:
     arrdict(world=arrdict(obs, reset), state). It shares no memory with the environment.
     """
     world = env.reset()
@@ -110,16 +110,17 @@ def start(env, policy):
 
 
 @torch.no_grad()
-def collect(env, policy, rollout, carry):
+def collect(env, policy, rollout, actor_state):
     """Fills a rollout: T times act, env.step, write. Never asks the GPU a question, so it can be a
     CUDA graph.
 
-    The carry (of `start`, or of the `collect` before) is brought up to date in place, and returned.
+    The actor_state (of `start`, or of the `collect` before) is brought up to date in place, and
+    returned.
     """
-    world, state = carry["world"], carry["state"]
-    rollout.remember(state)
+    world, state = actor_state["world"], actor_state["state"]
+    rollout.store_memory(state)
     for t in range(rollout.n_steps):
-        decision, state = policy(rollout.see(t, world), state)
+        decision, state = policy(rollout.store_world(t, world), state)
         rollout.actions[t] = decision["actions"]
         rollout.logprobs[t], rollout.values[t] = decision["logprobs"], decision["value"]
 
@@ -127,9 +128,9 @@ def collect(env, policy, rollout, carry):
         rollout.reward[t] = world["reward"]
         rollout.terminal[t], rollout.truncated[t] = world["terminal"], world["truncated"]
 
-    last = rollout.see(rollout.n_steps, world)
+    last = rollout.store_world(rollout.n_steps, world)
     rollout.values[-1] = policy(last, state, sample=False)[0]["value"]
     fresh = arrdict(world=arrdict(obs=world["obs"], reset=world["reset"]), state=state)
-    for target, source in zip(leaves(carry), leaves(fresh), strict=True):
+    for target, source in zip(leaves(actor_state), leaves(fresh), strict=True):
         target.copy_(source)
-    return carry
+    return actor_state

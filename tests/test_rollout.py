@@ -5,11 +5,12 @@ collect and lanes.
 import pytest
 import torch
 
-from agents import buffers
 from agents.policy import Policy
 from agents.returns import gae
+from agents.rollout import Rollout, collect, initial_actor_state
 from megastep import spaces
 from megastep.arrdict import arrdict
+from megastep.dotdict import leaves
 
 B, T = 6, 5
 
@@ -66,11 +67,11 @@ class Telltale:
 def collected(n_rollouts=1, dtype=torch.float32):
     env = Telltale()
     policy = Policy(env.obs_space, env.action_space, width=16)
-    rollout = buffers.Rollout(T, B, env.obs_space, env.action_space, obs_dtype=dtype)
-    carry = buffers.start(env, policy)
+    rollout = Rollout(T, B, env.obs_space, env.action_space, obs_dtype=dtype)
+    actor_state = initial_actor_state(env, policy)
     for _ in range(n_rollouts):
-        carry = buffers.collect(env, policy, rollout, carry)
-    return env, policy, rollout, carry
+        actor_state = collect(env, policy, rollout, actor_state)
+    return env, policy, rollout, actor_state
 
 
 @pytest.mark.parametrize("n_rollouts", [1, 3])
@@ -96,30 +97,30 @@ def test_rows_hold_what_was_seen_and_what_followed(n_rollouts):
 
 
 def test_a_rollout_begins_where_the_one_before_ended():
-    env, policy, rollout, carry = collected()
-    last, state = rollout.obs.eye[-1].clone(), carry.state.map(torch.clone)
-    buffers.collect(env, policy, rollout, carry)
+    env, policy, rollout, actor_state = collected()
+    last, state = rollout.obs.eye[-1].clone(), actor_state.state.map(torch.clone)
+    collect(env, policy, rollout, actor_state)
     assert torch.equal(rollout.obs.eye[0], last)
     assert torch.equal(rollout.state.cell, state.cell) and state.cell.any()
 
 
 def test_the_carry_stays_in_its_own_memory():
-    env, policy, rollout, carry = collected()
-    places = [leaf.data_ptr() for leaf in buffers.leaves(carry)]
-    again = buffers.collect(env, policy, rollout, carry)
-    assert [leaf.data_ptr() for leaf in buffers.leaves(again)] == places
-    assert carry.world.obs.eye.data_ptr() != env.obs.eye.data_ptr()
-    assert torch.equal(carry.world.obs.eye[:, 0, 0, 0, 0], env.label(2 * T))
+    env, policy, rollout, actor_state = collected()
+    places = [leaf.data_ptr() for leaf in leaves(actor_state)]
+    again = collect(env, policy, rollout, actor_state)
+    assert [leaf.data_ptr() for leaf in leaves(again)] == places
+    assert actor_state.world.obs.eye.data_ptr() != env.obs.eye.data_ptr()
+    assert torch.equal(actor_state.world.obs.eye[:, 0, 0, 0, 0], env.label(2 * T))
 
 
 def test_probabilities_and_values_are_those_of_an_unroll_over_what_was_written():
-    _, policy, rollout, carry = collected(n_rollouts=2, dtype=torch.float16)
+    _, policy, rollout, actor_state = collected(n_rollouts=2, dtype=torch.float16)
     seen = policy.unroll(rollout.obs, rollout.starts, rollout.state)
     close = dict(rtol=1e-4, atol=1e-4)  # products of numbers up to 500 in another order
     torch.testing.assert_close(rollout.values, seen.value, **close)
     logprobs = policy.output.logprob(seen.logits[:-1], rollout.actions)
     torch.testing.assert_close(rollout.logprobs, logprobs, **close)
-    last = policy.unroll(rollout.obs[-1:], rollout.starts[-1:], carry.state).value[0]
+    last = policy.unroll(rollout.obs[-1:], rollout.starts[-1:], actor_state.state).value[0]
     torch.testing.assert_close(rollout.values[-1], last, **close)
 
 
@@ -142,7 +143,7 @@ def test_a_minibatch_joins_the_rows_of_its_lanes():
 
 def test_an_outcome_is_what_returns_are_computed_from():
     env, _, rollout, _ = collected(n_rollouts=2)
-    judged = gae(**rollout.outcome(), gamma=0.0, lambda_=1.0)
+    judged = gae(**rollout.transitions(), gamma=0.0, lambda_=1.0)
     assert torch.equal(judged.valid, ~rollout.reset)
     # With gamma 0 an advantage is the reward that followed less the value before
     expected = (rollout.reward - rollout.values[:-1]) * ~rollout.reset
@@ -158,11 +159,11 @@ def test_the_same_seed_collects_the_same():
 
 def test_pictures_are_kept_in_half_precision_and_whole_numbers_whole():
     space = arrdict(rgb=spaces.MultiImage(1, 3, 1, 4), team=spaces.MultiDiscrete(1, 5000))
-    rollout = buffers.Rollout(T, B, space, spaces.MultiDiscrete(1, 7))
+    rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7))
     assert rollout.obs.rgb.dtype == torch.float16 and rollout.obs.team.dtype == torch.int64
     assert rollout.actions.shape == (T, B, 1)
 
 
 def test_a_rollout_of_nothing_is_refused():
     with pytest.raises(ValueError, match="not 0 and 6"):
-        buffers.Rollout(0, B, Telltale.obs_space, Telltale.action_space)
+        Rollout(0, B, Telltale.obs_space, Telltale.action_space)

@@ -49,7 +49,7 @@ class Steady(Console):
         deafen(self.file)
 
 
-def lively():
+def is_interactive():
     """Whether stdout can redraw a line: a terminal, and not a dumb one."""
     return sys.stdout.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown", "")
 
@@ -73,7 +73,7 @@ class Progress:
         self.bars, self.last = None, -QUIET
 
     def __enter__(self):
-        if lively():
+        if is_interactive():
             self.bars = Bars(BarColumn(24), TextColumn("{task.description}"), console=Steady())
             self.task = self.bars.add_task("starting", total=1)
             self.bars.start()

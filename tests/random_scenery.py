@@ -1,8 +1,8 @@
-"""Small worlds for the engine's tests: random ones with degenerate cases on demand, and the
+"""Small environments for the engine's tests: random ones with degenerate cases on demand, and the
 original's golden ones.
 
-Axes: N worlds, A agents, M model lines, L lines of all worlds (the agents' first in each), K
-lights, T texels.
+Axes: N environments, A agents, M model lines, L lines of all environments (the agents' first in
+each), K lights, T texels.
 """
 
 import math
@@ -24,8 +24,8 @@ OCTAGON = torch.stack([CORNERS, CORNERS.roll(-1, 0)], 1)  # the original's model
 
 @dataclass(frozen=True)
 class World:
-    """N worlds in the form `Scenery(n_agents, lights, lines, textures, model)` takes, and their
-    agents. All float32.
+    """N environments in the form `Scenery(n_agents, lights, lines, textures, model)` takes, and
+    their agents. All float32.
     """
 
     model: torch.Tensor  # (M, 2, 2)
@@ -88,7 +88,7 @@ class World:
 
 
 def unplaced(model, n_agents, walls):
-    """The lines of worlds with these walls before anybody has put the agents' lines in their
+    """The lines of environments with these walls before anybody has put the agents' lines in their
     places.
     """
     return torch.cat([torch.cat([*n_agents * [model], w]) for w in walls])
@@ -118,7 +118,7 @@ def golden(case):
     return world, dict(res=int(res), fov=fov, fps=fps), g
 
 
-# Random worlds
+# Random random_scenery
 
 
 class Draw:
@@ -255,7 +255,7 @@ def random_world(
     fov=130.0,
     max_lights=5,
 ):
-    """N random worlds: rooms of `size` metres from (origin, origin) on, with walls and the
+    """N random environments: rooms of `size` metres from (origin, origin) on, with walls and the
     `degenerate` cases named.
 
     The names are those of EVERYTHING; `res` and `fov` are the camera whose rays 'parallel' and

@@ -1,9 +1,9 @@
 """The settings of a run as frozen dataclasses, checked in one pass. Knows no Hydra, and no
 defaults: configs/ does.
 
-`build(Train, tree)` turns nested dicts into settings, or raises `Faults` with every fault of the
-tree by key path. Errors meant for whoever started the program are `Fault`s: one sentence, exit code
-2, no traceback.
+`build(Train, tree)` turns nested dicts into settings, or raises `ConfigErrors` with every error of
+the tree by key path. Errors meant for whoever started the program are `UserError`s: one sentence,
+exit code 2, no traceback.
 """
 
 import dataclasses
@@ -20,22 +20,22 @@ INFINITY = math.inf
 MOST_ENVS = 2**26
 
 
-class Fault(Exception):
+class UserError(Exception):
     """Something the user can put right: the message is one sentence with what came, what is allowed
     and the cure.
     """
 
 
-class Faults(Fault):
-    """Several faults of one configuration, `(key path, sentence)` each."""
+class ConfigErrors(UserError):
+    """Several errors of one configuration, `(key path, sentence)` each."""
 
-    def __init__(self, faults):
-        self.faults = list(faults)
-        lines = [f"{path}: {sentence}" for path, sentence in self.faults]
+    def __init__(self, errors):
+        self.errors = list(errors)
+        lines = [f"{path}: {sentence}" for path, sentence in self.errors]
         head = (
-            "1 fault in the configuration"
+            "1 error in the configuration"
             if len(lines) == 1
-            else f"{len(lines)} faults in the configuration"
+            else f"{len(lines)} errors in the configuration"
         )
         super().__init__("\n  ".join([head, *lines]))
 
@@ -126,7 +126,7 @@ class Minimal:
     shortest: int = within(1, 10**6)
     longest: int = within(1, 10**6)
 
-    def faults(self):
+    def errors(self):
         if self.shortest > self.longest:
             yield "shortest", f"{self.shortest} is more than longest, {self.longest}"
 
@@ -144,7 +144,7 @@ class Explorer:
     fps: float = within(1, 1000)
     patience: int = within(1, 10**6)
 
-    def faults(self):
+    def errors(self):
         if self.res % self.subsample:
             yield "subsample", f"{self.subsample} rays a pixel do not divide res, {self.res} rays"
 
@@ -163,7 +163,7 @@ class Geometry:
     seed: int = within(0, 2**63 - 1)
     path: str | None
 
-    def faults(self):
+    def errors(self):
         if self.name == "files" and self.path is None:
             yield "path", "is missing: geometry=files needs geometry.path=FILE.npz"
 
@@ -192,8 +192,8 @@ class Learner:
     gamma: float = within(0, 1)
     lambda_: float = within(0, 1)
     clip: float = within(0, 1e6, low_open=True)
-    entropy: float = within(0, 1e6)
-    value_weight: float = within(0, 1e6)
+    entropy_coef: float = within(0, 1e6)
+    value_coef: float = within(0, 1e6)
     max_grad_norm: float = within(0, 1e6, low_open=True)
     n_epochs: int = within(1, 1000)
     n_minibatches: int = within(1, MOST_ENVS)
@@ -240,7 +240,7 @@ class Train:
     resume: str | None
     init: str | None
 
-    def faults(self):
+    def errors(self):
         if self.learner.n_minibatches > self.env.n_envs:
             yield (
                 "learner.n_minibatches",
@@ -284,13 +284,13 @@ class Record:
 
 
 def build(kind, tree):
-    """The settings of dataclass `kind` from nested dicts; raises `Faults` with all that is wrong,
-    not the first.
+    """The settings of dataclass `kind` from nested dicts; raises `ConfigErrors` with all that is
+    wrong, not the first.
     """
-    faults = []
-    settings = _settings(kind, tree, "", faults)
-    if faults:
-        raise Faults(faults)
+    errors = []
+    settings = _settings(kind, tree, "", errors)
+    if errors:
+        raise ConfigErrors(errors)
     return settings
 
 
@@ -299,40 +299,40 @@ def as_tree(settings):
     return dataclasses.asdict(settings)
 
 
-def _settings(kind, tree, path, faults):
+def _settings(kind, tree, path, errors):
     fields, hints = {f.name: f for f in dataclasses.fields(kind)}, typing.get_type_hints(kind)
-    before, values = len(faults), {}
+    before, values = len(errors), {}
     for key in tree:
         if key not in fields:
-            faults.append((path + key, f"no such key; {closest(key, fields)}"))
+            errors.append((path + key, f"no such key; {closest(key, fields)}"))
     for name, field in fields.items():
         if name not in tree:
             if hints[name] == Geometry | None:  # a group that was not chosen is absent
                 values[name] = None
             else:
-                faults.append((path + name, "is missing"))
+                errors.append((path + name, "is missing"))
             continue
-        values[name] = _value(hints[name], tree[name], path + name, faults)
+        values[name] = _value(hints[name], tree[name], path + name, errors)
         check = field.metadata.get("check")
         if check and values[name] is not None and (sentence := check(values[name])):
-            faults.append((path + name, sentence))
-    if len(faults) > before:
+            errors.append((path + name, sentence))
+    if len(errors) > before:
         return None
     settings = kind(**values)
-    if hasattr(settings, "faults"):  # what concerns two settings at once
-        faults += [(path + name, sentence) for name, sentence in settings.faults()]
+    if hasattr(settings, "errors"):  # what concerns two settings at once
+        errors += [(path + name, sentence) for name, sentence in settings.errors()]
     return settings
 
 
-def _value(hint, value, path, faults):
+def _value(hint, value, path, errors):
     options = [o for o in typing.get_args(hint) if o is not types.NoneType] or [hint]
     if value is None and types.NoneType in typing.get_args(hint):
         return None
     if dataclasses.is_dataclass(options[0]):
         if not isinstance(value, dict):
-            faults.append((path, f"is a group of keys, got {value!r}"))
+            errors.append((path, f"is a group of keys, got {value!r}"))
             return None
-        return _settings(_variant(options, value, path, faults), value, path + ".", faults)
+        return _settings(_variant(options, value, path, errors), value, path + ".", errors)
     kind = options[0]
     if isinstance(value, kind) and not (kind is not bool and isinstance(value, bool)):
         return value
@@ -341,16 +341,16 @@ def _value(hint, value, path, faults):
     if kind is int and isinstance(value, float) and value.is_integer():
         return int(value)  # samples=1e6
     wanted = {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}[kind]
-    faults.append((path, f"expected {wanted}, got {'nothing' if value is None else repr(value)}"))
+    errors.append((path, f"expected {wanted}, got {'nothing' if value is None else repr(value)}"))
     return None
 
 
-def _variant(options, value, path, faults):
+def _variant(options, value, path, errors):
     """The dataclass among `options` that the group's `name` chooses."""
     if len(options) == 1:
         return options[0]
     name = value.get("name")
     if name not in ENVS:
-        faults.append((f"{path}.name", f"{name!r} is unknown; {closest(name, ENVS)}"))
+        errors.append((f"{path}.name", f"{name!r} is unknown; {closest(name, ENVS)}"))
         return options[0]
     return ENVS[name]

@@ -31,7 +31,7 @@ def mixed(value):
     return value ^ (value >> 31)
 
 
-class Draws:
+class RandomStream:
     """The stream of draws of one seed, any integer."""
 
     def __init__(self, seed):

@@ -3,7 +3,7 @@
 import torch
 
 
-class Draws:
+class RandomStream:
     """A torch.Generator made from a seed on the device where it is first asked for.
 
     Its state travels as plain numbers and tensors. On a device of another type, where a state means
