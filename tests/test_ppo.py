@@ -207,7 +207,7 @@ def test_a_saved_learner_goes_on_bit_by_bit(n_before):
     resumed.update(rollout)
     assert torch.equal(weights(other), weights(policy))
     assert torch.equal(
-        other.draws.on(other.device).get_state(), policy.random.on(policy.device).get_state()
+        other.random.on(other.device).get_state(), policy.random.on(policy.device).get_state()
     )
     resumed.set_lr(0.0)  # still reaches the optimizer
     resumed.update(rollout)
