@@ -1,4 +1,4 @@
-"""The benchmark: what a figure is, that every work is measurable, and that the page says what the
+"""The benchmarks: what a measurement is, that every benchmark runs, and that the page says what the
 records say.
 """
 
@@ -8,19 +8,22 @@ import subprocess
 import sys
 from pathlib import Path
 
+import benchmark
+import benchmark_report
+import counters
 import pytest
+import timing
 import torch
-
-from scripts import benchmark, counters
+import workloads
 
 ROOT = Path(__file__).resolve().parents[1]
 KEYS = {
-    "work",
+    "benchmark",
     "what",
     "value",
     "unit",
-    "low",
-    "high",
+    "lower",
+    "upper",
     "n",
     "on",
     "driver",
@@ -30,32 +33,31 @@ KEYS = {
     "date",
     "command",
 }
-PAGE = "\n\n".join(["# Title", "Before.", *benchmark.MARKS, "After.\n"])
 
 
 @pytest.fixture
 def tiny(monkeypatch):
-    """Works of a few environments in two homes, timed for a moment."""
+    """Benchmarks of a few environments in two homes, timed for a moment."""
     for name, value in dict(
         SIZES={"cuda": (8,), "cpu": (8,)},
         KERNEL_SIZES={"cuda": (8,), "cpu": (8,)},
         HOMES=2,
         WARM_UP=2,
-        REPEATS=3,
-        SECONDS=1e-3,
     ).items():
-        monkeypatch.setattr(benchmark, name, value)
+        monkeypatch.setattr(workloads, name, value)
+    monkeypatch.setattr(timing, "REPEATS", 3)
+    monkeypatch.setattr(timing, "SECONDS", 1e-3)
 
 
 def record(what, value, **others):
     return (
         dict(
-            work="step",
+            benchmark="step",
             what=what,
             value=value,
             unit="M/s",
-            low=None,
-            high=None,
+            lower=None,
+            upper=None,
             n=None,
             on="NVIDIA H200",
             driver=None,
@@ -69,60 +71,62 @@ def record(what, value, **others):
     )
 
 
-def kept(folder, *records):
-    """A page and its records in ``folder``; the path of the records."""
+def written(folder, *records):
+    """The path of records in ``folder``."""
     path = folder / "benchmarks.jsonl"
     path.write_text("".join(json.dumps(r) + "\n" for r in records))
-    path.with_suffix(".md").write_text(PAGE)
     return path
 
 
-# ---- Figures ----
+# ---- Measurements ----
 
 
-def test_a_figure_is_a_median_with_its_tenth_and_ninetieth_percentile():
-    found = benchmark.figure("what", "s", [11, 1, 10, 2, 9, 3, 8, 4, 7, 5, 6])
-    assert found == dict(what="what", unit="s", value=6, low=2, high=10, n=11)
+def test_a_measurement_is_a_median_with_its_tenth_and_ninetieth_percentile():
+    found = timing.measurement("what", "s", [11, 1, 10, 2, 9, 3, 8, 4, 7, 5, 6])
+    assert found == dict(what="what", unit="s", value=6, lower=2, upper=10, n=11)
 
 
 def test_what_was_sampled_once_has_no_spread():
-    assert benchmark.figure("what", "bytes", [7]) == dict(
-        what="what", unit="bytes", value=7, low=None, high=None, n=1
+    assert timing.measurement("what", "bytes", [7]) == dict(
+        what="what", unit="bytes", value=7, lower=None, upper=None, n=1
     )
 
 
 def test_a_thousand_things_in_two_milliseconds_are_half_a_million_a_second():
-    assert benchmark.rate("what", 1000, [0.002])["value"] == pytest.approx(0.5)
+    assert timing.rate("what", 1000, [0.002])["value"] == pytest.approx(0.5)
 
 
 def test_a_lap_makes_the_calls_it_is_said_to():
     calls = []
     assert (
-        len(benchmark.laps(lambda: calls.append(1), torch.device("cpu"), 4, 3)) == 3
+        len(timing.laps(lambda: calls.append(1), torch.device("cpu"), 4, 3)) == 3
         and len(calls) == 12
     )
 
 
-# ---- Works ----
+# ---- Benchmarks ----
 
 
-@pytest.mark.parametrize("name", benchmark.WORKS)
-def test_a_work_is_a_generator_that_says_what_it_measures(name):
-    assert inspect.isgeneratorfunction(benchmark.WORKS[name]) and benchmark.WORKS[name].__doc__
+@pytest.mark.parametrize("name", benchmark.BENCHMARKS)
+def test_a_benchmark_is_a_generator_that_says_what_it_measures(name):
+    assert (
+        inspect.isgeneratorfunction(benchmark.BENCHMARKS[name])
+        and benchmark.BENCHMARKS[name].__doc__
+    )
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 @pytest.mark.parametrize(
     ("name", "n"), [("step", 2), ("kernels", 7), ("observe", 2), ("memory", 1)]
 )
-def test_a_work_leaves_a_line_of_json_a_figure(name, n, device, tiny, tmp_path, capsys):
+def test_a_benchmark_leaves_a_line_of_json_per_measurement(name, n, device, tiny, tmp_path, capsys):
     path = tmp_path / "records.jsonl"
     assert benchmark.main([name, "--device", device, "--commit", "abc", "--json", str(path)]) == 0
-    records = benchmark.read(path)
+    records = benchmark_report.read(path)
     assert len(records) == n + (name == "memory" and device == "cuda")
     for r in records:
-        assert set(r) == KEYS and r["work"] == name and r["commit"] == "abc" and r["value"] > 0
-        assert r["low"] is None or r["low"] <= r["value"] <= r["high"]
+        assert set(r) == KEYS and r["benchmark"] == name and r["commit"] == "abc" and r["value"] > 0
+        assert r["lower"] is None or r["lower"] <= r["value"] <= r["upper"]
         assert r["on"].startswith("CPU, ") == (device == "cpu") and (r["driver"] is None) == (
             device == "cpu"
         )
@@ -140,7 +144,7 @@ def test_the_cpu_is_measured_on_the_cpu_and_keeps_its_threads(tiny):
     assert all(r["on"].startswith("CPU, ") for r in records)
 
 
-def test_a_work_that_is_not_there_ends_with_one_sentence():
+def test_an_unknown_benchmark_ends_with_one_sentence():
     done = subprocess.run(
         [sys.executable, "scripts/benchmark.py", "stpe"], cwd=ROOT, capture_output=True, text=True
     )
@@ -176,27 +180,23 @@ def test_counters_without_a_gpu_end_with_one_sentence(capsys):
 # ---- The report ----
 
 
-def test_a_report_stands_between_its_marks_and_is_the_same_again(tmp_path):
-    path = kept(
+def test_a_report_is_a_page_with_a_plot_and_the_same_again(tmp_path):
+    path = written(
         tmp_path,
-        record("explorer, `env.step`, 1,024 environments", 12.5, low=12.0, high=13.0, n=15),
+        record("explorer, `env.step`, 1,024 environments", 12.5, lower=12.0, upper=13.0, n=15),
         record("minimal, `env.step`, 8,192 environments", 70.0),
     )
     files = []
     for _ in range(2):
         assert benchmark.main(["report", "--json", str(path)]) == 0
-        files.append([path.with_suffix(suffix).read_text() for suffix in (".md", ".svg")])
+        files.append([(tmp_path / f"benchmark-table.{end}").read_text() for end in ("md", "svg")])
     (page, plot), again = files
     assert [page, plot] == again and "<svg" in plot and "explorer, NVIDIA H200" in plot
-    assert page.startswith("# Title\n\nBefore.\n") and page.endswith("\n\nAfter.\n")
-    assert (
-        "| `step` | explorer, `env.step`, 1,024 environments | 12.5 M/s | 12 to 13 | 15 | NVIDIA "
-        "H200 | abc | "
-        "2026-01-01 |"
-    ) in page
+    cells = "12.5 M/s | 12 to 13 | 15 | NVIDIA H200 | abc | 2026-01-01 |"
+    assert f"| `step` | explorer, `env.step`, 1,024 environments | {cells}" in page
 
 
-def test_the_newest_record_of_a_figure_is_kept_and_sizes_are_in_order():
+def test_the_newest_record_of_a_measurement_is_shown_and_sizes_are_in_order():
     records = [
         record("a, 8,192 environments", 2.0, date="2026-01-03"),
         record("a, 8,192 environments", 1.0),
@@ -205,26 +205,12 @@ def test_the_newest_record_of_a_figure_is_kept_and_sizes_are_in_order():
         record("a, 1,024 environments", 5.0, on="CPU, 2 threads"),
         record("a, 1,024 environments", 6.0, on="CPU, 16 threads"),
     ]
-    assert [r["value"] for r in benchmark.newest(records)] == [4.0, 2.0, 6.0]
-
-
-def test_a_page_without_marks_is_left_as_it_is(tmp_path, capsys):
-    path = kept(tmp_path, record("explorer, `env.step`, 8 environments", 1.0))
-    path.with_suffix(".md").write_text("# Title\n")
-    assert benchmark.main(["report", "--json", str(path)]) == 2
-    assert (
-        path.with_suffix(".md").read_text() == "# Title\n"
-        and benchmark.MARKS[0] in capsys.readouterr().err
-    )
+    assert [r["value"] for r in benchmark_report.newest(records)] == [4.0, 2.0, 6.0]
 
 
 def test_the_page_says_what_the_records_say():
     """If this fails: python scripts/benchmark.py report."""
-    page = (ROOT / "docs" / "benchmarks.md").read_text()
-    assert (
-        benchmark.rewritten(
-            page, benchmark.read(ROOT / "docs" / "benchmarks.jsonl"), "benchmarks.svg"
-        )
-        == page
-    )
-    assert (ROOT / "docs" / "benchmarks.svg").exists()
+    records = benchmark_report.read(ROOT / "docs" / "benchmarks.jsonl")
+    page = (ROOT / "docs" / "benchmark-table.md").read_text()
+    assert benchmark_report.page(records, "benchmark-table.svg") == page
+    assert (ROOT / "docs" / "benchmark-table.svg").exists()

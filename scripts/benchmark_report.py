@@ -1,0 +1,129 @@
+"""Turns the records of benchmark.py into a page with a table and a plot."""
+
+import json
+import re
+import textwrap
+from pathlib import Path
+
+from workloads import BENCHMARKS
+
+# Environments and frames per second of the original megastep's Explorer on one H200.
+ORIGINAL = 16_384, 0.86e6
+COLOURS = {"explorer": "tab:blue", "minimal": "tab:orange"}
+PAGE = """# Benchmark table
+
+`python scripts/benchmark.py report` writes this page from `benchmarks.jsonl`; `python
+scripts/benchmark.py BENCHMARK --json docs/benchmarks.jsonl` measures, with `--device cpu` on the
+CPU. [Benchmarks](benchmarks.md) says what the measurements mean.
+
+![Frames per second against environments, both logarithmic]({plot})
+
+A measurement is the median of n samples, beside it their 10th and 90th percentiles. A sample is the
+mean over as many calls as fill 50 ms after warming up, timed by CUDA events on a GPU; or one
+process; or one report of a training run. A return is a mean with its 95 % bootstrap interval over n
+homes. What has no spread was counted, or read once by Nsight Compute.
+
+{benchmarks}
+
+{table}
+"""
+
+
+def text(number):
+    """A number as a table shows it."""
+    return f"{number:,.0f}" if abs(number) >= 1000 else f"{number:.4g}"
+
+
+HEADER = (
+    "| benchmark | what | median | 10 % to 90 % | n | on | commit | date |\n" + 8 * "| --- " + "|"
+)
+
+
+def row(record):
+    """A record as a line of the table."""
+    spread = (
+        "" if record["lower"] is None else f"{text(record['lower'])} to {text(record['upper'])}"
+    )
+    names = [("driver", record["driver"]), ("torch", record["torch"])]
+    on = ", ".join([record["on"], *(f"{name} {version}" for name, version in names if version)])
+    value = f"{text(record['value'])} {record['unit']}".strip()
+    cells = [
+        f"`{record['benchmark']}`",
+        record["what"],
+        value,
+        spread,
+        record["n"] or "",
+        on,
+        record["commit"],
+        record["date"],
+    ]
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def newest(records):
+    """The newest record of each measurement on each GPU and on the CPU, in order of benchmark,
+    place and name.
+    """
+    found = {}
+    for record in sorted(records, key=lambda record: record["date"]):
+        kind = "CPU" if record["on"].startswith("CPU") else record["on"]
+        found[record["benchmark"], kind, record["what"]] = record
+
+    def order(key):
+        benchmark, kind, what = key
+        parts = re.split(r"(\d[\d,]*)", what)
+        numbers = [int(part.replace(",", "")) for part in parts[1::2]]
+        return list(BENCHMARKS).index(benchmark), kind == "CPU", kind, parts[::2], numbers
+
+    return [found[key] for key in sorted(found, key=order)]
+
+
+def page(records: list[dict], plot: str) -> str:
+    """The page of ``records`` with the plot in the file ``plot``."""
+    lines = [
+        textwrap.fill(f"- `{name}`: {' '.join(b.__doc__.split())}", 100, subsequent_indent="  ")
+        for name, b in BENCHMARKS.items()
+    ]
+    table = "\n".join([HEADER, *map(row, newest(records))])
+    return PAGE.format(plot=plot, benchmarks="\n".join(lines), table=table)
+
+
+def plot(records, path):
+    """Plots frames per second against environments, log-log; the same records give the same SVG."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    series = {}
+    for record in newest(records):
+        match = re.fullmatch(r"(\w+), `env.step`, ([\d,]+) environments", record["what"])
+        if record["benchmark"] == "step" and match:
+            bounds = [record[key] or record["value"] for key in ("value", "lower", "upper")]
+            point = int(match[2].replace(",", "")), *(1e6 * end for end in bounds)
+            series.setdefault((match[1], record["on"]), []).append(point)
+    ax = Figure(figsize=(7.5, 4.8), layout="constrained").subplots()
+    for (name, on), points in series.items():
+        n, value, lower, upper = zip(*sorted(points))
+        style = dict(color=COLOURS.get(name), linestyle="--" if on.startswith("CPU") else "-")
+        ax.plot(n, value, marker="o", markersize=4, label=f"{name}, {on}", **style)
+        ax.fill_between(n, lower, upper, color=style["color"], alpha=0.2, linewidth=0)
+    ax.plot(*ORIGINAL, "kx", label="the original's Explorer, one H200", linestyle="none")
+    ax.set(xscale="log", yscale="log", xlabel="environments", ylabel="frames per second")
+    ticks = [2**k for k in range(10, 21, 2)]
+    ax.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
+    ax.minorticks_off()
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8)
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
+        ax.figure.savefig(path, metadata={"Date": None})
+
+
+def read(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def report(path: Path) -> None:
+    """Writes the page and the plot beside the records in ``path``."""
+    records = read(path)
+    image = path.with_name("benchmark-table.svg")
+    path.with_name("benchmark-table.md").write_text(page(records, image.name))
+    plot(records, image)
