@@ -1,18 +1,16 @@
-"""What every home must be, by its walls and masks alone, on a raster of 5 cm; `make_homes.py` asks
-for it.
-"""
+"""Checks a home by its walls and masks alone, on a raster of 5 cm; `make_homes.py` uses it."""
 
 import numpy as np
 
 from megastep import geometry
 
-FINE = 0.05  # metres a cell
+FINE = 0.05  # metres per cell
 RADIUS = 0.15 / 2**0.5  # metres; an agent's
-GAP = 0.55  # metres; the least width of any passage
+GAP = 0.55  # metres; the minimum width of any passage
 SPAWN = 0.15  # metres; in each room some point is this far from all walls
-MOST_WALLS, LARGEST = 400, 40.0
-LIT = 0.05  # metres; the least distance of a light from any wall
-LEAST_CELLS = 4  # of the masks, a room
+MAX_WALLS, MAX_EXTENT = 400, 40.0
+LIT = 0.05  # metres; the minimum distance of a light from any wall
+MIN_CELLS = 4  # of the masks, per room
 
 
 def components(free):
@@ -21,9 +19,8 @@ def components(free):
     """
     edges = np.diff(np.pad(free, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     (row, start), end = np.nonzero(edges == 1), np.nonzero(edges == -1)[1]
-    first = np.searchsorted(
-        row, np.arange(len(free) + 1)
-    )  # the runs of free cells, and each row's first one
+    # The runs of free cells, and the first one of each row.
+    first = np.searchsorted(row, np.arange(len(free) + 1))
     parents = list(range(len(row)))
 
     def root(run):
@@ -43,17 +40,17 @@ def components(free):
     return result, labels.max(initial=-1) + 1
 
 
-def clearance(g, most=0.3):
-    """The distance in metres, up to `most`, from each cell's centre on the fine raster to the
+def clearance(g, limit=0.3):
+    """The distance in metres, up to `limit`, from each cell's centre on the fine raster to the
     nearest wall.
     """
     ratio = round(g.res / FINE)
     height, width = g.masks.shape[0] * ratio, g.masks.shape[1] * ratio
-    distance = np.full((height, width), most)
+    distance = np.full((height, width), limit)
     x, y = (np.arange(width) + 0.5) * FINE, (height - np.arange(height) - 0.5) * FINE
     for (ax, ay), (bx, by) in g.walls.astype(float):
-        columns = slice(*np.searchsorted(x, (min(ax, bx) - most, max(ax, bx) + most)))
-        rows = slice(*np.searchsorted(-y, (-max(ay, by) - most, -min(ay, by) + most)))
+        columns = slice(*np.searchsorted(x, (min(ax, bx) - limit, max(ax, bx) + limit)))
+        rows = slice(*np.searchsorted(-y, (-max(ay, by) - limit, -min(ay, by) + limit)))
         px, py = x[None, columns] - ax, y[rows, None] - ay
         dx, dy = bx - ax, by - ay
         along = np.clip((px * dx + py * dy) / max(dx * dx + dy * dy, 1e-12), 0, 1)
@@ -84,11 +81,11 @@ def errors(g):
         found.append("two walls are the same")
     if np.abs(g.walls.min((0, 1)) - 1).max() > 1e-3 and g.n_outer:
         found.append(f"coordinates start at {g.walls.min((0, 1))} and not at 1 m")
-    if np.ptp(g.walls, axis=(0, 1)).max() > LARGEST or len(walls) > MOST_WALLS:
+    if np.ptp(g.walls, axis=(0, 1)).max() > MAX_EXTENT or len(walls) > MAX_WALLS:
         found.append("it is too large")
 
     rooms = g.masks.max()
-    if min(np.bincount(g.masks[g.masks > 0], minlength=rooms + 1)[1:], default=0) < LEAST_CELLS:
+    if min(np.bincount(g.masks[g.masks > 0], minlength=rooms + 1)[1:], default=0) < MIN_CELLS:
         found.append("a room has too few cells")
     labels, _ = components(g.masks >= 0)
     if (g.masks[labels == labels[0, 0]] > 0).any():

@@ -2,8 +2,8 @@
 
     python scripts/check_walls.py --steps 1e9 --device auto
 
-Prints a line a course and a last one with the sums. The exit status is 1 if anyone passed a wall,
-sank into one or got stuck; the first few are then told in full, floats to the last bit.
+Prints a line per course and a last one with the sums. The exit code is 1 if an agent passed a wall,
+sank into one or got stuck; the first few cases are then printed in full, floats to the last bit.
 """
 
 import argparse
@@ -24,8 +24,7 @@ EVERY = 10  # seconds between lines within a course
 def sentence(total, seconds):
     return (
         f"{total['steps']:,} steps, {total['collisions']:,} collisions, {total['crossings']:,} "
-        f"crossings, "
-        f"{total['sunk']:,} sunk, {total['stuck']:,} stuck of {total['tried']:,} tried "
+        f"crossings, {total['sunk']:,} sunk, {total['stuck']:,} stuck of {total['tried']:,} tried "
         f"({total['held']:,} more held by geometry), {seconds:.1f} s"
     )
 
@@ -61,7 +60,7 @@ def main():
         print(f"check_walls.py: {error}", file=sys.stderr)
         return 2
     n_agents = args.agents or (2048 if device.type == "cpu" else 1 << 20)
-    share = -(-int(args.steps) // len(walls.COURSES))
+    steps = -(-int(args.steps) // len(walls.COURSES))
     start, sums, stories = time.time(), {}, []
     for name in walls.COURSES:
         began = last = time.time()
@@ -72,7 +71,7 @@ def main():
                 last = time.time()
                 print(f"{name} so far: {sentence(total, last - began)}", flush=True)
 
-        total = walls.run(name, share, n_agents, device, args.seed, args.tries, report)
+        total = walls.run(name, steps, n_agents, device, args.seed, args.tries, report)
         print(f"{name}: {sentence(total, time.time() - began)}", flush=True)
         stories += total["stories"][:3]
         sums = {key: sums.get(key, 0) + total[key] for key in total if isinstance(total[key], int)}

@@ -1,8 +1,9 @@
-"""Makes the 5,000 homes that come with the package, checks every one, and prints what they are
-like.
+"""Makes the 5,000 homes that come with the package, checks every one, and prints statistics.
 
-python scripts/make_homes.py                    # writes megastep/geometries/data/homes.npz and
-homes.sha256 python scripts/make_homes.py --count 1000 --dry # only prints
+    python scripts/make_homes.py                      # writes homes.npz and homes.sha256
+    python scripts/make_homes.py --count 1000 --dry   # prints only
+
+The files go to megastep/geometries/data/.
 """
 
 import argparse
@@ -26,8 +27,7 @@ from scripts import check_homes
 
 NEAR = 0.3  # metres; cells in which two homes' walls are compared
 
-# What real homes are like, from CubiCasa5k and Raster-to-Vector: (statistic, percentile, least,
-# most).
+# Real homes, from CubiCasa5k and Raster-to-Vector: (statistic, percentile, min, max).
 BANDS = [
     ("walls", 5, 30, 55),
     ("walls", 50, 55, 90),
@@ -39,7 +39,7 @@ BANDS = [
     ("room area, m2", 50, 4, 8),
     ("free area, m2", 50, 50, 72),
     ("door width, m", 50, 0.70, 0.90),
-    ("doors a room", 50, 0.7, 1.0),
+    ("doors per room", 50, 0.7, 1.0),
 ]
 
 
@@ -56,7 +56,7 @@ def statistics(made):
         "room area, m2": [area for g in made for area in g.areas],
         "free area, m2": [sum(g.areas) for g in made],
         "door width, m": [width for g in made for width in g.doors],
-        "doors a room": [len(g.doors) / len(g.rooms) for g in made],
+        "doors per room": [len(g.doors) / len(g.rooms) for g in made],
         "openings": [len(g.openings) for g in made],
     }
 

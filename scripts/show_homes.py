@@ -1,4 +1,4 @@
-"""Draws a sheet of homes, all at one scale, as a picture.
+"""Draws a sheet of homes, all at one scale, as an image.
 
 python scripts/show_homes.py homes.png --first 0 --count 20
 """
@@ -59,7 +59,7 @@ def sheet(seeds):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("path", help="the picture to write, say homes.png")
+    parser.add_argument("path", help="the image to write, say homes.png")
     parser.add_argument("--first", type=int, default=0, help="the seed of the first home")
     parser.add_argument("--count", type=int, default=20)
     args = parser.parse_args()
