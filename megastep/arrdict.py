@@ -6,6 +6,8 @@ plain numbers.
 
 import copy
 import operator
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import torch
@@ -98,14 +100,14 @@ for _name, _method in _operators():
     setattr(arrdict, _name, _method)
 
 
-def stack(trees, dim=0):
+def stack(trees: Iterable, dim: int = 0) -> Any:
     """Joins trees with the same keys along a new axis ``dim``. Numbers are stacked into a numpy
     array.
     """
     return _join("stack", torch.stack, np.stack, trees, dim)
 
 
-def cat(trees, dim=0):
+def cat(trees: Iterable, dim: int = 0) -> Any:
     """Joins trees with the same keys along their existing axis ``dim``."""
     return _join("cat", torch.cat, np.concatenate, trees, dim)
 
@@ -124,8 +126,8 @@ def _join(name, torch_join, numpy_join, trees, dim):
 
 
 @mapping
-def torchify(leaf):
-    """Arrays, numbers and Raggeds as CPU tensors. float64, numpy's habit, becomes float32; other
+def torchify(leaf: Any) -> Any:
+    """Arrays, numbers and Raggeds as CPU tensors. float64, numpy's default, becomes float32; other
     dtypes stay.
 
     The memory is shared where the dtype stays. Tensors are returned as they are.
@@ -148,7 +150,7 @@ def torchify(leaf):
 
 
 @mapping
-def numpyify(leaf):
+def numpyify(leaf: Any) -> Any:
     """Tensors and Raggeds as numpy arrays, also those in lists and tuples; anything else is
     returned as it is.
 
@@ -166,7 +168,7 @@ def numpyify(leaf):
 
 
 @mapping
-def clone(leaf):
+def clone(leaf: Any) -> Any:
     """A copy that shares no memory with the original."""
     return leaf.clone() if isinstance(leaf, torch.Tensor) else copy.deepcopy(leaf)
 

@@ -1,16 +1,18 @@
-"""Between linear light, which the engine calculates in, and the sRGB values that screens expect
-(IEC 61966-2-1).
+"""Conversion between linear light, in which the engine calculates, and the sRGB values that screens
+expect (IEC 61966-2-1).
 """
 
 import numpy as np
 import torch
 
+Light = np.ndarray | torch.Tensor
+
 _KNEE = 0.0031308  # linear light below which sRGB is a straight line
 _SLOPE, _SCALE, _POWER = 12.92, 1.055, 2.4
 
 
-def gamma_encode(light):
-    """sRGB values of linear light, both in [0, 1]: what a picture must go through before it is
+def gamma_encode(light: Light) -> Light:
+    """sRGB values of linear light, both in [0, 1]: what an image must go through before it is
     shown. Any shape.
     """
     return _pieces(
@@ -18,7 +20,7 @@ def gamma_encode(light):
     )
 
 
-def gamma_decode(values):
+def gamma_decode(values: Light) -> Light:
     """Linear light of sRGB values: the inverse of :func:`gamma_encode`."""
     return _pieces(
         values,

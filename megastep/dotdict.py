@@ -6,9 +6,12 @@ needs torch.
 
 import difflib
 import functools
+from collections.abc import Callable
+from typing import Any
 
 _INDENT = 4
 _WIDTH = 120
+_MAX_AXES = 8  # a tuple of more integers is data, not a shape
 
 
 class dotdict(dict):
@@ -63,19 +66,19 @@ class dotdict(dict):
     def __ror__(self, other):
         return type(self)({**other, **self}) if isinstance(other, dict) else NotImplemented
 
-    def copy(self):
+    def copy(self) -> "dotdict":
         """A new tree of the same type holding the same values."""
         return type(self)(self)
 
-    def pipe(self, f, *args, **kwargs):
+    def pipe(self, f: Callable, *args, **kwargs) -> Any:
         """``f(self, ...)``, for calls that read from left to right."""
         return f(self, *args, **kwargs)
 
-    def map(self, f, *args, **kwargs):
+    def map(self, f: Callable, *args, **kwargs) -> "dotdict":
         """``f(leaf, ...)`` at every leaf."""
         return _map(lambda leaf: f(leaf, *args, **kwargs), self)
 
-    def starmap(self, f, *others, **kwargs):
+    def starmap(self, f: Callable, *others: dict, **kwargs) -> "dotdict":
         """``f(leaf, other leaf, ...)`` at every leaf, the others being trees with the same keys
         (ValueError if not).
         """
@@ -88,14 +91,14 @@ class dotdict(dict):
         printer.text(f"{type(self).__name__}(...)" if cycle else repr(self))
 
 
-def leaves(tree):
+def leaves(tree: Any) -> list:
     """The leaves of a tree in order, as a list; a bare leaf is its own only one."""
     if isinstance(tree, dict):
         return [leaf for value in tree.values() for leaf in leaves(value)]
     return [tree]
 
 
-def mapping(f):
+def mapping(f: Callable) -> Callable:
     """Turns ``f(leaf, ...)`` into a function of trees that keeps keys and types. Bare leaves go
     straight to ``f``.
     """
@@ -180,14 +183,24 @@ def _rows(tree):
 
 
 def _summary(value, column):
-    """A leaf in one line: arrays by shape and dtype, collections by length, the rest by their
-    text.
+    """A leaf in one line: arrays by shape and dtype, shapes in full, other collections by their
+    length, the rest by their text.
     """
     name = type(value).__name__
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{name}({tuple(value.shape)}, {value.dtype})"
+    if _is_shape(value):
+        return str(tuple(value))
     if isinstance(value, (list, tuple, set, frozenset)):
         return f"{name}(({len(value)},))"
     text = " ".join(str(value).split())
     room = max(_WIDTH - column, 16)
     return text if len(text) <= room else f"{text[: room - 3]}..."
+
+
+def _is_shape(value):
+    return (
+        isinstance(value, tuple)
+        and len(value) <= _MAX_AXES
+        and all(type(size) is int for size in value)
+    )

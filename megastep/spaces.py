@@ -1,5 +1,5 @@
-"""What observations and actions look like: a space, or a dotdict of spaces, says which numbers to
-expect.
+"""Spaces: what observations and actions look like. A space, or a dotdict of spaces, says which
+numbers to expect.
 
 A space's ``shape`` is that of one lane, without the leading axis B. Heads turn spaces into network
 layers.
@@ -14,7 +14,7 @@ class _Space:
             value = getattr(self, field.name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(
-                    f"{type(self).__name__} needs a positive whole number for {field.name}, not "
+                    f"{type(self).__name__} needs a positive integer for {field.name}, not "
                     f"{value!r}"
                 )
 
@@ -27,13 +27,13 @@ class MultiVector(_Space):
     dim: int
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, ...]:
         return astuple(self)
 
 
 @dataclass(frozen=True)
 class MultiImage(_Space):
-    """A picture of C channels, H rows and W columns for every agent: shape (n_agents, C, H, W)."""
+    """An image of C channels, H rows and W columns for every agent: shape (n_agents, C, H, W)."""
 
     n_agents: int
     C: int
@@ -41,19 +41,19 @@ class MultiImage(_Space):
     W: int
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, ...]:
         return astuple(self)
 
 
 @dataclass(frozen=True)
 class MultiDiscrete(_Space):
-    """A whole number from 0 to ``n_actions`` - 1 for every agent: shape (n_agents,)."""
+    """An integer from 0 to ``n_actions`` - 1 for every agent: shape (n_agents,)."""
 
     n_agents: int
     n_actions: int
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, ...]:
         return (self.n_agents,)
 
 
@@ -62,5 +62,5 @@ class MultiEmpty(_Space):
     """Nothing at all: shape (0,)."""
 
     @property
-    def shape(self):
+    def shape(self) -> tuple[int, ...]:
         return (0,)

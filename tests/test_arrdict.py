@@ -64,6 +64,19 @@ def test_printing_shows_shape_and_dtype(tensors):
     )
 
 
+def test_shapes_are_printed_in_full():
+    tree = arrdict(rgb=torch.zeros(2, 1, 3, 1, 64), inner=arrdict(d=np.zeros(4)), n=torch.tensor(1))
+    assert repr(tree.shape) == "\n".join(
+        [
+            "arrdict:",
+            "rgb      (2, 1, 3, 1, 64)",
+            "inner    arrdict:",
+            "         d    (4,)",
+            "n        ()",
+        ]
+    )
+
+
 def test_indexing_goes_to_the_leaves():
     tree = arrdict(a=torch.arange(6).view(2, 3), b=dotdict(c=torch.arange(4).view(2, 2)))
     assert numbers(tree[1]) == {"a": [3, 4, 5], "b": {"c": [2, 3]}}

@@ -154,6 +154,17 @@ def test_printing_aligns_values_and_keeps_leaves_to_a_line():
     assert fourth.endswith("...") and len(fourth) <= 120
 
 
+def test_tuples_of_integers_are_printed_in_full_and_other_collections_by_their_length():
+    tree = dotdict(shape=(2, 3), flags=(True,), names=("a", "b"), long=tuple(range(9)))
+    assert repr(tree) == lines(
+        "dotdict:",
+        "shape    (2, 3)",
+        "flags    tuple((1,))",
+        "names    tuple((2,))",
+        "long     tuple((9,))",
+    )
+
+
 def test_completion_offers_the_keys(objs):
     assert {"a", "d", "map"} <= set(dir(objs))
 

@@ -40,6 +40,6 @@ def test_spaces_do_not_change():
 
 
 @pytest.mark.parametrize("bad", [0, -1, 2.5, True, "3", None])
-def test_sizes_are_positive_whole_numbers(bad):
-    with pytest.raises(ValueError, match="MultiVector needs a positive whole number for dim, not"):
+def test_sizes_are_positive_integers(bad):
+    with pytest.raises(ValueError, match="MultiVector needs a positive integer for dim, not"):
         spaces.MultiVector(1, bad)
