@@ -1,11 +1,14 @@
-"""What a policy earns: the first episode of every lane, and how sure that is.
+"""What a policy earns: the first episode of every lane, and a confidence interval for its mean.
 
-B lanes, N worlds, A agents. Nothing here asks the device a question more often than every `CHECK`
-steps.
+B lanes, N environments. The host waits for the device once every `CHECK` steps, and at the end.
 """
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
@@ -18,21 +21,23 @@ CHECK = 64
 class RandomActions:
     """A policy that draws every action evenly; the row a trained one is compared with."""
 
-    def __init__(self, action_space):
+    def __init__(self, action_space: Any):
         self.action_space = action_space
 
-    def initial(self, n_lanes, device):
+    def initial(self, n_lanes: int, device: torch.device | str) -> arrdict:
         return arrdict(lane=torch.zeros(n_lanes, device=device))
 
-    def __call__(self, world, state, sample=True, generator=None):
-        lanes = len(state.lane)
+    def __call__(
+        self, world: Mapping, state: Mapping, sample: bool = True, generator=None
+    ) -> tuple[arrdict, Mapping]:
+        lanes = len(state["lane"])
 
         @mapping
         def draw(space):
             return torch.randint(
                 space.n_actions,
                 (lanes, *space.shape),
-                device=state.lane.device,
+                device=state["lane"].device,
                 generator=generator,
             )
 
@@ -40,15 +45,22 @@ class RandomActions:
 
 
 @torch.no_grad()
-def first_episodes(env, policy, seed=1, greedy=False, max_steps=100_000):
-    """Plays each lane's first episode: arrdict of returns (B,), lengths (B,), done (B,), on the
-    environment's device.
+def first_episodes(
+    env: Any, policy: Any, seed: int = 1, greedy: bool = False, max_steps: int = 100_000
+) -> arrdict:
+    """Plays each lane's first episode: arrdict of `returns` (B,) float32, `lengths` (B,) float32
+    steps, `done` (B,) bool, and `homes` (B,) int32, on the environment's device.
 
-    An episode still going after `max_steps` is reported as it stands, with done False.
+    `homes` are the layouts that the environment shows after its reset, one per lane; a layout
+    changes at respawns alone, so each lane's episode is played in that home from end to end.
+    Without `env.layout` there is no such key. An episode still going after `max_steps` is reported
+    as it stands, with `done` False.
     """
     device, lanes = torch.device(env.device), env.n_envs * env.n_agents
     generator = torch.Generator(device).manual_seed(seed)
     world, state = env.reset(), policy.initial(lanes, device)
+    layout = getattr(env, "layout", None)
+    homes = {} if layout is None else {"homes": layout.repeat_interleave(env.n_agents)}
     returns, lengths = (torch.zeros(lanes, device=device) for _ in range(2))
     done = torch.zeros(lanes, dtype=torch.bool, device=device)
     for step in range(max_steps):
@@ -59,18 +71,26 @@ def first_episodes(env, policy, seed=1, greedy=False, max_steps=100_000):
         returns += torch.where(done, 0.0, world.reward)
         lengths += ~done
         done |= world.terminal | world.truncated
-    return arrdict(returns=returns, lengths=lengths, done=done)
+    return arrdict(returns=returns, lengths=lengths, done=done, **homes)
 
 
-def interval(values, groups, level=0.95, n_resamples=2000, seed=1):
-    """The mean of `values` (B,) and a bootstrap interval for it that resamples whole groups:
-    `(mean, low, high)`.
+def interval(
+    values: ArrayLike,
+    groups: ArrayLike | None = None,
+    level: float = 0.95,
+    n_resamples: int = 2000,
+    seed: int = 1,
+) -> tuple[float, float, float]:
+    """The mean of `values` (B,) and a bootstrap interval for it: `(mean, low, high)`.
 
-    Lanes in one home are alike, so it is homes (`groups`, (B,) whole numbers) that are drawn, with
-    replacement: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 13.3. With
-    one home, lanes are drawn.
+    Lanes in one home are alike, so homes are drawn with replacement, each with all its lanes
+    (`groups`, (B,) integers): Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section
+    13.3. Each resample's estimate is that of the table, the mean over its lanes: the sum of the
+    values drawn over their number, also where homes hold unequal numbers of lanes. Without groups,
+    or with a single one, lanes are drawn.
     """
-    values, groups = np.asarray(values, float), np.asarray(groups)
+    values = np.asarray(values, float)
+    groups = np.zeros(len(values)) if groups is None else np.asarray(groups)
     if len(np.unique(groups)) == 1:
         groups = np.arange(len(values))
     _, groups = np.unique(groups, return_inverse=True)
@@ -81,17 +101,18 @@ def interval(values, groups, level=0.95, n_resamples=2000, seed=1):
     return float(values.mean()), float(low), float(high)
 
 
-def summary(episodes, groups):
-    """A table's row: the mean return with its 95 % interval, the mean length, and what they were
-    taken over.
+def summary(episodes: Mapping) -> dict:
+    """A table's row for what `first_episodes` gave: the mean return with its 95 % interval, the
+    mean length, and what they were taken over; `homes` is None where there are none.
     """
-    mean, low, high = interval(episodes.returns.cpu().numpy(), groups)
+    homes = episodes["homes"].cpu().numpy() if "homes" in episodes else None
+    mean, low, high = interval(episodes["returns"].cpu().numpy(), homes)
     return {
         "return": mean,
         "low": low,
         "high": high,
-        "length": float(episodes.lengths.mean()),
-        "lanes": len(episodes.returns),
-        "homes": len(np.unique(groups)),
-        "unfinished": int((~episodes.done).sum()),
+        "length": float(episodes["lengths"].mean()),
+        "lanes": len(episodes["returns"]),
+        "homes": None if homes is None else len(np.unique(homes)),
+        "unfinished": int((~episodes["done"]).sum()),
     }

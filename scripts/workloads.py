@@ -325,7 +325,8 @@ def train(device):
                 cwd=ROOT,
                 stdout=sys.stderr,
             )
-            rows = json.loads((run / "evaluation.json").read_text())["rows"][:2]
+            (written,) = run.glob("evaluations/*.json")
+            rows = json.loads(written.read_text())["rows"][:2]
             perf = [json.loads(line) for line in (run / "perf.jsonl").read_text().splitlines()]
         for whose, row in zip(("return", "return of random actions"), rows):
             yield dict(

@@ -101,4 +101,4 @@ def test_a_reader_that_leaves_does_not_stop_the_run(tmp_path):
         env={**os.environ, "TERM": "dumb"},
     )
     assert done.stderr.splitlines() == ["code 0"]
-    assert (tmp_path / "run" / "evaluation.json").exists()
+    assert list((tmp_path / "run" / "evaluations").glob("box-test-*.json"))

@@ -3,6 +3,7 @@ and the script.
 """
 
 import dataclasses
+import itertools
 import json
 
 import numpy as np
@@ -10,11 +11,12 @@ import pytest
 import torch
 
 from agents import evaluation
-from agents.cli import evaluate, train
+from agents.cli import evaluate, run_folders, train
 from agents.cli.compose import ConfigLoader
 from agents.cli.settings import Evaluate, Train, UserError, build
-from megastep import spaces
+from megastep import envs, spaces
 from megastep.arrdict import arrdict
+from megastep.geometries import sample
 
 TINY = [
     "env=minimal",
@@ -76,7 +78,7 @@ def test_an_episode_that_does_not_end_is_reported_as_it_stands():
         env, evaluation.RandomActions(env.action_space), max_steps=64
     )
     assert int((~episodes.done).sum()) == 36 and float(episodes.returns.max()) == 64
-    assert evaluation.summary(episodes, range(100))["unfinished"] == 36
+    assert evaluation.summary(episodes)["unfinished"] == 36
 
 
 def test_random_actions_are_spread_evenly_over_every_action():
@@ -88,6 +90,54 @@ def test_random_actions_are_spread_evenly_over_every_action():
     assert decision.actions.move.shape == (10_000, 2) and decision.actions.fire.shape == (10_000, 1)
     shares = torch.bincount(decision.actions.move.flatten(), minlength=7) / 20_000
     assert shares.sub(1 / 7).abs().max() < 0.015  # six standard errors
+
+
+def lanes_of_homes(sizes, random):
+    """Returns of ``sizes[h]`` lanes in each home h, and the lanes' homes."""
+    homes = np.repeat(np.arange(len(sizes)), sizes)
+    return random.normal(np.arange(len(sizes))[homes], 1.0), homes
+
+
+class Moving:
+    """An Explorer that writes down in which home each lane's first episode ends."""
+
+    def __init__(self, *args, **settings):
+        self.env = envs.Explorer(*args, res=1, subsample=1, patience=1, **settings)
+        self.last = torch.full((self.env.n_envs,), -1)
+
+    def __getattr__(self, name):
+        return getattr(self.env, name)
+
+    def step(self, decision):
+        world, scenery = self.env.step(decision), self.env.core.scenery
+        ended = (world.terminal | world.truncated) & (self.last < 0)
+        self.last = torch.where(ended, scenery.layout.long(), self.last)
+        return world
+
+
+@pytest.mark.parametrize("resample", [False, True])
+def test_a_lane_is_labelled_with_the_home_its_first_episode_is_played_in(resample):
+    env = Moving(10, sample("bench", 4), device="cpu", resample=resample)
+    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    assert bool(episodes.done.all())
+    assert torch.equal(episodes.homes.long(), env.last)
+    assert torch.equal(env.layout, torch.arange(10) % 4) != resample
+
+
+def test_agents_of_one_environment_share_its_home():
+    class Pairs(Counting):
+        """Two agents in each of three environments."""
+
+        n_agents, layout = 2, torch.tensor([7, 8, 7])
+
+        def reset(self):
+            return Counting(6, False).reset()
+
+    env = Pairs(3, False)
+    episodes = evaluation.first_episodes(
+        env, evaluation.RandomActions(env.action_space), max_steps=0
+    )
+    assert episodes.homes.tolist() == [7, 7, 8, 8, 7, 7]
 
 
 def test_the_mean_is_exact_and_the_interval_holds_it():
@@ -108,9 +158,38 @@ def test_lanes_of_one_home_count_as_one_draw():
     assert again == pytest.approx(alone)
 
 
-def test_in_one_home_lanes_are_drawn():
-    mean, low, high = evaluation.interval([0.0, 1.0] * 200, np.zeros(400))
+@pytest.mark.parametrize("groups", [None, np.zeros(400)])
+def test_without_homes_or_in_one_alone_lanes_are_drawn(groups):
+    mean, low, high = evaluation.interval([0.0, 1.0] * 200, groups)
     assert mean == 0.5 and high - low == pytest.approx(4 * 0.5 / 20, rel=0.15)
+
+
+def test_an_environment_without_homes_has_an_interval_over_episodes():
+    env = Counting(400, False)
+    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    row = evaluation.summary(episodes)
+    assert "homes" not in episodes and row["homes"] is None
+    error = np.std(np.arange(1, 401)) / 20
+    assert row["high"] - row["low"] == pytest.approx(2 * 1.96 * error, rel=0.1)
+
+
+def test_a_home_with_more_lanes_weighs_more():
+    """One lane that earned 0 in one home, three that earned 4 in another. Of the resamples of two
+    homes half hold both: (0 + 3 * 4) / 4 = 3, not the mean of the homes' means, 2.
+    """
+    mean, low, high = evaluation.interval([0.0, 4.0, 4.0, 4.0], [0, 1, 1, 1], level=0.4)
+    assert mean == low == high == 3
+
+
+@pytest.mark.parametrize("sizes", [(1, 5, 2), (3, 3, 3), (1, 1, 7, 2)])
+def test_the_interval_is_that_of_an_evaluator_that_tries_every_resample(sizes):
+    values, homes = lanes_of_homes(sizes, np.random.default_rng(3))
+    tries = []
+    for chosen in itertools.product(range(len(sizes)), repeat=len(sizes)):
+        drawn = [value for home in chosen for value in values[homes == home]]
+        tries.append(sum(drawn) / len(drawn))
+    found = evaluation.interval(values, homes, level=0.8, n_resamples=200_000)
+    assert found == pytest.approx((values.mean(), *np.quantile(tries, [0.1, 0.9])), abs=0.02)
 
 
 def configured(**changes):
@@ -130,8 +209,9 @@ def trained(tmp_path_factory):
 
 
 def test_the_table_is_printed_and_written(trained, capsys):
-    assert evaluate.run(configured(run=str(trained))) == trained
-    result = json.loads((trained / "evaluation.json").read_text())
+    written = evaluate.run(configured(run=str(trained)))
+    assert written == trained / "evaluations" / "box-test-32.json"
+    result = json.loads(written.read_text())
     first, second = result["rows"]
     assert (first["agent"], second["agent"]) == ("trained", "random")
     assert (
@@ -141,25 +221,23 @@ def test_the_table_is_printed_and_written(trained, capsys):
         and 5 <= first["length"] <= 9
     )
     assert result["checkpoint"].endswith("step_32") and result["evaluation"]["split"] == "test"
-    for text in (capsys.readouterr().out, (trained / "evaluation.md").read_text()):
+    for text in (capsys.readouterr().out, written.with_suffix(".md").read_text()):
+        assert "95 % interval" in text and "random" in text
         assert (
-            "95 % interval" in text
-            and "random" in text
-            and "minimal in the test homes of box" in text
+            "minimal in the test homes of box, after 32 samples (step_32), seed 1, 6 lanes" in text
         )
+    assert run_folders.headline(trained) == run_folders.headline(written) == "0.00 (0.00 to 0.00)"
 
 
-def test_it_is_reproducible_and_other_homes_can_be_chosen(trained):
+def test_it_is_reproducible_and_each_has_a_file_of_its_own(trained):
     def lengths(**changes):
-        evaluate.run(configured(run=str(trained), **changes))
-        return [
-            row["length"] for row in json.loads((trained / "evaluation.json").read_text())["rows"]
-        ]
+        written = evaluate.run(configured(run=str(trained), **changes))
+        return [row["length"] for row in json.loads(written.read_text())["rows"]]
 
     with ConfigLoader("evaluate", Evaluate) as door:
         bench = build(Evaluate, door.tree(["run=x", "geometry=bench", "geometry.n=3"])).geometry
     assert lengths() == lengths() != lengths(seed=2)
-    evaluate.run(
+    written = evaluate.run(
         configured(
             run=str(trained / "checkpoints" / "step_32"),
             geometry=bench,
@@ -167,9 +245,42 @@ def test_it_is_reproducible_and_other_homes_can_be_chosen(trained):
             greedy=True,
         )
     )
-    result = json.loads((trained / "evaluation.json").read_text())
+    result = json.loads(written.read_text())
     assert [(row["agent"], row["homes"]) for row in result["rows"]] == [("trained, greedy", 3)]
-    assert "bench" in result["title"]
+    evaluate.run(configured(run=str(trained), split="training", baseline=False))
+    names = {path.name for path in (trained / "evaluations").iterdir()}
+    assert names == {
+        f"{name}.{kind}"
+        for name in ("box-test-32", "box-training-32", "bench-test-32-greedy")
+        for kind in ("json", "md")
+    }
+
+
+def test_a_lane_stays_in_one_home_whatever_the_training_did(tmp_path, monkeypatch):
+    """Ten lanes in four homes: three, three, two and two, each at home where its label says."""
+    monkeypatch.chdir(tmp_path)
+    small = ["env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1", "agent.width=8"]
+    explorer = ["env=explorer", "env.resample=true", "geometry=bench", "geometry.n=4", *small]
+    with ConfigLoader("train", Train) as door:
+        run = train.run(build(Train, door.tree([*explorer, *TINY[2:3], *TINY[7:9], *TINY[-2:]])))
+    seen = {}
+
+    def spied(env, *args):
+        seen["env"], seen["episodes"] = env, first_episodes(env, *args)
+        return seen["episodes"]
+
+    first_episodes = evaluation.first_episodes
+    monkeypatch.setattr(evaluation, "first_episodes", spied)
+    evaluate.run(configured(run=str(run), split="all", lanes=10, baseline=False))
+    assert seen["episodes"].homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1]
+    assert torch.equal(seen["env"].core.scenery.layout, seen["episodes"].homes)
+
+
+def test_a_table_that_cannot_be_written_is_one_sentence(trained, monkeypatch, tmp_path):
+    place = tmp_path / "file"
+    place.write_text("")
+    with pytest.raises(UserError, match="cannot be written to .*file"):
+        evaluate.write(place, "name", dict(title="", rows=[]))
 
 
 def test_a_checkpoint_of_another_environment_is_refused_with_both_shapes(trained, tmp_path):

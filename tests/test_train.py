@@ -275,7 +275,8 @@ def test_the_end_of_a_run_can_hold_a_table_and_a_video(here, capsys):
             "finish.steps=2",
         )
     )
-    result = json.loads((folder / "evaluation.json").read_text())
+    (written,) = (folder / "evaluations").glob("*.json")
+    result = json.loads(written.read_text())
     assert [row["agent"] for row in result["rows"]] == ["trained", "random"]
     assert (folder / "video.mp4").stat().st_size > 1000
     assert "random" in capsys.readouterr().out

@@ -4,7 +4,9 @@ from Python.
 
 import dataclasses
 import json
+import os
 import time
+from pathlib import Path
 
 from agents import evaluation
 from agents.cli import components, run_folders
@@ -13,7 +15,7 @@ from agents.cli.console import duration, say, table
 from agents.cli.settings import Evaluate, UserError
 
 HELP = """Prints and writes what a run's agent earns in the first episode of each lane, with a 95 %
-interval over homes.
+interval over homes. Each table is a file of its own in the run's folder: evaluations/*.md.
 
 The commonest:
   run=RUN              a run folder, one of its checkpoints, or latest
@@ -25,17 +27,17 @@ The commonest:
 COLUMNS = ("agent", "return", "95 % interval", "length", "episodes", "homes")
 
 
-def run(cfg):
-    """Evaluates as `cfg`, a settings.Evaluate, says. Writes evaluation.json and .md in the run's
-    folder; returns it.
+def run(cfg: Evaluate) -> Path:
+    """Evaluates as `cfg` says, each lane in one home of its own throughout. Writes the table to the
+    run's folder `evaluations`, one .json and .md per geometry source, split and checkpoint; returns
+    the path of the .json.
     """
     device, path = components.make_device(cfg.device), run_folders.find(cfg.run)
     loaded = components.load(path, device)
     trained = components.config_of(loaded)
-    homes = components.homes(cfg.geometry or trained.geometry, cfg.split, cfg.lanes)
-    env = components.make_env(
-        dataclasses.replace(trained.env, n_envs=cfg.lanes), homes, cfg.seed, device
-    )
+    geometry = cfg.geometry or trained.geometry
+    homes = components.homes(geometry, cfg.split, cfg.lanes)
+    env = components.make_env(settled(trained.env, cfg.lanes), homes, cfg.seed, device)
     policy = components.make_policy(trained.agent, env)
     components.load_weights(policy, env, loaded)
     players = {"trained, greedy" if cfg.greedy else "trained": policy}
@@ -43,24 +45,36 @@ def run(cfg):
         players["random"] = evaluation.RandomActions(env.action_space)
 
     start, rows = time.monotonic(), []
-    homes_of_lanes = [e % len(homes) for e in range(env.n_envs) for _ in range(env.n_agents)]
     for name, player in players.items():
         episodes = evaluation.first_episodes(env, player, cfg.seed, cfg.greedy and player is policy)
-        rows.append({"agent": name, **evaluation.summary(episodes, homes_of_lanes)})
-    geometry = (cfg.geometry or trained.geometry).name
+        rows.append({"agent": name, **evaluation.summary(episodes)})
     title = (
-        f"{trained.env.name} in the {cfg.split} homes of {geometry}, after {loaded.step:,} samples"
+        f"{trained.env.name} in the {cfg.split} homes of {source(geometry)}, after "
+        f"{loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, {cfg.lanes:,} lanes"
     )
-    say(table(COLUMNS, [cells(row) for row in rows], title))
+    say(title)
+    say(table(COLUMNS, [cells(row) for row in rows]))
     say(f"evaluated in {duration(time.monotonic() - start)}")
-    folder = run_folders.folder_of(path)
-    write(
-        folder,
-        dict(
-            title=title, checkpoint=str(loaded.path), evaluation=dataclasses.asdict(cfg), rows=rows
-        ),
+    name = f"{source(geometry)}-{cfg.split}-{loaded.step}{'-greedy' if cfg.greedy else ''}"
+    result = dict(
+        title=title,
+        checkpoint=str(loaded.path),
+        step=loaded.step,
+        evaluation=dataclasses.asdict(cfg),
+        rows=rows,
     )
-    return folder
+    return write(run_folders.folder_of(path) / "evaluations", name, result)
+
+
+def settled(env, n_envs):
+    """An environment's settings for `n_envs` environments that stay in the homes they start in."""
+    moving = {"resample": False} if hasattr(env, "resample") else {}
+    return dataclasses.replace(env, n_envs=n_envs, **moving)
+
+
+def source(geometry):
+    """The name of the geometries evaluated in, for titles and file names."""
+    return geometry.name if geometry.path is None else f"{geometry.name}-{Path(geometry.path).stem}"
 
 
 def cells(row):
@@ -72,23 +86,33 @@ def cells(row):
         f"{row['low']:.2f} to {row['high']:.2f}",
         f"{row['length']:.0f}",
         f"{row['lanes']}{cut}",
-        str(row["homes"]),
+        "none" if row["homes"] is None else str(row["homes"]),
     )
 
 
-def write(folder, result):
-    """Writes a result for machines and for people."""
+def write(folder, name, result):
+    """Writes a result for machines and for people, `name`.json and .md, each whole or not at all.
+    Returns the .json's path.
+    """
     lines = [
         "| " + " | ".join(line) + " |"
         for line in (COLUMNS, ("---",) * len(COLUMNS), *map(cells, result["rows"]))
     ]
+    texts = {
+        ".md": "\n".join([result["title"], "", *lines]) + "\n",
+        ".json": json.dumps(result, indent=2) + "\n",
+    }
     try:
-        (folder / "evaluation.json").write_text(json.dumps(result, indent=2) + "\n")
-        (folder / "evaluation.md").write_text("\n".join([result["title"], "", *lines]) + "\n")
+        folder.mkdir(exist_ok=True)
+        for suffix, text in texts.items():
+            partial = folder / f"{name}{suffix}.tmp-{os.getpid()}"
+            partial.write_text(text)
+            os.replace(partial, folder / f"{name}{suffix}")
     except OSError as error:
         raise UserError(
             f"The evaluation cannot be written to {folder} ({error.strerror})"
         ) from error
+    return folder / f"{name}.json"
 
 
 def main(argv=None):

@@ -102,25 +102,31 @@ def folder_of(path):
     return path.parent.parent if is_checkpoint(path) else path
 
 
-def headline(folder):
-    """What a finished run achieved, in a few words: its evaluated return, else the last one seen in
-    training.
+def headline(result):
+    """What a finished job achieved, in a few words: the return in its table (an evaluation's file,
+    or the one of a run's last checkpoint), else the last return seen in training. `result` is what
+    the job returned, None if it failed.
     """
     from agents.metrics import read
 
+    if result is None:
+        return ""
+    tables = [result] if result.is_file() else sorted(result.glob("evaluations/*.json"))
     try:
-        row = json.loads((folder / "evaluation.json").read_text())["rows"][0]
+        tables = [json.loads(path.read_text()) for path in tables if path.suffix == ".json"]
+        last = max(tables, key=lambda table: (table["step"], not table["evaluation"]["greedy"]))
+        row = last["rows"][0]
         return f"{row['return']:.2f} ({row['low']:.2f} to {row['high']:.2f})"
-    except (OSError, TypeError):
+    except (OSError, ValueError):
         pass
     try:
         returns = [
             row["episode/return"]
-            for row in read(folder / "metrics.jsonl")
+            for row in read(result / "metrics.jsonl")
             if "episode/return" in row
         ]
         return f"{returns[-1]:.2f} in training" if returns else ""
-    except (OSError, TypeError):
+    except OSError:
         return ""
 
 

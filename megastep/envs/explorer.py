@@ -119,6 +119,11 @@ class Explorer:
         )
         return obs, view.newly_seen[:, 0] if seen else None
 
+    @property
+    def layout(self) -> torch.Tensor:
+        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
+        return self.core.scenery.layout
+
     def state(self, e=0):
         """What :meth:`plot_state` draws of world ``e``."""
         return arrdict(

@@ -72,6 +72,11 @@ class Minimal:
         view = engine.observe(self.core.scenery, self.core.agents, depth=False)
         return view.rgb.view(self.n_envs, *self.obs_space.shape)
 
+    @property
+    def layout(self) -> torch.Tensor:
+        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
+        return self.core.scenery.layout
+
     def state(self, e=0):
         """What :meth:`plot_state` draws of world ``e``."""
         return arrdict(
