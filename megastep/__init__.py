@@ -1,4 +1,4 @@
-"""megastep: reinforcement learning in thousands of small flat worlds on one device.
+"""megastep: reinforcement learning in thousands of small flat environments on one device.
 
 Importing the package loads nothing else. Its modules arrive when they are first used, either way
 round::
@@ -27,6 +27,7 @@ _MODULES = (
     "recording",
     "scene",
     "spaces",
+    "state",
     "toys",
 )
 

@@ -1,201 +1,117 @@
-"""Any environment's step as a CUDA graph, and the walk over all that can change in it.
+"""Any environment's step, or any function of tensors, as a CUDA graph.
 
-Whatever changes in an environment is a tensor or a generator reachable from its attributes.
-:func:`state_tree` finds them, for capture, checkpoints and resume alike; :func:`capture` records a
-function of such state once and replays it without Python.
+:func:`capture` records a function once and replays it without Python. What the function changes
+must be tensors and generators reachable from the objects it is given as roots (see
+:mod:`~megastep.state`); their values are put back after the recording, so that warming up does not
+advance an environment. :class:`Captured` does this to an environment's ``step``.
 """
 
-import ast
 import contextlib
 import traceback
-import types
 import warnings
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch.utils import _pytree
 
-SCALARS = (bool, int, float, str, type(None))
-OPAQUE = (
-    types.ModuleType,
-    types.FunctionType,
-    types.MethodType,
-    types.BuiltinFunctionType,
-    type,
-    torch.dtype,
-    torch.device,
-)
+from .state import SCALARS, rebind, restore, snapshot, state_tree, walk
 
-
-def _children(node):
-    """(step of the path, child) of a node of the walk."""
-    if isinstance(node, dict):
-        return [(f"[{key!r}]", child) for key, child in dict.items(node)]
-    if isinstance(node, (list, tuple)):
-        return [(f"[{i}]", child) for i, child in enumerate(node)]
-    if isinstance(node, torch.nn.Module):
-        return [
-            (f".{key}", child)
-            for group in ("_parameters", "_buffers", "_modules")
-            for key, child in getattr(node, group).items()
-        ] + [(f".{key}", child) for key, child in vars(node).items() if not key.startswith("_")]
-    return (
-        [(f".{key}", child) for key, child in vars(node).items()]
-        if hasattr(node, "__dict__")
-        else []
-    )
-
-
-def _walk(root, wanted):
-    """{path: (parent, step, leaf)} of the leaves of types ``wanted`` below ``root``, each object
-    once.
-    """
-    found, seen, stack = {}, set(), [("", None, "", root)]
-    while stack:
-        path, parent, step, node = stack.pop()
-        if isinstance(node, wanted):
-            found[path] = (parent, step, node)
-        elif (
-            not isinstance(node, (*OPAQUE, *SCALARS, torch.Tensor, torch.Generator))
-            and id(node) not in seen
-        ):
-            seen.add(id(node))
-            stack += [
-                (path + below, node, below, child) for below, child in reversed(_children(node))
-            ]
-    return found
-
-
-def state_tree(env):
-    """{path: tensor or generator} of everything in ``env`` that can change; paths read as
-    attributes do, ``.core.agents.positions``.
-    """
-    return {
-        path: leaf for path, (_, _, leaf) in _walk(env, (torch.Tensor, torch.Generator)).items()
-    }
-
-
-def snapshot(env):
-    """A copy of what :func:`state_tree` finds, for :func:`restore`."""
-    return {
-        path: leaf.detach().clone() if isinstance(leaf, torch.Tensor) else leaf.get_state()
-        for path, leaf in state_tree(env).items()
-    }
-
-
-@torch.no_grad()
-def restore(env, saved):
-    """Writes a :func:`snapshot` back, in place. ValueError, naming the first, if the tree has other
-    leaves now.
-    """
-    tree = state_tree(env)
-    missing = sorted(saved.keys() - tree.keys())
-    if missing:
-        raise ValueError(
-            f"the state holds {missing[0][1:]}, which this {type(env).__name__} does not have: it "
-            f"belongs to "
-            f"another environment or version"
-        )
-    for path, value in saved.items():
-        leaf = tree[path]
-        if isinstance(leaf, torch.Generator):
-            leaf.set_state(value)
-        elif leaf.shape != value.shape or leaf.dtype != value.dtype:
-            raise ValueError(
-                f"the state's {path[1:]} is {tuple(value.shape)} {value.dtype}, but this "
-                f"{type(env).__name__} "
-                f"needs {tuple(leaf.shape)} {leaf.dtype}"
-            )
-        else:
-            leaf.copy_(value)
-
-
-def _rebind(parent, step, leaf):
-    if isinstance(parent, tuple):
-        raise TypeError("a tensor inside a tuple was replaced")
-    if step.startswith("["):
-        parent.__setitem__(ast.literal_eval(step[1:-1]), leaf)
-    elif isinstance(parent, torch.nn.Module) and step[1:] in parent._parameters:
-        parent._parameters[step[1:]] = leaf
-    else:
-        setattr(parent, step[1:], leaf)
-
-
-def _renew_generators(roots):
-    """Replaces the generators on GPUs: a capture that failed leaves its own believing that it goes
-    on.
-    """
-    renewed = {}
-    for parent, step, old in _walk(roots, torch.Generator).values():
-        if old.device.type == "cuda":
-            with contextlib.suppress(TypeError, AttributeError):
-                _rebind(parent, step, renewed.setdefault(id(old), torch.Generator(old.device)))
+__all__ = ["CaptureError", "Captured", "Graph", "capture", "restore", "snapshot", "state_tree"]
 
 
 class CaptureError(RuntimeError):
     """A function cannot be replayed as a graph. The message is one sentence with the cure."""
 
 
-class _State:
-    """The state of some objects before and after a call: what a graph has to keep in place."""
+class _StateBefore:
+    """Which tensors and scalars some objects held before a call of a function."""
 
     def __init__(self, roots):
         self.roots = dict(enumerate(roots))
-        self.tensors, self.scalars = _walk(self.roots, torch.Tensor), _walk(self.roots, SCALARS)
+        self.tensors, self.scalars = walk(self.roots, torch.Tensor), walk(self.roots, SCALARS)
 
-    def settle(self):
-        """Copies tensors that were rebound back to where they were, and refuses scalars that
-        changed.
+    def keep_in_place(self):
+        """After the call: copies tensors that were rebound to where they were before, and raises
+        CaptureError for any other change that a graph cannot repeat. A tensor that appears where
+        None stood, or nothing, stays: it is where the function will write from now on.
         """
-        scalars = _walk(self.roots, SCALARS)
-        for path in scalars.keys() & self.scalars.keys():
-            old, new = self.scalars[path][2], scalars[path][2]
-            if old != new and not (old != old and new != new):
+        tensors, scalars = walk(self.roots, torch.Tensor), walk(self.roots, SCALARS)
+        self._refuse_changed_scalars(tensors, scalars)
+        reachable = {id(leaf) for _, _, leaf in tensors.values()}
+        for path, (_, _, old) in self.tensors.items():
+            if path not in tensors:
+                if id(old) in reachable:
+                    continue
                 raise CaptureError(
-                    f"{_readable(path)} changed from {old!r} to {new!r} during the call, but a "
-                    f"graph replays "
-                    f"tensors only: make it a tensor on the device."
+                    f"{_readable(path)} was a tensor of shape {tuple(old.shape)} before the call "
+                    f"and is gone after it: keep it, and change it in place."
                 )
-        for path, (parent, step, new) in _walk(self.roots, torch.Tensor).items():
-            old = self.tensors.get(path, (None, None, None))[2]
-            if old is None or new is old:
-                continue
-            if old.shape != new.shape or old.dtype != new.dtype:
+            parent, step, new = tensors[path]
+            if new is not old:
+                _copy_back(path, parent, step, old, new)
+
+    def _refuse_changed_scalars(self, tensors, scalars):
+        for path, (_, _, old) in self.scalars.items():
+            new = scalars[path][2] if path in scalars else old
+            tensor = path in tensors and old is not None
+            if tensor or (old != new and not (old != old and new != new)):
+                became = "a tensor" if tensor else repr(new)
                 raise CaptureError(
-                    f"{_readable(path)} changed its shape or dtype during the call, from "
-                    f"{tuple(old.shape)} "
-                    f"{old.dtype} to {tuple(new.shape)} {new.dtype}: keep them fixed."
+                    f"{_readable(path)} changed from {old!r} to {became} during the call, but a "
+                    f"graph replays tensors only: make it a tensor on the device."
                 )
-            try:
-                old.copy_(new)
-                _rebind(parent, step, old)
-            except (TypeError, AttributeError) as error:
-                raise CaptureError(
-                    f"{_readable(path)} was replaced where it cannot be put back ({error}): "
-                    f"change it in place."
-                ) from None
 
     def undo(self):
         """Puts back every tensor and scalar that is another now than it was, as far as it can be
         put anywhere.
         """
         for before in (self.tensors, self.scalars):
-            now = _walk(self.roots, (torch.Tensor, *SCALARS))
+            now = walk(self.roots, (torch.Tensor, *SCALARS))
             for path, (parent, step, leaf) in before.items():
                 if path not in now or now[path][2] is not leaf:
                     with contextlib.suppress(TypeError, AttributeError, KeyError, IndexError):
-                        _rebind(parent, step, leaf)
+                        rebind(parent, step, leaf)
+
+
+def _copy_back(path, parent, step, old, new):
+    if old.shape != new.shape or old.dtype != new.dtype:
+        raise CaptureError(
+            f"{_readable(path)} changed its shape or dtype during the call, from "
+            f"{tuple(old.shape)} {old.dtype} to {tuple(new.shape)} {new.dtype}: keep them fixed."
+        )
+    try:
+        old.copy_(new)
+        rebind(parent, step, old)
+    except (TypeError, AttributeError) as error:
+        raise CaptureError(
+            f"{_readable(path)} was replaced where it cannot be put back ({error}): change it in "
+            f"place."
+        ) from None
 
 
 def _readable(path):
+    """A path without the number of its root."""
     return path.partition("]")[2].lstrip(".")
+
+
+def _renew_generators(roots):
+    """Replaces the generators on GPUs: those that a failed recording registered stay in the state
+    of being captured.
+    """
+    renewed = {}
+    for parent, step, old in walk(roots, (torch.Generator,)).values():
+        if old.device.type == "cuda":
+            with contextlib.suppress(TypeError, AttributeError):
+                rebind(parent, step, renewed.setdefault(id(old), torch.Generator(old.device)))
 
 
 class Graph:
     """A captured function. Calling it copies the arguments' tensors in, replays, and returns the
-    outputs, which are valid until the next call.
+    outputs, which are valid until the next call. Arguments are as for :func:`capture`.
     """
 
-    def __init__(self, function, args, roots, warmup=3):
+    def __init__(self, function: Callable, args: tuple, roots: tuple, warmup: int = 3):
         leaves, self._spec = _pytree.tree_flatten(args)
         self._leaves = [leaf.clone() if isinstance(leaf, torch.Tensor) else leaf for leaf in leaves]
         inputs = _pytree.tree_unflatten(self._leaves, self._spec)
@@ -207,38 +123,35 @@ class Graph:
         ]
         self._device = next((leaf.device for leaf in tensors if leaf.device.type == "cuda"), None)
         with torch.cuda.device(self._device):
-            self._record(function, inputs, roots, warmup)
+            saved, original = snapshot(roots), _StateBefore(roots.values())
+            try:
+                self._record(function, inputs, roots, saved, warmup)
+            except BaseException as error:
+                if isinstance(error, RuntimeError):
+                    _renew_generators(roots)
+                original.undo()
+                raise
+            finally:
+                restore(roots, saved)
 
-    def _record(self, function, inputs, roots, warmup):
-        saved, original = snapshot(roots), _State(roots.values())
-        generators = [
-            leaf
-            for leaf in state_tree(roots).values()
-            if isinstance(leaf, torch.Generator) and leaf.device.type == "cuda"
-        ]
+    def _record(self, function, inputs, roots, saved, warmup):
         self._graph = torch.cuda.CUDAGraph()
-        for generator in generators:
-            self._graph.register_generator_state(generator)
-        try:
-            side = torch.cuda.Stream()
-            side.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(side):
-                for _ in range(warmup):
-                    state = _State(roots.values())
-                    function(*inputs)
-                    state.settle()
-            torch.cuda.current_stream().wait_stream(side)
-            restore(roots, saved)
-            state = _State(roots.values())
-            with torch.cuda.graph(self._graph, stream=side):
-                self._out = function(*inputs)
-                state.settle()
-        except RuntimeError:
-            _renew_generators(roots)
-            raise
-        finally:
-            original.undo()
-            restore(roots, saved)
+        for leaf in state_tree(roots).values():
+            if isinstance(leaf, torch.Generator) and leaf.device.type == "cuda":
+                self._graph.register_generator_state(leaf)
+        side = torch.cuda.Stream()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            for _ in range(warmup):
+                before = _StateBefore(roots.values())
+                function(*inputs)
+                before.keep_in_place()
+        torch.cuda.current_stream().wait_stream(side)
+        restore(roots, saved)
+        before = _StateBefore(roots.values())
+        with torch.cuda.graph(self._graph, stream=side):
+            self._out = function(*inputs)
+            before.keep_in_place()
 
     def __call__(self, *args):
         leaves, spec = _pytree.tree_flatten(args)
@@ -252,8 +165,7 @@ class Graph:
                 if inside.shape != given.shape:
                     raise ValueError(
                         f"the captured function was recorded with an argument of shape "
-                        f"{tuple(inside.shape)}, but was "
-                        f"called with {tuple(given.shape)}"
+                        f"{tuple(inside.shape)}, but was called with {tuple(given.shape)}"
                     )
                 inside.copy_(given)
         with torch.cuda.device(self._device):
@@ -261,13 +173,15 @@ class Graph:
         return self._out
 
 
-def capture(function, args, roots, warmup=3):
+def capture(function: Callable, args: tuple, roots: tuple, warmup: int = 3) -> Callable:
     """``function`` recorded as a CUDA graph on the device of its state, or ``function`` itself,
     with one warning that names the line, if it cannot be.
 
     Args: ``args`` a tuple of example arguments, trees of tensors of fixed shapes; ``roots`` the
-    objects whose tensors and generators the function changes. Their state is as before afterwards:
-    warming up does not advance the world.
+    objects whose tensors and generators the function changes. Their values are as before
+    afterwards. A tensor that appears where None stood is kept, with the value that the last of
+    ``warmup`` calls gave it, because the graph writes into it: what must begin with another value
+    is made before capturing.
     """
     try:
         return Graph(function, args, roots, warmup)
@@ -284,7 +198,7 @@ def capture(function, args, roots, warmup=3):
 
 
 def _line(error):
-    """Where outside PyTorch and this file a error was raised, to follow a sentence."""
+    """Where outside PyTorch and this file an error was raised, to follow a sentence."""
     if isinstance(error, CaptureError):
         return ""
     frames = traceback.extract_tb(error.__traceback__)
@@ -297,13 +211,13 @@ class Captured:
     CPU the environment as it is. Everything else is the environment's own.
     """
 
-    def __init__(self, env):
+    def __init__(self, env: Any):
         self.env, self._step = env, None
 
     def __getattr__(self, name):
         return getattr(self.env, name)
 
-    def step(self, decision):
+    def step(self, decision: dict) -> dict:
         """As the environment's; on a GPU the world returned is valid until the next step. Only
         ``decision.actions`` reaches it.
         """

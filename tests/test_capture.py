@@ -1,5 +1,8 @@
-"""Capture: the walk over state runs anywhere; the graphs themselves need a GPU."""
+"""Capture: the walk over state, and what is put back around a recording, run anywhere; the graphs
+themselves need a GPU.
+"""
 
+import contextlib
 from operator import attrgetter
 
 import pytest
@@ -32,8 +35,12 @@ class Counter:
             self.parts["total"], self.parts[7], self.history[0] = total, total * 3, total * 2
         elif self.how == "scalar":
             self.steps += 1
-        elif self.how == "asks":
+        elif self.how == "scalar to tensor":
+            self.steps = total.sum()
+        elif self.how == "synchronises":
             total = total + float(total.sum())
+        elif self.how == "drops":
+            del self.parts["total"]
         elif self.how == "tuple":
             self.pair = (total,)
         elif self.how == "grows":
@@ -82,23 +89,113 @@ def test_a_snapshot_of_another_environment_is_refused():
         capture.restore(envs.Explorer(4, device="cpu"), saved)
 
 
-def test_settling_copies_rebound_tensors_back_and_names_changed_scalars():
-    for how, fault in [
+@pytest.mark.parametrize(
+    "how, error",
+    [
         ("in place", None),
         ("rebound", None),
         ("scalar", "steps changed from 0 to 1"),
+        ("scalar to tensor", "steps changed from 0 to a tensor"),
         ("tuple", "cannot be put back"),
         ("grows", "changed its shape"),
-    ]:
-        env = Counter(how)
-        state, before = capture._State([env]), env.parts["total"]
-        env.step(actions("cpu"))
-        if fault:
-            with pytest.raises(capture.CaptureError, match=fault):
-                state.settle()
-        else:
-            state.settle()
-            assert env.parts["total"] is before and before.tolist() == [1.0] * 4, how
+        ("drops", r"parts\['total'\] was a tensor of shape \(4,\) .* is gone after it"),
+    ],
+)
+def test_rebound_tensors_are_kept_in_place_and_what_a_graph_cannot_repeat_is_named(how, error):
+    env = Counter(how)
+    state, before = capture._StateBefore([env]), env.parts["total"]
+    env.step(actions("cpu"))
+    if error:
+        with pytest.raises(capture.CaptureError, match=error):
+            state.keep_in_place()
+    else:
+        state.keep_in_place()
+        assert env.parts["total"] is before and before.tolist() == [1.0] * 4
+
+
+def test_a_tensor_that_moved_to_another_attribute_is_not_gone():
+    env = Counter()
+    state = capture._StateBefore([env])
+    env.first = env.parts
+    del env.parts
+    state.keep_in_place()
+
+
+@pytest.mark.parametrize("how", ["rebound", "scalar", "scalar to tensor", "grows", "drops"])
+def test_undoing_puts_back_what_a_call_replaced(how):
+    env = Counter(how)
+    state, total = capture._StateBefore([env]), env.parts["total"]
+    env.step(actions("cpu"))
+    state.undo()
+    assert env.parts["total"] is total and type(env.steps) is int and env.steps == 0
+
+
+def test_undoing_puts_none_back_where_a_tensor_or_a_tree_has_appeared():
+    env = Counter()
+    env.memory, env.tree = None, None
+    state = capture._StateBefore([env])
+    env.memory, env.tree = torch.zeros(3), {"h": torch.zeros(3)}
+    state.undo()
+    assert env.memory is None and env.tree is None
+
+
+class Lazy:
+    """A function's state that is made by its first call, as a rollout's memory."""
+
+    def __init__(self):
+        self.memory, self.total = None, torch.zeros(2)
+
+    def __call__(self):
+        if self.memory is None:
+            self.memory = {"h": torch.zeros(2)}
+        self.memory["h"].add_(1)
+        self.total.add_(1)
+        return self.memory["h"]
+
+
+class Recorded:
+    """A stand-in for torch.cuda.CUDAGraph: what runs while it records is done at once."""
+
+    def register_generator_state(self, generator):
+        pass
+
+
+@pytest.fixture
+def fake_cuda(monkeypatch):
+    """Graph's recording without a GPU: streams and graphs that do nothing."""
+
+    class Stream:
+        def wait_stream(self, other):
+            pass
+
+    for name, stand_in in dict(
+        CUDAGraph=Recorded,
+        Stream=Stream,
+        current_stream=Stream,
+        stream=contextlib.nullcontext,
+        device=contextlib.nullcontext,
+        graph=lambda graph, stream: contextlib.nullcontext(),
+    ).items():
+        monkeypatch.setattr(torch.cuda, name, stand_in)
+
+
+def test_a_tensor_that_appears_where_none_stood_stays_for_the_graph_to_write(fake_cuda):
+    lazy = Lazy()
+    graph = capture.Graph(lazy, (), (lazy,))
+    assert graph._out is lazy.memory["h"], "the graph writes into what the attribute names"
+    assert lazy.total.tolist() == [0, 0], "all else is as it was"
+
+
+def test_after_a_failed_recording_none_stands_where_it_stood(fake_cuda):
+    lazy = Lazy()
+
+    def fails():
+        lazy()
+        raise RuntimeError("no graph of this")
+
+    with pytest.raises(RuntimeError, match="no graph of this"):
+        capture.Graph(fails, (), (lazy,))
+    assert lazy.memory is None and lazy.total.tolist() == [0, 0]
 
 
 def test_on_the_cpu_an_environment_steps_as_it_is():
@@ -117,7 +214,7 @@ class TestOnTheGPU:
         for value in (1, 2, 0, 2):
             a, b = eager.step(actions("cuda", value)), env.step(actions("cuda", value))
             assert torch.equal(a.obs, b.obs) and torch.equal(a.reward, b.reward), (
-                "the same numbers, newly_seen with each replay"
+                "the same numbers, new with each replay"
             )
         assert (
             isinstance(env._step, capture.Graph)
@@ -125,24 +222,24 @@ class TestOnTheGPU:
         )
 
     @pytest.mark.parametrize(
-        "how, fault",
+        "how, error",
         [
             ("scalar", "steps changed from"),
             ("tuple", "cannot be put back"),
-            ("asks", "test_capture.py:"),
+            ("synchronises", "test_capture.py:"),
             ("grows", "changed its shape"),
         ],
     )
-    def test_what_cannot_be_captured_runs_eagerly_with_one_warning(self, how, fault):
+    def test_what_cannot_be_captured_runs_eagerly_with_one_warning(self, how, error):
         env = capture.Captured(Counter(how, "cuda"))
-        with pytest.warns(UserWarning, match=fault):
+        with pytest.warns(UserWarning, match=error):
             env.step(actions("cuda"))
         assert not isinstance(env._step, capture.Graph)
         assert how == "grows" or env.step(actions("cuda")).obs.shape[0] == 4, (
             "it goes on as it would have"
         )
 
-    def test_warming_up_does_not_advance_the_world(self):
+    def test_warming_up_does_not_advance_the_environment(self):
         env = envs.Explorer(8, device="cuda")
         env.reset()
         counts, lengths = env.spawner.counts.clone(), env.length.clone()

@@ -17,7 +17,7 @@ SOURCES = sorted(
 
 # A module of the simulator may import modules of the layers above its own row only.
 LAYERS = (
-    ("dotdict", "colour", "spaces", "ragged"),
+    ("dotdict", "colour", "spaces", "ragged", "state"),
     ("arrdict",),
     ("geometry", "capture", "plotting", "kernels"),
     ("geometries", "scenery", "recording"),
