@@ -1,23 +1,32 @@
-"""The door: what composes, what is refused, and in which words. Nothing here starts a run."""
+"""The configuration: what composes, what is refused, and in which words. Nothing here starts a
+run.
+"""
 
 import copy
 import dataclasses
+import inspect
 
 import pytest
+import yaml
 
 from agents.cli import compose as compose_module
 from agents.cli import settings
+from agents.cli.build import as_tree, build
 from agents.cli.command import run_command
-from agents.cli.compose import ConfigLoader
-from agents.cli.settings import ConfigErrors, Evaluate, Record, Train, build
+from agents.cli.compose import CONFIGS, ConfigLoader
+from agents.cli.errors import ConfigErrors
+from agents.cli.settings import Evaluate, Record, Train
+from agents.metrics import Wandb
+from agents.policy import Policy
+from agents.ppo import PPO
 from megastep import envs, geometries
 
 SCRIPTS = {"train": Train, "evaluate": Evaluate, "record": Record}
 
 
 def compose(*overrides, script="train"):
-    with ConfigLoader(script, SCRIPTS[script]) as door:
-        return build(SCRIPTS[script], door.tree(list(overrides)))
+    with ConfigLoader(script, SCRIPTS[script]) as loader:
+        return build(SCRIPTS[script], loader.tree(list(overrides)))
 
 
 def errors(*overrides, script="train"):
@@ -35,8 +44,9 @@ def errors(*overrides, script="train"):
         "geometry=bench",
         "geometry=box",
         "geometry=column",
-        "agent=small",
-        "agent=large",
+        "preset=cpu",
+        "preset=gpu",
+        "preset=auto",
         "logger=wandb",
         "experiment=newcomer",
     ],
@@ -46,12 +56,65 @@ def test_every_group_member_composes(choice):
 
 
 def test_every_member_of_every_group_is_tested_above_or_needs_more():
-    with ConfigLoader("train", Train) as door:
-        groups = door.groups()
-    assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "experiment"}
+    with ConfigLoader("train", Train) as loader:
+        groups = loader.groups()
+    assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "preset", "experiment"}
     assert set(groups["env"]) == set(envs.ENVS) == set(settings.ENVS)
-    assert set(groups["geometry"]) == set(geometries.SOURCES)
-    assert set(groups["agent"]) == {"auto", "small", "large"}
+    assert set(groups["geometry"]) == set(geometries.SOURCES) == set(settings.GEOMETRIES)
+    assert set(groups["logger"]) == set(settings.LOGGERS)
+    assert set(groups["preset"]) == {"auto", "cpu", "gpu"}
+    assert groups["agent"] == ["lstm"] and groups["learner"] == ["ppo"]
+
+
+def leaves(tree, prefix=""):
+    """{dotted key: value}"""
+    found = {}
+    for key, value in tree.items():
+        nested = leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {}
+        found |= nested or {prefix + key: value}
+    return found
+
+
+def values(file, script):
+    """What a file of configs/ says, by dotted key; `defaults` are choices, no values."""
+    text = (CONFIGS / f"{file}.yaml").read_text()
+    tree = yaml.safe_load(text) or {}
+    tree.pop("defaults", None)
+    own = file == script or "@package _global_" in text
+    return leaves(tree if own else {file.split("/")[0]: tree})
+
+
+def compositions():
+    """For each member of each group: the files that it is composed of, `[(file, {key: value})]`,
+    those that win last.
+    """
+    for script, kind in SCRIPTS.items():
+        with ConfigLoader(script, kind) as loader:
+            groups = loader.groups()
+            for choice in [[]] + [[f"{group}={m}"] for group in groups for m in groups[group]]:
+                chosen = loader._compose(choice).hydra.runtime.choices
+                files = [f"{g}/{chosen[g]}" for g in groups if chosen[g] is not None]
+                files = [file.replace("preset/auto", "preset/cpu") for file in files]
+                last = [f for f in files if f.startswith("preset/")]
+                last += [f for f in files if f.startswith("experiment/")]
+                order = [f for f in files if f not in last] + [script] + last
+                yield [(file, values(file, script)) for file in order]
+
+
+def test_every_value_of_every_file_is_in_force_somewhere_and_none_is_said_twice(monkeypatch):
+    written, in_force, twice = set(), set(), set()
+    for gpu in (False, True):
+        monkeypatch.setattr(compose_module, "_has_gpu", lambda device, gpu=gpu: gpu)
+        for files in compositions():
+            last = {}
+            for file, said in files:
+                written |= {(file, key) for key in said}
+                twice |= {(file, key) for key in said if key in last and last[key][1] == said[key]}
+                last |= {key: (file, value) for key, value in said.items()}
+            in_force |= {(file, key) for key, (file, _) in last.items()}
+    assert written == in_force and not twice, (written - in_force, twice)
+    names = {str(path.relative_to(CONFIGS))[:-5] for path in CONFIGS.rglob("*.yaml")}
+    assert names - {file for file, _ in written} == {"preset/auto"}
 
 
 def test_settings_are_frozen():
@@ -61,24 +124,54 @@ def test_settings_are_frozen():
 
 def test_what_is_written_can_be_read_again():
     cfg = compose("env=minimal", "samples=1e6")
-    assert build(Train, settings.as_tree(cfg)) == cfg
+    assert build(Train, as_tree(cfg)) == cfg
 
 
-def test_the_keys_of_an_environment_are_its_arguments():
-    import inspect
+def arguments(made):
+    return set(inspect.signature(made).parameters)
 
+
+def keys(kind):
+    return {field.name for field in dataclasses.fields(kind)}
+
+
+def test_every_key_of_a_component_is_an_argument_of_what_it_makes():
     for name, kind in settings.ENVS.items():
-        arguments = set(inspect.signature(envs.ENVS[name].__init__).parameters)
-        assert {field.name for field in dataclasses.fields(kind)} - {"name"} <= arguments
+        assert keys(kind) - {"name"} <= arguments(envs.ENVS[name])
+    for name, kind in settings.GEOMETRIES.items():
+        allowed = arguments(geometries.sample) | arguments(geometries.SOURCES[name])
+        assert keys(kind) <= allowed - {"split"}
+    assert keys(settings.Agent) <= arguments(Policy)
+    assert keys(settings.Learner) - {"name", "n_steps", "anneal"} <= arguments(PPO)
+    assert keys(settings.WandbLogger) - {"name"} <= arguments(Wandb)
 
 
-def test_sizes_follow_the_device(monkeypatch):
-    small = compose("agent=small")
+def test_the_preset_follows_the_device(monkeypatch):
+    cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
+    assert compose("device=cpu") == dataclasses.replace(cpu, device="cpu")
     monkeypatch.setattr(compose_module, "_has_gpu", lambda device: device != "cpu")
-    assert compose() == compose("agent=large") != small
-    assert compose("experiment=newcomer").env.n_envs == compose("agent=large").env.n_envs
-    assert compose("device=cpu") == dataclasses.replace(small, device="cpu")
+    assert compose() == compose("preset=auto") == gpu != cpu
+    assert compose("preset=cpu") == cpu
+    assert compose("experiment=newcomer").env == gpu.env
+    assert compose("device=cpu") == dataclasses.replace(cpu, device="cpu")
     assert compose("env.n_envs=7", "learner.n_minibatches=1").env.n_envs == 7
+
+
+def test_what_a_cpu_and_a_gpu_train_with():
+    """The recipes behind the measurements in README: changed together with them only."""
+    same = dict(name="ppo", n_steps=32, n_minibatches=4, n_epochs=1, clip=0.2, value_coef=0.5)
+    same |= dict(max_grad_norm=0.5, target_kl=None)
+    cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
+    assert dataclasses.asdict(cpu.learner) == same | dict(
+        lr=3e-3, anneal=True, gamma=0.98, lambda_=0.9, entropy_coef=0.02
+    )
+    assert dataclasses.asdict(gpu.learner) == same | dict(
+        lr=1e-3, anneal=False, gamma=0.995, lambda_=0.95, entropy_coef=0.01
+    )
+    assert (cpu.env.n_envs, cpu.agent.width, cpu.report) == (256, 64, 4)
+    assert (gpu.env.n_envs, gpu.agent.width, gpu.report) == (4096, 256, 50)
+    assert dataclasses.replace(cpu.env, n_envs=4096) == gpu.env
+    assert compose("experiment=newcomer").geometry.n == 2000
 
 
 def test_a_typo_names_the_nearest_key():
@@ -97,7 +190,7 @@ def test_an_unknown_member_names_the_nearest_one():
     assert "minimal" in errors("env.name=zzz")["env.name"]
 
 
-def test_all_faults_are_listed_at_once():
+def test_all_errors_are_listed_at_once():
     found = errors(
         "env=explorr", "learner.lrr=1", "learner.lr=-1", "learner.gamma=nan", "seed=x", "device=gpu"
     )
@@ -106,8 +199,8 @@ def test_all_faults_are_listed_at_once():
 
 @pytest.fixture(scope="module")
 def tree():
-    with ConfigLoader("train", Train) as door:
-        return door.tree([])
+    with ConfigLoader("train", Train) as loader:
+        return loader.tree([])
 
 
 NAN, INFINITY = float("nan"), float("inf")
@@ -141,7 +234,11 @@ NAN, INFINITY = float("nan"), float("inf")
         ("geometry.n", 0),
         ("seed", -1),
         ("samples", 0),
+        ("samples", INFINITY),
         ("seconds", 0),
+        ("seconds", INFINITY),
+        ("seconds", -INFINITY),
+        ("checkpoint", INFINITY),
         ("seconds", NAN),
         ("checkpoint", -3),
         ("keep", 1),
@@ -185,9 +282,31 @@ def test_settings_that_contradict_each_other_are_named():
     assert "resume" in errors("resume=a", "init=b")["init"]
 
 
+def test_infinity_is_refused_as_it_is_typed():
+    found = errors("seconds=inf", "samples=.inf", "learner.lr=inf", "checkpoint=inf")
+    assert set(found) == {"seconds", "samples", "learner.lr", "checkpoint"}
+    assert found["seconds"] == "inf is out of range: allowed is more than 0"
+
+
+def test_a_minibatch_can_be_one_environment_and_no_less():
+    assert compose("env.n_envs=8", "learner.n_minibatches=8").learner.n_minibatches == 8
+    found = errors("env.n_envs=8", "learner.n_minibatches=9")
+    assert found == {"learner.n_minibatches": "9 is more than env.n_envs, 8"}
+
+
 @pytest.mark.parametrize("override", ["+x=1", "~env", "a=[", "env@x=minimal"])
 def test_what_is_no_override_is_refused(override):
     assert set(errors(override)) == {override}
+
+
+def test_hydras_own_settings_are_fixed():
+    typed = ["hydra.run.dir=x", "hydra/launcher=basic"]
+    assert list(errors(*typed)) == [text.split("=")[0] for text in typed]
+
+
+def test_a_group_of_keys_is_no_single_value():
+    assert "finish" in errors("finish=1")
+    assert compose("finish={steps:3}").finish == dataclasses.replace(compose().finish, steps=3)
 
 
 def test_several_values_need_multirun():
@@ -195,10 +314,10 @@ def test_several_values_need_multirun():
 
 
 def test_a_sweep_is_every_combination():
-    with ConfigLoader("train", Train) as door:
+    with ConfigLoader("train", Train) as loader:
         jobs = [
             overrides
-            for overrides, _ in door.jobs(
+            for overrides, _ in loader.jobs(
                 ["env=minimal,explorer", "seed=choice(1,2)", "keep=3"], True
             )
         ]
@@ -210,8 +329,8 @@ def test_a_sweep_is_every_combination():
 
 
 def test_a_sweep_is_checked_before_its_first_job():
-    with ConfigLoader("train", Train) as door, pytest.raises(ConfigErrors, match="learner.lr"):
-        door.jobs(["learner.lr=1e-3,-1"], True)
+    with ConfigLoader("train", Train) as loader, pytest.raises(ConfigErrors, match="learner.lr"):
+        loader.jobs(["learner.lr=1e-3,-1"], True)
 
 
 def test_help_lists_groups_and_members(capsys):

@@ -12,8 +12,10 @@ import torch
 
 from agents import evaluation
 from agents.cli import evaluate, run_folders, train
+from agents.cli.build import build
 from agents.cli.compose import ConfigLoader
-from agents.cli.settings import Evaluate, Train, UserError, build
+from agents.cli.errors import UserError
+from agents.cli.settings import Evaluate, Train
 from megastep import envs, spaces
 from megastep.arrdict import arrdict
 from megastep.geometries import sample
@@ -21,7 +23,7 @@ from megastep.geometries import sample
 TINY = [
     "env=minimal",
     "geometry=box",
-    "agent=small",
+    "preset=cpu",
     "env.n_envs=4",
     "env.res=8",
     "env.shortest=5",

@@ -6,14 +6,15 @@ import sys
 import pytest
 
 from agents.cli import record, train
+from agents.cli.build import build
 from agents.cli.compose import ConfigLoader
-from agents.cli.settings import Train, build
+from agents.cli.settings import Train
 from megastep import recording
 
 TINY = [
     "env=minimal",
     "geometry=box",
-    "agent=small",
+    "preset=cpu",
     "env.n_envs=4",
     "env.res=8",
     "learner.n_steps=8",

@@ -13,14 +13,16 @@ import yaml
 
 from agents import checkpoint, metrics
 from agents.cli import settings, train
+from agents.cli.build import build
 from agents.cli.compose import ConfigLoader
-from agents.cli.settings import ConfigErrors, Train, UserError, build
+from agents.cli.errors import ConfigErrors, UserError
+from agents.cli.settings import Train
 from agents.cli.signals import Interrupted
 
 TINY = [
     "env=minimal",
     "geometry=box",
-    "agent=small",
+    "preset=cpu",
     "env.n_envs=4",
     "env.res=8",
     "env.shortest=5",

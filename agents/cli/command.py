@@ -9,9 +9,10 @@ import warnings
 
 from omegaconf import OmegaConf
 
+from agents.cli.build import build
 from agents.cli.compose import ConfigLoader
 from agents.cli.console import say, warn
-from agents.cli.settings import UserError, build
+from agents.cli.errors import UserError
 from agents.cli.signals import Interrupted
 from agents.cli.sweep import sweep
 

@@ -6,8 +6,10 @@ import dataclasses
 import math
 from contextlib import contextmanager
 
+from agents.cli.build import build
+from agents.cli.errors import UserError
 from agents.cli.run_folders import is_checkpoint
-from agents.cli.settings import Train, UserError, build
+from agents.cli.settings import Train
 
 #: Environments in the small one that tells how much memory an environment takes.
 PROBE = 65

@@ -1,24 +1,29 @@
-"""The door: command line -> Hydra -> checked settings. Everything is composed and checked before
-anything is written.
+"""Command line -> Hydra -> checked settings. Everything is composed and checked before anything is
+written.
 
 Hydra is used through its compose API and its override grammar; `@hydra.main` would make its folder
 first, and exit 1.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from agents.cli.settings import ConfigErrors, UserError, build, closest, closest_key
+from agents.cli.build import build
+from agents.cli.errors import ConfigErrors, UserError, closest, closest_key
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+Tree = dict[str, Any]
 
 
 class ConfigLoader:
@@ -26,7 +31,7 @@ class ConfigLoader:
     global.
     """
 
-    def __init__(self, script, kind):
+    def __init__(self, script: str, kind: type):
         self.script, self.kind = script, kind
 
     def __enter__(self):
@@ -40,19 +45,19 @@ class ConfigLoader:
     def __exit__(self, *error):
         return self._context.__exit__(*error)
 
-    def groups(self):
+    def groups(self) -> dict[str, list[str]]:
         """{group: [members]}; train.yaml and its fellows are no groups."""
         loader = GlobalHydra.instance().config_loader()
-        chosen = self._compose([], hydra=True).hydra.runtime.choices
+        chosen = self._compose([]).hydra.runtime.choices
         return {
             g: loader.get_group_options(g)
             for g in loader.get_group_options("", ObjectType.GROUP)
             if g in chosen
         }
 
-    def jobs(self, overrides, multirun=False):
+    def jobs(self, overrides: list[str], multirun: bool = False) -> list[tuple[list[str], Tree]]:
         """The composed tree of each job, `[(overrides, nested dict)]`; one job unless multirun."""
-        parsed = self._parsed(overrides, multirun)
+        parsed = _parsed(overrides, multirun)
         if not multirun:
             return [(overrides, self.tree(overrides))]
         try:
@@ -61,79 +66,81 @@ class ConfigLoader:
             raise UserError(f"This sweep cannot be split: {error}") from None
         return [(list(job), self.tree(list(job))) for job in batches]
 
-    def tree(self, overrides):
+    def tree(self, overrides: list[str]) -> Tree:
         """Nested dicts for one list of overrides. ConfigErrors names every unknown key and group
         member, and bad value.
         """
-        errors, fine, groups = [], [], self.groups()
-        choices = [o for o in self._parsed(overrides) if o.key_or_group in groups]
-        for choice in choices:
+        parsed = _parsed(overrides)
+        try:
+            tree = _plain(self._compose(overrides))
+        except (HydraException, OmegaConfBaseException) as error:
+            raise ConfigErrors(self._errors(parsed) or [_as_error(error)]) from None
+        build(self.kind, tree)
+        return tree
+
+    def _errors(self, parsed: list[Override]) -> list[tuple[str, str]]:
+        """What is wrong with overrides that cannot be composed, and with the values of the rest."""
+        errors, good, groups = [], [], self.groups()
+        for choice in (o for o in parsed if o.key_or_group in groups):
             member, members = choice.value(), groups[choice.key_or_group]
-            if member is not None and member not in members:
-                errors.append(
-                    (choice.key_or_group, f"{member!r} is unknown; {closest(member, members)}")
-                )
+            if member is None or member in members:
+                good.append(choice.input_line)
             else:
-                fine.append(choice.input_line)
-        keys = list(_paths(_plain(self._compose(fine))))
-        for override in self._parsed(overrides):
+                sentence = f"{member!r} is unknown; {closest(member, members)}"
+                errors.append((choice.key_or_group, sentence))
+        keys = list(_paths(_plain(self._compose(good))))
+        for override in (o for o in parsed if o.key_or_group not in groups):
             key = override.key_or_group
-            if key in groups:
-                continue
-            if key in keys or any(k.startswith(key + ".") for k in keys):
-                fine.append(override.input_line)
+            if key in keys:
+                good.append(override.input_line)
             else:
                 errors.append((key, f"no such key; {closest_key(key, [*keys, *groups])}"))
         try:
-            tree = _plain(self._compose(fine))
+            build(self.kind, _plain(self._compose(good)))
         except (HydraException, OmegaConfBaseException) as error:
-            raise ConfigErrors([*errors, ("configuration", " ".join(str(error).split()))]) from None
-        try:
-            build(self.kind, tree)
+            errors.append(_as_error(error))
         except ConfigErrors as error:
             errors += error.errors
-        if errors:
-            raise ConfigErrors(errors)
-        return tree
+        return errors
 
-    def _compose(self, overrides, hydra=False):
-        """With a GPU to run on, `agent=auto` is replaced by `agent=large`; without one it is
-        `small` already.
+    def _compose(self, overrides: list[str]) -> DictConfig:
+        """With a GPU to run on, `preset=auto` is replaced by `preset=gpu`; without one it is `cpu`
+        already.
         """
         config = compose(self.script, overrides, return_hydra_config=True)
-        if config.hydra.runtime.choices.get("agent") == "auto" and _has_gpu(config.get("device")):
-            config = compose(self.script, [*overrides, "agent=large"], return_hydra_config=True)
-        if not hydra:
-            OmegaConf.set_struct(config, False)
-            config.pop("hydra")
+        if config.hydra.runtime.choices.get("preset") == "auto" and _has_gpu(config.device):
+            config = compose(self.script, [*overrides, "preset=gpu"], return_hydra_config=True)
         return config
 
-    def _parsed(self, overrides, multirun=False):
-        errors, parsed = [], []
-        for text in overrides:
-            try:
-                override = OverridesParser.create().parse_override(text)
-            except HydraException:
-                errors.append(
-                    (
-                        text,
-                        "is not understood; write key=value, quote blanks and brackets: 'key=\"a "
-                        "b\"'",
-                    )
-                )
-                continue
-            if override.type.name != "CHANGE" or override.package is not None:
-                errors.append((text, "keys and groups are fixed; write key=value or group=member"))
-            elif override.is_sweep_override() and not multirun:
-                errors.append((override.key_or_group, f"{text!r} asks for several runs; add -m"))
-            else:
-                parsed.append(override)
-        if errors:
-            raise ConfigErrors(errors)
-        return parsed
+
+def _parsed(overrides: list[str], multirun: bool = False) -> list[Override]:
+    """Overrides of keys and groups; ConfigErrors names those that are anything else."""
+    errors, parsed = [], []
+    for text in overrides:
+        try:
+            override = OverridesParser.create().parse_override(text)
+        except HydraException:
+            cure = "write key=value, quote blanks and brackets: 'key=\"a b\"'"
+            errors.append((text, f"is not understood; {cure}"))
+            continue
+        if override.type.name != "CHANGE" or override.package is not None:
+            errors.append((text, "keys and groups are fixed; write key=value or group=member"))
+        elif override.is_sweep_override() and not multirun:
+            errors.append((override.key_or_group, f"{text!r} means several runs; add -m"))
+        elif override.key_or_group.partition(".")[0].partition("/")[0] == "hydra":
+            errors.append((override.key_or_group, "no such key; Hydra's own settings are fixed"))
+        else:
+            parsed.append(override)
+    if errors:
+        raise ConfigErrors(errors)
+    return parsed
 
 
-def _has_gpu(device):
+def _as_error(error: Exception) -> tuple[str, str]:
+    return "configuration", " ".join(str(error).split())
+
+
+def _has_gpu(device: str) -> bool:
     if device == "cpu":
         return False
     import torch
@@ -141,11 +148,14 @@ def _has_gpu(device):
     return torch.cuda.is_available()
 
 
-def _plain(config):
+def _plain(config: DictConfig) -> Tree:
+    OmegaConf.set_struct(config, False)
+    config.pop("hydra")
     return OmegaConf.to_container(config, resolve=True)
 
 
-def _paths(tree, prefix=""):
+def _paths(tree: Tree, prefix: str = "") -> Iterator[str]:
+    """The dotted key of every value and every group of values."""
     for key, value in tree.items():
         yield prefix + key
         if isinstance(value, dict):

@@ -12,7 +12,8 @@ from agents import evaluation
 from agents.cli import components, run_folders
 from agents.cli.command import run_command
 from agents.cli.console import duration, say, table
-from agents.cli.settings import Evaluate, UserError
+from agents.cli.errors import UserError
+from agents.cli.settings import Evaluate
 
 HELP = """Prints and writes what a run's agent earns in the first episode of each lane, with a 95 %
 interval over homes. Each table is a file of its own in the run's folder: evaluations/*.md.
@@ -74,7 +75,8 @@ def settled(env, n_envs):
 
 def source(geometry):
     """The name of the geometries evaluated in, for titles and file names."""
-    return geometry.name if geometry.path is None else f"{geometry.name}-{Path(geometry.path).stem}"
+    path = geometry.options.get("path")
+    return geometry.name if path is None else f"{geometry.name}-{Path(path).stem}"
 
 
 def cells(row):

@@ -8,7 +8,8 @@ import torch
 from agents.cli import components, run_folders
 from agents.cli.command import run_command
 from agents.cli.console import say
-from agents.cli.settings import Record, UserError
+from agents.cli.errors import UserError
+from agents.cli.settings import Record
 from agents.metrics import missing
 
 HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.

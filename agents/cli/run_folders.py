@@ -10,7 +10,8 @@ from pathlib import Path
 
 import yaml
 
-from agents.cli.settings import UserError, as_tree
+from agents.cli.build import as_tree
+from agents.cli.errors import UserError
 
 RUNS = Path("runs")
 SWEEPS = Path("sweeps")

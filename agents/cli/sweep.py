@@ -7,7 +7,7 @@ from pathlib import Path
 
 from agents.cli import run_folders
 from agents.cli.console import say, table
-from agents.cli.settings import UserError
+from agents.cli.errors import UserError
 from agents.cli.signals import Interrupted
 
 

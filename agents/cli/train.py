@@ -10,9 +10,11 @@ import torch
 
 from agents import checkpoint, metrics
 from agents.cli import components, evaluate, record, run_folders
+from agents.cli.build import as_tree
 from agents.cli.command import run_command
 from agents.cli.console import Progress, duration, number, say, warn
-from agents.cli.settings import ConfigErrors, Evaluate, Record, Train, UserError, as_tree
+from agents.cli.errors import ConfigErrors, UserError
+from agents.cli.settings import Evaluate, Record, Train, WandbLogger
 from agents.cli.signals import Interrupted, Interruptions
 from agents.rollout import collect, initial_actor_state
 from megastep import capture, engine
@@ -23,7 +25,7 @@ The commonest:
   experiment=newcomer          the recipe of `make train`: train, evaluate on unseen homes, film
   env=minimal geometry=box     another environment, other homes
   seconds=60 samples=1e6       when to stop, whichever comes first; Ctrl-C stops too, and saves
-  agent=large env.n_envs=256   the sizes for a GPU, or your own
+  preset=gpu env.n_envs=256    the sizes for a GPU, or your own
   learner.lr=3e-4 seed=2       any key that --cfg job prints
   finish.evaluate=true finish.record=true
                                a table and a video at the end
@@ -66,12 +68,11 @@ class Trainer:
             components.load_weights(
                 self.policy, self.env, components.load(run_folders.find(cfg.init), device)
             )
-        wandb = dict(
-            project=cfg.logger.project, mode=cfg.logger.mode, name=folder.name, config=as_tree(cfg)
-        )
-        self.metrics = metrics.Metrics(
-            folder, self.samples, wandb if cfg.logger.name == "wandb" else None
-        )
+        wandb = None
+        if isinstance(cfg.logger, WandbLogger):
+            project, mode = cfg.logger.project, cfg.logger.mode
+            wandb = dict(project=project, mode=mode, name=folder.name, config=as_tree(cfg))
+        self.metrics = metrics.Metrics(folder, self.samples, wandb)
         self.reported = self.samples, time.monotonic()
         self.score = self.unsaved = (
             None  # the last reported return; why the last checkpoint is missing

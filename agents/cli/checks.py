@@ -1,0 +1,56 @@
+"""Dataclass fields that know which values they allow. A check returns a sentence, or None."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+from agents.cli.errors import closest
+
+
+def _field(check: Callable[[Any], str | None]) -> Any:
+    return dataclasses.field(metadata={"check": check})
+
+
+def within(min: float, max: float, min_open: bool = False, max_open: bool = False) -> Any:
+    """A finite number between two limits, which belong to it unless open."""
+    if max == math.inf:
+        allowed = f"{'more than' if min_open else 'at least'} {min:,}"
+    else:
+        allowed = f"{'above' if min_open else 'from'} {min:,}"
+        allowed += f" {'and below' if max_open else 'to'} {max:,}"
+
+    def check(value: float) -> str | None:
+        above_min = min < value if min_open else min <= value
+        below_max = value < max if max_open else value <= max
+        if above_min and below_max and math.isfinite(value):  # nan compares false
+            return None
+        return f"{value} is out of range: allowed is {allowed}"
+
+    return _field(check)
+
+
+def above(min: float) -> Any:
+    """A finite number larger than `min`."""
+    return within(min, math.inf, min_open=True)
+
+
+def among(*names: str) -> Any:
+    """One of these words."""
+
+    def check(value: str) -> str | None:
+        return None if value in names else f"{value!r} is unknown; {closest(value, names)}"
+
+    return _field(check)
+
+
+def device_name() -> Any:
+    """auto, cpu, cuda or cuda:<number>."""
+
+    def check(value: str) -> str | None:
+        if re.fullmatch(r"auto|cpu|cuda(:\d+)?", value):
+            return None
+        return f"{value!r} is no device: allowed are auto, cpu, cuda and cuda:<number>"
+
+    return _field(check)

@@ -1,0 +1,40 @@
+"""Errors meant for whoever started the program, and the nearest names of what they mistyped."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(Exception):
+    """Something the user can put right: the message is one sentence with what came, what is allowed
+    and the cure. The program ends with `code`, without a traceback.
+    """
+
+    code = 2
+
+
+class ConfigErrors(UserError):
+    """Several errors of one configuration, `(key path, sentence)` each."""
+
+    def __init__(self, errors: Iterable[tuple[str, str]]):
+        self.errors = list(errors)
+        lines = [f"{path}: {sentence}" for path, sentence in self.errors]
+        count = "1 error" if len(lines) == 1 else f"{len(lines)} errors"
+        super().__init__("\n  ".join([f"{count} in the configuration", *lines]))
+
+
+def closest(word: object, words: Iterable[object]) -> str:
+    """The sentence part that names the nearest of `words`, or lists them all when none is near."""
+    names = sorted(str(w) for w in words)
+    near = difflib.get_close_matches(str(word), names, n=1, cutoff=0.5)
+    return f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
+
+
+def closest_key(key: str, keys: list[str]) -> str:
+    """As `closest` for dotted paths: `lr` finds learner.lr, `learner.lrr` too."""
+    leaf = key.rsplit(".", 1)[-1]
+    same = [k for k in keys if k.rsplit(".", 1)[-1] == leaf]
+    near = same or difflib.get_close_matches(key, keys, n=1, cutoff=0.6)
+    if not near:
+        leaves = {k.rsplit(".", 1)[-1]: k for k in keys}
+        near = [leaves[n] for n in difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.5)]
+    return f"did you mean {near[0]}?" if near else "--cfg job prints the keys there are"
