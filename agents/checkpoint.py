@@ -19,7 +19,7 @@ from pathlib import Path
 import torch
 
 #: Raised by one whenever what is written changes so that an older reader would misread it.
-FORMAT = 1
+FORMAT = 2
 FILES = ("state.pt", "config.json")
 
 

@@ -13,8 +13,6 @@ import os
 import warnings
 from pathlib import Path
 
-import torch
-
 #: How each optional part is called, and what installs it.
 FEATURES = {
     "tensorboard": "TensorBoard events",
@@ -34,72 +32,9 @@ def missing(package):
     )
 
 
-class Episodes:
-    """Return and length of episodes, added up lane by lane on the device; only `take` asks it for
-    numbers.
-    """
-
-    def __init__(self, n_lanes, device):
-        self.returns = torch.zeros(n_lanes, dtype=torch.float64, device=device)
-        self.lengths = torch.zeros(n_lanes, dtype=torch.float64, device=device)
-        self.sums = torch.zeros(4, dtype=torch.float64, device=device)
-
-    def add(self, reward, reset, done):
-        """Takes T transitions of B lanes; `reward`, `reset`, `done` (T, B) are those of the worlds
-        they led to.
-        """
-        # running totals over all T rows, from which the total at the last end before each row is
-        # taken away
-        returns, lengths = (
-            self.returns + reward.double().cumsum(0),
-            self.lengths + (~reset).double().cumsum(0),
-        )
-        rows = torch.arange(len(reward), device=reward.device)[:, None]
-        last = torch.where(done, rows, -1).cummax(0).values
-        before = torch.cat([torch.full_like(last[:1], -1), last[:-1]])
-
-        def since(totals, ends):
-            return totals - torch.where(ends >= 0, totals.gather(0, ends.clamp(min=0)), 0.0)
-
-        finished = since(returns, before)
-        self.sums += torch.stack(
-            [
-                done.double().sum(),
-                (finished * done).sum(),
-                (finished**2 * done).sum(),
-                (since(lengths, before) * done).sum(),
-            ]
-        )
-        tail = last[-1:]
-        self.returns = (
-            returns[-1:] - torch.where(tail >= 0, returns.gather(0, tail.clamp(min=0)), 0.0)
-        )[0]
-        self.lengths = (
-            lengths[-1:] - torch.where(tail >= 0, lengths.gather(0, tail.clamp(min=0)), 0.0)
-        )[0]
-
-    def take(self):
-        """Of the episodes that ended since the last call: how many, mean and deviation of the
-        return, mean length.
-        """
-        n, total, squares, steps = self.sums.tolist()
-        self.sums.zero_()
-        if not n:
-            return {"episode/count": 0}
-        mean = total / n
-        return {
-            "episode/count": int(n),
-            "episode/return": mean,
-            "episode/length": steps / n,
-            "episode/deviation": math.sqrt(max(squares / n - mean**2, 0.0)),
-        }
-
-    def state_dict(self):
-        return {"returns": self.returns, "lengths": self.lengths, "sums": self.sums}
-
-    def load_state_dict(self, state):
-        for name, value in state.items():
-            getattr(self, name).copy_(value)
+def is_word(value):
+    """Whether a value is a plain field, such as what the learning rate follows, and no number."""
+    return isinstance(value, str)
 
 
 class JsonLines:
@@ -110,9 +45,8 @@ class JsonLines:
         self.file = open(self.path, "a", encoding="utf-8")
 
     def write(self, step, values):
-        finite = {
-            k: v if math.isfinite(v) else None for k, v in values.items()
-        }  # JSON knows no nan
+        # JSON knows no nan
+        finite = {k: v if is_word(v) or math.isfinite(v) else None for k, v in values.items()}
         self.file.write(json.dumps({"samples": step, **finite}) + "\n")
         self.file.flush()
 
@@ -151,7 +85,8 @@ class TensorBoard:
 
     def write(self, step, values):
         for name, value in values.items():
-            self.writer.add_scalar(name, value, step)
+            if not is_word(value):
+                self.writer.add_scalar(name, value, step)
 
     def close(self):
         self.writer.close()
@@ -229,7 +164,9 @@ class Metrics:
             warnings.warn(_first_line(error), stacklevel=3)
 
     def write(self, step, metrics, perf):
-        """Writes one report, both dicts of name -> number, after `step` environment steps."""
+        """Writes one report, both dicts of name -> number or word, after `step` environment
+        steps.
+        """
         self._guarded(self.metrics, "write", step, metrics)
         self._guarded(self.perf, "write", step, perf)
         for sink in list(self.others):

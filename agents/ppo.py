@@ -80,6 +80,7 @@ class PPO:
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
         self.target_kl = float("inf") if target_kl is None else target_kl
         on_gpu = self.device.type == "cuda"
+        self.lr = lr
         self._lr = torch.tensor(lr, device=self.device)
         # Fused Adam does nothing at all, to its moments neither, where its flag `found_inf` is set
         # on the device

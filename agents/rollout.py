@@ -1,42 +1,54 @@
-"""What happened: T steps of B lanes on the device, and how they come about.
+"""Rollouts: T steps of B lanes on the device, and how they are collected.
 
-Axes: T time, B lanes, M lanes of a minibatch. Row t of a rollout is what was seen and decided at
-time t; `reward`, `reset`, `terminal` and `truncated` at row t are those of the world that followed,
-t+1. So row t is a valid transition unless its `reset` is set.
+Axes: T time, B lanes, M lanes of a minibatch. Row t of a rollout is the observation and the action
+of time t; `reward`, `reset`, `terminal` and `truncated` at row t are those of the world that
+followed, t+1. So row t is a valid transition unless its `reset` is set.
 """
+
+from typing import Any
 
 import torch
 
 from megastep import spaces
 from megastep.arrdict import arrdict, clone
+from megastep.capture import capture
 from megastep.dotdict import leaves, mapping
 
 
-def _room(space, lead, device, dtype):
-    """Zeros for values of a tree of spaces, after `lead` axes. Whole numbers are int64 whatever the
+def _zeros(space, lead, device, dtype):
+    """Zeros for values of a tree of spaces, after `lead` axes. Integers are int64 whatever the
     dtype.
     """
     if isinstance(space, dict):
-        return arrdict({key: _room(child, lead, device, dtype) for key, child in space.items()})
+        return arrdict({key: _zeros(child, lead, device, dtype) for key, child in space.items()})
     dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else dtype
     return torch.zeros(*lead, *space.shape, dtype=dtype, device=device)
 
 
 class Rollout:
-    """T steps of B lanes, in memory taken once and written over by every `collect`.
+    """T steps of B lanes, in memory that is allocated once and overwritten by every `collect`.
 
-    obs              (T+1, B, ...) the last row is the observation that the next rollout starts from
-    starts           (T+1, B) bool, whether that observation is its episode's first
-    actions          (T, B, ...) int64
-    logprobs         (T, B) of those actions, under the policy that took them
-    values           (T+1, B) as judged then
-    reward           (T, B), and `terminal`, `truncated` (T, B) bool: what followed
-    state            what the policy remembered before row 0, leaves (B, ...); None until the first
-    `collect`
+    obs        (T+1, B, ...), the last row is the observation that the next rollout starts from
+    starts     (T+1, B) bool, whether that observation is its episode's first
+    actions    (T, B, ...) int64
+    logprobs   (T, B) of those actions, under the policy that chose them
+    values     (T+1, B), as the policy estimated them then
+    reward     (T, B), and `terminal`, `truncated` (T, B) bool: of the world that followed
+    state      the policy's state before row 0, leaves (B, ...)
+
+    Args: `state`, the policy's state of B lanes, such as `policy.initial(B)`, of which a copy is
+    made; `obs_dtype`, of all observations that are not integers. ValueError if it has no row.
     """
 
     def __init__(
-        self, n_steps, n_lanes, obs_space, action_space, device=None, obs_dtype=torch.float16
+        self,
+        n_steps: int,
+        n_lanes: int,
+        obs_space: Any,
+        action_space: Any,
+        state: arrdict,
+        device: torch.device | str | None = None,
+        obs_dtype: torch.dtype = torch.float16,
     ):
         if n_steps < 1 or n_lanes < 1:
             raise ValueError(
@@ -44,37 +56,28 @@ class Rollout:
             )
         self.n_steps, self.n_lanes = n_steps, n_lanes
         rows, more = (n_steps, n_lanes), (n_steps + 1, n_lanes)
-        self.obs = _room(obs_space, more, device, obs_dtype)
-        self.actions = _room(action_space, rows, device, torch.int64)
+        self.obs = _zeros(obs_space, more, device, obs_dtype)
+        self.actions = _zeros(action_space, rows, device, torch.int64)
         self.starts = torch.zeros(more, dtype=torch.bool, device=device)
-        self.terminal, self.truncated = (
-            torch.zeros(rows, dtype=torch.bool, device=device) for _ in range(2)
-        )
+        self.terminal = torch.zeros(rows, dtype=torch.bool, device=device)
+        self.truncated = torch.zeros(rows, dtype=torch.bool, device=device)
         self.values = torch.zeros(more, device=device)
-        self.logprobs, self.reward = (torch.zeros(rows, device=device) for _ in range(2))
-        self.state = None
+        self.logprobs = torch.zeros(rows, device=device)
+        self.reward = torch.zeros(rows, device=device)
+        self.state = clone(state)
 
     @property
-    def reset(self):
-        """(T, B) bool: whether row t's decision was ignored because an episode started instead."""
+    def reset(self) -> torch.Tensor:
+        """(T, B) bool: whether row t's action was ignored because an episode started instead."""
         return self.starts[1:]
 
-    def store_world(self, t, world):
-        """Writes down the world at time t, and gives it back as it was written, for the policy to
-        act on.
-        """
+    def store_world(self, t: int, world: arrdict) -> arrdict:
+        """Stores the world at time t, and returns it as it was stored, for the policy to act on."""
         self.obs[t] = world["obs"]
         self.starts[t] = world["reset"]
         return arrdict(obs=self.obs[t], reset=self.starts[t])
 
-    def store_memory(self, state):
-        """Writes down what the policy remembers before row 0."""
-        if self.state is None:
-            self.state = clone(state)
-        else:
-            self.state[:] = state
-
-    def transitions(self):
+    def transitions(self) -> dict[str, torch.Tensor]:
         """The arguments of `returns.gae`, each (T, B), the last value (B,)."""
         return dict(
             value=self.values[:-1],
@@ -85,7 +88,7 @@ class Rollout:
             truncated=self.truncated,
         )
 
-    def lanes(self, rows):
+    def lanes(self, rows: torch.Tensor) -> arrdict:
         """Whole sequences of some lanes, rows (M,) int64: arrdict(obs, starts, actions, logprobs,
         value), (T, M, ...), and their state (M, ...). A copy.
         """
@@ -100,25 +103,24 @@ class Rollout:
         )
 
 
-def initial_actor_state(env, policy):
-    """Resets an environment and gives the actor_state that `collect` begins with:
+def initial_actor_state(env: Any, policy: Any) -> arrdict:
+    """Resets an environment and returns the actor_state that `collect` begins with:
     arrdict(world=arrdict(obs, reset), state). It shares no memory with the environment.
     """
     world = env.reset()
-    seen = arrdict(obs=mapping(torch.clone)(world["obs"]), reset=world["reset"].clone())
-    return arrdict(world=seen, state=policy.initial(len(seen.reset)))
+    copy = arrdict(obs=mapping(torch.clone)(world["obs"]), reset=world["reset"].clone())
+    return arrdict(world=copy, state=policy.initial(len(copy.reset)))
 
 
 @torch.no_grad()
-def collect(env, policy, rollout, actor_state):
-    """Fills a rollout: T times act, env.step, write. Never asks the GPU a question, so it can be a
-    CUDA graph.
+def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> arrdict:
+    """Fills a rollout: T times act, env.step, store. Never synchronises, so it can be a CUDA graph.
 
-    The actor_state (of `start`, or of the `collect` before) is brought up to date in place, and
+    The actor_state (of `initial_actor_state`, or of the `collect` before) is updated in place, and
     returned.
     """
     world, state = actor_state["world"], actor_state["state"]
-    rollout.store_memory(state)
+    rollout.state[:] = state
     for t in range(rollout.n_steps):
         decision, state = policy(rollout.store_world(t, world), state)
         rollout.actions[t] = decision["actions"]
@@ -130,7 +132,30 @@ def collect(env, policy, rollout, actor_state):
 
     last = rollout.store_world(rollout.n_steps, world)
     rollout.values[-1] = policy(last, state, sample=False)[0]["value"]
-    fresh = arrdict(world=arrdict(obs=world["obs"], reset=world["reset"]), state=state)
-    for target, source in zip(leaves(actor_state), leaves(fresh), strict=True):
+    after = arrdict(world=arrdict(obs=world["obs"], reset=world["reset"]), state=state)
+    for target, source in zip(leaves(actor_state), leaves(after), strict=True):
         target.copy_(source)
     return actor_state
+
+
+class Collector:
+    """Fills one rollout after another from an environment, which it resets once.
+
+    The first time is eager, so that libraries set themselves up; from the second time on a GPU
+    replays a CUDA graph, `graph`.
+    """
+
+    def __init__(self, env: Any, policy: Any, rollout: Rollout):
+        self.parts = env, policy, rollout, initial_actor_state(env, policy)
+        self.on_gpu = torch.device(env.device).type == "cuda"
+        self.n_collected = 0
+        self.graph = None
+
+    def __call__(self) -> None:
+        if self.on_gpu and self.n_collected == 1:
+            self.graph = capture(lambda: collect(*self.parts), (), self.parts)
+        self.n_collected += 1
+        if self.graph is None:
+            collect(*self.parts)
+        else:
+            self.graph()

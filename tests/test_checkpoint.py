@@ -138,8 +138,8 @@ def test_code_in_a_checkpoint_is_refused_and_not_run(folder, tmp_path, write):
 
 def test_another_format_is_named(folder):
     path = folder / "step_30" / "manifest.json"
-    path.write_text(path.read_text().replace('"format": 1', '"format": 7'))
-    with pytest.raises(CheckpointError, match="format 7.*format 1.*use the megastep that wrote it"):
+    path.write_text(path.read_text().replace('"format": 2', '"format": 7'))
+    with pytest.raises(CheckpointError, match="format 7.*format 2.*use the megastep that wrote it"):
         checkpoint.load(folder)
 
 

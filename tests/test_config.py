@@ -163,7 +163,7 @@ def test_what_a_cpu_and_a_gpu_train_with():
     same |= dict(max_grad_norm=0.5, target_kl=None)
     cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
     assert dataclasses.asdict(cpu.learner) == same | dict(
-        lr=3e-3, anneal=True, gamma=0.98, lambda_=0.9, entropy_coef=0.02
+        lr=3e-3, anneal="auto", gamma=0.98, lambda_=0.9, entropy_coef=0.02
     )
     assert dataclasses.asdict(gpu.learner) == same | dict(
         lr=1e-3, anneal=False, gamma=0.995, lambda_=0.95, entropy_coef=0.01

@@ -116,7 +116,8 @@ def learn(world, n_updates, policy=None, n_steps=16, **how):
     ends, valid steps).
     """
     policy = policy or Policy(world.obs_space, world.action_space, width=32)
-    rollout = Rollout(n_steps, B, world.obs_space, world.action_space)
+    state = policy.initial(B)
+    rollout = Rollout(n_steps, B, world.obs_space, world.action_space, state)
     learner = PPO(policy, **{**dict(lr=5e-3, n_epochs=2, n_minibatches=4), **how})
     actor_state, counts = initial_actor_state(world, policy), torch.zeros(3)
     for i in range(n_updates):

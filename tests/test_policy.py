@@ -103,7 +103,7 @@ def test_a_width_of_zero_is_refused():
         Policy(OBS, MOVES, width=0)
 
 
-def test_draws_go_on_where_they_were_saved():
+def test_a_random_stream_goes_on_where_it_was_saved():
     stream, cpu = RandomStream(3), torch.device("cpu")
     untouched = stream.state_dict()
     start = torch.rand(4, generator=stream.on(cpu))
@@ -118,6 +118,17 @@ def test_draws_go_on_where_they_were_saved():
         {**saved, "device": "cuda"}, cpu
     )  # a GPU's state means nothing here: from the seed again
     assert torch.equal(torch.rand(4, generator=other.on(cpu)), start)
+
+
+@pytest.mark.cuda
+def test_a_random_stream_on_a_gpu_goes_on_from_a_state_that_was_loaded_onto_the_gpu():
+    device = torch.device("cuda", torch.cuda.current_device())
+    stream, other = RandomStream(3), RandomStream(8)
+    torch.rand(4, device=device, generator=stream.on(device))
+    saved = {**stream.state_dict(), "generator": stream.state_dict()["generator"].to(device)}
+    other.load_state_dict(saved, device)
+    expected = torch.rand(4, device=device, generator=stream.on(device))
+    assert torch.equal(torch.rand(4, device=device, generator=other.on(device)), expected)
 
 
 @pytest.mark.cuda

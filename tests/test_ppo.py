@@ -27,7 +27,8 @@ def made_up(seed=0, device="cpu"):
         policy.output.core.weight.mul_(
             100
         )  # a policy with opinions, so that gradients differ by action
-    rollout = Rollout(T, B, OBS, MOVES, device, obs_dtype=torch.float32)
+    state = policy.initial(B)
+    rollout = Rollout(T, B, OBS, MOVES, state, device, obs_dtype=torch.float32)
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape):
@@ -37,7 +38,6 @@ def made_up(seed=0, device="cpu"):
     rollout.starts[3, 1] = rollout.starts[5, 4] = True
     rollout.terminal[1, 1] = rollout.truncated[3, 4] = True
     rollout.reward[:] = normal(T, B)
-    rollout.store_memory(policy.initial(B))
     with torch.no_grad():
         seen = policy.unroll(rollout.obs, rollout.starts, rollout.state)
         rollout.values[:] = seen.value
@@ -223,8 +223,7 @@ def test_minibatches_need_lanes():
 def test_nested_actions_learn_together():
     moves = arrdict(move=MOVES, fire=spaces.MultiDiscrete(1, 2))
     policy = Policy(OBS, moves, width=WIDTH)
-    rollout = Rollout(T, B, OBS, moves)
-    rollout.store_memory(policy.initial(B))
+    rollout = Rollout(T, B, OBS, moves, policy.initial(B))
     rollout.logprobs[:] = math.log(1 / 6)
     rollout.reward[:] = torch.randn(T, B)
     before = weights(policy)

@@ -67,7 +67,8 @@ class Telltale:
 def collected(n_rollouts=1, dtype=torch.float32):
     env = Telltale()
     policy = Policy(env.obs_space, env.action_space, width=16)
-    rollout = Rollout(T, B, env.obs_space, env.action_space, obs_dtype=dtype)
+    state = policy.initial(B)
+    rollout = Rollout(T, B, env.obs_space, env.action_space, state, obs_dtype=dtype)
     actor_state = initial_actor_state(env, policy)
     for _ in range(n_rollouts):
         actor_state = collect(env, policy, rollout, actor_state)
@@ -159,11 +160,11 @@ def test_the_same_seed_collects_the_same():
 
 def test_pictures_are_kept_in_half_precision_and_whole_numbers_whole():
     space = arrdict(rgb=spaces.MultiImage(1, 3, 1, 4), team=spaces.MultiDiscrete(1, 5000))
-    rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7))
+    rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
     assert rollout.obs.rgb.dtype == torch.float16 and rollout.obs.team.dtype == torch.int64
     assert rollout.actions.shape == (T, B, 1)
 
 
 def test_a_rollout_of_nothing_is_refused():
     with pytest.raises(ValueError, match="not 0 and 6"):
-        Rollout(0, B, Telltale.obs_space, Telltale.action_space)
+        Rollout(0, B, Telltale.obs_space, Telltale.action_space, arrdict())

@@ -2,10 +2,12 @@
 are four boxes.
 """
 
+import itertools
 import json
 import os
 import re
 import signal
+import time
 
 import pytest
 import torch
@@ -68,9 +70,8 @@ def test_a_run_leaves_what_it_promises(here):
         "perf.jsonl",
         "curves.png",
     }
-    assert build(Train, yaml.safe_load((folder / "config.yaml").read_text())) == configured(
-        f"samples={3 * UPDATE}"
-    )
+    written = build(Train, yaml.safe_load((folder / "config.yaml").read_text()))
+    assert written == train.settled(configured(f"samples={3 * UPDATE}"))
     rows = metrics.read(folder / "metrics.jsonl")
     assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
     assert [row["updates"] for row in rows] == [1, 2, 3]
@@ -110,6 +111,63 @@ def test_a_run_goes_on_under_its_own_configuration(here):
     assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE, 4 * UPDATE]
     assert [row["updates"] for row in rows] == [1, 2, 3, 4]
     assert yaml.safe_load((folder / "config.yaml").read_text())["samples"] == 4 * UPDATE
+
+
+def test_episodes_start_anew_when_a_run_goes_on(here):
+    # every episode lasts 9 steps, and 8 are left over from the first rollout
+    folder = train.run(configured(f"samples={UPDATE}", "env.shortest=9", "env.longest=9"))
+    train.run(configured(f"resume={folder}", f"samples={5 * UPDATE}", tiny=[]))
+    rows = metrics.read(folder / "metrics.jsonl")
+    assert [row["episode/length"] for row in rows if row["episode/count"]] == [9, 9, 9]
+
+
+def test_episodes_that_ended_before_a_run_was_stopped_are_reported_when_it_goes_on(here):
+    lives = "env.shortest=7", "env.longest=7"
+    folder = train.run(configured(f"samples={UPDATE}", "report=2", *lives))
+    train.run(configured(f"resume={folder}", f"samples={2 * UPDATE}", tiny=[]))
+    (row,) = metrics.read(folder / "metrics.jsonl")
+    assert row["episode/count"] == 2 * 4 and row["episode/length"] == 7
+
+
+def clock_jumps(monkeypatch, seconds):
+    """From its 12th reading on, in the first updates of a run, the clock shows so much more."""
+    readings = itertools.count()
+    monkeypatch.setattr(
+        time, "monotonic", lambda: 1e-3 * (n := next(readings)) + seconds * (n >= 12)
+    )
+
+
+def test_the_learning_rate_falls_over_samples_where_both_budgets_are_given(here, monkeypatch):
+    clock_jumps(monkeypatch, 900)  # most of the seconds are gone before most of the samples are
+    lr, n = 0.01, 4
+    folder = train.run(configured(f"samples={n * UPDATE}", "seconds=1000", f"learner.lr={lr}"))
+    rows = metrics.read(folder / "metrics.jsonl")
+    assert [row["lr"] for row in rows] == pytest.approx([lr * (1 - i / n) for i in range(n)])
+    assert {row["anneal"] for row in rows} == {"samples"}
+    written = yaml.safe_load((folder / "config.yaml").read_text())
+    assert written["learner"]["anneal"] == "samples"
+
+
+def test_a_seed_determines_the_file_whatever_the_clock_shows(here, monkeypatch):
+    files = []
+    for seconds in (0, 900):
+        clock_jumps(monkeypatch, seconds)
+        folder = train.run(configured(f"samples={4 * UPDATE}", "seconds=1000"))
+        files.append((folder / "metrics.jsonl").read_bytes())
+    assert files[0] == files[1]
+
+
+def test_the_learning_rate_falls_over_seconds_where_they_are_the_only_budget(here):
+    folder = train.run(configured("seconds=0.3"))
+    rows = metrics.read(folder / "metrics.jsonl")
+    assert rows[0]["lr"] > rows[-1]["lr"] and {row["anneal"] for row in rows} == {"seconds"}
+    written = yaml.safe_load((folder / "config.yaml").read_text())
+    assert written["learner"]["anneal"] == "seconds"
+
+
+def test_a_learning_rate_cannot_fall_over_a_budget_that_is_not_given(here):
+    with pytest.raises(ConfigErrors, match="learner.anneal: is samples: .* which are not given"):
+        configured("seconds=1", "learner.anneal=samples")
 
 
 def test_what_is_learnt_cannot_change_when_a_run_goes_on(here):
@@ -178,8 +236,8 @@ def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_world(
 ):
     real = train.Trainer.report
 
-    def report(self, *arguments):
-        real(self, *arguments)
+    def report(self, losses):
+        real(self, losses)
         self.env.core.agents.positions[2] = float("nan")
 
     monkeypatch.setattr(train.Trainer, "report", report)
@@ -194,10 +252,7 @@ def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, mo
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch, pytest.warns(UserWarning) as caught:
-        import warnings
-
         patch.setattr(checkpoint, "save", full)
-        patch.setattr(train, "warn", warnings.warn)
         with pytest.raises(
             UserError, match="could not be saved .No space left on device.*MB are free"
         ):
@@ -206,7 +261,7 @@ def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, mo
     assert len(metrics.read(next((here / "runs").iterdir()) / "metrics.jsonl")) == 3
 
 
-def test_a_disk_that_is_free_again_gets_the_checkpoint(here, monkeypatch, capsys):
+def test_a_disk_that_is_free_again_gets_the_checkpoint(here, monkeypatch):
     real, calls = checkpoint.save, []
 
     def save(*arguments):
@@ -216,9 +271,9 @@ def test_a_disk_that_is_free_again_gets_the_checkpoint(here, monkeypatch, capsys
         return real(*arguments)
 
     monkeypatch.setattr(checkpoint, "save", save)
-    folder = train.run(configured(f"samples={3 * UPDATE}", "checkpoint=1e-9"))
+    with pytest.warns(UserWarning, match="tries again"):
+        folder = train.run(configured(f"samples={3 * UPDATE}", "checkpoint=1e-9"))
     assert checkpoint.load(folder / "checkpoints").step == 3 * UPDATE
-    assert "tries again" in capsys.readouterr().err
 
 
 def test_an_environment_that_cannot_be_made_leaves_no_folder(here, tmp_path):
@@ -245,7 +300,7 @@ def test_a_folder_that_cannot_be_used_is_one_sentence_before_anything_is_made(
     (here / "file").write_text("")
     (here / "full").mkdir()
     (here / "full" / "mine.txt").write_text("")
-    monkeypatch.setattr(train, "Trainer", None)
+    monkeypatch.setattr(train, "make_trainer", None)
     assert train.main([*TINY, f"folder={folder}"]) == 2
     error = capsys.readouterr().err.strip()
     assert folder in error and "folder=" in error and "\n" not in error

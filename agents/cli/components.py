@@ -114,15 +114,17 @@ def make_learner(learner, policy, seed=1):
     return PPO(policy, graph=True, seed=seed, **arguments)
 
 
-def make_rollout(cfg, env):
+def make_rollout(cfg, env, policy):
     from agents.rollout import Rollout
 
+    n_lanes = env.n_envs * env.n_agents
     with errors():
         return Rollout(
             cfg.learner.n_steps,
-            env.n_envs * env.n_agents,
+            n_lanes,
             env.obs_space,
             env.action_space,
+            policy.initial(n_lanes),
             env.device,
         )
 

@@ -110,7 +110,7 @@ class Learner:
     name: str = among("ppo")
     n_steps: int = within(1, 65_536)
     lr: float = within(0, 1e6, min_open=True)
-    anneal: bool
+    anneal: str = among("auto", "never", "samples", "seconds")
     gamma: float = within(0, 1)
     lambda_: float = within(0, 1)
     clip: float = within(0, 1e6, min_open=True)
@@ -178,6 +178,9 @@ class Train:
         parts, n_envs = self.learner.n_minibatches, self.env.n_envs
         if parts > n_envs:
             yield "learner.n_minibatches", f"{parts} is more than env.n_envs, {n_envs}"
+        over = self.learner.anneal
+        if over in ("samples", "seconds") and getattr(self, over) is None:
+            yield "learner.anneal", f"is {over}: lr falls over {over}, which are not given"
         if self.resume and self.init:
             yield (
                 "init",

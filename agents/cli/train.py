@@ -2,13 +2,14 @@
 Python.
 """
 
-import shutil
-import time
-from contextlib import nullcontext
+import dataclasses
+from contextlib import closing, nullcontext
+from functools import partial
 
 import torch
 
-from agents import checkpoint, metrics
+from agents import metrics
+from agents.budget import Budget
 from agents.cli import components, evaluate, record, run_folders
 from agents.cli.build import as_tree
 from agents.cli.command import run_command
@@ -16,8 +17,9 @@ from agents.cli.console import Progress, duration, number, say, warn
 from agents.cli.errors import ConfigErrors, UserError
 from agents.cli.settings import Evaluate, Record, Train, WandbLogger
 from agents.cli.signals import Interrupted, Interruptions
-from agents.rollout import collect, initial_actor_state
-from megastep import capture, engine
+from agents.saver import Saver
+from agents.trainer import Trainer
+from megastep import engine
 
 HELP = """Trains a policy in an environment.
 
@@ -47,199 +49,101 @@ RESUMABLE = (
 )
 
 
-class Trainer:
-    """All that one run trains with, and how far it has come."""
+def make_trainer(cfg, folder, device, on_report):
+    """A Trainer as `cfg` describes it, and its Saver: going on where a run stopped, or from the
+    weights of another, if `cfg` says so.
+    """
+    homes = components.homes(cfg.geometry, "training")
+    env = components.make_env(
+        cfg.env, homes, cfg.seed, device, lambda env: components.rollout_bytes(cfg, env)
+    )
+    policy = components.make_policy(cfg.agent, env, cfg.seed)
+    learner = components.make_learner(cfg.learner, policy, cfg.seed)
+    rollout = components.make_rollout(cfg, env, policy)
+    loaded = None
+    if cfg.resume or cfg.init:
+        loaded = components.load(run_folders.find(cfg.resume or cfg.init), device)
+        components.load_weights(policy, env, loaded)
+    wandb = None
+    if isinstance(cfg.logger, WandbLogger):
+        project, mode = cfg.logger.project, cfg.logger.mode
+        wandb = dict(project=project, mode=mode, name=folder.name, config=as_tree(cfg))
+    sinks = metrics.Metrics(folder, loaded.step if cfg.resume else 0, wandb)
+    saver = Saver(
+        folder / "checkpoints",
+        {"train": as_tree(cfg), "spaces": components.spaces_of(env)},
+        cfg.keep,
+    )
+    trainer = Trainer(
+        env,
+        policy,
+        learner,
+        rollout,
+        sinks,
+        saver,
+        Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
+        report_every=cfg.report,
+        save_every=cfg.checkpoint,
+        on_report=on_report,
+    )
+    if cfg.resume:
+        trainer.load_state_dict(loaded.state)
+    return trainer, saver
 
-    def __init__(self, cfg, folder, device):
-        self.cfg, self.folder = cfg, folder
-        homes = components.homes(cfg.geometry, "training")
-        self.env = components.make_env(
-            cfg.env, homes, cfg.seed, device, lambda env: components.rollout_bytes(cfg, env)
-        )
-        self.policy = components.make_policy(cfg.agent, self.env, cfg.seed)
-        self.learner = components.make_learner(cfg.learner, self.policy, cfg.seed)
-        self.rollout = components.make_rollout(cfg, self.env)
-        self.episodes = metrics.Episodes(self.rollout.n_lanes, device)
-        self.samples = self.updates = 0  # environment steps of all lanes; rollouts learnt from
-        self.seconds = 0.0  # of training, from the end of the first update on
-        if cfg.resume:
-            self.restore(components.load(run_folders.find(cfg.resume), device))
-        elif cfg.init:
-            components.load_weights(
-                self.policy, self.env, components.load(run_folders.find(cfg.init), device)
-            )
-        wandb = None
-        if isinstance(cfg.logger, WandbLogger):
-            project, mode = cfg.logger.project, cfg.logger.mode
-            wandb = dict(project=project, mode=mode, name=folder.name, config=as_tree(cfg))
-        self.metrics = metrics.Metrics(folder, self.samples, wandb)
-        self.reported = self.samples, time.monotonic()
-        self.score = self.unsaved = (
-            None  # the last reported return; why the last checkpoint is missing
-        )
 
-    def train(self, stop):
-        """Collects, updates, reports, saves, until the budget is spent or `stop.number` is set."""
-        actor_state = initial_actor_state(self.env, self.policy)
-        self.started = self.saved = None
-        with Progress() as progress:
-            while self.left() > 0 and stop.number is None:
-                self.collect(actor_state)
-                if self.cfg.learner.anneal:
-                    self.learner.set_lr(self.cfg.learner.lr * max(0.0, self.left()))
-                losses = self.learner.update(self.rollout)
-                self.count()
-                if self.updates % self.cfg.report == 0:
-                    self.report(losses, progress)
-                if self.now() - self.saved >= self.cfg.checkpoint:
-                    self.save()
-        self.save()
-        self.metrics.close()
+def show(progress, trainer):
+    """Shows the few numbers that people watch."""
+    words = [f"{number(trainer.samples)} samples"]
+    if trainer.rate is not None:
+        words.append(f"{number(trainer.rate)}/s")
+    if trainer.score is not None:
+        words.append(f"return {trainer.score:.2f}")
+    left = trainer.left
+    if trainer.budget.is_limited and left < 1:
+        words.append(f"{duration(trainer.clock.seconds * left / (1 - left))} left")
+    progress.show(1 - left if trainer.budget.is_limited else None, "  ".join(words))
 
-    def collect(self, actor_state):
-        """Fills the rollout. On a GPU from the second time on as a CUDA graph, which replaces this
-        method.
-        """
-        parts = self.env, self.policy, self.rollout, actor_state
-        if self.env.device.type == "cuda" and self.updates:
-            self.policy.random.on(self.env.device)
-            graph = capture.capture(lambda: collect(*parts), (), parts)
-            self.collect = lambda actor_state: graph()
-            return graph()
-        collect(*parts)
 
-    def count(self):
-        rollout = self.rollout
-        self.episodes.add(rollout.reward, rollout.reset, rollout.terminal | rollout.truncated)
-        self.samples += rollout.n_steps * rollout.n_lanes
-        self.updates += 1
-        if self.started is None:
-            if self.env.device.type == "cuda":
-                torch.cuda.synchronize(self.env.device)
-            self.started = time.monotonic() - self.seconds
-            self.saved = self.seconds
-            self.reported = self.samples, self.started + self.seconds
-
-    def now(self):
-        """Seconds of training so far, those before a resume included."""
-        return self.seconds if self.started is None else time.monotonic() - self.started
-
-    def left(self):
-        """The fraction of the budget that is left; without a budget, all of it."""
-        spent = [
-            done / budget
-            for done, budget in ((self.samples, self.cfg.samples), (self.now(), self.cfg.seconds))
-            if budget is not None
-        ]
-        return 1 - max(spent, default=0)
-
-    def report(self, losses, progress):
-        """Writes the metrics since the last report, and shows the few that people watch. Waits for
-        the device.
-        """
-        names, values = zip(*losses.items())
-        if hasattr(self.env, "core"):
-            engine.check(self.env.core.agents)
-        found = {
-            **self.episodes.take(),
-            **dict(zip(names, torch.stack(values).tolist())),
-            "updates": self.updates,
-        }
-        samples, then = self.reported
-        self.reported = self.samples, time.monotonic()
-        perf = {"perf/seconds": self.now()}
-        words = [f"{number(self.samples)} samples"]
-        if self.samples > samples:  # the first update, which compiles, says nothing of the rate
-            perf["perf/rate"] = (self.samples - samples) / (self.reported[1] - then)
-            words.append(f"{number(perf['perf/rate'])}/s")
-        self.metrics.write(self.samples, found, perf)
-        self.score = found.get("episode/return", self.score)
-        if self.score is not None:
-            words.append(f"return {self.score:.2f}")
-        left, limited = self.left(), self.cfg.samples is not None or self.cfg.seconds is not None
-        if limited and left < 1:
-            words.append(f"{duration(self.now() * left / (1 - left))} left")
-        progress.show(1 - left if limited else None, "  ".join(words))
-
-    def save(self):
-        """Writes a checkpoint; on a full disk warns once, and the next interval tries again."""
-        self.saved = self.now()
-        try:
-            config = {"train": as_tree(self.cfg), "spaces": components.spaces_of(self.env)}
-            checkpoint.save(
-                self.folder / "checkpoints",
-                self.samples,
-                self.state(),
-                config,
-                self.cfg.keep,
-                self.score,
-            )
-            self.unsaved = None
-        except OSError as error:
-            needed = 3 * sum(
-                p.numel() * p.element_size() for p in self.policy.parameters()
-            )  # Adam's two as well
-            free = shutil.disk_usage(self.folder).free
-            again, self.unsaved = (
-                self.unsaved,
-                (
-                    f"The checkpoint at {self.samples:,} samples could not be saved "
-                    f"({error.strerror}): it needs about "
-                    f"{needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free in {self.folder}"
-                ),
-            )
-            if not again:
-                warn(
-                    f"{self.unsaved}; training goes on and tries again in "
-                    f"{self.cfg.checkpoint:.0f} s"
-                )
-
-    def state(self):
-        """All that a checkpoint holds, as plain dicts of tensors and numbers."""
-        parts = {
-            name: getattr(self, name).state_dict() for name in ("policy", "learner", "episodes")
-        }
-        return dict(**parts, samples=self.samples, updates=self.updates, seconds=self.now())
-
-    def restore(self, loaded):
-        state = loaded.state
-        components.load_weights(self.policy, self.env, loaded)
-        self.learner.load_state_dict(state["learner"])
-        self.episodes.load_state_dict(state["episodes"])
-        self.samples, self.updates, self.seconds = (
-            state["samples"],
-            state["updates"],
-            state["seconds"],
-        )
+def settled(cfg):
+    """`cfg` with learner.anneal=auto replaced by what it stands for: samples if they are limited,
+    else seconds, else never.
+    """
+    if cfg.learner.anneal != "auto":
+        return cfg
+    limited = [name for name in ("samples", "seconds") if getattr(cfg, name) is not None]
+    anneal = [*limited, "never"][0]
+    return dataclasses.replace(cfg, learner=dataclasses.replace(cfg.learner, anneal=anneal))
 
 
 def run(cfg):
     """Trains as `cfg`, a settings.Train, says. Returns the run folder; after a signal, saves and
     raises Interrupted.
     """
+    cfg = settled(cfg)
     device = components.make_device(cfg.device)
     folder = (
         run_folders.folder_of(run_folders.find(cfg.resume)) if cfg.resume else run_folders.new(cfg)
     )
+    progress = Progress()
     with Interruptions() as stop:
         with nullcontext() if cfg.resume else run_folders.cleanup_on_error(folder):
-            trainer = Trainer(cfg, folder, device)
+            trainer, saver = make_trainer(cfg, folder, device, partial(show, progress))
             run_folders.write_config(folder, cfg)
         say(f"Training on {device} in {folder}")
+        resume = f"To go on: python train.py resume={folder}"
         try:
-            trainer.train(stop)
+            with progress, closing(trainer.metrics):
+                trainer.train(lambda: stop.number is not None)
         except (engine.EngineError, torch.OutOfMemoryError) as error:
             reason = str(error).splitlines()[0].rstrip(".")
-            raise UserError(f"{reason}. What was saved before it is in {folder}") from error
+            raise UserError(
+                f"{reason}. It stopped after {trainer.samples:,} samples. {resume}"
+            ) from error
         metrics.curves(folder)
         if stop.number is not None:
-            raise Interrupted(
-                stop.number,
-                f"Stopped after {trainer.samples:,} samples. "
-                f"To go on: python train.py resume={folder}",
-            )
-    if trainer.unsaved:
-        raise UserError(trainer.unsaved)
+            raise Interrupted(stop.number, f"Stopped after {trainer.samples:,} samples. {resume}")
+    if saver.unsaved:
+        raise UserError(saver.unsaved)
     del trainer  # its memory is the evaluation's now
     finish(cfg, folder)
     return folder

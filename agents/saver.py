@@ -1,0 +1,45 @@
+"""Saving a run: a checkpoint now and then, and what to say when one cannot be written."""
+
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+from agents import checkpoint
+from megastep.dotdict import leaves
+
+
+class Saver:
+    """Writes the checkpoints of one run into a folder, with the `config` that it runs under.
+
+    A disk that is full or not writable is a warning, the first time, and the next call tries again.
+    Until one succeeds, `unsaved` is the sentence that says why the last checkpoint is missing.
+    """
+
+    def __init__(self, folder: Path, config: dict[str, Any], keep: int = 2):
+        self.folder, self.config, self.keep = folder, config, keep
+        self.unsaved = None
+
+    def __call__(self, step: int, state: dict[str, Any], score: float | None = None) -> bool:
+        """Saves `state`, dicts of tensors and numbers, after `step` samples; whether it could."""
+        try:
+            checkpoint.save(self.folder, step, state, self.config, self.keep, score)
+        except OSError as error:
+            warned = self.unsaved is not None
+            self.unsaved = self._explain(step, state, error)
+            if not warned:
+                warnings.warn(
+                    f"{self.unsaved}; training goes on and the next checkpoint tries again",
+                    stacklevel=2,
+                )
+            return False
+        self.unsaved = None
+        return True
+
+    def _explain(self, step, state, error):
+        needed = sum(getattr(leaf, "nbytes", 0) for leaf in leaves(state))
+        free = shutil.disk_usage(self.folder.parent).free
+        return (
+            f"The checkpoint at {step:,} samples could not be saved ({error.strerror}): it needs "
+            f"about {needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free in {self.folder.parent}"
+        )

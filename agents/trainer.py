@@ -1,0 +1,146 @@
+"""The training loop: collect, update, report, save."""
+
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from agents.budget import Budget, Stopwatch
+from agents.episodes import Episodes
+from agents.rollout import Collector, Rollout
+
+
+class Trainer:
+    """Improves a policy in an environment until a budget is spent.
+
+    Args:
+    env, policy, rollout  the environment, who acts in it, and the memory of their transitions
+    learner      has `update(rollout)`, which returns a dict of tensors () on the device; `lr`,
+                 `set_lr`, `state_dict` and `load_state_dict`
+    metrics      has `write(samples, metrics, perf)`: `agents.metrics.Metrics`
+    save         called with (samples, state, score); returns whether it could: a `Saver`
+    budget       when to end, and how the learning rate falls
+    report_every, save_every  updates between two reports, and seconds between two checkpoints
+    on_report    called with the trainer after each report, to show how far it is
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        policy: Any,
+        learner: Any,
+        rollout: Rollout,
+        metrics: Any,
+        save: Callable[[int, dict, float | None], bool],
+        budget: Budget,
+        *,
+        report_every: int = 1,
+        save_every: float = 30.0,
+        on_report: Callable[["Trainer"], None] = lambda trainer: None,
+    ):
+        self.env, self.policy, self.learner, self.rollout = env, policy, learner, rollout
+        self.metrics, self.save_checkpoint, self.budget = metrics, save, budget
+        self.report_every, self.save_every, self.on_report = report_every, save_every, on_report
+        self.collect = Collector(env, policy, rollout)
+        self.episodes = Episodes(rollout.n_lanes, env.device)
+        self.clock = Stopwatch()
+        self.samples = self.updates = 0
+        self.lr = learner.lr
+        self.score = self.rate = None  # the last reported return, and samples per second
+        self.reported_at = 0, 0.0  # samples and seconds
+        self.saved_at = 0.0  # seconds
+        self.saved_updates = None  # updates that the last checkpoint holds
+
+    @property
+    def left(self) -> float:
+        """The fraction of the budget that is left."""
+        return self.budget.left(self.samples, self.clock.seconds)
+
+    def train(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Runs until the budget is spent or `stop()`. An error ends it too, once all that was
+        learnt is saved.
+        """
+        try:
+            while self.left > 0 and not stop():
+                self.collect()
+                losses = self.update()
+                if self.updates % self.report_every == 0:
+                    self.report(losses)
+                if self.clock.seconds - self.saved_at >= self.save_every:
+                    self.save()
+        except Exception:
+            with contextlib.suppress(Exception):  # the first error is the one to tell
+                self.save()
+            raise
+        self.save()
+
+    def update(self) -> dict[str, torch.Tensor]:
+        """Learns from the rollout and counts it. Returns the learner's metrics."""
+        rollout = self.rollout
+        if self.budget.anneal != "never":
+            self.lr = self.learner.lr * self.budget.lr_fraction(self.samples, self.clock.seconds)
+            self.learner.set_lr(self.lr)
+        losses = self.learner.update(rollout)
+        self.episodes.add(rollout.reward, rollout.reset, rollout.terminal | rollout.truncated)
+        self.samples += rollout.n_steps * rollout.n_lanes
+        self.updates += 1
+        if not self.clock.is_running:
+            if torch.device(self.env.device).type == "cuda":
+                torch.cuda.synchronize(self.env.device)
+            self.clock.start()
+            self.saved_at = self.clock.seconds
+            self.reported_at = self.samples, self.clock.seconds
+        return losses
+
+    def report(self, losses: dict[str, torch.Tensor]) -> None:
+        """Writes the metrics since the last report. Synchronises; raises what the environment
+        flagged since then, if it has `check()`.
+        """
+        if hasattr(self.env, "check"):
+            self.env.check()
+        values = torch.stack(list(losses.values())).tolist()
+        found = {
+            **self.episodes.take(),
+            **dict(zip(losses, values, strict=True)),
+            "updates": self.updates,
+            "lr": self.lr,
+            "anneal": self.budget.anneal,
+        }
+        (samples, seconds), now = self.reported_at, self.clock.seconds
+        self.reported_at = self.samples, now
+        perf = {"perf/seconds": now}
+        if self.samples > samples:  # the first update, which compiles, says nothing of the rate
+            self.rate = (self.samples - samples) / (now - seconds)
+            perf["perf/rate"] = self.rate
+        self.metrics.write(self.samples, found, perf)
+        self.score = found.get("episode/return", self.score)
+        self.on_report(self)
+
+    def save(self) -> None:
+        """Writes a checkpoint, unless the last one holds the same."""
+        self.saved_at = self.clock.seconds
+        if self.saved_updates != self.updates and self.save_checkpoint(
+            self.samples, self.state_dict(), self.score
+        ):
+            self.saved_updates = self.updates
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that a run goes on from, as plain dicts of tensors and numbers."""
+        return dict(
+            policy=self.policy.state_dict(),
+            learner=self.learner.state_dict(),
+            episodes=self.episodes.state_dict(),
+            samples=self.samples,
+            updates=self.updates,
+            seconds=self.clock.seconds,
+        )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from a `state_dict`. The environment starts new episodes."""
+        self.policy.load_state_dict(state["policy"])
+        self.learner.load_state_dict(state["learner"])
+        self.episodes.load_state_dict(state["episodes"])
+        self.samples, self.updates = state["samples"], state["updates"]
+        self.clock.before = state["seconds"]
+        self.saved_updates = self.updates
