@@ -166,7 +166,7 @@ def test_what_a_cpu_and_a_gpu_train_with():
         lr=3e-3, anneal="auto", gamma=0.98, lambda_=0.9, entropy_coef=0.02
     )
     assert dataclasses.asdict(gpu.learner) == same | dict(
-        lr=1e-3, anneal=False, gamma=0.995, lambda_=0.95, entropy_coef=0.01
+        lr=1e-3, anneal="never", gamma=0.995, lambda_=0.95, entropy_coef=0.01
     )
     assert (cpu.env.n_envs, cpu.agent.width, cpu.report) == (256, 64, 4)
     assert (gpu.env.n_envs, gpu.agent.width, gpu.report) == (4096, 256, 50)
