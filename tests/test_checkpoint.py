@@ -1,11 +1,14 @@
 """Checkpoints: whole or absent, and damage is named. The damage here is done for real, to files on
-the disk.
+the disk and to processes that write them.
 """
 
 import errno
+import itertools
 import json
 import os
+import pathlib
 import pickle
+import shutil
 import subprocess
 import sys
 
@@ -16,6 +19,7 @@ from agents import checkpoint
 from agents.checkpoint import CheckpointError
 
 CONFIG = {"env": {"name": "box"}}
+ROOT = pathlib.Path(__file__).parents[1]
 
 
 def state(n):
@@ -52,7 +56,7 @@ def test_one_checkpoint_can_be_chosen(folder):
 
 
 def test_steps_are_ordered_as_numbers(tmp_path):
-    for n in (9, 100, 20):
+    for n in (9, 20, 100):
         checkpoint.save(tmp_path, n, state(n), CONFIG, keep=9)
     assert names(tmp_path) == ["step_9", "step_20", "step_100"]
 
@@ -72,15 +76,22 @@ def test_a_lost_file_is_named(folder):
         assert checkpoint.load(folder).step == 20
 
 
-@pytest.mark.parametrize("file", ["state.pt", "config.json"])
-@pytest.mark.parametrize("where", [0.0, 0.3, 0.9])
-def test_a_flipped_bit_is_found(folder, file, where):
+@pytest.mark.parametrize(
+    "file, every", [("manifest.json", 3), ("config.json", 1), ("state.pt", 29)]
+)
+def test_a_flipped_bit_is_found_and_the_file_is_named(folder, file, every):
     path = folder / "step_30" / file
-    data = bytearray(path.read_bytes())
-    data[int(where * len(data))] ^= 16
-    path.write_bytes(data)
-    with pytest.warns(UserWarning, match=f"{file} does not have the sha256"):
+    whole = path.read_bytes()
+    for bit in range(0, 8 * len(whole), every):
+        data = bytearray(whole)
+        data[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(data)
+        with pytest.raises(checkpoint.Damaged, match=f"step_30 is damaged: {file}"):
+            checkpoint.load(folder / "step_30")
+    with pytest.warns(UserWarning, match=f"step_30 is damaged: {file}.*using step_20"):
         assert checkpoint.load(folder).step == 20
+    path.write_bytes(whole)
+    assert checkpoint.load(folder).step == 30
 
 
 def test_the_newest_whole_one_is_used_however_many_are_damaged(folder):
@@ -127,19 +138,37 @@ def test_code_in_a_checkpoint_is_refused_and_not_run(folder, tmp_path, write):
     mark, path = tmp_path / "ran", folder / "step_30" / "state.pt"
     write({"weights": Payload(mark)}, path)
     manifest = json.loads((path.parent / "manifest.json").read_text())
-    manifest["files"]["state.pt"]["sha256"] = checkpoint.hashlib.sha256(
-        path.read_bytes()
-    ).hexdigest()
-    (path.parent / "manifest.json").write_text(json.dumps(manifest))
+    digest = checkpoint.hashlib.sha256(path.read_bytes()).hexdigest()
+    manifest["files"]["state.pt"]["sha256"] = digest
+    seal(path.parent, manifest)
     with pytest.warns(UserWarning, match="step_30 is refused"):
         assert checkpoint.load(folder).step == 20
     assert not mark.exists()
 
 
-def test_another_format_is_named(folder):
+def seal(path, manifest):
+    """Writes a manifest with the digest that makes it believable."""
+    manifest.pop("sha256")
+    (path / "manifest.json").write_bytes(checkpoint._sealed(manifest))
+
+
+@pytest.mark.parametrize("version", [0, 1, 7])
+def test_another_format_is_named_and_neither_read_nor_passed_over(folder, version):
+    manifest = json.loads((folder / "step_30" / "manifest.json").read_text())
+    seal(folder / "step_30", {**manifest, "format": version})
+    with pytest.raises(
+        CheckpointError,
+        match=f"step_30 has format {version}.*format 2.*use the megastep that wrote it",
+    ):
+        checkpoint.load(folder)
+
+
+def test_a_checkpoint_from_before_manifests_had_a_digest_is_named_by_its_format(folder):
     path = folder / "step_30" / "manifest.json"
-    path.write_text(path.read_text().replace('"format": 2', '"format": 7'))
-    with pytest.raises(CheckpointError, match="format 7.*format 2.*use the megastep that wrote it"):
+    manifest = json.loads(path.read_text())
+    del manifest["sha256"]
+    path.write_text(json.dumps({**manifest, "format": 1}, indent=2))
+    with pytest.raises(CheckpointError, match="step_30 has format 1"):
         checkpoint.load(folder)
 
 
@@ -159,9 +188,136 @@ def test_nothing_is_deleted_before_the_new_one_is_known_to_be_whole(folder, monk
     assert names(folder) == ["step_10", "step_20", "step_30", "step_40"]
 
 
-def test_the_same_step_can_be_saved_again(folder):
+def test_the_same_step_can_be_saved_again_and_again(folder):
+    for n in (31, 32, 33):
+        checkpoint.save(folder, 30, state(n), CONFIG, keep=3)
+        assert checkpoint.load(folder).state["samples"] == n
+        assert [checkpoint.step_of(path) for path in checkpoint.checkpoints(folder)] == [10, 20, 30]
+    assert len(list(folder.iterdir())) == 3
+
+
+def test_a_damaged_second_one_of_a_step_is_replaced_by_nothing_newer(folder):
     checkpoint.save(folder, 30, state(31), CONFIG, keep=3)
-    assert checkpoint.load(folder).state["samples"] == 31
+    os.truncate(checkpoint.checkpoints(folder)[-1] / "state.pt", 10)
+    with pytest.warns(UserWarning, match="is damaged"):
+        assert checkpoint.load(folder).step == 20
+
+
+class Killed(BaseException):
+    """Stands for kill -9: from here on nothing happens to any file."""
+
+
+@pytest.mark.parametrize("step", [30, 31, 15])
+@pytest.mark.parametrize("n_old", [1, 3])
+def test_killed_between_any_two_changes_of_files_a_whole_checkpoint_is_left(tmp_path, step, n_old):
+    changes = [(os, "replace"), (os, "mkdir"), (shutil, "rmtree"), (checkpoint, "_write")]
+    for n in itertools.count():
+        folder = tmp_path / str(n)
+        for old in (10, 20, 30)[-n_old:]:
+            checkpoint.save(folder, old, state(old), CONFIG, keep=3)
+        done = itertools.count()
+
+        def until_killed(real, n=n, done=done):
+            def change(*arguments, **options):
+                if next(done) >= n:
+                    raise Killed
+                return real(*arguments, **options)
+
+            return change
+
+        with pytest.MonkeyPatch.context() as patch:
+            for place, name in changes:
+                patch.setattr(place, name, until_killed(getattr(place, name)))
+            try:
+                checkpoint.save(folder, step, state(99), CONFIG, keep=2)
+                break
+            except Killed:
+                pass
+        loaded = checkpoint.load(folder)
+        assert loaded.state["samples"] in (99, 30), n
+        checkpoint.save(folder, step + 1, state(100), CONFIG, keep=2)
+        assert checkpoint.load(folder).state["samples"] == 100
+        assert not list(folder.glob("*.tmp-*"))
+    assert n >= 5 and checkpoint.load(folder).state["samples"] == 99
+
+
+SAVES_UNTIL_KILLED = """
+import os, random, signal, sys, time
+import torch
+from agents import checkpoint
+
+folder, kills, again = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "again"
+checkpoint.save(folder, 1, {"n": 1, "w": torch.zeros(50_000)}, {})
+random.seed(1)
+newest = 1
+for kill in range(kills):
+    child = os.fork()
+    if not child:
+        for n in range(newest + 1, 10**9):
+            step = 1 if again else n
+            checkpoint.save(folder, step, {"n": n, "w": torch.zeros(50_000)}, {})
+    time.sleep(random.uniform(0, 0.08))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    found = checkpoint.load(folder).state["n"]
+    assert found >= newest, (found, newest)
+    newest = found
+checkpoint.save(folder, newest + 1, {"n": newest + 1}, {})
+print(newest, *sorted(os.listdir(folder)))
+"""
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("steps", ["again", "new"])
+@pytest.mark.parametrize("kills", [10, pytest.param(60, marks=pytest.mark.slow)])
+def test_kill_9_at_random_leaves_the_newest_whole_checkpoint(tmp_path, kills, steps):
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", SAVES_UNTIL_KILLED, tmp_path, str(kills), steps],
+        cwd=ROOT,
+        text=True,
+        timeout=120,
+        stdout=subprocess.PIPE,
+    )
+    assert done.returncode == 0
+    newest, *left = done.stdout.split()
+    assert int(newest) > kills // 2, "the processes lived long enough to save"
+    assert len(left) == 2 and not any("tmp" in name for name in left), left
+
+
+# ---- Going on from an earlier checkpoint ----
+
+
+def test_past_damaged_ones_the_new_checkpoint_stays_and_is_the_newest(folder):
+    for n in (20, 30):
+        os.truncate(folder / f"step_{n}" / "state.pt", 100)
+    checkpoint.save(folder, 12, state(12), CONFIG, keep=2)
+    assert checkpoint.load(folder).step == 12
+    checkpoint.save(folder, 14, state(14), CONFIG, keep=2)
+    assert checkpoint.load(folder).step == 14
+    assert names(folder) == ["step_12", "step_14"]
+
+
+def test_after_going_back_later_checkpoints_are_set_aside_at_once(folder):
+    checkpoint.rewind(folder, 10)
+    assert checkpoint.load(folder).step == 10 and names(folder) == ["step_10"]
+    assert checkpoint.load(folder / "step_30.aside").step == 30, "none is lost by going back"
+
+
+def test_what_was_set_aside_goes_once_the_run_has_come_as_far(folder):
+    checkpoint.rewind(folder, 10)
+    checkpoint.save(folder, 25, state(25), CONFIG, keep=3)
+    left = sorted(path.name for path in folder.iterdir())
+    assert left == ["step_10", "step_25", "step_30.aside"]
+    checkpoint.rewind(folder, 10)
+    checkpoint.save(folder, 30, state(30), CONFIG, keep=3)
+    assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_30"]
+
+
+def test_going_back_twice_sets_the_same_step_aside_twice(folder):
+    checkpoint.rewind(folder, 20)
+    checkpoint.save(folder, 30, state(31), CONFIG, keep=3)
+    checkpoint.rewind(folder, 20)
+    assert names(folder) == ["step_10", "step_20"]
 
 
 def test_a_full_disk_leaves_what_was_there(folder, monkeypatch):
@@ -175,14 +331,45 @@ def test_a_full_disk_leaves_what_was_there(folder, monkeypatch):
     assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_20", "step_30"]
 
 
+FULL_DISK = """
+import resource, sys, torch
+from agents import checkpoint
+
+folder = sys.argv[1]
+checkpoint.save(folder, 10, {"w": torch.zeros(1000)}, {})
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+try:
+    checkpoint.save(folder, 20, {"w": torch.zeros(100_000)}, {})
+except OSError as error:
+    print(error.strerror)
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+print(checkpoint.load(folder).step)
+checkpoint.save(folder, 20, {"w": torch.zeros(100_000)}, {})
+print(checkpoint.load(folder).step)
+"""
+
+
+def test_a_file_that_may_not_grow_leaves_what_was_there_and_the_next_save_works(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, tmp_path],
+        cwd=ROOT,
+        text=True,
+        timeout=60,
+        stdout=subprocess.PIPE,
+    )
+    assert done.stdout.splitlines() == ["File too large", "10", "20"]
+    assert names(tmp_path) == ["step_10", "step_20"] and len(list(tmp_path.iterdir())) == 2
+
+
 def test_what_a_killed_process_left_is_ignored_and_swept(folder):
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     left = folder / f"step_40.tmp-{gone.pid}"
-    left.mkdir()
-    (left / "state.pt").write_bytes(b"half")
+    own = folder / f"step_45.tmp-{os.getpid()}"  # a process of this number, before this one
     writing = folder / f"step_50.tmp-{os.getppid()}"  # a process that lives
-    writing.mkdir()
+    for path in (left, own, writing):
+        path.mkdir()
+        (path / "state.pt").write_bytes(b"half")
     assert checkpoint.load(folder).step == 30
     checkpoint.save(folder, 60, state(60), CONFIG)
-    assert not left.exists() and writing.exists()
+    assert not left.exists() and not own.exists() and writing.exists()
