@@ -192,6 +192,29 @@ def test_a_damaged_checkpoint_is_named_and_the_run_goes_on_from_the_one_before(h
     assert checkpoint.load(folder / "checkpoints").step == 2 * UPDATE
 
 
+def test_going_back_to_an_earlier_checkpoint_leaves_no_hole_in_the_metrics(here):
+    folder = train.run(configured(f"samples={4 * UPDATE}", "checkpoint=1e-9", "keep=9"))
+    before = (folder / "metrics.jsonl").read_bytes()
+    first = folder / "checkpoints" / f"step_{UPDATE}"
+    train.run(configured(f"resume={first}", f"samples={2 * UPDATE}", tiny=[]))
+    assert checkpoint.load(folder / "checkpoints").step == 2 * UPDATE
+    train.run(configured("resume=latest", f"samples={5 * UPDATE}", tiny=[]))
+    rows = metrics.read(folder / "metrics.jsonl")
+    assert [row["samples"] for row in rows] == [n * UPDATE for n in (1, 2, 3, 4, 5)]
+    assert (folder / "metrics.jsonl").read_bytes().startswith(before[: len(before) // 4])
+    assert checkpoint.load(folder / "checkpoints").step == 5 * UPDATE
+
+
+def test_a_run_that_goes_back_and_is_lost_before_it_saves_goes_on_from_there(here, monkeypatch):
+    folder = train.run(configured(f"samples={3 * UPDATE}", "checkpoint=1e-9", "keep=9"))
+    first = folder / "checkpoints" / f"step_{UPDATE}"
+    with monkeypatch.context() as patch:
+        patch.setattr(train.Trainer, "train", lambda *_: None)  # as if killed at once
+        train.run(configured(f"resume={first}", tiny=[]))
+    assert [row["samples"] for row in metrics.read(folder / "metrics.jsonl")] == [UPDATE]
+    assert checkpoint.load(folder / "checkpoints").step == UPDATE
+
+
 def test_a_new_run_can_start_from_the_weights_of_another(here):
     first = train.run(configured("samples=1"))
     second = train.run(configured("samples=1", "learner.lr=1e-12", f"init={first}", "seed=2"))

@@ -8,7 +8,7 @@ from functools import partial
 
 import torch
 
-from agents import metrics
+from agents import checkpoint, metrics
 from agents.budget import Budget
 from agents.cli import components, evaluate, record, run_folders
 from agents.cli.build import as_tree
@@ -68,6 +68,8 @@ def make_trainer(cfg, folder, device, on_report):
     if isinstance(cfg.logger, WandbLogger):
         project, mode = cfg.logger.project, cfg.logger.mode
         wandb = dict(project=project, mode=mode, name=folder.name, config=as_tree(cfg))
+    if cfg.resume:
+        checkpoint.rewind(folder / "checkpoints", loaded.step)
     sinks = metrics.Metrics(folder, loaded.step if cfg.resume else 0, wandb)
     saver = Saver(
         folder / "checkpoints",
