@@ -6,6 +6,8 @@ CORES := $(shell nproc 2>/dev/null || echo 1)
 # The virtual environment is made only when it is the interpreter in use.
 SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 
+KERNELS := $(wildcard megastep/kernels/*.h megastep/kernels/*.cu megastep/kernels/*.cpp)
+
 .PHONY: train test test-all lint setup clean
 
 train: $(SETUP)            ## train Explorer in generated homes, evaluate it on unseen ones, film it
@@ -20,6 +22,7 @@ test-all: $(SETUP)         ## every test
 lint: $(SETUP)
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
+	$(PYTHON) -c "import clang_format; clang_format.clang_format()" --dry-run --Werror $(KERNELS)
 
 setup: $(SETUP)
 

@@ -1,4 +1,4 @@
-"""A work of benchmark.py: what NVIDIA's Nsight Compute (`ncu`) counts of each kernel."""
+"""A benchmark of benchmark.py: what NVIDIA's Nsight Compute (`ncu`) counts of each kernel."""
 
 import csv
 import shutil
@@ -6,30 +6,32 @@ import subprocess
 import sys
 from pathlib import Path
 
+import timing
+
 N_AGENTS = 65_536
 METRICS = {  # of ncu: what they are called here, in what unit
-    "gpu__time_duration.sum": ("time", "ns an agent"),
-    "smsp__inst_executed.sum": ("warp instructions", "an agent"),
+    "gpu__time_duration.sum": ("time", "ns per agent"),
+    "smsp__inst_executed.sum": ("warp instructions", "per agent"),
     "smsp__issue_active.avg.pct_of_peak_sustained_active": ("issue slots used", "%"),
     "sm__warps_active.avg.pct_of_peak_sustained_active": ("achieved occupancy", "%"),
     "l1tex__throughput.avg.pct_of_peak_sustained_active": ("L1 throughput", "%"),
     "lts__throughput.avg.pct_of_peak_sustained_elapsed": ("L2 throughput", "%"),
     "dram__throughput.avg.pct_of_peak_sustained_elapsed": ("DRAM throughput", "%"),
 }
-KERNELS = (  # that the operations of benchmark.py launch, in order
+KERNELS = (  # in the order in which workloads.operations launches them
     ("physics", "`physics`"),
     ("spawn", "`spawn` of 1 in 256"),
-    ("draw", "`draw` of 1 in 256"),
-    ("sight", "`observe` as Explorer does"),
-    ("place", "`place` in `render`"),
-    ("sight", "`sight` in `render`"),
-    ("sight", "`observe` as Minimal does"),
-    ("place", "`place`, lit, 4 a home"),
+    ("uniform", "`uniform` of 1 in 256"),
+    ("render", "`observe` as Explorer does"),
+    ("update_agent_geometry", "`update_agent_geometry` in `render`"),
+    ("render", "`render` kernel"),
+    ("render", "`observe` as Minimal does"),
+    ("update_agent_geometry", "`update_agent_geometry`, lit, 4 per home"),
 )
 PROFILED = """
 import sys; sys.path.insert(0, {scripts!r})
-import torch, benchmark
-for _, function in benchmark.operations({n}, torch.device({device!r})):
+import torch, workloads
+for _, function in workloads.operations({n}, torch.device({device!r})):
     function(0)
     torch.cuda.synchronize()
     torch.cuda.profiler.start()
@@ -69,22 +71,22 @@ def counters(device):
         capture_output=True,
         text=True,
     )
-    yield from figures(done.stdout)
+    yield from measurements(done.stdout)
 
 
-def figures(said):
-    """The figures in what ncu prints. ValueError if other kernels than KERNELS are in it."""
-    lines = said.splitlines()
+def measurements(output: str):
+    """The measurements in what ncu prints. ValueError if other kernels than KERNELS are in it."""
+    lines = output.splitlines()
     start = next((i for i, line in enumerate(lines) if line.startswith('"ID"')), len(lines))
     names = {name for name, _ in KERNELS}
     rows = [row for row in csv.DictReader(lines[start:]) if row["Kernel Name"] in names]
     if [row["Kernel Name"] for row in rows] != [name for name, _ in KERNELS]:
         raise ValueError(
-            f"ncu did not count what was asked for; it said: {' '.join(said.split())[-300:]}"
+            f"ncu did not count the kernels it was given; it said: "
+            f"{' '.join(output.split())[-300:]}"
         )
     for (_, what), row in zip(KERNELS, rows):
         for metric, (name, unit) in METRICS.items():
-            value = float(row[metric].replace(",", "")) / (
-                N_AGENTS if unit.endswith("an agent") else 1
-            )
-            yield dict(what=f"{what}: {name}", value=value, unit=unit, low=None, high=None, n=1)
+            count = N_AGENTS if unit.endswith("per agent") else 1
+            value = float(row[metric].replace(",", "")) / count
+            yield timing.measurement(f"{what}: {name}", unit, [value])

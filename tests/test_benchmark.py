@@ -164,12 +164,12 @@ def counted(*names):
 
 def test_counters_are_read_kernel_by_kernel():
     names = [name for name, _ in counters.KERNELS]
-    found = list(counters.figures(counted(*names[:3], "void at::add<int>", *names[3:])))
+    found = list(counters.measurements(counted(*names[:3], "void at::add<int>", *names[3:])))
     assert len(found) == len(counters.KERNELS) * len(counters.METRICS)
     assert [f["value"] for f in found[:3]] == [1.0, 2.0, 3 * 65_536.0]
     assert found[1]["what"] == "`physics`: warp instructions"
     with pytest.raises(ValueError, match="did not count"):
-        list(counters.figures(counted(*names[:-1])))
+        list(counters.measurements(counted(*names[:-1])))
 
 
 def test_counters_without_a_gpu_end_with_one_sentence(capsys):
