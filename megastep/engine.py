@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import torch
 
-from .kernels import compile
 from .kernels.compile import EngineError
+from .kernels.launch import SIZES, WARP, launch, params
 from .scenery import Layouts, Scenery
 
 __all__ = [
@@ -118,7 +118,7 @@ class Observation(NamedTuple):
     depth: (
         torch.Tensor
     )  # (N, A, C, P) fp16: 1 at the agent's radius, falling to 0 at max_depth beyond it
-    middle: torch.Tensor  # (N, A, C) int32: the line in the middle of the screen, as Render.indices
+    centre_line: torch.Tensor  # (N, A, C) int32: the line at the screen's centre, as Render.indices
     imu: torch.Tensor  # (N, A, 3) fp16: angular velocity / 360, own velocity ahead and left / 10
     newly_seen: (
         torch.Tensor
@@ -198,7 +198,7 @@ def _pointer(name, tensor, shape, dtype, device):
     if (
         tensor.dtype != dtype
         or tensor.device != device
-        or tuple(tensor.shape) != tuple(shape)
+        or tensor.shape != shape
         or not tensor.is_contiguous()
     ):
         layout = "" if tensor.is_contiguous() else " that is not contiguous"
@@ -211,47 +211,51 @@ def _pointer(name, tensor, shape, dtype, device):
     return tensor.data_ptr()
 
 
-def _world(scenery, radius):
+def _scenery_params(scenery, radius):
     layouts = scenery.layouts
-    return compile.STRUCTS["World"](
-        layouts.lines.vals.data_ptr(),
-        layouts.wall_starts.data_ptr(),
-        layouts.texel_starts.data_ptr(),
-        layouts.boxes.data_ptr(),
-        layouts.box_starts.data_ptr(),
-        layouts.texels.data_ptr(),
-        layouts.lights.vals.data_ptr(),
-        layouts.light_starts.data_ptr(),
-        _pointer("scenery.layout", scenery.layout, (scenery.n_envs,), torch.int32, scenery.device),
-        scenery.model.data_ptr(),
-        scenery.model_texels.data_ptr(),
-        layouts.agent_textures.data_ptr(),
-        scenery.agent_lines.data_ptr(),
-        scenery.agent_light.data_ptr(),
-        scenery.n_envs,
-        scenery.n_agents,
-        len(scenery.model),
-        scenery.agent_light.shape[1],
-        torch.get_num_threads(),
-        radius,
-        1.001 * scenery.reach,
+    return params.SceneryParams(
+        walls=layouts.lines.vals.data_ptr(),
+        wall_starts=layouts.wall_starts.data_ptr(),
+        texel_starts=layouts.texel_starts.data_ptr(),
+        boxes=layouts.boxes.data_ptr(),
+        box_starts=layouts.box_starts.data_ptr(),
+        texels=layouts.texels.data_ptr(),
+        lights=layouts.lights.vals.data_ptr(),
+        light_starts=layouts.light_starts.data_ptr(),
+        layout=_pointer(
+            "scenery.layout", scenery.layout, (scenery.n_envs,), torch.int32, scenery.device
+        ),
+        model=scenery.model.data_ptr(),
+        model_texels=scenery.model_texels.data_ptr(),
+        agent_textures=layouts.agent_textures.data_ptr(),
+        agent_lines=scenery.agent_lines.data_ptr(),
+        agent_light=scenery.agent_light.data_ptr(),
+        n_envs=scenery.n_envs,
+        n_agents=scenery.n_agents,
+        n_model=len(scenery.model),
+        n_agent_texels=scenery.agent_light.shape[1],
+        n_threads=torch.get_num_threads(),
+        radius=radius,
+        reach=1.001 * scenery.reach,
     )
 
 
+_STATE = {"positions": (2,), "angles": (), "velocity": (2,), "angvelocity": ()}
+
+
 def _state(scenery, agents, *names):
-    n, a = scenery.n_envs, scenery.n_agents
-    shapes = {
-        "positions": (n, a, 2),
-        "angles": (n, a),
-        "velocity": (n, a, 2),
-        "angvelocity": (n, a),
-    }
-    return [
-        _pointer(
-            f"agents.{name}", getattr(agents, name), shapes[name], torch.float32, scenery.device
+    """The addresses of these tensors of the agents, by name."""
+    lanes = (scenery.n_envs, scenery.n_agents)
+    return {
+        name: _pointer(
+            f"agents.{name}",
+            getattr(agents, name),
+            lanes + _STATE[name],
+            torch.float32,
+            scenery.device,
         )
         for name in names
-    ]
+    }
 
 
 def check(agents):
@@ -295,76 +299,95 @@ def bake(scenery):
     wall_layout = torch.repeat_interleave(
         torch.arange(len(layouts), dtype=torch.int32, device=scenery.device), layouts.lines.widths
     )
-    params = compile.STRUCTS["Bake"](
-        _world(scenery, 0.0), texel_wall.data_ptr(), wall_layout.data_ptr(), len(texel_wall)
+    packed = params.BakeParams(
+        scenery=_scenery_params(scenery, 0.0),
+        texel_wall=texel_wall.data_ptr(),
+        wall_layout=wall_layout.data_ptr(),
+        n_texels=len(texel_wall),
     )
-    compile.launch("bake", params, scenery.device, len(texel_wall))
+    launch("bake", packed, scenery.device, threads=len(texel_wall))
 
 
-def physics(scenery, agents, actions=None, moves=None, keep=0.0):
+def physics(scenery, agents, actions=None, moves=None, damping=1.0):
     """Moves the agents by their velocities for 1 / fps seconds, each short of what it meets first:
     a wall, or another agent. Returns a :class:`Physics`.
 
-    If ``actions`` (N, A) int64 are given, each first multiplies its agent's velocities by ``keep``
-    and adds row ``action`` of ``moves`` (n_moves, 3): m/s ahead and left, deg/s.
+    If ``actions`` (N, A) int64 are given, each agent first loses the fraction ``damping`` of its
+    velocities, and row ``action`` of ``moves`` (n_moves, 3) is added: m/s ahead and left, deg/s.
     """
     n, a = scenery.n_envs, scenery.n_agents
-    progress = torch.empty((scenery.n_envs, scenery.n_agents), device=scenery.device)
-    state = _state(scenery, agents, "positions", "angles", "velocity", "angvelocity")
-    params = compile.STRUCTS["Motion"](
-        _world(scenery, agents.radius),
-        *state,
-        progress.data_ptr(),
-        agents.error_flag.data_ptr(),
-        _pointer("actions", actions, (n, a), torch.int64, scenery.device),
-        0 if moves is None else moves.data_ptr(),
-        0 if moves is None else len(moves),
-        keep,
-        1 / agents.fps,
+    progress = torch.empty((n, a), device=scenery.device)
+    threads_per_env = 8 if n > MANY else 32
+    packed = params.PhysicsParams(
+        scenery=_scenery_params(scenery, agents.radius),
+        **_state(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+        progress=progress.data_ptr(),
+        error_flag=agents.error_flag.data_ptr(),
+        actions=_pointer("actions", actions, (n, a), torch.int64, scenery.device),
+        moves=0 if moves is None else moves.data_ptr(),
+        n_moves=0 if moves is None else len(moves),
+        retained=1 - damping,
+        seconds=1 / agents.fps,
+        threads_per_env=threads_per_env,
     )
-    params.team = 8 if n > MANY else 32
-    compile.launch("physics", params, scenery.device, params.team * n)
+    launch("physics", packed, scenery.device, threads=threads_per_env * n)
     _checked(agents)
     return Physics(progress)
 
 
 def update_agent_geometry(scenery, agents, lit=True):
     """Carries the agents' models to where the agents are, and lights their texels."""
-    params = compile.STRUCTS["Placing"](
-        _world(scenery, agents.radius), *_state(scenery, agents, "positions", "angles"), int(lit)
+    packed = params.UpdateAgentGeometryParams(
+        scenery=_scenery_params(scenery, agents.radius),
+        **_state(scenery, agents, "positions", "angles"),
+        lit=int(lit),
     )
-    compile.launch("place", params, scenery.device, 32 * scenery.n_envs * scenery.n_agents)
+    threads = WARP * scenery.n_envs * scenery.n_agents
+    launch("update_agent_geometry", packed, scenery.device, threads)
 
 
-def _look(scenery, agents, **fields):
-    half = math.radians(agents.fov / 2)
-    width = math.tan(half)
-    params = compile.STRUCTS["Sight"](
-        _world(scenery, agents.radius),
-        *_state(scenery, agents, "positions", "angles"),
-        agents.yaws.data_ptr(),
-        agents.ray_lengths.data_ptr(),
-        agents.error_flag.data_ptr(),
-        len(agents.yaws),
-        agents.res,
-        width,
-        width * (agents.res - 1) / agents.res,
-        2 * width / agents.res,
-        agents.res / 2 - 0.5,
-        agents.res / (2 * width),
-        0.99 * agents.radius * math.cos(half),
+# What a view may give; 0: it is not wanted.
+_OUTPUTS = dict.fromkeys(
+    (
+        *("indices", "locations", "dots", "distances", "screen"),
+        *("rgb", "depth", "centre_line", "velocity", "angvelocity", "imu"),
+        *("seen", "clear_mask", "newly_seen", "n_words"),
+    ),
+    0,
+)
+
+
+def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
+    res = agents.res
+    half_width = math.tan(math.radians(agents.fov / 2))
+    fields = {
+        name: value.data_ptr() if isinstance(value, torch.Tensor) else value
+        for name, value in outputs.items()
+        if value is not None
+    }
+    packed = params.RenderParams(
+        scenery=_scenery_params(scenery, agents.radius),
+        **_state(scenery, agents, "positions", "angles"),
+        yaws=agents.yaws.data_ptr(),
+        ray_lengths=agents.ray_lengths.data_ptr(),
+        error_flag=agents.error_flag.data_ptr(),
+        n_cameras=len(agents.yaws),
+        res=res,
+        half_width=half_width,
+        edge=half_width * (res - 1) / res,
+        pitch=2 * half_width / res,
+        centre=res / 2 - 0.5,
+        scale=res / (2 * half_width),
+        near=0.99 * agents.radius * math.cos(math.radians(agents.fov / 2)),
+        subsample=subsample,
+        n_pixels=res // subsample,
+        inv_subsample=1 / subsample,
+        inv_max_depth=1 / max_depth,
+        **{**_OUTPUTS, **fields},
     )
-    params.subsample, params.per_depth = 1, 0.1
-    spelt = {"newly_seen": "fresh", "clear_mask": "forget"}
-    for name, value in fields.items():
-        setattr(
-            params,
-            spelt.get(name, name),
-            value.data_ptr() if isinstance(value, torch.Tensor) else value,
-        )
-    params.n_pixels, params.share = agents.res // params.subsample, 1 / params.subsample
-    threads = 32 * scenery.n_envs * scenery.n_agents
-    compile.launch("sight", params, scenery.device, threads, shared=256 * -(-agents.res // 32))
+    shared = SIZES["NearestLine"] * WARP * -(-res // WARP)
+    threads = WARP * scenery.n_envs * scenery.n_agents
+    launch("render", packed, scenery.device, threads, shared)
     _checked(agents)
 
 
@@ -389,7 +412,7 @@ def render(scenery, agents):
         screen=torch.empty((*shape, 3), device=scenery.device),
         **floats,
     )
-    _look(scenery, agents, **out._asdict())
+    _render(scenery, agents, **out._asdict())
     return out
 
 
@@ -400,7 +423,7 @@ def observe(
     rgb=True,
     depth=True,
     imu=False,
-    middle=False,
+    centre_line=False,
     seen=None,
     clear_mask=None,
     max_depth=10.0,
@@ -429,7 +452,7 @@ def observe(
     out = Observation(
         rgb=torch.empty((*shape, 3, pixels), dtype=torch.float16, device=where) if rgb else None,
         depth=torch.empty((*shape, pixels), dtype=torch.float16, device=where) if depth else None,
-        middle=torch.empty(shape, dtype=torch.int32, device=where) if middle else None,
+        centre_line=torch.empty(shape, dtype=torch.int32, device=where) if centre_line else None,
         imu=torch.empty((n, a, 3), dtype=torch.float16, device=where) if imu else None,
         newly_seen=torch.empty((n, a), dtype=torch.int32, device=where)
         if seen is not None
@@ -443,18 +466,16 @@ def observe(
             f"words an agent, "
             f"but it has {words}"
         )
-    velocity, angvelocity = _state(scenery, agents, "velocity", "angvelocity")
-    _look(
+    _render(
         scenery,
         agents,
-        subsample=subsample,
-        per_depth=1 / max_depth,
+        subsample,
+        max_depth,
         n_words=words,
-        velocity=velocity,
-        angvelocity=angvelocity,
+        **_state(scenery, agents, "velocity", "angvelocity"),
         seen=_pointer("seen", seen, (n, a, words), torch.int32, where),
         clear_mask=_pointer("clear_mask", clear_mask, (n, a), torch.bool, where),
-        **{name: tensor for name, tensor in out._asdict().items() if tensor is not None},
+        **out._asdict(),
     )
     return out
 
@@ -474,18 +495,18 @@ def spawn(scenery, agents, mask, points, counts, seed, resample=False):
             f"{scenery.n_agents} agents need at least as many points, but {n_points} a layout "
             f"were given"
         )
-    params = compile.STRUCTS["Spawn"](
-        _world(scenery, agents.radius),
-        *_state(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
-        _pointer("mask", mask, lanes, torch.bool, where),
-        _pointer("points", points, (n_layouts, n_points, 2), torch.float32, where),
-        _pointer("counts", counts, lanes, torch.int32, where),
-        seed & 0xFFFFFFFF,
-        seed >> 32 & 0xFFFFFFFF,
-        n_points,
-        n_layouts if resample else 0,
+    packed = params.SpawnParams(
+        scenery=_scenery_params(scenery, agents.radius),
+        **_state(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+        mask=_pointer("mask", mask, lanes, torch.bool, where),
+        points=_pointer("points", points, (n_layouts, n_points, 2), torch.float32, where),
+        counts=_pointer("counts", counts, lanes, torch.int32, where),
+        key0=seed & 0xFFFFFFFF,
+        key1=seed >> 32 & 0xFFFFFFFF,
+        n_points=n_points,
+        n_layouts=n_layouts if resample else 0,
     )
-    compile.launch("spawn", params, where, scenery.n_envs)
+    launch("spawn", packed, where, threads=scenery.n_envs)
 
 
 def uniform(counts, mask, seed, out):
@@ -496,15 +517,15 @@ def uniform(counts, mask, seed, out):
     ``out`` (B, 4), written where ``mask``.
     """
     n, where = len(counts), out.device
-    params = compile.STRUCTS["Draw"](
-        _pointer("counts", counts, (n,), torch.int32, where),
-        _pointer("mask", mask, (n,), torch.bool, where),
-        _pointer("out", out, (n, 4), torch.float32, where),
-        seed & 0xFFFFFFFF,
-        seed >> 32 & 0xFFFFFFFF,
-        n,
-        torch.get_num_threads(),
+    packed = params.UniformParams(
+        counts=_pointer("counts", counts, (n,), torch.int32, where),
+        mask=_pointer("mask", mask, (n,), torch.bool, where),
+        out=_pointer("out", out, (n, 4), torch.float32, where),
+        key0=seed & 0xFFFFFFFF,
+        key1=seed >> 32 & 0xFFFFFFFF,
+        n_lanes=n,
+        n_threads=torch.get_num_threads(),
     )
-    compile.launch("draw", params, where, n)
+    launch("uniform", packed, where, threads=n)
     counts.add_(mask)
     return out

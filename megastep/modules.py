@@ -34,10 +34,10 @@ def to_local(angles, vectors):
 
 
 class _Movement:
-    """Seven actions, each a velocity to add after ``keep`` of the old one is kept."""
+    """Seven actions: each adds a velocity once the fraction ``damping`` of the old one is lost."""
 
-    def __init__(self, core, speed, ang_speed, keep):
-        self.core, self.keep = core, keep
+    def __init__(self, core, speed, ang_speed, damping):
+        self.core, self.damping = core, damping
         self.moves = torch.tensor(
             [(speed * x, speed * y, ang_speed * turn) for (x, y), turn in zip(MOVES, TURNS)],
             dtype=torch.float32,
@@ -52,7 +52,9 @@ class _Movement:
         actions = (
             decision["actions"].reshape(self.core.n_envs, self.core.n_agents).long().contiguous()
         )
-        return engine.physics(self.core.scenery, self.core.agents, actions, self.moves, self.keep)
+        return engine.physics(
+            self.core.scenery, self.core.agents, actions, self.moves, self.damping
+        )
 
 
 class SimpleMovement(_Movement):
@@ -61,7 +63,7 @@ class SimpleMovement(_Movement):
     """
 
     def __init__(self, core, speed=10.0, ang_speed=180.0):
-        super().__init__(core, speed, ang_speed, keep=0.0)
+        super().__init__(core, speed, ang_speed, damping=1.0)
 
 
 class MomentumMovement(_Movement):
@@ -70,7 +72,7 @@ class MomentumMovement(_Movement):
     """
 
     def __init__(self, core, accel=5.0, ang_accel=180.0, decay=0.125):
-        super().__init__(core, accel / core.fps, ang_accel / core.fps, keep=1 - decay)
+        super().__init__(core, accel / core.fps, ang_accel / core.fps, damping=decay)
 
 
 # ---- Sensors ----

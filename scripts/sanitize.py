@@ -34,7 +34,7 @@ def main():
                 c.agents,
                 3,
                 imu=True,
-                middle=True,
+                centre_line=True,
                 seen=seen,
                 clear_mask=c.agent_full(False),
             )

@@ -148,7 +148,7 @@ def agents(device):
 
     def work(i):
         move(i)
-        engine.observe(c.scenery, c.agents, 4, imu=True, middle=True)
+        engine.observe(c.scenery, c.agents, 4, imu=True, centre_line=True)
 
     yield rate("4 agents, 512 rays to 128 pixels, agent-frames", 4 * n_envs, alone(work, device))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from megastep.kernels import compile
+from megastep.kernels import compile, launch
 
 ROOT = Path(__file__).resolve().parents[1]
 STEP = """
@@ -47,26 +47,92 @@ def built(tmp_path_factory):
     return cache, out
 
 
-def test_structs_match_the_source():
-    """The ctypes twins of params.h have the sizes that the compiler gives the structs."""
-    names = sorted(compile.STRUCTS)
-    prints = "".join(
-        f'extern "C" int size_{name}() {{ return sizeof({name}); }}\n' for name in names
-    )
-    source = (compile.HERE / "params.h").read_text() + prints
+def test_packed_params_have_the_compilers_layout(tmp_path):
+    """A compiler reads every field of every packed struct as it was given."""
+    reads, given = [], {}
+    for name, fields in launch.FIELDS.items():
+        values = {field: position + 1 for position, (field, _) in enumerate(fields)}
+        values |= {field: bytes(int(kind[2:-1])) for field, kind in fields if kind[-1] == "s"}
+        given[name] = getattr(launch.params, name)(**values)
+        tests = [
+            f"(long long)p->{field} == {values[field]}" for field, kind in fields if kind[-1] != "s"
+        ]
+        reads.append(
+            f'extern "C" int check_{name}(const {name}* p, int size) '
+            f"{{ return size == sizeof({name}) && {' && '.join(tests)}; }}\n"
+        )
+    source = tmp_path / "checks.cpp"
+    source.write_text((compile.HERE / "params.h").read_text() + "".join(reads))
     compiler, _ = compile._compiler()
-    library = Path(os.environ.get("TMPDIR", "/tmp")) / f"sizes-{os.getpid()}.so"
-    subprocess.run(
-        [compiler, "-x", "c++", "-shared", "-fPIC", "-", "-o", str(library)],
-        input=source,
+    library = tmp_path / "checks.so"
+    command = [compiler, "-std=c++17", "-shared", "-fPIC", str(source), "-o", str(library)]
+    subprocess.run(command, check=True)
+    checks = ctypes.CDLL(str(library))
+    for name, packed in given.items():
+        assert getattr(checks, f"check_{name}")(packed, launch.SIZES[name]), name
+        assert len(packed) == launch.SIZES[name]
+
+
+def test_a_field_that_is_misspelt_or_missing_is_named():
+    fields = dict(counts=0, mask=0, out=0, key0=1, key1=2, n_lanes=0, n_threads=1)
+    launch.params.UniformParams(**fields)
+    with pytest.raises(TypeError, match=r"UniformParams\(\) got an unexpected .* 'n_lane'"):
+        launch.params.UniformParams(**fields, n_lane=3)
+    del fields["key1"]
+    with pytest.raises(TypeError, match=r"UniformParams\(\) missing 1 required .* 'key1'"):
+        launch.params.UniformParams(**fields)
+    with pytest.raises(TypeError):
+        launch.params.UniformParams(0, 0, 0, 1, 2, 0, 1)
+
+
+def test_every_operation_keeps_its_file_and_line_in_the_program(tmp_path):
+    """The preprocessor, whose line markers messages and ncu follow, finds each kernel in the file
+    of its name, at the line where it stands.
+    """
+    files = compile.sources(".h", ".cu")
+    program = tmp_path / "engine.cu"
+    program.write_text(compile.program_of(files))
+    compiler, _ = compile._compiler()
+    done = subprocess.run(
+        [compiler, "-E", "-x", "c++", "-D__CUDACC__", f"-I{compile.HERE}", str(program)],
+        capture_output=True,
         text=True,
         check=True,
     )
-    sizes = ctypes.CDLL(str(library))
-    library.unlink()
-    assert {n: getattr(sizes, f"size_{n}")() for n in names} == {
-        n: ctypes.sizeof(compile.STRUCTS[n]) for n in names
-    }
+    found, name, line = {}, None, 0
+    for text in done.stdout.splitlines():
+        marker = re.match(r'# (\d+) "(.*?)"', text)
+        if marker:
+            line, name = int(marker[1]), Path(marker[2]).name
+            continue
+        kernel = re.match(r'extern "C" __global__ void .*?(\w+)\(\w+Params p\)', text)
+        if kernel:
+            found[kernel[1]] = name, line
+        line += 1
+    assert sorted(found) == sorted(compile.OPERATIONS)
+    for operation, (name, line) in found.items():
+        assert name == f"{operation}.cu"
+        assert files[name].splitlines()[line - 1].startswith("KERNEL")
+
+
+def nvrtc(files):
+    """A cubin of these files, by NVRTC, which needs no GPU."""
+    try:
+        return compile._build_cuda(files, (*compile.CUDA_FLAGS, "--gpu-architecture=sm_90"))
+    except (compile.EngineError, RuntimeError) as error:
+        if "NVRTC could not build" in str(error):
+            raise
+        pytest.skip(f"needs NVRTC: {error}")
+
+
+def test_nvrtc_is_told_files_and_lines():
+    files = compile.sources(".h", ".cu")
+    cubin = nvrtc(files)
+    assert all(f"{operation}.cu".encode() in cubin for operation in compile.OPERATIONS)
+    broken = {**files, "spawn.cu": files["spawn.cu"] + "\nint broken"}
+    line = len(broken["spawn.cu"].splitlines())
+    with pytest.raises(compile.EngineError, match=rf"spawn\.cu\({line}\): error"):
+        nvrtc(broken)
 
 
 def test_nothing_is_built_at_import(tmp_path):
@@ -162,8 +228,9 @@ def test_nothing_is_fused(tmp_path):
 
 def test_no_bindings_are_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "cuda.bindings", None)
+    compile.bindings.cache_clear()
     with pytest.raises(compile.EngineError, match="pip install cuda-bindings"):
-        compile._bindings()
+        compile.bindings()
 
 
 @pytest.mark.cuda
@@ -178,6 +245,7 @@ def test_the_gpu_sees_damage_too(tmp_path):
 
 
 RECIPROCALS = """
+#include "backend.h"
 KERNEL reciprocals(float* values, int n) {
     int i = blockIdx.x * blockDim.x + threadIdx.x;
     if (i < n) values[i] = RECIPROCAL(values[i]);
@@ -191,14 +259,14 @@ KERNEL reciprocals(float* values, int n) {
 def test_the_gpus_reciprocal_rounds_as_division_does(exponent):
     """Every significand, of either sign."""
     major, minor = torch.cuda.get_device_capability()
-    source = (compile.HERE / "cuda.h").read_text() + RECIPROCALS
-    driver, _ = compile._bindings()
+    files = {**compile.sources(".h"), "reciprocals.cu": RECIPROCALS}
+    driver, _ = compile.bindings()
     cubin = compile._build_cuda(
-        source, (*compile.CUDA_FLAGS, f"--gpu-architecture=sm_{major}{minor}")
+        files, (*compile.CUDA_FLAGS, f"--gpu-architecture=sm_{major}{minor}")
     )
     torch.cuda.current_stream().synchronize()
-    module = compile._checked(driver.cuModuleLoadData(cubin), "Loading")
-    kernel = compile._checked(driver.cuModuleGetFunction(module, b"reciprocals"), "Loading")
+    module = compile.checked(driver.cuModuleLoadData(cubin), "Loading")
+    kernel = compile.checked(driver.cuModuleGetFunction(module, b"reciprocals"), "Loading")
     significands = torch.arange(1 << 23, dtype=torch.int32) | 127 + exponent << 23
     values = torch.cat([significands, significands | -1 << 31]).view(torch.float32)
     found, n = values.cuda(), len(values)
@@ -208,5 +276,5 @@ def test_the_gpus_reciprocal_rounds_as_division_does(exponent):
     done = driver.cuLaunchKernel(
         kernel, -(-n // 64), 1, 1, 64, 1, 1, 0, stream, ctypes.addressof(arguments), 0
     )
-    compile._checked(done, "Launching")
+    compile.checked(done, "Launching")
     assert torch.equal(found.cpu(), 1 / values)

@@ -130,14 +130,14 @@ def test_observe_composes(n_agents, subsample, device):
     seen = torch.zeros(
         (8, n_agents, -(-core.scenery.layouts.max_texels // 32)), dtype=torch.int32, device=device
     )
-    o = engine.observe(core.scenery, core.agents, subsample, imu=True, middle=True, seen=seen)
+    o = engine.observe(core.scenery, core.agents, subsample, imu=True, centre_line=True, seen=seen)
     r = cuda.render(core.scenery, core.agents)
     # half a unit of fp16's last place, and the mean's rounding
     assert torch.allclose(o.rgb.float(), RGB(core, subsample)(r)[:, :, :, 0], atol=6e-4), "rgb"
     assert torch.allclose(o.depth.float(), Depth(core, subsample)(r)[:, :, 0, 0], atol=6e-4), (
         "depth"
     )
-    assert torch.equal(o.middle, r.indices[..., 32]), "middle"
+    assert torch.equal(o.centre_line, r.indices[..., 32]), "centre_line"
     assert torch.equal(bits_seen(core, r), seen), "seen"
     assert torch.equal(
         torch.tensor(
@@ -197,7 +197,7 @@ def trajectory(device, n_agents, subsample=1, **settings):
         actions = torch.randint(4, (24, n_agents), generator=random).to(device)
         out += engine.physics(core.scenery, core.agents, actions, moves, 0.9)
         out += engine.observe(
-            core.scenery, core.agents, subsample, imu=True, middle=True, seen=seen
+            core.scenery, core.agents, subsample, imu=True, centre_line=True, seen=seen
         )
     out += [
         *engine.render(core.scenery, core.agents),

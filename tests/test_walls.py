@@ -66,7 +66,7 @@ def test_the_shares_make_ten_million_steps_at_the_rates_and_accelerations_asked_
     assert (min(fps), max(fps), min(accel), max(accel)) == (1, 200, 1, 100)
     assert all(setting in walls.SETTINGS for setting in product((1, 200), (1, 100)))
     momentum = MomentumMovement(alone([(1, 1), (2, 1)], fps=1.0))
-    assert momentum.moves.max(0).values[0] == walls.ACCEL and momentum.keep == 1 - walls.DECAY
+    assert momentum.moves.max(0).values[0] == walls.ACCEL and momentum.damping == walls.DECAY
 
 
 def test_a_disc_that_touches_a_slanted_wall_is_held():

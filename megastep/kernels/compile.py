@@ -14,7 +14,6 @@ import functools
 import hashlib
 import os
 import platform
-import re
 import shutil
 import subprocess
 import tempfile
@@ -23,7 +22,7 @@ from pathlib import Path
 import torch
 
 HERE = Path(__file__).parent
-OPERATIONS = ("bake", "physics", "place", "sight", "spawn", "draw")
+OPERATIONS = ("bake", "physics", "update_agent_geometry", "render", "spawn", "uniform")
 CPU_FLAGS = (
     "-std=c++17",
     "-O3",
@@ -36,8 +35,16 @@ CPU_FLAGS = (
     "-shared",
     "-fPIC",
 )
-CUDA_FLAGS = ("--std=c++17", "--fmad=false", "--prec-div=true", "--prec-sqrt=true", "--ftz=false")
-BLOCK = 64  # threads
+BLOCK = 64  # threads per block, for the launcher and for the kernels
+CUDA_FLAGS = (
+    "--std=c++17",
+    "--fmad=false",
+    "--prec-div=true",
+    "--prec-sqrt=true",
+    "--ftz=false",
+    "--generate-line-info",
+    f"-DBLOCK={BLOCK}",
+)
 DIGEST = 32
 
 
@@ -45,23 +52,6 @@ class EngineError(RuntimeError):
     """The machine cannot do what was asked: no compiler, no GPU, no memory, a position that is not
     a number. The message is one sentence with the cure.
     """
-
-
-def _structs():
-    """The structs of params.h as ctypes classes, by name."""
-    source = re.sub(r"//.*", "", (HERE / "params.h").read_text())
-    scalars = {"int": ctypes.c_int, "float": ctypes.c_float, "unsigned int": ctypes.c_uint}
-    made = {}
-    for name, body in re.findall(r"struct (\w+) \{(.*?)\};", source, re.S):
-        fields = []
-        for kind, star, field in re.findall(r"([\w ]+?)\s*(\*?)\s+(\w+);", body):
-            kind = kind.replace("const", "").strip()
-            fields.append((field, ctypes.c_void_p if star else made.get(kind) or scalars[kind]))
-        made[name] = type(name, (ctypes.Structure,), {"_fields_": fields})
-    return made
-
-
-STRUCTS = _structs()
 
 
 # ---- The cache ----
@@ -118,6 +108,13 @@ def _key(*parts):
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
 
 
+def sources(*suffixes: str) -> dict[str, str]:
+    """The text of each file of this folder with such a suffix, by name."""
+    return {
+        path.name: path.read_text() for path in sorted(HERE.iterdir()) if path.suffix in suffixes
+    }
+
+
 # ---- The CPU ----
 
 
@@ -151,7 +148,7 @@ def _build_cpu(compiler):
     with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
         out = Path(folder) / "engine.so"
         done = subprocess.run(
-            [compiler, *CPU_FLAGS, str(HERE / "cpu.cpp"), "-o", str(out)],
+            [compiler, *CPU_FLAGS, *map(str, sorted(HERE.glob("*.cpp"))), "-o", str(out)],
             capture_output=True,
             text=True,
         )
@@ -167,21 +164,22 @@ def _build_cpu(compiler):
 
 @functools.cache
 def cpu():
-    """The CPU backend: operation name -> function of a pointer to its params."""
+    """The CPU backend: operation name -> function of its packed params."""
     compiler, version = _compiler()
-    sources = [(HERE / name).read_text() for name in ("cpu.cpp", "params.h", "math.h", "scene.h")]
-    name = f"cpu-{_key(*sources, *CPU_FLAGS, compiler, version, _processor())}.so"
+    parts = (*sources(".h", ".cpp").values(), *CPU_FLAGS, compiler, version, _processor())
+    name = f"cpu-{_key(*parts)}.so"
     library = ctypes.CDLL(str(kept(name, lambda: _build_cpu(compiler))))
     functions = {operation: getattr(library, operation) for operation in OPERATIONS}
     for function in functions.values():
-        function.restype = None
+        function.argtypes, function.restype = [ctypes.c_char_p], None
     return functions
 
 
 # ---- The GPU ----
 
 
-def _bindings():
+@functools.cache
+def bindings():
     try:
         from cuda.bindings import driver, nvrtc
     except ImportError:
@@ -193,7 +191,7 @@ def _bindings():
     return driver, nvrtc
 
 
-def _checked(result, what):
+def checked(result, what):
     """What a call of cuda.bindings returned beside its status, or an EngineError."""
     status, *values = result
     if int(status):
@@ -205,90 +203,60 @@ def _checked(result, what):
     return values[0] if len(values) == 1 else values
 
 
-def _build_cuda(source, flags):
-    _, nvrtc = _bindings()
-    program = _checked(nvrtc.nvrtcCreateProgram(source.encode(), b"engine.cu", 0, [], []), "NVRTC")
+def _build_cuda(files, flags):
+    """A cubin of all kernels. NVRTC gets every file under its own name, so that its errors, ncu and
+    compute-sanitizer name the file and line: physics.cu:23.
+    """
+    _, nvrtc = bindings()
+    headers = [text.encode() for text in files.values()], [name.encode() for name in files]
+    program = checked(
+        nvrtc.nvrtcCreateProgram(program_of(files).encode(), b"engine.cu", len(files), *headers),
+        "NVRTC",
+    )
     (status,) = nvrtc.nvrtcCompileProgram(program, len(flags), [flag.encode() for flag in flags])
     if int(status):
-        log = bytearray(_checked(nvrtc.nvrtcGetProgramLogSize(program), "NVRTC"))
+        log = bytearray(checked(nvrtc.nvrtcGetProgramLogSize(program), "NVRTC"))
         nvrtc.nvrtcGetProgramLog(program, log)
         raise EngineError(
             f"NVRTC could not build the GPU engine: {bytes(log).decode(errors='replace')[:2000]}"
         )
-    cubin = bytearray(_checked(nvrtc.nvrtcGetCUBINSize(program), "NVRTC"))
-    _checked(nvrtc.nvrtcGetCUBIN(program, cubin), "NVRTC")
+    cubin = bytearray(checked(nvrtc.nvrtcGetCUBINSize(program), "NVRTC"))
+    checked(nvrtc.nvrtcGetCUBIN(program, cubin), "NVRTC")
     nvrtc.nvrtcDestroyProgram(program)
     return bytes(cubin)
+
+
+def program_of(files: dict[str, str]) -> str:
+    """The program of all ``.cu`` files: it includes each."""
+    return "".join(f'#include "{name}"\n' for name in files if name.endswith(".cu"))
 
 
 @functools.cache
 def cuda(index):
     """The GPU backend on device ``index``: operation name -> CUfunction."""
-    driver, nvrtc = _bindings()
+    driver, nvrtc = bindings()
     major, minor = torch.cuda.get_device_capability(index)
-    names = (
-        "cuda.h",
-        "params.h",
-        "math.h",
-        "scene.h",
-        *(f"{operation}.cu" for operation in OPERATIONS),
-    )
-    source = "\n".join((HERE / name).read_text() for name in names)
+    files = sources(".h", ".cu")
     flags = (*CUDA_FLAGS, f"--gpu-architecture=sm_{major}{minor}")
     try:
-        version = _checked(nvrtc.nvrtcVersion(), "NVRTC")
-    except (RuntimeError, OSError) as fault:
+        version = checked(nvrtc.nvrtcVersion(), "NVRTC")
+    except (RuntimeError, OSError) as error:
         raise EngineError(
             f"The GPU engine needs NVRTC, which comes with PyTorch's CUDA wheels, and it could "
             f"not be loaded "
-            f"({fault}): reinstall torch."
+            f"({error}): reinstall torch."
         ) from None
     path = kept(
-        f"cuda-{_key(source, *flags, str(version))}.cubin", lambda: _build_cuda(source, flags)
+        f"cuda-{_key(*files.values(), *flags, str(version))}.cubin",
+        lambda: _build_cuda(files, flags),
     )
     with torch.cuda.device(index):
         torch.cuda.current_stream().synchronize()  # makes the device's primary context current
-        module = _checked(driver.cuModuleLoadData(_intact(path)), "Loading the GPU engine")
+        module = checked(driver.cuModuleLoadData(_intact(path)), "Loading the GPU engine")
         functions = {
-            operation: _checked(
+            operation: checked(
                 driver.cuModuleGetFunction(module, operation.encode()), "Loading the GPU engine"
             )
             for operation in OPERATIONS
         }
     return functions
-
-
-def launch(operation, params, device, threads, shared=0):
-    """Runs ``operation`` on ``params`` (a struct of STRUCTS): on the CPU at once, on a GPU in
-    ``threads`` threads on the device's current stream.
-
-    ``shared`` is dynamic shared memory in bytes a warp.
-    """
-    if device.type == "cpu":
-        cpu()[operation](ctypes.byref(params))
-        return
-    driver, _ = _bindings()
-    index = torch.cuda.current_device() if device.index is None else device.index
-    function = cuda(index)[operation]
-    blocks = -(-threads // BLOCK)
-    if not blocks:
-        return
-    arguments = (ctypes.c_void_p * 1)(ctypes.addressof(params))
-    with torch.cuda.device(index):
-        stream = torch.cuda.current_stream(index).cuda_stream
-        _checked(
-            driver.cuLaunchKernel(
-                function,
-                blocks,
-                1,
-                1,
-                BLOCK,
-                1,
-                1,
-                shared * (BLOCK // 32),
-                stream,
-                ctypes.addressof(arguments),
-                0,
-            ),
-            f"Launching {operation}",
-        )

@@ -1,47 +1,81 @@
-// A team of lanes a world, 8 where there are many worlds, 32 where there are few: for each agent in turn they go over boxes around 32 walls each, then over the walls
-// of those that its path meets, and over the other agents; then the agents move together.
-KERNEL BOUNDS physics(Motion p) {
-    const World& w = p.world;
-    int T = p.team, world = (blockIdx.x * blockDim.x + threadIdx.x) / T, lane = threadIdx.x & (T - 1), A = w.n_agents;
-    if (world >= w.n_worlds) return;
-    int before = threadIdx.x % 32 - lane;
-    unsigned int team = (T == 32 ? ~0u : (1u << T) - 1u) << before;
+// One group of threads per environment: 8 where there are many environments, 32 where there are
+// few. For each agent in turn, the group tests the boxes around 32 walls each, then the walls in
+// the boxes that the agent's path meets, then the other agents; after that all agents move at once.
+#include "movement.h"
+#include "scenery.h"
+
+// `size` neighbouring threads of a warp, of which this one is number `rank`; the group begins at
+// the warp's lane `first`, and `mask` has a bit for each of its warp lanes.
+struct ThreadGroup {
+    int size, rank, first;
+    unsigned int mask;
+};
+
+DEVICE ThreadGroup group_of(int size) {
+    int rank = threadIdx.x & (size - 1);
+    int first = threadIdx.x % WARP - rank;
+    unsigned int mask = (size == WARP ? FULL_WARP : (1u << size) - 1u) << first;
+    return {size, rank, first, mask};
+}
+
+// The earliest contact with a wall that this thread finds, of an agent at p that moves by d.
+DEVICE float sweep_walls(const SceneryParams& s, const ThreadGroup& group, const Walls& walls,
+                         float px, float py, float dx, float dy, float rho) {
+    float contact = NO_CONTACT;
+    for (int start = walls.first_box; start < walls.end_box; start += group.size) {
+        int meets = 0;
+        if (start + group.rank < walls.end_box && (dx != 0.f || dy != 0.f)) {
+            float4 box = ((const float4*)s.boxes)[start + group.rank];
+            meets = boxes_meet(px, py, dx, dy, box.x, box.y, box.z, box.w, rho);
+        }
+        unsigned int boxes = __ballot_sync(group.mask, meets) >> group.first;
+        for (; boxes; boxes &= boxes - 1) {
+            int first = walls.first_wall + BOX_WALLS * (start - walls.first_box + __ffs(boxes) - 1);
+            int end = mini(first + BOX_WALLS, walls.end_wall);
+            for (int j = first + group.rank; j < end; j += group.size) {
+                float4 wall = ((const float4*)s.walls)[j];
+                contact = minf(contact,
+                               sweep_segment(px, py, dx, dy, wall.x, wall.y, wall.z, wall.w, rho));
+            }
+        }
+    }
+    return contact;
+}
+
+// Writes which fraction of agent a's step is free.
+DEVICE void sweep(const PhysicsParams& p, const ThreadGroup& group, int env, const Walls& walls,
+                  float rho, int a) {
+    int n_agents = p.scenery.n_agents;
+    int i = env * n_agents + a;
+    float px = p.positions[2 * i], py = p.positions[2 * i + 1];
+    float dx = displacement(px, p.velocity[2 * i], p.seconds);
+    float dy = displacement(py, p.velocity[2 * i + 1], p.seconds);
+    float contact = sweep_walls(p.scenery, group, walls, px, py, dx, dy, rho);
+    for (int other = group.rank; other < n_agents; other += group.size)
+        if (other != a)
+            contact = minf(contact, sweep_agent(p, env * n_agents + other, px, py, dx, dy, rho));
+    for (int step = group.size / 2; step; step /= 2)
+        contact = minf(contact, __shfl_xor_sync(group.mask, contact, step));
+    if (group.rank == 0)
+        p.progress[i] = progress_of(contact);
+}
+
+KERNEL BOUNDS(24) physics(PhysicsParams p) {
+    int n_agents = p.scenery.n_agents;
+    int env = (blockIdx.x * blockDim.x + threadIdx.x) / p.threads_per_env;
+    if (env >= p.scenery.n_envs)
+        return;
+    ThreadGroup group = group_of(p.threads_per_env);
     if (p.actions) {
-        for (int a = lane; a < A; a += T) steer(p, world, a);
-        __syncwarp(team);
+        for (int a = group.rank; a < n_agents; a += group.size)
+            apply_action(p, env, a);
+        __syncwarp(group.mask);
     }
-    int design = w.design[world], first_wall = w.wall_starts[design], last_wall = w.wall_starts[design + 1];
-    int first_box = w.box_starts[design], last_box = w.box_starts[design + 1];
-    float rho = w.radius * INFLATION;
-    for (int a = 0; a < A; a++) {
-        int i = world * A + a;
-        float px = p.positions[2 * i], py = p.positions[2 * i + 1];
-        float dx = stride(px, p.velocity[2 * i], p.seconds), dy = stride(py, p.velocity[2 * i + 1], p.seconds);
-        float contact = NO_CONTACT;
-        for (int start = first_box; start < last_box; start += T) {
-            int meets = 0;
-            if (start + lane < last_box && (dx != 0.f || dy != 0.f)) {
-                float4 b = ((const float4*)w.boxes)[start + lane];
-                meets = boxes_meet(px, py, dx, dy, b.x, b.y, b.z, b.w, rho);
-            }
-            for (unsigned int some = __ballot_sync(team, meets) >> before; some; some &= some - 1) {
-                int first = first_wall + 32 * (start - first_box + __ffs(some) - 1), last = first + 32 < last_wall ? first + 32 : last_wall;
-                for (int j = first + lane; j < last; j += T) {
-                    float4 b = ((const float4*)w.walls)[j];
-                    contact = low(contact, sweep_segment(px, py, dx, dy, b.x, b.y, b.z, b.w, rho));
-                }
-            }
-        }
-        for (int other = lane; other < A; other += T) {
-            int k = world * A + other;
-            if (other != a)
-                contact = low(contact, sweep_point(px - p.positions[2 * k], py - p.positions[2 * k + 1],
-                    dx - stride(p.positions[2 * k], p.velocity[2 * k], p.seconds),
-                    dy - stride(p.positions[2 * k + 1], p.velocity[2 * k + 1], p.seconds), 2.f * rho));
-        }
-        for (int step = T / 2; step; step /= 2) contact = low(contact, __shfl_xor_sync(team, contact, step));
-        if (lane == 0) p.progress[i] = progress_of(contact);
-    }
-    __syncwarp(team);
-    for (int a = lane; a < A; a += T) advance(p, world, a);
+    Walls walls = walls_of(p.scenery, p.scenery.layout[env]);
+    float rho = p.scenery.radius * INFLATION;
+    for (int a = 0; a < n_agents; a++)
+        sweep(p, group, env, walls, rho, a);
+    __syncwarp(group.mask);
+    for (int a = group.rank; a < n_agents; a += group.size)
+        advance(p, env, a);
 }

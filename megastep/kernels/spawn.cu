@@ -1,5 +1,8 @@
-// One thread a world.
-KERNEL spawn(Spawn p) {
-    int world = blockIdx.x * blockDim.x + threadIdx.x;
-    if (world < p.world.n_worlds) spawn_world(p, world);
+// One thread per environment.
+#include "spawn.h"
+
+KERNEL spawn(SpawnParams p) {
+    int env = blockIdx.x * blockDim.x + threadIdx.x;
+    if (env < p.scenery.n_envs)
+        spawn_env(p, env);
 }

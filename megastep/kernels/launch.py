@@ -1,0 +1,88 @@
+"""Launches an operation on the device where its tensors are, with params that are given by name.
+
+``params.h`` declares a struct for each operation. The structs are read from there, so their layout
+in memory has one home, and ``params.RenderParams(scenery=..., positions=..., ...)`` packs one. All
+fields are keyword arguments that must be given, so Python itself refuses a misspelt or a missing
+one by name. A pointer is a tensor's address; 0 says that it is not wanted.
+"""
+
+import ctypes
+import re
+import struct
+from types import SimpleNamespace
+
+import torch
+
+from .compile import BLOCK, HERE, EngineError, bindings, checked, cpu, cuda
+
+WARP = 32  # threads
+MAX_THREADS = 2**32 - BLOCK  # per launch: kernels count them in 32 bits
+FORMATS = {"int": "i", "float": "f", "unsigned int": "I"}
+
+
+def _fields():
+    """By struct of params.h, its fields: (name, format of the module struct)."""
+    source = re.sub(r"//.*", "", (HERE / "params.h").read_text())
+    found = {}
+    formats = dict(FORMATS)
+    for name, body in re.findall(r"struct (?:alignas\(\d+\) )?(\w+) \{(.*?)\};", source, re.S):
+        found[name] = [
+            (field, "P" if star else formats[kind.replace("const", "").strip()])
+            for kind, star, field in re.findall(r"([\w ]+?)\s*(\*?)\s+(\w+);", body)
+        ]
+        formats[name] = f"0P{_packer(found[name]).size}s"
+    return found
+
+
+def _packer(fields):
+    """``0P`` pads to a pointer's alignment, as a compiler does at the end of such a struct."""
+    end = "0P" if any(kind[-1] in "Ps" for _, kind in fields) else ""
+    return struct.Struct("".join(kind for _, kind in fields) + end)
+
+
+def _builder(name, fields):
+    """A function of keyword arguments alone, the fields, that gives the struct as bytes."""
+    names = ", ".join(field for field, _ in fields)
+    made = eval(f"lambda *, {names}: pack({names})", {"pack": _packer(fields).pack})
+    made.__name__ = made.__qualname__ = name
+    return made
+
+
+FIELDS = _fields()
+SIZES = {name: _packer(fields).size for name, fields in FIELDS.items()}  # bytes
+params = SimpleNamespace(**{name: _builder(name, fields) for name, fields in FIELDS.items()})
+
+
+def launch(
+    operation: str, packed: bytes, device: torch.device, threads: int, shared: int = 0
+) -> None:
+    """Runs ``operation`` on its packed params: on the CPU at once, on a GPU in ``threads`` threads
+    on the device's current stream.
+
+    ``shared`` is dynamic shared memory in bytes per warp.
+    """
+    if device.type == "cpu":
+        cpu()[operation](packed)
+        return
+    if not threads:
+        return
+    if threads > MAX_THREADS:
+        raise EngineError(
+            f"{operation} would need {threads:,} threads on {device}, but a launch has at most "
+            f"{MAX_THREADS:,}: use fewer environments."
+        )
+    index = torch.cuda.current_device() if device.index is None else device.index
+    function = cuda(index)[operation]
+    arguments = (ctypes.c_char_p * 1)(packed)
+    with torch.cuda.device(index):
+        stream = torch.cuda.current_stream(index).cuda_stream
+        status = bindings()[0].cuLaunchKernel(
+            function,
+            *(-(-threads // BLOCK), 1, 1),
+            *(BLOCK, 1, 1),
+            shared * (BLOCK // WARP),
+            stream,
+            ctypes.addressof(arguments),
+            0,
+        )
+    checked(status, f"Launching {operation}")

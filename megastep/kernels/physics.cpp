@@ -1,0 +1,65 @@
+// A loop over environments. For each agent, a vectorised loop finds the walls whose boxes its path
+// meets; only those are swept.
+#include <vector>
+
+#include "movement.h"
+
+static float sweep_walls(const float* walls, int n, unsigned char* meets, float px, float py,
+                         float dx, float dy, float rho) {
+    if (dx == 0.f && dy == 0.f)
+        return NO_CONTACT;
+#pragma omp simd
+    for (int j = 0; j < n; j++)
+        meets[j] = (unsigned char)boxes_meet(px, py, dx, dy, walls[4 * j], walls[4 * j + 1],
+                                             walls[4 * j + 2], walls[4 * j + 3], rho);
+    float contact = NO_CONTACT;
+    for (int j = 0; j < n; j++) {
+        if (!meets[j])
+            continue;
+        const float* wall = walls + 4 * j;
+        contact =
+            minf(contact, sweep_segment(px, py, dx, dy, wall[0], wall[1], wall[2], wall[3], rho));
+    }
+    return contact;
+}
+
+// Writes which fraction of agent i's step is free. Its environment's agents are those from `first`
+// on.
+static void sweep(const PhysicsParams& p, int first, int i, const float* walls, int n,
+                  unsigned char* meets) {
+    float rho = p.scenery.radius * INFLATION;
+    float px = p.positions[2 * i], py = p.positions[2 * i + 1];
+    float dx = displacement(px, p.velocity[2 * i], p.seconds);
+    float dy = displacement(py, p.velocity[2 * i + 1], p.seconds);
+    float contact = sweep_walls(walls, n, meets, px, py, dx, dy, rho);
+    for (int k = first; k < first + p.scenery.n_agents; k++)
+        if (k != i)
+            contact = minf(contact, sweep_agent(p, k, px, py, dx, dy, rho));
+    p.progress[i] = progress_of(contact);
+}
+
+static void step(const PhysicsParams& p, int env, std::vector<unsigned char>& meets) {
+    const SceneryParams& s = p.scenery;
+    int n_agents = s.n_agents, layout = s.layout[env];
+    int first_wall = s.wall_starts[layout], n_walls = s.wall_starts[layout + 1] - first_wall;
+    const float* walls = s.walls + 4 * (long long)first_wall;
+    if ((int)meets.size() < n_walls)
+        meets.resize(n_walls);
+    if (p.actions)
+        for (int a = 0; a < n_agents; a++)
+            apply_action(p, env, a);
+    for (int a = 0; a < n_agents; a++)
+        sweep(p, env * n_agents, env * n_agents + a, walls, n_walls, meets.data());
+    for (int a = 0; a < n_agents; a++)
+        advance(p, env, a);
+}
+
+KERNEL physics(const PhysicsParams& p) {
+#pragma omp parallel num_threads(p.scenery.n_threads)
+    {
+        std::vector<unsigned char> meets;
+#pragma omp for schedule(static)
+        for (int env = 0; env < p.scenery.n_envs; env++)
+            step(p, env, meets);
+    }
+}

@@ -1,0 +1,149 @@
+// A warp rasterises one camera's view: groups of 32 lines, a warp lane each, into shared memory.
+// Each warp lane projects its line; then the warp goes over the tiles of 32 pixels that the group
+// covers, and over each tile's lines, a pixel per warp lane, keeping the largest inverse depth and,
+// of equals, the first line.
+#pragma once
+#include "raster.h"
+#include "shading.h"
+
+constexpr int TILE = WARP;  // pixels
+
+// One camera's view in the making. Warp lane k knows tile_min, the smallest inverse depth in tile
+// k. `nearest` has whole tiles: pixels beyond the screen are infinitely near, so that they never
+// are the smallest.
+struct View {
+    const Pose& camera;
+    const Screen& screen;
+    const float* ray_lengths;
+    PixelSpan* spans;      // (32) in shared memory: the group's
+    NearestLine* nearest;  // (whole tiles) in shared memory
+    int warp_lane;
+    float tile_min;
+};
+
+HD int whole_tiles(int res) { return (res + TILE - 1) & ~(TILE - 1); }
+
+DEVICE void clear(View& v) {
+    __syncwarp();
+    for (int r = v.warp_lane; r < whole_tiles(v.screen.res); r += WARP)
+        v.nearest[r] = {r < v.screen.res ? 0.f : INF_VALUE, -1};
+    v.tile_min = 0.f;
+}
+
+// The nearest of a group's lines at pixel r: its inverse depth, or 0, and its slot in the group.
+// `slots` are the lines that cover the tile; the near-clipped ones are not seen where they come
+// within the radius.
+DEVICE NearestLine nearest_of_group(const View& v, int r, unsigned int slots,
+                                    unsigned int near_clipped) {
+    float at = (float)r, max_inverse = 0.f;
+    int slot = 0;
+#pragma unroll 1
+    for (unsigned int left = slots & ~near_clipped; left;) {
+        int i = 31 - __clz(left);  // downwards, so that of equals the first line comes last
+        PixelSpan span = v.spans[i];
+        float inverse = span.base + span.gain * at;
+        if (r >= span.first && r < span.end && inverse >= max_inverse) {
+            max_inverse = inverse;
+            slot = i;
+        }
+        left ^= 1u << i;
+    }
+#pragma unroll 1
+    for (unsigned int left = slots & near_clipped; left; left &= left - 1) {
+        int i = __ffs(left) - 1;
+        PixelSpan span = v.spans[i];
+        float inverse = span.base + span.gain * at;
+        int is_first = inverse > max_inverse || (inverse == max_inverse && i < slot);
+        if (r >= span.first && r < span.end && inverse * v.screen.radius < v.ray_lengths[r] &&
+            is_first) {
+            max_inverse = inverse;
+            slot = i;
+        }
+    }
+    return {max_inverse, slot};
+}
+
+// Rasterises 32 lines at once, one per warp lane, where `on`. `line` is the first warp lane's index
+// in its environment.
+DEVICE void raster_group(View& v, const Float4* own_line, int line, int on) {
+    Projection own = {{0, 0, 0.f, 0.f}, 0};
+    if (on) {
+        Float4 ends = LOAD(own_line);
+        own = project(v.camera, v.screen, ends.x, ends.y, ends.z, ends.w);
+    }
+    PixelSpan span = own.span;
+    int visible = span.first < span.end;
+    int first_tile = visible ? span.first >> 5 : 32;
+    int last_tile = visible ? (span.end - 1) >> 5 : -1;
+    float max_inverse = maxf(span.base + span.gain * (float)span.first,
+                             span.base + span.gain * (float)(span.end - 1));
+    unsigned int near_clipped = __ballot_sync(FULL_WARP, own.near_clipped);
+    __syncwarp();
+    v.spans[v.warp_lane] = span;
+    __syncwarp();
+    int last = __reduce_max_sync(FULL_WARP, last_tile);
+#pragma unroll 1
+    for (int tile = __reduce_min_sync(FULL_WARP, first_tile); tile <= last; tile++) {
+        float tile_min = __shfl_sync(FULL_WARP, v.tile_min, tile);
+        int covers = first_tile <= tile && tile <= last_tile && max_inverse >= tile_min;
+        unsigned int slots = __ballot_sync(FULL_WARP, covers);
+        if (!slots)
+            continue;
+        int r = TILE * tile + v.warp_lane;
+        NearestLine group = nearest_of_group(v, r, slots, near_clipped);
+        NearestLine nearest = v.nearest[r];
+        group.line += line;
+        if (group.inverse > nearest.inverse ||
+            (group.inverse == nearest.inverse && group.line < nearest.line)) {
+            nearest = group;
+            v.nearest[r] = nearest;
+        }
+        // Of floats that are not negative the bits are in the same order.
+        unsigned int min_bits = __reduce_min_sync(FULL_WARP, __float_as_uint(nearest.inverse));
+        if (v.warp_lane == tile)
+            v.tile_min = __uint_as_float(min_bits);
+    }
+}
+
+// Walls come in groups of 32 with a box around each. Groups that cannot be seen are left out, and
+// the others come nearest first, so that those wholly behind what their tiles show already are
+// skipped.
+DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scenery, int layout,
+                         float half_width) {
+    int first_box = s.box_starts[layout];
+    for (int start = 0; BOX_WALLS * start < scenery.n_walls; start += WARP) {
+        unsigned int key = ~0u;
+        ScreenBounds bounds = {-1.f, 0.f, 0, 0};
+        if (BOX_WALLS * (start + v.warp_lane) < scenery.n_walls) {
+            float4 box = ((const float4*)s.boxes)[first_box + start + v.warp_lane];
+            bounds = bounds_of(v.camera, v.screen, half_width, box.x, box.y, box.z, box.w);
+            if (bounds.distance2 >= 0.f)
+                key = __float_as_uint(bounds.distance2);
+        }
+        int tiles = bounds.first / TILE | bounds.last / TILE << 16;
+        for (unsigned int min_key = __reduce_min_sync(FULL_WARP, key); min_key != ~0u;
+             min_key = __reduce_min_sync(FULL_WARP, key)) {
+            int k = __ffs(__ballot_sync(FULL_WARP, key == min_key)) - 1;
+            if (v.warp_lane == k)
+                key = ~0u;
+            int its_tiles = __shfl_sync(FULL_WARP, tiles, k);
+            float max_inverse = __shfl_sync(FULL_WARP, bounds.max_inverse, k);
+            int covers = v.warp_lane >= (its_tiles & 0xffff) && v.warp_lane <= its_tiles >> 16;
+            float tile_min = covers ? v.tile_min : INF_VALUE;
+            if (__all_sync(FULL_WARP, tile_min > max_inverse))
+                continue;  // all of the box is behind what is already there
+            int l = BOX_WALLS * (start + k);
+            raster_group(v, (const Float4*)s.walls + (scenery.first_wall + l + v.warp_lane),
+                         scenery.n_agent_lines + l, l + v.warp_lane < scenery.n_walls);
+        }
+    }
+}
+
+// The other agents' lines.
+DEVICE void raster_agents(View& v, const SceneryParams& s, const EnvScenery& scenery, int a) {
+    for (int first = 0; first < scenery.n_agent_lines; first += WARP) {
+        int l = first + v.warp_lane;
+        int on = l < scenery.n_agent_lines && l / s.n_model != a;
+        raster_group(v, (const Float4*)scenery.agent_lines + l, first, on);
+    }
+}

@@ -1,0 +1,113 @@
+// What a ray sees of the line it hits: where, at which angle, and in which colour.
+#pragma once
+#include "common.h"
+#include "params.h"
+#include "raster.h"
+
+// One environment's lines and texels.
+struct EnvScenery {
+    const float* agent_lines;
+    const float* agent_textures;
+    const float* agent_light;
+    int first_wall, n_walls, n_agent_lines, first_texel;
+};
+
+HD EnvScenery env_scenery(const SceneryParams& s, int env) {
+    int layout = s.layout[env];
+    int first = s.wall_starts[layout];
+    int n_agent_lines = s.n_agents * s.n_model;
+    return {s.agent_lines + 4 * (env * (long long)n_agent_lines),
+            s.agent_textures + 3 * (layout * (long long)s.n_agent_texels),
+            s.agent_light + env * (long long)s.n_agent_texels,
+            first,
+            s.wall_starts[layout + 1] - first,
+            n_agent_lines,
+            s.texel_starts[first]};
+}
+
+// A line that rays hit: its start and direction in the camera's frame, and its texels.
+struct Surface {
+    float ax, ay, vx, vy;
+    int first_texel, width, of_agent;
+};
+
+// Line l of an environment, the agents' first. `has_agents`: it may be an agent's.
+template <int has_agents>
+HD Surface surface_of(const SceneryParams& s, const EnvScenery& scenery, const Pose& camera,
+                      int l) {
+    int of_agent = has_agents && l < scenery.n_agent_lines;
+    int i = of_agent ? l : l + (scenery.first_wall - scenery.n_agent_lines);
+    Float4 line = LOAD((const Float4*)(of_agent ? scenery.agent_lines : s.walls) + i);
+    const int* starts = (of_agent ? s.model_texels : s.texel_starts) + i;
+    float ax, ay, bx, by;
+    to_camera(camera, line.x, line.y, ax, ay);
+    to_camera(camera, line.z, line.w, bx, by);
+    return {ax, ay, bx - ax, by - ay, starts[0], starts[1] - starts[0], of_agent};
+}
+
+// `location`: fraction along the line. `facing`: squared sine between ray and line.
+struct Hit {
+    float location, facing;
+};
+
+// Of the ray along (1, y), `length` long at unit depth. One division serves both numbers.
+HD Hit hit_of(const Surface& line, float y, float length) {
+    float across = line.vy - y * line.vx;
+    float size = length * length * (line.vx * line.vx + line.vy * line.vy);
+    float inverse = RECIPROCAL(across * size);
+    Hit hit;
+    hit.location = clamp((y * line.ax - line.ay) * size * inverse, 0.f, 1.f);
+    hit.facing = across * across * (across * inverse);
+    return hit;
+}
+
+// The cosine between ray and line.
+HD float cosine_of(const Surface& line, float y, float length) {
+    float size = SQRT(line.vx * line.vx + line.vy * line.vy);
+    return (line.vx + y * line.vy) / (length * size + 1e-6f);
+}
+
+// Linear filtering between texel centres, clamped at the line's ends.
+struct Filter {
+    int left, right;
+    float weight;
+};
+
+HD Filter filter_at(float location, int width) {
+    float at = location * (float)width - 0.5f;
+    float floor = FLOOR(at);
+    return {maxi((int)floor, 0), mini((int)floor + 1, width - 1), at - floor};
+}
+
+HD int texel_at(float location, int width) {
+    return mini((int)(location * (float)width), width - 1);
+}
+
+struct Colour {
+    float red, green, blue;
+};
+
+// Between two texels of red, green, blue and light.
+HD Colour blend(const Float4 left, const Float4 right, float weight, float facing) {
+    float light = mix(left.w, right.w, weight) * facing;
+    return {mix(left.x, right.x, weight) * light, mix(left.y, right.y, weight) * light,
+            mix(left.z, right.z, weight) * light};
+}
+
+HD Colour wall_colour(const SceneryParams& s, int first, int width, const Hit& hit) {
+    Filter f = filter_at(hit.location, width);
+    const Float4* texels = (const Float4*)s.texels;
+    return blend(LOAD(texels + (first + f.left)), LOAD(texels + (first + f.right)), f.weight,
+                 hit.facing);
+}
+
+HD Float4 agent_texel(const EnvScenery& scenery, int texel) {
+    const float* colour = scenery.agent_textures + 3 * texel;
+    return {colour[0], colour[1], colour[2], scenery.agent_light[texel]};
+}
+
+HD Colour agent_colour(const EnvScenery& scenery, int first, int width, const Hit& hit) {
+    Filter f = filter_at(hit.location, width);
+    return blend(agent_texel(scenery, first + f.left), agent_texel(scenery, first + f.right),
+                 f.weight, hit.facing);
+}

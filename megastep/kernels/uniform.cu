@@ -1,0 +1,8 @@
+// One thread per lane.
+#include "uniform.h"
+
+KERNEL uniform(UniformParams p) {
+    int lane = blockIdx.x * blockDim.x + threadIdx.x;
+    if (lane < p.n_lanes)
+        uniform_lane(p, lane);
+}

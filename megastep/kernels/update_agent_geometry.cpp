@@ -1,0 +1,28 @@
+// A loop over agents: carries their models to where they stand and, if told to, lights their
+// texels.
+#include "agent_geometry.h"
+#include "light_cpu.h"
+
+static void light_agent(const SceneryParams& s, int env, int a) {
+    int layout = s.layout[env];
+    float* light = s.agent_light + env * (long long)s.n_agent_texels;
+    int end = s.model_texels[(a + 1) * s.n_model];
+    for (int texel = s.model_texels[a * s.n_model]; texel < end; texel++) {
+        float x, y;
+        agent_texel_centre(s, env, a, texel, x, y);
+        light[texel] = light_at(s, layout, x, y);
+    }
+}
+
+KERNEL update_agent_geometry(const UpdateAgentGeometryParams& p) {
+    const SceneryParams& s = p.scenery;
+#pragma omp parallel for schedule(static) num_threads(s.n_threads)
+    for (int agent = 0; agent < s.n_envs * s.n_agents; agent++) {
+        float x = p.positions[2 * agent], y = p.positions[2 * agent + 1];
+        Pose pose = pose_at(x, y, p.angles[agent]);
+        for (int m = 0; m < s.n_model; m++)
+            update_line(s, pose, agent, m);
+        if (p.lit)
+            light_agent(s, agent / s.n_agents, agent % s.n_agents);
+    }
+}
