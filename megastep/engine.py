@@ -231,6 +231,7 @@ def _scenery_params(scenery, radius):
         agent_lines=scenery.agent_lines.data_ptr(),
         agent_light=scenery.agent_light.data_ptr(),
         n_envs=scenery.n_envs,
+        n_layouts=len(layouts),
         n_agents=scenery.n_agents,
         n_model=len(scenery.model),
         n_agent_texels=scenery.agent_light.shape[1],
@@ -258,24 +259,27 @@ def _state(scenery, agents, *names):
     }
 
 
+# By kind, as errors.h numbers them.
+_ERRORS = {
+    1: "An agent of environment {env} has a position, angle or velocity that is not a finite "
+    "number: look at what was last written to it.",
+    2: "An agent of environment {env} was given an action that is none of its action space: "
+    "actions count from 0.",
+    3: "Environment {env} shows a layout that the scenery does not have: ids in scenery.layout "
+    "count from 0 and stay below the number of layouts.",
+}
+
+
 def check(agents):
-    """EngineError if an agent's position, angle or velocity has stopped being a finite number, or
-    it was given an unknown action. Asks the device, so not for inside a step.
+    """EngineError, which names an environment, if since the last check an agent's position, angle
+    or velocity was not a finite number, an action was none, or a layout was none. Synchronises
+    with the device, so it is not for inside a step.
     """
-    world = int(agents.error_flag)
-    if world:
+    flag = int(agents.error_flag)
+    if flag:
         agents.error_flag.zero_()
-        if world < 0:
-            raise EngineError(
-                f"An agent of environment {-world - 1} was given an action that is none of its "
-                f"action space: "
-                f"actions count from 0."
-            )
-        raise EngineError(
-            f"An agent of environment {world - 1} has a position, angle or velocity that is not a "
-            f"finite number: "
-            f"look at what was last written to it."
-        )
+        env, kind = divmod(flag, 4)
+        raise EngineError(_ERRORS[kind].format(env=env))
 
 
 def _checked(agents):
@@ -340,10 +344,12 @@ def update_agent_geometry(scenery, agents, lit=True):
     packed = params.UpdateAgentGeometryParams(
         scenery=_scenery_params(scenery, agents.radius),
         **_state(scenery, agents, "positions", "angles"),
+        error_flag=agents.error_flag.data_ptr(),
         lit=int(lit),
     )
     threads = WARP * scenery.n_envs * scenery.n_agents
     launch("update_agent_geometry", packed, scenery.device, threads)
+    _checked(agents)
 
 
 # What a view may give; 0: it is not wanted.
@@ -501,12 +507,14 @@ def spawn(scenery, agents, mask, points, counts, seed, resample=False):
         mask=_pointer("mask", mask, lanes, torch.bool, where),
         points=_pointer("points", points, (n_layouts, n_points, 2), torch.float32, where),
         counts=_pointer("counts", counts, lanes, torch.int32, where),
+        error_flag=agents.error_flag.data_ptr(),
         key0=seed & 0xFFFFFFFF,
         key1=seed >> 32 & 0xFFFFFFFF,
         n_points=n_points,
-        n_layouts=n_layouts if resample else 0,
+        resample=int(resample),
     )
     launch("spawn", packed, where, threads=scenery.n_envs)
+    _checked(agents)
 
 
 def uniform(counts, mask, seed, out):

@@ -99,7 +99,7 @@ HD void apply_action(const PhysicsParams& p, int env, int a) {
     int i = env * p.scenery.n_agents + a;
     long long action = p.actions[i];
     if (action < 0 || action >= p.n_moves) {
-        *p.error_flag = -(env + 1);
+        flag_error(p.error_flag, env, BAD_ACTION);
         action = 0;
     }
     const float* move = p.moves + 3 * action;

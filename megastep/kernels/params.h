@@ -31,6 +31,7 @@ struct SceneryParams {
     float* agent_lines;           // (N, A M, 4) the agents' lines as last updated
     float* agent_light;           // (N, K) light on the agents' texels as last updated
     int n_envs;
+    int n_layouts;
     int n_agents;
     int n_model;
     int n_agent_texels;  // K
@@ -66,6 +67,7 @@ struct UpdateAgentGeometryParams {
     SceneryParams scenery;
     const float* positions;  // (N, A, 2)
     const float* angles;     // (N, A)
+    int* error_flag;         // (1) out: see errors.h
     int lit;                 // 1: light the agents' texels too
 };
 
@@ -114,10 +116,11 @@ struct SpawnParams {
     const unsigned char* mask;  // (N, A) agents that respawn
     const float* points;        // (D, n_points, 2) where agents may stand
     int* counts;                // (N, A) numbers that each agent has drawn
+    int* error_flag;            // (1) out: see errors.h
     unsigned int key0;          // the seed
     unsigned int key1;
     int n_points;
-    int n_layouts;  // an environment that respawns whole moves to one of these; 0: it stays
+    int resample;  // 1: an environment all of whose agents respawn moves to another layout
 };
 
 struct UniformParams {

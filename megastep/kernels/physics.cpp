@@ -40,7 +40,7 @@ static void sweep(const PhysicsParams& p, int first, int i, const float* walls, 
 
 static void step(const PhysicsParams& p, int env, std::vector<unsigned char>& meets) {
     const SceneryParams& s = p.scenery;
-    int n_agents = s.n_agents, layout = s.layout[env];
+    int n_agents = s.n_agents, layout = layout_of(s, env, p.error_flag);
     int first_wall = s.wall_starts[layout], n_walls = s.wall_starts[layout + 1] - first_wall;
     const float* walls = s.walls + 4 * (long long)first_wall;
     if ((int)meets.size() < n_walls)

@@ -71,7 +71,7 @@ KERNEL BOUNDS(24) physics(PhysicsParams p) {
             apply_action(p, env, a);
         __syncwarp(group.mask);
     }
-    Walls walls = walls_of(p.scenery, p.scenery.layout[env]);
+    Walls walls = walls_of(p.scenery, layout_of(p.scenery, env, p.error_flag));
     float rho = p.scenery.radius * INFLATION;
     for (int a = 0; a < n_agents; a++)
         sweep(p, group, env, walls, rho, a);

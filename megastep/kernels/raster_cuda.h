@@ -108,14 +108,13 @@ DEVICE void raster_group(View& v, const Float4* own_line, int line, int on) {
 // Walls come in groups of 32 with a box around each. Groups that cannot be seen are left out, and
 // the others come nearest first, so that those wholly behind what their tiles show already are
 // skipped.
-DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scenery, int layout,
+DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scenery,
                          float half_width) {
-    int first_box = s.box_starts[layout];
     for (int start = 0; BOX_WALLS * start < scenery.n_walls; start += WARP) {
         unsigned int key = ~0u;
         ScreenBounds bounds = {-1.f, 0.f, 0, 0};
         if (BOX_WALLS * (start + v.warp_lane) < scenery.n_walls) {
-            float4 box = ((const float4*)s.boxes)[first_box + start + v.warp_lane];
+            float4 box = ((const float4*)s.boxes)[scenery.first_box + start + v.warp_lane];
             bounds = bounds_of(v.camera, v.screen, half_width, box.x, box.y, box.z, box.w);
             if (bounds.distance2 >= 0.f)
                 key = __float_as_uint(bounds.distance2);

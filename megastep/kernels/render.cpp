@@ -126,7 +126,7 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
     int env = agent / s.n_agents, a = agent % s.n_agents;
     int newly_seen = 0;
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
-    EnvScenery scenery = env_scenery(s, env);
+    EnvScenery scenery = env_scenery(s, env, layout_of(s, env, p.error_flag));
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : nullptr;
     flag_nonfinite(p.error_flag, env, x, y, angle);
     if (p.imu)

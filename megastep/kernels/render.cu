@@ -75,7 +75,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     int newly_seen = 0;
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
     Screen screen = screen_of(p);
-    EnvScenery scenery = env_scenery(s, env);
+    EnvScenery scenery = env_scenery(s, env, layout_of(s, env, p.error_flag));
     unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : 0;
     if (warp_lane == 0)
         flag_nonfinite(p.error_flag, env, x, y, angle);
@@ -91,7 +91,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         clear(v);
         if (has_agents && s.n_agents > 1)
             raster_agents(v, s, scenery, a);
-        raster_walls(v, s, scenery, s.layout[env], p.half_width);
+        raster_walls(v, s, scenery, p.half_width);
         __syncwarp();
         if (p.centre_line && warp_lane == 0)
             p.centre_line[view] = nearest[p.res / 2].line;

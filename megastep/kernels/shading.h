@@ -9,16 +9,16 @@ struct EnvScenery {
     const float* agent_lines;
     const float* agent_textures;
     const float* agent_light;
-    int first_wall, n_walls, n_agent_lines, first_texel;
+    int first_box, first_wall, n_walls, n_agent_lines, first_texel;
 };
 
-HD EnvScenery env_scenery(const SceneryParams& s, int env) {
-    int layout = s.layout[env];
+HD EnvScenery env_scenery(const SceneryParams& s, int env, int layout) {
     int first = s.wall_starts[layout];
     int n_agent_lines = s.n_agents * s.n_model;
     return {s.agent_lines + 4 * (env * (long long)n_agent_lines),
             s.agent_textures + 3 * (layout * (long long)s.n_agent_texels),
             s.agent_light + env * (long long)s.n_agent_texels,
+            s.box_starts[layout],
             first,
             s.wall_starts[layout + 1] - first,
             n_agent_lines,

@@ -1,10 +1,12 @@
 // A loop over agents: carries their models to where they stand and, if told to, lights their
 // texels.
 #include "agent_geometry.h"
+#include "errors.h"
 #include "light_cpu.h"
 
-static void light_agent(const SceneryParams& s, int env, int a) {
-    int layout = s.layout[env];
+static void light_agent(const UpdateAgentGeometryParams& p, int env, int a) {
+    const SceneryParams& s = p.scenery;
+    int layout = layout_of(s, env, p.error_flag);
     float* light = s.agent_light + env * (long long)s.n_agent_texels;
     int end = s.model_texels[(a + 1) * s.n_model];
     for (int texel = s.model_texels[a * s.n_model]; texel < end; texel++) {
@@ -23,6 +25,6 @@ KERNEL update_agent_geometry(const UpdateAgentGeometryParams& p) {
         for (int m = 0; m < s.n_model; m++)
             update_line(s, pose, agent, m);
         if (p.lit)
-            light_agent(s, agent / s.n_agents, agent % s.n_agents);
+            light_agent(p, agent / s.n_agents, agent % s.n_agents);
     }
 }

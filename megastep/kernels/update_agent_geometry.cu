@@ -4,6 +4,7 @@
 // texel, until all texels are hidden.
 #include "agent_geometry.h"
 #include "corridor.h"
+#include "errors.h"
 #include "scenery.h"
 
 DEVICE float from_warp_lane(float x, int warp_lane) { return __shfl_sync(FULL_WARP, x, warp_lane); }
@@ -55,13 +56,14 @@ KERNEL BOUNDS(20) update_agent_geometry(UpdateAgentGeometryParams p) {
     int agent = (blockIdx.x * blockDim.x + threadIdx.x) / WARP, warp_lane = threadIdx.x % WARP;
     if (agent >= s.n_envs * s.n_agents)
         return;
-    int env = agent / s.n_agents, a = agent % s.n_agents, layout = s.layout[env];
+    int env = agent / s.n_agents, a = agent % s.n_agents;
     Pose pose = pose_at(p.positions[2 * agent], p.positions[2 * agent + 1], p.angles[agent]);
     for (int m = warp_lane; m < s.n_model; m += WARP)
         update_line(s, pose, agent, m);
     if (!p.lit)
         return;
     __syncwarp();
+    int layout = layout_of(s, env, p.error_flag);
     Walls walls = walls_of(s, layout);
     int end = s.model_texels[(a + 1) * s.n_model];
     for (int base = s.model_texels[a * s.n_model]; base < end; base += WARP) {
