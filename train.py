@@ -2,7 +2,7 @@
 
 import sys
 
-from agents.cli.train import main
+from agents.cli.entry import run_script
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_script("train"))
