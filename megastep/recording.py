@@ -12,6 +12,7 @@
 
 import base64
 import collections
+import contextlib
 import functools
 import inspect
 import io
@@ -21,14 +22,17 @@ import signal
 import sys
 import tempfile
 import warnings
+from collections.abc import Callable
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .arrdict import clone, numpyify
 
-MAX_WORKERS = 8  # some 80 figures a second; each has torch in memory, about half a gigabyte
-# x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines want more
+MAX_WORKERS = 8  # some 80 figures per second; each has torch in memory, about half a gigabyte
+# x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines need more
 QUALITY = "20"
 
 # Workers draw on one thread each, never on a screen, and see no GPU: even an idle CUDA context is
@@ -47,21 +51,20 @@ class ParallelEncoder:
 
     Args:
         plot_state: takes a numpyified state, returns a matplotlib figure or an (H, W, 3) uint8
-        array. Functions,
-            classmethods and staticmethods run in worker processes. A method of an object would drag
-            the object along, so it is called in this process instead, with a warning.
-        fps: frames a second of the video.
+            array. Functions, classmethods and staticmethods run in worker processes. A method of an
+            object would drag the object along, so it is called in this process, with a warning.
+        fps: frames per second of the video.
         n_workers: how many processes draw; by default as many as there are cores, 8 at most.
 
-    Inside its ``with`` block, call it with a state, or :meth:`frame` with a finished picture; after
+    Inside its ``with`` block, call it with a state, or :meth:`frame` with a finished image; after
     the block, use :meth:`save` or :meth:`notebook`. RuntimeError, from any of them, names the first
-    frame that could not be drawn.
+    frame that could not be drawn; KeyboardInterrupt and its like pass as they are.
     """
 
-    def __init__(self, plot_state, fps=20, n_workers=None):
+    def __init__(self, plot_state: Callable, fps: float = 20, n_workers: int | None = None):
         if not 0 < fps <= 1000:
             raise ValueError(
-                f"fps must be more than 0 and at most 1000 frames a second, but {fps} was given"
+                f"fps must be more than 0 and at most 1000 frames per second, but {fps} was given"
             )
         if n_workers is not None and n_workers < 1:
             raise ValueError(f"n_workers must be at least 1, but {n_workers} was given")
@@ -70,38 +73,42 @@ class ParallelEncoder:
         self._pool = self._video = self._bytes = None
         self._pending = collections.deque()  # (number, future or array), oldest first
 
-    def __enter__(self):
+    def __enter__(self) -> "ParallelEncoder":
         self._video, self._bytes, self._n_frames = _Video(self._fps), None, 0
         return self
 
-    def __call__(self, state):
+    def __call__(self, state: Any) -> None:
         """Draws a tree of tensors or arrays as the next frame; it is copied, so it may change
         afterwards.
         """
         self._check_open()
         state = numpyify(clone(state))
         if self._payload is None:
-            with _naming(self._n_frames):
+            with _named(self._n_frames):
                 self._add(_draw(self._plot_state, state))
         else:
             self._add(self._workers().submit(_draw_payload, self._payload, state))
 
-    def frame(self, array):
-        """Adds a picture as the next frame: (H, W, 3), uint8 or floats from 0 to 1, of the same
+    def frame(self, array: ArrayLike) -> None:
+        """Adds an image as the next frame: (H, W, 3), uint8 or floats from 0 to 1, of the same
         size as the others.
         """
         self._check_open()
-        self._add(_picture(array))
+        self._add(_image(array))
 
     def __exit__(self, kind, error, trace):
         try:
             if kind is None:
                 self._drain(0)
+                self._bytes = self._video.close()
         finally:
             self._stop(kill=bool(self._pending))
-            self._bytes, self._video = self._video.close(), None
+            if self._bytes is None:  # the error that ended the block matters more than one of this
+                with contextlib.suppress(Exception):
+                    self._bytes = self._video.close()
+            self._video = None
 
-    def save(self, path):
+    def save(self, path: str | os.PathLike) -> pathlib.Path:
         """Writes the video to ``path``, an mp4, whole or not at all; folders are made as needed.
         Returns the path.
         """
@@ -125,7 +132,7 @@ class ParallelEncoder:
                 raise
         return path
 
-    def notebook(self):
+    def notebook(self) -> Any:
         """The video as an object that a notebook shows."""
         video = self._finished()
         try:
@@ -178,7 +185,7 @@ class ParallelEncoder:
         """
         while self._pending and (len(self._pending) > n_left or _is_done(self._pending[0][1])):
             number, source = self._pending[0]
-            with _naming(number):
+            with _named(number):
                 self._video.add(source if isinstance(source, np.ndarray) else source.result())
             self._pending.popleft()
 
@@ -231,8 +238,8 @@ class _Video:
         return self._buffer.getvalue()
 
 
-class _naming:
-    """Says which frame it was that an exception kept from the video."""
+class _named:
+    """Names the frame in an exception that kept it from the video."""
 
     def __init__(self, number):
         self.number = number
@@ -277,7 +284,7 @@ def _is_done(source):
     return isinstance(source, np.ndarray) or source.done()
 
 
-def _picture(array):
+def _image(array):
     """An (H, W, 3) uint8 array of a uint8 or float one; ValueError for anything else."""
     array = np.asarray(array)
     if array.ndim != 3 or array.shape[-1] != 3 or not array.size:
@@ -314,7 +321,7 @@ def _draw(plot_state, state):
     """(H, W, 3) uint8 of a state."""
     drawn = plot_state(state)
     if isinstance(drawn, np.ndarray):
-        return _picture(drawn)
+        return _image(drawn)
     if not hasattr(drawn, "savefig"):
         raise TypeError(
             f"plot_state must return a matplotlib figure or an array, but it returned a "

@@ -1,6 +1,8 @@
 """Videos of trained agents."""
 
 import builtins
+import os
+import signal
 import sys
 
 import pytest
@@ -47,6 +49,35 @@ def test_a_video_has_a_frame_for_every_step(trained):
 def test_a_place_that_cannot_be_written_is_one_sentence(trained, capsys):
     assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=/proc/video.mp4"]) == 2
     assert "/proc/video.mp4 could not be made" in capsys.readouterr().err
+
+
+def test_another_kind_of_file_is_one_sentence(trained, capsys):
+    assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=video.gif"]) == 2
+    assert "video.gif could not be made: videos are mp4 files" in capsys.readouterr().err
+
+
+@pytest.fixture
+def handlers():
+    """Puts the handlers of signals back."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("script", ["record", "train"])
+def test_a_signal_while_filming_is_no_fault_of_the_video(
+    script, number, code, trained, tmp_path, handlers, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(recording._Video, "add", lambda *_: os.kill(os.getpid(), number))
+    if script == "record":
+        assert record.main([f"run={trained}", "steps=9", "device=cpu"]) == code
+    else:
+        assert train.main([*TINY, "finish.record=true"]) == code
+    assert "could not be" not in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.mp4"))
 
 
 def failing(*_, **__):

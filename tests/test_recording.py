@@ -22,7 +22,7 @@ TOLERANCE = 6  # grey levels: what h264 at this quality loses on flat colour
 
 
 def plot_grey(state):
-    """A flat picture of the state's grey level; early frames take longest, so that workers finish
+    """A flat image of the state's grey level; early frames take longest, so that workers finish
     out of order.
     """
     time.sleep(0.2 / (1 + state.i))
@@ -109,7 +109,7 @@ def test_the_file_is_h264_in_yuv420p_at_the_rate_asked_for(tmp_path):
     assert os.listdir(tmp_path / "new") == ["video.mp4"]
 
 
-def test_pictures_and_states_can_be_mixed_and_keep_their_order(tmp_path):
+def test_images_and_states_can_be_mixed_and_keep_their_order(tmp_path):
     with ParallelEncoder(plot_grey, n_workers=1) as encoder:
         encoder(arrdict(i=0, grey=50))
         encoder.frame(np.full((SIZE, SIZE, 3), 100, np.uint8))
@@ -235,6 +235,41 @@ def test_an_exception_in_the_block_is_passed_on_unchanged():
         raise KeyError("mine")
 
 
+class Stopped(BaseException):
+    """As signal handlers raise."""
+
+
+@pytest.mark.parametrize("how", ["waiting", "drawing", "encoding"])
+def test_a_signal_is_passed_on_unchanged_wherever_it_strikes(how, monkeypatch):
+    """While it waits for a worker, draws here, or encodes; also where closing the video fails."""
+
+    def stop(*args, **options):
+        raise Stopped
+
+    def broken(self):
+        raise OSError("the container is broken")
+
+    plot_state = types.MethodType(stop, Env()) if how == "drawing" else plot_grey
+    if how == "waiting":
+        monkeypatch.setattr(recording, "_is_done", stop)
+    if how == "encoding":
+        monkeypatch.setattr(recording._Video, "add", stop)
+    monkeypatch.setattr(recording._Video, "close", broken)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        encoder = ParallelEncoder(plot_state, n_workers=1)
+    with pytest.raises(Stopped), encoder:
+        encoder(arrdict(i=9, grey=0))
+    assert encoder._pool is None
+
+
+def test_what_was_recorded_before_an_error_can_be_saved(tmp_path):
+    with pytest.raises(KeyError), ParallelEncoder(plot_grey) as encoder:
+        encoder.frame(np.zeros((SIZE, SIZE, 3)))
+        raise KeyError
+    assert len(frames(encoder.save(tmp_path / "video.mp4"))) == 1
+
+
 def test_frames_of_another_size_are_refused():
     with pytest.raises(
         RuntimeError, match="frame 1 .* first, 32 x 16 pixels, but this one has 32 x 32"
@@ -253,7 +288,7 @@ def test_frames_of_another_size_are_refused():
         (np.zeros((4, 4, 3), int), "uint8 or floats from 0 to 1, but this one holds int"),
     ],
 )
-def test_what_is_no_picture_is_refused(array, error):
+def test_what_is_no_image_is_refused(array, error):
     with pytest.raises(ValueError, match=error), ParallelEncoder(plot_grey) as encoder:
         encoder.frame(array)
 

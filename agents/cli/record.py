@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -21,14 +22,12 @@ The commonest:
   file=out.mp4     instead of video.mp4 in the run folder"""
 
 
-def run(cfg):
-    """Films as `cfg`, a settings.Record, says. Returns the path of the video."""
+def run(cfg: Record) -> Path:
+    """Films as `cfg` says. Returns the path of the video."""
     try:
         import av  # noqa: F401, what the recorder encodes with
     except ImportError:
         raise UserError(missing("av")) from None
-    from megastep.recording import ParallelEncoder
-
     device, path = components.make_device(cfg.device), run_folders.find(cfg.run)
     loaded = components.load(path, device)
     trained = components.config_of(loaded)
@@ -41,27 +40,33 @@ def run(cfg):
 
     place = Path(cfg.file) if cfg.file else run_folders.folder_of(path) / "video.mp4"
     try:
-        with ParallelEncoder(env.plot_state, fps=trained.env.fps) as encoder:
-            for state in states(env, policy, cfg):
-                encoder(state)
-        encoder.save(place)
-    except (RuntimeError, OSError) as error:
-        raise UserError(
-            f"The video {place} could not be made: {str(error).splitlines()[0]}"
-        ) from error
+        film(env, policy, place, cfg.steps, cfg.greedy, cfg.seed)
+    except Exception as error:  # a video is the last thing that a run should fail for
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise UserError(f"The video {place} could not be made: {reason}") from error
     say(f"Filmed {cfg.steps} steps: {place}")
     return place
 
 
 @torch.no_grad()
-def states(env, policy, cfg):
-    """The environment's state after each of `cfg.steps` steps."""
-    generator = torch.Generator(env.device).manual_seed(cfg.seed)
-    world, memory = env.reset(), policy.initial(env.n_agents, env.device)
-    for _ in range(cfg.steps):
-        yield env.state(0)
-        decision, memory = policy(world, memory, sample=not cfg.greedy, generator=generator)
-        world = env.step(decision)
+def film(
+    env: Any, policy: Any, path: str | Path, steps: int, greedy: bool = False, seed: int = 1
+) -> Path:
+    """Films environment 0 of `env` for some steps from its reset, each a frame, at the
+    environment's own frames per second. Returns the path of the mp4.
+
+    ValueError for another kind of file; RuntimeError that names the first frame that failed.
+    """
+    from megastep.recording import ParallelEncoder
+
+    generator = torch.Generator(env.device).manual_seed(seed)
+    with ParallelEncoder(env.plot_state, fps=env.fps) as encoder:
+        world, memory = env.reset(), policy.initial(env.n_envs * env.n_agents, env.device)
+        for _ in range(steps):
+            encoder(env.state(0))
+            decision, memory = policy(world, memory, sample=not greedy, generator=generator)
+            world = env.step(decision)
+    return encoder.save(path)
 
 
 def main(argv=None):

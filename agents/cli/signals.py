@@ -10,9 +10,10 @@ from agents.cli.console import say
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class Interrupted(Exception):
+class Interrupted(BaseException):
     """A signal stopped the work; the message says what is saved and how to go on. The exit code is
-    128 + `number`.
+    128 + `number`. Like KeyboardInterrupt no Exception, so that what handles the errors of a video
+    or a job lets it pass.
     """
 
     def __init__(self, number, message):

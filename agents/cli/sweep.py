@@ -8,7 +8,6 @@ from pathlib import Path
 from agents.cli import run_folders
 from agents.cli.console import say, table
 from agents.cli.errors import UserError
-from agents.cli.signals import Interrupted
 
 
 def sweep(run, overrides, settings):
@@ -26,8 +25,6 @@ def sweep(run, overrides, settings):
         try:
             result = run(job)
             state = "done"
-        except Interrupted:
-            raise
         except Exception as error:  # whatever it is, the other jobs are worth running
             reason = (
                 str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
