@@ -77,8 +77,9 @@ def wall_textures(widths, random):
     )
     wall = np.repeat(np.arange(n), widths)
     along = (np.arange(len(wall)) - (widths.cumsum() - widths)[wall] + 0.5) * TEXEL
-    striped = (along / period[wall] + phase[wall]) % 1 < share[wall]
-    return np.where(striped[:, None], stripe[wall], base[wall]).astype(np.float32)
+    turns = along / period[wall] + phase[wall]
+    striped = turns - np.floor(turns) < share[wall]
+    return np.concatenate([base, stripe]).astype(np.float32)[wall + n * striped]
 
 
 def _near_together(walls):
