@@ -12,6 +12,7 @@ import importlib
 _MODULES = (
     "arrdict",
     "capture",
+    "contract",
     "core",
     "cubicasa",
     "cuda",

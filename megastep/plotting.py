@@ -9,7 +9,11 @@ pyplot figure, which notebooks show; :func:`panels` makes a figure that pyplot k
 A agents, C channels, H and W rows and columns, L lines, K lights, R rays.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .colour import gamma_decode, gamma_encode
 
@@ -17,6 +21,7 @@ __all__ = [
     "gamma_decode",
     "gamma_encode",
     "panels",
+    "plot_bars",
     "plot_images",
     "plot_lines",
     "plot_scenery",
@@ -127,6 +132,23 @@ def _plot_image(ax, image, title, aspect):
     ax.set_xlabel("pixel, from left to right", fontsize="x-small", labelpad=1)
     ax.tick_params(labelsize="x-small")
     ax.set_yticks([])
+
+
+def plot_bars(names: Sequence[str], values: ArrayLike, ax: Any = None) -> Any:
+    """Draws named numbers between -1 and 1 as bars: ``values`` (A, len(names)), a group per agent.
+    Returns the axes, those given or of a new figure.
+    """
+    if ax is None:
+        from matplotlib import pyplot
+
+        ax = pyplot.subplots(figsize=(3, 1.5), layout="constrained")[1]
+    values = np.asarray(values, np.float32).reshape(-1, len(names))
+    width = 0.8 / len(values)
+    for a, row in enumerate(values):
+        ax.bar(np.arange(len(names)) + width * (a - (len(values) - 1) / 2), row, width)
+    ax.set_xticks(np.arange(len(names)), names, fontsize="x-small")
+    ax.set_ylim(-1, 1)
+    return ax
 
 
 def plot_lines(ax, lines, colours, seen=None, exposure=EXPOSURE, width=2.5):

@@ -11,7 +11,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from unittest import mock
 
 import torch
 from counters import counters
@@ -29,23 +28,6 @@ FRESH = 3  # samples of what takes a process each
 BUDGETS = 60, 240  # seconds of training
 
 
-FOUND = {}  # id of a home -> the home, its spawn points
-
-
-def searched_once():
-    """Within it a home's spawn points are searched for once: 512 homes take seconds, and all sizes
-    have the same.
-    """
-    search = modules._spawn_points
-
-    def recalled(home, *how):
-        if id(home) not in FOUND:
-            FOUND[id(home)] = home, search(home, *how)
-        return FOUND[id(home)][1]
-
-    return mock.patch.object(modules, "_spawn_points", recalled)
-
-
 def random_actions(n_envs, n_agents, device, turns=TURNS):
     return [
         arrdict.arrdict(actions=torch.randint(7, (n_envs, n_agents), device=device))
@@ -57,8 +39,7 @@ def stepper(name, n_envs, device, turns=TURNS):
     """An environment that has been walked about in, and a function that takes its next step,
     captured on a GPU.
     """
-    with searched_once():
-        env = capture.Captured(envs.ENVS[name](n_envs, sample("bench", HOMES), device=device))
+    env = capture.Captured(envs.ENVS[name](n_envs, sample("bench", HOMES), device=device))
     actions = itertools.cycle(random_actions(n_envs, 1, device, turns))
     env.reset()
     for _ in range(WARM_UP):
@@ -72,8 +53,7 @@ def four_agents(n_envs, device):
     """
     homes = sample("bench", HOMES)
     c = core.Core(scene.scenery(homes, 4, n_envs=n_envs, device=device), res=512, fov=70)
-    with searched_once():
-        modules.RandomSpawns(homes, c)(c.agent_full(True))
+    modules.RandomSpawns(homes, c)(c.agent_full(True))
     movement, actions = modules.MomentumMovement(c), random_actions(n_envs, 4, device)
     for i in range(WARM_UP):
         movement(actions[i % TURNS])

@@ -62,7 +62,7 @@ def test_the_walk_finds_tensors_and_generators_by_path():
         ".core.scenery.layout",
         ".seen",
         ".spawner.counts",
-        ".ended",
+        ".lifecycle.ended",
     } <= set(paths)
 
 
@@ -242,10 +242,10 @@ class TestOnTheGPU:
     def test_warming_up_does_not_advance_the_environment(self):
         env = envs.Explorer(8, device="cuda")
         env.reset()
-        counts, lengths = env.spawner.counts.clone(), env.length.clone()
+        counts, ages = env.spawner.counts.clone(), env.lifecycle.ages.clone()
         captured = capture.Captured(env)
         captured.step(arrdict.arrdict(actions=torch.zeros((8, 1), dtype=torch.long, device="cuda")))
-        assert torch.equal(env.spawner.counts, counts) and torch.equal(env.length, lengths + 1)
+        assert torch.equal(env.spawner.counts, counts) and torch.equal(env.lifecycle.ages, ages + 1)
 
     def test_a_captured_step_allocates_nothing(self):
         env = capture.Captured(envs.Explorer(64, device="cuda"))

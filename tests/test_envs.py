@@ -1,11 +1,11 @@
 """Every environment against the world contract, and the rules of each."""
 
-import contract
 import numpy as np
 import pytest
 import torch
 
-from megastep import arrdict, capture, envs, plotting, spaces, toys
+from megastep import arrdict, capture, contract, envs, plotting, spaces, toys
+from megastep.engine import EngineError
 from megastep.geometries import sample
 
 GPU = torch.cuda.is_available()
@@ -41,10 +41,14 @@ def test_contract(name, device):
 
 class Fake:
     """The smallest environment: episodes of three steps, observing how old they are. ``fault``
-    breaks a clause " "of the contract."""
+    breaks a clause of the contract.
+    """
 
-    n_envs, n_agents, device = 2, 1, "cpu"
+    n_envs, n_agents, device, fps = 2, 1, "cpu", 10.0
     obs_space, action_space = spaces.MultiVector(1, 1), spaces.MultiDiscrete(1, 2)
+
+    def check(self):
+        pass
 
     def __init__(self, fault=None):
         self.fault, self.age = fault, torch.tensor([0, 1])
@@ -85,6 +89,33 @@ class Fake:
 
 def test_the_checker_accepts_a_world_that_keeps_the_contract():
     contract.rollout(Fake(), 9)
+
+
+@pytest.mark.parametrize("name", contract.ATTRIBUTES)
+def test_the_checker_names_what_an_environment_lacks(name):
+    class Lacking:
+        def __getattr__(self, asked):
+            if asked == name:
+                raise AttributeError(asked)
+            return getattr(Fake(), asked)
+
+    with pytest.raises(AssertionError, match=f"Lacking has no {name}: {contract.ATTRIBUTES[name]}"):
+        contract.check_environment(Lacking())
+
+
+@pytest.mark.parametrize(
+    "name, value, clause",
+    [
+        ("fps", 0, "fps is a positive number of steps per second, not 0"),
+        ("layout", torch.zeros(3, dtype=torch.int32), "layout has one integer per environment"),
+        ("layout", torch.zeros(2), "layout has one integer per environment"),
+    ],
+)
+def test_the_checker_names_an_attribute_that_is_wrong(name, value, clause):
+    env = Fake()
+    setattr(env, name, value)
+    with pytest.raises(AssertionError, match=clause):
+        contract.check_environment(env)
 
 
 @pytest.mark.parametrize(
@@ -184,7 +215,7 @@ def test_explorer_truncates_when_its_length_reaches_what_it_has_seen_and_its_pat
 
 def test_explorer_pays_once_for_each_texel():
     """Turning on the spot in an empty box: after a full turn everything has been seen, and all pay
-    adds up to " "what the first view did not show."""
+    adds up to what the first view did not show."""
     env = envs.Explorer(1, [toys.box()], device="cpu", res=1024, subsample=16)
     env.reset()
     first, paid = int(env.n_seen), 0.0
@@ -193,6 +224,38 @@ def test_explorer_pays_once_for_each_texel():
         paid += float(env.step(turn).reward)
     assert round(64 * paid) == 400 - first, "four walls of 5 m, 5 cm a texel"
     assert not any(float(env.step(turn).reward) for _ in range(30))
+
+
+@pytest.mark.parametrize("name", envs.ENVS)
+def test_check_raises_what_the_device_has_flagged(name, device):
+    env = make(name, device)
+    env.reset()
+    env.check()
+    if device == "cpu":  # whose operations look at once, so the flag is set by hand
+        env.core.agents.error_flag.fill_(-1)
+    else:
+        env.step(arrdict.arrdict(actions=torch.full((12, 1), 7, device=device)))
+    with pytest.raises(EngineError, match="environment .* none of its action space"):
+        env.check()
+    env.check()
+
+
+@pytest.mark.parametrize("name", envs.ENVS)
+def test_star_imports_bring_the_environment_and_no_more(name):
+    found = {"arrdict": arrdict}
+    exec(f"from megastep.envs.{name} import *", found)
+    assert found.keys() - {"__builtins__"} == {"arrdict", envs.ENVS[name].__name__}
+    assert found["arrdict"] is arrdict
+
+
+@pytest.mark.parametrize("name", envs.ENVS)
+def test_an_environment_is_displayed_as_it_is(name):
+    env = make(name)
+    env.reset()
+    figure = env.display(3)
+    drawn = type(env).plot_state(arrdict.numpyify(env.state(3)))
+    assert (plotting.rasterise(figure) == plotting.rasterise(drawn)).all()
+    assert figure.axes[0].get_title().startswith("step 0")
 
 
 def test_explorer_state_counts_what_the_bitmap_holds():

@@ -19,7 +19,7 @@ SOURCES = sorted(
 LAYERS = (
     ("dotdict", "colour", "spaces", "ragged", "state"),
     ("arrdict",),
-    ("geometry", "capture", "plotting", "kernels"),
+    ("geometry", "capture", "contract", "plotting", "kernels"),
     ("geometries", "scenery", "recording"),
     ("engine", "toys", "cubicasa"),
     ("scene",),

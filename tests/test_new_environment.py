@@ -1,23 +1,26 @@
 """The code of docs/new-environment.md, run in order, and what its text promises of it."""
 
+import importlib.util
 import re
 from pathlib import Path
 
-import contract
 import pytest
 import torch
 
-from megastep import arrdict, capture, plotting
+from megastep import arrdict, capture, contract, plotting
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "new-environment.md"
 
 
 @pytest.fixture(scope="module")
-def names():
-    """What the page's code defines."""
-    found = {}
-    for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S):
-        exec(compile(block, str(PAGE), "exec"), found)
+def names(tmp_path_factory):
+    """What the page's code defines, run in a folder of its own; without PyAV it is not filmed."""
+    found = {"__name__": "__main__", "folder": tmp_path_factory.mktemp("page")}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(found["folder"])
+        for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S):
+            if "record.film" not in block or importlib.util.find_spec("av"):
+                exec(compile(block, str(PAGE), "exec"), found)
     return found
 
 
@@ -37,10 +40,17 @@ def test_rover_pays_metres_and_ends_at_walls(names):
     assert max(float(w.reward.max()) for w in worlds) < 0.5, "at most 4 m/s, a tenth of a second"
 
 
-def test_rover_is_drawn(names):
+def test_rover_is_displayed(names):
     env = names["Rover"](n_envs=2, device="cpu")
     env.reset()
-    assert plotting.rasterise(env.plot_state(arrdict.numpyify(env.state(1)))).std() > 5
+    assert plotting.rasterise(env.display(1)).std() > 5
+
+
+def test_rover_is_filmed_at_its_own_rate(names):
+    av = pytest.importorskip("av")
+    with av.open(str(names["folder"] / "rover.mp4")) as container:
+        video = container.streams.video[0]
+        assert (video.frames, video.average_rate) == (20, 10)
 
 
 @pytest.mark.cuda

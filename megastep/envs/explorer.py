@@ -1,15 +1,23 @@
-"""Explorer: see as much of a home as you can."""
+"""Explorer: see as much of a home as you can.
+
+N environments of one agent, so N lanes.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 
 from .. import engine, modules, plotting, spaces
 from .. import geometries as sources
-from ..arrdict import arrdict
+from ..arrdict import arrdict, numpyify
 from ..core import Core
 from ..dotdict import dotdict
 from ..scene import scenery
 
-TEXELS_A_POINT = 64  # newly seen texels that earn a reward of 1
+__all__ = ["Explorer"]
+
+TEXELS_PER_POINT = 64  # newly seen texels that earn a reward of 1
 PATIENCE = 200  # steps an episode lasts beyond one for each texel seen
 
 
@@ -22,33 +30,30 @@ class Explorer:
     number of texels seen, the first view's included, + 200.
 
     Args: ``geometries`` to live in, generated homes by default; ``res`` rays and ``subsample`` rays
-    a pixel; ``fov`` degrees; ``patience`` steps; ``resample``, every episode in a home drawn anew,
-    instead of one home a world for ever.
+    per pixel; ``fov`` degrees; ``fps`` steps per second; ``patience`` steps; ``resample``: every
+    episode in a home drawn anew, instead of one home per environment for ever.
     """
 
     n_agents = 1
 
     def __init__(
         self,
-        n_envs=128,
-        geometries=None,
+        n_envs: int = 128,
+        geometries: Sequence[Any] | None = None,
         *,
-        seed=1,
-        device=None,
-        res=256,
-        subsample=4,
-        fov=130.0,
-        fps=10.0,
-        patience=PATIENCE,
-        resample=False,
+        seed: int = 1,
+        device: torch.device | str | None = None,
+        res: int = 256,
+        subsample: int = 4,
+        fov: float = 130.0,
+        fps: float = 10.0,
+        patience: int = PATIENCE,
+        resample: bool = False,
     ):
         if patience < 1:
             raise ValueError(f"patience must be at least one step, but {patience} was given")
-        geometries = (
-            sources.sample("homes", min(n_envs, 512), seed=seed)
-            if geometries is None
-            else geometries
-        )
+        if geometries is None:
+            geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
         geometries = geometries if resample else geometries[:n_envs]
         self.core = Core(
             scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
@@ -57,14 +62,11 @@ class Explorer:
             fps,
             seed=seed,
         )
-        self.n_envs, self.device, self.subsample, self.patience = (
-            n_envs,
-            self.core.device,
-            subsample,
-            patience,
-        )
+        self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
+        self.subsample, self.patience = subsample, patience
         self.spawner = modules.RandomSpawns(geometries, self.core, resample=resample)
         self.movement = modules.MomentumMovement(self.core)
+        self.lifecycle = modules.Lifecycle(self.core)
         pixels = modules.RGB(self.core, subsample).space.W
         self.obs_space = dotdict(
             rgb=spaces.MultiImage(1, 3, 1, pixels),
@@ -75,67 +77,66 @@ class Explorer:
         words = -(-self.core.scenery.layouts.max_texels // 32)
         engine.fit(n_envs, 4 * words + 8 * pixels + 64, self.device)
         self.seen = torch.zeros((n_envs, 1, words), dtype=torch.int32, device=self.device)
-        self.length = torch.zeros(n_envs, dtype=torch.int32, device=self.device)
-        self.left = torch.zeros(
-            n_envs, dtype=torch.int32, device=self.device
-        )  # steps, if nothing new is seen
-        self.ended = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
-        self._never = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
 
-    def reset(self):
+    def reset(self) -> arrdict:
         """Starts every episode anew. Returns a world."""
-        return self._observe(torch.ones_like(self.ended))
+        return self._world(self.lifecycle.start_all())
 
-    def step(self, decision):
+    def step(self, decision: Mapping) -> arrdict:
         """One step by ``decision.actions`` (B, 1). Returns a world."""
         self.movement(decision)
-        return self._observe(self.ended.clone())
+        return self._world(self.lifecycle.start_ended())
 
-    def _observe(self, reset):
+    def _world(self, reset):
         self.spawner(reset)
-        obs, newly_seen = self._look(seen=self.seen, clear_mask=reset[:, None])
-        self.length.add_(1).masked_fill_(reset, 0)
-        self.left.sub_(1).masked_fill_(reset, self.patience).add_(newly_seen)
-        torch.le(self.left, 0, out=self.ended)
-        reward = (newly_seen / TEXELS_A_POINT).masked_fill_(reset, 0.0)
-        return arrdict(
-            obs=obs, reward=reward, reset=reset, terminal=self._never, truncated=self.ended.clone()
-        )
+        clear_mask = modules.to_agents(reset, self.n_agents)
+        obs, newly_seen = self._observation(seen=self.seen, clear_mask=clear_mask)
+        self.lifecycle.limits.masked_fill_(reset, self.patience).add_(newly_seen)
+        reward = (newly_seen / TEXELS_PER_POINT).masked_fill_(reset, 0.0)
+        return arrdict(obs=obs, reward=reward, **self.lifecycle(reset))
 
     @property
-    def n_seen(self):
-        """(N,) texels seen in this episode."""
-        return self.left - self.patience + self.length
+    def n_seen(self) -> torch.Tensor:
+        """(N,) int32: texels seen in this episode."""
+        return self.lifecycle.limits - self.patience
 
-    def _look(self, **seen):
+    def _observation(self, **seen):
         """The observation, and if ``seen`` is given how many texels were new (N,)."""
         view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True, **seen)
-        pictures = {"rgb": view.rgb, "d": view.depth, "imu": view.imu}
+        parts = {"rgb": view.rgb, "d": view.depth, "imu": view.imu}
         obs = arrdict(
             {
-                key: pictures[key].view(self.n_envs, *space.shape)
+                key: parts[key].view(self.n_envs, *space.shape)
                 for key, space in self.obs_space.items()
             }
         )
-        return obs, view.newly_seen[:, 0] if seen else None
+        return obs, modules.to_lanes(view.newly_seen) if seen else None
+
+    def check(self) -> None:
+        """EngineError if the engine has flagged an error since the last check. Waits for the
+        device, so not for inside a step.
+        """
+        engine.check(self.core.agents)
 
     @property
     def layout(self) -> torch.Tensor:
         """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
         return self.core.scenery.layout
 
-    def state(self, e=0):
-        """What :meth:`plot_state` draws of world ``e``."""
+    def state(self, e: int = 0) -> arrdict:
+        """What :meth:`plot_state` draws of environment ``e``."""
         return arrdict(
             core=self.core.state(e),
-            obs=self._look()[0][e],
+            obs=self._observation()[0][e],
             seen=self._seen_texels(e),
-            length=self.length[e].clone(),
             n_seen=self.n_seen[e].clone(),
+            lifecycle=self.lifecycle.state(e),
         )
 
     def _seen_texels(self, e):
-        """(T,) bool: which of the static texels of world ``e`` have been seen in this episode."""
+        """(T,) bool: which of the static texels of environment ``e`` have been seen in this
+        episode.
+        """
         bits = (
             self.seen[e, 0, :, None] >> torch.arange(32, dtype=torch.int32, device=self.device) & 1
         )
@@ -144,16 +145,20 @@ class Explorer:
         return bits.flatten()[: last - first].bool()
 
     @classmethod
-    def plot_state(cls, state):
+    def plot_state(cls, state: arrdict) -> Any:
         """A matplotlib figure of a numpyified :meth:`state`: the plan, bright where it has been
         seen, and what the agent sees.
         """
+        steps, n_texels = state.lifecycle.age[0], len(state.seen)
         figure, plan, strips = plotting.panels(
-            2, title=f"step {state.length}, {state.n_seen} of {len(state.seen)} texels seen"
+            2, title=f"step {steps}, {state.n_seen} of {n_texels} texels seen"
         )
         distances = engine.AGENT_RADIUS + 10 * (1 - state.obs.d[0].astype("float32"))
         Core.plot_state(state.core, plan, seen=state.seen, distances=distances)
-        plotting.plot_images(
-            {"rgb": state.obs.rgb, "depth": state.obs.d}, aspect=plotting.STRIP, axes=strips
-        )
+        modules.RGB.plot_state(state.obs.rgb, strips[:1])
+        modules.Depth.plot_state(state.obs.d, strips[1:])
         return figure
+
+    def display(self, e: int = 0) -> Any:
+        """Environment ``e`` as it is now, as a matplotlib figure."""
+        return self.plot_state(numpyify(self.state(e)))

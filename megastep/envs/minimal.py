@@ -1,35 +1,43 @@
-"""Minimal: an agent that moves and sees. Nothing is rewarded; episodes end at a random lifespan."""
+"""Minimal: an agent that moves and sees. Nothing is rewarded; episodes end at a random lifespan.
+
+N environments of one agent, so N lanes.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 
 from .. import engine, modules, plotting, toys
-from ..arrdict import arrdict
+from ..arrdict import arrdict, numpyify
 from ..core import Core
 from ..scene import scenery
 
+__all__ = ["Minimal"]
+
 
 class Minimal:
-    """Seed of every other environment: RGB of 64 pixels, seven actions, no reward, truncated after
-    a random 128 to 256 steps.
+    """The environment to start others from: RGB of 64 pixels, seven actions, no reward, truncated
+    after a random 128 to 256 steps.
 
-    Args: ``geometries`` to live in, boxes by default; ``res`` rays; ``fov`` degrees; ``shortest``
-    and ``longest`` lifespan in steps.
+    Args: ``geometries`` to live in, boxes by default; ``res`` rays; ``fov`` degrees; ``fps`` steps
+    per second; ``shortest`` and ``longest`` lifespan in steps.
     """
 
     n_agents = 1
 
     def __init__(
         self,
-        n_envs=128,
-        geometries=None,
+        n_envs: int = 128,
+        geometries: Sequence[Any] | None = None,
         *,
-        seed=1,
-        device=None,
-        res=64,
-        fov=130.0,
-        fps=10.0,
-        shortest=128,
-        longest=256,
+        seed: int = 1,
+        device: torch.device | str | None = None,
+        res: int = 64,
+        fov: float = 130.0,
+        fps: float = 10.0,
+        shortest: int = 128,
+        longest: int = 256,
     ):
         geometries = [toys.box()] if geometries is None else geometries[:n_envs]
         self.core = Core(
@@ -39,56 +47,59 @@ class Minimal:
             fps=fps,
             seed=seed,
         )
-        self.n_envs, self.device = self.core.n_envs, self.core.device
+        self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.spawner = modules.RandomSpawns(geometries, self.core)
-        self.lifespans = modules.RandomLifespans(self.core, shortest, longest)
         self.movement = modules.SimpleMovement(self.core)
+        self.lifecycle = modules.Lifecycle(
+            self.core, modules.RandomLifespans(self.core, shortest, longest)
+        )
         self.obs_space = modules.RGB(self.core).space
         self.action_space = self.movement.space
-        self.ended = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
         self._reward = torch.zeros(n_envs, device=self.device)
 
-    def reset(self):
+    def reset(self) -> arrdict:
         """Starts every episode anew. Returns a world."""
-        return self._observe(torch.ones_like(self.ended))
+        return self._world(self.lifecycle.start_all())
 
-    def step(self, decision):
+    def step(self, decision: Mapping) -> arrdict:
         """One step by ``decision.actions`` (B, 1). Returns a world."""
         self.movement(decision)
-        return self._observe(self.ended.clone())
+        return self._world(self.lifecycle.start_ended())
 
-    def _observe(self, reset):
+    def _world(self, reset):
         self.spawner(reset)
-        self.ended.copy_(self.lifespans(reset) & ~reset)
-        return arrdict(
-            obs=self._look(),
-            reward=self._reward.clone(),
-            reset=reset,
-            terminal=torch.zeros_like(reset),
-            truncated=self.ended.clone(),
-        )
+        return arrdict(obs=self._rgb(), reward=self._reward.clone(), **self.lifecycle(reset))
 
-    def _look(self):
+    def _rgb(self):
         view = engine.observe(self.core.scenery, self.core.agents, depth=False)
         return view.rgb.view(self.n_envs, *self.obs_space.shape)
+
+    def check(self) -> None:
+        """EngineError if the engine has flagged an error since the last check. Waits for the
+        device, so not for inside a step.
+        """
+        engine.check(self.core.agents)
 
     @property
     def layout(self) -> torch.Tensor:
         """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
         return self.core.scenery.layout
 
-    def state(self, e=0):
-        """What :meth:`plot_state` draws of world ``e``."""
+    def state(self, e: int = 0) -> arrdict:
+        """What :meth:`plot_state` draws of environment ``e``."""
         return arrdict(
-            core=self.core.state(e), obs=self._look()[e], lifespans=self.lifespans.state(e)
+            core=self.core.state(e), rgb=self._rgb()[e], lifecycle=self.lifecycle.state(e)
         )
 
     @classmethod
-    def plot_state(cls, state):
+    def plot_state(cls, state: arrdict) -> Any:
         """A matplotlib figure of a numpyified :meth:`state`: the plan, and what the agent sees."""
-        figure, plan, strips = plotting.panels(
-            1, title=f"step {state.lifespans.age} of {state.lifespans.lifespan}"
-        )
+        life = state.lifecycle
+        figure, plan, strips = plotting.panels(1, title=f"step {life.age[0]} of {life.limit[0]}")
         Core.plot_state(state.core, plan)
-        plotting.plot_images({"rgb": state.obs}, aspect=plotting.STRIP, axes=strips)
+        modules.RGB.plot_state(state.rgb, strips)
         return figure
+
+    def display(self, e: int = 0) -> Any:
+        """Environment ``e`` as it is now, as a matplotlib figure."""
+        return self.plot_state(numpyify(self.state(e)))

@@ -1,0 +1,30 @@
+"""What environments are made of: movement, sensors, spawning, the lifecycle of episodes. Callables
+with a ``.space`` where there is one to declare.
+"""
+
+from .lanes import to_agents, to_lanes
+from .lifecycle import Lifecycle, RandomLifespans, RandomStream
+from .movement import MOVES, TURNS, MomentumMovement, SimpleMovement, to_global, to_local
+from .sensors import IMU, RGB, Depth, downsample, render
+from .spawning import RandomSpawns, spawn_points
+
+__all__ = [
+    "IMU",
+    "MOVES",
+    "RGB",
+    "TURNS",
+    "Depth",
+    "Lifecycle",
+    "MomentumMovement",
+    "RandomLifespans",
+    "RandomSpawns",
+    "RandomStream",
+    "SimpleMovement",
+    "downsample",
+    "render",
+    "spawn_points",
+    "to_agents",
+    "to_global",
+    "to_lanes",
+    "to_local",
+]
