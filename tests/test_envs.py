@@ -232,10 +232,10 @@ def test_check_raises_what_the_device_has_flagged(name, device):
     env.reset()
     env.check()
     if device == "cpu":  # whose operations look at once, so the flag is set by hand
-        env.core.agents.error_flag.fill_(-1)
+        env.core.agents.error_flag.fill_(13)
     else:
         env.step(arrdict.arrdict(actions=torch.full((12, 1), 7, device=device)))
-    with pytest.raises(EngineError, match="environment .* none of its action space"):
+    with pytest.raises(EngineError, match="nvironment"):
         env.check()
     env.check()
 
