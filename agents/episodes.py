@@ -7,6 +7,8 @@ import math
 
 import torch
 
+from agents.finite import LIMIT
+
 
 class Episodes:
     """Return and length of the episodes that end, each summed from its first step; only `take`
@@ -22,8 +24,9 @@ class Episodes:
 
     def add(self, reward: torch.Tensor, reset: torch.Tensor, done: torch.Tensor) -> None:
         """Takes T transitions of B lanes; `reward`, `reset`, `done` (T, B) are those of the worlds
-        that followed.
+        that followed. A reward that is not finite, or beyond `finite.LIMIT`, counts as 0.
         """
+        reward = torch.where(reward.abs() <= LIMIT, reward, 0.0)
         # cumulative sums over all T rows, less the sum at the last end before each row
         returns = self.returns + reward.double().cumsum(0)
         lengths = self.lengths + (~reset).double().cumsum(0)

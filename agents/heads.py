@@ -1,19 +1,19 @@
-"""Network layers made from spaces: intakes turn observations into a vector, outputs turn a vector
-into actions.
+"""Network layers made from spaces: an *intake* turns observations into a vector, an output turns a
+vector into actions.
 
-Axes: `...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A the agents one lane
-controls.
+Axes: `...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A the agents that one
+lane controls.
 
-    intake = heads.intake(env.obs_space, width)        # (..., A, C, H, W) and (..., A, D)  ->
-    (..., width) output = heads.output(env.action_space, width)     # (..., width)  ->
-    log-probabilities (..., A, n) logits = nn.Sequential(intake, output)(world.obs)
-    actions = output.sample(logits)                    # (..., A) whole numbers
+    intake = heads.intake(env.obs_space, width)     # (..., A, C, H, W), (..., A, D) -> (..., width)
+    output = heads.output(env.action_space, width)  # (..., width) -> log-probabilities (..., A, n)
+    logits = nn.Sequential(intake, output)(world.obs)
+    actions = output.sample(logits)                 # (..., A) integers
 
-Nested dicts of spaces give nested dicts of logits and actions. Nothing here asks the GPU a
-question.
+Nested dicts of spaces give nested dicts of logits and actions. Nothing here synchronises.
 """
 
 import math
+from typing import Any
 
 import torch
 from torch import nn
@@ -22,7 +22,7 @@ from torch.nn import functional as F
 from megastep import spaces
 from megastep.arrdict import arrdict
 
-_TINY = 1e-20  # below the smallest exponential draw that float32 makes, and far from its underflow
+_TINY = 1e-20  # below the smallest exponential number that float32 gives, far from underflow
 
 
 def compute_dtype(weight):
@@ -34,51 +34,56 @@ def compute_dtype(weight):
 
 
 class RunningNorm(nn.Module):
-    """Pictures less their channels' running mean, over their running deviation; vectors likewise,
-    number by number.
+    """Images less their channels' running mean, over their running standard deviation; vectors
+    likewise, number by number.
 
-    A picture's numbers may well be .87 plus or minus .1, of which a network that starts at random
-    sees mostly the .87.
+    An image's numbers may well be .87 plus or minus .1, of which a network with its first weights
+    would see mostly the .87.
     """
 
-    def __init__(self, space, least_scale=1e-2):
+    def __init__(self, space: Any, min_scale: float = 1e-2):
         super().__init__()
-        is_picture = isinstance(space, spaces.MultiImage)
-        shape = (*space.shape[:2], 1, 1) if is_picture else space.shape
-        self.pooled = (0, -2, -1) if is_picture else (0,)
-        self.least_scale = (
-            least_scale  # what varies less than this is not worth looking at more closely
-        )
+        is_image = isinstance(space, spaces.MultiImage)
+        shape = (*space.shape[:2], 1, 1) if is_image else space.shape
+        self.pooled = (0, -2, -1) if is_image else (0,)
+        self.min_scale = min_scale  # what varies less than this is not enlarged any further
         self.register_buffer("mean", torch.zeros(shape))
         self.register_buffer("scale", torch.ones(shape))
         self.register_buffer("count", torch.tensor(0.0))
 
-    def forward(self, obs):
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return (obs - self.mean) / self.scale
 
     @torch.no_grad()
-    def update_stats(self, obs):
-        """Takes observations (B, ...) into account, the n-th call with weight 1/n."""
-        self.count += 1
-        spread, seen = torch.var_mean(obs.float(), self.pooled, correction=0, keepdim=True)
-        mean, variance = _moments(
-            self.mean, self.scale.square(), seen[0], spread[0], 1 / self.count
-        )
-        self.mean.copy_(mean)
-        self.scale.copy_(variance.sqrt().clamp(min=self.least_scale))
+    def update_stats(self, obs: torch.Tensor, is_fine: torch.Tensor | bool = True) -> None:
+        """Takes observations (B, ...) into account, the n-th call with weight 1/n. Changes nothing
+        unless `is_fine`, or if a mean or variance of them is not finite.
+        """
+        variance, mean = torch.var_mean(obs.float(), self.pooled, correction=0, keepdim=True)
+        count = self.count + 1
+        mean, scale = _mixed(self, mean[0], variance[0], 1 / count)
+        is_fine = is_fine & (mean + scale).isfinite().all()
+        _store(is_fine, [(self.mean, mean), (self.scale, scale), (self.count, count)])
 
 
-def _moments(mean, variance, seen, spread, rate):
-    """Mean and variance of a mixture: what they were, with weight 1 - rate, and what was seen now,
-    with weight rate.
+def _mixed(norm, mean, variance, rate):
+    """The mean and scale of a mixture: a norm's own with weight 1 - rate, and another mean and
+    variance with weight rate.
     """
-    return mean.lerp(seen, rate), variance.lerp(spread, rate) + rate * (1 - rate) * (
-        seen - mean
-    ).square()
+    own = norm.scale.square()
+    spread = rate * (1 - rate) * (mean - norm.mean).square()
+    variance = own.lerp(variance, rate) + spread
+    return norm.mean.lerp(mean, rate), variance.sqrt().clamp(min=norm.min_scale)
+
+
+def _store(is_taken, pairs):
+    """Gives tensors their new values in place, or, unless `is_taken`, leaves every bit as it is."""
+    for old, new in pairs:
+        old.copy_(torch.where(is_taken, new, old))
 
 
 class Flat(nn.Module):
-    """A vector or a picture as it is, unrolled: (..., *shape) -> (..., n_features)."""
+    """A vector or an image as it is, unrolled: (..., *shape) -> (..., n_features)."""
 
     def __init__(self, space):
         super().__init__()
@@ -90,7 +95,7 @@ class Flat(nn.Module):
 
 
 class OneHot(nn.Module):
-    """Whole numbers as indicators: (..., A) -> (..., A n)."""
+    """Integers as indicators: (..., A) -> (..., A n)."""
 
     def __init__(self, space):
         super().__init__()
@@ -102,10 +107,10 @@ class OneHot(nn.Module):
 
 
 class Conv(nn.Module):
-    """A picture through two convolutions along its rows: (..., A, C, H, W) -> (..., n_features).
+    """An image through two convolutions along its rows: (..., A, C, H, W) -> (..., n_features).
 
-    The picture's rows count as channels, since pictures here are one pixel high or a few. Agents
-    share the weights.
+    The image's rows count as channels, since images here are one pixel high or a few. Agents share
+    the weights.
     """
 
     def __init__(self, space, channels=32):
@@ -126,9 +131,9 @@ class Conv(nn.Module):
 ENCODERS = {"linear": Flat, "conv": Conv}
 
 
-def _encoder(space, pictures, path):
+def _encoder(space, of_images, path):
     if isinstance(space, spaces.MultiImage):
-        return ENCODERS[pictures](space)
+        return ENCODERS[of_images](space)
     if isinstance(space, spaces.MultiVector):
         return Flat(space)
     if isinstance(space, spaces.MultiDiscrete):
@@ -149,11 +154,12 @@ def _paths(space, path=()):
 
 
 class ConcatIntake(nn.Module):
-    """Encodes every leaf of an observation, joins what comes out, and projects it to one vector
-    (..., width), relu'd.
+    """Encodes every leaf of an observation, joins the features, and projects them to one vector
+    (..., width), rectified.
 
-    At the start every leaf has the same say, however many numbers it has: a weight's variance is 2
-    / (leaves x leaf's features), which keeps the vector's size that of the inputs (He et al. 2015).
+    At the start every leaf weighs the same, however many numbers it has: a weight's variance is
+    2 / (leaves x leaf's features), which keeps the vector's size that of the inputs (He et al.
+    2015).
     """
 
     def __init__(self, space, width, encoder="linear"):
@@ -162,7 +168,7 @@ class ConcatIntake(nn.Module):
             raise ValueError(f"encoder is {encoder!r}; it can be {' or '.join(ENCODERS)}")
         leaves = list(_paths(space))
         if not leaves:
-            raise ValueError(f"the observation space {space!r} has nothing in it to see")
+            raise ValueError(f"the observation space {space!r} has nothing in it to encode")
         self.paths = [path for path, _ in leaves]
         self.encoders = nn.ModuleList(
             _encoder(leaf, encoder, ".".join(path)) for path, leaf in leaves
@@ -184,11 +190,13 @@ class ConcatIntake(nn.Module):
         joined = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
         return F.relu(self.project(joined))
 
-    def update_stats(self, obs):
-        """Takes observations (B, ...) into account in how they are standardised from now on."""
+    def update_stats(self, obs: Any, is_fine: torch.Tensor | bool = True) -> None:
+        """Takes observations (B, ...) into account in how they are standardised from now on, if
+        `is_fine`.
+        """
         for leaf, norm, _ in self._leaves(obs):
             if isinstance(norm, RunningNorm):
-                norm.update_stats(leaf)
+                norm.update_stats(leaf, is_fine)
 
     def _leaves(self, obs):
         for path, norm, encoder in zip(self.paths, self.norms, self.encoders, strict=True):
@@ -198,12 +206,12 @@ class ConcatIntake(nn.Module):
             yield leaf, norm, encoder
 
 
-def intake(space, width, encoder="linear"):
+def intake(space: Any, width: int, encoder: str = "linear") -> ConcatIntake:
     """A module from observations of this space, or dict of spaces, to vectors (..., width).
 
-    Observations may be of any dtype; they are cast to the weights'. `encoder` says how pictures are
-    looked at: 'linear', as so many numbers, or 'conv', by convolutions. ValueError if the space is
-    of no known kind.
+    Observations may be of any dtype; they are cast to the weights'. `encoder` is that of images:
+    'linear', as so many numbers, or 'conv', by convolutions. ValueError if the space is of no known
+    kind.
     """
     return ConcatIntake(space, width, encoder)
 
@@ -229,8 +237,8 @@ class MultiDiscreteOutput(nn.Module):
         return scores.unflatten(-1, self.shape).log_softmax(-1)
 
     def sample(self, logits, generator=None):
-        """Draws actions: the maximum of log-probability plus Gumbel noise is distributed as
-        the probabilities.
+        """Samples actions: the maximum of log-probability plus Gumbel noise is distributed as the
+        probabilities.
         """
         noise = torch.empty_like(logits).exponential_(generator=generator).clamp_(min=_TINY).log_()
         return (logits - noise).argmax(-1)
@@ -271,9 +279,9 @@ class DictOutput(nn.Module):
         return sum(self._each(lambda key, child: child.entropy(logits[key])).values())
 
 
-def output(space, width):
+def output(space: Any, width: int) -> MultiDiscreteOutput | DictOutput:
     """A module from vectors (..., width) to logits of this action space, or dict of spaces, that
-    can also `sample` them, pick the likeliest (`greedy`) and tell `logprob` and `entropy`.
+    can also `sample` them, pick the likeliest (`greedy`) and compute `logprob` and `entropy`.
     ValueError if the space is of no known kind.
     """
     if isinstance(space, dict) and space:
@@ -289,39 +297,39 @@ def output(space, width):
 class ValueOutput(nn.Module):
     """The expected return, (..., width) -> (...,) float32, in units of reward.
 
-    The layer itself predicts returns less their running mean, over their running deviation, so that
-    its error is about 1 whatever an environment pays. `update_stats` moves mean and deviation and
-    corrects the layer so that no prediction changes (PopArt, van Hasselt et al. 2016).
+    The layer itself predicts returns less their running mean, over their running standard
+    deviation, so that its error is about 1 whatever an environment pays. `update_stats` moves both
+    and corrects the layer so that no prediction changes (PopArt, van Hasselt et al. 2016).
     """
 
-    def __init__(self, width, least_scale=1e-3):
+    def __init__(self, width: int, min_scale: float = 1e-3):
         super().__init__()
         self.core = nn.Linear(width, 1)
         nn.init.orthogonal_(self.core.weight, gain=0.1)
         nn.init.zeros_(self.core.bias)
-        self.least_scale = least_scale  # returns that vary less than this are taken for constant
+        self.min_scale = min_scale  # returns that vary less than this are taken for constant
         for name, start in dict(mean=0.0, scale=1.0, count=0.0).items():
             self.register_buffer(name, torch.tensor(start))
 
-    def forward(self, x):
-        return (
-            self.core(x.to(compute_dtype(self.core.weight))).float().squeeze(-1) * self.scale
-            + self.mean
-        )
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        predicted = self.core(x.to(compute_dtype(self.core.weight))).float().squeeze(-1)
+        return predicted * self.scale + self.mean
 
     @torch.no_grad()
-    def update_stats(self, targets, valid, rate=0.05):
-        """Takes returns (...,) into account where `valid`. The n-th call weighs max(rate, 1/n), 0
-        if nothing is.
+    def update_stats(
+        self, targets: torch.Tensor, valid: torch.Tensor, min_rate: float = 0.05
+    ) -> None:
+        """Takes returns (...,) into account where `valid`, the n-th call with weight
+        max(min_rate, 1/n). Changes nothing if none is, or if their mean or variance is not finite.
         """
         n_valid = valid.sum()
-        self.count += n_valid > 0
-        rate = (1 / self.count).clamp(min=rate, max=1.0) * (n_valid > 0)
-        seen = targets.masked_fill(~valid, 0.0).sum() / n_valid.clamp(min=1)
-        spread = (targets - seen).square().masked_fill(~valid, 0.0).sum() / n_valid.clamp(min=1)
-        mean, variance = _moments(self.mean, self.scale.square(), seen, spread, rate)
-        scale = variance.sqrt().clamp(min=self.least_scale)
-        self.core.weight.mul_(self.scale / scale)
-        self.core.bias.mul_(self.scale).add_(self.mean - mean).div_(scale)
-        self.mean.copy_(mean)
-        self.scale.copy_(scale)
+        n = n_valid.clamp(min=1)
+        mean = targets.masked_fill(~valid, 0.0).sum() / n
+        variance = (targets - mean).square().masked_fill(~valid, 0.0).sum() / n
+        count = self.count + 1
+        mean, scale = _mixed(self, mean, variance, (1 / count).clamp(min=min_rate, max=1.0))
+        weight = self.core.weight * (self.scale / scale)
+        bias = (self.core.bias * self.scale + (self.mean - mean)) / scale
+        is_taken = (n_valid > 0) & (mean + scale).isfinite()
+        old = self.core.weight, self.core.bias, self.mean, self.scale, self.count
+        _store(is_taken, zip(old, (weight, bias, mean, scale, count), strict=True))

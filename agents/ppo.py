@@ -1,14 +1,19 @@
 """Proximal policy optimisation (Schulman et al. 2017) for recurrent policies.
 
 Axes: T time, B lanes, M lanes of a minibatch. A minibatch is whole sequences of some lanes. Every
-mean is over valid steps. Nothing in an update asks the GPU a question: what would be an `if` is a
-flag on the device.
+mean is over valid steps. An update never synchronises: what would be an `if` is a flag on the
+device.
 """
+
+from typing import Any
 
 import torch
 
 from agents import returns
+from agents.adam import Adam
+from agents.finite import FiniteCheck
 from agents.random_stream import RandomStream
+from agents.rollout import Rollout
 from megastep.arrdict import arrdict
 
 _AVERAGED = ("policy", "value", "entropy", "kl", "clip_fraction", "grad_norm")
@@ -17,20 +22,22 @@ _AVERAGED = ("policy", "value", "entropy", "kl", "clip_fraction", "grad_norm")
 _WARM_UPS = 2
 
 
-def masked_mean(x, valid):
+def masked_mean(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """The mean of x where valid; 0 where nothing is."""
     return x.masked_fill(~valid, 0.0).sum() / valid.sum().clamp(min=1)
 
 
-def normalised(x, valid):
-    """x less its mean, over its deviation, both over the valid; 0 elsewhere."""
+def normalised(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """x less its mean, over its standard deviation, both over the valid; 0 elsewhere."""
     centred = (x - masked_mean(x, valid)).masked_fill(~valid, 0.0)
     return centred / (masked_mean(centred.square(), valid).sqrt() + 1e-8)
 
 
-def explained_variance(value, targets, valid):
-    """How much of the targets' variance the value tells: 1 all, 0 no more than their mean,
-    negative: worse than it.
+def explained_variance(
+    value: torch.Tensor, targets: torch.Tensor, valid: torch.Tensor
+) -> torch.Tensor:
+    """How much of the targets' variance the value explains: 1 all, 0 no more than their mean,
+    negative: less than it.
     """
     error, spread = targets - value, targets - masked_mean(targets, valid)
     error = error - masked_mean(error, valid)
@@ -42,59 +49,60 @@ def explained_variance(value, targets, valid):
 class PPO:
     """Improves a policy, in place, from rollouts it collected.
 
-    lr              Adam's step size; `set_lr` changes it
-    gamma, lambda_  discount per step, and how far GAE looks before it trusts the value
-    clip            how far the probability of an action may move, as a ratio, before the gradient
-    stops
-    entropy         what a nat of entropy is worth, in norm deviations of advantage
-    value_coef    weight of the value's squared error, the value measured in its own scale
-    max_grad_norm   longer gradients are shortened to this
+    lr                Adam's step size; `set_lr` changes it
+    gamma, lambda_    discount per step, and the decay of GAE
+    clip              how far the probability of an action may move, as a ratio, before the gradient
+                      stops
+    entropy_coef      what a nat of entropy is worth, in standard deviations of advantage
+    value_coef        weight of the value's squared error, the value measured in its own scale
+    max_grad_norm     longer gradients are shortened to this
     n_epochs, n_minibatches  passes over a rollout, and the parts each is cut into by lanes
-    target_kl       once a minibatch finds the policy further than this (nats) from the one that
-    acted, the rest of the
-                    update is left out; None for never
-    graph           on a GPU, captures the update as a CUDA graph; always with one and the same
-    rollout then
+    target_kl         once a minibatch finds the policy further than this (nats) from the one that
+                      acted, the rest of the update is left out; None for never
+    graph             on a GPU, captures the update as a CUDA graph; always with one and the same
+                      rollout then
+
+    A rollout with a number that is not finite, or beyond `finite.LIMIT`, changes nothing: no
+    weight, no statistic. `check` tells which it was, and how many updates were skipped in a row.
     """
 
     def __init__(
         self,
-        policy,
+        policy: Any,
         *,
-        lr=3e-4,
-        gamma=0.99,
-        lambda_=0.95,
-        clip=0.2,
-        entropy_coef=0.01,
-        value_coef=0.5,
-        max_grad_norm=0.5,
-        n_epochs=1,
-        n_minibatches=4,
-        target_kl=None,
-        graph=False,
-        seed=1,
+        lr: float = 3e-4,
+        gamma: float = 0.99,
+        lambda_: float = 0.95,
+        clip: float = 0.2,
+        entropy_coef: float = 0.01,
+        value_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        n_epochs: int = 1,
+        n_minibatches: int = 4,
+        target_kl: float | None = None,
+        graph: bool = False,
+        seed: int = 1,
     ):
         self.policy, self.device = policy, policy.device
         self.gamma, self.lambda_, self.clip, self.entropy_coef = gamma, lambda_, clip, entropy_coef
         self.value_coef, self.max_grad_norm = value_coef, max_grad_norm
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
         self.target_kl = float("inf") if target_kl is None else target_kl
-        on_gpu = self.device.type == "cuda"
         self.lr = lr
         self._lr = torch.tensor(lr, device=self.device)
-        # Fused Adam does nothing at all, to its moments neither, where its flag `found_inf` is set
-        # on the device
-        self._fixed = dict(lr=self._lr, fused=True, capturable=on_gpu)
-        self.optimizer = torch.optim.Adam(policy.parameters(), eps=1e-5, **self._fixed)
+        self.optimizer = Adam(policy.parameters(), self._lr)
         self.random = RandomStream(seed)
-        self.graph, self._captured = graph and on_gpu, None
-        self._warm_ups = _WARM_UPS
+        self.check = FiniteCheck(self.device)
+        # the stream of warming up and capturing, on the policy's own GPU
+        is_captured = graph and self.device.type == "cuda"
+        self._stream = torch.cuda.Stream(self.device) if is_captured else None
+        self._warm_ups, self._captured = _WARM_UPS, None
 
-    def set_lr(self, lr):
+    def set_lr(self, lr: float) -> None:
         """Changes Adam's step size, also for a captured update."""
         self._lr.fill_(lr)
 
-    def update(self, rollout):
+    def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Learns from a rollout. Returns means over its minibatches as tensors () on the device,
         among them `loss/skipped_steps`, how many gradients were not finite and so were not
         followed. ValueError if its lanes cannot be cut into minibatches.
@@ -102,18 +110,18 @@ class PPO:
         if rollout.n_lanes < self.n_minibatches:
             raise ValueError(
                 f"{rollout.n_lanes} lanes cannot be cut into {self.n_minibatches} minibatches of "
-                f"whole "
-                "lanes; use fewer minibatches or more lanes"
+                f"whole lanes; use fewer minibatches or more lanes"
             )
-        metrics = self._replay(rollout) if self.graph else self._update(rollout)
+        metrics = self._update(rollout) if self._stream is None else self._replay(rollout)
         return {f"loss/{key}": value for key, value in metrics.items()}
 
     def _update(self, rollout):
-        outcome = rollout.transitions()
-        judged = returns.gae(**outcome, gamma=self.gamma, lambda_=self.lambda_)
-        self.policy.value.update_stats(judged.targets, judged.valid)
-        explained = explained_variance(outcome["value"], judged.targets, judged.valid)
-        judged["advantages"] = normalised(judged.advantages, judged.valid)
+        is_fine = self.check(rollout.numbers())
+        transitions = rollout.transitions()
+        estimates = returns.gae(**transitions, gamma=self.gamma, lambda_=self.lambda_)
+        self.policy.value.update_stats(estimates.targets, estimates.valid & is_fine)
+        explained = explained_variance(transitions["value"], estimates.targets, estimates.valid)
+        estimates["advantages"] = normalised(estimates.advantages, estimates.valid)
 
         totals = torch.zeros(len(_AVERAGED) + 2, device=self.device)
         stopped = torch.zeros((), dtype=torch.bool, device=self.device)
@@ -122,86 +130,93 @@ class PPO:
                 rollout.n_lanes, generator=self.random.on(self.device), device=self.device
             ).argsort()
             for rows in order.tensor_split(self.n_minibatches):
-                batch = arrdict({**rollout.lanes(rows), **judged.map(torch.index_select, 1, rows)})
-                row, stopped = self._step(batch, stopped)
+                batch = arrdict(
+                    {**rollout.lanes(rows), **estimates.map(torch.index_select, 1, rows)}
+                )
+                row, stopped = self._step(batch, is_fine, stopped)
                 totals = totals + row
-        # Only now: a rollout is learned from as it was seen. One row is plenty, B lanes again with
+        # Only now: a rollout is learnt from as it was seen. One row is enough, B lanes again with
         # every rollout.
-        self.policy.intake.update_stats(rollout.obs[-1])
+        self.policy.intake.update_stats(rollout.obs[-1], is_fine)
         *sums, n_taken, n_skipped = totals.unbind()
+        self.check.count((n_taken == 0) & (n_skipped > 0))
         means = {key: total / n_taken for key, total in zip(_AVERAGED, sums, strict=True)}
         return {**means, "explained_variance": explained, "skipped_steps": n_skipped}
 
     def _losses(self, batch):
         """The loss of a minibatch, and what there is to say about it, each a tensor ()."""
-        seen = self.policy.unroll(batch.obs, batch.starts, batch.state)
+        now = self.policy.unroll(batch.obs, batch.starts, batch.state)
         valid, output = batch.valid, self.policy.output
-        log_ratio = output.logprob(seen.logits, batch.actions) - batch.logprobs
+        log_ratio = output.logprob(now.logits, batch.actions) - batch.logprobs
         ratio = log_ratio.exp()
         clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
         gain = torch.minimum(ratio * batch.advantages, clipped * batch.advantages)
-        error = (seen.value - batch.targets) / self.policy.value.scale
+        error = (now.value - batch.targets) / self.policy.value.scale
 
         policy = -masked_mean(gain, valid)
         value = masked_mean(error.square(), valid)
-        entropy = masked_mean(output.entropy(seen.logits), valid)
+        entropy = masked_mean(output.entropy(now.logits), valid)
         with torch.no_grad():
-            kl = masked_mean(
-                ratio - 1 - log_ratio, valid
-            )  # >= 0 term by term, unlike the mean log ratio
+            # >= 0 term by term, unlike the mean log ratio
+            kl = masked_mean(ratio - 1 - log_ratio, valid)
             clip_fraction = masked_mean((ratio != clipped).float(), valid)
         loss = policy + self.value_coef * value - self.entropy_coef * entropy
         return loss, dict(
             policy=policy, value=value, entropy=entropy, kl=kl, clip_fraction=clip_fraction
         )
 
-    def _step(self, batch, stopped):
+    def _step(self, batch, is_fine, stopped):
         """One gradient step, unless `stopped`, or the KL is too large (which stops the next ones
-        too), or the gradient is not finite. Returns the metrics, with how many steps were taken (0
-        or 1) and skipped, and `stopped`.
+        too), or the rollout or the gradient is not finite. Returns the metrics, with how many steps
+        were taken (0 or 1) and skipped, and `stopped`.
         """
         loss, metrics = self._losses(batch)
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad()
         loss.backward()
         metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(
-            self.policy.parameters(), self.max_grad_norm
+            self.optimizer.parameters, self.max_grad_norm
         )
-        finite = metrics["grad_norm"].isfinite()
+        finite = metrics["grad_norm"].isfinite() & is_fine
         stopped = stopped | (metrics["kl"] > self.target_kl)
         taken = finite & ~stopped
-        self.optimizer.found_inf = (~taken).float()
-        self.optimizer.step()
+        self.optimizer.step(taken)
         row = torch.stack([metrics[key].detach() for key in _AVERAGED])
         return torch.cat(
             [row.masked_fill(~taken, 0.0), torch.stack([taken, ~finite & ~stopped]).float()]
         ), stopped
 
     def _replay(self, rollout):
-        """`_update` as a CUDA graph, after some for real on the stream a capture would use."""
-        if self._warm_ups:
-            self._warm_ups -= 1
-            # PyTorch would warn that gradients were first added up on another stream, which this
-            # waits for
-            torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)
-            side = torch.cuda.Stream(self.device)
-            side.wait_stream(torch.cuda.current_stream(self.device))
-            with torch.cuda.stream(side):
-                metrics = self._update(rollout)
-            torch.cuda.current_stream(self.device).wait_stream(side)
-            return metrics
-        if self._captured is None or self._captured[0] is not rollout:
-            graph = torch.cuda.CUDAGraph()
-            graph.register_generator_state(self.random.on(self.device))
-            with torch.cuda.graph(graph):
-                metrics = self._update(rollout)
-            self._captured = rollout, graph, metrics
-        _, graph, metrics = self._captured
-        graph.replay()
-        return {key: value.clone() for key, value in metrics.items()}
+        """`_update` as a CUDA graph, after some for real on the stream that captures."""
+        with torch.cuda.device(self.device):
+            if self._warm_ups:
+                self._warm_ups -= 1
+                return self._warm_up(rollout)
+            if self._captured is None or self._captured[0] is not rollout:
+                self._captured = self._capture(rollout)
+            _, graph, metrics = self._captured
+            graph.replay()
+            return {key: value.clone() for key, value in metrics.items()}
 
-    def state_dict(self):
-        """All that an update changes beside the policy's weights, and how far the policy's draws
-        have come: dicts of plain tensors and numbers.
+    def _warm_up(self, rollout):
+        # PyTorch would warn that gradients were first added up on another stream, which this waits
+        # for
+        torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)
+        self._stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._stream):
+            metrics = self._update(rollout)
+        torch.cuda.current_stream().wait_stream(self._stream)
+        return metrics
+
+    def _capture(self, rollout):
+        graph = torch.cuda.CUDAGraph()
+        graph.register_generator_state(self.random.on(self.device))
+        with torch.cuda.graph(graph, stream=self._stream):
+            metrics = self._update(rollout)
+        return rollout, graph, metrics
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that an update changes beside the policy's weights, and where the policy's random
+        stream is: dicts of plain tensors and numbers.
         """
         return dict(
             optimizer=self.optimizer.state_dict(),
@@ -210,12 +225,10 @@ class PPO:
             policy_random=self.policy.random.state_dict(),
         )
 
-    def load_state_dict(self, state):
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on from a `state_dict`, taken on this device or another."""
         self.optimizer.load_state_dict(state["optimizer"])
         self._lr.copy_(state["lr"])
-        for group in self.optimizer.param_groups:
-            group.update(self._fixed)
         self.random.load_state_dict(state["random"], self.device)
         self.policy.random.load_state_dict(state["policy_random"], self.device)
-        self._captured, self._warm_ups = None, _WARM_UPS
+        self._warm_ups, self._captured = _WARM_UPS, None

@@ -25,6 +25,14 @@ def _zeros(space, lead, device, dtype):
     return torch.zeros(*lead, *space.shape, dtype=dtype, device=device)
 
 
+def _floats(tree, name):
+    """The leaves of a tree that are not integers, by their paths below `name`."""
+    if isinstance(tree, dict):
+        parts = (_floats(child, f"{name}.{key}") for key, child in tree.items())
+        return {path: leaf for part in parts for path, leaf in part.items()}
+    return {name: tree} if tree.is_floating_point() else {}
+
+
 class Rollout:
     """T steps of B lanes, in memory that is allocated once and overwritten by every `collect`.
 
@@ -76,6 +84,11 @@ class Rollout:
         self.obs[t] = world["obs"]
         self.starts[t] = world["reset"]
         return arrdict(obs=self.obs[t], reset=self.starts[t])
+
+    def numbers(self) -> dict[str, torch.Tensor]:
+        """All that may stop being finite, by name, each (T, B) or (T+1, B, ...)."""
+        named = _floats(self.obs, "obs")
+        return named | dict(reward=self.reward, value=self.values, logprob=self.logprobs)
 
     def transitions(self) -> dict[str, torch.Tensor]:
         """The arguments of `returns.gae`, each (T, B), the last value (B,)."""
@@ -132,6 +145,8 @@ def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> ar
 
     last = rollout.store_world(rollout.n_steps, world)
     rollout.values[-1] = policy(last, state, sample=False)[0]["value"]
+    # a memory that is not finite starts anew, or it would last until the lane's episode ends
+    state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
     after = arrdict(world=arrdict(obs=world["obs"], reset=world["reset"]), state=state)
     for target, source in zip(leaves(actor_state), leaves(after), strict=True):
         target.copy_(source)

@@ -5,15 +5,19 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch.utils._pytree import tree_leaves, tree_map_only
+
 from agents import checkpoint
-from megastep.dotdict import leaves
+from agents.finite import NonFiniteError, bad_leaf
 
 
 class Saver:
     """Writes the checkpoints of one run into a folder, with the `config` that it runs under.
 
     A disk that is full or not writable is a warning, the first time, and the next call tries again.
-    Until one succeeds, `unsaved` is the sentence that says why the last checkpoint is missing.
+    Until one succeeds, `unsaved` is the sentence that says why the last checkpoint is missing. A
+    state that is not finite is never written: NonFiniteError, and the checkpoints before it stay.
     """
 
     def __init__(self, folder: Path, config: dict[str, Any], keep: int = 2):
@@ -22,6 +26,12 @@ class Saver:
 
     def __call__(self, step: int, state: dict[str, Any], score: float | None = None) -> bool:
         """Saves `state`, dicts of tensors and numbers, after `step` samples; whether it could."""
+        # first of all to the CPU: a GPU may have no memory left
+        state = tree_map_only(torch.Tensor, lambda leaf: leaf.detach().cpu(), state)
+        if path := bad_leaf(state):
+            raise NonFiniteError(
+                f"The checkpoint at {step:,} samples was not saved, for {path} is not finite"
+            )
         try:
             checkpoint.save(self.folder, step, state, self.config, self.keep, score)
         except OSError as error:
@@ -37,7 +47,7 @@ class Saver:
         return True
 
     def _explain(self, step, state, error):
-        needed = sum(getattr(leaf, "nbytes", 0) for leaf in leaves(state))
+        needed = sum(getattr(leaf, "nbytes", 0) for leaf in tree_leaves(state))
         free = shutil.disk_usage(self.folder.parent).free
         return (
             f"The checkpoint at {step:,} samples could not be saved ({error.strerror}): it needs "

@@ -1,6 +1,7 @@
 """The training loop: collect, update, report, save."""
 
 import contextlib
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -8,7 +9,11 @@ import torch
 
 from agents.budget import Budget, Stopwatch
 from agents.episodes import Episodes
+from agents.finite import NonFiniteError
 from agents.rollout import Collector, Rollout
+
+#: So many skipped updates in a row end a run.
+MAX_SKIPPED = 20
 
 
 class Trainer:
@@ -16,8 +21,8 @@ class Trainer:
 
     Args:
     env, policy, rollout  the environment, who acts in it, and the memory of their transitions
-    learner      has `update(rollout)`, which returns a dict of tensors () on the device; `lr`,
-                 `set_lr`, `state_dict` and `load_state_dict`
+    learner      has `update(rollout)`, which returns a dict of tensors () on the device; `check`,
+                 a FiniteCheck; `lr`, `set_lr`, `state_dict` and `load_state_dict`
     metrics      has `write(samples, metrics, perf)`: `agents.metrics.Metrics`
     save         called with (samples, state, score); returns whether it could: a `Saver`
     budget       when to end, and how the learning rate falls
@@ -51,6 +56,7 @@ class Trainer:
         self.reported_at = 0, 0.0  # samples and seconds
         self.saved_at = 0.0  # seconds
         self.saved_updates = None  # updates that the last checkpoint holds
+        self.bad_number = None  # the first one that was not finite
 
     @property
     def left(self) -> float:
@@ -59,7 +65,7 @@ class Trainer:
 
     def train(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Runs until the budget is spent or `stop()`. An error ends it too, once all that was
-        learnt is saved.
+        learnt is saved; so does NonFiniteError, of which only what came before it is saved.
         """
         try:
             while self.left > 0 and not stop():
@@ -67,8 +73,12 @@ class Trainer:
                 losses = self.update()
                 if self.updates % self.report_every == 0:
                     self.report(losses)
-                if self.clock.seconds - self.saved_at >= self.save_every:
+                is_due = self.clock.seconds - self.saved_at >= self.save_every
+                if is_due and self.check_numbers():
                     self.save()
+            self.check_numbers()
+        except NonFiniteError:
+            raise
         except Exception:
             with contextlib.suppress(Exception):  # the first error is the one to tell
                 self.save()
@@ -116,6 +126,26 @@ class Trainer:
         self.metrics.write(self.samples, found, perf)
         self.score = found.get("episode/return", self.score)
         self.on_report(self)
+        self.check_numbers()
+
+    def check_numbers(self) -> bool:
+        """Whether the last update was followed. Warns of the first number that could not be learnt
+        from; NonFiniteError if none of the last `MAX_SKIPPED` rollouts could. Synchronises.
+        """
+        bad, n_skipped = self.learner.check.read(self.rollout.numbers())
+        if bad and self.bad_number is None:
+            self.bad_number = bad
+            warnings.warn(f"{bad}; its rollout was not learnt from", stacklevel=2)
+        if n_skipped < MAX_SKIPPED:
+            return n_skipped == 0
+        advice = f"the policy diverged, so try a learning rate smaller than {self.learner.lr:g}"
+        if bad and bad.is_from_env:
+            self.save()  # the policy is as good as it was before
+            advice = f"the environment gave it, so look at how it computes {bad.name}"
+        raise NonFiniteError(
+            f"The last {n_skipped} updates were skipped, as their numbers were not finite or too "
+            f"large ({bad or 'gradients'}): {advice}"
+        )
 
     def save(self) -> None:
         """Writes a checkpoint, unless the last one holds the same."""

@@ -64,3 +64,14 @@ def test_episodes_run_across_rollouts_as_if_there_were_one():
     assert episodes.returns.tolist() == pytest.approx(
         [partial[lane][0] for lane in range(n_lanes)], rel=1e-6
     )
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e30])
+def test_a_reward_that_is_not_finite_counts_as_nothing(bad):
+    episodes, none = Episodes(2, "cpu"), torch.zeros(3, 2, dtype=torch.bool)
+    episodes.add(torch.tensor([[1.0, 1.0], [bad, 2.0], [3.0, 3.0]]), none, none)
+    done = torch.tensor([[True, True]])
+    episodes.add(torch.full((1, 2), 4.0), none[:1], done)
+    found = episodes.take()
+    assert (found["episode/count"], found["episode/return"]) == (2, (8 + 10) / 2)
+    assert not episodes.returns.any() and found["episode/length"] == 4

@@ -206,6 +206,23 @@ def test_a_value_learns_the_mean_and_deviation_of_what_is_valid():
     assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
+def test_statistics_never_take_in_what_is_not_finite(bad):
+    # 1e30 is finite, and its square is not
+    value, norm = heads.ValueOutput(WIDTH), heads.RunningNorm(spaces.MultiVector(1, 2))
+    value.update_stats(torch.randn(64) * 3 + 1, EVERY)
+    norm.update_stats(torch.randn(64, 1, 2) + 5)
+    before = [
+        {name: tensor.clone() for name, tensor in module.state_dict().items()}
+        for module in (value, norm)
+    ]
+    value.update_stats(torch.tensor([1.0, 2.0, bad]), torch.tensor([True, True, True]))
+    norm.update_stats(torch.tensor([1.0, 2.0, 3.0, bad]).view(2, 1, 2))
+    norm.update_stats(torch.zeros(2, 1, 2), torch.tensor(False))
+    for module, old in zip((value, norm), before, strict=True):
+        assert all(torch.equal(module.state_dict()[name], old[name]) for name in old)
+
+
 def test_returns_that_never_vary_do_not_divide_by_zero():
     value = heads.ValueOutput(WIDTH)
     for _ in range(5):

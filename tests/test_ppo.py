@@ -138,22 +138,49 @@ def test_what_an_invalid_row_holds_teaches_nothing():
 
 def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
     policy, rollout = made_up()
-    learner = ppo.PPO(policy, n_minibatches=B, n_epochs=2)
-    learner.update(rollout)
-    before = weights(policy), learner.optimizer.state_dict()["state"][0]["exp_avg"].clone()
-    rollout.logprobs[:] = torch.nan
-    metrics = learner.update(rollout)
-    assert metrics["loss/skipped_steps"].item() == 2 * B and metrics["loss/kl"].isnan()
-    assert torch.equal(weights(policy), before[0])
-    assert torch.equal(learner.optimizer.state_dict()["state"][0]["exp_avg"], before[1])
-
-    policy, rollout = made_up()
-    rollout.logprobs[2, 3] = torch.nan  # one lane of six, a minibatch of its own
+    rollout.logprobs[2, 3] = -200.0  # a ratio of e^200 in one lane of six, a minibatch of its own
     before = weights(policy)
-    metrics = ppo.PPO(policy, n_minibatches=B).update(rollout)
+    learner = ppo.PPO(policy, n_minibatches=B)
+    metrics = learner.update(rollout)
     assert metrics["loss/skipped_steps"].item() == 1
     assert not torch.equal(weights(policy), before) and weights(policy).isfinite().all()
     assert all(value.isfinite() for value in metrics.values())
+    assert learner.check.read(rollout.numbers()) == (None, 0)  # the update was not skipped
+
+
+@pytest.mark.parametrize("name", ["obs", "reward", "value", "logprob"])
+@pytest.mark.parametrize("value", [math.nan, 1e30])
+def test_a_bad_number_in_a_rollout_changes_no_bit_of_weights_or_statistics(name, value):
+    policy, rollout = made_up()
+    learner = ppo.PPO(policy, n_minibatches=B, n_epochs=2)
+    learner.update(rollout)
+    parts = policy.state_dict(), {"n": learner.optimizer.n_steps}
+    lists = learner.optimizer.means, learner.optimizer.squares
+    before = [{key: tensor.clone() for key, tensor in part.items()} for part in parts]
+    before_lists = [[tensor.clone() for tensor in each] for each in lists]
+    rollout.numbers()[name][2, 3] = value
+    metrics = learner.update(rollout)
+    assert metrics["loss/skipped_steps"].item() == 2 * B
+    for part, old in zip(parts, before, strict=True):
+        assert all(torch.equal(part[key], old[key]) for key in old)
+    for each, old in zip(lists, before_lists, strict=True):
+        assert all(map(torch.equal, each, old))
+    bad, n_skipped = learner.check.read(rollout.numbers())
+    assert (bad.name, bad.lane, bad.step, n_skipped) == (name, 3, T + 3, 1)
+
+
+def test_what_comes_after_a_stop_is_not_counted_as_skipped():
+    # The policy that acted is found 1 - log 2 = .31 nats away in the first minibatch of one lane,
+    # which stops the update; in the lanes that follow, gradients are not finite.
+    policy, rollout = made_up()
+    rollout.logprobs -= math.log(2)
+    next(policy.parameters()).register_hook(lambda grad: grad * math.nan)
+    stopped = ppo.PPO(policy, n_minibatches=B, target_kl=0.1)
+    assert stopped.update(rollout)["loss/skipped_steps"].item() == 0
+    assert stopped.check.read(rollout.numbers()) == (None, 0)
+    going_on = ppo.PPO(policy, n_minibatches=B, target_kl=1.0)
+    assert going_on.update(rollout)["loss/skipped_steps"].item() == B
+    assert going_on.check.read(rollout.numbers()) == (None, 1)
 
 
 def test_an_update_stops_once_the_policy_has_gone_too_far():
@@ -248,7 +275,43 @@ def test_a_captured_update_is_the_eager_one():
 
 
 @pytest.mark.cuda
-def test_an_update_asks_the_gpu_nothing():
+def test_an_update_is_captured_on_the_gpu_of_its_policy_whichever_is_current():
+    if torch.cuda.device_count() < 2:
+        pytest.skip("there is one GPU")
+    ends = []
+    for device in ("cuda:0", "cuda:1"):
+        policy, rollout = made_up(device=device)
+        learner = ppo.PPO(policy, n_epochs=2, n_minibatches=3, lr=1e-3, graph=True)
+        with torch.cuda.device(0):
+            for _ in range(5):
+                metrics = learner.update(rollout)
+        ends.append((weights(policy).cpu(), metrics["loss/value"].cpu()))
+    assert metrics["loss/value"].device == torch.device("cuda:1")
+    torch.testing.assert_close(ends[1], ends[0], rtol=1e-3, atol=1e-4)  # bf16 products
+
+
+@pytest.mark.cuda
+def test_a_captured_update_skips_a_rollout_that_is_not_finite():
+    policy, rollout = made_up(device="cuda")
+    learner = ppo.PPO(policy, n_minibatches=3, graph=True)
+    for _ in range(4):
+        learner.update(rollout)
+    before = weights(policy)
+    kept = rollout.reward[2, 3].clone()
+    rollout.reward[2, 3] = math.nan
+    for _ in range(2):
+        assert learner.update(rollout)["loss/skipped_steps"].item() == 3
+    assert torch.equal(weights(policy), before)
+    bad, n_skipped = learner.check.read(rollout.numbers())
+    assert (bad.name, bad.lane, bad.step, n_skipped) == ("reward", 3, 4 * T + 3, 2)
+    rollout.reward[2, 3] = kept
+    learner.update(rollout)
+    assert not torch.equal(weights(policy), before)
+    assert learner.check.read(rollout.numbers()) == (None, 0)
+
+
+@pytest.mark.cuda
+def test_an_update_never_synchronises():
     policy, rollout = made_up(device="cuda")
     learner = ppo.PPO(policy, n_epochs=2, n_minibatches=2, target_kl=0.01)
     learner.update(rollout)

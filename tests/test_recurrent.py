@@ -118,6 +118,18 @@ def test_lanes_do_not_mix():
     assert d_x[-1, 2].all() and not d_x[:, [0, 1, 3, 4]].any()
 
 
+def test_forget_gates_start_open_and_no_other_gate():
+    # Jozefowicz et al. 2015: a bias of 1; in the order of torch.nn.LSTM, forget is the second of
+    # four. With no input and no output yet, a cell then keeps sigmoid(1) of itself per step.
+    lstm = LSTM(W)
+    biases = lstm.input.bias.detach().split(W)
+    assert [bias.unique().tolist() for bias in biases] == [[0.0], [1.0], [0.0], [0.0]]
+    state = arrdict(output=torch.zeros(B, W), cell=torch.ones(B, W))
+    _, after = lstm.step(torch.zeros(B, W), torch.zeros(B, dtype=torch.bool), state)
+    kept = torch.sigmoid(torch.tensor(1.0)).item()
+    torch.testing.assert_close(after.cell, torch.full((B, W), kept), **CLOSE)
+
+
 @pytest.mark.cuda
 def test_the_fused_cell_agrees_with_the_written_out_one():
     lstm, x, reset, state = case()

@@ -7,7 +7,7 @@ import torch
 
 from agents.policy import Policy
 from agents.returns import gae
-from agents.rollout import Rollout, collect, initial_actor_state
+from agents.rollout import Collector, Rollout, collect, initial_actor_state
 from megastep import spaces
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
@@ -24,6 +24,8 @@ class Telltale:
         eye=spaces.MultiImage(1, 1, 1, 2), rest=arrdict(imu=spaces.MultiVector(1, 3))
     )
     action_space = arrdict(move=spaces.MultiDiscrete(1, 7), fire=spaces.MultiDiscrete(1, 2))
+
+    device = "cpu"
 
     def __init__(self):
         self.time = 0
@@ -105,7 +107,7 @@ def test_a_rollout_begins_where_the_one_before_ended():
     assert torch.equal(rollout.state.cell, state.cell) and state.cell.any()
 
 
-def test_the_carry_stays_in_its_own_memory():
+def test_an_actor_state_stays_in_its_own_memory():
     env, policy, rollout, actor_state = collected()
     places = [leaf.data_ptr() for leaf in leaves(actor_state)]
     again = collect(env, policy, rollout, actor_state)
@@ -125,6 +127,31 @@ def test_probabilities_and_values_are_those_of_an_unroll_over_what_was_written()
     torch.testing.assert_close(rollout.values[-1], last, **close)
 
 
+def test_a_memory_that_is_not_finite_starts_anew_with_the_next_rollout():
+    env, policy, rollout, actor_state = collected()
+    actor_state.world.obs.eye[2] = torch.nan
+    collect(env, policy, rollout, actor_state)
+    # until an episode of the lane starts, or the rollout ends
+    assert rollout.values[0, 2].isnan() and rollout.values[:, [0, 1, 3, 4, 5]].isfinite().all()
+    collect(env, policy, rollout, actor_state)
+    assert rollout.values.isfinite().all() and rollout.logprobs.isfinite().all()
+    assert rollout.state.cell.isfinite().all()
+
+
+def test_a_collector_begins_each_rollout_where_the_one_before_ended():
+    env = Telltale()
+    policy = Policy(env.obs_space, env.action_space, width=16)
+    rollout = Rollout(T, B, env.obs_space, env.action_space, policy.initial(B))
+    collector = Collector(env, policy, rollout)
+    places = [leaf.data_ptr() for leaf in leaves(rollout.state)]
+    for _ in range(3):
+        collector()
+    _, _, expected, _ = collected(n_rollouts=3, dtype=torch.float16)
+    assert torch.equal(rollout.values, expected.values) and collector.graph is None
+    assert torch.equal(rollout.state.cell, expected.state.cell)
+    assert [leaf.data_ptr() for leaf in leaves(rollout.state)] == places
+
+
 def test_a_minibatch_joins_the_rows_of_its_lanes():
     _, _, rollout, _ = collected(n_rollouts=2)
     rollout.logprobs[:] = torch.arange(T)[:, None] + 100.0 * torch.arange(B)
@@ -142,13 +169,13 @@ def test_a_minibatch_joins_the_rows_of_its_lanes():
         assert (batch.state.cell[i] == b).all()
 
 
-def test_an_outcome_is_what_returns_are_computed_from():
+def test_transitions_are_what_returns_are_computed_from():
     env, _, rollout, _ = collected(n_rollouts=2)
-    judged = gae(**rollout.transitions(), gamma=0.0, lambda_=1.0)
-    assert torch.equal(judged.valid, ~rollout.reset)
+    estimates = gae(**rollout.transitions(), gamma=0.0, lambda_=1.0)
+    assert torch.equal(estimates.valid, ~rollout.reset)
     # With gamma 0 an advantage is the reward that followed less the value before
     expected = (rollout.reward - rollout.values[:-1]) * ~rollout.reset
-    assert torch.equal(judged.advantages, expected)
+    assert torch.equal(estimates.advantages, expected)
 
 
 def test_the_same_seed_collects_the_same():
@@ -158,7 +185,7 @@ def test_the_same_seed_collects_the_same():
     )
 
 
-def test_pictures_are_kept_in_half_precision_and_whole_numbers_whole():
+def test_images_are_stored_in_half_precision_and_integers_as_integers():
     space = arrdict(rgb=spaces.MultiImage(1, 3, 1, 4), team=spaces.MultiDiscrete(1, 5000))
     rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
     assert rollout.obs.rgb.dtype == torch.float16 and rollout.obs.team.dtype == torch.int64

@@ -13,13 +13,15 @@ import pytest
 import torch
 import yaml
 
-from agents import checkpoint, metrics
+from agents import checkpoint, metrics, ppo
 from agents.cli import settings, train
 from agents.cli.build import build
 from agents.cli.compose import ConfigLoader
 from agents.cli.errors import ConfigErrors, UserError
 from agents.cli.settings import Train
 from agents.cli.signals import Interrupted
+from agents.finite import bad_leaf
+from megastep import envs
 
 TINY = [
     "env=minimal",
@@ -268,6 +270,76 @@ def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_world(
     (sentence,) = capsys.readouterr().err.splitlines()
     assert "environment 2" in sentence and "not a finite number" in sentence and "run" in sentence
     assert len(metrics.read(here / "run" / "metrics.jsonl")) == 1
+
+
+def inject(monkeypatch, name, step, value, lane=2):
+    """In the environment's `step`-th step and, if it is given as a range, in others, a lane's
+    number is another.
+    """
+    real, steps = envs.Minimal.step, itertools.count(1)
+    faulty = step if isinstance(step, range) else [step]
+
+    def with_fault(self, decision):
+        world = real(self, decision)
+        if next(steps) in faulty:
+            world[name][lane] = value
+        return world
+
+    monkeypatch.setattr(envs.Minimal, "step", with_fault)
+
+
+@pytest.mark.parametrize("value", [float("nan"), 1e30])
+@pytest.mark.parametrize("name", ["reward", "obs"])
+def test_a_number_that_is_not_finite_is_named_and_the_exit_code_says_so(
+    here, monkeypatch, capsys, name, value
+):
+    inject(monkeypatch, name, step=13, value=value)
+    assert train.main([*TINY, f"samples={8 * UPDATE}", "folder=run"]) == 1
+    warning, sentence = capsys.readouterr().err.splitlines()
+    named = f"{name} of lane 2 was {'inf' if name == 'obs' and value > 0 else f'{value:g}'} at step"
+    assert named in warning and named in sentence
+    rows = metrics.read(here / "run" / "metrics.jsonl")
+    assert [row["loss/skipped_steps"] for row in rows] == [0, 2, 0, 0, 0, 0, 0, 0]
+    loaded = checkpoint.load(here / "run" / "checkpoints")
+    assert loaded.step == 8 * UPDATE and bad_leaf(loaded.state) is None
+
+
+def test_numbers_that_are_never_finite_end_a_run_with_one_sentence(here, monkeypatch, capsys):
+    inject(monkeypatch, "reward", step=range(17, 10**6), value=float("nan"))
+    assert train.main([*TINY, "seconds=60", "folder=run", "report=8"]) == 1
+    _, sentence = capsys.readouterr().err.splitlines()
+    assert "The last 22 updates were skipped" in sentence and "reward of lane 2 was nan" in sentence
+    loaded = checkpoint.load(here / "run" / "checkpoints")
+    assert loaded.step == 24 * UPDATE and bad_leaf(loaded.state) is None
+    monkeypatch.undo()
+    monkeypatch.chdir(here)
+    assert train.main(["resume=run", f"samples={26 * UPDATE}"]) == 0
+
+
+def test_a_learning_rate_that_is_too_large_ends_a_run_with_advice(here, capsys):
+    assert train.main([*TINY, "learner.lr=1e3", "seconds=60", "checkpoint=1e-9", "folder=run"]) == 1
+    sentence = capsys.readouterr().err.splitlines()[-1]
+    assert "the policy diverged, so try a learning rate smaller than 1000" in sentence
+    assert len(metrics.read(here / "run" / "metrics.jsonl")) < 100
+    assert bad_leaf(checkpoint.load(here / "run" / "checkpoints").state) is None
+
+
+def test_memory_that_runs_out_is_one_sentence_and_the_run_can_go_on(here, monkeypatch, capsys):
+    real = ppo.PPO.update
+
+    def update(self, rollout):
+        if self.check.record[0] == 2:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nMore")
+        return real(self, rollout)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo.PPO, "update", update)
+        assert train.main([*TINY, "seconds=60", "folder=run"]) == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert "out of memory" in sentence and "python train.py resume=run" in sentence
+    assert checkpoint.load(here / "run" / "checkpoints").step == 2 * UPDATE
+    assert train.main(["resume=run", f"samples={3 * UPDATE}"]) == 0
+    assert checkpoint.load(here / "run" / "checkpoints").step == 3 * UPDATE
 
 
 def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, monkeypatch):

@@ -43,7 +43,7 @@ def run_command(script, kind, run, help_text, argv=None, prepare=lambda tree, ov
         return 0
     except UserError as error:
         say(f"{script}.py: {error}", sys.stderr)
-        return 2
+        return error.code
     except Interrupted as stop:
         say(str(stop), sys.stderr)
         return 128 + stop.number

@@ -12,6 +12,12 @@ class UserError(Exception):
     code = 2
 
 
+class NotFinite(UserError):
+    """Training stopped on numbers that are not finite, or went on without them."""
+
+    code = 1
+
+
 class ConfigErrors(UserError):
     """Several errors of one configuration, `(key path, sentence)` each."""
 

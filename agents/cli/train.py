@@ -14,9 +14,10 @@ from agents.cli import components, evaluate, record, run_folders
 from agents.cli.build import as_tree
 from agents.cli.command import run_command
 from agents.cli.console import Progress, duration, number, say, warn
-from agents.cli.errors import ConfigErrors, UserError
+from agents.cli.errors import ConfigErrors, NotFinite, UserError
 from agents.cli.settings import Evaluate, Record, Train, WandbLogger
 from agents.cli.signals import Interrupted, Interruptions
+from agents.finite import NonFiniteError
 from agents.saver import Saver
 from agents.trainer import Trainer
 from megastep import engine
@@ -136,18 +137,24 @@ def run(cfg):
         try:
             with progress, closing(trainer.metrics):
                 trainer.train(lambda: stop.number is not None)
+        except NonFiniteError as error:
+            raise NotFinite(f"{error}. What was saved before is in {folder}") from error
         except (engine.EngineError, torch.OutOfMemoryError) as error:
             reason = str(error).splitlines()[0].rstrip(".")
             raise UserError(
-                f"{reason}. It stopped after {trainer.samples:,} samples. {resume}"
+                f"{reason}. It is saved at {trainer.samples:,} samples. {resume}"
             ) from error
-        metrics.curves(folder)
+        finally:
+            metrics.curves(folder)
         if stop.number is not None:
             raise Interrupted(stop.number, f"Stopped after {trainer.samples:,} samples. {resume}")
     if saver.unsaved:
         raise UserError(saver.unsaved)
+    bad_number = trainer.bad_number
     del trainer  # its memory is the evaluation's now
     finish(cfg, folder)
+    if bad_number and bad_number.is_from_env:
+        raise NotFinite(f"{bad_number}. All else was learnt from, and is in {folder}")
     return folder
 
 
