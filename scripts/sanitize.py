@@ -1,7 +1,8 @@
-"""Every operation of the engine on a small world, for NVIDIA's checkers:
+"""Every operation of the engine on small scenery, ids out of range too, for NVIDIA's checkers:
 
-for tool in memcheck racecheck initcheck; do compute-sanitizer --tool $tool python
-scripts/sanitize.py; done
+for tool in memcheck racecheck initcheck; do
+    compute-sanitizer --tool $tool python scripts/sanitize.py
+done
 """
 
 import sys
@@ -14,6 +15,22 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from megastep import arrdict, core, engine, envs, scene
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns
+
+
+def out_of_range(c, spawn):
+    """Each operation with a layout that does not exist, which raises a flag and reads nothing."""
+    for layout in (-1, 3, 2**31 - 1):
+        c.scenery.layout[4] = layout
+        for operation in (engine.physics, engine.observe, engine.render):
+            operation(c.scenery, c.agents)
+        spawn.resample = False
+        spawn(c.agent_full(True))
+        try:
+            engine.check(c.agents)
+        except engine.EngineError:
+            c.scenery.layout[4] = 0
+        else:
+            raise AssertionError("a layout that does not exist was not flagged")
 
 
 def main():
@@ -39,6 +56,7 @@ def main():
                 clear_mask=c.agent_full(False),
             )
             engine.render(c.scenery, c.agents)
+        out_of_range(c, spawn)
     for env in (envs.Explorer(7, homes, device="cuda"), envs.Minimal(7, homes, device="cuda")):
         env.reset()
         for action in range(7):

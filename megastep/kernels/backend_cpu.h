@@ -36,8 +36,8 @@ static inline unsigned short half_bits(float value) {
     unsigned int bits = float_bits(value);
     unsigned int sign = (bits >> 16) & 0x8000u;
     unsigned int magnitude = bits & 0x7fffffffu;
-    if (magnitude > 0x7f800000u)  // NaN
-        return (unsigned short)(sign | 0x7e00u);
+    if (magnitude > 0x7f800000u)  // NaN: the one that a GPU makes of all
+        return 0x7fff;
     if (magnitude >= 0x477ff000u)  // rounds to more than 65504, the largest half
         return (unsigned short)(sign | 0x7c00u);
     if (magnitude < 0x38800000u) {  // subnormal as a half: adding 0.5 shifts and rounds it
