@@ -143,49 +143,6 @@ def test_nothing_is_built_at_import(tmp_path):
     assert status == 0 and not (tmp_path / "cache").exists(), err
 
 
-def test_the_library_is_kept_and_used_again(built):
-    cache, out = built
-    (path,) = cache.iterdir()
-    before = path.stat().st_mtime_ns
-    assert run(STEP, cache)[:2] == (0, out) and path.stat().st_mtime_ns == before
-
-
-@pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "garbage"])
-def test_a_damaged_library_is_built_again(built, damage, tmp_path):
-    cache, out = built
-    (path,) = cache.iterdir()
-    body = path.read_bytes()
-    flipped = bytearray(body)
-    flipped[len(body) // 2] ^= 1
-    copy = tmp_path / path.name
-    copy.write_bytes(
-        {"truncated": body[:1000], "flipped": bytes(flipped), "empty": b"", "garbage": b"x" * 500}[
-            damage
-        ]
-    )
-    assert run(STEP, tmp_path)[:2] == (0, out)
-    assert compile._intact(copy) is not None
-
-
-def test_a_folder_that_cannot_be_written_is_done_without(built, tmp_path):
-    file = tmp_path / "file"
-    file.write_text("in the way")
-    assert run(STEP, file / "cache")[:2] == (0, built[1])
-    assert file.read_text() == "in the way"
-
-
-def test_two_processes_may_build_at_once(built, tmp_path):
-    env = {**os.environ, "MEGASTEP_CACHE": str(tmp_path)}
-    both = [
-        subprocess.Popen(
-            [sys.executable, "-c", STEP], stdout=subprocess.PIPE, text=True, cwd=ROOT, env=env
-        )
-        for _ in range(2)
-    ]
-    assert [process.communicate()[0].strip() for process in both] == [built[1]] * 2
-    assert len(list(tmp_path.iterdir())) == 1, "no temporary file is left"
-
-
 def test_no_compiler_is_one_sentence_with_the_cure(tmp_path, monkeypatch):
     monkeypatch.setenv("CXX", "/nonexistent")
     with pytest.raises(

@@ -1,25 +1,25 @@
-"""Builds the kernels at first use and keeps what was built.
+"""Builds the kernels at first use, and loads them.
 
 The CPU library comes from the system's C++ compiler, the GPU's cubin from NVRTC, which PyTorch's
-CUDA wheels bring along: no nvcc. Either is kept in ``$MEGASTEP_CACHE`` (else
-``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``) under a hash of sources, flags, compiler
-and processor. A kept file ends in its own SHA-256, so a damaged one is seen and built again; it is
-written beside its place and renamed, so that two processes cannot harm each other; where the folder
-cannot be written a temporary one serves.
+CUDA wheels bring along: no nvcc. Either is cached under a hash of sources, flags, compiler and
+processor.
 """
 
-import atexit
 import ctypes
 import functools
 import hashlib
 import os
 import platform
+import re
 import shutil
+import signal
 import subprocess
 import tempfile
 from pathlib import Path
 
 import torch
+
+from . import cache
 
 HERE = Path(__file__).parent
 OPERATIONS = ("bake", "physics", "update_agent_geometry", "render", "spawn", "uniform")
@@ -45,63 +45,12 @@ CUDA_FLAGS = (
     "--generate-line-info",
     f"-DBLOCK={BLOCK}",
 )
-DIGEST = 32
 
 
 class EngineError(RuntimeError):
     """The machine cannot do what was asked: no compiler, no GPU, no memory, a position that is not
     a number. The message is one sentence with the cure.
     """
-
-
-# ---- The cache ----
-
-
-def _folder():
-    chosen = os.environ.get("MEGASTEP_CACHE")
-    base = (
-        Path(chosen)
-        if chosen
-        else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "megastep"
-    )
-    try:
-        base.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=base):
-            return base
-    except OSError:
-        return None
-
-
-def _intact(path):
-    """The bytes of a kept file less the digest it ends in, or None if it is missing or damaged."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    body, digest = content[:-DIGEST], content[-DIGEST:]
-    return body if body and hashlib.sha256(body).digest() == digest else None
-
-
-@functools.cache
-def _temporary():
-    folder = Path(tempfile.mkdtemp(prefix="megastep-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
-
-
-def kept(name, build):
-    """The path of ``name`` in the cache, built by ``build() -> bytes`` unless an intact one is
-    there.
-    """
-    folder = _folder() or _temporary()
-    path = folder / name
-    if _intact(path) is None:
-        body = build()
-        handle, temporary = tempfile.mkstemp(dir=folder, prefix=name)
-        with os.fdopen(handle, "wb") as file:
-            file.write(body + hashlib.sha256(body).digest())
-        os.replace(temporary, path)
-    return path
 
 
 def _key(*parts):
@@ -120,18 +69,33 @@ def sources(*suffixes: str) -> dict[str, str]:
 
 def _compiler():
     """The C++ compiler's command, and its version as text."""
-    asked = os.environ.get("CXX")
-    for command in [asked] if asked else ["c++", "g++", "clang++"]:
+    chosen = os.environ.get("CXX")
+    for command in [chosen] if chosen else ["c++", "g++", "clang++"]:
         found = shutil.which(command)
         if found:
-            return found, subprocess.run(
-                [found, "--version"], capture_output=True, text=True
-            ).stdout
-    what = f"CXX={asked} is not a program" if asked else "none of c++, g++ and clang++ is there"
+            return found, _run([found, "--version"]).stdout
+    what = f"CXX={chosen} is not a program" if chosen else "none of c++, g++ and clang++ is there"
     raise EngineError(
         f"The CPU engine needs a C++ compiler and {what}: install one (Debian: apt install g++) "
         f"or set CXX to yours."
     )
+
+
+def _run(command, **env):
+    """Runs a compiler, apart from the terminal: what Ctrl-C does is for Python's handlers to say.
+    EngineError if a signal stopped it.
+    """
+    done = subprocess.run(
+        command, capture_output=True, text=True, start_new_session=True, env={**os.environ, **env}
+    )
+    by_driver = re.search(r"(\w+) signal terminated program", done.stderr)  # as g++ puts it
+    if done.returncode < 0 or by_driver:
+        name = by_driver[1] if by_driver else signal.Signals(-done.returncode).name
+        raise EngineError(
+            f"{command[0]} was stopped by a signal ({name}) before the CPU engine was built: start "
+            f"again; if no one stopped it, free some memory first."
+        )
+    return done
 
 
 def _processor():
@@ -145,21 +109,43 @@ def _processor():
 
 
 def _build_cpu(compiler):
-    with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
-        out = Path(folder) / "engine.so"
-        done = subprocess.run(
-            [compiler, *CPU_FLAGS, *map(str, sorted(HERE.glob("*.cpp"))), "-o", str(out)],
-            capture_output=True,
-            text=True,
-        )
-        if done.returncode:
-            raise EngineError(
-                f"{compiler} could not build the CPU engine; it needs a C++17 compiler with "
-                f"OpenMP (Debian: apt "
-                f"install g++). It said: "
-                f"{' '.join(done.stderr.split())[:500]}"
-            )
-        return out.read_bytes()
+    files = [str(path) for path in sorted(HERE.glob("*.cpp"))]
+    try:
+        with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
+            out = Path(folder) / "engine.so"
+            done = _run([compiler, *CPU_FLAGS, *files, "-o", str(out)], TMPDIR=folder)
+            if not done.returncode:
+                return out.read_bytes()
+    except OSError as error:
+        raise EngineError(
+            f"The CPU engine could not be built in {tempfile.gettempdir()} ({error.strerror}): "
+            f"make room there, or set TMPDIR to a folder that has some."
+        ) from None
+    raise EngineError(
+        f"{compiler} could not build the CPU engine; it needs a C++17 compiler with OpenMP "
+        f"(Debian: apt install g++) and room in {tempfile.gettempdir()}. It said: "
+        f"{' '.join(done.stderr.split())[:500]}"
+    )
+
+
+def _load(name, body, path):
+    """The library ``body``, from its cached file or else from a private one that is gone again."""
+    if path is not None:
+        try:
+            return ctypes.CDLL(str(path))
+        except OSError as error:
+            cache.warn(f"no library can be loaded from {path.parent} ({error})")
+    try:
+        with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
+            copy = Path(folder) / name
+            copy.write_bytes(body)
+            return ctypes.CDLL(str(copy))
+    except OSError as error:
+        raise EngineError(
+            f"The CPU engine was built, but cannot be loaded from {tempfile.gettempdir()} "
+            f"({error}): set MEGASTEP_CACHE to a folder of your own, with room, whose mount is not "
+            f"noexec."
+        ) from None
 
 
 @functools.cache
@@ -168,7 +154,7 @@ def cpu():
     compiler, version = _compiler()
     parts = (*sources(".h", ".cpp").values(), *CPU_FLAGS, compiler, version, _processor())
     name = f"cpu-{_key(*parts)}.so"
-    library = ctypes.CDLL(str(kept(name, lambda: _build_cpu(compiler))))
+    library = _load(name, *cache.fetch(name, lambda: _build_cpu(compiler)))
     functions = {operation: getattr(library, operation) for operation in OPERATIONS}
     for function in functions.values():
         function.argtypes, function.restype = [ctypes.c_char_p], None
@@ -246,13 +232,13 @@ def cuda(index):
             f"not be loaded "
             f"({error}): reinstall torch."
         ) from None
-    path = kept(
+    cubin, _ = cache.fetch(
         f"cuda-{_key(*files.values(), *flags, str(version))}.cubin",
         lambda: _build_cuda(files, flags),
     )
     with torch.cuda.device(index):
         torch.cuda.current_stream().synchronize()  # makes the device's primary context current
-        module = checked(driver.cuModuleLoadData(_intact(path)), "Loading the GPU engine")
+        module = checked(driver.cuModuleLoadData(cubin), "Loading the GPU engine")
         functions = {
             operation: checked(
                 driver.cuModuleGetFunction(module, operation.encode()), "Loading the GPU engine"
