@@ -11,6 +11,8 @@ import torch
 
 from .arrdict import arrdict
 
+__all__ = ["ATTRIBUTES", "check_environment", "check_world", "random_actions", "rollout", "same"]
+
 FLAGS = "reset", "terminal", "truncated"
 ATTRIBUTES = {
     "n_envs": "the number of its environments, N",

@@ -8,6 +8,8 @@ it.
 
 from .geometries import sample as _sample
 
+__all__ = ["sample"]
+
 
 def sample(n_geometries, split="training", seed=1):
     """``n_geometries`` homes, a list of geometries. ``split`` is training, test or all."""

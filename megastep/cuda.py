@@ -17,4 +17,4 @@ def __dir__():
     return sorted({*dir(engine), "Core"})
 
 
-__all__ = [*(name for name in dir(engine) if not name.startswith("_")), "Core"]
+__all__ = [*engine.__all__, "Core"]

@@ -9,6 +9,8 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+__all__ = ["dotdict", "leaves", "mapping"]
+
 _INDENT = 4
 _WIDTH = 120
 _MAX_AXES = 8  # a tuple of more integers is data, not a shape

@@ -17,6 +17,8 @@ below is always the (H, W) of the masks, and an index an (i, j) pair of row and 
 
 import numpy as np
 
+__all__ = ["centers", "checked", "display", "indices", "masks"]
+
 RES = (
     0.2  # metres a cell; the original's, coarse enough to be cheap and fine enough for a 0.6 m door
 )

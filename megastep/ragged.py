@@ -13,6 +13,8 @@ from functools import cached_property
 import numpy as np
 import torch
 
+__all__ = ["Bounds", "Ragged", "RaggedNumpy", "RaggedTorch"]
+
 
 class Bounds:
     """What follows from the ``widths`` (D,) of subarrays that lie end to end."""

@@ -31,6 +31,8 @@ from numpy.typing import ArrayLike
 
 from .arrdict import clone, numpyify
 
+__all__ = ["ParallelEncoder"]
+
 MAX_WORKERS = 8  # some 80 figures per second; each has torch in memory, about half a gigabyte
 # x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines need more
 QUALITY = "20"

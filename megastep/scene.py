@@ -8,6 +8,8 @@ from .colour import gamma_decode
 from .ragged import Ragged
 from .scenery import Layouts, Scenery
 
+__all__ = ["TEXEL", "agent_model", "display", "scenery", "texel_widths", "wall_textures"]
+
 TEXEL = 0.05  # metres a texel
 STRIPE = (0.4, 2.0)  # metres, shortest and longest period of a wall's pattern
 INTENSITY = (0.5, 1.6)  # of lights

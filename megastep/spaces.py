@@ -7,6 +7,8 @@ layers.
 
 from dataclasses import astuple, dataclass, fields
 
+__all__ = ["MultiDiscrete", "MultiEmpty", "MultiImage", "MultiVector"]
+
 
 class _Space:
     def __post_init__(self):

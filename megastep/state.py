@@ -11,6 +11,8 @@ from typing import Any
 
 import torch
 
+__all__ = ["rebind", "restore", "snapshot", "state_tree", "walk"]
+
 State = dict[str, torch.Tensor]
 
 SCALARS = (bool, int, float, str, type(None))

@@ -18,6 +18,7 @@ Names that moved, all through: `rebar` and `megastep.demo` are `megastep`, `mega
 
 import doctest
 import importlib
+import types
 
 import numpy as np
 import pytest
@@ -50,6 +51,17 @@ def session(text, **names):
 @pytest.mark.parametrize("name", megastep._MODULES)
 def test_every_module_is_an_attribute_of_the_package(name):
     assert getattr(megastep, name) is importlib.import_module(f"megastep.{name}")
+
+
+@pytest.mark.parametrize("name", sorted({*megastep._MODULES} - {"kernels"}))
+def test_a_star_import_brings_what_is_the_module_s_own(name):
+    found = {}
+    exec(f"from megastep.{name} import *", found)
+    own = {key: value for key, value in found.items() if key != "__builtins__"}
+    assert own
+    for key, value in own.items():
+        assert not isinstance(value, types.ModuleType), f"{key} would replace a module"
+        assert getattr(value, "__module__", "megastep").startswith("megastep"), key
 
 
 def test_a_module_that_is_not_there_is_named():

@@ -3,4 +3,6 @@
 from .explorer import Explorer
 from .minimal import Minimal
 
+__all__ = ["ENVS", "Explorer", "Minimal"]
+
 ENVS = {"minimal": Minimal, "explorer": Explorer}

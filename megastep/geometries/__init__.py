@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry import centers, indices, masks
-from . import files, homes, toys
+from . import files, toys
 from .homes import database
 
-__all__ = ["SOURCES", "SPLITS", "centers", "files", "homes", "indices", "masks", "sample", "toys"]
+__all__ = ["SOURCES", "SPLITS", "centers", "indices", "masks", "sample"]
 
 SPLITS = ("training", "test", "all")
 BENCH = Path(__file__).parent / "data" / "bench_homes.npz"
