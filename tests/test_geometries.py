@@ -209,6 +209,15 @@ def test_a_bad_file_is_refused_in_one_sentence(tmp_path, message):
     ).exists()
 
 
+def test_an_encrypted_array_is_refused_in_one_sentence(tmp_path):
+    path = written(tmp_path / "locked.npz")
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\1\2") + 8] |= 1  # the first entry's flags in the table of contents
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=f"^Geometry file '{path}', .*: is encrypted.$"):
+        files.load(path)
+
+
 @pytest.mark.parametrize(
     "content, message",
     [
