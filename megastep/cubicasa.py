@@ -1,4 +1,4 @@
-"""Floor plans under the name of the database that the seeds took theirs from:
+"""Floor plans under the name of the database that the original megastep took its own from:
 ``cubicasa.sample(64)``.
 
 CubiCasa5k's licence (CC BY-NC) keeps it out of this package. These are the homes of
@@ -6,11 +6,12 @@ CubiCasa5k's licence (CC BY-NC) keeps it out of this package. These are the home
 it.
 """
 
+from .dotdict import dotdict
 from .geometries import sample as _sample
 
 __all__ = ["sample"]
 
 
-def sample(n_geometries, split="training", seed=1):
+def sample(n_geometries: int, split: str = "training", seed: int = 1) -> list[dotdict]:
     """``n_geometries`` homes, a list of geometries. ``split`` is training, test or all."""
     return _sample("homes", n_geometries, split, seed)

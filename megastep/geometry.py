@@ -1,4 +1,4 @@
-"""What a geometry is: the walls, lights and rooms of one static world, as a dotdict of numpy
+"""What a geometry is: the walls, lights and rooms of one floor plan, as a dotdict of numpy
 arrays.
 
 | key | value |
@@ -15,13 +15,16 @@ The masks' lower-left corner is at (0, 0) and row 0 is at the top. Further keys 
 below is always the (H, W) of the masks, and an index an (i, j) pair of row and column.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 __all__ = ["centers", "checked", "display", "indices", "masks"]
 
-RES = (
-    0.2  # metres a cell; the original's, coarse enough to be cheap and fine enough for a 0.6 m door
-)
+# Metres per cell; the original's, coarse enough to be cheap and fine enough for a 0.6 m door.
+RES = 0.2
 MARGIN = 1.0  # metres of free cells kept beyond the furthest wall
 MAX_EXTENT = 200.0  # metres; 1,000 x 1,000 cells of the usual side
 MAX_WALLS = 32_768  # some 150 times a dense home
@@ -31,15 +34,12 @@ MAX_ROOMS = 32_767  # what int16 numbers
 
 # cells; a wall this near to a cell's edge touches the cell: float32 is good to 1e-5 m at 200 m
 TOLERANCE = 1e-4
-NUMBERS = {
-    "iuf": "numbers",
-    "iu": "whole numbers",
-    "iub": "whole numbers",
-}  # numpy's kinds of dtype, in words
+# numpy's kinds of dtype, in words
+NUMBERS = {"iuf": "numbers", "iu": "integers", "iub": "integers"}
 CHUNK = 1_024  # walls rasterised at a time, which bounds the memory at some 100 MB
 
 
-def centers(indices, shape, res=RES):
+def centers(indices: ArrayLike, shape: tuple[int, int], res: float = RES) -> np.ndarray:
     """The (x, y) centres in metres, (..., 2) float32, of the cells at `indices`, (..., 2) of (i,
     j).
     """
@@ -48,7 +48,7 @@ def centers(indices, shape, res=RES):
     return (np.stack([j + 0.5, shape[0] - i - 0.5], -1) * res).astype(np.float32)
 
 
-def indices(coords, shape, res=RES):
+def indices(coords: ArrayLike, shape: tuple[int, int], res: float = RES) -> np.ndarray:
     """The (i, j) indices, (..., 2) int64, of the cells that hold the points `coords`, (..., 2) of
     (x, y) in metres.
 
@@ -118,7 +118,7 @@ def _inside(rings, shape):
     return flips.cumsum(1)[:, :width] % 2 == 1
 
 
-def masks(walls, rooms, res=RES):
+def masks(walls: ArrayLike, rooms: Sequence[Any], res: float = RES) -> np.ndarray:
     """The (H, W) int16 masks of a geometry.
 
     `walls` is (M, 2, 2) in metres. Each of `rooms` is a polygon, (P, 2) in metres, or a list of
@@ -185,7 +185,7 @@ def _coordinates(g, key, shape, limit):
     return points
 
 
-def checked(g):
+def checked(g: dict) -> Any:
     """A copy of geometry `g` with the documented dtypes and without walls of no length.
 
     Raises ValueError, saying what is wrong and what is allowed, unless it is finite, positive, has
@@ -207,12 +207,12 @@ def checked(g):
         )
     res = float(_array(g, "res", "iuf", ()))
     if not 0.01 <= res <= 10:
-        raise ValueError(f"'res' is {res:g} m a cell, and 0.01 to 10 is allowed")
+        raise ValueError(f"'res' is {res:g} m per cell, and 0.01 to 10 is allowed")
     number = int(_array(g, "id", "iu", ()))
     return type(g)(g, id=number, walls=walls, lights=lights, masks=cells.astype(np.int16), res=res)
 
 
-def display(g, ax=None):
+def display(g: Any, ax: Any = None) -> Any:
     """Draws the plan of geometry `g`: rooms tinted, walls black, lights yellow. Returns the
     matplotlib axes.
     """

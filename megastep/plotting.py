@@ -1,4 +1,4 @@
-"""Pictures for people: plans in their lit colours, what an agent can see of them, and the strips
+"""Drawing for people: plans in their lit colours, what an agent can see of them, and the strips
 its camera delivers.
 
 Everything here takes numpy arrays in metres, degrees and linear light: a numpyified
@@ -9,7 +9,7 @@ pyplot figure, which notebooks show; :func:`panels` makes a figure that pyplot k
 A agents, C channels, H and W rows and columns, L lines, K lights, R rays.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,19 +37,18 @@ UNSEEN = 0.2  # how far texels that have not been seen rise from the background
 STRIP = 0.09  # height of a strip over its width
 
 
-def panels(n_strips=0, width=6.0, title=None):
+def panels(
+    n_strips: int = 0, width: float = 6.0, title: str | None = None
+) -> tuple[Any, Any, list]:
     """A figure with a square for the plan and ``n_strips`` strips under it: (figure, plan axes,
     list of strip axes).
 
-    ``width`` is in inches, at 100 pixels an inch. The figure is not pyplot's, so nothing has to be
+    ``width`` is in inches, at 100 pixels per inch. The figure is not pyplot's, so nothing has to be
     closed.
     """
     from matplotlib.figure import Figure
 
-    margin, gap = (
-        0.55,
-        0.5,
-    )  # inches: about the plan, and what a strip needs below it for its own labels
+    margin, gap = 0.55, 0.5  # inches: about the plan, and below a strip for its labels
     inner = width - 2 * margin
     strip = STRIP * inner
     height = 2 * margin + inner + n_strips * (strip + gap)
@@ -68,25 +67,28 @@ def panels(n_strips=0, width=6.0, title=None):
     )
 
 
-def plot_images(images, transpose=False, aspect=None, axes=None):
-    """Draws pictures side by side, a row of panels for each name. Returns the axes, (names,
-    pictures).
+def plot_images(
+    images: Mapping[str, ArrayLike],
+    transpose: bool = False,
+    aspect: float | None = None,
+    axes: Any = None,
+) -> np.ndarray:
+    """Draws images side by side, a row of panels for each name. Returns the axes, (names, images).
 
     Args:
         images: dict of arrays (..., C, H, W) as policies see them, of 1 channel (shown in grey, 0
-        to 1) or 3 (linear
-            light, gamma encoded here). All axes before the last three are further pictures of that
-            name.
+            to 1) or 3 (linear light, gamma encoded here). All axes before the last three are
+            further images of that name.
         transpose: the arrays are (..., H, W, C) instead, like ``Render.screen``.
         aspect: height of a panel over its width; by default such that pixels are square.
-        axes: as many axes as there are pictures in all, row by row.
+        axes: as many axes as there are images in all, row by row.
     Raises ValueError for other shapes.
     """
-    pictures = {name: _pictures(name, image, transpose) for name, image in images.items()}
-    shape = len(pictures), max(map(len, pictures.values()), default=0)
+    stacks = {name: _stack(name, image, transpose) for name, image in images.items()}
+    shape = len(stacks), max(map(len, stacks.values()), default=0)
     if not all(shape):
         raise ValueError(
-            "plot_images was given no pictures; it needs a dict of arrays with at least one each"
+            "plot_images was given no images; it needs a dict of arrays with at least one each"
         )
     if axes is None:
         from matplotlib import pyplot
@@ -95,7 +97,7 @@ def plot_images(images, transpose=False, aspect=None, axes=None):
             *shape, squeeze=False, layout="constrained", figsize=(6 * shape[1], 1.5 * shape[0])
         )[1]
     axes = np.asarray(axes, dtype=object).reshape(shape)
-    for row, (name, stack) in zip(axes, pictures.items(), strict=True):
+    for row, (name, stack) in zip(axes, stacks.items(), strict=True):
         for i, ax in enumerate(row):
             if i < len(stack):
                 _plot_image(ax, stack[i], name if len(stack) == 1 else f"{name} {i}", aspect)
@@ -104,7 +106,7 @@ def plot_images(images, transpose=False, aspect=None, axes=None):
     return axes
 
 
-def _pictures(name, image, transpose):
+def _stack(name, image, transpose):
     """(n, H, W, C) floats in [0, 1], ready to show."""
     image = np.asarray(image, np.float32)
     if image.ndim >= 3 and not transpose:
@@ -112,7 +114,7 @@ def _pictures(name, image, transpose):
     if image.ndim < 3 or image.shape[-1] not in (1, 3):
         wanted = "(..., H, W, C)" if transpose else "(..., C, H, W)"
         raise ValueError(
-            f"picture '{name}' must have shape {wanted} with 1 or 3 channels C, but with transpose="
+            f"image '{name}' must have shape {wanted} with 1 or 3 channels C, but with transpose="
             f"{bool(transpose)} its shape {np.shape(image)} is read as one of other channels"
         )
     image = np.clip(np.nan_to_num(image), 0, 1).reshape(-1, *image.shape[-3:])
@@ -151,14 +153,22 @@ def plot_bars(names: Sequence[str], values: ArrayLike, ax: Any = None) -> Any:
     return ax
 
 
-def plot_lines(ax, lines, colours, seen=None, exposure=EXPOSURE, width=2.5):
+def plot_lines(
+    ax: Any,
+    lines: ArrayLike,
+    colours: Sequence[ArrayLike],
+    seen: Sequence[ArrayLike] | None = None,
+    exposure: float = EXPOSURE,
+    width: float = 2.5,
+) -> Any:
     """Draws lines texel by texel on ``ax``. Returns the matplotlib LineCollection.
 
     Args:
         lines: (L, 2, 2) endpoints in metres.
-        colours: one (w, 3) array a line, its w lit texels in linear light.
-        seen: one (w,) array of bools a line; texels that are False are drawn faintly. All are seen
-        by default. exposure: what the light is multiplied with.
+        colours: one (w, 3) array per line, its w lit texels in linear light.
+        seen: one (w,) array of bools per line; texels that are False are drawn faintly. All are
+            seen by default.
+        exposure: what the light is multiplied with.
         width: of the lines, in points.
     """
     from matplotlib.collections import LineCollection
@@ -167,9 +177,8 @@ def plot_lines(ax, lines, colours, seen=None, exposure=EXPOSURE, width=2.5):
     widths = np.array([len(texels) for texels in colours], int)
     if len(widths) != len(lines):
         raise ValueError(
-            f"plot_lines needs one array of colours a line, but {len(lines)} lines and "
-            f"{len(widths)} "
-            "arrays of colours were given"
+            f"plot_lines needs one array of colours per line, but {len(lines)} lines and "
+            f"{len(widths)} arrays of colours were given"
         )
     line = np.repeat(np.arange(len(lines)), widths)
     texel = np.arange(len(line)) - (widths.cumsum() - widths)[line]
@@ -190,8 +199,15 @@ def plot_lines(ax, lines, colours, seen=None, exposure=EXPOSURE, width=2.5):
     )
 
 
-def plot_scenery(lines, colours, lights=None, seen=None, ax=None):
-    """Draws one world from above: its lines in their lit colours, and its lights. Returns the axes.
+def plot_scenery(
+    lines: ArrayLike,
+    colours: Sequence[ArrayLike],
+    lights: ArrayLike | None = None,
+    seen: Sequence[ArrayLike] | None = None,
+    ax: Any = None,
+) -> Any:
+    """Draws one environment from above: its lines in their lit colours, and its lights. Returns
+    the axes.
 
     Args: ``lines``, ``colours`` and ``seen`` as in :func:`plot_lines`; ``lights`` (K, 2 or more), x
     and y first.
@@ -220,7 +236,15 @@ def plot_scenery(lines, colours, lights=None, seen=None, ax=None):
     return ax
 
 
-def plot_view(ax, position, angle, fov, distances=None, reach=1.0, colour="w"):
+def plot_view(
+    ax: Any,
+    position: ArrayLike,
+    angle: float,
+    fov: float,
+    distances: ArrayLike | None = None,
+    reach: float = 1.0,
+    colour: str = "w",
+) -> Any:
     """Draws where a camera looks: a wedge, or with ``distances`` the area it sees. Returns the
     matplotlib patch.
 
@@ -229,7 +253,8 @@ def plot_view(ax, position, angle, fov, distances=None, reach=1.0, colour="w"):
         angle: degrees from +x, anticlockwise.
         fov: degrees between the outermost rays.
         distances: (R,) metres along each ray, the leftmost first, as in ``Render.distances``;
-        misses may be infinite. reach: metres; how far the wedge goes, and misses.
+            misses may be infinite.
+        reach: metres; how far the wedge goes, and misses.
     """
     from matplotlib.patches import Polygon
 
@@ -246,7 +271,7 @@ def plot_view(ax, position, angle, fov, distances=None, reach=1.0, colour="w"):
     )
 
 
-def rasterise(figure):
+def rasterise(figure: Any) -> np.ndarray:
     """A figure as an (H, W, 3) uint8 array, drawn by Agg whatever canvas it has."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 

@@ -144,7 +144,7 @@ WRONG = {
     "has no wall of any length": lambda g: g.update(walls=np.ones((5, 2, 2))),
     "has 40,000 walls, and the limit is 32,768": lambda g: g.update(walls=np.ones((40_000, 2, 2))),
     "has no room": lambda g: g.update(masks=np.minimum(g.masks, 0)),
-    "'masks' is of dtype float32, and whole numbers": lambda g: g.update(
+    "'masks' is of dtype float32, and integers": lambda g: g.update(
         masks=g.masks.astype(np.float32)
     ),
     "'masks' holds -2 to 1, and -1 to 32,767 is": lambda g: g.update(
@@ -153,9 +153,9 @@ WRONG = {
     "has masks of 4,002,000 cells, and the limit": lambda g: g.update(
         masks=np.ones((2001, 2000), np.int8)
     ),
-    "'res' is 0 m a cell, and 0.01 to 10 is": lambda g: g.update(res=0.0),
-    "'res' is nan m a cell": lambda g: g.update(res=np.nan),
-    "'id' is of dtype float64, and whole numbers": lambda g: g.update(id=1.5),
+    "'res' is 0 m per cell, and 0.01 to 10 is": lambda g: g.update(res=0.0),
+    "'res' is nan m per cell": lambda g: g.update(res=np.nan),
+    "'id' is of dtype float64, and integers": lambda g: g.update(id=1.5),
 }
 
 

@@ -1,4 +1,4 @@
-"""Pictures: the sRGB curve, and what is drawn where."""
+"""Drawing: the sRGB curve, and what is drawn where."""
 
 import subprocess
 import sys
@@ -64,7 +64,7 @@ def test_core_offers_it_too():
     assert core.gamma_encode is gamma_encode and core.gamma_decode is gamma_decode
 
 
-# ---- Pictures and strips ----
+# ---- Images and strips ----
 
 
 def test_a_screen_is_shown_encoded_left_to_right_as_typed_in_the_tutorial():
@@ -116,13 +116,13 @@ def test_given_axes_are_used():
     [((3, 1, 64), True), ((2, 64, 3), False), ((64,), False), ((64, 3), True)],
 )
 def test_other_shapes_are_refused(shape, transpose):
-    with pytest.raises(ValueError, match="picture 'rgb' must have shape .* with 1 or 3 channels C"):
+    with pytest.raises(ValueError, match="image 'rgb' must have shape .* with 1 or 3 channels C"):
         plotting.plot_images({"rgb": np.zeros(shape)}, transpose=transpose)
 
 
 @pytest.mark.parametrize("images", [{}, {"rgb": np.zeros((0, 3, 1, 8))}])
 def test_nothing_to_show_is_refused(images):
-    with pytest.raises(ValueError, match="given no pictures"):
+    with pytest.raises(ValueError, match="given no images"):
         plotting.plot_images(images)
 
 
@@ -136,6 +136,14 @@ def test_lines_are_cut_into_texels_of_their_lit_colours(ax):
     drawn = plotting.plot_lines(ax, LINES, COLOURS, exposure=2.0)
     assert np.allclose(drawn.get_segments(), [[[1, 1], [2, 1]], [[2, 1], [3, 1]], [[3, 1], [3, 5]]])
     assert np.allclose(drawn.get_colors()[:, :3], gamma_encode(2 * np.concatenate(COLOURS)))
+
+
+def test_bars_stand_side_by_side_a_group_for_each_name(ax):
+    drawn = plotting.plot_bars(("turn", "ahead"), [[0.5, -1], [0, 1]], ax)
+    assert drawn is ax and [bar.get_height() for bar in ax.patches] == [0.5, -1, 0, 1]
+    assert [bar.get_x() for bar in ax.patches] == pytest.approx([-0.4, 0.6, 0, 1])
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["turn", "ahead"]
+    assert plotting.plot_bars(("turn",), [0.5]).figure is not ax.figure
 
 
 def test_unseen_texels_are_nearly_background(ax):
@@ -178,14 +186,14 @@ def test_colours_land_where_the_walls_are():
     assert pixel(2, 3) == 3 * [round(255 * plotting.BACKGROUND)]
 
 
-def test_sight_reaches_each_hit_leftmost_ray_first(ax):
+def test_what_is_in_view_reaches_each_hit_leftmost_ray_first(ax):
     # Facing +y with 90 degrees and two rays, these look along (1, 1/2) and (1, -1/2): left of +y is
     # -x.
     patch = plotting.plot_view(ax, (1, 1), 90, 90, distances=[5**0.5, np.inf], reach=2 * 5**0.5)
     assert np.allclose(patch.get_xy()[:3], [[1, 1], [0, 3], [3, 5]])
 
 
-def test_sight_without_distances_is_a_wedge_of_its_field_of_view(ax):
+def test_a_view_without_distances_is_a_wedge_of_its_field_of_view(ax):
     rim = plotting.plot_view(ax, (0, 0), 0, 60, reach=2.0).get_xy()[1:-1]
     assert np.allclose(np.linalg.norm(rim, axis=1), 2)
     degrees = np.degrees(np.arctan2(rim[:, 1], rim[:, 0]))

@@ -2,7 +2,7 @@
 names there are.
 
 A source is a function `(n, split, seed, **options) -> list` of n geometries, the same for the same
-arguments. Sources that hold many different worlds keep a tenth of them for `split="test"`;
+arguments. Sources that hold many different geometries keep a tenth of them for `split="test"`;
 `"training"` is the rest and `"all"` both. When more are asked for than a split holds, its
 geometries come again in the same order (the same objects, not copies).
 """
@@ -11,9 +11,11 @@ import difflib
 import functools
 import inspect
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ..dotdict import dotdict
 from ..geometry import centers, indices, masks
 from . import files, toys
 from .homes import database
@@ -24,8 +26,8 @@ SPLITS = ("training", "test", "all")
 BENCH = Path(__file__).parent / "data" / "bench_homes.npz"
 
 
-def _held(count, split):
-    """The range of a database of `count` worlds that `split` holds; a database of one serves every
+def _split_range(count, split):
+    """The range of a database of `count` geometries that `split` holds; a single one is in every
     split.
     """
     training = count - max(1, round(count / 10)) if count > 1 else 1
@@ -40,11 +42,11 @@ def _selected(count, n, split, seed):
     """n indices into a database of `count`: the split in an order drawn from `seed`, over and
     over.
     """
-    held = _held(count, split)
+    members = _split_range(count, split)
     order = np.random.RandomState(seed % 2**32).permutation(
-        len(held)
+        len(members)
     )  # a stream numpy promises never to change
-    return [held[order[i % len(held)]] for i in range(n)]
+    return [members[order[i % len(members)]] for i in range(n)]
 
 
 def _box(n, split, seed, width=5):
@@ -90,7 +92,9 @@ def _known(kind, given, allowed):
         )
 
 
-def sample(name, n, split="training", seed=1, **options):
+def sample(
+    name: str, n: int, split: str = "training", seed: int = 1, **options: Any
+) -> list[dotdict]:
     """A list of n geometries from the source `name`, the same for the same arguments.
 
     `options` are the source's own: `width` of "box", `width` and `pillar` of "column", `outer` of
@@ -103,9 +107,7 @@ def sample(name, n, split="training", seed=1, **options):
     for option in options:
         _known(f"option of geometry source {name!r} called", option, allowed)
     if not isinstance(n, (int, np.integer)) or isinstance(n, bool) or n < 1:
-        raise ValueError(
-            f"n={n!r} geometries cannot be sampled; ask for a whole number of 1 or more."
-        )
+        raise ValueError(f"n={n!r} geometries cannot be sampled; take an integer of 1 or more.")
     if name == "files" and options.get("path") is None:
         raise ValueError(
             "Geometry source 'files' needs its option path, an .npz file of geometries."

@@ -13,6 +13,7 @@ import tempfile
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Sequence
 from math import prod
 from pathlib import Path
 
@@ -23,12 +24,10 @@ from ..dotdict import dotdict
 
 KEYS = ("walls", "lights", "masks", "res", "id")
 MAX_GEOMETRIES = 16_384
-MAX_DIRECTORY = (
-    8 << 20
-)  # bytes of the zip's table of contents: five entries each of the most geometries
-MAX_UNPACKED = (
-    96 << 20
-)  # bytes of all arrays; twice that once masks are int16, so under 500 MB with Python itself
+# Bytes of the zip's table of contents: five entries for each of the most geometries.
+MAX_DIRECTORY = 8 << 20
+# Bytes of all arrays; twice that once masks are int16, so under 500 MB with Python itself.
+MAX_UNPACKED = 96 << 20
 MAX_ARRAY = 32 << 20  # bytes of one array: the most cells in the widest type
 MAX_HEADER = 1_024  # bytes of an array's own header, which is parsed as Python; numpy writes 118
 
@@ -137,7 +136,7 @@ def _clause(error):
     return str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
 
 
-def load(path):
+def load(path: str | Path) -> list[dotdict]:
     """The list of geometries in the `.npz` file at `path`; walls of no length are dropped.
 
     Raises ValueError, one sentence with the file, the geometry and what is allowed, for a file that
@@ -158,7 +157,7 @@ def load(path):
         raise ValueError(f"Geometry file {str(path)!r}{where}: {_clause(error)}.") from error
 
 
-def save(path, geometries):
+def save(path: str | Path, geometries: Sequence[dict]) -> None:
     """Writes a list of geometries to `path` as `.npz`, all or nothing; of further keys those that
     are numbers.
 

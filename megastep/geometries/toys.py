@@ -33,14 +33,15 @@ def _toy(rings, lights):
     )
 
 
-def _checked_width(width, least):
-    if not isinstance(width, Real) or not least <= width <= geometry.MAX_EXTENT - CORNER:
+def _checked_width(width, minimum):
+    if not isinstance(width, Real) or not minimum <= width <= geometry.MAX_EXTENT - CORNER:
         raise ValueError(
-            f"width={width!r} m is not allowed: take {least:g} to {geometry.MAX_EXTENT - CORNER:g}"
+            f"width={width!r} m is not allowed: take {minimum:g} to "
+            f"{geometry.MAX_EXTENT - CORNER:g}"
         )
 
 
-def box(width=5):
+def box(width: float = 5) -> dotdict:
     """One square room `width` metres wide from (1, 1) and a light at its centre; by default walls
     run from 1 to 6.
     """
@@ -48,7 +49,7 @@ def box(width=5):
     return _toy([_square(CORNER, width)], [[CORNER + width / 2] * 2])
 
 
-def column(width=5, pillar=1):
+def column(width: float = 5, pillar: float = 1) -> dotdict:
     """A box with a square pillar of side `pillar` metres in its middle, and a light in two opposite
     corners.
     """

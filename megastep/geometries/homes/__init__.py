@@ -1,7 +1,7 @@
 """Homes: floor plans like those of real flats and houses.
 
-`generate(seed)` makes the home of a seed, the same on every machine (see `draws`): a number of
-rooms, what they are, an outline, a partition, doors and openings, walls. `database` holds 5,000
+`generate(seed)` makes the home of a seed, the same on every machine (see `random_stream`): a number
+of rooms, what they are, an outline, a partition, doors and openings, walls. `database` holds 5,000
 ready ones, those of seeds 0 to 4,999.
 """
 
@@ -12,69 +12,67 @@ from ...dotdict import dotdict
 from . import openings, partition, plan, walls
 from .random_stream import RandomStream
 
-ATTEMPTS = 60  # layouts tried before a home is given one room less
-ENOUGH, FEW = (
-    3,
-    10,
-)  # the best of three layouts is taken, and with more than ten rooms, as those are dear, the first
+ATTEMPTS = 60  # plans tried before a home is given one room less
+# The best of three plans is taken; with more than ten rooms, which are expensive, the first.
+ENOUGH, FEW = 3, 10
 THIN, THICK = (10, 11, 12, 14), (20, 24, 30)  # cm; the thickness of inner walls and of the envelope
 SLANTED = 0.08  # of the homes have a corner cut off at 45 degrees
-START = 100  # cm; the least coordinate of a home
+START = 100  # cm; the minimum coordinate of a home
 
 
-def _attempt(count, draws):
-    """A layout of `count` rooms as [(cost, footprint, rooms, contacts, depth, gaps)], or [] if it
+def _attempt(count, stream):
+    """A plan of `count` rooms as [(cost, footprint, rooms, contacts, depth, gaps)], or [] if it
     does not work out.
     """
-    rooms = plan.programme(count, draws)
-    footprint = plan.footprint(sum(size for _, size in rooms), draws)
+    rooms = plan.programme(count, stream)
+    footprint = plan.footprint(sum(size for _, size in rooms), stream)
     try:
-        rooms, sides = partition.partition(footprint, rooms, draws)
+        rooms, sides = partition.partition(footprint, rooms, stream)
     except partition.Failure:
         return []
-    depth = walls.depths(sides, THIN[draws.below(len(THIN))])
+    depth = walls.depths(sides, THIN[stream.below(len(THIN))])
     meetings = openings.contacts(rooms)
     spans = {contact: openings.clear(contact, meetings, depth) for contact in meetings}
-    found = openings.connections(rooms, spans, draws)
+    found = openings.connections(rooms, spans, stream)
     if not found:
         return []
     cost, chosen = found
     gaps = [
-        openings.opening(c, spans[c], (rooms[c.a].kind, rooms[c.b].kind), draws) for c in chosen
+        openings.opening(c, spans[c], (rooms[c.a].kind, rooms[c.b].kind), stream) for c in chosen
     ]
     return [(cost, footprint, rooms, meetings, depth, gaps)]
 
 
-def _layout(draws):
-    """The best of a few layouts: (cost, footprint, rooms, contacts, depth, gaps).
+def _best_plan(stream):
+    """The best of a few plans: (cost, footprint, rooms, contacts, depth, gaps).
 
-    The number of rooms is drawn once, before any layout is rejected: small homes work out more
+    The number of rooms is drawn once, before any plan is rejected: small homes work out more
     often, so drawing it anew each time would make the homes small.
     """
-    count = plan.room_count(draws)
+    count = plan.room_count(stream)
     while True:
         found = []
         for _ in range(ATTEMPTS):
-            found += _attempt(count, draws)
+            found += _attempt(count, stream)
             if len(found) >= (ENOUGH if count <= FEW else 1):
                 break
         if found:
-            return min(found, key=lambda layout: layout[0])
+            return min(found, key=lambda found: found[0])
         count -= 1
 
 
-def generate(seed, outer=True):
-    """The home of a seed, any integer; if not `outer`, less its envelope's outer face, which nobody
-    indoors sees.
+def generate(seed: int, outer: bool = True) -> dotdict:
+    """The home of a seed, any integer; if not `outer`, less its envelope's outer face, which cannot
+    be seen from indoors.
 
     A geometry with further keys: `rooms`, the kind of each room in the order of the masks' numbers;
     `areas`, their clear areas in m2; `doors` and `openings`, the widths in metres of the gaps with
     and without a door; `n_outer`, how many of the walls, the last ones, are the envelope's outer
     face.
     """
-    draws = RandomStream(seed)
-    _, footprint, rooms, meetings, depth, gaps = _layout(draws)
-    thickness = THICK[draws.below(len(THICK))]
+    stream = RandomStream(seed)
+    _, footprint, rooms, meetings, depth, gaps = _best_plan(stream)
+    thickness = THICK[stream.below(len(THICK))]
     grid = walls.paint(
         footprint, walls.solids(meetings, depth), [walls.gap(g, depth) for g in gaps], thickness
     )
@@ -84,8 +82,8 @@ def generate(seed, outer=True):
         [[(x0, y0), (x1, y0), (x1, y1), (x0, y1)] for x0, y0, x1, y1 in room.region]
         for room in rooms
     ]
-    if draws.chance(SLANTED):
-        inside, outside, triangle = walls.slanted(inside, outside, *grid, thickness, draws)
+    if stream.chance(SLANTED):
+        inside, outside, triangle = walls.slanted(inside, outside, *grid, thickness, stream)
         for room, ring in zip(rooms, rings):
             ring += [triangle] if walls.holds(room.region, triangle) else []
 

@@ -1,7 +1,7 @@
 """The 5,000 homes that come with the package: `data/homes.npz` and its sha256, written by
 `scripts/make_homes.py`.
 
-The arrays of all homes lie end to end, coordinates as whole centimetres in int16: `walls` (M, 2,
+The arrays of all homes lie end to end, coordinates in centimetres as int16: `walls` (M, 2,
 2), `lights` (K, 2) and `masks` (cells,) int8; `widths` (homes, 5) has each home's number of walls,
 of those in the outer face, of lights, and its masks' height and width.
 """
@@ -45,7 +45,7 @@ def _arrays(path):
 
 
 @functools.lru_cache(maxsize=COUNT)
-def home(index, outer=True, path=PATH):
+def home(index: int, outer: bool = True, path: Path = PATH) -> dotdict:
     """The home of seed `index` as a geometry with `n_outer`; `outer` as for `generate`."""
     arrays, starts = _arrays(path)
     _, n_outer, _, height, width = arrays["widths"][index]

@@ -1,26 +1,23 @@
-"""Where rooms meet, and which of those walls have a door or an opening. Whole centimetres."""
+"""Where rooms meet, and which of those walls have a door or an opening. Integer centimetres."""
 
+from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-DOORS = {
-    60: 0.06,
-    65: 0.12,
-    70: 0.16,
-    75: 0.18,
-    80: 0.24,
-    85: 0.14,
-    90: 0.10,
-}  # widths and how often
+from .random_stream import RandomStream
+
+# How often a door has each width.
+DOORS = {60: 0.06, 65: 0.12, 70: 0.16, 75: 0.18, 80: 0.24, 85: 0.14, 90: 0.10}
 SMALL = ("bath", "closet", "lobby", "storage")  # rooms with doors of at most 80 cm
-WIDEST_SMALL = 80
+MAX_SMALL = 80
 STUB = 5  # cm of wall beside a door in a corner
 IN_CORNER = 0.70  # of the doors; the others stand anywhere
-LEAST_CONTACT = 95  # cm of clear wall a door needs
+MIN_CONTACT = 95  # cm of clear wall a door needs
 LOOPS = 0.45  # of the cheap contacts that the tree of doors leaves out become doors too
+# How often a connection has no door.
 OPEN = {
     frozenset(pair): share
-    for pair, share in {  # how often a connection has no door
+    for pair, share in {
         ("living", "kitchen"): 0.7,
         ("living", "entry"): 0.6,
         ("kitchen", "entry"): 0.6,
@@ -57,7 +54,7 @@ COSTS = {
     }.items()
 }
 COST_ENTRY, COST_LIVING, COST = 0.15, 0.3, 1.0
-CHEAP = 0.8  # the most a loop may cost
+CHEAP = 0.8  # the maximum cost of a loop
 
 
 class Contact(NamedTuple):
@@ -82,7 +79,7 @@ class Opening(NamedTuple):
     door: bool
 
 
-def contacts(rooms):
+def contacts(rooms: Sequence[Any]) -> list[Contact]:
     """Every Contact between two of the rooms, collinear pieces merged."""
     pieces = []
     for (i, room), (j, other) in combinations(enumerate(rooms), 2):
@@ -102,7 +99,7 @@ def contacts(rooms):
     return [Contact(axis, at, low, high, i, j) for i, j, axis, at, low, high in merged]
 
 
-def clear(contact, others, depth):
+def clear(contact: Contact, others: Iterable[Contact], depth: Callable) -> tuple[int, int]:
     """The part (low, high) of a contact that no other wall meets; `depth` as from
     `walls.depths`.
     """
@@ -125,7 +122,9 @@ def _cost(a, b):
     )
 
 
-def connections(rooms, spans, draws):
+def connections(
+    rooms: Sequence[Any], spans: dict[Contact, tuple[int, int]], stream: RandomStream
+) -> tuple[float, list[Contact]] | None:
     """The contacts to open: a cheapest tree over the rooms and some loops.
 
     `spans` has the clear (low, high) of every contact. Returns (mean cost of the tree, [contact]),
@@ -134,10 +133,10 @@ def connections(rooms, spans, draws):
     longest = {}
     for contact, (low, high) in spans.items():
         pair = contact.a, contact.b
-        if high - low >= LEAST_CONTACT and high - low > longest.get(pair, (0, None))[0]:
+        if high - low >= MIN_CONTACT and high - low > longest.get(pair, (0, None))[0]:
             longest[pair] = high - low, contact
     edges = sorted(
-        (_cost(rooms[a].kind, rooms[b].kind) + draws.uniform(0, 0.15), contact)
+        (_cost(rooms[a].kind, rooms[b].kind) + stream.uniform(0, 0.15), contact)
         for (a, b), (_, contact) in longest.items()
     )
     parts = list(range(len(rooms)))
@@ -152,26 +151,28 @@ def connections(rooms, spans, draws):
         total += cost
     if len(set(parts)) > 1:
         return None
-    return total / (len(rooms) - 1), chosen + [contact for contact in rest if draws.chance(LOOPS)]
+    return total / (len(rooms) - 1), chosen + [contact for contact in rest if stream.chance(LOOPS)]
 
 
-def opening(contact, span, kinds, draws):
+def opening(
+    contact: Contact, span: tuple[int, int], kinds: tuple[str, str], stream: RandomStream
+) -> Opening:
     """The Opening made in a contact between rooms of two kinds, somewhere within the clear span
     (low, high).
     """
     low, high = span
-    open_plan = draws.chance(OPEN.get(frozenset(kinds), 0.0))
+    open_plan = stream.chance(OPEN.get(frozenset(kinds), 0.0))
     if open_plan:
-        if draws.chance(FULL):
+        if stream.chance(FULL):
             return Opening(contact, low, high, False)
-        width = draws.between(OPENING[0] // 5, OPENING[1] // 5) * 5
+        width = stream.between(OPENING[0] // 5, OPENING[1] // 5) * 5
     else:
         widths = list(DOORS)
         if any(kind in SMALL for kind in kinds):
-            widths = [width for width in widths if width <= WIDEST_SMALL]
-        width = widths[draws.pick([DOORS[width] for width in widths])]
+            widths = [width for width in widths if width <= MAX_SMALL]
+        width = widths[stream.pick([DOORS[width] for width in widths])]
     spare = high - low - width - 2 * STUB
     if spare < 0:
         return Opening(contact, low, high, False)
-    offset = draws.below(2) * spare if draws.chance(IN_CORNER) else draws.between(0, spare)
+    offset = stream.below(2) * spare if stream.chance(IN_CORNER) else stream.between(0, spare)
     return Opening(contact, low + STUB + offset, low + STUB + offset + width, not open_plan)

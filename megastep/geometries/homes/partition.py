@@ -2,22 +2,23 @@
 rooms.
 """
 
+from collections.abc import Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
 from . import regions
 from .plan import ALLOWANCE, KINDS
-from .random_stream import exp
+from .random_stream import RandomStream, exp
 
-PORTAL = 120  # cm; the least neck between the parts of a region that is still to be cut
-LEAST_FILL = 0.55  # of a room's bounding box
-LEAST_JOG = 35  # cm; shorter steps in a room's outline are refused
+PORTAL = 120  # cm; the minimum neck between the parts of a region that is still to be cut
+MIN_FILL = 0.55  # of a room's bounding box
+MIN_JOG = 35  # cm; shorter steps in a room's outline are refused
 SNAP = 45  # cm within which a cut moves to a corner of the outline
-TEMPERATURE = 0.35  # of the draw among cuts by their worst aspect
+TEMPERATURE = 0.35  # of the choice among cuts by their worst aspect
 BRANCHES = 4  # cuts tried at one place before giving it up
 STEPS = 40  # cuts tried before a whole partition is given up
 CORRIDOR = (110, 150)  # cm of clear width
-LONGEST_CORRIDOR = 850  # cm
+MAX_CORRIDOR = 850  # cm
 CORRIDORS = 8.0  # how much likelier a corridor is drawn than a simple cut of its aspect
 
 # Rooms close in this order tend to be neighbours: dry rooms at the ends, entry and wet rooms in
@@ -56,48 +57,50 @@ class Failure(Exception):
     """No partition was found in the steps allowed."""
 
 
-def partition(region, rooms, draws):
+def partition(
+    region: regions.Region, rooms: Sequence[tuple[str, int]], stream: RandomStream
+) -> tuple[list[Room], dict]:
     """Rooms, a list of (kind, area), laid out in a region.
 
     Returns ([Room], {(axis, at): side}), the second the side of each cut's line on which its wall
     is to stand. Raises Failure.
     """
-    keyed = [(ORDER[kind] + draws.normal(0.0, 0.8), i) for i, (kind, _) in enumerate(rooms)]
+    keyed = [(ORDER[kind] + stream.normal(0.0, 0.8), i) for i, (kind, _) in enumerate(rooms)]
     ordered = [rooms[i] for _, i in sorted(keyed)]
     steps = [STEPS]
-    found = _divided(region, ordered, draws, steps)
+    found = _divided(region, ordered, stream, steps)
     if found is None:
         raise Failure
     return found
 
 
-def _divided(region, rooms, draws, steps):
+def _divided(region, rooms, stream, steps):
     """As `partition`, for rooms in their order; None when it fails. `steps` counts down over the
     whole recursion.
     """
     if len(rooms) == 1:
         return [Room(rooms[0][0], region)], {}
-    cuts = _cuts(region, rooms, draws)
+    cuts = _cuts(region, rooms, stream)
     for _ in range(min(BRANCHES, len(cuts))):
         steps[0] -= 1
         if steps[0] < 0:
             return None
         cut = cuts.pop(
-            draws.pick([c.favour * exp(-min(c.aspect, 5.0) / TEMPERATURE) for c in cuts])
+            stream.pick([c.favour * exp(-min(c.aspect, 5.0) / TEMPERATURE) for c in cuts])
         )
-        laid, sides = [], {(axis, at): side for axis, at, side in cut.lines}
+        placed, sides = [], {(axis, at): side for axis, at, side in cut.lines}
         for part, inside in cut.parts:
-            found = _divided(part, inside, draws, steps)
+            found = _divided(part, inside, stream, steps)
             if found is None:
                 break
-            laid += found[0]
+            placed += found[0]
             sides.update(found[1])
         else:
-            return laid, sides
+            return placed, sides
     return None
 
 
-def _cuts(region, rooms, draws):
+def _cuts(region, rooms, stream):
     """All the cuts of a region in two that suit its rooms, and those with a corridor."""
     widths = [KINDS[kind].width + ALLOWANCE for kind, _ in rooms]
     firsts, lasts = list(accumulate(widths, max)), list(accumulate(widths[::-1], max))[::-1]
@@ -106,7 +109,7 @@ def _cuts(region, rooms, draws):
     for axis in (0, 1):
         inner, slices = regions.corners(region, axis), regions.bands(region, axis)
         low, high = slices[0][0], slices[-1][1]
-        flipped = draws.chance(0.5)
+        flipped = stream.chance(0.5)
         below = 0
         for k in range(1, len(rooms)):
             below += rooms[k - 1][1]
@@ -120,12 +123,12 @@ def _cuts(region, rooms, draws):
                 lower, upper = regions.cut(region, axis, at)
                 lower, upper = (upper, lower) if flipped else (lower, upper)
                 pairs = [(lower, rooms[:k]), (upper, rooms[k:])]
-                cuts.append(_judged(pairs, [(axis, at, side)]))
-        cuts.append(_corridor(region, rooms, axis, slices, draws))
+                cuts.append(_suitable_cut(pairs, [(axis, at, side)]))
+        cuts.append(_corridor(region, rooms, axis, slices, stream))
     return [cut for cut in cuts if cut]
 
 
-def _corridor(region, rooms, axis, slices, draws):
+def _corridor(region, rooms, axis, slices, stream):
     """A cut of a region into two rows of rooms with the entry as a corridor between them, or
     None.
     """
@@ -134,8 +137,8 @@ def _corridor(region, rooms, axis, slices, draws):
     if not entries or len(others) < 4:
         return None
     low, high = slices[0][0], slices[-1][1]
-    width = draws.between(*CORRIDOR) // regions.LATTICE * regions.LATTICE + ALLOWANCE // 2 * 2
-    k = draws.between(2, len(others) - 2)
+    width = stream.between(*CORRIDOR) // regions.LATTICE * regions.LATTICE + ALLOWANCE // 2 * 2
+    k = stream.between(2, len(others) - 2)
     below, total = (sum(size for _, size in part) for part in (others[:k], others))
     at = (
         regions.position(slices, regions.area(region) * below // total)
@@ -145,15 +148,15 @@ def _corridor(region, rooms, axis, slices, draws):
         return None
     lower, rest = regions.cut(region, axis, at)
     strip, upper = regions.cut(rest, axis, at + width)
-    if len(strip) > 1 or strip[0][3 - axis] - strip[0][1 - axis] > LONGEST_CORRIDOR:
+    if len(strip) > 1 or strip[0][3 - axis] - strip[0][1 - axis] > MAX_CORRIDOR:
         return None
-    cut = _judged(
+    cut = _suitable_cut(
         [(lower, others[:k]), (upper, others[k:])], [(axis, at, 0), (axis, at + width, 0)]
     )
     return cut and cut._replace(parts=[*cut.parts, (strip, entries)], favour=CORRIDORS)
 
 
-def _judged(pairs, lines):
+def _suitable_cut(pairs, lines):
     """The Cut of these (region, rooms), or None when a part does not suit its rooms."""
     worst = 1.0
     for part, rooms in pairs:
@@ -186,9 +189,7 @@ def _leaf_aspect(region, kind):
     if len(region) > 1:
         (_, a, p, b), (_, c, _, d) = sorted(region)
         jogs = [abs(a - c), abs(b - d), p - x0, x1 - p]
-        if regions.area(region) < LEAST_FILL * short * long or any(
-            0 < jog < LEAST_JOG for jog in jogs
-        ):
+        if regions.area(region) < MIN_FILL * short * long or any(0 < jog < MIN_JOG for jog in jogs):
             return None
         if min(abs(a - c), abs(b - d)) > 0 or regions.narrowest(region) < 90 + ALLOWANCE:
             return None

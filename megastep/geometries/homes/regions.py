@@ -1,25 +1,27 @@
-"""Rectilinear regions: lists of disjoint rectangles (x0, y0, x1, y1) in whole centimetres, side by
-side.
+"""Rectilinear regions: lists of disjoint rectangles (x0, y0, x1, y1) in integer centimetres, side
+by side.
 
 `footprint` makes them so that no two of their rectangles are stacked, and cuts keep it so: each
 rectangle is as tall as the region is there. Axis 0 is x, axis 1 is y.
 """
 
+Region = list[tuple[int, int, int, int]]
+
 LATTICE = 5  # centimetres; where cuts may be
 
 
-def area(region):
+def area(region: Region) -> int:
     """In cm2."""
     return sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in region)
 
 
-def bounds(region):
+def bounds(region: Region) -> tuple[int, int, int, int]:
     """The bounding box (x0, y0, x1, y1)."""
     x0, y0, x1, y1 = zip(*region)
     return min(x0), min(y0), max(x1), max(y1)
 
 
-def cut(region, axis, at):
+def cut(region: Region, axis: int, at: int) -> tuple[Region, Region]:
     """The parts of a region below and above a line."""
     lower, upper = [], []
     for rectangle in region:
@@ -34,7 +36,7 @@ def cut(region, axis, at):
     return lower, upper
 
 
-def bands(region, axis):
+def bands(region: Region, axis: int) -> list[tuple[int, int, int]]:
     """The region in slices across an axis, between all of its lines: a list of (low, high, length
     across).
     """
@@ -54,7 +56,7 @@ def bands(region, axis):
     ]
 
 
-def position(slices, wanted):
+def position(slices: list[tuple[int, int, int]], wanted: int) -> int:
     """The lattice line nearest to having `wanted` cm2 of a region's `bands` below it."""
     for low, high, length in slices:
         if wanted <= (high - low) * length:
@@ -63,8 +65,8 @@ def position(slices, wanted):
     return (low + wanted // max(length, 1) + LATTICE // 2) // LATTICE * LATTICE
 
 
-def corners(region, axis):
-    """{line: side} for the lines through the region's inner corners; the world outside is on side
+def corners(region: Region, axis: int) -> dict[int, int]:
+    """{line: side} for the lines through the region's inner corners; what is outside is on side
     -1 (below) or +1.
     """
     if len(region) == 1:
@@ -83,8 +85,8 @@ def corners(region, axis):
     }
 
 
-def connected(region, portal):
-    """Whether one can get everywhere in a region through contacts of at least `portal` cm."""
+def connected(region: Region, portal: int) -> bool:
+    """Whether all of a region can be reached through contacts of at least `portal` cm."""
     if len(region) == 1:
         return True
     reached, rest = [region[0]], list(region[1:])
@@ -99,7 +101,7 @@ def connected(region, portal):
     return not rest
 
 
-def narrowest(region):
+def narrowest(region: Region) -> int:
     """The shortest line along x or y, in cm, from boundary to boundary of a region."""
     shortest = min(y1 - y0 for _, y0, _, y1 in region)
     levels = sorted({y for r in region for y in (r[1], r[3])})
@@ -115,7 +117,7 @@ def narrowest(region):
     return shortest
 
 
-def widest(region):
+def widest(region: Region) -> tuple[int, int, int, int]:
     """The rectangle in a region that has the longest short side (the larger one when two do)."""
     best = max(region, key=_breadth)
     ordered = sorted(region)

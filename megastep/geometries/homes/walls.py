@@ -5,18 +5,23 @@ Everything is painted on a grid whose lines are the coordinates that occur: a ce
 outdoors, wall or indoors.
 """
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from . import regions
+from .openings import Contact, Opening
+from .random_stream import RandomStream
+
+Grid = tuple[np.ndarray, np.ndarray, np.ndarray]  # xs, ys, cells
 
 OUTDOORS, WALL, INDOORS = 0, 1, 2
-CLEAR = (
-    21  # cm, along x or y, between a light and any wall: then its cell of the masks touches none
-)
+# cm, along x or y, between a light and any wall: then its cell of the masks touches none
+CLEAR = 21
 SHORTEST, LONGEST = 60, 150  # cm; what a slanted corner takes off either side
 
 
-def depths(sides, thickness):
+def depths(sides: dict, thickness: int) -> Callable:
     """A function from a contact to how far its wall reaches (before, after) its line; `sides` as
     from `partition`.
     """
@@ -34,7 +39,7 @@ def _rectangle(axis, across, along):
     return (a, c, b, d) if axis == 0 else (c, a, d, b)
 
 
-def solids(meetings, depth):
+def solids(meetings: Sequence[Contact], depth: Callable) -> regions.Region:
     """The rectangle of the wall on every contact, long enough to fill the corners it makes with
     others.
     """
@@ -55,14 +60,16 @@ def solids(meetings, depth):
     return rectangles
 
 
-def gap(opening, depth):
+def gap(opening: Opening, depth: Callable) -> tuple[int, int, int, int]:
     """The rectangle an opening takes out of its wall."""
     before, after = depth(opening.contact)
     at = opening.contact.at
     return _rectangle(opening.contact.axis, (at - before, at + after), (opening.low, opening.high))
 
 
-def paint(floor, walls, gaps, envelope):
+def paint(
+    floor: regions.Region, walls: regions.Region, gaps: regions.Region, envelope: int
+) -> Grid:
     """The grid of a home from rectangles of floor, inner walls and gaps, the envelope so many cm
     thick.
 
@@ -103,7 +110,7 @@ def _faces(lines, along, cells, beside):
     )
 
 
-def segments(xs, ys, cells, beside):
+def segments(xs: np.ndarray, ys: np.ndarray, cells: np.ndarray, beside: int) -> np.ndarray:
     """All the segments (n, 2, 2) of (x, y) between walls and cells in the state `beside`, joined
     where collinear.
     """
@@ -112,7 +119,7 @@ def segments(xs, ys, cells, beside):
     return np.concatenate([level, upright])
 
 
-def areas(grid, parts):
+def areas(grid: Grid, parts: Sequence[regions.Region]) -> list[float]:
     """The indoor area in m2 of each of some regions of a painted grid."""
     xs, ys, cells = grid
     indoors = np.outer(np.diff(ys), np.diff(xs)) * (cells == INDOORS)
@@ -126,7 +133,7 @@ def areas(grid, parts):
     return found
 
 
-def light(region, inside):
+def light(region: regions.Region, inside: np.ndarray) -> tuple[int, int]:
     """Where the light of a room is: at its centroid if that is clear of walls, else amid its widest
     rectangle.
 
@@ -142,7 +149,15 @@ def light(region, inside):
     return (x0 + x1) // 2, (y0 + y1) // 2
 
 
-def slanted(inside, outside, xs, ys, cells, thickness, draws):
+def slanted(
+    inside: np.ndarray,
+    outside: np.ndarray,
+    xs: np.ndarray,
+    ys: np.ndarray,
+    cells: np.ndarray,
+    thickness: int,
+    stream: RandomStream,
+) -> tuple[np.ndarray, np.ndarray, list]:
     """A home with one outer corner cut off at 45 degrees: the new segments inside and outside, and
     the triangle lost.
 
@@ -158,7 +173,7 @@ def slanted(inside, outside, xs, ys, cells, thickness, draws):
         + tuple(int(outdoors[i + k, j + l]) for k in (0, 1) for l in (0, 1))
         for i, j in zip(*np.nonzero(around == 3))
     ]
-    x, y, *quadrants = corners[draws.below(len(corners))]
+    x, y, *quadrants = corners[stream.below(len(corners))]
     k, l = divmod(quadrants.index(0), 2)  # the quadrant that is wall
     right, up = 2 * l - 1, 2 * k - 1
     inner = x + right * thickness, y + up * thickness
@@ -192,7 +207,7 @@ def _chamfered(lines, corner, dx, dy):
     return np.concatenate([lines, [[(x + dx, y), (x, y + dy)]]])
 
 
-def holds(region, triangle):
+def holds(region: regions.Region, triangle: list) -> bool:
     """Whether a corner of one of a region's rectangles is the triangle's first."""
     return bool(triangle) and any(
         triangle[0] in ((x0, y0), (x1, y0), (x1, y1), (x0, y1)) for x0, y0, x1, y1 in region
