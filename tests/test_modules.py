@@ -10,6 +10,7 @@ import torch
 from megastep import core, dotdict, engine, modules, plotting, scene, toys
 from megastep.arrdict import numpyify
 from megastep.geometries import sample
+from megastep.modules import spawning
 
 RADIUS = engine.AGENT_RADIUS
 
@@ -219,6 +220,58 @@ def test_a_geometry_without_space_is_named(n_agents, message):
 def test_every_agent_needs_a_point():
     with pytest.raises(ValueError, match="for each of the 3 agents, but 2 was given"):
         modules.RandomSpawns([toys.box()], core_of([toys.box()], 3), n_spawns=2)
+
+
+def cached_points(folder):
+    return sorted(folder.glob("spawn-points-*"))
+
+
+def test_the_points_of_many_layouts_are_found_once_and_cached(tmp_path, monkeypatch):
+    monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
+    homes = sample("bench", 40)
+    c = core_of(homes)
+    found = modules.RandomSpawns(homes, c).points
+    alone = [modules.RandomSpawns([g], core_of([g])).points for g in homes[:1]]
+    assert torch.equal(found[:1], alone[0])
+    (path,) = cached_points(tmp_path)
+
+    with monkeypatch.context() as patch:  # nothing is searched for again
+        patch.setattr(spawning, "spawn_points", None)
+        assert torch.equal(modules.RandomSpawns(homes, c).points, found)
+
+    body = path.read_bytes()
+    path.write_bytes(body[:100] + bytes([body[100] ^ 1]) + body[101:])
+    assert torch.equal(modules.RandomSpawns(homes, c).points, found)
+    assert path.read_bytes() == body
+
+
+def test_other_homes_seeds_and_radii_have_points_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
+    homes = sample("bench", 40)
+    c = core_of(homes)
+    others = [*homes[:-1], homes[0]]
+    found = [
+        modules.RandomSpawns(homes, c).points,
+        modules.RandomSpawns(homes, c, seed=2).points,
+        modules.RandomSpawns(others, c).points,
+    ]
+    c.agents.radius = 0.2
+    found.append(modules.RandomSpawns(homes, c).points)
+    assert len(cached_points(tmp_path)) == 4
+    assert not any(torch.equal(found[0], points) for points in found[1:])
+
+
+def test_only_the_newest_points_stay_in_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
+    monkeypatch.setattr(spawning, "MAX_FILES", 2)
+    homes = sample("bench", 32)
+    c = core_of(homes)
+    left = []
+    for seed in range(4):
+        modules.RandomSpawns(homes, c, seed=seed)
+        left.append({path.name for path in cached_points(tmp_path)})
+    assert [len(names) for names in left] == [1, 2, 2, 2]
+    assert not left[1] & left[3] and len(left[2] & left[3]) == 1
 
 
 # ---- Sensors ----

@@ -40,10 +40,20 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
 
 def warn(problem: str) -> None:
     warnings.warn(
-        f"the kernel cache is not used, so kernels are built at each start: {problem}; set "
-        f"MEGASTEP_CACHE to another folder of your own",
+        f"the kernel cache is not used, so kernels are built, and spawn points found, at each "
+        f"start: {problem}; set MEGASTEP_CACHE to another folder of your own",
         stacklevel=2,
     )
+
+
+def prune(prefix: str, keep: int) -> None:
+    """Deletes all files whose names begin with ``prefix`` but the ``keep`` that are newest."""
+    try:
+        found = sorted(_folder().glob(f"{prefix}*"), key=lambda path: path.stat().st_mtime)
+        for path in found[: -keep or None]:
+            path.unlink()
+    except OSError:
+        pass  # another process deletes too, or there is no cache
 
 
 def intact(path: Path) -> bytes | None:

@@ -3,7 +3,9 @@
 N environments, A agents, D layouts, P points, M walls.
 """
 
+import hashlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,13 @@ import torch
 
 from .. import engine
 from ..geometry import centers
+from ..kernels import cache
 from .lanes import to_agents
 
 CLEARANCE = 0.05  # metres from a spawned agent's collision disc to walls and to others spawned
+PREFIX = "spawn-points-"  # of their files in the cache
+MAX_FILES = 64  # of them, half a megabyte each for 512 layouts
+MIN_CACHED = 32  # layouts; the points of fewer are found in no time
 BATCHES = 20  # of candidates that are tried before a geometry is held to have no more room
 
 
@@ -113,11 +119,9 @@ class RandomSpawns:
             )
         self.core, self.resample = core, resample
         self.seed = core.seed if seed is None else seed
-        points = [
-            spawn_points(g, n_spawns, core.n_agents, core.agents.radius, _generator(self.seed, d))
-            for d, g in enumerate(geometries[: len(core.scenery.layouts)])
-        ]
-        self.points = torch.as_tensor(np.stack(points), dtype=torch.float32, device=core.device)
+        geometries = geometries[: len(core.scenery.layouts)]
+        points = _cached_points(geometries, n_spawns, core.n_agents, core.agents.radius, self.seed)
+        self.points = torch.as_tensor(points, device=core.device)
         self.counts = torch.zeros(
             (core.n_envs, core.n_agents), dtype=torch.int32, device=core.device
         )
@@ -135,5 +139,29 @@ class RandomSpawns:
         )
 
 
-def _generator(seed, layout):
-    return np.random.Generator(np.random.Philox([seed, layout]))
+def _all_points(geometries, n_spawns, n_agents, radius, seed):
+    """(D, A * (n_spawns // A), 2) float32: the points of every layout."""
+    points = [
+        spawn_points(
+            g, n_spawns, n_agents, radius, np.random.Generator(np.random.Philox([seed, d]))
+        )
+        for d, g in enumerate(geometries)
+    ]
+    return np.stack(points).astype(np.float32)
+
+
+def _cached_points(geometries, *arguments):
+    """:func:`_all_points`, from the cache if the same were found before."""
+    if len(geometries) < MIN_CACHED:
+        return _all_points(geometries, *arguments)
+    key = hashlib.sha256(Path(__file__).read_bytes() + repr((np.__version__, arguments)).encode())
+    for g in geometries:
+        for array in (g.walls, g.masks, np.asarray(g.res)):
+            key.update(repr((array.shape, array.dtype)).encode() + array.tobytes())
+
+    def build():
+        cache.prune(PREFIX, MAX_FILES - 1)
+        return _all_points(geometries, *arguments).tobytes()
+
+    body, _ = cache.fetch(f"{PREFIX}{key.hexdigest()[:20]}", build)
+    return np.frombuffer(body, np.float32).reshape(len(geometries), -1, 2).copy()
