@@ -2,16 +2,18 @@
 curves at the end.
 
 `metrics.jsonl` holds what the seed determines, so two runs of one configuration write the same
-bytes; rates and times are in `perf.jsonl`. A sink that fails is dropped with one warning; nothing
-here can stop a run. T time, B lanes.
+bytes; rates and times are in `perf.jsonl`. A sink that fails is dropped with one warning; once it
+is open, nothing here can stop a run.
 """
 
 import importlib
-import json
-import math
 import os
 import warnings
 from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from agents.json_lines import JsonLines, read, rewind
 
 #: How each optional part is called, and what installs it.
 FEATURES = {
@@ -20,11 +22,15 @@ FEATURES = {
     "matplotlib": "curves.png",
     "av": "video.mp4",
 }
-#: Seconds that Weights & Biases may take to answer before the run goes on without it.
-PATIENCE = 20
+#: Seconds that Weights & Biases may take to start before the run goes on without it.
+WANDB_TIMEOUT = 20
 
 
-def missing(package):
+class MetricsError(RuntimeError):
+    """The files of a run's metrics cannot be used; the message is one sentence with the cure."""
+
+
+def missing(package: str) -> str:
     """The sentence for a package that is not installed."""
     return (
         f"{FEATURES[package]} left out: the package {package} is not installed; pip install "
@@ -32,51 +38,10 @@ def missing(package):
     )
 
 
-def is_word(value):
-    """Whether a value is a plain field, such as what the learning rate follows, and no number."""
-    return isinstance(value, str)
-
-
-class JsonLines:
-    """One object a line, written at once, so that a killed run loses none."""
-
-    def __init__(self, path):
-        self.path = Path(path)
-        self.file = open(self.path, "a", encoding="utf-8")
-
-    def write(self, step, values):
-        # JSON knows no nan
-        finite = {k: v if is_word(v) or math.isfinite(v) else None for k, v in values.items()}
-        self.file.write(json.dumps({"samples": step, **finite}) + "\n")
-        self.file.flush()
-
-    def close(self):
-        self.file.close()
-
-
-def read(path):
-    """The objects of a file of JSON lines; a line cut short by a crash or a full disk is passed
-    over.
-    """
-    rows = []
-    for line in Path(path).read_text(encoding="utf-8").splitlines():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return rows
-
-
-def rewind(path, step):
-    """Drops the lines after `step` environment steps: a resumed run writes them again."""
-    path = Path(path)
-    if path.exists():
-        rows = [row for row in read(path) if row["samples"] <= step]
-        path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
-
-
 class TensorBoard:
-    def __init__(self, folder, step):
+    """Event files, from `step` environment steps on."""
+
+    def __init__(self, folder: Path, step: int):
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
@@ -85,7 +50,7 @@ class TensorBoard:
 
     def write(self, step, values):
         for name, value in values.items():
-            if not is_word(value):
+            if not isinstance(value, str):
                 self.writer.add_scalar(name, value, step)
 
     def close(self):
@@ -93,11 +58,11 @@ class TensorBoard:
 
 
 class Wandb:
-    """Weights & Biases, online or offline; it never asks at the terminal and waits `PATIENCE`
-    seconds at most.
+    """Weights & Biases, online or offline; it never asks for a key at the terminal. The run's id is
+    kept in its folder, so that a resumed run goes on as the same run there.
     """
 
-    def __init__(self, folder, project, mode, name, config):
+    def __init__(self, folder: Path, project: str, mode: str, name: str, config: dict[str, Any]):
         os.environ.setdefault("WANDB_SILENT", "true")
         try:
             wandb = importlib.import_module("wandb")
@@ -108,6 +73,7 @@ class Wandb:
                 "Weights & Biases left out: it has no key here; `wandb login` stores one, "
                 "logger.mode=offline needs none"
             )
+        known = folder / "wandb-id.txt"
         try:
             self.run = wandb.init(
                 project=project,
@@ -115,22 +81,25 @@ class Wandb:
                 name=name,
                 config=config,
                 dir=str(folder),
-                settings=wandb.Settings(init_timeout=PATIENCE, silent=True, console="off"),
+                id=known.read_text() if known.exists() else None,
+                resume="allow",
+                settings=wandb.Settings(init_timeout=WANDB_TIMEOUT, silent=True, console="off"),
             )
+            known.write_text(self.run.id)
         except Exception as error:  # the package raises its own, the network's and the system's
             raise RuntimeError(
                 f"Weights & Biases left out: it did not start ({_first_line(error)})"
             ) from None
 
     @staticmethod
-    def _has_key(wandb):
+    def _has_key(wandb: ModuleType) -> bool:
         """Whether there is a key, in the environment or a file, without asking for one at the
         terminal.
         """
         try:
-            return os.environ.get("WANDB_API_KEY") or wandb.login(prompt=False)
+            return bool(os.environ.get("WANDB_API_KEY") or wandb.login(prompt=False))
         except TypeError:  # older versions have no such argument
-            return wandb.api.api_key
+            return bool(wandb.api.api_key)
 
     def write(self, step, values):
         self.run.log({"samples": step, **values}, step=step)
@@ -141,17 +110,21 @@ class Wandb:
 
 class Metrics:
     """All sinks of one run folder. `step`: where a resumed run goes on; `wandb`: arguments of
-    `Wandb`, or None.
+    `Wandb`, or None. MetricsError if the files cannot be written; they are as they were then.
     """
 
-    def __init__(self, folder, step=0, wandb=None):
+    def __init__(self, folder: Path | str, step: int = 0, wandb: dict[str, Any] | None = None):
         folder = Path(folder)
-        for name in ("metrics.jsonl", "perf.jsonl"):
-            rewind(folder / name, step)
-        self.metrics, self.perf = (
-            JsonLines(folder / "metrics.jsonl"),
-            JsonLines(folder / "perf.jsonl"),
-        )
+        paths = folder / "metrics.jsonl", folder / "perf.jsonl"
+        try:
+            for path in paths:
+                rewind(path, step)
+            self.metrics, self.perf = (JsonLines(path) for path in paths)
+        except OSError as error:
+            raise MetricsError(
+                f"The metrics in {folder} cannot be written ({error.strerror}) and are as they "
+                "were; make room there, then start again"
+            ) from error
         self.others = []
         self._open(TensorBoard, folder / "tensorboard", step)
         if wandb is not None:
@@ -163,7 +136,7 @@ class Metrics:
         except Exception as error:
             warnings.warn(_first_line(error), stacklevel=3)
 
-    def write(self, step, metrics, perf):
+    def write(self, step: int, metrics: dict[str, float | str], perf: dict[str, float]) -> None:
         """Writes one report, both dicts of name -> number or word, after `step` environment
         steps.
         """
@@ -172,7 +145,7 @@ class Metrics:
         for sink in list(self.others):
             self._guarded(sink, "write", step, {**metrics, **perf})
 
-    def close(self):
+    def close(self) -> None:
         for sink in [self.metrics, self.perf, *self.others]:
             self._guarded(sink, "close")
 
@@ -195,11 +168,11 @@ class Metrics:
                 )
 
 
-def _first_line(error):
+def _first_line(error: Exception) -> str:
     return (str(error) or type(error).__name__).splitlines()[0]
 
 
-def curves(folder):
+def curves(folder: Path | str) -> None:
     """Draws `curves.png` in a run folder: return, episode length, losses and rate against
     environment steps.
     """
@@ -208,24 +181,22 @@ def curves(folder):
     except ImportError:
         return warnings.warn(missing("matplotlib"), stacklevel=2)
     folder = Path(folder)
-    metrics, perf = read(folder / "metrics.jsonl"), read(folder / "perf.jsonl")
-    panels = {
-        "return": (metrics, ["episode/return"]),
-        "episode length (steps)": (metrics, ["episode/length"]),
-        "entropy": (metrics, ["loss/entropy"]),
-        "value loss": (metrics, ["loss/value"]),
-        "explained variance": (metrics, ["loss/explained_variance"]),
-        "samples / s": (perf, ["perf/rate"]),
-    }
-    figure = Figure(figsize=(12, 6), layout="constrained")
-    for axes, (title, (rows, names)) in zip(figure.subplots(2, 3).flat, panels.items()):
-        for name in names:
-            points = [(row["samples"], row[name]) for row in rows if row.get(name) is not None]
-            axes.plot(*zip(*points) if points else ([], []), label=name)
-        axes.set_title(title)
-        axes.set_xlabel("samples")
-        axes.grid(alpha=0.3)
     try:
+        metrics, perf = read(folder / "metrics.jsonl"), read(folder / "perf.jsonl")
+        panels = {
+            "return": (metrics, "episode/return"),
+            "episode length (steps)": (metrics, "episode/length"),
+            "entropy": (metrics, "loss/entropy"),
+            "value loss": (metrics, "loss/value"),
+            "explained variance": (metrics, "loss/explained_variance"),
+            "samples / s": (perf, "perf/rate"),
+        }
+        figure = Figure(figsize=(12, 6), layout="constrained")
+        for axes, (title, (rows, name)) in zip(figure.subplots(2, 3).flat, panels.items()):
+            points = [(row["samples"], row[name]) for row in rows if row.get(name) is not None]
+            axes.plot(*zip(*points) if points else ([], []))
+            axes.set(title=title, xlabel="samples")
+            axes.grid(alpha=0.3)
         figure.savefig(folder / "curves.png", dpi=80)
     except OSError as error:
-        warnings.warn(f"curves.png cannot be written ({error.strerror})", stacklevel=2)
+        warnings.warn(f"curves.png cannot be drawn ({error.strerror})", stacklevel=2)

@@ -1,12 +1,13 @@
 """Metrics: files that a crash cannot damage, and sinks that fail and do no harm."""
 
-import builtins
 import json
+import os
 import pathlib
 import subprocess
 import sys
 import types
 
+import faults
 import pytest
 
 from agents import metrics
@@ -40,30 +41,96 @@ def test_a_resumed_run_writes_again_what_came_after_its_checkpoint(tmp_path):
     assert [row["x"] for row in metrics.read(tmp_path / "metrics.jsonl")] == [10, 20, -1]
 
 
-def without(monkeypatch, package):
-    """As if the package were not installed."""
-    real = builtins.__import__
-
-    def refuse(name, *args, **kwargs):
-        if name.split(".")[0] == package:
-            raise ImportError(f"No module named {name!r}")
-        return real(name, *args, **kwargs)
-
-    for name in [
-        n
-        for n in sys.modules
-        if n.split(".")[0] == package or n.startswith("torch.utils.tensorboard")
-    ]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr(builtins, "__import__", refuse)
-    monkeypatch.setattr("importlib.import_module", lambda name, package=None: refuse(name))
+def lines(n, **values):
+    return "".join(json.dumps({"samples": i, **values}) + "\n" for i in range(n)).encode()
 
 
-@pytest.mark.parametrize("package", ["tensorboard", "wandb"])
+def test_rewinding_keeps_the_bytes_up_to_the_step(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(lines(9, rate=0.1, none=None))
+    metrics.rewind(path, 4)
+    assert path.read_bytes() == lines(5, rate=0.1, none=None)
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.jsonl"]
+
+
+def test_a_file_that_needs_no_rewinding_is_left_alone(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(lines(5))
+    inode = path.stat().st_ino
+    metrics.rewind(path, 4)
+    assert path.stat().st_ino == inode and path.read_bytes() == lines(5)
+    metrics.rewind(tmp_path / "absent.jsonl", 4)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [b"\xff\xfe{", b'{"samples": 2', b'{"sanples": 2}', b"[]", b"7", b'{"samples": null}', b"\0"],
+)
+def test_a_damaged_line_is_named_and_skipped(tmp_path, damage):
+    path = tmp_path / "metrics.jsonl"
+    parts = lines(5).split(b"\n")
+    parts[2] = damage
+    path.write_bytes(b"\n".join(parts))
+    with pytest.warns(UserWarning, match="metrics.jsonl: line 3 is damaged and is skipped"):
+        assert [row["samples"] for row in metrics.read(path)] == [0, 1, 3, 4]
+    with pytest.warns(UserWarning, match="line 3"):
+        sinks = Metrics(tmp_path, step=3)
+    sinks.write(9, {}, {})
+    sinks.close()
+    assert [row["samples"] for row in metrics.read(path)] == [0, 1, 3, 9], "and named only once"
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_last_line_cut_short_is_nothing_to_worry_about(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(lines(3)[:-5])
+    assert [row["samples"] for row in metrics.read(path)] == [0, 1]
+    path.write_bytes(lines(3)[:-1])  # only its end is missing
+    sinks = Metrics(tmp_path, step=9)
+    sinks.write(9, {}, {})
+    sinks.close()
+    assert [row["samples"] for row in metrics.read(path)] == [0, 1, 2, 9]
+
+
+def test_whichever_byte_is_lost_a_run_can_be_resumed(tmp_path):
+    path, whole = tmp_path / "metrics.jsonl", lines(4, x=0.5)
+    for n in range(len(whole) - 1):
+        path.write_bytes(whole[:n] + bytes([whole[n] ^ 0x80]) + whole[n + 1 :])
+        with pytest.warns(UserWarning, match="damaged"):
+            metrics.rewind(path, 2)
+        assert set(path.read_bytes().splitlines()) <= set(lines(3, x=0.5).splitlines())
+
+
+def test_a_disk_that_is_full_while_a_file_is_rewound_leaves_the_file(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(lines(1000))
+    with faults.full_disk(5000), pytest.raises(metrics.MetricsError, match="File too large"):
+        Metrics(tmp_path, step=900)
+    assert path.read_bytes() == lines(1000)
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.jsonl"]
+
+
+def test_a_process_killed_while_it_rewinds_leaves_the_old_file_or_the_new(tmp_path, monkeypatch):
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(lines(9))
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        metrics.rewind(path, 4)
+    assert path.read_bytes() == lines(9)
+
+
+TENSORBOARD = ("torch.utils.tensorboard", "tensorboard")
+
+
+@pytest.mark.parametrize("package, modules", [("tensorboard", TENSORBOARD), ("wandb", ("wandb",))])
 def test_a_package_that_is_missing_is_named_with_the_line_that_installs_it(
-    tmp_path, monkeypatch, package
+    tmp_path, monkeypatch, package, modules
 ):
-    without(monkeypatch, package)
+    faults.not_installed(monkeypatch, *modules)
     with pytest.warns(UserWarning, match=f"pip install {package}"):
         sinks = Metrics(tmp_path, wandb=WANDB if package == "wandb" else None)
     sinks.write(1, {"x": 1}, {})
@@ -71,14 +138,25 @@ def test_a_package_that_is_missing_is_named_with_the_line_that_installs_it(
     assert metrics.read(tmp_path / "metrics.jsonl") == [{"samples": 1, "x": 1}]
 
 
+def test_without_matplotlib_the_curves_are_named(tmp_path, monkeypatch):
+    faults.not_installed(monkeypatch, "matplotlib", "matplotlib.figure")
+    with pytest.warns(UserWarning, match="curves.png left out.*pip install matplotlib"):
+        metrics.curves(tmp_path)
+
+
 def fake_wandb(monkeypatch, key="key", init=None, log=None):
     """A stand-in for the package, to fail where it is told to."""
     logged = []
     room = types.SimpleNamespace
     run = room(log=log or (lambda values, step: logged.append((step, values))), finish=lambda: None)
-    module = room(
-        login=lambda prompt: key is not None, Settings=dict, init=init or (lambda **_: run)
-    )
+
+    def started(**options):
+        module.options.append(options)
+        run.id = options["id"] or f"id{len(module.options)}"
+        return run
+
+    module = room(login=lambda prompt: key is not None, Settings=dict, init=init or started)
+    module.options = []
     monkeypatch.setitem(sys.modules, "wandb", module)
     return logged
 
@@ -95,6 +173,18 @@ def test_wandb_gets_what_the_files_get(tmp_path, monkeypatch):
     sinks = Metrics(tmp_path, wandb=WANDB)
     sinks.write(5, {"a": 1}, {"b": 2})
     assert logged == [(5, {"samples": 5, "a": 1, "b": 2})]
+
+
+def test_a_run_that_goes_on_is_the_same_run_of_wandb_and_a_new_one_is_another(
+    tmp_path, monkeypatch
+):
+    fake_wandb(monkeypatch)
+    for folder, step in ((tmp_path / "a", 0), (tmp_path / "b", 0), (tmp_path / "a", 5)):
+        folder.mkdir(exist_ok=True)
+        Metrics(folder, step, WANDB).close()
+    started = sys.modules["wandb"].options
+    assert [options["id"] for options in started] == [None, None, "id1"]
+    assert [options["resume"] for options in started] == ["allow"] * 3
 
 
 @pytest.mark.parametrize(
@@ -119,16 +209,23 @@ def test_wandb_failing_is_one_warning_and_the_run_goes_on(tmp_path, monkeypatch,
     assert len(metrics.read(tmp_path / "metrics.jsonl")) == 3
 
 
-def test_a_full_disk_is_one_warning(tmp_path):
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_full_disk_is_one_warning_for_each_file_and_loses_no_line_once_there_is_room(tmp_path):
     sinks = Metrics(tmp_path)
-    sinks.metrics.file.close()
-    sinks.metrics.file = open("/dev/full", "a")
-    with pytest.warns(
-        UserWarning, match="metrics.jsonl cannot be written .*No space left.*the run goes on"
-    ) as caught:
-        sinks.write(1, {"x": 1}, {"y": 2})
-        sinks.write(2, {"x": 1}, {"y": 2})
-    assert len(caught) == 1 and len(metrics.read(tmp_path / "perf.jsonl")) == 2
+    sinks.write(1, {"x": 1}, {"y": 2})
+    size = (tmp_path / "metrics.jsonl").stat().st_size
+    with pytest.warns(UserWarning, match="File too large.*the run goes on") as caught:
+        with faults.full_disk(size + 5):  # room for a part of a line
+            sinks.write(2, {"x": 1}, {"y": 2})
+            sinks.write(3, {"x": 1}, {"y": 2})
+    assert sorted(str(w.message).split(" ")[0].rpartition("/")[2] for w in caught) == [
+        "metrics.jsonl",
+        "perf.jsonl",
+    ]
+    sinks.write(4, {"x": 1}, {"y": 2})
+    sinks.close()
+    for name in ("metrics.jsonl", "perf.jsonl"):
+        assert [row["samples"] for row in metrics.read(tmp_path / name)] == [1, 2, 3, 4]
 
 
 def test_the_curves_are_a_picture_of_the_files(tmp_path):

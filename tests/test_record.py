@@ -1,10 +1,9 @@
 """Videos of trained agents."""
 
-import builtins
 import os
 import signal
-import sys
 
+import faults
 import pytest
 
 from agents.cli import record, train
@@ -95,16 +94,8 @@ def test_training_survives_a_video_that_fails(trained, tmp_path, monkeypatch, ca
 def test_without_the_encoder_training_goes_on_and_the_package_is_named(
     tmp_path, monkeypatch, capsys
 ):
-    real = builtins.__import__
-
-    def refuse(name, *arguments, **options):
-        if name == "av":
-            raise ImportError("No module named 'av'")
-        return real(name, *arguments, **options)
-
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delitem(sys.modules, "av", raising=False)
-    monkeypatch.setattr(builtins, "__import__", refuse)
+    faults.not_installed(monkeypatch, "av")
     assert train.main([*TINY, "finish.record=true"]) == 0
     assert "pip install av" in capsys.readouterr().err
     assert len(list(tmp_path.glob("runs/*/curves.png"))) == 1

@@ -23,6 +23,7 @@ def errors():
     import torch
 
     from agents.checkpoint import CheckpointError
+    from agents.metrics import MetricsError
     from megastep.engine import EngineError
 
     try:
@@ -31,6 +32,7 @@ def errors():
         ValueError,
         EngineError,
         CheckpointError,
+        MetricsError,
         FileNotFoundError,
         torch.OutOfMemoryError,
     ) as error:

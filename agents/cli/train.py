@@ -71,7 +71,8 @@ def make_trainer(cfg, folder, device, on_report):
         wandb = dict(project=project, mode=mode, name=folder.name, config=as_tree(cfg))
     if cfg.resume:
         checkpoint.rewind(folder / "checkpoints", loaded.step)
-    sinks = metrics.Metrics(folder, loaded.step if cfg.resume else 0, wandb)
+    with components.errors():
+        sinks = metrics.Metrics(folder, loaded.step if cfg.resume else 0, wandb)
     saver = Saver(
         folder / "checkpoints",
         {"train": as_tree(cfg), "spaces": components.spaces_of(env)},
