@@ -33,16 +33,6 @@ def test_without_a_driver_nothing_happens(monkeypatch):
     assert entry.create_cuda_context() is None
 
 
-def test_ctrl_c_while_importing_is_one_line(monkeypatch, capsys):
-    def interrupted(name):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(sys, "argv", ["train.py", "device=cpu"])
-    monkeypatch.setattr(entry.importlib, "import_module", interrupted)
-    assert entry.run_script("train") == 130
-    assert capsys.readouterr().err == "train.py: interrupted\n"
-
-
 @pytest.mark.cuda
 def test_pytorch_works_in_the_context_that_was_created():
     code = """

@@ -2,7 +2,7 @@
 
 Importing it comes before torch: OpenMP reads how to wait when it is loaded. Threads that spin while
 they wait for others take the cores that those others need, wherever anything else runs: with one of
-two cores taken, training was 100 times slower. Asleep, they lose a few microseconds a wait.
+two cores taken, training was 100 times slower. Asleep, they lose a few microseconds per wait.
 """
 
 import os

@@ -1,20 +1,25 @@
-"""What train.py, evaluate.py and record.py begin with: the GPU wakes up while Python imports."""
+"""What train.py, evaluate.py and record.py begin with: the GPU wakes up while Python imports, and
+signals and closed streams are taken care of before that.
+"""
 
 import ctypes
 import importlib
 import sys
 import threading
 
+from agents.cli import signals
+
 
 def run_script(name: str) -> int:
     """Runs a script of this package by its name; returns the exit code."""
+    signals.exit_on_signals(name)
     if wants_first_gpu(sys.argv[1:]):
         threading.Thread(target=create_cuda_context, daemon=True).start()
-    try:
-        return importlib.import_module(f"agents.cli.{name}").main()
-    except KeyboardInterrupt:  # while importing; later on main() sees to it
-        print(f"{name}.py: interrupted", file=sys.stderr)
-        return 130
+    from agents.cli import console  # its imports take a while, too
+
+    console.open_streams()
+    threading.excepthook = console.warn_of_thread
+    return importlib.import_module(f"agents.cli.{name}").main()
 
 
 def wants_first_gpu(words: list[str]) -> bool:

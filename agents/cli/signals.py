@@ -1,49 +1,87 @@
-"""Ctrl-C and SIGTERM: the first asks the training loop to stop after its step, the second ends the
-program at once.
+"""Ctrl-C, SIGTERM and SIGHUP: the first stops the work in good order, the second ends the program
+at once. The exit code is 128 + the signal's number.
 """
 
+import contextlib
 import os
 import signal
+import sys
+import time
+from collections.abc import Callable
+from typing import NoReturn, TextIO
 
-from agents.cli.console import say
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: Seconds in which a repeated signal is the same one: `timeout` and closing terminals send two.
+SAME = 0.3
 
 
 class Interrupted(BaseException):
-    """A signal stopped the work; the message says what is saved and how to go on. The exit code is
-    128 + `number`. Like KeyboardInterrupt no Exception, so that what handles the errors of a video
-    or a job lets it pass.
+    """A signal stopped the work; the message says what is saved and how to go on. It is no
+    Exception, so that nothing takes it for an error of what it interrupted.
     """
 
-    def __init__(self, number, message):
+    def __init__(self, number: int, message: str):
         super().__init__(message)
         self.number = number
 
 
-class Interruptions:
-    """While entered, `number` turns from None to that of the first signal, and nothing else
-    happens.
+def announce(number: int) -> None:
+    """Says that the work will stop soon."""
+    _write(sys.__stdout__, "\nStopping after this step; once more stops at once.")
+
+
+def interrupt(number: int) -> NoReturn:
+    """Raises Interrupted out of whatever is going on."""
+    raise Interrupted(number, f"stopped by {signal.Signals(number).name}")
+
+
+def _write(stream: TextIO | None, line: str) -> None:
+    """Prints from a signal handler: past the stream's buffer, which may be in use."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        os.write(stream.fileno(), f"{line}\n".encode())
+
+
+def is_ignored(number: int) -> bool:
+    """Whether whoever started the program keeps a signal from it: `nohup` does so with SIGHUP."""
+    return number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
+
+
+def exit_on_signals(script: str) -> None:
+    """From here on a signal ends the program at once, with one line: for imports and the
+    interpreter's end, which have nothing to save.
     """
 
-    def __init__(self):
-        self.number = None
+    def exit_at_once(number, frame):
+        _write(sys.__stderr__, f"{script}.py: stopped by {signal.Signals(number).name}")
+        os._exit(128 + number)
+
+    for number in SIGNALS:
+        if not is_ignored(number):
+            signal.signal(number, exit_at_once)
+
+
+class Interruptions:
+    """While entered, the first signal calls `on_first(number)` and sets `number`; another Ctrl-C or
+    SIGTERM ends the program, which harms nothing: checkpoints are renamed into place when whole.
+    """
+
+    def __init__(self, on_first: Callable[[int], None] = announce):
+        self.on_first, self.number, self.first_at = on_first, None, 0.0
 
     def __enter__(self):
-        try:
-            self.before = {number: signal.signal(number, self._take) for number in SIGNALS}
-        except ValueError:  # not the main thread: signals go elsewhere
-            self.before = {}
+        taken = [number for number in SIGNALS if not is_ignored(number)]
+        self.before = {}
+        with contextlib.suppress(ValueError):  # not the main thread: signals go elsewhere
+            self.before |= {number: signal.signal(number, self._take) for number in taken}
         return self
 
     def __exit__(self, *error):
         for number, handler in self.before.items():
             signal.signal(number, handler)
 
-    def _take(self, number, frame):
-        if self.number is not None:
-            os._exit(
-                128 + number
-            )  # a checkpoint is renamed into place when it is whole, so nothing is half-written
-        self.number = number
-        say("\nStopping after this step; once more stops at once.")
+    def _take(self, number: int, frame: object) -> None:
+        if self.number is None:
+            self.number, self.first_at = number, time.monotonic()
+            self.on_first(number)
+        elif number != signal.SIGHUP and time.monotonic() - self.first_at > SAME:
+            os._exit(128 + number)
