@@ -5,10 +5,11 @@ Written so that a killed run loses no line, read so that a damaged line costs no
 
 import json
 import math
-import os
 import warnings
 from pathlib import Path
 from typing import Any
+
+from agents import files
 
 
 class JsonLines:
@@ -46,18 +47,8 @@ def rewind(path: Path | str, step: int) -> None:
     if not path.exists():
         return
     kept = b"".join(line + b"\n" for row, line in _lines(path) if row["samples"] <= step)
-    if kept == path.read_bytes():
-        return
-    copy = path.with_name(f"{path.name}.tmp")
-    try:
-        with open(copy, "wb") as file:
-            file.write(kept)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(copy, path)
-    except BaseException:
-        copy.unlink(missing_ok=True)
-        raise
+    if kept != path.read_bytes():
+        files.replace(path, kept)
 
 
 def _lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:

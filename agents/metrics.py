@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from agents import files
 from agents.json_lines import JsonLines, read, rewind
 
 #: How each optional part is called, and what installs it.
@@ -85,7 +86,7 @@ class Wandb:
                 resume="allow",
                 settings=wandb.Settings(init_timeout=WANDB_TIMEOUT, silent=True, console="off"),
             )
-            known.write_text(self.run.id)
+            files.replace(known, self.run.id.encode())
         except Exception as error:  # the package raises its own, the network's and the system's
             raise RuntimeError(
                 f"Weights & Biases left out: it did not start ({_first_line(error)})"

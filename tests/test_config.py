@@ -351,6 +351,7 @@ def test_a_sweep_goes_past_a_failing_job(capsys, tmp_path, monkeypatch):
         if cfg.seed == 1:
             raise ZeroDivisionError("by chance")
 
-    assert run_command("train", Train, run, "", ["-m", "seed=1,2"]) == 2
+    assert run_command("train", Train, run, "", ["-m", "seed=1,2"]) == 1
     out = capsys.readouterr().out
     assert "FAILED: ZeroDivisionError: by chance" in out and "done" in out
+    assert run_command("train", Train, run, "", ["-m", "seed=2,3"]) == 0

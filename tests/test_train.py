@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import re
+import shlex
 import signal
 import time
 
@@ -14,10 +15,11 @@ import torch
 import yaml
 
 from agents import checkpoint, metrics, ppo
-from agents.cli import settings, train
+from agents.cli import evaluate, settings, train
 from agents.cli.build import build
 from agents.cli.compose import ConfigLoader
 from agents.cli.errors import ConfigErrors, UserError
+from agents.cli.lock import locked
 from agents.cli.settings import Train
 from agents.cli.signals import Interrupted
 from agents.finite import bad_leaf
@@ -51,6 +53,12 @@ def configured(*overrides, tiny=TINY):
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def only_run(here):
+    """The one run folder there is."""
+    (folder,) = (path for path in (here / "runs").iterdir() if path.is_dir())
+    return folder
 
 
 def weights(folder):
@@ -231,29 +239,61 @@ def test_weights_of_another_environment_are_refused_with_both_shapes(here):
         train.run(configured("samples=1", f"init={first}", "env.res=16"))
     with pytest.raises(UserError, match="is .*8.* and should be .*16.*; choose the agent"):
         train.run(configured("samples=1", f"init={first}", "agent.width=16"))
-    assert len(list((here / "runs").iterdir())) == 1  # the refused runs left nothing behind
+    assert only_run(here) == here / first  # the refused runs left nothing behind
 
 
-@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_finishes_the_step_saves_and_says_how_to_go_on(
-    here, monkeypatch, capsys, number, code
-):
+def test_a_run_that_a_signal_stopped_goes_on(here, monkeypatch, capsys):
     real = metrics.Metrics.write
 
     def write(self, step, *values):
         real(self, step, *values)
         if step == 2 * UPDATE:
-            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(metrics.Metrics, "write", write)
-    assert train.main([*TINY, "seconds=20"]) == code
-    folder = next((here / "runs").iterdir())
-    assert checkpoint.load(folder / "checkpoints").step == 2 * UPDATE
-    assert f"python train.py resume=runs/{folder.name}" in capsys.readouterr().err
-    assert train.run(
-        configured("resume=latest", f"samples={3 * UPDATE}", tiny=[])
-    ) == folder.relative_to(here)
-    assert checkpoint.load(folder / "checkpoints").step == 3 * UPDATE
+    assert train.main([*TINY, "seconds=20", 'folder="r n ü"']) == 143
+    (command,) = re.findall("To go on: python train.py (.*)", capsys.readouterr().err)
+    assert train.main([*shlex.split(command), f"samples={3 * UPDATE}"]) == 0
+    rows = metrics.read(here / "r n ü" / "metrics.jsonl")
+    assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
+    assert checkpoint.load(here / "r n ü" / "checkpoints").step == 3 * UPDATE
+
+
+def test_a_budget_that_is_spent_is_told_and_nothing_changes(here, capsys):
+    folder = train.run(configured(f"samples={2 * UPDATE}", "seconds=600"))
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    capsys.readouterr()
+    for more, told in (
+        ([], "samples: the run has had 64 of 64; give more to go on"),
+        (["samples=40"], "samples: the run has had 64 of 40; give more to go on"),
+        (["samples=9e3", "seconds=1e-9"], "seconds: the run has had .* of 1e-09; give more"),
+    ):
+        assert train.main([f"resume={folder}", *more]) == 2
+        assert re.search(told, capsys.readouterr().err)
+    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    assert train.main([f"resume={folder}", f"samples={3 * UPDATE}"]) == 0
+
+
+def test_the_latest_run_is_the_one_trained_last_not_evaluated_last(here):
+    first = train.run(configured("samples=1"))
+    second = train.run(configured("samples=1", "seed=2"))
+    assert evaluate.main([f"run={first}", "lanes=2", "device=cpu"]) == 0
+    assert train.run(configured("resume=latest", f"samples={2 * UPDATE}", tiny=[])) == second
+    assert train.run(configured(f"resume={first}", f"samples={2 * UPDATE}", tiny=[])) == first
+    assert train.run(configured("resume=latest", f"samples={3 * UPDATE}", tiny=[])) == first
+
+
+def test_a_second_training_in_one_folder_is_refused_and_harms_nothing(here, capsys):
+    folder = train.run(configured("samples=1"))
+    (here / "new").mkdir()
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    for name, words in ((folder, [f"resume={folder}", "samples=99"]), ("new", ["folder=new"])):
+        with locked(here / name):
+            capsys.readouterr()
+            assert train.main([*(TINY if name == "new" else []), *words]) == 2
+            (sentence,) = capsys.readouterr().err.splitlines()
+            assert "in use by process" in sentence or "is not empty" in sentence
+    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
 def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_world(
@@ -353,7 +393,7 @@ def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, mo
         ):
             train.run(configured(f"samples={3 * UPDATE}", "checkpoint=1e-9"))
     assert len([w for w in caught if "could not be saved" in str(w.message)]) == 1
-    assert len(metrics.read(next((here / "runs").iterdir()) / "metrics.jsonl")) == 3
+    assert len(metrics.read(only_run(here) / "metrics.jsonl")) == 3
 
 
 def test_a_disk_that_is_free_again_gets_the_checkpoint(here, monkeypatch):

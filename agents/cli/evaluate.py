@@ -4,11 +4,10 @@ from Python.
 
 import dataclasses
 import json
-import os
 import time
 from pathlib import Path
 
-from agents import evaluation
+from agents import evaluation, files
 from agents.cli import components, run_folders
 from agents.cli.command import run_command
 from agents.cli.console import duration, say, table
@@ -107,9 +106,7 @@ def write(folder, name, result):
     try:
         folder.mkdir(exist_ok=True)
         for suffix, text in texts.items():
-            partial = folder / f"{name}{suffix}.tmp-{os.getpid()}"
-            partial.write_text(text)
-            os.replace(partial, folder / f"{name}{suffix}")
+            files.replace(folder / f"{name}{suffix}", text.encode())
     except OSError as error:
         raise UserError(
             f"The evaluation cannot be written to {folder} ({error.strerror})"

@@ -1,68 +1,75 @@
 """Run folders: new ones, existing ones by name, and what is written in them."""
 
+import contextlib
 import difflib
+import itertools
 import json
 import os
+import re
+import shlex
 import shutil
 import time
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 
 import yaml
 
+from agents import files
 from agents.cli.build import as_tree
+from agents.cli.console import warn
 from agents.cli.errors import UserError
+from agents.cli.settings import Train
 
 RUNS = Path("runs")
 SWEEPS = Path("sweeps")
+#: One line for each start of a run, its folder.
+STARTED = RUNS / "started.txt"
 
 
 # ---- Folders ----
 
 
-def fresh(path):
+def make(path: Path) -> Path:
     """Makes a new folder and returns it; a taken name gets -2, -3, ... UserError unless it can be
     written to.
     """
-    path, number = Path(path), 2
-    place = path
-    while place.exists():
-        place, number = path.with_name(f"{path.name}-{number}"), number + 1
     try:
-        place.mkdir(parents=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for number in itertools.count(1):
+            place = path if number == 1 else path.with_name(f"{path.name}-{number}")
+            with contextlib.suppress(FileExistsError):  # another program may have taken it just now
+                place.mkdir()
+                return place
     except OSError as error:
         raise UserError(
-            f"The run folder {place} cannot be made ({error.strerror}); choose another with folder="
+            f"The run folder {path} cannot be made ({error.strerror}); choose another with folder="
         ) from error
-    return place
 
 
-def new(cfg):
+def new(cfg: Train) -> Path:
     """The folder of a new run: `cfg.folder`, which must be new or empty, or one named after time
     and settings.
     """
     if cfg.folder is None:
-        return fresh(
-            RUNS
-            / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{cfg.env.name}-{cfg.geometry.name}-{cfg.seed}"
-        )
+        start = time.strftime("%Y-%m-%d_%H-%M-%S")
+        return make(RUNS / f"{start}-{cfg.env.name}-{cfg.geometry.name}-{cfg.seed}")
     path = Path(cfg.folder)
-    if path.exists() and not path.is_dir():
-        raise UserError(f"The run folder {path} is a file; choose another with folder=")
+    if not path.exists():
+        return make(path)
     if not path.is_dir():
-        return fresh(path)
+        raise UserError(f"The run folder {path} is a file; choose another with folder=")
     if not os.access(path, os.W_OK | os.X_OK):
         raise UserError(f"The run folder {path} cannot be written to; choose another with folder=")
     if any(path.iterdir()):
         raise UserError(
-            f"The run folder {path} is not empty; choose another with folder=, or go on with "
-            f"resume={path}"
+            f"The run folder {path} is not empty; choose another with folder=, or go on: "
+            f"{resume_command(path)}"
         )
     return path
 
 
-@contextmanager
-def cleanup_on_error(folder):
+@contextlib.contextmanager
+def cleanup_on_error(folder: Path) -> Iterator[None]:
     """Deletes a new folder again if setting up fails, so that nothing half-written stays behind."""
     try:
         yield
@@ -71,39 +78,67 @@ def cleanup_on_error(folder):
         raise
 
 
-def find(name):
+def record_start(folder: Path) -> None:
+    """Notes that training starts in a folder now: what `latest` goes by, as the times of folders
+    change with whatever is written there, and clocks are moved.
+    """
+    try:
+        RUNS.mkdir(exist_ok=True)
+        with open(STARTED, "a", errors="surrogateescape") as file:
+            file.write(f"{folder}\n")
+    except OSError as error:
+        warn(f"{STARTED} cannot be written ({error.strerror}); `latest` will not know {folder}")
+
+
+def known() -> list[Path]:
+    """The runs with checkpoints here, and elsewhere if they were started here; the one that
+    started or went on last is the last.
+    """
+    text = STARTED.read_text(errors="surrogateescape") if STARTED.exists() else ""
+    order = {Path(line): n for n, line in enumerate(text.splitlines())}
+    found = {p.parent for p in [*RUNS.glob("*/checkpoints"), *SWEEPS.glob("*/*/checkpoints")]}
+    found |= {path for path in order if (path / "checkpoints").is_dir()}
+    return sorted(found, key=lambda path: (order.get(path, -1), str(path)))
+
+
+def find(name: str) -> Path:
     """An existing run's folder, from a path, `latest`, or one of its checkpoints. UserError that
     names the nearest run.
     """
-    known = sorted(
-        (p.parent for p in [*RUNS.glob("*/checkpoints"), *SWEEPS.glob("*/*/checkpoints")]),
-        key=lambda p: p.stat().st_mtime,
-    )
+    runs = known()
     if name == "latest":
-        if not known:
+        if not runs:
             raise UserError(
                 f"There is no run in {RUNS}/ or {SWEEPS}/ yet; python train.py makes one"
             )
-        return known[-1]
+        return runs[-1]
     path = Path(name)
     if is_checkpoint(path) or (path / "checkpoints").is_dir():
         return path
     if path.exists():
         raise UserError(f"{path} is no run: it has no folder named checkpoints")
-    near = difflib.get_close_matches(str(path), [str(k) for k in known], n=1, cutoff=0.4)
+    near = difflib.get_close_matches(str(path), [str(run) for run in runs], n=1, cutoff=0.4)
     raise UserError(f"There is no run {path}" + (f"; did you mean {near[0]}?" if near else ""))
 
 
-def is_checkpoint(path):
+def resume_command(folder: Path) -> str:
+    """What to type to go on with a run, quoted for the shell and for Hydra where that is needed."""
+    if re.fullmatch(r"[A-Za-z0-9_./:-]+", str(folder)):
+        return f"python train.py resume={folder}"
+    name = str(folder).replace('"', '\\"')
+    return "python train.py " + shlex.quote(f'resume="{name}"')
+
+
+def is_checkpoint(path: Path) -> bool:
     return (path / "manifest.json").exists()
 
 
-def folder_of(path):
+def folder_of(path: Path) -> Path:
     """The run folder that a path given by `find` belongs to."""
     return path.parent.parent if is_checkpoint(path) else path
 
 
-def headline(result):
+def headline(result: Path | None) -> str:
     """What a finished job achieved, in a few words: the return in its table (an evaluation's file,
     or the one of a run's last checkpoint), else the last return seen in training. `result` is what
     the job returned, None if it failed.
@@ -131,6 +166,13 @@ def headline(result):
         return ""
 
 
-def write_config(folder, cfg):
+def write_config(folder: Path, cfg: Train) -> None:
     """Writes the composed configuration, config.yaml."""
-    (folder / "config.yaml").write_text(yaml.safe_dump(as_tree(cfg), sort_keys=False))
+    text = yaml.safe_dump(as_tree(cfg), sort_keys=False, allow_unicode=True)
+    try:
+        files.replace(folder / "config.yaml", text.encode())
+    except OSError as error:
+        raise UserError(
+            f"The run folder {folder} cannot be written to ({error.strerror}); choose another with "
+            "folder="
+        ) from error

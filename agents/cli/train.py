@@ -15,6 +15,7 @@ from agents.cli.build import as_tree
 from agents.cli.command import run_command
 from agents.cli.console import Progress, duration, number, say, warn
 from agents.cli.errors import ConfigErrors, NotFinite, UserError
+from agents.cli.lock import locked
 from agents.cli.settings import Evaluate, Record, Train, WandbLogger
 from agents.cli.signals import Interrupted, Interruptions
 from agents.finite import NonFiniteError
@@ -128,15 +129,16 @@ def run(cfg):
     folder = (
         run_folders.folder_of(run_folders.find(cfg.resume)) if cfg.resume else run_folders.new(cfg)
     )
-    progress = Progress()
-    with Interruptions() as stop:
+    with locked(folder):
+        progress = Progress()
         with nullcontext() if cfg.resume else run_folders.cleanup_on_error(folder):
             trainer, saver = make_trainer(cfg, folder, device, partial(show, progress))
             run_folders.write_config(folder, cfg)
+        run_folders.record_start(folder)
         say(f"Training on {device} in {folder}")
-        resume = f"To go on: python train.py resume={folder}"
+        resume = f"To go on: {run_folders.resume_command(folder)}"
         try:
-            with progress, closing(trainer.metrics):
+            with Interruptions() as stop, progress, closing(trainer.metrics):
                 trainer.train(lambda: stop.number is not None)
         except NonFiniteError as error:
             raise NotFinite(f"{error}. What was saved before is in {folder}") from error
@@ -149,13 +151,13 @@ def run(cfg):
             metrics.curves(folder)
         if stop.number is not None:
             raise Interrupted(stop.number, f"Stopped after {trainer.samples:,} samples. {resume}")
-    if saver.unsaved:
-        raise UserError(saver.unsaved)
-    bad_number = trainer.bad_number
-    del trainer  # its memory is the evaluation's now
-    finish(cfg, folder)
-    if bad_number and bad_number.is_from_env:
-        raise NotFinite(f"{bad_number}. All else was learnt from, and is in {folder}")
+        if saver.unsaved:
+            raise UserError(saver.unsaved)
+        bad_number = trainer.bad_number
+        del trainer  # its memory is the evaluation's now
+        finish(cfg, folder)
+        if bad_number and bad_number.is_from_env:
+            raise NotFinite(f"{bad_number}. All else was learnt from, and is in {folder}")
     return folder
 
 
@@ -186,13 +188,20 @@ def resumed(tree, overrides):
         if key.split(".")[0] not in RESUMABLE
     ]:
         raise ConfigErrors(refused)
-    own = components.load(run_folders.find(tree["resume"])).config["train"]
+    loaded = components.load(run_folders.find(tree["resume"]))
+    own = loaded.config["train"]
     for path in given:
         *groups, key = path.split(".")
         target, source = own, tree
         for group in groups:
             target, source = target[group], source[group]
         target[key] = source[key]
+    if spent := [
+        (name, f"the run has had {loaded.state[name]:,.9g} of {own[name]:,.9g}; give more to go on")
+        for name in ("samples", "seconds")
+        if own[name] is not None and loaded.state[name] >= own[name]
+    ]:
+        raise ConfigErrors(spent)
     return {**own, "init": None}
 
 
