@@ -6,6 +6,8 @@ unpacked, nothing is written to disk, pickled objects are refused, and every err
 of one sentence naming file and geometry.
 """
 
+import functools
+import io
 import os
 import re
 import struct
@@ -97,28 +99,36 @@ def _contents(archive):
     return found
 
 
+@functools.lru_cache(maxsize=1024)  # the arrays of a file have few different ones
+def _header(start):
+    """(shape, fortran order, dtype) from the first bytes of an array's file."""
+    file = io.BytesIO(start)
+    version = np.lib.format.read_magic(file)
+    reader = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }.get(version)
+    if reader is None:
+        raise ValueError(f"has an array format {version} that is not known")
+    return reader(file, max_header_size=MAX_HEADER)
+
+
 def _array(archive, entry):
     """The array of one zip entry, refused when its header promises other than the entry holds."""
     if entry.flag_bits & 1:
         raise ValueError("is encrypted")
-    with archive.open(entry) as file:
-        version = np.lib.format.read_magic(file)
-        reader = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }.get(version)
-        if reader is None:
-            raise ValueError(f"has an array format {version} that is not known")
-        shape, fortran, dtype = reader(file, max_header_size=MAX_HEADER)
-        if dtype.hasobject:
-            raise ValueError("is a pickled object, which is never loaded")
-        if dtype.kind not in "fiub":
-            raise ValueError(f"is of dtype {dtype}, which is not a number")
-        if prod(shape) * dtype.itemsize != entry.file_size - file.tell():
-            raise ValueError(
-                f"claims shape {shape} of {dtype} but holds {entry.file_size - file.tell():,} bytes"
-            )
-        values = np.frombuffer(file.read(), dtype)
+    content = archive.read(entry)
+    counts = slice(8, 12 if content[6:7] == b"\2" else 10)  # where the header's length stands
+    offset = counts.stop + int.from_bytes(content[counts], "little")
+    shape, fortran, dtype = _header(content[: min(offset, 1 << 16)])
+    if dtype.hasobject:
+        raise ValueError("is a pickled object, which is never loaded")
+    if dtype.kind not in "fiub":
+        raise ValueError(f"is of dtype {dtype}, which is not a number")
+    held = entry.file_size - offset
+    if prod(shape) * dtype.itemsize != held:
+        raise ValueError(f"claims shape {shape} of {dtype} but holds {held:,} bytes")
+    values = np.frombuffer(content, dtype, offset=offset)
     return values.reshape(shape, order="F" if fortran else "C")
 
 
