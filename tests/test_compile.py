@@ -1,5 +1,5 @@
-"""Building the kernels: what is kept, what is damaged, what is missing. Every fault is injected for
-real.
+"""Building and launching the kernels: params by name, files and lines by name, and what is missing
+or fails. Each fault is injected for real.
 """
 
 import ctypes

@@ -48,8 +48,8 @@ CUDA_FLAGS = (
 
 
 class EngineError(RuntimeError):
-    """The machine cannot do what was asked: no compiler, no GPU, no memory, a position that is not
-    a number. The message is one sentence with the cure.
+    """The machine cannot do this: no compiler, no GPU, no memory, a position that is not a number.
+    The message is one sentence with the cure.
     """
 
 
