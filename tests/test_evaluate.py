@@ -1,5 +1,5 @@
-"""Evaluation: first episodes counted on worlds whose returns are known, intervals checked on paper,
-and the script.
+"""Evaluation: first episodes counted where returns are known, intervals checked on paper, and the
+script.
 """
 
 import dataclasses
@@ -195,19 +195,19 @@ def test_the_interval_is_that_of_an_evaluator_that_tries_every_resample(sizes):
 
 
 def configured(**changes):
-    with ConfigLoader("evaluate", Evaluate) as door:
+    with ConfigLoader("evaluate", Evaluate) as loader:
         return dataclasses.replace(
-            build(Evaluate, door.tree(["run=latest", "lanes=6", "device=cpu"])), **changes
+            build(Evaluate, loader.tree(["run=latest", "lanes=6", "device=cpu"])), **changes
         )
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A run folder, and the folder it was trained from."""
-    with ConfigLoader("train", Train) as door, pytest.MonkeyPatch.context() as patch:
+    with ConfigLoader("train", Train) as loader, pytest.MonkeyPatch.context() as patch:
         base = tmp_path_factory.mktemp("trained")
         patch.chdir(base)
-        return base / train.run(build(Train, door.tree(TINY)))
+        return base / train.run(build(Train, loader.tree(TINY)))
 
 
 def test_the_table_is_printed_and_written(trained, capsys):
@@ -236,8 +236,8 @@ def test_it_is_reproducible_and_each_has_a_file_of_its_own(trained):
         written = evaluate.run(configured(run=str(trained), **changes))
         return [row["length"] for row in json.loads(written.read_text())["rows"]]
 
-    with ConfigLoader("evaluate", Evaluate) as door:
-        bench = build(Evaluate, door.tree(["run=x", "geometry=bench", "geometry.n=3"])).geometry
+    with ConfigLoader("evaluate", Evaluate) as loader:
+        bench = build(Evaluate, loader.tree(["run=x", "geometry=bench", "geometry.n=3"])).geometry
     assert lengths() == lengths() != lengths(seed=2)
     written = evaluate.run(
         configured(
@@ -263,8 +263,8 @@ def test_a_lane_stays_in_one_home_whatever_the_training_did(tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     small = ["env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1", "agent.width=8"]
     explorer = ["env=explorer", "env.resample=true", "geometry=bench", "geometry.n=4", *small]
-    with ConfigLoader("train", Train) as door:
-        run = train.run(build(Train, door.tree([*explorer, *TINY[2:3], *TINY[7:9], *TINY[-2:]])))
+    with ConfigLoader("train", Train) as loader:
+        run = train.run(build(Train, loader.tree([*explorer, *TINY[2:3], *TINY[7:9], *TINY[-2:]])))
     seen = {}
 
     def spied(env, *args):

@@ -1,3 +1,5 @@
+"""Where geometries come from: toys, splits, files, and files of strangers."""
+
 import io
 import subprocess
 import sys

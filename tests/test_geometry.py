@@ -1,3 +1,5 @@
+"""Geometries: cells and coordinates, masks against walls, what is refused."""
+
 import matplotlib
 import numpy as np
 import pytest
@@ -172,8 +174,8 @@ def test_display_draws_every_wall_and_light():
     ax = geometry.display(g)
     lines, dots = ax.collections
     assert len(lines.get_segments()) == 8 and len(dots.get_offsets()) == 2
-    picture = ax.images[0]
-    assert picture.get_extent() == pytest.approx((0, 7, 0, 7))
-    assert picture.get_array().shape == (35, 35, 3)
+    image = ax.images[0]
+    assert image.get_extent() == pytest.approx((0, 7, 0, 7))
+    assert image.get_array().shape == (35, 35, 3)
     assert geometry.display(toys.box(), ax) is ax
     matplotlib.pyplot.close(ax.figure)

@@ -1,3 +1,5 @@
+"""Homes: the generator's parts, what homes are like, and the database of ready ones."""
+
 import hashlib
 import math
 import shutil
@@ -31,7 +33,7 @@ def ready():
     return [database.home(index) for index in range(database.COUNT)]
 
 
-def test_draws_are_those_of_splitmix64():
+def test_random_numbers_are_those_of_splitmix64():
     # The first outputs of the published generator from state 0, which is `mixed` of multiples of
     # its increment.
     outputs = [
@@ -40,7 +42,7 @@ def test_draws_are_those_of_splitmix64():
     assert outputs == [0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F]
 
 
-def test_draws_differ_between_seeds_and_not_between_runs():
+def test_random_numbers_differ_between_seeds_and_not_between_runs():
     assert random_stream.RandomStream(5).bits() == 0x4000795F8E33B2A8
     assert len({random_stream.RandomStream(seed).bits() for seed in range(-100, 1000)}) == 1100
 
@@ -50,7 +52,7 @@ def test_exp_is_the_exponential():
         assert random_stream.exp(float(x)) == pytest.approx(math.exp(x), rel=1e-11)
 
 
-def test_draws_have_the_moments_they_claim():
+def test_random_numbers_have_the_moments_they_claim():
     stream, n = random_stream.RandomStream(1), 20_000
     uniform, normal = (
         np.array([draw() for _ in range(n)]) for draw in (stream.uniform, stream.normal)

@@ -28,10 +28,10 @@ TINY = [
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    with ConfigLoader("train", Train) as door, pytest.MonkeyPatch.context() as patch:
+    with ConfigLoader("train", Train) as loader, pytest.MonkeyPatch.context() as patch:
         base = tmp_path_factory.mktemp("trained")
         patch.chdir(base)
-        return base / train.run(build(Train, door.tree(TINY)))
+        return base / train.run(build(Train, loader.tree(TINY)))
 
 
 def test_a_video_has_a_frame_for_every_step(trained):

@@ -1,7 +1,7 @@
-"""The code of seed 002, "Concepts", run as its users type it, on the CPU, and what it says about
-geometry and scenery.
+"""The code of the original megastep's page "Concepts", run as its readers type it, on the CPU, and
+what it says about geometry and scenery.
 
-What the seed prints, where it was right, is compared word by word: its line breaks and columns are
+What the page prints, where it was right, is compared word by word: its line breaks and columns are
 lost.
 
 Names that moved, all through: `rebar` and `megastep.demo` are `megastep`, `megastep.demo.heads` is
@@ -12,8 +12,8 @@ Names that moved, all through: `rebar` and `megastep.demo` are `megastep`, `mega
 | `cpu_tensors.cuda()` | no GPU | `.cpu()` |
 | `.starmap(float.__add__, d)` | `d` is not defined | `objs`, as two lines before |
 | `r[0]` prints `array([0, 1, 2])` | the values were given as floats | `array([0., 1., 2.])` |
-| `spaces.intake(env.observation_space)`, `spaces.output` | never existed |
-`heads.intake(env.obs_space, width)` |
+| `spaces.intake(env.observation_space)` | never existed | `heads.intake(env.obs_space, width)` |
+| `spaces.output(env.action_space)` | never existed | `heads.output(env.action_space, width)` |
 """
 
 import doctest
@@ -69,7 +69,7 @@ def test_a_module_that_is_not_there_is_named():
         megastep.toy  # noqa: B018, the access is the test
 
 
-def test_names_that_the_seeds_use():
+def test_names_that_the_original_s_pages_use():
     assert (
         cuda.render is megastep.engine.render
         and cuda.Agents is megastep.engine.Agents
