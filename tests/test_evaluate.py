@@ -18,7 +18,7 @@ from agents.cli.errors import UserError
 from agents.cli.settings import Evaluate, Train
 from megastep import envs, spaces
 from megastep.arrdict import arrdict
-from megastep.geometries import sample
+from megastep.geometries import files, sample
 
 TINY = [
     "env=minimal",
@@ -258,13 +258,28 @@ def test_it_is_reproducible_and_each_has_a_file_of_its_own(trained):
     }
 
 
+def test_a_file_of_homes_is_named_in_title_and_file_name(trained, tmp_path):
+    files.save(tmp_path / "plans.npz", sample("homes", 3))
+    with ConfigLoader("evaluate", Evaluate) as loader:
+        words = ["run=x", "geometry=files", f"geometry.path={tmp_path / 'plans.npz'}"]
+        plans = build(Evaluate, loader.tree(words)).geometry
+    written = evaluate.run(
+        configured(run=str(trained), geometry=plans, split="all", baseline=False)
+    )
+    assert written.name == "files-plans-all-32.json"
+    result = json.loads(written.read_text())
+    assert "in all homes of files-plans" in result["title"] and result["rows"][0]["homes"] == 3
+
+
 def test_a_lane_stays_in_one_home_whatever_the_training_did(tmp_path, monkeypatch):
     """Ten lanes in four homes: three, three, two and two, each at home where its label says."""
     monkeypatch.chdir(tmp_path)
-    small = ["env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1", "agent.width=8"]
-    explorer = ["env=explorer", "env.resample=true", "geometry=bench", "geometry.n=4", *small]
+    shape = ["env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1", "agent.width=8"]
+    learner = ["learner.n_steps=8", "learner.n_minibatches=2", "device=cpu", "samples=1"]
+    homes = ["geometry=bench", "geometry.n=4", "env.resample=true"]
     with ConfigLoader("train", Train) as loader:
-        run = train.run(build(Train, loader.tree([*explorer, *TINY[2:3], *TINY[7:9], *TINY[-2:]])))
+        tree = loader.tree(["env=explorer", "preset=cpu", *homes, *shape, *learner])
+        run = train.run(build(Train, tree))
     seen = {}
 
     def spied(env, *args):

@@ -6,13 +6,14 @@ import dataclasses
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 from agents import evaluation, files
 from agents.cli import components, run_folders
 from agents.cli.command import run_command
 from agents.cli.console import duration, say, table
 from agents.cli.errors import UserError
-from agents.cli.settings import Evaluate
+from agents.cli.settings import Evaluate, Files, Homes, Toy
 
 HELP = """Prints and writes what a run's agent earns in the first episode of each lane, with a 95 %
 interval over homes. Each table is a file of its own in the run's folder: evaluations/*.md.
@@ -48,8 +49,9 @@ def run(cfg: Evaluate) -> Path:
     for name, player in players.items():
         episodes = evaluation.first_episodes(env, player, cfg.seed, cfg.greedy and player is policy)
         rows.append({"agent": name, **evaluation.summary(episodes)})
+    which = "all" if cfg.split == "all" else f"the {cfg.split}"
     title = (
-        f"{trained.env.name} in the {cfg.split} homes of {source(geometry)}, after "
+        f"{trained.env.name} in {which} homes of {source(geometry)}, after "
         f"{loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, {cfg.lanes:,} lanes"
     )
     say(title)
@@ -66,19 +68,19 @@ def run(cfg: Evaluate) -> Path:
     return write(run_folders.folder_of(path) / "evaluations", name, result)
 
 
-def settled(env, n_envs):
+def settled(env: Any, n_envs: int) -> Any:
     """An environment's settings for `n_envs` environments that stay in the homes they start in."""
     moving = {"resample": False} if hasattr(env, "resample") else {}
     return dataclasses.replace(env, n_envs=n_envs, **moving)
 
 
-def source(geometry):
+def source(geometry: Toy | Homes | Files) -> str:
     """The name of the geometries evaluated in, for titles and file names."""
     path = geometry.options.get("path")
     return geometry.name if path is None else f"{geometry.name}-{Path(path).stem}"
 
 
-def cells(row):
+def cells(row: dict) -> tuple[str, ...]:
     """A row of the table, as text."""
     cut = f", {row['unfinished']} cut short" if row["unfinished"] else ""
     return (
@@ -91,7 +93,7 @@ def cells(row):
     )
 
 
-def write(folder, name, result):
+def write(folder: Path, name: str, result: dict) -> Path:
     """Writes a result for machines and for people, `name`.json and .md, each whole or not at all.
     Returns the .json's path.
     """
@@ -114,5 +116,5 @@ def write(folder, name, result):
     return folder / f"{name}.json"
 
 
-def main(argv=None):
+def main(argv: list[str] | None = None) -> int:
     return run_command("evaluate", Evaluate, run, HELP, argv)

@@ -69,5 +69,5 @@ def film(
     return encoder.save(path)
 
 
-def main(argv=None):
+def main(argv: list[str] | None = None) -> int:
     return run_command("record", Record, run, HELP, argv)
