@@ -1,5 +1,5 @@
-"""A long short-term memory (Hochreiter and Schmidhuber 1997) that forgets inside a sequence where
-an episode starts.
+"""A long short-term memory (Hochreiter and Schmidhuber 1997) whose state is cleared inside a
+sequence where an episode starts.
 
 Axes: T time, B lanes, W width. Gates are laid out (..., 4 W): input, forget, candidate, output, as
 PyTorch's own are. Matrix products run in the compute dtype (autocast's), the cell and its gates in
@@ -59,8 +59,8 @@ def _cell_backward(d_output, d_after, before, after, gates):
 class _Sequence(torch.autograd.Function):
     """The recurrence over time, with its gradient written out.
 
-    PyTorch's own tape would add up the weight's gradient step by step; here it is one matrix
-    product for all of time.
+    Autograd would add up the weight's gradient step by step; here it is one matrix product for all
+    of time.
     """
 
     @staticmethod
@@ -98,11 +98,11 @@ class _Sequence(torch.autograd.Function):
 
 
 class LSTM(nn.Module):
-    """A memory of `width` numbers a lane, kept between calls in a state: arrdict(output, cell),
-    each (B, W) float32.
+    """An LSTM of `width` units. Between calls its state is arrdict(output, cell), each (B, W)
+    float32.
     """
 
-    def __init__(self, width):
+    def __init__(self, width: int):
         super().__init__()
         self.width = width
         self.input = nn.Linear(width, 4 * width)
@@ -114,30 +114,33 @@ class LSTM(nn.Module):
             # (Jozefowicz et al. 2015)
             self.input.bias.zero_()[width : 2 * width] = 1.0
 
-    def initial(self, n_lanes, device=None):
-        """The state of lanes that remember nothing."""
+    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """The state of lanes at the start of an episode."""
         return arrdict(
             {key: torch.zeros(n_lanes, self.width, device=device) for key in ("output", "cell")}
         )
 
-    def forward(self, x, reset, state):
-        """Runs over x (T, B, W) from a state; what a lane remembers is cleared before each step
-        where reset (T, B).
+    def forward(
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+    ) -> tuple[torch.Tensor, arrdict]:
+        """Runs over x (T, B, W) from a state; a lane's state is cleared before each step where
+        reset (T, B).
 
         Returns the outputs (T, B, W) and the state after the last step.
         """
         dtype = compute_dtype(self.memory.weight)
         from_input = F.linear(x.to(dtype), self.input.weight.to(dtype), self.input.bias.to(dtype))
         weight = self.memory.weight.to(dtype)
-        with torch.autocast(
-            x.device.type, enabled=False
-        ):  # which would take the fused cell to low precision
+        # autocast would take the fused cell to low precision
+        with torch.autocast(x.device.type, enabled=False):
             outputs, cell = _Sequence.apply(
                 from_input, weight, reset[..., None], state["output"], state["cell"]
             )
         return outputs, arrdict(output=outputs[-1].float(), cell=cell)
 
-    def step(self, x, reset, state):
+    def step(
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+    ) -> tuple[torch.Tensor, arrdict]:
         """One step, x (B, W) and reset (B,): the outputs (B, W) and the state after it."""
         outputs, state = self(x[None], reset[None], state)
         return outputs[0], state

@@ -1,14 +1,13 @@
-"""What an action was worth: GAE and V-trace as pure functions.
+"""Advantages and returns: GAE and V-trace as pure functions.
 
-Axes: T time, B lanes. Everything is (T, B); row t is the decision taken at time t, and `reward`,
-`reset`, `terminal`, `truncated` at row t belong to the world that followed it, t+1. `value` at row
-t is V_t, the value of what was seen
-*before* the decision, and `last_value` (B,) is V_T, that of the last observation, so V_{t+1} is the
-next row.
+Axes: T time, B lanes. Everything is (T, B); row t is the action of time t, and `reward`, `reset`,
+`terminal`, `truncated` at row t belong to the world that followed it, t+1. `value` at row t is V_t,
+the value of the observation *before* the action, and `last_value` (B,) is V_T, that of the last
+observation, so V_{t+1} is the next row.
 
-A decision is *valid* if the world took it: valid_t = not reset_{t+1}. An episode's last observation
-has `terminal` (nothing follows: V counts as 0) or `truncated` (something would have followed: V
-counts) set; no sum crosses either.
+An action is *valid* if the environment took it: valid_t = not reset_{t+1}. An episode's last
+observation has `terminal` (nothing follows: V counts as 0) or `truncated` (something would have
+followed: V counts) set; no sum crosses either.
 """
 
 import torch
@@ -16,13 +15,13 @@ import torch
 from megastep import arrdict
 
 
-def discounted_sum(terms, discounts):
+def discounted_sum(terms: torch.Tensor, discounts: torch.Tensor) -> torch.Tensor:
     """x_t = terms_t + discounts_t x_{t+1}, x_T = 0, along the first axis.
 
-    Done by doubling, in log2(T) passes over the whole array: after a pass of stride k, x_t holds
-    the first 2k terms of its sum and d_t the product of the discounts up to the term that comes
-    next. Nothing is divided by a product of discounts, so zeros among them, which is how an episode
-    ends, are exact.
+    Computed by doubling, in log2(T) passes over the whole array: after a pass of stride k, x_t
+    holds the first 2k terms of its sum and d_t the product of the discounts up to the term that
+    comes next. Nothing is divided by a product of discounts, so zeros among them, which is how an
+    episode ends, are exact.
     """
     total, product = terms, discounts
     stride = 1
@@ -38,15 +37,24 @@ def _following(value, last_value):
     return torch.cat([value[1:], last_value[None]])
 
 
-def gae(reward, value, last_value, reset, terminal, truncated, *, gamma, lambda_):
+def gae(
+    reward: torch.Tensor,
+    value: torch.Tensor,
+    last_value: torch.Tensor,
+    reset: torch.Tensor,
+    terminal: torch.Tensor,
+    truncated: torch.Tensor,
+    *,
+    gamma: float,
+    lambda_: float,
+) -> arrdict.arrdict:
     """Generalised advantage estimates (Schulman et al. 2016), and the lambda returns A + V for the
     value to fit.
 
         delta_t = r_{t+1} + gamma (1 - terminal_{t+1}) V_{t+1} - V_t
         A_t     = delta_t + gamma lambda (1 - done_{t+1}) A_{t+1},   done = terminal or truncated
 
-    A is 0 where the decision was not valid. Returns arrdict(advantages, targets, valid), each (T,
-    B).
+    A is 0 where the action was not valid. Returns arrdict(advantages, targets, valid), each (T, B).
     """
     delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.0) - value
     delta = delta.masked_fill(reset, 0.0)
@@ -58,21 +66,21 @@ def gae(reward, value, last_value, reset, terminal, truncated, *, gamma, lambda_
 
 
 def vtrace(
-    log_ratio,
-    reward,
-    value,
-    last_value,
-    reset,
-    terminal,
-    truncated,
+    log_ratio: torch.Tensor,
+    reward: torch.Tensor,
+    value: torch.Tensor,
+    last_value: torch.Tensor,
+    reset: torch.Tensor,
+    terminal: torch.Tensor,
+    truncated: torch.Tensor,
     *,
-    gamma,
-    lambda_=1.0,
-    rho_clip=1.0,
-    c_clip=1.0,
-):
-    """V-trace (Espeholt et al. 2018, IMPALA): what a policy pi can learn from what another, mu,
-    did.
+    gamma: float,
+    lambda_: float = 1.0,
+    rho_clip: float = 1.0,
+    c_clip: float = 1.0,
+) -> arrdict.arrdict:
+    """V-trace (Espeholt et al. 2018, IMPALA): returns and advantages of a policy pi from the
+    actions of another, mu.
 
     With `log_ratio` = log pi(a_t) - log mu(a_t), rho_t = min(rho_clip, pi/mu), c_t = lambda
     min(c_clip, pi/mu):
@@ -82,7 +90,7 @@ def vtrace(
         A_t       = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) v'_{t+1} - V_t),        v' = V at a
         truncation, else v
 
-    The targets v are what the value should fit; A weighs the policy's gradient. Where the decision
+    The targets v are what the value should fit; A weighs the policy's gradient. Where the action
     was not valid v = V and A = 0. Returns arrdict(advantages, targets, valid), each (T, B).
     """
     following = _following(value, last_value)
