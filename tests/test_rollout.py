@@ -66,8 +66,8 @@ class Telltale:
         )
 
 
-def collected(n_rollouts=1, dtype=torch.float32):
-    env = Telltale()
+def collected(n_rollouts=1, dtype=torch.float32, env=None):
+    env = env or Telltale()
     policy = Policy(env.obs_space, env.action_space, width=16)
     state = policy.initial(B)
     rollout = Rollout(T, B, env.obs_space, env.action_space, state, obs_dtype=dtype)
@@ -127,15 +127,23 @@ def test_probabilities_and_values_are_those_of_an_unroll_over_what_was_written()
     torch.testing.assert_close(rollout.values[-1], last, **close)
 
 
+class Faulty(Telltale):
+    """Lane 4, whose episode lasts from time 7 to time 12, sees no number at time 9."""
+
+    def _world(self, reset):
+        world = super()._world(reset)
+        if self.time == 9:
+            world.obs.eye[4] = torch.nan
+        return world
+
+
 def test_a_memory_that_is_not_finite_starts_anew_with_the_next_rollout():
-    env, policy, rollout, actor_state = collected()
-    actor_state.world.obs.eye[2] = torch.nan
+    env, policy, rollout, actor_state = collected(n_rollouts=2, env=Faulty())
+    assert rollout.values[4:, 4].isnan().all() and rollout.values[:4].isfinite().all()
+    assert rollout.values[:, :4].isfinite().all()
     collect(env, policy, rollout, actor_state)
-    # until an episode of the lane starts, or the rollout ends
-    assert rollout.values[0, 2].isnan() and rollout.values[:, [0, 1, 3, 4, 5]].isfinite().all()
-    collect(env, policy, rollout, actor_state)
+    assert not rollout.state.cell[4].any() and rollout.state.cell[3].any()
     assert rollout.values.isfinite().all() and rollout.logprobs.isfinite().all()
-    assert rollout.state.cell.isfinite().all()
 
 
 def test_a_collector_begins_each_rollout_where_the_one_before_ended():

@@ -159,6 +159,13 @@ def test_one_bad_number_is_named_costs_its_rollouts_and_changes_nothing_else(tmp
     assert all(0 < r <= 7 for r in returns)
 
 
+def test_a_bad_number_is_named_though_no_report_follows(tmp_path):
+    run = made(tmp_path, {("reward", 6, 3): torch.nan}, samples=8 * UPDATE, every=100)
+    with pytest.warns(UserWarning, match="reward of lane 3 was nan at step 6"):
+        run.train()
+    assert run.bad_number.step == 6
+
+
 @pytest.mark.parametrize("every", [1, 7])
 def test_an_environment_that_gives_no_more_good_numbers_ends_the_run(tmp_path, every):
     run = made(tmp_path, always("reward", 2, float("nan")), every=every)
