@@ -58,7 +58,7 @@ class Episodes:
             "episode/count": int(n),
             "episode/return": mean,
             "episode/length": steps / n,
-            "episode/deviation": math.sqrt(max(squares / n - mean**2, 0.0)),
+            "episode/return_std": math.sqrt(max(squares / n - mean**2, 0.0)),
         }
 
     def state_dict(self) -> dict[str, torch.Tensor]:

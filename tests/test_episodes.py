@@ -33,7 +33,7 @@ def test_two_steps_and_an_end_are_an_episode_of_length_two():
         "episode/count": 1,
         "episode/return": 3.0,
         "episode/length": 2.0,
-        "episode/deviation": 0.0,
+        "episode/return_std": 0.0,
     }
     assert episodes.returns.tolist() == [5.0] and episodes.lengths.tolist() == [1.0]
     assert episodes.take() == {"episode/count": 0}
@@ -57,7 +57,7 @@ def test_episodes_run_across_rollouts_as_if_there_were_one():
     returns = torch.tensor([total for total, _ in finished])
     assert found["episode/count"] == len(finished) > 20
     assert found["episode/return"] == pytest.approx(float(returns.mean()), rel=1e-6)
-    assert found["episode/deviation"] == pytest.approx(float(returns.std(correction=0)), rel=1e-5)
+    assert found["episode/return_std"] == pytest.approx(float(returns.std(correction=0)), rel=1e-5)
     assert found["episode/length"] == pytest.approx(
         sum(length for _, length in finished) / len(finished)
     )

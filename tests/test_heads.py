@@ -20,7 +20,7 @@ MOVES = arrdict(movement=spaces.MultiDiscrete(2, 7), fire=spaces.MultiDiscrete(2
 WIDTH = 24
 
 
-def draw(space, *lead, seed=0, dtype=torch.float32):
+def sample_of(space, *lead, seed=0, dtype=torch.float32):
     """Something that an environment with this space might show."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -39,7 +39,7 @@ def draw(space, *lead, seed=0, dtype=torch.float32):
 @pytest.mark.parametrize("lead", [(), (6,), (3, 6)])
 def test_an_intake_gives_width_numbers_whatever_it_is_shown(space, encoder, lead):
     intake = heads.intake(space, WIDTH, encoder)
-    out = intake(draw(space, *lead))
+    out = intake(sample_of(space, *lead))
     assert out.shape == (*lead, WIDTH) and out.dtype == torch.float32 and out.isfinite().all()
 
 
@@ -47,7 +47,7 @@ def test_an_intake_gives_width_numbers_whatever_it_is_shown(space, encoder, lead
 def test_every_pixel_and_every_leaf_matters(encoder):
     torch.manual_seed(0)
     intake = heads.intake(TREE, 512, encoder)
-    obs = draw(TREE, 1)
+    obs = sample_of(TREE, 1)
     for leaf in (obs.eyes.rgb, obs.eyes.d, obs.imu):
         leaf.requires_grad_()
     intake(obs).sum().backward()
@@ -59,14 +59,14 @@ def test_every_pixel_and_every_leaf_matters(encoder):
 
 def test_the_order_of_keys_does_not_matter():
     intake = heads.intake(TREE, WIDTH)
-    obs = draw(TREE, 6)
+    obs = sample_of(TREE, 6)
     backwards = arrdict({key: obs[key] for key in reversed(obs)})
     assert torch.equal(intake(backwards), intake(obs))
 
 
-def test_half_precision_pictures_meet_single_precision_weights():
+def test_half_precision_images_meet_single_precision_weights():
     intake = heads.intake(TREE, WIDTH)
-    half = draw(TREE, 6, dtype=torch.float16)
+    half = sample_of(TREE, 6, dtype=torch.float16)
     single = half.map(lambda leaf: leaf.float() if leaf.is_floating_point() else leaf)
     assert torch.equal(intake(half), intake(single))
 
@@ -74,7 +74,7 @@ def test_half_precision_pictures_meet_single_precision_weights():
 def test_autocast_decides_the_dtype_of_the_products_but_not_of_the_logits():
     intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
     with torch.autocast("cpu", torch.bfloat16):
-        x = intake(draw(TREE, 6, dtype=torch.float16))
+        x = intake(sample_of(TREE, 6, dtype=torch.float16))
         assert x.dtype == torch.bfloat16
         assert (
             output(x).movement.dtype == torch.float32
@@ -82,8 +82,8 @@ def test_autocast_decides_the_dtype_of_the_products_but_not_of_the_logits():
         )
 
 
-def test_leaves_have_the_same_say_at_the_start():
-    # A picture of 3 x 64 numbers and a vector of 3, all 1: each leaf's part of the sum has variance
+def test_leaves_weigh_the_same_at_the_start():
+    # An image of 3 x 64 numbers and a vector of 3, all 1: each leaf's part of the sum has variance
     # 2/2
     torch.manual_seed(0)
     intake = heads.intake(
@@ -93,12 +93,12 @@ def test_leaves_have_the_same_say_at_the_start():
     for part in (of_rgb, of_imu):
         assert part.sum(1).var().item() == pytest.approx(
             1, abs=0.1
-        )  # 4096 samples: 4.5 norm errors
+        )  # 4096 samples: 4.5 standard errors
 
 
 def test_logits_are_log_probabilities_that_an_env_can_be_given():
     intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
-    logits = nn.Sequential(intake, output)(draw(TREE, 6))
+    logits = nn.Sequential(intake, output)(sample_of(TREE, 6))
     assert logits.movement.shape == (6, 2, 7) and logits.fire.shape == (6, 2, 2)
     torch.testing.assert_close(logits.movement.exp().sum(-1), torch.ones(6, 2))
     actions = output.sample(logits)
@@ -137,24 +137,24 @@ def test_the_first_policy_is_close_to_uniform():
     )
 
 
-def test_actions_are_drawn_as_often_as_they_are_probable():
+def test_actions_are_sampled_as_often_as_they_are_probable():
     probabilities = torch.tensor([0.5, 0.3, 0.15, 0.05])
     output, n = heads.output(spaces.MultiDiscrete(1, 4), WIDTH), 100_000
     logits = probabilities.log().expand(n, 1, 4)
-    drawn = (
+    sampled = (
         output.sample(logits, torch.Generator().manual_seed(0)).flatten().bincount(minlength=4) / n
     )
     error = (probabilities * (1 - probabilities) / n).sqrt()
-    assert ((drawn - probabilities).abs() < 4 * error).all()
+    assert ((sampled - probabilities).abs() < 4 * error).all()
 
 
-def test_what_is_impossible_is_never_drawn():
+def test_what_is_impossible_is_never_sampled():
     output = heads.output(spaces.MultiDiscrete(1, 3), WIDTH)
     logits = torch.tensor([0.0, 1.0, 0.0]).log().expand(100_000, 1, 3)
     assert (output.sample(logits, torch.Generator().manual_seed(0)) == 1).all()
 
 
-def test_a_generator_decides_all_draws():
+def test_a_generator_decides_all_samples():
     output = heads.output(MOVES, WIDTH)
     logits = output(torch.randn(50, WIDTH))
     torch.manual_seed(0)
@@ -167,7 +167,7 @@ def test_a_generator_decides_all_draws():
 @pytest.mark.parametrize(
     "make, words",
     [
-        (lambda: heads.intake("pictures", WIDTH), "observation space itself = 'pictures'"),
+        (lambda: heads.intake("images", WIDTH), "observation space itself = 'images'"),
         (lambda: heads.intake(arrdict(imu=VECTOR, x=3), WIDTH), "observation space x = 3"),
         (lambda: heads.intake(arrdict(nothing=spaces.MultiEmpty()), WIDTH), "nothing in it"),
         (lambda: heads.intake(IMAGE, WIDTH, "resnet"), "'resnet'; it can be linear or conv"),
@@ -175,7 +175,7 @@ def test_a_generator_decides_all_draws():
         (lambda: heads.output(arrdict(), WIDTH), "there are MultiDiscrete and dicts of it"),
     ],
 )
-def test_what_no_head_is_known_for_is_said(make, words):
+def test_a_space_that_no_head_is_known_for_is_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()
 
@@ -183,7 +183,7 @@ def test_what_no_head_is_known_for_is_said(make, words):
 EVERY = torch.ones(64, dtype=torch.bool)
 
 
-def test_rescaling_a_value_changes_no_prediction():
+def test_updating_the_statistics_of_a_value_changes_no_prediction():
     value, x = heads.ValueOutput(WIDTH), torch.randn(200, WIDTH)
     before = value(x)
     for offset in (0.0, 300.0, 310.0):
@@ -194,13 +194,13 @@ def test_rescaling_a_value_changes_no_prediction():
         )  # float32 at a mean of 300
 
 
-def test_a_value_learns_the_mean_and_deviation_of_what_is_valid():
+def test_a_value_learns_the_mean_and_standard_deviation_of_what_is_valid():
     value = heads.ValueOutput(WIDTH)
     value.update_stats(torch.tensor([1.0, 5.0, torch.nan]), torch.tensor([True, True, False]))
     assert value.mean.item() == pytest.approx(3) and value.scale.item() == pytest.approx(2)
     value.update_stats(torch.full((64,), 9.0), EVERY)
-    # The second of two calls weighs a half: mean 6, mean square (13 + 81) / 2 = 47, deviation
-    # sqrt(47 - 36)
+    # The second of two calls weighs a half: mean 6, mean square (13 + 81) / 2 = 47, standard
+    # deviation sqrt(47 - 36)
     assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
     value.update_stats(torch.full((64,), 7.0), ~EVERY)
     assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
@@ -232,7 +232,7 @@ def test_returns_that_never_vary_do_not_divide_by_zero():
     )
 
 
-def test_pictures_are_standardised_by_channel_and_vectors_by_number():
+def test_images_are_standardised_by_channel_and_vectors_by_number():
     space = arrdict(rgb=spaces.MultiImage(1, 2, 1, 3), imu=spaces.MultiVector(1, 2))
     intake = heads.intake(space, WIDTH)
     rgb = (
@@ -245,7 +245,7 @@ def test_pictures_are_standardised_by_channel_and_vectors_by_number():
     of_rgb, of_imu = intake.norms
     torch.testing.assert_close(
         of_rgb(rgb)[0, 0, 0, 0], torch.tensor([-(1.5**0.5), 0.0, 1.5**0.5])
-    )  # deviation sqrt 2/3
+    )  # std sqrt 2/3
     torch.testing.assert_close(
         of_rgb(rgb)[0, 0, 1, 0], torch.tensor([-(0.5**0.5), -(0.5**0.5), 2**0.5])
     )
@@ -260,7 +260,7 @@ def test_pictures_are_standardised_by_channel_and_vectors_by_number():
 
 
 def test_what_was_learned_about_observations_is_saved_with_the_weights():
-    intake, other, obs = heads.intake(TREE, WIDTH), heads.intake(TREE, WIDTH), draw(TREE, 6)
+    intake, other, obs = heads.intake(TREE, WIDTH), heads.intake(TREE, WIDTH), sample_of(TREE, 6)
     intake.update_stats(obs)
     other.load_state_dict(intake.state_dict())
     assert torch.equal(other(obs), intake(obs))

@@ -1,5 +1,5 @@
-"""PPO learns: small worlds, each of which only a learner with one particular virtue can solve, in
-seconds.
+"""PPO learns: small environments, each of which only a learner with one particular ability can
+solve, in seconds.
 """
 
 import pytest
@@ -14,9 +14,9 @@ from megastep.arrdict import arrdict
 B = 64
 
 
-class World:
-    """Lanes whose episodes are at step `age`; subclasses say what is seen, paid, and when it
-    ends.
+class Env:
+    """Lanes whose episodes are at step `age`; subclasses define what is observed and paid, and when
+    it ends.
     """
 
     n_shown, n_actions = 1, 4
@@ -47,11 +47,11 @@ class World:
         return self._world(torch.zeros(B), which, none, none)
 
     def step(self, decision):
-        fresh, action = self.over, decision.actions[:, 0]
-        reward, terminal, truncated = (x.masked_fill(fresh, 0) for x in self.judge(action))
+        new, action = self.over, decision.actions[:, 0]
+        reward, terminal, truncated = (x.masked_fill(new, 0) for x in self.result(action))
         self.age += 1
-        self._begin(fresh)
-        return self._world(reward, fresh, terminal, truncated)
+        self._begin(new)
+        return self._world(reward, new, terminal, truncated)
 
     def begin(self, which):
         pass
@@ -60,7 +60,7 @@ class World:
         return torch.zeros(B, self.n_shown)
 
 
-class Cue(World):
+class Cue(Env):
     """Shows one of four cues on an episode's first observation and then nothing; doing what it said
     pays 1 at age 5.
     """
@@ -68,18 +68,18 @@ class Cue(World):
     n_shown, lag = 4, 5
 
     def begin(self, which):
-        fresh = torch.randint(self.n_actions, (B,), generator=self.generator)
-        self.cue = torch.where(which, fresh, getattr(self, "cue", fresh))
+        new = torch.randint(self.n_actions, (B,), generator=self.generator)
+        self.cue = torch.where(which, new, getattr(self, "cue", new))
 
     def show(self):
         return torch.nn.functional.one_hot(self.cue, 4).float() * (self.age == 0)[:, None]
 
-    def judge(self, action):
+    def result(self, action):
         due = self.age == self.lag
         return (due & (action == self.cue)).float(), due, torch.zeros_like(due)
 
 
-class Clock(World):
+class Clock(Env):
     """Shows nothing at all, ever. At age k the action PATTERN[k] pays 1, and an episode may be cut
     after any step.
 
@@ -88,13 +88,13 @@ class Clock(World):
 
     PATTERN = torch.tensor([2, 0, 3, 1, 1])
 
-    def judge(self, action):
+    def result(self, action):
         right = (action == self.PATTERN[self.age % len(self.PATTERN)]).float()
         cut = (torch.rand(B, generator=self.generator) < 0.25) | (self.age == len(self.PATTERN) - 1)
         return right, torch.zeros_like(cut), cut
 
 
-class Wage(World):
+class Wage(Env):
     """Pays 1 for every step, whatever one does; an episode ends after each with probability 1/8, in
     one way.
     """
@@ -103,7 +103,7 @@ class Wage(World):
         super().__init__()
         self.ends = ends
 
-    def judge(self, action):
+    def result(self, action):
         ended, none = (
             torch.rand(B, generator=self.generator) < 1 / 8,
             torch.zeros(B, dtype=torch.bool),
@@ -111,17 +111,17 @@ class Wage(World):
         return torch.ones(B), *((ended, none) if self.ends == "terminal" else (none, ended))
 
 
-def learn(world, n_updates, policy=None, n_steps=16, **how):
+def learn(env, n_updates, policy=None, n_steps=16, **how):
     """Trains a small policy and counts what happened in the last ten rollouts: (policy, rewards,
     ends, valid steps).
     """
-    policy = policy or Policy(world.obs_space, world.action_space, width=32)
+    policy = policy or Policy(env.obs_space, env.action_space, width=32)
     state = policy.initial(B)
-    rollout = Rollout(n_steps, B, world.obs_space, world.action_space, state)
+    rollout = Rollout(n_steps, B, env.obs_space, env.action_space, state)
     learner = PPO(policy, **{**dict(lr=5e-3, n_epochs=2, n_minibatches=4), **how})
-    actor_state, counts = initial_actor_state(world, policy), torch.zeros(3)
+    actor_state, counts = initial_actor_state(env, policy), torch.zeros(3)
     for i in range(n_updates):
-        collect(world, policy, rollout, actor_state)
+        collect(env, policy, rollout, actor_state)
         if i >= n_updates - 10:
             counts += torch.stack(
                 [rollout.reward.sum(), rollout.terminal.sum(), (~rollout.reset).sum()]
@@ -144,11 +144,11 @@ def test_a_cue_is_remembered():
 
 
 def test_memory_starts_anew_with_every_episode():
-    how, world = dict(n_updates=60, lr=1e-2, entropy_coef=0.03), Clock()
-    _, rewards, _, valid = learn(world, **how)
+    how, env = dict(n_updates=60, lr=1e-2, entropy_coef=0.03), Clock()
+    _, rewards, _, valid = learn(env, **how)
     assert rewards / valid > 0.9
-    leaky = Forgetless(world.obs_space, world.action_space, width=32)
-    _, rewards, _, valid = learn(world, policy=leaky, **how)
+    leaky = Forgetless(env.obs_space, env.action_space, width=32)
+    _, rewards, _, valid = learn(env, policy=leaky, **how)
     assert rewards / valid < 0.5  # nothing it sees tells it when an episode begins
 
 
@@ -160,8 +160,8 @@ def test_memory_starts_anew_with_every_episode():
     ],
 )  # a death does: 1 + .9 (7/8) + ...
 def test_a_time_limit_is_not_a_death(ends, worth):
-    world = Wage(ends)
-    policy, *_ = learn(world, n_updates=60, gamma=0.9, lambda_=0.8)
+    env = Wage(ends)
+    policy, *_ = learn(env, n_updates=60, gamma=0.9, lambda_=0.8)
     obs, reset = torch.zeros(12, 1, 1, 1), torch.zeros(12, 1, dtype=torch.bool)
     value = policy.unroll(obs, reset, policy.initial(1)).value[:, 0]
     torch.testing.assert_close(value, torch.full((12,), worth), rtol=0.1, atol=0)

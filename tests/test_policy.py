@@ -1,6 +1,4 @@
-"""The policy: what it does step by step is what it does over a sequence, and a seed decides all of
-it.
-"""
+"""The policy: acting step by step is an unroll over the sequence, and a seed decides all of it."""
 
 import io
 
@@ -23,19 +21,19 @@ def worlds(obs_space=OBS, dtype=torch.float16, seed=0):
     return arrdict(obs=obs, reset=torch.rand(T, B, generator=generator) < 0.3)
 
 
-def play(policy, seen, **how):
+def play(policy, world, **how):
     state, decisions = policy.initial(B), []
     for t in range(T):
-        decision, state = policy(seen[t], state, **how)
+        decision, state = policy(world[t], state, **how)
         decisions.append(decision)
     return stack(decisions), state
 
 
 @pytest.mark.parametrize("encoder", ["linear", "conv"])
-def test_acting_step_by_step_sees_what_an_unroll_sees(encoder):
-    policy, seen = Policy(OBS, MOVES, width=32, encoder=encoder), worlds()
-    decisions, state = play(policy, seen)
-    unrolled = policy.unroll(seen.obs, seen.reset, policy.initial(B))
+def test_acting_step_by_step_gives_what_an_unroll_gives(encoder):
+    policy, world = Policy(OBS, MOVES, width=32, encoder=encoder), worlds()
+    decisions, state = play(policy, world)
+    unrolled = policy.unroll(world.obs, world.reset, policy.initial(B))
     close = dict(
         rtol=1e-5, atol=1e-5
     )  # the same float32 products over T rows at once and one at a time
@@ -64,7 +62,7 @@ def test_bare_spaces_work_too():
     assert torch.equal(decision.actions, decision.logits.argmax(-1))
 
 
-def test_a_seed_decides_weights_and_actions_and_leaves_torchs_own_alone():
+def test_a_seed_decides_weights_and_actions_and_leaves_torchs_own_generator_alone():
     before = torch.get_rng_state()
     first, second, other = (
         play(Policy(OBS, MOVES, width=32, seed=seed), worlds())[0] for seed in (1, 1, 2)
@@ -77,9 +75,9 @@ def test_a_seed_decides_weights_and_actions_and_leaves_torchs_own_alone():
 
 
 def test_a_generator_of_ones_own_decides_the_actions():
-    policy, seen = Policy(OBS, MOVES, width=32), worlds()
+    policy, world = Policy(OBS, MOVES, width=32), worlds()
     first, second = (
-        play(policy, seen, generator=torch.Generator().manual_seed(5))[0].actions for _ in range(2)
+        play(policy, world, generator=torch.Generator().manual_seed(5))[0].actions for _ in range(2)
     )
     assert torch.equal(first.movement, second.movement) and torch.equal(first.fire, second.fire)
 
@@ -91,8 +89,8 @@ def test_weights_load_from_plain_tensors():
     torch.save(policy.state_dict(), file)
     file.seek(0)
     twin.load_state_dict(torch.load(file, weights_only=True))
-    seen = worlds()
-    ours, theirs = (p.unroll(seen.obs, seen.reset, p.initial(B)) for p in (policy, twin))
+    world = worlds()
+    ours, theirs = (p.unroll(world.obs, world.reset, p.initial(B)) for p in (policy, twin))
     assert torch.equal(ours.value, theirs.value) and torch.equal(
         ours.logits.fire, theirs.logits.fire
     )
@@ -132,16 +130,16 @@ def test_a_random_stream_on_a_gpu_goes_on_from_a_state_that_was_loaded_onto_the_
 
 
 @pytest.mark.cuda
-def test_on_a_gpu_acting_asks_nothing_and_stays_close_to_single_precision():
-    seen, results = worlds().cuda(), []
+def test_on_a_gpu_acting_never_synchronises_and_stays_close_to_single_precision():
+    world, results = worlds().cuda(), []
     for bf16 in (False, True):
         policy = Policy(OBS, MOVES, width=64, bf16=bf16).cuda()
         state = policy.initial(B)
-        policy(seen[0], state)
+        policy(world[0], state)
         torch.cuda.set_sync_debug_mode("error")
         try:
-            policy(seen[1], state)
-            results.append(policy.unroll(seen.obs, seen.reset, state).logits.movement)
+            policy(world[1], state)
+            results.append(policy.unroll(world.obs, world.reset, state).logits.movement)
         finally:
             torch.cuda.set_sync_debug_mode("default")
     torch.testing.assert_close(

@@ -1,4 +1,4 @@
-"""PPO: what one update does, on rollouts made up for the purpose. That it learns is in
+"""PPO: what one update does, on made-up rollouts. That it learns is in
 test_learning.py.
 """
 
@@ -26,7 +26,7 @@ def made_up(seed=0, device="cpu"):
     with torch.no_grad():
         policy.output.core.weight.mul_(
             100
-        )  # a policy with opinions, so that gradients differ by action
+        )  # a policy far from uniform, so that gradients differ by action
     state = policy.initial(B)
     rollout = Rollout(T, B, OBS, MOVES, state, device, obs_dtype=torch.float32)
     generator = torch.Generator().manual_seed(seed)
@@ -39,15 +39,15 @@ def made_up(seed=0, device="cpu"):
     rollout.terminal[1, 1] = rollout.truncated[3, 4] = True
     rollout.reward[:] = normal(T, B)
     with torch.no_grad():
-        seen = policy.unroll(rollout.obs, rollout.starts, rollout.state)
-        rollout.values[:] = seen.value
-        rollout.actions[:] = policy.output.sample(seen.logits[:-1], policy.random.on(policy.device))
-        rollout.logprobs[:] = policy.output.logprob(seen.logits[:-1], rollout.actions)
+        out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
+        rollout.values[:] = out.value
+        rollout.actions[:] = policy.output.sample(out.logits[:-1], policy.random.on(policy.device))
+        rollout.logprobs[:] = policy.output.logprob(out.logits[:-1], rollout.actions)
     return policy, rollout
 
 
 def weights(policy):
-    """All but the value's own layer, which `update_stats` changes without changing what it says."""
+    """All but the value's own layer, which `update_stats` changes and its predictions do not show."""
     return torch.cat(
         [
             p.detach().flatten()
@@ -57,14 +57,14 @@ def weights(policy):
     )
 
 
-def test_means_and_deviations_are_over_the_valid():
+def test_means_and_standard_deviations_are_over_the_valid():
     x, valid = (
         torch.tensor([[1.0, 5.0], [torch.nan, 3.0]]),
         torch.tensor([[True, True], [False, True]]),
     )
     assert ppo.masked_mean(x, valid).item() == 3
-    deviation = math.sqrt(8 / 3)
-    expected = torch.tensor([[-2 / deviation, 2 / deviation], [0.0, 0.0]])
+    std = math.sqrt(8 / 3)
+    expected = torch.tensor([[-2 / std, 2 / std], [0.0, 0.0]])
     torch.testing.assert_close(ppo.normalised(x, valid), expected)
     assert ppo.masked_mean(x, torch.zeros_like(valid)).item() == 0
 
@@ -122,9 +122,9 @@ def test_good_actions_become_likelier_and_bad_ones_rarer():
 
 def test_what_an_invalid_row_holds_teaches_nothing():
     results = []
-    for spoil in (False, True):
+    for corrupt in (False, True):
         policy, rollout = made_up()
-        if spoil:
+        if corrupt:
             ignored = rollout.reset.nonzero(as_tuple=True)
             assert len(ignored[0]) == 2
             rollout.reward[ignored], rollout.logprobs[ignored] = 1e3, -5.0
@@ -297,14 +297,14 @@ def test_a_captured_update_skips_a_rollout_that_is_not_finite():
     for _ in range(4):
         learner.update(rollout)
     before = weights(policy)
-    kept = rollout.reward[2, 3].clone()
+    good = rollout.reward[2, 3].clone()
     rollout.reward[2, 3] = math.nan
     for _ in range(2):
         assert learner.update(rollout)["loss/skipped_steps"].item() == 3
     assert torch.equal(weights(policy), before)
     bad, n_skipped = learner.check.read(rollout.numbers())
     assert (bad.name, bad.lane, bad.step, n_skipped) == ("reward", 3, 4 * T + 3, 2)
-    rollout.reward[2, 3] = kept
+    rollout.reward[2, 3] = good
     learner.update(rollout)
     assert not torch.equal(weights(policy), before)
     assert learner.check.read(rollout.numbers()) == (None, 0)

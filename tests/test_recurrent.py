@@ -1,4 +1,4 @@
-"""The LSTM against PyTorch's own, and its forgetting against sequences cut by hand."""
+"""The LSTM against PyTorch's own, and its resets against sequences cut by hand."""
 
 import pytest
 import torch
@@ -97,8 +97,8 @@ def test_nothing_before_a_reset_is_remembered_not_even_a_nan():
     reset = torch.zeros(T, B, dtype=torch.bool)
     reset[4] = True
     outputs, _ = lstm(x, reset, state)
-    spoiled = torch.cat([torch.full((4, B, W), torch.nan), x[4:]])
-    again, _ = lstm(spoiled, reset, state.map(lambda leaf: leaf * torch.nan))
+    corrupted = torch.cat([torch.full((4, B, W), torch.nan), x[4:]])
+    again, _ = lstm(corrupted, reset, state.map(lambda leaf: leaf * torch.nan))
     assert torch.equal(again[4:], outputs[4:]) and again[:4].isnan().all()
     (d_x,) = torch.autograd.grad(outputs[4:].sum(), x)
     assert not d_x[:4].any() and d_x[4:].all()
@@ -120,14 +120,14 @@ def test_lanes_do_not_mix():
 
 def test_forget_gates_start_open_and_no_other_gate():
     # Jozefowicz et al. 2015: a bias of 1; in the order of torch.nn.LSTM, forget is the second of
-    # four. With no input and no output yet, a cell then keeps sigmoid(1) of itself per step.
+    # four. With no input and no output yet, a cell then retains sigmoid(1) of itself per step.
     lstm = LSTM(W)
     biases = lstm.input.bias.detach().split(W)
     assert [bias.unique().tolist() for bias in biases] == [[0.0], [1.0], [0.0], [0.0]]
     state = arrdict(output=torch.zeros(B, W), cell=torch.ones(B, W))
     _, after = lstm.step(torch.zeros(B, W), torch.zeros(B, dtype=torch.bool), state)
-    kept = torch.sigmoid(torch.tensor(1.0)).item()
-    torch.testing.assert_close(after.cell, torch.full((B, W), kept), **CLOSE)
+    retained = torch.sigmoid(torch.tensor(1.0)).item()
+    torch.testing.assert_close(after.cell, torch.full((B, W), retained), **CLOSE)
 
 
 @pytest.mark.cuda

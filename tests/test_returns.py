@@ -69,7 +69,7 @@ def test_gae_by_hand():
     assert r.valid.all()
 
 
-def test_gae_terminal_forgets_the_value_and_truncated_keeps_it():
+def test_a_terminal_end_drops_the_value_of_gae_and_a_truncated_one_does_not():
     # The episode's last observation is that of row 1; row 2 is the transition to the next episode's
     # first.
     case = dict(value=[1, 4, 100, 6], last_value=8, reward=[1, 2, 0, 3], reset=[0, 0, 1, 0])
@@ -154,7 +154,7 @@ def split(case, b):
 
 
 def beyond(case, t, b):
-    """What the value function says of the observation after row t."""
+    """The value of the observation after row t."""
     last = t + 1 == len(case["reward"])
     value = case["last_value"][b] if last else case["value"][t + 1, b]
     return 0.0 if case["terminal"][t, b] else value.item()
@@ -209,11 +209,11 @@ def test_vtrace_matches_the_sums_and_products_of_the_paper():
 
 
 def test_what_an_invalid_row_holds_changes_nothing():
-    """The world ignored that decision; even a NaN there must not leak."""
+    """The environment ignored that action; even a NaN there must not leak."""
     case, log_ratio = episodes(seed=3)
-    spoiled = dict(case, reward=torch.where(case["reset"], torch.nan, case["reward"]))
+    corrupted = dict(case, reward=torch.where(case["reset"], torch.nan, case["reward"]))
     for f in (returns.gae, lambda **k: returns.vtrace(log_ratio, **k)):
-        clean, dirty = (f(**c, gamma=0.9, lambda_=0.8) for c in (case, spoiled))
+        clean, dirty = (f(**c, gamma=0.9, lambda_=0.8) for c in (case, corrupted))
         assert torch.equal(clean.advantages, dirty.advantages) and torch.equal(
             clean.targets, dirty.targets
         )

@@ -1,5 +1,5 @@
-"""Rollouts: a world made of numbers that say which lane, time and key they are, followed through
-collect and lanes.
+"""Rollouts: an environment of numbers that tell their lane, time and key, followed through collect
+and lanes.
 """
 
 import pytest
@@ -118,10 +118,10 @@ def test_an_actor_state_stays_in_its_own_memory():
 
 def test_probabilities_and_values_are_those_of_an_unroll_over_what_was_written():
     _, policy, rollout, actor_state = collected(n_rollouts=2, dtype=torch.float16)
-    seen = policy.unroll(rollout.obs, rollout.starts, rollout.state)
+    out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
     close = dict(rtol=1e-4, atol=1e-4)  # products of numbers up to 500 in another order
-    torch.testing.assert_close(rollout.values, seen.value, **close)
-    logprobs = policy.output.logprob(seen.logits[:-1], rollout.actions)
+    torch.testing.assert_close(rollout.values, out.value, **close)
+    logprobs = policy.output.logprob(out.logits[:-1], rollout.actions)
     torch.testing.assert_close(rollout.logprobs, logprobs, **close)
     last = policy.unroll(rollout.obs[-1:], rollout.starts[-1:], actor_state.state).value[0]
     torch.testing.assert_close(rollout.values[-1], last, **close)

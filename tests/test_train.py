@@ -1,5 +1,5 @@
-"""Training, in this process: the configuration is composed as the command line does it, the worlds
-are four boxes.
+"""Training, in this process: the configuration is composed as the command line does it, the
+environments are four boxes.
 """
 
 import itertools
@@ -85,7 +85,7 @@ def test_a_run_leaves_what_it_promises(here):
     rows = metrics.read(folder / "metrics.jsonl")
     assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
     assert [row["updates"] for row in rows] == [1, 2, 3]
-    # lives of 5 to 9 steps, and one step for the reset: two or three episodes end in 24 steps of
+    # episodes of 5 to 9 steps, and one step for the reset: two or three episodes end in 24 steps of
     # each of 4 lanes
     assert 8 <= sum(row["episode/count"] for row in rows) <= 16
     assert all(5 <= row["episode/length"] <= 9 for row in rows if row["episode/count"])
@@ -132,8 +132,8 @@ def test_episodes_start_anew_when_a_run_goes_on(here):
 
 
 def test_episodes_that_ended_before_a_run_was_stopped_are_reported_when_it_goes_on(here):
-    lives = "env.shortest=7", "env.longest=7"
-    folder = train.run(configured(f"samples={UPDATE}", "report=2", *lives))
+    lengths = "env.shortest=7", "env.longest=7"
+    folder = train.run(configured(f"samples={UPDATE}", "report=2", *lengths))
     train.run(configured(f"resume={folder}", f"samples={2 * UPDATE}", tiny=[]))
     (row,) = metrics.read(folder / "metrics.jsonl")
     assert row["episode/count"] == 2 * 4 and row["episode/length"] == 7
@@ -296,7 +296,7 @@ def test_a_second_training_in_one_folder_is_refused_and_harms_nothing(here, caps
     assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
-def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_world(
+def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_environment(
     here, monkeypatch, capsys
 ):
     real = train.Trainer.report
