@@ -47,7 +47,7 @@ def made_up(seed=0, device="cpu"):
 
 
 def weights(policy):
-    """All but the value's own layer, which `update_stats` changes and its predictions do not show."""
+    """All but the value's own layer, which `update_stats` changes with no prediction."""
     return torch.cat(
         [
             p.detach().flatten()
