@@ -8,3 +8,5 @@ two cores taken, training was 100 times slower. Asleep, they lose a few microsec
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# PyTorch would search all installed packages for drivers of other accelerators.
+os.environ.setdefault("TORCH_DEVICE_BACKEND_AUTOLOAD", "0")

@@ -13,8 +13,9 @@ from agents.cli import signals
 def run_script(name: str) -> int:
     """Runs a script of this package by its name; returns the exit code."""
     signals.exit_on_signals(name)
+    waking = threading.Thread(target=create_cuda_context)
     if wants_first_gpu(sys.argv[1:]):
-        threading.Thread(target=create_cuda_context, daemon=True).start()
+        waking.start()  # the interpreter waits for it: a process must not end within the driver
     from agents.cli import console  # its imports take a while, too
 
     console.open_streams()
