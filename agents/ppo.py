@@ -210,8 +210,12 @@ class PPO:
     def _capture(self, rollout):
         graph = torch.cuda.CUDAGraph()
         graph.register_generator_state(self.random.on(self.device))
-        with torch.cuda.graph(graph, stream=self._stream):
-            metrics = self._update(rollout)
+        try:
+            with torch.cuda.graph(graph, stream=self._stream):
+                metrics = self._update(rollout)
+        except RuntimeError as error:
+            # the end of a capture that failed fails as well: the first error is the one to tell
+            raise error.__context__ or error from None
         return rollout, graph, metrics
 
     def state_dict(self) -> dict[str, Any]:

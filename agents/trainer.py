@@ -63,6 +63,11 @@ class Trainer:
         """The fraction of the budget that is left."""
         return self.budget.left(self.samples, self.clock.seconds)
 
+    @property
+    def is_saved(self) -> bool:
+        """Whether a checkpoint holds all that was learnt."""
+        return self.saved_updates == self.updates
+
     def train(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Runs until the budget is spent or `stop()`. An error ends it too, once all that was
         learnt is saved; so does NonFiniteError, of which only what came before it is saved.
@@ -150,9 +155,7 @@ class Trainer:
     def save(self) -> None:
         """Writes a checkpoint, unless the last one holds the same."""
         self.saved_at = self.clock.seconds
-        if self.saved_updates != self.updates and self.save_checkpoint(
-            self.samples, self.state_dict(), self.score
-        ):
+        if not self.is_saved and self.save_checkpoint(self.samples, self.state_dict(), self.score):
             self.saved_updates = self.updates
 
     def state_dict(self) -> dict[str, Any]:

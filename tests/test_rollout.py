@@ -10,6 +10,7 @@ from agents.returns import gae
 from agents.rollout import Collector, Rollout, collect, initial_actor_state
 from megastep import spaces
 from megastep.arrdict import arrdict
+from megastep.capture import state_tree
 from megastep.dotdict import leaves
 
 B, T = 6, 5
@@ -158,6 +159,18 @@ def test_a_collector_begins_each_rollout_where_the_one_before_ended():
     assert torch.equal(rollout.values, expected.values) and collector.graph is None
     assert torch.equal(rollout.state.cell, expected.state.cell)
     assert [leaf.data_ptr() for leaf in leaves(rollout.state)] == places
+
+
+def test_collecting_allocates_nothing_that_stays():
+    """A graph writes where its capture wrote, so all must be there before."""
+    env = Telltale()
+    policy = Policy(env.obs_space, env.action_space, width=16)
+    rollout = Rollout(T, B, env.obs_space, env.action_space, policy.initial(B))
+    before = state_tree(rollout)
+    collect(env, policy, rollout, initial_actor_state(env, policy))
+    after = state_tree(rollout)
+    assert before.keys() == after.keys() and ".state['cell']" in after
+    assert all(before[path] is after[path] for path in after)
 
 
 def test_a_minibatch_joins_the_rows_of_its_lanes():

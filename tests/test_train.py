@@ -376,7 +376,8 @@ def test_memory_that_runs_out_is_one_sentence_and_the_run_can_go_on(here, monkey
         patch.setattr(ppo.PPO, "update", update)
         assert train.main([*TINY, "seconds=60", "folder=run"]) == 2
     (sentence,) = capsys.readouterr().err.splitlines()
-    assert "out of memory" in sentence and "python train.py resume=run" in sentence
+    assert "out of memory" in sentence and f"All {2 * UPDATE} samples are saved" in sentence
+    assert "python train.py resume=run" in sentence
     assert checkpoint.load(here / "run" / "checkpoints").step == 2 * UPDATE
     assert train.main(["resume=run", f"samples={3 * UPDATE}"]) == 0
     assert checkpoint.load(here / "run" / "checkpoints").step == 3 * UPDATE

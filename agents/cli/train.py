@@ -3,8 +3,10 @@ Python.
 """
 
 import dataclasses
+from collections.abc import Callable
 from contextlib import closing, nullcontext
 from functools import partial
+from pathlib import Path
 
 import torch
 
@@ -51,7 +53,9 @@ RESUMABLE = (
 )
 
 
-def make_trainer(cfg, folder, device, on_report):
+def make_trainer(
+    cfg: Train, folder: Path, device: torch.device, on_report: Callable[[Trainer], None]
+) -> tuple[Trainer, Saver]:
     """A Trainer as `cfg` describes it, and its Saver: going on where a run stopped, or from the
     weights of another, if `cfg` says so.
     """
@@ -96,7 +100,7 @@ def make_trainer(cfg, folder, device, on_report):
     return trainer, saver
 
 
-def show(progress, trainer):
+def show(progress: Progress, trainer: Trainer) -> None:
     """Shows the few numbers that people watch."""
     words = [f"{number(trainer.samples)} samples"]
     if trainer.rate is not None:
@@ -109,7 +113,7 @@ def show(progress, trainer):
     progress.show(1 - left if trainer.budget.is_limited else None, "  ".join(words))
 
 
-def settled(cfg):
+def settled(cfg: Train) -> Train:
     """`cfg` with learner.anneal=auto replaced by what it stands for: samples if they are limited,
     else seconds, else never.
     """
@@ -120,7 +124,7 @@ def settled(cfg):
     return dataclasses.replace(cfg, learner=dataclasses.replace(cfg.learner, anneal=anneal))
 
 
-def run(cfg):
+def run(cfg: Train) -> Path:
     """Trains as `cfg`, a settings.Train, says. Returns the run folder; after a signal, saves and
     raises Interrupted.
     """
@@ -144,9 +148,10 @@ def run(cfg):
             raise NotFinite(f"{error}. What was saved before is in {folder}") from error
         except (engine.EngineError, torch.OutOfMemoryError) as error:
             reason = str(error).splitlines()[0].rstrip(".")
-            raise UserError(
-                f"{reason}. It is saved at {trainer.samples:,} samples. {resume}"
-            ) from error
+            saved = saver.unsaved or "What was learnt last could not be saved"
+            if trainer.is_saved:
+                saved = f"All {trainer.samples:,} samples are saved"
+            raise UserError(f"{reason}. {saved}. {resume}") from error
         finally:
             metrics.curves(folder)
         if stop.number is not None:
@@ -161,7 +166,7 @@ def run(cfg):
     return folder
 
 
-def finish(cfg, folder):
+def finish(cfg: Train, folder: Path) -> None:
     """What the run leaves behind beside its checkpoints: a table and a video, if asked for."""
     common = dict(
         run=str(folder), geometry=None, split="test", greedy=False, seed=cfg.seed, device=cfg.device
@@ -175,7 +180,7 @@ def finish(cfg, folder):
             warn(str(error))
 
 
-def resumed(tree, overrides):
+def resumed(tree: dict, overrides: list[str]) -> dict:
     """The tree of a run that goes on: its own, but for what `overrides` may change. That of a new
     run is as it was.
     """
@@ -205,5 +210,5 @@ def resumed(tree, overrides):
     return {**own, "init": None}
 
 
-def main(argv=None):
+def main(argv: list[str] | None = None) -> int:
     return run_command("train", Train, run, HELP, argv, resumed)
