@@ -19,6 +19,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from agents.running_norm import RunningNorm
 from megastep import spaces
 from megastep.arrdict import arrdict
 
@@ -31,55 +32,6 @@ def compute_dtype(weight):
     """
     device = weight.device.type
     return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else weight.dtype
-
-
-class RunningNorm(nn.Module):
-    """Images less their channels' running mean, over their running standard deviation; vectors
-    likewise, number by number.
-
-    An image's numbers may well be .87 plus or minus .1, of which a network with its first weights
-    would see mostly the .87.
-    """
-
-    def __init__(self, space: Any, min_scale: float = 1e-2):
-        super().__init__()
-        is_image = isinstance(space, spaces.MultiImage)
-        shape = (*space.shape[:2], 1, 1) if is_image else space.shape
-        self.pooled = (0, -2, -1) if is_image else (0,)
-        self.min_scale = min_scale  # what varies less than this is not enlarged any further
-        self.register_buffer("mean", torch.zeros(shape))
-        self.register_buffer("scale", torch.ones(shape))
-        self.register_buffer("count", torch.tensor(0.0))
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return (obs - self.mean) / self.scale
-
-    @torch.no_grad()
-    def update_stats(self, obs: torch.Tensor, is_fine: torch.Tensor | bool = True) -> None:
-        """Takes observations (B, ...) into account, the n-th call with weight 1/n. Changes nothing
-        unless `is_fine`, or if a mean or variance of them is not finite.
-        """
-        variance, mean = torch.var_mean(obs.float(), self.pooled, correction=0, keepdim=True)
-        count = self.count + 1
-        mean, scale = _mixed(self, mean[0], variance[0], 1 / count)
-        is_fine = is_fine & (mean + scale).isfinite().all()
-        _store(is_fine, [(self.mean, mean), (self.scale, scale), (self.count, count)])
-
-
-def _mixed(norm, mean, variance, rate):
-    """The mean and scale of a mixture: a norm's own with weight 1 - rate, and another mean and
-    variance with weight rate.
-    """
-    own = norm.scale.square()
-    spread = rate * (1 - rate) * (mean - norm.mean).square()
-    variance = own.lerp(variance, rate) + spread
-    return norm.mean.lerp(mean, rate), variance.sqrt().clamp(min=norm.min_scale)
-
-
-def _store(is_taken, pairs):
-    """Gives tensors their new values in place, or, unless `is_taken`, leaves every bit as it is."""
-    for old, new in pairs:
-        old.copy_(torch.where(is_taken, new, old))
 
 
 class Flat(nn.Module):
@@ -292,44 +244,3 @@ def output(space: Any, width: int) -> MultiDiscreteOutput | DictOutput:
         f"no output is known for the action space {space!r}; there are MultiDiscrete and dicts of "
         f"it"
     )
-
-
-class ValueOutput(nn.Module):
-    """The expected return, (..., width) -> (...,) float32, in units of reward.
-
-    The layer itself predicts returns less their running mean, over their running standard
-    deviation, so that its error is about 1 whatever an environment pays. `update_stats` moves both
-    and corrects the layer so that no prediction changes (PopArt, van Hasselt et al. 2016).
-    """
-
-    def __init__(self, width: int, min_scale: float = 1e-3):
-        super().__init__()
-        self.core = nn.Linear(width, 1)
-        nn.init.orthogonal_(self.core.weight, gain=0.1)
-        nn.init.zeros_(self.core.bias)
-        self.min_scale = min_scale  # returns that vary less than this are taken for constant
-        for name, start in dict(mean=0.0, scale=1.0, count=0.0).items():
-            self.register_buffer(name, torch.tensor(start))
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        predicted = self.core(x.to(compute_dtype(self.core.weight))).float().squeeze(-1)
-        return predicted * self.scale + self.mean
-
-    @torch.no_grad()
-    def update_stats(
-        self, targets: torch.Tensor, valid: torch.Tensor, min_rate: float = 0.05
-    ) -> None:
-        """Takes returns (...,) into account where `valid`, the n-th call with weight
-        max(min_rate, 1/n). Changes nothing if none is, or if their mean or variance is not finite.
-        """
-        n_valid = valid.sum()
-        n = n_valid.clamp(min=1)
-        mean = targets.masked_fill(~valid, 0.0).sum() / n
-        variance = (targets - mean).square().masked_fill(~valid, 0.0).sum() / n
-        count = self.count + 1
-        mean, scale = _mixed(self, mean, variance, (1 / count).clamp(min=min_rate, max=1.0))
-        weight = self.core.weight * (self.scale / scale)
-        bias = (self.core.bias * self.scale + (self.mean - mean)) / scale
-        is_taken = (n_valid > 0) & (mean + scale).isfinite()
-        old = self.core.weight, self.core.bias, self.mean, self.scale, self.count
-        _store(is_taken, zip(old, (weight, bias, mean, scale, count), strict=True))

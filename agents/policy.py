@@ -13,6 +13,7 @@ from torch import nn
 from agents import heads
 from agents.random_stream import RandomStream
 from agents.recurrent import LSTM
+from agents.value import ValueOutput
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 
@@ -46,7 +47,7 @@ class Policy(nn.Module):
             self.intake = heads.intake(obs_space, width, encoder)
             self.memory = LSTM(width)
             self.output = heads.output(action_space, width)
-            self.value = heads.ValueOutput(width)
+            self.value = ValueOutput(width)
 
     @property
     def device(self) -> torch.device:

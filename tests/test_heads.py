@@ -76,10 +76,7 @@ def test_autocast_decides_the_dtype_of_the_products_but_not_of_the_logits():
     with torch.autocast("cpu", torch.bfloat16):
         x = intake(sample_of(TREE, 6, dtype=torch.float16))
         assert x.dtype == torch.bfloat16
-        assert (
-            output(x).movement.dtype == torch.float32
-            and heads.ValueOutput(WIDTH)(x).dtype == torch.float32
-        )
+        assert output(x).movement.dtype == torch.float32
 
 
 def test_leaves_weigh_the_same_at_the_start():
@@ -178,58 +175,6 @@ def test_a_generator_decides_all_samples():
 def test_a_space_that_no_head_is_known_for_is_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()
-
-
-EVERY = torch.ones(64, dtype=torch.bool)
-
-
-def test_updating_the_statistics_of_a_value_changes_no_prediction():
-    value, x = heads.ValueOutput(WIDTH), torch.randn(200, WIDTH)
-    before = value(x)
-    for offset in (0.0, 300.0, 310.0):
-        value.update_stats(torch.randn(64) * 20 + offset, EVERY)
-        assert value.mean.item() != 0 and value.scale.item() != 1
-        torch.testing.assert_close(
-            value(x), before, rtol=1e-4, atol=1e-4
-        )  # float32 at a mean of 300
-
-
-def test_a_value_learns_the_mean_and_standard_deviation_of_what_is_valid():
-    value = heads.ValueOutput(WIDTH)
-    value.update_stats(torch.tensor([1.0, 5.0, torch.nan]), torch.tensor([True, True, False]))
-    assert value.mean.item() == pytest.approx(3) and value.scale.item() == pytest.approx(2)
-    value.update_stats(torch.full((64,), 9.0), EVERY)
-    # The second of two calls weighs a half: mean 6, mean square (13 + 81) / 2 = 47, standard
-    # deviation sqrt(47 - 36)
-    assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
-    value.update_stats(torch.full((64,), 7.0), ~EVERY)
-    assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
-def test_statistics_never_take_in_what_is_not_finite(bad):
-    # 1e30 is finite, and its square is not
-    value, norm = heads.ValueOutput(WIDTH), heads.RunningNorm(spaces.MultiVector(1, 2))
-    value.update_stats(torch.randn(64) * 3 + 1, EVERY)
-    norm.update_stats(torch.randn(64, 1, 2) + 5)
-    before = [
-        {name: tensor.clone() for name, tensor in module.state_dict().items()}
-        for module in (value, norm)
-    ]
-    value.update_stats(torch.tensor([1.0, 2.0, bad]), torch.tensor([True, True, True]))
-    norm.update_stats(torch.tensor([1.0, 2.0, 3.0, bad]).view(2, 1, 2))
-    norm.update_stats(torch.zeros(2, 1, 2), torch.tensor(False))
-    for module, old in zip((value, norm), before, strict=True):
-        assert all(torch.equal(module.state_dict()[name], old[name]) for name in old)
-
-
-def test_returns_that_never_vary_do_not_divide_by_zero():
-    value = heads.ValueOutput(WIDTH)
-    for _ in range(5):
-        value.update_stats(torch.zeros(64), EVERY)
-    assert (
-        value.scale.item() == pytest.approx(1e-3) and value(torch.randn(8, WIDTH)).isfinite().all()
-    )
 
 
 def test_images_are_standardised_by_channel_and_vectors_by_number():

@@ -1,0 +1,28 @@
+"""Running statistics of observations; that they are by channel or number is in test_heads.py."""
+
+import math
+
+import pytest
+import torch
+
+from agents.running_norm import RunningNorm
+from megastep import spaces
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
+def test_observations_that_are_not_finite_change_nothing(bad):
+    norm = RunningNorm(spaces.MultiVector(1, 2))
+    norm.update_stats(torch.randn(64, 1, 2) + 5)
+    before = {name: tensor.clone() for name, tensor in norm.state_dict().items()}
+    # 1e30 is finite, and its square is not; one number stands for all
+    norm.update_stats(torch.tensor([1.0, 2.0, 3.0, bad]).view(2, 1, 2))
+    norm.update_stats(torch.zeros(2, 1, 2), torch.tensor(False))
+    assert all(torch.equal(norm.state_dict()[name], before[name]) for name in before)
+
+
+def test_batches_weigh_the_same():
+    norm, batches = RunningNorm(spaces.MultiVector(1, 1)), torch.randn(5, 8, 1, 1) * 3 + 2
+    for batch in batches:
+        norm.update_stats(batch)
+    torch.testing.assert_close(norm.mean, batches.mean((0, 1)))
+    torch.testing.assert_close(norm.scale, batches.std((0, 1), correction=0))
