@@ -12,6 +12,8 @@ import time
 
 import pytest
 
+from agents import checkpoint
+
 ROOT = pathlib.Path(__file__).parents[1]
 TINY = [
     "env=minimal",
@@ -23,6 +25,7 @@ TINY = [
     "learner.n_minibatches=2",
     "agent.width=8",
     "device=cpu",
+    "checkpoint=0.2",
 ]
 
 
@@ -71,34 +74,56 @@ def test_a_gpu_that_is_not_there_and_a_compiler_that_is_not_there_are_one_senten
     assert not any(tmp_path.glob("runs/*"))
 
 
-@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_saves_and_says_how_to_go_on(tmp_path, number, code):
+def test_a_run_keeps_others_out_of_its_folder_and_saves_when_its_terminal_is_closed(tmp_path):
     process = start("train", *TINY, "folder=run", cwd=tmp_path)
-    deadline = time.monotonic() + 60
-    while (
-        not (tmp_path / "run" / "metrics.jsonl").exists()
-        or not (tmp_path / "run" / "metrics.jsonl").stat().st_size
-    ):
+    metrics, deadline = tmp_path / "run" / "metrics.jsonl", time.monotonic() + 60
+    while not metrics.exists() or not metrics.stat().st_size:
         assert time.monotonic() < deadline and process.poll() is None, process.communicate()
         time.sleep(0.05)
-    process.send_signal(number)
+    while not any((tmp_path / "run" / "checkpoints").glob("step_*")):
+        time.sleep(0.05)
+    code, _, err = finished("train", "resume=run", cwd=tmp_path)
+    assert code == 2 and f"in use by process {process.pid}" in err and len(err.splitlines()) == 1
+    process.send_signal(signal.SIGHUP)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == code
+    assert process.returncode == 129
     assert "python train.py resume=run" in err and "Traceback" not in err
-    (saved,) = (tmp_path / "run" / "checkpoints").iterdir()
-    assert json.loads((saved / "manifest.json").read_text())["step"] > 0
+    rows = [json.loads(line)["samples"] for line in metrics.read_text().splitlines()]
+    assert rows == sorted(set(rows)), "no row twice"
+    saved = checkpoint.load(tmp_path / "run" / "checkpoints")
+    assert saved.step >= rows[-1] and saved.path.name == f"step_{saved.step}"
 
 
-def test_a_reader_that_leaves_does_not_stop_the_run(tmp_path):
+@pytest.mark.parametrize(
+    "redirected",
+    [
+        "{command} | true",
+        "{command} >/dev/full 2>/dev/full",
+        "{command} >&- 2>&-",
+        "{command} <&- | head -1 >/dev/full",
+    ],
+)
+def test_a_run_that_cannot_print_goes_on_and_says_nothing(tmp_path, redirected):
     overrides = [*TINY, "samples=64", "folder=run", "finish.evaluate=true", "finish.lanes=4"]
-    command = f"{sys.executable} {ROOT / 'train.py'} {' '.join(overrides)}"
-    done = subprocess.run(
-        ["bash", "-c", f"{{ {command}; echo code $? >&2; }} | true"],
+    command = f"{{ {sys.executable} {ROOT / 'train.py'} {' '.join(overrides)}; echo $? >code; }}"
+    subprocess.run(
+        ["bash", "-c", redirected.format(command=command)],
         cwd=tmp_path,
-        text=True,
-        stderr=subprocess.PIPE,
         timeout=120,
         env={**os.environ, "TERM": "dumb"},
     )
-    assert done.stderr.splitlines() == ["code 0"]
+    assert (tmp_path / "code").read_text() == "0\n"
     assert list((tmp_path / "run" / "evaluations").glob("box-test-*.json"))
+    for name in ("metrics.jsonl", "perf.jsonl"):  # no line of stdout's is in a file
+        assert all(json.loads(line) for line in (tmp_path / "run" / name).read_text().splitlines())
+    assert checkpoint.load(tmp_path / "run" / "checkpoints").step == 64
+
+
+def test_where_only_ascii_can_be_shown_tables_and_names_are_ascii(tmp_path):
+    overrides = [*TINY, "samples=1", 'folder="ü"', "finish.evaluate=true", "finish.lanes=4"]
+    code, out, err = finished(
+        "train", *overrides, cwd=tmp_path, PYTHONIOENCODING="ascii", TERM="dumb", COLUMNS="20"
+    )
+    assert (code, err) == (0, "") and (out + err).isascii()
+    assert "Training on cpu in \\xfc" in out and "| trained |" in out and "95 % interval" in out
+    assert list((tmp_path / "ü" / "evaluations").iterdir())
