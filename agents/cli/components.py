@@ -1,22 +1,35 @@
 """The objects a run is made of, from its settings: device, homes, environment, policy, learner,
-rollout, weights.
+rollout, weights. PyTorch is imported where it is used: composing a configuration needs none.
 """
+
+from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from agents.cli import settings
 from agents.cli.build import build
 from agents.cli.errors import UserError
 from agents.cli.run_folders import is_checkpoint
-from agents.cli.settings import Train
 
-#: Environments in the small one that tells how much memory an environment takes.
+if TYPE_CHECKING:
+    import torch
+
+    from agents.checkpoint import Checkpoint
+    from agents.policy import Policy
+    from agents.ppo import PPO
+    from agents.rollout import Rollout
+
+#: Environments that are made to measure how much memory one takes.
 PROBE = 65
 
 
 @contextmanager
-def errors():
+def errors() -> Iterator[None]:
     """Turns what the library says about bad arguments, files, devices and memory into a UserError.
     For setting up only.
     """
@@ -39,7 +52,7 @@ def errors():
         raise UserError(str(error).splitlines()[0]) from error
 
 
-def make_device(name):
+def make_device(name: str) -> torch.device:
     """The device called `name`; a GPU becomes PyTorch's current one, on which graphs are
     captured.
     """
@@ -54,21 +67,25 @@ def make_device(name):
     return chosen
 
 
-def homes(geometry, split, most=None):
-    """The different geometries of a split, in order, at most `most`; the source repeats them when
-    it runs out.
-    """
+def homes(geometry: settings.Geometry, split: str, max_homes: int | None = None) -> list[dict]:
+    """The different geometries of a split, in order; the source repeats them when it runs out."""
     from megastep import geometries
 
     with errors():
         found = geometries.sample(
             geometry.name, geometry.n, split=split, seed=geometry.seed, **geometry.options
         )
-    return list({id(home): home for home in found}.values())[:most]
+    return list({id(home): home for home in found}.values())[:max_homes]
 
 
-def make_env(settings, homes, seed, device, bytes_beside=lambda env: 0):
-    """The environment that `settings` (such as settings.Explorer) describe, in these homes.
+def make_env(
+    chosen: settings.Minimal | settings.Explorer,
+    homes: list[dict],
+    seed: int,
+    device: torch.device,
+    bytes_beside: Callable[[Any], float] = lambda env: 0,
+) -> Any:
+    """The environment that settings describe, in these homes.
 
     UserError that says how many environments fit, if these are too many for the memory;
     `bytes_beside(env)` is what each needs beside its own, in a rollout. Before a large one is made,
@@ -77,46 +94,44 @@ def make_env(settings, homes, seed, device, bytes_beside=lambda env: 0):
     from megastep import engine, envs
     from megastep.capture import state_tree
 
-    arguments = {
-        k: v for k, v in dataclasses.asdict(settings).items() if k not in ("name", "n_envs")
-    }
+    arguments = _arguments(chosen, "name", "n_envs")
 
-    def made(n_envs, homes):
-        return envs.ENVS[settings.name](n_envs, homes, seed=seed, device=device, **arguments)
+    def make(n_envs, homes):
+        return envs.ENVS[chosen.name](n_envs, homes, seed=seed, device=device, **arguments)
 
     with errors():
-        if settings.n_envs > PROBE:
-            few, many = made(1, homes[:1]), made(PROBE, homes[:1])
+        if chosen.n_envs > PROBE:
+            few, many = make(1, homes[:1]), make(PROBE, homes[:1])
             sizes = [
                 sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())
                 for env in (few, many)
             ]
             each = (sizes[1] - sizes[0]) / (PROBE - 1) + bytes_beside(few)
-            engine.fit(settings.n_envs, each, device)
-        return made(settings.n_envs, homes)
+            engine.fit(chosen.n_envs, each, device)
+        return make(chosen.n_envs, homes)
 
 
-def make_policy(agent, env, seed=1):
+def _arguments(chosen: Any, *others: str) -> dict[str, Any]:
+    """Settings as keyword arguments, but for `others`, which are used elsewhere."""
+    return {k: v for k, v in dataclasses.asdict(chosen).items() if k not in others}
+
+
+def make_policy(agent: settings.Agent, env: Any, seed: int = 1) -> Policy:
     from agents.policy import Policy
 
     with errors():
-        return Policy(env.obs_space, env.action_space, seed=seed, **dataclasses.asdict(agent)).to(
-            env.device
-        )
+        policy = Policy(env.obs_space, env.action_space, seed=seed, **_arguments(agent))
+        return policy.to(env.device)
 
 
-def make_learner(learner, policy, seed=1):
+def make_learner(learner: settings.Learner, policy: Policy, seed: int = 1) -> PPO:
     from agents.ppo import PPO
 
-    arguments = {
-        k: v
-        for k, v in dataclasses.asdict(learner).items()
-        if k not in ("name", "n_steps", "anneal")
-    }
+    arguments = _arguments(learner, "name", "n_steps", "anneal")
     return PPO(policy, graph=True, seed=seed, **arguments)
 
 
-def make_rollout(cfg, env, policy):
+def make_rollout(cfg: settings.Train, env: Any, policy: Policy) -> Rollout:
     from agents.rollout import Rollout
 
     n_lanes = env.n_envs * env.n_agents
@@ -131,36 +146,32 @@ def make_rollout(cfg, env, policy):
         )
 
 
-def rollout_bytes(cfg, env):
-    """About how many bytes a settings.Train learns from at once for each of env's worlds."""
+def rollout_bytes(cfg: settings.Train, env: Any) -> float:
+    """About how many bytes a rollout and a minibatch of it take per environment."""
     from megastep.dotdict import leaves
 
     numbers = sum(math.prod(space.shape) for space in leaves(env.obs_space))
     steps, width, parts = cfg.learner.n_steps + 1, cfg.agent.width, cfg.learner.n_minibatches
-    # observations of 2 bytes and about 64 of the rest, a minibatch's share of those and of some 16
-    # activations a unit
+    # observations of 2 bytes per number and about 64 of the rest; a minibatch's share of those, and
+    # of some 16 activations of 4 bytes per unit
     return env.n_agents * steps * ((2 * numbers + 64) * (1 + 1 / parts) + 64 * width / parts)
 
 
-def load(path, device="cpu"):
-    """The checkpoint of a run found with `find`; damaged ones are named in warnings and passed
-    over.
-    """
+def load(path: Path, device: torch.device | str = "cpu") -> Checkpoint:
+    """The checkpoint of a run found with `find`; damaged ones are named in warnings and skipped."""
     from agents import checkpoint
 
     with errors():
         return checkpoint.load(path if is_checkpoint(path) else path / "checkpoints", device)
 
 
-def config_of(checkpoint):
-    """The settings.Train that a checkpoint was trained with."""
-    return build(Train, checkpoint.config["train"])
+def config_of(checkpoint: Checkpoint) -> settings.Train:
+    """The settings that a checkpoint was trained with."""
+    return build(settings.Train, checkpoint.config["train"])
 
 
-def spaces_of(env):
-    """What an environment shows and takes, by name, as plain text: {'obs.rgb': 'MultiImage(...)',
-    ...}.
-    """
+def spaces_of(env: Any) -> dict[str, str]:
+    """The spaces of an environment by name, as text: {'obs.rgb': 'MultiImage(...)', ...}."""
 
     def flat(space, name):
         if not isinstance(space, dict):
@@ -172,7 +183,7 @@ def spaces_of(env):
     return {**flat(env.obs_space, "obs"), **flat(env.action_space, "actions")}
 
 
-def load_weights(policy, env, checkpoint):
+def load_weights(policy: Policy, env: Any, checkpoint: Checkpoint) -> None:
     """Loads a checkpoint's weights into a policy made for `env`. UserError that names what differs
     if they do not fit.
     """

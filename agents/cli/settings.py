@@ -92,6 +92,7 @@ class Files:
         return {"path": self.path}
 
 
+Geometry = Toy | Homes | Files
 GEOMETRIES = {"box": Toy, "column": Toy, "homes": Homes, "bench": Homes, "files": Files}
 
 
@@ -158,7 +159,7 @@ class Train:
     """A training run."""
 
     env: Minimal | Explorer
-    geometry: Toy | Homes | Files
+    geometry: Geometry
     agent: Agent
     learner: Learner
     logger: LocalLogger | WandbLogger
@@ -194,7 +195,7 @@ class Evaluate:
     """An evaluation of a run's checkpoint."""
 
     run: str
-    geometry: Toy | Homes | Files | None
+    geometry: Geometry | None
     split: str = among("training", "test", "all")
     lanes: int = within(1, 1_000_000)
     greedy: bool
@@ -208,7 +209,7 @@ class Record:
     """A video of a run's checkpoint."""
 
     run: str
-    geometry: Toy | Homes | Files | None
+    geometry: Geometry | None
     split: str = among("training", "test", "all")
     steps: int = within(1, 100_000)
     home: int = within(0, 1_000_000)
