@@ -182,6 +182,13 @@ def test_a_typo_names_the_nearest_key():
     assert "geometry?" in errors("geometri=box")["geometri"]
 
 
+def test_a_key_of_another_member_names_that_member():
+    assert errors("logger.mode=offline")["logger.mode"] == "no such key here; logger=wandb has it"
+    found = errors("env=minimal", "env.patience=3", "geometry=box", "geometry.n=2")
+    assert found["env.patience"] == "no such key here; env=explorer has it"
+    assert found["geometry.n"] == "no such key here; geometry=bench has it"
+
+
 def test_an_unknown_member_names_the_nearest_one():
     assert "explorer?" in errors("env=explorr")["env"]
     assert "homes?" in errors("geometry=home")["geometry"]

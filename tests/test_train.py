@@ -2,14 +2,17 @@
 environments are four boxes.
 """
 
+import contextlib
 import itertools
 import json
 import os
+import pathlib
 import re
 import shlex
 import signal
 import time
 
+import faults
 import pytest
 import torch
 import yaml
@@ -397,6 +400,28 @@ def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, mo
     assert len(metrics.read(only_run(here) / "metrics.jsonl")) == 3
 
 
+def test_on_a_disk_that_fills_up_training_goes_on_and_the_last_checkpoint_stays(
+    here, monkeypatch, capsys
+):
+    real, full = train.Trainer.report, contextlib.ExitStack()
+
+    def report(self, losses):
+        real(self, losses)
+        if self.updates == 2:  # the first checkpoint is written
+            full.enter_context(faults.full_disk(5000))
+
+    with full, monkeypatch.context() as patch:
+        patch.setattr(train.Trainer, "report", report)
+        code = train.main([*TINY, f"samples={5 * UPDATE}", "checkpoint=1e-9", "folder=run"])
+    warning, *others, error = capsys.readouterr().err.splitlines()
+    assert code == 2 and all("curves.png" in line for line in others)
+    assert "at 64 samples could not be saved (File too large)" in warning
+    assert "at 160 samples could not be saved" in error and "MB are free in run" in error
+    assert len(metrics.read(here / "run" / "metrics.jsonl")) == 5
+    assert train.main(["resume=run"]) == 0
+    assert checkpoint.load(here / "run" / "checkpoints").step == 5 * UPDATE
+
+
 def test_a_disk_that_is_free_again_gets_the_checkpoint(here, monkeypatch):
     real, calls = checkpoint.save, []
 
@@ -477,3 +502,18 @@ def test_the_end_of_a_run_can_hold_a_table_and_a_video(here, capsys):
 
 def test_interrupted_carries_the_signal():
     assert Interrupted(signal.SIGTERM, "x").number == 15
+
+
+@pytest.mark.slow
+def test_a_long_run_leaks_neither_memory_nor_files(here, monkeypatch):
+    real, seen = train.Trainer.report, {}
+
+    def report(self, losses):
+        real(self, losses)
+        pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
+        seen[self.updates] = pages * 4096 / 1e6, len(os.listdir("/proc/self/fd"))
+
+    monkeypatch.setattr(train.Trainer, "report", report)
+    train.run(configured(f"samples={2000 * UPDATE}", "checkpoint=0.5"))
+    (early, files), (late, files_late) = seen[500], seen[2000]
+    assert late - early < 4 and files_late == files, seen  # megabytes in 1,500 updates

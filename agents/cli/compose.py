@@ -93,6 +93,8 @@ class ConfigLoader:
             key = override.key_or_group
             if key in keys:
                 good.append(override.input_line)
+            elif chosen := self._with_key(key, groups):
+                errors.append((key, f"no such key here; {chosen} has it"))
             else:
                 errors.append((key, f"no such key; {closest_key(key, [*keys, *groups])}"))
         try:
@@ -102,6 +104,14 @@ class ConfigLoader:
         except ConfigErrors as error:
             errors += error.errors
         return errors
+
+    def _with_key(self, key: str, groups: dict[str, list[str]]) -> str | None:
+        """The choice of a group's member that has this key: `logger=wandb` for logger.mode."""
+        group = key.partition(".")[0]
+        for member in groups.get(group, ()):
+            if key in _paths(_plain(self._compose([f"{group}={member}"]))):
+                return f"{group}={member}"
+        return None
 
     def _compose(self, overrides: list[str]) -> DictConfig:
         """With a GPU to run on, `preset=auto` is replaced by `preset=gpu`; without one it is `cpu`

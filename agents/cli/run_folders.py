@@ -84,8 +84,8 @@ def record_start(folder: Path) -> None:
     """
     try:
         RUNS.mkdir(exist_ok=True)
-        with open(STARTED, "a", errors="surrogateescape") as file:
-            file.write(f"{folder}\n")
+        with open(STARTED, "ab") as file:
+            file.write(os.fsencode(folder) + b"\n")
     except OSError as error:
         warn(f"{STARTED} cannot be written ({error.strerror}); `latest` will not know {folder}")
 
@@ -94,8 +94,8 @@ def known() -> list[Path]:
     """The runs with checkpoints here, and elsewhere if they were started here; the one that
     started or went on last is the last.
     """
-    text = STARTED.read_text(errors="surrogateescape") if STARTED.exists() else ""
-    order = {Path(line): n for n, line in enumerate(text.splitlines())}
+    lines = STARTED.read_bytes().split(b"\n") if STARTED.exists() else []
+    order = {Path(os.fsdecode(line)): n for n, line in enumerate(lines) if line}
     found = {p.parent for p in [*RUNS.glob("*/checkpoints"), *SWEEPS.glob("*/*/checkpoints")]}
     found |= {path for path in order if (path / "checkpoints").is_dir()}
     return sorted(found, key=lambda path: (order.get(path, -1), str(path)))
