@@ -89,7 +89,9 @@ class ParallelEncoder:
             with _named(self._n_frames):
                 self._add(_draw(self._plot_state, state))
         else:
-            self._add(self._workers().submit(_draw_payload, self._payload, state))
+            with _keep_from_terminal():
+                drawn = self._workers().submit(_draw_payload, self._payload, state)
+            self._add(drawn)
 
     def frame(self, array: ArrayLike) -> None:
         """Adds an image as the next frame: (H, W, 3), uint8 or floats from 0 to 1, of the same
@@ -171,9 +173,7 @@ class ParallelEncoder:
             import loky
 
             self._n_workers = self._n_workers or min(loky.cpu_count(), MAX_WORKERS)
-            self._pool = loky.ProcessPoolExecutor(
-                self._n_workers, env=_WORKER_ENV, initializer=_ignore_interrupts
-            )
+            self._pool = loky.ProcessPoolExecutor(self._n_workers, env=_WORKER_ENV)
         return self._pool
 
     def _add(self, source):
@@ -282,6 +282,18 @@ def _payload(plot_state):
     return None
 
 
+@contextlib.contextmanager
+def _keep_from_terminal():
+    """Processes that start meanwhile, and theirs, never get what a terminal sends to all it has,
+    Ctrl-C and SIGHUP: the one that owns the workers ends them.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _is_done(source):
     return isinstance(source, np.ndarray) or source.done()
 
@@ -301,11 +313,6 @@ def _image(array):
 
 
 # ---- In the workers ----
-
-
-def _ignore_interrupts():
-    """Ctrl-C reaches every process of a terminal; the one that owns the workers ends them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @functools.lru_cache(1)

@@ -224,6 +224,19 @@ def test_ctrl_c_while_compiling_is_no_missing_compiler(here):
     assert not (here / "run").exists()
 
 
+def test_a_terminal_that_is_closed_while_filming_ends_every_process_with_one_line(here):
+    """Its signal reaches them all: this one, its workers, and what watches over these."""
+    filming = ["finish.record=true", "finish.steps=5000"]
+    process = launched(*TINY, f"samples={UPDATE}", "folder=run", *filming)
+    children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    while len(children.read_text().split()) < 2:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGHUP)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (129, "train.py: stopped by SIGHUP\n")
+
+
 def at_any_moment(here, seed):
     """One run that gets a signal at a random time, and what has to hold whenever that is."""
     draw = random.Random(seed)
