@@ -1,5 +1,9 @@
 """Our use of PyTorch's fused Adam, against PyTorch's own class."""
 
+import pathlib
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -67,3 +71,20 @@ def test_a_saved_adam_goes_on():
     first.step(YES)
     second.step(YES)
     assert all(map(torch.equal, ours, theirs))
+
+
+def test_an_update_does_not_import_pytorchs_compiler():
+    # It takes more than a second, before the first update.
+    script = """
+import sys, torch
+from agents.policy import Policy
+from agents.ppo import PPO
+from agents.rollout import Rollout
+from megastep import spaces
+obs, moves = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 3)
+policy = Policy(obs, moves, width=4)
+PPO(policy, n_minibatches=1).update(Rollout(2, 3, obs, moves, policy.initial(3)))
+sys.exit("torch._dynamo" in sys.modules)
+"""
+    root = pathlib.Path(__file__).parents[1]
+    assert subprocess.run([sys.executable, "-c", script], cwd=root, timeout=120).returncode == 0
