@@ -295,7 +295,7 @@ def bake(scenery):
     no wall of the layout hides.
     """
     layouts = scenery.layouts
-    layouts.bound()
+    layouts.update_bounding_boxes()
     texel_wall = torch.repeat_interleave(
         torch.arange(len(layouts.textures), dtype=torch.int32, device=scenery.device),
         layouts.textures.widths,

@@ -13,51 +13,51 @@ from functools import cached_property
 import numpy as np
 import torch
 
-__all__ = ["Bounds", "Ragged", "RaggedNumpy", "RaggedTorch"]
+from .read_only import SetOnce
+
+__all__ = ["Ragged", "RaggedNumpy", "RaggedTorch"]
+
+Array = np.ndarray | torch.Tensor
 
 
-class Bounds:
-    """What follows from the ``widths`` (D,) of subarrays that lie end to end."""
-
-    @cached_property
-    def ends(self):
-        """(D,) index into ``vals`` one past each subarray's last element."""
-        return self.widths.cumsum(0)
-
-    @cached_property
-    def starts(self):
-        """(D,) index into ``vals`` of each subarray's first element."""
-        return self.ends - self.widths
-
-
-class Ragged(Bounds):
+class Ragged(SetOnce):
     """``vals`` (V, ...) cut along its first axis into D subarrays of ``widths`` (D,) elements each.
 
     An integer index gives a subarray, a slice gives a Ragged; both share memory with ``vals``,
-    except slices with a step. ``widths`` must be whole numbers, none negative, that add up to V
-    (ValueError if not), and are kept as int64.
+    except slices with a step. ``vals`` may be written in place, not replaced. ``widths`` must be
+    integers, none negative, that add up to V (ValueError if not), and become int64.
     """
 
-    def __new__(cls, vals, widths):
+    def __new__(cls, *args):
         if cls is Ragged:
-            cls = RaggedTorch if isinstance(vals, torch.Tensor) else RaggedNumpy
+            cls = RaggedTorch if isinstance(args[0], torch.Tensor) else RaggedNumpy
         return super().__new__(cls)
 
-    def __init__(self, vals, widths):
+    def __init__(self, vals: Array, widths: Array):
         self.vals = self._asarray(vals)
         widths = self._asarray_like(widths)
         _check(self.vals, widths)
         self.widths = self._int64(widths)
 
     @cached_property
+    def ends(self) -> Array:
+        """(D,) index into ``vals`` one past each subarray's last element."""
+        return self.widths.cumsum(0)
+
+    @cached_property
+    def starts(self) -> Array:
+        """(D,) index into ``vals`` of each subarray's first element."""
+        return self.ends - self.widths
+
+    @cached_property
     def _host(self):
-        """Starts and ends as lists, so that indexing asks the device only once."""
+        """Starts and ends as lists, so that indexing synchronises with the device only once."""
         return self.starts.tolist(), self.ends.tolist()
 
     def __len__(self):
         return len(self.widths)
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: int | slice) -> "Array | Ragged":
         starts, ends = self._host
         if isinstance(index, slice):
             chosen = range(len(self))[index]
@@ -72,6 +72,11 @@ class Ragged(Bounds):
                 self._cat([self.vals[starts[i] : ends[i]] for i in chosen]),
                 self.widths[list(chosen)],
             )
+        i = self._index(index)
+        return self.vals[starts[i] : ends[i]]
+
+    def _index(self, index):
+        """A subarray's number from 0 on."""
         try:
             i = operator.index(index)
         except TypeError:
@@ -80,7 +85,7 @@ class Ragged(Bounds):
             ) from None
         if not -len(self) <= i < len(self):
             raise IndexError(f"index {i} is out of range for a Ragged of {len(self)} subarrays")
-        return self.vals[starts[i] : ends[i]]
+        return i % len(self)
 
     def __repr__(self):
         return f"{type(self).__name__}({np.array(self.widths.tolist(), int)})"
@@ -104,16 +109,16 @@ class RaggedNumpy(Ragged):
         return widths.astype(np.int64, copy=False)
 
     @cached_property
-    def inverse(self):
+    def inverse(self) -> Array:
         """(V,) the subarray that each element of ``vals`` belongs to."""
         return np.repeat(np.arange(len(self)), self.widths)
 
-    def torchify(self):
+    def torchify(self) -> "RaggedTorch":
         """The same Ragged on CPU tensors; float64 becomes float32."""
         vals = self.vals.astype(np.float32) if self.vals.dtype == np.float64 else self.vals
         return Ragged(torch.as_tensor(vals), torch.as_tensor(self.widths))
 
-    def numpyify(self):
+    def numpyify(self) -> "RaggedNumpy":
         return self
 
 
@@ -132,18 +137,18 @@ class RaggedTorch(Ragged):
         return widths.to(torch.int64)
 
     @cached_property
-    def inverse(self):
+    def inverse(self) -> Array:
         """(V,) the subarray that each element of ``vals`` belongs to."""
         return torch.repeat_interleave(torch.arange(len(self), device=self.device), self.widths)
 
     @property
-    def device(self):
+    def device(self) -> torch.device:
         return self.vals.device
 
-    def torchify(self):
+    def torchify(self) -> "RaggedTorch":
         return self
 
-    def numpyify(self):
+    def numpyify(self) -> RaggedNumpy:
         """The same Ragged on numpy arrays."""
         vals = self.vals.detach().cpu()
         return Ragged(
@@ -151,18 +156,18 @@ class RaggedTorch(Ragged):
             self.widths.cpu().numpy(),
         )
 
-    def to(self, *args, **kwargs):
+    def to(self, *args, **kwargs) -> "RaggedTorch":
         """``vals.to(...)`` and the widths on the same device."""
         vals = self.vals.to(*args, **kwargs)
         return Ragged(vals, self.widths.to(vals.device))
 
-    def cpu(self):
+    def cpu(self) -> "RaggedTorch":
         return self.to("cpu")
 
-    def cuda(self, device="cuda"):
+    def cuda(self, device: torch.device | str = "cuda") -> "RaggedTorch":
         return self.to(device)
 
-    def clone(self):
+    def clone(self) -> "RaggedTorch":
         return Ragged(self.vals.clone(), self.widths.clone())
 
 
@@ -176,9 +181,9 @@ def _check(vals, widths):
             f"the widths of a Ragged need exactly one axis, but theirs have shape "
             f"{tuple(widths.shape)}"
         )
-    if not _whole(widths):
+    if not _are_integers(widths):
         raise ValueError(
-            f"the widths of a Ragged must be whole numbers, but their dtype is {widths.dtype}"
+            f"the widths of a Ragged must be integers, but their dtype is {widths.dtype}"
         )
     listed = np.array(widths.tolist(), int)
     if (listed < 0).any():
@@ -193,7 +198,7 @@ def _check(vals, widths):
         )
 
 
-def _whole(widths):
+def _are_integers(widths):
     if isinstance(widths, torch.Tensor):
         return not (widths.is_floating_point() or widths.is_complex() or widths.dtype == torch.bool)
     return np.issubdtype(widths.dtype, np.integer)

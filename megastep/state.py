@@ -11,6 +11,8 @@ from typing import Any
 
 import torch
 
+from .read_only import ReadOnlyTensor
+
 __all__ = ["rebind", "restore", "snapshot", "state_tree", "walk"]
 
 State = dict[str, torch.Tensor]
@@ -75,8 +77,14 @@ def rebind(parent: Any, step: str, leaf: Any) -> None:
 
 
 def state_tree(env: Any) -> dict[str, torch.Tensor | torch.Generator]:
-    """{path: tensor or generator} of everything in ``env`` that can change."""
-    return {path: leaf for path, (_, _, leaf) in walk(env, _LEAVES).items()}
+    """{path: tensor or generator} of everything in ``env`` that can change, so without its
+    read-only tensors.
+    """
+    return {
+        path: leaf
+        for path, (_, _, leaf) in walk(env, _LEAVES).items()
+        if not isinstance(leaf, ReadOnlyTensor)
+    }
 
 
 def snapshot(env: Any) -> State:

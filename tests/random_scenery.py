@@ -242,7 +242,7 @@ def random_agents(draw, n_agents, size, origin, overlap):
     return positions.float().double()
 
 
-def random_world(
+def random_environments(
     seed,
     n_envs=4,
     n_agents=1,

@@ -83,7 +83,7 @@ VIEWS = [
 @pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
 def test_twin_sight(view, n_agents, degenerate, device):
     for seed in range(2):
-        world = random_scenery.random_world(
+        world = random_scenery.random_environments(
             seed,
             n_agents=n_agents,
             degenerate=degenerate,
@@ -103,7 +103,7 @@ def test_twin_sight(view, n_agents, degenerate, device):
 @pytest.mark.parametrize("name", [None, *random_scenery.DEGENERATE, "overlap"])
 def test_twin_physics(name, n_agents, device):
     for seed in range(6):
-        world = random_scenery.random_world(
+        world = random_scenery.random_environments(
             seed,
             n_envs=16,
             n_agents=n_agents,
@@ -122,7 +122,7 @@ def test_twin_physics(name, n_agents, device):
 @pytest.mark.parametrize("n_agents", [1, 3])
 @pytest.mark.parametrize("subsample", [1, 4])
 def test_observe_composes(n_agents, subsample, device):
-    world = random_scenery.random_world(
+    world = random_scenery.random_environments(
         5, n_envs=8, n_agents=n_agents, degenerate=random_scenery.EVERYTHING, res=64
     )
     core = core_of(world, device, res=64)

@@ -17,10 +17,11 @@ SOURCES = sorted(
 
 # A module of the simulator may import modules of the layers above its own row only.
 LAYERS = (
-    ("dotdict", "colour", "spaces", "ragged", "state"),
-    ("arrdict",),
-    ("geometry", "capture", "contract", "plotting", "kernels"),
-    ("geometries", "scenery", "recording"),
+    ("dotdict", "colour", "spaces", "read_only"),
+    ("arrdict", "ragged", "state"),
+    ("checks", "geometry", "capture", "contract", "plotting", "kernels"),
+    ("geometries", "scenery_views", "recording"),
+    ("scenery",),
     ("engine", "toys", "cubicasa"),
     ("scene",),
     ("core",),
@@ -202,7 +203,7 @@ PLANTED = [
     (the_simulator_imports_downwards, "megastep.engine", "megastep.modules"),
     (the_simulator_imports_downwards, "megastep.plotting", "megastep.scenery"),
     (the_simulator_imports_downwards, "megastep.kernels.compile", "megastep.engine"),
-    (the_simulator_imports_downwards, "megastep.scenery", "megastep.geometries.toys"),
+    (the_simulator_imports_downwards, "megastep.scenery_views", "megastep.geometries.toys"),
     (the_simulator_knows_no_learner, "megastep.envs.minimal", "agents.heads"),
     (the_simulator_knows_no_learner, "megastep.core", "train"),
     (an_environment_is_one_file, "megastep.envs.minimal", "megastep.envs.explorer"),

@@ -112,18 +112,29 @@ def test_copies(ragged, trip):
 
 
 @pytest.mark.parametrize(
-    ("widths", "fault"),
+    ("widths", "error"),
     [
         ([3, 1], "add up to 4 and there are 6 vals"),
         ([3, -1, 4], r"must not be negative, but widths\[1\] is -1"),
-        ([3.0, 3.0], "whole numbers, but their dtype is .*float"),
-        ([True] * 6, "whole numbers, but their dtype is .*bool"),
+        ([3.0, 3.0], "integers, but their dtype is .*float"),
+        ([True] * 6, "integers, but their dtype is .*bool"),
         ([[3, 3]], r"exactly one axis, but theirs have shape \(1, 2\)"),
     ],
 )
-def test_bad_widths_are_refused_in_a_sentence(kind, widths, fault):
-    with pytest.raises(ValueError, match=fault):
+def test_bad_widths_are_refused_in_a_sentence(kind, widths, error):
+    with pytest.raises(ValueError, match=error):
         Ragged(kind(VALS), kind(widths))
+
+
+@pytest.mark.parametrize("name", ["vals", "widths"])
+def test_values_are_written_in_place_and_never_replaced(ragged, name):
+    with pytest.raises(AttributeError, match=f"{name} of a Ragged.* "):
+        setattr(ragged, name, [1])
+    with pytest.raises(AttributeError, match=f"{name} of a Ragged.* "):
+        delattr(ragged, name)
+    ragged.vals[:] = 6
+    ragged.vals += 1
+    assert ragged[2].tolist() == [7, 7]
 
 
 def test_values_need_an_axis(kind):

@@ -356,7 +356,7 @@ def rounded(world, res, fov, cameras=(0.0,)):
     ],
 )
 def test_rounding_is_no_mistake(seed, origin, camera):
-    world = random_scenery.random_world(seed, **{**HARD, "origin": origin})
+    world = random_scenery.random_environments(seed, **{**HARD, "origin": origin})
     render, step, light = rounded(world, **camera)
     compare.check_render(render, world, **camera)
     compare.check_physics(step, world)
@@ -383,7 +383,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_in_rendering_is_named(mistake):
-    world = random_scenery.random_world(4, **HARD)
+    world = random_scenery.random_environments(4, **HARD)
     render = rounded(world, 48, 100.0)[0]
     with pytest.raises(
         AssertionError, match=rf"{mistake.split()[0]} at env \d+, agent \d+, camera 0, ray \d+"
@@ -393,7 +393,7 @@ def test_a_mistake_in_rendering_is_named(mistake):
 
 @pytest.mark.parametrize("field", ["progress", "positions", "angles", "velocity", "angvelocity"])
 def test_a_mistake_in_physics_is_named(field):
-    world = random_scenery.random_world(5, **HARD)
+    world = random_scenery.random_environments(5, **HARD)
     step = rounded(world, 48, 100.0)[1]
     step[field][:, 1] -= 0.01
     with pytest.raises(AssertionError, match=rf"{field} at env \d+, agent 1"):
@@ -401,7 +401,7 @@ def test_a_mistake_in_physics_is_named(field):
 
 
 def test_a_mistake_in_one_texel_is_named():
-    world = random_scenery.random_world(6, **HARD)
+    world = random_scenery.random_environments(6, **HARD)
     light = rounded(world, 48, 100.0)[2]
     light[-7] += 0.01
     with pytest.raises(AssertionError, match="baked at env 1, texel"):
@@ -416,7 +416,7 @@ def test_golden_mistakes_are_named():
 
 
 def test_random_worlds_repeat_and_differ_by_seed():
-    same, again, other = (random_scenery.random_world(seed, **HARD) for seed in (7, 7, 8))
+    same, again, other = (random_scenery.random_environments(seed, **HARD) for seed in (7, 7, 8))
     assert torch.equal(same.lines, again.lines) and torch.equal(same.velocity, again.velocity)
     assert not torch.equal(same.angles, other.angles)
     assert int(same.line_widths.sum()) == len(same.lines) == len(same.texture_widths)
@@ -426,7 +426,7 @@ def test_random_worlds_repeat_and_differ_by_seed():
 
 
 def test_random_worlds_hold_the_degenerate_cases_asked_for():
-    world = random_scenery.random_world(9, **HARD)
+    world = random_scenery.random_environments(9, **HARD)
     for e in range(world.n_envs):
         w = world.one(e)
         walls, lengths = w["walls"], (w["walls"][:, 1] - w["walls"][:, 0]).norm(dim=-1)

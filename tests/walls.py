@@ -120,7 +120,7 @@ def fragments(seed):
     """
     cases = "parallel", "zero_length", "duplicates", "touching", "pixel_ends", "tiny", "long"
     return (
-        random_scenery.random_world(seed, 1, n_walls=6, size=5.0, degenerate=cases)
+        random_scenery.random_environments(seed, 1, n_walls=6, size=5.0, degenerate=cases)
         .one(0)["walls"]
         .numpy()
     )

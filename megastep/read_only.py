@@ -1,0 +1,81 @@
+"""What may be read, but not written or replaced."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+_WRITING = ("__setitem__", "__delitem__", "__set__", "__delete__")
+
+
+class ReadOnlyTensor(torch.Tensor):
+    """A tensor that raises ValueError, with the sentence it was given, at any operation that would
+    write into it or into a view of it. What is calculated from it is a plain tensor, and
+    ``numpy()`` a read-only array.
+    """
+
+    def __new__(cls, tensor: torch.Tensor, refusal: str):
+        self = tensor.as_subclass(cls)
+        self.refusal = refusal
+        return self
+
+    @classmethod
+    def __torch_function__(cls, function, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        name = getattr(function, "__name__", "")
+        for tensor in tree_leaves([kwargs.get("out"), args[:1] if _writes(name) else None]):
+            if isinstance(tensor, cls):
+                raise ValueError(tensor.refusal)
+        refusals = {}
+
+        def plain(tensor):
+            with torch._C.DisableTorchFunctionSubclass():
+                plain = tensor.as_subclass(torch.Tensor)
+                refusals[plain.untyped_storage()._cdata] = tensor.refusal
+                return plain.clone() if name == "__dlpack__" else plain
+
+        def guarded(tensor):
+            refusal = refusals.get(tensor.untyped_storage()._cdata)
+            return cls(tensor, refusal) if refusal else tensor
+
+        out = function(*tree_map_only(cls, plain, args), **tree_map_only(cls, plain, kwargs))
+        if isinstance(out, np.ndarray):
+            out.setflags(write=False)
+        return out if isinstance(out, torch.Size) else tree_map_only(torch.Tensor, guarded, out)
+
+    def set_(self, *args, **kwargs):  # alone of its kind, it does not pass through the above
+        raise ValueError(self.refusal)
+
+
+def _writes(name):
+    """Whether PyTorch's function of this name writes into its first argument: add_, __iadd__."""
+    in_place = name.endswith("_") and not name.endswith("__")
+    return in_place or name in _WRITING or name.startswith("__i") and name not in _READING
+
+
+# What begins as in-place operators do, but reads.
+_READING = ("__index__", "__int__", "__invert__", "__init__", "__init_subclass__", "__iter__")
+
+
+class SetOnce:
+    """An object whose attributes are set once and then written in place, never replaced: the
+    engine and recorded CUDA graphs hold their addresses. AttributeError, naming the attribute.
+    """
+
+    _replaceable: tuple[str, ...] = ()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        held = self.__dict__.get(name, value)
+        if held is not value and name not in self._replaceable:
+            raise AttributeError(self._refusal(name))
+        super().__setattr__(name, value)
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError(self._refusal(name))
+
+    def _refusal(self, name):
+        kind = type(self).__name__
+        if isinstance(self.__dict__.get(name), torch.Tensor):
+            return f"{name} of a {kind} cannot be replaced: write into it, .{name}[...] = ..."
+        return f"{name} of a {kind} is set when it is made: make another {kind}"
