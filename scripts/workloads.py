@@ -278,7 +278,7 @@ def twin_frame(c, e):
     twin.physics(
         walls, seers.positions[e], seers.angles[e], seers.velocity[e], seers.angvelocity[e]
     )
-    hits = twin.cast(walls, seers.positions[e], twin.rays(seers.angles[e], [0.0], 256, 130.0))
+    hits = twin.raycast(walls, seers.positions[e], twin.rays(seers.angles[e], [0.0], 256, 130.0))
     bounds = layouts.texel_starts[first_wall : first_wall + len(walls) + 1].long()
     texels = layouts.texels[int(bounds[0]) : int(bounds[-1])]
     twin.shade(hits, texels[:, :3], bounds.diff(), texels[:, 3])

@@ -47,14 +47,14 @@ class Report:
                 f"{field} at {where}: ours {at(ours):.8g}, the twin {at(right):.8g}",
             )
 
-    def within(self, field, env, ours, low, high, tolerance, axes):
+    def within(self, field, env, ours, lower, upper, tolerance, axes):
         self.add(
             field,
             env,
-            torch.maximum(low - ours, ours - high).clamp(min=0),
+            torch.maximum(lower - ours, ours - upper).clamp(min=0),
             tolerance,
             ours,
-            low,
+            lower,
             axes,
         )
 
@@ -76,14 +76,14 @@ def double(tree):
     return {k: torch.as_tensor(v).detach().cpu().double() for k, v in tree.items()}
 
 
-def meetings(lines, positions, looks, radius):
+def meetings(lines, positions, directions, radius):
     """How rays (A, C, R, 2) from positions (A, 2) meet lines (L, 2, 2) whose ends may be off by
     SLACK.
 
     Six (A, C, R, L): certain and possible meetings, their distance and location, and the
     uncertainty (blur, smear) of these two.
     """
-    rays = (looks / looks.norm(dim=-1, keepdim=True))[..., None, :]
+    rays = (directions / directions.norm(dim=-1, keepdim=True))[..., None, :]
     a, b = ((end - positions[:, None])[:, None, None] for end in lines.unbind(1))
     furthest = a.norm(dim=-1).maximum(b.norm(dim=-1))
     slack = (
@@ -105,11 +105,13 @@ def meetings(lines, positions, looks, radius):
     return certain, possible, distance, location, blur, smear
 
 
-def check_sight(report, env, ours, lines, positions, looks, radius):
+def check_hits(report, env, ours, lines, positions, directions, radius):
     """Indices (A, C, R) must be some that the laws allow; locations, dots, distances those of the
     lines they name.
     """
-    certain, possible, distance, location, blur, smear = meetings(lines, positions, looks, radius)
+    certain, possible, distance, location, blur, smear = meetings(
+        lines, positions, directions, radius
+    )
     first = (
         (lines[:, None] == lines[None]).flatten(2).all(-1).int().argmax(-1)
     )  # the first line with the same ends
@@ -129,7 +131,7 @@ def check_sight(report, env, ours, lines, positions, looks, radius):
         (lines[:, 1] - lines[:, 0])[index],
         (lines[:, 1] - lines[:, 0]).norm(dim=-1)[index],
     )
-    dot = (looks * along).sum(-1) / (looks.norm(dim=-1) * length + twin.DOT_GUARD)
+    dot = (directions * along).sum(-1) / (directions.norm(dim=-1) * length + twin.DOT_GUARD)
     shaky = COORDINATE_SLACK * lines.abs().max() / length.clamp(min=1e-12)
     distance = pick(distance)
     for field, law, tolerance, blank in (
@@ -150,7 +152,7 @@ def check_sight(report, env, ours, lines, positions, looks, radius):
         )
 
 
-def check_render(ours, world, *, res=64, fov=130.0, cameras=(0.0,), radius=twin.RADIUS):
+def check_render(ours, envs, *, res=64, fov=130.0, cameras=(0.0,), radius=twin.RADIUS):
     """Checks indices, locations, dots, distances (N, A[, C], R) and screen (N, A[, C], R, 3) of
     `ours`.
 
@@ -158,12 +160,12 @@ def check_render(ours, world, *, res=64, fov=130.0, cameras=(0.0,), radius=twin.
     worst ratios by field.
     """
     report, ours = Report(), double(ours)
-    for e in range(world.n_envs):
-        w = world.one(e)
-        shape = (world.n_agents, len(cameras), res)
+    for e in range(envs.n_envs):
+        w = envs.one(e)
+        shape = (envs.n_agents, len(cameras), res)
         mine = {k: ours[k][e].reshape(shape) for k in ("indices", "locations", "dots", "distances")}
         lines = torch.cat([twin.agent_lines(w["model"], w["positions"], w["angles"]), w["walls"]])
-        check_sight(
+        check_hits(
             report,
             e,
             mine,
@@ -178,17 +180,17 @@ def check_render(ours, world, *, res=64, fov=130.0, cameras=(0.0,), radius=twin.
             locations=mine["locations"].nan_to_num(),
             dots=mine["dots"].nan_to_num(),
         )
-        low, high = (
+        lower, upper = (
             twin.shade(drawn, w["textures"], w["widths"], light)
             for light in light_bracket(w, lines)
         )
         axes = "agent", "camera", "ray", "colour"
-        report.within("screen", e, ours["screen"][e].reshape(*shape, 3), low, high, SCREEN, axes)
+        report.within("screen", e, ours["screen"][e].reshape(*shape, 3), lower, upper, SCREEN, axes)
     return report.check()
 
 
 def light_bracket(w, lines):
-    """The least and the most light (T,) that the texels of one world's lines may have."""
+    """The least and the most light (T,) that the texels of an environment's lines may have."""
     points = twin.texel_positions(lines, w["widths"])
     slack = (
         1e-6
@@ -200,28 +202,28 @@ def light_bracket(w, lines):
     )
 
 
-def check_baked(baked, world, static_only=True):
+def check_baked(baked, envs, static_only=True):
     """Checks the light (T,) of all environments' texels, or of their static ones only; returns the
     worst ratio.
     """
-    report, each = Report(), double(dict(baked=baked))["baked"].split(world.texels().tolist())
-    n_lines = world.n_agents * len(world.model)
+    report, each = Report(), double(dict(baked=baked))["baked"].split(envs.texels().tolist())
+    n_lines = envs.n_agents * len(envs.model)
     for e, mine in enumerate(each):
-        w = world.one(e)
+        w = envs.one(e)
         lines = torch.cat([twin.agent_lines(w["model"], w["positions"], w["angles"]), w["walls"]])
         start = int(w["widths"][:n_lines].sum()) if static_only else 0
-        low, high = (light[start:] for light in light_bracket(w, lines))
-        report.within("baked", e, mine[start:], low, high, LIGHT, ("texel",))
+        lower, upper = (light[start:] for light in light_bracket(w, lines))
+        report.within("baked", e, mine[start:], lower, upper, LIGHT, ("texel",))
     return report.check()
 
 
-def check_physics(ours, world, *, fps=10.0, radius=twin.RADIUS):
+def check_physics(ours, envs, *, fps=10.0, radius=twin.RADIUS):
     """Checks progress, positions, angles, velocity, angvelocity (N, A, ...) after a step that began
-    as `world` says.
+    as `envs` says.
     """
     report, ours = Report(), double(ours)
-    for e in range(world.n_envs):
-        w = world.one(e)
+    for e in range(envs.n_envs):
+        w = envs.one(e)
         mine = {
             k: ours[k][e] for k in ("progress", "positions", "angles", "velocity", "angvelocity")
         }
@@ -229,11 +231,11 @@ def check_physics(ours, world, *, fps=10.0, radius=twin.RADIUS):
         step = w["velocity"] / fps
         extent = max(w["walls"].abs().max(), w["positions"].abs().max()) + step.norm(dim=-1).max()
         slack = 1e-6 + COORDINATE_SLACK * extent
-        low, high = (
+        lower, upper = (
             twin.physics(*state, fps=fps, radius=radius, slack=s)["progress"]
             for s in (slack, -slack)
         )
-        report.within("progress", e, mine["progress"], low, high, FRACTION, ("agent",))
+        report.within("progress", e, mine["progress"], lower, upper, FRACTION, ("agent",))
         arrived = w["positions"] + mine["progress"][:, None] * step
         report.add(
             "positions",
@@ -279,7 +281,7 @@ MISJUDGED = {
 }
 
 
-def golden_figures(case, ours):
+def golden_errors(case, ours):
     """{name: (figure, the most it may be)}: shares of values out of tolerance, or mean errors where
     the name says so.
 
@@ -287,22 +289,22 @@ def golden_figures(case, ours):
     (N, A, R[, 3]), and of a step of physics `progress` with the `positions`, `angles`, `velocity`,
     `angvelocity` after it.
     """
-    world, settings, right = random_scenery.golden(case)
+    envs, settings, right = random_scenery.golden(case)
     right = {
         k.removesuffix("_after").removesuffix("_vals").removesuffix("_after_render"): v
         for k, v in right.items()
     }
-    ours, right, figures = double(ours), double(right), {}
-    n_own, widths = world.n_agents * len(world.model), world.line_widths.tolist()
+    ours, right, errors = double(ours), double(right), {}
+    n_own, widths = envs.n_agents * len(envs.model), envs.line_widths.tolist()
     own = torch.cat([torch.arange(w) < n_own for w in widths])
 
     def share(name, wrong, limit):
-        figures[name] = float(wrong.double().mean()), limit
+        errors[name] = float(wrong.double().mean()), limit
 
     if "lines" in ours:
         share("lines", (ours["lines"] - right["lines"]).abs() > 1e-5, 0)
     if "baked" in ours:
-        static = ~own.repeat_interleave(world.texture_widths)
+        static = ~own.repeat_interleave(envs.texture_widths)
         share("baked", ~((ours["baked"] - right["baked"]).abs() <= 2e-3)[static], 0.005)
     if "indices" in ours:
         agree = ours["indices"] == right["indices"]
@@ -313,20 +315,20 @@ def golden_figures(case, ours):
             share(field, ~((ours[field] - right[field]).abs() <= tolerance)[hit], 0.002)
         off = (ours["screen"] - right["screen"]).abs().mean(-1)
         on_wall = right["indices"] >= n_own
-        figures["screen, mean on walls"] = float(off[hit & on_wall].mean()), 2e-3
+        errors["screen, mean on walls"] = float(off[hit & on_wall].mean()), 2e-3
         if (hit & ~on_wall).any():
-            figures["screen, mean on agents"] = float(off[hit & ~on_wall].mean()), 2e-2
+            errors["screen, mean on agents"] = float(off[hit & ~on_wall].mean()), 2e-2
         blank = ours["locations"].isnan() & ours["dots"].isnan() & (ours["distances"] == math.inf)
         share("misses", agree & ~hit & ~(blank & (ours["screen"] == 0).all(-1)), 0)
     if "progress" in ours:
         judged = torch.ones_like(right["progress"], dtype=torch.bool)
         for _, env, agent in (k for k in MISJUDGED if k[0] == case):
             judged[env, agent] = False
-        step = (world.velocity.double() / settings["fps"]).norm(dim=-1)
+        step = (envs.velocity.double() / settings["fps"]).norm(dim=-1)
         share("progress", ~((ours["progress"] - right["progress"]).abs() <= 2e-3)[judged], 0.005)
         apart = (ours["positions"] - right["positions"]).norm(dim=-1)
         share("positions", ~(apart <= 0.005 + 0.004 * step)[judged], 0.005)
-        turned = 1e-4 + 2e-3 * (world.angvelocity.double() / settings["fps"]).abs()
+        turned = 1e-4 + 2e-3 * (envs.angvelocity.double() / settings["fps"]).abs()
         share(
             "angles",
             ~(twin.wrapped(ours["angles"] - right["angles"]).abs() <= turned)[judged],
@@ -342,17 +344,17 @@ def golden_figures(case, ours):
             ~((ours["angvelocity"] - right["angvelocity"]).abs() <= 1e-4)[judged],
             0.005,
         )
-    return figures
+    return errors
 
 
 def check_golden(case, ours):
-    """Raises, naming the figures, if `ours` misses a golden tolerance; returns the figures."""
-    figures = golden_figures(case, ours)
+    """Raises, naming the errors, if `ours` misses a golden tolerance; returns the errors."""
+    errors = golden_errors(case, ours)
     bad = [
         f"{name}: {figure:.4g}, at most {most:g}"
-        for name, (figure, most) in figures.items()
+        for name, (figure, most) in errors.items()
         if not figure <= most
     ]
     if bad:
         raise AssertionError(f"{case}: " + "; ".join(bad))
-    return figures
+    return errors

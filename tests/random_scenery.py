@@ -1,5 +1,5 @@
-"""Small environments for the engine's tests: random ones with degenerate cases on demand, and the
-original's golden ones.
+"""Small environments for the engine's tests: random ones with degenerate cases on demand, and those
+of the golden data.
 
 Axes: N environments, A agents, M model lines, L lines of all environments (the agents' first in
 each), K lights, T texels.
@@ -23,7 +23,7 @@ OCTAGON = torch.stack([CORNERS, CORNERS.roll(-1, 0)], 1)  # the original's model
 
 
 @dataclass(frozen=True)
-class World:
+class Environments:
     """N environments in the form `Scenery(n_agents, lights, lines, textures, model)` takes, and
     their agents. All float32.
     """
@@ -55,22 +55,24 @@ class World:
         """The keyword arguments of Scenery's documented constructor."""
         from megastep.ragged import Ragged
 
-        world = self.to(device)
+        moved = self.to(device)
         return dict(
             n_agents=self.n_agents,
-            model=world.model,
-            lights=Ragged(world.lights, world.light_widths),
-            lines=Ragged(world.lines, world.line_widths),
-            textures=Ragged(world.textures, world.texture_widths),
+            model=moved.model,
+            lights=Ragged(moved.lights, moved.light_widths),
+            lines=Ragged(moved.lines, moved.line_widths),
+            textures=Ragged(moved.textures, moved.texture_widths),
         )
 
     def texels(self):
-        """How many texels each world has, (N,)."""
+        """How many texels each environment has, (N,)."""
         return torch.stack([w.sum() for w in self.texture_widths.split(self.line_widths.tolist())])
 
     def one(self, e, dtype=torch.float64):
-        """World e alone: dict of model, walls (all lines but the agents'), lights, textures, widths
-        (of the lines' textures), positions, angles, velocity, angvelocity."""
+        """Environment e alone: dict of model, walls (all lines but the agents'), lights, textures,
+        widths (of the
+        lines' textures), positions, angles, velocity, angvelocity.
+        """
         mine = lambda vals, widths: vals.split(widths.tolist())[e]  # noqa: E731
         state = {
             k: getattr(self, k)[e].to(dtype)
@@ -88,15 +90,15 @@ class World:
 
 
 def unplaced(model, n_agents, walls):
-    """The lines of environments with these walls before anybody has put the agents' lines in their
-    places.
+    """The lines of environments with these walls before a render has moved the agents' lines to
+    where the agents are.
     """
     return torch.cat([torch.cat([*n_agents * [model], w]) for w in walls])
 
 
 def golden(case):
-    """A golden case: its World, its settings (res, fov, fps), what the original computed (named as
-    in its README).
+    """A golden case: its Environments, its settings (res, fov, fps), and what the original
+    computed, named as in the README beside the data.
     """
     with np.load(GOLDEN) as arrays:
         g = {k.split("/")[1]: torch.as_tensor(arrays[k]) for k in arrays if k.split("/")[0] == case}
@@ -105,7 +107,7 @@ def golden(case):
         lines[8 * int(n_agents) :]
         for lines in g["lines_after_render"].split(g["line_widths"].tolist())
     ]
-    world = World(
+    envs = Environments(
         model=g["model"],
         lines=unplaced(g.pop("model"), int(n_agents), walls),
         line_widths=g.pop("line_widths"),
@@ -115,20 +117,22 @@ def golden(case):
         texture_widths=g.pop("texture_widths"),
         **{k: g.pop(k) for k in ("positions", "angles", "velocity", "angvelocity")},
     )
-    return world, dict(res=int(res), fov=fov, fps=fps), g
+    return envs, dict(res=int(res), fov=fov, fps=fps), g
 
 
-# Random random_scenery
+# Random environments
 
 
-class Draw:
-    """Seeded draws, float64."""
+class RandomStream:
+    """Seeded random numbers, float64."""
 
     def __init__(self, seed):
         self.generator = torch.Generator().manual_seed(seed)
 
-    def uniform(self, low, high, *shape):
-        return low + (high - low) * torch.rand(shape, generator=self.generator, dtype=torch.float64)
+    def uniform(self, lower, upper, *shape):
+        return lower + (upper - lower) * torch.rand(
+            shape, generator=self.generator, dtype=torch.float64
+        )
 
     def pick(self, options, *shape):
         picked = torch.randint(len(options), shape, generator=self.generator)
@@ -138,10 +142,11 @@ class Draw:
         turn = self.uniform(0, 2 * math.pi, *shape)
         return torch.stack([turn.cos(), turn.sin()], -1)
 
-    def segments(self, n, low, high, size):
-        """n segments with centres in a square of `size` and lengths log-uniform in [low, high]."""
+    def segments(self, n, lower, upper, size):
+        """n segments, centres in a square of `size` and lengths log-uniform in [lower, upper]."""
         half = (
-            self.direction(n) * (self.uniform(math.log(low), math.log(high), n).exp() / 2)[:, None]
+            self.direction(n)
+            * (self.uniform(math.log(lower), math.log(upper), n).exp() / 2)[:, None]
         )
         centre = self.uniform(0, size, n, 2)
         return torch.stack([centre - half, centre + half], 1)
@@ -153,34 +158,34 @@ def nudged(x, ulps):
     return bits.view(torch.float32).double()
 
 
-def parallel(draw, walls, agents, looks):
+def parallel(random, walls, agents, directions):
     """Walls that lie exactly along a ray: ahead of the agent, behind it, and one that it stands
     on.
     """
-    p, ray = agents[0], looks[0, 0, draw.pick(range(looks.shape[2]), 3).long()]
+    p, ray = agents[0], directions[0, 0, random.pick(range(directions.shape[2]), 3).long()]
     return torch.stack(
         [p + near * r + torch.stack([0 * r, r]) for near, r in zip((1, -2, -0.5), ray)]
     )
 
 
-def zero_length(draw, walls, agents, looks):
+def zero_length(random, walls, agents, directions):
     """Points: in the way of an agent, just beside it, and anywhere."""
     at = torch.stack(
         [
-            agents[0] + 0.5 * draw.direction(),
-            agents[-1] + 0.12 * draw.direction(),
+            agents[0] + 0.5 * random.direction(),
+            agents[-1] + 0.12 * random.direction(),
             walls.mean((0, 1)),
         ]
     )
     return at[:, None].expand(-1, 2, -1)
 
 
-def duplicates(draw, walls, agents, looks):
+def duplicates(random, walls, agents, directions):
     """Walls that are there already, to the bit and the other way round."""
     return torch.cat([walls[-4:], walls[-6:-4].flip(1)])
 
 
-def touching(draw, walls, agents, looks):
+def touching(random, walls, agents, directions):
     """Axis-parallel walls at the distance of contact from the first agent: on it, and a few ulps to
     either side.
     """
@@ -192,27 +197,27 @@ def touching(draw, walls, agents, looks):
         wall[:, 1 - axis] += torch.tensor([-0.4, 0.7], dtype=p.dtype)
         made.append(wall)
     return torch.stack(made)[
-        torch.randperm(4, generator=draw.generator)[:2]
-    ]  # all four would hold it fast
+        torch.randperm(4, generator=random.generator)[:2]
+    ]  # between all four it could not move
 
 
-def pixel_ends(draw, walls, agents, looks):
+def pixel_ends(random, walls, agents, directions):
     """Walls whose ends lie on the rays of pixels."""
-    rays = looks[-1, 0][draw.pick(range(looks.shape[2]), 4, 2).long()]
-    return agents[-1] + rays * draw.uniform(0.5, 3, 4, 2, 1)
+    rays = directions[-1, 0][random.pick(range(directions.shape[2]), 4, 2).long()]
+    return agents[-1] + rays * random.uniform(0.5, 3, 4, 2, 1)
 
 
-def tiny(draw, walls, agents, looks):
+def tiny(random, walls, agents, directions):
     """Walls of 0.01 to 10 mm close to the agents."""
-    centres = agents[draw.pick(range(len(agents)), 6).long()] + draw.direction(6) * draw.uniform(
-        0.15, 1, 6, 1
-    )
-    return draw.segments(6, 1e-5, 1e-2, 1e-9) + centres[:, None]
+    centres = agents[random.pick(range(len(agents)), 6).long()] + random.direction(
+        6
+    ) * random.uniform(0.15, 1, 6, 1)
+    return random.segments(6, 1e-5, 1e-2, 1e-9) + centres[:, None]
 
 
-def long(draw, walls, agents, looks):
+def long(random, walls, agents, directions):
     """Walls of 100 to 400 m: past an agent at arm's length, and anywhere."""
-    along = draw.direction(2) * draw.uniform(100, 200, 2, 1)
+    along = random.direction(2) * random.uniform(100, 200, 2, 1)
     aside = torch.stack([-along[:, 1], along[:, 0]], -1) / along.norm(dim=-1, keepdim=True)
     middle = torch.stack([agents[0] + 0.3 * aside[0], walls.mean((0, 1)) + 2 * aside[1]])
     return torch.stack([middle - along, middle + 0.7 * along], 1)
@@ -224,21 +229,23 @@ DEGENERATE = {
 EVERYTHING = (*DEGENERATE, "overlap")  # agents overlapping
 
 
-def random_walls(draw, n, size, origin):
+def random_walls(random, n, size, origin):
     """A square room and n walls in it: a third of them axis-parallel, as in homes."""
     corners = torch.tensor([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=torch.float64) * size
-    walls = draw.segments(n, 0.05, size, size)
+    walls = random.segments(n, 0.05, size, size)
     upright = walls[: n // 3]
     upright[:, 1, 0] = upright[:, 0, 0]
     return torch.cat([torch.stack([corners, corners.roll(-1, 0)], 1), walls]) + origin
 
 
-def random_agents(draw, n_agents, size, origin, overlap):
+def random_agents(random, n_agents, size, origin, overlap):
     """Positions (A, 2), each agent overlapping the one before it if `overlap`."""
-    positions = draw.uniform(0.2, size - 0.2, n_agents, 2) + origin
+    positions = random.uniform(0.2, size - 0.2, n_agents, 2) + origin
     if overlap:
         for a in range(1, n_agents):
-            positions[a] = positions[a - 1] + draw.direction() * draw.uniform(0.05, 2 * twin.RADIUS)
+            positions[a] = positions[a - 1] + random.direction() * random.uniform(
+                0.05, 2 * twin.RADIUS
+            )
     return positions.float().double()
 
 
@@ -259,41 +266,41 @@ def random_environments(
     `degenerate` cases named.
 
     The names are those of EVERYTHING; `res` and `fov` are the camera whose rays 'parallel' and
-    'pixel_ends' aim at. Worlds differ in their number of lines and lights. An origin of 190 puts
-    coordinates at 200 m.
+    'pixel_ends' aim at. Environments differ in their number of lines and lights. An origin of 190
+    puts coordinates at 200 m.
     """
-    draw, lines, lights, agents, angles = Draw(seed), [], [], [], []
+    random, lines, lights, agents, angles = RandomStream(seed), [], [], [], []
     for _ in range(n_envs):
-        positions = random_agents(draw, n_agents, size, origin, "overlap" in degenerate)
-        facing = draw.uniform(-180, 180, n_agents).float().double()
-        walls = random_walls(draw, n_walls + int(draw.pick(range(4))), size, origin)
-        looks = twin.rays(facing, [0.0], res, fov)
+        positions = random_agents(random, n_agents, size, origin, "overlap" in degenerate)
+        facing = random.uniform(-180, 180, n_agents).float().double()
+        walls = random_walls(random, n_walls + int(random.pick(range(4))), size, origin)
+        directions = twin.rays(facing, [0.0], res, fov)
         extra = [
-            DEGENERATE[name](draw, walls, positions, looks)
+            DEGENERATE[name](random, walls, positions, directions)
             for name in degenerate
             if name != "overlap"
         ]
         walls = torch.cat([walls, *extra])[
-            torch.randperm(len(walls) + sum(map(len, extra)), generator=draw.generator)
+            torch.randperm(len(walls) + sum(map(len, extra)), generator=random.generator)
         ]
         lines.append(unplaced(OCTAGON, n_agents, [walls.float()]))
-        n_lights = 1 + int(draw.pick(range(max_lights)))
-        places = draw.uniform(0, size, n_lights, 2) + origin
-        lights.append(torch.cat([places, draw.uniform(0.2, 2, n_lights, 1)], -1).float())
+        n_lights = 1 + int(random.pick(range(max_lights)))
+        places = random.uniform(0, size, n_lights, 2) + origin
+        lights.append(torch.cat([places, random.uniform(0.2, 2, n_lights, 1)], -1).float())
         agents.append(positions)
         angles.append(facing)
     widths = [((w[:, 1] - w[:, 0]).norm(dim=-1) / TEXEL).ceil().clamp(min=1).int() for w in lines]
-    speed = draw.pick([0, 0.1, 1, 10, 1000], n_envs, n_agents, 1)  # m/s
-    return World(
+    speed = random.pick([0, 0.1, 1, 10, 1000], n_envs, n_agents, 1)  # m/s
+    return Environments(
         model=OCTAGON,
         lines=torch.cat(lines),
         line_widths=torch.tensor([len(x) for x in lines], dtype=torch.int32),
         lights=torch.cat(lights),
         light_widths=torch.tensor([len(x) for x in lights], dtype=torch.int32),
-        textures=draw.uniform(0, 1, int(torch.cat(widths).sum()), 3).float(),
+        textures=random.uniform(0, 1, int(torch.cat(widths).sum()), 3).float(),
         texture_widths=torch.cat(widths),
         positions=torch.stack(agents).float(),
         angles=torch.stack(angles).float(),
-        velocity=(draw.direction(n_envs, n_agents) * speed).float(),
-        angvelocity=draw.uniform(-300, 300, n_envs, n_agents).float(),
+        velocity=(random.direction(n_envs, n_agents) * speed).float(),
+        angvelocity=random.uniform(-300, 300, n_envs, n_agents).float(),
     )

@@ -1,4 +1,4 @@
-"""Scenery: views by environment, what may be written and what refuses, and layouts that are shared."""
+"""Scenery: views by environment, what may be written and what refuses, layouts that are shared."""
 
 import copy
 

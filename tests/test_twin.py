@@ -1,5 +1,5 @@
-"""The twin against what the original engine computed and against paper; whether comparing with it
-finds mistakes.
+"""The twin against what the original engine computed and against sums on paper; whether comparing
+with it finds mistakes.
 """
 
 import math
@@ -39,30 +39,30 @@ def golden_light(w, baked):
 
 
 @pytest.mark.parametrize("case", random_scenery.CASES)
-def test_sight_of_the_original(case):
-    world, settings, right = random_scenery.golden(case)
+def test_rays_of_the_original(case):
+    envs, settings, right = random_scenery.golden(case)
     seen = []
-    for e, baked in enumerate(right["baked_vals"].split(world.texels().tolist())):
-        w = world.one(e)
-        hits = twin.cast(
+    for e, baked in enumerate(right["baked_vals"].split(envs.texels().tolist())):
+        w = envs.one(e)
+        hits = twin.raycast(
             placed(w),
             w["positions"],
             twin.rays(w["angles"], [0.0], settings["res"], settings["fov"]),
         )
         hits["screen"] = twin.shade(hits, w["textures"], w["widths"], golden_light(w, baked))
         seen.append({k: v[:, 0] for k, v in hits.items()})
-    lines = torch.cat([placed(world.one(e)) for e in range(world.n_envs)])
-    figures = compare.check_golden(case, dict(stacked(seen), lines=lines))
-    assert {"indices", "distances", "screen, mean on walls"} <= set(figures)
+    lines = torch.cat([placed(envs.one(e)) for e in range(envs.n_envs)])
+    errors = compare.check_golden(case, dict(stacked(seen), lines=lines))
+    assert {"indices", "distances", "screen, mean on walls"} <= set(errors)
 
 
 @pytest.mark.parametrize("case", random_scenery.CASES)
 def test_light_of_the_original(case):
-    world, _, right = random_scenery.golden(case)
+    envs, _, right = random_scenery.golden(case)
     errors = []
-    for e, baked in enumerate(right["baked_vals"].split(world.texels().tolist())):
-        w = world.one(e)
-        n_own = int(w["widths"][: world.n_agents * 8].sum())
+    for e, baked in enumerate(right["baked_vals"].split(envs.texels().tolist())):
+        w = envs.one(e)
+        n_own = int(w["widths"][: envs.n_agents * 8].sum())
         points = twin.texel_positions(placed(w), w["widths"])[
             n_own::11
         ]  # all of them take a quarter of a minute
@@ -73,8 +73,8 @@ def test_light_of_the_original(case):
 
 
 def golden_step(case):
-    world, settings, right = random_scenery.golden(case)
-    ws = [world.one(e) for e in range(world.n_envs)]
+    envs, settings, right = random_scenery.golden(case)
+    ws = [envs.one(e) for e in range(envs.n_envs)]
     return (
         stacked([twin.physics(*(w[k] for k in MOVING), fps=settings["fps"]) for w in ws]),
         settings,
@@ -123,20 +123,20 @@ def test_the_original_misjudges_the_agents_that_we_excuse_and_no_others(case):
             assert abs(progress - right["progress"][e, a]) < 1e-4, (case, e, a)
 
 
-# Sight on paper
+# Rays on paper
 
-NOBODY = torch.zeros((0, 2, 2), dtype=torch.float64)
+NO_LINES = torch.zeros((0, 2, 2), dtype=torch.float64)
 WALL_AT_3 = t([[3, -5], [3, 5]])
 
 
-def look(lines, position=(1.0, 0.0), angle=0.0, res=3, fov=90.0):
+def raycast(lines, position=(1.0, 0.0), angle=0.0, res=3, fov=90.0):
     """What one camera at `position` sees of lines: fields of shape (R,)."""
-    hits = twin.cast(lines, t(position), twin.rays(t(angle), [0.0], res, fov))
+    hits = twin.raycast(lines, t(position), twin.rays(t(angle), [0.0], res, fov))
     return {k: v[0, 0] for k, v in hits.items()}
 
 
 def test_a_wall_two_metres_ahead_is_two_metres_away():
-    seen = look(WALL_AT_3)
+    seen = raycast(WALL_AT_3)
     assert seen["indices"].tolist() == [0, 0, 0]
     assert seen["distances"][1] == 2
     # the outer of three pixels look 2/3 of tan(45 degrees) to the side
@@ -149,12 +149,12 @@ def test_a_wall_two_metres_ahead_is_two_metres_away():
 
 def test_a_wall_behind_another_is_hidden_and_one_behind_the_camera_unseen():
     walls = torch.cat([WALL_AT_3 + t([1, 0]), WALL_AT_3, WALL_AT_3 - t([4, 0])])
-    assert look(walls)["indices"].tolist() == [1, 1, 1]
+    assert raycast(walls)["indices"].tolist() == [1, 1, 1]
 
 
 def test_a_miss_is_blank_and_black():
     wall, light, white, one = t([[9, 9], [9, 10]]), t([5, 5, 1]), t([1, 1, 1]), torch.tensor([1])
-    seen = twin.render(NOBODY, wall, light, white, one, t([1, 1]), t(180), res=2, fov=60)
+    seen = twin.render(NO_LINES, wall, light, white, one, t([1, 1]), t(180), res=2, fov=60)
     assert (
         (seen["indices"] == -1).all()
         and (seen["distances"] == math.inf).all()
@@ -165,20 +165,22 @@ def test_a_miss_is_blank_and_black():
 
 def test_pixel_0_is_on_the_left_and_cameras_turn_counter_clockwise():
     left = t([[2, 0.1], [2, 5]])
-    assert look(left)["indices"].tolist() == [0, -1, -1]
-    hits = twin.cast(WALL_AT_3, t([1, 0]), twin.rays(t(-90), [0.0, 90.0], 1, 60))
+    assert raycast(left)["indices"].tolist() == [0, -1, -1]
+    hits = twin.raycast(WALL_AT_3, t([1, 0]), twin.rays(t(-90), [0.0, 90.0], 1, 60))
     assert hits["indices"].tolist() == [[[-1], [0]]]
 
 
 @pytest.mark.parametrize("angle", [0, 30])
 def test_the_near_limit_is_a_circle(angle):
     closer, further = (t([[x, -5], [x, 5]]) for x in (0.9 * twin.RADIUS, 1.1 * twin.RADIUS))
-    seen = look(torch.cat([closer, further]), (0, 0), angle, fov=1)
+    seen = raycast(torch.cat([closer, further]), (0, 0), angle, fov=1)
     assert seen["indices"].tolist() == 3 * [0 if math.cos(math.radians(angle)) < 0.9 else 1]
 
 
 def test_of_equal_lines_the_first_is_seen():
-    assert look(torch.cat([WALL_AT_3 + t([1, 0]), WALL_AT_3, WALL_AT_3]))["indices"].tolist() == [
+    assert raycast(torch.cat([WALL_AT_3 + t([1, 0]), WALL_AT_3, WALL_AT_3]))[
+        "indices"
+    ].tolist() == [
         1,
         1,
         1,
@@ -186,12 +188,12 @@ def test_of_equal_lines_the_first_is_seen():
 
 
 def test_lines_along_a_ray_and_lines_without_length_are_unseen():
-    assert look(t([[2, 0], [3, 0]], [[2, 0], [2, 0]]))["indices"].tolist() == [-1, -1, -1]
+    assert raycast(t([[2, 0], [3, 0]], [[2, 0], [2, 0]]))["indices"].tolist() == [-1, -1, -1]
 
 
 def test_agents_see_each_other_but_not_themselves():
     lines = twin.agent_lines(random_scenery.OCTAGON.double(), t([1, 1], [3, 1]), t(0, 45))
-    seen = twin.cast(lines, t([1, 1], [3, 1]), twin.rays(t(0, 180), [0.0], 1, 60))
+    seen = twin.raycast(lines, t([1, 1], [3, 1]), twin.rays(t(0, 180), [0.0], 1, 60))
     assert seen["indices"].flatten().tolist() == [
         13,
         2,
@@ -239,7 +241,7 @@ def test_light_at_the_origin(wall, light, level, why):
     )
 
 
-def test_texels_sit_at_the_middle_of_their_share():
+def test_texels_sit_at_the_middle_of_their_part():
     points = twin.texel_positions(t([[0, 0], [4, 0]], [[1, 1], [1, 2]]), torch.tensor([2, 1]))
     assert points.tolist() == [[1, 0], [3, 0], [1, 1.5]]
 
@@ -249,7 +251,7 @@ def test_texels_sit_at_the_middle_of_their_share():
 
 def move(walls, positions, velocity, fps=1.0, angles=None, angvelocity=None):
     blank = torch.zeros(len(positions), dtype=torch.float64)
-    walls = t(*walls) if walls else NOBODY
+    walls = t(*walls) if walls else NO_LINES
     return twin.physics(
         walls,
         t(*positions),
@@ -330,13 +332,13 @@ HARD = dict(
 )
 
 
-def rounded(world, res, fov, cameras=(0.0,)):
-    """Render, step and light of a world by the twin in float32: an engine that is right, but
+def rounded(envs, res, fov, cameras=(0.0,)):
+    """Render, step and light of environments by the twin in float32: an engine that is right, but
     rounds.
     """
     renders, steps, lights = [], [], []
-    for e in range(world.n_envs):
-        w = world.one(e, torch.float32)
+    for e in range(envs.n_envs):
+        w = envs.one(e, torch.float32)
         steps.append(twin.physics(*(w.pop(k) if k.endswith("velocity") else w[k] for k in MOVING)))
         renders.append(twin.render(**w, res=res, fov=fov, cameras=cameras))
         lights.append(renders[-1]["light"])
@@ -356,11 +358,11 @@ def rounded(world, res, fov, cameras=(0.0,)):
     ],
 )
 def test_rounding_is_no_mistake(seed, origin, camera):
-    world = random_scenery.random_environments(seed, **{**HARD, "origin": origin})
-    render, step, light = rounded(world, **camera)
-    compare.check_render(render, world, **camera)
-    compare.check_physics(step, world)
-    compare.check_baked(light, world, static_only=False)
+    envs = random_scenery.random_environments(seed, **{**HARD, "origin": origin})
+    render, step, light = rounded(envs, **camera)
+    compare.check_render(render, envs, **camera)
+    compare.check_physics(step, envs)
+    compare.check_baked(light, envs, static_only=False)
 
 
 def hidden(render):
@@ -383,29 +385,29 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_in_rendering_is_named(mistake):
-    world = random_scenery.random_environments(4, **HARD)
-    render = rounded(world, 48, 100.0)[0]
+    envs = random_scenery.random_environments(4, **HARD)
+    render = rounded(envs, 48, 100.0)[0]
     with pytest.raises(
         AssertionError, match=rf"{mistake.split()[0]} at env \d+, agent \d+, camera 0, ray \d+"
     ):
-        compare.check_render(MISTAKES[mistake](render), world, res=48, fov=100.0)
+        compare.check_render(MISTAKES[mistake](render), envs, res=48, fov=100.0)
 
 
 @pytest.mark.parametrize("field", ["progress", "positions", "angles", "velocity", "angvelocity"])
 def test_a_mistake_in_physics_is_named(field):
-    world = random_scenery.random_environments(5, **HARD)
-    step = rounded(world, 48, 100.0)[1]
+    envs = random_scenery.random_environments(5, **HARD)
+    step = rounded(envs, 48, 100.0)[1]
     step[field][:, 1] -= 0.01
     with pytest.raises(AssertionError, match=rf"{field} at env \d+, agent 1"):
-        compare.check_physics(step, world)
+        compare.check_physics(step, envs)
 
 
 def test_a_mistake_in_one_texel_is_named():
-    world = random_scenery.random_environments(6, **HARD)
-    light = rounded(world, 48, 100.0)[2]
+    envs = random_scenery.random_environments(6, **HARD)
+    light = rounded(envs, 48, 100.0)[2]
     light[-7] += 0.01
     with pytest.raises(AssertionError, match="baked at env 1, texel"):
-        compare.check_baked(light, world)
+        compare.check_baked(light, envs)
 
 
 def test_golden_mistakes_are_named():
@@ -415,7 +417,7 @@ def test_golden_mistakes_are_named():
         compare.check_golden(case, dict(step, progress=step["progress"] * 0.99))
 
 
-def test_random_worlds_repeat_and_differ_by_seed():
+def test_random_environments_repeat_and_differ_by_seed():
     same, again, other = (random_scenery.random_environments(seed, **HARD) for seed in (7, 7, 8))
     assert torch.equal(same.lines, again.lines) and torch.equal(same.velocity, again.velocity)
     assert not torch.equal(same.angles, other.angles)
@@ -425,10 +427,10 @@ def test_random_worlds_repeat_and_differ_by_seed():
     )
 
 
-def test_random_worlds_hold_the_degenerate_cases_asked_for():
-    world = random_scenery.random_environments(9, **HARD)
-    for e in range(world.n_envs):
-        w = world.one(e)
+def test_random_environments_hold_the_degenerate_cases_asked_for():
+    envs = random_scenery.random_environments(9, **HARD)
+    for e in range(envs.n_envs):
+        w = envs.one(e)
         walls, lengths = w["walls"], (w["walls"][:, 1] - w["walls"][:, 0]).norm(dim=-1)
         assert (lengths == 0).sum() == 3 and (lengths > 100).sum() == 2
         assert ((lengths > 0) & (lengths < 0.011)).sum() >= 6

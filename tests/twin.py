@@ -1,9 +1,9 @@
 """The engine's laws by brute force: every ray against every line, every texel and light, every disc
 and obstacle.
 
-Plain PyTorch, one world at a time, in the dtype and on the device of its arguments (the tests use
-float64). It shares nothing with the kernels and is meant to be read beside Concepts, not to be
-fast.
+Plain PyTorch, one environment at a time, in the dtype and on the device of its arguments (the tests
+use float64). It shares nothing with the kernels and is meant to be read beside the original
+megastep's Concepts page, not to be fast.
 
 Axes: A agents, C cameras, R pixels, L lines (the agents' first), W walls (static lines), K lights,
 P points, T texels. Units: metres, degrees, seconds. A line is its two ends, (2, 2). A light is (x,
@@ -68,13 +68,13 @@ def texel_positions(lines, widths):
 
 def light_at(points, walls, lights, slack=0.0, chunk=2**20):
     """Light (P,) in [0.1, 1] at points (P, 2): ambient, and 2 I/max(d^2, 1) from each light that no
-    wall blocks.
+    wall occludes.
     """
     levels = []
     for some in points.split(max(chunk // max(len(walls), 1), 1)):
         level = torch.full_like(some[:, 0], AMBIENT)
         for light in lights:
-            shadow = blocked(some - light[:2], walls - light[:2], slack).any(-1)
+            shadow = occluded(some - light[:2], walls - light[:2], slack).any(-1)
             level += torch.where(
                 shadow, 0, 2 * light[2] / (some - light[:2]).square().sum(-1).clamp(min=1)
             )
@@ -82,7 +82,7 @@ def light_at(points, walls, lights, slack=0.0, chunk=2**20):
     return torch.cat(levels) if levels else points.new_zeros(0)
 
 
-def blocked(ways, walls, slack=0.0):
+def occluded(ways, walls, slack=0.0):
     """Whether a wall crosses the way (P, 2) from a light at 0 to a point, short of 0.999 of it: (P,
     W).
 
@@ -106,7 +106,7 @@ def bake(walls, lights, points):
     return light_at(points, walls, lights)
 
 
-# Sight
+# Raycasting
 
 
 def rays(angles, cameras, res, fov):
@@ -119,7 +119,7 @@ def rays(angles, cameras, res, fov):
     return turn(torch.stack([torch.ones_like(sideways), sideways], -1), yaws[..., None])
 
 
-def cast(lines, positions, looks, radius=RADIUS):
+def raycast(lines, positions, directions, radius=RADIUS):
     """The nearest line beyond the radius along each ray: indices, locations, dots, distances, each
     (A, C, R).
 
@@ -128,7 +128,7 @@ def cast(lines, positions, looks, radius=RADIUS):
     seen; parallel or zero-length lines are not. An agent does not see itself because its lines lie
     within its radius.
     """
-    along, ray = lines[:, 1] - lines[:, 0], looks[..., None, :]
+    along, ray = lines[:, 1] - lines[:, 0], directions[..., None, :]
     start = (lines[:, 0] - positions[:, None])[:, None, None]
     area = cross(ray, along)
     meets = area != 0
@@ -141,7 +141,7 @@ def cast(lines, positions, looks, radius=RADIUS):
     index = (distance == nearest[..., None]).int().argmax(-1)  # the first of equals
     hit = nearest < math.inf
     along = along[index]
-    dot = (looks * along).sum(-1) / (looks.norm(dim=-1) * along.norm(dim=-1) + DOT_GUARD)
+    dot = (directions * along).sum(-1) / (directions.norm(dim=-1) * along.norm(dim=-1) + DOT_GUARD)
     location = location.gather(-1, index[..., None])[..., 0]
     return dict(
         indices=torch.where(hit, index, -1),
@@ -156,10 +156,10 @@ def filtered(values, width, start, location):
     from `start` on.
     """
     place = torch.minimum((location * width - 0.5).clamp(min=0), (width - 1).to(location))
-    low = place.floor().long()
-    high = torch.minimum(low + 1, width - 1)
-    share = (place - low)[..., None]
-    return (1 - share) * values[start + low] + share * values[start + high]
+    left = place.floor().long()
+    right = torch.minimum(left + 1, width - 1)
+    weight = (place - left)[..., None]
+    return (1 - weight) * values[start + left] + weight * values[start + right]
 
 
 def shade(hits, textures, widths, light):
@@ -189,12 +189,12 @@ def render(
     cameras=(0.0,),
     radius=RADIUS,
 ):
-    """All that `cuda.render` says of one world, the placed `lines` (L, 2, 2) and the `light` (T,)
-    of every texel.
+    """All that `cuda.render` says of one environment, the placed `lines` (L, 2, 2) and the `light`
+    (T,) of every texel.
     """
     lines = torch.cat([agent_lines(model, positions, angles), walls])
     light = light_at(texel_positions(lines, widths), walls, lights)
-    hits = cast(lines, positions, rays(angles, cameras, res, fov), radius)
+    hits = raycast(lines, positions, rays(angles, cameras, res, fov), radius)
     return dict(hits, screen=shade(hits, textures, widths, light), lines=lines, light=light)
 
 
@@ -240,8 +240,8 @@ def wall_contact(start, end, step, radius, slack=0.0):
 
 
 def physics(walls, positions, angles, velocity, angvelocity, *, fps=10.0, radius=RADIUS, slack=0.0):
-    """One step of one world: dict of progress (A,), positions, angles, velocity, angvelocity after
-    it.
+    """One step of one environment: dict of progress (A,), and positions, angles, velocity,
+    angvelocity after it.
 
     Progress is the part of the step that was travelled. `slack` (metres) makes discs that much
     larger and more easily stopped: with +slack and -slack the true progress of slightly different
