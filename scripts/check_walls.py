@@ -1,4 +1,4 @@
-"""Has agents try to pass walls and, when stopped, to leave, in the environments of tests/walls.py:
+"""Has agents try to pass walls and, when stopped, to leave, on the courses of tests/walls.py:
 
     python scripts/check_walls.py --steps 1e9 --device auto
 
@@ -18,7 +18,7 @@ import walls
 
 from megastep import engine
 
-EVERY = 10  # seconds between lines within a course
+INTERVAL = 10  # seconds between lines within a course
 
 
 def sentence(total, seconds):
@@ -61,22 +61,22 @@ def main():
         return 2
     n_agents = args.agents or (2048 if device.type == "cpu" else 1 << 20)
     steps = -(-int(args.steps) // len(walls.COURSES))
-    start, sums, stories = time.time(), {}, []
+    start, sums, descriptions = time.time(), {}, []
     for name in walls.COURSES:
         began = last = time.time()
 
         def report(total, name=name, began=began):
             nonlocal last
-            if time.time() - last > EVERY:
+            if time.time() - last > INTERVAL:
                 last = time.time()
                 print(f"{name} so far: {sentence(total, last - began)}", flush=True)
 
         total = walls.run(name, steps, n_agents, device, args.seed, args.tries, report)
         print(f"{name}: {sentence(total, time.time() - began)}", flush=True)
-        stories += total["stories"][:3]
+        descriptions += total["descriptions"][:3]
         sums = {key: sums.get(key, 0) + total[key] for key in total if isinstance(total[key], int)}
-    for story in stories[:12]:
-        print(story)
+    for description in descriptions[:12]:
+        print(description)
     print(f"all on {device}: {sentence(sums, time.time() - start)}")
     return int(any(sums[key] for key in ("crossings", "sunk", "stuck")))
 

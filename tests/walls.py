@@ -1,9 +1,9 @@
-"""No agent passes a wall and none is ever stuck: environments that tempt, walkers that try, and
-judges that share nothing with the kernels.
+"""No agent passes a wall and none is ever stuck: layouts that make it hard, agents that try, and
+checks that share nothing with the kernels.
 
-Axes: B copies of each of D layouts (world e shows layout e % D, as in `scene.scenery`), A agents a
-world, W walls of the largest layout; a smaller one is filled up with NaN, which meets nothing.
-Metres, degrees, seconds.
+Axes: B copies of each of D layouts (environment e shows layout e % D, as in `scene.scenery`), A
+agents per environment, W walls of the largest layout; a smaller one is filled up with NaN, which
+meets nothing. Metres, degrees, seconds.
 """
 
 import math
@@ -21,22 +21,24 @@ from megastep.modules import MomentumMovement
 RADIUS = 0.15 / math.sqrt(2)  # m, an agent's
 BODY = 1.001 * RADIUS  # m, at which it is stopped
 TOUCH = 1.01 * RADIUS  # m, nearer than which it counts as touching
-PINCH = -0.125  # cosine between the ways to two touched walls: they meet at less than 83 degrees
-HAIR = (
-    1e-4  # m, no agent is set down nearer to a wall: 6 units in the last place of float32 at 200 m
+CORNER_COSINE = (
+    -0.125
+)  # cosine between the headings to two touched walls: they meet at less than 83 degrees
+MIN_GAP = (
+    1e-4  # m, no agent is placed nearer to a wall: 6 units in the last place of float32 at 200 m
 )
-SPELL, SPELLS = 16, 2  # steps between changes of mind; and the fewest spells of a walk
+PHASE, PHASES = 16, 2  # steps in which agents keep their goals; and the fewest such phases
 ACCEL, DECAY = 5.0, 0.125  # MomentumMovement's defaults: m/s^2, and a fraction a step
 TRY, LEAVES = (
     0.01,
     0.001,
-)  # m: the way tried from where an agent was stopped, and the least of it that is leaving
+)  # m: the distance tried from where an agent was stopped, and the least that counts as leaving
 # m, deeper than which a wall is within the radius, and no rounding: of the 1e-4 between RADIUS and
 # BODY
 SUNK = 1e-5
-PAIRS = dict(
+MAX_PAIRS = dict(
     cpu=1 << 16, cuda=1 << 24
-)  # agents times walls at once: within a core's cache; 128 MB a float64
+)  # agents times walls checked at once: within a core's cache; 128 MB a float64
 SETTINGS = [
     (1, 1),
     (1, 100),
@@ -50,7 +52,7 @@ SETTINGS = [
 ]  # fps, accel
 
 
-# ---- Worlds: (W, 2, 2) float64 arrays of walls ----
+# ---- Layouts: (W, 2, 2) float64 arrays of walls ----
 
 
 def turned(walls, degrees):
@@ -109,9 +111,9 @@ def zigzag(width, degrees, turn, n=8, leg=0.8):
     return turned(np.concatenate([path(corners), path(corners + aside)]), turn)
 
 
-def crossing(draw, n=9, size=6.0):
+def crossing(random, n=9, size=6.0):
     """Long walls through one another."""
-    return draw.segments(n, 1.0, size, size).numpy()
+    return random.segments(n, 1.0, size, size).numpy()
 
 
 def fragments(seed):
@@ -126,12 +128,12 @@ def fragments(seed):
     )
 
 
-def remote(draw):
-    """Worlds near (190, 190), where a unit in the last place is 15 micrometres."""
-    shapes = [wedge(degrees, draw.uniform(0, 360).item(), 6.0) for degrees in (5, 20, 60)]
+def remote(random):
+    """Layouts near (190, 190), where a unit in the last place is 15 micrometres."""
+    shapes = [wedge(degrees, random.uniform(0, 360).item(), 6.0) for degrees in (5, 20, 60)]
     return [
         enclosed(walls, 190.0)
-        for walls in (*shapes, spokes(7, 10.0), crossing(draw), slit(2.1 * BODY, 33.0))
+        for walls in (*shapes, spokes(7, 10.0), crossing(random), slit(2.1 * BODY, 33.0))
     ]
 
 
@@ -139,48 +141,50 @@ def homes(source, n):
     return [enclosed(g.walls) for g in sample(source, n)]
 
 
-COURSES = {  # name: (layouts from a draw, agents a world)
-    "box": (lambda draw: [g.walls for g in sample("box", 1)], 1),
-    "column": (lambda draw: [g.walls for g in sample("column", 1)], 4),
+COURSES = {  # name: (layouts from a random stream, agents per environment)
+    "box": (lambda random: [g.walls for g in sample("box", 1)], 1),
+    "column": (lambda random: [g.walls for g in sample("column", 1)], 4),
     "wedges": (
-        lambda draw: [
-            enclosed(wedge(degrees, draw.uniform(0, 360).item()))
+        lambda random: [
+            enclosed(wedge(degrees, random.uniform(0, 360).item()))
             for degrees in (2, 3, 5, 8, 12, 20, 30, 45, 60, 75, 90, 120)
         ],
         1,
     ),
     "slivers": (
-        lambda draw: [
-            enclosed(sliver(degrees, draw.uniform(0, 360).item()))
+        lambda random: [
+            enclosed(sliver(degrees, random.uniform(0, 360).item()))
             for degrees in (3, 5, 8, 12, 20, 30, 45, 60)
         ],
         1,
     ),
     "spokes": (
-        lambda draw: [enclosed(spokes(n, draw.uniform(0, 90).item())) for n in (4, 5, 7, 8, 12)],
+        lambda random: [
+            enclosed(spokes(n, random.uniform(0, 90).item())) for n in (4, 5, 7, 8, 12)
+        ],
         2,
     ),
     "slits": (
-        lambda draw: [
+        lambda random: [
             enclosed(slit(gap, turn))
-            for turn in (0, 90, *draw.uniform(0, 180, 2).tolist())
+            for turn in (0, 90, *random.uniform(0, 180, 2).tolist())
             for gap in (0.01, 0.2, 2 * BODY + 2e-4, 2 * BODY + 2e-3, 0.25)
         ],
         1,
     ),
     "zigzags": (
-        lambda draw: [
+        lambda random: [
             enclosed(zigzag(width, degrees, turn))
             for degrees in (30, 60, 90)
-            for width, turn in zip((0.23, 0.3), draw.uniform(0, 360, 2).tolist())
+            for width, turn in zip((0.23, 0.3), random.uniform(0, 360, 2).tolist())
         ],
         1,
     ),
-    "crossing": (lambda draw: [enclosed(crossing(draw)) for _ in range(8)], 1),
-    "fragments": (lambda draw: [enclosed(fragments(seed)) for seed in range(8)], 2),
+    "crossing": (lambda random: [enclosed(crossing(random)) for _ in range(8)], 1),
+    "fragments": (lambda random: [enclosed(fragments(seed)) for seed in range(8)], 2),
     "remote": (remote, 1),
-    "homes": (lambda draw: homes("homes", 16), 1),
-    "bench": (lambda draw: homes("bench", 16), 2),
+    "homes": (lambda random: homes("homes", 16), 1),
+    "bench": (lambda random: homes("bench", 16), 2),
 }
 
 
@@ -191,58 +195,60 @@ def clearances(points, walls):
     return (offset - u[..., None] * along).norm(dim=-1)
 
 
-def places(walls, n, draw):
-    """Where agents are set down: (n, 2) float32 points within the bounds of walls (W, 2, 2), no
-    nearer than a HAIR to any. Four in ten lie anywhere; the rest at a wall's flank or end: touching
-    it to a few units in the last place, overlapping it, or with the centre a hair from it.
+def places(walls, n, random):
+    """Where agents are placed: (n, 2) float32 points within the bounds of walls (W, 2, 2), no
+    nearer than MIN_GAP to any. Four in ten lie anywhere; the rest at a wall's flank or end: touching
+    it to a few units in the last place, overlapping it, or with the centre next to it.
     """
-    found, low, high = torch.zeros((0, 2)), walls.amin((0, 1)), walls.amax((0, 1))
+    found, lower, upper = torch.zeros((0, 2)), walls.amin((0, 1)), walls.amax((0, 1))
     while len(found) < n:
-        a, b = walls[draw.pick(range(len(walls)), n).long()].unbind(1)
-        u, aside = draw.uniform(-0.5, 1.5, n, 1).clamp(0, 1), draw.direction(n)
+        a, b = walls[random.pick(range(len(walls)), n).long()].unbind(1)
+        u, aside = random.uniform(-0.5, 1.5, n, 1).clamp(0, 1), random.direction(n)
         normal = torch.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], -1)
         normal = (
-            normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-9) * draw.pick([-1, 1], n, 1)
+            normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-9) * random.pick([-1, 1], n, 1)
         )
         inner = (u > 0) & (u < 1) & (normal.norm(dim=-1, keepdim=True) > 0)
-        touching = draw.pick([RADIUS, BODY], n, 1) + draw.pick([-1e-6, -1e-7, 0, 1e-7, 1e-6], n, 1)
-        overlapping = 10 ** draw.uniform(math.log10(HAIR), math.log10(RADIUS), n, 1)
-        distance = torch.where(draw.uniform(0, 1, n, 1) < 0.5, touching, overlapping)
+        touching = random.pick([RADIUS, BODY], n, 1) + random.pick(
+            [-1e-6, -1e-7, 0, 1e-7, 1e-6], n, 1
+        )
+        overlapping = 10 ** random.uniform(math.log10(MIN_GAP), math.log10(RADIUS), n, 1)
+        distance = torch.where(random.uniform(0, 1, n, 1) < 0.5, touching, overlapping)
         near = a + u * (b - a) + distance * torch.where(inner, normal, aside)
-        anywhere = draw.uniform(0, 1, n, 2) * (high - low) + low
-        points = torch.where(draw.uniform(0, 1, n, 1) < 0.4, anywhere, near).float()
-        inside = ((points > low) & (points < high)).all(-1)
+        anywhere = random.uniform(0, 1, n, 2) * (upper - lower) + lower
+        points = torch.where(random.uniform(0, 1, n, 1) < 0.4, anywhere, near).float()
+        inside = ((points > lower) & (points < upper)).all(-1)
         found = torch.cat(
-            [found, points[inside & (clearances(points.double(), walls).amin(1) > HAIR)]]
+            [found, points[inside & (clearances(points.double(), walls).amin(1) > MIN_GAP)]]
         )
     return found[:n]
 
 
 @dataclass(frozen=True)
-class Ground:
-    """A course's layouts, ready to be walked on."""
+class Course:
+    """A course's layouts and where agents are placed in them."""
 
     name: str
     n_agents: int
     geometries: list
     walls: torch.Tensor  # (D, W, 2, 2) float32
     counts: torch.Tensor  # (D,) how many walls each layout has
-    spots: torch.Tensor  # (D, P, 2) float32: where agents are set down
+    spots: torch.Tensor  # (D, P, 2) float32: where agents are placed
     clear: torch.Tensor  # (D, P) bool: where they then overlap no wall
 
 
-def ground(name, seed=0, device="cpu", n_spots=512):
-    """The ground of the course `name`."""
+def make_course(name, seed=0, device="cpu", n_spots=512):
+    """The course called `name`."""
     make, n_agents = COURSES[name]
-    draw = random_scenery.Draw(seed)
-    layouts = [torch.as_tensor(np.float32(walls)) for walls in make(draw)]
+    random = random_scenery.RandomStream(seed)
+    layouts = [torch.as_tensor(np.float32(walls)) for walls in make(random)]
     walls = torch.full((len(layouts), max(map(len, layouts)), 2, 2), math.nan)
     for d, w in enumerate(layouts):
         walls[d, : len(w)] = w
-    spots = [places(w.double(), n_spots, draw) for w in layouts]
+    spots = [places(w.double(), n_spots, random) for w in layouts]
     clear = [clearances(p.double(), w.double()).amin(1) > BODY for p, w in zip(spots, layouts)]
     geometries = [dotdict(walls=w.numpy(), lights=np.zeros((0, 2))) for w in layouts]
-    return Ground(
+    return Course(
         name,
         n_agents,
         geometries,
@@ -253,7 +259,7 @@ def ground(name, seed=0, device="cpu", n_spots=512):
     )
 
 
-# ---- The judge of paths ----
+# ---- Does a path cross a wall? ----
 
 
 def cross(ax, ay, bx, by):
@@ -286,17 +292,19 @@ def crossed(before, after, walls, dense=None):
 
     Closed segments meet if their boxes do and each straddles the other's line (true of points and
     of collinear ones too). Boxes are compared in the given type, which is exact, sides in float64.
-    The CPU tries only the pairs whose boxes meet, a GPU all of them (`dense`), as it would have to
-    wait for their number.
+    The CPU tries only the pairs whose boxes meet, a GPU all of them (`dense`), because their
+    number would take a synchronisation.
     """
     dense = before.device.type == "cuda" if dense is None else dense
-    rows, judge = rows_of(before, walls), _crossed_dense if dense else _crossed_sparse
-    return torch.cat([judge(p, q, walls) for p, q in zip(before.split(rows), after.split(rows))])
+    rows, check = rows_of(before, walls), _crossed_dense if dense else _crossed_sparse
+    return torch.cat([check(p, q, walls) for p, q in zip(before.split(rows), after.split(rows))])
 
 
 def rows_of(points, walls):
-    """How many of the copies of points (B, D, A, 2) to judge at once."""
-    return max(PAIRS[points.device.type] // (walls.shape[0] * walls.shape[1] * points.shape[2]), 1)
+    """How many of the copies of points (B, D, A, 2) to check at once."""
+    return max(
+        MAX_PAIRS[points.device.type] // (walls.shape[0] * walls.shape[1] * points.shape[2]), 1
+    )
 
 
 def _ends(p, q, walls):
@@ -339,13 +347,13 @@ def _surroundings(points, walls):
     least, nearest = distance.min(-1)
     first = normal.gather(-2, nearest[..., None, None].expand(*nearest.shape, 1, 2))
     cosine = (normal * first).sum(-1) / (distance * least[..., None]).clamp(min=1e-12)
-    return nearest, least, ((distance < TOUCH) & (cosine < PINCH)).any(-1) & (least < TOUCH)
+    return nearest, least, ((distance < TOUCH) & (cosine < CORNER_COSINE)).any(-1) & (least < TOUCH)
 
 
 # ---- Walkers ----
 
 COUNTED = "steps", "collisions", "crossings", "sunk"
-NOTED = (
+RECORDED = (
     "x before",
     "y before",
     "x after",
@@ -359,22 +367,22 @@ NOTED = (
 
 
 class Walk:
-    """Agents on one ground, at one rate and acceleration, that seek walls and corners for spells of
+    """Agents on one course, at one rate and acceleration, that seek walls and corners in phases of
     16 steps.
 
-    Before each spell a quarter of them is set down anew. In a spell an agent heads for an end of a
+    Before each phase a quarter of them is placed anew. In a phase an agent heads for an end of a
     wall, for a point of one, along one, or anywhere, at up to the speed that MomentumMovement would
     give it in the end. If `acting` it does so by MomentumMovement's actions, else its velocity is
     written.
 
-    ``counts`` (4,) int64 are of steps, collisions, crossings, and agents who overlapped no wall
-    when set down but are nearer than their radius to one when a spell ends. ``pinched`` (D,) counts
-    those who then are in an acute corner. ``notes`` (B, D, A, 9) are what each agent's first
-    crossing was like.
+    ``counts`` (4,) int64 are of steps, collisions, crossings, and agents that overlapped no wall
+    when placed but are nearer than their radius to one when a phase ends. ``cornered`` (D,) counts
+    those that then are in an acute corner. ``records`` (B, D, A, 9) describe each agent's first
+    crossing.
     """
 
     def __init__(self, ground, scenery, fps, accel, acting, seed):
-        self.ground, self.fps, self.accel, self.acting, self.seed = ground, fps, accel, acting, seed
+        self.course, self.fps, self.accel, self.acting, self.seed = ground, fps, accel, acting, seed
         self.core = core.Core(scenery, res=1, fps=fps)
         device, walls = self.core.device, ground.walls
         self.shape = (scenery.n_envs // len(walls), len(walls), ground.n_agents)
@@ -389,8 +397,8 @@ class Walk:
             [0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3, 0.1, -0.1], device=device
         )
         self.counts = torch.zeros(len(COUNTED), dtype=torch.int64, device=device)
-        self.pinched = torch.zeros(len(walls), dtype=torch.int64, device=device)
-        self.notes = torch.full((*self.shape, len(NOTED)), math.nan, device=device)
+        self.cornered = torch.zeros(len(walls), dtype=torch.int64, device=device)
+        self.records = torch.full((*self.shape, len(RECORDED)), math.nan, device=device)
         self.clear = torch.zeros(self.shape, dtype=torch.bool, device=device)
         self.progress = torch.ones(self.shape, device=device)
         self.age = 0
@@ -405,21 +413,21 @@ class Walk:
     def positions(self):
         return self.core.agents.positions.view(*self.shape, 2)
 
-    def look(self):
+    def count_places(self):
         """Counts where agents have got to."""
-        _, least, pinched = surroundings(self.positions, self.ground.walls)
+        _, least, cornered = surroundings(self.positions, self.course.walls)
         self.counts[3] += (self.clear & (least < RADIUS - SUNK)).sum()
-        self.pinched += pinched.sum((0, 2))
+        self.cornered += cornered.sum((0, 2))
 
-    def respawn(self, share):
-        """Sets down that share of the agents anew, at rest."""
-        agents, again = self.core.agents, self.random() < share
-        spot = self.pick(self.ground.spots.shape[1])
+    def respawn(self, fraction):
+        """Places that fraction of the agents anew, at rest."""
+        agents, again = self.core.agents, self.random() < fraction
+        spot = self.pick(self.course.spots.shape[1])
         flat, wide = again.view(agents.angles.shape), again[..., None]
         self.positions.copy_(
-            torch.where(wide, self.ground.spots[self.layout, spot], self.positions)
+            torch.where(wide, self.course.spots[self.layout, spot], self.positions)
         )
-        self.clear = torch.where(again, self.ground.clear[self.layout, spot], self.clear)
+        self.clear = torch.where(again, self.course.clear[self.layout, spot], self.clear)
         agents.angles.copy_(
             torch.where(flat, 360 * self.random().view(flat.shape) - 180, agents.angles)
         )
@@ -427,11 +435,11 @@ class Walk:
         agents.angvelocity.masked_fill_(flat, 0)
 
     def aim(self):
-        """Gives each agent a wall, and a goal there, for a spell."""
-        nearest = surroundings(self.positions, self.ground.walls)[0]
-        some = (self.random() * self.ground.counts[:, None]).long()
+        """Gives each agent a wall, and a goal there, for a phase."""
+        nearest = surroundings(self.positions, self.course.walls)[0]
+        some = (self.random() * self.course.counts[:, None]).long()
         wall = torch.where(self.random() < 0.5, nearest, some)
-        a, b = self.ground.walls[self.layout, wall].unbind(-2)
+        a, b = self.course.walls[self.layout, wall].unbind(-2)
         along = b - a
         foot = (
             ((self.positions - a) * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
@@ -446,77 +454,82 @@ class Walk:
             self.slants[self.pick(len(self.slants))][..., None],
         )
         self.grazing = sign * along + slant * torch.stack([-along[..., 1], along[..., 0]], -1)
-        self.manner = self.pick(8)[
+        self.mode = self.pick(8)[
             ..., None
         ]  # 0: anywhere, 1 and 2: along the wall, else: to the goal
-        self.haste = (
+        self.speeds = (
             self.speed * torch.where(self.random() < 0.5, 1, 10 ** (-4 * self.random()))[..., None]
         )
 
-    def ways(self):
+    def headings(self):
         """Where each agent wants to go, (B, D, A, 2) of length 1 or, being there, 0."""
-        way = torch.where(self.manner == 0, self.random(2) - 0.5, self.goal - self.positions)
-        way = torch.where((self.manner == 1) | (self.manner == 2), self.grazing, way)
+        way = torch.where(self.mode == 0, self.random(2) - 0.5, self.goal - self.positions)
+        way = torch.where((self.mode == 1) | (self.mode == 2), self.grazing, way)
         return way / way.norm(dim=-1, keepdim=True).clamp(min=1e-30)
 
-    def actions(self, ways):
+    def actions(self, headings):
         """For each agent the action of the first five that takes it furthest along its way; one in
         ten any.
         """
         radians = torch.deg2rad(self.core.agents.angles.view(self.shape))
         c, s = radians.cos(), radians.sin()
         local = torch.stack(
-            [c * ways[..., 0] + s * ways[..., 1], c * ways[..., 1] - s * ways[..., 0]], -1
+            [
+                c * headings[..., 0] + s * headings[..., 1],
+                c * headings[..., 1] - s * headings[..., 0],
+            ],
+            -1,
         )
         best = (local[..., None, :] * self.ahead).sum(-1).argmax(-1)
         return torch.where(self.random() < 0.1, self.pick(7), best)
 
     def step(self):
         agents = self.core.agents
-        before, angles, ways = self.positions.clone(), agents.angles.clone(), self.ways()
+        before, angles, headings = self.positions.clone(), agents.angles.clone(), self.headings()
         if self.acting:
-            action, velocity = self.actions(ways), agents.velocity.clone()
+            action, velocity = self.actions(headings), agents.velocity.clone()
             progress = self.move(dict(actions=action)).progress
         else:
-            action, velocity = self.pick(1) - 1, ways * self.haste
+            action, velocity = self.pick(1) - 1, headings * self.speeds
             agents.velocity.copy_(velocity.view(agents.velocity.shape))
             progress = engine.physics(self.core.scenery, agents).progress
-        self.progress, self.way = progress.view(self.shape), ways
-        bad = crossed(before, self.positions, self.ground.walls)
+        self.progress, self.way = progress.view(self.shape), headings
+        bad = crossed(before, self.positions, self.course.walls)
         self.counts[1] += (progress < 1).sum()
         self.counts[2] += bad.sum()
-        self.note(bad, before, velocity.view(before.shape), angles.view(self.shape), action)
+        self.record(bad, before, velocity.view(before.shape), angles.view(self.shape), action)
         self.counts[0] += progress.numel()
         self.age += 1
 
-    def note(self, bad, before, velocity, angles, action):
+    def record(self, bad, before, velocity, angles, action):
         rest = torch.stack([angles, action.float(), torch.full_like(angles, self.age)], -1)
         now = torch.cat([before, self.positions, velocity, rest], -1)
-        new = (bad & self.notes[..., 0].isnan())[..., None]
-        self.notes = torch.where(new, now, self.notes)
+        new = (bad & self.records[..., 0].isnan())[..., None]
+        self.records = torch.where(new, now, self.records)
 
-    def spell(self):
+    def phase(self):
         self.respawn(1.0 if self.age == 0 else 0.25)
         self.aim()
-        for _ in range(SPELL):
+        for _ in range(PHASE):
             self.step()
-        self.look()
+        self.count_places()
 
     def stopped(self, most):
-        """The (b, d, a) of at most that many agents that the last step stopped, anyhow. Asks the
-        device.
+        """The (b, d, a) of at most that many agents that the last step stopped, at random.
+        Synchronises with the device.
         """
         b, d, a = (self.progress < 1).nonzero(as_tuple=True)
         some = torch.randperm(len(b), generator=self.generator, device=b.device)[:most]
         return b[some], d[some], a[some]
 
-    def story(self, most=3):
+    def describe_crossings(self, most=3):
         """Sentences on the first few crossings, from which each can be made again; the walls are
-        those of `ground(name, seed // 1000)`."""
+        those of `make_course(name, seed // 1000)`.
+        """
         told = []
-        for b, d, a in (~self.notes[..., 0].isnan()).nonzero()[:most].tolist():
+        for b, d, a in (~self.records[..., 0].isnan()).nonzero()[:most].tolist():
             note = ", ".join(
-                f"{name} {x!r}" for name, x in zip(NOTED, self.notes[b, d, a].tolist())
+                f"{name} {x!r}" for name, x in zip(RECORDED, self.records[b, d, a].tolist())
             )
             told.append(f"{self}: copy {b} of layout {d}, agent {a}: {note}")
         return told
@@ -524,26 +537,26 @@ class Walk:
     def __str__(self):
         how = "acting" if self.acting else "driven"
         return (
-            f"{self.ground.name} at {self.fps} fps, {self.accel} times the acceleration, "
+            f"{self.course.name} at {self.fps} fps, {self.accel} times the acceleration, "
             f"{how}, seed {self.seed}"
         )
 
 
-# ---- The judge of the stuck ----
+# ---- Is an agent stuck? ----
 
 
 def directions(n, device):
     """(n, 2) unit vectors, those along the axes exactly so."""
     turn = 2 * math.pi * torch.arange(n, dtype=torch.float64) / n
-    ways = torch.stack([turn.cos(), turn.sin()], -1)
-    return torch.where(ways.abs() < 1e-12, 0, ways).float().to(device)
+    headings = torch.stack([turn.cos(), turn.sin()], -1)
+    return torch.where(headings.abs() < 1e-12, 0, headings).float().to(device)
 
 
-def attempts(scenery, fps, positions, layout, agent, ways):
-    """How far (K, n) agent k of each world (K, A, 2) gets by a step of 1 cm in each direction of
-    ways (K, n, 2) while the others rest; 0 if physics says that no progress was made.
+def attempts(scenery, fps, positions, layout, agent, headings):
+    """How far (K, n) agent k of each environment (K, A, 2) gets by a step of 1 cm in each direction of
+    headings (K, n, 2) while the others rest; 0 if physics says that no progress was made.
     """
-    k, n, _ = ways.shape
+    k, n, _ = headings.shape
     copies = engine.Scenery.of_layouts(
         scenery.n_agents,
         scenery.layouts,
@@ -554,14 +567,14 @@ def attempts(scenery, fps, positions, layout, agent, ways):
     agents = engine.Agents(k * n, scenery.n_agents, res=1, fps=fps, device=scenery.device)
     agents.positions.copy_(positions.repeat_interleave(n, 0))
     each, who = torch.arange(k * n, device=scenery.device), agent.repeat_interleave(n)
-    agents.velocity[each, who] = ways.reshape(-1, 2) * TRY * fps
+    agents.velocity[each, who] = headings.reshape(-1, 2) * TRY * fps
     start = agents.positions.clone()
     progress = engine.physics(copies, agents).progress
     way = (agents.positions - start)[each, who].norm(dim=-1)
     return torch.where(progress[each, who] > 0, way, 0).view(k, n)
 
 
-def hemmed(position, others, walls):
+def held_by_geometry(position, others, walls):
     """Whether all that an agent overlaps or all but touches leaves it no direction, within half a
     degree, that does not bring it nearer to something: then a disc cannot leave. position (2,),
     others (A - 1, 2), walls (W, 2, 2).
@@ -585,29 +598,28 @@ def stuck(walk, most):
     if not len(b):
         return 0, 0, []
     positions = walk.positions[b, d]
-    ways = torch.cat(
+    headings = torch.cat(
         [directions(32, device).expand(len(b), -1, -1), -walk.way[b, d, a][:, None]], 1
     )
-    far = attempts(scenery, walk.fps, positions, d, a, ways).amax(1)
+    far = attempts(scenery, walk.fps, positions, d, a, headings).amax(1)
     rest, fine = (far < LEAVES).nonzero()[:, 0], directions(720, device)
     for some in rest.split(256):
         all_ways = fine.expand(len(some), -1, -1)
         far[some] = attempts(scenery, walk.fps, positions[some], d[some], a[some], all_ways).amax(1)
     n_held, told = 0, []
     for k in rest[far[rest] < LEAVES].tolist():
-        world, own = (
+        places_of_all, own = (
             positions[k].double(),
-            torch.arange(walk.ground.n_agents, device=device) == a[k],
+            torch.arange(walk.course.n_agents, device=device) == a[k],
         )
-        walls = walk.ground.walls[d[k], : int(walk.ground.counts[d[k]])].double()
-        excusable = walk.ground.n_agents > 1 or not walk.clear[b[k], d[k], a[k]]
-        if excusable and hemmed(world[own][0], world[~own], walls):
+        walls = walk.course.walls[d[k], : int(walk.course.counts[d[k]])].double()
+        excusable = walk.course.n_agents > 1 or not walk.clear[b[k], d[k], a[k]]
+        if excusable and held_by_geometry(places_of_all[own][0], places_of_all[~own], walls):
             n_held += 1
         else:
             told.append(
-                f"{walk}: copy {b[k]} of layout {d[k]}, agent {a[k]}, step {walk.age}: stuck in a "
-                f"world whose "
-                f"agents are at {positions[k].tolist()!r}"
+                f"{walk}: copy {b[k]} of layout {d[k]}, agent {a[k]}, step {walk.age}: stuck in an "
+                f"environment whose agents are at {positions[k].tolist()!r}"
             )
     return len(b), n_held, told
 
@@ -617,39 +629,39 @@ def stuck(walk, most):
 
 def run(name, n_steps, n_agents, device="cpu", seed=0, tries=1 << 30, report=None):
     """Walks a course for at least n_steps agent-steps in all, with up to n_agents at once, at each
-    of the SETTINGS in turn, driven and acting. After each spell up to `tries` of those who were
+    of the SETTINGS in turn, driven and acting. After each phase up to `tries` of those that were
     stopped try to leave.
 
-    Returns a dict: the COUNTED; `tried`, `held` and `stuck`; `pinched` (D,), a list; and `stories`
+    Returns a dict: the COUNTED; `tried`, `held` and `stuck`; `cornered` (D,), a list; and `descriptions`
     of the first crossings and of the stuck. ``report(total)`` is called after each walk.
     """
-    course = ground(name, seed, device)
+    course = make_course(name, seed, device)
     modes = [(*setting, acting) for setting in SETTINGS for acting in (False, True)]
-    n_agents = min(n_agents, n_steps // (len(modes) * SPELL * SPELLS))
+    n_agents = min(n_agents, n_steps // (len(modes) * PHASE * PHASES))
     copies = max(n_agents // (len(course.walls) * course.n_agents), 1)
     scenery = scene.scenery(
         course.geometries, course.n_agents, copies * len(course.walls), device=torch.device(device)
     )
     total = dict.fromkeys((*COUNTED, "tried", "held", "stuck"), 0) | dict(
-        pinched=len(course.walls) * [0], stories=[]
+        cornered=len(course.walls) * [0], descriptions=[]
     )
-    a_spell = SPELL * scenery.n_envs * course.n_agents
+    per_phase = PHASE * scenery.n_envs * course.n_agents
     for i, (fps, accel, acting) in enumerate(modes):
         walk = Walk(course, scenery, fps, accel, acting, 1000 * seed + i)
-        for _ in range(math.ceil((n_steps - total["steps"]) / ((len(modes) - i) * a_spell))):
-            walk.spell()
+        for _ in range(math.ceil((n_steps - total["steps"]) / ((len(modes) - i) * per_phase))):
+            walk.phase()
             if tries:
                 tried, held, told = stuck(walk, tries)
                 total["tried"], total["held"] = total["tried"] + tried, total["held"] + held
-                total["stuck"], total["stories"] = (
+                total["stuck"], total["descriptions"] = (
                     total["stuck"] + len(told),
-                    total["stories"] + told[:3],
+                    total["descriptions"] + told[:3],
                 )
         engine.check(walk.core.agents)
         for key, value in zip(COUNTED, walk.counts.tolist()):
             total[key] += value
-        total["pinched"] = [x + y for x, y in zip(total["pinched"], walk.pinched.tolist())]
-        total["stories"] += walk.story()
+        total["cornered"] = [x + y for x, y in zip(total["cornered"], walk.cornered.tolist())]
+        total["descriptions"] += walk.describe_crossings()
         if report:
             report(total)
     return total
