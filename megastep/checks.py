@@ -3,14 +3,31 @@ be and what was given.
 """
 
 import math
+import numbers
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
 
 from .ragged import Ragged, RaggedTorch
 from .read_only import ReadOnlyTensor
+
+__all__ = [
+    "address",
+    "device",
+    "flag",
+    "floats",
+    "instance",
+    "integer",
+    "integers",
+    "items",
+    "length",
+    "number",
+    "ragged",
+]
+
+LIMIT = 1e9  # of what kernels calculate with: products of four still fit into float32
 
 
 def integer(name: str, value: Any, min: int, max: float = math.inf) -> int:
@@ -25,14 +42,25 @@ def integer(name: str, value: Any, min: int, max: float = math.inf) -> int:
     return found
 
 
-def number(name: str, value: Any, min: float, max: float, what: str = "a number") -> float:
+def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: str = "") -> float:
     """``value`` as a float. ValueError unless it is a number between ``min`` and ``max``, both
     excluded.
     """
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not min < value < max:
-        range_ = f"between {min} and {max}" if max < math.inf else f"above {min}"
-        raise ValueError(f"{name} must be {what} {range_}, but {_given(value)} was given")
+    plain = type(value) is float or type(value) is int
+    real = plain or isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not real or not min < value < max:
+        kind = f"a number of {unit}" if unit else "a number"
+        range_ = f"between {min:g} and {max:g}" if max < math.inf else f"above {min:g}"
+        range_ = range_ if min > -math.inf else "that is finite"
+        raise ValueError(f"{name} must be {kind} {range_}{hint}, but {_given(value)} was given")
     return float(value)
+
+
+def flag(name: str, value: Any) -> bool:
+    """``value``. TypeError unless it is True or False."""
+    if value is not True and value is not False:
+        raise TypeError(f"{name} must be True or False, but {_given(value)} was given")
+    return value
 
 
 def instance(name: str, value: Any, kind: type) -> Any:
@@ -40,6 +68,16 @@ def instance(name: str, value: Any, kind: type) -> Any:
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be a {kind.__name__}, but {_given(value)} was given")
     return value
+
+
+def items(name: str, value: Any) -> list:
+    """``value`` as a list. TypeError or ValueError unless it holds something."""
+    if isinstance(value, (str, dict)) or not isinstance(value, Iterable):
+        raise TypeError(f"{name} must be a list, but {_given(value)} was given")
+    found = list(value)
+    if not found:
+        raise ValueError(f"{name} must hold at least one, but an empty list was given")
+    return found
 
 
 def device(name: str, value: Any) -> torch.device:
@@ -54,7 +92,7 @@ def device(name: str, value: Any) -> torch.device:
 
 def floats(name: str, value: Any, shape: Sequence, device: Any) -> torch.Tensor:
     """``value`` as a contiguous float32 tensor on ``device``. ValueError unless it is an array of
-    finite numbers of that shape; a string in ``shape`` stands for any size.
+    numbers of that shape, none as large as 1e9; a string in ``shape`` stands for any size.
     """
     try:
         found = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
@@ -67,8 +105,10 @@ def floats(name: str, value: Any, shape: Sequence, device: Any) -> torch.Tensor:
             f"{name} must be an array of numbers of shape ({_sizes(shape)}), but {_given(value)} "
             f"was given"
         )
-    if not bool(found.isfinite().all()):
-        raise ValueError(f"{name} must hold finite numbers, but one is NaN or infinite")
+    if not bool((found.abs() < LIMIT).all()):
+        raise ValueError(
+            f"{name} must hold numbers below {LIMIT:g}, but one is NaN, infinite or larger"
+        )
     return found.contiguous()
 
 
@@ -111,6 +151,15 @@ def ragged(name: str, value: Any, shape: Sequence, device: Any) -> RaggedTorch:
         raise TypeError(f"{name} must be a Ragged, but {_given(value)} was given")
     value = value.torchify()
     return Ragged(floats(f"{name}.vals", value.vals, shape, device), value.widths.to(device))
+
+
+def length(name: str, value: Any, axis: int = 0) -> int:
+    """The size of a tensor's ``axis``. TypeError or ValueError unless it has one."""
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{name} must be a tensor, but {_given(value)} was given")
+    if not -value.ndim <= axis < value.ndim:
+        raise ValueError(f"{name} must have more axes than {_given(value)} has")
+    return value.shape[axis]
 
 
 def address(

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 
 from . import engine
+from .agents import AGENT_RADIUS, AGENT_WIDTH
 from .arrdict import arrdict
 from .colour import gamma_decode, gamma_encode
-from .engine import AGENT_RADIUS, AGENT_WIDTH
 from .scene import TEXEL
 
 __all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "TEXEL", "Core", "gamma_decode", "gamma_encode"]

@@ -1,8 +1,9 @@
-"""The engine: ``bake``, ``physics``, ``render``, ``observe``. Each checks, allocates and launches,
-on the CPU or the GPU, whichever its tensors are on.
+"""The engine: ``bake``, ``physics``, ``render``, ``observe``, ``spawn``, ``uniform``. Each checks
+its arguments, allocates and launches, on the CPU or the GPU, whichever its tensors are on; none
+synchronises. TypeError or ValueError, naming the argument, if one does not fit.
 
-N worlds, A agents a world, C cameras an agent (the axis is dropped if there is one), R rays a
-camera, P = R / subsample pixels. Metres, degrees, seconds.
+N environments, A agents per environment, C cameras per agent (the axis is dropped if there is one),
+R rays per camera, P = R / subsample pixels, D layouts, B lanes. Metres, degrees, seconds.
 """
 
 import math
@@ -10,14 +11,21 @@ from typing import NamedTuple
 
 import torch
 
+from . import checks
+from .agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents
+from .devices import device, fit
 from .kernels.compile import EngineError
 from .kernels.launch import SIZES, WARP, launch, params
+from .launch_params import error_flag, scenery_params, state_params
 from .scenery import Layouts, Scenery
 
 __all__ = [
+    "AGENT_RADIUS",
+    "AGENT_WIDTH",
+    "MAX_RES",
     "Agents",
-    "Layouts",
     "EngineError",
+    "Layouts",
     "Observation",
     "Physics",
     "Render",
@@ -25,78 +33,23 @@ __all__ = [
     "bake",
     "check",
     "device",
-    "uniform",
     "fit",
     "observe",
     "physics",
     "render",
     "spawn",
+    "uniform",
+    "update_agent_geometry",
 ]
 
-AGENT_WIDTH = 0.15
-AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # the disc about a square of that width
-MAX_RES = 1024
-MANY = 32_768  # worlds that fill a GPU with a quarter of a warp each
-
-
-class Agents:
-    """Where the agents are, how they move, and what their cameras are like.
-
-    ``positions`` (N, A, 2), ``angles`` (N, A), ``velocity`` (N, A, 2) a second, ``angvelocity`` (N,
-    A) a second; an angle of 0 looks along +x. ``cameras`` are yaw offsets in degrees. ValueError
-    unless 1 <= res <= 1024, 0 < fov < 180, fps > 0, radius > 0.
-    """
-
-    def __init__(
-        self,
-        n_envs,
-        n_agents,
-        res=64,
-        fov=130.0,
-        fps=10.0,
-        cameras=None,
-        radius=AGENT_RADIUS,
-        device="cpu",
-    ):
-        if not (isinstance(res, int) and 1 <= res <= MAX_RES):
-            raise ValueError(
-                f"res must be a whole number of rays from 1 to {MAX_RES}, but {res} was given"
-            )
-        if not 0 < fov < 180:
-            raise ValueError(
-                f"fov must be more than 0 and less than 180 degrees, but {fov} was given; for a "
-                f"wider view use "
-                f"several cameras"
-            )
-        if not 0 < fps < math.inf:
-            raise ValueError(
-                f"fps must be a positive number of steps a second, but {fps} was given"
-            )
-        if not 0 < radius < math.inf:
-            raise ValueError(f"radius must be a positive number of metres, but {radius} was given")
-        self.res, self.fov, self.fps, self.radius = res, float(fov), float(fps), float(radius)
-        self.yaws = torch.tensor(
-            [0.0] if cameras is None else list(cameras), dtype=torch.float32, device=device
-        )
-        if not len(self.yaws):
-            raise ValueError("an agent needs at least one camera, but an empty list was given")
-        sideways = math.tan(math.radians(fov / 2)) * (
-            1 - (2 * torch.arange(res, dtype=torch.float64) + 1) / res
-        )
-        self.ray_lengths = (1 + sideways**2).sqrt().float().to(device)  # (R,), per unit of depth
-        self.positions = torch.zeros((n_envs, n_agents, 2), device=device)
-        self.angles = torch.zeros((n_envs, n_agents), device=device)
-        self.velocity = torch.zeros((n_envs, n_agents, 2), device=device)
-        self.angvelocity = torch.zeros((n_envs, n_agents), device=device)
-        self.error_flag = torch.zeros(1, dtype=torch.int32, device=device)
+MANY_ENVS = 32_768  # that fill a GPU with a quarter of a warp each
+MAX_SUBSAMPLE = 32
 
 
 class Render(NamedTuple):
     """What the cameras see, ray by ray. A miss is -1, NaN, NaN, inf, black."""
 
-    indices: (
-        torch.Tensor
-    )  # (N, A, C, R) int32: the line hit, counted within its world, the agents' first
+    indices: torch.Tensor  # (N, A, C, R) int32: the line hit, of its environment's lines
     locations: torch.Tensor  # (N, A, C, R): where along the line, 0 to 1
     dots: torch.Tensor  # (N, A, C, R): cosine between ray and line
     distances: torch.Tensor  # (N, A, C, R): metres
@@ -112,151 +65,16 @@ class Physics(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """What a policy needs of a view; None where not asked for."""
+    """What a policy needs of a view; None where it was not wanted."""
 
-    rgb: torch.Tensor  # (N, A, C, 3, P) fp16, linear light
-    depth: (
-        torch.Tensor
-    )  # (N, A, C, P) fp16: 1 at the agent's radius, falling to 0 at max_depth beyond it
-    centre_line: torch.Tensor  # (N, A, C) int32: the line at the screen's centre, as Render.indices
-    imu: torch.Tensor  # (N, A, 3) fp16: angular velocity / 360, own velocity ahead and left / 10
-    newly_seen: (
-        torch.Tensor
-    )  # (N, A) int32: static texels now marked in `seen` that were not before
+    rgb: torch.Tensor | None  # (N, A, C, 3, P) fp16, linear light
+    depth: torch.Tensor | None  # (N, A, C, P) fp16: 1 at the agent's radius, 0 at max_depth beyond
+    centre_line: torch.Tensor | None  # (N, A, C) int32: the line at the centre, as Render.indices
+    imu: torch.Tensor | None  # (N, A, 3) fp16: angvelocity / 360, own velocity ahead and left / 10
+    newly_seen: torch.Tensor | None  # (N, A) int32: texels now marked in `seen`, not before
 
 
-def device(name="auto"):
-    """The device called ``name``: auto (a GPU if there is one), cpu, cuda, cuda:1. EngineError if
-    it is not there.
-    """
-    if name == "auto":
-        return (
-            torch.device("cuda", torch.cuda.current_device())
-            if torch.cuda.is_available()
-            else torch.device("cpu")
-        )
-    try:
-        chosen = torch.device(name)
-    except RuntimeError:
-        chosen = None
-    if chosen is None or chosen.type not in ("cpu", "cuda"):
-        raise EngineError(f"device={name} is unknown: use auto, cpu, cuda, or cuda: and a number.")
-    if chosen.type == "cuda":
-        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        if (chosen.index or 0) >= count:
-            why = (
-                f"there are {count} GPUs"
-                if count
-                else "no GPU is to be seen"
-                + ("" if torch.version.cuda else " and this PyTorch is built for the CPU only")
-            )
-            raise EngineError(
-                f"device={name} was asked for, but {why}: use device=auto or device=cpu."
-            )
-        return torch.device("cuda", chosen.index or 0)
-    return chosen
-
-
-def fit(n_envs, bytes_each, device, what="environments"):
-    """EngineError, with the number that fits, if ``n_envs`` things of ``bytes_each`` bytes are too
-    many for the memory that is free on ``device``.
-    """
-    free = free_memory(device)
-    if n_envs * bytes_each > 0.95 * free:
-        raise EngineError(
-            f"{n_envs:,} {what} need {n_envs * bytes_each / 1e9:.1f} GB, but {free / 1e9:.1f} GB "
-            f"are free on "
-            f"{device}: at most {int(0.95 * free / bytes_each):,} fit."
-        )
-
-
-def free_memory(device):
-    """Bytes that can still be allocated on ``device``."""
-    device = torch.device(device)
-    if device.type == "cuda":
-        return (
-            torch.cuda.mem_get_info(device)[0]
-            + torch.cuda.memory_reserved(device)
-            - torch.cuda.memory_allocated(device)
-        )
-    try:
-        with open("/proc/meminfo") as file:
-            return next(
-                int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable")
-            )
-    except (OSError, StopIteration):
-        return 1 << 62
-
-
-# ---- From tensors to the params of a launch ----
-
-
-def _pointer(name, tensor, shape, dtype, device):
-    """A checked tensor's address; 0 for None."""
-    if tensor is None:
-        return 0
-    if (
-        tensor.dtype != dtype
-        or tensor.device != device
-        or tensor.shape != shape
-        or not tensor.is_contiguous()
-    ):
-        layout = "" if tensor.is_contiguous() else " that is not contiguous"
-        raise ValueError(
-            f"{name} must be a contiguous {dtype} tensor of shape {tuple(shape)} on {device}, but "
-            f"it is a "
-            f"{tensor.dtype} one of shape "
-            f"{tuple(tensor.shape)} on {tensor.device}{layout}"
-        )
-    return tensor.data_ptr()
-
-
-def _scenery_params(scenery, radius):
-    layouts = scenery.layouts
-    return params.SceneryParams(
-        walls=layouts.lines.vals.data_ptr(),
-        wall_starts=layouts.wall_starts.data_ptr(),
-        texel_starts=layouts.texel_starts.data_ptr(),
-        boxes=layouts.boxes.data_ptr(),
-        box_starts=layouts.box_starts.data_ptr(),
-        texels=layouts.texels.data_ptr(),
-        lights=layouts.lights.vals.data_ptr(),
-        light_starts=layouts.light_starts.data_ptr(),
-        layout=_pointer(
-            "scenery.layout", scenery.layout, (scenery.n_envs,), torch.int32, scenery.device
-        ),
-        model=scenery.model.data_ptr(),
-        model_texels=scenery.model_texels.data_ptr(),
-        agent_textures=layouts.agent_textures.data_ptr(),
-        agent_lines=scenery.agent_lines.data_ptr(),
-        agent_light=scenery.agent_light.data_ptr(),
-        n_envs=scenery.n_envs,
-        n_layouts=len(layouts),
-        n_agents=scenery.n_agents,
-        n_model=len(scenery.model),
-        n_agent_texels=scenery.agent_light.shape[1],
-        n_threads=torch.get_num_threads(),
-        radius=radius,
-        reach=1.001 * scenery.reach,
-    )
-
-
-_STATE = {"positions": (2,), "angles": (), "velocity": (2,), "angvelocity": ()}
-
-
-def _state(scenery, agents, *names):
-    """The addresses of these tensors of the agents, by name."""
-    lanes = (scenery.n_envs, scenery.n_agents)
-    return {
-        name: _pointer(
-            f"agents.{name}",
-            getattr(agents, name),
-            lanes + _STATE[name],
-            torch.float32,
-            scenery.device,
-        )
-        for name in names
-    }
+# ---- What the device flags ----
 
 
 # By kind, as errors.h numbers them.
@@ -270,86 +88,113 @@ _ERRORS = {
 }
 
 
-def check(agents):
+def check(agents: Agents) -> None:
     """EngineError, which names an environment, if since the last check an agent's position, angle
     or velocity was not a finite number, an action was none, or a layout was none. Synchronises
     with the device, so it is not for inside a step.
     """
-    flag = int(agents.error_flag)
+    flag = int(checks.instance("agents", agents, Agents).error_flag)
     if flag:
         agents.error_flag.zero_()
         env, kind = divmod(flag, 4)
         raise EngineError(_ERRORS[kind].format(env=env))
 
 
-def _checked(agents):
+def _check_on_cpu(agents):
     if agents.error_flag.device.type == "cpu" and int(agents.error_flag):
         check(agents)
+
+
+def _lanes(scenery, agents):
+    """(N, A), after a look at the types."""
+    checks.instance("scenery", scenery, Scenery)
+    checks.instance("agents", agents, Agents)
+    return scenery.n_envs, scenery.n_agents
 
 
 # ---- The operations ----
 
 
-def bake(scenery):
+def bake(scenery: Scenery) -> None:
     """Fills ``scenery.layouts.baked``: min(1, 0.1 + sum of 2 I / max(d^2, 1)) over the lights that
-    no wall of the layout hides.
+    no wall of the layout occludes. Fits the bounding boxes to the walls first.
     """
-    layouts = scenery.layouts
+    layouts = checks.instance("scenery", scenery, Scenery).layouts
+    packed_scenery = scenery_params(scenery, 0.0)
     layouts.update_bounding_boxes()
-    texel_wall = torch.repeat_interleave(
-        torch.arange(len(layouts.textures), dtype=torch.int32, device=scenery.device),
-        layouts.textures.widths,
-    )
-    wall_layout = torch.repeat_interleave(
-        torch.arange(len(layouts), dtype=torch.int32, device=scenery.device), layouts.lines.widths
-    )
+    texel_wall = _owners(layouts.textures.widths, layouts.n_texels)
+    wall_layout = _owners(layouts.lines.widths, layouts.n_walls)
     packed = params.BakeParams(
-        scenery=_scenery_params(scenery, 0.0),
+        scenery=packed_scenery,
         texel_wall=texel_wall.data_ptr(),
         wall_layout=wall_layout.data_ptr(),
-        n_texels=len(texel_wall),
+        n_texels=layouts.n_texels,
     )
-    launch("bake", packed, scenery.device, threads=len(texel_wall))
+    launch("bake", packed, scenery.device, threads=layouts.n_texels)
 
 
-def physics(scenery, agents, actions=None, moves=None, damping=1.0):
+def _owners(widths, total):
+    """(total,) int32: the subarray that each element belongs to."""
+    each = torch.arange(len(widths), dtype=torch.int32, device=widths.device)
+    return torch.repeat_interleave(each, widths, output_size=total)
+
+
+def physics(
+    scenery: Scenery,
+    agents: Agents,
+    actions: torch.Tensor | None = None,
+    moves: torch.Tensor | None = None,
+    damping: float = 1.0,
+) -> Physics:
     """Moves the agents by their velocities for 1 / fps seconds, each short of what it meets first:
-    a wall, or another agent. Returns a :class:`Physics`.
+    a wall, or another agent.
 
     If ``actions`` (N, A) int64 are given, each agent first loses the fraction ``damping`` of its
     velocities, and row ``action`` of ``moves`` (n_moves, 3) is added: m/s ahead and left, deg/s.
     """
-    n, a = scenery.n_envs, scenery.n_agents
-    progress = torch.empty((n, a), device=scenery.device)
-    threads_per_env = 8 if n > MANY else 32
+    n, a = lanes = _lanes(scenery, agents)
+    checks.number("damping", damping, -math.inf, math.inf)
+    on = scenery.device
+    if actions is None and moves is None:
+        n_moves = actions_at = moves_at = 0
+    else:
+        actions_at = checks.address("actions", actions, lanes, torch.int64, on)
+        n_moves = checks.length("moves", moves)
+        if not n_moves:
+            raise ValueError("moves must have a row for each action, but it is empty")
+        moves_at = checks.address("moves", moves, (n_moves, 3), torch.float32, on)
+    progress = torch.empty(lanes, device=on)
+    threads_per_env = 8 if n > MANY_ENVS else WARP
     packed = params.PhysicsParams(
-        scenery=_scenery_params(scenery, agents.radius),
-        **_state(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
         progress=progress.data_ptr(),
-        error_flag=agents.error_flag.data_ptr(),
-        actions=_pointer("actions", actions, (n, a), torch.int64, scenery.device),
-        moves=0 if moves is None else moves.data_ptr(),
-        n_moves=0 if moves is None else len(moves),
+        error_flag=error_flag(scenery, agents),
+        actions=actions_at,
+        moves=moves_at,
+        n_moves=n_moves,
         retained=1 - damping,
         seconds=1 / agents.fps,
         threads_per_env=threads_per_env,
     )
-    launch("physics", packed, scenery.device, threads=threads_per_env * n)
-    _checked(agents)
+    launch("physics", packed, on, threads=threads_per_env * n)
+    _check_on_cpu(agents)
     return Physics(progress)
 
 
-def update_agent_geometry(scenery, agents, lit=True):
-    """Carries the agents' models to where the agents are, and lights their texels."""
+def update_agent_geometry(scenery: Scenery, agents: Agents, lit: bool = True) -> None:
+    """Moves the agents' lines to where the agents are and, if ``lit``, calculates the light on
+    them.
+    """
+    n, a = _lanes(scenery, agents)
     packed = params.UpdateAgentGeometryParams(
-        scenery=_scenery_params(scenery, agents.radius),
-        **_state(scenery, agents, "positions", "angles"),
-        error_flag=agents.error_flag.data_ptr(),
-        lit=int(lit),
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles"),
+        error_flag=error_flag(scenery, agents),
+        lit=int(checks.flag("lit", lit)),
     )
-    threads = WARP * scenery.n_envs * scenery.n_agents
-    launch("update_agent_geometry", packed, scenery.device, threads)
-    _checked(agents)
+    launch("update_agent_geometry", packed, scenery.device, threads=WARP * n * a)
+    _check_on_cpu(agents)
 
 
 # What a view may give; 0: it is not wanted.
@@ -364,7 +209,7 @@ _OUTPUTS = dict.fromkeys(
 
 
 def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
-    res = agents.res
+    res, on = agents.res, scenery.device
     half_width = math.tan(math.radians(agents.fov / 2))
     fields = {
         name: value.data_ptr() if isinstance(value, torch.Tensor) else value
@@ -372,12 +217,14 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
         if value is not None
     }
     packed = params.RenderParams(
-        scenery=_scenery_params(scenery, agents.radius),
-        **_state(scenery, agents, "positions", "angles"),
-        yaws=agents.yaws.data_ptr(),
-        ray_lengths=agents.ray_lengths.data_ptr(),
-        error_flag=agents.error_flag.data_ptr(),
-        n_cameras=len(agents.yaws),
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles"),
+        yaws=checks.address("agents.yaws", agents.yaws, (agents.n_cameras,), torch.float32, on),
+        ray_lengths=checks.address(
+            "agents.ray_lengths", agents.ray_lengths, (res,), torch.float32, on
+        ),
+        error_flag=error_flag(scenery, agents),
+        n_cameras=agents.n_cameras,
         res=res,
         half_width=half_width,
         edge=half_width * (res - 1) / res,
@@ -393,147 +240,154 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
     )
     shared = SIZES["NearestLine"] * WARP * -(-res // WARP)
     threads = WARP * scenery.n_envs * scenery.n_agents
-    launch("render", packed, scenery.device, threads, shared)
-    _checked(agents)
+    launch("render", packed, on, threads, shared)
+    _check_on_cpu(agents)
 
 
-def _cameras(scenery, agents):
-    return (scenery.n_envs, scenery.n_agents) + (
-        (len(agents.yaws),) if len(agents.yaws) > 1 else ()
-    )
+def _per_camera(lanes, agents):
+    return lanes if agents.n_cameras == 1 else (*lanes, agents.n_cameras)
 
 
-def render(scenery, agents):
-    """Places the agents' models, lights them, and returns a :class:`Render` of what every camera
-    sees.
-    """
+def render(scenery: Scenery, agents: Agents) -> Render:
+    """What every camera sees, after moving the agents' lines to where the agents are."""
     update_agent_geometry(scenery, agents)
-    shape = _cameras(scenery, agents) + (agents.res,)
-    floats = {
-        name: torch.empty(shape, device=scenery.device)
-        for name in ("locations", "dots", "distances")
-    }
+    on, shape = scenery.device, (*_per_camera(_lanes(scenery, agents), agents), agents.res)
     out = Render(
-        indices=torch.empty(shape, dtype=torch.int32, device=scenery.device),
-        screen=torch.empty((*shape, 3), device=scenery.device),
-        **floats,
+        indices=torch.empty(shape, dtype=torch.int32, device=on),
+        locations=torch.empty(shape, device=on),
+        dots=torch.empty(shape, device=on),
+        distances=torch.empty(shape, device=on),
+        screen=torch.empty((*shape, 3), device=on),
     )
     _render(scenery, agents, **out._asdict())
     return out
 
 
 def observe(
-    scenery,
-    agents,
-    subsample=1,
-    rgb=True,
-    depth=True,
-    imu=False,
-    centre_line=False,
-    seen=None,
-    clear_mask=None,
-    max_depth=10.0,
-):
+    scenery: Scenery,
+    agents: Agents,
+    subsample: int = 1,
+    rgb: bool = True,
+    depth: bool = True,
+    imu: bool = False,
+    centre_line: bool = False,
+    seen: torch.Tensor | None = None,
+    clear_mask: torch.Tensor | None = None,
+    max_depth: float = 10.0,
+) -> Observation:
     """What training needs of a view, in one pass: a fused form of :func:`render` and the sensors of
     :mod:`~megastep.modules`.
 
-    Args: ``subsample`` rays to a pixel, a divisor of res; ``seen`` (N, A, n_words) int32, a bit for
-    each static texel of the world's layout, updated in place; ``clear_mask`` (N, A) bool, clears
-    ``seen`` first; ``max_depth`` metres. With one agent a world, ``scenery.lines`` is left as it
-    was. Returns an :class:`Observation`.
+    Args: ``subsample`` rays per pixel, a divisor of res; ``seen`` (N, A, n_words) int32, a bit for
+    each static texel of the environment's layout, updated in place; ``clear_mask`` (N, A) bool,
+    where ``seen`` is cleared first; ``max_depth`` metres. With one agent per environment,
+    ``scenery.lines`` is left as it was.
     """
-    if not 1 <= subsample <= 32 or agents.res % subsample:
+    n, a = lanes = _lanes(scenery, agents)
+    on = scenery.device
+    if agents.res % checks.integer("subsample", subsample, 1, MAX_SUBSAMPLE):
         raise ValueError(
-            f"subsample must be at most 32 and divide the {agents.res} rays of a camera, but "
-            f"{subsample} was given"
+            f"subsample must divide the {agents.res} rays of a camera, but {subsample} was given"
         )
-    if not max_depth > 0:
-        raise ValueError(
-            f"max_depth must be a positive number of metres, but {max_depth} was given"
-        )
-    n, a, where = scenery.n_envs, scenery.n_agents, scenery.device
+    checks.number("max_depth", max_depth, 0, math.inf, "metres")
+    for name, value in (("rgb", rgb), ("depth", depth), ("imu", imu), ("centre_line", centre_line)):
+        checks.flag(name, value)
+    seen_fields = {} if seen is None and clear_mask is None else _seen(scenery, seen, clear_mask)
     if a > 1:
         update_agent_geometry(scenery, agents, lit=rgb)
-    shape, pixels = _cameras(scenery, agents), agents.res // subsample
+    shape, pixels = _per_camera(lanes, agents), agents.res // subsample
+    half, int32 = torch.float16, torch.int32
     out = Observation(
-        rgb=torch.empty((*shape, 3, pixels), dtype=torch.float16, device=where) if rgb else None,
-        depth=torch.empty((*shape, pixels), dtype=torch.float16, device=where) if depth else None,
-        centre_line=torch.empty(shape, dtype=torch.int32, device=where) if centre_line else None,
-        imu=torch.empty((n, a, 3), dtype=torch.float16, device=where) if imu else None,
-        newly_seen=torch.empty((n, a), dtype=torch.int32, device=where)
-        if seen is not None
-        else None,
+        rgb=torch.empty((*shape, 3, pixels), dtype=half, device=on) if rgb else None,
+        depth=torch.empty((*shape, pixels), dtype=half, device=on) if depth else None,
+        centre_line=torch.empty(shape, dtype=int32, device=on) if centre_line else None,
+        imu=torch.empty((n, a, 3), dtype=half, device=on) if imu else None,
+        newly_seen=torch.empty(lanes, dtype=int32, device=on) if seen_fields else None,
     )
-    words = 0 if seen is None else seen.shape[-1]
-    most = scenery.layouts.max_texels
-    if seen is not None and 32 * words < most:
-        raise ValueError(
-            f"seen must have a bit for each of a layout's texels, so at least {-(-most // 32)} "
-            f"words an agent, "
-            f"but it has {words}"
-        )
-    _render(
-        scenery,
-        agents,
-        subsample,
-        max_depth,
-        n_words=words,
-        **_state(scenery, agents, "velocity", "angvelocity"),
-        seen=_pointer("seen", seen, (n, a, words), torch.int32, where),
-        clear_mask=_pointer("clear_mask", clear_mask, (n, a), torch.bool, where),
-        **out._asdict(),
-    )
+    moving = state_params(scenery, agents, "velocity", "angvelocity") if imu else {}
+    _render(scenery, agents, subsample, max_depth, **moving, **seen_fields, **out._asdict())
     return out
 
 
-def spawn(scenery, agents, mask, points, counts, seed, resample=False):
-    """Puts agents at random points of their world's layout, at rest, looking anywhere: one Philox
-    draw each.
+def _seen(scenery, seen, clear_mask):
+    """The addresses of the texels seen and of the mask that clears them."""
+    lanes, on = (scenery.n_envs, scenery.n_agents), scenery.device
+    if seen is None:
+        raise ValueError("clear_mask clears seen, but seen was not given")
+    needed = -(-scenery.layouts.max_texels // 32)
+    n_words = checks.length("seen", seen, axis=-1)
+    if n_words < needed:
+        raise ValueError(
+            f"seen must have a bit for each of a layout's texels, so at least {needed} words per "
+            f"agent, but it has {n_words}"
+        )
+    mask = 0
+    if clear_mask is not None:
+        mask = checks.address("clear_mask", clear_mask, lanes, torch.bool, on)
+    at = checks.address("seen", seen, (*lanes, n_words), torch.int32, on)
+    return dict(seen=at, clear_mask=mask, n_words=n_words)
 
-    Args: ``mask`` (N, A) bool, who; ``points`` (D, n, 2), of which the agents of one world have n /
-    A each; ``counts`` (N, A) int32, draws made so far, advanced here; ``resample``: a world all of
-    whose agents respawn moves to a random layout first.
+
+def spawn(
+    scenery: Scenery,
+    agents: Agents,
+    mask: torch.Tensor,
+    points: torch.Tensor,
+    counts: torch.Tensor,
+    seed: int,
+    resample: bool = False,
+) -> None:
+    """Puts agents at random points of their environment's layout, at rest, looking anywhere. Each
+    draws once from its random stream.
+
+    Args: ``mask`` (N, A) bool, who; ``points`` (D, n, 2), of which the agents of one environment
+    have n / A each; ``counts`` (N, A) int32, numbers drawn so far, advanced here; ``resample``: an
+    environment whose agents all respawn moves to a random layout first.
     """
-    where, lanes = scenery.device, (scenery.n_envs, scenery.n_agents)
-    n_layouts, n_points = len(scenery.layouts), points.shape[1]
+    lanes, on, n_layouts = _lanes(scenery, agents), scenery.device, len(scenery.layouts)
+    n_points = checks.length("points", points, axis=1)
     if n_points < scenery.n_agents:
         raise ValueError(
-            f"{scenery.n_agents} agents need at least as many points, but {n_points} a layout "
-            f"were given"
+            f"points must be at least as many per layout as there are agents, so "
+            f"{scenery.n_agents}, but {n_points} were given"
         )
     packed = params.SpawnParams(
-        scenery=_scenery_params(scenery, agents.radius),
-        **_state(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
-        mask=_pointer("mask", mask, lanes, torch.bool, where),
-        points=_pointer("points", points, (n_layouts, n_points, 2), torch.float32, where),
-        counts=_pointer("counts", counts, lanes, torch.int32, where),
-        error_flag=agents.error_flag.data_ptr(),
-        key0=seed & 0xFFFFFFFF,
-        key1=seed >> 32 & 0xFFFFFFFF,
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+        mask=checks.address("mask", mask, lanes, torch.bool, on),
+        points=checks.address("points", points, (n_layouts, n_points, 2), torch.float32, on),
+        counts=checks.address("counts", counts, lanes, torch.int32, on),
+        error_flag=error_flag(scenery, agents),
+        **_keys(seed),
         n_points=n_points,
-        resample=int(resample),
+        resample=int(checks.flag("resample", resample)),
     )
-    launch("spawn", packed, where, threads=scenery.n_envs)
-    _checked(agents)
+    launch("spawn", packed, on, threads=scenery.n_envs)
+    _check_on_cpu(agents)
 
 
-def uniform(counts, mask, seed, out):
-    """Uniform numbers in [0, 1), four a lane: Philox 4x32-10 with key ``seed`` and counter (lane,
-    count).
+def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tensor) -> torch.Tensor:
+    """Uniform numbers in [0, 1), four per lane: Philox 4x32-10 with key ``seed`` and counter (lane,
+    count). Returns ``out``.
 
-    Args: ``counts`` (B,) int32, draws each lane has made, advanced by one where ``mask`` (B,) bool;
-    ``out`` (B, 4), written where ``mask``.
+    Args: ``counts`` (B,) int32, numbers each lane has drawn, advanced by one where ``mask`` (B,)
+    bool; ``out`` (B, 4), written where ``mask``.
     """
-    n, where = len(counts), out.device
+    n, on = checks.length("counts", counts), counts.device
     packed = params.UniformParams(
-        counts=_pointer("counts", counts, (n,), torch.int32, where),
-        mask=_pointer("mask", mask, (n,), torch.bool, where),
-        out=_pointer("out", out, (n, 4), torch.float32, where),
-        key0=seed & 0xFFFFFFFF,
-        key1=seed >> 32 & 0xFFFFFFFF,
+        counts=checks.address("counts", counts, (n,), torch.int32, on),
+        mask=checks.address("mask", mask, (n,), torch.bool, on),
+        out=checks.address("out", out, (n, 4), torch.float32, on),
+        **_keys(seed),
         n_lanes=n,
         n_threads=torch.get_num_threads(),
     )
-    launch("uniform", packed, where, threads=n)
+    launch("uniform", packed, on, threads=n)
     counts.add_(mask)
     return out
+
+
+def _keys(seed):
+    """A seed's two words."""
+    seed = checks.integer("seed", seed, 0, 2**64 - 1)
+    return dict(key0=seed & 0xFFFFFFFF, key1=seed >> 32)

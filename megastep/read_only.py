@@ -6,6 +6,8 @@ import numpy as np
 import torch
 from torch.utils._pytree import tree_leaves, tree_map_only
 
+__all__ = ["ReadOnlyTensor", "SetOnce"]
+
 _WRITING = ("__setitem__", "__delitem__", "__set__", "__delete__")
 
 

@@ -1,17 +1,20 @@
 """From geometries to scenery: textures, lights, agents' models, baked light."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import torch
 
-from . import engine
+from . import checks, engine
 from .colour import gamma_decode
 from .ragged import Ragged
 from .scenery import Layouts, Scenery
 
 __all__ = ["TEXEL", "agent_model", "display", "scenery", "texel_widths", "wall_textures"]
 
-TEXEL = 0.05  # metres a texel
-STRIPE = (0.4, 2.0)  # metres, shortest and longest period of a wall's pattern
+TEXEL = 0.05  # metres per texel
+STRIPE = (0.4, 2.0)  # metres, min and max of the period of a wall's pattern
 INTENSITY = (0.5, 1.6)  # of lights
 PALETTE = (
     "d9b08c",
@@ -38,13 +41,13 @@ def _linear(palette):
     )
 
 
-def texel_widths(lines):
+def texel_widths(lines: np.ndarray) -> np.ndarray:
     """(L,) how many texels of 5 cm lines (L, 2, 2) need, at least one."""
     lengths = np.linalg.norm(lines[:, 1].astype(float) - lines[:, 0], axis=-1)
     return np.maximum(np.ceil(lengths / TEXEL - 1e-3), 1).astype(np.int64)
 
 
-def agent_model(width=engine.AGENT_WIDTH):
+def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
     """(8, 2, 2) lines of an octagon in a square of ``width`` metres, its front (+x) the third."""
     w, h = width / 2, width / 4
     corners = np.array(
@@ -54,8 +57,8 @@ def agent_model(width=engine.AGENT_WIDTH):
 
 
 def _agent_textures(n_agents, model):
-    """(K, 3) colours of a world's agents, and (A M,) texels a line: a colour an agent, and a red
-    front.
+    """(K, 3) colours of an environment's agents, and (A M,) texels per line: a colour for each
+    agent, and a red front.
     """
     widths = texel_widths(model)
     bodies, front = _linear(AGENT_PALETTE), _linear([FRONT])[0]
@@ -65,14 +68,14 @@ def _agent_textures(n_agents, model):
     return np.repeat(colours.reshape(-1, 3), widths, 0), widths
 
 
-def wall_textures(widths, random):
-    """(T, 3) texels of walls that have ``widths`` (W,) texels each: two colours a wall, in stripes
-    of random period, phase and share.
+def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """(T, 3) texels of walls that have ``widths`` (W,) texels each: two colours per wall, in
+    stripes of random period, phase and duty cycle.
     """
     n, palette = len(widths), _linear(PALETTE)
     base = palette[random.integers(len(palette), size=n)] * random.uniform(0.6, 1.0, (n, 1))
     stripe = palette[random.integers(len(palette), size=n)] * random.uniform(0.2, 0.8, (n, 1))
-    period, phase, share = (
+    period, phase, duty = (
         random.uniform(*STRIPE, n),
         random.uniform(0, 1, n),
         random.uniform(0.1, 0.5, n),
@@ -80,7 +83,7 @@ def wall_textures(widths, random):
     wall = np.repeat(np.arange(n), widths)
     along = (np.arange(len(wall)) - (widths.cumsum() - widths)[wall] + 0.5) * TEXEL
     turns = along / period[wall] + phase[wall]
-    striped = turns - np.floor(turns) < share[wall]
+    striped = turns - np.floor(turns) < duty[wall]
     return np.concatenate([base, stripe]).astype(np.float32)[wall + n * striped]
 
 
@@ -95,60 +98,78 @@ def _near_together(walls):
     return walls[np.argsort(order, kind="stable")]
 
 
-def scenery(geometries, n_agents=1, n_envs=None, seed=1, device=None):
-    """Baked :class:`~megastep.scenery.Scenery` of ``n_envs`` worlds (default: one a geometry);
-    world e shows geometry ``e % len(geometries)``.
+def _part(geometries, name, shape):
+    """That part of all geometries as arrays; ValueError, naming it, if one is no such array."""
+    found = []
+    for i, g in enumerate(geometries):
+        try:
+            array = np.asarray(getattr(g, name, None), float)
+            fits = array.size == 0 or (
+                array.shape[1:] == shape and bool((np.abs(array) < checks.LIMIT).all())
+            )
+        except (TypeError, ValueError):
+            fits = False
+        if not fits:
+            raise ValueError(
+                f"geometries[{i}].{name} must be an array of numbers below {checks.LIMIT:g} of "
+                f"shape {('n', *shape)}: make geometries with megastep.toys or "
+                f"megastep.geometries.sample"
+            )
+        found.append(np.reshape(getattr(g, name), (-1, *shape)))
+    return found
+
+
+def scenery(
+    geometries: Sequence,
+    n_agents: int = 1,
+    n_envs: int | None = None,
+    seed: int = 1,
+    device: Any = None,
+) -> Scenery:
+    """Baked :class:`~megastep.scenery.Scenery` of ``n_envs`` environments (default: one per
+    geometry); environment e starts with geometry ``e % len(geometries)``.
 
     Each geometry is one layout, with textures and light intensities of its own drawn from ``seed``;
     the same geometry given twice is two layouts. ``device`` is as in
-    :func:`~megastep.engine.device`. ValueError without geometries; EngineError if the worlds do not
-    fit into memory.
+    :func:`~megastep.engine.device`. ValueError, naming the argument, if one does not fit;
+    EngineError if the environments do not fit into memory.
     """
-    geometries = list(geometries)
-    n_envs = len(geometries) if n_envs is None else n_envs
-    if not geometries or n_envs < 1 or n_agents < 0:
-        raise ValueError(
-            f"scenery needs at least one geometry and one environment, but {len(geometries)} and "
-            f"{n_envs} were "
-            f"given (and {n_agents} agents)"
-        )
-    device = engine.device(device or "auto") if not isinstance(device, torch.device) else device
+    geometries = checks.items("geometries", geometries)
+    n_agents = checks.integer("n_agents", n_agents, 0)
+    n_envs = checks.integer("n_envs", len(geometries) if n_envs is None else n_envs, 1)
+    random = np.random.Generator(np.random.Philox(checks.integer("seed", seed, 0)))
+    if not isinstance(device, torch.device):
+        device = engine.device("auto" if device is None else device)
     model = agent_model()
     agent_textures, model_widths = _agent_textures(n_agents, model)
     engine.fit(n_envs, 20 * n_agents * len(model) + 4 * len(agent_textures) + 64, device)
 
-    random = np.random.Generator(np.random.Philox(seed))
-    walls = np.concatenate(
-        [_near_together(np.reshape(g.walls, (-1, 2, 2))) for g in geometries]
-    ).astype(np.float32)
+    wall_parts, light_parts = _part(geometries, "walls", (2, 2)), _part(geometries, "lights", (2,))
+    walls = np.concatenate([_near_together(part) for part in wall_parts]).astype(np.float32)
     widths = texel_widths(walls)
-    positions = np.concatenate([np.reshape(g.lights, (-1, 2)) for g in geometries])
+    positions = np.concatenate(light_parts)
     lights = np.concatenate([positions, random.uniform(*INTENSITY, (len(positions), 1))], 1).astype(
         np.float32
     )
     layouts = Layouts(
-        lines=Ragged(torch.as_tensor(walls), torch.tensor([len(g.walls) for g in geometries])),
+        lines=Ragged(torch.as_tensor(walls), torch.tensor([len(part) for part in wall_parts])),
         textures=Ragged(torch.as_tensor(wall_textures(widths, random)), torch.as_tensor(widths)),
-        lights=Ragged(torch.as_tensor(lights), torch.tensor([len(g.lights) for g in geometries])),
+        lights=Ragged(torch.as_tensor(lights), torch.tensor([len(part) for part in light_parts])),
         agent_textures=torch.as_tensor(agent_textures, dtype=torch.float32).repeat(
             len(geometries), 1, 1
         ),
         device=device,
     )
     made = Scenery.of_layouts(
-        n_agents,
-        layouts,
-        torch.as_tensor(model),
-        torch.as_tensor(model_widths),
-        torch.arange(n_envs) % len(geometries),
+        n_agents, layouts, model, model_widths, torch.arange(n_envs) % len(geometries)
     )
     engine.bake(made)
     return made
 
 
-def display(scenery, e=0, ax=None):
-    """Draws world ``e`` in its lit colours, with its lights and agents. Returns the matplotlib
-    axes.
+def display(scenery: Scenery, e: int = 0, ax: Any = None) -> Any:
+    """Draws environment ``e`` in its lit colours, with its lights and agents. Returns the
+    matplotlib axes.
     """
     from . import plotting
 

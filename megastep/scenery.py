@@ -18,12 +18,9 @@ from .ragged import Ragged
 from .read_only import ReadOnlyTensor, SetOnce
 from .scenery_views import JoinedRagged
 
+__all__ = ["Layouts", "Scenery"]
+
 BOX = 32  # walls per bounding box, as the kernels have it: one for each lane of a warp
-_TABLE = (
-    "the tables of scenery are read-only, because the kernels find walls and texels by them: make "
-    "another Scenery for other widths"
-)
-_MODEL = "scenery.model is read-only: make another Scenery for another model"
 
 
 class Layouts(SetOnce):
@@ -45,39 +42,46 @@ class Layouts(SetOnce):
         lines = checks.ragged("lines", lines, ("W", 2, 2), device)
         textures = checks.ragged("textures", textures, ("T", 3), device)
         lights = checks.ragged("lights", lights, ("l", 3), device)
-        n_layouts = len(lines)
-        if not n_layouts:
+        self.n_layouts = len(lines)
+        if not self.n_layouts:
             raise ValueError(
                 "lines must have the walls of at least one layout, but none were given"
             )
-        _same("textures", "one subarray per wall", len(lines.vals), len(textures))
-        _same("lights", "one subarray per layout", n_layouts, len(lights))
+        _same("textures", "one subarray per wall of lines", len(lines.vals), len(textures))
+        _same("lights", "one subarray per layout of lines", self.n_layouts, len(lights))
         if len(textures) and int(textures.widths.min()) < 1:
             raise ValueError("textures must have at least one texel per wall, but one has none")
         self.agent_textures = checks.floats(
-            "agent_textures", agent_textures, (n_layouts, "K", 3), device
+            "agent_textures", agent_textures, (self.n_layouts, "K", 3), device
         )
-        self.lines, self.lights = (_of_fixed_widths(r.vals, r.widths) for r in (lines, lights))
+        self.lines = _of_fixed_widths("lines", lines.vals, lines.widths)
+        self.lights = _of_fixed_widths("lights", lights.vals, lights.widths)
         light = torch.ones((len(textures.vals), 1), device=device)
         self.texels = torch.cat([textures.vals, light], 1)
-        self.textures = _of_fixed_widths(self.texels[:, :3], textures.widths)
-        self.baked = _of_fixed_widths(self.texels[:, 3], textures.widths)
-        self.wall_starts, self.light_starts, self.texel_starts, self.box_starts = (
-            _starts(widths)
-            for widths in (lines.widths, lights.widths, textures.widths, -(-lines.widths // BOX))
+        self.textures = _of_fixed_widths("textures", self.texels[:, :3], textures.widths)
+        self.baked = _of_fixed_widths("baked", self.texels[:, 3], textures.widths)
+        self.wall_starts = _starts("wall_starts", lines.widths)
+        self.light_starts = _starts("light_starts", lights.widths)
+        self.texel_starts = _starts("texel_starts", textures.widths)
+        self.box_starts = _starts("box_starts", -(-lines.widths // BOX))
+        self.n_walls, self.n_texels, self.n_lights = (
+            len(r.vals) for r in (lines, textures, lights)
         )
         self._boxes = torch.empty((int(self.box_starts[-1]), 4), device=device)
         self.update_bounding_boxes()
 
     def __len__(self):
-        return len(self.lines)
+        return self.n_layouts
 
     @property
     def boxes(self) -> torch.Tensor:
         """(b, 4) min x, min y, max x, max y around every 32 walls of a layout, which let the GPU
         skip what cannot be seen or met. Read-only.
         """
-        return ReadOnlyTensor(self._boxes, "boxes follow the walls: call bake after moving them")
+        return ReadOnlyTensor(
+            self._boxes,
+            "boxes are read-only: they follow the walls, so call bake after moving them",
+        )
 
     def update_bounding_boxes(self) -> None:
         """Fits ``boxes`` to where the walls are now, in place. ``bake`` does it too."""
@@ -126,7 +130,7 @@ class Scenery(SetOnce):
         textures = checks.ragged("textures", textures, ("T", 3), device)
         model = checks.floats("model", model, ("M", 2, 2), device)
         n, own = len(lines), n_agents * len(model)
-        _same("textures", "one subarray per line", len(lines.vals), len(textures))
+        _same("textures", "one subarray per line of lines", len(lines.vals), len(textures))
         if not n or int(lines.widths.min()) < own:
             fewest = int(lines.widths.min()) if n else 0
             raise ValueError(
@@ -173,14 +177,10 @@ class Scenery(SetOnce):
         _same("model_widths", "widths that add up to agent_textures'", n_texels, int(widths.sum()))
         if not len(layout):
             raise ValueError("layout must have at least one environment, but none was given")
-        self.n_agents, self.n_envs, self.layouts, self.device = (
-            n_agents,
-            len(layout),
-            layouts,
-            device,
-        )
-        self.model = ReadOnlyTensor(model.clone(), _MODEL)
-        self.model_texels = _starts(widths)
+        self.n_envs, self.n_agents, self.n_agent_texels = len(layout), n_agents, n_texels
+        self.layouts, self.device = layouts, device
+        self.model = _fixed("model", model.clone())
+        self.model_texels = _starts("model_texels", widths)
         self.layout = layout.to(torch.int32)
         self.agent_lines = model.repeat(self.n_envs, n_agents, 1, 1)
         self.agent_light = torch.ones((self.n_envs, n_texels), device=device)
@@ -236,11 +236,17 @@ def _widths(bounds):
     return [last - first for first, last in zip(bounds, bounds[1:])]
 
 
-def _of_fixed_widths(vals, widths):
-    return Ragged(vals, ReadOnlyTensor(widths.clone(), _TABLE))
+def _fixed(name, tensor):
+    return ReadOnlyTensor(
+        tensor, f"{name} is read-only, because all else is laid out by it: make another Scenery"
+    )
 
 
-def _starts(widths):
+def _of_fixed_widths(name, vals, widths):
+    return Ragged(vals, _fixed(f"{name}.widths", widths.clone()))
+
+
+def _starts(name, widths):
     """(n + 1,) int32: where each subarray starts, and where the last ends."""
     ends = widths.cumsum(0)
     if len(ends) and int(ends[-1]) >= 2**31:
@@ -248,4 +254,4 @@ def _starts(widths):
             f"scenery holds at most 2,147,483,647 walls and texels of each kind, but "
             f"{int(ends[-1])} were given: use fewer layouts"
         )
-    return ReadOnlyTensor(torch.cat([ends.new_zeros(1), ends]).to(torch.int32), _TABLE)
+    return _fixed(name, torch.cat([ends.new_zeros(1), ends]).to(torch.int32))

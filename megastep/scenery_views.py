@@ -11,6 +11,8 @@ import torch
 from .ragged import Ragged, RaggedNumpy, RaggedTorch
 from .read_only import ReadOnlyTensor
 
+__all__ = ["JoinedRagged", "baked", "lights", "lines", "textures"]
+
 _SHARED = "which reaches every environment that shows the layout"
 LINES = (
     "scenery.lines is a read-only copy: write walls into scenery.layouts.lines, "

@@ -14,6 +14,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+import wall_courses
 import walls
 
 from megastep import engine
@@ -60,9 +61,9 @@ def main():
         print(f"check_walls.py: {error}", file=sys.stderr)
         return 2
     n_agents = args.agents or (2048 if device.type == "cpu" else 1 << 20)
-    steps = -(-int(args.steps) // len(walls.COURSES))
+    steps = -(-int(args.steps) // len(wall_courses.COURSES))
     start, sums, descriptions = time.time(), {}, []
-    for name in walls.COURSES:
+    for name in wall_courses.COURSES:
         began = last = time.time()
 
         def report(total, name=name, began=began):

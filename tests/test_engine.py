@@ -1,5 +1,5 @@
 """The engine against the laws: the original's golden outputs, the brute-force twin on random
-environments, and the CPU against the GPU bit by bit.
+environments, and the CPU against the GPU bit by bit. Outputs are poisoned first.
 """
 
 import math
@@ -10,9 +10,9 @@ import pytest
 import random_scenery
 import torch
 
-from megastep import cuda, engine, scene, toys
+from megastep import cuda, devices, engine, scene, toys
 from megastep.geometries import sample
-from megastep.modules import RGB, Depth, RandomSpawns
+from megastep.modules import IMU, RGB, Depth, RandomSpawns
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 HAS_GPU = torch.cuda.is_available()
@@ -25,18 +25,57 @@ def device(request):
     return request.param
 
 
-def core_of(world, device, **settings):
-    """A Core that holds a test's world."""
-    core = cuda.Core(cuda.Scenery(**world.scenery_arguments(), device=device), **settings)
+def core_of(envs, device, **settings):
+    """A Core of a test's environments."""
+    core = cuda.Core(cuda.Scenery(**envs.scenery_arguments(), device=device), **settings)
     for name in ("positions", "angles", "velocity", "angvelocity"):
-        getattr(core.agents, name).copy_(getattr(world, name))
+        getattr(core.agents, name).copy_(getattr(envs, name))
     return core
 
 
-def poison():
-    """Fills the allocator's next blocks with NaN, so that an output that is not written shows."""
-    for size in (1 << 10, 1 << 14, 1 << 18):
-        torch.full((size,), math.nan)
+# Bits that no kernel writes: NaNs that are not its own, and an integer that is no index or count.
+POISON = {torch.float32: 0x7FC0DEAD, torch.float16: 0x7EAD, torch.int32: -0x21524111}
+
+
+def bits(tensor):
+    return tensor.view(torch.int16 if tensor.dtype == torch.float16 else torch.int32)
+
+
+class Poison:
+    """Fills memory that the engine is to write with bits of its own, and finds what is left of
+    them.
+    """
+
+    def __init__(self, empty):
+        self.empty = empty
+
+    def allocate(self, *args, **kwargs):
+        """Stands in for torch.empty."""
+        made = self.empty(*args, **kwargs)
+        bits(made).fill_(POISON[made.dtype])
+        return made
+
+    def scenery(self, scenery):
+        """Poisons what render writes into a scenery."""
+        for tensor in (scenery.agent_lines, scenery.agent_light):
+            bits(tensor).fill_(POISON[tensor.dtype])
+
+    def check(self, **outputs):
+        """Asserts that all of these tensors were written."""
+        left = {
+            name: int((bits(tensor) == POISON[tensor.dtype]).sum())
+            for name, tensor in outputs.items()
+            if tensor is not None
+        }
+        unwritten = [f"{name}: {n}" for name, n in left.items() if n]
+        assert not unwritten, f"elements that no kernel wrote: {', '.join(unwritten)}"
+
+
+@pytest.fixture
+def poison(monkeypatch):
+    found = Poison(torch.empty)
+    monkeypatch.setattr(torch, "empty", found.allocate)
+    return found
 
 
 def state_of(core, physics):
@@ -50,20 +89,32 @@ def state_of(core, physics):
     )
 
 
+def baked_and_rendered(core, poison):
+    """A render's fields, after a bake; all that either must write was poisoned."""
+    baked = core.scenery.layouts.baked.vals
+    baked.fill_(math.nan)
+    cuda.bake(core.scenery)
+    assert not baked.isnan().any(), "light that bake did not write"
+    poison.scenery(core.scenery)
+    r = cuda.render(core.scenery, core.agents)._asdict()
+    poison.check(**r, lines=core.scenery.agent_lines, light=core.scenery.agent_light)
+    return r
+
+
 # ---- Golden: what the original computed, within the tolerances its README gives ----
 
 
 @pytest.mark.parametrize("case", random_scenery.CASES)
-def test_golden(case, device):
-    world, settings, _ = random_scenery.golden(case)
-    core = core_of(world, device, **settings)
-    cuda.bake(core.scenery)
-    poison()
-    r = cuda.render(core.scenery, core.agents)._asdict()
+def test_golden(case, device, poison):
+    envs, settings, _ = random_scenery.golden(case)
+    core = core_of(envs, device, **settings)
+    r = baked_and_rendered(core, poison)
     compare.check_golden(
         case, dict(r, lines=core.scenery.lines.vals, baked=core.scenery.baked.vals)
     )
-    compare.check_golden(case, state_of(core, cuda.physics(core.scenery, core.agents)))
+    physics = cuda.physics(core.scenery, core.agents)
+    poison.check(**physics._asdict())
+    compare.check_golden(case, state_of(core, physics))
 
 
 # ---- The twin: random environments, all degenerate cases ----
@@ -81,9 +132,9 @@ VIEWS = [
 @pytest.mark.parametrize("n_agents", [1, 4])
 @pytest.mark.parametrize("view", VIEWS, ids=str)
 @pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
-def test_twin_sight(view, n_agents, degenerate, device):
+def test_twin_render(view, n_agents, degenerate, device, poison):
     for seed in range(2):
-        world = random_scenery.random_environments(
+        envs = random_scenery.random_environments(
             seed,
             n_agents=n_agents,
             degenerate=degenerate,
@@ -91,29 +142,42 @@ def test_twin_sight(view, n_agents, degenerate, device):
             fov=view["fov"],
             origin=190.0 if seed else 1.0,
         )
-        core = core_of(world, device, **view)
-        cuda.bake(core.scenery)
-        poison()
-        r = cuda.render(core.scenery, core.agents)._asdict()
-        compare.check_render(r, world, **view)
-        compare.check_baked(core.scenery.baked.vals, world, static_only=False)
+        core = core_of(envs, device, **view)
+        r = baked_and_rendered(core, poison)
+        compare.check_render(r, envs, **view)
+        compare.check_baked(core.scenery.baked.vals, envs, static_only=False)
 
 
 @pytest.mark.parametrize("n_agents", [1, 4])
 @pytest.mark.parametrize("name", [None, *random_scenery.DEGENERATE, "overlap"])
-def test_twin_physics(name, n_agents, device):
+def test_twin_physics(name, n_agents, device, poison):
     for seed in range(6):
-        world = random_scenery.random_environments(
+        envs = random_scenery.random_environments(
             seed,
             n_envs=16,
             n_agents=n_agents,
             degenerate=(name,) if name else (),
             origin=190.0 if seed % 2 else 1.0,
         )
-        core = core_of(world, device)
-        poison()
+        core = core_of(envs, device)
         physics = cuda.physics(core.scenery, core.agents)
-        compare.check_physics(state_of(core, physics), world)
+        poison.check(**physics._asdict())
+        compare.check_physics(state_of(core, physics), envs)
+
+
+def test_an_output_that_is_not_written_is_named(poison, monkeypatch):
+    """What the checks above would say of kernels that write nothing."""
+    core = core_of(random_scenery.random_environments(0), "cpu")
+    monkeypatch.setattr(engine, "launch", lambda *args, **kwargs: None)
+    outputs = [
+        cuda.render(core.scenery, core.agents),
+        cuda.physics(core.scenery, core.agents),
+        engine.observe(core.scenery, core.agents, imu=True, centre_line=True, seen=seen_of(core)),
+    ]
+    for output in outputs:
+        for name, tensor in output._asdict().items():
+            with pytest.raises(AssertionError, match=f"wrote: {name}: {tensor.numel()}$"):
+                poison.check(**{name: tensor})
 
 
 # ---- The fused pass is the composition of the public pieces ----
@@ -121,16 +185,15 @@ def test_twin_physics(name, n_agents, device):
 
 @pytest.mark.parametrize("n_agents", [1, 3])
 @pytest.mark.parametrize("subsample", [1, 4])
-def test_observe_composes(n_agents, subsample, device):
-    world = random_scenery.random_environments(
+def test_observe_composes(n_agents, subsample, device, poison):
+    envs = random_scenery.random_environments(
         5, n_envs=8, n_agents=n_agents, degenerate=random_scenery.EVERYTHING, res=64
     )
-    core = core_of(world, device, res=64)
+    core = core_of(envs, device, res=64)
     cuda.bake(core.scenery)
-    seen = torch.zeros(
-        (8, n_agents, -(-core.scenery.layouts.max_texels // 32)), dtype=torch.int32, device=device
-    )
+    seen = seen_of(core)
     o = engine.observe(core.scenery, core.agents, subsample, imu=True, centre_line=True, seen=seen)
+    poison.check(**o._asdict())
     r = cuda.render(core.scenery, core.agents)
     # half a unit of fp16's last place, and the mean's rounding
     assert torch.allclose(o.rgb.float(), RGB(core, subsample)(r)[:, :, :, 0], atol=6e-4), "rgb"
@@ -138,6 +201,7 @@ def test_observe_composes(n_agents, subsample, device):
         "depth"
     )
     assert torch.equal(o.centre_line, r.indices[..., 32]), "centre_line"
+    assert torch.allclose(o.imu.float(), IMU(core)(), rtol=1e-3, atol=1e-6), "imu"
     assert torch.equal(bits_seen(core, r), seen), "seen"
     assert torch.equal(
         torch.tensor(
@@ -149,14 +213,20 @@ def test_observe_composes(n_agents, subsample, device):
     ), "newly_seen"
     again = engine.observe(core.scenery, core.agents, subsample, seen=seen)
     assert not again.newly_seen.any(), "a texel is new only once"
-    forgot = engine.observe(
+    cleared = engine.observe(
         core.scenery, core.agents, subsample, seen=seen, clear_mask=core.agent_full(True)
     )
-    assert torch.equal(forgot.newly_seen, o.newly_seen), "forgetting starts anew"
+    assert torch.equal(cleared.newly_seen, o.newly_seen), "a cleared mask starts anew"
+
+
+def seen_of(core):
+    """Room for the texels that each agent has seen."""
+    n_words = -(-core.scenery.layouts.max_texels // 32)
+    return torch.zeros((core.n_envs, core.n_agents, n_words), dtype=torch.int32, device=core.device)
 
 
 def bits_seen(core, r):
-    """What `seen` must hold after one look, from a full render, agent by agent."""
+    """What `seen` must hold after one view, from a full render, agent by agent."""
     scenery, layouts = core.scenery, core.scenery.layouts
     out = torch.zeros((core.n_envs, core.n_agents, -(-layouts.max_texels // 32)), dtype=torch.int64)
     own, starts = scenery.agent_lines.shape[1], layouts.texel_starts.tolist()
@@ -183,10 +253,7 @@ def trajectory(device, n_agents, subsample=1, **settings):
     """All tensors of a few steps in generated homes."""
     homes = sample("homes", 8)
     core = cuda.Core(scene.scenery(homes, n_agents, n_envs=24, device=device), **settings)
-    spawn, seen = RandomSpawns(homes, core), None
-    seen = torch.zeros(
-        (24, n_agents, -(-core.scenery.layouts.max_texels // 32)), dtype=torch.int32, device=device
-    )
+    spawn, seen = RandomSpawns(homes, core), seen_of(core)
     random = torch.Generator().manual_seed(1)
     moves = torch.tensor(
         [(0, 0, 0), (3, 0, 0), (0, 3, 40), (9, 1, -40)], dtype=torch.float32, device=device
@@ -306,7 +373,7 @@ def test_two_cores_live_side_by_side(device):
     assert before.screen.shape == (2, 1, 16, 3) and torch.equal(before.screen, after.screen)
 
 
-def test_designs_are_shared(device):
+def test_layouts_are_shared(device):
     scenery = scene.scenery([toys.box(), toys.column()], n_agents=1, n_envs=6, device=device)
     assert scenery.layout.tolist() == [0, 1, 0, 1, 0, 1] and len(scenery.layouts) == 2
     lines, textures, baked = scenery.lines, scenery.textures, scenery.baked
@@ -326,7 +393,7 @@ def test_designs_are_shared(device):
     )
 
 
-def test_draws_are_philox(device):
+def test_random_streams_are_philox(device):
     """Against the published vector for key 0, counter 0 (Random123's kat_vectors)."""
     counts = torch.zeros(1, dtype=torch.int32, device=device)
     out = engine.uniform(
@@ -354,18 +421,18 @@ def test_bad_settings_are_refused(settings):
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, math.nan, math.inf])
 def test_a_disc_needs_a_radius(radius):
-    with pytest.raises(ValueError, match="radius must be a positive number"):
+    with pytest.raises(ValueError, match="radius must be a number of metres above 0"):
         engine.Agents(1, 1, radius=radius)
 
 
 @pytest.mark.parametrize("max_depth", [0.0, -1.0, math.nan])
 def test_depth_needs_a_range(max_depth):
     core = box("cpu")
-    with pytest.raises(ValueError, match="max_depth must be a positive number"):
+    with pytest.raises(ValueError, match="max_depth must be a number of metres above 0"):
         engine.observe(core.scenery, core.agents, max_depth=max_depth)
 
 
-def test_a_position_that_is_no_number_is_named(device):
+def test_a_position_that_is_not_finite_is_named(device):
     core = box(device)
     core.agents.positions[1, 0, 0] = math.nan
     with pytest.raises(engine.EngineError, match="environment 1 .* not a finite number"):
@@ -376,22 +443,24 @@ def test_a_position_that_is_no_number_is_named(device):
     engine.check(core.agents)
 
 
-def test_wrong_tensors_are_named():
+@pytest.mark.parametrize(
+    "broken, found",
+    [
+        (lambda good: good.double(), r"a torch.float64 tensor of shape \(2, 1, 2\)"),
+        (lambda good: good[:1].clone(), r"a torch.float32 tensor of shape \(1, 1, 2\)"),
+        (lambda good: torch.stack([good, good], -1)[..., 0], "a non-contiguous torch.float32"),
+        (lambda good: None, "None was given"),
+    ],
+    ids=["dtype", "shape", "not contiguous", "None"],
+)
+def test_wrong_tensors_are_named(broken, found):
     core = box("cpu")
-    for broken in (
-        core.agents.positions.double(),
-        core.agents.positions[:1],
-        core.agents.positions.expand(2, 1, 2)
-        .transpose(0, 0)[:, :, [1, 0]]
-        .flip(2)
-        .mT.contiguous()
-        .mT,
-    ):
-        core.agents.positions = broken
-        if broken.is_contiguous() and broken.dtype == torch.float32 and broken.shape == (2, 1, 2):
-            continue
-        with pytest.raises(ValueError, match="agents.positions must be"):
-            cuda.render(core.scenery, core.agents)
+    good = core.agents.positions
+    core.agents.positions = broken(good)
+    with pytest.raises((TypeError, ValueError), match=f"agents.positions must be .*but {found}"):
+        cuda.render(core.scenery, core.agents)
+    core.agents.positions = good.clone()
+    cuda.render(core.scenery, core.agents)
 
 
 def test_unknown_devices_are_refused():
@@ -403,6 +472,6 @@ def test_unknown_devices_are_refused():
 
 
 def test_too_many_environments_are_counted(monkeypatch):
-    monkeypatch.setattr(engine, "free_memory", lambda device: 10**6)
+    monkeypatch.setattr(devices, "free_memory", lambda device: 10**6)
     with pytest.raises(engine.EngineError, match="at most [0-9,]+ fit"):
         scene.scenery([toys.box()], n_agents=1, n_envs=10**6, device="cpu")

@@ -10,15 +10,19 @@ import numpy as np
 import pytest
 import random_scenery
 import torch
+import wall_courses
+import wall_crossings
 import walls
+from wall_courses import BODY, COURSES, RADIUS, make_course
+from wall_crossings import crossed
 
 from megastep import core, engine, scene
 from megastep.dotdict import dotdict
 from megastep.modules import MomentumMovement
 
 STEPS = 10**7  # agent-steps of all courses
-SHARE = -(-STEPS // len(walls.COURSES))
-# the least share of steps that a wall or an agent stops, lest the walk be a stroll; some 0.65 are
+STEPS_PER_COURSE = -(-STEPS // len(COURSES))
+# the least fraction of steps that a wall or an agent stops, or the test is too easy; some 0.65 are
 STOPPED = 0.5
 ACUTE = dict(
     wedges=10, slivers=8, spokes=4, zigzags=4, crossing=8, fragments=8
@@ -32,37 +36,40 @@ def alone(*ends, n_envs=1, fps=10.0):
 
 
 def check(total, n_steps):
-    """Asserts that a run was long and hard enough, and that nobody passed, sank or stuck."""
+    """Asserts that a run was long and hard enough, and that no agent passed, sank or stuck."""
     assert total["steps"] >= n_steps and total["collisions"] >= STOPPED * total["steps"], total
-    faults = {key: total[key] for key in ("crossings", "sunk", "stuck")}
-    assert not any(faults.values()), f"{faults} in {total['steps']:,} steps: " + "; ".join(
-        total["stories"][:3]
+    failures = {key: total[key] for key in ("crossings", "sunk", "stuck")}
+    assert not any(failures.values()), f"{failures} in {total['steps']:,} steps: " + "; ".join(
+        total["descriptions"][:3]
     )
 
 
 # ---- The law ----
 
 
-@pytest.mark.parametrize("name", walls.COURSES)
+@pytest.mark.parametrize("name", COURSES)
 def test_no_agent_passes_a_wall_and_none_is_stuck(name):
-    total = walls.run(name, SHARE, 2048)
-    check(total, SHARE)
+    total = walls.run(name, STEPS_PER_COURSE, 2048)
+    check(total, STEPS_PER_COURSE)
     assert total["tried"] > 10_000 and total["held"] < 0.1 * total["tried"]
-    reached = sum(n > 0 for n in total["pinched"])
+    reached = sum(n > 0 for n in total["cornered"])
     assert reached >= ACUTE.get(name, 0), (
-        f"agents wedged themselves into the corners of {reached} layouts only"
+        f"agents reached the acute corners of {reached} layouts only"
     )
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("name", walls.COURSES)
+@pytest.mark.parametrize("name", COURSES)
 def test_no_agent_passes_a_wall_on_a_gpu(name):
-    check(walls.run(name, 10 * SHARE, 2**20, "cuda", seed=1, tries=256), 10 * SHARE)
+    check(
+        walls.run(name, 10 * STEPS_PER_COURSE, 2**20, "cuda", seed=1, tries=256),
+        10 * STEPS_PER_COURSE,
+    )
 
 
-def test_the_shares_make_ten_million_steps_at_the_rates_and_accelerations_asked_for():
+def test_the_courses_make_ten_million_steps_at_the_rates_and_accelerations_wanted():
     fps, accel = zip(*walls.SETTINGS)
-    assert SHARE * len(walls.COURSES) >= 10**7
+    assert STEPS_PER_COURSE * len(COURSES) >= 10**7
     assert (min(fps), max(fps), min(accel), max(accel)) == (1, 200, 1, 100)
     assert all(setting in walls.SETTINGS for setting in product((1, 200), (1, 100)))
     momentum = MomentumMovement(alone([(1, 1), (2, 1)], fps=1.0))
@@ -76,7 +83,7 @@ def test_a_disc_that_touches_a_slanted_wall_is_held():
     assert engine.physics(c.scenery, c.agents).progress.item() < 1e-3
 
 
-def test_an_agent_a_hair_from_a_wall_does_not_slip_through_along_it():
+def test_an_agent_that_all_but_touches_a_wall_does_not_slip_through_along_it():
     c = alone([(6, 1), (6, 6)], fps=1.0)
     c.agents.positions[:] = torch.tensor([5.999889850616455, 4.891547679901123])
     c.agents.velocity[:] = torch.tensor([0.004166539758443832, -40.0])
@@ -99,42 +106,42 @@ def test_steps_smaller_than_float32_resolves_do_not_add_up_to_a_way_into_a_wall(
     along = torch.tensor([math.cos(0.5), math.sin(0.5)])
     c = alone([(30, 30), (30 + 8 * along[0], 30 + 8 * along[1])], n_envs=64, fps=200.0)
     normal = side * torch.tensor([-along[1], along[0]])
-    c.agents.positions[:] = 30 + 4 * along + 1.001 * walls.BODY * normal
+    c.agents.positions[:] = 30 + 4 * along + 1.001 * BODY * normal
     way = torch.linspace(1e-6, 2e-5, 32)[
         :, None
-    ]  # metres a step; a unit in the last place is 1.9e-6 m there
+    ]  # metres per step; a unit in the last place is 1.9e-6 m there
     velocity = 200 * torch.cat(
         [way * (0.01 * normal + sign * along) for sign in (1, -1)]
-    )  # and ever so slightly away
+    )  # and very slightly away
     for _ in range(2000):
         c.agents.velocity[:, 0] = velocity
         engine.physics(c.scenery, c.agents)
-    assert ((c.agents.positions[:, 0] - 30) @ normal).min().item() > walls.RADIUS
+    assert ((c.agents.positions[:, 0] - 30) @ normal).min().item() > RADIUS
 
 
 # ---- Whether these tests can fail ----
 
 
-def ghosts(scenery, agents, *rest):
+def without_walls(scenery, agents, *rest):
     """Physics without walls."""
     agents.positions += agents.velocity / agents.fps
     return engine.Physics(torch.ones_like(agents.angles))
 
 
-def stones(scenery, agents, *rest):
-    """Physics in which nobody moves."""
+def without_motion(scenery, agents, *rest):
+    """Physics in which no agent moves."""
     return engine.Physics(torch.zeros_like(agents.angles))
 
 
-def test_ghosts_are_caught(monkeypatch):
-    monkeypatch.setattr(engine, "physics", ghosts)
+def test_agents_that_pass_walls_are_caught(monkeypatch):
+    monkeypatch.setattr(engine, "physics", without_walls)
     total = walls.run("box", 20_000, 512)
-    assert total["crossings"] > 0.05 * total["steps"] and "box at 1 fps" in total["stories"][0]
+    assert total["crossings"] > 0.05 * total["steps"] and "box at 1 fps" in total["descriptions"][0]
 
 
-def test_a_story_is_enough_to_cross_again(monkeypatch):
-    monkeypatch.setattr(engine, "physics", ghosts)
-    course = walls.ground("wedges")
+def test_the_description_of_a_crossing_is_enough_to_repeat_it(monkeypatch):
+    monkeypatch.setattr(engine, "physics", without_walls)
+    course = make_course("wedges")
     walk = walls.Walk(
         course,
         scene.scenery(course.geometries, 1, 48, device=torch.device("cpu")),
@@ -143,22 +150,20 @@ def test_a_story_is_enough_to_cross_again(monkeypatch):
         False,
         seed=3,
     )
-    walk.spell()
-    b, d, a = (~walk.notes[..., 0].isnan()).nonzero()[0].tolist()
-    note = dict(zip(walls.NOTED, walk.notes[b, d, a].tolist()))
+    walk.phase()
+    b, d, a = (~walk.records[..., 0].isnan()).nonzero()[0].tolist()
+    record = dict(zip(walls.RECORDED, walk.records[b, d, a].tolist()))
     before, after = (
-        torch.tensor([note[f"x {when}"], note[f"y {when}"]]) for when in ("before", "after")
+        torch.tensor([record[f"x {when}"], record[f"y {when}"]]) for when in ("before", "after")
     )
-    assert walls.crossed(
-        before.view(1, 1, 1, 2), after.view(1, 1, 1, 2), course.walls[d : d + 1]
-    ).all()
-    velocity = torch.tensor([note["velocity x"], note["velocity y"]])
+    assert crossed(before.view(1, 1, 1, 2), after.view(1, 1, 1, 2), course.walls[d : d + 1]).all()
+    velocity = torch.tensor([record["velocity x"], record["velocity y"]])
     assert torch.equal(before + velocity / walk.fps, after)
-    assert all(f"{x!r}" in walk.story()[0] for x in note.values())
+    assert all(f"{x!r}" in walk.describe_crossings()[0] for x in record.values())
 
 
-def test_stones_are_stuck(monkeypatch):
-    monkeypatch.setattr(engine, "physics", stones)
+def test_agents_that_cannot_move_are_stuck(monkeypatch):
+    monkeypatch.setattr(engine, "physics", without_motion)
     total = walls.run("box", 10_000, 256)
     assert (
         total["stuck"] > 0.3 * total["tried"]
@@ -185,26 +190,26 @@ def brute(p, q, a, b):
 
 
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
-def test_paths_are_judged_as_by_fractions(dense):
+def test_paths_cross_as_fractions_say(dense):
     """On a grid of four by four points they touch, lie in line and shrink to points; off it they
     cross or do not.
     """
-    draw = random_scenery.Draw(0)
-    grid = draw.pick(range(4), 3000, 4, 2)
-    fine = draw.uniform(0, 4, 1000, 4, 2).float().double()
+    random = random_scenery.RandomStream(0)
+    grid = random.pick(range(4), 3000, 4, 2)
+    fine = random.uniform(0, 4, 1000, 4, 2).float().double()
     cases = torch.cat(
         [grid, fine, fine * torch.tensor([1e-3, 1.0]) + torch.tensor([190.0, 0.0])]
     ).float()
     p, q, a, b = cases.unbind(1)
     right = torch.tensor([brute(*case) for case in cases.tolist()])
-    mine = walls.crossed(
-        p[None, :, None], q[None, :, None], torch.stack([a, b], 1)[:, None], dense
-    )[0, :, 0]
+    mine = crossed(p[None, :, None], q[None, :, None], torch.stack([a, b], 1)[:, None], dense)[
+        0, :, 0
+    ]
     assert torch.equal(mine, right) and 500 < right.sum() < 4500
 
 
-def test_a_world_of_few_walls_is_filled_up_with_what_nobody_meets():
-    course = walls.ground("remote")
+def test_a_layout_of_few_walls_is_filled_up_with_what_no_path_meets():
+    course = make_course("remote")
     filling = course.walls.isnan().all((-1, -2))
     assert filling.any() and torch.equal(filling.sum(1), len(filling[0]) - course.counts)
     everywhere = 200 * torch.rand(
@@ -212,51 +217,53 @@ def test_a_world_of_few_walls_is_filled_up_with_what_nobody_meets():
     )
     nothing = torch.where(filling[..., None, None], course.walls, math.nan)
     for dense in (False, True):
-        assert not walls.crossed(everywhere[:, :, 0], everywhere[:, :, 1], nothing, dense).any()
+        assert not crossed(everywhere[:, :, 0], everywhere[:, :, 1], nothing, dense).any()
 
 
 def test_chunks_do_not_matter(monkeypatch):
-    course, random = walls.ground("crossing"), torch.Generator().manual_seed(0)
+    course, random = make_course("crossing"), torch.Generator().manual_seed(0)
     before, after = (
         1 + 8 * torch.rand((40, len(course.walls), 3, 2), generator=random) for _ in range(2)
     )
-    whole = walls.crossed(before, after, course.walls)
-    monkeypatch.setitem(walls.PAIRS, "cpu", 1)
+    whole = crossed(before, after, course.walls)
+    monkeypatch.setitem(wall_crossings.MAX_PAIRS, "cpu", 1)
     assert (
-        torch.equal(walls.crossed(before, after, course.walls), whole)
-        and whole.any()
-        and not whole.all()
+        torch.equal(crossed(before, after, course.walls), whole) and whole.any() and not whole.all()
     )
 
 
-def test_agents_are_set_down_touching_overlapping_and_clear():
-    for name in walls.COURSES:
-        course = walls.ground(name)
+def test_agents_are_placed_touching_overlapping_and_clear():
+    for name in COURSES:
+        course = make_course(name)
         for layout in range(len(course.walls)):
             mine = course.walls[layout, : course.counts[layout]].double()
-            gap = walls.clearances(course.spots[layout].double(), mine).amin(1)
-            touching = (gap - walls.RADIUS).abs() < 2e-4
+            gap = wall_courses.clearances(course.spots[layout].double(), mine).amin(1)
+            touching = (gap - RADIUS).abs() < 2e-4
             assert (
-                gap.min() > walls.HAIR and (gap < walls.RADIUS - 1e-3).any() and touching.any()
+                gap.min() > wall_courses.MIN_GAP and (gap < RADIUS - 1e-3).any() and touching.any()
             ), name
-            assert (
-                torch.equal(course.clear[layout], gap > walls.BODY) and course.clear[layout].any()
-            ), name
+            assert torch.equal(course.clear[layout], gap > BODY) and course.clear[layout].any(), (
+                name
+            )
 
 
 @pytest.mark.parametrize(
     "shape, position, held",
     [
-        (walls.slit(0.1, 20.0), (1.5, 0.05), True),
-        (walls.slit(0.3, 0.0), (1.5, 0.1), False),
-        (walls.wedge(2.0, 0.0), (5.9, 0.0), False),
-        (walls.wedge(90.0, 0.0), (0.1, 0.0), False),
-        (walls.path([(-0.1, -0.1), (0.1, -0.1), (0.0, 0.1), (-0.1, -0.1)]), (0.0, 0.0), True),
+        (wall_courses.slit(0.1, 20.0), (1.5, 0.05), True),
+        (wall_courses.slit(0.3, 0.0), (1.5, 0.1), False),
+        (wall_courses.wedge(2.0, 0.0), (5.9, 0.0), False),
+        (wall_courses.wedge(90.0, 0.0), (0.1, 0.0), False),
+        (
+            wall_courses.path([(-0.1, -0.1), (0.1, -0.1), (0.0, 0.1), (-0.1, -0.1)]),
+            (0.0, 0.0),
+            True,
+        ),
     ],
     ids=["slit", "wide slit", "wedge", "corner", "cell"],
 )
 def test_geometry_holds_a_disc_in_a_slit_and_a_cell_but_not_in_a_corner(shape, position, held):
     if shape.shape[0] == 2 and held:
-        position = walls.turned([position], 20.0)[0]
+        position = wall_courses.turned([position], 20.0)[0]
     at = torch.tensor(position, dtype=torch.float64)
-    assert walls.hemmed(at, at.new_zeros((0, 2)), torch.as_tensor(shape)) == held
+    assert walls.held_by_geometry(at, at.new_zeros((0, 2)), torch.as_tensor(shape)) == held

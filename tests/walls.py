@@ -1,44 +1,26 @@
-"""No agent passes a wall and none is ever stuck: layouts that make it hard, agents that try, and
-checks that share nothing with the kernels.
+"""Agents that try to pass walls and, when stopped, to leave, on the courses of wall_courses.py.
+What comes of it is checked by wall_crossings.py, which shares nothing with the kernels.
 
 Axes: B copies of each of D layouts (environment e shows layout e % D, as in `scene.scenery`), A
-agents per environment, W walls of the largest layout; a smaller one is filled up with NaN, which
-meets nothing. Metres, degrees, seconds.
+agents per environment, W walls of the largest layout. Metres, degrees, seconds.
 """
 
 import math
-from dataclasses import dataclass
 
-import numpy as np
-import random_scenery
 import torch
+from wall_courses import BODY, RADIUS, make_course
+from wall_crossings import crossed, surroundings
 
 from megastep import core, engine, scene
-from megastep.dotdict import dotdict
-from megastep.geometries import sample
 from megastep.modules import MomentumMovement
 
-RADIUS = 0.15 / math.sqrt(2)  # m, an agent's
-BODY = 1.001 * RADIUS  # m, at which it is stopped
-TOUCH = 1.01 * RADIUS  # m, nearer than which it counts as touching
-CORNER_COSINE = (
-    -0.125
-)  # cosine between the headings to two touched walls: they meet at less than 83 degrees
-MIN_GAP = (
-    1e-4  # m, no agent is placed nearer to a wall: 6 units in the last place of float32 at 200 m
-)
-PHASE, PHASES = 16, 2  # steps in which agents keep their goals; and the fewest such phases
-ACCEL, DECAY = 5.0, 0.125  # MomentumMovement's defaults: m/s^2, and a fraction a step
-TRY, LEAVES = (
-    0.01,
-    0.001,
-)  # m: the distance tried from where an agent was stopped, and the least that counts as leaving
+PHASE, MIN_PHASES = 16, 2  # steps in which agents keep their goals; and the fewest such phases
+ACCEL, DECAY = 5.0, 0.125  # MomentumMovement's defaults: m/s^2, and a fraction per step
+TRY = 0.01  # m: the distance tried from where an agent was stopped
+LEAVES = 0.001  # m: the least that counts as leaving
 # m, deeper than which a wall is within the radius, and no rounding: of the 1e-4 between RADIUS and
 # BODY
 SUNK = 1e-5
-MAX_PAIRS = dict(
-    cpu=1 << 16, cuda=1 << 24
-)  # agents times walls checked at once: within a core's cache; 128 MB a float64
 SETTINGS = [
     (1, 1),
     (1, 100),
@@ -50,304 +32,6 @@ SETTINGS = [
     (200, 1),
     (200, 100),
 ]  # fps, accel
-
-
-# ---- Layouts: (W, 2, 2) float64 arrays of walls ----
-
-
-def turned(walls, degrees):
-    """Walls turned counter-clockwise about the origin."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return np.asarray(walls, float) @ np.array([[c, s], [-s, c]])
-
-
-def path(corners):
-    """The walls from corner to corner."""
-    corners = np.asarray(corners, float)
-    return np.stack([corners[:-1], corners[1:]], 1)
-
-
-def enclosed(walls, corner=1.0):
-    """The walls, in a room that leaves a metre on all sides and whose lower-left corner is at
-    (corner, corner).
-    """
-    walls = np.asarray(walls, float)
-    walls = walls - walls.min((0, 1)) + corner + 1
-    width, height = walls.max((0, 1)) - corner + 1
-    room = path(corner + np.array([(0, 0), (width, 0), (width, height), (0, height), (0, 0)]))
-    return np.concatenate([walls, room])
-
-
-def wedge(degrees, turn, arm=9.0):
-    """Two walls that meet at an angle; a disc wedges RADIUS / sin(angle / 2) from their corner."""
-    return np.concatenate(
-        [turned([[(0, 0), (arm, 0)]], turn + side * degrees / 2) for side in (-1, 1)]
-    )
-
-
-def sliver(degrees, turn, arm=9.0):
-    """A closed triangle with two long sides."""
-    (a, b), (_, c) = wedge(degrees, turn, arm)
-    return path([a, b, c, a])
-
-
-def spokes(n, turn, arm=3.0):
-    """Walls from one point in n directions: as many corners of 360 / n degrees."""
-    return np.concatenate([turned([[(0, 0), (arm, 0)]], turn + 360 * k / n) for k in range(n)])
-
-
-def slit(gap, turn, length=3.0):
-    """Two walls side by side."""
-    return turned([[(0, 0), (length, 0)], [(0, gap), (length, gap)]], turn)
-
-
-def zigzag(width, degrees, turn, n=8, leg=0.8):
-    """A corridor, `width` across its legs, that turns by 180 minus `degrees` n times."""
-    half = math.radians(degrees) / 2
-    corners = np.array(
-        [(k * leg * math.sin(half), k % 2 * leg * math.cos(half)) for k in range(n + 1)]
-    )
-    aside = np.array([width / math.sin(half), 0])
-    return turned(np.concatenate([path(corners), path(corners + aside)]), turn)
-
-
-def crossing(random, n=9, size=6.0):
-    """Long walls through one another."""
-    return random.segments(n, 1.0, size, size).numpy()
-
-
-def fragments(seed):
-    """A room of free-standing walls with all that degenerates: of no length, double, tiny, of 400
-    m.
-    """
-    cases = "parallel", "zero_length", "duplicates", "touching", "pixel_ends", "tiny", "long"
-    return (
-        random_scenery.random_environments(seed, 1, n_walls=6, size=5.0, degenerate=cases)
-        .one(0)["walls"]
-        .numpy()
-    )
-
-
-def remote(random):
-    """Layouts near (190, 190), where a unit in the last place is 15 micrometres."""
-    shapes = [wedge(degrees, random.uniform(0, 360).item(), 6.0) for degrees in (5, 20, 60)]
-    return [
-        enclosed(walls, 190.0)
-        for walls in (*shapes, spokes(7, 10.0), crossing(random), slit(2.1 * BODY, 33.0))
-    ]
-
-
-def homes(source, n):
-    return [enclosed(g.walls) for g in sample(source, n)]
-
-
-COURSES = {  # name: (layouts from a random stream, agents per environment)
-    "box": (lambda random: [g.walls for g in sample("box", 1)], 1),
-    "column": (lambda random: [g.walls for g in sample("column", 1)], 4),
-    "wedges": (
-        lambda random: [
-            enclosed(wedge(degrees, random.uniform(0, 360).item()))
-            for degrees in (2, 3, 5, 8, 12, 20, 30, 45, 60, 75, 90, 120)
-        ],
-        1,
-    ),
-    "slivers": (
-        lambda random: [
-            enclosed(sliver(degrees, random.uniform(0, 360).item()))
-            for degrees in (3, 5, 8, 12, 20, 30, 45, 60)
-        ],
-        1,
-    ),
-    "spokes": (
-        lambda random: [
-            enclosed(spokes(n, random.uniform(0, 90).item())) for n in (4, 5, 7, 8, 12)
-        ],
-        2,
-    ),
-    "slits": (
-        lambda random: [
-            enclosed(slit(gap, turn))
-            for turn in (0, 90, *random.uniform(0, 180, 2).tolist())
-            for gap in (0.01, 0.2, 2 * BODY + 2e-4, 2 * BODY + 2e-3, 0.25)
-        ],
-        1,
-    ),
-    "zigzags": (
-        lambda random: [
-            enclosed(zigzag(width, degrees, turn))
-            for degrees in (30, 60, 90)
-            for width, turn in zip((0.23, 0.3), random.uniform(0, 360, 2).tolist())
-        ],
-        1,
-    ),
-    "crossing": (lambda random: [enclosed(crossing(random)) for _ in range(8)], 1),
-    "fragments": (lambda random: [enclosed(fragments(seed)) for seed in range(8)], 2),
-    "remote": (remote, 1),
-    "homes": (lambda random: homes("homes", 16), 1),
-    "bench": (lambda random: homes("bench", 16), 2),
-}
-
-
-def clearances(points, walls):
-    """(P, W) distances of points (P, 2) from walls (W, 2, 2), float64."""
-    along, offset = walls[:, 1] - walls[:, 0], points[:, None] - walls[:, 0]
-    u = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-30)).clamp(0, 1)
-    return (offset - u[..., None] * along).norm(dim=-1)
-
-
-def places(walls, n, random):
-    """Where agents are placed: (n, 2) float32 points within the bounds of walls (W, 2, 2), no
-    nearer than MIN_GAP to any. Four in ten lie anywhere; the rest at a wall's flank or end: touching
-    it to a few units in the last place, overlapping it, or with the centre next to it.
-    """
-    found, lower, upper = torch.zeros((0, 2)), walls.amin((0, 1)), walls.amax((0, 1))
-    while len(found) < n:
-        a, b = walls[random.pick(range(len(walls)), n).long()].unbind(1)
-        u, aside = random.uniform(-0.5, 1.5, n, 1).clamp(0, 1), random.direction(n)
-        normal = torch.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], -1)
-        normal = (
-            normal / normal.norm(dim=-1, keepdim=True).clamp(min=1e-9) * random.pick([-1, 1], n, 1)
-        )
-        inner = (u > 0) & (u < 1) & (normal.norm(dim=-1, keepdim=True) > 0)
-        touching = random.pick([RADIUS, BODY], n, 1) + random.pick(
-            [-1e-6, -1e-7, 0, 1e-7, 1e-6], n, 1
-        )
-        overlapping = 10 ** random.uniform(math.log10(MIN_GAP), math.log10(RADIUS), n, 1)
-        distance = torch.where(random.uniform(0, 1, n, 1) < 0.5, touching, overlapping)
-        near = a + u * (b - a) + distance * torch.where(inner, normal, aside)
-        anywhere = random.uniform(0, 1, n, 2) * (upper - lower) + lower
-        points = torch.where(random.uniform(0, 1, n, 1) < 0.4, anywhere, near).float()
-        inside = ((points > lower) & (points < upper)).all(-1)
-        found = torch.cat(
-            [found, points[inside & (clearances(points.double(), walls).amin(1) > MIN_GAP)]]
-        )
-    return found[:n]
-
-
-@dataclass(frozen=True)
-class Course:
-    """A course's layouts and where agents are placed in them."""
-
-    name: str
-    n_agents: int
-    geometries: list
-    walls: torch.Tensor  # (D, W, 2, 2) float32
-    counts: torch.Tensor  # (D,) how many walls each layout has
-    spots: torch.Tensor  # (D, P, 2) float32: where agents are placed
-    clear: torch.Tensor  # (D, P) bool: where they then overlap no wall
-
-
-def make_course(name, seed=0, device="cpu", n_spots=512):
-    """The course called `name`."""
-    make, n_agents = COURSES[name]
-    random = random_scenery.RandomStream(seed)
-    layouts = [torch.as_tensor(np.float32(walls)) for walls in make(random)]
-    walls = torch.full((len(layouts), max(map(len, layouts)), 2, 2), math.nan)
-    for d, w in enumerate(layouts):
-        walls[d, : len(w)] = w
-    spots = [places(w.double(), n_spots, random) for w in layouts]
-    clear = [clearances(p.double(), w.double()).amin(1) > BODY for p, w in zip(spots, layouts)]
-    geometries = [dotdict(walls=w.numpy(), lights=np.zeros((0, 2))) for w in layouts]
-    return Course(
-        name,
-        n_agents,
-        geometries,
-        walls.to(device),
-        torch.tensor([len(w) for w in layouts], device=device),
-        torch.stack(spots).to(device),
-        torch.stack(clear).to(device),
-    )
-
-
-# ---- Does a path cross a wall? ----
-
-
-def cross(ax, ay, bx, by):
-    return ax * by - ay * bx
-
-
-def boxes_meet(p, q, a, b):
-    """Whether the bounding boxes of segments pq and ab meet, touching included. Exact in any
-    floating type.
-    """
-    meet = None
-    for i in (0, 1):
-        here = (torch.minimum(p[i], q[i]) <= torch.maximum(a[i], b[i])) & (
-            torch.maximum(p[i], q[i]) >= torch.minimum(a[i], b[i])
-        )
-        meet = here if meet is None else meet & here
-    return meet
-
-
-def straddles(p, q, a, b):
-    """Whether p and q do not both lie strictly on one side of the line through a and b. Float64."""
-    ex, ey = b[0] - a[0], b[1] - a[1]
-    one, other = cross(ex, ey, p[0] - a[0], p[1] - a[1]), cross(ex, ey, q[0] - a[0], q[1] - a[1])
-    return (torch.minimum(one, other) <= 0) & (torch.maximum(one, other) >= 0)
-
-
-def crossed(before, after, walls, dense=None):
-    """Whether the straight paths from before to after (B, D, A, 2) touch any of walls (D, W, 2, 2):
-    bool (B, D, A).
-
-    Closed segments meet if their boxes do and each straddles the other's line (true of points and
-    of collinear ones too). Boxes are compared in the given type, which is exact, sides in float64.
-    The CPU tries only the pairs whose boxes meet, a GPU all of them (`dense`), because their
-    number would take a synchronisation.
-    """
-    dense = before.device.type == "cuda" if dense is None else dense
-    rows, check = rows_of(before, walls), _crossed_dense if dense else _crossed_sparse
-    return torch.cat([check(p, q, walls) for p, q in zip(before.split(rows), after.split(rows))])
-
-
-def rows_of(points, walls):
-    """How many of the copies of points (B, D, A, 2) to check at once."""
-    return max(
-        MAX_PAIRS[points.device.type] // (walls.shape[0] * walls.shape[1] * points.shape[2]), 1
-    )
-
-
-def _ends(p, q, walls):
-    return [(x[..., 0, None], x[..., 1, None]) for x in (p, q)] + [
-        (walls[:, None, :, i, 0], walls[:, None, :, i, 1]) for i in (0, 1)
-    ]
-
-
-def _crossed_dense(p, q, walls):
-    ends = _ends(p.double(), q.double(), walls.double())
-    p, q, a, b = ends
-    return (boxes_meet(*ends) & straddles(p, q, a, b) & straddles(a, b, p, q)).any(-1)
-
-
-def _crossed_sparse(p, q, walls):
-    i, d, a, w = boxes_meet(*_ends(p, q, walls)).nonzero(as_tuple=True)
-    start, end = (x[i, d, a].double().unbind(-1) for x in (p, q))
-    one, other = (x.unbind(-1) for x in walls[d, w].double().unbind(1))
-    meet = straddles(start, end, one, other) & straddles(one, other, start, end)
-    out = torch.zeros(p.shape[:-1], dtype=torch.bool)
-    out[i[meet], d[meet], a[meet]] = True
-    return out
-
-
-def surroundings(points, walls):
-    """The nearest wall of each agent at points (B, D, A, 2), how far it is, and whether the agent
-    touches two walls that meet at less than 83 degrees, having them on opposite sides: all (B, D,
-    A).
-    """
-    some = (_surroundings(p, walls) for p in points.split(rows_of(points, walls)))
-    return tuple(map(torch.cat, zip(*some)))
-
-
-def _surroundings(points, walls):
-    start, along = walls[:, None, :, 0], (walls[:, :, 1] - walls[:, :, 0])[:, None]
-    offset = points[..., None, :] - start
-    u = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-30)).clamp(0, 1)
-    normal = offset - u[..., None] * along
-    distance = normal.norm(dim=-1).nan_to_num(nan=math.inf)
-    least, nearest = distance.min(-1)
-    first = normal.gather(-2, nearest[..., None, None].expand(*nearest.shape, 1, 2))
-    cosine = (normal * first).sum(-1) / (distance * least[..., None]).clamp(min=1e-12)
-    return nearest, least, ((distance < TOUCH) & (cosine < CORNER_COSINE)).any(-1) & (least < TOUCH)
 
 
 # ---- Walkers ----
@@ -381,11 +65,11 @@ class Walk:
     crossing.
     """
 
-    def __init__(self, ground, scenery, fps, accel, acting, seed):
-        self.course, self.fps, self.accel, self.acting, self.seed = ground, fps, accel, acting, seed
+    def __init__(self, course, scenery, fps, accel, acting, seed):
+        self.course, self.fps, self.accel, self.acting, self.seed = course, fps, accel, acting, seed
         self.core = core.Core(scenery, res=1, fps=fps)
-        device, walls = self.core.device, ground.walls
-        self.shape = (scenery.n_envs // len(walls), len(walls), ground.n_agents)
+        device, walls = self.core.device, course.walls
+        self.shape = (scenery.n_envs // len(walls), len(walls), course.n_agents)
         self.generator = torch.Generator(device).manual_seed(seed)
         self.move = MomentumMovement(self.core, accel=accel * ACCEL)
         self.speed = accel * ACCEL / fps / DECAY
@@ -548,13 +232,13 @@ class Walk:
 def directions(n, device):
     """(n, 2) unit vectors, those along the axes exactly so."""
     turn = 2 * math.pi * torch.arange(n, dtype=torch.float64) / n
-    headings = torch.stack([turn.cos(), turn.sin()], -1)
-    return torch.where(headings.abs() < 1e-12, 0, headings).float().to(device)
+    found = torch.stack([turn.cos(), turn.sin()], -1)
+    return torch.where(found.abs() < 1e-12, 0, found).float().to(device)
 
 
 def attempts(scenery, fps, positions, layout, agent, headings):
-    """How far (K, n) agent k of each environment (K, A, 2) gets by a step of 1 cm in each direction of
-    headings (K, n, 2) while the others rest; 0 if physics says that no progress was made.
+    """How far (K, n) agent k of each environment (K, A, 2) gets by a step of 1 cm in each direction
+    of headings (K, n, 2) while the others rest; 0 if physics says that no progress was made.
     """
     k, n, _ = headings.shape
     copies = engine.Scenery.of_layouts(
@@ -603,7 +287,7 @@ def stuck(walk, most):
     )
     far = attempts(scenery, walk.fps, positions, d, a, headings).amax(1)
     rest, fine = (far < LEAVES).nonzero()[:, 0], directions(720, device)
-    for some in rest.split(256):
+    for some in rest.split(256) if len(rest) else ():
         all_ways = fine.expand(len(some), -1, -1)
         far[some] = attempts(scenery, walk.fps, positions[some], d[some], a[some], all_ways).amax(1)
     n_held, told = 0, []
@@ -632,12 +316,13 @@ def run(name, n_steps, n_agents, device="cpu", seed=0, tries=1 << 30, report=Non
     of the SETTINGS in turn, driven and acting. After each phase up to `tries` of those that were
     stopped try to leave.
 
-    Returns a dict: the COUNTED; `tried`, `held` and `stuck`; `cornered` (D,), a list; and `descriptions`
-    of the first crossings and of the stuck. ``report(total)`` is called after each walk.
+    Returns a dict: the COUNTED; `tried`, `held` and `stuck`; `cornered` (D,), a list; and
+    `descriptions` of the first crossings and of the stuck. ``report(total)`` is called after each
+    walk.
     """
     course = make_course(name, seed, device)
     modes = [(*setting, acting) for setting in SETTINGS for acting in (False, True)]
-    n_agents = min(n_agents, n_steps // (len(modes) * PHASE * PHASES))
+    n_agents = min(n_agents, n_steps // (len(modes) * PHASE * MIN_PHASES))
     copies = max(n_agents // (len(course.walls) * course.n_agents), 1)
     scenery = scene.scenery(
         course.geometries, course.n_agents, copies * len(course.walls), device=torch.device(device)

@@ -1,0 +1,27 @@
+"""A wrong argument or buffer is refused by name: nothing crashes, and nothing is silently wrong."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parent
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_every_bad_call_is_refused_by_name(device):
+    done = subprocess.run(
+        [sys.executable, str(TESTS / "bad_calls.py"), device],
+        capture_output=True,
+        text=True,
+        cwd=TESTS.parent,
+        env=None,
+    )
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.returncode == 0, f"it crashed in {rows[-1]['call']}: {done.stderr[-2000:]}"
+    results = [row for row in rows if "wrong" in row]
+    wrong = [f"{row['call']}: {row['wrong']}" for row in results if row["wrong"]]
+    assert not wrong, f"{len(wrong)} of {len(results)} calls:\n" + "\n".join(wrong)
+    assert len(results) > 330
