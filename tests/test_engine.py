@@ -176,7 +176,7 @@ def test_an_output_that_is_not_written_is_named(poison, monkeypatch):
     ]
     for output in outputs:
         for name, tensor in output._asdict().items():
-            with pytest.raises(AssertionError, match=f"wrote: {name}: {tensor.numel()}$"):
+            with pytest.raises(AssertionError, match=rf"wrote: {name}: {tensor.numel()}\b"):
                 poison.check(**{name: tensor})
 
 
