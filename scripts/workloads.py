@@ -25,7 +25,7 @@ KERNEL_SIZES = {"cuda": (8192, 262_144), "cpu": (2048,)}
 HOMES = 512
 WARM_UP = 60  # steps, so that agents are not where they spawned
 FRESH = 3  # samples of what takes a process each
-BUDGETS = 60, 240  # seconds of training
+BUDGETS = 10, 60, 240  # seconds of training
 
 
 def random_actions(n_envs, n_agents, device, turns=TURNS):
@@ -285,7 +285,7 @@ def twin_frame(c, e):
 
 
 def train(device):
-    """Training on the benchmark's homes for a minute and for four, without compilation, and what
+    """Training on the benchmark's homes for 10, 60 and 240 seconds, without compilation, and what
     that evaluates to.
     """
     for budget in BUDGETS:
