@@ -52,7 +52,8 @@ class Poison:
     def allocate(self, *args, **kwargs):
         """Stands in for torch.empty."""
         made = self.empty(*args, **kwargs)
-        bits(made).fill_(POISON[made.dtype])
+        if made.dtype in POISON:
+            bits(made).fill_(POISON[made.dtype])
         return made
 
     def scenery(self, scenery):
