@@ -1,9 +1,12 @@
-"""Core: scenery, agents, and their cameras' settings, in one bag."""
+"""Core: scenery, agents, and the settings of their cameras, in one object."""
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 
-from . import engine
+from . import checks, engine
 from .agents import AGENT_RADIUS, AGENT_WIDTH
 from .arrdict import arrdict
 from .colour import gamma_decode, gamma_encode
@@ -16,13 +19,22 @@ class Core:
     """What an environment is built around. All attributes are public: ``scenery``, ``agents``,
     ``n_envs``, ``n_agents``, ``device``, ``res``, ``fov``, ``fps``, ``seed``.
 
-    Args: ``res`` rays a camera; ``fov`` degrees; ``fps`` steps a second; ``cameras`` yaw offsets in
-    degrees, one camera ahead by default; ``seed`` of everything drawn by the modules built on this
-    core.
+    Args: ``res`` rays per camera; ``fov`` degrees; ``fps`` steps per second; ``cameras`` yaw
+    offsets in degrees, one camera ahead by default; ``seed`` of the random streams of the modules
+    built on this core.
     """
 
-    def __init__(self, scenery, res=64, fov=130.0, fps=10.0, cameras=None, seed=1):
-        self.scenery, self.seed = scenery, seed
+    def __init__(
+        self,
+        scenery: engine.Scenery,
+        res: int = 64,
+        fov: float = 130.0,
+        fps: float = 10.0,
+        cameras: Sequence[float] | None = None,
+        seed: int = 1,
+    ):
+        self.scenery = checks.instance("scenery", scenery, engine.Scenery)
+        self.seed = checks.integer("seed", seed, 0)
         self.n_envs, self.n_agents, self.device = scenery.n_envs, scenery.n_agents, scenery.device
         self.agents = engine.Agents(
             self.n_envs,
@@ -35,17 +47,17 @@ class Core:
         )
         self.res, self.fov, self.fps = self.agents.res, self.agents.fov, self.agents.fps
 
-    def agent_full(self, value):
+    def agent_full(self, value: Any) -> torch.Tensor:
         """An (N, A) tensor of ``value`` on the device; bools stay bools, ints ints."""
         return torch.full((self.n_envs, self.n_agents), value, device=self.device)
 
-    def env_full(self, value):
+    def env_full(self, value: Any) -> torch.Tensor:
         """An (N,) tensor of ``value`` on the device."""
         return torch.full((self.n_envs,), value, device=self.device)
 
-    def state(self, e=0):
-        """World ``e`` as :meth:`plot_state` draws it, in tensors: its lines, their lit texels end
-        to end, lights, and where the agents stand and look.
+    def state(self, e: int = 0) -> arrdict:
+        """Environment ``e`` as :meth:`plot_state` draws it, in tensors: its lines, their lit texels
+        end to end, lights, and where the agents stand and look.
         """
         engine.update_agent_geometry(self.scenery, self.agents)
         lines, colours, lights = self.scenery.env(e)
@@ -54,7 +66,7 @@ class Core:
             lines=lines,
             texels=torch.cat(colours),
             widths=torch.tensor([len(texels) for texels in colours]),
-            lights=lights.clone(),
+            lights=lights,
             n_agent_lines=torch.tensor(self.scenery.agent_lines.shape[1]),
             positions=agents.positions[e].clone(),
             angles=agents.angles[e].clone(),
@@ -63,7 +75,7 @@ class Core:
         )
 
     @staticmethod
-    def plot_state(state, ax=None, seen=None, distances=None):
+    def plot_state(state: dict, ax: Any = None, seen: Any = None, distances: Any = None) -> Any:
         """Draws a numpyified :meth:`state` from above, with each camera's field of view. Returns
         the axes.
 

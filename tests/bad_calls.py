@@ -349,7 +349,7 @@ def resizings(device):
         yield f"{name}.resize_(0)", name, lambda f, b=buffer: (b(f).resize_(0), CALLS["render"](f))
         yield f"{name}.data a row less", name, exchange(buffer, lambda t: t[1:].clone())
         yield f"{name}.data of float64", name, exchange(buffer, lambda t: t.clone().double())
-        yield f"{name}.data empty", name, exchange(buffer, lambda t: torch.empty(0))
+        yield f"{name}.data empty", name, exchange(buffer, lambda t: t.new_empty(0))
 
 
 def others(device):
@@ -386,7 +386,8 @@ def others(device):
         yield f"scenery.{name}['a']", "str", lambda f, name=name: getattr(f.scenery, name)["a"]
     yield "device tpu", "device", lambda f: engine.device("tpu")
     yield "device None", "device", lambda f: engine.device(None)
-    for name, value in dict(res=0, fov=200.0, fps=-1.0, cameras=[]).items():
+    yield "Core of no scenery", "scenery", lambda f: cuda.Core(None)
+    for name, value in dict(res=0, fov=200.0, fps=-1.0, cameras=[], seed=0.5).items():
         yield (
             f"Core({name}={value})",
             "camera" if name == "cameras" else name,

@@ -10,7 +10,7 @@ import pytest
 import random_scenery
 import torch
 
-from megastep import cuda, devices, engine, scene, toys
+from megastep import capture, cuda, devices, engine, scene, toys
 from megastep.geometries import sample
 from megastep.modules import IMU, RGB, Depth, RandomSpawns
 
@@ -476,3 +476,58 @@ def test_too_many_environments_are_counted(monkeypatch):
     monkeypatch.setattr(devices, "free_memory", lambda device: 10**6)
     with pytest.raises(engine.EngineError, match="at most [0-9,]+ fit"):
         scene.scenery([toys.box()], n_agents=1, n_envs=10**6, device="cpu")
+
+
+# ---- What needs a GPU ----
+
+
+def no_synchronisation(act):
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        act()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+@pytest.mark.cuda
+def test_no_operation_synchronises():
+    homes = sample("homes", 3)
+    core = cuda.Core(scene.scenery(homes, 2, n_envs=6, device="cuda"), res=64)
+    spawn, seen, mask = (
+        RandomSpawns(homes, core, resample=True),
+        seen_of(core),
+        core.agent_full(True),
+    )
+    moves = torch.zeros((7, 3), device="cuda")
+    actions = torch.zeros((6, 2), dtype=torch.long, device="cuda")
+
+    def everything():
+        engine.bake(core.scenery)
+        spawn(mask)
+        engine.physics(core.scenery, core.agents, actions, moves, 0.5)
+        engine.render(core.scenery, core.agents)
+        engine.observe(core.scenery, core.agents, 4, imu=True, seen=seen, clear_mask=mask)
+        core.agents.positions = core.agents.positions + 0.01
+        engine.physics(core.scenery, core.agents)
+
+    everything()  # compiles, and fills caches
+    no_synchronisation(everything)
+    engine.check(core.agents)
+
+
+@pytest.mark.cuda
+def test_a_recorded_bake_follows_walls_and_lights_that_move():
+    recorded, eager = (
+        scene.scenery([toys.box(), toys.column()], 1, 4, device="cuda") for _ in range(2)
+    )
+    graph = capture.Graph(lambda: engine.bake(recorded), (), (recorded,))
+    for scenery in (recorded, eager):
+        scenery.layouts.lines.vals.add_(0.25)
+        scenery.layouts.lights.vals[:, 2].mul_(0.5)
+    graph()
+    engine.bake(eager)
+    assert torch.equal(recorded.layouts.boxes, eager.layouts.boxes)
+    assert torch.equal(recorded.layouts.baked.vals, eager.layouts.baked.vals)
+    images = [cuda.render(s, cuda.Core(s).agents).screen for s in (recorded, eager)]
+    assert torch.equal(*images)
