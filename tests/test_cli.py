@@ -53,8 +53,8 @@ def test_a_typo_is_exit_code_2_and_leaves_nothing(tmp_path):
     assert err.splitlines() == [
         "train.py: 3 errors in the configuration",
         "  env: 'explorr' is unknown; did you mean explorer?",
-        "  learner.lrr: no such key; did you mean learner.lr?",
         "  env.n_envs: 0 is out of range: allowed is from 1 to 67,108,864",
+        "  learner.lrr: no such key; did you mean learner.lr?",
     ]
     assert not any(tmp_path.iterdir())
 

@@ -18,7 +18,7 @@ import torch
 import yaml
 
 from agents import checkpoint, metrics, ppo
-from agents.cli import evaluate, settings, train
+from agents.cli import evaluate, train
 from agents.cli.build import build
 from agents.cli.compose import ConfigLoader
 from agents.cli.errors import ConfigErrors, UserError
@@ -27,6 +27,7 @@ from agents.cli.settings import Train
 from agents.cli.signals import Interrupted
 from agents.finite import bad_leaf
 from megastep import envs
+from megastep.bounds import MAX_ENVS
 
 TINY = [
     "env=minimal",
@@ -444,13 +445,24 @@ def test_an_environment_that_cannot_be_made_leaves_no_folder(here, tmp_path):
     assert not any((here / "runs").iterdir())
 
 
+def test_settings_of_an_environment_that_contradict_each_other_are_one_sentence(here, capsys):
+    explorer = [word for word in TINY if "est=" not in word] + ["env=explorer", "env.subsample=3"]
+    for words, told in (
+        ([*TINY, "env.shortest=10"], "shortest <= longest steps, but 10 and 9 were given"),
+        (explorer, "subsample must divide the 8 rays of the screen, but 3 was given"),
+    ):
+        assert train.main(words) == 2
+        (sentence,) = capsys.readouterr().err.splitlines()
+        assert told in sentence and not any((here / "runs").iterdir())
+
+
 def test_too_many_environments_are_refused_with_the_number_that_fits(here, capsys):
-    assert train.main([*TINY, f"env.n_envs={settings.MOST_ENVS}", "learner.n_steps=4096"]) == 2
+    assert train.main([*TINY, f"env.n_envs={MAX_ENVS}", "learner.n_steps=4096"]) == 2
     told = re.search(
         "67,108,864 environments need .* free on cpu: at most ([0-9,]+) fit",
         capsys.readouterr().err,
     )
-    assert 10 < int(told[1].replace(",", "")) < settings.MOST_ENVS
+    assert 10 < int(told[1].replace(",", "")) < MAX_ENVS
     assert not any((here / "runs").iterdir())
 
 

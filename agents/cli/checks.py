@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from agents.cli.errors import closest
+from megastep.bounds import Within
 
 
 def _field(check: Callable[[Any], str | None]) -> Any:
@@ -15,20 +16,13 @@ def _field(check: Callable[[Any], str | None]) -> Any:
 
 def within(min: float, max: float, min_open: bool = False, max_open: bool = False) -> Any:
     """A finite number between two limits, which belong to it unless open."""
-    if max == math.inf:
-        allowed = f"{'more than' if min_open else 'at least'} {min:,}"
-    else:
-        allowed = f"{'above' if min_open else 'from'} {min:,}"
-        allowed += f" {'and below' if max_open else 'to'} {max:,}"
+    return _field(Within(min, max, min_open, max_open).error)
 
-    def check(value: float) -> str | None:
-        above_min = min < value if min_open else min <= value
-        below_max = value < max if max_open else value <= max
-        if above_min and below_max and math.isfinite(value):  # nan compares false
-            return None
-        return f"{value} is out of range: allowed is {allowed}"
 
-    return _field(check)
+def bounded_by(bounds: Within | None, default: Any) -> Any:
+    """A value of an argument with these bounds and this default."""
+    check = bounds.error if bounds else lambda value: None
+    return dataclasses.field(default=default, metadata={"check": check})
 
 
 def above(min: float) -> Any:

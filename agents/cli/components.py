@@ -79,7 +79,7 @@ def homes(geometry: settings.Geometry, split: str, max_homes: int | None = None)
 
 
 def make_env(
-    chosen: settings.Minimal | settings.Explorer,
+    chosen: settings.Env,
     homes: list[dict],
     seed: int,
     device: torch.device,

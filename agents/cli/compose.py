@@ -5,22 +5,21 @@ Hydra is used through its compose API and its override grammar; `@hydra.main` wo
 first, and exit 1.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from agents.cli.build import build
-from agents.cli.errors import ConfigErrors, UserError, closest, closest_key
+from agents.cli.build import as_tree, build
+from agents.cli.errors import ConfigErrors, UserError, closest
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 Tree = dict[str, Any]
@@ -46,14 +45,11 @@ class ConfigLoader:
         return self._context.__exit__(*error)
 
     def groups(self) -> dict[str, list[str]]:
-        """{group: [members]}; train.yaml and its fellows are no groups."""
+        """{group: [members]}: those that the script's own file has a default for."""
         loader = GlobalHydra.instance().config_loader()
-        chosen = self._compose([]).hydra.runtime.choices
-        return {
-            g: loader.get_group_options(g)
-            for g in loader.get_group_options("", ObjectType.GROUP)
-            if g in chosen
-        }
+        defaults = yaml.safe_load((CONFIGS / f"{self.script}.yaml").read_text())["defaults"]
+        chosen = [group for default in defaults if isinstance(default, dict) for group in default]
+        return {group: loader.get_group_options(group) for group in chosen}
 
     def jobs(self, overrides: list[str], multirun: bool = False) -> list[tuple[list[str], Tree]]:
         """The composed tree of each job, `[(overrides, nested dict)]`; one job unless multirun."""
@@ -67,51 +63,27 @@ class ConfigLoader:
         return [(list(job), self.tree(list(job))) for job in batches]
 
     def tree(self, overrides: list[str]) -> Tree:
-        """Nested dicts for one list of overrides. ConfigErrors names every unknown key and group
-        member, and bad value.
+        """Nested dicts for one list of overrides, every setting in them. ConfigErrors names every
+        unknown key and group member, and bad value.
         """
-        parsed = _parsed(overrides)
-        try:
-            tree = _plain(self._compose(overrides))
-        except (HydraException, OmegaConfBaseException) as error:
-            raise ConfigErrors(self._errors(parsed) or [_as_error(error)]) from None
-        build(self.kind, tree)
-        return tree
-
-    def _errors(self, parsed: list[Override]) -> list[tuple[str, str]]:
-        """What is wrong with overrides that cannot be composed, and with the values of the rest."""
         errors, good, groups = [], [], self.groups()
-        for choice in (o for o in parsed if o.key_or_group in groups):
-            member, members = choice.value(), groups[choice.key_or_group]
-            if member is None or member in members:
-                good.append(choice.input_line)
-            else:
-                sentence = f"{member!r} is unknown; {closest(member, members)}"
-                errors.append((choice.key_or_group, sentence))
-        keys = list(_paths(_plain(self._compose(good))))
-        for override in (o for o in parsed if o.key_or_group not in groups):
-            key = override.key_or_group
-            if key in keys:
+        for override in _parsed(overrides):
+            key, member = override.key_or_group, override.value()
+            if key not in groups:
+                good.append(f"++{override.input_line}")  # `build` knows which keys there are
+            elif member is None or member in groups[key]:
                 good.append(override.input_line)
-            elif chosen := self._with_key(key, groups):
-                errors.append((key, f"no such key here; {chosen} has it"))
             else:
-                errors.append((key, f"no such key; {closest_key(key, [*keys, *groups])}"))
+                errors.append((key, f"{member!r} is unknown; {closest(member, groups[key])}"))
         try:
-            build(self.kind, _plain(self._compose(good)))
-        except (HydraException, OmegaConfBaseException) as error:
-            errors.append(_as_error(error))
+            settings = build(self.kind, _plain(self._compose(good)), list(groups))
         except ConfigErrors as error:
             errors += error.errors
-        return errors
-
-    def _with_key(self, key: str, groups: dict[str, list[str]]) -> str | None:
-        """The choice of a group's member that has this key: `logger=wandb` for logger.mode."""
-        group = key.partition(".")[0]
-        for member in groups.get(group, ()):
-            if key in _paths(_plain(self._compose([f"{group}={member}"]))):
-                return f"{group}={member}"
-        return None
+        except (HydraException, OmegaConfBaseException) as error:
+            errors.append(("configuration", " ".join(str(error).split())))
+        if errors:
+            raise ConfigErrors(errors)
+        return as_tree(settings)
 
     def _compose(self, overrides: list[str]) -> DictConfig:
         """With a GPU to run on, `preset=auto` is replaced by `preset=gpu`; without one it is `cpu`
@@ -146,10 +118,6 @@ def _parsed(overrides: list[str], multirun: bool = False) -> list[Override]:
     return parsed
 
 
-def _as_error(error: Exception) -> tuple[str, str]:
-    return "configuration", " ".join(str(error).split())
-
-
 def _has_gpu(device: str) -> bool:
     if device == "cpu":
         return False
@@ -162,11 +130,3 @@ def _plain(config: DictConfig) -> Tree:
     OmegaConf.set_struct(config, False)
     config.pop("hydra")
     return OmegaConf.to_container(config, resolve=True)
-
-
-def _paths(tree: Tree, prefix: str = "") -> Iterator[str]:
-    """The dotted key of every value and every group of values."""
-    for key, value in tree.items():
-        yield prefix + key
-        if isinstance(value, dict):
-            yield from _paths(value, f"{prefix}{key}.")

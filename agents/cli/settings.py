@@ -1,55 +1,37 @@
-"""The settings of a run as frozen dataclasses, each value with its bounds. Knows no Hydra, and no
-defaults: configs/ does.
+"""The settings of a run as frozen dataclasses, each value with its bounds. Knows no Hydra. Defaults
+are those of configs/, but for environments, whose constructors have them.
 """
 
+import dataclasses
+import inspect
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from agents.cli.checks import above, among, device_name, within
+from agents.cli.checks import above, among, bounded_by, device_name, within
+from megastep import envs
+from megastep.bounds import MAX_ENVS, bounds_of
 
-#: 2**26 copies of the smallest environment fill the largest accelerator there is; more is a typing
-#: mistake.
-MOST_ENVS = 2**26
 Sentences = Iterator[tuple[str, str]]
+#: Arguments of an environment that a run gives it from other settings.
+FROM_RUN = ("self", "geometries", "seed", "device")
 
 
-@dataclass(frozen=True)
-class Minimal:
-    """Arguments of `envs.Minimal`."""
-
-    name: str
-    n_envs: int = within(1, MOST_ENVS)
-    res: int = within(1, 1024)
-    fov: float = within(0, 180, min_open=True, max_open=True)
-    fps: float = within(1, 1000)
-    shortest: int = within(1, 10**6)
-    longest: int = within(1, 10**6)
-
-    def errors(self) -> Sentences:
-        if self.shortest > self.longest:
-            yield "shortest", f"{self.shortest} is more than longest, {self.longest}"
+def of_environment(constructor: Callable) -> type:
+    """A dataclass of an environment's settings: `name`, and the arguments of its constructor with
+    the types, bounds and defaults that they have there.
+    """
+    hints, bounds = typing.get_type_hints(constructor), bounds_of(constructor)
+    fields = [("name", str)]
+    for name, argument in inspect.signature(constructor).parameters.items():
+        if name not in FROM_RUN:
+            kind = hints.get(name, type(argument.default))
+            fields.append((name, kind, bounded_by(bounds.get(name), argument.default)))
+    return dataclasses.make_dataclass("Env", fields, frozen=True)
 
 
-@dataclass(frozen=True)
-class Explorer:
-    """Arguments of `envs.Explorer`."""
-
-    name: str
-    resample: bool
-    n_envs: int = within(1, MOST_ENVS)
-    res: int = within(1, 1024)
-    subsample: int = within(1, 32)
-    fov: float = within(0, 180, min_open=True, max_open=True)
-    fps: float = within(1, 1000)
-    patience: int = within(1, 10**6)
-
-    def errors(self) -> Sentences:
-        if self.res % self.subsample:
-            yield "subsample", f"{self.subsample} rays per pixel do not divide res, {self.res} rays"
-
-
-ENVS = {"minimal": Minimal, "explorer": Explorer}
+ENVS = {name: of_environment(env.__init__) for name, env in envs.ENVS.items()}
+Env = typing.Union[tuple(ENVS.values())]  # noqa: UP007
 
 
 @dataclass(frozen=True)
@@ -119,7 +101,7 @@ class Learner:
     value_coef: float = within(0, 1e6)
     max_grad_norm: float = within(0, 1e6, min_open=True)
     n_epochs: int = within(1, 1000)
-    n_minibatches: int = within(1, MOST_ENVS)
+    n_minibatches: int = within(1, MAX_ENVS)
     target_kl: float | None = within(0, 1e6, min_open=True)
 
 
@@ -158,7 +140,7 @@ class Finish:
 class Train:
     """A training run."""
 
-    env: Minimal | Explorer
+    env: Env
     geometry: Geometry
     agent: Agent
     learner: Learner

@@ -4,13 +4,14 @@ N environments of one agent, so N lanes.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
 from .. import engine, modules, plotting, spaces
 from .. import geometries as sources
 from ..arrdict import arrdict, numpyify
+from ..bounds import MAX_ENVS, Within, bounded
 from ..core import Core
 from ..dotdict import dotdict
 from ..scene import scenery
@@ -18,7 +19,6 @@ from ..scene import scenery
 __all__ = ["Explorer"]
 
 TEXELS_PER_POINT = 64  # newly seen texels that earn a reward of 1
-PATIENCE = 200  # steps an episode lasts beyond one for each texel seen
 
 
 class Explorer:
@@ -36,22 +36,21 @@ class Explorer:
 
     n_agents = 1
 
+    @bounded
     def __init__(
         self,
-        n_envs: int = 128,
+        n_envs: Annotated[int, Within(1, MAX_ENVS)] = 128,
         geometries: Sequence[Any] | None = None,
         *,
         seed: int = 1,
         device: torch.device | str | None = None,
-        res: int = 256,
-        subsample: int = 4,
-        fov: float = 130.0,
-        fps: float = 10.0,
-        patience: int = PATIENCE,
+        res: Annotated[int, Within(1, 1024)] = 256,
+        subsample: Annotated[int, Within(1, 32)] = 4,
+        fov: Annotated[float, Within(0, 180, min_open=True, max_open=True)] = 130.0,
+        fps: Annotated[float, Within(1, 1000)] = 10.0,
+        patience: Annotated[int, Within(1, 10**6)] = 200,
         resample: bool = False,
     ):
-        if patience < 1:
-            raise ValueError(f"patience must be at least one step, but {patience} was given")
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
         geometries = geometries if resample else geometries[:n_envs]

@@ -4,12 +4,13 @@ N environments of one agent, so N lanes.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
 from .. import engine, modules, plotting, toys
 from ..arrdict import arrdict, numpyify
+from ..bounds import MAX_ENVS, Within, bounded
 from ..core import Core
 from ..scene import scenery
 
@@ -26,18 +27,19 @@ class Minimal:
 
     n_agents = 1
 
+    @bounded
     def __init__(
         self,
-        n_envs: int = 128,
+        n_envs: Annotated[int, Within(1, MAX_ENVS)] = 128,
         geometries: Sequence[Any] | None = None,
         *,
         seed: int = 1,
         device: torch.device | str | None = None,
-        res: int = 64,
-        fov: float = 130.0,
-        fps: float = 10.0,
-        shortest: int = 128,
-        longest: int = 256,
+        res: Annotated[int, Within(1, 1024)] = 64,
+        fov: Annotated[float, Within(0, 180, min_open=True, max_open=True)] = 130.0,
+        fps: Annotated[float, Within(1, 1000)] = 10.0,
+        shortest: Annotated[int, Within(1, 10**6)] = 128,
+        longest: Annotated[int, Within(1, 10**6)] = 256,
     ):
         geometries = [toys.box()] if geometries is None else geometries[:n_envs]
         self.core = Core(
