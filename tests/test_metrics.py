@@ -228,7 +228,7 @@ def test_a_full_disk_is_one_warning_for_each_file_and_loses_no_line_once_there_i
         assert [row["samples"] for row in metrics.read(tmp_path / name)] == [1, 2, 3, 4]
 
 
-def test_the_curves_are_a_picture_of_the_files(tmp_path):
+def test_the_curves_are_an_image_of_the_files(tmp_path):
     from matplotlib.image import imread
 
     rows = [{"samples": n, "episode/return": n, "loss/value": None} for n in range(3)]

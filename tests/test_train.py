@@ -49,8 +49,8 @@ UPDATE = 4 * 8  # samples of one update
 def configured(*overrides, tiny=TINY):
     """The settings as train.main makes them."""
     overrides = [*tiny, *overrides]
-    with ConfigLoader("train", Train) as door:
-        return build(Train, train.resumed(door.tree(overrides), overrides))
+    with ConfigLoader("train", Train) as loader:
+        return build(Train, train.resumed(loader.tree(overrides), overrides))
 
 
 @pytest.fixture
@@ -268,9 +268,12 @@ def test_a_budget_that_is_spent_is_told_and_nothing_changes(here, capsys):
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     capsys.readouterr()
     for more, told in (
-        ([], "samples: the run has had 64 of 64; give more to go on"),
-        (["samples=40"], "samples: the run has had 64 of 40; give more to go on"),
-        (["samples=9e3", "seconds=1e-9"], "seconds: the run has had .* of 1e-09; give more"),
+        ([], "samples: the run has had 64 of 64; to go on, give samples= more"),
+        (["samples=40"], "samples: the run has had 64 of 40; to go on, give samples= more"),
+        (
+            ["samples=9e3", "seconds=1e-9"],
+            "seconds: .* of 1e-09; to go on, give seconds= more",
+        ),
     ):
         assert train.main([f"resume={folder}", *more]) == 2
         assert re.search(told, capsys.readouterr().err)

@@ -201,10 +201,11 @@ def resumed(tree: dict, overrides: list[str]) -> dict:
         for group in groups:
             target, source = target[group], source[group]
         target[key] = source[key]
+    had = {name: loaded.state[name] for name in ("samples", "seconds")}
     if spent := [
-        (name, f"the run has had {loaded.state[name]:,.9g} of {own[name]:,.9g}; give more to go on")
-        for name in ("samples", "seconds")
-        if own[name] is not None and loaded.state[name] >= own[name]
+        (name, f"the run has had {round(n, 1):,} of {own[name]:,}; to go on, give {name}= more")
+        for name, n in had.items()
+        if own[name] is not None and n >= own[name]
     ]:
         raise ConfigErrors(spent)
     return {**own, "init": None}
