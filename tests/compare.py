@@ -298,48 +298,48 @@ def golden_errors(case, ours):
     n_own, widths = envs.n_agents * len(envs.model), envs.line_widths.tolist()
     own = torch.cat([torch.arange(w) < n_own for w in widths])
 
-    def share(name, wrong, limit):
+    def fraction(name, wrong, limit):
         errors[name] = float(wrong.double().mean()), limit
 
     if "lines" in ours:
-        share("lines", (ours["lines"] - right["lines"]).abs() > 1e-5, 0)
+        fraction("lines", (ours["lines"] - right["lines"]).abs() > 1e-5, 0)
     if "baked" in ours:
         static = ~own.repeat_interleave(envs.texture_widths)
-        share("baked", ~((ours["baked"] - right["baked"]).abs() <= 2e-3)[static], 0.005)
+        fraction("baked", ~((ours["baked"] - right["baked"]).abs() <= 2e-3)[static], 0.005)
     if "indices" in ours:
         agree = ours["indices"] == right["indices"]
-        share("indices", ~agree, 0.001)
+        fraction("indices", ~agree, 0.001)
         hit = agree & (right["indices"] >= 0)
         far = 1e-4 * (1 + right["distances"])
         for field, tolerance in (("distances", far), ("locations", 1e-3), ("dots", 1e-3)):
-            share(field, ~((ours[field] - right[field]).abs() <= tolerance)[hit], 0.002)
+            fraction(field, ~((ours[field] - right[field]).abs() <= tolerance)[hit], 0.002)
         off = (ours["screen"] - right["screen"]).abs().mean(-1)
         on_wall = right["indices"] >= n_own
         errors["screen, mean on walls"] = float(off[hit & on_wall].mean()), 2e-3
         if (hit & ~on_wall).any():
             errors["screen, mean on agents"] = float(off[hit & ~on_wall].mean()), 2e-2
         blank = ours["locations"].isnan() & ours["dots"].isnan() & (ours["distances"] == math.inf)
-        share("misses", agree & ~hit & ~(blank & (ours["screen"] == 0).all(-1)), 0)
+        fraction("misses", agree & ~hit & ~(blank & (ours["screen"] == 0).all(-1)), 0)
     if "progress" in ours:
         judged = torch.ones_like(right["progress"], dtype=torch.bool)
         for _, env, agent in (k for k in MISJUDGED if k[0] == case):
             judged[env, agent] = False
         step = (envs.velocity.double() / settings["fps"]).norm(dim=-1)
-        share("progress", ~((ours["progress"] - right["progress"]).abs() <= 2e-3)[judged], 0.005)
+        fraction("progress", ~((ours["progress"] - right["progress"]).abs() <= 2e-3)[judged], 0.005)
         apart = (ours["positions"] - right["positions"]).norm(dim=-1)
-        share("positions", ~(apart <= 0.005 + 0.004 * step)[judged], 0.005)
+        fraction("positions", ~(apart <= 0.005 + 0.004 * step)[judged], 0.005)
         turned = 1e-4 + 2e-3 * (envs.angvelocity.double() / settings["fps"]).abs()
-        share(
+        fraction(
             "angles",
             ~(twin.wrapped(ours["angles"] - right["angles"]).abs() <= turned)[judged],
             0.005,
         )
-        share(
+        fraction(
             "velocity",
             ~((ours["velocity"] - right["velocity"]).abs().amax(-1) <= 1e-5)[judged],
             0.005,
         )
-        share(
+        fraction(
             "angvelocity",
             ~((ours["angvelocity"] - right["angvelocity"]).abs() <= 1e-4)[judged],
             0.005,

@@ -9,15 +9,7 @@ import torch
 
 from megastep import core, engine, scene, toys
 
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 LAST = 3  # of four environments, so that they end where memory does
-
-
-@pytest.fixture(params=DEVICES)
-def device(request):
-    if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("needs a GPU")
-    return request.param
 
 
 def boxes(device, n_agents=1):

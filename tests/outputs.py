@@ -1,0 +1,47 @@
+"""Memory that kernels write: poisoned, so that what they leave out is found."""
+
+import torch
+
+# Bits that no kernel writes: NaNs that are not its own, and an integer that is no index or count.
+POISON = {torch.float32: 0x7FC0DEAD, torch.float16: 0x7EAD, torch.int32: -0x21524111}
+
+
+def bits(tensor):
+    return tensor.view(torch.int16 if tensor.dtype == torch.float16 else torch.int32)
+
+
+class Poison:
+    """Fills memory that the engine is to write with bits of its own, and finds what is left of
+    them.
+    """
+
+    def __init__(self, empty):
+        self.empty = empty
+
+    def allocate(self, *args, **kwargs):
+        """Stands in for torch.empty."""
+        made = self.empty(*args, **kwargs)
+        if made.dtype in POISON:
+            bits(made).fill_(POISON[made.dtype])
+        return made
+
+    def scenery(self, scenery):
+        """Poisons what render writes into a scenery."""
+        for tensor in (scenery.agent_lines, scenery.agent_light):
+            bits(tensor).fill_(POISON[tensor.dtype])
+
+    def check(self, **outputs):
+        """Asserts that all of these tensors were written."""
+        left = {
+            name: int((bits(tensor) == POISON[tensor.dtype]).sum())
+            for name, tensor in outputs.items()
+            if tensor is not None
+        }
+        unwritten = [f"{name}: {n}" for name, n in left.items() if n]
+        assert not unwritten, f"elements that no kernel wrote: {', '.join(unwritten)}"
+
+
+def seen_of(core):
+    """Room for the texels that each agent has seen."""
+    n_words = -(-core.scenery.layouts.max_texels // 32)
+    return torch.zeros((core.n_envs, core.n_agents, n_words), dtype=torch.int32, device=core.device)
