@@ -299,6 +299,10 @@ def test_past_damaged_ones_the_new_checkpoint_stays_and_is_the_newest(folder):
 
 
 def test_after_going_back_later_checkpoints_are_set_aside_at_once(folder):
+    checkpoint.rewind(folder, 30)
+    assert checkpoint.load(folder).step == 30
+    checkpoint.rewind(folder, 29)
+    assert checkpoint.load(folder).step == 20
     checkpoint.rewind(folder, 10)
     assert checkpoint.load(folder).step == 10 and names(folder) == ["step_10"]
     assert checkpoint.load(folder / "step_30.aside").step == 30, "none is lost by going back"

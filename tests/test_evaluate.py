@@ -5,6 +5,7 @@ script.
 import dataclasses
 import itertools
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -232,6 +233,8 @@ def test_the_table_is_printed_and_written(trained, capsys):
 
 
 def test_it_is_reproducible_and_each_has_a_file_of_its_own(trained):
+    shutil.rmtree(trained / "evaluations", ignore_errors=True)  # of other tests
+
     def lengths(**changes):
         written = evaluate.run(configured(run=str(trained), **changes))
         return [row["length"] for row in json.loads(written.read_text())["rows"]]

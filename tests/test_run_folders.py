@@ -1,5 +1,7 @@
 """Run folders: made once each, however many programs start at a time; found by name; locked."""
 
+import errno
+import fcntl
 import os
 import pathlib
 import shutil
@@ -159,6 +161,30 @@ def test_a_lock_left_with_the_number_of_another_living_process_is_no_obstacle(he
     (here / "lock").write_text(str(os.getppid()))
     with locked(here):
         assert (here / "lock").read_text() == str(os.getpid())
+
+
+def test_a_lock_file_that_its_owner_deletes_meanwhile_is_made_anew(here, monkeypatch):
+    real, calls = fcntl.flock, []
+
+    def flock(file, how):
+        calls.append(1)
+        if len(calls) == 1:
+            (here / "lock").unlink()
+        return real(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with locked(here):
+        assert (here / "lock").read_text() == str(os.getpid())
+    assert len(calls) == 2
+
+
+def test_on_a_file_system_without_locks_a_run_is_warned(here, monkeypatch, capsys):
+    def flock(file, how):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with locked(here):
+        assert "file system without locks" in capsys.readouterr().err
 
 
 def test_only_one_of_many_has_the_lock_at_a_time(here):
