@@ -81,7 +81,7 @@ def interval(
     n_resamples: int = 2000,
     seed: int = 1,
 ) -> tuple[float, float, float]:
-    """The mean of `values` (B,) and a bootstrap interval for it: `(mean, low, high)`.
+    """The mean of `values` (B,) and a bootstrap interval for it: `(mean, lower, upper)`.
 
     Lanes in one home are alike, so homes are drawn with replacement, each with all its lanes
     (`groups`, (B,) integers): Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section
@@ -97,8 +97,8 @@ def interval(
     sums, counts = np.bincount(groups, values), np.bincount(groups)
     chosen = np.random.default_rng(seed).integers(len(sums), size=(n_resamples, len(sums)))
     means = sums[chosen].sum(1) / counts[chosen].sum(1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return float(values.mean()), float(low), float(high)
+    lower, upper = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    return float(values.mean()), float(lower), float(upper)
 
 
 def summary(episodes: Mapping) -> dict:
@@ -106,11 +106,11 @@ def summary(episodes: Mapping) -> dict:
     mean length, and what they were taken over; `homes` is None where there are none.
     """
     homes = episodes["homes"].cpu().numpy() if "homes" in episodes else None
-    mean, low, high = interval(episodes["returns"].cpu().numpy(), homes)
+    mean, lower, upper = interval(episodes["returns"].cpu().numpy(), homes)
     return {
         "return": mean,
-        "low": low,
-        "high": high,
+        "lower": lower,
+        "upper": upper,
         "length": float(episodes["lengths"].mean()),
         "lanes": len(episodes["returns"]),
         "homes": None if homes is None else len(np.unique(homes)),

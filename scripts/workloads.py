@@ -313,8 +313,8 @@ def train(device):
                 what=f"training, {budget} s, {whose} in unseen homes",
                 value=row["return"],
                 unit="",
-                lower=row["low"],
-                upper=row["high"],
+                lower=row["lower"],
+                upper=row["upper"],
                 n=row["homes"],
             )
         yield measurement(

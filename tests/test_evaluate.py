@@ -145,11 +145,11 @@ def test_agents_of_one_environment_share_its_home():
 
 def test_the_mean_is_exact_and_the_interval_holds_it():
     values = np.random.default_rng(1).normal(5, 2, 400)
-    mean, low, high = evaluation.interval(values, np.arange(400))
+    mean, lower, upper = evaluation.interval(values, np.arange(400))
     assert mean == pytest.approx(values.mean())
     # 2 / sqrt(400) = 0.1 is the standard error; the interval is 1.96 of it to each side, within the
     # bootstrap's noise
-    assert mean - low == pytest.approx(0.196, abs=0.03) and high - mean == pytest.approx(
+    assert mean - lower == pytest.approx(0.196, abs=0.03) and upper - mean == pytest.approx(
         0.196, abs=0.03
     )
 
@@ -163,8 +163,8 @@ def test_lanes_of_one_home_count_as_one_draw():
 
 @pytest.mark.parametrize("groups", [None, np.zeros(400)])
 def test_without_homes_or_in_one_alone_lanes_are_drawn(groups):
-    mean, low, high = evaluation.interval([0.0, 1.0] * 200, groups)
-    assert mean == 0.5 and high - low == pytest.approx(4 * 0.5 / 20, rel=0.15)
+    mean, lower, upper = evaluation.interval([0.0, 1.0] * 200, groups)
+    assert mean == 0.5 and upper - lower == pytest.approx(4 * 0.5 / 20, rel=0.15)
 
 
 def test_an_environment_without_homes_has_an_interval_over_episodes():
@@ -173,15 +173,15 @@ def test_an_environment_without_homes_has_an_interval_over_episodes():
     row = evaluation.summary(episodes)
     assert "homes" not in episodes and row["homes"] is None
     error = np.std(np.arange(1, 401)) / 20
-    assert row["high"] - row["low"] == pytest.approx(2 * 1.96 * error, rel=0.1)
+    assert row["upper"] - row["lower"] == pytest.approx(2 * 1.96 * error, rel=0.1)
 
 
 def test_a_home_with_more_lanes_weighs_more():
     """One lane that earned 0 in one home, three that earned 4 in another. Of the resamples of two
     homes half hold both: (0 + 3 * 4) / 4 = 3, not the mean of the homes' means, 2.
     """
-    mean, low, high = evaluation.interval([0.0, 4.0, 4.0, 4.0], [0, 1, 1, 1], level=0.4)
-    assert mean == low == high == 3
+    mean, lower, upper = evaluation.interval([0.0, 4.0, 4.0, 4.0], [0, 1, 1, 1], level=0.4)
+    assert mean == lower == upper == 3
 
 
 @pytest.mark.parametrize("sizes", [(1, 5, 2), (3, 3, 3), (1, 1, 7, 2)])

@@ -86,7 +86,7 @@ def cells(row: dict) -> tuple[str, ...]:
     return (
         row["agent"],
         f"{row['return']:.2f}",
-        f"{row['low']:.2f} to {row['high']:.2f}",
+        f"{row['lower']:.2f} to {row['upper']:.2f}",
         f"{row['length']:.0f}",
         f"{row['lanes']}{cut}",
         "none" if row["homes"] is None else str(row["homes"]),

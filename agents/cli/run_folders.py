@@ -152,7 +152,7 @@ def headline(result: Path | None) -> str:
         tables = [json.loads(path.read_text()) for path in tables if path.suffix == ".json"]
         last = max(tables, key=lambda table: (table["step"], not table["evaluation"]["greedy"]))
         row = last["rows"][0]
-        return f"{row['return']:.2f} ({row['low']:.2f} to {row['high']:.2f})"
+        return f"{row['return']:.2f} ({row['lower']:.2f} to {row['upper']:.2f})"
     except (OSError, ValueError):
         pass
     try:
