@@ -340,16 +340,26 @@ def _set(owner, name, value, call):
 
 
 def resizings(device):
-    """(label, name, act): a buffer's own memory is exchanged, and a call follows."""
+    """(label, name, act): after a good call a buffer's own memory is exchanged, and a call
+    follows.
+    """
+
+    def between_calls(change):
+        return lambda f: (CALLS["render"](f), change(f), CALLS["render"](f))
 
     def exchange(buffer, make):
-        return lambda f: (setattr(buffer(f), "data", make(buffer(f))), CALLS["render"](f))
+        return between_calls(lambda f: setattr(buffer(f), "data", make(buffer(f))))
 
     for name, buffer in BUFFERS.items():
-        yield f"{name}.resize_(0)", name, lambda f, b=buffer: (b(f).resize_(0), CALLS["render"](f))
+        yield f"{name}.resize_(0)", name, between_calls(lambda f, b=buffer: b(f).resize_(0))
         yield f"{name}.data a row less", name, exchange(buffer, lambda t: t[1:].clone())
         yield f"{name}.data of float64", name, exchange(buffer, lambda t: t.clone().double())
         yield f"{name}.data empty", name, exchange(buffer, lambda t: t.new_empty(0))
+    for name in ("textures", "baked"):
+        views = lambda f, name=name: getattr(f.layouts, name).vals  # noqa: E731
+        yield f"{name}.vals.data elsewhere", name, exchange(views, torch.clone)
+    texels = lambda f: f.layouts.texels  # noqa: E731
+    yield "texels.data elsewhere", "texels", exchange(texels, torch.clone)
 
 
 def others(device):

@@ -28,6 +28,14 @@ def test_two_metres_from_a_wall_depth_reads_two_metres(device):
     assert abs(float(o.depth[0, 0, 31]) - (1 - (2 - engine.AGENT_RADIUS) / 10)) < 5e-4
 
 
+def test_depth_falls_to_0_at_max_depth_beyond_the_radius(device):
+    core = box(device, res=63)
+    core.agents.positions[:, :, 0] = 4.0
+    for max_depth, expected in ((4.0, 1 - (2 - engine.AGENT_RADIUS) / 4), (1.5, 0.0)):
+        o = engine.observe(core.scenery, core.agents, max_depth=max_depth)
+        assert abs(float(o.depth[0, 0, 31]) - expected) < 5e-4
+
+
 def test_the_tutorials_wall(device):
     core = box(device)
     core.agents.velocity[:] = torch.tensor([1000.0, 0.0])

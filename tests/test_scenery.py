@@ -203,6 +203,14 @@ def test_lights_and_walls_that_move_are_seen_after_baking(shared):
     assert (image(shared) != darker).any()
 
 
+def test_memory_that_was_exchanged_is_read_where_it_is_now(shared):
+    image(shared)
+    lights = shared.layouts.lights.vals
+    lights.data = lights * torch.tensor([1.0, 1.0, 0.0])
+    engine.bake(shared)
+    assert (shared.layouts.baked.vals == 0.1).all(), "ambient light alone"
+
+
 def test_bounding_boxes_are_updated_in_place(shared):
     layouts, address = shared.layouts, shared.layouts.boxes.data_ptr()
     before = layouts.boxes.clone()
@@ -222,6 +230,14 @@ def test_boxes_hold_32_walls_of_one_layout_each():
         assert len(groups) == starts[d + 1] - starts[d] == 3
         for box, walls in zip(layouts.boxes[starts[d] :], groups):
             assert box.tolist() == [*walls.amin((0, 1)).tolist(), *walls.amax((0, 1)).tolist()]
+
+
+@pytest.mark.parametrize("n_walls, n_boxes", [(0, 0), (1, 1), (31, 1), (32, 1), (33, 2), (64, 2)])
+def test_a_layout_has_as_many_boxes_as_its_walls_need(n_walls, n_boxes):
+    walls = Ragged(torch.rand(n_walls, 2, 2), [n_walls])
+    texels, lights = Ragged(torch.rand(n_walls, 3), [1] * n_walls), Ragged(torch.rand(0, 3), [0])
+    layouts = Layouts(walls, texels, lights, torch.rand(1, 8, 3), "cpu")
+    assert layouts.box_starts.tolist() == [0, n_boxes] and len(layouts.boxes) == n_boxes
 
 
 TABLES = "wall_starts", "texel_starts", "light_starts", "box_starts", "boxes"
@@ -276,3 +292,46 @@ def test_an_environment_alone_is_a_copy(shared):
     after = [shared.layouts.lines.vals, shared.layouts.lights.vals]
     assert all(map(torch.equal, before, after))
     assert torch.equal(shared.env(-1)[0], shared.env(5)[0])
+
+
+# ---- Parts that do not fit ----
+
+
+def parts(**changes):
+    """The arguments of a Scenery of two environments with one agent each."""
+    return random_scenery.random_environments(0, n_envs=2).scenery_arguments() | changes
+
+
+def test_agents_textures_must_have_the_same_widths_everywhere():
+    good = parts()
+    widths = good["textures"].widths.clone()
+    second = int(good["lines"].widths[0])
+    widths[second] += 1  # of the second environment's first agent line
+    widths[second + 1] -= 1
+    with pytest.raises(ValueError, match="textures of the agents' lines must have the same widths"):
+        Scenery(**parts(textures=Ragged(good["textures"].vals, widths)))
+
+
+def test_every_wall_needs_a_texel():
+    good = parts()
+    widths = good["textures"].widths.clone()
+    widths[-2:] += torch.tensor([widths[-1], -widths[-1]])
+    with pytest.raises(ValueError, match="textures must have at least one texel per wall"):
+        Scenery(**parts(textures=Ragged(good["textures"].vals, widths)))
+
+
+def test_every_environment_begins_with_its_agents_lines():
+    good = parts()
+    with pytest.raises(ValueError, match="lines must begin, .* with the 1600 lines of its 200"):
+        Scenery(**parts(n_agents=200))
+    assert Scenery(**good).n_agents == 1
+
+
+def test_parts_of_one_scenery_make_another():
+    good = Scenery(**parts())
+    views = {name: getattr(good, name) for name in ("lights", "lines", "textures")}
+    made = Scenery(1, **views, model=good.model)
+    for name in VIEWS:
+        assert torch.equal(getattr(made, name).vals, getattr(good, name).vals), name
+    made.layouts.lights.vals.zero_()
+    assert good.lights.vals.any(), "memory of its own"
