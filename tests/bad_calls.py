@@ -99,6 +99,7 @@ def arrays(good):
     if good.numel():
         yield "NaN", good * math.nan
         yield "infinite", good + math.inf
+        yield "too large", good + 1e12
 
 
 def raggeds(good):

@@ -81,12 +81,49 @@ def test_a_snapshot_brings_an_episode_back():
     )
 
 
+def test_a_snapshot_holds_generators_too():
+    env = Counter()
+    saved = capture.snapshot(env)
+    first = [env.step(actions("cpu")).reward for _ in range(3)]
+    capture.restore(env, saved)
+    again = [env.step(actions("cpu")).reward for _ in range(3)]
+    assert all(map(torch.equal, first, again)) and not torch.equal(first[0], first[1])
+
+
 def test_a_snapshot_of_another_environment_is_refused():
     saved = capture.snapshot(envs.Explorer(3, device="cpu"))
     with pytest.raises(ValueError, match="which this Minimal does not have"):
         capture.restore(envs.Minimal(3, device="cpu"), saved)
     with pytest.raises(ValueError, match="but this Explorer needs"):
         capture.restore(envs.Explorer(4, device="cpu"), saved)
+    env = Counter()
+    env.pair = (env.pair[0].int(),)
+    with pytest.raises(
+        ValueError, match=r"pair\[0\] is \(4,\) torch.float32, but this Counter needs"
+    ):
+        capture.restore(env, capture.snapshot(Counter()))
+
+
+def test_read_only_tensors_are_no_state():
+    env = envs.Minimal(2, device="cpu")
+    paths = capture.state_tree(env)
+    assert ".core.scenery.layouts.wall_starts" not in paths
+    assert ".core.scenery.layouts.lines.vals" in paths
+
+
+def test_objects_that_hold_each_other_are_walked_once():
+    env = Counter()
+    env.itself, env.others = env, [env, {"env": env}]
+    assert len(capture.state_tree(env)) == len(capture.state_tree(Counter()))
+
+
+def test_a_module_keeps_its_parameters_in_place():
+    module = torch.nn.Linear(2, 1)
+    weight, before = module.weight, capture._StateBefore([module])
+    module.weight = torch.nn.Parameter(torch.ones(1, 2))
+    with torch.no_grad():
+        before.keep_in_place()
+    assert module.weight is weight and weight.tolist() == [[1, 1]]
 
 
 @pytest.mark.parametrize(
@@ -111,6 +148,14 @@ def test_rebound_tensors_are_kept_in_place_and_what_a_graph_cannot_repeat_is_nam
     else:
         state.keep_in_place()
         assert env.parts["total"] is before and before.tolist() == [1.0] * 4
+
+
+def test_a_scalar_that_stays_nan_has_not_changed():
+    env = Counter()
+    env.last = float("nan")
+    before = capture._StateBefore([env])
+    env.last = float("nan")
+    before.keep_in_place()
 
 
 def test_a_tensor_that_moved_to_another_attribute_is_not_gone():
@@ -154,10 +199,17 @@ class Lazy:
 
 
 class Recorded:
-    """A stand-in for torch.cuda.CUDAGraph: what runs while it records is done at once."""
+    """A stand-in for torch.cuda.CUDAGraph: what runs while it records is done at once, and what
+    replays is only counted.
+    """
+
+    replays = 0
 
     def register_generator_state(self, generator):
         pass
+
+    def replay(self):
+        self.replays += 1
 
 
 @pytest.fixture
@@ -196,6 +248,56 @@ def test_after_a_failed_recording_none_stands_where_it_stood(fake_cuda):
     with pytest.raises(RuntimeError, match="no graph of this"):
         capture.Graph(fails, (), (lazy,))
     assert lazy.memory is None and lazy.total.tolist() == [0, 0]
+
+
+def test_a_function_is_warmed_up_and_then_recorded(fake_cuda):
+    calls = []
+    capture.Graph(lambda: calls.append(1), (), (Lazy(),), warmup=2)
+    assert len(calls) == 3
+
+
+def test_arguments_are_copied_in_before_each_replay(fake_cuda):
+    given, seen = {"x": torch.zeros(2)}, []
+    graph = capture.Graph(lambda tree: seen.append(tree["x"]) or tree["x"], (given,), ())
+    inside = graph({"x": torch.tensor([3.0, 4.0])})
+    assert inside is seen[-1] and inside.tolist() == [3, 4] and given["x"].tolist() == [0, 0]
+    assert graph._graph.replays == 1
+
+
+@pytest.mark.parametrize(
+    "argument, error",
+    [
+        ({"x": torch.zeros(3)}, r"shape \(2,\), but was called with \(3,\)"),
+        ({}, "was recorded with"),
+    ],
+)
+def test_arguments_of_other_shapes_or_trees_are_refused(fake_cuda, argument, error):
+    graph = capture.Graph(lambda tree: tree["x"], ({"x": torch.zeros(2)},), ())
+    with pytest.raises(ValueError, match=error):
+        graph(argument)
+    assert not graph._graph.replays
+
+
+def test_the_warning_names_the_line_unless_the_sentence_says_it_all(fake_cuda):
+    env = Counter("scalar")
+    with pytest.warns(UserWarning, match="steps changed from 0 to 1 .* on the device.$"):
+        assert capture.capture(env.step, (actions("cpu"),), (env,)) == env.step
+    assert env.steps == 0
+
+    def fails():
+        raise RuntimeError("no graph of this")
+
+    with pytest.warns(UserWarning, match=r"no graph of this at .*test_capture.py:\d+$"):
+        assert capture.capture(fails, (), ()) is fails
+
+
+def test_only_the_actions_of_a_decision_reach_the_environment():
+    given = []
+    env = Counter()
+    env.step = given.append
+    decision = arrdict.arrdict(**actions("cpu"), logits=torch.zeros(4))
+    capture.Captured(env).step(decision)
+    assert set(given[0]) == {"actions"}
 
 
 def test_on_the_cpu_an_environment_steps_as_it_is():

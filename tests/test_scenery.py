@@ -8,6 +8,7 @@ import random_scenery
 import torch
 
 from megastep import core, engine, scene, toys
+from megastep import scenery as scenery_module
 from megastep.ragged import Ragged
 from megastep.read_only import ReadOnlyTensor
 from megastep.scenery import Layouts, Scenery
@@ -335,3 +336,8 @@ def test_parts_of_one_scenery_make_another():
         assert torch.equal(getattr(made, name).vals, getattr(good, name).vals), name
     made.layouts.lights.vals.zero_()
     assert good.lights.vals.any(), "memory of its own"
+
+
+def test_tables_that_outgrow_32_bits_are_refused():
+    with pytest.raises(ValueError, match="at most 2,147,483,647 .* but 2147483648 were given"):
+        scenery_module._starts("texel_starts", torch.tensor([2**31 - 1, 1]))
