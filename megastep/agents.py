@@ -1,4 +1,6 @@
-"""Agents: where they are, how they move, and what their cameras are like."""
+"""Agents: where they are, how they move, what their cameras are like, and what the device found
+wrong with them.
+"""
 
 import math
 from collections.abc import Sequence
@@ -7,9 +9,10 @@ from typing import Any
 import torch
 
 from . import checks
+from .kernels.compile import EngineError
 from .read_only import SetOnce
 
-__all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "MAX_RES", "Agents"]
+__all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "MAX_RES", "Agents", "check", "check_on_cpu"]
 
 AGENT_WIDTH = 0.15
 AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # the disc about a square of that width
@@ -62,3 +65,32 @@ class Agents(SetOnce):
         self.velocity = torch.zeros((n_envs, n_agents, 2), device=device)
         self.angvelocity = torch.zeros((n_envs, n_agents), device=device)
         self.error_flag = torch.zeros(1, dtype=torch.int32, device=device)
+
+
+# By kind, as errors.h numbers them.
+_ERRORS = {
+    1: "An agent of environment {env} has a position, angle or velocity that is not a finite "
+    "number: look at what was last written to it.",
+    2: "An agent of environment {env} was given an action that is none of its action space: "
+    "actions count from 0.",
+    3: "Environment {env} shows a layout that the scenery does not have: ids in scenery.layout "
+    "count from 0 and stay below the number of layouts.",
+}
+
+
+def check(agents: Agents) -> None:
+    """EngineError, which names an environment, if since the last check an agent's position, angle
+    or velocity was not a finite number, an action was none, or a layout was none. Synchronises
+    with the device, so it is not for inside a step.
+    """
+    flag = int(checks.instance("agents", agents, Agents).error_flag)
+    if flag:
+        agents.error_flag.zero_()
+        env, kind = divmod(flag, 4)
+        raise EngineError(_ERRORS[kind].format(env=env))
+
+
+def check_on_cpu(agents: Agents) -> None:
+    """:func:`check` where it takes no synchronisation."""
+    if agents.error_flag.device.type == "cpu" and int(agents.error_flag):
+        check(agents)

@@ -7,16 +7,16 @@ R rays per camera, P = R / subsample pixels, D layouts, B lanes. Metres, degrees
 """
 
 import math
-from typing import NamedTuple
 
 import torch
 
 from . import checks
-from .agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents
+from .agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents, check, check_on_cpu
 from .devices import device, fit
 from .kernels.compile import EngineError
 from .kernels.launch import SIZES, WARP, launch, params
 from .launch_params import error_flag, scenery_params, state_params
+from .outputs import Observation, Physics, Render
 from .scenery import Layouts, Scenery
 
 __all__ = [
@@ -44,65 +44,6 @@ __all__ = [
 
 MANY_ENVS = 32_768  # that fill a GPU with a quarter of a warp each
 MAX_SUBSAMPLE = 32
-
-
-class Render(NamedTuple):
-    """What the cameras see, ray by ray. A miss is -1, NaN, NaN, inf, black."""
-
-    indices: torch.Tensor  # (N, A, C, R) int32: the line hit, of its environment's lines
-    locations: torch.Tensor  # (N, A, C, R): where along the line, 0 to 1
-    dots: torch.Tensor  # (N, A, C, R): cosine between ray and line
-    distances: torch.Tensor  # (N, A, C, R): metres
-    screen: torch.Tensor  # (N, A, C, R, 3): linear light; gamma_encode it before showing it
-
-
-class Physics(NamedTuple):
-    """``progress`` (N, A): the fraction of the step that was free; below 1 the agent met something
-    and its velocities are now 0.
-    """
-
-    progress: torch.Tensor
-
-
-class Observation(NamedTuple):
-    """What a policy needs of a view; None where it was not wanted."""
-
-    rgb: torch.Tensor | None  # (N, A, C, 3, P) fp16, linear light
-    depth: torch.Tensor | None  # (N, A, C, P) fp16: 1 at the agent's radius, 0 at max_depth beyond
-    centre_line: torch.Tensor | None  # (N, A, C) int32: the line at the centre, as Render.indices
-    imu: torch.Tensor | None  # (N, A, 3) fp16: angvelocity / 360, own velocity ahead and left / 10
-    newly_seen: torch.Tensor | None  # (N, A) int32: texels now marked in `seen`, not before
-
-
-# ---- What the device flags ----
-
-
-# By kind, as errors.h numbers them.
-_ERRORS = {
-    1: "An agent of environment {env} has a position, angle or velocity that is not a finite "
-    "number: look at what was last written to it.",
-    2: "An agent of environment {env} was given an action that is none of its action space: "
-    "actions count from 0.",
-    3: "Environment {env} shows a layout that the scenery does not have: ids in scenery.layout "
-    "count from 0 and stay below the number of layouts.",
-}
-
-
-def check(agents: Agents) -> None:
-    """EngineError, which names an environment, if since the last check an agent's position, angle
-    or velocity was not a finite number, an action was none, or a layout was none. Synchronises
-    with the device, so it is not for inside a step.
-    """
-    flag = int(checks.instance("agents", agents, Agents).error_flag)
-    if flag:
-        agents.error_flag.zero_()
-        env, kind = divmod(flag, 4)
-        raise EngineError(_ERRORS[kind].format(env=env))
-
-
-def _check_on_cpu(agents):
-    if agents.error_flag.device.type == "cpu" and int(agents.error_flag):
-        check(agents)
 
 
 def _lanes(scenery, agents):
@@ -178,7 +119,7 @@ def physics(
         threads_per_env=threads_per_env,
     )
     launch("physics", packed, on, threads=threads_per_env * n)
-    _check_on_cpu(agents)
+    check_on_cpu(agents)
     return Physics(progress)
 
 
@@ -194,7 +135,7 @@ def update_agent_geometry(scenery: Scenery, agents: Agents, lit: bool = True) ->
         lit=int(checks.flag("lit", lit)),
     )
     launch("update_agent_geometry", packed, scenery.device, threads=WARP * n * a)
-    _check_on_cpu(agents)
+    check_on_cpu(agents)
 
 
 # What a view may give; 0: it is not wanted.
@@ -241,7 +182,7 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
     shared = SIZES["NearestLine"] * WARP * -(-res // WARP)
     threads = WARP * scenery.n_envs * scenery.n_agents
     launch("render", packed, on, threads, shared)
-    _check_on_cpu(agents)
+    check_on_cpu(agents)
 
 
 def _per_camera(lanes, agents):
@@ -363,7 +304,7 @@ def spawn(
         resample=int(checks.flag("resample", resample)),
     )
     launch("spawn", packed, on, threads=scenery.n_envs)
-    _check_on_cpu(agents)
+    check_on_cpu(agents)
 
 
 def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tensor) -> torch.Tensor:

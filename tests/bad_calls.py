@@ -353,6 +353,8 @@ def resizings(device):
 
     for name, buffer in BUFFERS.items():
         yield f"{name}.resize_(0)", name, between_calls(lambda f, b=buffer: b(f).resize_(0))
+        shorten = lambda f, b=buffer: b(f).resize_(len(b(f)) - 1, *b(f).shape[1:])  # noqa: E731
+        yield f"{name}.resize_ by a row", name, between_calls(shorten)
         yield f"{name}.data a row less", name, exchange(buffer, lambda t: t[1:].clone())
         yield f"{name}.data of float64", name, exchange(buffer, lambda t: t.clone().double())
         yield f"{name}.data empty", name, exchange(buffer, lambda t: t.new_empty(0))

@@ -17,7 +17,7 @@ SOURCES = sorted(
 
 # A module of the simulator may import modules of the layers above its own row only.
 LAYERS = (
-    ("bounds", "dotdict", "colour", "spaces", "read_only"),
+    ("bounds", "colour", "dotdict", "outputs", "read_only", "spaces"),
     ("arrdict", "ragged", "state"),
     ("checks", "geometry", "capture", "contract", "plotting", "kernels"),
     ("geometries", "scenery_views", "recording"),
