@@ -11,22 +11,12 @@ import sys
 import time
 
 import pytest
+import tiny
 
 from agents import checkpoint
 
 ROOT = pathlib.Path(__file__).parents[1]
-TINY = [
-    "env=minimal",
-    "geometry=box",
-    "preset=cpu",
-    "env.n_envs=4",
-    "env.res=8",
-    "learner.n_steps=8",
-    "learner.n_minibatches=2",
-    "agent.width=8",
-    "device=cpu",
-    "checkpoint=0.2",
-]
+TINY = [*tiny.TINY, "checkpoint=0.2"]
 
 
 def start(script, *arguments, cwd, **environment):

@@ -9,6 +9,7 @@ import shutil
 
 import numpy as np
 import pytest
+import tiny
 import torch
 
 from agents import evaluation
@@ -21,20 +22,7 @@ from megastep import envs, spaces
 from megastep.arrdict import arrdict
 from megastep.geometries import files, sample
 
-TINY = [
-    "env=minimal",
-    "geometry=box",
-    "preset=cpu",
-    "env.n_envs=4",
-    "env.res=8",
-    "env.shortest=5",
-    "env.longest=9",
-    "learner.n_steps=8",
-    "learner.n_minibatches=2",
-    "agent.width=8",
-    "device=cpu",
-    "samples=1",
-]
+TINY = [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=1"]
 
 
 class Counting:

@@ -218,10 +218,10 @@ def test_a_full_disk_is_one_warning_for_each_file_and_loses_no_line_once_there_i
         with faults.full_disk(size + 5):  # room for a part of a line
             sinks.write(2, {"x": 1}, {"y": 2})
             sinks.write(3, {"x": 1}, {"y": 2})
-    assert sorted(str(w.message).split(" ")[0].rpartition("/")[2] for w in caught) == [
-        "metrics.jsonl",
-        "perf.jsonl",
-    ]
+    named = sorted(str(w.message).split(" ")[0].rpartition("/")[2] for w in caught)
+    if "TensorBoard" in named:  # its thread may meet the full disk, too
+        named.remove("TensorBoard")
+    assert named == ["metrics.jsonl", "perf.jsonl"]
     sinks.write(4, {"x": 1}, {"y": 2})
     sinks.close()
     for name in ("metrics.jsonl", "perf.jsonl"):

@@ -5,6 +5,7 @@ import signal
 
 import faults
 import pytest
+import tiny
 
 from agents.cli import record, train
 from agents.cli.build import build
@@ -12,18 +13,7 @@ from agents.cli.compose import ConfigLoader
 from agents.cli.settings import Train
 from megastep import recording
 
-TINY = [
-    "env=minimal",
-    "geometry=box",
-    "preset=cpu",
-    "env.n_envs=4",
-    "env.res=8",
-    "learner.n_steps=8",
-    "learner.n_minibatches=2",
-    "agent.width=8",
-    "device=cpu",
-    "samples=1",
-]
+TINY = [*tiny.TINY, "samples=1"]
 
 
 @pytest.fixture(scope="module")

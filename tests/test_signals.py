@@ -12,6 +12,7 @@ import sys
 import time
 
 import pytest
+import tiny
 
 from agents import checkpoint, evaluation, metrics
 from agents.cli import components, train
@@ -19,19 +20,8 @@ from agents.rollout import Collector
 from megastep import recording
 
 ROOT = pathlib.Path(__file__).parents[1]
-TINY = [
-    "env=minimal",
-    "geometry=box",
-    "preset=cpu",
-    "env.n_envs=4",
-    "env.res=8",
-    "learner.n_steps=8",
-    "learner.n_minibatches=2",
-    "agent.width=8",
-    "device=cpu",
-    "report=1",
-]
-UPDATE = 4 * 8  # samples of one update
+TINY = [*tiny.TINY, "report=1"]
+UPDATE = tiny.UPDATE
 WHOLE = ["finish.evaluate=true", "finish.lanes=4", "finish.record=true", "finish.steps=3"]
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 

@@ -14,6 +14,7 @@ import time
 
 import faults
 import pytest
+import tiny
 import torch
 import yaml
 
@@ -29,21 +30,8 @@ from agents.finite import bad_leaf
 from megastep import envs
 from megastep.bounds import MAX_ENVS
 
-TINY = [
-    "env=minimal",
-    "geometry=box",
-    "preset=cpu",
-    "env.n_envs=4",
-    "env.res=8",
-    "env.shortest=5",
-    "env.longest=9",
-    "learner.n_steps=8",
-    "learner.n_minibatches=2",
-    "agent.width=8",
-    "device=cpu",
-    "report=1",
-]
-UPDATE = 4 * 8  # samples of one update
+TINY = [*tiny.TINY, *tiny.SHORT_EPISODES, "report=1"]
+UPDATE = tiny.UPDATE
 
 
 def configured(*overrides, tiny=TINY):

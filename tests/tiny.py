@@ -1,0 +1,15 @@
+"""The smallest run, as overrides of the command line: an update takes milliseconds."""
+
+TINY = [
+    "env=minimal",
+    "geometry=box",
+    "preset=cpu",
+    "env.n_envs=4",
+    "env.res=8",
+    "learner.n_steps=8",
+    "learner.n_minibatches=2",
+    "agent.width=8",
+    "device=cpu",
+]
+SHORT_EPISODES = ["env.shortest=5", "env.longest=9"]
+UPDATE = 4 * 8  # samples of one update
