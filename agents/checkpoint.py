@@ -22,7 +22,7 @@ import torch
 
 #: Raised by one whenever what is written changes so that an older reader would misread it, or a
 #: newer one what is older.
-FORMAT = 2
+FORMAT = 3
 FILES = ("state.pt", "config.json")
 
 

@@ -34,7 +34,7 @@ class BadNumber:
     @property
     def is_from_env(self) -> bool:
         """Whether the environment gave it, rather than the policy."""
-        return self.name == "reward" or self.name.split(".")[0] == "obs"
+        return self.name.split(".")[0] in ("obs", "privileged", "reward")
 
     def __str__(self):
         return f"{self.name} of lane {self.lane} was {self.size:.3g} at step {self.step:,}"

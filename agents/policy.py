@@ -1,5 +1,5 @@
-"""The actor-critic: an intake (the encoder of observations), an LSTM, and two outputs, one to act
-and one for the value.
+"""The actor-critic: an intake (the encoder of observations), an LSTM, an output to act, and a
+critic, which may see more than the actor.
 
 Axes: T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, on the CPU in
 float32.
@@ -11,47 +11,60 @@ import torch
 from torch import nn
 
 from agents import heads
+from agents.critic import Critic
 from agents.random_stream import RandomStream
 from agents.recurrent import LSTM
-from agents.value import ValueOutput
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
+
+#: What a critic may be called.
+CRITICS = "asymmetric", "plain"
 
 
 class Policy(nn.Module):
     """Acts on worlds: `decision, state = policy(world, state)`, starting from `policy.initial(B)`.
     A world is what an environment's `step` returns, a decision what it takes.
 
+    `critic` is "asymmetric", which also sees a world's `privileged` of `privileged_space` where
+    there is such a space; "plain", which sees what the actor sees; or None, for a policy that only
+    acts. Nothing privileged reaches the actions.
+
     `seed` decides the first weights and, where no generator is given, the sampled actions. The
-    weights are in `state_dict()`; where the random stream is, is in `random.state_dict()`, which a
-    learner saves. ValueError if the width is less than 1 or a space is of no known kind.
+    weights are in `state_dict()`, the critic's own under "critic."; where the random stream is, is
+    in `random.state_dict()`, which a learner saves. ValueError if the width is less than 1 or a
+    space is of no known kind.
     """
 
     def __init__(
         self,
         obs_space: Any,
         action_space: Any,
+        privileged_space: Any = None,
         *,
         width: int = 128,
         encoder: str = "linear",
+        critic: str | None = "asymmetric",
         bf16: bool = True,
         seed: int = 1,
     ):
         super().__init__()
         if width < 1:
             raise ValueError(f"width is {width}; a policy needs at least 1")
+        if critic not in (*CRITICS, None):
+            raise ValueError(f"critic is {critic!r}; it can be {' or '.join(CRITICS)}")
         self.bf16 = bf16
+        self.privileged_space = privileged_space if critic == "asymmetric" else None
         self.random = RandomStream(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.intake = heads.intake(obs_space, width, encoder)
             self.memory = LSTM(width)
             self.output = heads.output(action_space, width)
-            self.value = ValueOutput(width)
+            self.critic = None if critic is None else Critic(width, self.privileged_space)
 
     @property
     def device(self) -> torch.device:
-        return self.value.mean.device
+        return self.memory.memory.weight.device
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """The state of B lanes at the start of an episode: arrdict of (B, width) float32."""
@@ -67,11 +80,18 @@ class Policy(nn.Module):
         """One step for all lanes: (decision, state) from world.obs and world.reset, which clears a
         lane's state.
 
-        decision is arrdict(actions, logits, logprobs (B,), value (B,)); value is the return
-        expected from this world on. Actions are sampled with `generator`, by default the policy's
-        own, or are the likeliest if not `sample`.
+        decision is arrdict(actions, logits, logprobs (B,), value (B,)); value, the return expected
+        from this world on, is absent where the critic is, or what it needs. Actions are sampled
+        with `generator`, by default the policy's own, or are the likeliest if not `sample`.
         """
-        out = self.unroll(mapping(torch.unsqueeze)(world["obs"], 0), world["reset"][None], state)
+        one_step = mapping(torch.unsqueeze)
+        privileged = world.get("privileged") if self.privileged_space else None
+        out = self.unroll(
+            one_step(world["obs"], 0),
+            world["reset"][None],
+            state,
+            None if privileged is None else one_step(privileged, 0),
+        )
         logits = mapping(torch.squeeze)(out["logits"], 0)
         if sample:
             generator = self.random.on(self.device) if generator is None else generator
@@ -82,14 +102,18 @@ class Policy(nn.Module):
             actions=actions,
             logits=logits,
             logprobs=self.output.logprob(logits, actions),
-            value=out["value"][0],
         )
+        if "value" in out:
+            decision["value"] = out["value"][0]
         return decision, out["state"]
 
-    def unroll(self, obs: Any, reset: torch.Tensor, state: arrdict) -> arrdict:
-        """Many steps for all lanes: obs (T, B, ...), reset (T, B) and the state before them. The
-        state is cleared inside the sequence where reset. Returns arrdict(logits (T, B, ...), value
-        (T, B), state after the last step).
+    def unroll(
+        self, obs: Any, reset: torch.Tensor, state: arrdict, privileged: Any = None
+    ) -> arrdict:
+        """Many steps for all lanes: obs and privileged (T, B, ...), reset (T, B) and the state
+        before them. The state is cleared inside the sequence where reset. Returns arrdict(logits
+        (T, B, ...), state after the last step, value (T, B)), without the value where the critic is
+        absent, or what it needs.
         """
         with torch.autocast(
             self.device.type, torch.bfloat16, enabled=self.bf16 and self.device.type == "cuda"
@@ -98,4 +122,17 @@ class Policy(nn.Module):
             outputs, state = self.memory(encoded, reset, state)
             # what needs no memory does not have to pass through it
             features = encoded + outputs
-            return arrdict(logits=self.output(features), value=self.value(features), state=state)
+            out = arrdict(logits=self.output(features), state=state)
+            if self.critic is not None and (privileged is not None or not self.privileged_space):
+                out["value"] = self.critic(features, privileged)
+            return out
+
+    def update_stats(
+        self, obs: Any, privileged: Any = None, is_fine: torch.Tensor | bool = True
+    ) -> None:
+        """Takes what B lanes saw into account in how it is standardised from now on, if
+        `is_fine`.
+        """
+        self.intake.update_stats(obs, is_fine)
+        if privileged is not None:
+            self.critic.intake.update_stats(privileged, is_fine)

@@ -119,7 +119,7 @@ class PPO:
         is_fine = self.check(rollout.numbers())
         transitions = rollout.transitions()
         estimates = returns.gae(**transitions, gamma=self.gamma, lambda_=self.lambda_)
-        self.policy.value.update_stats(estimates.targets, estimates.valid & is_fine)
+        self.policy.critic.output.update_stats(estimates.targets, estimates.valid & is_fine)
         explained = explained_variance(transitions["value"], estimates.targets, estimates.valid)
         estimates["advantages"] = normalised(estimates.advantages, estimates.valid)
 
@@ -137,7 +137,8 @@ class PPO:
                 totals = totals + row
         # Only now: a rollout is learnt from as it was seen. One row is enough, B lanes again with
         # every rollout.
-        self.policy.intake.update_stats(rollout.obs[-1], is_fine)
+        last = rollout.world(-1)
+        self.policy.update_stats(last.obs, last.get("privileged"), is_fine)
         *sums, n_taken, n_skipped = totals.unbind()
         self.check.count((n_taken == 0) & (n_skipped > 0))
         means = {key: total / n_taken for key, total in zip(_AVERAGED, sums, strict=True)}
@@ -145,13 +146,15 @@ class PPO:
 
     def _losses(self, batch):
         """The loss of a minibatch, and what there is to say about it, each a tensor ()."""
-        now = self.policy.unroll(batch.obs, batch.starts, batch.state)
+        now = self.policy.unroll(
+            batch.obs, batch.starts, batch.state, batch.get("privileged")
+        )
         valid, output = batch.valid, self.policy.output
         log_ratio = output.logprob(now.logits, batch.actions) - batch.logprobs
         ratio = log_ratio.exp()
         clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
         gain = torch.minimum(ratio * batch.advantages, clipped * batch.advantages)
-        error = (now.value - batch.targets) / self.policy.value.scale
+        error = (now.value - batch.targets) / self.policy.critic.output.scale
 
         policy = -masked_mean(gain, valid)
         value = masked_mean(error.square(), valid)

@@ -37,6 +37,8 @@ class Rollout:
     """T steps of B lanes, in memory that is allocated once and overwritten by every `collect`.
 
     obs        (T+1, B, ...), the last row is the observation that the next rollout starts from
+    privileged (T+1, B, ...) float32, what the critic alone sees, or None where there is no such
+               space
     starts     (T+1, B) bool, whether that observation is its episode's first
     actions    (T, B, ...) int64
     logprobs   (T, B) of those actions, under the policy that chose them
@@ -56,6 +58,7 @@ class Rollout:
         action_space: Any,
         state: arrdict,
         device: torch.device | str | None = None,
+        privileged_space: Any = None,
         obs_dtype: torch.dtype = torch.float16,
     ):
         if n_steps < 1 or n_lanes < 1:
@@ -65,6 +68,9 @@ class Rollout:
         self.n_steps, self.n_lanes = n_steps, n_lanes
         rows, more = (n_steps, n_lanes), (n_steps + 1, n_lanes)
         self.obs = _zeros(obs_space, more, device, obs_dtype)
+        self.privileged = None
+        if privileged_space is not None:
+            self.privileged = _zeros(privileged_space, more, device, torch.float32)
         self.actions = _zeros(action_space, rows, device, torch.int64)
         self.starts = torch.zeros(more, dtype=torch.bool, device=device)
         self.terminal = torch.zeros(rows, dtype=torch.bool, device=device)
@@ -83,11 +89,22 @@ class Rollout:
         """Stores the world at time t, and returns it as it was stored, for the policy to act on."""
         self.obs[t] = world["obs"]
         self.starts[t] = world["reset"]
-        return arrdict(obs=self.obs[t], reset=self.starts[t])
+        if self.privileged is not None:
+            self.privileged[t] = world["privileged"]
+        return self.world(t)
+
+    def world(self, t: int) -> arrdict:
+        """What a policy sees at time t: arrdict(obs, reset, and privileged if there is any)."""
+        seen = arrdict(obs=self.obs[t], reset=self.starts[t])
+        if self.privileged is not None:
+            seen["privileged"] = self.privileged[t]
+        return seen
 
     def numbers(self) -> dict[str, torch.Tensor]:
         """All that may stop being finite, by name, each (T, B) or (T+1, B, ...)."""
         named = _floats(self.obs, "obs")
+        if self.privileged is not None:
+            named |= _floats(self.privileged, "privileged")
         return named | dict(reward=self.reward, value=self.values, logprob=self.logprobs)
 
     def transitions(self) -> dict[str, torch.Tensor]:
@@ -103,10 +120,10 @@ class Rollout:
 
     def lanes(self, rows: torch.Tensor) -> arrdict:
         """Whole sequences of some lanes, rows (M,) int64: arrdict(obs, starts, actions, logprobs,
-        value), (T, M, ...), and their state (M, ...). A copy.
+        value, and privileged if there is any), (T, M, ...), and their state (M, ...). A copy.
         """
         select = mapping(lambda leaf: leaf[: self.n_steps].index_select(1, rows))
-        return arrdict(
+        batch = arrdict(
             obs=select(self.obs),
             starts=select(self.starts),
             actions=select(self.actions),
@@ -114,15 +131,23 @@ class Rollout:
             value=select(self.values),
             state=self.state.map(lambda leaf: leaf.index_select(0, rows)),
         )
+        if self.privileged is not None:
+            batch["privileged"] = select(self.privileged)
+        return batch
 
 
 def initial_actor_state(env: Any, policy: Any) -> arrdict:
     """Resets an environment and returns the actor_state that `collect` begins with:
-    arrdict(world=arrdict(obs, reset), state). It shares no memory with the environment.
+    arrdict(world, state), of the world what a policy acts on. It shares no memory with the
+    environment.
     """
-    world = env.reset()
-    copy = arrdict(obs=mapping(torch.clone)(world["obs"]), reset=world["reset"].clone())
-    return arrdict(world=copy, state=policy.initial(len(copy.reset)))
+    world = _acted_on(env.reset()).map(torch.clone)
+    return arrdict(world=world, state=policy.initial(len(world.reset)))
+
+
+def _acted_on(world):
+    """Of a world, what a policy acts on."""
+    return arrdict({key: world[key] for key in ("obs", "reset", "privileged") if key in world})
 
 
 @torch.no_grad()
@@ -147,7 +172,7 @@ def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> ar
     rollout.values[-1] = policy(last, state, sample=False)[0]["value"]
     # a memory that is not finite starts anew, or it would last until the lane's episode ends
     state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
-    after = arrdict(world=arrdict(obs=world["obs"], reset=world["reset"]), state=state)
+    after = arrdict(world=_acted_on(world), state=state)
     for target, source in zip(leaves(actor_state), leaves(after), strict=True):
         target.copy_(source)
     return actor_state

@@ -37,7 +37,9 @@ def _spaces(tree):
 
 
 def check_environment(env: Any) -> None:
-    """What an environment must have beside its worlds, and ``layout`` if it has one."""
+    """What an environment must have beside its worlds, and ``layout`` and ``privileged_space`` if
+    it has them.
+    """
     for name, meaning in ATTRIBUTES.items():
         _require(hasattr(env, name), f"{type(env).__name__} has no {name}: {meaning}")
     _require(env.fps > 0, f"fps is a positive number of steps per second, not {env.fps}")
@@ -65,6 +67,20 @@ def check_world(env: Any, world: Mapping, last: Mapping | None = None) -> None:
             f"observation {key} is a float on the device",
         )
         _require(bool(obs.isfinite().all()), f"observation {key} is finite")
+    privileged_space = getattr(env, "privileged_space", None)
+    _require(
+        ("privileged" in world) == (privileged_space is not None),
+        "a world has privileged values if, and only if, there is a privileged_space",
+    )
+    for key, space in [] if privileged_space is None else _spaces(privileged_space):
+        values = world["privileged"] if key is None else world["privileged"][key]
+        name = f"privileged {'values' if key is None else key}"
+        _require(values.shape == (lanes, *space.shape), f"{name} are as their space says")
+        _require(
+            values.device.type == device.type and values.dtype == torch.float32,
+            f"{name} are float32 on the device",
+        )
+        _require(bool(values.isfinite().all()), f"{name} are finite")
     _require(bool(world["reward"].isfinite().all()), "rewards are finite")
     reset, terminal, truncated = (world[key] for key in FLAGS)
     _require(not bool((terminal & truncated).any()), "terminal and truncated exclude each other")

@@ -133,8 +133,8 @@ def learn(env, n_updates, policy=None, n_steps=16, **how):
 class Forgetless(Policy):
     """A policy whose memory leaks from one episode into the next."""
 
-    def unroll(self, obs, reset, state):
-        return super().unroll(obs, torch.zeros_like(reset), state)
+    def unroll(self, obs, reset, state, privileged=None):
+        return super().unroll(obs, torch.zeros_like(reset), state, privileged)
 
 
 def test_a_cue_is_remembered():

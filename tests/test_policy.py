@@ -84,7 +84,7 @@ def test_a_generator_of_ones_own_decides_the_actions():
 
 def test_weights_load_from_plain_tensors():
     policy, twin = Policy(OBS, MOVES, width=32, seed=1), Policy(OBS, MOVES, width=32, seed=2)
-    policy.value.update_stats(torch.tensor([1.0, 9.0]), torch.tensor([True, True]))
+    policy.critic.output.update_stats(torch.tensor([1.0, 9.0]), torch.tensor([True, True]))
     file = io.BytesIO()
     torch.save(policy.state_dict(), file)
     file.seek(0)

@@ -52,7 +52,7 @@ def weights(policy):
         [
             p.detach().flatten()
             for name, p in policy.named_parameters()
-            if not name.startswith("value")
+            if not name.startswith("critic.output")
         ]
     )
 

@@ -215,7 +215,7 @@ def test_a_policy_that_diverged_ends_the_run_with_advice_and_leaves_the_checkpoi
 @pytest.mark.parametrize(
     "path, spoil",
     [
-        ("policy.value.scale", lambda run: run.policy.value.scale.fill_(torch.nan)),
+        ("policy.critic.output.scale", lambda run: run.policy.critic.output.scale.fill_(torch.nan)),
         (
             "policy.intake.norms.0.mean",
             lambda run: run.policy.intake.norms[0].mean.fill_(torch.inf),

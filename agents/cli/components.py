@@ -5,6 +5,7 @@ rollout, weights. PyTorch is imported where it is used: composing a configuratio
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -84,8 +85,10 @@ def make_env(
     seed: int,
     device: torch.device,
     bytes_beside: Callable[[Any], float] = lambda env: 0,
+    privileged: bool = False,
 ) -> Any:
-    """The environment that settings describe, in these homes.
+    """The environment that settings describe, in these homes. One that takes `privileged` is told
+    whether a critic wants to see it.
 
     UserError that says how many environments fit, if these are too many for the memory;
     `bytes_beside(env)` is what each needs beside its own, in a rollout. Before a large one is made,
@@ -94,10 +97,13 @@ def make_env(
     from megastep import engine, envs
     from megastep.capture import state_tree
 
-    arguments = _arguments(chosen, "name", "n_envs")
+    constructor = envs.ENVS[chosen.name]
+    arguments = dict(_arguments(chosen, "name", "n_envs"), seed=seed, device=device)
+    if "privileged" in inspect.signature(constructor).parameters:
+        arguments["privileged"] = privileged
 
     def make(n_envs, homes):
-        return envs.ENVS[chosen.name](n_envs, homes, seed=seed, device=device, **arguments)
+        return constructor(n_envs, homes, **arguments)
 
     with errors():
         if chosen.n_envs > PROBE:
@@ -117,10 +123,27 @@ def _arguments(chosen: Any, *others: str) -> dict[str, Any]:
 
 
 def make_policy(agent: settings.Agent, env: Any, seed: int = 1) -> Policy:
+    """The actor and its critic, to be trained."""
+    return _make_policy(agent, env, seed, agent.critic)
+
+
+def make_actor(agent: settings.Agent, env: Any) -> Policy:
+    """The actor alone."""
+    return _make_policy(agent, env, 1, None)
+
+
+def _make_policy(agent, env, seed, critic):
     from agents.policy import Policy
 
     with errors():
-        policy = Policy(env.obs_space, env.action_space, seed=seed, **_arguments(agent))
+        policy = Policy(
+            env.obs_space,
+            env.action_space,
+            getattr(env, "privileged_space", None),
+            critic=critic,
+            seed=seed,
+            **_arguments(agent, "critic"),
+        )
         return policy.to(env.device)
 
 
@@ -143,6 +166,7 @@ def make_rollout(cfg: settings.Train, env: Any, policy: Policy) -> Rollout:
             env.action_space,
             policy.initial(n_lanes),
             env.device,
+            policy.privileged_space,
         )
 
 
@@ -150,11 +174,15 @@ def rollout_bytes(cfg: settings.Train, env: Any) -> float:
     """About how many bytes a rollout and a minibatch of it take per environment."""
     from megastep.dotdict import leaves
 
-    numbers = sum(math.prod(space.shape) for space in leaves(env.obs_space))
+    numbers, privileged = (
+        sum(math.prod(space.shape) for space in leaves(getattr(env, name, None) or {}))
+        for name in ("obs_space", "privileged_space")
+    )
     steps, width, parts = cfg.learner.n_steps + 1, cfg.agent.width, cfg.learner.n_minibatches
-    # observations of 2 bytes per number and about 64 of the rest; a minibatch's share of those, and
-    # of some 16 activations of 4 bytes per unit
-    return env.n_agents * steps * ((2 * numbers + 64) * (1 + 1 / parts) + 64 * width / parts)
+    # observations of 2 bytes per number, 4 of what is privileged, and about 64 of the rest; a
+    # minibatch's share of those, and of some 24 activations of 4 bytes per unit
+    each = 2 * numbers + 4 * privileged + 64
+    return env.n_agents * steps * (each * (1 + 1 / parts) + 96 * width / parts)
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> Checkpoint:
@@ -184,8 +212,8 @@ def spaces_of(env: Any) -> dict[str, str]:
 
 
 def load_weights(policy: Policy, env: Any, checkpoint: Checkpoint) -> None:
-    """Loads a checkpoint's weights into a policy made for `env`. UserError that names what differs
-    if they do not fit.
+    """Loads a checkpoint's weights into a policy made for `env`, the critic's too if it has one.
+    UserError that names what differs if they do not fit.
     """
     saved, present = checkpoint.config["spaces"], spaces_of(env)
     differing = [
@@ -210,4 +238,4 @@ def load_weights(policy: Policy, env: Any, checkpoint: Checkpoint) -> None:
             f"The weights of {checkpoint.path} do not fit this agent: {shapes[0]}; choose the "
             f"agent it has"
         )
-    policy.load_state_dict(weights)
+    policy.load_state_dict({name: weights[name] for name in own})

@@ -39,7 +39,7 @@ def run(cfg: Evaluate) -> Path:
     geometry = cfg.geometry or trained.geometry
     homes = components.homes(geometry, cfg.split, cfg.lanes)
     env = components.make_env(settled(trained.env, cfg.lanes), homes, cfg.seed, device)
-    policy = components.make_policy(trained.agent, env)
+    policy = components.make_actor(trained.agent, env)
     components.load_weights(policy, env, loaded)
     players = {"trained, greedy" if cfg.greedy else "trained": policy}
     if cfg.baseline:

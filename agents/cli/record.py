@@ -35,7 +35,7 @@ def run(cfg: Record) -> Path:
     env = components.make_env(
         dataclasses.replace(trained.env, n_envs=1), [homes[cfg.home % len(homes)]], cfg.seed, device
     )
-    policy = components.make_policy(trained.agent, env)
+    policy = components.make_actor(trained.agent, env)
     components.load_weights(policy, env, loaded)
 
     place = Path(cfg.file) if cfg.file else run_folders.folder_of(path) / "video.mp4"

@@ -14,7 +14,7 @@ from megastep.bounds import MAX_ENVS, bounds_of
 
 Sentences = Iterator[tuple[str, str]]
 #: Arguments of an environment that a run gives it from other settings.
-FROM_RUN = ("self", "geometries", "seed", "device")
+FROM_RUN = ("self", "geometries", "seed", "device", "privileged")
 
 
 def of_environment(constructor: Callable) -> type:
@@ -84,6 +84,7 @@ class Agent:
 
     width: int = within(1, 8192)
     encoder: str = among("linear", "conv")
+    critic: str = among("asymmetric", "plain")
 
 
 @dataclass(frozen=True)

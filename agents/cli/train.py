@@ -61,7 +61,12 @@ def make_trainer(
     """
     homes = components.homes(cfg.geometry, "training")
     env = components.make_env(
-        cfg.env, homes, cfg.seed, device, lambda env: components.rollout_bytes(cfg, env)
+        cfg.env,
+        homes,
+        cfg.seed,
+        device,
+        lambda env: components.rollout_bytes(cfg, env),
+        privileged=cfg.agent.critic == "asymmetric",
     )
     policy = components.make_policy(cfg.agent, env, cfg.seed)
     learner = components.make_learner(cfg.learner, policy, cfg.seed)

@@ -19,6 +19,19 @@ from ..scene import scenery
 __all__ = ["Explorer"]
 
 TEXELS_PER_POINT = 64  # newly seen texels that earn a reward of 1
+#: What a critic is told, each in units that make it about 1: how long the episode lasts yet and how
+#: long it has lasted, texels it has seen and those it has not that can be seen from a spawn point,
+#: and where the agent is and looks.
+PRIVILEGED = {
+    "steps left": 1 / 200,
+    "age": 1 / 1000,
+    "texels seen": 1 / 1000,
+    "texels left": 1 / 1000,
+    "x": 1 / 10,
+    "y": 1 / 10,
+    "cosine of the heading": 1.0,
+    "sine of the heading": 1.0,
+}
 
 
 class Explorer:
@@ -31,7 +44,8 @@ class Explorer:
 
     Args: ``geometries`` to live in, generated homes by default; ``res`` rays and ``subsample`` rays
     per pixel; ``fov`` degrees; ``fps`` steps per second; ``patience`` steps; ``resample``: every
-    episode in a home drawn anew, instead of one home per environment for ever.
+    episode in a home drawn anew, instead of one home per environment for ever; ``privileged``:
+    worlds also have what ``PRIVILEGED`` names, for a critic.
     """
 
     n_agents = 1
@@ -50,6 +64,7 @@ class Explorer:
         fps: Annotated[float, Within(1, 1000)] = 10.0,
         patience: Annotated[int, Within(1, 10**6)] = 200,
         resample: bool = False,
+        privileged: bool = False,
     ):
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
@@ -73,9 +88,14 @@ class Explorer:
             imu=spaces.MultiVector(1, 3),
         )
         self.action_space = self.movement.space
+        self.privileged_space = spaces.MultiVector(1, len(PRIVILEGED)) if privileged else None
         words = -(-self.core.scenery.layouts.max_texels // 32)
         engine.fit(n_envs, 4 * words + 8 * pixels + 64, self.device)
         self.seen = torch.zeros((n_envs, 1, words), dtype=torch.int32, device=self.device)
+        if privileged:
+            visible = modules.visible_texels(self.core.scenery, self.spawner.points)
+            self.n_visible = modules.count_texels(visible)
+            self.units = torch.tensor(list(PRIVILEGED.values()), device=self.device)
 
     def reset(self) -> arrdict:
         """Starts every episode anew. Returns a world."""
@@ -92,7 +112,25 @@ class Explorer:
         obs, newly_seen = self._observation(seen=self.seen, clear_mask=clear_mask)
         self.lifecycle.limits.masked_fill_(reset, self.patience).add_(newly_seen)
         reward = (newly_seen / TEXELS_PER_POINT).masked_fill_(reset, 0.0)
-        return arrdict(obs=obs, reward=reward, **self.lifecycle(reset))
+        flags = self.lifecycle(reset)
+        if self.privileged_space is None:
+            return arrdict(obs=obs, reward=reward, **flags)
+        return arrdict(obs=obs, reward=reward, privileged=self._privileged(), **flags)
+
+    def _privileged(self):
+        """(N, 1, P): what ``PRIVILEGED`` names."""
+        ages, limits, agents = self.lifecycle.ages, self.lifecycle.limits, self.core.agents
+        numbers = torch.empty((self.n_envs, 1, len(PRIVILEGED)), device=self.device)
+        left, age, n_seen, n_unseen = numbers[:, 0, :4].unbind(1)
+        torch.sub(limits, ages, out=left)
+        age.copy_(ages)
+        n_seen.copy_(self.n_seen)
+        torch.sub(self.n_visible[self.layout], n_seen, out=n_unseen).clamp_(min=0)
+        numbers[..., 4:6] = agents.positions
+        radians = agents.angles.deg2rad()
+        torch.cos(radians, out=numbers[..., 6])
+        torch.sin(radians, out=numbers[..., 7])
+        return numbers.mul_(self.units)
 
     @property
     def n_seen(self) -> torch.Tensor:

@@ -7,6 +7,7 @@ from .lifecycle import Lifecycle, RandomLifespans, RandomStream
 from .movement import MOVES, TURNS, MomentumMovement, SimpleMovement, to_global, to_local
 from .sensors import IMU, RGB, Depth, downsample, render
 from .spawning import RandomSpawns, spawn_points
+from .visibility import count_texels, visible_texels
 
 __all__ = [
     "IMU",
@@ -20,6 +21,7 @@ __all__ = [
     "RandomSpawns",
     "RandomStream",
     "SimpleMovement",
+    "count_texels",
     "downsample",
     "render",
     "spawn_points",
@@ -27,4 +29,5 @@ __all__ = [
     "to_global",
     "to_lanes",
     "to_local",
+    "visible_texels",
 ]
