@@ -137,10 +137,13 @@ class ConcatIntake(nn.Module):
                 block.normal_(std=math.sqrt(2 / (len(sizes) * size)))
 
     def forward(self, obs):
+        return F.relu(self.project(self.encoded(obs)))
+
+    def encoded(self, obs: Any) -> torch.Tensor:
+        """All leaves, standardised, encoded and joined, (..., n_features)."""
         dtype = compute_dtype(self.project.weight)
         features = [encoder(norm(leaf)).to(dtype) for leaf, norm, encoder in self._leaves(obs)]
-        joined = features[0] if len(features) == 1 else torch.cat(features, dim=-1)
-        return F.relu(self.project(joined))
+        return features[0] if len(features) == 1 else torch.cat(features, dim=-1)
 
     def update_stats(self, obs: Any, is_fine: torch.Tensor | bool = True) -> None:
         """Takes observations (B, ...) into account in how they are standardised from now on, if

@@ -27,7 +27,8 @@ class Policy(nn.Module):
 
     `critic` is "asymmetric", which also sees a world's `privileged` of `privileged_space` where
     there is such a space; "plain", which sees what the actor sees; or None, for a policy that only
-    acts. Nothing privileged reaches the actions.
+    acts. Nothing privileged reaches the actions; but `prediction_error` can teach the memory what
+    the critic knows.
 
     `seed` decides the first weights and, where no generator is given, the sampled actions. The
     weights are in `state_dict()`, the critic's own under "critic."; where the random stream is, is
@@ -61,6 +62,8 @@ class Policy(nn.Module):
             self.memory = LSTM(width)
             self.output = heads.output(action_space, width)
             self.critic = None if critic is None else Critic(width, self.privileged_space)
+            if self.privileged_space:
+                self.prediction = nn.Linear(width, self.critic.intake.project.in_features)
 
     @property
     def device(self) -> torch.device:
@@ -112,20 +115,34 @@ class Policy(nn.Module):
     ) -> arrdict:
         """Many steps for all lanes: obs and privileged (T, B, ...), reset (T, B) and the state
         before them. The state is cleared inside the sequence where reset. Returns arrdict(logits
-        (T, B, ...), state after the last step, value (T, B)), without the value where the critic is
-        absent, or what it needs.
+        (T, B, ...), features (T, B, width) that they were made from, state after the last step,
+        value (T, B)), without the value where the critic is absent, or what it needs.
         """
-        with torch.autocast(
-            self.device.type, torch.bfloat16, enabled=self.bf16 and self.device.type == "cuda"
-        ):
+        with self._compute_dtype():
             encoded = self.intake(obs)
             outputs, state = self.memory(encoded, reset, state)
             # what needs no memory does not have to pass through it
             features = encoded + outputs
-            out = arrdict(logits=self.output(features), state=state)
+            out = arrdict(logits=self.output(features), features=features, state=state)
             if self.critic is not None and (privileged is not None or not self.privileged_space):
                 out["value"] = self.critic(features, privileged)
             return out
+
+    def prediction_error(self, features: torch.Tensor, privileged: Any) -> torch.Tensor:
+        """(T, B): how badly the features of `unroll` tell what the critic sees, as a mean squared
+        error in standard deviations. An auxiliary loss that only shapes the memory (Mirowski et al.
+        2017; of privileged information: Lambrechts et al. 2024).
+        """
+        with torch.no_grad():
+            target = self.critic.intake.encoded(privileged)
+        with self._compute_dtype():
+            predicted = self.prediction(features)
+        return (predicted - target).square().mean(-1)
+
+    def _compute_dtype(self):
+        return torch.autocast(
+            self.device.type, torch.bfloat16, enabled=self.bf16 and self.device.type == "cuda"
+        )
 
     def update_stats(
         self, obs: Any, privileged: Any = None, is_fine: torch.Tensor | bool = True

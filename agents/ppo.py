@@ -55,6 +55,7 @@ class PPO:
                       stops
     entropy_coef      what a nat of entropy is worth, in standard deviations of advantage
     value_coef        weight of the value's squared error, the value measured in its own scale
+    auxiliary_coef    weight of the policy's `prediction_error`, where its critic is asymmetric
     max_grad_norm     longer gradients are shortened to this
     n_epochs, n_minibatches  passes over a rollout, and the parts each is cut into by lanes
     target_kl         once a minibatch finds the policy further than this (nats) from the one that
@@ -76,6 +77,7 @@ class PPO:
         clip: float = 0.2,
         entropy_coef: float = 0.01,
         value_coef: float = 0.5,
+        auxiliary_coef: float = 0.5,
         max_grad_norm: float = 0.5,
         n_epochs: int = 1,
         n_minibatches: int = 4,
@@ -85,7 +87,8 @@ class PPO:
     ):
         self.policy, self.device = policy, policy.device
         self.gamma, self.lambda_, self.clip, self.entropy_coef = gamma, lambda_, clip, entropy_coef
-        self.value_coef, self.max_grad_norm = value_coef, max_grad_norm
+        self.value_coef, self.auxiliary_coef = value_coef, auxiliary_coef
+        self.max_grad_norm = max_grad_norm
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
         self.target_kl = float("inf") if target_kl is None else target_kl
         self.lr = lr
@@ -93,6 +96,9 @@ class PPO:
         self.optimizer = Adam(policy.parameters(), self._lr)
         self.random = RandomStream(seed)
         self.check = FiniteCheck(self.device)
+        self._averaged = _AVERAGED
+        if policy.privileged_space:
+            self._averaged += ("auxiliary",)
         # the stream of warming up and capturing, on the policy's own GPU
         is_captured = graph and self.device.type == "cuda"
         self._stream = torch.cuda.Stream(self.device) if is_captured else None
@@ -123,7 +129,7 @@ class PPO:
         explained = explained_variance(transitions["value"], estimates.targets, estimates.valid)
         estimates["advantages"] = normalised(estimates.advantages, estimates.valid)
 
-        totals = torch.zeros(len(_AVERAGED) + 2, device=self.device)
+        totals = torch.zeros(len(self._averaged) + 2, device=self.device)
         stopped = torch.zeros((), dtype=torch.bool, device=self.device)
         for _ in range(self.n_epochs):
             order = torch.rand(
@@ -141,14 +147,12 @@ class PPO:
         self.policy.update_stats(last.obs, last.get("privileged"), is_fine)
         *sums, n_taken, n_skipped = totals.unbind()
         self.check.count((n_taken == 0) & (n_skipped > 0))
-        means = {key: total / n_taken for key, total in zip(_AVERAGED, sums, strict=True)}
+        means = {key: total / n_taken for key, total in zip(self._averaged, sums, strict=True)}
         return {**means, "explained_variance": explained, "skipped_steps": n_skipped}
 
     def _losses(self, batch):
         """The loss of a minibatch, and what there is to say about it, each a tensor ()."""
-        now = self.policy.unroll(
-            batch.obs, batch.starts, batch.state, batch.get("privileged")
-        )
+        now = self.policy.unroll(batch.obs, batch.starts, batch.state, batch.get("privileged"))
         valid, output = batch.valid, self.policy.output
         log_ratio = output.logprob(now.logits, batch.actions) - batch.logprobs
         ratio = log_ratio.exp()
@@ -164,9 +168,14 @@ class PPO:
             kl = masked_mean(ratio - 1 - log_ratio, valid)
             clip_fraction = masked_mean((ratio != clipped).float(), valid)
         loss = policy + self.value_coef * value - self.entropy_coef * entropy
-        return loss, dict(
+        metrics = dict(
             policy=policy, value=value, entropy=entropy, kl=kl, clip_fraction=clip_fraction
         )
+        if self.policy.privileged_space:
+            error = self.policy.prediction_error(now.features, batch.privileged)
+            metrics["auxiliary"] = masked_mean(error, valid)
+            loss = loss + self.auxiliary_coef * metrics["auxiliary"]
+        return loss, metrics
 
     def _step(self, batch, is_fine, stopped):
         """One gradient step, unless `stopped`, or the KL is too large (which stops the next ones
@@ -183,7 +192,7 @@ class PPO:
         stopped = stopped | (metrics["kl"] > self.target_kl)
         taken = finite & ~stopped
         self.optimizer.step(taken)
-        row = torch.stack([metrics[key].detach() for key in _AVERAGED])
+        row = torch.stack([metrics[key].detach() for key in self._averaged])
         return torch.cat(
             [row.masked_fill(~taken, 0.0), torch.stack([taken, ~finite & ~stopped]).float()]
         ), stopped

@@ -1,6 +1,6 @@
-"""The engine: ``bake``, ``physics``, ``render``, ``observe``, ``spawn``, ``uniform``. Each checks
-its arguments, allocates and launches, on the CPU or the GPU, whichever its tensors are on; none
-synchronises. TypeError or ValueError, naming the argument, if one does not fit.
+"""The engine: ``bake``, ``physics``, ``render``, ``observe``, ``unseen``, ``spawn``, ``uniform``.
+Each checks its arguments, allocates and launches, on the CPU or the GPU, whichever its tensors are
+on; none synchronises. TypeError or ValueError, naming the argument, if one does not fit.
 
 N environments, A agents per environment, C cameras per agent (the axis is dropped if there is one),
 R rays per camera, P = R / subsample pixels, D layouts, B lanes. Metres, degrees, seconds.
@@ -39,9 +39,12 @@ __all__ = [
     "render",
     "spawn",
     "uniform",
+    "unseen",
     "update_agent_geometry",
 ]
 
+BANDS = 3  # of distance from an agent: up to 1.5 m, up to 4 m, and beyond
+SECTORS = 16  # of bearing from an agent
 MANY_ENVS = 32_768  # that fill a GPU with a quarter of a warp each
 MAX_SUBSAMPLE = 32
 
@@ -233,7 +236,9 @@ def observe(
     checks.number("max_depth", max_depth, 0, math.inf, "metres")
     for name, value in (("rgb", rgb), ("depth", depth), ("imu", imu), ("centre_line", centre_line)):
         checks.flag(name, value)
-    seen_fields = {} if seen is None and clear_mask is None else _seen(scenery, seen, clear_mask)
+    seen_fields = {}
+    if seen is not None or clear_mask is not None:
+        seen_fields = _seen(scenery, seen, clear_mask)
     if a > 1:
         update_agent_geometry(scenery, agents, lit=rgb)
     shape, pixels = _per_camera(lanes, agents), agents.res // subsample
@@ -255,18 +260,55 @@ def _seen(scenery, seen, clear_mask):
     lanes, on = (scenery.n_envs, scenery.n_agents), scenery.device
     if seen is None:
         raise ValueError("clear_mask clears seen, but seen was not given")
-    needed = -(-scenery.layouts.max_texels // 32)
-    n_words = checks.length("seen", seen, axis=-1)
-    if n_words < needed:
-        raise ValueError(
-            f"seen must have a bit for each of a layout's texels, so at least {needed} words per "
-            f"agent, but it has {n_words}"
-        )
     mask = 0
     if clear_mask is not None:
         mask = checks.address("clear_mask", clear_mask, lanes, torch.bool, on)
-    at = checks.address("seen", seen, (*lanes, n_words), torch.int32, on)
+    at, n_words = _texel_bits(scenery, "seen", seen, lanes)
     return dict(seen=at, clear_mask=mask, n_words=n_words)
+
+
+def _texel_bits(scenery, name, bits, owners):
+    """The address of (*owners, n_words) int32, a bit for each texel of a layout, and n_words."""
+    needed = -(-scenery.layouts.max_texels // 32)
+    n_words = checks.length(name, bits, axis=-1)
+    if n_words < needed:
+        raise ValueError(
+            f"{name} must have a bit for each of a layout's texels, so at least {needed} words, "
+            f"but it has {n_words}"
+        )
+    at = checks.address(name, bits, (*owners, n_words), torch.int32, scenery.device)
+    return at, n_words
+
+
+def unseen(
+    scenery: Scenery, agents: Agents, seen: torch.Tensor, visible: torch.Tensor
+) -> torch.Tensor:
+    """Where the texels are that an agent has not seen yet, of those that are visible at all: (N, A,
+    3, 16) int32, how many lie within 1.5 m, within 4 m and beyond, in each of 16 sectors of 22.5
+    degrees, the first straight ahead, the next further left. Texels of one wall that share a word
+    count together, where their middle lies.
+
+    Args: ``seen`` (N, A, n_words) int32, as of :func:`observe`; ``visible`` (D, n_words) int32, as
+    of :func:`~megastep.modules.visible_texels`.
+    """
+    n, a = lanes = _lanes(scenery, agents)
+    seen_at, n_words = _texel_bits(scenery, "seen", seen, lanes)
+    visible_at = checks.address(
+        "visible", visible, (len(scenery.layouts), n_words), torch.int32, scenery.device
+    )
+    counts = torch.empty((n, a, BANDS, SECTORS), dtype=torch.int32, device=scenery.device)
+    packed = params.UnseenParams(
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles"),
+        seen=seen_at,
+        visible=visible_at,
+        error_flag=error_flag(scenery, agents),
+        counts=counts.data_ptr(),
+        n_words=n_words,
+    )
+    launch("unseen", packed, scenery.device, threads=WARP * n * a)
+    check_on_cpu(agents)
+    return counts
 
 
 def spawn(

@@ -100,6 +100,7 @@ class Learner:
     clip: float = within(0, 1e6, min_open=True)
     entropy_coef: float = within(0, 1e6)
     value_coef: float = within(0, 1e6)
+    auxiliary_coef: float = within(0, 1e6)
     max_grad_norm: float = within(0, 1e6, min_open=True)
     n_epochs: int = within(1, 1000)
     n_minibatches: int = within(1, MAX_ENVS)

@@ -19,19 +19,6 @@ from ..scene import scenery
 __all__ = ["Explorer"]
 
 TEXELS_PER_POINT = 64  # newly seen texels that earn a reward of 1
-#: What a critic is told, each in units that make it about 1: how long the episode lasts yet and how
-#: long it has lasted, texels it has seen and those it has not that can be seen from a spawn point,
-#: and where the agent is and looks.
-PRIVILEGED = {
-    "steps left": 1 / 200,
-    "age": 1 / 1000,
-    "texels seen": 1 / 1000,
-    "texels left": 1 / 1000,
-    "x": 1 / 10,
-    "y": 1 / 10,
-    "cosine of the heading": 1.0,
-    "sine of the heading": 1.0,
-}
 
 
 class Explorer:
@@ -45,7 +32,8 @@ class Explorer:
     Args: ``geometries`` to live in, generated homes by default; ``res`` rays and ``subsample`` rays
     per pixel; ``fov`` degrees; ``fps`` steps per second; ``patience`` steps; ``resample``: every
     episode in a home drawn anew, instead of one home per environment for ever; ``privileged``:
-    worlds also have what ``PRIVILEGED`` names, for a critic.
+    worlds also tell a critic how far the episode is and where the texels are that can be seen from
+    some spawn point and have not been seen yet.
     """
 
     n_agents = 1
@@ -88,14 +76,17 @@ class Explorer:
             imu=spaces.MultiVector(1, 3),
         )
         self.action_space = self.movement.space
-        self.privileged_space = spaces.MultiVector(1, len(PRIVILEGED)) if privileged else None
+        self.privileged_space = None
         words = -(-self.core.scenery.layouts.max_texels // 32)
         engine.fit(n_envs, 4 * words + 8 * pixels + 64, self.device)
         self.seen = torch.zeros((n_envs, 1, words), dtype=torch.int32, device=self.device)
         if privileged:
-            visible = modules.visible_texels(self.core.scenery, self.spawner.points)
-            self.n_visible = modules.count_texels(visible)
-            self.units = torch.tensor(list(PRIVILEGED.values()), device=self.device)
+            self.visible = modules.visible_texels(self.core.scenery, self.spawner.points)
+            self.units = torch.tensor([200.0, 1000.0, 1000.0, 1000.0], device=self.device)
+            self.privileged_space = dotdict(
+                episode=spaces.MultiVector(1, 4),
+                unseen=spaces.MultiVector(1, engine.BANDS * engine.SECTORS),
+            )
 
     def reset(self) -> arrdict:
         """Starts every episode anew. Returns a world."""
@@ -118,19 +109,18 @@ class Explorer:
         return arrdict(obs=obs, reward=reward, privileged=self._privileged(), **flags)
 
     def _privileged(self):
-        """(N, 1, P): what ``PRIVILEGED`` names."""
-        ages, limits, agents = self.lifecycle.ages, self.lifecycle.limits, self.core.agents
-        numbers = torch.empty((self.n_envs, 1, len(PRIVILEGED)), device=self.device)
-        left, age, n_seen, n_unseen = numbers[:, 0, :4].unbind(1)
-        torch.sub(limits, ages, out=left)
-        age.copy_(ages)
-        n_seen.copy_(self.n_seen)
-        torch.sub(self.n_visible[self.layout], n_seen, out=n_unseen).clamp_(min=0)
-        numbers[..., 4:6] = agents.positions
-        radians = agents.angles.deg2rad()
-        torch.cos(radians, out=numbers[..., 6])
-        torch.sin(radians, out=numbers[..., 7])
-        return numbers.mul_(self.units)
+        """What only a critic sees, in units that make each number about 1: ``episode`` (N, 1, 4),
+        steps left and behind, texels seen and left; ``unseen`` (N, 1, 48), the root of how many are
+        left in each band and sector of ``engine.unseen``.
+        """
+        ages, limits = self.lifecycle.ages, self.lifecycle.limits
+        counts = engine.unseen(self.core.scenery, self.core.agents, self.seen, self.visible)
+        counts = counts.view(self.n_envs, 1, -1)
+        columns = limits - ages, ages, self.n_seen, counts.sum((1, 2), dtype=torch.int32)
+        return arrdict(
+            episode=torch.stack(columns, -1)[:, None] / self.units,
+            unseen=(counts / TEXELS_PER_POINT).sqrt_(),
+        )
 
     @property
     def n_seen(self) -> torch.Tensor:

@@ -12,6 +12,8 @@
 #define RECIPROCAL(x) (1.f / (x))
 #define LOAD(address) (*(address))
 #define OR_BITS(word, bits) or_bits(word, bits)
+#define ADD(word, number) (*(word) += (number))
+#define COUNT_BITS(word) __builtin_popcount(word)
 #define HALF_BITS(x) half_bits(x)
 #define NAN_VALUE __builtin_nanf("")
 #define INF_VALUE __builtin_inff()

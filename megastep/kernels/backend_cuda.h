@@ -16,6 +16,8 @@
 #define RECIPROCAL(x) reciprocal(x)
 #define LOAD(address) load(address)
 #define OR_BITS(word, bits) atomicOr(word, bits)
+#define ADD(word, number) atomicAdd(word, number)
+#define COUNT_BITS(word) __popc(word)
 #define HALF_BITS(x) half_bits(x)
 #define NAN_VALUE __int_as_float(0x7fc00000)
 #define INF_VALUE __int_as_float(0x7f800000)

@@ -22,7 +22,7 @@ import torch
 from . import cache
 
 HERE = Path(__file__).parent
-OPERATIONS = ("bake", "physics", "update_agent_geometry", "render", "spawn", "uniform")
+OPERATIONS = ("bake", "physics", "update_agent_geometry", "render", "unseen", "spawn", "uniform")
 CPU_FLAGS = (
     "-std=c++17",
     "-O3",

@@ -123,6 +123,17 @@ struct SpawnParams {
     int resample;  // 1: an environment all of whose agents respawn moves to another layout
 };
 
+struct UnseenParams {
+    SceneryParams scenery;
+    const float* positions;       // (N, A, 2)
+    const float* angles;          // (N, A)
+    const unsigned int* seen;     // (N, A, n_words) a bit per static texel
+    const unsigned int* visible;  // (D, n_words) a bit per static texel
+    int* error_flag;              // (1) out: see errors.h
+    int* counts;                  // (N, A, bands, sectors) out
+    int n_words;
+};
+
 struct UniformParams {
     const int* counts;          // (B) numbers that each lane has drawn
     const unsigned char* mask;  // (B) lanes that draw; others keep what out holds

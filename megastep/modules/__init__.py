@@ -7,7 +7,7 @@ from .lifecycle import Lifecycle, RandomLifespans, RandomStream
 from .movement import MOVES, TURNS, MomentumMovement, SimpleMovement, to_global, to_local
 from .sensors import IMU, RGB, Depth, downsample, render
 from .spawning import RandomSpawns, spawn_points
-from .visibility import count_texels, visible_texels
+from .visibility import visible_texels
 
 __all__ = [
     "IMU",
@@ -21,7 +21,6 @@ __all__ = [
     "RandomSpawns",
     "RandomStream",
     "SimpleMovement",
-    "count_texels",
     "downsample",
     "render",
     "spawn_points",

@@ -8,7 +8,7 @@ import torch
 from .. import checks, engine
 from ..scenery import Scenery
 
-__all__ = ["count_texels", "visible_texels"]
+__all__ = ["visible_texels"]
 
 CAMERAS = (0.0, 120.0, 240.0)  # degrees
 FOV = 122.0  # degrees; neighbouring cameras overlap by two
@@ -39,9 +39,3 @@ def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
         engine.observe(each_once, agents, rgb=False, depth=False, seen=seen)
     engine.check(agents)
     return seen[:, 0].clone()
-
-
-def count_texels(bits: torch.Tensor) -> torch.Tensor:
-    """(...,) int32: how many bits are set in words (..., n_words) int32."""
-    shifts = torch.arange(32, dtype=torch.int32, device=bits.device)
-    return sum((bits >> shift & 1).sum(-1, dtype=torch.int32) for shift in shifts)

@@ -1,0 +1,44 @@
+// Where the texels are that an agent could see and has not seen yet: how many lie in each of 16
+// sectors about the way it looks, in each of three bands of distance.
+#pragma once
+#include "errors.h"
+#include "scenery.h"
+
+constexpr int BANDS = 3, SECTORS = 16, BINS = BANDS * SECTORS;
+constexpr float BAND_ENDS[] = {1.5f, 4.f};  // metres
+
+// Sector 0 lies straight ahead, 4 to the left, 8 behind. A bearing is compared with odd multiples
+// of 11.25 degrees by their tangents, which needs no arc tangent.
+HD int sector_of(float ahead, float left) {
+    float along = ahead < 0.f ? -ahead : ahead, across = left < 0.f ? -left : left;
+    int sector = (across > 0.19891237f * along) + (across > 0.66817864f * along) +
+                 (across > 1.49660576f * along) + (across > 5.02733949f * along);
+    if (ahead < 0.f)
+        sector = SECTORS / 2 - sector;
+    return left < 0.f ? (SECTORS - sector) % SECTORS : sector;
+}
+
+HD int band_of(float ahead, float left) {
+    float squared = ahead * ahead + left * left;
+    return (squared > BAND_ENDS[0] * BAND_ENDS[0]) + (squared > BAND_ENDS[1] * BAND_ENDS[1]);
+}
+
+// Adds the unseen texels of a wall of the layout whose texels start at `first_texel`. Those that
+// share a word of bits, at most 1.6 m of a wall, count where their middle lies.
+HD void count_unseen(const UnseenParams& p, const Pose& pose, const unsigned int* seen,
+                     const unsigned int* visible, int first_texel, int wall, int* bins) {
+    int first = p.scenery.texel_starts[wall] - first_texel;
+    int end = p.scenery.texel_starts[wall + 1] - first_texel;
+    for (int word = first >> 5; word <= (end - 1) >> 5; word++) {
+        int from = maxi(first, 32 * word), to = mini(end, 32 * word + 32);
+        unsigned int bits = visible[word] & ~seen[word] & (~0u << (from & 31));
+        bits &= ~0u >> (32 * word + 32 - to);
+        if (!bits)
+            continue;
+        Float4 line = LOAD((const Float4*)p.scenery.walls + wall);
+        float middle = (0.5f * (float)(from + to) - (float)first) / (float)(end - first);
+        float dx = mix(line.x, line.z, middle) - pose.x, dy = mix(line.y, line.w, middle) - pose.y;
+        float ahead = pose.cosine * dx + pose.sine * dy, left = pose.cosine * dy - pose.sine * dx;
+        ADD(bins + SECTORS * band_of(ahead, left) + sector_of(ahead, left), COUNT_BITS(bits));
+    }
+}
