@@ -63,7 +63,7 @@ class Policy(nn.Module):
             self.output = heads.output(action_space, width)
             self.critic = None if critic is None else Critic(width, self.privileged_space)
             if self.privileged_space:
-                self.prediction = nn.Linear(width, self.critic.intake.project.in_features)
+                self.prediction = nn.Linear(width, self.critic.intake.n_features)
 
     @property
     def device(self) -> torch.device:
@@ -83,18 +83,10 @@ class Policy(nn.Module):
         """One step for all lanes: (decision, state) from world.obs and world.reset, which clears a
         lane's state.
 
-        decision is arrdict(actions, logits, logprobs (B,), value (B,)); value, the return expected
-        from this world on, is absent where the critic is, or what it needs. Actions are sampled
-        with `generator`, by default the policy's own, or are the likeliest if not `sample`.
+        decision is arrdict(actions, logits, logprobs (B,), features (B, width)). Actions are
+        sampled with `generator`, by default the policy's own, or are the likeliest if not `sample`.
         """
-        one_step = mapping(torch.unsqueeze)
-        privileged = world.get("privileged") if self.privileged_space else None
-        out = self.unroll(
-            one_step(world["obs"], 0),
-            world["reset"][None],
-            state,
-            None if privileged is None else one_step(privileged, 0),
-        )
+        out = self.unroll(mapping(torch.unsqueeze)(world["obs"], 0), world["reset"][None], state)
         logits = mapping(torch.squeeze)(out["logits"], 0)
         if sample:
             generator = self.random.on(self.device) if generator is None else generator
@@ -105,28 +97,28 @@ class Policy(nn.Module):
             actions=actions,
             logits=logits,
             logprobs=self.output.logprob(logits, actions),
+            features=out["features"][0],
         )
-        if "value" in out:
-            decision["value"] = out["value"][0]
         return decision, out["state"]
 
-    def unroll(
-        self, obs: Any, reset: torch.Tensor, state: arrdict, privileged: Any = None
-    ) -> arrdict:
-        """Many steps for all lanes: obs and privileged (T, B, ...), reset (T, B) and the state
-        before them. The state is cleared inside the sequence where reset. Returns arrdict(logits
-        (T, B, ...), features (T, B, width) that they were made from, state after the last step,
-        value (T, B)), without the value where the critic is absent, or what it needs.
+    def unroll(self, obs: Any, reset: torch.Tensor, state: arrdict) -> arrdict:
+        """Many steps for all lanes: obs (T, B, ...), reset (T, B) and the state before them. The
+        state is cleared inside the sequence where reset. Returns arrdict(logits (T, B, ...),
+        features (T, B, width) that they were made from, state after the last step).
         """
-        with self._compute_dtype():
+        with self.compute_dtype():
             encoded = self.intake(obs)
             outputs, state = self.memory(encoded, reset, state)
             # what needs no memory does not have to pass through it
             features = encoded + outputs
-            out = arrdict(logits=self.output(features), features=features, state=state)
-            if self.critic is not None and (privileged is not None or not self.privileged_space):
-                out["value"] = self.critic(features, privileged)
-            return out
+            return arrdict(logits=self.output(features), features=features, state=state)
+
+    def value(self, features: torch.Tensor, privileged: Any = None) -> torch.Tensor:
+        """The return expected by the critic, (...,) float32, from features (..., width) and, if it
+        is asymmetric, from the world's `privileged`.
+        """
+        with self.compute_dtype():
+            return self.critic(features, privileged)
 
     def prediction_error(self, features: torch.Tensor, privileged: Any) -> torch.Tensor:
         """(T, B): how badly the features of `unroll` tell what the critic sees, as a mean squared
@@ -135,11 +127,14 @@ class Policy(nn.Module):
         """
         with torch.no_grad():
             target = self.critic.intake.encoded(privileged)
-        with self._compute_dtype():
+        with self.compute_dtype():
             predicted = self.prediction(features)
         return (predicted - target).square().mean(-1)
 
-    def _compute_dtype(self):
+    def compute_dtype(self) -> torch.autocast:
+        """The context in which matrix products are taken. Within one of them, weights are cast
+        once, however often they are used.
+        """
         return torch.autocast(
             self.device.type, torch.bfloat16, enabled=self.bf16 and self.device.type == "cuda"
         )

@@ -152,13 +152,14 @@ class PPO:
 
     def _losses(self, batch):
         """The loss of a minibatch, and what there is to say about it, each a tensor ()."""
-        now = self.policy.unroll(batch.obs, batch.starts, batch.state, batch.get("privileged"))
+        now = self.policy.unroll(batch.obs, batch.starts, batch.state)
         valid, output = batch.valid, self.policy.output
         log_ratio = output.logprob(now.logits, batch.actions) - batch.logprobs
         ratio = log_ratio.exp()
         clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
         gain = torch.minimum(ratio * batch.advantages, clipped * batch.advantages)
-        error = (now.value - batch.targets) / self.policy.critic.output.scale
+        estimate = self.policy.value(now.features, batch.get("privileged"))
+        error = (estimate - batch.targets) / self.policy.critic.output.scale
 
         policy = -masked_mean(gain, valid)
         value = masked_mean(error.square(), valid)

@@ -146,7 +146,7 @@ def initial_actor_state(env: Any, policy: Any) -> arrdict:
 
 
 def _acted_on(world):
-    """Of a world, what a policy acts on."""
+    """Of a world, what a policy is shown."""
     return arrdict({key: world[key] for key in ("obs", "reset", "privileged") if key in world})
 
 
@@ -159,17 +159,20 @@ def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> ar
     """
     world, state = actor_state["world"], actor_state["state"]
     rollout.state[:] = state
-    for t in range(rollout.n_steps):
-        decision, state = policy(rollout.store_world(t, world), state)
-        rollout.actions[t] = decision["actions"]
-        rollout.logprobs[t], rollout.values[t] = decision["logprobs"], decision["value"]
+    features = []
+    with policy.compute_dtype():
+        for t in range(rollout.n_steps):
+            decision, state = policy(rollout.store_world(t, world), state)
+            rollout.actions[t], rollout.logprobs[t] = decision["actions"], decision["logprobs"]
+            features.append(decision["features"])
+            with torch.autocast(rollout.reward.device.type, enabled=False):
+                world = env.step(arrdict(actions=decision["actions"]))
+            rollout.reward[t] = world["reward"]
+            rollout.terminal[t], rollout.truncated[t] = world["terminal"], world["truncated"]
 
-        world = env.step(arrdict(actions=decision["actions"]))
-        rollout.reward[t] = world["reward"]
-        rollout.terminal[t], rollout.truncated[t] = world["terminal"], world["truncated"]
-
-    last = rollout.store_world(rollout.n_steps, world)
-    rollout.values[-1] = policy(last, state, sample=False)[0]["value"]
+        last = rollout.store_world(rollout.n_steps, world)
+        features.append(policy(last, state, sample=False)[0]["features"])
+        rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
     # a memory that is not finite starts anew, or it would last until the lane's episode ends
     state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
     after = arrdict(world=_acted_on(world), state=state)

@@ -189,7 +189,7 @@ def test_the_preset_follows_the_device(monkeypatch):
 def test_what_a_cpu_and_a_gpu_train_with():
     """The recipes behind the measurements in README: changed together with them only."""
     same = dict(name="ppo", n_steps=32, n_minibatches=4, n_epochs=1, clip=0.2, value_coef=0.5)
-    same |= dict(max_grad_norm=0.5, target_kl=None)
+    same |= dict(max_grad_norm=0.5, target_kl=None, auxiliary_coef=0.5)
     cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
     assert dataclasses.asdict(cpu.learner) == same | dict(
         lr=3e-3, anneal="auto", gamma=0.98, lambda_=0.9, entropy_coef=0.02

@@ -133,8 +133,8 @@ def learn(env, n_updates, policy=None, n_steps=16, **how):
 class Forgetless(Policy):
     """A policy whose memory leaks from one episode into the next."""
 
-    def unroll(self, obs, reset, state, privileged=None):
-        return super().unroll(obs, torch.zeros_like(reset), state, privileged)
+    def unroll(self, obs, reset, state):
+        return super().unroll(obs, torch.zeros_like(reset), state)
 
 
 def test_a_cue_is_remembered():
@@ -163,5 +163,5 @@ def test_a_time_limit_is_not_a_death(ends, worth):
     env = Wage(ends)
     policy, *_ = learn(env, n_updates=60, gamma=0.9, lambda_=0.8)
     obs, reset = torch.zeros(12, 1, 1, 1), torch.zeros(12, 1, dtype=torch.bool)
-    value = policy.unroll(obs, reset, policy.initial(1)).value[:, 0]
+    value = policy.value(policy.unroll(obs, reset, policy.initial(1)).features)[:, 0]
     torch.testing.assert_close(value, torch.full((12,), worth), rtol=0.1, atol=0)

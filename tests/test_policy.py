@@ -38,7 +38,7 @@ def test_acting_step_by_step_gives_what_an_unroll_gives(encoder):
         rtol=1e-5, atol=1e-5
     )  # the same float32 products over T rows at once and one at a time
     torch.testing.assert_close(decisions.logits.movement, unrolled.logits.movement, **close)
-    torch.testing.assert_close(decisions.value, unrolled.value, **close)
+    torch.testing.assert_close(decisions.features, unrolled.features, **close)
     torch.testing.assert_close(state.cell, unrolled.state.cell, **close)
     logprobs = policy.output.logprob(unrolled.logits, decisions.actions)
     torch.testing.assert_close(decisions.logprobs, logprobs, **close)
@@ -48,10 +48,8 @@ def test_a_decision_has_the_shapes_of_the_contract():
     policy = Policy(OBS, MOVES, width=32)
     decision, state = policy(worlds()[0], policy.initial(B))
     assert decision.actions.movement.shape == (B, 1) and decision.logits.fire.shape == (B, 1, 2)
-    assert (
-        decision.logprobs.shape == decision.value.shape == (B,)
-        and decision.value.dtype == torch.float32
-    )
+    value = policy.value(decision.features)
+    assert decision.logprobs.shape == value.shape == (B,) and value.dtype == torch.float32
     assert state.cell.shape == (B, 32)
 
 
@@ -91,7 +89,7 @@ def test_weights_load_from_plain_tensors():
     twin.load_state_dict(torch.load(file, weights_only=True))
     world = worlds()
     ours, theirs = (p.unroll(world.obs, world.reset, p.initial(B)) for p in (policy, twin))
-    assert torch.equal(ours.value, theirs.value) and torch.equal(
+    assert torch.equal(policy.value(ours.features), twin.value(theirs.features)) and torch.equal(
         ours.logits.fire, theirs.logits.fire
     )
 

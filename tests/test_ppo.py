@@ -40,7 +40,7 @@ def made_up(seed=0, device="cpu"):
     rollout.reward[:] = normal(T, B)
     with torch.no_grad():
         out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
-        rollout.values[:] = out.value
+        rollout.values[:] = policy.value(out.features)
         rollout.actions[:] = policy.output.sample(out.logits[:-1], policy.random.on(policy.device))
         rollout.logprobs[:] = policy.output.logprob(out.logits[:-1], rollout.actions)
     return policy, rollout

@@ -121,11 +121,11 @@ def test_probabilities_and_values_are_those_of_an_unroll_over_what_was_written()
     _, policy, rollout, actor_state = collected(n_rollouts=2, dtype=torch.float16)
     out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
     close = dict(rtol=1e-4, atol=1e-4)  # products of numbers up to 500 in another order
-    torch.testing.assert_close(rollout.values, out.value, **close)
+    torch.testing.assert_close(rollout.values, policy.value(out.features), **close)
     logprobs = policy.output.logprob(out.logits[:-1], rollout.actions)
     torch.testing.assert_close(rollout.logprobs, logprobs, **close)
-    last = policy.unroll(rollout.obs[-1:], rollout.starts[-1:], actor_state.state).value[0]
-    torch.testing.assert_close(rollout.values[-1], last, **close)
+    last = policy.unroll(rollout.obs[-1:], rollout.starts[-1:], actor_state.state)
+    torch.testing.assert_close(rollout.values[-1:], policy.value(last.features), **close)
 
 
 class Faulty(Telltale):

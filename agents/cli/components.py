@@ -180,9 +180,10 @@ def rollout_bytes(cfg: settings.Train, env: Any) -> float:
     )
     steps, width, parts = cfg.learner.n_steps + 1, cfg.agent.width, cfg.learner.n_minibatches
     # observations of 2 bytes per number, 4 of what is privileged, and about 64 of the rest; a
-    # minibatch's share of those, and of some 24 activations of 4 bytes per unit
+    # minibatch's share of those, and of some 24 activations of 4 bytes per unit; the features that
+    # values are made of
     each = 2 * numbers + 4 * privileged + 64
-    return env.n_agents * steps * (each * (1 + 1 / parts) + 96 * width / parts)
+    return env.n_agents * steps * (each * (1 + 1 / parts) + (96 / parts + 4) * width)
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> Checkpoint:
