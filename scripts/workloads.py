@@ -167,7 +167,7 @@ BUILD = (
     + """
 from megastep.kernels import compile
 start = time.perf_counter()
-compile.cuda(device.index or 0) if device.type == 'cuda' else compile.cpu()
+compile.cuda(device.index or 0, compile.ENGINE) if device.type == 'cuda' else compile.cpu()
 print(time.perf_counter() - start)
 """
 )

@@ -15,6 +15,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -47,6 +48,20 @@ CUDA_FLAGS = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Program:
+    """Kernels for the GPU that are built together: every ``.cu`` and ``.h`` of a folder, which
+    define the operations. Flags are NVRTC's, without the architecture.
+    """
+
+    folder: Path
+    operations: tuple[str, ...]
+    flags: tuple[str, ...]
+
+
+ENGINE = Program(HERE, OPERATIONS, CUDA_FLAGS)
+
+
 class EngineError(RuntimeError):
     """The machine cannot do this: no compiler, no GPU, no memory, a position that is not a number.
     The message is one sentence with the cure.
@@ -57,10 +72,10 @@ def _key(*parts):
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
 
 
-def sources(*suffixes: str) -> dict[str, str]:
-    """The text of each file of this folder with such a suffix, by name."""
+def sources(*suffixes: str, folder: Path = HERE) -> dict[str, str]:
+    """The text of each file of the folder with such a suffix, by name."""
     return {
-        path.name: path.read_text() for path in sorted(HERE.iterdir()) if path.suffix in suffixes
+        path.name: path.read_text() for path in sorted(folder.iterdir()) if path.suffix in suffixes
     }
 
 
@@ -170,9 +185,8 @@ def bindings():
         from cuda.bindings import driver, nvrtc
     except ImportError:
         raise EngineError(
-            "The GPU engine needs the package cuda-bindings, which comes with PyTorch for CUDA "
-            "13: pip install "
-            "cuda-bindings."
+            "Kernels on a GPU need the package cuda-bindings, which comes with PyTorch for CUDA "
+            "13: pip install cuda-bindings."
         ) from None
     return driver, nvrtc
 
@@ -196,7 +210,7 @@ def _build_cuda(files, flags):
     _, nvrtc = bindings()
     headers = [text.encode() for text in files.values()], [name.encode() for name in files]
     program = checked(
-        nvrtc.nvrtcCreateProgram(program_of(files).encode(), b"engine.cu", len(files), *headers),
+        nvrtc.nvrtcCreateProgram(program_of(files).encode(), b"kernels.cu", len(files), *headers),
         "NVRTC",
     )
     (status,) = nvrtc.nvrtcCompileProgram(program, len(flags), [flag.encode() for flag in flags])
@@ -204,7 +218,7 @@ def _build_cuda(files, flags):
         log = bytearray(checked(nvrtc.nvrtcGetProgramLogSize(program), "NVRTC"))
         nvrtc.nvrtcGetProgramLog(program, log)
         raise EngineError(
-            f"NVRTC could not build the GPU engine: {bytes(log).decode(errors='replace')[:2000]}"
+            f"NVRTC could not build the GPU's kernels: {bytes(log).decode(errors='replace')[:2000]}"
         )
     cubin = bytearray(checked(nvrtc.nvrtcGetCUBINSize(program), "NVRTC"))
     checked(nvrtc.nvrtcGetCUBIN(program, cubin), "NVRTC")
@@ -218,31 +232,28 @@ def program_of(files: dict[str, str]) -> str:
 
 
 @functools.cache
-def cuda(index):
-    """The GPU backend on device ``index``: operation name -> CUfunction."""
+def cuda(index, program):
+    """A program on GPU ``index``: operation name -> CUfunction."""
     driver, nvrtc = bindings()
     major, minor = torch.cuda.get_device_capability(index)
-    files = sources(".h", ".cu")
-    flags = (*CUDA_FLAGS, f"--gpu-architecture=sm_{major}{minor}")
+    files = sources(".h", ".cu", folder=program.folder)
+    flags = (*program.flags, f"--gpu-architecture=sm_{major}{minor}")
     try:
         version = checked(nvrtc.nvrtcVersion(), "NVRTC")
     except (RuntimeError, OSError) as error:
         raise EngineError(
-            f"The GPU engine needs NVRTC, which comes with PyTorch's CUDA wheels, and it could "
-            f"not be loaded "
-            f"({error}): reinstall torch."
+            f"Kernels on a GPU need NVRTC, which comes with PyTorch's CUDA wheels, and it could "
+            f"not be loaded ({error}): reinstall torch."
         ) from None
     cubin, _ = cache.fetch(
         f"cuda-{_key(*files.values(), *flags, str(version))}.cubin",
         lambda: _build_cuda(files, flags),
     )
+    loading = "Loading the GPU's kernels"
     with torch.cuda.device(index):
         torch.cuda.current_stream().synchronize()  # makes the device's primary context current
-        module = checked(driver.cuModuleLoadData(cubin), "Loading the GPU engine")
-        functions = {
-            operation: checked(
-                driver.cuModuleGetFunction(module, operation.encode()), "Loading the GPU engine"
-            )
-            for operation in OPERATIONS
+        module = checked(driver.cuModuleLoadData(cubin), loading)
+        return {
+            operation: checked(driver.cuModuleGetFunction(module, operation.encode()), loading)
+            for operation in program.operations
         }
-    return functions

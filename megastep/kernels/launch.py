@@ -1,28 +1,29 @@
 """Launches an operation on the device where its tensors are, with params that are given by name.
 
-``params.h`` declares a struct for each operation. The structs are read from there, so their layout
-in memory has one home, and ``params.RenderParams(scenery=..., positions=..., ...)`` packs one. All
-fields are keyword arguments that must be given, so Python itself refuses a misspelt or a missing
-one by name. A pointer is a tensor's address; 0 says that it is not wanted.
+A program's ``params.h`` declares a struct for each operation. The structs are read from there, so
+their layout in memory has one home, and ``params.RenderParams(scenery=..., positions=..., ...)``
+packs one. All fields are keyword arguments that must be given, so Python itself refuses a misspelt
+or a missing one by name. A pointer is a tensor's address; 0 says that it is not wanted.
 """
 
 import ctypes
 import re
 import struct
+from pathlib import Path
 from types import SimpleNamespace
 
 import torch
 
-from .compile import BLOCK, HERE, EngineError, bindings, checked, cpu, cuda
+from .compile import BLOCK, ENGINE, EngineError, Program, bindings, checked, cpu, cuda
 
 WARP = 32  # threads
 MAX_THREADS = 2**32 - BLOCK  # per launch: kernels count them in 32 bits
 FORMATS = {"int": "i", "float": "f", "unsigned int": "I"}
 
 
-def _fields():
-    """By struct of params.h, its fields: (name, format of the module struct)."""
-    source = re.sub(r"//.*", "", (HERE / "params.h").read_text())
+def fields_of(folder: Path) -> dict[str, list[tuple[str, str]]]:
+    """By struct of the folder's params.h, its fields: (name, format of the module struct)."""
+    source = re.sub(r"//.*", "", (folder / "params.h").read_text())
     found = {}
     formats = dict(FORMATS)
     for name, body in re.findall(r"struct (?:alignas\(\d+\) )?(\w+) \{(.*?)\};", source, re.S):
@@ -48,16 +49,31 @@ def _builder(name, fields):
     return made
 
 
-FIELDS = _fields()
-SIZES = {name: _packer(fields).size for name, fields in FIELDS.items()}  # bytes
-params = SimpleNamespace(**{name: _builder(name, fields) for name, fields in FIELDS.items()})
+def builders(fields: dict[str, list[tuple[str, str]]]) -> SimpleNamespace:
+    """By struct, a function of its fields that packs one."""
+    return SimpleNamespace(**{name: _builder(name, own) for name, own in fields.items()})
+
+
+def sizes_of(fields: dict[str, list[tuple[str, str]]]) -> dict[str, int]:
+    """By struct, its bytes."""
+    return {name: _packer(own).size for name, own in fields.items()}
+
+
+FIELDS = fields_of(ENGINE.folder)
+SIZES = sizes_of(FIELDS)
+params = builders(FIELDS)
 
 
 def launch(
-    operation: str, packed: bytes, device: torch.device, threads: int, shared: int = 0
+    operation: str,
+    packed: bytes,
+    device: torch.device,
+    threads: int,
+    shared: int = 0,
+    program: Program = ENGINE,
 ) -> None:
-    """Runs ``operation`` on its packed params: on the CPU at once, on a GPU in ``threads`` threads
-    on the device's current stream.
+    """Runs ``operation`` on its packed params: on the CPU, where there is the engine alone, at
+    once; on a GPU in ``threads`` threads on the device's current stream.
 
     ``shared`` is dynamic shared memory in bytes per warp.
     """
@@ -72,7 +88,7 @@ def launch(
             f"{MAX_THREADS:,}: use fewer environments."
         )
     index = torch.cuda.current_device() if device.index is None else device.index
-    function = cuda(index)[operation]
+    function = cuda(index, program)[operation]
     arguments = (ctypes.c_char_p * 1)(packed)
     with torch.cuda.device(index):
         stream = torch.cuda.current_stream(index).cuda_stream
