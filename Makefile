@@ -6,7 +6,7 @@ CORES := $(shell nproc 2>/dev/null || echo 1)
 # The virtual environment is made only when it is the interpreter in use.
 SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 
-KERNELS := $(wildcard megastep/kernels/*.h megastep/kernels/*.cu megastep/kernels/*.cpp)
+KERNELS := $(wildcard $(foreach suffix,h cu cpp,*/kernels/*.$(suffix)) tests/*.h)
 
 .PHONY: train test test-all lint setup clean
 

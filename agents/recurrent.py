@@ -2,9 +2,15 @@
 sequence where an episode starts.
 
 Axes: T time, B lanes, W width. Gates are laid out (..., 4 W): input, forget, candidate, output, as
-PyTorch's own are. Matrix products run in the compute dtype (autocast's), the cell and its gates in
-float32: over hundreds of steps a bfloat16 cell would round small additions away.
+PyTorch's own are. On a GPU matrix products run in the compute dtype (autocast's), on a CPU in
+float32; the cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell would
+round small additions away.
+
+What happens between two matrix products is written out here for the CPU; on a GPU it is a kernel of
+the same arguments (`agents.kernels.lstm`).
 """
+
+from types import SimpleNamespace
 
 import torch
 from torch import nn
@@ -12,89 +18,137 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from agents.heads import compute_dtype
+from agents.kernels import lstm as kernels
 from megastep.arrdict import arrdict
 
+_sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input  # (d, y): d y (1 - y)
+_tanh_backward = torch.ops.aten.tanh_backward.grad_input  # (d, y): d (1 - y^2)
 
-def _cell(from_input, from_memory, before):
-    """One step of all lanes: the two halves of the gates (B, 4 W) and the cell before it (B, W),
-    float32.
 
-    Returns the output and the cell after it (B, W), and the activated gates (B, 4 W) for
-    `_cell_backward`.
-    """
-    if before.is_cuda:
-        return torch.ops.aten._thnn_fused_lstm_cell(from_input, from_memory, before)
-    gates = from_input + from_memory
-    i, f, g, o = gates.chunk(4, -1)
-    gates[:, : 2 * f.shape[-1]].sigmoid_()
+def _split(gates):
+    return gates.view(len(gates), 4, -1).unbind(1)
+
+
+def _start(reset, last_output, last_cell, memory, cell):
+    reset = reset[:, None]
+    memory.copy_(last_output).masked_fill_(reset, 0.0)
+    cell.copy_(last_cell).masked_fill_(reset, 0.0)
+
+
+def _forward(gates, cell, next_reset, output, next_memory, next_cell):
+    """Leaves the gates activated, for `_backward`; kernels activate them twice."""
+    i, f, g, o = _split(gates)
+    gates[:, : 2 * i.shape[1]].sigmoid_()
     g.tanh_()
     o.sigmoid_()
-    after = (f * before).addcmul_(i, g)
-    return after.tanh().mul_(o), after, gates
+    torch.mul(f, cell, out=next_cell).addcmul_(i, g)
+    torch.tanh(next_cell, out=output).mul_(o)
+    if next_reset is not None:
+        reset = next_reset[:, None]
+        next_memory.copy_(output).masked_fill_(reset, 0.0)
+        next_cell.masked_fill_(reset, 0.0)
 
 
-def _cell_backward(d_output, d_after, before, after, gates):
-    """Gradients of `_cell` in the gates before their activation (B, 4 W) and in the cell before the
-    step (B, W).
-    """
-    if before.is_cuda:
-        return torch.ops.aten._thnn_fused_lstm_cell_backward_impl(
-            d_output, d_after, before, after, gates, False
-        )[:2]
-    i, f, g, o = gates.chunk(4, -1)
-    squashed = after.tanh()
-    d_cell = torch.addcmul(d_after, d_output * o, 1 - squashed * squashed)
-    d_gates = torch.cat(
-        [
-            d_cell * g * i * (1 - i),
-            d_cell * before * f * (1 - f),
-            d_cell * i * (1 - g * g),
-            d_output * squashed * o * (1 - o),
-        ],
-        -1,
-    )
-    return d_gates, d_cell * f
+def _backward(gates, cell, next_reset, d_output, d_next_memory, d_next_cell, d_gates, d_cell):
+    i, f, g, o = _split(gates)
+    d_i, d_f, d_g, d_o = _split(d_gates)
+    squashed = (f * cell).addcmul_(i, g).tanh_()
+    if next_reset is not None:
+        reset = next_reset[:, None]
+        d_output = d_output + d_next_memory.masked_fill(reset, 0.0)
+        d_next_cell = d_next_cell.masked_fill(reset, 0.0)
+    d_after = _tanh_backward(d_output * o, squashed, grad_input=d_cell).add_(d_next_cell)
+    _sigmoid_backward(d_after * g, i, grad_input=d_i)
+    _sigmoid_backward(d_after * cell, f, grad_input=d_f)
+    _tanh_backward(d_after * i, g, grad_input=d_g)
+    _sigmoid_backward(squashed.mul_(d_output), o, grad_input=d_o)
+    d_cell.mul_(f)
+
+
+_WRITTEN_OUT = SimpleNamespace(start=_start, forward=_forward, backward=_backward)
+
+
+def _steps(x):
+    return kernels if x.is_cuda else _WRITTEN_OUT
+
+
+def _aligned(tensor):
+    """The tensor as kernels read it: contiguous, from a multiple of 16 bytes on."""
+    if tensor.data_ptr() % 16:
+        return tensor.clone(memory_format=torch.contiguous_format)
+    return tensor.contiguous()
 
 
 class _Sequence(torch.autograd.Function):
     """The recurrence over time, with its gradient written out.
 
-    Autograd would add up the weight's gradient step by step; here it is one matrix product for all
-    of time.
+    Autograd would add up the weights' gradients step by step; here each is one matrix product for
+    all of time.
     """
 
     @staticmethod
-    def forward(ctx, from_input, weight, reset, output, cell):
-        """from_input (T, B, 4 W) and weight (4 W, W) in the compute dtype, reset (T, B, 1), output
-        and cell (B, W) float32. Returns outputs (T, B, W) in the compute dtype and the last cell.
+    def forward(ctx, x, input_weight, bias, weight, reset, output, cell):
+        """x (T, B, W), weights (4 W, W) and bias (4 W) in the compute dtype, reset (T, B) bool,
+        output and cell (B, W) float32. Returns outputs (T, B, W) in the compute dtype and the last
+        cell.
         """
-        outputs = from_input.new_empty(*reset.shape[:2], weight.shape[1])
-        memories = torch.empty_like(outputs)
-        ctx.steps = []
-        for t in range(len(reset)):
-            memories[t] = output.masked_fill(reset[t], 0.0)
-            before = cell.masked_fill(reset[t], 0.0)
-            output, cell, gates = _cell(
-                from_input[t].float(), (memories[t] @ weight.T).float(), before
-            )
-            outputs[t] = output
-            ctx.steps.append((before, cell, gates))
-        ctx.save_for_backward(weight, reset, memories)
-        return outputs, cell
+        steps, x, reset = _steps(x), x.contiguous(), reset.contiguous()
+        gates = F.linear(x, input_weight, bias)
+        outputs, memories = torch.empty_like(x), torch.empty_like(x)
+        output, cell = _aligned(output), _aligned(cell)
+        cells = [torch.empty_like(cell)]
+        steps.start(reset[0], output, cell, memories[0], cells[0])
+        upcoming = [*zip(reset[1:], memories[1:], strict=True), (None, None)]
+        for t, (next_reset, next_memory) in enumerate(upcoming):
+            gates[t].addmm_(memories[t], weight.T)
+            cells.append(torch.empty_like(cells[t]))
+            steps.forward(gates[t], cells[t], next_reset, outputs[t], next_memory, cells[t + 1])
+        ctx.save_for_backward(x, input_weight, weight, reset, gates, memories, *cells[:-1])
+        return outputs, cells[-1]
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_outputs, d_cell):
-        weight, reset, memories = ctx.saved_tensors
-        d_gates = weight.new_empty(*reset.shape[:2], weight.shape[0])
-        d_output = torch.zeros_like(d_cell)
+        x, input_weight, weight, reset, gates, memories, *cells = ctx.saved_tensors
+        steps = _steps(x)
+        d_outputs, d_cell, d_gates = _aligned(d_outputs), _aligned(d_cell), torch.empty_like(gates)
+        next_reset = d_memory = d_output = None
         for t in reversed(range(len(reset))):
-            d_step, d_cell = _cell_backward(d_output + d_outputs[t], d_cell, *ctx.steps[t])
-            d_gates[t] = d_step
-            d_output = (d_gates[t] @ weight).float().masked_fill_(reset[t], 0.0)
-            d_cell = d_cell.masked_fill(reset[t], 0.0)
-        d_weight = d_gates.flatten(0, 1).T @ memories.flatten(0, 1)
-        return d_gates, d_weight, None, d_output, d_cell
+            d_next_cell, d_cell = d_cell, torch.empty_like(d_cell)
+            steps.backward(
+                *(gates[t], cells[t], next_reset),
+                *(d_outputs[t], d_memory, d_next_cell),
+                *(d_gates[t], d_cell),
+            )
+            if t or any(ctx.needs_input_grad[-2:]):
+                next_reset, d_memory = reset[t], d_gates[t] @ weight
+        if any(ctx.needs_input_grad[-2:]):
+            d_output = d_memory.float().masked_fill_(reset[0, :, None], 0.0)
+            d_cell.masked_fill_(reset[0, :, None], 0.0)
+        flat = d_gates.flatten(0, 1)
+        return (
+            d_gates @ input_weight,
+            flat.T @ x.flatten(0, 1),
+            flat.sum(0),
+            flat.T @ memories.flatten(0, 1),
+            None,
+            d_output,
+            d_cell,
+        )
+
+
+def _check(x, reset, state):
+    """Kernels would read past the end of what is too small, or in another device's memory."""
+    for name, given, shape in (
+        ("reset", reset, x.shape[:2]),
+        ("state.output", state["output"], x.shape[1:]),
+        ("state.cell", state["cell"], x.shape[1:]),
+    ):
+        if given.shape != shape or given.device != x.device:
+            raise ValueError(
+                f"{name} is {tuple(given.shape)} on {given.device}, but x asks for {tuple(shape)} "
+                f"on {x.device}"
+            )
 
 
 class LSTM(nn.Module):
@@ -126,15 +180,19 @@ class LSTM(nn.Module):
         """Runs over x (T, B, W) from a state; a lane's state is cleared before each step where
         reset (T, B).
 
-        Returns the outputs (T, B, W) and the state after the last step.
+        Returns the outputs (T, B, W), in the compute dtype on a GPU and float32 on a CPU, and the
+        state after the last step. ValueError if shapes or devices do not fit.
         """
-        dtype = compute_dtype(self.memory.weight)
-        from_input = F.linear(x.to(dtype), self.input.weight.to(dtype), self.input.bias.to(dtype))
-        weight = self.memory.weight.to(dtype)
-        # autocast would take the fused cell to low precision
+        _check(x, reset, state)
+        dtype = compute_dtype(self.memory.weight) if x.is_cuda else torch.float32
+        weights = self.input.weight, self.input.bias, self.memory.weight
+        # autocast would choose dtypes of its own inside
         with torch.autocast(x.device.type, enabled=False):
             outputs, cell = _Sequence.apply(
-                from_input, weight, reset[..., None], state["output"], state["cell"]
+                x.to(dtype),
+                *(weight.to(dtype) for weight in weights),
+                reset.bool(),
+                *(state["output"].float(), state["cell"].float()),
             )
         return outputs, arrdict(output=outputs[-1].float(), cell=cell)
 

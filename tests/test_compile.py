@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from agents.kernels.lstm import LSTM
 from megastep.kernels import compile, launch
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,13 +48,17 @@ def built(tmp_path_factory):
     return cache, out
 
 
-def test_packed_params_have_the_compilers_layout(tmp_path):
+@pytest.mark.parametrize("package", ["megastep", "agents"])
+def test_packed_params_have_the_compilers_layout(tmp_path, package):
     """A compiler reads every field of every packed struct as it was given."""
+    folder = ROOT / package / "kernels"
+    structs = launch.fields_of(folder)
+    params, sizes = launch.builders(structs), launch.sizes_of(structs)
     reads, given = [], {}
-    for name, fields in launch.FIELDS.items():
+    for name, fields in structs.items():
         values = {field: position + 1 for position, (field, _) in enumerate(fields)}
         values |= {field: bytes(int(kind[2:-1])) for field, kind in fields if kind[-1] == "s"}
-        given[name] = getattr(launch.params, name)(**values)
+        given[name] = getattr(params, name)(**values)
         tests = [
             f"(long long)p->{field} == {values[field]}" for field, kind in fields if kind[-1] != "s"
         ]
@@ -62,15 +67,15 @@ def test_packed_params_have_the_compilers_layout(tmp_path):
             f"{{ return size == sizeof({name}) && {' && '.join(tests)}; }}\n"
         )
     source = tmp_path / "checks.cpp"
-    source.write_text((compile.HERE / "params.h").read_text() + "".join(reads))
+    source.write_text((folder / "params.h").read_text() + "".join(reads))
     compiler, _ = compile._compiler()
     library = tmp_path / "checks.so"
     command = [compiler, "-std=c++17", "-shared", "-fPIC", str(source), "-o", str(library)]
     subprocess.run(command, check=True)
     checks = ctypes.CDLL(str(library))
     for name, packed in given.items():
-        assert getattr(checks, f"check_{name}")(packed, launch.SIZES[name]), name
-        assert len(packed) == launch.SIZES[name]
+        assert getattr(checks, f"check_{name}")(packed, sizes[name]), name
+        assert len(packed) == sizes[name]
 
 
 def test_a_field_that_is_misspelt_or_missing_is_named():
@@ -115,14 +120,20 @@ def test_every_operation_keeps_its_file_and_line_in_the_program(tmp_path):
         assert files[name].splitlines()[line - 1].startswith("KERNEL")
 
 
-def nvrtc(files):
+def nvrtc(files, flags=compile.CUDA_FLAGS):
     """A cubin of these files, by NVRTC, which needs no GPU."""
     try:
-        return compile._build_cuda(files, (*compile.CUDA_FLAGS, "--gpu-architecture=sm_90"))
+        return compile._build_cuda(files, (*flags, "--gpu-architecture=sm_90"))
     except (compile.EngineError, RuntimeError) as error:
         if "NVRTC could not build" in str(error):
             raise
         pytest.skip(f"needs NVRTC: {error}")
+
+
+def test_nvrtc_builds_the_learners_kernels():
+    """With its own flags, and as another program than the engine's."""
+    cubin = nvrtc(compile.sources(".h", ".cu", folder=LSTM.folder), LSTM.flags)
+    assert all(operation.encode() in cubin for operation in LSTM.operations)
 
 
 def test_nvrtc_is_told_files_and_lines():

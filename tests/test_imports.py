@@ -30,8 +30,8 @@ LAYERS = (
     ("envs",),
 )
 LAYER = {name: layer for layer, names in enumerate(LAYERS) for name in names}
-# What the learner may know of the simulator: trees, spaces, and how to capture a step. No
-# environment, no engine.
+# What the learner may know of the simulator: trees, spaces, how to capture a step and how to build
+# and launch kernels. No environment, no engine.
 SHARED = {
     "megastep",
     "megastep.arrdict",
@@ -39,6 +39,8 @@ SHARED = {
     "megastep.ragged",
     "megastep.spaces",
     "megastep.capture",
+    "megastep.kernels.compile",
+    "megastep.kernels.launch",
 }
 # Packages from outside that only some files may import, directly or through importlib.
 USERS = {

@@ -1,11 +1,22 @@
-"""The LSTM against PyTorch's own, and its resets against sequences cut by hand."""
+"""The LSTM against PyTorch's own, and its resets against sequences cut by hand.
+
+The GPU's kernels are compared with what is written out for the CPU: on a GPU, and compiled for a
+CPU through `cuda_on_cpu.h`, which runs the same source.
+"""
+
+import ctypes
+import subprocess
+from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
 
+from agents import recurrent
+from agents.kernels import lstm as kernels
 from agents.recurrent import LSTM
 from megastep.arrdict import arrdict
+from megastep.kernels import compile
 
 T, B, W = 9, 5, 16
 CLOSE = dict(rtol=1e-5, atol=1e-5)  # float32 sums of 16 products, nine steps deep, in another order
@@ -130,23 +141,225 @@ def test_forget_gates_start_open_and_no_other_gate():
     torch.testing.assert_close(after.cell, torch.full((B, W), retained), **CLOSE)
 
 
-@pytest.mark.cuda
-def test_the_fused_cell_agrees_with_the_written_out_one():
+def test_a_state_or_reset_of_another_shape_is_named():
     lstm, x, reset, state = case()
-    on_gpu = LSTM(W).cuda()
-    on_gpu.load_state_dict(lstm.state_dict())
-    results = []
-    for module, device in ((lstm, "cpu"), (on_gpu, "cuda")):
-        inputs = [
-            leaf.detach().to(device).requires_grad_() for leaf in (x, state.output, state.cell)
-        ]
-        outputs, after = module(
-            inputs[0], reset.to(device), arrdict(output=inputs[1], cell=inputs[2])
+    with pytest.raises(
+        ValueError, match=r"reset is \(9, 4\) on cpu, but x asks for \(9, 5\) on cpu"
+    ):
+        lstm(x, reset[:, :4], state)
+    with pytest.raises(
+        ValueError, match=r"state.cell is \(1, 16\) on cpu, but x asks for \(5, 16\)"
+    ):
+        lstm(x, reset, arrdict(state, cell=state.cell[:1]))
+
+
+def test_a_gradient_may_be_asked_for_twice():
+    lstm, x, reset, state = case()
+    loss = lstm(x, reset, state)[0].square().sum()
+    first, second = (torch.autograd.grad(loss, x, retain_graph=True)[0] for _ in range(2))
+    assert torch.equal(first, second)
+
+
+# ---- The kernels ----
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """The kernels for a CPU: operation name -> function of packed params and threads."""
+    folder = tmp_path_factory.mktemp("lstm")
+    source, library = folder / "lstm.cpp", folder / "lstm.so"
+    here = Path(__file__).parent
+    structs = {"start": "Start", "forward": "Forward", "backward": "Backward"}
+    lines = [f'#include "{here / "cuda_on_cpu.h"}"', f'#include "{kernels.HERE / "lstm.cu"}"']
+    for operation in kernels.LSTM.operations:
+        params = f"const Lstm{structs[operation.split('_')[1]]}Params* p"
+        lines.append(
+            f'extern "C" void run_{operation}({params}, unsigned int threads) '
+            f"{{ launch({operation}, p, threads); }}"
         )
-        loss = outputs.square().sum() + after.cell.sum()
-        grads = torch.autograd.grad(loss, [*inputs, *module.parameters()])
-        results.append([leaf.cpu() for leaf in (outputs, after.cell, *grads)])
-    for ours, theirs in zip(*results, strict=True):
+    source.write_text("\n".join(lines))
+    compiler, _ = compile._compiler()
+    command = [compiler, "-std=c++17", "-O1", "-shared", "-fPIC", f"-DBLOCK={compile.BLOCK}"]
+    subprocess.run([*command, str(source), "-o", str(library)], check=True)
+    loaded = ctypes.CDLL(str(library))
+    return {name: getattr(loaded, f"run_{name}") for name in kernels.LSTM.operations}
+
+
+@pytest.fixture(params=["compiled", pytest.param("cuda", marks=pytest.mark.cuda)])
+def where(request, monkeypatch):
+    """The device of the kernels: a GPU, or the CPU with the kernels compiled for it."""
+    if request.param == "cuda":
+        return "cuda"
+    functions = request.getfixturevalue("compiled")
+
+    def launch(operation, packed, device, threads, program):
+        functions[operation](packed, ctypes.c_uint(threads))
+
+    monkeypatch.setattr(kernels, "launch", launch)
+    monkeypatch.setattr(recurrent, "_steps", lambda x: kernels)
+    return "cpu"
+
+
+def sequence(device, dtype, x, reset, state, weights, d_outputs, d_cell):
+    """Outputs, last cell and all gradients of the bare recurrence, on the CPU in float32."""
+    to = [leaf.detach().to(device, dtype).requires_grad_() for leaf in (x, *weights)]
+    states = [leaf.detach().to(device).requires_grad_() for leaf in state]
+    outputs, cell = recurrent._Sequence.apply(*to, reset.to(device), *states)
+    assert outputs.dtype == dtype and cell.dtype == torch.float32
+    grads = torch.autograd.grad(
+        [outputs, cell], [*to, *states], [d_outputs.to(device, dtype), d_cell.to(device)]
+    )
+    return [leaf.detach().float().cpu() for leaf in (outputs, cell, *grads)]
+
+
+NAMES = ("outputs", "cell", "d x", "d input weight", "d bias", "d weight", "d output", "d cell")
+# Per dtype, the share of an array's greatest magnitude by which an element may be off: approximate
+# exponentials and TF32 products; numbers of 8 bits, over nine steps.
+SLACK = {torch.float32: 2e-3, torch.bfloat16: 6e-2}
+
+
+@pytest.mark.parametrize("dtype", SLACK, ids=str)
+@pytest.mark.parametrize(
+    "n_steps, n_lanes, width", [(9, 5, 16), (9, 5, 7), (1, 3, 16), (9, 1, 1), (3, 40, 256)]
+)
+def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lanes, width):
+    torch.manual_seed(0)
+    given = dict(
+        # Rounded beforehand, so that all begin with the same numbers, and of another layout in
+        # memory than the kernels'.
+        x=torch.randn(width, n_steps, n_lanes).permute(1, 2, 0).bfloat16().float(),
+        reset=(torch.rand(n_lanes, n_steps) < 0.3).T,
+        state=[torch.randn(width, n_lanes).T for _ in range(2)],
+        weights=[
+            (torch.randn(shape) / width**0.5).bfloat16().float()
+            for shape in ((4 * width, width), (4 * width,), (4 * width, width))
+        ],
+        d_outputs=torch.randn(width, n_steps, n_lanes).permute(1, 2, 0).bfloat16().float(),
+        d_cell=torch.randn(width, n_lanes).T,
+    )
+    found = sequence(where, dtype, **given)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recurrent, "_steps", lambda x: recurrent._WRITTEN_OUT)
+        expected = sequence("cpu", torch.float32, **given)
+    for name, ours, theirs in zip(NAMES, found, expected, strict=True):
+        slack = SLACK[dtype] * theirs.abs().max().item()
         torch.testing.assert_close(
-            theirs, ours, rtol=1e-3, atol=1e-3
-        )  # products may round to TF32 on a GPU
+            ours, theirs, rtol=0, atol=slack, msg=lambda text, name=name: f"{name}: {text}"
+        )
+
+
+@pytest.mark.parametrize("offset", [0, 1])
+@pytest.mark.parametrize("shape", [(4, 8), (8, 4)])
+def test_kernels_read_words_of_16_bytes(offset, shape):
+    tensor = torch.arange(40.0)[offset : offset + 32].view(shape)
+    for given in (tensor, tensor.T):
+        found = recurrent._aligned(given)
+        assert torch.equal(found, given)
+        assert found.is_contiguous() and not found.data_ptr() % 16
+
+
+@pytest.mark.parametrize("dtype", SLACK, ids=str)
+@pytest.mark.parametrize("width", [16, 7])
+def test_the_kernels_forget_even_a_nan(where, dtype, width):
+    torch.manual_seed(0)
+    given = dict(
+        x=torch.randn(T, B, width),
+        reset=torch.zeros(T, B, dtype=torch.bool),
+        state=[torch.randn(B, width) for _ in range(2)],
+        weights=[torch.randn(n, width) for n in (4 * width, 4 * width)],
+        d_outputs=torch.randn(T, B, width),
+        d_cell=torch.randn(B, width),
+    )
+    given["weights"].insert(1, torch.randn(4 * width))
+    given["reset"][[0, 4]] = True
+    clean = sequence(where, dtype, **given)
+    given["x"][:4] = torch.nan
+    after_nan = sequence(where, dtype, **given)
+    assert torch.equal(after_nan[0][4:], clean[0][4:]) and after_nan[0][:4].isnan().all()
+    assert torch.equal(after_nan[1], clean[1])  # the cell
+    assert torch.equal(after_nan[2][4:], clean[2][4:])  # d x
+    given["x"][:4] = 0.0
+    given["state"] = [torch.full((B, width), torch.nan) for _ in range(2)]
+    found = sequence(where, dtype, **given)
+    assert torch.equal(found[0][4:], clean[0][4:]) and all(leaf.isfinite().all() for leaf in found)
+    assert not found[-2].any() and not found[-1].any()  # d output, d cell: cleared at once
+    # nor does a gradient that is not a number come back through a reset
+    given["state"] = [torch.zeros(B, width) for _ in range(2)]
+    given["d_outputs"][4:] = torch.nan
+    d_x = sequence(where, dtype, **given)[2]
+    assert d_x[:4].isfinite().all() and d_x[4:].isnan().all()
+
+
+@pytest.mark.parametrize("width", [4, 3])
+def test_gates_saturate_and_a_nan_stays_one(where, width):
+    """By hand: all gates of a lane before their activation are one number."""
+    inf, nan = torch.inf, torch.nan
+    values = torch.tensor([-inf, -1e30, -100.0, -20.0, 0.0, 20.0, 100.0, 1e30, inf, nan])
+    gates = values[:, None].expand(-1, 4 * width).contiguous().to(where)
+    cell = torch.full((len(values), width), 0.5, device=where)
+    output, after = (torch.full_like(cell, 7.0) for _ in range(2))
+    kernels.forward(gates, cell, None, output, None, after)
+    sigmoid, squashed = values.double().sigmoid(), values.double().tanh()
+    cells = sigmoid * 0.5 + sigmoid * squashed
+    for found, expected in ((after, cells), (output, sigmoid * cells.tanh())):
+        torch.testing.assert_close(
+            found.cpu().double(),
+            expected[:, None].expand(-1, width),
+            rtol=0,
+            atol=1e-6,
+            equal_nan=True,
+        )
+
+
+def test_rounding_to_bfloat16_is_pytorchs(where):
+    """Through `start`, which rounds and no more: ties, infinities, the greatest float and NaN."""
+    inf, nan = torch.inf, torch.nan
+    values = torch.tensor([0.0, -0.0, 1 + 2**-8, 1 + 3 * 2**-8, -1 - 2**-8, 3.3e38, inf, -inf, nan])
+    bits = torch.tensor([0x3F80_7FFF, 0x3F80_8001, 0x7F7F_FFFF, 0x7FFF_FFFF], dtype=torch.int32)
+    values = torch.cat([values, bits.view(torch.float32), torch.randn(1011)]).view(-1, 4).to(where)
+    reset = torch.zeros(len(values), dtype=torch.bool, device=where)
+    memory, cell = torch.empty_like(values, dtype=torch.bfloat16), torch.empty_like(values)
+    kernels.start(reset, values, values, memory, cell)
+    torch.testing.assert_close(memory, values.bfloat16(), rtol=0, atol=0, equal_nan=True)
+    torch.testing.assert_close(cell, values, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("bf16", [False, True])
+def test_on_a_gpu_a_captured_graph_unrolls_as_steps_do(bf16):
+    """Inputs, resets and the state are changed between capture and replay."""
+    torch.manual_seed(0)
+    lstm = LSTM(256).cuda()
+    x = torch.randn(T, 64, 256, device="cuda", requires_grad=True)
+    reset = torch.rand(T, 64, device="cuda") < 0.3
+    state = lstm.initial(64, "cuda")
+    wanted = [x, *lstm.parameters()]
+
+    def unroll():
+        with torch.autocast("cuda", torch.bfloat16, enabled=bf16):
+            outputs, after = lstm(x, reset, state)
+        loss = outputs.float().square().sum() + after.cell.sum()
+        return [outputs, after.cell, *torch.autograd.grad(loss, wanted)]
+
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        unroll()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = unroll()
+    with torch.no_grad():
+        for tensor in (x, state.output, state.cell):
+            tensor.normal_()
+        reset.copy_(torch.rand(T, 64, device="cuda") < 0.3)
+    graph.replay()
+    slack = SLACK[torch.bfloat16 if bf16 else torch.float32]
+    for found, expected in zip(captured, unroll(), strict=True):
+        torch.testing.assert_close(
+            found.float(), expected.float(), rtol=0, atol=slack * expected.abs().max().item()
+        )
+    with torch.no_grad(), torch.autocast("cuda", torch.bfloat16, enabled=bf16):
+        for t in range(T):
+            output, state = lstm.step(x[t], reset[t], state)
+            torch.testing.assert_close(output.float(), captured[0][t].float(), rtol=0, atol=slack)

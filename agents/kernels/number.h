@@ -1,0 +1,72 @@
+// Numbers of either dtype, several at once, and the gates' activations.
+#pragma once
+
+#define DEVICE static __device__ __forceinline__
+
+// The upper half of a float. Without its header, NVRTC needs no include folder.
+struct Bfloat16 {
+    unsigned short bits;
+};
+
+DEVICE float to_float(float x) { return x; }
+
+DEVICE float to_float(Bfloat16 x) { return __uint_as_float((unsigned int)x.bits << 16); }
+
+DEVICE void assign(float& target, float x) { target = x; }
+
+// Rounds to the nearest, ties to even. A NaN stays one: rounded up, it might end as an infinity.
+DEVICE void assign(Bfloat16& target, float x) {
+    unsigned int bits = __float_as_uint(x);
+    bool is_nan = (bits & 0x7fffffffu) > 0x7f800000u;
+    unsigned int rounded = bits + 0x7fffu + (bits >> 16 & 1u);
+    target.bits = (unsigned short)((is_nan ? bits | 0x400000u : rounded) >> 16);
+}
+
+// The word of so many bytes that one instruction moves.
+template <int BYTES>
+struct Word;
+template <>
+struct Word<2> {
+    typedef unsigned short Type;
+};
+template <>
+struct Word<4> {
+    typedef unsigned int Type;
+};
+template <>
+struct Word<8> {
+    typedef uint2 Type;
+};
+template <>
+struct Word<16> {
+    typedef uint4 Type;
+};
+
+// N neighbours in one word: left to itself, the compiler moves some of them singly.
+template <class T, int N>
+union Pack {
+    typename Word<N * sizeof(T)>::Type word;
+    T values[N];
+};
+
+template <class T, int N>
+DEVICE void read(float (&values)[N], const void* base, long long index) {
+    Pack<T, N> pack;
+    pack.word = ((const Pack<T, N>*)((const T*)base + index))->word;
+    for (int n = 0; n < N; n++)
+        values[n] = to_float(pack.values[n]);
+}
+
+template <class T, int N>
+DEVICE void write(void* base, long long index, const float (&values)[N]) {
+    Pack<T, N> pack;
+    for (int n = 0; n < N; n++)
+        assign(pack.values[n], values[n]);
+    ((Pack<T, N>*)((T*)base + index))->word = pack.word;
+}
+
+// Where x is large either way, the exponential is 0 or infinite and the quotient 0 or 1. NaN stays.
+DEVICE float sigmoid(float x) { return __fdividef(1.f, 1.f + __expf(-x)); }
+
+// Within 3e-7, from -1 to 1.
+DEVICE float tanh_of(float x) { return 1.f - 2.f * sigmoid(-2.f * x); }
