@@ -86,7 +86,8 @@ def test_leaves_weigh_the_same_at_the_start():
     intake = heads.intake(
         arrdict(rgb=spaces.MultiImage(1, 3, 1, 64), imu=spaces.MultiVector(1, 3)), 4096
     )
-    of_rgb, of_imu = intake.project.weight.split([192, 3], dim=1)
+    of_rgb, of_imu, padding = intake.project.weight.split([192, 3, 5], dim=1)
+    assert not padding.any()
     for part in (of_rgb, of_imu):
         assert part.sum(1).var().item() == pytest.approx(
             1, abs=0.1
