@@ -38,6 +38,14 @@ def geometry(c):
     return c.scenery.agent_light
 
 
+def unseen(c):
+    layouts = c.scenery.layouts
+    words = -(-layouts.max_texels // 32)
+    seen = torch.zeros((LAST + 1, c.n_agents, words), dtype=torch.int32, device=c.device)
+    visible = torch.full((len(layouts), words), -1, dtype=torch.int32, device=c.device)
+    return engine.unseen(c.scenery, c.agents, seen, visible)
+
+
 def spawn(c):
     n, a, device = c.scenery.n_envs, c.n_agents, c.scenery.device
     mask = torch.ones((n, a), dtype=torch.bool, device=device)
@@ -49,7 +57,7 @@ def spawn(c):
 
 @pytest.mark.parametrize("layout", [2, -1, 2**31 - 1, -(2**31)])
 @pytest.mark.parametrize("n_agents", [1, 3])
-@pytest.mark.parametrize("operation", [physics, render, observe, geometry, spawn])
+@pytest.mark.parametrize("operation", [physics, render, observe, geometry, unseen, spawn])
 def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, layout, device):
     expected = operation(boxes(device, n_agents))
     c = boxes(device, n_agents)
@@ -62,6 +70,19 @@ def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, la
     c.scenery.layout[LAST] = 1
     operation(c)
     engine.check(c.agents)
+
+
+@pytest.mark.parametrize("operation", [physics, render, observe, unseen])
+@pytest.mark.parametrize("field", ["positions", "angles"])
+def test_a_place_that_is_not_finite_is_named_by_whatever_reads_it(operation, field, device):
+    expected = operation(boxes(device, 2))
+    c = boxes(device, 2)
+    getattr(c.agents, field)[LAST, 1] = math.nan
+    found = expected
+    with pytest.raises(engine.EngineError, match=f"environment {LAST} .* not a finite number"):
+        found = operation(c)
+        engine.check(c.agents)
+    assert torch.equal(found[:LAST], expected[:LAST])
 
 
 @pytest.mark.parametrize("action", [7, -1, 2**40])

@@ -11,8 +11,11 @@ KERNEL unseen(UnseenParams p) {
     for (int i = warp_lane; i < BINS; i += WARP)
         bins[i] = 0;
     __syncwarp();
-    Pose pose = pose_at(p.positions[2 * agent], p.positions[2 * agent + 1], p.angles[agent]);
-    int layout = layout_of(s, agent / s.n_agents, p.error_flag);
+    float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
+    int env = agent / s.n_agents, layout = layout_of(s, env, p.error_flag);
+    if (warp_lane == 0)
+        flag_nonfinite(p.error_flag, env, x, y, angle);
+    Pose pose = pose_at(x, y, angle);
     Walls walls = walls_of(s, layout);
     int first_texel = s.texel_starts[walls.first_wall];
     const unsigned int* seen = p.seen + agent * (long long)p.n_words;
