@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import torch
 
-from megastep import core, cuda, engine, scene, toys
+from megastep import core, cuda, engine, modules, scene, toys
 from megastep.ragged import Ragged
 from megastep.scenery import Layouts, Scenery
 
@@ -40,6 +40,7 @@ def fixture(device):
         counts=torch.zeros((N, A), dtype=torch.int32, device=device),
         seen=torch.zeros((N, A, words), dtype=torch.int32, device=device),
         moves=torch.zeros((7, 3), device=device),
+        visible=torch.zeros((D, words), dtype=torch.int32, device=device),
         points=torch.full((D, 4, 2), 3.0, device=device),
         out=torch.zeros((N * A, 4), device=device),
     )
@@ -179,6 +180,11 @@ def operations(f):
         ),
     )
     yield (
+        engine.unseen,
+        dict(both, seen=f.seen, visible=f.visible),
+        dict(OPERANDS, seen=tensors, visible=tensors),
+    )
+    yield (
         engine.spawn,
         dict(both, mask=f.mask, points=f.points, counts=f.counts, seed=1, resample=True),
         dict(
@@ -194,6 +200,11 @@ def operations(f):
         engine.uniform,
         dict(counts=f.counts.view(-1), mask=f.mask.view(-1), seed=1, out=f.out),
         dict(counts=tensors, mask=tensors, seed=lambda g: [*integers(0)(g)][:6], out=tensors),
+    )
+    yield (
+        modules.visible_texels,
+        dict(scenery=f.scenery, points=f.points),
+        dict(scenery=objects, points=arrays),
     )
     yield engine.bake, dict(scenery=f.scenery), dict(scenery=objects)
     yield engine.check, dict(agents=f.agents), dict(agents=objects)
@@ -286,6 +297,7 @@ CALLS = {
     "render": lambda f: engine.render(f.scenery, f.agents),
     "physics": lambda f: engine.physics(f.scenery, f.agents),
     "observe": lambda f: engine.observe(f.scenery, f.agents, imu=True),
+    "unseen": lambda f: engine.unseen(f.scenery, f.agents, f.seen, f.visible),
 }
 STATE = "positions", "angles", "velocity", "angvelocity"
 SETTINGS = dict(res=10**6, fov=0.0, fps=0.0, radius=-1.0)

@@ -6,7 +6,7 @@ from outputs import seen_of
 
 from megastep import cuda, engine, scene
 from megastep.geometries import sample
-from megastep.modules import RandomSpawns
+from megastep.modules import RandomSpawns, visible_texels
 
 
 def trajectory(device, n_agents, subsample=1, **settings):
@@ -14,11 +14,12 @@ def trajectory(device, n_agents, subsample=1, **settings):
     homes = sample("homes", 8)
     core = cuda.Core(scene.scenery(homes, n_agents, n_envs=24, device=device), **settings)
     spawn, seen = RandomSpawns(homes, core), seen_of(core)
+    visible = visible_texels(core.scenery, spawn.points[:, :4])
     random = torch.Generator().manual_seed(1)
     moves = torch.tensor(
         [(0, 0, 0), (3, 0, 0), (0, 3, 40), (9, 1, -40)], dtype=torch.float32, device=device
     )
-    out = [core.scenery.layouts.baked.vals]
+    out = [core.scenery.layouts.baked.vals, visible]
     for step in range(12):
         spawn(torch.rand((24, n_agents), generator=random).to(device) < (1 if step == 0 else 0.1))
         actions = torch.randint(4, (24, n_agents), generator=random).to(device)
@@ -26,6 +27,7 @@ def trajectory(device, n_agents, subsample=1, **settings):
         out += engine.observe(
             core.scenery, core.agents, subsample, imu=True, centre_line=True, seen=seen
         )
+        out.append(engine.unseen(core.scenery, core.agents, seen, visible))
     out += [
         *engine.render(core.scenery, core.agents),
         *engine.observe(core.scenery, core.agents, subsample, rgb=False)[1:2],

@@ -247,7 +247,7 @@ def test_no_operation_synchronises():
         seen_of(core),
         core.agent_full(True),
     )
-    moves = torch.zeros((7, 3), device="cuda")
+    moves, visible = torch.zeros((7, 3), device="cuda"), seen[:3, 0].clone()
     actions = torch.zeros((6, 2), dtype=torch.long, device="cuda")
 
     def everything():
@@ -256,6 +256,7 @@ def test_no_operation_synchronises():
         engine.physics(core.scenery, core.agents, actions, moves, 0.5)
         engine.render(core.scenery, core.agents)
         engine.observe(core.scenery, core.agents, 4, imu=True, seen=seen, clear_mask=mask)
+        engine.unseen(core.scenery, core.agents, seen, visible)
         core.agents.positions = core.agents.positions + 0.01
         engine.physics(core.scenery, core.agents)
 

@@ -266,3 +266,46 @@ def physics(walls, positions, angles, velocity, angvelocity, *, fps=10.0, radius
         velocity=torch.where(free[:, None], velocity, 0),
         angvelocity=torch.where(free, angvelocity, 0),
     )
+
+
+# What is left to see
+
+BANDS = 1.5, 4.0  # m, where the first and the second of three end
+SECTOR = 22.5  # degrees; the first of 16 is centred on the way the agent looks
+
+
+def unseen(walls, widths, left, position, angle, slack):
+    """How many texels lie in each band and sector: (least, most), each (3, 16).
+
+    `left` (T,) bool are the texels to count, of which each wall (W, 2, 2) has so many as `widths`
+    says. 32 successive texels share a word; those of a wall that share one lie where the middle of
+    all the wall's texels in that word is. Where that may be off by `slack` (metres, and as a
+    fraction of the distance), any of the places it may be counts.
+    """
+    least = torch.zeros(3, 16, dtype=torch.int64)
+    most, first = least.clone(), 0
+    for (start, end), width in zip(walls, widths.tolist()):
+        texels = torch.arange(first, first + width)
+        for word in (texels // 32).unique():
+            shared = texels[texels // 32 == word]
+            n_left = int(left[shared].sum())
+            if n_left:
+                along = (shared - first + 0.5).double().mean() / width
+                bins = _bins(start + along * (end - start) - position, angle, slack)
+                for bin in bins:
+                    most[bin] += n_left
+                if len(bins) == 1:
+                    least[bins.pop()] += n_left
+        first += width
+    return least, most
+
+
+def _bins(offset, angle, slack):
+    """The set of (band, sector) that a place so far from an agent may be in."""
+    (x, y), found = offset.tolist(), set()
+    reach = slack * (1 + math.hypot(x, y))
+    for dx, dy in ((0, 0), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)):
+        there = x + reach * dx, y + reach * dy
+        bearing = math.degrees(math.atan2(there[1], there[0])) - angle
+        found.add((sum(math.hypot(*there) > end for end in BANDS), round(bearing / SECTOR) % 16))
+    return found

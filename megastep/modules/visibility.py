@@ -19,8 +19,10 @@ AWAY = 1e4  # metres
 def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
     """(D, n_words) int32, a bit for each static texel of each layout: whether it is seen by a look
     all round from one of the layout's ``points`` (D, P, 2), as :func:`~megastep.engine.observe`
-    marks what is seen.
+    marks what is seen. ValueError if the scenery has no agent to look with.
     """
+    checks.instance("scenery", scenery, Scenery)
+    checks.integer("scenery.n_agents", scenery.n_agents, 1)
     layouts, device = scenery.layouts, scenery.device
     points = checks.floats("points", points, (len(layouts), "P", 2), device)
     each_once = Scenery.of_layouts(
