@@ -155,13 +155,13 @@ class ConcatIntake(nn.Module):
         dtype = compute_dtype(self.project.weight)
         return [encoder(norm(leaf)).to(dtype) for leaf, norm, encoder in self._leaves(obs)]
 
-    def update_stats(self, obs: Any, is_fine: torch.Tensor | bool = True) -> None:
-        """Takes observations (B, ...) into account in how they are standardised from now on, if
-        `is_fine`.
+    def update_stats(self, obs: Any, taken: torch.Tensor | bool = True) -> None:
+        """Takes observations (B, ...), or those `taken`, () or (B,) bool, into account in how they
+        are standardised from now on.
         """
         for leaf, norm, _ in self._leaves(obs):
             if isinstance(norm, RunningNorm):
-                norm.update_stats(leaf, is_fine)
+                norm.update_stats(leaf, taken)
 
     def _leaves(self, obs):
         for path, norm, encoder in zip(self.paths, self.norms, self.encoders, strict=True):

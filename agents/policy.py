@@ -140,11 +140,11 @@ class Policy(nn.Module):
         )
 
     def update_stats(
-        self, obs: Any, privileged: Any = None, is_fine: torch.Tensor | bool = True
+        self, obs: Any, privileged: Any = None, taken: torch.Tensor | bool = True
     ) -> None:
-        """Takes what B lanes saw into account in how it is standardised from now on, if
-        `is_fine`.
+        """Takes what B lanes saw, or those `taken`, () or (B,) bool, into account in how it is
+        standardised from now on.
         """
-        self.intake.update_stats(obs, is_fine)
+        self.intake.update_stats(obs, taken)
         if privileged is not None:
-            self.critic.intake.update_stats(privileged, is_fine)
+            self.critic.intake.update_stats(privileged, taken)

@@ -1,8 +1,8 @@
 """Proximal policy optimisation (Schulman et al. 2017) for recurrent policies.
 
 Axes: T time, B lanes, M lanes of a minibatch. A minibatch is whole sequences of some lanes. Every
-mean is over valid steps. An update never synchronises: what would be an `if` is a flag on the
-device.
+mean is over valid steps: those that the environment took, of lanes that learn. An update never
+synchronises: what would be an `if` is a flag on the device.
 """
 
 from typing import Any
@@ -125,6 +125,7 @@ class PPO:
         is_fine = self.check(rollout.numbers())
         transitions = rollout.transitions()
         estimates = returns.gae(**transitions, gamma=self.gamma, lambda_=self.lambda_)
+        estimates["valid"] = estimates.valid & rollout.learns[:-1]
         self.policy.critic.output.update_stats(estimates.targets, estimates.valid & is_fine)
         explained = explained_variance(transitions["value"], estimates.targets, estimates.valid)
         estimates["advantages"] = normalised(estimates.advantages, estimates.valid)
@@ -144,7 +145,7 @@ class PPO:
         # Only now: a rollout is learnt from as it was seen. One row is enough, B lanes again with
         # every rollout.
         last = rollout.world(-1)
-        self.policy.update_stats(last.obs, last.get("privileged"), is_fine)
+        self.policy.update_stats(last.obs, last.get("privileged"), is_fine & rollout.learns[-1])
         *sums, n_taken, n_skipped = totals.unbind()
         self.check.count((n_taken == 0) & (n_skipped > 0))
         means = {key: total / n_taken for key, total in zip(self._averaged, sums, strict=True)}
@@ -155,6 +156,7 @@ class PPO:
         now = self.policy.unroll(batch.obs, batch.starts, batch.state)
         valid, output = batch.valid, self.policy.output
         log_ratio = output.logprob(now.logits, batch.actions) - batch.logprobs
+        log_ratio = log_ratio.masked_fill(~valid, 0.0)  # or its exp may overflow, and 0 inf be nan
         ratio = log_ratio.exp()
         clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
         gain = torch.minimum(ratio * batch.advantages, clipped * batch.advantages)

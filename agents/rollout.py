@@ -16,12 +16,14 @@ from megastep.dotdict import leaves, mapping
 
 
 def _zeros(space, lead, device, dtype):
-    """Zeros for values of a tree of spaces, after `lead` axes. Integers are int64 whatever the
-    dtype.
+    """Zeros for values of a tree of spaces, after `lead` axes: of the dtype that a space names,
+    int64 for its integers, else of `dtype`.
     """
     if isinstance(space, dict):
         return arrdict({key: _zeros(child, lead, device, dtype) for key, child in space.items()})
-    dtype = torch.int64 if isinstance(space, spaces.MultiDiscrete) else dtype
+    if isinstance(space, spaces.MultiDiscrete):
+        dtype = torch.int64
+    dtype = getattr(space, "dtype", None) or dtype
     return torch.zeros(*lead, *space.shape, dtype=dtype, device=device)
 
 
@@ -40,14 +42,18 @@ class Rollout:
     privileged (T+1, B, ...) float32, what the critic alone sees, or None where there is no such
                space
     starts     (T+1, B) bool, whether that observation is its episode's first
+    learns     (T+1, B) bool, whether the learner learns from the lane then; all do unless worlds
+               say otherwise
     actions    (T, B, ...) int64
     logprobs   (T, B) of those actions, under the policy that chose them
     values     (T+1, B), as the policy estimated them then
     reward     (T, B), and `terminal`, `truncated` (T, B) bool: of the world that followed
+    metrics    by name, (T, B) float32: of the world that followed, where an episode ended
     state      the policy's state before row 0, leaves (B, ...)
 
     Args: `state`, the policy's state of B lanes, such as `policy.initial(B)`, of which a copy is
-    made; `obs_dtype`, of all observations that are not integers. ValueError if it has no row.
+    made; `obs_dtype`, of all observations that are not integers and whose space names none.
+    ValueError if it has no row.
     """
 
     def __init__(
@@ -73,12 +79,19 @@ class Rollout:
             self.privileged = _zeros(privileged_space, more, device, torch.float32)
         self.actions = _zeros(action_space, rows, device, torch.int64)
         self.starts = torch.zeros(more, dtype=torch.bool, device=device)
+        self.learns = torch.ones(more, dtype=torch.bool, device=device)
         self.terminal = torch.zeros(rows, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(rows, dtype=torch.bool, device=device)
         self.values = torch.zeros(more, device=device)
         self.logprobs = torch.zeros(rows, device=device)
         self.reward = torch.zeros(rows, device=device)
+        self.metrics = arrdict()
         self.state = clone(state)
+
+    def make_room(self, world: arrdict) -> None:
+        """For the metrics of worlds like this one, before the first is stored."""
+        for name in world.get("metrics", {}):
+            self.metrics[name] = torch.zeros_like(self.reward)
 
     @property
     def reset(self) -> torch.Tensor:
@@ -89,9 +102,18 @@ class Rollout:
         """Stores the world at time t, and returns it as it was stored, for the policy to act on."""
         self.obs[t] = world["obs"]
         self.starts[t] = world["reset"]
+        if "learns" in world:
+            self.learns[t] = world["learns"]
         if self.privileged is not None:
             self.privileged[t] = world["privileged"]
         return self.world(t)
+
+    def store_outcome(self, t: int, world: arrdict) -> None:
+        """Stores what the world that followed time t says of the actions of that time."""
+        self.reward[t] = world["reward"]
+        self.terminal[t], self.truncated[t] = world["terminal"], world["truncated"]
+        for name, rows in self.metrics.items():
+            rows[t] = world["metrics"][name]
 
     def world(self, t: int) -> arrdict:
         """What a policy sees at time t: arrdict(obs, reset, and privileged if there is any)."""
@@ -136,18 +158,21 @@ class Rollout:
         return batch
 
 
-def initial_actor_state(env: Any, policy: Any) -> arrdict:
-    """Resets an environment and returns the actor_state that `collect` begins with:
-    arrdict(world, state), of the world what a policy acts on. It shares no memory with the
-    environment.
+def initial_actor_state(env: Any, policy: Any, rollout: Rollout) -> arrdict:
+    """Resets an environment, makes room in the rollout for the metrics of its worlds, and returns
+    the actor_state that `collect` begins with: arrdict(world, state), of the world what
+    `store_world` stores. It shares no memory with the environment.
     """
-    world = _acted_on(env.reset()).map(torch.clone)
+    first = env.reset()
+    rollout.make_room(first)
+    world = _stored(first).map(torch.clone)
     return arrdict(world=world, state=policy.initial(len(world.reset)))
 
 
-def _acted_on(world):
-    """Of a world, what a policy is shown."""
-    return arrdict({key: world[key] for key in ("obs", "reset", "privileged") if key in world})
+def _stored(world):
+    """Of a world, what `store_world` stores."""
+    keys = "obs", "reset", "learns", "privileged"
+    return arrdict({key: world[key] for key in keys if key in world})
 
 
 @torch.no_grad()
@@ -167,15 +192,14 @@ def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> ar
             features.append(decision["features"])
             with torch.autocast(rollout.reward.device.type, enabled=False):
                 world = env.step(arrdict(actions=decision["actions"]))
-            rollout.reward[t] = world["reward"]
-            rollout.terminal[t], rollout.truncated[t] = world["terminal"], world["truncated"]
+            rollout.store_outcome(t, world)
 
         last = rollout.store_world(rollout.n_steps, world)
         features.append(policy(last, state, sample=False)[0]["features"])
         rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
     # a memory that is not finite starts anew, or it would last until the lane's episode ends
     state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
-    after = arrdict(world=_acted_on(world), state=state)
+    after = arrdict(world=_stored(world), state=state)
     for target, source in zip(leaves(actor_state), leaves(after), strict=True):
         target.copy_(source)
     return actor_state
@@ -189,7 +213,7 @@ class Collector:
     """
 
     def __init__(self, env: Any, policy: Any, rollout: Rollout):
-        self.parts = env, policy, rollout, initial_actor_state(env, policy)
+        self.parts = env, policy, rollout, initial_actor_state(env, policy, rollout)
         self.on_gpu = torch.device(env.device).type == "cuda"
         self.n_collected = 0
         self.graph = None

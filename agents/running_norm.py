@@ -34,15 +34,21 @@ class RunningNorm(nn.Module):
         return (obs - self.mean) / self.scale
 
     @torch.no_grad()
-    def update_stats(self, obs: torch.Tensor, is_fine: torch.Tensor | bool = True) -> None:
-        """Takes observations (B, ...) into account, the n-th call with weight 1/n. Changes nothing
-        unless `is_fine`, or if a mean or variance of them is not finite.
+    def update_stats(self, obs: torch.Tensor, taken: torch.Tensor | bool = True) -> None:
+        """Takes observations (B, ...) into account, or those `taken`, () or (B,) bool; the n-th
+        call with weight 1/n. Changes nothing if none is, or if a mean or variance is not finite.
         """
-        variance, mean = torch.var_mean(obs.float(), self.pooled, correction=0, keepdim=True)
+        lanes = torch.ones(len(obs), dtype=torch.bool, device=obs.device) & taken
+        left_out = ~lanes.view(-1, *[1] * (obs.dim() - 1))
+        n_lanes = lanes.sum()
+        n = n_lanes.clamp(min=1) * (obs[0].numel() // self.mean.numel())
+        mean = obs.float().masked_fill(left_out, 0.0).sum(self.pooled, keepdim=True) / n
+        error = (obs - mean).masked_fill(left_out, 0.0)
+        variance = error.square().sum(self.pooled, keepdim=True) / n
         count = self.count + 1
         mean, scale = mixed_moments(self, mean[0], variance[0], 1 / count)
-        is_fine = is_fine & (mean + scale).isfinite().all()
-        store(is_fine, [(self.mean, mean), (self.scale, scale), (self.count, count)])
+        is_taken = (n_lanes > 0) & (mean + scale).isfinite().all()
+        store(is_taken, [(self.mean, mean), (self.scale, scale), (self.count, count)])
 
 
 def mixed_moments(

@@ -2,49 +2,71 @@
 numbers to expect.
 
 A space's ``shape`` is that of one lane, without the leading axis B. Heads turn spaces into network
-layers.
+layers. A vector or an image may name its ``dtype``, in which it is given and stored:
+``MultiImage(1, 3, 1, 64, dtype=torch.uint8)``. Without one, any float will do.
 """
 
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, field, fields
+
+import torch
 
 __all__ = ["MultiDiscrete", "MultiEmpty", "MultiImage", "MultiVector"]
 
 
+DTYPES = torch.uint8, torch.float16, torch.float32
+
+
 class _Space:
     def __post_init__(self):
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for name, value in self._sizes().items():
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(
-                    f"{type(self).__name__} needs a positive integer for {field.name}, not "
-                    f"{value!r}"
+                    f"{type(self).__name__} needs a positive integer for {name}, not {value!r}"
                 )
+
+    def _sizes(self):
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "dtype"}
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self._sizes().values())
 
 
 @dataclass(frozen=True)
-class MultiVector(_Space):
+class _Numbers(_Space):
+    dtype: torch.dtype | None = field(default=None, kw_only=True)
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.dtype not in (None, *DTYPES):
+            raise ValueError(
+                f"{type(self).__name__} can be of dtype {', '.join(map(str, DTYPES))}, not "
+                f"{self.dtype!r}"
+            )
+
+    def __repr__(self):
+        # a dtype only where it is named: checkpoints compare spaces as text
+        named = {**self._sizes(), **({"dtype": self.dtype} if self.dtype else {})}
+        values = ", ".join(f"{name}={value!r}" for name, value in named.items())
+        return f"{type(self).__name__}({values})"
+
+
+@dataclass(frozen=True, repr=False)
+class MultiVector(_Numbers):
     """A vector of ``dim`` numbers for every agent: shape (n_agents, dim)."""
 
     n_agents: int
     dim: int
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return astuple(self)
 
-
-@dataclass(frozen=True)
-class MultiImage(_Space):
+@dataclass(frozen=True, repr=False)
+class MultiImage(_Numbers):
     """An image of C channels, H rows and W columns for every agent: shape (n_agents, C, H, W)."""
 
     n_agents: int
     C: int
     H: int
     W: int
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return astuple(self)
 
 
 @dataclass(frozen=True)

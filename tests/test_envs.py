@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from megastep import arrdict, capture, contract, envs, plotting, spaces, toys
+from megastep import arrdict, capture, contract, dotdict, envs, plotting, spaces, toys
 from megastep.engine import EngineError
 from megastep.geometries import sample
 
@@ -41,12 +41,17 @@ def test_contract(name, device):
 
 
 class Fake:
-    """The smallest environment: episodes of three steps, observing how old they are. ``fault``
-    breaks a clause of the contract.
+    """The smallest environment: episodes of three steps, observing how old they are, that says all
+    that a world may. ``fault`` breaks a clause of the contract.
     """
 
     n_envs, n_agents, device, fps = 2, 1, "cpu", 10.0
-    obs_space, action_space = spaces.MultiVector(1, 1), spaces.MultiDiscrete(1, 2)
+    obs_space = dotdict.dotdict(
+        age=spaces.MultiVector(1, 1),
+        sky=spaces.MultiImage(1, 3, 1, 2, dtype=torch.uint8),
+        body=dotdict.dotdict(hands=spaces.MultiDiscrete(2, 4)),
+    )
+    action_space, roles = spaces.MultiDiscrete(1, 2), ("runner",)
 
     def check(self):
         pass
@@ -57,17 +62,46 @@ class Fake:
     def _world(self, reset):
         ends = (self.age == 3) & ~reset
         world = arrdict.arrdict(
-            obs=self.age.float().view(2, 1, 1),
+            obs=arrdict.arrdict(
+                age=self.age.float().view(2, 1, 1),
+                sky=torch.full((2, 1, 3, 1, 2), 255, dtype=torch.uint8),
+                body=arrdict.arrdict(hands=self.age[:, None] + torch.zeros(2, dtype=torch.int64)),
+            ),
             reward=torch.where(reset, 0.0, 1.0),
             reset=reset,
             terminal=ends & torch.tensor([True, False]),
             truncated=ends & torch.tensor([False, True]),
+            learns=torch.tensor([True, False]),
+            metrics=arrdict.arrdict(laps=torch.where(ends, 3.0, torch.nan)),
         )
+        later = self.fault and self.age.max() > 1
         faults = {
             "late reset": dict(reset=torch.zeros_like(reset)),
             "both": dict(terminal=ends, truncated=ends),
             "paid": dict(reward=torch.ones(2)),
-            "shape": dict(obs=world.obs[:, 0]),
+            "absent": dict(obs=arrdict.arrdict(age=world.obs.age, sky=world.obs.sky)),
+            "shape": dict(obs=arrdict.arrdict(world.obs, age=world.obs.age[:, 0])),
+            "double": dict(obs=arrdict.arrdict(world.obs, age=world.obs.age.double())),
+            "not a number": dict(obs=arrdict.arrdict(world.obs, age=world.obs.age / 0 * 0)),
+            "pale": dict(obs=arrdict.arrdict(world.obs, sky=world.obs.sky.half())),
+            "half hands": dict(
+                obs=arrdict.arrdict(world.obs, body=dict(hands=world.obs.body.hands / 2))
+            ),
+            "five hands": dict(
+                obs=arrdict.arrdict(world.obs, body=dict(hands=world.obs.body.hands + 1))
+            ),
+            "learns once": dict(learns=torch.tensor(True)),
+            "learns a bit": dict(learns=torch.ones(2)),
+            "metric of a column": dict(metrics=dict(laps=torch.zeros(2, 1))),
+            "metric of integers": dict(metrics=dict(laps=torch.zeros(2, dtype=torch.int64))),
+            "metric of one": dict(metrics=dict(laps=3.0)),
+            "metric that is taken": dict(metrics={"return": torch.zeros(2)}),
+            "metric of two words": dict(metrics={"lap/time": torch.zeros(2)}),
+            "metric without a value": dict(metrics=dict(laps=torch.full((2,), torch.nan))),
+            "metric alone": dict(metrics=torch.zeros(2)),
+            "metric that comes late": dict(metrics=dict(laps=torch.zeros(2), more=torch.zeros(2)))
+            if later
+            else {},
             "dtype": dict(reset=reset.float()),
             "nan": dict(reward=world.reward / 0 * 0),
             "ends at once": dict(
@@ -76,6 +110,9 @@ class Fake:
         }
         for key, value in faults.get(self.fault, {}).items():
             world[key] = value
+        for key, absent in {"no reward": "reward", "learns at first": "learns"}.items():
+            if self.fault == key and (absent == "reward" or later):
+                del world[absent]
         return world
 
     def reset(self):
@@ -100,7 +137,10 @@ def test_the_checker_names_what_an_environment_lacks(name):
                 raise AttributeError(asked)
             return getattr(Fake(), asked)
 
-    with pytest.raises(AssertionError, match=f"Lacking has no {name}: {contract.ATTRIBUTES[name]}"):
+    with pytest.raises(
+        AssertionError,
+        match=f"Lacking breaks the contract: it has no {name}: {contract.ATTRIBUTES[name]}",
+    ):
         contract.check_environment(Lacking())
 
 
@@ -110,6 +150,11 @@ def test_the_checker_names_what_an_environment_lacks(name):
         ("fps", 0, "fps is a positive number of steps per second, not 0"),
         ("layout", torch.zeros(3, dtype=torch.int32), "layout has one integer per environment"),
         ("layout", torch.zeros(2), "layout has one integer per environment"),
+        ("roles", ("leader", "follower"), "roles has one name per agent of an environment, 1 in"),
+        ("roles", (), "roles has one name per agent"),
+        ("roles", "a", "roles has one name per agent"),
+        ("roles", ("the leader",), "roles has one name per agent"),
+        ("roles", (1,), "roles has one name per agent"),
     ],
 )
 def test_the_checker_names_an_attribute_that_is_wrong(name, value, clause):
@@ -125,14 +170,35 @@ def test_the_checker_names_an_attribute_that_is_wrong(name, value, clause):
         ("late reset", "reset follows"),
         ("both", "exclude"),
         ("paid", "pays nothing"),
-        ("shape", "as its space"),
+        ("no reward", "a world has reward"),
+        ("absent", "observation body.hands is as its space says"),
+        ("shape", "observation age is as its space says"),
+        ("double", "observation age is a float on the device"),
+        ("not a number", "observation age is finite"),
+        ("pale", "observation sky is of the torch.uint8 that its space names"),
+        ("half hands", "observation body.hands is integers"),
+        ("five hands", "observation body.hands is from 0 to 3"),
+        ("learns once", "learns has one bool per lane"),
+        ("learns a bit", "learns has one bool per lane"),
+        ("learns at first", "every world has learns, or none has"),
+        (
+            "metric of a column",
+            r"metric laps has one float32 per lane, \(2,\), .*not torch.float32 \(2, 1\)",
+        ),
+        ("metric of integers", r"not torch.int64 \(2,\)"),
+        ("metric of one", "not 3.0"),
+        ("metric that is taken", "not 'return'"),
+        ("metric of two words", "not 'lap/time'"),
+        ("metric without a value", "metric laps is finite where episodes end"),
+        ("metric alone", "metrics is a dict"),
+        ("metric that comes late", "every world has the same metrics"),
         ("dtype", "flags are bools"),
         ("nan", "rewards are finite"),
         ("ends at once", "does not end"),
     ],
 )
 def test_the_checker_names_the_broken_clause(fault, clause):
-    with pytest.raises(AssertionError, match=clause):
+    with pytest.raises(contract.ContractError, match=f"^Fake breaks the contract: .*{clause}"):
         contract.rollout(Fake(fault), 9)
 
 

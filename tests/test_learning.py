@@ -119,7 +119,7 @@ def learn(env, n_updates, policy=None, n_steps=16, **how):
     state = policy.initial(B)
     rollout = Rollout(n_steps, B, env.obs_space, env.action_space, state)
     learner = PPO(policy, **{**dict(lr=5e-3, n_epochs=2, n_minibatches=4), **how})
-    actor_state, counts = initial_actor_state(env, policy), torch.zeros(3)
+    actor_state, counts = initial_actor_state(env, policy, rollout), torch.zeros(3)
     for i in range(n_updates):
         collect(env, policy, rollout, actor_state)
         if i >= n_updates - 10:

@@ -16,19 +16,20 @@ from megastep.arrdict import arrdict
 
 T, B, WIDTH = 8, 6, 16
 OBS, MOVES = spaces.MultiVector(1, 4), spaces.MultiDiscrete(1, 3)
+MORE = spaces.MultiVector(1, 2)  # what a critic may see beside
 
 
-def made_up(seed=0, device="cpu"):
+def made_up(seed=0, device="cpu", privileged=None):
     """A policy and a rollout of random worlds, acted in by that policy. Lanes 1 and 4 have resets
     in the middle.
     """
-    policy = Policy(OBS, MOVES, width=WIDTH, seed=seed).to(device)
+    policy = Policy(OBS, MOVES, privileged, width=WIDTH, seed=seed).to(device)
     with torch.no_grad():
         policy.output.core.weight.mul_(
             100
         )  # a policy far from uniform, so that gradients differ by action
     state = policy.initial(B)
-    rollout = Rollout(T, B, OBS, MOVES, state, device, obs_dtype=torch.float32)
+    rollout = Rollout(T, B, OBS, MOVES, state, device, privileged, torch.float32)
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape):
@@ -38,9 +39,11 @@ def made_up(seed=0, device="cpu"):
     rollout.starts[3, 1] = rollout.starts[5, 4] = True
     rollout.terminal[1, 1] = rollout.truncated[3, 4] = True
     rollout.reward[:] = normal(T, B)
+    if privileged:
+        rollout.privileged[:] = normal(T + 1, B, *privileged.shape)
     with torch.no_grad():
         out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
-        rollout.values[:] = policy.value(out.features)
+        rollout.values[:] = policy.value(out.features, rollout.privileged)
         rollout.actions[:] = policy.output.sample(out.logits[:-1], policy.random.on(policy.device))
         rollout.logprobs[:] = policy.output.logprob(out.logits[:-1], rollout.actions)
     return policy, rollout
@@ -134,6 +137,46 @@ def test_what_an_invalid_row_holds_teaches_nothing():
     (clean_metrics, clean), (dirty_metrics, dirty) = results
     assert torch.equal(clean, dirty)
     assert clean_metrics == dirty_metrics
+
+
+@pytest.mark.parametrize("n_minibatches", [2, B])
+def test_lanes_that_do_not_learn_change_no_bit_of_weights_or_statistics(n_minibatches):
+    """All of two lanes is replaced, by numbers whose ratios of probabilities overflow. One lane
+    learns at some times: its other rows count in no mean, though its memory passes through them.
+    """
+    results = []
+    for changed in (False, True):
+        policy, rollout = made_up(privileged=MORE)
+        rollout.learns[:, [0, 4]] = False
+        rollout.learns[2:4, 3] = False
+        if changed:
+            for lanes in (rollout.obs, rollout.privileged, rollout.reward, rollout.values):
+                lanes[:, [0, 4]] = torch.randn(lanes[:, [0, 4]].shape) * 50 + 9
+            rollout.logprobs[:, 0], rollout.logprobs[:, 4] = -200.0, 3.0
+            rollout.actions[:, [0, 4]] = (rollout.actions[:, [0, 4]] + 1) % 3
+            rollout.terminal[5, 0] = rollout.truncated[6, 4] = rollout.starts[4, 0] = True
+            rollout.state.cell[[0, 4]] = 7.0
+            rollout.logprobs[2:4, 3], rollout.values[2:4, 3] = -200.0, rollout.values[2:4, 3]
+            rollout.actions[2:4, 3] = (rollout.actions[2:4, 3] + 1) % 3
+        learner = ppo.PPO(policy, n_epochs=2, n_minibatches=n_minibatches, lr=1e-2)
+        metrics = learner.update(rollout)
+        results.append((metrics, policy.state_dict(), learner.optimizer.means))
+    (clean_metrics, clean, means), (metrics, dirty, dirty_means) = results
+    assert clean.keys() == dirty.keys() and all(torch.equal(clean[k], dirty[k]) for k in clean)
+    assert all(map(torch.equal, means, dirty_means))
+    assert metrics == clean_metrics and metrics["loss/skipped_steps"].item() == 0
+
+
+def test_lanes_that_learn_do_change_the_weights():
+    ends = []
+    for lane in (None, 0, 2):
+        policy, rollout = made_up()
+        rollout.learns[:, 0] = False
+        if lane is not None:
+            rollout.reward[:, lane] += torch.arange(T)
+        ppo.PPO(policy, n_minibatches=2, lr=1e-2).update(rollout)
+        ends.append(weights(policy))
+    assert torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], ends[2])
 
 
 def test_a_gradient_that_is_not_finite_is_skipped_and_counted():

@@ -72,7 +72,7 @@ def collected(n_rollouts=1, dtype=torch.float32, env=None):
     policy = Policy(env.obs_space, env.action_space, width=16)
     state = policy.initial(B)
     rollout = Rollout(T, B, env.obs_space, env.action_space, state, obs_dtype=dtype)
-    actor_state = initial_actor_state(env, policy)
+    actor_state = initial_actor_state(env, policy, rollout)
     for _ in range(n_rollouts):
         actor_state = collect(env, policy, rollout, actor_state)
     return env, policy, rollout, actor_state
@@ -167,7 +167,7 @@ def test_collecting_allocates_nothing_that_stays():
     policy = Policy(env.obs_space, env.action_space, width=16)
     rollout = Rollout(T, B, env.obs_space, env.action_space, policy.initial(B))
     before = state_tree(rollout)
-    collect(env, policy, rollout, initial_actor_state(env, policy))
+    collect(env, policy, rollout, initial_actor_state(env, policy, rollout))
     after = state_tree(rollout)
     assert before.keys() == after.keys() and ".state['cell']" in after
     assert all(before[path] is after[path] for path in after)
@@ -211,6 +211,44 @@ def test_images_are_stored_in_half_precision_and_integers_as_integers():
     rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
     assert rollout.obs.rgb.dtype == torch.float16 and rollout.obs.team.dtype == torch.int64
     assert rollout.actions.shape == (T, B, 1)
+
+
+def test_what_a_space_names_its_dtype_is_stored_as_such():
+    space = arrdict(
+        sky=spaces.MultiImage(1, 3, 1, 4, dtype=torch.uint8),
+        gauge=spaces.MultiVector(1, 2, dtype=torch.float32),
+    )
+    rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
+    assert rollout.obs.sky.dtype == torch.uint8 and rollout.obs.gauge.dtype == torch.float32
+    assert rollout.numbers().keys() == {"obs.gauge", "reward", "value", "logprob"}
+
+
+class Talkative(Telltale):
+    """Lane b learns at times divisible by b + 1. Two metrics tell lane and time, and a half."""
+
+    def _world(self, reset):
+        world, label = super()._world(reset), self.label(self.time)
+        metrics = arrdict(laps=label, falls=label + 0.5)
+        return arrdict(world, learns=self.learns(self.time), metrics=metrics)
+
+    def learns(self, time):
+        return torch.tensor([time % (b + 1) == 0 for b in range(B)])
+
+
+@pytest.mark.parametrize("n_rollouts", [1, 3])
+def test_rows_hold_who_learnt_then_and_the_metrics_that_followed(n_rollouts):
+    env, _, rollout, _ = collected(n_rollouts, env=Talkative())
+    first = (n_rollouts - 1) * T
+    for row in range(T + 1):
+        assert torch.equal(rollout.learns[row], env.learns(first + row))
+    for row in range(T):
+        assert torch.equal(rollout.metrics.laps[row], env.label(first + row + 1))
+        assert torch.equal(rollout.metrics.falls[row], env.label(first + row + 1) + 0.5)
+
+
+def test_all_lanes_learn_unless_a_world_says_otherwise():
+    _, _, rollout, _ = collected()
+    assert rollout.learns.all() and not rollout.metrics
 
 
 def test_a_rollout_of_nothing_is_refused():

@@ -20,6 +20,21 @@ def test_observations_that_are_not_finite_change_nothing(bad):
     assert all(torch.equal(norm.state_dict()[name], before[name]) for name in before)
 
 
+def test_lanes_that_are_left_out_do_not_count():
+    image = spaces.MultiImage(2, 3, 1, 5, dtype=torch.uint8)
+    norm, fewer = RunningNorm(image), RunningNorm(image)
+    obs, taken = torch.randint(256, (40, 2, 3, 1, 5), dtype=torch.uint8), torch.rand(40) < 0.5
+    norm.update_stats(obs, taken)
+    fewer.update_stats(obs[taken])
+    torch.testing.assert_close(norm.mean, fewer.mean)
+    torch.testing.assert_close(norm.scale, fewer.scale)
+    expected = obs[taken].double().std((0, 3, 4), correction=0)
+    torch.testing.assert_close(norm.scale.double().flatten(), expected.flatten())
+    before = norm.mean.clone()
+    norm.update_stats(obs, torch.zeros(40, dtype=torch.bool))
+    assert torch.equal(norm.mean, before) and norm.count == 1
+
+
 def test_batches_weigh_the_same():
     norm, batches = RunningNorm(spaces.MultiVector(1, 1)), torch.randn(5, 8, 1, 1) * 3 + 2
     for batch in batches:

@@ -3,6 +3,7 @@
 import pickle
 
 import pytest
+import torch
 
 from megastep import spaces
 
@@ -32,6 +33,16 @@ def test_equality_hash_and_text_go_by_value():
     assert pickle.loads(pickle.dumps(spaces.MultiImage(1, 3, 1, 64))) == spaces.MultiImage(
         1, 3, 1, 64
     )
+
+
+def test_a_dtype_is_named_or_left_open():
+    image, bytes_ = spaces.MultiImage(1, 3, 1, 8), spaces.MultiImage(1, 3, 1, 8, dtype=torch.uint8)
+    assert image.dtype is None and bytes_.dtype == torch.uint8
+    assert image != bytes_ and image.shape == bytes_.shape == (1, 3, 1, 8)
+    assert repr(image) == "MultiImage(n_agents=1, C=3, H=1, W=8)"
+    assert repr(bytes_) == "MultiImage(n_agents=1, C=3, H=1, W=8, dtype=torch.uint8)"
+    with pytest.raises(ValueError, match=r"MultiVector can be of dtype torch.uint8.*not 'uint8'"):
+        spaces.MultiVector(1, 3, dtype="uint8")
 
 
 def test_spaces_do_not_change():
