@@ -49,14 +49,16 @@ def _require(env: Any, kept: bool, clause: str) -> None:
         raise ContractError(f"{type(env).__name__} breaks the contract: {clause}")
 
 
-def _leaves(space: Any, values: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
+def _leaves(env: Any, space: Any, values: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
     """(name, space, values) for every leaf of a tree of spaces; values are None where absent."""
     if not isinstance(space, Mapping):
         yield name, space, values
         return
+    extra = [key for key in values if key not in space] if isinstance(values, Mapping) else []
+    _require(env, not extra, f"{name} has the keys of its space, and not {extra[:1]}")
     for key, child in space.items():
         inner = values.get(key) if isinstance(values, Mapping) else None
-        yield from _leaves(child, inner, f"{name}{' ' if name in ROOTS else '.'}{key}")
+        yield from _leaves(env, child, inner, f"{name}{' ' if name in ROOTS else '.'}{key}")
 
 
 def check_environment(env: Any) -> None:
@@ -95,7 +97,7 @@ def check_world(env: Any, world: Mapping, last: Mapping | None = None) -> None:
         _require(env, _is_there(env, world[key]), f"{key} is on the environment's device")
     _require(env, world["reward"].dtype == torch.float32, "rewards are float32")
     _require(env, all(world[key].dtype == torch.bool for key in FLAGS), "flags are bools")
-    for name, space, values in _leaves(env.obs_space, world["obs"], "observation"):
+    for name, space, values in _leaves(env, env.obs_space, world["obs"], "observation"):
         _check_observation(env, name, space, values)
     _check_privileged(env, world)
     _check_flow(env, world, last)
@@ -155,7 +157,7 @@ def _check_privileged(env, world):
         return
     lanes = env.n_envs * env.n_agents
     root = "privileged" if isinstance(space, Mapping) else "privileged values"
-    for name, leaf, values in _leaves(space, world["privileged"], root):
+    for name, leaf, values in _leaves(env, space, world["privileged"], root):
         _require(
             env,
             isinstance(values, torch.Tensor) and values.shape == (lanes, *leaf.shape),

@@ -14,7 +14,8 @@ DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 SHORT = {
     "minimal": dict(shortest=3, longest=9),
     "explorer": dict(patience=1, res=1, subsample=1),
-}  # episodes that end within a test
+    "explorer, privileged": dict(patience=1, res=1, subsample=1, privileged=True),
+}  # settings of which episodes end within a test
 
 
 @pytest.fixture(params=DEVICES)
@@ -25,7 +26,7 @@ def device(request):
 
 
 def make(name, device="cpu", n_envs=12, seed=1, **settings):
-    return envs.ENVS[name](
+    return envs.ENVS[name.split(",")[0]](
         n_envs, sample("bench", 4), seed=seed, device=device, **{**SHORT[name], **settings}
     )
 
@@ -33,7 +34,7 @@ def make(name, device="cpu", n_envs=12, seed=1, **settings):
 # ---- The contract ----
 
 
-@pytest.mark.parametrize("name", envs.ENVS)
+@pytest.mark.parametrize("name", SHORT)
 def test_contract(name, device):
     worlds = contract.rollout(make(name, device), 60)
     ends = sum(int((w.terminal | w.truncated).sum()) for w in worlds)
@@ -52,6 +53,7 @@ class Fake:
         body=dotdict.dotdict(hands=spaces.MultiDiscrete(2, 4)),
     )
     action_space, roles = spaces.MultiDiscrete(1, 2), ("runner",)
+    privileged_space = dotdict.dotdict(left=spaces.MultiVector(1, 1), lane=spaces.MultiVector(1, 2))
 
     def check(self):
         pass
@@ -67,6 +69,9 @@ class Fake:
                 sky=torch.full((2, 1, 3, 1, 2), 255, dtype=torch.uint8),
                 body=arrdict.arrdict(hands=self.age[:, None] + torch.zeros(2, dtype=torch.int64)),
             ),
+            privileged=arrdict.arrdict(
+                left=3.0 - self.age.view(2, 1, 1), lane=torch.eye(2).view(2, 1, 2)
+            ),
             reward=torch.where(reset, 0.0, 1.0),
             reset=reset,
             terminal=ends & torch.tensor([True, False]),
@@ -74,6 +79,7 @@ class Fake:
             learns=torch.tensor([True, False]),
             metrics=arrdict.arrdict(laps=torch.where(ends, 3.0, torch.nan)),
         )
+        told = world.privileged
         later = self.fault and self.age.max() > 1
         faults = {
             "late reset": dict(reset=torch.zeros_like(reset)),
@@ -102,6 +108,13 @@ class Fake:
             "metric that comes late": dict(metrics=dict(laps=torch.zeros(2), more=torch.zeros(2)))
             if later
             else {},
+            "more seen": dict(obs=arrdict.arrdict(world.obs, more=world.obs.age)),
+            "less told": dict(privileged=dict(left=told.left)),
+            "more told": dict(privileged=dict(told, more=told.left)),
+            "told bare": dict(privileged=told.left),
+            "told in a column": dict(privileged=dict(told, lane=told.lane[..., :1])),
+            "told in half": dict(privileged=dict(told, lane=told.lane.half())),
+            "told no number": dict(privileged=dict(told, left=told.left / 0 * 0)),
             "dtype": dict(reset=reset.float()),
             "nan": dict(reward=world.reward / 0 * 0),
             "ends at once": dict(
@@ -110,8 +123,9 @@ class Fake:
         }
         for key, value in faults.get(self.fault, {}).items():
             world[key] = value
-        for key, absent in {"no reward": "reward", "learns at first": "learns"}.items():
-            if self.fault == key and (absent == "reward" or later):
+        gone = {"no reward": "reward", "told nothing": "privileged", "learns at first": "learns"}
+        for key, absent in gone.items():
+            if self.fault == key and (absent != "learns" or later):
                 del world[absent]
         return world
 
@@ -192,6 +206,14 @@ def test_the_checker_names_an_attribute_that_is_wrong(name, value, clause):
         ("metric without a value", "metric laps is finite where episodes end"),
         ("metric alone", "metrics is a dict"),
         ("metric that comes late", "every world has the same metrics"),
+        ("more seen", r"observation has the keys of its space, and not \['more'\]"),
+        ("told nothing", "a world has privileged values if, and only if"),
+        ("less told", "privileged lane are as their space says"),
+        ("more told", r"privileged has the keys of its space, and not \['more'\]"),
+        ("told bare", "privileged left are as their space says"),
+        ("told in a column", "privileged lane are as their space says"),
+        ("told in half", "privileged lane are float32 on the device"),
+        ("told no number", "privileged left are finite"),
         ("dtype", "flags are bools"),
         ("nan", "rewards are finite"),
         ("ends at once", "does not end"),
@@ -202,7 +224,27 @@ def test_the_checker_names_the_broken_clause(fault, clause):
         contract.rollout(Fake(fault), 9)
 
 
-@pytest.mark.parametrize("name", envs.ENVS)
+@pytest.mark.parametrize("space", [None, spaces.MultiVector(1, 1)])
+def test_privileged_values_may_be_absent_or_bare(space):
+    class Bare(Fake):
+        privileged_space = space
+
+        def _world(self, reset):
+            world = super()._world(reset)
+            told = world.pop("privileged")
+            return world if space is None else arrdict.arrdict(world, privileged=told.left)
+
+    contract.rollout(Bare(), 9)
+
+
+def test_privileged_values_need_a_space():
+    env = Fake()
+    env.privileged_space = None
+    with pytest.raises(contract.ContractError, match="only if, there is a privileged_space"):
+        contract.rollout(env, 0)
+
+
+@pytest.mark.parametrize("name", SHORT)
 def test_a_seed_determines_an_episode(name, device):
     first, second, other = (
         contract.rollout(make(name, device, seed=seed), 20, check=False) for seed in (1, 1, 2)
@@ -211,7 +253,7 @@ def test_a_seed_determines_an_episode(name, device):
     assert not contract.same(arrdict.stack(first).obs, arrdict.stack(other).obs)
 
 
-@pytest.mark.parametrize("name", envs.ENVS)
+@pytest.mark.parametrize("name", SHORT)
 def test_an_ended_lane_ignores_its_decision(name):
     a, b = make(name), make(name)
     worlds, generator, ignored = [a.reset(), b.reset()], torch.Generator().manual_seed(3), 0
@@ -225,7 +267,7 @@ def test_an_ended_lane_ignores_its_decision(name):
     assert ignored
 
 
-@pytest.mark.parametrize("name", envs.ENVS)
+@pytest.mark.parametrize("name", SHORT)
 def test_states_are_drawn(name, device):
     env = make(name, device)
     contract.rollout(env, 3, check=False)
@@ -240,7 +282,7 @@ def test_states_are_drawn(name, device):
 @pytest.mark.cuda
 @pytest.mark.skipif(not GPU, reason="needs a GPU")
 class TestOnTheGPU:
-    @pytest.mark.parametrize("name", envs.ENVS)
+    @pytest.mark.parametrize("name", SHORT)
     def test_step_never_synchronises(self, name):
         env = make(name, "cuda")
         env.reset()
@@ -253,7 +295,7 @@ class TestOnTheGPU:
         finally:
             torch.cuda.set_sync_debug_mode("default")
 
-    @pytest.mark.parametrize("name", envs.ENVS)
+    @pytest.mark.parametrize("name", SHORT)
     def test_an_episode_is_the_same_on_cpu_and_gpu_captured_or_not(self, name):
         runs = [
             contract.rollout(env, 40, check=False)
@@ -293,7 +335,7 @@ def test_explorer_pays_once_for_each_texel():
     assert not any(float(env.step(turn).reward) for _ in range(30))
 
 
-@pytest.mark.parametrize("name", envs.ENVS)
+@pytest.mark.parametrize("name", SHORT)
 def test_check_raises_what_the_device_has_flagged(name, device):
     env = make(name, device)
     env.reset()
@@ -322,7 +364,9 @@ class Launches(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("name, most", [("minimal", 10), ("explorer", 9)])
+@pytest.mark.parametrize(
+    "name, most", [("minimal", 10), ("explorer", 9), ("explorer, privileged", 16)]
+)
 def test_a_step_launches_few_small_operations(name, most):
     """At a few thousand environments their number is what a step takes on a GPU."""
     env = make(name)
@@ -341,7 +385,7 @@ def test_star_imports_bring_the_environment_and_no_more(name):
     assert found["arrdict"] is arrdict
 
 
-@pytest.mark.parametrize("name", envs.ENVS)
+@pytest.mark.parametrize("name", SHORT)
 def test_an_environment_is_displayed_as_it_is(name):
     env = make(name)
     env.reset()
