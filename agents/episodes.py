@@ -1,9 +1,10 @@
 """Statistics of whole episodes, summed lane by lane on the device.
 
-Axes: T time, B lanes.
+Axes: T time, B lanes, R roles.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 
 import torch
 
@@ -11,20 +12,40 @@ from agents.finite import LIMIT
 
 
 class Episodes:
-    """Return and length of the episodes that end, each summed from its first step; only `take`
-    synchronises.
+    """Return, length and metrics of the episodes that end, each summed from its first step; only
+    `take` synchronises.
+
+    Args: `metrics`, the names of those that worlds carry; `roles`, a name for each lane of an
+    environment in turn, several of which may share one.
     """
 
-    def __init__(self, n_lanes: int, device: torch.device | str):
+    def __init__(
+        self,
+        n_lanes: int,
+        device: torch.device | str,
+        metrics: Sequence[str] = (),
+        roles: Sequence[str] | None = None,
+    ):
+        self.metrics, self.roles = tuple(metrics), tuple(roles or ())
         # of the episodes that go on, (B,)
         self.returns = torch.zeros(n_lanes, dtype=torch.float64, device=device)
         self.lengths = torch.zeros(n_lanes, dtype=torch.float64, device=device)
-        # of those that ended: their number, sum of returns, sum of squared returns, sum of lengths
-        self.sums = torch.zeros(4, dtype=torch.float64, device=device)
+        # of those that ended, for each lane of an environment if they have roles, else for all:
+        # their number, sums of returns, of squared returns, of lengths, of each metric
+        shape = 4 + len(self.metrics), len(self.roles) or 1
+        self.sums = torch.zeros(shape, dtype=torch.float64, device=device)
 
-    def add(self, reward: torch.Tensor, reset: torch.Tensor, done: torch.Tensor) -> None:
-        """Takes T transitions of B lanes; `reward`, `reset`, `done` (T, B) are those of the worlds
-        that followed. A reward that is not finite, or beyond `finite.LIMIT`, counts as 0.
+    def add(
+        self,
+        reward: torch.Tensor,
+        reset: torch.Tensor,
+        done: torch.Tensor,
+        learns: torch.Tensor | bool = True,
+        metrics: Mapping[str, torch.Tensor] | None = None,
+    ) -> None:
+        """Takes T transitions of B lanes; `reward`, `reset`, `done` and `metrics` (T, B) are those
+        of the worlds that followed. Episodes count where `learns` (T, B), in the world before their
+        end. A reward that is not finite, or beyond `finite.LIMIT`, counts as 0.
         """
         reward = torch.where(reward.abs() <= LIMIT, reward, 0.0)
         # cumulative sums over all T rows, less the sum at the last end before each row
@@ -33,33 +54,48 @@ class Episodes:
         rows = torch.arange(len(reward), device=reward.device)[:, None]
         last = torch.where(done, rows, -1).cummax(0).values
         before = torch.cat([torch.full_like(last[:1], -1), last[:-1]])
-        finished = _since(returns, before)
-        self.sums += torch.stack(
-            [
-                done.double().sum(),
-                (finished * done).sum(),
-                (finished**2 * done).sum(),
-                (_since(lengths, before) * done).sum(),
-            ]
-        )
+        finished, ended = _since(returns, before), done & learns
+        values = [
+            torch.ones_like(finished),
+            finished,
+            finished**2,
+            _since(lengths, before),
+            *(metrics[name].double() for name in self.metrics),
+        ]
+        self.sums += torch.stack([self._sum(torch.where(ended, each, 0.0)) for each in values])
         self.returns = _since(returns, last, slice(-1, None))[0]
         self.lengths = _since(lengths, last, slice(-1, None))[0]
 
+    def _sum(self, values):
+        """(T, B) to sums for each lane of an environment, or for all."""
+        return values.view(-1, self.sums.shape[1]).sum(0)
+
     def take(self) -> dict[str, float]:
         """Of the episodes that ended since the last call: how many, mean and standard deviation of
-        the return, mean length.
+        the return, means of length and metrics; means by role too, such as `episode/return/leader`.
         """
-        n, total, squares, steps = self.sums.tolist()
+        columns = self.sums.T.tolist()
         self.sums.zero_()
+        n, _, squares, *_ = totals = _added(columns)
         if not n:
             return {"episode/count": 0}
-        mean = total / n
-        return {
+        means = self._means(totals)
+        found = {
             "episode/count": int(n),
-            "episode/return": mean,
-            "episode/length": steps / n,
-            "episode/return_std": math.sqrt(max(squares / n - mean**2, 0.0)),
+            **means,
+            "episode/return_std": math.sqrt(max(squares / n - means["episode/return"] ** 2, 0.0)),
         }
+        for role in dict.fromkeys(self.roles):
+            own = [column for column, name in zip(columns, self.roles, strict=True) if name == role]
+            found |= {f"{name}/{role}": mean for name, mean in self._means(_added(own)).items()}
+        return found
+
+    def _means(self, totals):
+        n, total, _, steps, *metrics = totals
+        if not n:
+            return {}
+        named = {"return": total, "length": steps, **dict(zip(self.metrics, metrics, strict=True))}
+        return {f"episode/{name}": value / n for name, value in named.items()}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """The sums over episodes that ended. Episodes that go on are not saved, as environments are
@@ -68,7 +104,13 @@ class Episodes:
         return {"sums": self.sums}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        self.sums.copy_(state["sums"])
+        """Sums of other metrics, of an environment that has changed since, are left out."""
+        if state["sums"].shape == self.sums.shape:
+            self.sums.copy_(state["sums"])
+
+
+def _added(columns):
+    return [sum(values) for values in zip(*columns, strict=True)]
 
 
 def _since(totals, ends, rows=slice(None)):

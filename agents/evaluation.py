@@ -3,7 +3,7 @@
 B lanes, N environments. The host waits for the device once every `CHECK` steps, and at the end.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,7 +49,9 @@ def first_episodes(
     env: Any, policy: Any, seed: int = 1, greedy: bool = False, max_steps: int = 100_000
 ) -> arrdict:
     """Plays each lane's first episode: arrdict of `returns` (B,) float32, `lengths` (B,) float32
-    steps, `done` (B,) bool, and `homes` (B,) int32, on the environment's device.
+    steps, `done` (B,) bool, `learns` (B,) bool, as of the first world, `metrics` by name (B,)
+    float32, of the world it ended with, nan without one, and `homes` (B,) int32, on the
+    environment's device.
 
     `homes` are the layouts that the environment shows after its reset, one per lane; a layout
     changes at respawns alone, so each lane's episode is played in that home from end to end.
@@ -63,6 +65,10 @@ def first_episodes(
     homes = {} if layout is None else {"homes": layout.repeat_interleave(env.n_agents)}
     returns, lengths = (torch.zeros(lanes, device=device) for _ in range(2))
     done = torch.zeros(lanes, dtype=torch.bool, device=device)
+    learns = torch.ones_like(done) if "learns" not in world else world["learns"].clone()
+    metrics = arrdict(
+        {name: torch.full_like(returns, torch.nan) for name in world.get("metrics", {})}
+    )
     for step in range(max_steps):
         if step % CHECK == 0 and bool(done.all()):
             break
@@ -70,8 +76,13 @@ def first_episodes(
         world = env.step(decision)
         returns += torch.where(done, 0.0, world.reward)
         lengths += ~done
-        done |= world.terminal | world.truncated
-    return arrdict(returns=returns, lengths=lengths, done=done, **homes)
+        ends = (world.terminal | world.truncated) & ~done
+        for name, values in metrics.items():
+            values.copy_(torch.where(ends, world["metrics"][name], values))
+        done |= ends
+    return arrdict(
+        returns=returns, lengths=lengths, done=done, learns=learns, metrics=metrics, **homes
+    )
 
 
 def interval(
@@ -101,18 +112,50 @@ def interval(
     return float(values.mean()), float(lower), float(upper)
 
 
-def summary(episodes: Mapping) -> dict:
-    """A table's row for what `first_episodes` gave: the mean return with its 95 % interval, the
-    mean length, and what they were taken over; `homes` is None where there are none.
+def summaries(episodes: Mapping, roles: Sequence[str] | None = None) -> list[dict]:
+    """A table's rows for what `first_episodes` gave: of all lanes that learn, or of all if none
+    does; and of those of each role, where an environment's lanes have `roles` in turn.
     """
-    homes = episodes["homes"].cpu().numpy() if "homes" in episodes else None
-    mean, lower, upper = interval(episodes["returns"].cpu().numpy(), homes)
+    learns = episodes["learns"].cpu().numpy()
+    learns = learns if learns.any() else ~learns
+    rows = [_summary(episodes, learns)]
+    of_lane = np.resize(np.array(roles or ()), len(learns))
+    for role in dict.fromkeys(roles or ()):
+        if (chosen := learns & (of_lane == role)).any():
+            rows.append({"role": role, **_summary(episodes, chosen)})
+    return rows
+
+
+def _summary(episodes, chosen):
+    """The mean return of the chosen lanes (B,) with its 95 % interval, their mean length, the means
+    of their metrics where episodes ended, and what all was taken over; `homes` is None where there
+    are none.
+    """
+    taken = {
+        key: episodes[key].cpu().numpy()[chosen]
+        for key in ("returns", "lengths", "done", "homes")
+        if key in episodes
+    }
+    homes, done = taken.get("homes"), taken["done"]
+    mean, lower, upper = interval(taken["returns"], homes)
     return {
         "return": mean,
         "lower": lower,
         "upper": upper,
-        "length": float(episodes["lengths"].mean()),
-        "lanes": len(episodes["returns"]),
+        "length": float(taken["lengths"].mean()),
+        "lanes": int(chosen.sum()),
         "homes": None if homes is None else len(np.unique(homes)),
-        "unfinished": int((~episodes["done"]).sum()),
+        "unfinished": int((~done).sum()),
+        "metrics": {
+            name: _metric(
+                values.cpu().numpy()[chosen][done], None if homes is None else homes[done]
+            )
+            for name, values in episodes["metrics"].items()
+        },
     }
+
+
+def _metric(values, homes):
+    """The mean with its 95 % interval; None for each where no episode ended."""
+    found = interval(values, homes) if len(values) else (None,) * 3
+    return dict(zip(("mean", "lower", "upper"), found, strict=True))

@@ -48,11 +48,14 @@ class Trainer:
         self.metrics, self.save_checkpoint, self.budget = metrics, save, budget
         self.report_every, self.save_every, self.on_report = report_every, save_every, on_report
         self.collect = Collector(env, policy, rollout)
-        self.episodes = Episodes(rollout.n_lanes, env.device)
+        self.episodes = Episodes(
+            rollout.n_lanes, env.device, tuple(rollout.metrics), getattr(env, "roles", None)
+        )
         self.clock = Stopwatch()
         self.samples = self.updates = 0
         self.lr = learner.lr
         self.score = self.rate = None  # the last reported return, and samples per second
+        self.latest = {}  # of episodes, by name, when the last ones ended
         self.reported_at = 0, 0.0  # samples and seconds
         self.saved_at = 0.0  # seconds
         self.saved_updates = None  # updates that the last checkpoint holds
@@ -97,7 +100,13 @@ class Trainer:
             self.lr = self.learner.lr * self.budget.lr_fraction(self.samples, self.clock.seconds)
             self.learner.set_lr(self.lr)
         losses = self.learner.update(rollout)
-        self.episodes.add(rollout.reward, rollout.reset, rollout.terminal | rollout.truncated)
+        self.episodes.add(
+            rollout.reward,
+            rollout.reset,
+            rollout.terminal | rollout.truncated,
+            rollout.learns[:-1],
+            rollout.metrics,
+        )
         self.samples += rollout.n_steps * rollout.n_lanes
         self.updates += 1
         if not self.clock.is_running:
@@ -115,8 +124,10 @@ class Trainer:
         if hasattr(self.env, "check"):
             self.env.check()
         values = torch.stack(list(losses.values())).tolist()
+        episodes = self.episodes.take()
+        self.latest.update(episodes)
         found = {
-            **self.episodes.take(),
+            **episodes,
             **dict(zip(losses, values, strict=True)),
             "updates": self.updates,
             "lr": self.lr,

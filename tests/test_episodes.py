@@ -75,3 +75,66 @@ def test_a_reward_that_is_not_finite_counts_as_nothing(bad):
     found = episodes.take()
     assert (found["episode/count"], found["episode/return"]) == (2, (8 + 10) / 2)
     assert not episodes.returns.any() and found["episode/length"] == 4
+
+
+def test_metrics_are_read_where_episodes_end_and_split_by_role():
+    """Two environments of three agents; the two followers share a role."""
+    roles = "leader", "follower", "follower"
+    episodes = Episodes(6, "cpu", ["laps", "falls"], roles)
+    done = torch.zeros(2, 6, dtype=torch.bool)
+    done[0, 0] = done[1, 3] = done[1, 4] = done[1, 5] = True
+    reward = torch.tensor([[1.0, 0, 0, 2, 3, 4], [0, 0, 0, 5, 6, 7]])
+    laps = torch.where(done, 10.0 * reward, torch.nan)  # elsewhere a metric may be anything
+    metrics = dict(laps=laps, falls=torch.ones(2, 6))
+    episodes.add(reward, torch.zeros_like(done), done, metrics=metrics)
+    found = episodes.take()
+    assert found == {
+        "episode/count": 4,
+        "episode/return": (1 + 7 + 9 + 11) / 4,
+        "episode/length": 7 / 4,
+        "episode/laps": 10 * (1 + 5 + 6 + 7) / 4,
+        "episode/falls": 1,
+        "episode/return_std": pytest.approx(14**0.5),
+        "episode/return/leader": (1 + 7) / 2,
+        "episode/length/leader": 3 / 2,
+        "episode/laps/leader": 30,
+        "episode/falls/leader": 1,
+        "episode/return/follower": (9 + 11) / 2,
+        "episode/length/follower": 2,
+        "episode/laps/follower": 65,
+        "episode/falls/follower": 1,
+    }
+    assert list(found)[:6] == [
+        f"episode/{name}" for name in ("count", "return", "length", "laps", "falls", "return_std")
+    ]
+    done[:] = False
+    done[1, 0] = True
+    episodes.add(reward, torch.zeros_like(done), done, metrics=metrics)
+    found = episodes.take()
+    assert found["episode/return/leader"] == 1 and "episode/return/follower" not in found
+
+
+def test_an_episode_counts_where_its_lane_learns():
+    episodes = Episodes(2, "cpu", ["laps"])
+    done, none = torch.ones(1, 2, dtype=torch.bool), torch.zeros(1, 2, dtype=torch.bool)
+    learns = torch.tensor([[True, False]])
+    for reward in (1.0, 5.0):
+        rewards = torch.tensor([[reward, torch.nan]])
+        episodes.add(rewards, none, done, learns, dict(laps=rewards))
+    assert episodes.take() == {
+        "episode/count": 2,
+        "episode/return": 3,
+        "episode/length": 1,
+        "episode/laps": 3,
+        "episode/return_std": 2,
+    }
+    assert not episodes.returns.any(), "the lane that does not learn begins anew as well"
+
+
+def test_sums_are_restored_unless_they_are_of_other_metrics():
+    done, none = torch.ones(1, 2, dtype=torch.bool), torch.zeros(1, 2, dtype=torch.bool)
+    first, same, other = Episodes(2, "cpu", ["a"]), Episodes(2, "cpu", ["a"]), Episodes(2, "cpu")
+    first.add(torch.ones(1, 2), none, done, metrics=dict(a=torch.ones(1, 2)))
+    for episodes in (same, other):
+        episodes.load_state_dict(first.state_dict())
+    assert same.take() == first.take() and other.take() == {"episode/count": 0}

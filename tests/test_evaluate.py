@@ -69,7 +69,70 @@ def test_an_episode_that_does_not_end_is_reported_as_it_stands():
         env, evaluation.RandomActions(env.action_space), max_steps=64
     )
     assert int((~episodes.done).sum()) == 36 and float(episodes.returns.max()) == 64
-    assert evaluation.summary(episodes)["unfinished"] == 36
+    (row,) = evaluation.summaries(episodes)
+    assert row["unfinished"] == 36
+
+
+class Teams(Counting):
+    """Environments of a leader and two followers, of whom the second follower does not learn. Its
+    metric is how old a lane is, and anything where no episode ends.
+    """
+
+    n_agents, roles = 3, ("leader", "follower", "follower")
+
+    def reset(self):
+        self.n_lanes = 3 * self.n_envs
+        env = Counting(self.n_lanes, False)
+        self.env, world = env, env.reset()
+        return self.told(world)
+
+    def step(self, decision):
+        return self.told(self.env.step(decision))
+
+    def told(self, world):
+        ended = world.terminal | world.truncated
+        learns = torch.arange(self.n_lanes) % 3 < 2
+        metrics = arrdict(age=torch.where(ended, self.env.age, -1e9))
+        return arrdict(world, learns=learns, metrics=metrics)
+
+
+def test_metrics_and_returns_are_split_by_role_among_lanes_that_learn():
+    env = Teams(20, False)
+    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    ages = torch.arange(1, 61)
+    assert episodes.metrics.age.tolist() == ages.tolist()
+    every, leader, follower = evaluation.summaries(episodes, env.roles)
+    for row, chosen in ((every, ages[ages % 3 > 0]), (leader, ages[::3]), (follower, ages[1::3])):
+        mean = pytest.approx(chosen.float().mean())
+        assert row["return"] == row["length"] == row["metrics"]["age"]["mean"] == mean
+        assert row["metrics"]["age"]["lower"] == row["lower"] < row["return"] < row["upper"]
+        assert row["lanes"] == len(chosen)
+    assert (leader["role"], follower["role"]) == ("leader", "follower") and "role" not in every
+
+
+def test_a_metric_is_the_mean_over_episodes_that_ended():
+    env = Teams(20, False)
+    random = evaluation.RandomActions(env.action_space)
+    (row,) = evaluation.summaries(evaluation.first_episodes(env, random, max_steps=10))
+    assert (
+        row["unfinished"] == 40 - 7
+        and row["metrics"]["age"]["mean"] == (1 + 2 + 4 + 5 + 7 + 8 + 10) / 7
+    )
+    (row,) = evaluation.summaries(evaluation.first_episodes(env, random, max_steps=0))
+    assert row["metrics"]["age"] == dict(mean=None, lower=None, upper=None)
+    assert evaluate.cells({"agent": "a", **row})[3:5] == ("none", "none")
+
+
+def test_metrics_stand_beside_the_return_of_a_table():
+    env = Teams(20, False)
+    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    rows = [{"agent": "trained", **row} for row in evaluation.summaries(episodes, env.roles)]
+    head = "agent", "return", "95 % interval", "age", "95 % interval", "length", "episodes", "homes"
+    assert evaluate.columns(rows) == head
+    name, earned, within, age, its, *_ = evaluate.cells(rows[2])
+    assert (name, earned, age) == ("trained: follower", "30.50", "30.5")
+    lower, upper = rows[2]["lower"], rows[2]["upper"]
+    assert within == f"{lower:.2f} to {upper:.2f}" and its == f"{lower:.3g} to {upper:.3g}"
 
 
 def test_random_actions_are_spread_evenly_over_every_action():
@@ -158,7 +221,7 @@ def test_without_homes_or_in_one_alone_lanes_are_drawn(groups):
 def test_an_environment_without_homes_has_an_interval_over_episodes():
     env = Counting(400, False)
     episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
-    row = evaluation.summary(episodes)
+    (row,) = evaluation.summaries(episodes)
     assert "homes" not in episodes and row["homes"] is None
     error = np.std(np.arange(1, 401)) / 20
     assert row["upper"] - row["lower"] == pytest.approx(2 * 1.96 * error, rel=0.1)

@@ -520,3 +520,16 @@ def test_a_long_run_leaks_neither_memory_nor_files(here, monkeypatch):
     train.run(configured(f"samples={2000 * UPDATE}", "checkpoint=0.5"))
     (early, files), (late, files_late) = seen[500], seen[2000]
     assert late - early < 4 and files_late == files, seen  # megabytes in 1,500 updates
+
+
+def test_few_metrics_and_roles_are_shown_beside_the_return():
+    latest = {
+        "episode/return/leader": 12.345,
+        "episode/return/follower": 2.0,
+        "episode/coverage": 0.8371,
+        "episode/length": 9.0,
+    }
+    shown = train.few_means(latest, ["coverage"], ("leader", "follower", "follower"))
+    assert shown == ["leader 12.3", "follower 2", "coverage 0.837"]
+    assert train.few_means({}, ["coverage"], ()) == []
+    assert train.few_means(latest, ["coverage", *"abcd"], ()) == []

@@ -62,9 +62,27 @@ class Rows(list):
         self.append({"samples": samples, **metrics})
 
 
-def made(folder, faults=(), samples=None, every=1, lr=1e-3, **options):
+class Pairs(Numbers):
+    """The same lanes as three environments of a leader and a follower; its metric is how many steps
+    each lane's number has seen, and a follower's episodes end a step later.
+    """
+
+    n_envs, n_agents, roles = B // 2, 2, ("leader", "follower")
+
+    def step(self, decision):
+        self.steps += 1
+        return self._world(self.age == 7 + torch.arange(B) % 2)
+
+    def _world(self, reset):
+        world = super()._world(reset)
+        ends = self.age == 7 + torch.arange(B) % 2
+        age = torch.where(ends, 10.0 * self.age, torch.nan)
+        return arrdict(world, truncated=ends, learns=torch.arange(B) < 4, metrics=arrdict(age=age))
+
+
+def made(folder, faults=(), samples=None, every=1, lr=1e-3, env=None, **options):
     """A trainer in `Numbers` that saves into a folder."""
-    env = Numbers(faults)
+    env = env or Numbers(faults)
     policy = Policy(env.obs_space, env.action_space, width=8)
     rollout = Rollout(T, B, env.obs_space, env.action_space, policy.initial(B))
     learner = PPO(policy, n_minibatches=2, lr=lr)
@@ -97,6 +115,16 @@ def test_a_trainer_collects_updates_reports_and_saves(tmp_path):
     assert [row["episode/count"] for row in run.metrics] == [B, B]
     assert [row["episode/return"] for row in run.metrics] == [7, 7]
     assert run.score == 7 and run.left == 0
+
+
+def test_metrics_are_reported_by_name_and_role_from_lanes_that_learn(tmp_path):
+    run = made(tmp_path, samples=2 * UPDATE, every=2, env=Pairs())
+    run.train()
+    (row,) = run.metrics
+    assert row["episode/count"] == 4 and row["episode/age"] == 75 and run.score == 7.5
+    assert (row["episode/age/leader"], row["episode/age/follower"]) == (70, 80)
+    assert (row["episode/return/leader"], row["episode/return/follower"]) == (7, 8)
+    assert run.latest["episode/age"] == 75
 
 
 def test_all_that_a_trainer_has_it_has_from_the_start(tmp_path):

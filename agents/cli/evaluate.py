@@ -5,6 +5,7 @@ from Python.
 import dataclasses
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ The commonest:
   greedy=true          the likeliest actions instead of sampled ones
   lanes=256            fewer episodes
   baseline=false       no row for random actions"""
-COLUMNS = ("agent", "return", "95 % interval", "length", "episodes", "homes")
+INTERVAL = "95 % interval"
 
 
 def run(cfg: Evaluate) -> Path:
@@ -48,14 +49,15 @@ def run(cfg: Evaluate) -> Path:
     start, rows = time.monotonic(), []
     for name, player in players.items():
         episodes = evaluation.first_episodes(env, player, cfg.seed, cfg.greedy and player is policy)
-        rows.append({"agent": name, **evaluation.summary(episodes)})
+        roles = getattr(env, "roles", None)
+        rows += [{"agent": name, **row} for row in evaluation.summaries(episodes, roles)]
     which = "all" if cfg.split == "all" else f"the {cfg.split}"
     title = (
         f"{trained.env.name} in {which} homes of {source(geometry)}, after "
         f"{loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, {cfg.lanes:,} lanes"
     )
     say(title)
-    say(table(COLUMNS, [cells(row) for row in rows]))
+    say(table(columns(rows), [cells(row) for row in rows]))
     say(f"evaluated in {duration(time.monotonic() - start)}")
     name = f"{source(geometry)}-{cfg.split}-{loaded.step}{'-greedy' if cfg.greedy else ''}"
     result = dict(
@@ -80,26 +82,40 @@ def source(geometry: Toy | Homes | Files) -> str:
     return geometry.name if path is None else f"{geometry.name}-{Path(path).stem}"
 
 
+def columns(rows: Sequence[dict]) -> tuple[str, ...]:
+    """The head of the table: each metric and its interval beside the return's."""
+    metrics = [word for name in (rows[0]["metrics"] if rows else ()) for word in (name, INTERVAL)]
+    return "agent", "return", INTERVAL, *metrics, "length", "episodes", "homes"
+
+
 def cells(row: dict) -> tuple[str, ...]:
     """A row of the table, as text."""
     cut = f", {row['unfinished']} cut short" if row["unfinished"] else ""
+    metrics = [word for metric in row["metrics"].values() for word in metric_cells(**metric)]
     return (
-        row["agent"],
+        f"{row['agent']}: {row['role']}" if "role" in row else row["agent"],
         f"{row['return']:.2f}",
         f"{row['lower']:.2f} to {row['upper']:.2f}",
+        *metrics,
         f"{row['length']:.0f}",
         f"{row['lanes']}{cut}",
         "none" if row["homes"] is None else str(row["homes"]),
     )
 
 
+def metric_cells(mean: float | None, lower: float | None, upper: float | None) -> tuple[str, str]:
+    """A metric and its interval, as text."""
+    return ("none", "none") if mean is None else (f"{mean:.3g}", f"{lower:.3g} to {upper:.3g}")
+
+
 def write(folder: Path, name: str, result: dict) -> Path:
     """Writes a result for machines and for people, `name`.json and .md, each whole or not at all.
     Returns the .json's path.
     """
+    head = columns(result["rows"])
     lines = [
         "| " + " | ".join(line) + " |"
-        for line in (COLUMNS, ("---",) * len(COLUMNS), *map(cells, result["rows"]))
+        for line in (head, ("---",) * len(head), *map(cells, result["rows"]))
     ]
     texts = {
         ".md": "\n".join([result["title"], "", *lines]) + "\n",

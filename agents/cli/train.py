@@ -3,7 +3,7 @@ Python.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
@@ -38,6 +38,8 @@ The commonest:
   resume=RUN                   continue a run (its folder, or latest) under its own configuration
   init=RUN                     start a new run from its weights
   logger=wandb logger.mode=offline"""
+#: Metrics and roles that are shown beside the return.
+FEW = 4
 #: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
 #: what it learns.
 RESUMABLE = (
@@ -112,10 +114,20 @@ def show(progress: Progress, trainer: Trainer) -> None:
         words.append(f"{number(trainer.rate)}/s")
     if trainer.score is not None:
         words.append(f"return {trainer.score:.2f}")
+        words += few_means(trainer.latest, trainer.episodes.metrics, trainer.episodes.roles)
     left = trainer.left
     if trainer.budget.is_limited and left < 1:
         words.append(f"{duration(trainer.clock.seconds * left / (1 - left))} left")
     progress.show(1 - left if trainer.budget.is_limited else None, "  ".join(words))
+
+
+def few_means(latest: dict[str, float], metrics: Sequence[str], roles: Sequence[str]) -> list[str]:
+    """Returns by role, and metrics, as text, where they are few enough for one line."""
+    by_role = {role: f"episode/return/{role}" for role in dict.fromkeys(roles)}
+    names = {**by_role, **{name: f"episode/{name}" for name in metrics}}
+    if len(names) > FEW:
+        return []
+    return [f"{name} {latest[key]:.3g}" for name, key in names.items() if key in latest]
 
 
 def settled(cfg: Train) -> Train:
