@@ -13,7 +13,7 @@ import torch
 from . import checks
 from .agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents, check, check_on_cpu
 from .devices import device, fit
-from .kernels.compile import EngineError
+from .kernels.compile import BLOCK, EngineError
 from .kernels.launch import SIZES, WARP, launch, params
 from .launch_params import error_flag, scenery_params, state_params
 from .outputs import Observation, Physics, Render
@@ -306,7 +306,7 @@ def unseen(
         counts=counts.data_ptr(),
         n_words=n_words,
     )
-    launch("unseen", packed, scenery.device, threads=WARP * n * a)
+    launch("unseen", packed, scenery.device, threads=BLOCK * n * a)
     check_on_cpu(agents)
     return counts
 

@@ -29,13 +29,13 @@ HD void count_unseen(const UnseenParams& p, const Pose& pose, const unsigned int
                      const unsigned int* visible, int first_texel, int wall, int* bins) {
     int first = p.scenery.texel_starts[wall] - first_texel;
     int end = p.scenery.texel_starts[wall + 1] - first_texel;
+    Float4 line = LOAD((const Float4*)p.scenery.walls + wall);
     for (int word = first >> 5; word <= (end - 1) >> 5; word++) {
         int from = maxi(first, 32 * word), to = mini(end, 32 * word + 32);
         unsigned int bits = visible[word] & ~seen[word] & (~0u << (from & 31));
         bits &= ~0u >> (32 * word + 32 - to);
         if (!bits)
             continue;
-        Float4 line = LOAD((const Float4*)p.scenery.walls + wall);
         float middle = (0.5f * (float)(from + to) - (float)first) / (float)(end - first);
         float dx = mix(line.x, line.z, middle) - pose.x, dy = mix(line.y, line.w, middle) - pose.y;
         float ahead = pose.cosine * dx + pose.sine * dy, left = pose.cosine * dy - pose.sine * dx;
