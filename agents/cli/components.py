@@ -228,6 +228,13 @@ def load_weights(policy: Policy, env: Any, checkpoint: Checkpoint) -> None:
             "choose the env it was trained in"
         )
     weights, own = checkpoint.state["policy"], policy.state_dict()
+    had, has = ("critic.intake.project.weight" in found for found in (weights, own))
+    if policy.critic is not None and had != has:
+        kinds = {True: "asymmetric", False: "plain"}
+        raise UserError(
+            f"The critic of {checkpoint.path} is {kinds[had]} and this run's is {kinds[has]}: give "
+            f"agent.critic={kinds[had]}"
+        )
     shapes = {name: tuple(weights[name].shape) if name in weights else "absent" for name in own}
     shapes = [
         f"{name} is {shapes[name]} and should be {tuple(value.shape)}"
