@@ -31,9 +31,9 @@ class Policy(nn.Module):
     the critic knows.
 
     `seed` decides the first weights and, where no generator is given, the sampled actions. The
-    weights are in `state_dict()`, the critic's own under "critic."; where the random stream is, is
-    in `random.state_dict()`, which a learner saves. ValueError if the width is less than 1 or a
-    space is of no known kind.
+    weights are in `state_dict()`, those that only training needs under "critic." and "prediction.";
+    where the random stream is, is in `random.state_dict()`, which a learner saves. ValueError if
+    the width is less than 1 or a space is of no known kind.
     """
 
     def __init__(
@@ -142,9 +142,9 @@ class Policy(nn.Module):
     def update_stats(
         self, obs: Any, privileged: Any = None, taken: torch.Tensor | bool = True
     ) -> None:
-        """Takes what B lanes saw, or those `taken`, () or (B,) bool, into account in how it is
-        standardised from now on.
+        """Takes what B lanes and their critic saw, or those `taken`, () or (B,) bool, into account
+        in how it is standardised from now on.
         """
         self.intake.update_stats(obs, taken)
-        if privileged is not None:
+        if self.privileged_space:
             self.critic.intake.update_stats(privileged, taken)

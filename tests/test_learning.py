@@ -111,22 +111,40 @@ class Wage(Env):
         return torch.ones(B), *((ended, none) if self.ends == "terminal" else (none, ended))
 
 
+class Luck(Env):
+    """Pays the same at every step of an episode, whatever one does: how much is drawn as it begins,
+    and shown to nobody but a critic.
+    """
+
+    privileged_space = arrdict(luck=spaces.MultiVector(1, 1))
+
+    def begin(self, which):
+        new = torch.randn(B, generator=self.generator)
+        self.luck = torch.where(which, new, getattr(self, "luck", new))
+
+    def result(self, action):
+        ended = self.age == 4
+        return self.luck, ended, torch.zeros_like(ended)
+
+    def _world(self, *flags):
+        return arrdict(super()._world(*flags), privileged=dict(luck=self.luck.view(B, 1, 1)))
+
+
 def learn(env, n_updates, policy=None, n_steps=16, **how):
     """Trains a small policy and counts what happened in the last ten rollouts: (policy, rewards,
-    ends, valid steps).
+    ends, valid steps, tenths of the returns' variance that the critic explained).
     """
     policy = policy or Policy(env.obs_space, env.action_space, width=32)
-    state = policy.initial(B)
-    rollout = Rollout(n_steps, B, env.obs_space, env.action_space, state)
+    state, spaces_of = policy.initial(B), (env.obs_space, env.action_space)
+    rollout = Rollout(n_steps, B, *spaces_of, state, privileged_space=policy.privileged_space)
     learner = PPO(policy, **{**dict(lr=5e-3, n_epochs=2, n_minibatches=4), **how})
-    actor_state, counts = initial_actor_state(env, policy, rollout), torch.zeros(3)
+    actor_state, counts = initial_actor_state(env, policy, rollout), torch.zeros(4)
     for i in range(n_updates):
         collect(env, policy, rollout, actor_state)
+        explained = learner.update(rollout)["loss/explained_variance"]
         if i >= n_updates - 10:
-            counts += torch.stack(
-                [rollout.reward.sum(), rollout.terminal.sum(), (~rollout.reset).sum()]
-            )
-        learner.update(rollout)
+            happened = rollout.reward.sum(), rollout.terminal.sum(), (~rollout.reset).sum()
+            counts += torch.stack([*happened, explained])
     return policy, *counts.tolist()
 
 
@@ -139,16 +157,16 @@ class Forgetless(Policy):
 
 def test_a_cue_is_remembered():
     # Guessing earns 1/4, and so does any policy without a memory
-    _, rewards, ends, _ = learn(Cue(), n_updates=60, lr=3e-3)
+    _, rewards, ends, *_ = learn(Cue(), n_updates=60, lr=3e-3)
     assert rewards / ends > 0.9
 
 
 def test_memory_starts_anew_with_every_episode():
     how, env = dict(n_updates=60, lr=1e-2, entropy_coef=0.03), Clock()
-    _, rewards, _, valid = learn(env, **how)
+    _, rewards, _, valid, _ = learn(env, **how)
     assert rewards / valid > 0.9
     leaky = Forgetless(env.obs_space, env.action_space, width=32)
-    _, rewards, _, valid = learn(env, policy=leaky, **how)
+    _, rewards, _, valid, _ = learn(env, policy=leaky, **how)
     assert rewards / valid < 0.5  # nothing it sees tells it when an episode begins
 
 
@@ -165,3 +183,11 @@ def test_a_time_limit_is_not_a_death(ends, worth):
     obs, reset = torch.zeros(12, 1, 1, 1), torch.zeros(12, 1, dtype=torch.bool)
     value = policy.value(policy.unroll(obs, reset, policy.initial(1)).features)[:, 0]
     torch.testing.assert_close(value, torch.full((12,), worth), rtol=0.1, atol=0)
+
+
+@pytest.mark.parametrize("critic, least, most", [("asymmetric", 0.95, 1), ("plain", -0.1, 0.1)])
+def test_what_only_the_critic_sees_explains_the_returns(critic, least, most):
+    env = Luck()
+    policy = Policy(env.obs_space, env.action_space, env.privileged_space, critic=critic, width=32)
+    *_, tenths = learn(env, 60, policy)
+    assert least < tenths / 10 <= most
