@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "scripts")]
 
 import benchmark_report  # noqa: E402
-from workloads import BENCHMARKS  # noqa: E402
+from workloads import BENCHMARKS, BUDGETS, SEEDS  # noqa: E402
 
 from megastep import engine  # noqa: E402
 
@@ -71,14 +71,14 @@ def machine(device):
     )
 
 
-def measure(name, device, commit):
-    """The records of a benchmark, as they come."""
+def measure(name, device, commit, options=None):
+    """The records of a benchmark, as they come; `options` are arguments of it."""
     device = torch.device("cpu") if name == "cpu" else device
     command = f"python scripts/benchmark.py {name}" + (
         "" if device.type == "cuda" else " --device cpu"
     )
     where = machine(device)
-    for found in BENCHMARKS[name](device):
+    for found in BENCHMARKS[name](device, **options or {}):
         numbers = {key: rounded(found[key]) for key in ("value", "lower", "upper")}
         yield dict(
             benchmark=name,
@@ -122,6 +122,12 @@ def main(argv=None):
         help=f"{', '.join(BENCHMARKS)}, or report alone",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
+    parser.add_argument(
+        "--seeds", nargs="+", type=int, default=SEEDS, metavar="SEED", help="of train"
+    )
+    parser.add_argument(
+        "--budgets", nargs="+", type=int, default=BUDGETS, metavar="SECONDS", help="of train"
+    )
     parser.add_argument("--commit", help="what is measured, where git cannot tell")
     parser.add_argument(
         "--json", type=Path, help="a file to append records to; report reads docs/benchmarks.jsonl"
@@ -140,7 +146,8 @@ def run(options):
     device, measured = checked(options), options.commit or commit()
     print(benchmark_report.HEADER, flush=True)
     for name in options.benchmarks:
-        for record in measure(name, device, measured):
+        only = dict(seeds=options.seeds, budgets=options.budgets) if name == "train" else {}
+        for record in measure(name, device, measured, only):
             print(benchmark_report.row(record), flush=True)
             if options.json:
                 with options.json.open("a") as file:

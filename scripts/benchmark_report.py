@@ -1,14 +1,17 @@
-"""Turns the records of benchmark.py into a page with a table and a plot."""
+"""Turns the records of benchmark.py into a page with a table, and plots."""
 
 import json
 import re
 import textwrap
 from pathlib import Path
 
+import numpy as np
 from workloads import BENCHMARKS
 
 # Environments and frames per second of the original megastep's Explorer on one H200.
 ORIGINAL = 16_384, 0.86e6
+RUN_COLOURS = "tab:green", "tab:blue", "tab:red"  # by budget
+ALL_SEEN = 59.5  # the return of all texels that can be seen, the mean over the test homes
 COLOURS = {"explorer": "tab:blue", "minimal": "tab:orange"}
 PAGE = """# Benchmark table
 
@@ -117,13 +120,64 @@ def plot(records, path):
         ax.figure.savefig(path, metadata={"Date": None})
 
 
+def learning_curves(records: list[dict]) -> dict[int, dict]:
+    """By budget in seconds, of the newest runs on a GPU: `seconds` (P,), `mean`, `lower` and
+    `upper` (P,) of the seeds' returns while they trained, and `evaluated`, a return per seed.
+    """
+    runs = {}
+    for record in newest(records):
+        match = re.match(r"training, (\d+) s, seed (\d+), (.*)", record["what"])
+        if match and not record["on"].startswith("CPU"):
+            runs.setdefault(int(match[1]), {}).setdefault(match[3], []).append(record)
+    found = {}
+    for budget, parts in sorted(runs.items()):
+        curves = [np.array(record["curve"]) for record in parts["median rate"]]
+        first = max(curve[0, 0] for curve in curves)
+        seconds = np.geomspace(first, min(curve[-1, 0] for curve in curves), 50)
+        returns = np.stack([np.interp(seconds, curve[:, 0], curve[:, 2]) for curve in curves])
+        found[budget] = dict(
+            seconds=seconds,
+            mean=returns.mean(0),
+            lower=returns.min(0),
+            upper=returns.max(0),
+            evaluated=[record["value"] for record in parts["return in unseen homes"]],
+        )
+    return found
+
+
+def plot_learning(records, path):
+    """Plots returns against seconds of training, a colour per budget."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    ax = Figure(figsize=(7.5, 4.8), layout="constrained").subplots()
+    for (budget, run), colour in zip(learning_curves(records).items(), RUN_COLOURS):
+        n_seeds = len(run["evaluated"])
+        label = f"{budget} s, {n_seeds} seeds: mean and range in training"
+        ax.plot(run["seconds"], run["mean"], color=colour, label=label)
+        ax.fill_between(
+            run["seconds"], run["lower"], run["upper"], color=colour, alpha=0.2, linewidth=0
+        )
+        ax.plot([budget] * n_seeds, run["evaluated"], "o", color=colour, markersize=5)
+    ax.plot([], [], "o", color="grey", markersize=5, label="evaluated in unseen homes, a seed each")
+    ax.axhline(ALL_SEEN, color="grey", linewidth=1, linestyle="--", label="all that can be seen")
+    ax.set(xscale="log", xlabel="seconds of training", ylabel="return", ylim=(0, None))
+    ax.set_xticks([1, 10, 60, 240], ["1", "10", "60", "240"])
+    ax.minorticks_off()
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8, loc="lower right")
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
+        ax.figure.savefig(path, metadata={"Date": None})
+
+
 def read(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
 def report(path: Path) -> None:
-    """Writes the page and the plot beside the records in ``path``."""
+    """Writes the page and the plots beside the records in ``path``."""
     records = read(path)
     image = path.with_name("benchmark-table.svg")
     path.with_name("benchmark-table.md").write_text(page(records, image.name))
     plot(records, image)
+    plot_learning(records, path.with_name("results.svg"))

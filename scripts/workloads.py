@@ -26,6 +26,8 @@ HOMES = 512
 WARM_UP = 60  # steps, so that agents are not where they spawned
 FRESH = 3  # samples of what takes a process each
 BUDGETS = 10, 60, 240  # seconds of training
+SEEDS = 1, 2, 3  # of training
+CURVE = 50  # points that are kept of a run's learning curve, at most
 
 
 def random_actions(n_envs, n_agents, device, turns=TURNS):
@@ -73,6 +75,8 @@ def operations(n, device):
         "`observe` as Explorer does, 256 rays to 64 pixels",
         lambda i: engine.observe(scenery, seers, 4, imu=True, seen=env.seen, clear_mask=some),
     )
+    visible = modules.visible_texels(scenery, env.spawner.points)
+    yield "`unseen`", lambda i: engine.unseen(scenery, seers, env.seen, visible)
     yield "`render`, 256 rays, all fields", lambda i: engine.render(scenery, seers)
     minimal, _ = stepper("minimal", n, device)
     yield (
@@ -284,11 +288,12 @@ def twin_frame(c, e):
     twin.shade(hits, texels[:, :3], bounds.diff(), texels[:, 3])
 
 
-def train(device):
-    """Training on the benchmark's homes for 10, 60 and 240 seconds, without compilation, and what
-    that evaluates to.
+def train(device, seeds=SEEDS, budgets=BUDGETS):
+    """Training on the benchmark's homes for 10, 60 and 240 seconds, without compilation, three
+    seeds each, and what that evaluates to in unseen homes.
     """
-    for budget in BUDGETS:
+    for budget, seed in itertools.product(budgets, seeds):
+        what = f"training, {budget} s, seed {seed}"
         with tempfile.TemporaryDirectory() as folder:
             run = Path(folder) / "run"
             subprocess.run(
@@ -297,6 +302,7 @@ def train(device):
                     "train.py",
                     "geometry=bench",
                     f"seconds={budget}",
+                    f"seed={seed}",
                     f"folder={run}",
                     "finish.evaluate=true",
                     f"device={device}",
@@ -307,21 +313,41 @@ def train(device):
             )
             (written,) = run.glob("evaluations/*.json")
             rows = json.loads(written.read_text())["rows"][:2]
-            perf = [json.loads(line) for line in (run / "perf.jsonl").read_text().splitlines()]
+            reports = curve(run)
         for whose, row in zip(("return", "return of random actions"), rows):
             yield dict(
-                what=f"training, {budget} s, {whose} in unseen homes",
+                what=f"{what}, {whose} in unseen homes",
                 value=row["return"],
                 unit="",
                 lower=row["lower"],
                 upper=row["upper"],
                 n=row["homes"],
             )
-        yield measurement(
-            f"training, {budget} s, median rate",
-            "M/s",
-            [row["perf/rate"] / 1e6 for row in perf if "perf/rate" in row],
-        )
+        rates = [
+            (samples - before) / (seconds - earlier) / 1e6
+            for (earlier, before, _), (seconds, samples, _) in itertools.pairwise(reports)
+        ]
+        thinned = [
+            [round(seconds, 2), samples, round(earned, 3)]
+            for seconds, samples, earned in reports[:: -(-len(reports) // CURVE)]
+        ]
+        if rates:
+            yield measurement(f"{what}, median rate", "M/s", rates) | dict(curve=thinned)
+
+
+def curve(run):
+    """[(seconds, samples, return), ...]: what a run folder's reports say of the episodes that ended
+    while it trained.
+    """
+    metrics, perf = (
+        {row["samples"]: row for row in map(json.loads, (run / name).read_text().splitlines())}
+        for name in ("metrics.jsonl", "perf.jsonl")
+    )
+    return [
+        (perf[samples]["perf/seconds"], samples, row["episode/return"])
+        for samples, row in metrics.items()
+        if samples in perf and "episode/return" in row
+    ]
 
 
 BENCHMARKS = {

@@ -104,6 +104,27 @@ def test_a_lap_makes_the_calls_it_is_said_to():
     )
 
 
+def test_learning_curves_are_the_mean_and_range_of_seeds(tmp_path):
+    records = [
+        record(f"training, 10 s, seed {seed}, return in unseen homes", 40.0 + seed)
+        for seed in (1, 2, 3)
+    ] + [
+        record(
+            f"training, 10 s, seed {seed}, median rate",
+            7.0,
+            curve=[[1, 50, seed], [10, 99, 7 * seed]],
+        )
+        for seed in (1, 2, 3)
+    ]
+    (run,) = benchmark_report.learning_curves(records).values()
+    assert run["evaluated"] == [41, 42, 43] and run["seconds"][[0, -1]].tolist() == [1, 10]
+    ends = [run[key][[0, -1]].tolist() for key in ("mean", "lower", "upper")]
+    assert ends == [[2, 14], [1, 7], [3, 21]]
+    path = written(tmp_path, *records)
+    assert benchmark.main(["report", "--json", str(path)]) == 0
+    assert "3 seeds" in (tmp_path / "results.svg").read_text()
+
+
 # ---- Benchmarks ----
 
 
@@ -117,7 +138,7 @@ def test_a_benchmark_is_a_generator_that_says_what_it_measures(name):
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 @pytest.mark.parametrize(
-    ("name", "n"), [("step", 2), ("kernels", 7), ("observe", 2), ("memory", 1)]
+    ("name", "n"), [("step", 2), ("kernels", 8), ("observe", 2), ("memory", 1)]
 )
 def test_a_benchmark_leaves_a_line_of_json_per_measurement(name, n, device, tiny, tmp_path, capsys):
     path = tmp_path / "records.jsonl"
@@ -142,6 +163,16 @@ def test_the_cpu_is_measured_on_the_cpu_and_keeps_its_threads(tiny):
         "times",
     ] and torch.get_num_threads() == threads
     assert all(r["on"].startswith("CPU, ") for r in records)
+
+
+def test_a_curve_joins_what_was_earned_to_when(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text(
+        '{"samples": 10, "lr": 1}\n{"samples": 20, "episode/return": 3.5}\n'
+    )
+    (tmp_path / "perf.jsonl").write_text(
+        '{"samples": 10, "perf/seconds": 1.0}\n{"samples": 20, "perf/seconds": 2.0}\n'
+    )
+    assert workloads.curve(tmp_path) == [(2.0, 20, 3.5)]
 
 
 def test_an_unknown_benchmark_ends_with_one_sentence():

@@ -191,12 +191,8 @@ def test_what_a_cpu_and_a_gpu_train_with():
     same = dict(name="ppo", n_steps=32, n_minibatches=4, n_epochs=1, clip=0.2, value_coef=0.5)
     same |= dict(max_grad_norm=0.5, target_kl=None, auxiliary_coef=0.5, lambda_=0.95, anneal="auto")
     cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
-    assert dataclasses.asdict(cpu.learner) == same | dict(
-        lr=3e-3, gamma=0.98, entropy_coef=0.02
-    )
-    assert dataclasses.asdict(gpu.learner) == same | dict(
-        lr=1e-3, gamma=0.995, entropy_coef=0.01
-    )
+    assert dataclasses.asdict(cpu.learner) == same | dict(lr=3e-3, gamma=0.98, entropy_coef=0.02)
+    assert dataclasses.asdict(gpu.learner) == same | dict(lr=1e-3, gamma=0.995, entropy_coef=0.01)
     assert (cpu.env.n_envs, cpu.agent.width, cpu.report) == (256, 64, 4)
     assert (gpu.env.n_envs, gpu.agent.width, gpu.report) == (4096, 256, 50)
     assert dataclasses.replace(cpu.env, n_envs=4096) == gpu.env
