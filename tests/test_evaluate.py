@@ -75,7 +75,7 @@ def test_an_episode_that_does_not_end_is_reported_as_it_stands():
 
 class Teams(Counting):
     """Environments of a leader and two followers, of whom the second follower does not learn. Its
-    metric is how old a lane is, and anything where no episode ends.
+    metric is how old a lane is, and 1000 in a second life; anything where no episode ends.
     """
 
     n_agents, roles = 3, ("leader", "follower", "follower")
@@ -92,7 +92,8 @@ class Teams(Counting):
     def told(self, world):
         ended = world.terminal | world.truncated
         learns = torch.arange(self.n_lanes) % 3 < 2
-        metrics = arrdict(age=torch.where(ended, self.env.age, -1e9))
+        life = 1000 * (self.env.lives - 1)
+        metrics = arrdict(age=torch.where(ended, life + self.env.age, -1e9))
         return arrdict(world, learns=learns, metrics=metrics)
 
 
