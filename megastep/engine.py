@@ -1,4 +1,5 @@
-"""The engine: ``bake``, ``physics``, ``render``, ``observe``, ``unseen``, ``spawn``, ``uniform``.
+"""The engine: ``bake``, ``physics``, ``render``, ``observe``, ``unseen``, ``coverage``, ``spawn``,
+``uniform``.
 Each checks its arguments, allocates and launches, on the CPU or the GPU, whichever its tensors are
 on; none synchronises. TypeError or ValueError, naming the argument, if one does not fit.
 
@@ -32,6 +33,7 @@ __all__ = [
     "Scenery",
     "bake",
     "check",
+    "coverage",
     "device",
     "fit",
     "observe",
@@ -291,24 +293,53 @@ def unseen(
     Args: ``seen`` (N, A, n_words) int32, as of :func:`observe`; ``visible`` (D, n_words) int32, as
     of :func:`~megastep.modules.visible_texels`.
     """
-    n, a = lanes = _lanes(scenery, agents)
-    seen_at, n_words = _texel_bits(scenery, "seen", seen, lanes)
-    visible_at = checks.address(
-        "visible", visible, (len(scenery.layouts), n_words), torch.int32, scenery.device
-    )
+    n, a = _lanes(scenery, agents)
     counts = torch.empty((n, a, BANDS, SECTORS), dtype=torch.int32, device=scenery.device)
     packed = params.UnseenParams(
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
-        seen=seen_at,
-        visible=visible_at,
+        **_seen_and_visible(scenery, seen, visible),
         error_flag=error_flag(scenery, agents),
         counts=counts.data_ptr(),
-        n_words=n_words,
     )
     launch("unseen", packed, scenery.device, threads=BLOCK * n * a)
     check_on_cpu(agents)
     return counts
+
+
+def coverage(
+    scenery: Scenery,
+    agents: Agents,
+    seen: torch.Tensor,
+    visible: torch.Tensor,
+    mask: torch.Tensor,
+) -> torch.Tensor:
+    """The share that an agent has seen of the texels of its environment's layout that are visible
+    at all: (N, A) float32, 0 where not in ``mask`` (N, A) bool.
+
+    Args: ``seen`` and ``visible`` as of :func:`unseen`.
+    """
+    lanes, on = _lanes(scenery, agents), scenery.device
+    shares = torch.empty(lanes, device=on)
+    packed = params.CoverageParams(
+        scenery=scenery_params(scenery, agents.radius),
+        **_seen_and_visible(scenery, seen, visible),
+        mask=checks.address("mask", mask, lanes, torch.bool, on),
+        error_flag=error_flag(scenery, agents),
+        coverage=shares.data_ptr(),
+    )
+    launch("coverage", packed, on, threads=shares.numel())
+    check_on_cpu(agents)
+    return shares
+
+
+def _seen_and_visible(scenery, seen, visible):
+    """The addresses of the texels seen and visible, and how many words they have."""
+    on = scenery.device
+    seen_at, n_words = _texel_bits(scenery, "seen", seen, (scenery.n_envs, scenery.n_agents))
+    shape = len(scenery.layouts), n_words
+    visible_at = checks.address("visible", visible, shape, torch.int32, on)
+    return dict(seen=seen_at, visible=visible_at, n_words=n_words)
 
 
 def spawn(

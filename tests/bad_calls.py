@@ -185,6 +185,11 @@ def operations(f):
         dict(OPERANDS, seen=tensors, visible=tensors),
     )
     yield (
+        engine.coverage,
+        dict(both, seen=f.seen, visible=f.visible, mask=f.mask),
+        dict(OPERANDS, seen=tensors, visible=tensors, mask=tensors),
+    )
+    yield (
         engine.spawn,
         dict(both, mask=f.mask, points=f.points, counts=f.counts, seed=1, resample=True),
         dict(

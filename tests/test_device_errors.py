@@ -46,6 +46,15 @@ def unseen(c):
     return engine.unseen(c.scenery, c.agents, seen, visible)
 
 
+def coverage(c):
+    layouts, lanes = c.scenery.layouts, (LAST + 1, c.n_agents)
+    words = -(-layouts.max_texels // 32)
+    seen = torch.full((*lanes, words), 1, dtype=torch.int32, device=c.device)
+    visible = torch.full((len(layouts), words), -1, dtype=torch.int32, device=c.device)
+    mask = torch.ones(lanes, dtype=torch.bool, device=c.device)
+    return engine.coverage(c.scenery, c.agents, seen, visible, mask)
+
+
 def spawn(c):
     n, a, device = c.scenery.n_envs, c.n_agents, c.scenery.device
     mask = torch.ones((n, a), dtype=torch.bool, device=device)
@@ -57,7 +66,7 @@ def spawn(c):
 
 @pytest.mark.parametrize("layout", [2, -1, 2**31 - 1, -(2**31)])
 @pytest.mark.parametrize("n_agents", [1, 3])
-@pytest.mark.parametrize("operation", [physics, render, observe, geometry, unseen, spawn])
+@pytest.mark.parametrize("operation", [physics, render, observe, geometry, unseen, coverage, spawn])
 def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, layout, device):
     expected = operation(boxes(device, n_agents))
     c = boxes(device, n_agents)

@@ -28,6 +28,8 @@ def trajectory(device, n_agents, subsample=1, **settings):
             core.scenery, core.agents, subsample, imu=True, centre_line=True, seen=seen
         )
         out.append(engine.unseen(core.scenery, core.agents, seen, visible))
+        mask = torch.rand((24, n_agents), generator=random).to(device) < 0.3
+        out.append(engine.coverage(core.scenery, core.agents, seen, visible, mask))
     out += [
         *engine.render(core.scenery, core.agents),
         *engine.observe(core.scenery, core.agents, subsample, rgb=False)[1:2],

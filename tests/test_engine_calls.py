@@ -257,6 +257,7 @@ def test_no_operation_synchronises():
         engine.render(core.scenery, core.agents)
         engine.observe(core.scenery, core.agents, 4, imu=True, seen=seen, clear_mask=mask)
         engine.unseen(core.scenery, core.agents, seen, visible)
+        engine.coverage(core.scenery, core.agents, seen, visible, mask)
         core.agents.positions = core.agents.positions + 0.01
         engine.physics(core.scenery, core.agents)
 

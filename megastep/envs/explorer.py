@@ -27,7 +27,8 @@ class Explorer:
 
     Observation: RGB and depth of 64 pixels, each the mean of 4 rays over 130 degrees, and IMU, all
     fp16. Seven actions, with momentum. Truncated when the episode's length in steps reaches the
-    number of texels seen, the first view's included, + 200.
+    number of texels seen, the first view's included, + 200. Its metric is ``coverage``, the share
+    seen of the texels that a look all round from some spawn point can show.
 
     Args: ``geometries`` to live in, generated homes by default; ``res`` rays and ``subsample`` rays
     per pixel; ``fov`` degrees; ``fps`` steps per second; ``patience`` steps; ``resample``: every
@@ -80,8 +81,8 @@ class Explorer:
         words = -(-self.core.scenery.layouts.max_texels // 32)
         engine.fit(n_envs, 4 * words + 8 * pixels + 64, self.device)
         self.seen = torch.zeros((n_envs, 1, words), dtype=torch.int32, device=self.device)
+        self.visible = modules.visible_texels(self.core.scenery, self.spawner.points)
         if privileged:
-            self.visible = modules.visible_texels(self.core.scenery, self.spawner.points)
             self.units = torch.tensor([200.0, 1000.0, 1000.0, 1000.0], device=self.device)
             self.privileged_space = dotdict(
                 episode=spaces.MultiVector(1, 4),
@@ -104,9 +105,16 @@ class Explorer:
         self.lifecycle.limits.masked_fill_(reset, self.patience).add_(newly_seen)
         reward = (newly_seen / TEXELS_PER_POINT).masked_fill_(reset, 0.0)
         flags = self.lifecycle(reset)
-        if self.privileged_space is None:
-            return arrdict(obs=obs, reward=reward, **flags)
-        return arrdict(obs=obs, reward=reward, privileged=self._privileged(), **flags)
+        world = arrdict(obs=obs, reward=reward, metrics=self._metrics(flags.truncated), **flags)
+        if self.privileged_space is not None:
+            world["privileged"] = self._privileged()
+        return world
+
+    def _metrics(self, ends):
+        """``coverage`` (N,), of the episodes that end here."""
+        ends = modules.to_agents(ends, self.n_agents)
+        shares = engine.coverage(self.core.scenery, self.core.agents, self.seen, self.visible, ends)
+        return arrdict(coverage=modules.to_lanes(shares))
 
     def _privileged(self):
         """What only a critic sees, in units that make each number about 1: ``episode`` (N, 1, 4),

@@ -40,8 +40,8 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
 
 def warn(problem: str) -> None:
     warnings.warn(
-        f"the kernel cache is not used, so kernels are built, and spawn points found, at each "
-        f"start: {problem}; set MEGASTEP_CACHE to another folder of your own",
+        f"the kernel cache is not used, so kernels are built, and spawn points and visible texels "
+        f"found, at each start: {problem}; set MEGASTEP_CACHE to another folder of your own",
         stacklevel=2,
     )
 

@@ -23,7 +23,10 @@ import torch
 from . import cache
 
 HERE = Path(__file__).parent
-OPERATIONS = ("bake", "physics", "update_agent_geometry", "render", "unseen", "spawn", "uniform")
+OPERATIONS = (
+    *("bake", "physics", "update_agent_geometry", "render"),
+    *("unseen", "coverage", "spawn", "uniform"),
+)
 CPU_FLAGS = (
     "-std=c++17",
     "-O3",

@@ -107,6 +107,16 @@ struct RenderParams {
     int n_words;
 };
 
+struct CoverageParams {
+    SceneryParams scenery;
+    const unsigned int* seen;     // (N, A, n_words) a bit per static texel
+    const unsigned int* visible;  // (D, n_words) a bit per static texel
+    const unsigned char* mask;    // (N, A) agents that are asked for
+    int* error_flag;              // (1) out: see errors.h
+    float* coverage;              // (N, A) out: 0 where not asked for
+    int n_words;
+};
+
 struct SpawnParams {
     SceneryParams scenery;
     float* positions;           // (N, A, 2) out, as the next three, where mask
