@@ -50,8 +50,8 @@ def first_episodes(
 ) -> arrdict:
     """Plays each lane's first episode: arrdict of `returns` (B,) float32, `lengths` (B,) float32
     steps, `done` (B,) bool, `learns` (B,) bool, as of the first world, `metrics` by name (B,)
-    float32, of the world it ended with, nan without one, and `homes` (B,) int32, on the
-    environment's device.
+    float32, of the world it ended with, nan without one, `envs` (B,) int64, the environment that
+    the lane is of, and `homes` (B,) int32, on the environment's device.
 
     `homes` are the layouts that the environment shows after its reset, one per lane; a layout
     changes at respawns alone, so each lane's episode is played in that home from end to end.
@@ -62,6 +62,7 @@ def first_episodes(
     generator = torch.Generator(device).manual_seed(seed)
     world, state = env.reset(), policy.initial(lanes, device)
     layout = getattr(env, "layout", None)
+    envs = torch.arange(env.n_envs, device=device).repeat_interleave(env.n_agents)
     homes = {} if layout is None else {"homes": layout.repeat_interleave(env.n_agents)}
     returns, lengths = (torch.zeros(lanes, device=device) for _ in range(2))
     done = torch.zeros(lanes, dtype=torch.bool, device=device)
@@ -81,7 +82,13 @@ def first_episodes(
             values.copy_(torch.where(ends, world["metrics"][name], values))
         done |= ends
     return arrdict(
-        returns=returns, lengths=lengths, done=done, learns=learns, metrics=metrics, **homes
+        returns=returns,
+        lengths=lengths,
+        done=done,
+        learns=learns,
+        metrics=metrics,
+        envs=envs,
+        **homes,
     )
 
 
@@ -129,15 +136,16 @@ def summaries(episodes: Mapping, roles: Sequence[str] | None = None) -> list[dic
 def _summary(episodes, chosen):
     """The mean return of the chosen lanes (B,) with its 95 % interval, their mean length, the means
     of their metrics where episodes ended, and what all was taken over; `homes` is None where there
-    are none.
+    are none. Without homes, or in a single one, intervals are over environments.
     """
     taken = {
         key: episodes[key].cpu().numpy()[chosen]
-        for key in ("returns", "lengths", "done", "homes")
+        for key in ("returns", "lengths", "done", "envs", "homes")
         if key in episodes
     }
     homes, done = taken.get("homes"), taken["done"]
-    mean, lower, upper = interval(taken["returns"], homes)
+    groups = taken["envs"] if homes is None or len(np.unique(homes)) == 1 else homes
+    mean, lower, upper = interval(taken["returns"], groups)
     return {
         "return": mean,
         "lower": lower,
@@ -147,9 +155,7 @@ def _summary(episodes, chosen):
         "homes": None if homes is None else len(np.unique(homes)),
         "unfinished": int((~done).sum()),
         "metrics": {
-            name: _metric(
-                values.cpu().numpy()[chosen][done], None if homes is None else homes[done]
-            )
+            name: _metric(values.cpu().numpy()[chosen][done], groups[done])
             for name, values in episodes["metrics"].items()
         },
     }

@@ -111,6 +111,25 @@ def test_metrics_and_returns_are_split_by_role_among_lanes_that_learn():
     assert (leader["role"], follower["role"]) == ("leader", "follower") and "role" not in every
 
 
+def test_the_agents_of_one_environment_are_one_draw():
+    """Two agents that always earn the same: half as many draws as there are episodes."""
+    alike = torch.arange(100.0).repeat_interleave(2)
+    episodes = arrdict(
+        returns=alike,
+        lengths=alike,
+        done=alike >= 0,
+        learns=alike >= 0,
+        metrics=arrdict(laps=alike),
+        envs=torch.arange(100).repeat_interleave(2),
+    )
+    (row,) = evaluation.summaries(episodes)
+    expected = evaluation.interval(np.arange(100.0), np.arange(100))
+    assert (row["return"], row["lower"], row["upper"]) == pytest.approx(expected)
+    assert row["metrics"]["laps"]["lower"] == row["lower"] and row["lanes"] == 200
+    in_one_home = arrdict(episodes, homes=torch.full((200,), 7))
+    assert evaluation.summaries(in_one_home)[0]["lower"] == row["lower"]
+
+
 def test_a_metric_is_the_mean_over_episodes_that_ended():
     env = Teams(20, False)
     random = evaluation.RandomActions(env.action_space)
