@@ -22,7 +22,7 @@ import torch
 
 #: Raised by one whenever what is written changes so that an older reader would misread it, or a
 #: newer one what is older.
-FORMAT = 3
+FORMAT = 4
 FILES = ("state.pt", "config.json")
 
 

@@ -19,6 +19,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from agents.imports import choose
 from agents.running_norm import RunningNorm
 from megastep import spaces
 from megastep.arrdict import arrdict
@@ -80,12 +81,36 @@ class Conv(nn.Module):
         return F.relu(self.second(F.relu(self.first(rows)))).reshape(*lead, self.n_features)
 
 
+#: Encoders of images, by name. One is a module `Encoder(space)` with `n_features`, which takes
+#: images (..., A, C, H, W) to features (..., n_features).
 ENCODERS = {"linear": Flat, "conv": Conv}
+
+
+def encoder(name: str, space: spaces.MultiImage) -> nn.Module:
+    """The encoder of images called `name`: one of `ENCODERS`, or an import path. ValueError if its
+    features are not as it says.
+    """
+    made = choose(name, ENCODERS)(space)
+    if ":" in name:
+        _check_encoder(name, made, space)
+    return made
+
+
+@torch.no_grad()
+def _check_encoder(name, made, space):
+    for lead in (3,), (3, 2):
+        got = tuple(made(torch.zeros(*lead, *space.shape)).shape)
+        wanted = *lead, getattr(made, "n_features", "n_features")
+        if got != wanted:
+            raise ValueError(
+                f"{name} breaks the contract of encoders: images {(*lead, *space.shape)} give "
+                f"features {wanted}, not {got}"
+            )
 
 
 def _encoder(space, of_images, path):
     if isinstance(space, spaces.MultiImage):
-        return ENCODERS[of_images](space)
+        return encoder(of_images, space)
     if isinstance(space, spaces.MultiVector):
         return Flat(space)
     if isinstance(space, spaces.MultiDiscrete):
@@ -116,8 +141,6 @@ class ConcatIntake(nn.Module):
 
     def __init__(self, space, width, encoder="linear"):
         super().__init__()
-        if encoder not in ENCODERS:
-            raise ValueError(f"encoder is {encoder!r}; it can be {' or '.join(ENCODERS)}")
         leaves = list(_paths(space))
         if not leaves:
             raise ValueError(f"the observation space {space!r} has nothing in it to encode")
@@ -175,8 +198,8 @@ def intake(space: Any, width: int, encoder: str = "linear") -> ConcatIntake:
     """A module from observations of this space, or dict of spaces, to vectors (..., width).
 
     Observations may be of any dtype; they are cast to the weights'. `encoder` is that of images:
-    'linear', as so many numbers, or 'conv', by convolutions. ValueError if the space is of no known
-    kind.
+    'linear', as so many numbers; 'conv', by convolutions; or an import path. ValueError if the
+    space is of no known kind.
     """
     return ConcatIntake(space, width, encoder)
 

@@ -1,34 +1,45 @@
-"""The actor-critic: an intake (the encoder of observations), an LSTM, an output to act, and a
+"""The actor-critic: an intake (the encoder of observations), a memory, an output to act, and a
 critic, which may see more than the actor.
 
 Axes: T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, on the CPU in
 float32.
 """
 
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import AfterValidator, Field
 from torch import nn
 
 from agents import heads
+from agents import memory as cores
 from agents.critic import Critic
+from agents.imports import choose
 from agents.random_stream import RandomStream
-from agents.recurrent import LSTM
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
+from megastep.settings import checked
 
-#: What a critic may be called.
-CRITICS = "asymmetric", "plain"
+
+def _known(table):
+    """The check of a name: a word of the table, or an import path."""
+
+    def check(name):
+        choose(name, table)
+        return name
+
+    return AfterValidator(check)
 
 
 class Policy(nn.Module):
     """Acts on worlds: `decision, state = policy(world, state)`, starting from `policy.initial(B)`.
     A world is what an environment's `step` returns, a decision what it takes.
 
-    `critic` is "asymmetric", which also sees a world's `privileged` of `privileged_space` where
-    there is such a space; "plain", which sees what the actor sees; or None, for a policy that only
-    acts. Nothing privileged reaches the actions; but `prediction_error` can teach the memory what
-    the critic knows.
+    `memory` and `encoder` are names in `memory.MEMORIES` and `heads.ENCODERS`, or import paths of
+    others. `critic` is "asymmetric", which also sees a world's `privileged` of `privileged_space`
+    where there is such a space; "plain", which sees what the actor sees; or None, for a policy that
+    only acts. Nothing privileged reaches the actions; but `prediction_error` can teach the memory
+    what the critic knows.
 
     `seed` decides the first weights and, where no generator is given, the sampled actions. The
     weights are in `state_dict()`, those that only training needs under "critic." and "prediction.";
@@ -36,30 +47,28 @@ class Policy(nn.Module):
     the width is less than 1 or a space is of no known kind.
     """
 
+    @checked
     def __init__(
         self,
         obs_space: Any,
         action_space: Any,
         privileged_space: Any = None,
         *,
-        width: int = 128,
-        encoder: str = "linear",
-        critic: str | None = "asymmetric",
+        width: Annotated[int, Field(ge=1, le=8192)] = 128,
+        memory: Annotated[str, _known(cores.MEMORIES)] = "lstm",
+        encoder: Annotated[str, _known(heads.ENCODERS)] = "linear",
+        critic: Literal["asymmetric", "plain"] | None = "asymmetric",
         bf16: bool = True,
         seed: int = 1,
     ):
         super().__init__()
-        if width < 1:
-            raise ValueError(f"width is {width}; a policy needs at least 1")
-        if critic not in (*CRITICS, None):
-            raise ValueError(f"critic is {critic!r}; it can be {' or '.join(CRITICS)}")
-        self.bf16 = bf16
+        self.width, self.bf16 = width, bf16
         self.privileged_space = privileged_space if critic == "asymmetric" else None
         self.random = RandomStream(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.intake = heads.intake(obs_space, width, encoder)
-            self.memory = LSTM(width)
+            self.memory = cores.memory(memory, width)
             self.output = heads.output(action_space, width)
             self.critic = None if critic is None else Critic(width, self.privileged_space)
             if self.privileged_space:
@@ -67,10 +76,10 @@ class Policy(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        return self.memory.memory.weight.device
+        return next(self.parameters()).device
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """The state of B lanes at the start of an episode: arrdict of (B, width) float32."""
+        """The state of B lanes at the start of an episode: arrdict of (B, ...) float32."""
         return self.memory.initial(n_lanes, self.device if device is None else device)
 
     def forward(

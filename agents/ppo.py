@@ -5,21 +5,28 @@ mean is over valid steps: those that the environment took, of lanes that learn. 
 synchronises: what would be an `if` is a flag on the device.
 """
 
-from typing import Any
+import math
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 
 from agents import returns
 from agents.adam import Adam
 from agents.finite import FiniteCheck
 from agents.random_stream import RandomStream
-from agents.rollout import Rollout
+from agents.rollout import Collector, Rollout
 from megastep.arrdict import arrdict
+from megastep.dotdict import leaves
+from megastep.settings import MAX_ENVS, checked
 
 _AVERAGED = ("policy", "value", "entropy", "kl", "clip_fraction", "grad_norm")
 # updates done eagerly, and for real, before one is captured: libraries set themselves up in the
 # first
 _WARM_UPS = 2
+Coefficient = Annotated[float, Field(ge=0, le=10**6)]
+Positive = Annotated[float, Field(gt=0, le=10**6)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 def masked_mean(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
@@ -49,6 +56,7 @@ def explained_variance(
 class PPO:
     """Improves a policy, in place, from rollouts it collected.
 
+    n_steps           of a rollout
     lr                Adam's step size; `set_lr` changes it
     gamma, lambda_    discount per step, and the decay of GAE
     clip              how far the probability of an action may move, as a ratio, before the gradient
@@ -67,25 +75,29 @@ class PPO:
     weight, no statistic. `check` tells which it was, and how many updates were skipped in a row.
     """
 
+    @checked
     def __init__(
         self,
         policy: Any,
         *,
-        lr: float = 3e-4,
-        gamma: float = 0.99,
-        lambda_: float = 0.95,
-        clip: float = 0.2,
-        entropy_coef: float = 0.01,
-        value_coef: float = 0.5,
-        auxiliary_coef: float = 0.5,
-        max_grad_norm: float = 0.5,
-        n_epochs: int = 1,
-        n_minibatches: int = 4,
-        target_kl: float | None = None,
+        n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
+        lr: Positive = 3e-4,
+        gamma: Fraction = 0.99,
+        lambda_: Fraction = 0.95,
+        clip: Positive = 0.2,
+        entropy_coef: Coefficient = 0.01,
+        value_coef: Coefficient = 0.5,
+        auxiliary_coef: Coefficient = 0.5,
+        max_grad_norm: Positive = 0.5,
+        n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
+        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 4,
+        target_kl: Positive | None = None,
         graph: bool = False,
         seed: int = 1,
     ):
-        self.policy, self.device = policy, policy.device
+        if policy.critic is None:
+            raise ValueError("PPO needs a policy with a critic")
+        self.policy, self.device, self.n_steps = policy, policy.device, n_steps
         self.gamma, self.lambda_, self.clip, self.entropy_coef = gamma, lambda_, clip, entropy_coef
         self.value_coef, self.auxiliary_coef = value_coef, auxiliary_coef
         self.max_grad_norm = max_grad_norm
@@ -107,6 +119,33 @@ class PPO:
     def set_lr(self, lr: float) -> None:
         """Changes Adam's step size, also for a captured update."""
         self._lr.fill_(lr)
+
+    def collector(self, env: Any) -> Collector:
+        """What acts in `env`, and the memory of `n_steps` steps of all its lanes."""
+        n_lanes = env.n_envs * env.n_agents
+        rollout = Rollout(
+            self.n_steps,
+            n_lanes,
+            env.obs_space,
+            env.action_space,
+            self.policy.initial(n_lanes),
+            env.device,
+            self.policy.privileged_space,
+        )
+        return Collector(env, self.policy, rollout)
+
+    def bytes_per_env(self, env: Any) -> float:
+        """About how many bytes a rollout and a minibatch of it take per environment."""
+        numbers, privileged = (
+            sum(math.prod(space.shape) for space in leaves(tree or {}))
+            for tree in (env.obs_space, self.policy.privileged_space)
+        )
+        # observations of 2 bytes per number, 4 of what is privileged, and about 64 of the rest; a
+        # minibatch's share of those, and of some 24 activations of 4 bytes per unit; the features
+        # that values are made of
+        each, parts = 2 * numbers + 4 * privileged + 64, self.n_minibatches
+        each = each * (1 + 1 / parts) + (96 / parts + 4) * self.policy.width
+        return env.n_agents * (self.n_steps + 1) * each
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Learns from a rollout. Returns means over its minibatches as tensors () on the device,

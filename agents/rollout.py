@@ -206,19 +206,21 @@ def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> ar
 
 
 class Collector:
-    """Fills one rollout after another from an environment, which it resets once.
+    """Fills a rollout, again and again, from an environment, which it resets once. Each call
+    returns the rollout.
 
     The first time is eager, so that libraries set themselves up; from the second time on a GPU
     replays a CUDA graph, `graph`.
     """
 
     def __init__(self, env: Any, policy: Any, rollout: Rollout):
+        self.rollout = rollout
         self.parts = env, policy, rollout, initial_actor_state(env, policy, rollout)
         self.on_gpu = torch.device(env.device).type == "cuda"
         self.n_collected = 0
         self.graph = None
 
-    def __call__(self) -> None:
+    def __call__(self) -> Rollout:
         if self.on_gpu and self.n_collected == 1:
             self.graph = capture(lambda: collect(*self.parts), (), self.parts)
         self.n_collected += 1
@@ -226,3 +228,4 @@ class Collector:
             collect(*self.parts)
         else:
             self.graph()
+        return self.rollout

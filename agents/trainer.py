@@ -10,7 +10,6 @@ import torch
 from agents.budget import Budget, Stopwatch
 from agents.episodes import Episodes
 from agents.finite import NonFiniteError
-from agents.rollout import Collector, Rollout
 
 #: So many skipped updates in a row end a run.
 MAX_SKIPPED = 20
@@ -20,9 +19,8 @@ class Trainer:
     """Improves a policy in an environment until a budget is spent.
 
     Args:
-    env, policy, rollout  the environment, who acts in it, and the memory of their transitions
-    learner      has `update(rollout)`, which returns a dict of tensors () on the device; `check`,
-                 a FiniteCheck; `lr`, `set_lr`, `state_dict` and `load_state_dict`
+    env, policy  the environment, and who acts in it
+    learner      what improves the policy, as `agents.learner` describes it
     metrics      has `write(samples, metrics, perf)`: `agents.metrics.Metrics`
     save         called with (samples, state, score); returns whether it could: a `Saver`
     budget       when to end, and how the learning rate falls
@@ -35,7 +33,6 @@ class Trainer:
         env: Any,
         policy: Any,
         learner: Any,
-        rollout: Rollout,
         metrics: Any,
         save: Callable[[int, dict, float | None], bool],
         budget: Budget,
@@ -44,12 +41,16 @@ class Trainer:
         save_every: float = 30.0,
         on_report: Callable[["Trainer"], None] = lambda trainer: None,
     ):
-        self.env, self.policy, self.learner, self.rollout = env, policy, learner, rollout
+        self.env, self.policy, self.learner = env, policy, learner
         self.metrics, self.save_checkpoint, self.budget = metrics, save, budget
         self.report_every, self.save_every, self.on_report = report_every, save_every, on_report
-        self.collect = Collector(env, policy, rollout)
+        self.collect = learner.collector(env)
+        self.rollout = self.collect.rollout  # what was collected last
         self.episodes = Episodes(
-            rollout.n_lanes, env.device, tuple(rollout.metrics), getattr(env, "roles", None)
+            env.n_envs * env.n_agents,
+            env.device,
+            tuple(self.rollout.metrics),
+            getattr(env, "roles", None),
         )
         self.clock = Stopwatch()
         self.samples = self.updates = 0
@@ -77,7 +78,7 @@ class Trainer:
         """
         try:
             while self.left > 0 and not stop():
-                self.collect()
+                self.rollout = self.collect()
                 losses = self.update()
                 if self.updates % self.report_every == 0:
                     self.report(losses)

@@ -159,7 +159,7 @@ def test_another_format_is_named_and_neither_read_nor_passed_over(folder, versio
     seal(folder / "step_30", {**manifest, "format": version})
     with pytest.raises(
         CheckpointError,
-        match=f"step_30 has format {version}.*format 2.*use the megastep that wrote it",
+        match=f"step_30 has format {version}.*format 4.*use the megastep that wrote it",
     ):
         checkpoint.load(folder)
 

@@ -5,23 +5,19 @@ run.
 import copy
 import dataclasses
 import inspect
-from typing import Annotated
 
 import pytest
 import yaml
 
 from agents.cli import compose as compose_module
-from agents.cli import settings
 from agents.cli.build import as_tree, build
 from agents.cli.command import run_command
-from agents.cli.compose import CONFIGS, ConfigLoader
+from agents.cli.compose import ConfigLoader
 from agents.cli.errors import ConfigErrors
-from agents.cli.settings import Evaluate, Record, Train
+from agents.cli.registry import CONFIGS
+from agents.cli.settings import GROUPS, Agent, Evaluate, Record, Train, WandbLogger
 from agents.metrics import Wandb
-from agents.policy import Policy
-from agents.ppo import PPO
 from megastep import envs, geometries
-from megastep.bounds import Within
 
 SCRIPTS = {"train": Train, "evaluate": Evaluate, "record": Record}
 
@@ -37,35 +33,18 @@ def errors(*overrides, script="train"):
     return dict(error.value.errors)
 
 
-@pytest.mark.parametrize(
-    "choice",
-    [
-        "env=minimal",
-        "env=explorer",
-        "geometry=homes",
-        "geometry=bench",
-        "geometry=box",
-        "geometry=column",
-        "preset=cpu",
-        "preset=gpu",
-        "preset=auto",
-        "logger=wandb",
-        "experiment=newcomer",
-    ],
-)
-def test_every_group_member_composes(choice):
-    assert isinstance(compose(choice), Train)
+#: What a member of a group needs beside itself.
+MORE = {"geometry=files": ["geometry.path=plans.npz"]}
 
 
-def test_every_member_of_every_group_is_tested_above_or_needs_more():
+def test_every_member_of_every_group_composes():
     with ConfigLoader("train", Train) as loader:
         groups = loader.groups()
     assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "preset", "experiment"}
-    assert set(groups["env"]) == set(envs.ENVS) == set(settings.ENVS)
-    assert set(groups["geometry"]) == set(geometries.SOURCES) == set(settings.GEOMETRIES)
-    assert set(groups["logger"]) == set(settings.LOGGERS)
-    assert set(groups["preset"]) == {"auto", "cpu", "gpu"}
-    assert groups["agent"] == ["lstm"] and groups["learner"] == ["ppo"]
+    assert set(groups["env"]) == set(envs.ENVS)
+    assert set(groups["geometry"]) == set(geometries.SOURCES)
+    for choice in [f"{group}={member}" for group in groups for member in groups[group]]:
+        assert isinstance(compose(choice, *MORE.get(choice, ())), Train)
 
 
 def leaves(tree, prefix=""):
@@ -129,50 +108,18 @@ def test_what_is_written_can_be_read_again():
     assert build(Train, as_tree(cfg)) == cfg
 
 
-def test_a_file_of_an_environment_says_what_differs_from_its_constructor():
-    for name, environment in envs.ENVS.items():
-        defaults = inspect.signature(environment.__init__).parameters
-        for key, value in values(f"env/{name}", "train").items():
-            key = key.removeprefix("env.")
-            assert key == "name" or defaults[key].default != value
+@pytest.mark.parametrize("group", ["env", "geometry", "learner", "agent"])
+def test_a_file_says_what_differs_from_the_defaults_of_the_constructor(group):
+    for path in (CONFIGS / group).glob("*.yaml"):
+        said = {k.split(".")[1]: v for k, v in values(f"{group}/{path.stem}", "train").items()}
+        kind = GROUPS[group].kind(said["name"]) if group in GROUPS else Agent
+        defaults = {field.name: field.default for field in dataclasses.fields(kind)}
+        assert not [key for key in said if said[key] == defaults[key]], path
 
 
-def test_the_settings_of_an_environment_are_its_constructors():
-    class Rover:
-        def __init__(
-            self,
-            n_envs=8,
-            geometries=None,
-            *,
-            seed=1,
-            device=None,
-            limit: Annotated[float, Within(1, 500)] = 300.0,
-        ):
-            pass
-
-    kind = settings.of_environment(Rover.__init__)
-    assert build(kind, {"name": "rover"}) == kind("rover", 8, 300)
-    assert build(kind, {"name": "rover", "limit": 7}).limit == 7.0
-    with pytest.raises(ConfigErrors) as error:
-        build(kind, {"name": "rover", "limit": 501, "n_envs": "many", "seed": 3})
-    assert [path for path, _ in error.value.errors] == ["seed", "n_envs", "limit"]
-
-
-def arguments(made):
-    return set(inspect.signature(made).parameters)
-
-
-def keys(kind):
-    return {field.name for field in dataclasses.fields(kind)}
-
-
-def test_every_key_of_a_component_is_an_argument_of_what_it_makes():
-    for name, kind in settings.GEOMETRIES.items():
-        allowed = arguments(geometries.sample) | arguments(geometries.SOURCES[name])
-        assert keys(kind) <= allowed - {"split"}
-    assert keys(settings.Agent) <= arguments(Policy)
-    assert keys(settings.Learner) - {"name", "n_steps", "anneal"} <= arguments(PPO)
-    assert keys(settings.WandbLogger) - {"name"} <= arguments(Wandb)
+def test_every_key_of_a_logger_is_an_argument_of_what_it_makes():
+    keys = {field.name for field in dataclasses.fields(WandbLogger)}
+    assert keys - {"name"} <= set(inspect.signature(Wandb).parameters)
 
 
 def test_the_preset_follows_the_device(monkeypatch):
@@ -188,7 +135,9 @@ def test_the_preset_follows_the_device(monkeypatch):
 
 def test_what_a_cpu_and_a_gpu_train_with():
     """The recipes behind the measurements in README: changed together with them only."""
-    same = dict(name="ppo", n_steps=32, n_minibatches=4, n_epochs=1, clip=0.2, value_coef=0.5)
+    same = dict(
+        name="agents.ppo:PPO", n_steps=32, n_minibatches=4, n_epochs=1, clip=0.2, value_coef=0.5
+    )
     same |= dict(max_grad_norm=0.5, target_kl=None, auxiliary_coef=0.5, lambda_=0.95, anneal="auto")
     cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
     assert dataclasses.asdict(cpu.learner) == same | dict(lr=3e-3, gamma=0.98, entropy_coef=0.02)
@@ -209,9 +158,9 @@ def test_a_typo_names_the_nearest_key():
 
 def test_a_key_of_another_member_names_that_member():
     assert errors("logger.mode=offline")["logger.mode"] == "no such key here; logger=wandb has it"
-    found = errors("env=minimal", "env.patience=3", "geometry=box", "geometry.n=2")
+    found = errors("env=minimal", "env.patience=3", "geometry=box", "geometry.outer=false")
     assert found["env.patience"] == "no such key here; env=explorer has it"
-    assert found["geometry.n"] == "no such key here; geometry=homes has it"
+    assert found["geometry.outer"] == "no such key here; geometry=homes has it"
 
 
 def test_an_unknown_member_names_the_nearest_one():
@@ -219,7 +168,8 @@ def test_an_unknown_member_names_the_nearest_one():
     assert "homes?" in errors("geometry=home")["geometry"]
     assert "newcomer?" in errors("experiment=newcomr")["experiment"]
     assert "test?" in errors("run=x", "split=tset", script="evaluate")["split"]
-    assert "minimal" in errors("env.name=zzz")["env.name"]
+    assert "import path" in errors("env.name=zzz")["env"]
+    assert "wandb" in errors("logger.name=zzz")["logger"]
 
 
 def test_all_errors_are_listed_at_once():
@@ -302,14 +252,13 @@ def test_a_missing_key_is_named(tree):
 def test_a_range_is_told():
     assert errors("env.res=1025")["env.res"] == "1025 is out of range: allowed is from 1 to 1,024"
     assert (
-        errors("env.fov=180")["env.fov"]
-        == "180.0 is out of range: allowed is above 0 and below 180"
+        errors("env.fov=180")["env.fov"] == "180 is out of range: allowed is above 0 and below 180"
     )
 
 
 def test_settings_that_contradict_each_other_are_named():
     assert "2" in errors("env.n_envs=2")["learner.n_minibatches"]
-    assert "path" in errors("geometry=files")["geometry.path"]
+    assert errors("geometry=files") == {"geometry.path": "is missing"}
     assert "resume" in errors("resume=a", "init=b")["init"]
 
 

@@ -168,7 +168,10 @@ def test_a_generator_decides_all_samples():
         (lambda: heads.intake("images", WIDTH), "observation space itself = 'images'"),
         (lambda: heads.intake(arrdict(imu=VECTOR, x=3), WIDTH), "observation space x = 3"),
         (lambda: heads.intake(arrdict(nothing=spaces.MultiEmpty()), WIDTH), "nothing in it"),
-        (lambda: heads.intake(IMAGE, WIDTH, "resnet"), "'resnet'; it can be linear or conv"),
+        (
+            lambda: heads.intake(IMAGE, WIDTH, "resnet"),
+            "'resnet' is unknown; there are conv, linear, module:Class",
+        ),
         (lambda: heads.output(VECTOR, WIDTH), "there are MultiDiscrete and dicts of it"),
         (lambda: heads.output(arrdict(), WIDTH), "there are MultiDiscrete and dicts of it"),
     ],

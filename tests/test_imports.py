@@ -17,7 +17,7 @@ SOURCES = sorted(
 
 # A module of the simulator may import modules of the layers above its own row only.
 LAYERS = (
-    ("bounds", "colour", "dotdict", "outputs", "read_only", "spaces"),
+    ("colour", "dotdict", "outputs", "read_only", "settings", "spaces"),
     ("arrdict", "ragged", "state"),
     ("checks", "geometry", "capture", "contract", "plotting", "kernels"),
     ("geometries", "scenery_views", "recording"),
@@ -37,6 +37,7 @@ SHARED = {
     "megastep.arrdict",
     "megastep.dotdict",
     "megastep.ragged",
+    "megastep.settings",
     "megastep.spaces",
     "megastep.capture",
     "megastep.kernels.compile",

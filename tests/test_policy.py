@@ -95,7 +95,7 @@ def test_weights_load_from_plain_tensors():
 
 
 def test_a_width_of_zero_is_refused():
-    with pytest.raises(ValueError, match="width is 0"):
+    with pytest.raises(ValueError, match="width: 0 is out of range"):
         Policy(OBS, MOVES, width=0)
 
 

@@ -28,7 +28,7 @@ from agents.cli.settings import Train
 from agents.cli.signals import Interrupted
 from agents.finite import bad_leaf
 from megastep import envs
-from megastep.bounds import MAX_ENVS
+from megastep.settings import MAX_ENVS
 
 TINY = [*tiny.TINY, *tiny.SHORT_EPISODES, "report=1"]
 UPDATE = tiny.UPDATE
@@ -37,8 +37,8 @@ UPDATE = tiny.UPDATE
 def configured(*overrides, tiny=TINY):
     """The settings as train.main makes them."""
     overrides = [*tiny, *overrides]
-    with ConfigLoader("train", Train) as loader:
-        return build(Train, train.resumed(loader.tree(overrides), overrides))
+    with ConfigLoader("train", Train, train.prepared) as loader:
+        return build(Train, loader.tree(overrides))
 
 
 @pytest.fixture

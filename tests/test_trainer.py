@@ -10,7 +10,6 @@ from agents.budget import Budget
 from agents.finite import NonFiniteError
 from agents.policy import Policy
 from agents.ppo import PPO
-from agents.rollout import Rollout
 from agents.saver import Saver
 from agents.trainer import Trainer
 from megastep import spaces
@@ -84,12 +83,9 @@ def made(folder, faults=(), samples=None, every=1, lr=1e-3, env=None, **options)
     """A trainer in `Numbers` that saves into a folder."""
     env = env or Numbers(faults)
     policy = Policy(env.obs_space, env.action_space, width=8)
-    rollout = Rollout(T, B, env.obs_space, env.action_space, policy.initial(B))
-    learner = PPO(policy, n_minibatches=2, lr=lr)
+    learner = PPO(policy, n_steps=T, n_minibatches=2, lr=lr)
     saver, budget = Saver(folder, {}), Budget(samples)
-    return Trainer(
-        env, policy, learner, rollout, Rows(), saver, budget, report_every=every, **options
-    )
+    return Trainer(env, policy, learner, Rows(), saver, budget, report_every=every, **options)
 
 
 def always(name, lane, value, n=1000):

@@ -1,124 +1,83 @@
 """Settings from nested dicts, checked in one pass: `build(Train, tree)`. Knows no Hydra."""
 
 import dataclasses
-import types
-import typing
+import json
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from agents.cli.errors import ConfigErrors, closest, closest_key
-from agents.cli.settings import VARIANTS
+from pydantic import TypeAdapter, ValidationError
 
-#: What a value of each type is called in an error.
-WANTED = {int: "an integer", float: "a number", bool: "true or false", str: "a word"}
+from agents.cli.errors import ConfigErrors, closest_key
+from agents.cli.settings import GROUPS
+from megastep.settings import sentence
 
-Errors = list[tuple[str, str]]
+#: Keys that no setting has.
+UNKNOWN = ("unexpected_keyword_argument", "extra_forbidden")
 
 
 def build(kind: type, tree: dict[str, Any], choices: Iterable[str] = ()) -> Any:
     """The settings of dataclass `kind` from nested dicts; raises `ConfigErrors` with all that is
     wrong, not the first. `choices` are names that may have been meant beside those of keys.
     """
-    errors: Errors = []
-    settings = _settings(kind, tree, "", errors)
-    if errors:
-        known = [*_keys(kind, tree), *choices]
-        raise ConfigErrors(
-            (path, sentence or f"no such key; {closest_key(path, known)}")
-            for path, sentence in errors
-        )
-    return settings
+    try:
+        # As text, for a configuration is text: a list in it stands for a tuple, a word for a path.
+        return TypeAdapter(kind).validate_json(json.dumps(_whole(tree)))
+    except ValidationError as error:
+        keys, told = [*_keys(kind, tree), *choices], {}
+        for one in error.errors():
+            path, text = _sentence(kind, tree, one, keys)
+            told.setdefault(path, text)
+        raise ConfigErrors(told.items()) from None
 
 
 def as_tree(settings: Any) -> dict[str, Any]:
     """Nested plain dicts, the inverse of `build`."""
-    return dataclasses.asdict(settings)
+    return TypeAdapter(type(settings)).dump_python(settings, mode="json")
 
 
-def _settings(kind: type, tree: dict[str, Any], path: str, errors: Errors) -> Any:
-    fields = {field.name: field for field in dataclasses.fields(kind)}
-    hints = typing.get_type_hints(kind)
-    before, values = len(errors), {}
-    errors += [(path + key, _of_another(kind, key, path)) for key in tree if key not in fields]
-    for name, field in fields.items():
-        options, optional = _options(hints[name])
-        if name in tree:
-            values[name] = _value(options, optional, tree[name], path + name, errors)
-        elif optional and dataclasses.is_dataclass(options[0]):  # a group that was not chosen
-            values[name] = None
-        elif field.default is not dataclasses.MISSING:
-            continue
-        else:
-            errors.append((path + name, "is missing"))
-            continue
-        check = field.metadata.get("check")
-        if check and values[name] is not None and (sentence := check(values[name])):
-            errors.append((path + name, sentence))
-    if len(errors) > before:
-        return None
-    settings = kind(**values)
-    if hasattr(settings, "errors"):  # what concerns two settings at once
-        errors += [(path + name, sentence) for name, sentence in settings.errors()]
-    return settings
+def _whole(tree: Any) -> Any:
+    """The tree with integers for numbers such as 1e6, which YAML reads as fractions."""
+    if isinstance(tree, dict):
+        return {key: _whole(value) for key, value in tree.items()}
+    if isinstance(tree, list):
+        return [_whole(value) for value in tree]
+    return int(tree) if isinstance(tree, float) and tree.is_integer() else tree
 
 
-def _options(hint: Any) -> tuple[list[type], bool]:
-    """The types that a hint allows beside None, and whether it allows None."""
-    options = list(typing.get_args(hint)) or [hint]
-    return [o for o in options if o is not types.NoneType], types.NoneType in options
+def _sentence(kind: type, tree: Any, error: dict, keys: list[str]) -> tuple[str, str]:
+    """The dotted key of one of pydantic's errors, and what to say of it."""
+    path, field, group = [], None, None
+    for part in error["loc"]:
+        if kind is None:
+            break  # inside a list, or an option of several types
+        field, group = kind.__pydantic_fields__.get(part), GROUPS.get(path[0]) if path else None
+        path.append(str(part))
+        tree = tree.get(part) if isinstance(tree, dict) else None
+        kind = _below(part, field, tree)
+    key = ".".join(path)
+    if error["type"] not in UNKNOWN:
+        return key, sentence(error, field, tree)
+    other = group.having(path[-1]) if group and len(path) == 2 else None
+    if other:
+        return key, f"no such key here; {path[0]}={other} has it"
+    return key, f"no such key; {closest_key(key, keys)}"
 
 
-def _value(options: list[type], optional: bool, value: Any, path: str, errors: Errors) -> Any:
-    if value is None and optional:
-        return None
-    if dataclasses.is_dataclass(options[0]):
-        if not isinstance(value, dict):
-            errors.append((path, f"is a group of keys, got {value!r}"))
+def _below(key: str, field: Any, tree: Any) -> type | None:
+    """The dataclass of the settings below a key, if it is that of a group."""
+    if key in GROUPS and isinstance(tree, dict):
+        try:
+            return GROUPS[key].kind(str(tree.get("name")))
+        except ValueError:
             return None
-        variants = _variants(options[0])
-        if variants and value.get("name") not in variants:
-            name = value.get("name")
-            errors.append((f"{path}.name", f"{name!r} is unknown; {closest(name, variants)}"))
-        return _settings(_variant(options, value), value, path + ".", errors)
-    (kind,) = options
-    if isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
-        return value
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if kind is int and isinstance(value, float) and value.is_integer():
-        return int(value)  # samples=1e6
-    got = "nothing" if value is None else repr(value)
-    errors.append((path, f"expected {WANTED[kind]}, got {got}"))
-    return None
-
-
-# ---- Groups whose member decides which keys there are ----
-
-
-def _variants(kind: type) -> dict[str, type]:
-    """All members of the group that a dataclass is one of, by name; empty if it is of none."""
-    return next((table for table in VARIANTS if kind in table.values()), {})
-
-
-def _variant(options: list[type], value: dict[str, Any]) -> type:
-    """The dataclass that the group's `name` chooses."""
-    return _variants(options[0]).get(value.get("name"), options[0])
-
-
-def _of_another(kind: type, key: str, path: str) -> str:
-    """The sentence for a key that another member of the group has, or none."""
-    for name, other in _variants(kind).items():
-        if key in (field.name for field in dataclasses.fields(other)):
-            return f"no such key here; {path[:-1]}={name} has it"
-    return ""
+    kind = getattr(field, "annotation", None)
+    return kind if dataclasses.is_dataclass(kind) else None
 
 
 def _keys(kind: type, tree: Any, path: str = "") -> Iterator[str]:
     """The dotted key of every setting and every group of settings."""
-    for name, hint in typing.get_type_hints(kind).items():
+    for name, field in kind.__pydantic_fields__.items():
         yield path + name
-        options, _ = _options(hint)
-        if dataclasses.is_dataclass(options[0]):
-            below = tree.get(name) if isinstance(tree, dict) else None
-            below = below if isinstance(below, dict) else {}
-            yield from _keys(_variant(options, below), below, f"{path}{name}.")
+        tree_below = tree.get(name) if isinstance(tree, dict) else None
+        if below := _below(name, field, tree_below):
+            yield from _keys(below, tree_below, f"{path}{name}.")

@@ -11,7 +11,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from agents.cli.build import build
-from agents.cli.compose import ConfigLoader, Tree
+from agents.cli.compose import ConfigLoader, Prepare
 from agents.cli.console import say, warn
 from agents.cli.errors import UserError
 from agents.cli.help import help_text
@@ -25,12 +25,12 @@ def run_command(
     run: Callable[[Any], Any],
     text: str,
     argv: list[str] | None = None,
-    prepare: Callable[[Tree, list[str]], Tree] = lambda tree, overrides: tree,
+    prepare: Prepare = lambda tree, overrides: tree,
 ) -> int:
     """Parses, composes, checks, runs; returns the exit code.
 
     `run(settings)` does the work; `prepare(tree, overrides)` may replace a composed tree before it
-    is built. `text` is the head of `--help`.
+    is checked. `text` is the head of `--help`.
     """
     warnings.showwarning = lambda message, *_, **__: warn(message)
     options = _options(script, sys.argv[1:] if argv is None else argv)
@@ -52,14 +52,13 @@ def _run(
     run: Callable,
     text: str,
     options: argparse.Namespace,
-    prepare: Callable,
+    prepare: Prepare,
 ) -> int:
-    with ConfigLoader(script, kind) as loader:
+    with ConfigLoader(script, kind, prepare) as loader:
         if options.help:
             say(help_text(script, text, loader.groups()))
             return 0
         jobs = loader.jobs(options.overrides, options.multirun)
-        jobs = [(overrides, prepare(tree, overrides)) for overrides, tree in jobs]
         settings = [build(kind, tree) for _, tree in jobs]
     if options.cfg:
         say("\n---\n".join(OmegaConf.to_yaml(tree) for _, tree in jobs))

@@ -6,27 +6,27 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.cli import settings
 from agents.cli.build import build
-from agents.cli.errors import UserError
+from agents.cli.errors import ConfigErrors, UserError
 from agents.cli.run_folders import is_checkpoint
+from agents.imports import load as imported
 
 if TYPE_CHECKING:
     import torch
 
     from agents.checkpoint import Checkpoint
     from agents.policy import Policy
-    from agents.ppo import PPO
-    from agents.rollout import Rollout
 
 #: Environments that are made to measure how much memory one takes.
 PROBE = 65
+#: Environments of a sample, and steps that they take where they have to keep the contract.
+SAMPLE, SAMPLE_STEPS = 4, 16
 
 
 @contextmanager
@@ -68,14 +68,16 @@ def make_device(name: str) -> torch.device:
     return chosen
 
 
-def homes(geometry: settings.Geometry, split: str, max_homes: int | None = None) -> list[dict]:
-    """The different geometries of a split, in order; the source repeats them when it runs out."""
-    from megastep import geometries
-
+def homes(
+    env: settings.Env, geometry: settings.Geometry, split: str, max_homes: int | None = None
+) -> list[dict]:
+    """The different geometries of a split, in order; the source repeats them when it runs out. None
+    for an environment that takes no geometries.
+    """
+    if not _takes(env, "geometries"):
+        return []
     with errors():
-        found = geometries.sample(
-            geometry.name, geometry.n, split=split, seed=geometry.seed, **geometry.options
-        )
+        found = imported(geometry.name)(split=split, **_arguments(geometry, "name"))
     return list({id(home): home for home in found}.values())[:max_homes]
 
 
@@ -84,42 +86,69 @@ def make_env(
     homes: list[dict],
     seed: int,
     device: torch.device,
-    bytes_beside: Callable[[Any], float] = lambda env: 0,
     privileged: bool = False,
+    bytes_beside: float = 0,
 ) -> Any:
-    """The environment that settings describe, in these homes. One that takes `privileged` is told
-    whether a critic wants to see it.
+    """The environment that settings describe, in these homes. It is given what its constructor
+    takes of geometries, seed and device, and of `privileged`: whether a critic wants to see that.
 
     UserError that says how many environments fit, if these are too many for the memory;
-    `bytes_beside(env)` is what each needs beside its own, in a rollout. Before a large one is made,
-    two small ones tell what one environment takes.
+    `bytes_beside` is what each needs beside its own, in a rollout. Before a large one is made, two
+    small ones tell what one environment takes.
     """
-    from megastep import engine, envs
+    from megastep import engine
     from megastep.capture import state_tree
 
-    constructor = envs.ENVS[chosen.name]
-    arguments = dict(_arguments(chosen, "name", "n_envs"), seed=seed, device=device)
-    if "privileged" in inspect.signature(constructor).parameters:
-        arguments["privileged"] = privileged
+    constructor = imported(chosen.name)
 
     def make(n_envs, homes):
-        return constructor(n_envs, homes, **arguments)
+        run = dict(geometries=homes, seed=seed, device=device, privileged=privileged)
+        run = {name: value for name, value in run.items() if _takes(chosen, name)}
+        return constructor(n_envs=n_envs, **_arguments(chosen, "name", "n_envs"), **run)
 
     with errors():
         if chosen.n_envs > PROBE:
-            few, many = make(1, homes[:1]), make(PROBE, homes[:1])
             sizes = [
                 sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())
-                for env in (few, many)
+                for env in (make(1, homes[:1]), make(PROBE, homes[:1]))
             ]
-            each = (sizes[1] - sizes[0]) / (PROBE - 1) + bytes_beside(few)
+            each = (sizes[1] - sizes[0]) / (PROBE - 1) + bytes_beside
             engine.fit(chosen.n_envs, each, device)
         return make(chosen.n_envs, homes)
 
 
+def make_sample(
+    chosen: settings.Env,
+    homes: list[dict],
+    seed: int,
+    device: torch.device,
+    privileged: bool = False,
+) -> Any:
+    """A few environments of the kind that settings describe, which tell spaces and sizes.
+    UserError that names the clause of the contract that they break; ours are tested elsewhere.
+    """
+    from megastep import contract
+
+    n_envs = min(SAMPLE, chosen.n_envs)
+    few = dataclasses.replace(chosen, n_envs=n_envs)
+    env = make_env(few, homes[:n_envs], seed, device, privileged)
+    if not chosen.name.startswith("megastep."):
+        try:
+            contract.rollout(env, SAMPLE_STEPS)
+        except contract.ContractError as error:
+            raise UserError(f"{error} ({chosen.name})") from error
+    return env
+
+
+def _takes(chosen: Any, argument: str) -> bool:
+    """Whether the class or function that settings name takes an argument."""
+    return argument in inspect.signature(imported(chosen.name)).parameters
+
+
 def _arguments(chosen: Any, *others: str) -> dict[str, Any]:
     """Settings as keyword arguments, but for `others`, which are used elsewhere."""
-    return {k: v for k, v in dataclasses.asdict(chosen).items() if k not in others}
+    names = [field.name for field in dataclasses.fields(chosen)]
+    return {name: getattr(chosen, name) for name in names if name not in others}
 
 
 def make_policy(agent: settings.Agent, env: Any, seed: int = 1) -> Policy:
@@ -147,43 +176,20 @@ def _make_policy(agent, env, seed, critic):
         return policy.to(env.device)
 
 
-def make_learner(learner: settings.Learner, policy: Policy, seed: int = 1) -> PPO:
-    from agents.ppo import PPO
+def make_learner(learner: settings.Learner, policy: Policy, seed: int = 1) -> Any:
+    """What improves the policy, which `agents.learner` describes. It is given what its constructor
+    takes of seed and of `graph`: whether to capture its update.
+    """
+    from agents.learner import LearnerError, check_learner
 
-    arguments = _arguments(learner, "name", "n_steps", "anneal")
-    return PPO(policy, graph=True, seed=seed, **arguments)
-
-
-def make_rollout(cfg: settings.Train, env: Any, policy: Policy) -> Rollout:
-    from agents.rollout import Rollout
-
-    n_lanes = env.n_envs * env.n_agents
+    run = {k: v for k, v in dict(seed=seed, graph=True).items() if _takes(learner, k)}
     with errors():
-        return Rollout(
-            cfg.learner.n_steps,
-            n_lanes,
-            env.obs_space,
-            env.action_space,
-            policy.initial(n_lanes),
-            env.device,
-            policy.privileged_space,
-        )
-
-
-def rollout_bytes(cfg: settings.Train, env: Any) -> float:
-    """About how many bytes a rollout and a minibatch of it take per environment."""
-    from megastep.dotdict import leaves
-
-    numbers, privileged = (
-        sum(math.prod(space.shape) for space in leaves(getattr(env, name, None) or {}))
-        for name in ("obs_space", "privileged_space")
-    )
-    steps, width, parts = cfg.learner.n_steps + 1, cfg.agent.width, cfg.learner.n_minibatches
-    # observations of 2 bytes per number, 4 of what is privileged, and about 64 of the rest; a
-    # minibatch's share of those, and of some 24 activations of 4 bytes per unit; the features that
-    # values are made of
-    each = 2 * numbers + 4 * privileged + 64
-    return env.n_agents * steps * (each * (1 + 1 / parts) + (96 / parts + 4) * width)
+        made = imported(learner.name)(policy=policy, **_arguments(learner, "name", "anneal"), **run)
+    try:
+        check_learner(made)
+    except LearnerError as error:
+        raise UserError(f"{learner.name} is no learner: {error}") from None
+    return made
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> Checkpoint:
@@ -195,8 +201,12 @@ def load(path: Path, device: torch.device | str = "cpu") -> Checkpoint:
 
 
 def config_of(checkpoint: Checkpoint) -> settings.Train:
-    """The settings that a checkpoint was trained with."""
-    return build(settings.Train, checkpoint.config["train"])
+    """The settings that a checkpoint was trained with. UserError if they cannot be used here."""
+    try:
+        return build(settings.Train, checkpoint.config["train"])
+    except ConfigErrors as error:
+        (key, sentence), *_ = error.errors
+        raise UserError(f"{checkpoint.path} cannot be used: {key}: {sentence}") from None
 
 
 def spaces_of(env: Any) -> dict[str, str]:

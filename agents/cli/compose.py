@@ -5,12 +5,13 @@ Hydra is used through its compose API and its override grammar; `@hydra.main` wo
 first, and exit 1.
 """
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import yaml
 from hydra import compose, initialize_config_dir
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -19,19 +20,23 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from agents.cli.build import as_tree, build
-from agents.cli.errors import ConfigErrors, UserError, closest
+from agents.cli.errors import ConfigErrors, UserError
+from agents.cli.registry import CONFIGS
+from agents.cli.settings import GROUPS
+from megastep.settings import closest
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 Tree = dict[str, Any]
+#: Changes a composed tree before it is checked, given the overrides.
+Prepare = Callable[[Tree, list[str]], Tree]
 
 
 class ConfigLoader:
     """Composes and checks the configuration of one script; a context, as Hydra keeps its state in a
-    global.
+    global. `prepare` may change what was composed before it is checked.
     """
 
-    def __init__(self, script: str, kind: type):
-        self.script, self.kind = script, kind
+    def __init__(self, script: str, kind: type, prepare: Prepare = lambda tree, overrides: tree):
+        self.script, self.kind, self.prepare = script, kind, prepare
 
     def __enter__(self):
         GlobalHydra.instance().clear()
@@ -49,7 +54,8 @@ class ConfigLoader:
         loader = GlobalHydra.instance().config_loader()
         defaults = yaml.safe_load((CONFIGS / f"{self.script}.yaml").read_text())["defaults"]
         chosen = [group for default in defaults if isinstance(default, dict) for group in default]
-        return {group: loader.get_group_options(group) for group in chosen}
+        members = {group: loader.get_group_options(group) for group in chosen}
+        return {group: [m for m in found if ":" not in m] for group, found in members.items()}
 
     def jobs(self, overrides: list[str], multirun: bool = False) -> list[tuple[list[str], Tree]]:
         """The composed tree of each job, `[(overrides, nested dict)]`; one job unless multirun."""
@@ -71,12 +77,13 @@ class ConfigLoader:
             key, member = override.key_or_group, override.value()
             if key not in groups:
                 good.append(f"++{override.input_line}")  # `build` knows which keys there are
-            elif member is None or member in groups[key]:
+            elif member is None or member in groups[key] or _is_stored(key, member):
                 good.append(override.input_line)
             else:
                 errors.append((key, f"{member!r} is unknown; {closest(member, groups[key])}"))
         try:
-            settings = build(self.kind, _plain(self._compose(good)), list(groups))
+            tree = self.prepare(_plain(self._compose(good)), overrides)
+            settings = build(self.kind, tree, list(groups))
         except ConfigErrors as error:
             errors += error.errors
         except (HydraException, OmegaConfBaseException) as error:
@@ -116,6 +123,14 @@ def _parsed(overrides: list[str], multirun: bool = False) -> list[Override]:
     if errors:
         raise ConfigErrors(errors)
     return parsed
+
+
+def _is_stored(group: str, member: str) -> bool:
+    """Whether a member of a group is an import path; then Hydra is told of it."""
+    if ":" not in member or not getattr(GROUPS.get(group), "takes_imports", False):
+        return False
+    ConfigStore.instance().store(group=group, name=member, node={"name": member})
+    return True
 
 
 def _has_gpu(device: str) -> bool:

@@ -28,15 +28,10 @@ class ConfigErrors(UserError):
         super().__init__("\n  ".join([f"{count} in the configuration", *lines]))
 
 
-def closest(word: object, words: Iterable[object]) -> str:
-    """The sentence part that names the nearest of `words`, or lists them all when none is near."""
-    names = sorted(str(w) for w in words)
-    near = difflib.get_close_matches(str(word), names, n=1, cutoff=0.5)
-    return f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
-
-
 def closest_key(key: str, keys: list[str]) -> str:
-    """As `closest` for dotted paths: `lr` finds learner.lr, `learner.lrr` too."""
+    """The sentence part that names the nearest of dotted keys: `lr` finds learner.lr, and so does
+    `learner.lrr`.
+    """
     leaf = key.rsplit(".", 1)[-1]
     same = [k for k in keys if k.rsplit(".", 1)[-1] == leaf]
     near = same or difflib.get_close_matches(key, keys, n=1, cutoff=0.6)

@@ -14,7 +14,8 @@ from agents.cli import components, run_folders
 from agents.cli.command import run_command
 from agents.cli.console import duration, say, table
 from agents.cli.errors import UserError
-from agents.cli.settings import Evaluate, Files, Homes, Toy
+from agents.cli.registry import label
+from agents.cli.settings import Evaluate, Geometry
 
 HELP = """Prints and writes what a run's agent earns in the first episode of each lane, with a 95 %
 interval over homes. Each table is a file of its own in the run's folder: evaluations/*.md.
@@ -38,7 +39,7 @@ def run(cfg: Evaluate) -> Path:
     loaded = components.load(path, device)
     trained = components.config_of(loaded)
     geometry = cfg.geometry or trained.geometry
-    homes = components.homes(geometry, cfg.split, cfg.lanes)
+    homes = components.homes(trained.env, geometry, cfg.split, cfg.lanes)
     env = components.make_env(settled(trained.env, cfg.lanes), homes, cfg.seed, device)
     policy = components.make_actor(trained.agent, env)
     components.load_weights(policy, env, loaded)
@@ -53,7 +54,7 @@ def run(cfg: Evaluate) -> Path:
         rows += [{"agent": name, **row} for row in evaluation.summaries(episodes, roles)]
     which = "all" if cfg.split == "all" else f"the {cfg.split}"
     title = (
-        f"{trained.env.name} in {which} homes of {source(geometry)}, after "
+        f"{label(trained.env.name)} in {which} homes of {source(geometry)}, after "
         f"{loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, {cfg.lanes:,} lanes"
     )
     say(title)
@@ -76,10 +77,10 @@ def settled(env: Any, n_envs: int) -> Any:
     return dataclasses.replace(env, n_envs=n_envs, **moving)
 
 
-def source(geometry: Toy | Homes | Files) -> str:
+def source(geometry: Geometry) -> str:
     """The name of the geometries evaluated in, for titles and file names."""
-    path = geometry.options.get("path")
-    return geometry.name if path is None else f"{geometry.name}-{Path(path).stem}"
+    name, path = label(geometry.name), getattr(geometry, "path", None)
+    return name if path is None else f"{name}-{Path(path).stem}"
 
 
 def columns(rows: Sequence[dict]) -> tuple[str, ...]:

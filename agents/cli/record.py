@@ -1,4 +1,6 @@
-"""Films a trained policy. `python record.py --help`; `run(cfg)` is the same from Python."""
+"""Films a trained policy, or random actions. `python record.py --help`; `run(cfg)` is the same
+from Python.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -10,16 +12,21 @@ from agents.cli import components, run_folders
 from agents.cli.command import run_command
 from agents.cli.console import say
 from agents.cli.errors import UserError
-from agents.cli.settings import Record
+from agents.cli.settings import GROUPS, Record
+from agents.evaluation import RandomActions
 from agents.metrics import missing
 
 HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
 
 The commonest:
   run=RUN          a run folder, one of its checkpoints, or latest
+  env=explorer     random actions in an environment, without a run
   steps=400        frames
   home=3           another of the unseen homes; split=training: one it was trained in
   file=out.mp4     instead of video.mp4 in the run folder"""
+
+#: Where random actions are filmed unless geometry= says otherwise.
+HOMES = {"name": "megastep.geometries.sources:homes"}
 
 
 def run(cfg: Record) -> Path:
@@ -28,17 +35,23 @@ def run(cfg: Record) -> Path:
         import av  # noqa: F401, what the recorder encodes with
     except ImportError:
         raise UserError(missing("av")) from None
-    device, path = components.make_device(cfg.device), run_folders.find(cfg.run)
-    loaded = components.load(path, device)
-    trained = components.config_of(loaded)
-    homes = components.homes(cfg.geometry or trained.geometry, cfg.split)
-    env = components.make_env(
-        dataclasses.replace(trained.env, n_envs=1), [homes[cfg.home % len(homes)]], cfg.seed, device
-    )
-    policy = components.make_actor(trained.agent, env)
-    components.load_weights(policy, env, loaded)
+    device, folder = components.make_device(cfg.device), Path()
+    chosen, geometry, loaded = cfg.env, cfg.geometry or GROUPS["geometry"].settings(HOMES), None
+    if cfg.run is not None:
+        path = run_folders.find(cfg.run)
+        folder, loaded = run_folders.folder_of(path), components.load(path, device)
+        trained = components.config_of(loaded)
+        chosen, geometry = trained.env, cfg.geometry or trained.geometry
+    homes = components.homes(chosen, geometry, cfg.split)
+    home = [homes[cfg.home % len(homes)]] if homes else []
+    env = components.make_sample(dataclasses.replace(chosen, n_envs=1), home, cfg.seed, device)
+    if loaded is None:
+        policy = RandomActions(env.action_space)
+    else:
+        policy = components.make_actor(trained.agent, env)
+        components.load_weights(policy, env, loaded)
 
-    place = Path(cfg.file) if cfg.file else run_folders.folder_of(path) / "video.mp4"
+    place = Path(cfg.file) if cfg.file else folder / "video.mp4"
     try:
         film(env, policy, place, cfg.steps, cfg.greedy, cfg.seed)
     except Exception as error:  # a video is the last thing that a run should fail for

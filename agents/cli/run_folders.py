@@ -18,6 +18,7 @@ from agents import files
 from agents.cli.build import as_tree
 from agents.cli.console import warn
 from agents.cli.errors import UserError
+from agents.cli.registry import label
 from agents.cli.settings import Train
 
 RUNS = Path("runs")
@@ -52,7 +53,7 @@ def new(cfg: Train) -> Path:
     """
     if cfg.folder is None:
         start = time.strftime("%Y-%m-%d_%H-%M-%S")
-        return make(RUNS / f"{start}-{cfg.env.name}-{cfg.geometry.name}-{cfg.seed}")
+        return make(RUNS / f"{start}-{label(cfg.env.name)}-{label(cfg.geometry.name)}-{cfg.seed}")
     path = Path(cfg.folder)
     if not path.exists():
         return make(path)

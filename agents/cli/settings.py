@@ -1,144 +1,89 @@
-"""The settings of a run as frozen dataclasses, each value with its bounds. Knows no Hydra. Defaults
-are those of configs/, but for environments, whose constructors have them.
+"""The settings of a run as frozen dataclasses, checked by their annotations. Knows no Hydra.
+
+Defaults are those of configs/; but what a run is made of (environment, geometries, learner, agent)
+has its settings, their bounds and defaults from the arguments of its constructor.
 """
 
-import dataclasses
-import inspect
-import typing
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import re
+from typing import Annotated, Any, Literal
 
-from agents.cli.checks import above, among, bounded_by, device_name, within
-from megastep import envs
-from megastep.bounds import MAX_ENVS, bounds_of
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-Sentences = Iterator[tuple[str, str]]
-#: Arguments of an environment that a run gives it from other settings.
-FROM_RUN = ("self", "geometries", "seed", "device", "privileged")
+from agents.cli.registry import Choice, Group
+from agents.policy import Policy
+from megastep.settings import frozen, located, settings_of
 
-
-def of_environment(constructor: Callable) -> type:
-    """A dataclass of an environment's settings: `name`, and the arguments of its constructor with
-    the types, bounds and defaults that they have there.
-    """
-    hints, bounds = typing.get_type_hints(constructor), bounds_of(constructor)
-    fields = [("name", str)]
-    for name, argument in inspect.signature(constructor).parameters.items():
-        if name not in FROM_RUN:
-            kind = hints.get(name, type(argument.default))
-            fields.append((name, kind, bounded_by(bounds.get(name), argument.default)))
-    return dataclasses.make_dataclass("Env", fields, frozen=True)
+Above0 = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Steps = Annotated[int, Field(ge=1, le=100_000)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Split = Literal["training", "test", "all"]
 
 
-ENVS = {name: of_environment(env.__init__) for name, env in envs.ENVS.items()}
-Env = typing.Union[tuple(ENVS.values())]  # noqa: UP007
+def _device(name: str) -> str:
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
+        raise ValueError(f"{name!r} is no device: allowed are auto, cpu, cuda and cuda:<number>")
+    return name
 
 
-@dataclass(frozen=True)
-class Toy:
-    """A source of one geometry."""
-
-    name: str
-    n: typing.ClassVar[int] = 1
-    seed: typing.ClassVar[int] = 1
-    options: typing.ClassVar[dict] = {}
+Device = Annotated[str, AfterValidator(_device)]
 
 
-@dataclass(frozen=True)
-class Homes:
-    """A source of at most `n` homes of a split, in an order that `seed` gives: arguments of
-    `geometries.sample`. `options` are those it takes beside n, split and seed.
-    """
-
-    name: str
-    n: int = within(1, 1_000_000)
-    seed: int = within(0, 2**63 - 1)
-    options: typing.ClassVar[dict] = {}
-
-
-@dataclass(frozen=True)
-class Files:
-    """As `Homes`, from the file `path`."""
-
-    name: str
-    n: int = within(1, 1_000_000)
-    seed: int = within(0, 2**63 - 1)
-    path: str | None
-
-    def errors(self) -> Sentences:
-        if self.path is None:
-            yield "path", "is missing: geometry=files needs geometry.path=FILE.npz"
-
-    @property
-    def options(self) -> dict:
-        return {"path": self.path}
-
-
-Geometry = Toy | Homes | Files
-GEOMETRIES = {"box": Toy, "column": Toy, "homes": Homes, "bench": Homes, "files": Files}
-
-
-@dataclass(frozen=True)
-class Agent:
-    """Arguments of `agents.policy.Policy`."""
-
-    width: int = within(1, 8192)
-    encoder: str = among("linear", "conv")
-    critic: str = among("asymmetric", "plain")
-
-
-@dataclass(frozen=True)
-class Learner:
-    """Arguments of `agents.ppo.PPO`, and the rollout's length."""
-
-    name: str = among("ppo")
-    n_steps: int = within(1, 65_536)
-    lr: float = within(0, 1e6, min_open=True)
-    anneal: str = among("auto", "never", "samples", "seconds")
-    gamma: float = within(0, 1)
-    lambda_: float = within(0, 1)
-    clip: float = within(0, 1e6, min_open=True)
-    entropy_coef: float = within(0, 1e6)
-    value_coef: float = within(0, 1e6)
-    auxiliary_coef: float = within(0, 1e6)
-    max_grad_norm: float = within(0, 1e6, min_open=True)
-    n_epochs: int = within(1, 1000)
-    n_minibatches: int = within(1, MAX_ENVS)
-    target_kl: float | None = within(0, 1e6, min_open=True)
-
-
-@dataclass(frozen=True)
+@frozen
 class LocalLogger:
     """Metrics go to TensorBoard and JSON lines, which are always written."""
 
     name: str
 
 
-@dataclass(frozen=True)
+@frozen
 class WandbLogger:
     """They go to Weights & Biases as well."""
 
     name: str
     project: str
-    mode: str = among("online", "offline")
+    mode: Literal["online", "offline"]
 
 
-LOGGERS = {"none": LocalLogger, "wandb": WandbLogger}
-#: Groups whose member, by its name, decides which settings there are.
-VARIANTS = (ENVS, GEOMETRIES, LOGGERS)
+GROUPS = {
+    "env": Group(
+        "env",
+        reserved=("geometries", "seed", "device", "privileged"),
+        needed={"n_envs": "the number of its environments"},
+    ),
+    "geometry": Group(
+        "geometry",
+        reserved=("split",),
+        needed={"n": "how many geometries", "split": "training, test or all", "seed": "a number"},
+    ),
+    "learner": Group(
+        "learner",
+        reserved=("policy", "seed", "graph"),
+        needed={"policy": "the policy that it improves"},
+        # what lr falls to 0 over; auto: samples if given, else seconds if given
+        anneal=(Literal["auto", "never", "samples", "seconds"], "auto"),
+    ),
+    "logger": Choice("logger", {"none": LocalLogger, "wandb": WandbLogger}),
+}
+Env, Geometry, Learner, Logger = (
+    Annotated[Any, BeforeValidator(GROUPS[key].settings)]
+    for key in ("env", "geometry", "learner", "logger")
+)
+#: Arguments of `agents.policy.Policy`.
+Agent = settings_of(Policy, ("obs_space", "action_space", "privileged_space", "seed"))
 
 
-@dataclass(frozen=True)
+@frozen
 class Finish:
     """What happens to the trained agent at the end of a run."""
 
     evaluate: bool
-    lanes: int = within(1, 1_000_000)
+    lanes: Count
     record: bool
-    steps: int = within(1, 100_000)
+    steps: Steps
 
 
-@dataclass(frozen=True)
+@frozen
 class Train:
     """A training run."""
 
@@ -146,21 +91,28 @@ class Train:
     geometry: Geometry
     agent: Agent
     learner: Learner
-    logger: LocalLogger | WandbLogger
+    logger: Logger
     finish: Finish
-    seed: int = within(0, 2**63 - 1)
-    device: str = device_name()
-    samples: int | None = within(1, 10**18)
-    seconds: float | None = above(0)
-    report: int = within(1, 1_000_000)
-    checkpoint: float = above(0)
-    keep: int = within(2, 1000)
+    seed: Seed
+    device: Device
+    samples: Annotated[int, Field(ge=1, le=10**18)] | None
+    seconds: Above0 | None
+    report: Count
+    checkpoint: Above0
+    keep: Annotated[int, Field(ge=2, le=1000)]
     folder: str | None
     resume: str | None
     init: str | None
 
-    def errors(self) -> Sentences:
-        parts, n_envs = self.learner.n_minibatches, self.env.n_envs
+    @model_validator(mode="after")
+    def _agrees(self):
+        if errors := list(self._errors()):
+            raise located(errors)
+        return self
+
+    def _errors(self):
+        # of learners that cut lanes into minibatches
+        parts, n_envs = getattr(self.learner, "n_minibatches", 1), self.env.n_envs
         if parts > n_envs:
             yield "learner.n_minibatches", f"{parts} is more than env.n_envs, {n_envs}"
         over = self.learner.anneal
@@ -174,30 +126,39 @@ class Train:
             )
 
 
-@dataclass(frozen=True)
+@frozen
 class Evaluate:
     """An evaluation of a run's checkpoint."""
 
     run: str
-    geometry: Geometry | None
-    split: str = among("training", "test", "all")
-    lanes: int = within(1, 1_000_000)
+    geometry: Geometry | None = None
+    split: Split
+    lanes: Count
     greedy: bool
     baseline: bool
-    seed: int = within(0, 2**63 - 1)
-    device: str = device_name()
+    seed: Seed
+    device: Device
 
 
-@dataclass(frozen=True)
+@frozen
 class Record:
-    """A video of a run's checkpoint."""
+    """A video of a run's checkpoint, or of random actions in an environment."""
 
-    run: str
-    geometry: Geometry | None
-    split: str = among("training", "test", "all")
-    steps: int = within(1, 100_000)
-    home: int = within(0, 1_000_000)
+    run: str | None
+    env: Env | None = None
+    geometry: Geometry | None = None
+    split: Split
+    steps: Steps
+    home: Annotated[int, Field(ge=0, le=1_000_000)]
     greedy: bool
-    seed: int = within(0, 2**63 - 1)
-    device: str = device_name()
+    seed: Seed
+    device: Device
     file: str | None
+
+    @model_validator(mode="after")
+    def _agrees(self):
+        if self.run is None and self.env is None:
+            raise located([("run", "is missing; without a run, env=explorer films random actions")])
+        if self.run is not None and self.env is not None:
+            raise located([("env", "cannot be given together with run, which has its own")])
+        return self

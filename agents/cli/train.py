@@ -36,7 +36,8 @@ The commonest:
   finish.evaluate=true finish.record=true
                                a table and a video at the end
   resume=RUN                   continue a run (its folder, or latest) under its own configuration
-  init=RUN                     start a new run from its weights
+  init=RUN                     start a new run from its weights, in its environment
+  env=my_package.rover:Rover   a class of your own; so too geometry, learner, agent.memory
   logger=wandb logger.mode=offline"""
 #: Metrics and roles that are shown beside the return.
 FEW = 4
@@ -61,18 +62,12 @@ def make_trainer(
     """A Trainer as `cfg` describes it, and its Saver: going on where a run stopped, or from the
     weights of another, if `cfg` says so.
     """
-    homes = components.homes(cfg.geometry, "training")
-    env = components.make_env(
-        cfg.env,
-        homes,
-        cfg.seed,
-        device,
-        lambda env: components.rollout_bytes(cfg, env),
-        privileged=cfg.agent.critic == "asymmetric",
-    )
-    policy = components.make_policy(cfg.agent, env, cfg.seed)
+    homes = components.homes(cfg.env, cfg.geometry, "training")
+    wanted = cfg.env, homes, cfg.seed, device, cfg.agent.critic == "asymmetric"
+    sample = components.make_sample(*wanted)
+    policy = components.make_policy(cfg.agent, sample, cfg.seed)
     learner = components.make_learner(cfg.learner, policy, cfg.seed)
-    rollout = components.make_rollout(cfg, env, policy)
+    env = components.make_env(*wanted, bytes_beside=learner.bytes_per_env(sample))
     loaded = None
     if cfg.resume or cfg.init:
         loaded = components.load(run_folders.find(cfg.resume or cfg.init), device)
@@ -94,7 +89,6 @@ def make_trainer(
         env,
         policy,
         learner,
-        rollout,
         sinks,
         saver,
         Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
@@ -197,13 +191,32 @@ def finish(cfg: Train, folder: Path) -> None:
             warn(str(error))
 
 
-def resumed(tree: dict, overrides: list[str]) -> dict:
-    """The tree of a run that goes on: its own, but for what `overrides` may change. That of a new
-    run is as it was.
+def prepared(tree: dict, overrides: list[str]) -> dict:
+    """The tree of a run that goes on, or that starts from the weights of another; that of any
+    other is as it was.
     """
-    if tree["resume"] is None:
-        return tree
     given = [word.split("=", 1)[0] for word in overrides]
+    if tree["resume"] is not None and tree["init"] is None:
+        return _resumed(tree, given)
+    if tree["init"] is not None and tree["resume"] is None:
+        return _initialised(tree, given)
+    return tree
+
+
+def _initialised(tree, given):
+    """The environment and the agent are those of the run that the weights are from, but for the
+    keys that are given; a group that is given whole is as it was.
+    """
+    own = components.load(run_folders.find(tree["init"])).config["train"]
+    for group in ("env", "agent"):
+        if group not in given:
+            keys = [key.split(".", 1)[1] for key in given if key.startswith(f"{group}.")]
+            tree[group] = own[group] | {key: tree[group][key] for key in keys}
+    return tree
+
+
+def _resumed(tree, given):
+    """The run's own tree, but for what may change."""
     if refused := [
         (key, "cannot change when a run goes on; init=RUN starts a new one from its weights")
         for key in given
@@ -229,4 +242,4 @@ def resumed(tree: dict, overrides: list[str]) -> dict:
 
 
 def main(argv: list[str] | None = None) -> int:
-    return run_command("train", Train, run, HELP, argv, resumed)
+    return run_command("train", Train, run, HELP, argv, prepared)

@@ -1,8 +1,13 @@
-"""The environments: one file, one environment. ``ENVS`` names them."""
+"""The environments: one file, one environment. ``ENVS`` names them after their files."""
 
-from .explorer import Explorer
-from .minimal import Minimal
+import importlib
+import pkgutil
 
-__all__ = ["ENVS", "Explorer", "Minimal"]
+#: By the name of its file, the class that the file's ``__all__`` names.
+ENVS = {}
+for _file in pkgutil.iter_modules(__path__):
+    _module = importlib.import_module(f"{__name__}.{_file.name}")
+    ENVS[_file.name] = getattr(_module, _module.__all__[0])
+globals().update({_env.__name__: _env for _env in ENVS.values()})
 
-ENVS = {"minimal": Minimal, "explorer": Explorer}
+__all__ = ["ENVS", *sorted(_env.__name__ for _env in ENVS.values())]

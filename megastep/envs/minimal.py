@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 
 from .. import engine, modules, plotting, toys
 from ..arrdict import arrdict, numpyify
-from ..bounds import MAX_ENVS, Within, bounded
 from ..core import Core
 from ..scene import scenery
+from ..settings import MAX_ENVS, checked
 
 __all__ = ["Minimal"]
 
@@ -27,19 +28,19 @@ class Minimal:
 
     n_agents = 1
 
-    @bounded
+    @checked
     def __init__(
         self,
-        n_envs: Annotated[int, Within(1, MAX_ENVS)] = 128,
+        n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128,
         geometries: Sequence[Any] | None = None,
         *,
         seed: int = 1,
         device: torch.device | str | None = None,
-        res: Annotated[int, Within(1, 1024)] = 64,
-        fov: Annotated[float, Within(0, 180, min_open=True, max_open=True)] = 130.0,
-        fps: Annotated[float, Within(1, 1000)] = 10.0,
-        shortest: Annotated[int, Within(1, 10**6)] = 128,
-        longest: Annotated[int, Within(1, 10**6)] = 256,
+        res: Annotated[int, Field(ge=1, le=1024)] = 64,
+        fov: Annotated[float, Field(gt=0, lt=180)] = 130.0,
+        fps: Annotated[float, Field(ge=1, le=1000)] = 10.0,
+        shortest: Annotated[int, Field(ge=1, le=10**6)] = 128,
+        longest: Annotated[int, Field(ge=1, le=10**6)] = 256,
     ):
         geometries = [toys.box()] if geometries is None else geometries[:n_envs]
         self.core = Core(

@@ -8,78 +8,21 @@ geometries come again in the same order (the same objects, not copies).
 """
 
 import difflib
-import functools
 import inspect
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..dotdict import dotdict
 from ..geometry import centers, indices, masks
-from . import files, toys
-from .homes import database
+from . import files as files
+from . import sources
+from . import toys as toys
 
 __all__ = ["SOURCES", "SPLITS", "centers", "indices", "masks", "sample"]
 
 SPLITS = ("training", "test", "all")
-BENCH = Path(__file__).parent / "data" / "bench_homes.npz"
-
-
-def _split_range(count, split):
-    """The range of a database of `count` geometries that `split` holds; a single one is in every
-    split.
-    """
-    training = count - max(1, round(count / 10)) if count > 1 else 1
-    return {
-        "training": range(training),
-        "test": range(training if count > 1 else 0, count),
-        "all": range(count),
-    }[split]
-
-
-def _selected(count, n, split, seed):
-    """n indices into a database of `count`: the split in an order drawn from `seed`, over and
-    over.
-    """
-    members = _split_range(count, split)
-    order = np.random.RandomState(seed % 2**32).permutation(
-        len(members)
-    )  # a stream numpy promises never to change
-    return [members[order[i % len(members)]] for i in range(n)]
-
-
-def _box(n, split, seed, width=5):
-    return [toys.box(width)] * n
-
-
-def _column(n, split, seed, width=5, pillar=1):
-    return [toys.column(width, pillar)] * n
-
-
-@functools.lru_cache(maxsize=2)
-def _loaded(path, changed):
-    return files.load(path)
-
-
-def _files(n, split, seed, path):
-    """From the `.npz` file at `path`; the last tenth of it is the test split."""
-    path = Path(path)
-    database = _loaded(path, path.stat().st_mtime_ns if path.exists() else 0)
-    return [database[i] for i in _selected(len(database), n, split, seed)]
-
-
-def _homes(n, split, seed, outer=True):
-    """From the 5,000 homes; without the outer face of their envelopes if not `outer`."""
-    return [database.home(index, outer) for index in _selected(database.COUNT, n, split, seed)]
-
-
-def _bench(n, split, seed):
-    """The 512 dense homes every benchmark runs on."""
-    return _files(n, split, seed, BENCH)
-
-
-SOURCES = {"box": _box, "column": _column, "homes": _homes, "bench": _bench, "files": _files}
+SOURCES = {name: getattr(sources, name) for name in sources.__all__}
 
 
 def _known(kind, given, allowed):

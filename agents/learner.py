@@ -1,0 +1,45 @@
+"""What a learner is: the class behind `learner=module:Class`.
+
+    learner = Class(policy, seed=1, **settings)    # settings are its own arguments
+    collect = learner.collector(env)               # owns what is stored
+    for ever:
+        rollout = collect()
+        losses = learner.update(rollout)
+
+`collect()` acts in the environment and returns what it stored of the steps just taken, a
+`rollout.Rollout` or what has the same:
+
+n_steps, n_lanes   how many there were, T steps of B lanes
+reward, reset, terminal, truncated, metrics   (T, B), of the worlds that followed
+numbers()          all that may stop being finite, by name: what the learner's `check` looked over
+
+`collect.rollout` is the one returned last, before the first call an empty one. A replay memory
+belongs to the learner, which fills it in `update`, or to its collector; one that acts ahead on a
+stream of its own returns an earlier rollout. Neither call synchronises host and device. A
+constructor that takes `graph` is told to capture its update.
+"""
+
+from typing import Any
+
+ATTRIBUTES = {
+    "collector": "a method that takes an environment and returns what acts in it and stores",
+    "update": "a method that learns from a rollout and returns a dict of tensors ()",
+    "bytes_per_env": "a method that says how many bytes it needs for each environment like a given "
+    "one, what its collector stores included",
+    "check": "a finite.FiniteCheck, which its update calls",
+    "lr": "its learning rate, the one that annealing begins with",
+    "set_lr": "a method that changes the learning rate",
+    "state_dict": "a method that returns all that changes beside the policy's weights",
+    "load_state_dict": "a method that goes on from there",
+}
+
+
+class LearnerError(AssertionError):
+    """A class is no learner. The message names what it lacks."""
+
+
+def check_learner(learner: Any) -> None:
+    """LearnerError unless it has all that a learner has."""
+    for name, meaning in ATTRIBUTES.items():
+        if not hasattr(learner, name):
+            raise LearnerError(f"it has no {name}: {meaning}")

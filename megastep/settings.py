@@ -1,0 +1,204 @@
+"""Settings: the arguments of a constructor or a function, checked by annotations and defaults.
+
+pydantic reads the annotations, whoever wrote them::
+
+    @checked
+    def __init__(self, n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128): ...
+
+A command line makes a dataclass of them with `settings_of`. Kinds are kept apart: true is no
+integer, "3" no number, and neither nan nor infinity is a number.
+"""
+
+import dataclasses
+import difflib
+import functools
+import inspect
+import math
+import numbers
+import typing
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import annotated_types
+import pydantic.dataclasses
+from pydantic.fields import FieldInfo
+from pydantic_core import InitErrorDetails, PydanticCustomError, ValidationError
+
+__all__ = ["MAX_ENVS", "checked", "closest", "frozen", "located", "sentence", "settings_of"]
+
+#: 2**26 copies of the smallest environment fill the largest accelerator there is; more is a typing
+#: mistake.
+MAX_ENVS = 2**26
+CONFIG = pydantic.ConfigDict(
+    strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True
+)
+#: Decorates a class: a frozen dataclass whose fields are checked by their annotations.
+frozen = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=CONFIG)
+
+# What a value should have been, by the first part of pydantic's name of the error
+WANTED = {
+    "int": "an integer",
+    "float": "a number",
+    "bool": "true or false",
+    "string": "a word",
+    "list": "a list",
+    "tuple": "a list",
+}
+BOUNDS = {"ge": "at least {:,}", "gt": "more than {:,}", "le": "at most {:,}", "lt": "below {:,}"}
+RANGES = {"ge": "from {:,}", "gt": "above {:,}", "le": "to {:,}", "lt": "and below {:,}"}
+
+
+# ---- Settings from signatures ----
+
+
+def settings_of(made: Callable, reserved: Sequence[str] = (), **more: Any) -> type:
+    """A frozen dataclass of the arguments of a class or a function, but for those `reserved`, with
+    their types, bounds and defaults. An argument without an annotation has its default's type.
+
+    `more` are fields beside them: a type, or (type, default). ValueError if an annotation cannot be
+    read, or an argument is called like one of `more`.
+    """
+    function = made.__init__ if inspect.isclass(made) else made
+    fields = {name: f if isinstance(f, tuple) else (f,) for name, f in more.items()}
+    try:
+        hints = typing.get_type_hints(function, include_extras=True)
+        for name, argument in inspect.signature(made).parameters.items():
+            if name in reserved or argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
+                continue
+            if name in more:
+                raise ValueError(f"none of its arguments can be called {name}")
+            fields[name] = _field(hints.get(name), argument.default)
+        return frozen(_class(made.__name__, fields))
+    except (NameError, TypeError, pydantic.errors.PydanticUserError) as error:
+        raise ValueError(f"its arguments cannot be read: {str(error).splitlines()[0]}") from None
+
+
+def _field(hint, default):
+    """An argument's type, and its default if it has one."""
+    if default is inspect.Parameter.empty:
+        return (Any if hint is None else hint,)
+    if hint is None:
+        hint = Any if default is None else type(default)
+    return hint, default
+
+
+def _class(name, fields):
+    """What a dataclass is made from: annotations, and defaults as attributes."""
+    body = {"__annotations__": {key: field[0] for key, field in fields.items()}}
+    for key, (_, *default) in fields.items():
+        if default and type(default[0]).__hash__ is None:  # one that could change, such as a list
+            body[key] = dataclasses.field(default_factory=functools.partial(_same, default[0]))
+        elif default:
+            body[key] = default[0]
+    return type(name, (), body)
+
+
+def _same(value):
+    return value
+
+
+def checked(function: Callable) -> Callable:
+    """The function, which raises ValueError for arguments that are not as its annotations say; the
+    message names each.
+    """
+    signature = inspect.signature(function)
+    settings = functools.cache(functools.partial(settings_of, function, ("self",)))
+
+    @functools.wraps(function)
+    def wrapped(*args, **kwargs):
+        given = signature.bind(*args, **kwargs).arguments
+        fields = settings().__pydantic_fields__
+        values = {name: _plain(value) for name, value in given.items() if name in fields}
+        try:
+            settings()(**values)
+        except ValidationError as error:
+            told = {}
+            for one in error.errors():
+                name = one["loc"][0]
+                told.setdefault(name, sentence(one, fields[name], values[name]))
+            raise ValueError("; ".join(f"{k}: {text}" for k, text in told.items())) from None
+        return function(*args, **kwargs)
+
+    return wrapped
+
+
+def _plain(value):
+    """NumPy's numbers as Python's."""
+    if isinstance(value, numbers.Real) and not isinstance(value, (bool, int, float)):
+        return int(value) if isinstance(value, numbers.Integral) else float(value)
+    return value
+
+
+# ---- What is wrong, in words ----
+
+
+def sentence(error: dict[str, Any], field: FieldInfo | None, value: Any) -> str:
+    """What one of pydantic's errors says of the `value` of a `field`: what is allowed, what
+    came.
+    """
+    kind, got = error["type"], "nothing" if value is None else repr(value)
+    if kind == "missing":
+        return "is missing"
+    if kind == "located":
+        return error["msg"]
+    if kind == "value_error":
+        return str(error["ctx"]["error"])
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if is_number and (not kind.endswith("_type") or not math.isfinite(value)):
+        return f"{value} is out of range: allowed is {allowed(field)}"
+    if kind == "literal_error":
+        return f"{value!r} is unknown; {closest(value, _words(field.annotation))}"
+    if wanted := WANTED.get(kind.split("_")[0]):
+        return f"expected {wanted}, got {got}"
+    if kind.startswith("dataclass"):
+        return f"is a group of keys, got {got}"
+    return f"{error['msg'][0].lower()}{error['msg'][1:]}, got {got}"
+
+
+def allowed(field: FieldInfo) -> str:
+    """The bounds of a number in words."""
+    bounds = {
+        key: getattr(extra, key)
+        for extra in _metadata(field)
+        for key in BOUNDS
+        if isinstance(extra, annotated_types.BaseMetadata) and hasattr(extra, key)
+    }
+    words = RANGES if len(bounds) == 2 else BOUNDS
+    told = [words[key].format(bounds[key]) for key in BOUNDS if key in bounds]
+    return " ".join(told) or "any finite number"
+
+
+def _metadata(field):
+    """All that `Annotated` says of a field, also inside `X | None`."""
+    yield from field.metadata
+    for option in typing.get_args(field.annotation):
+        for extra in getattr(option, "__metadata__", ()):
+            yield from extra.metadata if isinstance(extra, FieldInfo) else [extra]
+
+
+def _words(hint):
+    """The words of a Literal, also of `Literal | None`."""
+    for option in typing.get_args(hint):
+        yield from [option] if isinstance(option, str) else _words(option)
+
+
+def closest(word: object, words: Iterable[object]) -> str:
+    """The sentence part that names the nearest of `words`, or lists them all when none is near."""
+    names = sorted(str(w) for w in words)
+    near = difflib.get_close_matches(str(word), names, n=1, cutoff=0.5)
+    return f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
+
+
+def located(errors: Iterable[tuple[str, str]]) -> ValidationError:
+    """An error of pydantic's that says so of each dotted key: `(key, sentence)`."""
+    return ValidationError.from_exception_data(
+        "settings",
+        [
+            InitErrorDetails(
+                type=PydanticCustomError("located", "{text}", {"text": text}),
+                loc=tuple(key.split(".")),
+                input=None,
+            )
+            for key, text in errors
+        ],
+    )

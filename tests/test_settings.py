@@ -1,0 +1,148 @@
+"""Settings: what an argument allows is said in its annotation, and enforced wherever it is from."""
+
+import dataclasses
+import inspect
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import pytest
+from pydantic import Field
+
+from agents.cli.build import as_tree, build
+from agents.cli.errors import ConfigErrors
+from megastep import envs
+from megastep.settings import checked, settings_of
+
+NAN = float("nan")
+
+
+def told(kind, **values):
+    """What is said of values that are not allowed, by key."""
+    with pytest.raises(ConfigErrors) as error:
+        build(kind, values)
+    return dict(error.value.errors)
+
+
+@pytest.mark.parametrize(
+    "bounds, inside, outside, allowed",
+    [
+        (dict(ge=1, le=3), (1, 2, 3), (0, 4, NAN, math.inf), "from 1 to 3"),
+        (dict(gt=0, lt=180), (1e-9, 179.9), (0, 180, -1), "above 0 and below 180"),
+        (dict(gt=0), (1e-9, 1e300), (0, math.inf, -math.inf), "more than 0"),
+        (dict(ge=2), (2, 10**18), (1.5, math.inf), "at least 2"),
+        (dict(lt=2), (1.9, -5), (2, NAN), "below 2"),
+        (dict(ge=1, le=2**26), (2**26,), (2**26 + 1,), "from 1 to 67,108,864"),
+        (dict(), (-1e300, 0), (NAN, math.inf), "any finite number"),
+    ],
+)
+@pytest.mark.parametrize("optional", [False, True])
+def test_a_value_outside_is_told_what_is_allowed(bounds, inside, outside, allowed, optional):
+    hint = Annotated[float, Field(**bounds)] if bounds else float
+
+    def f(x: hint | None if optional else hint): ...
+
+    kind = settings_of(f)
+    assert [build(kind, {"x": value}).x for value in inside] == list(inside)
+    for value in outside:
+        assert told(kind, x=value) == {"x": f"{value} is out of range: allowed is {allowed}"}
+
+
+def rover(
+    n_envs: Annotated[int, Field(ge=1)] = 8,
+    *,
+    seed=1,
+    limit: Annotated[float, Field(gt=0, le=500)] = 300,
+    far: bool = False,
+    colour: Literal["red", "green"] = "red",
+    sizes: tuple[int, ...] = (3, 4),
+    names=["a"],  # noqa: B006, an argument of a stranger's
+    plan: Path | None = None,
+    speed=1.5,
+    must: str,
+    **others,
+): ...
+
+
+def test_arguments_are_settings_with_types_and_defaults():
+    kind = settings_of(rover, ("seed",), name=str)
+    made = build(kind, {"name": "r", "must": "x", "sizes": [5], "limit": 7, "n_envs": 1e3})
+    assert dataclasses.astuple(made) == ("r", 1000, 7.0, False, "red", (5,), ["a"], None, 1.5, "x")
+    assert build(kind, as_tree(made)) == made and as_tree(made)["sizes"] == [5]
+    assert as_tree(build(kind, {"name": "r", "must": "x", "plan": "a/b"}))["plan"] == "a/b"
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        made.limit = 3
+
+
+@pytest.mark.parametrize(
+    "key, value, sentence",
+    [
+        ("n_envs", 1.5, "expected an integer, got 1.5"),
+        ("n_envs", True, "expected an integer, got True"),
+        ("n_envs", "3", "expected an integer, got '3'"),
+        ("n_envs", None, "expected an integer, got nothing"),
+        ("limit", "far", "expected a number, got 'far'"),
+        ("limit", True, "expected a number, got True"),
+        ("far", 1, "expected true or false, got 1"),
+        ("far", "yes", "expected true or false, got 'yes'"),
+        ("must", 3, "expected a word, got 3"),
+        ("sizes", 3, "expected a list, got 3"),
+        ("speed", "x", "expected a number, got 'x'"),
+        ("colour", "gren", "'gren' is unknown; did you mean green?"),
+        ("seed", 2, "no such key; did you mean speed?"),
+    ],
+)
+def test_a_value_of_another_kind_is_told_what_was_expected(key, value, sentence):
+    kind = settings_of(rover, ("seed",))
+    assert told(kind, **{"must": "x", key: value}) == {key: sentence}
+
+
+def test_all_that_is_wrong_is_told_at_once():
+    kind = settings_of(rover, ("seed",))
+    assert set(told(kind, n_envs=0, limit=-1, far=3, zzz=1)) == {
+        "n_envs",
+        "limit",
+        "far",
+        "zzz",
+        "must",
+    }
+
+
+def test_arguments_that_cannot_be_read_are_refused():
+    def unknown(x: "Nowhere"): ...  # noqa: F821
+
+    def taken(name: str): ...
+
+    with pytest.raises(ValueError, match="arguments cannot be read: name 'Nowhere'"):
+        settings_of(unknown)
+    with pytest.raises(ValueError, match="called name"):
+        settings_of(taken, name=str)
+
+
+def test_a_checked_function_refuses_by_name_and_keeps_its_signature():
+    @checked
+    def f(a: Annotated[int, Field(ge=1, le=3)], b=2, *, c: Annotated[float, Field(le=1)] = 0):
+        """Adds up."""
+        return a + b + c
+
+    assert f(1) == 3 and f(3, 4, c=1) == 8 and f.__doc__ == "Adds up."
+    assert f(np.int64(2), c=np.float32(0.5)) == 4.5
+    assert list(inspect.signature(f).parameters) == ["a", "b", "c"]
+    with pytest.raises(ValueError, match="^a: 0 is out of range: allowed is from 1 to 3$"):
+        f(0)
+    with pytest.raises(ValueError, match="^a: 4 is .*; c: 2 is out .* is at most 1$"):
+        f(4, c=2)
+    with pytest.raises(ValueError, match="^a: expected an integer, got 1.5$"):
+        f(1.5)
+    with pytest.raises(TypeError):
+        f(1, typo=1)
+
+
+@pytest.mark.parametrize("name", envs.ENVS)
+def test_an_environment_refuses_what_is_out_of_the_bounds_of_its_arguments(name):
+    outside = {"n_envs": (0, 2**26 + 1), "res": (0, 1025), "fov": (0, 180), "fps": (0.5, 1001)}
+    for argument, values in outside.items():
+        for value in values:
+            with pytest.raises(ValueError, match=f"^{argument}: .* is out of range: "):
+                envs.ENVS[name](**{"n_envs": 1, "device": "cpu", argument: value})
