@@ -14,7 +14,7 @@ from agents.cli.errors import ConfigErrors, UserError
 from agents.critic import Critic
 from agents.policy import Policy
 from agents.rollout import Collector, Rollout, collect, initial_actor_state
-from megastep import envs, modules, spaces, toys
+from megastep import envs, spaces, toys
 from megastep.arrdict import arrdict, stack
 from megastep.capture import state_tree
 
@@ -368,7 +368,6 @@ def test_a_run_trains_goes_on_is_evaluated_and_filmed_and_another_begins_with_it
 
     # whoever only plays does not ask what a critic would be told
     monkeypatch.setattr(envs.Explorer, "_privileged", None)
-    monkeypatch.setattr(modules, "visible_texels", None)
     assert evaluate.main([f"run={run}", "lanes=3", "baseline=false", "device=cpu"]) == 0
     pytest.importorskip("av")
     assert record.main([f"run={run}", "steps=1", "device=cpu"]) == 0
