@@ -10,7 +10,8 @@
 `rollout.Rollout` or what has the same:
 
 n_steps, n_lanes   how many there were, T steps of B lanes
-reward, reset, terminal, truncated, metrics   (T, B), of the worlds that followed
+reward, reset, terminal, truncated   (T, B), of the worlds that followed; metrics, by name
+learns             (T+1, B) bool, whether the learner learns from the lane then
 numbers()          all that may stop being finite, by name: what the learner's `check` looked over
 
 `collect.rollout` is the one returned last, before the first call an empty one. A replay memory

@@ -53,6 +53,12 @@ def explained_variance(
     )
 
 
+def _itemsize(space, otherwise):
+    """Bytes of one number of a space, `otherwise` where it names no dtype."""
+    dtype = getattr(space, "dtype", None)
+    return dtype.itemsize if dtype else otherwise
+
+
 class PPO:
     """Improves a policy, in place, from rollouts it collected.
 
@@ -136,14 +142,14 @@ class PPO:
 
     def bytes_per_env(self, env: Any) -> float:
         """About how many bytes a rollout and a minibatch of it take per environment."""
-        numbers, privileged = (
-            sum(math.prod(space.shape) for space in leaves(tree or {}))
-            for tree in (env.obs_space, self.policy.privileged_space)
+        seen, privileged = (
+            sum(math.prod(space.shape) * _itemsize(space, size) for space in leaves(tree or {}))
+            for tree, size in ((env.obs_space, 2), (self.policy.privileged_space, 4))
         )
-        # observations of 2 bytes per number, 4 of what is privileged, and about 64 of the rest; a
+        # numbers of observations, of what is privileged, and about 64 bytes of the rest; a
         # minibatch's share of those, and of some 24 activations of 4 bytes per unit; the features
         # that values are made of
-        each, parts = 2 * numbers + 4 * privileged + 64, self.n_minibatches
+        each, parts = seen + privileged + 64, self.n_minibatches
         each = each * (1 + 1 / parts) + (96 / parts + 4) * self.policy.width
         return env.n_agents * (self.n_steps + 1) * each
 

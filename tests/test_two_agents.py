@@ -11,7 +11,7 @@ import torch
 
 from agents import checkpoint
 from agents.cli import evaluate, record, train
-from megastep import arrdict, contract, plotting
+from megastep import arrdict, capture, contract, plotting
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "new-environment.md"
 MAINS = {"train.py": train.main, "evaluate.py": evaluate.main, "record.py": record.main}
@@ -68,6 +68,16 @@ def test_a_convoy_pays_the_leader_metres_and_the_follower_nearness(convoy, scrip
     assert last.metrics.together.max() > last.metrics.together.min()
     assert leader.min() > 0 and leader.max() < 20 * 0.4, "at most 4 m/s, a tenth of a second"
     assert plotting.rasterise(env.plot_state(arrdict.numpyify(env.state(1)))).std() > 5
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_convoy_is_captured(convoy):
+    runs = []
+    for wrap in (lambda env: env, capture.Captured):
+        env = wrap(convoy(16, device="cuda", limit=10, scripted=True))
+        runs.append(arrdict.stack(contract.rollout(env, 30)))
+    assert isinstance(env._step, capture.Graph) and contract.same(*runs)
 
 
 def test_what_a_scripted_leader_meets_changes_no_bit_of_the_weights(convoy, monkeypatch):

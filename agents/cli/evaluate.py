@@ -31,9 +31,9 @@ INTERVAL = "95 % interval"
 
 
 def run(cfg: Evaluate) -> Path:
-    """Evaluates as `cfg` says, each lane in one home of its own throughout. Writes the table to the
-    run's folder `evaluations`, one .json and .md per geometry source, split and checkpoint; returns
-    the path of the .json.
+    """Evaluates as `cfg` says, each environment in one home throughout. Writes the table to the
+    run's folder `evaluations`, one .json and .md per geometry source (the environment's name if it
+    has none), split and checkpoint; returns the path of the .json.
     """
     device, path = components.make_device(cfg.device), run_folders.find(cfg.run)
     loaded = components.load(path, device)
@@ -53,14 +53,17 @@ def run(cfg: Evaluate) -> Path:
         roles = getattr(env, "roles", None)
         rows += [{"agent": name, **row} for row in evaluation.summaries(episodes, roles)]
     which = "all" if cfg.split == "all" else f"the {cfg.split}"
+    where, name = label(trained.env.name), label(trained.env.name)
+    if homes:
+        where, name = f"{where} in {which} homes of {source(geometry)}", source(geometry)
     title = (
-        f"{label(trained.env.name)} in {which} homes of {source(geometry)}, after "
-        f"{loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, {cfg.lanes:,} lanes"
+        f"{where}, after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, "
+        f"{env.n_envs * env.n_agents:,} lanes"
     )
     say(title)
     say(table(columns(rows), [cells(row) for row in rows]))
     say(f"evaluated in {duration(time.monotonic() - start)}")
-    name = f"{source(geometry)}-{cfg.split}-{loaded.step}{'-greedy' if cfg.greedy else ''}"
+    name = f"{name}-{cfg.split}-{loaded.step}{'-greedy' if cfg.greedy else ''}"
     result = dict(
         title=title,
         checkpoint=str(loaded.path),
