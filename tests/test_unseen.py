@@ -269,7 +269,8 @@ def test_a_critic_is_told_how_far_the_episode_is_and_what_is_left(resample, devi
 
 def test_what_a_critic_is_told_changes_nothing_else(device):
     plain, told = (
-        contract.rollout(explorer(device, privileged=privileged), 40) for privileged in (0, 1)
+        contract.rollout(explorer(device, privileged=privileged), 40)
+        for privileged in (False, True)
     )
     assert all("privileged" not in world for world in plain)
     assert explorer(privileged=False).privileged_space is None
