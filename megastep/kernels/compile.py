@@ -23,10 +23,8 @@ import torch
 from . import cache
 
 HERE = Path(__file__).parent
-OPERATIONS = (
-    *("bake", "physics", "update_agent_geometry", "render"),
-    *("unseen", "coverage", "spawn", "uniform"),
-)
+#: Each is a kernel of this name in two files, one for the GPU and one for the CPU.
+OPERATIONS = tuple(sorted(path.stem for path in HERE.glob("*.cu")))
 CPU_FLAGS = (
     "-std=c++17",
     "-O3",
