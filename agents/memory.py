@@ -12,7 +12,7 @@ from torch import nn
 from agents.imports import choose
 from agents.recurrent import LSTM
 from megastep.arrdict import arrdict
-from megastep.dotdict import leaves, mapping
+from megastep.dotdict import leaves
 
 
 class GRU(nn.Module):
@@ -83,7 +83,7 @@ def memory(name: str, width: int) -> nn.Module:
 @torch.no_grad()
 def _check(name, core, width, n_steps=3, n_lanes=2):
     _require(name, hasattr(core, "initial"), "it has a method initial(B, device)")
-    state, shapes = core.initial(n_lanes, "cpu"), mapping(lambda leaf: tuple(leaf.shape))
+    state = core.initial(n_lanes, "cpu")
     _require(name, isinstance(state, arrdict), "a state is an arrdict of tensors")
     _require(name, all(len(leaf) == n_lanes for leaf in leaves(state)), "it has a row per lane")
     generator = torch.Generator().manual_seed(1)
@@ -98,8 +98,14 @@ def _check(name, core, width, n_steps=3, n_lanes=2):
         shape == (n_steps, n_lanes, width),
         f"outputs are (T, B, width), here {(n_steps, n_lanes, width)}, not {shape}",
     )
-    _require(name, shapes(after) == shapes(state), "a state is like the one before it")
+    _require(name, _shapes(after) == _shapes(state), "a state is like the one before it")
     _require(name, torch.equal(outputs[1:], others[1:]), "what came before a reset is forgotten")
+
+
+def _shapes(tree):
+    if isinstance(tree, dict):
+        return {key: _shapes(child) for key, child in tree.items()}
+    return tuple(tree.shape)
 
 
 def _require(name, kept, clause):

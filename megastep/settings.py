@@ -16,7 +16,7 @@ import inspect
 import math
 import numbers
 import typing
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import annotated_types
@@ -51,9 +51,15 @@ RANGES = {"ge": "from {:,}", "gt": "above {:,}", "le": "to {:,}", "lt": "and bel
 # ---- Settings from signatures ----
 
 
-def settings_of(made: Callable, reserved: Sequence[str] = (), **more: Any) -> type:
+def settings_of(
+    made: Callable,
+    reserved: Sequence[str] = (),
+    missing: Mapping[str, Any] | None = None,
+    **more: Any,
+) -> type:
     """A frozen dataclass of the arguments of a class or a function, but for those `reserved`, with
     their types, bounds and defaults. An argument without an annotation has its default's type.
+    `missing` has defaults of some that may have none.
 
     `more` are fields beside them: a type, or (type, default). ValueError if an annotation cannot be
     read, or an argument is called like one of `more`.
@@ -67,7 +73,10 @@ def settings_of(made: Callable, reserved: Sequence[str] = (), **more: Any) -> ty
                 continue
             if name in more:
                 raise ValueError(f"none of its arguments can be called {name}")
-            fields[name] = _field(hints.get(name), argument.default)
+            default = argument.default
+            if default is inspect.Parameter.empty:
+                default = (missing or {}).get(name, default)
+            fields[name] = _field(hints.get(name), default)
         return frozen(_class(made.__name__, fields))
     except (NameError, TypeError, pydantic.errors.PydanticUserError) as error:
         raise ValueError(f"its arguments cannot be read: {str(error).splitlines()[0]}") from None

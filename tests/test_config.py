@@ -62,7 +62,7 @@ def values(file, script):
     tree = yaml.safe_load(text) or {}
     tree.pop("defaults", None)
     own = file == script or "@package _global_" in text
-    return leaves(tree if own else {file.split("/")[0]: tree})
+    return leaves(tree if own else {file.split("/")[-2]: tree})
 
 
 def compositions():
@@ -75,8 +75,9 @@ def compositions():
             for choice in [[]] + [[f"{group}={m}"] for group in groups for m in groups[group]]:
                 chosen = loader._compose(choice).hydra.runtime.choices
                 files = [f"{g}/{chosen[g]}" for g in groups if chosen[g] is not None]
-                files = [file.replace("preset/auto", "preset/cpu") for file in files]
                 last = [f for f in files if f.startswith("preset/")]
+                if last and "cpu" in last[0]:
+                    last.append(f"preset/learner/cpu_{chosen['learner']}")
                 last += [f for f in files if f.startswith("experiment/")]
                 order = [f for f in files if f not in last] + [script] + last
                 yield [(file, values(file, script)) for file in order]

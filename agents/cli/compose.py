@@ -52,10 +52,16 @@ class ConfigLoader:
     def groups(self) -> dict[str, list[str]]:
         """{group: [members]}: those that the script's own file has a default for."""
         loader = GlobalHydra.instance().config_loader()
-        defaults = yaml.safe_load((CONFIGS / f"{self.script}.yaml").read_text())["defaults"]
-        chosen = [group for default in defaults if isinstance(default, dict) for group in default]
-        members = {group: loader.get_group_options(group) for group in chosen}
+        members = {group: loader.get_group_options(group) for group in self._defaults()}
         return {group: [m for m in found if ":" not in m] for group, found in members.items()}
+
+    def _defaults(self) -> dict[str, str | None]:
+        """{group: member} of the script's own file, but for what follows from other members."""
+        defaults = yaml.safe_load((CONFIGS / f"{self.script}.yaml").read_text())["defaults"]
+        groups = {
+            k: v for default in defaults if isinstance(default, dict) for k, v in default.items()
+        }
+        return {group: member for group, member in groups.items() if "@" not in group}
 
     def jobs(self, overrides: list[str], multirun: bool = False) -> list[tuple[list[str], Tree]]:
         """The composed tree of each job, `[(overrides, nested dict)]`; one job unless multirun."""
@@ -73,11 +79,14 @@ class ConfigLoader:
         unknown key and group member, and bad value.
         """
         errors, good, groups = [], [], self.groups()
+        optional = [group for group, member in self._defaults().items() if member is None]
         for override in _parsed(overrides):
             key, member = override.key_or_group, override.value()
             if key not in groups:
                 good.append(f"++{override.input_line}")  # `build` knows which keys there are
-            elif member is None or member in groups[key] or _is_stored(key, member):
+            elif member is None and key in optional:
+                continue  # it is null already
+            elif member in groups[key] or _is_stored(key, member):
                 good.append(override.input_line)
             else:
                 errors.append((key, f"{member!r} is unknown; {closest(member, groups[key])}"))
@@ -93,12 +102,11 @@ class ConfigLoader:
         return as_tree(settings)
 
     def _compose(self, overrides: list[str]) -> DictConfig:
-        """With a GPU to run on, `preset=auto` is replaced by `preset=gpu`; without one it is `cpu`
-        already.
-        """
+        """`preset=auto` is replaced by `preset=gpu` with a GPU to run on, else by `preset=cpu`."""
         config = compose(self.script, overrides, return_hydra_config=True)
-        if config.hydra.runtime.choices.get("preset") == "auto" and _has_gpu(config.device):
-            config = compose(self.script, [*overrides, "preset=gpu"], return_hydra_config=True)
+        if config.hydra.runtime.choices.get("preset") == "auto":
+            preset = "preset=gpu" if _has_gpu(config.device) else "preset=cpu"
+            config = compose(self.script, [*overrides, preset], return_hydra_config=True)
         return config
 
 
@@ -127,7 +135,7 @@ def _parsed(overrides: list[str], multirun: bool = False) -> list[Override]:
 
 def _is_stored(group: str, member: str) -> bool:
     """Whether a member of a group is an import path; then Hydra is told of it."""
-    if ":" not in member or not getattr(GROUPS.get(group), "takes_imports", False):
+    if ":" not in str(member) or not getattr(GROUPS.get(group), "takes_imports", False):
         return False
     ConfigStore.instance().store(group=group, name=member, node={"name": member})
     return True

@@ -23,13 +23,21 @@ class Group:
     a function, and the arguments of that. It may also be such a path itself.
 
     Args: `reserved`, arguments that a run gives; `needed`, those that must be there, with what they
-    mean; `more`, settings that every member has.
+    mean; `missing`, defaults of some that may have none; `more`, settings that every member has.
     """
 
     takes_imports = True
 
-    def __init__(self, key: str, reserved: tuple = (), needed: dict | None = None, **more: Any):
-        self.key, self.reserved, self.needed, self.more = key, reserved, needed or {}, more
+    def __init__(
+        self,
+        key: str,
+        reserved: tuple = (),
+        needed: dict | None = None,
+        missing: dict | None = None,
+        **more: Any,
+    ):
+        self.key, self.reserved, self.needed = key, reserved, needed or {}
+        self.missing, self.more = missing, more
         self.kind = functools.cache(self._kind)
 
     def _kind(self, name: str) -> type:
@@ -42,7 +50,7 @@ class Group:
             for argument, meaning in self.needed.items():
                 if argument not in present:
                     raise ValueError(f"it takes no {argument}, {meaning}")
-            return settings_of(made, self.reserved, name=str, **self.more)
+            return settings_of(made, self.reserved, self.missing, name=str, **self.more)
         except (ValueError, TypeError) as error:
             raise ValueError(f"{name} cannot be used: {error}") from error
 

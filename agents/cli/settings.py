@@ -50,11 +50,13 @@ GROUPS = {
         "env",
         reserved=("geometries", "seed", "device", "privileged"),
         needed={"n_envs": "the number of its environments"},
+        missing={"n_envs": 128},
     ),
     "geometry": Group(
         "geometry",
         reserved=("split",),
         needed={"n": "how many geometries", "split": "training, test or all", "seed": "a number"},
+        missing={"n": 512, "seed": 1},
     ),
     "learner": Group(
         "learner",
