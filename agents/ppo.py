@@ -227,7 +227,7 @@ class PPO:
 
     def _step(self, batch, is_fine, stopped):
         """One gradient step, unless `stopped`, or the KL is too large (which stops the next ones
-        too), or the rollout or the gradient is not finite. Returns the metrics, with how many steps
+        too), or no row is valid, or the rollout or the gradient is not finite. Returns the metrics, with how many steps
         were taken (0 or 1) and skipped, and `stopped`.
         """
         loss, metrics = self._losses(batch)
@@ -238,7 +238,7 @@ class PPO:
         )
         finite = metrics["grad_norm"].isfinite() & is_fine
         stopped = stopped | (metrics["kl"] > self.target_kl)
-        taken = finite & ~stopped
+        taken = finite & ~stopped & batch.valid.any()
         self.optimizer.step(taken)
         row = torch.stack([metrics[key].detach() for key in self._averaged])
         return torch.cat(

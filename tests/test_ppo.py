@@ -167,6 +167,20 @@ def test_lanes_that_do_not_learn_change_no_bit_of_weights_or_statistics(n_miniba
     assert metrics == clean_metrics and metrics["loss/skipped_steps"].item() == 0
 
 
+def test_an_update_without_a_lane_that_learns_changes_nothing():
+    """Adam's means of earlier gradients would move the weights on."""
+    policy, rollout = made_up()
+    learner = ppo.PPO(policy, n_minibatches=2, lr=1e-2)
+    learner.update(rollout)
+    before = {name: value.clone() for name, value in policy.state_dict().items()}
+    means = [mean.clone() for mean in learner.optimizer.means]
+    rollout.learns[:] = False
+    learner.update(rollout)
+    assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
+    assert all(map(torch.equal, learner.optimizer.means, means))
+    assert learner.check.read(rollout.numbers()) == (None, 0), "nor is it counted as skipped"
+
+
 def test_lanes_that_learn_do_change_the_weights():
     ends = []
     for lane in (None, 0, 2):
