@@ -227,8 +227,8 @@ class PPO:
 
     def _step(self, batch, is_fine, stopped):
         """One gradient step, unless `stopped`, or the KL is too large (which stops the next ones
-        too), or no row is valid, or the rollout or the gradient is not finite. Returns the metrics, with how many steps
-        were taken (0 or 1) and skipped, and `stopped`.
+        too), or no row is valid, or the rollout or the gradient is not finite. Returns the metrics,
+        with how many steps were taken (0 or 1) and skipped, and `stopped`.
         """
         loss, metrics = self._losses(batch)
         self.optimizer.zero_grad()
