@@ -4,6 +4,7 @@ import importlib.util
 import re
 from pathlib import Path
 
+import pages
 import pytest
 import torch
 
@@ -22,6 +23,18 @@ def names(tmp_path_factory):
             if "record.film" not in block or importlib.util.find_spec("av"):
                 exec(compile(block, str(PAGE), "exec"), found)
     return found
+
+
+def test_its_commands_train_evaluate_and_film(tmp_path, monkeypatch, capsys):
+    """The first part's, in an empty folder; the second part has a test file of its own."""
+    pytest.importorskip("av")
+    text = PAGE.read_text().split("## Two agents")[0]
+    assert "This is `rover.py`" in text
+    (tmp_path / "rover.py").write_text(pages.code(text)[0])
+    assert pages.type_all(text, tmp_path, monkeypatch) == list(pages.MAINS)
+    assert "rover in the test homes of column" in capsys.readouterr().out
+    (run,) = (path for path in (tmp_path / "runs").iterdir() if path.is_dir())
+    assert (run / "video.mp4").stat().st_size > 1000
 
 
 def test_the_page_trains(names):
