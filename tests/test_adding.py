@@ -182,7 +182,7 @@ def test_a_geometry_source(outside):
     assert json.loads(table.read_text())["rows"][0]["homes"] == 3
 
 
-def test_a_learner(outside):
+def test_a_learner(outside, capsys):
     """REINFORCE without a baseline, with storage and an estimate of its own."""
     learner = '''
         from typing import Annotated
@@ -249,6 +249,10 @@ def test_a_learner(outside):
     assert [row["samples"] for row in rows] == [16, 32, 48] and "loss/policy" in rows[-1]
     assert train.main(["resume=latest", "samples=64"]) == 0
     assert evaluate.main(["run=latest", "lanes=4"]) == 0
+    capsys.readouterr()
+    many = [*words, *chosen, "env.n_envs=100", "folder=many", "learner.length=1000000000"]
+    assert train.main(many) == 2  # 100 times 1e12 bytes, by its own estimate
+    assert "100 environments" in capsys.readouterr().err and not pathlib.Path("many").exists()
 
 
 MEAN = '''

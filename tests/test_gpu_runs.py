@@ -163,3 +163,10 @@ def test_a_number_that_is_not_finite_is_named_in_a_captured_run(
     assert "The last 20 updates were skipped" in sentence
     assert "reward of lane 5 was nan" in sentence and is_captured(trainers[0])
     assert bad_leaf(checkpoint.load(tmp_path / "run" / "checkpoints").state) is None
+
+
+@pytest.mark.parametrize("memory", ["gru", "none"])
+def test_every_core_acts_and_learns_in_graphs(memory, trainers, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert train.main([*TINY, f"agent.memory={memory}", f"samples={6 * UPDATE}"]) == 0
+    assert is_captured(trainers[0]) and trainers[0].bad_number is None

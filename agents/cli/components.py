@@ -87,6 +87,7 @@ def make_env(
     seed: int,
     device: torch.device,
     privileged: bool = False,
+    sample: Any = None,
     bytes_beside: float = 0,
 ) -> Any:
     """The environment that settings describe, in these homes. It is given what its constructor
@@ -94,7 +95,7 @@ def make_env(
 
     UserError that says how many environments fit, if these are too many for the memory;
     `bytes_beside` is what each needs beside its own, in a rollout. Before a large one is made, two
-    small ones tell what one environment takes.
+    small ones tell what one environment takes; the `sample` of `make_sample` may be one of them.
     """
     from megastep import engine
     from megastep.capture import state_tree
@@ -108,12 +109,13 @@ def make_env(
 
     with errors():
         if chosen.n_envs > PROBE:
+            few, many = sample or make(1, homes[:1]), make(PROBE, homes[:1])
             sizes = [
                 sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())
-                for env in (make(1, homes[:1]), make(PROBE, homes[:1]))
+                for env in (few, many)
             ]
-            each = (sizes[1] - sizes[0]) / (PROBE - 1) + bytes_beside
-            engine.fit(chosen.n_envs, each, device)
+            each = (sizes[1] - sizes[0]) / (many.n_envs - few.n_envs)
+            engine.fit(chosen.n_envs, each + bytes_beside, device)
         return make(chosen.n_envs, homes)
 
 
@@ -124,15 +126,16 @@ def make_sample(
     device: torch.device,
     privileged: bool = False,
 ) -> Any:
-    """A few environments of the kind that settings describe, which tell spaces and sizes.
-    UserError that names the clause of the contract that they break; ours are tested elsewhere.
+    """An environment of the kind that settings describe, which tells spaces and sizes; a few if the
+    class is not ours, which is tested elsewhere. UserError that names the clause of the contract
+    that they break.
     """
     from megastep import contract
 
-    n_envs = min(SAMPLE, chosen.n_envs)
-    few = dataclasses.replace(chosen, n_envs=n_envs)
-    env = make_env(few, homes[:n_envs], seed, device, privileged)
-    if not chosen.name.startswith("megastep."):
+    is_ours = chosen.name.startswith("megastep.")
+    few = dataclasses.replace(chosen, n_envs=1 if is_ours else min(SAMPLE, chosen.n_envs))
+    env = make_env(few, homes[:1], seed, device, privileged)
+    if not is_ours:
         try:
             contract.rollout(env, SAMPLE_STEPS)
         except contract.ContractError as error:

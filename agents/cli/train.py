@@ -67,7 +67,7 @@ def make_trainer(
     sample = components.make_sample(*wanted)
     policy = components.make_policy(cfg.agent, sample, cfg.seed)
     learner = components.make_learner(cfg.learner, policy, cfg.seed)
-    env = components.make_env(*wanted, bytes_beside=learner.bytes_per_env(sample))
+    env = components.make_env(*wanted, sample, bytes_beside=learner.bytes_per_env(sample))
     loaded = None
     if cfg.resume or cfg.init:
         loaded = components.load(run_folders.find(cfg.resume or cfg.init), device)
