@@ -45,6 +45,7 @@ WANTED = {
     "tuple": "a list",
 }
 BOUNDS = {"ge": "at least {:,}", "gt": "more than {:,}", "le": "at most {:,}", "lt": "below {:,}"}
+OUTSIDE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number")
 RANGES = {"ge": "from {:,}", "gt": "above {:,}", "le": "to {:,}", "lt": "and below {:,}"}
 
 
@@ -152,8 +153,7 @@ def sentence(error: dict[str, Any], field: FieldInfo | None, value: Any) -> str:
         return error["msg"]
     if kind == "value_error":
         return str(error["ctx"]["error"])
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if is_number and (not kind.endswith("_type") or not math.isfinite(value)):
+    if kind in OUTSIDE or isinstance(value, float) and not math.isfinite(value):
         return f"{value} is out of range: allowed is {allowed(field)}"
     if kind == "literal_error":
         return f"{value!r} is unknown; {closest(value, _words(field.annotation))}"

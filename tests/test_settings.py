@@ -60,6 +60,7 @@ def rover(
     names=["a"],  # noqa: B006, an argument of a stranger's
     plan: Path | None = None,
     speed=1.5,
+    even: Annotated[int, Field(multiple_of=2)] = 2,
     must: str,
     **others,
 ): ...
@@ -68,7 +69,19 @@ def rover(
 def test_arguments_are_settings_with_types_and_defaults():
     kind = settings_of(rover, ("seed",), name=str)
     made = build(kind, {"name": "r", "must": "x", "sizes": [5], "limit": 7, "n_envs": 1e3})
-    assert dataclasses.astuple(made) == ("r", 1000, 7.0, False, "red", (5,), ["a"], None, 1.5, "x")
+    assert dataclasses.astuple(made) == (
+        "r",
+        1000,
+        7.0,
+        False,
+        "red",
+        (5,),
+        ["a"],
+        None,
+        1.5,
+        2,
+        "x",
+    )
     assert build(kind, as_tree(made)) == made and as_tree(made)["sizes"] == [5]
     assert as_tree(build(kind, {"name": "r", "must": "x", "plan": "a/b"}))["plan"] == "a/b"
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -90,6 +103,8 @@ def test_arguments_are_settings_with_types_and_defaults():
         ("sizes", 3, "expected a list, got 3"),
         ("speed", "x", "expected a number, got 'x'"),
         ("colour", "gren", "'gren' is unknown; did you mean green?"),
+        ("colour", 3, "3 is unknown; there are green, red"),
+        ("even", 3, "input should be a multiple of 2, got 3"),
         ("seed", 2, "no such key; did you mean speed?"),
     ],
 )
