@@ -12,7 +12,10 @@ from . import checks
 from .kernels.compile import EngineError
 from .read_only import SetOnce
 
-__all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "MAX_RES", "Agents", "check", "check_on_cpu"]
+__all__ = [
+    *("AGENT_RADIUS", "AGENT_WIDTH", "MAX_RES", "Agents"),
+    *("check", "check_flag", "check_on_cpu", "check_flag_on_cpu"),
+]
 
 AGENT_WIDTH = 0.15
 AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # the disc about a square of that width
@@ -83,14 +86,24 @@ def check(agents: Agents) -> None:
     or velocity was not a finite number, an action was none, or a layout was none. Synchronises
     with the device, so it is not for inside a step.
     """
-    flag = int(checks.instance("agents", agents, Agents).error_flag)
+    check_flag(checks.instance("agents", agents, Agents).error_flag)
+
+
+def check_flag(error_flag: torch.Tensor) -> None:
+    """:func:`check` of a flag (1,) int32 that is no agents'."""
+    flag = int(error_flag)
     if flag:
-        agents.error_flag.zero_()
+        error_flag.zero_()
         env, kind = divmod(flag, 4)
         raise EngineError(_ERRORS[kind].format(env=env))
 
 
 def check_on_cpu(agents: Agents) -> None:
     """:func:`check` where it takes no synchronisation."""
-    if agents.error_flag.device.type == "cpu" and int(agents.error_flag):
-        check(agents)
+    check_flag_on_cpu(agents.error_flag)
+
+
+def check_flag_on_cpu(error_flag: torch.Tensor) -> None:
+    """:func:`check_flag` where it takes no synchronisation."""
+    if error_flag.device.type == "cpu":
+        check_flag(error_flag)

@@ -1,5 +1,5 @@
 """The engine: ``bake``, ``physics``, ``render``, ``observe``, ``unseen``, ``coverage``, ``spawn``,
-``uniform``.
+``uniform``, ``pong``.
 Each checks its arguments, allocates and launches, on the CPU or the GPU, whichever its tensors are
 on; none synchronises. TypeError or ValueError, naming the argument, if one does not fit.
 
@@ -12,12 +12,21 @@ import math
 import torch
 
 from . import checks
-from .agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents, check, check_on_cpu
+from .agents import (
+    AGENT_RADIUS,
+    AGENT_WIDTH,
+    MAX_RES,
+    Agents,
+    check,
+    check_flag,
+    check_flag_on_cpu,
+    check_on_cpu,
+)
 from .devices import device, fit
 from .kernels.compile import BLOCK, EngineError
 from .kernels.launch import SIZES, WARP, launch, params
 from .launch_params import error_flag, scenery_params, state_params
-from .outputs import Observation, Physics, Render
+from .outputs import Observation, Physics, Pong, Render
 from .scenery import Layouts, Scenery
 
 __all__ = [
@@ -29,15 +38,18 @@ __all__ = [
     "Layouts",
     "Observation",
     "Physics",
+    "Pong",
     "Render",
     "Scenery",
     "bake",
     "check",
+    "check_flag",
     "coverage",
     "device",
     "fit",
     "observe",
     "physics",
+    "pong",
     "render",
     "spawn",
     "uniform",
@@ -49,6 +61,10 @@ BANDS = 3  # of distance from an agent: up to 1.5 m, up to 4 m, and beyond
 SECTORS = 16  # of bearing from an agent
 MANY_ENVS = 32_768  # that fill a GPU with a quarter of a warp each
 MAX_SUBSAMPLE = 32
+GAME_FIELDS = 13  # of a game of Pong
+FEATURES = 8  # that a side is told of it
+PIXELS = 30, 40  # of its picture
+CELL = 256  # parts of a pixel that its places and speeds are counted in
 
 
 def _lanes(scenery, agents):
@@ -399,6 +415,71 @@ def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tens
     launch("uniform", packed, on, threads=n)
     counts.add_(mask)
     return out
+
+
+def pong(
+    games: torch.Tensor,
+    actions: torch.Tensor,
+    error_flag: torch.Tensor,
+    seed: int,
+    *,
+    restart: bool = False,
+    points: int = 1,
+    limit: int = 1000,
+    tracker_speed: float = 0.5,
+    pixels: torch.Tensor | None = None,
+) -> Pong:
+    """One step of N games of Pong, or, where the last step ended one, the start of another; see
+    :class:`~megastep.envs.Pong`. Each serve draws once from the environment's random stream.
+
+    Args: ``games`` (13, N) int32, updated in place, zeros before the first ``restart``, which
+    starts all; ``actions`` (B, 1) int64, of one lane per game, or two, the left paddle first: 0
+    nothing, 1 up, 2 down; ``error_flag`` (1,) int32, see :func:`check_flag`; ``points`` that win a
+    game; ``limit`` steps that truncate it; ``tracker_speed`` cells per step of the right paddle
+    where it is no lane; ``pixels`` (B, 1, 1, 30, 40) uint8, written instead of features.
+    """
+    n, on = checks.length("games", games, axis=1), games.device
+    lanes = checks.length("actions", actions)
+    if lanes not in (n, 2 * n) or actions.device != on:
+        raise ValueError(
+            f"actions must be of one lane or two for each of the {n} games on {on}, but those of "
+            f"{lanes} lanes on {actions.device} were given"
+        )
+    flags = [torch.empty(lanes, dtype=torch.bool, device=on) for _ in range(3)]
+    reward, points_won = (torch.empty(lanes, device=on) for _ in range(2))
+    features, pixels_at = None, 0
+    if pixels is None:
+        features = torch.empty((lanes, 1, FEATURES), dtype=torch.float16, device=on)
+    else:
+        pixels_at = checks.address("pixels", pixels, (lanes, 1, 1, *PIXELS), torch.uint8, on)
+        if pixels_at % 8:
+            raise ValueError("pixels must begin at a multiple of 8 bytes, as a whole tensor does")
+    speed = checks.number("tracker_speed", tracker_speed, -math.inf, PIXELS[1], "cells per step")
+    if speed < 0:
+        raise ValueError(f"tracker_speed must be at least 0 cells per step, not {speed:g}")
+    packed = params.PongParams(
+        games=checks.address("games", games, (GAME_FIELDS, n), torch.int32, on),
+        actions=checks.address("actions", actions, (lanes, 1), torch.int64, on),
+        reward=reward.data_ptr(),
+        reset=flags[0].data_ptr(),
+        terminal=flags[1].data_ptr(),
+        truncated=flags[2].data_ptr(),
+        points_won=points_won.data_ptr(),
+        features=0 if features is None else features.data_ptr(),
+        pixels=pixels_at,
+        error_flag=checks.address("error_flag", error_flag, (1,), torch.int32, on),
+        **_keys(seed),
+        n_envs=n,
+        n_sides=lanes // n,
+        restart=int(checks.flag("restart", restart)),
+        points=checks.integer("points", points, 1, 2**31 - 1),
+        limit=checks.integer("limit", limit, 1, 2**31 - 1),
+        tracker_speed=round(CELL * speed),
+        n_threads=torch.get_num_threads(),
+    )
+    launch("pong", packed, on, threads=n)
+    check_flag_on_cpu(error_flag)
+    return Pong(reward, *flags, points_won, features)
 
 
 def _keys(seed):

@@ -1,14 +1,14 @@
 """What the engine's operations return.
 
 N environments, A agents per environment, C cameras per agent (the axis is dropped if there is one),
-R rays per camera, P pixels per camera.
+R rays per camera, P pixels per camera, B lanes.
 """
 
 from typing import NamedTuple
 
 import torch
 
-__all__ = ["Observation", "Physics", "Render"]
+__all__ = ["Observation", "Physics", "Pong", "Render"]
 
 
 class Render(NamedTuple):
@@ -37,3 +37,14 @@ class Observation(NamedTuple):
     centre_line: torch.Tensor | None  # (N, A, C) int32: the line at the centre, as Render.indices
     imu: torch.Tensor | None  # (N, A, 3) fp16: angvelocity / 360, own velocity ahead and left / 10
     newly_seen: torch.Tensor | None  # (N, A) int32: texels now marked in `seen`, not before
+
+
+class Pong(NamedTuple):
+    """A step of a game of Pong, one value per lane."""
+
+    reward: torch.Tensor  # (B,): 1 for a point won, -1 for one lost
+    reset: torch.Tensor  # (B,) bool, as the next two
+    terminal: torch.Tensor
+    truncated: torch.Tensor
+    points_won: torch.Tensor  # (B,): where a game ends, the share of its points; 0 elsewhere
+    features: torch.Tensor | None  # (B, 1, 8) fp16; None where pixels were wanted

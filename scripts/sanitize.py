@@ -61,6 +61,12 @@ def main():
         env.reset()
         for action in range(7):
             env.step(arrdict.arrdict(actions=torch.full((7, 1), action, device="cuda")))
+    for settings in (dict(), dict(self_play=True), dict(pixels=True, points=2)):
+        env = envs.Pong(67, device="cuda", **settings)
+        env.reset()
+        for action in (*range(3), 7) * 20:
+            actions = torch.full((67 * env.n_agents, 1), action, device="cuda")
+            env.step(arrdict.arrdict(actions=actions))
     torch.cuda.synchronize()
     print("done")
 

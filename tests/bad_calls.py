@@ -43,6 +43,10 @@ def fixture(device):
         visible=torch.zeros((D, words), dtype=torch.int32, device=device),
         points=torch.full((D, 4, 2), 3.0, device=device),
         out=torch.zeros((N * A, 4), device=device),
+        games=torch.zeros((engine.GAME_FIELDS, N), dtype=torch.int32, device=device),
+        actions=torch.zeros((N, 1), dtype=torch.int64, device=device),
+        error_flag=torch.zeros(1, dtype=torch.int32, device=device),
+        pixels=torch.zeros((N, 1, 1, *engine.PIXELS), dtype=torch.uint8, device=device),
     )
 
 
@@ -205,6 +209,21 @@ def operations(f):
         engine.uniform,
         dict(counts=f.counts.view(-1), mask=f.mask.view(-1), seed=1, out=f.out),
         dict(counts=tensors, mask=tensors, seed=lambda g: [*integers(0)(g)][:6], out=tensors),
+    )
+    yield (
+        engine.pong,
+        dict(games=f.games, actions=f.actions, error_flag=f.error_flag, seed=1, pixels=f.pixels),
+        dict(
+            games=tensors,
+            actions=tensors,
+            error_flag=lambda good: [c for c in tensors(good) if c[0] != "not contiguous"],
+            seed=lambda good: [*integers(0)(2)][:6],
+            restart=flags,
+            points=lambda good: integers(1, 2**31 - 1)(1),
+            limit=lambda good: integers(1, 2**31 - 1)(1),
+            tracker_speed=numbers(-0.1, 40),
+            pixels=optional_tensors,
+        ),
     )
     yield (
         modules.visible_texels,

@@ -117,6 +117,28 @@ struct CoverageParams {
     int n_words;
 };
 
+struct PongParams {
+    int* games;                // (13, N) in and out: the fields of Game, in their order
+    const long long* actions;  // (B) lane B = N sides: 0 nothing, 1 up, 2 down
+    float* reward;             // (B) out, as all that follows
+    unsigned char* reset;      // (B)
+    unsigned char* terminal;   // (B)
+    unsigned char* truncated;  // (B)
+    float* points_won;         // (B) share of a game's points where it ends; 0 elsewhere
+    unsigned short* features;  // (B, 8) fp16
+    unsigned char* pixels;     // (B, 30, 40)
+    int* error_flag;           // (1) out: see errors.h
+    unsigned int key0;         // the seed
+    unsigned int key1;
+    int n_envs;         // N
+    int n_sides;        // that act: 2, or 1, the left, against the tracker
+    int restart;        // 1: every environment begins a game
+    int points;         // that win a game
+    int limit;          // steps of a game
+    int tracker_speed;  // 256ths of a cell per step
+    int n_threads;      // of the CPU
+};
+
 struct SpawnParams {
     SceneryParams scenery;
     float* positions;           // (N, A, 2) out, as the next three, where mask
