@@ -24,6 +24,7 @@ The commonest:
   run=RUN              a run folder, one of its checkpoints, or latest
   split=training       the homes it was trained in, instead of unseen ones
   geometry=bench       other homes altogether
+  env=pong             another environment of the same spaces: the tracker, after self-play
   greedy=true          the likeliest actions instead of sampled ones
   lanes=256            fewer episodes
   baseline=false       no row for random actions"""
@@ -38,9 +39,9 @@ def run(cfg: Evaluate) -> Path:
     device, path = components.make_device(cfg.device), run_folders.find(cfg.run)
     loaded = components.load(path, device)
     trained = components.config_of(loaded)
-    geometry = cfg.geometry or trained.geometry
-    homes = components.homes(trained.env, geometry, cfg.split, cfg.lanes)
-    env = components.make_env(settled(trained.env, cfg.lanes), homes, cfg.seed, device)
+    chosen, geometry = cfg.env or trained.env, cfg.geometry or trained.geometry
+    homes = components.homes(chosen, geometry, cfg.split, cfg.lanes)
+    env = components.make_env(settled(chosen, cfg.lanes), homes, cfg.seed, device)
     policy = components.make_actor(trained.agent, env)
     components.load_weights(policy, env, loaded)
     players = {"trained, greedy" if cfg.greedy else "trained": policy}
@@ -53,7 +54,7 @@ def run(cfg: Evaluate) -> Path:
         roles = getattr(env, "roles", None)
         rows += [{"agent": name, **row} for row in evaluation.summaries(episodes, roles)]
     which = "all" if cfg.split == "all" else f"the {cfg.split}"
-    where, name = label(trained.env.name), label(trained.env.name)
+    where, name = label(chosen.name), label(chosen.name)
     if homes:
         where, name = f"{where} in {which} homes of {source(geometry)}", source(geometry)
     title = (
@@ -63,7 +64,8 @@ def run(cfg: Evaluate) -> Path:
     say(title)
     say(table(columns(rows), [cells(row) for row in rows]))
     say(f"evaluated in {duration(time.monotonic() - start)}")
-    name = f"{name}-{cfg.split}-{loaded.step}{'-greedy' if cfg.greedy else ''}"
+    other = "-env" if cfg.env else ""
+    name = f"{name}{other}-{cfg.split}-{loaded.step}{'-greedy' if cfg.greedy else ''}"
     result = dict(
         title=title,
         checkpoint=str(loaded.path),

@@ -133,6 +133,7 @@ class Evaluate:
     """An evaluation of a run's checkpoint."""
 
     run: str
+    env: Env | None = None
     geometry: Geometry | None = None
     split: Split
     lanes: Count
