@@ -79,6 +79,8 @@ def compositions():
                 if last and "cpu" in last[0]:
                     last.append(f"preset/learner/cpu_{chosen['learner']}")
                 last += [f for f in files if f.startswith("experiment/")]
+                for_recipe = f"preset/experiment/{chosen.get('preset')}_{chosen.get('experiment')}"
+                last += [for_recipe] if (CONFIGS / f"{for_recipe}.yaml").exists() else []
                 order = [f for f in files if f not in last] + [script] + last
                 yield [(file, values(file, script)) for file in order]
 
@@ -147,6 +149,13 @@ def test_what_a_cpu_and_a_gpu_train_with():
     assert (gpu.env.n_envs, gpu.agent.width, gpu.report) == (4096, 256, 50)
     assert dataclasses.replace(cpu.env, n_envs=4096) == gpu.env
     assert compose("experiment=newcomer").geometry.n == 2000
+
+
+def test_a_recipe_differs_on_a_cpu_and_on_a_gpu():
+    cpu, gpu = (compose("experiment=pong", f"preset={preset}") for preset in ("cpu", "gpu"))
+    assert (cpu.seconds, gpu.seconds) == (240, 12) and cpu.env.n_envs == 256
+    assert (cpu.agent.memory, cpu.learner.n_epochs) == ("none", 2)
+    assert compose("experiment=pong", "preset=cpu", "seconds=7").seconds == 7
 
 
 def test_a_typo_names_the_nearest_key():

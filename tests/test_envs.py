@@ -1,5 +1,7 @@
 """Every environment against the contract, and the rules of each."""
 
+import inspect
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from megastep import arrdict, capture, contract, dotdict, envs, plotting, spaces, toys
 from megastep.engine import EngineError
 from megastep.geometries import sample
+from megastep.state import state_tree
 
 GPU = torch.cuda.is_available()
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
@@ -15,6 +18,9 @@ SHORT = {
     "minimal": dict(shortest=3, longest=9),
     "explorer": dict(patience=1, res=1, subsample=1),
     "explorer, privileged": dict(patience=1, res=1, subsample=1, privileged=True),
+    "pong": dict(limit=20),
+    "pong, pixels": dict(limit=20, pixels=True),
+    "pong, self-play": dict(limit=20, self_play=True),
 }  # settings of which episodes end within a test
 
 
@@ -26,9 +32,16 @@ def device(request):
 
 
 def make(name, device="cpu", n_envs=12, seed=1, **settings):
-    return envs.ENVS[name.split(",")[0]](
-        n_envs, sample("bench", 4), seed=seed, device=device, **{**SHORT[name], **settings}
-    )
+    made = envs.ENVS[name.split(",")[0]]
+    if "geometries" in inspect.signature(made).parameters:
+        settings["geometries"] = sample("bench", 4)
+    return made(n_envs, seed=seed, device=device, **{**SHORT[name], **settings})
+
+
+def idle(env):
+    """The decision of every lane's action 0."""
+    lanes = env.n_envs * env.n_agents
+    return arrdict.arrdict(actions=torch.zeros((lanes, 1), dtype=torch.long, device=env.device))
 
 
 # ---- The contract ----
@@ -260,7 +273,7 @@ def test_an_ended_lane_ignores_its_decision(name):
     for _ in range(40):
         ended = worlds[0].terminal | worlds[0].truncated
         actions = contract.random_actions(a, generator)
-        others = torch.where(ended[:, None], (actions + 1) % 7, actions)
+        others = torch.where(ended[:, None], (actions + 1) % a.action_space.n_actions, actions)
         ignored += int(ended.sum())
         worlds = [a.step(arrdict.arrdict(actions=actions)), b.step(arrdict.arrdict(actions=others))]
         assert contract.same(*worlds)
@@ -275,8 +288,7 @@ def test_states_are_drawn(name, device):
     state = arrdict.numpyify(env.state(5))
     image = plotting.rasterise(type(env).plot_state(state))
     assert image.ndim == 3 and image.std() > 5, "a figure with something on it"
-    after = env.step(arrdict.arrdict(actions=torch.zeros((12, 1), dtype=torch.long, device=device)))
-    contract.check_world(env, after, before)
+    contract.check_world(env, env.step(idle(env)), before)
 
 
 @pytest.mark.cuda
@@ -286,7 +298,7 @@ class TestOnTheGPU:
     def test_step_never_synchronises(self, name):
         env = make(name, "cuda")
         env.reset()
-        decision = arrdict.arrdict(actions=torch.zeros((12, 1), dtype=torch.long, device="cuda"))
+        decision = idle(env)
         env.step(decision)
         torch.cuda.set_sync_debug_mode("error")
         try:
@@ -341,9 +353,10 @@ def test_check_raises_what_the_device_has_flagged(name, device):
     env.reset()
     env.check()
     if device == "cpu":  # whose operations look at once, so the flag is set by hand
-        env.core.agents.error_flag.fill_(13)
+        (flag,) = [leaf for path, leaf in state_tree(env).items() if "error_flag" in path]
+        flag.fill_(13)
     else:
-        env.step(arrdict.arrdict(actions=torch.full((12, 1), 7, device=device)))
+        env.step(idle(env).map(torch.add, 7))
     with pytest.raises(EngineError, match="nvironment"):
         env.check()
     env.check()
@@ -365,13 +378,13 @@ class Launches(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(
-    "name, most", [("minimal", 10), ("explorer", 9), ("explorer, privileged", 16)]
+    "name, most", [("minimal", 10), ("explorer", 9), ("explorer, privileged", 16), ("pong", 0)]
 )
 def test_a_step_launches_few_small_operations(name, most):
     """At a few thousand environments their number is what a step takes on a GPU."""
     env = make(name)
     env.reset()
-    decision = arrdict.arrdict(actions=torch.zeros((12, 1), dtype=torch.long))
+    decision = idle(env)
     with Launches() as launches:
         env.step(decision)
     assert launches.count <= most

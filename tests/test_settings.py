@@ -157,7 +157,9 @@ def test_a_checked_function_refuses_by_name_and_keeps_its_signature():
 @pytest.mark.parametrize("name", envs.ENVS)
 def test_an_environment_refuses_what_is_out_of_the_bounds_of_its_arguments(name):
     outside = {"n_envs": (0, 2**26 + 1), "res": (0, 1025), "fov": (0, 180), "fps": (0.5, 1001)}
-    for argument, values in outside.items():
+    outside |= {"points": (0, 1001), "limit": (0, 10**6 + 1), "tracker_speed": (-0.1, 40)}
+    taken = inspect.signature(envs.ENVS[name]).parameters
+    for argument, values in ((key, outside[key]) for key in taken if key in outside):
         for value in values:
             with pytest.raises(ValueError, match=f"^{argument}: .* is out of range: "):
                 envs.ENVS[name](**{"n_envs": 1, "device": "cpu", argument: value})
