@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 from counters import counters
-from timing import TURNS, alone, measurement, rate, timed
+from timing import TURNS, alone, laps, measurement, rate, timed
 
 from megastep import arrdict, capture, core, engine, envs, modules, scene
 from megastep.geometries import sample
@@ -209,6 +209,47 @@ def fresh(code, device, n):
         ]
 
 
+def pong(device):
+    """Pong's `env.step`, of features and of pictures; of pictures also beside filling as many bytes
+    with zeros, the best of many rounds, on one thread of the CPU.
+    """
+    for pixels, n_envs in itertools.product((False, True), SIZES[device.type]):
+        what = f"pong, {'pictures' if pixels else 'features'}, `env.step`, {n_envs:,} environments"
+        yield rate(what, n_envs, timed(pong_stepper(n_envs, device, pixels)[1], device))
+    if device.type == "cpu":
+        yield from pong_and_zeros(device)
+
+
+def pong_stepper(n_envs, device, pixels):
+    """Pong that has been played for a while, and a function that takes its next step, captured on a
+    GPU.
+    """
+    env = capture.Captured(envs.Pong(n_envs, pixels=pixels, device=device))
+    drawn = torch.randint(3, (TURNS, n_envs, 1), device=device)
+    actions = itertools.cycle([arrdict.arrdict(actions=some) for some in drawn])
+    env.reset()
+    for _ in range(WARM_UP):
+        env.step(next(actions))
+    return env, lambda: env.step(next(actions))
+
+
+def pong_and_zeros(device, n_envs=10_000, rounds=300):
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        env, work = pong_stepper(n_envs, device, pixels=True)
+        pictures = env.reset().obs
+        pairs = [
+            [laps(one, device, 1, 1)[0] / n_envs * 1e9 for one in (work, pictures.zero_)]
+            for _ in range(rounds)
+        ]
+    finally:
+        torch.set_num_threads(threads)
+    for what, times in zip(("`env.step`", "zeros in their place"), zip(*pairs)):
+        name = f"pong, pictures of {n_envs:,} environments, {what}, one thread, best of {rounds}"
+        yield measurement(name, "ns per environment", [min(times)])
+
+
 def compile(device):
     """All kernels built with an empty cache: by NVRTC for a GPU, by a C++ compiler for the CPU."""
     yield measurement(
@@ -354,6 +395,6 @@ BENCHMARKS = {
     benchmark.__name__: benchmark
     for benchmark in (
         *(step, kernels, counters, observe, agents, memory),
-        *(compile, first, startup, cpu, train),
+        *(pong, compile, first, startup, cpu, train),
     )
 }
