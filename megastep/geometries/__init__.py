@@ -16,6 +16,7 @@ import numpy as np
 from ..dotdict import dotdict
 from ..geometry import centers, indices, masks
 from . import files as files
+from . import mazes as mazes
 from . import sources
 from . import toys as toys
 
@@ -41,8 +42,9 @@ def sample(
     """A list of n geometries from the source `name`, the same for the same arguments.
 
     `options` are the source's own: `width` of "box", `width` and `pillar` of "column", `outer` of
-    "homes", `path` of "files". Raises ValueError for an unknown name, split or option, and for what
-    the source cannot use.
+    "homes", `path` of "files", `size`, `corridor`, `thickness` and `braid` of "maze". Raises
+    ValueError for an unknown name, split or option, and for what the source cannot use; EngineError
+    for mazes that do not fit into memory.
     """
     _known("geometry source", name, SOURCES)
     _known("split", split, SPLITS)

@@ -10,11 +10,12 @@ import numpy as np
 from pydantic import Field
 
 from ..dotdict import dotdict
+from ..settings import checked
 from . import files as npz
-from . import toys
+from . import mazes, toys
 from .homes import database
 
-__all__ = ["bench", "box", "column", "files", "homes"]
+__all__ = ["bench", "box", "column", "files", "homes", "maze"]
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
@@ -78,3 +79,27 @@ def homes(
 def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdict]:
     """The 512 dense homes every benchmark runs on."""
     return files(n, split, seed, path=BENCH)
+
+
+@checked
+def maze(
+    n: Count = 512,
+    split: str = "training",
+    seed: Seed = 1,
+    size: Annotated[int, Field(ge=2, le=32)] = 8,
+    corridor: Annotated[float, Field(gt=0, le=100)] = 1.0,
+    thickness: Annotated[float, Field(ge=0.02, le=100)] = 0.2,
+    braid: Annotated[float, Field(ge=0, le=1)] = 0.0,
+) -> list[dotdict]:
+    """From 5,000 mazes of `size` x `size` cells, `corridor` metres wide between walls of
+    `thickness`, with the share `braid` of their dead ends opened.
+    """
+    from ..devices import fit  # brings PyTorch, without which settings are read
+
+    mazes.checked(size, corridor, thickness)
+    indices = _selected(mazes.COUNT, n, split, seed)
+    different = dict.fromkeys(indices)
+    what = f"mazes of {size} x {size} cells"
+    fit(len(different), mazes.bytes_each(size, corridor, thickness), "cpu", what)
+    made = {i: mazes.generate(i, size, corridor, thickness, braid) for i in different}
+    return [made[i] for i in indices]
