@@ -76,8 +76,8 @@ class Core:
 
     @staticmethod
     def plot_state(state: dict, ax: Any = None, seen: Any = None, distances: Any = None) -> Any:
-        """Draws a numpyified :meth:`state` from above, with each camera's field of view. Returns
-        the axes.
+        """Draws a numpyified :meth:`state` from above, with each camera's field of view; several
+        agents are numbered. Returns the axes.
 
         Args: ``seen`` (T,) bools, dims static texels that are False; ``distances`` (A, C, R)
         metres, to draw what is in view instead of a wedge.
@@ -90,8 +90,13 @@ class Core:
             agents = int(state.widths[: int(state.n_agent_lines)].sum())
             seen = np.split(np.concatenate([np.ones(agents, bool), seen]), ends[:-1])
         ax = plotting.plot_scenery(state.lines, colours, state.lights, seen=seen, ax=ax)
+        marks = plotting.camera_colours(len(state.yaws))
         for a, (position, angle) in enumerate(zip(state.positions, state.angles, strict=True)):
-            for c, yaw in enumerate(state.yaws):
+            for c, (yaw, mark) in enumerate(zip(state.yaws, marks, strict=True)):
                 in_view = None if distances is None else distances[a, c]
-                plotting.plot_view(ax, position, angle + yaw, float(state.fov), in_view)
+                plotting.plot_view(
+                    ax, position, angle + yaw, float(state.fov), in_view, colour=mark
+                )
+            if len(state.positions) > 1:
+                ax.annotate(str(a), position, (4, 4), textcoords="offset points", color="w")
         return ax

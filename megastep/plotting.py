@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from .colour import gamma_decode, gamma_encode
 
 __all__ = [
+    "camera_colours",
     "gamma_decode",
     "gamma_encode",
     "panels",
@@ -38,10 +39,10 @@ STRIP = 0.09  # height of a strip over its width
 
 
 def panels(
-    n_strips: int = 0, width: float = 6.0, title: str | None = None
+    n_strips: int = 0, width: float = 6.0, title: str | None = None, n_cameras: int = 1
 ) -> tuple[Any, Any, list]:
-    """A figure with a square for the plan and ``n_strips`` strips under it: (figure, plan axes,
-    list of strip axes).
+    """A figure with a square for the plan and ``n_strips`` strips under it, each as high as
+    ``n_cameras`` rows of pixels: (figure, plan axes, list of strip axes).
 
     ``width`` is in inches, at 100 pixels per inch. The figure is not pyplot's, so nothing has to be
     closed.
@@ -50,7 +51,7 @@ def panels(
 
     margin, gap = 0.55, 0.5  # inches: about the plan, and below a strip for its labels
     inner = width - 2 * margin
-    strip = STRIP * inner
+    strip = STRIP * inner * n_cameras
     height = 2 * margin + inner + n_strips * (strip + gap)
     figure = Figure(figsize=(width, height), dpi=100)
 
@@ -72,6 +73,7 @@ def plot_images(
     transpose: bool = False,
     aspect: float | None = None,
     axes: Any = None,
+    yaws: ArrayLike | None = None,
 ) -> np.ndarray:
     """Draws images side by side, a row of panels for each name. Returns the axes, (names, images).
 
@@ -82,6 +84,7 @@ def plot_images(
         transpose: the arrays are (..., H, W, C) instead, like ``Render.screen``.
         aspect: height of a panel over its width; by default such that pixels are square.
         axes: as many axes as there are images in all, row by row.
+        yaws: degrees, of the camera that each row of pixels is of, to label it.
     Raises ValueError for other shapes.
     """
     stacks = {name: _stack(name, image, transpose) for name, image in images.items()}
@@ -100,7 +103,7 @@ def plot_images(
     for row, (name, stack) in zip(axes, stacks.items(), strict=True):
         for i, ax in enumerate(row):
             if i < len(stack):
-                _plot_image(ax, stack[i], name if len(stack) == 1 else f"{name} {i}", aspect)
+                _plot_image(ax, stack[i], name if len(stack) == 1 else f"{name} {i}", aspect, yaws)
             else:
                 ax.set_axis_off()
     return axes
@@ -121,7 +124,7 @@ def _stack(name, image, transpose):
     return gamma_encode(image) if image.shape[-1] == 3 else image
 
 
-def _plot_image(ax, image, title, aspect):
+def _plot_image(ax, image, title, aspect, yaws):
     options = dict(cmap="gray", vmin=0, vmax=1) if image.shape[-1] == 1 else {}
     ax.imshow(
         image.squeeze(-1) if image.shape[-1] == 1 else image,
@@ -134,6 +137,15 @@ def _plot_image(ax, image, title, aspect):
     ax.set_xlabel("pixel, from left to right", fontsize="x-small", labelpad=1)
     ax.tick_params(labelsize="x-small")
     ax.set_yticks([])
+    if yaws is not None and len(yaws) > 1:
+        ax.set_yticks(range(len(yaws)), [f"{yaw:g}°" for yaw in yaws])
+        for label, colour in zip(ax.get_yticklabels(), camera_colours(len(yaws)), strict=True):
+            label.set_color(colour)
+
+
+def camera_colours(n_cameras: int) -> list[str]:
+    """What each camera's view and its row of pixels are marked with: white for a single one."""
+    return ["w"] if n_cameras == 1 else [f"C{camera}" for camera in range(n_cameras)]
 
 
 def plot_bars(names: Sequence[str], values: ArrayLike, ax: Any = None) -> Any:

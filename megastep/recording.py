@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike
 
 from .arrdict import clone, numpyify
 
-__all__ = ["ParallelEncoder"]
+__all__ = ["ParallelEncoder", "draw"]
 
 MAX_WORKERS = 8  # some 80 figures per second; each has torch in memory, about half a gigabyte
 # x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines need more
@@ -87,7 +87,7 @@ class ParallelEncoder:
         state = numpyify(clone(state))
         if self._payload is None:
             with _named(self._n_frames):
-                self._add(_draw(self._plot_state, state))
+                self._add(draw(self._plot_state, state))
         else:
             with _keep_from_terminal():
                 drawn = self._workers().submit(_draw_payload, self._payload, state)
@@ -323,11 +323,11 @@ def _unpickled(payload):
 
 
 def _draw_payload(payload, state):
-    return _draw(_unpickled(payload), state)
+    return draw(_unpickled(payload), state)
 
 
-def _draw(plot_state, state):
-    """(H, W, 3) uint8 of a state."""
+def draw(plot_state: Callable, state: Any) -> np.ndarray:
+    """(H, W, 3) uint8: what ``plot_state`` draws of a numpyified state."""
     drawn = plot_state(state)
     if isinstance(drawn, np.ndarray):
         return _image(drawn)

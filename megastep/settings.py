@@ -43,9 +43,14 @@ WANTED = {
     "string": "a word",
     "list": "a list",
     "tuple": "a list",
+    "sequence": "a list",
 }
 BOUNDS = {"ge": "at least {:,}", "gt": "more than {:,}", "le": "at most {:,}", "lt": "below {:,}"}
 OUTSIDE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number")
+LENGTHS = {
+    "too_short": "at least {min_length}",
+    "too_long": "at most {max_length}",
+}
 RANGES = {"ge": "from {:,}", "gt": "above {:,}", "le": "to {:,}", "lt": "and below {:,}"}
 
 
@@ -153,6 +158,9 @@ def sentence(error: dict[str, Any], field: FieldInfo | None, value: Any) -> str:
         return error["msg"]
     if kind == "value_error":
         return str(error["ctx"]["error"])
+    if kind in LENGTHS:
+        bound, n = LENGTHS[kind].format(**error["ctx"]), error["ctx"]["actual_length"]
+        return f"a list of {n} is out of range: allowed is {bound}"
     if kind in OUTSIDE or isinstance(value, float) and not math.isfinite(value):
         return f"{value} is out of range: allowed is {allowed(field)}"
     if kind == "literal_error":

@@ -266,6 +266,12 @@ def test_a_range_is_told():
     )
 
 
+def test_a_list_may_be_too_short():
+    assert compose("env.cameras=[0,120,240]").env.cameras == [0, 120, 240]
+    found = errors("env.cameras=[]")["env.cameras"]
+    assert found == "a list of 0 is out of range: allowed is at least 1"
+
+
 def test_settings_that_contradict_each_other_are_named():
     assert "2" in errors("env.n_envs=2")["learner.n_minibatches"]
     assert errors("geometry=files") == {"geometry.path": "is missing"}

@@ -18,6 +18,7 @@ SHORT = {
     "minimal": dict(shortest=3, longest=9),
     "explorer": dict(patience=1, res=1, subsample=1),
     "explorer, privileged": dict(patience=1, res=1, subsample=1, privileged=True),
+    "explorer, cameras": dict(patience=1, res=1, subsample=1, cameras=(0, 120, 240)),
     "pong": dict(limit=20),
     "pong, pixels": dict(limit=20, pixels=True),
     "pong, self-play": dict(limit=20, self_play=True),
@@ -347,6 +348,38 @@ def test_explorer_pays_once_for_each_texel():
     assert not any(float(env.step(turn).reward) for _ in range(30))
 
 
+def test_explorer_sees_with_each_camera_what_it_would_see_turned():
+    """Cameras at 0, 90 and -90 degrees show what one camera does in agents turned so far."""
+    several = envs.Explorer(1, [toys.column()], device="cpu", cameras=[0, 90, -90])
+    views = several.reset().obs
+    assert views.rgb.shape == (1, 1, 3, 3, 64) and views.d.shape == (1, 1, 1, 3, 64)
+    for camera, yaw in enumerate((0, 90, -90)):
+        one = envs.Explorer(1, [toys.column()], device="cpu")
+        one.reset()
+        one.core.agents.positions.copy_(several.core.agents.positions)
+        one.core.agents.angles.copy_(several.core.agents.angles + yaw)
+        obs = one._observation()[0]
+        close = dict(rtol=0, atol=2e-3)  # fp16, and an angle that is rounded before it is turned
+        torch.testing.assert_close(views.rgb[:, :, :, camera], obs.rgb[:, :, :, 0], **close)
+        torch.testing.assert_close(views.d[:, :, :, camera], obs.d[:, :, :, 0], **close)
+    seen = [int(env.n_seen) for env in (several, one)]
+    assert seen[0] > seen[1], "all cameras count"
+
+
+@pytest.mark.parametrize(
+    "cameras, message",
+    [
+        ([], "^cameras: a list of 0 is out of range: allowed is at least 1$"),
+        ([0] * 17, "^cameras: a list of 17 is out of range: allowed is at most 16$"),
+        (["ahead"], "^cameras: expected a number, got "),
+        ([1e10], "^cameras must hold numbers below 1e"),
+    ],
+)
+def test_explorer_refuses_cameras_that_are_none(cameras, message):
+    with pytest.raises(ValueError, match=message):
+        envs.Explorer(1, [toys.box()], device="cpu", cameras=cameras)
+
+
 @pytest.mark.parametrize("name", SHORT)
 def test_check_raises_what_the_device_has_flagged(name, device):
     env = make(name, device)
@@ -378,7 +411,14 @@ class Launches(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(
-    "name, most", [("minimal", 10), ("explorer", 9), ("explorer, privileged", 16), ("pong", 0)]
+    "name, most",
+    [
+        ("minimal", 10),
+        ("explorer", 9),
+        ("explorer, privileged", 16),
+        ("explorer, cameras", 9),
+        ("pong", 0),
+    ],
 )
 def test_a_step_launches_few_small_operations(name, most):
     """At a few thousand environments their number is what a step takes on a GPU."""

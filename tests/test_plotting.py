@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import core, plotting
+from megastep import core, modules, plotting, scene, toys
+from megastep.arrdict import numpyify
 from megastep.plotting import gamma_decode, gamma_encode
 
 matplotlib.use("Agg")
@@ -109,6 +110,41 @@ def test_given_axes_are_used():
         {"rgb": np.zeros((1, 3, 1, 8)), "d": np.zeros((1, 1, 1, 8), np.float16)}, axes=strips
     )
     assert list(axes[:, 0]) == strips and all(ax.figure is figure for ax in strips)
+
+
+def test_every_agent_and_camera_is_shown():
+    """Three agents with two cameras: a strip for each agent, in it a row for each camera, which has
+    the colour of its view on the plan; agents are numbered there."""
+    cpu = scene.scenery([toys.column()], 3, device="cpu")
+    c = core.Core(cpu, res=16, cameras=[0, 180])
+    c.agents.positions[:] = torch.tensor([[2.0, 2.0], [5.0, 2.0], [2.0, 5.0]])
+    figure, plan, strips = plotting.panels(3, n_cameras=2)
+    state, rgb = numpyify(c.state(0)), modules.RGB(c).state(0).numpy()
+    core.Core.plot_state(state, plan)
+    modules.RGB.plot_state(rgb, strips, state.yaws)
+    assert [ax.get_title("left") for ax in strips] == ["rgb 0", "rgb 1", "rgb 2"]
+    for strip, seen in zip(strips, rgb, strict=True):
+        shown = strip.images[0].get_array()
+        assert np.allclose(shown, gamma_encode(seen.transpose(1, 2, 0)), atol=1e-6)
+        assert [label.get_text() for label in strip.get_yticklabels()] == ["0°", "180°"]
+    assert np.ptp(rgb, axis=(0, 2)).min() > 0.01, "what they see differs"
+    assert [(note.get_text(), list(note.xy)) for note in plan.texts] == [
+        ("0", [2, 2]),
+        ("1", [5, 2]),
+        ("2", [2, 5]),
+    ]
+    views = [matplotlib.colors.to_rgb(patch.get_facecolor()) for patch in plan.patches]
+    labels = [matplotlib.colors.to_rgb(t.get_color()) for t in strips[0].get_yticklabels()]
+    assert views == 3 * labels and labels[0] != labels[1]
+
+
+def test_one_camera_has_no_label_and_one_agent_no_number():
+    c = core.Core(scene.scenery([toys.box()], 1, device="cpu"), res=8)
+    figure, plan, strips = plotting.panels(1)
+    core.Core.plot_state(numpyify(c.state(0)), plan)
+    modules.Depth.plot_state(modules.Depth(c).state(0).numpy(), strips, c.agents.yaws)
+    assert not plan.texts and not strips[0].get_yticklabels()
+    assert strips[0].get_box_aspect() == plotting.STRIP
 
 
 @pytest.mark.parametrize(

@@ -4,14 +4,16 @@ import os
 import signal
 
 import faults
+import numpy as np
 import pytest
 import tiny
+from matplotlib import pyplot as plt
 
 from agents.cli import record, train
 from agents.cli.build import build
 from agents.cli.compose import ConfigLoader
 from agents.cli.settings import Train
-from megastep import recording
+from megastep import plotting, recording
 
 TINY = [*tiny.TINY, "samples=1"]
 
@@ -33,6 +35,35 @@ def test_a_video_has_a_frame_for_every_step(trained):
         assert video.streams.video[0].average_rate == 10  # the environment's
     assert len(frames) == 3 and frames[0].std() > 10
     assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
+
+
+def test_an_image_is_the_last_frame_and_needs_no_encoder(trained, tmp_path, monkeypatch):
+    import av
+
+    video, still = tmp_path / "a.mp4", tmp_path / "folder" / "a.png"
+    common = [f"run={trained}", "steps=4", "device=cpu"]
+    assert record.main([*common, f"file={video}"]) == 0
+    with av.open(str(video)) as file:
+        *_, last = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    faults.not_installed(monkeypatch, "av")
+    assert record.main([*common, f"file={still}"]) == 0
+    drawn = (255 * plt.imread(still)[..., :3]).round()
+    height, width = drawn.shape[:2]  # of the video, sizes are even
+    errors = np.abs(drawn - last[:height, :width])
+    assert drawn.std() > 10 and errors.mean() < 3, "compression loses as much"
+
+
+def test_a_video_of_several_cameras_shows_each(tmp_path):
+    options = ["env=explorer", "geometry=box", "env.cameras=[0,120,240]", "device=cpu", "steps=1"]
+    heights = []
+    for cameras in options[2], "env.cameras=[0]":
+        file = tmp_path / "a.png"
+        assert record.main([*options[:2], cameras, *options[3:], f"file={file}"]) == 0
+        heights.append(len(plt.imread(file)))
+    strip = 100 * plotting.STRIP * (6 - 2 * 0.55)
+    assert heights[0] - heights[1] == pytest.approx(2 * 2 * strip, abs=2), (
+        "two rows more in each of two strips"
+    )
 
 
 def test_a_place_that_cannot_be_written_is_one_sentence(trained, capsys):

@@ -2,6 +2,7 @@
 from Python.
 """
 
+import collections
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from agents.cli.errors import UserError
 from agents.cli.settings import GROUPS, Record
 from agents.evaluation import RandomActions
 from agents.metrics import missing
+from megastep.arrdict import numpyify
 
 HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
 
@@ -23,7 +25,7 @@ The commonest:
   env=explorer     random actions in an environment, without a run
   steps=400        frames
   home=3           another of the unseen homes; split=training: one it was trained in
-  file=out.mp4     instead of video.mp4 in the run folder"""
+  file=out.mp4     instead of video.mp4 in the run folder; out.png: the last frame alone"""
 
 #: Where random actions are filmed unless geometry= says otherwise.
 HOMES = {"name": "megastep.geometries.sources:homes"}
@@ -31,10 +33,11 @@ HOMES = {"name": "megastep.geometries.sources:homes"}
 
 def run(cfg: Record) -> Path:
     """Films as `cfg` says. Returns the path of the video."""
-    try:
-        import av  # noqa: F401, what the recorder encodes with
-    except ImportError:
-        raise UserError(missing("av")) from None
+    if not (cfg.file or "").endswith(".png"):
+        try:
+            import av  # noqa: F401, what the recorder encodes with
+        except ImportError:
+            raise UserError(missing("av")) from None
     device, folder = components.make_device(cfg.device), Path()
     chosen, geometry, loaded = cfg.env, cfg.geometry or GROUPS["geometry"].settings(HOMES), None
     if cfg.run is not None:
@@ -66,20 +69,40 @@ def film(
     env: Any, policy: Any, path: str | Path, steps: int, greedy: bool = False, seed: int = 1
 ) -> Path:
     """Films environment 0 of `env` for some steps from its reset, each a frame, at the
-    environment's own frames per second. Returns the path of the mp4.
+    environment's own frames per second; an image, .png, is the last frame. Returns the path of the
+    mp4 or the image.
 
     ValueError for another kind of file; RuntimeError that names the first frame that failed.
     """
-    from megastep.recording import ParallelEncoder
+    from megastep.recording import ParallelEncoder, draw
 
-    generator = torch.Generator(env.device).manual_seed(seed)
+    states = _states(env, policy, steps, greedy, torch.Generator(env.device).manual_seed(seed))
+    if Path(path).suffix == ".png":
+        (last,) = collections.deque(states, maxlen=1)
+        return _save_image(path, draw(env.plot_state, numpyify(last)))
     with ParallelEncoder(env.plot_state, fps=env.fps) as encoder:
-        world, memory = env.reset(), policy.initial(env.n_envs * env.n_agents, env.device)
-        for _ in range(steps):
-            encoder(env.state(0))
-            decision, memory = policy(world, memory, sample=not greedy, generator=generator)
-            world = env.step(decision)
+        for state in states:
+            encoder(state)
     return encoder.save(path)
+
+
+def _states(env, policy, steps, greedy, generator):
+    """What there is to see of environment 0, at its reset and after each of `steps` - 1 steps."""
+    world, memory = env.reset(), policy.initial(env.n_envs * env.n_agents, env.device)
+    yield env.state(0)
+    for _ in range(steps - 1):
+        decision, memory = policy(world, memory, sample=not greedy, generator=generator)
+        world = env.step(decision)
+        yield env.state(0)
+
+
+def _save_image(path, image):
+    from matplotlib.image import imsave
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    imsave(path, image)
+    return path
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -26,13 +26,14 @@ class Explorer:
     """Reward for wall texels seen for the first time in an episode, / 64; what the first view shows
     pays nothing.
 
-    Observation: RGB and depth of 64 pixels, each the mean of 4 rays over 130 degrees, and IMU, all
-    fp16. Seven actions, with momentum. Truncated when the episode's length in steps reaches the
+    Observation: RGB and depth of 64 pixels per camera, each the mean of 4 rays, and IMU, all fp16.
+    One camera looks ahead, 130 degrees wide. Seven actions, with momentum. Truncated when the episode's length in steps reaches the
     number of texels seen, the first view's included, + 200. Its metric is ``coverage``, the share
     seen of the texels that a look all round from some spawn point can show.
 
     Args: ``geometries`` to live in, generated homes by default; ``res`` rays and ``subsample`` rays
-    per pixel; ``fov`` degrees; ``fps`` steps per second; ``patience`` steps; ``resample``: every
+    per pixel; ``fov`` degrees; ``cameras``, the yaw of each in degrees, 0 ahead and 90 left;
+    ``fps`` steps per second; ``patience`` steps; ``resample``: every
     episode in a home drawn anew, instead of one home per environment for ever; ``privileged``:
     worlds also tell a critic how far the episode is and where the texels are that can be seen from
     some spawn point and have not been seen yet.
@@ -51,6 +52,7 @@ class Explorer:
         res: Annotated[int, Field(ge=1, le=1024)] = 256,
         subsample: Annotated[int, Field(ge=1, le=32)] = 4,
         fov: Annotated[float, Field(gt=0, lt=180)] = 130.0,
+        cameras: Annotated[Sequence[float], Field(min_length=1, max_length=16)] = (0.0,),
         fps: Annotated[float, Field(ge=1, le=1000)] = 10.0,
         patience: Annotated[int, Field(ge=1, le=10**6)] = 200,
         resample: bool = False,
@@ -64,22 +66,23 @@ class Explorer:
             res,
             fov,
             fps,
-            seed=seed,
+            cameras,
+            seed,
         )
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, self.patience = subsample, patience
         self.spawner = modules.RandomSpawns(geometries, self.core, resample=resample)
         self.movement = modules.MomentumMovement(self.core)
         self.lifecycle = modules.Lifecycle(self.core)
-        pixels = modules.RGB(self.core, subsample).space.W
         self.obs_space = dotdict(
-            rgb=spaces.MultiImage(1, 3, 1, pixels),
-            d=spaces.MultiImage(1, 1, 1, pixels),
+            rgb=modules.RGB(self.core, subsample).space,
+            d=modules.Depth(self.core, subsample).space,
             imu=spaces.MultiVector(1, 3),
         )
         self.action_space = self.movement.space
         self.privileged_space = None
         words = -(-self.core.scenery.layouts.max_texels // 32)
+        pixels = self.obs_space.d.H * self.obs_space.d.W
         engine.fit(n_envs, 4 * words + 8 * pixels + 64, self.device)
         self.seen = torch.zeros((n_envs, 1, words), dtype=torch.int32, device=self.device)
         self.visible = modules.visible_texels(self.core.scenery, self.spawner.points)
@@ -139,12 +142,11 @@ class Explorer:
     def _observation(self, **seen):
         """The observation, and if ``seen`` is given how many texels were new (N,)."""
         view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True, **seen)
-        parts = {"rgb": view.rgb, "d": view.depth, "imu": view.imu}
+        per_camera = view.rgb.view(self.n_envs, 1, -1, 3, self.obs_space.rgb.W)
         obs = arrdict(
-            {
-                key: parts[key].view(self.n_envs, *space.shape)
-                for key, space in self.obs_space.items()
-            }
+            rgb=per_camera.transpose(2, 3),
+            d=view.depth.view(self.n_envs, *self.obs_space.d.shape),
+            imu=view.imu,
         )
         return obs, modules.to_lanes(view.newly_seen) if seen else None
 
@@ -186,13 +188,13 @@ class Explorer:
         seen, and what the agent sees.
         """
         steps, n_texels = state.lifecycle.age[0], len(state.seen)
-        figure, plan, strips = plotting.panels(
-            2, title=f"step {steps}, {state.n_seen} of {n_texels} texels seen"
-        )
+        title = f"step {steps}, {state.n_seen} of {n_texels} texels seen"
+        yaws = state.core.yaws
+        figure, plan, strips = plotting.panels(2, title=title, n_cameras=len(yaws))
         distances = engine.AGENT_RADIUS + 10 * (1 - state.obs.d[0].astype("float32"))
         Core.plot_state(state.core, plan, seen=state.seen, distances=distances)
-        modules.RGB.plot_state(state.obs.rgb, strips[:1])
-        modules.Depth.plot_state(state.obs.d, strips[1:])
+        modules.RGB.plot_state(state.obs.rgb, strips[:1], yaws)
+        modules.Depth.plot_state(state.obs.d, strips[1:], yaws)
         return figure
 
     def display(self, e: int = 0) -> Any:

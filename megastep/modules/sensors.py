@@ -30,6 +30,12 @@ def downsample(screen: torch.Tensor, subsample: int) -> torch.Tensor:
     return screen.reshape(*screen.shape[:-1], screen.shape[-1] // subsample, subsample)
 
 
+def _plot_strips(name, state, axes, yaws):
+    """Strips of images (A, channels, C, R), one per agent, with a row per camera."""
+    aspect = plotting.STRIP * np.shape(state)[-2]
+    return plotting.plot_images({name: state}, aspect=aspect, axes=axes, yaws=yaws)
+
+
 class RGB:
     """Colour: float32 (N, A, 3, 1, R / subsample) in linear light, the mean over ``subsample``
     rays. Several cameras per agent give (N, A, 3, C, R / subsample).
@@ -53,11 +59,12 @@ class RGB:
         return self()[e]
 
     @staticmethod
-    def plot_state(state: np.ndarray, axes: Any = None) -> np.ndarray:
+    def plot_state(state: np.ndarray, axes: Any = None, yaws: Any = None) -> np.ndarray:
         """Draws a numpyified :meth:`state` as strips, one per agent, on as many ``axes`` or on a
-        new figure. Returns the axes.
+        new figure. A strip has a row for each camera, named by its angle if ``yaws`` (C,) are
+        given. Returns the axes.
         """
-        return plotting.plot_images({"rgb": state}, aspect=plotting.STRIP, axes=axes)
+        return _plot_strips("rgb", state, axes, yaws)
 
 
 class Depth:
@@ -84,11 +91,11 @@ class Depth:
         return self()[e]
 
     @staticmethod
-    def plot_state(state: np.ndarray, axes: Any = None) -> np.ndarray:
-        """Draws a numpyified :meth:`state` as strips in grey, near is bright, one per agent, on as
-        many ``axes`` or on a new figure. Returns the axes.
+    def plot_state(state: np.ndarray, axes: Any = None, yaws: Any = None) -> np.ndarray:
+        """Draws a numpyified :meth:`state` as :meth:`RGB.plot_state` does, in grey; near is
+        bright. Returns the axes.
         """
-        return plotting.plot_images({"depth": state}, aspect=plotting.STRIP, axes=axes)
+        return _plot_strips("depth", state, axes, yaws)
 
 
 class IMU:
