@@ -27,16 +27,17 @@ class Explorer:
     pays nothing.
 
     Observation: RGB and depth of 64 pixels per camera, each the mean of 4 rays, and IMU, all fp16.
-    One camera looks ahead, 130 degrees wide. Seven actions, with momentum. Truncated when the episode's length in steps reaches the
-    number of texels seen, the first view's included, + 200. Its metric is ``coverage``, the share
-    seen of the texels that a look all round from some spawn point can show.
+    One camera looks ahead, 130 degrees wide. Seven actions, with momentum. Truncated when the
+    episode's length in steps reaches the number of texels seen, the first view's included, + 200.
+    Its metric is ``coverage``, the share seen of the texels that a look all round from some spawn
+    point can show.
 
     Args: ``geometries`` to live in, generated homes by default; ``res`` rays and ``subsample`` rays
     per pixel; ``fov`` degrees; ``cameras``, the yaw of each in degrees, 0 ahead and 90 left;
-    ``fps`` steps per second; ``patience`` steps; ``resample``: every
-    episode in a home drawn anew, instead of one home per environment for ever; ``privileged``:
-    worlds also tell a critic how far the episode is and where the texels are that can be seen from
-    some spawn point and have not been seen yet.
+    ``fps`` steps per second; ``patience`` steps; ``resample``: every episode in a home drawn anew,
+    instead of one home per environment for ever; ``privileged``: worlds also tell a critic how far
+    the episode is and where the texels are that can be seen from some spawn point and have not been
+    seen yet.
     """
 
     n_agents = 1

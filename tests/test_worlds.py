@@ -1,0 +1,30 @@
+"""The page on worlds: its commands can be typed, its pictures are there, its rules hold."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from agents.cli.build import build
+from agents.cli.compose import ConfigLoader
+from agents.cli.settings import Evaluate, Record, Train
+from megastep import envs
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGE = (DOCS / "worlds.md").read_text()
+COMMANDS = re.findall(r"^python (\w+)\.py ([^#\n]*)", PAGE, re.MULTILINE)
+SCRIPTS = {"train": Train, "evaluate": Evaluate, "record": Record}
+
+
+@pytest.mark.parametrize("script, arguments", [c for c in COMMANDS if c[0] in SCRIPTS])
+def test_a_command_is_a_configuration(script, arguments):
+    with ConfigLoader(script, SCRIPTS[script]) as loader:
+        kind = SCRIPTS[script]
+        assert isinstance(build(kind, loader.tree(shlex.split(arguments))), kind)
+
+
+def test_pictures_are_there_and_every_environment_is_told_of():
+    pictures = re.findall(r"!\[[^]]+\]\(([^)]+)\)", PAGE)
+    assert len(pictures) >= 4 and all((DOCS / name).exists() for name in pictures)
+    assert set(envs.ENVS) <= set(map(str.lower, re.findall(r"^## (\w+)$", PAGE, re.MULTILINE)))
