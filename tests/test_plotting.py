@@ -134,6 +134,8 @@ def test_every_agent_and_camera_is_shown():
         ("2", [2, 5]),
     ]
     views = [matplotlib.colors.to_rgb(patch.get_facecolor()) for patch in plan.patches]
+    ahead, behind = (patch.get_xy()[:, 0] for patch in plan.patches[:2])  # of an agent at (2, 2)
+    assert ahead.min() >= 1.99 and behind.max() <= 2.01
     labels = [matplotlib.colors.to_rgb(t.get_color()) for t in strips[0].get_yticklabels()]
     assert views == 3 * labels and labels[0] != labels[1]
 
