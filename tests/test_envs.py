@@ -415,7 +415,7 @@ class Launches(TorchDispatchMode):
     [
         ("minimal", 10),
         ("explorer", 9),
-        ("explorer, privileged", 16),
+        ("explorer, privileged", 18),
         ("explorer, cameras", 9),
         ("pong", 0),
     ],

@@ -132,7 +132,8 @@ class Explorer:
         columns = limits - ages, ages, self.n_seen, counts.sum((1, 2), dtype=torch.int32)
         return arrdict(
             episode=torch.stack(columns, -1)[:, None] / self.units,
-            unseen=(counts / TEXELS_PER_POINT).sqrt_(),
+            # in double precision, as PyTorch's root of a float has other last bits on a CPU
+            unseen=(counts.double() / TEXELS_PER_POINT).sqrt_().float(),
         )
 
     @property
