@@ -6,7 +6,9 @@ import torch
 
 from .kernels.compile import EngineError
 
-__all__ = ["device", "fit", "free_memory"]
+__all__ = ["device", "fit", "free_memory", "set_threads", "threads"]
+
+_set_threads = None
 
 
 def device(name: str | torch.device = "auto") -> torch.device:
@@ -40,6 +42,19 @@ def _missing(count):
         return f"there are {count} GPUs"
     built = "" if torch.version.cuda else " and this PyTorch is built for the CPU only"
     return f"PyTorch sees no GPU{built}"
+
+
+def threads() -> int:
+    """How many threads an operation of the engine takes on the CPU: what :func:`set_threads` was
+    given, else as many as PyTorch's operations.
+    """
+    return _set_threads or torch.get_num_threads()
+
+
+def set_threads(n: int | None) -> None:
+    """Gives the engine a number of threads of its own, or with None PyTorch's."""
+    global _set_threads
+    _set_threads = n
 
 
 def fit(n_envs: int, bytes_each: float, device: Any, what: str = "environments") -> None:

@@ -22,7 +22,7 @@ from .agents import (
     check_flag_on_cpu,
     check_on_cpu,
 )
-from .devices import device, fit
+from .devices import device, fit, set_threads, threads
 from .kernels.compile import BLOCK, EngineError
 from .kernels.launch import SIZES, WARP, launch, params
 from .launch_params import error_flag, scenery_params, state_params
@@ -51,7 +51,9 @@ __all__ = [
     "physics",
     "pong",
     "render",
+    "set_threads",
     "spawn",
+    "threads",
     "uniform",
     "unseen",
     "update_agent_geometry",
@@ -410,7 +412,7 @@ def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tens
         out=checks.address("out", out, (n, 4), torch.float32, on),
         **_keys(seed),
         n_lanes=n,
-        n_threads=torch.get_num_threads(),
+        n_threads=threads(),
     )
     launch("uniform", packed, on, threads=n)
     counts.add_(mask)
@@ -475,7 +477,7 @@ def pong(
         points=checks.integer("points", points, 1, 2**31 - 1),
         limit=checks.integer("limit", limit, 1, 2**31 - 1),
         tracker_speed=round(CELL * speed),
-        n_threads=torch.get_num_threads(),
+        n_threads=threads(),
     )
     launch("pong", packed, on, threads=n)
     check_flag_on_cpu(error_flag)

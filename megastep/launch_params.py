@@ -4,7 +4,7 @@ import operator
 
 import torch
 
-from . import checks
+from . import checks, devices
 from .agents import Agents
 from .kernels.launch import params
 from .scenery import Scenery
@@ -44,7 +44,7 @@ def scenery_params(scenery: Scenery, radius: float) -> bytes:
     packed = vars(scenery).get("_packed")
     if packed is None:
         packed = vars(scenery)["_packed"] = _Packed(scenery)
-    n_threads = torch.get_num_threads()
+    n_threads = devices.threads()
     memory = [*map(_address, packed.tensors), *map(_shape, packed.tensors), radius, n_threads]
     if packed.memory != memory:
         packed.params = _pack(scenery, radius, n_threads)

@@ -148,7 +148,7 @@ def test_what_a_cpu_and_a_gpu_train_with():
     assert (cpu.env.n_envs, cpu.agent.width, cpu.report) == (256, 64, 4)
     assert (gpu.env.n_envs, gpu.agent.width, gpu.report) == (4096, 256, 50)
     assert dataclasses.replace(cpu.env, n_envs=4096) == gpu.env
-    assert compose("experiment=newcomer").geometry.n == 2000
+    assert compose("experiment=newcomer").seconds == 160
 
 
 def test_a_recipe_differs_on_a_cpu_and_on_a_gpu():

@@ -19,7 +19,7 @@ import torch
 import yaml
 
 from agents import checkpoint, metrics, ppo
-from agents.cli import evaluate, train
+from agents.cli import components, evaluate, train
 from agents.cli.build import build
 from agents.cli.compose import ConfigLoader
 from agents.cli.errors import ConfigErrors, UserError
@@ -27,7 +27,7 @@ from agents.cli.lock import locked
 from agents.cli.settings import Train
 from agents.cli.signals import Interrupted
 from agents.finite import bad_leaf
-from megastep import envs
+from megastep import engine, envs
 from megastep.settings import MAX_ENVS
 
 TINY = [*tiny.TINY, *tiny.SHORT_EPISODES, "report=1"]
@@ -533,3 +533,16 @@ def test_few_metrics_and_roles_are_shown_beside_the_return():
     assert shown == ["leader 12.3", "follower 2", "coverage 0.837"]
     assert train.few_means({}, ["coverage"], ()) == []
     assert train.few_means(latest, ["coverage", *"abcd"], ()) == []
+
+
+def test_on_a_cpu_the_engine_takes_all_threads_and_a_small_network_one():
+    before = torch.get_num_threads()
+    try:
+        for width, expected in ((64, 1), (256, 2), (4096, 3)):
+            torch.set_num_threads(3)
+            engine.set_threads(None)
+            components.share_threads(width)
+            assert (torch.get_num_threads(), engine.threads()) == (expected, 3)
+    finally:
+        torch.set_num_threads(before)
+        engine.set_threads(None)

@@ -164,8 +164,23 @@ def make_actor(agent: settings.Agent, env: Any) -> Policy:
     return _make_policy(agent, env, 1, None)
 
 
+def share_threads(width: int) -> None:
+    """On a CPU the engine takes all threads, and PyTorch one for every 128 units of a network:
+    where layers are smaller, waiting for each other costs threads more than they do.
+    """
+    import torch
+
+    from megastep import engine
+
+    n_threads = engine.threads()
+    engine.set_threads(n_threads)
+    torch.set_num_threads(max(1, min(n_threads, width // 128)))
+
+
 def _make_policy(agent, env, seed, critic):
     from agents.policy import Policy
+
+    share_threads(agent.width)
 
     with errors():
         policy = Policy(
