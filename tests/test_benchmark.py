@@ -122,7 +122,7 @@ def test_learning_curves_are_the_mean_and_range_of_seeds(tmp_path):
     assert ends == [[2, 14], [1, 7], [3, 21]]
     path = written(tmp_path, *records)
     assert benchmark.main(["report", "--json", str(path)]) == 0
-    assert "3 seeds" in (tmp_path / "results.svg").read_text()
+    assert "seeds: 3" in (tmp_path / "results.svg").read_text()
 
 
 # ---- Benchmarks ----

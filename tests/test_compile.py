@@ -2,6 +2,7 @@
 or fails. Each fault is injected for real.
 """
 
+import contextlib
 import ctypes
 import os
 import re
@@ -9,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -246,3 +248,26 @@ def test_the_gpus_reciprocal_rounds_as_division_does(exponent):
     )
     compile.checked(done, "Launching")
     assert torch.equal(found.cpu(), 1 / values)
+
+
+def test_a_thread_without_a_context_takes_the_gpus_and_launches_again(monkeypatch):
+    calls, current = [], []
+
+    def launched(function, *shape):
+        calls.append((function, *shape))
+        return (0 if current else launch.INVALID_CONTEXT,)
+
+    driver = SimpleNamespace(
+        cuLaunchKernel=launched,
+        cuDeviceGet=lambda index: (0, f"device {index}"),
+        cuDevicePrimaryCtxRetain=lambda device: (0, f"context of {device}"),
+        cuCtxSetCurrent=lambda context: current.append(context) or (0,),
+    )
+    monkeypatch.setattr(launch, "bindings", lambda: (driver, None))
+    monkeypatch.setattr(launch, "cuda", lambda index, program: {"uniform": "function"})
+    monkeypatch.setattr(torch.cuda, "device", lambda index: contextlib.nullcontext())
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=7))
+    for _ in range(2):
+        launch.launch("uniform", b"params", torch.device("cuda", 1), threads=100)
+    assert current == ["context of device 1"] and len(calls) == 3
+    assert calls[0] == calls[1] and calls[0][:4] == ("function", 2, 1, 1)

@@ -17,6 +17,7 @@ import torch
 from .compile import BLOCK, ENGINE, EngineError, Program, bindings, checked, cpu, cuda
 
 WARP = 32  # threads
+INVALID_CONTEXT = 201  # CUDA_ERROR_INVALID_CONTEXT
 MAX_THREADS = 2**32 - BLOCK  # per launch: kernels count them in 32 bits
 FORMATS = {"int": "i", "float": "f", "unsigned int": "I"}
 
@@ -92,13 +93,20 @@ def launch(
     arguments = (ctypes.c_char_p * 1)(packed)
     with torch.cuda.device(index):
         stream = torch.cuda.current_stream(index).cuda_stream
-        status = bindings()[0].cuLaunchKernel(
-            function,
-            *(-(-threads // BLOCK), 1, 1),
-            *(BLOCK, 1, 1),
-            shared * (BLOCK // WARP),
-            stream,
-            ctypes.addressof(arguments),
-            0,
-        )
+        shape = *(-(-threads // BLOCK), 1, 1), *(BLOCK, 1, 1), shared * (BLOCK // WARP)
+        given = function, *shape, stream, ctypes.addressof(arguments), 0
+        status = bindings()[0].cuLaunchKernel(*given)
+        if int(status[0]) == INVALID_CONTEXT:
+            make_current(index)
+            status = bindings()[0].cuLaunchKernel(*given)
     checked(status, f"Launching {operation}")
+
+
+def make_current(index: int) -> None:
+    """Makes a GPU's context this thread's. Autograd's threads have none until PyTorch's first
+    operation there; the driver, unlike the runtime, does not see to it by itself.
+    """
+    driver, _ = bindings()
+    device = checked(driver.cuDeviceGet(index), "Finding the GPU")
+    context = checked(driver.cuDevicePrimaryCtxRetain(device), "Finding the GPU's context")
+    checked(driver.cuCtxSetCurrent(context), "Taking the GPU's context")

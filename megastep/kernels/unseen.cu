@@ -1,5 +1,4 @@
-// One block per agent, over the walls of its layout: each waits for its texels' bits, so that a
-// second warp halves the time where agents are few.
+// One block per agent, over the walls of its layout.
 #include "unseen.h"
 
 KERNEL BOUNDS(20) unseen(UnseenParams p) {
