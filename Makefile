@@ -10,7 +10,7 @@ KERNELS := $(wildcard $(foreach suffix,h cu cpp,*/kernels/*.$(suffix)) tests/*.h
 
 .PHONY: train test test-all lint setup clean
 
-train: $(SETUP)            ## train Explorer in generated homes, evaluate it on unseen ones, film it
+train: $(SETUP)            ## train Explorer in homes, evaluate it in unseen ones, film it
 	$(PYTHON) train.py experiment=newcomer
 
 test: $(SETUP)             ## the tests, without those marked slow

@@ -160,7 +160,9 @@ def plot_learning(records, path):
         )
         ax.plot([budget] * n_seeds, run["evaluated"], "o", color=colour, markersize=5)
     ax.plot([], [], "o", color="grey", markersize=5, label="evaluated in unseen homes, a seed each")
-    ax.axhline(ALL_SEEN, color="grey", linewidth=1, linestyle="--", label="what 128 looks all round show")
+    ax.axhline(
+        ALL_SEEN, color="grey", linewidth=1, linestyle="--", label="what 128 looks all round show"
+    )
     ax.set(xscale="log", xlabel="seconds of training", ylabel="return", ylim=(0, None))
     ax.set_xticks([1, 10, 60, 240], ["1", "10", "60", "240"])
     ax.minorticks_off()
