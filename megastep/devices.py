@@ -1,4 +1,6 @@
-"""Devices by name, and whether what is to be made fits into their memory."""
+"""Devices by name, whether what is to be made fits into their memory, and how many threads of the
+CPU the engine takes.
+"""
 
 from typing import Any
 
@@ -8,7 +10,7 @@ from .kernels.compile import EngineError
 
 __all__ = ["device", "fit", "free_memory", "set_threads", "threads"]
 
-_set_threads = None
+_n_threads = None  # None: as many as PyTorch
 
 
 def device(name: str | torch.device = "auto") -> torch.device:
@@ -48,13 +50,13 @@ def threads() -> int:
     """How many threads an operation of the engine takes on the CPU: what :func:`set_threads` was
     given, else as many as PyTorch's operations.
     """
-    return _set_threads or torch.get_num_threads()
+    return _n_threads or torch.get_num_threads()
 
 
 def set_threads(n: int | None) -> None:
     """Gives the engine a number of threads of its own, or with None PyTorch's."""
-    global _set_threads
-    _set_threads = n
+    global _n_threads
+    _n_threads = n
 
 
 def fit(n_envs: int, bytes_each: float, device: Any, what: str = "environments") -> None:

@@ -1,7 +1,7 @@
 """The engine: ``bake``, ``physics``, ``render``, ``observe``, ``unseen``, ``coverage``, ``spawn``,
-``uniform``, ``pong``.
-Each checks its arguments, allocates and launches, on the CPU or the GPU, whichever its tensors are
-on; none synchronises. TypeError or ValueError, naming the argument, if one does not fit.
+``uniform``, ``pong``. Each checks its arguments, allocates and launches, on the CPU or the GPU,
+whichever its tensors are on; none synchronises. TypeError or ValueError, naming the argument, if
+one does not fit.
 
 N environments, A agents per environment, C cameras per agent (the axis is dropped if there is one),
 R rays per camera, P = R / subsample pixels, D layouts, B lanes. Metres, degrees, seconds.

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from agents.kernels.lstm import LSTM
+from megastep import engine
 from megastep.kernels import compile, launch
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -271,3 +272,12 @@ def test_a_thread_without_a_context_takes_the_gpus_and_launches_again(monkeypatc
         launch.launch("uniform", b"params", torch.device("cuda", 1), threads=100)
     assert current == ["context of device 1"] and len(calls) == 3
     assert calls[0] == calls[1] and calls[0][:4] == ("function", 2, 1, 1)
+
+
+def test_sizes_that_python_and_the_kernels_have_are_the_same():
+    text = "".join((compile.HERE / name).read_text() for name in ("unseen.h", "pong.h"))
+    found = {name: int(value) for name, value in re.findall(r"\b([A-Z_]+) = (\d+)\b", text)}
+    assert (found["BANDS"], found["SECTORS"]) == (engine.BANDS, engine.SECTORS)
+    assert found["GAME_FIELDS"] == engine.GAME_FIELDS and found["N_FEATURES"] == engine.FEATURES
+    assert found["CELL"] == engine.CELL
+    assert (found["HEIGHT"], found["WIDTH"]) == engine.PIXELS  # in cells

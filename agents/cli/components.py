@@ -165,8 +165,8 @@ def make_actor(agent: settings.Agent, env: Any) -> Policy:
 
 
 def share_threads(width: int) -> None:
-    """On a CPU the engine takes all threads, and PyTorch one for every 128 units of a network:
-    where layers are smaller, waiting for each other costs threads more than they do.
+    """Gives the engine all threads of the CPU, and PyTorch one for every 128 units of a network
+    there: where layers are smaller, waiting for each other costs threads more than they do.
     """
     import torch
 
@@ -178,10 +178,12 @@ def share_threads(width: int) -> None:
 
 
 def _make_policy(agent, env, seed, critic):
+    import torch
+
     from agents.policy import Policy
 
-    share_threads(agent.width)
-
+    if torch.device(env.device).type == "cpu":
+        share_threads(agent.width)
     with errors():
         policy = Policy(
             env.obs_space,

@@ -25,8 +25,8 @@ HD int band_of(float ahead, float left) {
 
 // Adds the unseen texels of a wall of the layout whose texels start at `first_texel`. Those that
 // share a word of bits, at most 1.6 m of a wall, count where their middle lies.
-HD void count_unseen(const UnseenParams& p, const Pose& pose, const unsigned int* seen,
-                     const unsigned int* visible, int first_texel, int wall, int* bins) {
+HD void count_wall(const UnseenParams& p, const Pose& pose, const unsigned int* seen,
+                   const unsigned int* visible, int first_texel, int wall, int* bins) {
     int first = p.scenery.texel_starts[wall] - first_texel;
     int end = p.scenery.texel_starts[wall + 1] - first_texel;
     Float4 line = LOAD((const Float4*)p.scenery.walls + wall);
@@ -41,4 +41,21 @@ HD void count_unseen(const UnseenParams& p, const Pose& pose, const unsigned int
         float ahead = pose.cosine * dx + pose.sine * dy, left = pose.cosine * dy - pose.sine * dx;
         ADD(bins + SECTORS * band_of(ahead, left) + sector_of(ahead, left), COUNT_BITS(bits));
     }
+}
+
+// Adds the unseen texels of the walls of an agent's layout that are this thread's: number `rank`
+// and each `n_threads` further.
+HD void count_unseen(const UnseenParams& p, int agent, int rank, int n_threads, int* bins) {
+    const SceneryParams& s = p.scenery;
+    float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
+    int env = agent / s.n_agents, layout = layout_of(s, env, p.error_flag);
+    if (rank == 0)
+        flag_nonfinite(p.error_flag, env, x, y, angle);
+    Pose pose = pose_at(x, y, angle);
+    Walls walls = walls_of(s, layout);
+    int first_texel = s.texel_starts[walls.first_wall];
+    const unsigned int* seen = p.seen + agent * (long long)p.n_words;
+    const unsigned int* visible = p.visible + layout * (long long)p.n_words;
+    for (int wall = walls.first_wall + rank; wall < walls.end_wall; wall += n_threads)
+        count_wall(p, pose, seen, visible, first_texel, wall, bins);
 }
