@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from agents.imports import choose
-from agents.recurrent import LSTM
+from agents.lstm import LSTM
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
 

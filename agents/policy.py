@@ -141,8 +141,8 @@ class Policy(nn.Module):
         return (predicted - target).square().mean(-1)
 
     def compute_dtype(self) -> torch.autocast:
-        """The context in which matrix products are taken. Within one of them, weights are cast
-        once, however often they are used.
+        """The context in which matrix products are taken. Within one of them autocast casts a
+        weight once, however often it is used.
         """
         return torch.autocast(
             self.device.type, torch.bfloat16, enabled=self.bf16 and self.device.type == "cuda"

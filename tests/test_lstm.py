@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch import nn
 
-from agents import recurrent
+from agents import lstm as lstm_module
 from agents.kernels import lstm as kernels
-from agents.recurrent import LSTM
+from agents.lstm import LSTM
 from megastep.arrdict import arrdict
 from megastep.kernels import compile
 
@@ -196,7 +196,7 @@ def where(request, monkeypatch):
         functions[operation](packed, ctypes.c_uint(threads))
 
     monkeypatch.setattr(kernels, "launch", launch)
-    monkeypatch.setattr(recurrent, "_steps", lambda x: kernels)
+    monkeypatch.setattr(lstm_module, "_steps", lambda x: kernels)
     return "cpu"
 
 
@@ -204,7 +204,7 @@ def sequence(device, dtype, x, reset, state, weights, d_outputs, d_cell):
     """Outputs, last cell and all gradients of the bare recurrence, on the CPU in float32."""
     to = [leaf.detach().to(device, dtype).requires_grad_() for leaf in (x, *weights)]
     states = [leaf.detach().to(device).requires_grad_() for leaf in state]
-    outputs, cell = recurrent._Sequence.apply(*to, reset.to(device), *states)
+    outputs, cell = lstm_module._Sequence.apply(*to, reset.to(device), *states)
     assert outputs.dtype == dtype and cell.dtype == torch.float32
     grads = torch.autograd.grad(
         [outputs, cell], [*to, *states], [d_outputs.to(device, dtype), d_cell.to(device)]
@@ -239,7 +239,7 @@ def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lan
     )
     found = sequence(where, dtype, **given)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recurrent, "_steps", lambda x: recurrent._WRITTEN_OUT)
+        patch.setattr(lstm_module, "_steps", lambda x: lstm_module._WRITTEN_OUT)
         expected = sequence("cpu", torch.float32, **given)
     for name, ours, theirs in zip(NAMES, found, expected, strict=True):
         slack = SLACK[dtype] * theirs.abs().max().item()
@@ -253,7 +253,7 @@ def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lan
 def test_kernels_read_words_of_16_bytes(offset, shape):
     tensor = torch.arange(40.0)[offset : offset + 32].view(shape)
     for given in (tensor, tensor.T):
-        found = recurrent._aligned(given)
+        found = lstm_module._aligned(given)
         assert torch.equal(found, given)
         assert found.is_contiguous() and not found.data_ptr() % 16
 
