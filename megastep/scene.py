@@ -30,7 +30,26 @@ PALETTE = (
     "7fb0b0",
     "e8e0d8",
 )
-AGENT_PALETTE = ("3b6ea5", "a5523b", "4f8f4f", "8a5ba5", "a58a3b", "3b9a9a", "a53b74", "6b6b6b")
+# Saturated, as walls are not: an agent's weakest channel has at most a tenth of its light, a wall's
+# at least an eighth. So a pixel tells one from the other, however bright it is.
+AGENT_PALETTE = (
+    "3b6ea5",
+    "a5523b",
+    "2c9030",
+    "7a3ba5",
+    "a58a3b",
+    "3b9a9a",
+    "a53b74",
+    "6f9a2a",
+    "c87a18",
+    "2438c8",
+    "18a868",
+    "c82cb4",
+    "c8c020",
+    "5018c0",
+    "20a8e0",
+    "804010",
+)
 FRONT = "ff3020"
 
 
