@@ -1,7 +1,7 @@
 """The engine: ``bake``, ``physics``, ``render``, ``observe``, ``unseen``, ``coverage``, ``spawn``,
-``uniform``, ``pong``. Each checks its arguments, allocates and launches, on the CPU or the GPU,
-whichever its tensors are on; none synchronises. TypeError or ValueError, naming the argument, if
-one does not fit.
+``uniform``, ``pong``, ``shoot``. Each checks its arguments, allocates and launches, on the CPU or
+the GPU, whichever its tensors are on; none synchronises. TypeError or ValueError, naming the
+argument, if one does not fit.
 
 N environments, A agents per environment, C cameras per agent (the axis is dropped if there is one),
 R rays per camera, P = R / subsample pixels, D layouts, B lanes. Metres, degrees, seconds.
@@ -19,20 +19,25 @@ from .agents import (
     Agents,
     check,
     check_flag,
-    check_flag_on_cpu,
     check_on_cpu,
 )
 from .devices import device, fit, set_threads, threads
+from .games import CELL, FEATURES, GAME_FIELDS, MAX_SHOOTERS, PIXELS, pong, shoot
 from .kernels.compile import BLOCK, EngineError
 from .kernels.launch import SIZES, WARP, launch, params
-from .launch_params import error_flag, scenery_params, state_params
-from .outputs import Observation, Physics, Pong, Render
+from .launch_params import error_flag, lanes_of, scenery_params, seed_params, state_params
+from .outputs import Observation, Physics, Pong, Render, Shots
 from .scenery import Layouts, Scenery
 
 __all__ = [
     "AGENT_RADIUS",
     "AGENT_WIDTH",
+    "CELL",
+    "FEATURES",
+    "GAME_FIELDS",
     "MAX_RES",
+    "MAX_SHOOTERS",
+    "PIXELS",
     "Agents",
     "EngineError",
     "Layouts",
@@ -41,6 +46,7 @@ __all__ = [
     "Pong",
     "Render",
     "Scenery",
+    "Shots",
     "bake",
     "check",
     "check_flag",
@@ -52,6 +58,7 @@ __all__ = [
     "pong",
     "render",
     "set_threads",
+    "shoot",
     "spawn",
     "threads",
     "uniform",
@@ -63,17 +70,6 @@ BANDS = 3  # of distance from an agent: up to 1.5 m, up to 4 m, and beyond
 SECTORS = 16  # of bearing from an agent
 MANY_ENVS = 32_768  # that fill a GPU with a quarter of a warp each
 MAX_SUBSAMPLE = 32
-GAME_FIELDS = 13  # of a game of Pong
-FEATURES = 8  # that a side is told of it
-PIXELS = 30, 40  # of its picture
-CELL = 256  # parts of a pixel that its places and speeds are counted in
-
-
-def _lanes(scenery, agents):
-    """(N, A), after a look at the types."""
-    checks.instance("scenery", scenery, Scenery)
-    checks.instance("agents", agents, Agents)
-    return scenery.n_envs, scenery.n_agents
 
 
 # ---- The operations ----
@@ -116,7 +112,7 @@ def physics(
     If ``actions`` (N, A) int64 are given, each agent first loses the fraction ``damping`` of its
     velocities, and row ``action`` of ``moves`` (n_moves, 3) is added: m/s ahead and left, deg/s.
     """
-    n, a = lanes = _lanes(scenery, agents)
+    n, a = lanes = lanes_of(scenery, agents)
     checks.number("damping", damping, -math.inf, math.inf)
     on = scenery.device
     if actions is None and moves is None:
@@ -150,7 +146,7 @@ def update_agent_geometry(scenery: Scenery, agents: Agents, lit: bool = True) ->
     """Moves the agents' lines to where the agents are and, if ``lit``, calculates the light on
     them.
     """
-    n, a = _lanes(scenery, agents)
+    n, a = lanes_of(scenery, agents)
     packed = params.UpdateAgentGeometryParams(
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
@@ -165,7 +161,7 @@ def update_agent_geometry(scenery: Scenery, agents: Agents, lit: bool = True) ->
 _OUTPUTS = dict.fromkeys(
     (
         *("indices", "locations", "dots", "distances", "screen"),
-        *("rgb", "depth", "centre_line", "velocity", "angvelocity", "imu"),
+        *("rgb", "depth", "centre_line", "agent_ray", "velocity", "angvelocity", "imu"),
         *("seen", "clear_mask", "newly_seen", "n_words"),
     ),
     0,
@@ -215,7 +211,7 @@ def _per_camera(lanes, agents):
 def render(scenery: Scenery, agents: Agents) -> Render:
     """What every camera sees, after moving the agents' lines to where the agents are."""
     update_agent_geometry(scenery, agents)
-    on, shape = scenery.device, (*_per_camera(_lanes(scenery, agents), agents), agents.res)
+    on, shape = scenery.device, (*_per_camera(lanes_of(scenery, agents), agents), agents.res)
     out = Render(
         indices=torch.empty(shape, dtype=torch.int32, device=on),
         locations=torch.empty(shape, device=on),
@@ -235,6 +231,7 @@ def observe(
     depth: bool = True,
     imu: bool = False,
     centre_line: bool = False,
+    agent_ray: bool = False,
     seen: torch.Tensor | None = None,
     clear_mask: torch.Tensor | None = None,
     max_depth: float = 10.0,
@@ -247,14 +244,15 @@ def observe(
     where ``seen`` is cleared first; ``max_depth`` metres. With one agent per environment,
     ``scenery.lines`` is left as it was.
     """
-    n, a = lanes = _lanes(scenery, agents)
+    n, a = lanes = lanes_of(scenery, agents)
     on = scenery.device
     if agents.res % checks.integer("subsample", subsample, 1, MAX_SUBSAMPLE):
         raise ValueError(
             f"subsample must divide the {agents.res} rays of a camera, but {subsample} was given"
         )
     checks.number("max_depth", max_depth, 0, math.inf, "metres")
-    for name, value in (("rgb", rgb), ("depth", depth), ("imu", imu), ("centre_line", centre_line)):
+    wanted = dict(rgb=rgb, depth=depth, imu=imu, centre_line=centre_line, agent_ray=agent_ray)
+    for name, value in wanted.items():
         checks.flag(name, value)
     seen_fields = {}
     if seen is not None or clear_mask is not None:
@@ -267,6 +265,7 @@ def observe(
         rgb=torch.empty((*shape, 3, pixels), dtype=half, device=on) if rgb else None,
         depth=torch.empty((*shape, pixels), dtype=half, device=on) if depth else None,
         centre_line=torch.empty(shape, dtype=int32, device=on) if centre_line else None,
+        agent_ray=torch.empty(shape, dtype=int32, device=on) if agent_ray else None,
         imu=torch.empty((n, a, 3), dtype=half, device=on) if imu else None,
         newly_seen=torch.empty(lanes, dtype=int32, device=on) if seen_fields else None,
     )
@@ -311,7 +310,7 @@ def unseen(
     Args: ``seen`` (N, A, n_words) int32, as of :func:`observe`; ``visible`` (D, n_words) int32, as
     of :func:`~megastep.modules.visible_texels`.
     """
-    n, a = _lanes(scenery, agents)
+    n, a = lanes_of(scenery, agents)
     counts = torch.empty((n, a, BANDS, SECTORS), dtype=torch.int32, device=scenery.device)
     packed = params.UnseenParams(
         scenery=scenery_params(scenery, agents.radius),
@@ -337,7 +336,7 @@ def coverage(
 
     Args: ``seen`` and ``visible`` as of :func:`unseen`.
     """
-    lanes, on = _lanes(scenery, agents), scenery.device
+    lanes, on = lanes_of(scenery, agents), scenery.device
     shares = torch.empty(lanes, device=on)
     packed = params.CoverageParams(
         scenery=scenery_params(scenery, agents.radius),
@@ -368,15 +367,20 @@ def spawn(
     counts: torch.Tensor,
     seed: int,
     resample: bool = False,
+    hidden: bool = False,
 ) -> None:
     """Puts agents at random points of their environment's layout, at rest, looking anywhere. Each
     draws once from its random stream.
+
+    ``hidden``: out of sight of whoever stands in the environment, but for gaps as narrow as an
+    agent's radius, if it has such a point; else at the one furthest from whoever is nearest to it.
+    Agents take turns: those who have respawned stand.
 
     Args: ``mask`` (N, A) bool, who; ``points`` (D, n, 2), of which the agents of one environment
     have n / A each; ``counts`` (N, A) int32, numbers drawn so far, advanced here; ``resample``: an
     environment whose agents all respawn moves to a random layout first.
     """
-    lanes, on, n_layouts = _lanes(scenery, agents), scenery.device, len(scenery.layouts)
+    lanes, on, n_layouts = lanes_of(scenery, agents), scenery.device, len(scenery.layouts)
     n_points = checks.length("points", points, axis=1)
     if n_points < scenery.n_agents:
         raise ValueError(
@@ -390,11 +394,14 @@ def spawn(
         points=checks.address("points", points, (n_layouts, n_points, 2), torch.float32, on),
         counts=checks.address("counts", counts, lanes, torch.int32, on),
         error_flag=error_flag(scenery, agents),
-        **_keys(seed),
+        **seed_params(seed),
         n_points=n_points,
         resample=int(checks.flag("resample", resample)),
     )
-    launch("spawn", packed, on, threads=scenery.n_envs)
+    if checks.flag("hidden", hidden):
+        launch("spawn_hidden", packed, on, threads=WARP * scenery.n_envs)
+    else:
+        launch("spawn", packed, on, threads=scenery.n_envs)
     check_on_cpu(agents)
 
 
@@ -410,81 +417,10 @@ def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tens
         counts=checks.address("counts", counts, (n,), torch.int32, on),
         mask=checks.address("mask", mask, (n,), torch.bool, on),
         out=checks.address("out", out, (n, 4), torch.float32, on),
-        **_keys(seed),
+        **seed_params(seed),
         n_lanes=n,
         n_threads=threads(),
     )
     launch("uniform", packed, on, threads=n)
     counts.add_(mask)
     return out
-
-
-def pong(
-    games: torch.Tensor,
-    actions: torch.Tensor,
-    error_flag: torch.Tensor,
-    seed: int,
-    *,
-    restart: bool = False,
-    points: int = 1,
-    limit: int = 1000,
-    tracker_speed: float = 0.5,
-    pixels: torch.Tensor | None = None,
-) -> Pong:
-    """One step of N games of Pong, or, where the last step ended one, the start of another; see
-    :class:`~megastep.envs.Pong`. Each serve draws once from the environment's random stream.
-
-    Args: ``games`` (13, N) int32, updated in place, zeros before the first ``restart``, which
-    starts all; ``actions`` (B, 1) int64, of one lane per game, or two, the left paddle first: 0
-    nothing, 1 up, 2 down; ``error_flag`` (1,) int32, see :func:`check_flag`; ``points`` that win a
-    game; ``limit`` steps that truncate it; ``tracker_speed`` cells per step of the right paddle
-    where it is no lane; ``pixels`` (B, 1, 1, 30, 40) uint8, written instead of features.
-    """
-    n, on = checks.length("games", games, axis=1), games.device
-    lanes = checks.length("actions", actions)
-    if lanes not in (n, 2 * n) or actions.device != on:
-        raise ValueError(
-            f"actions must be of one lane or two for each of the {n} games on {on}, but those of "
-            f"{lanes} lanes on {actions.device} were given"
-        )
-    flags = [torch.empty(lanes, dtype=torch.bool, device=on) for _ in range(3)]
-    reward, points_won = (torch.empty(lanes, device=on) for _ in range(2))
-    features, pixels_at = None, 0
-    if pixels is None:
-        features = torch.empty((lanes, 1, FEATURES), dtype=torch.float16, device=on)
-    else:
-        pixels_at = checks.address("pixels", pixels, (lanes, 1, 1, *PIXELS), torch.uint8, on)
-        if pixels_at % 8:
-            raise ValueError("pixels must begin at a multiple of 8 bytes, as a whole tensor does")
-    speed = checks.number("tracker_speed", tracker_speed, -math.inf, PIXELS[1], "cells per step")
-    if speed < 0:
-        raise ValueError(f"tracker_speed must be at least 0 cells per step, not {speed:g}")
-    packed = params.PongParams(
-        games=checks.address("games", games, (GAME_FIELDS, n), torch.int32, on),
-        actions=checks.address("actions", actions, (lanes, 1), torch.int64, on),
-        reward=reward.data_ptr(),
-        reset=flags[0].data_ptr(),
-        terminal=flags[1].data_ptr(),
-        truncated=flags[2].data_ptr(),
-        points_won=points_won.data_ptr(),
-        features=0 if features is None else features.data_ptr(),
-        pixels=pixels_at,
-        error_flag=checks.address("error_flag", error_flag, (1,), torch.int32, on),
-        **_keys(seed),
-        n_envs=n,
-        n_sides=lanes // n,
-        restart=int(checks.flag("restart", restart)),
-        points=checks.integer("points", points, 1, 2**31 - 1),
-        limit=checks.integer("limit", limit, 1, 2**31 - 1),
-        tracker_speed=round(CELL * speed),
-        n_threads=threads(),
-    )
-    launch("pong", packed, on, threads=n)
-    check_flag_on_cpu(error_flag)
-    return Pong(reward, *flags, points_won, features)
-
-
-def _keys(seed):
-    """A seed's two words."""
-    seed = checks.integer("seed", seed, 0, 2**64 - 1)
-    return dict(key0=seed & 0xFFFFFFFF, key1=seed >> 32)

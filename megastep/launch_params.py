@@ -9,7 +9,7 @@ from .agents import Agents
 from .kernels.launch import params
 from .scenery import Scenery
 
-__all__ = ["error_flag", "scenery_params", "state_params"]
+__all__ = ["error_flag", "lanes_of", "scenery_params", "seed_params", "state_params"]
 
 _address, _shape = torch.Tensor.data_ptr, operator.attrgetter("shape")
 
@@ -114,3 +114,16 @@ def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int
 def error_flag(scenery: Scenery, agents: Agents) -> int:
     """The address of the flag that the device raises; see :func:`~megastep.engine.check`."""
     return checks.address("agents.error_flag", agents.error_flag, (1,), torch.int32, scenery.device)
+
+
+def lanes_of(scenery: Scenery, agents: Agents) -> tuple[int, int]:
+    """(N, A), after a look at the types."""
+    checks.instance("scenery", scenery, Scenery)
+    checks.instance("agents", agents, Agents)
+    return scenery.n_envs, scenery.n_agents
+
+
+def seed_params(seed: int) -> dict[str, int]:
+    """A seed's two words."""
+    seed = checks.integer("seed", seed, 0, 2**64 - 1)
+    return dict(key0=seed & 0xFFFFFFFF, key1=seed >> 32)

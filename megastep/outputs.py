@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 
-__all__ = ["Observation", "Physics", "Pong", "Render"]
+__all__ = ["Observation", "Physics", "Pong", "Render", "Shots"]
 
 
 class Render(NamedTuple):
@@ -35,6 +35,9 @@ class Observation(NamedTuple):
     rgb: torch.Tensor | None  # (N, A, C, 3, P) fp16, linear light
     depth: torch.Tensor | None  # (N, A, C, P) fp16: 1 at the agent's radius, 0 at max_depth beyond
     centre_line: torch.Tensor | None  # (N, A, C) int32: the line at the centre, as Render.indices
+    agent_ray: (
+        torch.Tensor | None
+    )  # (N, A, C) int32: nearest to the centre that shows another agent
     imu: torch.Tensor | None  # (N, A, 3) fp16: angvelocity / 360, own velocity ahead and left / 10
     newly_seen: torch.Tensor | None  # (N, A) int32: texels now marked in `seen`, not before
 
@@ -48,3 +51,15 @@ class Pong(NamedTuple):
     truncated: torch.Tensor
     points_won: torch.Tensor  # (B,): where a game ends, the share of its points; 0 elsewhere
     features: torch.Tensor | None  # (B, 1, 8) fp16; None where pixels were wanted
+
+
+class Shots(NamedTuple):
+    """A step of agents that hit whoever stands in the middle of their view, one value per lane."""
+
+    reward: torch.Tensor  # (B,)
+    reset: torch.Tensor  # (B,) bool, as the next two
+    terminal: torch.Tensor
+    truncated: torch.Tensor
+    metrics: torch.Tensor  # (4, B): where an episode ends, kills, deaths, damage, accuracy; else 0
+    vitals: torch.Tensor  # (B, 1, 3) fp16: health, whether it hit somebody, how many hit it
+    told: torch.Tensor | None  # (B, 1, 1 + 5 (A - 1)): what a critic is told; None if not wanted

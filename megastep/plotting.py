@@ -22,8 +22,10 @@ __all__ = [
     "gamma_decode",
     "gamma_encode",
     "panels",
+    "panels_beside",
     "plot_bars",
     "plot_images",
+    "plot_level",
     "plot_lines",
     "plot_scenery",
     "plot_view",
@@ -66,6 +68,53 @@ def panels(
         plan,
         [axes(gap + (n_strips - 1 - i) * (strip + gap), strip) for i in range(n_strips)],
     )
+
+
+def panels_beside(
+    n_rows: int, n_strips: int, width: float = 12.0, title: str | None = None
+) -> tuple[Any, Any, list]:
+    """A figure with a square for the plan and beside it ``n_rows`` rows of ``n_strips`` strips, one
+    above the other: (figure, plan axes, list of lists of strip axes). Else as :func:`panels`.
+    """
+    from matplotlib.figure import Figure
+
+    margin, head, gap = 0.55, 0.3, 0.08  # inches: about the plan, above a row, between its strips
+    inner = width / 2 - 1.5 * margin
+    row = max(inner / n_rows, head + n_strips * (0.18 + gap))  # inches
+    height = 2 * margin + n_rows * row
+    strip = (row - head) / n_strips - gap
+    figure = Figure(figsize=(width, height), dpi=100)
+
+    def axes(left, bottom, tall):
+        return figure.add_axes((left / width, bottom / height, inner / width, tall / height))
+
+    plan = axes(margin, (height - inner) / 2, inner)
+    if title is not None:
+        plan.set_title(title)
+    return (
+        figure,
+        plan,
+        [
+            [
+                axes(
+                    width / 2 + margin / 2,
+                    height - margin - r * row - head - (k + 1) * strip - k * gap,
+                    strip,
+                )
+                for k in range(n_strips)
+            ]
+            for r in range(n_rows)
+        ],
+    )
+
+
+def plot_level(ax: Any, level: float) -> None:
+    """Draws a number from 0 to 1 as a bar along the upper edge of ``ax``, the redder the less."""
+    from matplotlib.patches import Rectangle
+
+    bar = dict(transform=ax.transAxes, clip_on=False, linewidth=0)
+    ax.add_patch(Rectangle((0, 1.02), 1, 0.12, facecolor="0.8", **bar))
+    ax.add_patch(Rectangle((0, 1.02), level, 0.12, facecolor=(1 - level, 0.7 * level, 0), **bar))
 
 
 def plot_images(

@@ -61,6 +61,12 @@ def main():
         env.reset()
         for action in range(7):
             env.step(arrdict.arrdict(actions=torch.full((7, 1), action, device="cuda")))
+    for n_agents in (2, 16):
+        env = envs.Deathmatch(7, homes, n_agents=n_agents, device="cuda", damage=1, privileged=True)
+        env.reset()
+        for action in (*range(7), 7) * 5:
+            actions = torch.full((7 * n_agents, 1), action, device="cuda")
+            env.step(arrdict.arrdict(actions=actions))
     for settings in (dict(), dict(self_play=True), dict(pixels=True, points=2)):
         env = envs.Pong(67, device="cuda", **settings)
         env.reset()

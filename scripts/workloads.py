@@ -22,6 +22,7 @@ from megastep.geometries import sample
 ROOT = Path(__file__).resolve().parents[1]
 SIZES = {"cuda": (1024, 2048, 4096, 8192, 16_384, 65_536, 262_144, 1_048_576), "cpu": (1024, 8192)}
 KERNEL_SIZES = {"cuda": (8192, 262_144), "cpu": (2048,)}
+ARENAS = {"cuda": (1024, 8192, 65_536), "cpu": (1024,)}  # homes of four agents each
 HOMES = 512
 WARM_UP = 60  # steps, so that agents are not where they spawned
 FRESH = 3  # samples of what takes a process each
@@ -42,7 +43,7 @@ def stepper(name, n_envs, device, turns=TURNS):
     captured on a GPU.
     """
     env = capture.Captured(envs.ENVS[name](n_envs, sample("bench", HOMES), device=device))
-    actions = itertools.cycle(random_actions(n_envs, 1, device, turns))
+    actions = itertools.cycle(random_actions(n_envs * env.n_agents, 1, device, turns))
     env.reset()
     for _ in range(WARM_UP):
         env.step(next(actions))
@@ -135,6 +136,23 @@ def agents(device):
         engine.observe(c.scenery, c.agents, 4, imu=True, centre_line=True)
 
     yield rate("4 agents, 512 rays to 128 pixels, agent-frames", 4 * n_envs, alone(work, device))
+
+
+def deathmatch(device):
+    """Deathmatch's `env.step` of four agents per home with everything it does, and the same physics
+    and sight without the game.
+    """
+    for n_envs in ARENAS[device.type]:
+        env, work = stepper("deathmatch", n_envs, device)
+        c, n, actions = env.core, env.n_agents * n_envs, random_actions(n_envs, 4, device)
+
+        def without(i, env=env, c=c, actions=actions):
+            env.movement(actions[i])
+            engine.observe(c.scenery, c.agents, env.subsample, imu=True, centre_line=True)
+
+        whole, part = timed(work, device), alone(without, device)
+        yield rate(f"deathmatch, `env.step`, {n_envs:,} homes of 4, agent-frames", n, whole)
+        yield rate(f"deathmatch without its game, {n_envs:,} homes of 4, agent-frames", n, part)
 
 
 def memory(device):
@@ -394,7 +412,7 @@ def curve(run):
 BENCHMARKS = {
     benchmark.__name__: benchmark
     for benchmark in (
-        *(step, kernels, counters, observe, agents, memory),
+        *(step, kernels, counters, observe, agents, deathmatch, memory),
         *(pong, compile, first, startup, cpu, train),
     )
 }

@@ -47,6 +47,12 @@ def fixture(device):
         actions=torch.zeros((N, 1), dtype=torch.int64, device=device),
         error_flag=torch.zeros(1, dtype=torch.int32, device=device),
         pixels=torch.zeros((N, 1, 1, *engine.PIXELS), dtype=torch.uint8, device=device),
+        one_eyed=(one_eyed := core.Core(scenery, res=16)).agents,
+        view=engine.observe(scenery, one_eyed.agents, centre_line=True, agent_ray=True),
+        health=torch.ones(N * A, device=device),
+        tally=torch.zeros((3, N * A), device=device),
+        ages=torch.zeros(N * A, dtype=torch.int32, device=device),
+        ended=torch.zeros(N * A, dtype=torch.bool, device=device),
     )
 
 
@@ -148,6 +154,13 @@ def objects(good):
     yield from [("None", None), ("a number", 3), ("a string", "x"), ("another", SimpleNamespace())]
 
 
+def views(good):
+    yield from objects(good)
+    for name in ("centre_line", "agent_ray"):
+        for label, wrong in tensors(getattr(good, name)):
+            yield f"{name} {label}", good._replace(**{name: wrong})
+
+
 def ids(good):
     yield from [("None", None), ("a string", "text"), ("floats", good.float()), ("2d", good[None])]
     yield from [("bools", good.bool()), ("negative", good - 9), ("too large", good + 10**6)]
@@ -181,6 +194,7 @@ def operations(f):
             rgb=flags,
             depth=flags,
             centre_line=flags,
+            agent_ray=flags,
         ),
     )
     yield (
@@ -203,6 +217,7 @@ def operations(f):
             counts=tensors,
             seed=lambda good: [*integers(0)(good)][:6],
             resample=flags,
+            hidden=flags,
         ),
     )
     yield (
@@ -225,6 +240,23 @@ def operations(f):
             pixels=optional_tensors,
         ),
     )
+    yield (
+        engine.shoot,
+        dict(
+            scenery=f.scenery, agents=f.one_eyed, view=f.view, health=f.health, tally=f.tally,
+            ages=f.ages, ended=f.ended, limit=9, aim_reward=1.0, told=True,
+        ),
+        dict(
+            OPERANDS,
+            view=views,
+            **dict.fromkeys(("health", "tally", "ages", "ended"), tensors),
+            **dict.fromkeys(("damage", "recovery", "drain", "spoils"), numbers(-0.1)),
+            **dict.fromkeys(("hit_reward", "wound_cost", "kill_reward", "death_cost"), numbers()),
+            aim_reward=numbers(),
+            limit=lambda good: integers(1, 2**31 - 1)(1),
+            told=flags,
+        ),
+    )  # fmt: skip
     yield (
         modules.visible_texels,
         dict(scenery=f.scenery, points=f.points),

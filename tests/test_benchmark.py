@@ -41,6 +41,7 @@ def tiny(monkeypatch):
     for name, value in dict(
         SIZES={"cuda": (8,), "cpu": (8,)},
         KERNEL_SIZES={"cuda": (8,), "cpu": (8,)},
+        ARENAS={"cuda": (8,), "cpu": (8,)},
         HOMES=2,
         WARM_UP=2,
     ).items():
@@ -138,7 +139,8 @@ def test_a_benchmark_is_a_generator_that_says_what_it_measures(name):
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 @pytest.mark.parametrize(
-    ("name", "n"), [("step", 2), ("kernels", 8), ("observe", 2), ("memory", 1), ("pong", 2)]
+    ("name", "n"),
+    [("step", 2), ("kernels", 8), ("observe", 2), ("deathmatch", 2), ("memory", 1), ("pong", 2)],
 )
 def test_a_benchmark_leaves_a_line_of_json_per_measurement(name, n, device, tiny, tmp_path, capsys):
     path = tmp_path / "records.jsonl"

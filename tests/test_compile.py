@@ -275,9 +275,9 @@ def test_a_thread_without_a_context_takes_the_gpus_and_launches_again(monkeypatc
 
 
 def test_sizes_that_python_and_the_kernels_have_are_the_same():
-    text = "".join((compile.HERE / name).read_text() for name in ("unseen.h", "pong.h"))
+    text = "".join((compile.HERE / name).read_text() for name in ("unseen.h", "pong.h", "shoot.h"))
     found = {name: int(value) for name, value in re.findall(r"\b([A-Z_]+) = (\d+)\b", text)}
     assert (found["BANDS"], found["SECTORS"]) == (engine.BANDS, engine.SECTORS)
     assert found["GAME_FIELDS"] == engine.GAME_FIELDS and found["N_FEATURES"] == engine.FEATURES
-    assert found["CELL"] == engine.CELL
+    assert found["CELL"] == engine.CELL and found["MAX_SHOOTERS"] == engine.MAX_SHOOTERS
     assert (found["HEIGHT"], found["WIDTH"]) == engine.PIXELS  # in cells

@@ -124,7 +124,14 @@ def test_an_output_that_is_not_written_is_named(poison, monkeypatch):
     outputs = [
         cuda.render(core.scenery, core.agents),
         cuda.physics(core.scenery, core.agents),
-        engine.observe(core.scenery, core.agents, imu=True, centre_line=True, seen=seen_of(core)),
+        engine.observe(
+            core.scenery,
+            core.agents,
+            imu=True,
+            centre_line=True,
+            agent_ray=True,
+            seen=seen_of(core),
+        ),
     ]
     for output in outputs:
         for name, tensor in output._asdict().items():

@@ -14,6 +14,7 @@ def trajectory(device, n_agents, subsample=1, **settings):
     homes = sample("homes", 8)
     core = cuda.Core(scene.scenery(homes, n_agents, n_envs=24, device=device), **settings)
     spawn, seen = RandomSpawns(homes, core), seen_of(core)
+    hide = RandomSpawns(homes, core, hidden=True, resample=True)
     visible = visible_texels(core.scenery, spawn.points[:, :4])
     random = torch.Generator().manual_seed(1)
     moves = torch.tensor(
@@ -21,11 +22,19 @@ def trajectory(device, n_agents, subsample=1, **settings):
     )
     out = [core.scenery.layouts.baked.vals, visible]
     for step in range(12):
-        spawn(torch.rand((24, n_agents), generator=random).to(device) < (1 if step == 0 else 0.1))
+        some = torch.rand((24, n_agents), generator=random).to(device)
+        spawn(some < (1 if step == 0 else 0.1))
+        hide(some > 0.8)
         actions = torch.randint(4, (24, n_agents), generator=random).to(device)
         out += engine.physics(core.scenery, core.agents, actions, moves, 0.9)
         out += engine.observe(
-            core.scenery, core.agents, subsample, imu=True, centre_line=True, seen=seen
+            core.scenery,
+            core.agents,
+            subsample,
+            imu=True,
+            centre_line=True,
+            agent_ray=True,
+            seen=seen,
         )
         out.append(engine.unseen(core.scenery, core.agents, seen, visible))
         mask = torch.rand((24, n_agents), generator=random).to(device) < 0.3

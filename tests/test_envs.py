@@ -19,6 +19,11 @@ SHORT = {
     "explorer": dict(patience=1, res=1, subsample=1),
     "explorer, privileged": dict(patience=1, res=1, subsample=1, privileged=True),
     "explorer, cameras": dict(patience=1, res=1, subsample=1, cameras=(0, 0)),
+    "deathmatch": dict(limit=20),
+    "deathmatch, privileged": dict(limit=20, n_agents=2, damage=1, privileged=True),
+    "deathmatch, all rules": dict(
+        limit=20, n_agents=16, recovery=0.1, drain=0.05, spoils=0.1, kill_reward=1, aim_reward=1
+    ),
     "pong": dict(limit=20),
     "pong, pixels": dict(limit=20, pixels=True),
     "pong, self-play": dict(limit=20, self_play=True),
@@ -417,6 +422,9 @@ class Launches(TorchDispatchMode):
         ("explorer", 9),
         ("explorer, privileged", 18),
         ("explorer, cameras", 9),
+        ("deathmatch", 1),
+        ("deathmatch, privileged", 1),
+        ("deathmatch, all rules", 1),
         ("pong", 0),
     ],
 )

@@ -23,6 +23,7 @@ LAYERS = (
     ("devices", "scenery_views", "recording"),
     ("geometries", "scenery", "agents"),
     ("launch_params",),
+    ("games",),
     ("engine", "toys", "cubicasa"),
     ("scene",),
     ("core",),

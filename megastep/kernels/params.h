@@ -98,6 +98,7 @@ struct RenderParams {
     unsigned short* rgb;              // (N, A, C, 3, P) out: fp16
     unsigned short* depth;            // (N, A, C, P) out: fp16, 1 at the radius, falling to 0
     int* centre_line;                 // (N, A, C) out: line at the centre of the screen
+    int* agent_ray;                   // (N, A, C) out: nearest to it that shows an agent, or -1
     const float* velocity;            // (N, A, 2) for imu
     const float* angvelocity;         // (N, A) for imu
     unsigned short* imu;              // (N, A, 3) out: fp16
@@ -137,6 +138,39 @@ struct PongParams {
     int limit;          // steps of a game
     int tracker_speed;  // 256ths of a cell per step
     int n_threads;      // of the CPU
+};
+
+struct ShootParams {
+    const int* centre_line;  // (N, A) line at the centre of each view, of their environment's
+    const int* agent_ray;    // (N, A) ray nearest to it that shows an agent, or -1; null: no aim
+    const float* positions;  // (N, A, 2) for told
+    const float* angles;     // (N, A) for told
+    float* health;           // (N, A) in and out, as the next three: 1 is whole
+    float* tally;            // (3, N, A) of an episode so far: kills, damage, hits
+    int* ages;               // (N, A) steps since the first observation
+    unsigned char* ended;    // (N, A) in: begins an episode in this step; out: ends it in this step
+    float* reward;           // (N, A) out, as all that follows
+    unsigned char* reset;    // (N, A)
+    unsigned char* terminal;   // (N, A)
+    unsigned char* truncated;  // (N, A)
+    float* metrics;            // (4, N, A) where an episode ends: kills, deaths, damage, accuracy
+    unsigned short* vitals;    // (N, A, 3) fp16: health, whether it hit, how many hit it
+    float* told;               // (N, A, 1 + 5 (A - 1)): what a critic is told
+    float damage;              // health that a hit takes
+    float recovery;            // health that a step without a wound gives back
+    float drain;               // health that a step takes
+    float spoils;              // health that a hit gives to whom it is due
+    float hit_reward;
+    float wound_cost;
+    float kill_reward;
+    float death_cost;
+    float aim_reward;  // for an agent in the middle of the view, falling to 0 at its edge
+    int limit;         // steps of an episode
+    int res;           // rays per view
+    int n_envs;        // N
+    int n_agents;      // A
+    int n_model;       // M
+    int n_threads;     // of the CPU
 };
 
 struct SpawnParams {

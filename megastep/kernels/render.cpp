@@ -104,6 +104,19 @@ static void write_pixels(const RenderParams& p, int view, const RaySample* sampl
     }
 }
 
+// The ray nearest to the middle one that shows another agent, of equals the first; or -1.
+static int agent_ray_of(const std::vector<int>& index, int n_agent_lines) {
+    int res = (int)index.size(), best = -1, least = res;
+    for (int r = 0; r < res; r++) {
+        int off = r < res / 2 ? res / 2 - r : r - res / 2;
+        if (index[r] >= 0 && index[r] < n_agent_lines && off < least) {
+            best = r;
+            least = off;
+        }
+    }
+    return best;
+}
+
 static void render_view(const RenderParams& p, const EnvScenery& scenery, const Pose& camera,
                         int view, int a, unsigned int* seen, Scratch& scratch, int& newly_seen) {
     const SceneryParams& s = p.scenery;
@@ -117,6 +130,8 @@ static void render_view(const RenderParams& p, const EnvScenery& scenery, const 
                  scenery.n_agent_lines, 0, 0, scratch);
     if (p.centre_line)
         p.centre_line[view] = scratch.index[p.res / 2];
+    if (p.agent_ray)
+        p.agent_ray[view] = agent_ray_of(scratch.index, scenery.n_agent_lines);
     shade(p, screen, scenery, camera, view, seen, scratch, newly_seen);
     write_pixels(p, view, scratch.samples.data());
 }

@@ -67,6 +67,18 @@ DEVICE void shade(const RenderParams& p, const View& v, const EnvScenery& scener
     }
 }
 
+// The ray nearest to the middle one that shows another agent, of equals the first; or -1.
+DEVICE int agent_ray_of(const NearestLine* nearest, int res, int n_agent_lines, int warp_lane) {
+    unsigned int best = ~0u;
+    for (int r = warp_lane; r < res; r += WARP) {
+        int line = nearest[r].line;
+        if (line >= 0 && line < n_agent_lines)
+            best = min(best, (unsigned int)(abs(r - res / 2) << 16 | r));
+    }
+    best = __reduce_min_sync(FULL_WARP, best);
+    return best == ~0u ? -1 : (int)(best & 0xffffu);
+}
+
 template <int full_res, int has_agents>
 DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelSpan* spans,
                          NearestLine* nearest) {
@@ -95,6 +107,13 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         __syncwarp();
         if (p.centre_line && warp_lane == 0)
             p.centre_line[view] = nearest[p.res / 2].line;
+        if (p.agent_ray) {
+            int ray = -1;
+            if (has_agents)
+                ray = agent_ray_of(nearest, p.res, scenery.n_agent_lines, warp_lane);
+            if (warp_lane == 0)
+                p.agent_ray[view] = ray;
+        }
         shade<full_res, has_agents>(p, v, scenery, view, seen, newly_seen);
     }
     if (!p.newly_seen)

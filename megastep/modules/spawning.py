@@ -99,7 +99,8 @@ class RandomSpawns:
     agent has some of its own, 5 cm clear of all other agents'. So agents that respawn together
     never overlap; one that respawns alone may land on another that has walked there, and the
     physics lets overlapping discs part. With ``resample`` an environment whose agents all respawn
-    moves to another layout first.
+    moves to another layout first. With ``hidden`` an agent respawns out of sight of the others that
+    stand in its environment, or if it has no such point, as far from them as it can.
 
     Args: ``geometries`` are those the scenery was made from; ``n_spawns`` points per layout.
     """
@@ -111,13 +112,14 @@ class RandomSpawns:
         n_spawns: int = 128,
         resample: bool = False,
         seed: int | None = None,
+        hidden: bool = False,
     ):
         if n_spawns < core.n_agents:
             raise ValueError(
                 f"n_spawns must be at least one point for each of the {core.n_agents} agents, but "
                 f"{n_spawns} was given"
             )
-        self.core, self.resample = core, resample
+        self.core, self.resample, self.hidden = core, resample, hidden
         self.seed = core.seed if seed is None else seed
         geometries = geometries[: len(core.scenery.layouts)]
         points = _cached_points(geometries, n_spawns, core.n_agents, core.agents.radius, self.seed)
@@ -136,6 +138,7 @@ class RandomSpawns:
             self.counts,
             self.seed,
             self.resample,
+            self.hidden,
         )
 
 
