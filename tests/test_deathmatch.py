@@ -137,6 +137,14 @@ def test_the_agent_ray_is_the_nearest_to_the_middle_that_shows_an_agent(n_agents
     assert n_agents == 1 or (rays >= 0).any()
 
 
+def test_of_two_as_near_to_the_middle_the_agent_ray_is_the_left(device):
+    c = core.Core(scene.scenery([toys.box()], 3, 1, device=device), res=63, fov=70)
+    c.agents.positions[0] = torch.tensor([(2.0, 3.5), (4.0, 3.0), (4.0, 4.0)])
+    ray = engine.observe(c.scenery, c.agents, agent_ray=True).agent_ray[0, 0]
+    shown = engine.render(c.scenery, c.agents).indices[0, 0]
+    assert ray < 31 and shown[ray] // 8 == 2 and shown[62 - ray] // 8 == 1
+
+
 # ---- Spawning out of sight ----
 
 
@@ -397,14 +405,16 @@ def test_lanes_are_truncated_each_in_its_time(device):
 
 
 def test_a_body_takes_no_action_of_its_own(device):
-    """In the step that begins another life, the last one's action moves nobody."""
-    ring = Ring(device, *AMBUSH, damage=1)
+    """In the step that begins another life, the last one's action moves nobody: the body stands
+    4 cm ahead, and who walks into it is stopped.
+    """
+    ring = Ring(device, (2, 3.5, 0), (2.25, 3.5, 0), damage=1)
     ring.step()
     assert ring.env.ended.tolist() == [False, True]
     world = ring.step(1, 3, 3)
     agents = ring.env.core.agents
-    assert world.reset.tolist() == [False, True]
-    assert float(agents.velocity[0, 0].norm()) > 0 and not agents.velocity[0, 1].any()
+    assert world.reset.tolist() == [False, True] and not agents.velocity.any()
+    assert 2.03 < float(agents.positions[0, 0, 0]) < 2.04
 
 
 def test_a_death_respawns_out_of_sight_in_the_world_that_is_shown(device):
