@@ -219,7 +219,7 @@ class Deathmatch:
             colour.set_title(told, fontsize="small", loc="left", pad=7)
             depth.set_title("", loc="left")
             for strip in (colour, depth):
-                strip.set(xlabel="", xticks=[])
+                strip.set(xlabel="", xticks=[], box_aspect=None)
             plotting.plot_level(colour, state.health[agent])
         return figure
 
