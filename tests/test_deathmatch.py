@@ -1,11 +1,14 @@
 """Deathmatch: against its twins on every bit, and what its rules say."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from deathmatch_twins import in_sight, shots, spawned, told
 
-from agents.cli import train
+from agents.cli import evaluate, record, train
 from megastep import arrdict, contract, core, engine, envs, modules, plotting, scene, toys
 from megastep.geometries import sample
 from megastep.outputs import Observation
@@ -567,3 +570,35 @@ def test_threads_do_not_matter():
     finally:
         engine.set_threads(None)
     assert contract.same(*runs)
+
+
+# ---- Learning ----
+
+
+def rows_of(run):
+    """A run's only table."""
+    (table,) = Path(run).glob("evaluations/*.json")
+    return json.loads(table.read_text())["rows"]
+
+
+def test_a_run_is_trained_in_self_play_evaluated_and_filmed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small = ["env.n_envs=4", "env.n_agents=3", "env.limit=20", "learner.n_minibatches=2"]
+    small += ["agent.width=8", "env.res=64", "geometry=column", "samples=1000", "folder=run"]
+    assert train.main(["env=deathmatch", *small, "device=cpu"]) == 0
+    assert evaluate.main(["run=run", "lanes=12", "device=cpu"]) == 0
+    for row in rows_of("run"):
+        assert set(row["metrics"]) == set(METRICS) and row["lanes"] == 36
+    assert record.main(["run=run", "steps=2", "device=cpu"]) == 0
+    assert Path("run/video.mp4").exists()
+
+
+@pytest.mark.slow
+def test_the_recipe_learns_to_hit_more_often_than_random_actions(tmp_path, monkeypatch):
+    """In a quarter of its samples, five times as much as it takes to see it."""
+    monkeypatch.chdir(tmp_path)
+    words = ["experiment=deathmatch", "preset=cpu", "geometry=box", "samples=250_000"]
+    assert train.main([*words, "finish.record=false", "device=cpu", "folder=run"]) == 0
+    assert evaluate.main(["run=run", "lanes=256", "split=all", "device=cpu"]) == 0
+    trained, random = (row["metrics"]["accuracy"] for row in rows_of("run"))
+    assert trained["lower"] > 1.3 * random["upper"]
