@@ -78,12 +78,15 @@ _ERRORS = {
     "actions count from 0.",
     3: "Environment {env} shows a layout that the scenery does not have: ids in scenery.layout "
     "count from 0 and stay below the number of layouts.",
+    4: "An agent of environment {env} has a goal that its layout does not have: goals count from 0 "
+    "and stay below the number of goals per layout.",
 }
+_KINDS = 8  # as errors.h has it
 
 
 def check(agents: Agents) -> None:
     """EngineError, which names an environment, if since the last check an agent's position, angle
-    or velocity was not a finite number, an action was none, or a layout was none. Synchronises
+    or velocity was not a finite number, an action, a layout or a goal was none. Synchronises
     with the device, so it is not for inside a step.
     """
     check_flag(checks.instance("agents", agents, Agents).error_flag)
@@ -94,7 +97,7 @@ def check_flag(error_flag: torch.Tensor) -> None:
     flag = int(error_flag)
     if flag:
         error_flag.zero_()
-        env, kind = divmod(flag, 4)
+        env, kind = divmod(flag, _KINDS)
         raise EngineError(_ERRORS[kind].format(env=env))
 
 

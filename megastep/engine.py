@@ -1,7 +1,7 @@
 """The engine: ``bake``, ``physics``, ``render``, ``observe``, ``unseen``, ``coverage``, ``spawn``,
-``uniform``, ``pong``, ``shoot``. Each checks its arguments, allocates and launches, on the CPU or
-the GPU, whichever its tensors are on; none synchronises. TypeError or ValueError, naming the
-argument, if one does not fit.
+``uniform``, ``to_goal``, ``pong``, ``shoot``. Each checks its arguments, allocates and launches, on
+the CPU or the GPU, whichever its tensors are on; none synchronises. TypeError or ValueError, naming
+the argument, if one does not fit.
 
 N environments, A agents per environment, C cameras per agent (the axis is dropped if there is one),
 R rays per camera, P = R / subsample pixels, D layouts, B lanes. Metres, degrees, seconds.
@@ -22,11 +22,12 @@ from .agents import (
     check_on_cpu,
 )
 from .devices import device, fit, set_threads, threads
+from .distance_fields import DistanceFields
 from .games import CELL, FEATURES, GAME_FIELDS, MAX_SHOOTERS, PIXELS, pong, shoot
 from .kernels.compile import BLOCK, EngineError
 from .kernels.launch import SIZES, WARP, launch, params
 from .launch_params import error_flag, lanes_of, scenery_params, seed_params, state_params
-from .outputs import Observation, Physics, Pong, Render, Shots
+from .outputs import Observation, Physics, Pong, Render, Shots, ToGoal
 from .scenery import Layouts, Scenery
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "MAX_SHOOTERS",
     "PIXELS",
     "Agents",
+    "DistanceFields",
     "EngineError",
     "Layouts",
     "Observation",
@@ -47,6 +49,7 @@ __all__ = [
     "Render",
     "Scenery",
     "Shots",
+    "ToGoal",
     "bake",
     "check",
     "check_flag",
@@ -61,6 +64,7 @@ __all__ = [
     "shoot",
     "spawn",
     "threads",
+    "to_goal",
     "uniform",
     "unseen",
     "update_agent_geometry",
@@ -368,6 +372,7 @@ def spawn(
     seed: int,
     resample: bool = False,
     hidden: bool = False,
+    chosen: torch.Tensor | None = None,
 ) -> None:
     """Puts agents at random points of their environment's layout, at rest, looking anywhere. Each
     draws once from its random stream.
@@ -378,7 +383,8 @@ def spawn(
 
     Args: ``mask`` (N, A) bool, who; ``points`` (D, n, 2), of which the agents of one environment
     have n / A each; ``counts`` (N, A) int32, numbers drawn so far, advanced here; ``resample``: an
-    environment whose agents all respawn moves to a random layout first.
+    environment whose agents all respawn moves to a random layout first; ``chosen`` (N, A) int32,
+    where the numbers of the points that agents went to are written.
     """
     lanes, on, n_layouts = lanes_of(scenery, agents), scenery.device, len(scenery.layouts)
     n_points = checks.length("points", points, axis=1)
@@ -393,6 +399,7 @@ def spawn(
         mask=checks.address("mask", mask, lanes, torch.bool, on),
         points=checks.address("points", points, (n_layouts, n_points, 2), torch.float32, on),
         counts=checks.address("counts", counts, lanes, torch.int32, on),
+        chosen=0 if chosen is None else checks.address("chosen", chosen, lanes, torch.int32, on),
         error_flag=error_flag(scenery, agents),
         **seed_params(seed),
         n_points=n_points,
@@ -423,4 +430,40 @@ def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tens
     )
     launch("uniform", packed, on, threads=n)
     counts.add_(mask)
+    return out
+
+
+def to_goal(
+    scenery: Scenery, agents: Agents, fields: DistanceFields, goals: torch.Tensor
+) -> ToGoal:
+    """Where the goals of agents lie: straight, and by the shortest way, which is interpolated from
+    ``fields``.
+
+    Args: ``goals`` (N, A) int32, each a number of one of its layout's goals.
+    """
+    lanes, on = lanes_of(scenery, agents), scenery.device
+    checks.instance("fields", fields, DistanceFields)
+    if fields.n_layouts != len(scenery.layouts) or fields.device != on:
+        raise ValueError(
+            f"fields must be of the scenery's {len(scenery.layouts)} layouts and on {on}, but those "
+            f"of {fields.n_layouts} on {fields.device} were given"
+        )
+    out = ToGoal(
+        bearing=torch.empty((*lanes, 3), dtype=torch.float16, device=on),
+        straight=torch.empty(lanes, device=on),
+        distance=torch.empty(lanes, device=on),
+        descent=torch.empty((*lanes, 2), device=on),
+    )
+    packed = params.ToGoalParams(
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles"),
+        goals=checks.address("goals", goals, lanes, torch.int32, on),
+        **fields.addresses(),
+        error_flag=error_flag(scenery, agents),
+        **{name: value.data_ptr() for name, value in out._asdict().items()},
+        n_goals=fields.n_goals,
+        per_cell=1 / fields.cell,
+    )
+    launch("to_goal", packed, on, threads=out.straight.numel())
+    check_on_cpu(agents)
     return out

@@ -15,13 +15,14 @@ The masks' lower-left corner is at (0, 0) and row 0 is at the top. Further keys 
 below is always the (H, W) of the masks, and an index an (i, j) pair of row and column.
 """
 
+import hashlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["centers", "checked", "display", "indices", "masks"]
+__all__ = ["centers", "checked", "display", "hashed", "indices", "masks"]
 
 # Metres per cell; the original's, coarse enough to be cheap and fine enough for a 0.6 m door.
 RES = 0.2
@@ -210,6 +211,15 @@ def checked(g: dict) -> Any:
         raise ValueError(f"'res' is {res:g} m per cell, and 0.01 to 10 is allowed")
     number = int(_array(g, "id", "iu", ()))
     return type(g)(g, id=number, walls=walls, lights=lights, masks=cells.astype(np.int16), res=res)
+
+
+def hashed(geometries: Sequence[Any]) -> Any:
+    """A SHA-256, to be updated further, of the walls and rooms of geometries."""
+    key = hashlib.sha256()
+    for g in geometries:
+        for array in (g.walls, g.masks, np.asarray(g.res)):
+            key.update(repr((array.shape, array.dtype)).encode() + array.tobytes())
+    return key
 
 
 def display(g: Any, ax: Any = None) -> Any:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 
-__all__ = ["Observation", "Physics", "Pong", "Render", "Shots"]
+__all__ = ["Observation", "Physics", "Pong", "Render", "Shots", "ToGoal"]
 
 
 class Render(NamedTuple):
@@ -63,3 +63,12 @@ class Shots(NamedTuple):
     metrics: torch.Tensor  # (4, B): where an episode ends, kills, deaths, damage, accuracy; else 0
     vitals: torch.Tensor  # (B, 1, 3) fp16: health, whether it hit somebody, how many hit it
     told: torch.Tensor | None  # (B, 1, 1 + 5 (A - 1)): what a critic is told; None if not wanted
+
+
+class ToGoal(NamedTuple):
+    """Where an agent's goal lies."""
+
+    bearing: torch.Tensor  # (N, A, 3) fp16: metres / 10 straight, cosine and sine of the bearing
+    straight: torch.Tensor  # (N, A): metres
+    distance: torch.Tensor  # (N, A): metres by the shortest way, inf where none is known
+    descent: torch.Tensor  # (N, A, 2): how it falls per metre ahead and left

@@ -24,6 +24,7 @@ __all__ = [
     "panels",
     "panels_beside",
     "plot_bars",
+    "plot_goal",
     "plot_images",
     "plot_level",
     "plot_lines",
@@ -212,6 +213,16 @@ def plot_bars(names: Sequence[str], values: ArrayLike, ax: Any = None) -> Any:
     ax.set_xticks(np.arange(len(names)), names, fontsize="x-small")
     ax.set_ylim(-1, 1)
     return ax
+
+
+def plot_goal(ax: Any, position: ArrayLike, radius: float) -> Any:
+    """Draws a goal at ``position`` (2,) that is reached within ``radius``, both in metres. Returns
+    the matplotlib patch.
+    """
+    from matplotlib.patches import Circle
+
+    disc = Circle(position, radius, facecolor="C2", edgecolor="w", linewidth=0.8, zorder=3)
+    return ax.add_patch(disc)
 
 
 def plot_lines(

@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from . import workers
 from .arrdict import clone, numpyify
 
 __all__ = ["ParallelEncoder", "draw"]
@@ -36,16 +37,6 @@ __all__ = ["ParallelEncoder", "draw"]
 MAX_WORKERS = 8  # some 80 figures per second; each has torch in memory, about half a gigabyte
 # x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines need more
 QUALITY = "20"
-
-# Workers draw on one thread each, never on a screen, and see no GPU: even an idle CUDA context is
-# half a gigabyte.
-_WORKER_ENV = {
-    "MPLBACKEND": "Agg",
-    "CUDA_VISIBLE_DEVICES": "",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-}
 
 
 class ParallelEncoder:
@@ -173,7 +164,7 @@ class ParallelEncoder:
             import loky
 
             self._n_workers = self._n_workers or min(loky.cpu_count(), MAX_WORKERS)
-            self._pool = loky.ProcessPoolExecutor(self._n_workers, env=_WORKER_ENV)
+            self._pool = loky.ProcessPoolExecutor(self._n_workers, env=workers.ENV)
         return self._pool
 
     def _add(self, source):

@@ -15,6 +15,7 @@
 #define ADD(word, number) (*(word) += (number))
 #define COUNT_BITS(word) __builtin_popcount(word)
 #define HALF_BITS(x) half_bits(x)
+#define HALF_VALUE(bits) half_value(bits)
 #define NAN_VALUE __builtin_nanf("")
 #define INF_VALUE __builtin_inff()
 
@@ -48,4 +49,16 @@ static inline unsigned short half_bits(float value) {
     }
     unsigned int to_even = 0xfffu + ((magnitude >> 13) & 1u);
     return (unsigned short)(sign | ((magnitude - 0x38000000u + to_even) >> 13));
+}
+
+static inline float half_value(unsigned short bits) {
+    union {
+        unsigned int bits;
+        float value;
+    } same = {(bits & 0x7fffu) << 13};
+    same.value *= 0x1p112f;  // the difference of the exponents, subnormals too
+    if ((bits & 0x7c00u) == 0x7c00u)
+        same.bits |= 0x7f800000u;
+    same.bits |= (bits & 0x8000u) << 16;
+    return same.value;
 }

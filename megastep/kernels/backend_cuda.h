@@ -19,6 +19,7 @@
 #define ADD(word, number) atomicAdd(word, number)
 #define COUNT_BITS(word) __popc(word)
 #define HALF_BITS(x) half_bits(x)
+#define HALF_VALUE(bits) half_value(bits)
 #define NAN_VALUE __int_as_float(0x7fc00000)
 #define INF_VALUE __int_as_float(0x7f800000)
 
@@ -45,4 +46,10 @@ DEVICE unsigned short half_bits(float x) {
     unsigned short bits;
     asm("cvt.rn.f16.f32 %0, %1;" : "=h"(bits) : "f"(x));
     return bits;
+}
+
+DEVICE float half_value(unsigned short bits) {
+    float x;
+    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(bits));
+    return x;
 }

@@ -3,11 +3,13 @@
 It lies in ``$MEGASTEP_CACHE`` (else ``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``) and
 is made with mode 0700. What is loaded from it runs with the user's rights, so nothing is read that
 another user may write. A cached file ends in its own SHA-256, so a damaged one is seen and built
-again; it is written beside its place and renamed, so that two processes cannot harm each other. A
+again; it is written beside its place and renamed, so that two processes cannot harm each other. The digest is
+of the name too, so no file passes for another. A
 cache that cannot be used costs a warning of one line and a build per start.
 """
 
 import hashlib
+import math
 import os
 import stat
 import tempfile
@@ -27,6 +29,8 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
     body = None if problem else intact(path)
     if body is not None:
         return body, path
+    if problem is None and path.exists():
+        warnings.warn(f"{path} is damaged or not this user's own: it is made again", stacklevel=2)
     body = build()
     if problem is None:
         try:
@@ -40,18 +44,22 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
 
 def warn(problem: str) -> None:
     warnings.warn(
-        f"the kernel cache is not used, so kernels are built, and spawn points and visible texels "
-        f"found, at each start: {problem}; set MEGASTEP_CACHE to another folder of your own",
+        f"the kernel cache is not used, so kernels are built, and spawn points, shortest "
+        f"ways and visible texels found, at each start: {problem}; set MEGASTEP_CACHE to another folder of your own",
         stacklevel=2,
     )
 
 
-def prune(prefix: str, keep: int) -> None:
-    """Deletes all files whose names begin with ``prefix`` but the ``keep`` that are newest."""
+def prune(prefix: str, keep: int, max_bytes: float = math.inf) -> None:
+    """Deletes all files whose names begin with ``prefix`` but the ``keep`` that are newest, and as
+    many of those as it takes until the rest is ``max_bytes`` at most.
+    """
     try:
-        found = sorted(_folder().glob(f"{prefix}*"), key=lambda path: path.stat().st_mtime)
-        for path in found[: -keep or None]:
-            path.unlink()
+        found = sorted(_folder().glob(f"{prefix}*"), key=lambda path: -path.stat().st_mtime)
+        for number, path in enumerate(found):
+            max_bytes -= path.stat().st_size
+            if number >= keep or max_bytes < 0:
+                path.unlink()
     except OSError:
         pass  # another process deletes too, or there is no cache
 
@@ -68,7 +76,13 @@ def intact(path: Path) -> bytes | None:
     except OSError:
         return None
     body, digest = content[:-DIGEST], content[-DIGEST:]
-    return body if body and hashlib.sha256(body).digest() == digest else None
+    return body if body and _digest(path.name, body) == digest else None
+
+
+def _digest(name, body):
+    digest = hashlib.sha256(f"{name}\0".encode())
+    digest.update(body)
+    return digest.digest()
 
 
 def _folder():
@@ -102,7 +116,8 @@ def _write(path, body):
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
     try:
         with os.fdopen(handle, "wb") as file:
-            file.write(body + hashlib.sha256(body).digest())
+            file.write(body)
+            file.write(_digest(path.name, body))
         os.replace(temporary, path)
     except BaseException:
         os.unlink(temporary)

@@ -182,11 +182,31 @@ struct SpawnParams {
     const unsigned char* mask;  // (N, A) agents that respawn
     const float* points;        // (D, n_points, 2) where agents may stand
     int* counts;                // (N, A) numbers that each agent has drawn
+    int* chosen;                // (N, A) out: the layout's point, where mask
     int* error_flag;            // (1) out: see errors.h
     unsigned int key0;          // the seed
     unsigned int key1;
     int n_points;
     int resample;  // 1: an environment all of whose agents respawn moves to another layout
+};
+
+struct ToGoalParams {
+    SceneryParams scenery;
+    const float* positions;        // (N, A, 2)
+    const float* angles;           // (N, A)
+    const int* goals;              // (N, A) each agent's, of the goals of its layout
+    const float* points;           // (D, n_goals, 2) where they are
+    const unsigned short* fields;  // fp16: of each layout (n_goals, height, width) cells, in metres
+    const long long* starts;       // (D) first cell of each layout's fields
+    const int* shapes;             // (D, 2) height, width
+    const float* origins;          // (D, 2) the centre of the first cell
+    int* error_flag;               // (1) out: see errors.h
+    unsigned short* bearing;       // (N, A, 3) out: fp16
+    float* straight;               // (N, A) out: metres, as the next
+    float* distance;               // (N, A) out: by the shortest way
+    float* descent;                // (N, A, 2) out: its gradient, negated: ahead, left
+    int n_goals;
+    float per_cell;  // one over a cell's side
 };
 
 struct UnseenParams {

@@ -74,9 +74,12 @@ HD void spawn_env(const SpawnParams& p, const Crew& crew, int env) {
         if (hidden)
             point = hidden_point(p, crew, env, a, layout, point);
         sync(crew);  // until all have read what is written now
-        if (crew.rank == 0)
+        if (crew.rank == 0) {
+            if (p.chosen)
+                p.chosen[i] = a * n_own + point;
             place(p, i, p.points + 2 * ((long long)layout * p.n_points + a * n_own + point),
                   360.f * unit_float(bits.b) - 180.f);
+        }
         sync(crew);
     }
     if (moves && crew.rank == 0)

@@ -1,7 +1,8 @@
-"""What environments are made of: movement, sensors, spawning, the lifecycle of episodes. Callables
+"""What environments are made of: movement, sensors, spawning, goals, the lifecycle of episodes. Callables
 with a ``.space`` where there is one to declare.
 """
 
+from .goals import RandomGoals
 from .lanes import to_agents, to_lanes
 from .lifecycle import Lifecycle, RandomLifespans, RandomStream
 from .movement import MOVES, TURNS, MomentumMovement, SimpleMovement, to_global, to_local
@@ -17,6 +18,7 @@ __all__ = [
     "Depth",
     "Lifecycle",
     "MomentumMovement",
+    "RandomGoals",
     "RandomLifespans",
     "RandomSpawns",
     "RandomStream",

@@ -3,7 +3,6 @@
 N environments, A agents, D layouts, P points, M walls.
 """
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 
 from .. import engine
-from ..geometry import centers
+from ..geometry import centers, hashed
 from ..kernels import cache
 from .lanes import to_agents
 
@@ -23,7 +22,7 @@ MIN_CACHED = 32  # layouts; the points of fewer are found in no time
 BATCHES = 20  # of candidates that are tried before a geometry is held to have no more room
 
 
-def _distances(points, walls):
+def distances(points, walls):
     """(P,) float64 metres from points (P, 2) to the nearest of walls (M, 2, 2)."""
     (ax, ay), (vx, vy) = walls[:, 0].T, (walls[:, 1] - walls[:, 0]).T
     dx, dy = points[:, :1] - ax, points[:, 1:] - ay
@@ -75,7 +74,7 @@ def spawn_points(
     size, points, owners = n // n_agents, np.empty((0, 2)), np.empty(0, int)
     from_wall, apart = radius + CLEARANCE, 2 * radius + CLEARANCE
     for batch in _candidates(g, n, random):
-        found = batch[_distances(batch, g.walls) > from_wall]
+        found = batch[distances(batch, g.walls) > from_wall]
         points, owners = _dealt(points, owners, found, n_agents, size, apart)
         if len(points) == n_agents * size:
             return points[owners.argsort(kind="stable")]
@@ -102,7 +101,9 @@ class RandomSpawns:
     moves to another layout first. With ``hidden`` an agent respawns out of sight of the others that
     stand in its environment, or if it has no such point, as far from them as it can.
 
-    Args: ``geometries`` are those the scenery was made from; ``n_spawns`` points per layout.
+    Args: ``geometries`` are those the scenery was made from; ``n_spawns`` points per layout;
+    ``points`` (D, A * n, 2) float32 to spawn at instead, each agent's end to end. ``chosen`` (N, A)
+    int32 are the numbers of the points where agents spawned last.
     """
 
     def __init__(
@@ -113,6 +114,7 @@ class RandomSpawns:
         resample: bool = False,
         seed: int | None = None,
         hidden: bool = False,
+        points: torch.Tensor | None = None,
     ):
         if n_spawns < core.n_agents:
             raise ValueError(
@@ -121,11 +123,14 @@ class RandomSpawns:
             )
         self.core, self.resample, self.hidden = core, resample, hidden
         self.seed = core.seed if seed is None else seed
-        geometries = geometries[: len(core.scenery.layouts)]
-        points = _cached_points(geometries, n_spawns, core.n_agents, core.agents.radius, self.seed)
+        if points is None:
+            geometries = geometries[: len(core.scenery.layouts)]
+            given = n_spawns, core.n_agents, core.agents.radius, self.seed
+            points = _cached_points(geometries, *given)
         self.points = torch.as_tensor(points, device=core.device)
-        self.counts = torch.zeros(
-            (core.n_envs, core.n_agents), dtype=torch.int32, device=core.device
+        self.counts, self.chosen = (
+            torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
+            for _ in range(2)
         )
 
     def __call__(self, reset: torch.Tensor) -> None:
@@ -139,6 +144,7 @@ class RandomSpawns:
             self.seed,
             self.resample,
             self.hidden,
+            self.chosen,
         )
 
 
@@ -157,10 +163,8 @@ def _cached_points(geometries, *arguments):
     """:func:`_all_points`, from the cache if the same were found before."""
     if len(geometries) < MIN_CACHED:
         return _all_points(geometries, *arguments)
-    key = hashlib.sha256(Path(__file__).read_bytes() + repr((np.__version__, arguments)).encode())
-    for g in geometries:
-        for array in (g.walls, g.masks, np.asarray(g.res)):
-            key.update(repr((array.shape, array.dtype)).encode() + array.tobytes())
+    key = hashed(geometries)
+    key.update(Path(__file__).read_bytes() + repr((np.__version__, arguments)).encode())
 
     def build():
         cache.prune(PREFIX, MAX_FILES - 1)
