@@ -13,6 +13,7 @@ import math
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import torch
 
 from megastep import core, cuda, engine, modules, scene, toys
@@ -46,6 +47,13 @@ def fixture(device):
         games=torch.zeros((engine.GAME_FIELDS, N), dtype=torch.int32, device=device),
         actions=torch.zeros((N, 1), dtype=torch.int64, device=device),
         error_flag=torch.zeros(1, dtype=torch.int32, device=device),
+        fields=engine.DistanceFields(
+            D * [np.ones((2, 2))],
+            D * [np.ones((2, 3, 3), np.float16)],
+            D * [np.ones(2)],
+            1.0,
+            scenery.device,
+        ),
         pixels=torch.zeros((N, 1, 1, *engine.PIXELS), dtype=torch.uint8, device=device),
         one_eyed=(one_eyed := core.Core(scenery, res=16)).agents,
         view=engine.observe(scenery, one_eyed.agents, centre_line=True, agent_ray=True),
@@ -209,7 +217,15 @@ def operations(f):
     )
     yield (
         engine.spawn,
-        dict(both, mask=f.mask, points=f.points, counts=f.counts, seed=1, resample=True),
+        dict(
+            both,
+            mask=f.mask,
+            points=f.points,
+            counts=f.counts,
+            seed=1,
+            resample=True,
+            chosen=f.counts,
+        ),
         dict(
             OPERANDS,
             mask=tensors,
@@ -218,7 +234,13 @@ def operations(f):
             seed=lambda good: [*integers(0)(good)][:6],
             resample=flags,
             hidden=flags,
+            chosen=optional_tensors,
         ),
+    )
+    yield (
+        engine.to_goal,
+        dict(both, fields=f.fields, goals=f.counts),
+        dict(OPERANDS, fields=objects, goals=tensors),
     )
     yield (
         engine.uniform,

@@ -4,6 +4,7 @@ never reads out of bounds for them; it raises a flag, and ``engine.check`` names
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -55,6 +56,13 @@ def coverage(c):
     return engine.coverage(c.scenery, c.agents, seen, visible, mask)
 
 
+def to_goal(c):
+    field = np.arange(36, dtype=np.float16).reshape(1, 6, 6)
+    fields = engine.DistanceFields(2 * [np.ones((1, 2))], 2 * [field], 2 * [np.ones(2)], 1.0, c.device)
+    goals = torch.zeros((LAST + 1, c.n_agents), dtype=torch.int32, device=c.device)
+    return engine.to_goal(c.scenery, c.agents, fields, goals).distance
+
+
 def spawn(c):
     n, a, device = c.scenery.n_envs, c.n_agents, c.scenery.device
     mask = torch.ones((n, a), dtype=torch.bool, device=device)
@@ -66,7 +74,7 @@ def spawn(c):
 
 @pytest.mark.parametrize("layout", [2, -1, 2**31 - 1, -(2**31)])
 @pytest.mark.parametrize("n_agents", [1, 3])
-@pytest.mark.parametrize("operation", [physics, render, observe, geometry, unseen, coverage, spawn])
+@pytest.mark.parametrize("operation", [physics, render, observe, geometry, unseen, coverage, to_goal, spawn])
 def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, layout, device):
     expected = operation(boxes(device, n_agents))
     c = boxes(device, n_agents)
@@ -81,7 +89,7 @@ def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, la
     engine.check(c.agents)
 
 
-@pytest.mark.parametrize("operation", [physics, render, observe, unseen])
+@pytest.mark.parametrize("operation", [physics, render, observe, unseen, to_goal])
 @pytest.mark.parametrize("field", ["positions", "angles"])
 def test_a_place_that_is_not_finite_is_named_by_whatever_reads_it(operation, field, device):
     expected = operation(boxes(device, 2))

@@ -24,6 +24,8 @@ SHORT = {
     "deathmatch, all rules": dict(
         limit=20, n_agents=16, recovery=0.1, drain=0.05, spoils=0.1, kill_reward=1, aim_reward=1
     ),
+    "pointgoal": dict(limit=15, res=1, subsample=1),
+    "pointgoal, privileged": dict(limit=15, res=1, subsample=1, privileged=True),
     "pong": dict(limit=20),
     "pong, pixels": dict(limit=20, pixels=True),
     "pong, self-play": dict(limit=20, self_play=True),
@@ -392,7 +394,7 @@ def test_check_raises_what_the_device_has_flagged(name, device):
     env.check()
     if device == "cpu":  # whose operations look at once, so the flag is set by hand
         (flag,) = [leaf for path, leaf in state_tree(env).items() if "error_flag" in path]
-        flag.fill_(13)
+        flag.fill_(8 * 3 + 1)
     else:
         env.step(idle(env).map(torch.add, 7))
     with pytest.raises(EngineError, match="nvironment"):
@@ -425,6 +427,7 @@ class Launches(TorchDispatchMode):
         ("deathmatch", 1),
         ("deathmatch, privileged", 1),
         ("deathmatch, all rules", 1),
+        ("pointgoal", 48),
         ("pong", 0),
     ],
 )

@@ -102,8 +102,13 @@ def test_a_damaged_file_is_built_again(fetch, damage, tmp_path):
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     damaged = {"truncated": content[:1000], "flipped": content, "empty": b"", "garbage": b"x" * 500}
-    path.unlink() if damage == "missing" else path.write_bytes(damaged[damage])
-    assert fetch(tmp_path) == (BODY, path, 1)
+    if damage == "missing":
+        path.unlink()
+        assert fetch(tmp_path) == (BODY, path, 1)
+    else:
+        path.write_bytes(damaged[damage])
+        with pytest.warns(UserWarning, match="is damaged or not this user's own: it is made again"):
+            assert fetch(tmp_path) == (BODY, path, 1)
     assert fetch(tmp_path) == (BODY, path, 0)
 
 

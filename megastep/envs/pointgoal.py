@@ -76,7 +76,7 @@ class PointGoal:
             seed=seed,
         )
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
-        self.subsample, self.limit, self.bonus, self.cost = subsample, limit, bonus, cost
+        self.subsample, self.bonus, self.cost = subsample, bonus, cost
         self.goals = modules.RandomGoals(geometries, self.core, nearest, furthest)
         self.spawner = modules.RandomSpawns(
             geometries, self.core, resample=resample, points=self.goals.spawns
@@ -90,7 +90,10 @@ class PointGoal:
             goal=spaces.MultiVector(1, 3),
         )
         self.action_space = self.movement.space
-        self.privileged_space = dotdict(way=spaces.MultiVector(1, 4)) if privileged else None
+        self.privileged_space = None
+        if privileged:
+            self.units = torch.tensor([10.0, 1.0, 1.0, limit], device=self.device)
+            self.privileged_space = dotdict(way=spaces.MultiVector(1, 4))
         self.places = self.core.agents.positions.clone()  # where the agents were a step ago
         # by the shortest way in metres: now, at the start; and metres and collisions since then
         self.distances, self.first, self.travelled, self.collisions = (
@@ -158,9 +161,9 @@ class PointGoal:
         """What only a critic sees (N, 1, 4): the shortest way in tens of metres, how its length falls
         per metre ahead and left, and the share of the steps that is left.
         """
-        left = 1 - self.lifecycle.ages / self.limit
-        columns = self.distances / 10, way.descent[:, 0, 0], way.descent[:, 0, 1], left
-        return torch.stack(columns, -1)[:, None]
+        left = self.lifecycle.limits - self.lifecycle.ages
+        columns = self.distances, way.descent[:, 0, 0], way.descent[:, 0, 1], left
+        return torch.stack(columns, -1)[:, None] / self.units
 
     def check(self) -> None:
         """EngineError if the engine has flagged an error since the last check. Waits for the
