@@ -78,8 +78,8 @@ _ERRORS = {
     "actions count from 0.",
     3: "Environment {env} shows a layout that the scenery does not have: ids in scenery.layout "
     "count from 0 and stay below the number of layouts.",
-    4: "An agent of environment {env} has a goal that its layout does not have: goals count from 0 "
-    "and stay below the number of goals per layout.",
+    4: "An agent of environment {env} has a goal or a spawn point that its layout does not have: "
+    "they count from 0 and stay below their number per layout.",
 }
 _KINDS = 8  # as errors.h has it
 

@@ -1,5 +1,5 @@
 """The engine: ``bake``, ``physics``, ``render``, ``observe``, ``unseen``, ``coverage``, ``spawn``,
-``uniform``, ``to_goal``, ``pong``, ``shoot``. Each checks its arguments, allocates and launches, on
+``uniform``, ``pong``, ``shoot``, ``seek``. Each checks its arguments, allocates and launches, on
 the CPU or the GPU, whichever its tensors are on; none synchronises. TypeError or ValueError, naming
 the argument, if one does not fit.
 
@@ -22,12 +22,12 @@ from .agents import (
     check_on_cpu,
 )
 from .devices import device, fit, set_threads, threads
-from .distance_fields import DistanceFields
-from .games import CELL, FEATURES, GAME_FIELDS, MAX_SHOOTERS, PIXELS, pong, shoot
+from .games import CELL, FEATURES, GAME_FIELDS, JOURNEY, MAX_SHOOTERS, PIXELS, pong, seek, shoot
+from .goal_fields import GoalFields
 from .kernels.compile import BLOCK, EngineError
 from .kernels.launch import SIZES, WARP, launch, params
 from .launch_params import error_flag, lanes_of, scenery_params, seed_params, state_params
-from .outputs import Observation, Physics, Pong, Render, Shots, ToGoal
+from .outputs import Observation, Physics, Pong, Render, Shots, Sought
 from .scenery import Layouts, Scenery
 
 __all__ = [
@@ -36,12 +36,13 @@ __all__ = [
     "CELL",
     "FEATURES",
     "GAME_FIELDS",
+    "JOURNEY",
     "MAX_RES",
     "MAX_SHOOTERS",
     "PIXELS",
     "Agents",
-    "DistanceFields",
     "EngineError",
+    "GoalFields",
     "Layouts",
     "Observation",
     "Physics",
@@ -49,7 +50,7 @@ __all__ = [
     "Render",
     "Scenery",
     "Shots",
-    "ToGoal",
+    "Sought",
     "bake",
     "check",
     "check_flag",
@@ -60,11 +61,11 @@ __all__ = [
     "physics",
     "pong",
     "render",
+    "seek",
     "set_threads",
     "shoot",
     "spawn",
     "threads",
-    "to_goal",
     "uniform",
     "unseen",
     "update_agent_geometry",
@@ -430,40 +431,4 @@ def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tens
     )
     launch("uniform", packed, on, threads=n)
     counts.add_(mask)
-    return out
-
-
-def to_goal(
-    scenery: Scenery, agents: Agents, fields: DistanceFields, goals: torch.Tensor
-) -> ToGoal:
-    """Where the goals of agents lie: straight, and by the shortest way, which is interpolated from
-    ``fields``.
-
-    Args: ``goals`` (N, A) int32, each a number of one of its layout's goals.
-    """
-    lanes, on = lanes_of(scenery, agents), scenery.device
-    checks.instance("fields", fields, DistanceFields)
-    if fields.n_layouts != len(scenery.layouts) or fields.device != on:
-        raise ValueError(
-            f"fields must be of the scenery's {len(scenery.layouts)} layouts and on {on}, but those "
-            f"of {fields.n_layouts} on {fields.device} were given"
-        )
-    out = ToGoal(
-        bearing=torch.empty((*lanes, 3), dtype=torch.float16, device=on),
-        straight=torch.empty(lanes, device=on),
-        distance=torch.empty(lanes, device=on),
-        descent=torch.empty((*lanes, 2), device=on),
-    )
-    packed = params.ToGoalParams(
-        scenery=scenery_params(scenery, agents.radius),
-        **state_params(scenery, agents, "positions", "angles"),
-        goals=checks.address("goals", goals, lanes, torch.int32, on),
-        **fields.addresses(),
-        error_flag=error_flag(scenery, agents),
-        **{name: value.data_ptr() for name, value in out._asdict().items()},
-        n_goals=fields.n_goals,
-        per_cell=1 / fields.cell,
-    )
-    launch("to_goal", packed, on, threads=out.straight.numel())
-    check_on_cpu(agents)
     return out

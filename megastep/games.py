@@ -1,4 +1,4 @@
-"""The engine's operations that are a game's whole step: ``pong`` and ``shoot``.
+"""The engine's operations that are a game's whole step: ``pong``, ``shoot`` and ``seek``.
 
 N environments, A agents per environment, B lanes.
 """
@@ -8,19 +8,33 @@ import math
 import torch
 
 from . import checks
-from .agents import Agents, check_flag_on_cpu
+from .agents import Agents, check_flag_on_cpu, check_on_cpu
 from .devices import threads
+from .goal_fields import GoalFields
 from .kernels.launch import launch, params
-from .launch_params import lanes_of, seed_params, state_params
-from .outputs import Observation, Pong, Shots
+from .launch_params import error_flag as error_flag_of
+from .launch_params import lanes_of, scenery_params, seed_params, state_params
+from .outputs import Observation, Pong, Shots, Sought
 from .scenery import Scenery
 
-__all__ = ["CELL", "FEATURES", "GAME_FIELDS", "MAX_SHOOTERS", "PIXELS", "pong", "shoot"]
+__all__ = [
+    "CELL",
+    "FEATURES",
+    "GAME_FIELDS",
+    "JOURNEY",
+    "MAX_SHOOTERS",
+    "PIXELS",
+    "pong",
+    "seek",
+    "shoot",
+]
 
 MAX_SHOOTERS = 16  # agents per environment
 GAME_FIELDS = 13  # of a game of Pong
 FEATURES = 8  # that a side is told of it
 PIXELS = 30, 40  # of its picture
+JOURNEY = 7  # numbers that are kept of an agent that seeks a goal
+TOLD = 4  # numbers that its critic is told
 CELL = 256  # parts of a pixel that its places and speeds are counted in
 
 
@@ -171,4 +185,81 @@ def shoot(
         n_threads=threads(),
     )
     launch("shoot", packed, on, threads=n)
+    return out
+
+
+def seek(
+    scenery: Scenery,
+    agents: Agents,
+    goals: GoalFields,
+    chosen: torch.Tensor,
+    journey: torch.Tensor,
+    ages: torch.Tensor,
+    ended: torch.Tensor,
+    draws: torch.Tensor,
+    spawned: torch.Tensor,
+    free: torch.Tensor | None = None,
+    *,
+    seed: int = 1,
+    reach: float = 0.2,
+    bonus: float = 5.0,
+    cost: float = 0.02,
+    limit: int = 500,
+    told: bool = False,
+) -> Sought:
+    """Each agent is told where its goal lies, paid for what the shortest way there has become
+    shorter, and done within ``reach`` metres; see :class:`~megastep.envs.PointGoal`. Those that
+    begin an episode draw a goal, once from their random stream.
+
+    Args: in place, ``chosen`` (B,) int32, the goals' numbers, ``journey`` (7, B) float32, of which
+    rows 2 to 6 are metres to go by the shortest way, the same at the start, the length of the
+    shortest way from there, metres walked, and collisions; ``ages`` (B,) int32, ``ended`` (B,)
+    bool, lanes that begin an episode in this step, and then those that end theirs, ``draws`` (B,)
+    int32, goals drawn so far; ``spawned`` (N, A) int32, the spawn points of those that begin one; ``free``
+    (N, A) float32, the progress of :func:`physics`, None if no step was taken; ``bonus`` for being
+    there, ``cost`` of a step, ``limit`` steps per episode; ``told``: what a critic is told is
+    wanted, too.
+    """
+    n, a = lanes = lanes_of(scenery, agents)
+    on, n_lanes = scenery.device, n * a
+    checks.instance("goals", goals, GoalFields)
+    if goals.n_layouts != len(scenery.layouts) or goals.device != on:
+        raise ValueError(
+            f"goals must be of the scenery's {len(scenery.layouts)} layouts and on {on}, but those "
+            f"of {goals.n_layouts} on {goals.device} were given"
+        )
+    for name, value in dict(reach=reach, bonus=bonus, cost=cost).items():
+        checks.number(name, value, -math.inf, math.inf)
+    flags = [torch.empty(n_lanes, dtype=torch.bool, device=on) for _ in range(3)]
+    out = Sought(
+        torch.empty(n_lanes, device=on),
+        *flags,
+        metrics=torch.empty((4, n_lanes), device=on),
+        bearing=torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=on),
+        told=torch.empty((n_lanes, 1, TOLD), device=on) if checks.flag("told", told) else None,
+    )
+    packed = params.SeekParams(
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles"),
+        free=0 if free is None else checks.address("free", free, lanes, torch.float32, on),
+        spawned=checks.address("spawned", spawned, lanes, torch.int32, on),
+        **goals.addresses,
+        draws=checks.address("draws", draws, (n_lanes,), torch.int32, on),
+        goals=checks.address("chosen", chosen, (n_lanes,), torch.int32, on),
+        journey=checks.address("journey", journey, (JOURNEY, n_lanes), torch.float32, on),
+        ages=checks.address("ages", ages, (n_lanes,), torch.int32, on),
+        ended=checks.address("ended", ended, (n_lanes,), torch.bool, on),
+        error_flag=error_flag_of(scenery, agents),
+        **{k: 0 if v is None else v.data_ptr() for k, v in out._asdict().items()},
+        **seed_params(seed),
+        per_cell=1 / goals.cell,
+        reach=reach,
+        bonus=bonus,
+        cost=cost,
+        limit=checks.integer("limit", limit, 1, 2**31 - 1),
+        n_goals=goals.n_goals,
+        n_spawns=goals.n_spawns,
+    )
+    launch("seek", packed, on, threads=n_lanes)
+    check_on_cpu(agents)
     return out

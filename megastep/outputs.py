@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 
-__all__ = ["Observation", "Physics", "Pong", "Render", "Shots", "ToGoal"]
+__all__ = ["Observation", "Physics", "Pong", "Render", "Shots", "Sought"]
 
 
 class Render(NamedTuple):
@@ -65,10 +65,13 @@ class Shots(NamedTuple):
     told: torch.Tensor | None  # (B, 1, 1 + 5 (A - 1)): what a critic is told; None if not wanted
 
 
-class ToGoal(NamedTuple):
-    """Where an agent's goal lies."""
+class Sought(NamedTuple):
+    """A step of agents that seek a goal, one value per lane."""
 
-    bearing: torch.Tensor  # (N, A, 3) fp16: metres / 10 straight, cosine and sine of the bearing
-    straight: torch.Tensor  # (N, A): metres
-    distance: torch.Tensor  # (N, A): metres by the shortest way, inf where none is known
-    descent: torch.Tensor  # (N, A, 2): how it falls per metre ahead and left
+    reward: torch.Tensor  # (B,)
+    reset: torch.Tensor  # (B,) bool, as the next two
+    terminal: torch.Tensor
+    truncated: torch.Tensor
+    metrics: torch.Tensor  # (4, B): where an episode ends, success, SPL, soft SPL, collisions
+    bearing: torch.Tensor  # (B, 1, 3) fp16: metres / 10 straight, cosine and sine of the bearing
+    told: torch.Tensor | None  # (B, 1, 4): what a critic is told; None if not wanted

@@ -56,11 +56,31 @@ def coverage(c):
     return engine.coverage(c.scenery, c.agents, seen, visible, mask)
 
 
-def to_goal(c):
-    field = np.arange(36, dtype=np.float16).reshape(1, 6, 6)
-    fields = engine.DistanceFields(2 * [np.ones((1, 2))], 2 * [field], 2 * [np.ones(2)], 1.0, c.device)
-    goals = torch.zeros((LAST + 1, c.n_agents), dtype=torch.int32, device=c.device)
-    return engine.to_goal(c.scenery, c.agents, fields, goals).distance
+def seek(c):
+    goals = engine.GoalFields(
+        points=2 * [np.ones((1, 2))],
+        fields=2 * [np.arange(36, dtype=np.float16).reshape(1, 6, 6)],
+        origins=2 * [np.ones(2)],
+        spawns=2 * [np.ones((1, 2))],
+        lengths=2 * [np.ones((1, 1))],
+        allowed=2 * [np.ones((1, 1), bool)],
+        cell=1.0,
+        device=c.device,
+    )
+    n, on = (LAST + 1) * c.n_agents, dict(device=c.device)
+    chosen, ages, draws = (torch.zeros(n, dtype=torch.int32, **on) for _ in range(3))
+    found = engine.seek(
+        c.scenery,
+        c.agents,
+        goals,
+        chosen,
+        torch.zeros((engine.JOURNEY, n), **on),
+        ages,
+        torch.zeros(n, dtype=torch.bool, **on),
+        draws,
+        torch.zeros((LAST + 1, c.n_agents), dtype=torch.int32, **on),
+    )
+    return found.reward.view(LAST + 1, -1)
 
 
 def spawn(c):
@@ -74,7 +94,9 @@ def spawn(c):
 
 @pytest.mark.parametrize("layout", [2, -1, 2**31 - 1, -(2**31)])
 @pytest.mark.parametrize("n_agents", [1, 3])
-@pytest.mark.parametrize("operation", [physics, render, observe, geometry, unseen, coverage, to_goal, spawn])
+@pytest.mark.parametrize(
+    "operation", [physics, render, observe, geometry, unseen, coverage, seek, spawn]
+)
 def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, layout, device):
     expected = operation(boxes(device, n_agents))
     c = boxes(device, n_agents)
@@ -89,7 +111,7 @@ def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, la
     engine.check(c.agents)
 
 
-@pytest.mark.parametrize("operation", [physics, render, observe, unseen, to_goal])
+@pytest.mark.parametrize("operation", [physics, render, observe, unseen, seek])
 @pytest.mark.parametrize("field", ["positions", "angles"])
 def test_a_place_that_is_not_finite_is_named_by_whatever_reads_it(operation, field, device):
     expected = operation(boxes(device, 2))

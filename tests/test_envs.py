@@ -427,7 +427,7 @@ class Launches(TorchDispatchMode):
         ("deathmatch", 1),
         ("deathmatch, privileged", 1),
         ("deathmatch, all rules", 1),
-        ("pointgoal", 48),
+        ("pointgoal", 1),
         ("pong", 0),
     ],
 )

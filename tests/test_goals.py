@@ -2,6 +2,7 @@
 
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,20 +32,23 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
-# ---- engine.to_goal ----
+# ---- GoalFields and where a goal lies ----
 
 
-def fields_of(random, n_layouts=3, n_goals=5, holes=0.2):
-    """Fields of random numbers, of other sizes in each layout, with holes."""
-    points, fields, origins = [], [], []
+def fields_of(random, n_layouts=3, n_goals=5, n_spawns=4, holes=0.2):
+    """Fields of random numbers, of other sizes in each layout, with holes; all goals allowed."""
+    made = {key: [] for key in ("points", "fields", "origins", "spawns", "lengths", "allowed")}
     for d in range(n_layouts):
         height, width = 2 + 3 * d, 7 - 2 * d
         field = random.uniform(0, 20, (n_goals, height, width))
         field[random.random(field.shape) < holes] = np.inf
-        fields.append(field.astype(np.float16))
-        points.append(random.uniform(1, 4, (n_goals, 2)))
-        origins.append(random.uniform(1, 2, 2).astype(np.float32))
-    return points, fields, origins
+        made["fields"].append(field.astype(np.float16))
+        made["points"].append(random.uniform(1, 4, (n_goals, 2)))
+        made["origins"].append(random.uniform(1, 2, 2).astype(np.float32))
+        made["spawns"].append(random.uniform(1, 4, (n_spawns, 2)))
+        made["lengths"].append(random.uniform(1, 9, (n_spawns, n_goals)))
+        made["allowed"].append(np.ones((n_spawns, n_goals), bool))
+    return made
 
 
 def boxes(device, n_envs, n_agents=1):
@@ -53,8 +57,23 @@ def boxes(device, n_envs, n_agents=1):
     )
 
 
+def seek(c, goals, chosen, spawned=None, **settings):
+    """What agents are told that are in the middle of an episode of their `chosen` goals (N, A)."""
+    n, on = chosen.numel(), dict(device=c.device)
+    state = dict(
+        chosen=chosen.flatten().clone(),
+        journey=torch.zeros((engine.JOURNEY, n), **on),
+        ages=torch.zeros(n, dtype=torch.int32, **on),
+        ended=torch.full((n,), spawned is not None, **on),
+        draws=torch.zeros(n, dtype=torch.int32, **on),
+    )
+    spawned = torch.zeros_like(chosen) if spawned is None else spawned
+    found = engine.seek(c.scenery, c.agents, goals, **state, spawned=spawned, told=True, **settings)
+    return found, SimpleNamespace(**state)
+
+
 def expected(point, field, origin, x, y, angle):
-    """bearing, straight, distance, descent in double precision, from the definition."""
+    """(straight, bearing, distance, descent) in double precision, from the definition."""
     cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
 
     def own(vx, vy):
@@ -69,7 +88,7 @@ def expected(point, field, origin, x, y, angle):
     cells = field[row : row + 2, column : column + 2].astype(float)
     known, weights = np.isfinite(cells), np.outer([1 - up, up], [1 - right, right])
     if not known.any():
-        return straight, own(dx, dy) / straight, math.inf, np.zeros(2)
+        return straight, own(dx, dy) / straight, 0.0, np.zeros(2)  # as far as it was
     total = weights[known].sum()
     distance = (weights[known] @ cells[known]) / total if total > 1e-9 else cells[known].mean()
     cells = np.where(known, cells, distance)
@@ -82,32 +101,37 @@ def expected(point, field, origin, x, y, angle):
 def test_where_a_goal_lies_is_as_defined(n_agents, device, monkeypatch):
     """Agents within the fields, at their edges, beyond them and where nothing is known."""
     random, n = np.random.default_rng(1), 200
-    points, fields, origins = fields_of(random)
+    made = fields_of(random)
     c = boxes(device, n, n_agents)
     shape = n, n_agents
     c.agents.positions.copy_(torch.as_tensor(random.uniform(0.8, 2.8, (*shape, 2))))
     c.agents.angles.copy_(torch.as_tensor(random.uniform(-180, 180, shape)))
-    goals = torch.as_tensor(random.integers(5, size=shape), dtype=torch.int32, device=device)
-    made = engine.DistanceFields(points, fields, origins, CELL, device)
+    chosen = torch.as_tensor(random.integers(5, size=shape), dtype=torch.int32, device=device)
+    goals = engine.GoalFields(**made, cell=CELL, device=device)
     poison = Poison(torch.empty)
     with monkeypatch.context() as patch:
         patch.setattr(torch, "empty", poison.allocate)
-        found = engine.to_goal(c.scenery, c.agents, made, goals)
-        poison.check(**found._asdict())
-    found = engine.ToGoal(*(value.cpu().double() for value in found))
-    n_infinite = 0
-    for e, a in np.ndindex(shape):
-        d, g = int(c.scenery.layout[e]), int(goals[e, a])
+        found, state = seek(c, goals, chosen)
+        outputs = "reward", "metrics", "bearing", "told"
+        poison.check(**{name: getattr(found, name) for name in outputs})
+    bearing, told = found.bearing.cpu().double(), found.told.cpu().double()
+    n_unknown = 0
+    for lane, (e, a) in enumerate(np.ndindex(shape)):
+        d, g = int(c.scenery.layout[e]), int(chosen[e, a])
         x, y = c.agents.positions[e, a].tolist()
-        straight, bearing, distance, descent = expected(
-            points[d][g], fields[d][g], origins[d], x, y, float(c.agents.angles[e, a])
+        straight, way, distance, descent = expected(
+            *(made[key][d][g] for key in ("points", "fields")),
+            made["origins"][d],
+            x,
+            y,
+            float(c.agents.angles[e, a]),
         )
-        assert float(found.straight[e, a]) == pytest.approx(straight, rel=1e-5)
-        assert found.bearing[e, a].tolist() == pytest.approx([straight / 10, *bearing], abs=2e-3)
-        assert float(found.distance[e, a]) == pytest.approx(distance, rel=1e-4)
-        assert found.descent[e, a].tolist() == pytest.approx(descent.tolist(), abs=2e-2)
-        n_infinite += math.isinf(distance)
-    assert 0 < n_infinite < n
+        assert bearing[lane, 0].tolist() == pytest.approx([straight / 10, *way], abs=2e-3)
+        assert float(state.journey[2, lane]) == pytest.approx(distance, rel=1e-4)
+        assert float(told[lane, 0, 0]) == pytest.approx(distance / 10, rel=1e-4)
+        assert told[lane, 0, 1:3].tolist() == pytest.approx(descent.tolist(), abs=2e-2)
+        n_unknown += distance == 0
+    assert 0 < n_unknown < n
 
 
 def test_ahead_left_behind_and_right(device):
@@ -115,127 +139,118 @@ def test_ahead_left_behind_and_right(device):
     c = boxes(device, 4)
     c.agents.positions.fill_(1.5)
     c.agents.angles.copy_(torch.tensor([[0.0], [90.0], [180.0], [270.0]]))
-    points = 3 * [np.array([[1.5, 3.5]])]
+    made = fields_of(np.random.default_rng(1), n_goals=1)
     field = 10 - np.arange(30, dtype=np.float16)[:, None] / 10 + np.zeros((1, 30, 30), np.float16)
-    made = engine.DistanceFields(points, 3 * [field], 3 * [np.ones(2)], CELL, device)
-    goals = torch.zeros((4, 1), dtype=torch.int32, device=device)
-    found = engine.to_goal(c.scenery, c.agents, made, goals)
+    made |= dict(points=3 * [np.array([[1.5, 3.5]])], fields=3 * [field], origins=3 * [np.ones(2)])
+    goals = engine.GoalFields(**made, cell=CELL, device=device)
+    chosen = torch.zeros((4, 1), dtype=torch.int32, device=device)
+    found, state = seek(c, goals, chosen)
     turned = [[0, 1], [1, 0], [0, -1], [-1, 0]]
-    assert found.bearing[:, 0].tolist() == [
-        pytest.approx([0.2, *way], abs=1e-3) for way in turned
-    ]
-    assert found.descent[:, 0].tolist() == [pytest.approx(way, abs=0.1) for way in turned]
-    assert found.distance[:, 0].tolist() == pytest.approx(4 * [9.5], abs=1e-2)
+    assert found.bearing[:, 0].tolist() == [pytest.approx([0.2, *way], abs=1e-3) for way in turned]
+    assert found.told[:, 0, 1:3].tolist() == [pytest.approx(way, abs=0.1) for way in turned]
+    assert state.journey[2].tolist() == pytest.approx(4 * [9.5], abs=1e-2)
     c.agents.positions.copy_(torch.tensor([1.5, 3.5]))
-    there = engine.to_goal(c.scenery, c.agents, made, goals)
-    assert there.bearing[:, 0].tolist() == 4 * [[0, 1, 0]] and not there.straight.any()
+    there, _ = seek(c, goals, chosen)
+    assert there.bearing[:, 0].tolist() == 4 * [[0, 1, 0]] and there.terminal.all()
 
 
-@pytest.mark.parametrize("goal", [5, -1, 2**31 - 1])
-def test_a_goal_that_is_none_is_named_and_others_go_on(goal, device):
+@pytest.mark.parametrize("number", [5, -1, 2**31 - 1])
+@pytest.mark.parametrize("which", ["goal", "spawn point"])
+def test_a_goal_or_spawn_point_that_is_none_is_named_and_others_go_on(which, number, device):
     c = boxes(device, 4)
     c.agents.positions.fill_(1.5)
-    made = engine.DistanceFields(*fields_of(np.random.default_rng(1)), CELL, device)
-    goals = torch.zeros((4, 1), dtype=torch.int32, device=device)
-    right = engine.to_goal(c.scenery, c.agents, made, goals)
-    goals[3] = goal
-    found = right
-    with pytest.raises(engine.EngineError, match="environment 3 has a goal that its layout does"):
-        found = engine.to_goal(c.scenery, c.agents, made, goals)
+    goals = engine.GoalFields(**fields_of(np.random.default_rng(1)), cell=CELL, device=device)
+    zeros = torch.zeros((4, 1), dtype=torch.int32, device=device)
+    wrong = zeros.clone()
+    wrong[3] = number
+    right = found = seek(c, goals, zeros, None if which == "goal" else zeros)[0]
+    with pytest.raises(engine.EngineError, match="environment 3 has a goal or a spawn point that"):
+        found = seek(c, goals, *((wrong, None) if which == "goal" else (zeros, wrong)))[0]
         engine.check(c.agents)
-    assert all(torch.equal(a[:3], b[:3]) for a, b in zip(found, right))
+    assert all(
+        torch.equal(a[..., :3, :, :], b[..., :3, :, :]) for a, b in zip(found[5:], right[5:])
+    )
 
 
 def test_half_precision_is_read_as_pytorch_reads_it(device):
-    """Every half but the NaNs, as the value of a field of one number."""
-    bits = torch.arange(2**15, dtype=torch.int32).to(torch.int16)[: 0x7C01].view(torch.float16)
-    c = core.Core(scene.scenery([toys.box(3)], 1, len(bits), device=device), res=8)
+    """Every positive half, as the value of a field of one number; infinity leaves 0 as it was."""
+    halves = torch.arange(0x7C01, dtype=torch.int32).to(torch.int16).view(torch.float16)
+    c = core.Core(scene.scenery([toys.box(3)], 1, len(halves), device=device), res=8)
     c.agents.positions.fill_(1.05)
-    fields = np.repeat(bits.numpy()[:, None], 4, 1).reshape(-1, 2, 2)
-    made = engine.DistanceFields(
-        [np.ones((len(bits), 2))], [fields], [np.ones(2)], CELL, device
-    )
-    goals = torch.arange(len(bits), dtype=torch.int32, device=device)[:, None]
-    found = engine.to_goal(c.scenery, c.agents, made, goals).distance.cpu().flatten()
-    torch.testing.assert_close(found, bits.float(), rtol=1e-6, atol=0)
+    made = fields_of(np.random.default_rng(1), 1, len(halves), 1)
+    fields = np.repeat(halves.numpy()[:, None], 4, 1).reshape(-1, 2, 2)
+    made |= dict(fields=[fields], origins=[np.ones(2)])
+    chosen = torch.arange(len(halves), dtype=torch.int32, device=device)[:, None]
+    goals = engine.GoalFields(**made, cell=CELL, device=device)
+    found = seek(c, goals, chosen)[1].journey[2].cpu()
+    torch.testing.assert_close(found[:-1], halves[:-1].float(), rtol=1e-6, atol=0)
+    assert found[-1] == 0
 
 
-def test_fields_that_do_not_fit_are_refused():
-    points, fields, origins = fields_of(np.random.default_rng(1))
-    with pytest.raises(ValueError, match="points must be one array"):
-        engine.DistanceFields(points[:2], fields, origins, CELL)
-    with pytest.raises(ValueError, match="float16 .* at least 2 x 2 cells, but one is float64"):
-        engine.DistanceFields(points, [fields[0].astype(float), *fields[1:]], origins, CELL)
-    with pytest.raises(ValueError, match="at least 2 x 2"):
-        engine.DistanceFields(points, [fields[0][:, :1], *fields[1:]], origins, CELL)
-    two = engine.DistanceFields(points[:2], fields[:2], origins[:2], CELL)
-    c = boxes("cpu", 2)
-    with pytest.raises(ValueError, match="fields must be of the scenery's 3 layouts .* 2 on cpu"):
-        engine.to_goal(c.scenery, c.agents, two, torch.zeros((2, 1), dtype=torch.int32))
+@pytest.mark.parametrize(
+    "key, wrong, words",
+    [
+        ("points", lambda made: made["points"][:2], r"points must be an array \(5, 2\) for each"),
+        ("lengths", lambda made: 3 * [made["lengths"][0].T], "lengths must be an array"),
+        ("fields", lambda made: 3 * [made["fields"][0].astype(float)], "but one is float64"),
+        ("fields", lambda made: 3 * [made["fields"][0][:, :1]], "at least 2 x 2 cells"),
+        ("allowed", lambda made: 3 * [made["allowed"][0] & False], "at least one goal for each"),
+    ],
+)
+def test_fields_that_do_not_fit_are_refused(key, wrong, words):
+    made = fields_of(np.random.default_rng(1))
+    with pytest.raises(ValueError, match=words):
+        engine.GoalFields(**{**made, key: wrong(made)}, cell=CELL)
 
 
-# ---- RandomGoals ----
+def test_goals_of_other_layouts_are_refused():
+    goals = engine.GoalFields(**fields_of(np.random.default_rng(1), 2), cell=CELL)
+    with pytest.raises(ValueError, match="goals must be of the scenery's 3 layouts .* 2 on cpu"):
+        seek(boxes("cpu", 2), goals, torch.zeros((2, 1), dtype=torch.int32))
 
 
-def world(geometries, n_envs, device="cpu", n_agents=1, **settings):
-    c = core.Core(scene.scenery(geometries, n_agents, n_envs, device=device), res=8)
-    goals = modules.RandomGoals(geometries, c, **settings)
-    spawner = modules.RandomSpawns(geometries, c, resample=True, points=goals.spawns)
-    return c, goals, spawner
+# ---- Goals that are drawn ----
 
 
 @pytest.mark.parametrize("n_agents", [1, 2])
 def test_goals_are_in_range_and_lengths_are_theirs(n_agents, device):
-    homes = [*sample("homes", 3), toys.column()]
-    c, goals, spawner = world(homes, 300, device, n_agents, nearest=2.0, furthest=4.0)
-    everyone = c.agent_full(True)
+    homes, n = [*sample("homes", 3), toys.column()], 300
+    c = core.Core(scene.scenery(homes, n_agents, n, device=device), res=8)
+    goals = modules.goal_fields(homes, c, nearest=2.0, furthest=4.0)
+    spawner = modules.RandomSpawns(homes, c, resample=True, points=goals.spawns)
     truth = [
         ways.geodesics(
             g, 128, 16, c.agents.radius, np.random.Generator(np.random.Philox([c.seed, d]))
         )
         for d, g in enumerate(homes)
     ]
-    chosen = set()
-    for _ in range(3):
-        spawner(everyone)
-        goals(everyone, spawner.chosen)
-        assert 2 <= goals.lengths.min() and goals.lengths.max() <= 4
-        for e, a in np.ndindex(100, n_agents):
-            d, goal = int(c.scenery.layout[e]), int(goals.chosen[e, a])
-            place = c.agents.positions[e, a].cpu().numpy()
-            (spawn,) = np.unique((truth[d].spawns == place).all(1).nonzero()[0][:1])
-            assert float(goals.lengths[e, a]) == truth[d].lengths[spawn, goal]
-            at = goals.fields.points[d, goal].cpu().numpy()
-            assert (at == truth[d].goals[goal]).all()
-            chosen.add((d, goal))
-    assert len(chosen) > 40, "of 64"
-
-
-def test_only_those_that_reset_get_another_goal():
-    homes = sample("homes", 2)
-    c, goals, spawner = world(homes, 64)
-    everyone = c.agent_full(True)
-    spawner(everyone)
-    goals(everyone, spawner.chosen)
-    before = goals.chosen.clone(), goals.lengths.clone()
-    some = everyone & (torch.arange(64) % 2 == 0)[:, None]
-    spawner(some)
-    goals(some, spawner.chosen)
-    changed = (goals.chosen != before[0]) | (goals.lengths != before[1])
-    assert not changed[1::2].any() and changed[::2].float().mean() > 0.8
+    drawn = set()
+    spawner(c.agent_full(True))
+    _, state = seek(c, goals, torch.zeros_like(spawner.chosen), spawner.chosen)
+    lengths = state.journey[4].cpu()
+    assert 2 <= lengths.min() and lengths.max() <= 4 and (state.draws == 1).all()
+    for lane, (e, a) in enumerate(np.ndindex(n, n_agents)):
+        d, goal = int(c.scenery.layout[e]), int(state.chosen[lane])
+        place = c.agents.positions[e, a].cpu().numpy()
+        spawn = (truth[d].spawns == place).all(1).nonzero()[0][0]
+        assert float(lengths[lane]) == truth[d].lengths[spawn, goal]
+        assert (goals.points[d, goal].cpu().numpy() == truth[d].goals[goal]).all()
+        drawn.add((d, goal))
+    assert len(drawn) > 40, "of 64"
 
 
 @pytest.mark.parametrize(
     "range_, words",
     [
-        (dict(nearest=40.0, furthest=50.0), r"geometry \d+ has no goal from 40 to 50 m .* [\d.]+ m"),
-        (dict(nearest=3.0, furthest=3.0), "0 <= nearest < furthest"),
-        (dict(nearest=-1.0), "0 <= nearest < furthest"),
+        ((40.0, 50.0), r"geometry \d+ has no goal from 40 to 50 m .* [\d.]+ m"),
+        ((3.0, 3.0), "0 <= nearest < furthest"),
+        ((-1.0, 3.0), "0 <= nearest < furthest"),
     ],
 )
 def test_a_range_without_goals_is_refused(range_, words):
+    c = core.Core(scene.scenery([toys.box(5)], 1, 2, device="cpu"), res=8)
     with pytest.raises(ValueError, match=words):
-        world([toys.box(5)], 2, **range_)
+        modules.goal_fields([toys.box(5)], c, *range_)
 
 
 # ---- Found once, and kept ----

@@ -19,7 +19,8 @@ from ..settings import MAX_ENVS, checked
 
 __all__ = ["PointGoal"]
 
-REACHED = 0.2  # metres from the goal: there
+METRICS = "success", "spl", "soft_spl", "collisions"
+REACH = 0.2  # metres from the goal: there
 
 
 class PointGoal:
@@ -33,14 +34,15 @@ class PointGoal:
 
     Metrics: ``success``; ``spl``, success weighted by path length (Anderson et al. 2018): 0 without
     success, else the length of the shortest way over that of the agent's, or over itself if that is
-    longer; ``soft_spl``, the same with the share of the way that was made in place of success (Datta
-    et al. 2020); ``collisions``, steps that a wall cut short.
+    longer; ``soft_spl``, the same with the share of the way that was made in place of success
+    (Datta et al. 2020); ``collisions``, steps that a wall cut short.
 
     Args: ``geometries`` to live in, generated homes by default; ``nearest`` and ``furthest`` metres
-    that the shortest way to a goal may be; ``limit`` steps; ``bonus`` and ``cost``; ``res`` rays and
-    ``subsample`` rays per pixel; ``fov`` degrees; ``fps`` steps per second; ``resample``: every
+    that the shortest way to a goal may be; ``limit`` steps; ``bonus`` and ``cost``; ``res`` rays
+    and ``subsample`` rays per pixel; ``fov`` degrees; ``fps`` steps per second; ``resample``: every
     episode in a home drawn anew, instead of one home per environment for ever; ``privileged``:
-    worlds also tell a critic the distance by the shortest way and its gradient.
+    worlds also tell a critic how far the goal is by the shortest way, how that distance falls ahead
+    and to the left, and the share of the steps that is left.
     """
 
     n_agents = 1
@@ -76,13 +78,13 @@ class PointGoal:
             seed=seed,
         )
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
-        self.subsample, self.bonus, self.cost = subsample, bonus, cost
-        self.goals = modules.RandomGoals(geometries, self.core, nearest, furthest)
+        self.subsample, self.seed = subsample, seed + (2 << 32)  # other draws than the spawns'
+        self.rules = dict(bonus=bonus, cost=cost, limit=limit, reach=REACH)
+        self.goals = modules.goal_fields(geometries, self.core, nearest, furthest)
         self.spawner = modules.RandomSpawns(
             geometries, self.core, resample=resample, points=self.goals.spawns
         )
         self.movement = modules.MomentumMovement(self.core)
-        self.lifecycle = modules.Lifecycle(self.core, limit)
         self.obs_space = dotdict(
             rgb=modules.RGB(self.core, subsample).space,
             d=modules.Depth(self.core, subsample).space,
@@ -90,80 +92,61 @@ class PointGoal:
             goal=spaces.MultiVector(1, 3),
         )
         self.action_space = self.movement.space
-        self.privileged_space = None
-        if privileged:
-            self.units = torch.tensor([10.0, 1.0, 1.0, limit], device=self.device)
-            self.privileged_space = dotdict(way=spaces.MultiVector(1, 4))
-        self.places = self.core.agents.positions.clone()  # where the agents were a step ago
-        # by the shortest way in metres: now, at the start; and metres and collisions since then
-        self.distances, self.first, self.travelled, self.collisions = (
-            torch.zeros(n_envs, device=self.device) for _ in range(4)
+        self.privileged_space = dotdict(way=spaces.MultiVector(1, 4)) if privileged else None
+        self.chosen, self.ages, self.draws = (
+            torch.zeros(n_envs, dtype=torch.int32, device=self.device) for _ in range(3)
         )
+        self.ended = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
+        self.journey = torch.zeros((engine.JOURNEY, n_envs), device=self.device)
 
     def reset(self) -> arrdict:
         """Starts every episode anew. Returns a world."""
-        return self._world(self.lifecycle.start_all())
+        self.ended.fill_(True)
+        return self._world()
 
     def step(self, decision: Mapping) -> arrdict:
         """One step by ``decision.actions`` (B, 1). Returns a world."""
-        free = self.movement(decision).progress
-        # in double precision, as PyTorch's root of a float has other last bits on a CPU
-        moved = (self.core.agents.positions - self.places).double().square().sum(-1).sqrt()
-        self.travelled += modules.to_lanes(moved)
-        self.collisions += modules.to_lanes(free < 1)
-        return self._world(self.lifecycle.start_ended())
+        return self._world(self.movement(decision).progress)
 
-    def _world(self, reset):
-        core, goals = self.core, self.goals
-        self.spawner(reset)
-        goals(reset, self.spawner.chosen)
-        view = engine.observe(core.scenery, core.agents, self.subsample, imu=True)
-        way = engine.to_goal(core.scenery, core.agents, goals.fields, goals.chosen)
-        self.places.copy_(core.agents.positions)
-        for count in (self.travelled, self.collisions):
-            count.masked_fill_(reset, 0.0)
-
-        known = way.distance.flatten()
-        distances = torch.where(known.isfinite(), known, self.distances)
-        progress = self.distances - distances
-        self.distances.copy_(distances)
-        self.first.copy_(torch.where(reset, distances, self.first))
-        there = way.straight.flatten() <= REACHED
-        reward = (progress + self.bonus * there - self.cost).masked_fill_(reset, 0.0)
-        world = arrdict(
-            obs=arrdict(
-                rgb=view.rgb.view(self.n_envs, *self.obs_space.rgb.shape),
-                d=view.depth.view(self.n_envs, *self.obs_space.d.shape),
-                imu=view.imu,
-                goal=way.bearing,
-            ),
-            reward=reward,
-            metrics=self._metrics(there),
-            **self.lifecycle(reset, there),
+    def _world(self, free=None):
+        """Respawns who ended an episode, looks, and judges where the agents have got to."""
+        self.spawner(self.ended)
+        obs = self._view()
+        sought = engine.seek(
+            self.core.scenery,
+            self.core.agents,
+            self.goals,
+            self.chosen,
+            self.journey,
+            self.ages,
+            self.ended,
+            self.draws,
+            self.spawner.chosen,
+            free,
+            seed=self.seed,
+            told=self.privileged_space is not None,
+            **self.rules,
         )
-        if self.privileged_space is not None:
-            world["privileged"] = arrdict(way=self._privileged(way))
+        world = arrdict(
+            obs=arrdict(obs, goal=sought.bearing),
+            reward=sought.reward,
+            reset=sought.reset,
+            terminal=sought.terminal,
+            truncated=sought.truncated,
+            metrics=arrdict(zip(METRICS, sought.metrics.unbind())),
+        )
+        if sought.told is not None:
+            world["privileged"] = arrdict(way=sought.told)
         return world
 
-    def _metrics(self, there):
-        """Of the episodes as they stand (N,) each, which counts where they end."""
-        shortest = self.goals.lengths.flatten()
-        efficiency = shortest / torch.maximum(shortest, self.travelled).clamp_(min=1e-3)
-        made = (1 - self.distances / self.first.clamp(min=1e-3)).clamp_(0, 1)
+    def _view(self):
+        """The observation but for the goal."""
+        view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True)
         return arrdict(
-            success=there.float(),
-            spl=there * efficiency,
-            soft_spl=torch.where(there, 1.0, made) * efficiency,
-            collisions=self.collisions.clone(),
+            rgb=view.rgb.view(self.n_envs, *self.obs_space.rgb.shape),
+            d=view.depth.view(self.n_envs, *self.obs_space.d.shape),
+            imu=view.imu,
         )
-
-    def _privileged(self, way):
-        """What only a critic sees (N, 1, 4): the shortest way in tens of metres, how its length falls
-        per metre ahead and left, and the share of the steps that is left.
-        """
-        left = self.lifecycle.limits - self.lifecycle.ages
-        columns = self.distances, way.descent[:, 0, 0], way.descent[:, 0, 1], left
-        return torch.stack(columns, -1)[:, None] / self.units
 
     def check(self) -> None:
         """EngineError if the engine has flagged an error since the last check. Waits for the
@@ -178,18 +161,16 @@ class PointGoal:
 
     def state(self, e: int = 0) -> arrdict:
         """What :meth:`plot_state` draws of environment ``e``."""
-        core, goals = self.core, self.goals
-        view = engine.observe(core.scenery, core.agents, self.subsample)
-        layout = self.layout[e].long()
+        layout, goal = self.layout[e].long(), self.chosen[e].long()
+        _, _, distance, _, shortest, walked, _ = self.journey[:, e].clone()
         return arrdict(
-            core=core.state(e),
-            rgb=view.rgb.view(self.n_envs, *self.obs_space.rgb.shape)[e],
-            d=view.depth.view(self.n_envs, *self.obs_space.d.shape)[e],
-            goal=goals.fields.points[layout, goals.chosen[e, 0].long()],
-            distance=self.distances[e].clone(),
-            travelled=self.travelled[e].clone(),
-            shortest=goals.lengths[e, 0].clone(),
-            lifecycle=self.lifecycle.state(e),
+            self._view().map(lambda leaf: leaf[e]),
+            core=self.core.state(e),
+            goal=self.goals.points[layout, goal].clone(),
+            age=self.ages[e].clone(),
+            distance=distance,
+            shortest=shortest,
+            walked=walked,
         )
 
     @classmethod
@@ -198,14 +179,14 @@ class PointGoal:
         agent sees.
         """
         title = (
-            f"step {state.lifecycle.age[0]}, {state.distance:.1f} m to go, {state.travelled:.1f} m "
-            f"walked, {state.shortest:.1f} m shortest"
+            f"step {state.age}, {state.distance:.1f} m to go, {state.walked:.1f} m walked, "
+            f"{state.shortest:.1f} m shortest"
         )
         yaws = state.core.yaws
         figure, plan, strips = plotting.panels(2, title=title, n_cameras=len(yaws))
         distances = engine.AGENT_RADIUS + 10 * (1 - state.d[0].astype("float32"))
         Core.plot_state(state.core, plan, distances=distances)
-        plotting.plot_goal(plan, state.goal, REACHED)
+        plotting.plot_goal(plan, state.goal, REACH)
         modules.RGB.plot_state(state.rgb, strips[:1], yaws)
         modules.Depth.plot_state(state.d, strips[1:], yaws)
         return figure

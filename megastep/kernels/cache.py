@@ -3,9 +3,9 @@
 It lies in ``$MEGASTEP_CACHE`` (else ``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``) and
 is made with mode 0700. What is loaded from it runs with the user's rights, so nothing is read that
 another user may write. A cached file ends in its own SHA-256, so a damaged one is seen and built
-again; it is written beside its place and renamed, so that two processes cannot harm each other. The digest is
-of the name too, so no file passes for another. A
-cache that cannot be used costs a warning of one line and a build per start.
+again; it is written beside its place and renamed, so that two processes cannot harm each other. The
+digest is of the name too, so no file passes for another. A cache that cannot be used costs a
+warning of one line and a build per start.
 """
 
 import hashlib
@@ -44,8 +44,9 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
 
 def warn(problem: str) -> None:
     warnings.warn(
-        f"the kernel cache is not used, so kernels are built, and spawn points, shortest "
-        f"ways and visible texels found, at each start: {problem}; set MEGASTEP_CACHE to another folder of your own",
+        f"the kernel cache is not used, so kernels are built, and spawn points, shortest ways and "
+        f"visible texels found, at each start: {problem}; set MEGASTEP_CACHE to another folder of "
+        f"your own",
         stacklevel=2,
     )
 

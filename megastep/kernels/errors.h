@@ -1,6 +1,6 @@
 // What only the device can see to be wrong sets a flag there, which engine.check reads: so no step
-// synchronises. The flag is KINDS env + kind, one of these; 0 says that nothing is wrong. Of several
-// errors any may stand, so threads need not agree on one.
+// synchronises. The flag is KINDS env + kind, one of these; 0 says that nothing is wrong. Of
+// several errors any may stand, so threads need not agree on one.
 #pragma once
 #include "common.h"
 #include "params.h"

@@ -140,6 +140,44 @@ struct PongParams {
     int n_threads;      // of the CPU
 };
 
+struct SeekParams {
+    SceneryParams scenery;
+    const float* positions;  // (N, A, 2)
+    const float* angles;     // (N, A)
+    const float* free;       // (N, A) fraction of the step that was free; null: none was taken
+    const int* spawned;      // (N, A) the layout's spawn point, where an episode begins
+    const float* points;     // (D, n_goals, 2) the goals
+    const unsigned short* fields;  // fp16: of each layout (n_goals, height, width) cells, in metres
+    const long long* starts;       // (D) first cell of each layout's fields
+    const int* shapes;             // (D, 2) height, width
+    const float* origins;          // (D, 2) the centre of the first cell
+    const float* lengths;          // (D, n_spawns, n_goals) of the shortest ways
+    const int* in_range;           // (D, n_spawns, n_goals) goals, those first that may be drawn
+    const int* n_in_range;         // (D, n_spawns) how many those are
+    int* draws;                    // (N, A) in and out, as the next four: goals drawn so far
+    int* goals;                    // (N, A) each agent's, of the goals of its layout
+    float* journey;                // (7, N, A) see seek.h
+    int* ages;                     // (N, A) steps since the first observation
+    unsigned char* ended;  // (N, A) in: begins an episode in this step; out: ends it in this step
+    int* error_flag;       // (1) out: see errors.h
+    float* reward;         // (N, A) out, as all that follows
+    unsigned char* reset;  // (N, A)
+    unsigned char* terminal;   // (N, A)
+    unsigned char* truncated;  // (N, A)
+    float* metrics;           // (4, N, A) where an episode ends: success, SPL, soft SPL, collisions
+    unsigned short* bearing;  // (N, A, 3) fp16: tens of metres straight to it, cosine and sine
+    float* told;              // (N, A, 4) what a critic is told; null: nothing
+    unsigned int key0;        // the seed
+    unsigned int key1;
+    float per_cell;  // one over a cell's side
+    float reach;     // metres from the goal: there
+    float bonus;     // for being there
+    float cost;      // of a step
+    int limit;       // steps of an episode
+    int n_goals;     // per layout
+    int n_spawns;    // per layout
+};
+
 struct ShootParams {
     const int* centre_line;  // (N, A) line at the centre of each view, of their environment's
     const int* agent_ray;    // (N, A) ray nearest to it that shows an agent, or -1; null: no aim
@@ -188,25 +226,6 @@ struct SpawnParams {
     unsigned int key1;
     int n_points;
     int resample;  // 1: an environment all of whose agents respawn moves to another layout
-};
-
-struct ToGoalParams {
-    SceneryParams scenery;
-    const float* positions;        // (N, A, 2)
-    const float* angles;           // (N, A)
-    const int* goals;              // (N, A) each agent's, of the goals of its layout
-    const float* points;           // (D, n_goals, 2) where they are
-    const unsigned short* fields;  // fp16: of each layout (n_goals, height, width) cells, in metres
-    const long long* starts;       // (D) first cell of each layout's fields
-    const int* shapes;             // (D, 2) height, width
-    const float* origins;          // (D, 2) the centre of the first cell
-    int* error_flag;               // (1) out: see errors.h
-    unsigned short* bearing;       // (N, A, 3) out: fp16
-    float* straight;               // (N, A) out: metres, as the next
-    float* distance;               // (N, A) out: by the shortest way
-    float* descent;                // (N, A, 2) out: its gradient, negated: ahead, left
-    int n_goals;
-    float per_cell;  // one over a cell's side
 };
 
 struct UnseenParams {

@@ -1,8 +1,8 @@
-"""What environments are made of: movement, sensors, spawning, goals, the lifecycle of episodes. Callables
-with a ``.space`` where there is one to declare.
+"""What environments are made of: movement, sensors, spawning, goals, the lifecycle of episodes.
+Callables with a ``.space`` where there is one to declare.
 """
 
-from .goals import RandomGoals
+from .goals import goal_fields
 from .lanes import to_agents, to_lanes
 from .lifecycle import Lifecycle, RandomLifespans, RandomStream
 from .movement import MOVES, TURNS, MomentumMovement, SimpleMovement, to_global, to_local
@@ -18,12 +18,12 @@ __all__ = [
     "Depth",
     "Lifecycle",
     "MomentumMovement",
-    "RandomGoals",
     "RandomLifespans",
     "RandomSpawns",
     "RandomStream",
     "SimpleMovement",
     "downsample",
+    "goal_fields",
     "render",
     "spawn_points",
     "to_agents",

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .spawning import CLEARANCE, distances, spawn_points
+from .spawning import distances, spawn_points
 
 CELL = 0.1  # metres, of fields
 FINE = 2  # times finer are the cells of which the clearance is known

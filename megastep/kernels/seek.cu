@@ -1,8 +1,8 @@
 // One thread per agent.
-#include "to_goal.h"
+#include "seek.h"
 
-KERNEL to_goal(ToGoalParams p) {
+KERNEL seek(SeekParams p) {
     int agent = blockIdx.x * blockDim.x + threadIdx.x;
     if (agent < p.scenery.n_envs * p.scenery.n_agents)
-        find_goal(p, agent);
+        seek_goal(p, agent);
 }
