@@ -215,10 +215,10 @@ def seek(
     rows 2 to 6 are metres to go by the shortest way, the same at the start, the length of the
     shortest way from there, metres walked, and collisions; ``ages`` (B,) int32, ``ended`` (B,)
     bool, lanes that begin an episode in this step, and then those that end theirs, ``draws`` (B,)
-    int32, goals drawn so far; ``spawned`` (N, A) int32, the spawn points of those that begin one; ``free``
-    (N, A) float32, the progress of :func:`physics`, None if no step was taken; ``bonus`` for being
-    there, ``cost`` of a step, ``limit`` steps per episode; ``told``: what a critic is told is
-    wanted, too.
+    int32, goals drawn so far; ``spawned`` (N, A) int32, the spawn points of those that begin one;
+    ``free`` (N, A) float32, the progress of :func:`physics`, None if no step was taken; ``bonus``
+    for being there, ``cost`` of a step, ``limit`` steps per episode; ``told``: what a critic is
+    told is wanted, too.
     """
     n, a = lanes = lanes_of(scenery, agents)
     on, n_lanes = scenery.device, n * a

@@ -21,9 +21,9 @@ class GoalFields:
     Args, a list of D arrays each, in metres: ``points`` (G, 2), the goals; ``fields`` (G, H, W)
     float16, at least 2 x 2 square cells, row 0 at the bottom: how far it is to each goal from the
     centre of a cell, infinite where nothing leads there; ``origins`` (2,), the centre of the first
-    cell; ``spawns`` (S, 2); ``lengths`` (S, G) of the shortest ways between the two; ``allowed`` (S,
-    G) bool: the goals that an agent may be sent to, at least one from each spawn point. ``cell`` is
-    the side of a cell. Layouts may share arrays. ValueError if they do not fit each other.
+    cell; ``spawns`` (S, 2); ``lengths`` (S, G) of the shortest ways between the two; ``allowed``
+    (S, G) bool: the goals that an agent may be sent to, at least one from each spawn point.
+    ``cell`` is the side of a cell. Layouts may share arrays. ValueError if they do not fit each other.
     """
 
     __slots__ = (
