@@ -23,7 +23,8 @@ class GoalFields:
     centre of a cell, infinite where nothing leads there; ``origins`` (2,), the centre of the first
     cell; ``spawns`` (S, 2); ``lengths`` (S, G) of the shortest ways between the two; ``allowed``
     (S, G) bool: the goals that an agent may be sent to, at least one from each spawn point.
-    ``cell`` is the side of a cell. Layouts may share arrays. ValueError if they do not fit each other.
+    ``cell`` is the side of a cell. Layouts may share arrays. ValueError if they do not fit each
+    other.
     """
 
     __slots__ = (

@@ -101,7 +101,7 @@ def expected(point, field, origin, x, y, angle):
 def test_where_a_goal_lies_is_as_defined(n_agents, device, monkeypatch):
     """Agents within the fields, at their edges, beyond them and where nothing is known."""
     random, n = np.random.default_rng(1), 200
-    made = fields_of(random)
+    made = fields_of(random, holes=0.5)
     c = boxes(device, n, n_agents)
     shape = n, n_agents
     c.agents.positions.copy_(torch.as_tensor(random.uniform(0.8, 2.8, (*shape, 2))))

@@ -1,10 +1,10 @@
 """Shortest paths of an agent between walls: goals, a field of distances to each, and how long the
 ways to them from spawn points are.
 
-A field is Dijkstra's algorithm on square cells that are joined to 16 neighbours each, so up to 2.7 %
-too long, and steady: progress is counted on it. The length of a way is that of the shortest polyline
-along which the agent's disc touches no wall, from a visibility graph (Lozano-Perez and Wesley 1979)
-of goals, spawn points and points about the ends of walls.
+A field is Dijkstra's algorithm on square cells that are joined to 16 neighbours each: a few per cent
+too long, and steady, so progress is counted on it. The length of a way is that of the shortest
+polyline along which the agent's disc touches no wall, from a visibility graph (Lozano-Perez and
+Wesley 1979) of goals, spawn points and points about the ends of walls.
 
 M walls, H x W cells, G goals, S spawn points, P points, K pairs of points.
 """
@@ -21,8 +21,8 @@ FAR = 0.5  # metres; no clearance above it is told apart
 RINGS = 3  # of cells beside walls that take over a neighbour's distance, to interpolate from
 ARC = 8  # points about the end of a wall
 STEP = 0.05  # metres between the points of a way that are looked at
-# Metres that a way may come nearer to a wall than the agent does: what an interpolated clearance may
-# be short of the true one, and the chord of an arc lies inside of it.
+# Metres that a way may come nearer to a wall than the agent does: what an interpolated clearance
+# may be short of the true one, and the chord of an arc lies inside of it.
 TOLERANCE = 0.015
 SPARE = 4  # times as many points are drawn as are needed, as some may lie in rooms without a door
 # Half of the moves between neighbours, as ways go both ways: rows up and columns right, and the
@@ -50,8 +50,8 @@ class Geodesics(NamedTuple):
 
 
 class _Grid:
-    """Square cells (H, W), and the clearance of `FINE` times finer ones: metres from their centres to
-    the nearest wall, at most `FAR`.
+    """Square cells (H, W), and the clearance of `FINE` times finer ones: metres from their centres
+    to the nearest wall, at most `FAR`.
     """
 
     def __init__(self, walls):
@@ -82,7 +82,7 @@ class _Grid:
         return self.clearance[::FINE, ::FINE] >= radius
 
     def read(self, values, points):
-        """`values` (..., H, W) of cells, or of finer ones, interpolated at points (P, 2): (..., P)."""
+        """(..., P) what `values` (..., H, W) of cells, or of finer ones, are at points (P, 2)."""
         height, width = values.shape[-2:]
         side = CELL * len(self.clearance) / (FINE * height)
         at = (points - self.origin) / side
@@ -195,9 +195,9 @@ def _corners(walls, radius):
 
 
 def _pairs(points, away, n_goals, n_ends, to_goals):
-    """(K,), (K,) numbers of points (P, 2), of which two and two may be neighbours on a shortest way:
-    goals, then from `n_goals` spawns, then from `n_ends` corners, with `away` (P, 2) the directions
-    from the walls they touch, 0 elsewhere. `to_goals` (G, P) are distances.
+    """(K,), (K,) numbers of points (P, 2), of which two and two may be neighbours on a shortest
+    way: goals, then from `n_goals` spawns, then from `n_ends` corners, with `away` (P, 2) the
+    directions from the walls they touch, 0 elsewhere. `to_goals` (G, P) are distances.
 
     Left out are those that cannot see each other, as their distances to a goal differ by more than
     the way between them, and those where a way would not bend round the end of the wall.
@@ -218,8 +218,8 @@ def _pairs(points, away, n_goals, n_ends, to_goals):
 
 
 def _lengths(grid, goals, spawns, corners, away, fields, radius):
-    """(S, G) lengths of the shortest ways from spawns (S, 2) to goals (G, 2), bending at corners (C,
-    2). `fields` (G, H, W) are distances to the goals.
+    """(S, G) lengths of the shortest ways from spawns (S, 2) to goals (G, 2), bending at corners
+    (C, 2). `fields` (G, H, W) are distances to the goals.
     """
     from scipy.sparse.csgraph import dijkstra
 
@@ -256,7 +256,8 @@ def geodesics(
     of_point[entries[0]] = parts[entries[1]]
     if (of_point < 0).all():
         raise ValueError(
-            f"geometry {g.id} has no room for an agent to walk in: no gap is {2 * radius + CELL:.2f} m wide"
+            f"geometry {g.id} has no room for an agent to walk in: no gap is "
+            f"{2 * radius + CELL:.2f} m wide"
         )
     largest = np.bincount(of_point[of_point >= 0]).argmax()
     points = points[of_point == largest]

@@ -38,7 +38,8 @@ def goal_fields(
     """
     if not 0 <= nearest < furthest:
         raise ValueError(
-            f"goals need 0 <= nearest < furthest metres, but {nearest:g} and {furthest:g} were given"
+            f"goals need 0 <= nearest < furthest metres, but {nearest:g} and {furthest:g} were "
+            f"given"
         )
     seed, device = core.seed if seed is None else seed, core.device
     geometries = geometries[: len(core.scenery.layouts)]
@@ -60,8 +61,8 @@ def _in_range(found, g, nearest, furthest):
     if not len(kept):
         raise ValueError(
             f"geometry {g.id} has no goal from {nearest:g} to {furthest:g} m from where agents "
-            f"spawn: its ways are {found.lengths.min():.1f} to {found.lengths.max():.1f} m long, so "
-            f"allow others, or leave it out"
+            f"spawn: its ways are {found.lengths.min():.1f} to {found.lengths.max():.1f} m long, "
+            f"so allow others, or leave it out"
         )
     kept = np.resize(kept, len(found.spawns))
     return found.spawns[kept], found.lengths[kept], allowed[kept]
