@@ -28,7 +28,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "scripts")]
 
 import benchmark_report  # noqa: E402
-from workloads import BENCHMARKS, BUDGETS, SEEDS  # noqa: E402
+from trainings import BUDGETS, SEEDS  # noqa: E402
+from workloads import BENCHMARKS  # noqa: E402
 
 from megastep import engine  # noqa: E402
 

@@ -4,7 +4,6 @@ All run in the benchmark's homes, with random actions drawn beforehand on the de
 """
 
 import itertools
-import json
 import os
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from pathlib import Path
 import torch
 from counters import counters
 from timing import TURNS, alone, laps, measurement, rate, timed
+from trainings import train, worlds
 
 from megastep import arrdict, capture, core, engine, envs, modules, scene
 from megastep.geometries import sample
@@ -26,9 +26,6 @@ ARENAS = {"cuda": (1024, 8192, 65_536), "cpu": (1024,)}  # homes of four agents 
 HOMES = 512
 WARM_UP = 60  # steps, so that agents are not where they spawned
 FRESH = 3  # samples of what takes a process each
-BUDGETS = 10, 60, 240  # seconds of training
-SEEDS = 1, 2, 3  # of training
-CURVE = 50  # points that are kept of a run's learning curve, at most
 
 
 def random_actions(n_envs, n_agents, device, turns=TURNS):
@@ -96,7 +93,7 @@ def operations(n, device):
 
 def step(device):
     """`env.step` of whole environments with everything they do: frames per second."""
-    for name in ("explorer", "minimal"):
+    for name in ("explorer", "minimal", "pointgoal"):
         for n_envs in SIZES[device.type]:
             times = timed(stepper(name, n_envs, device)[1], device)
             yield rate(f"{name}, `env.step`, {n_envs:,} environments", n_envs, times)
@@ -347,72 +344,10 @@ def twin_frame(c, e):
     twin.shade(hits, texels[:, :3], bounds.diff(), texels[:, 3])
 
 
-def train(device, seeds=SEEDS, budgets=BUDGETS):
-    """Training on the benchmark's homes for 10, 60 and 240 seconds, without compilation, three
-    seeds each, and what that evaluates to in unseen homes.
-    """
-    for budget, seed in itertools.product(budgets, seeds):
-        what = f"training, {budget} s, seed {seed}"
-        with tempfile.TemporaryDirectory() as folder:
-            run = Path(folder) / "run"
-            subprocess.run(
-                [
-                    sys.executable,
-                    "train.py",
-                    "geometry=bench",
-                    f"seconds={budget}",
-                    f"seed={seed}",
-                    f"folder={run}",
-                    "finish.evaluate=true",
-                    f"device={device}",
-                ],
-                check=True,
-                cwd=ROOT,
-                stdout=sys.stderr,
-            )
-            (written,) = run.glob("evaluations/*.json")
-            rows = json.loads(written.read_text())["rows"][:2]
-            reports = curve(run)
-        for whose, row in zip(("return", "return of random actions"), rows):
-            yield dict(
-                what=f"{what}, {whose} in unseen homes",
-                value=row["return"],
-                unit="",
-                lower=row["lower"],
-                upper=row["upper"],
-                n=row["homes"],
-            )
-        rates = [
-            (samples - before) / (seconds - earlier) / 1e6
-            for (earlier, before, _), (seconds, samples, _) in itertools.pairwise(reports)
-        ]
-        thinned = [
-            [round(seconds, 2), samples, round(earned, 3)]
-            for seconds, samples, earned in reports[:: -(-len(reports) // CURVE)]
-        ]
-        if rates:
-            yield measurement(f"{what}, median rate", "M/s", rates) | dict(curve=thinned)
-
-
-def curve(run):
-    """[(seconds, samples, return), ...]: what a run folder's reports say of the episodes that ended
-    while it trained.
-    """
-    metrics, perf = (
-        {row["samples"]: row for row in map(json.loads, (run / name).read_text().splitlines())}
-        for name in ("metrics.jsonl", "perf.jsonl")
-    )
-    return [
-        (perf[samples]["perf/seconds"], samples, row["episode/return"])
-        for samples, row in metrics.items()
-        if samples in perf and "episode/return" in row
-    ]
-
-
 BENCHMARKS = {
     benchmark.__name__: benchmark
     for benchmark in (
         *(step, kernels, counters, observe, agents, deathmatch, memory),
-        *(pong, compile, first, startup, cpu, train),
+        *(pong, compile, first, startup, cpu, train, worlds),
     )
 }

@@ -14,6 +14,7 @@ import counters
 import pytest
 import timing
 import torch
+import trainings
 import workloads
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -140,7 +141,7 @@ def test_a_benchmark_is_a_generator_that_says_what_it_measures(name):
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 @pytest.mark.parametrize(
     ("name", "n"),
-    [("step", 2), ("kernels", 8), ("observe", 2), ("deathmatch", 2), ("memory", 1), ("pong", 2)],
+    [("step", 3), ("kernels", 8), ("observe", 2), ("deathmatch", 2), ("memory", 1), ("pong", 2)],
 )
 def test_a_benchmark_leaves_a_line_of_json_per_measurement(name, n, device, tiny, tmp_path, capsys):
     path = tmp_path / "records.jsonl"
@@ -168,6 +169,18 @@ def test_the_cpu_is_measured_on_the_cpu_and_keeps_its_threads(tiny):
     assert all(r["on"].startswith("CPU, ") for r in records)
 
 
+@pytest.mark.slow
+def test_worlds_are_trained_and_evaluated_where_they_say(monkeypatch):
+    recipe = "env=pong preset=cpu samples=2048 env.n_envs=32 report=1", {"": "", "games": "lanes=7"}
+    monkeypatch.setattr(trainings, "RECIPES", {"Pong": recipe})
+    records = list(trainings.worlds(torch.device("cpu")))
+    assert len(records) == 2 * 2 * 2 and {r["n"] for r in records} == {1024, 7}
+    assert all(r["what"].startswith("Pong, ") for r in records)
+    words = [r["what"].split(", ")[-2:] for r in records]
+    assert sum("points_won" in " ".join(w) for w in words) == 4
+    assert sum("random" in " ".join(w) for w in words) == 4
+
+
 def test_a_curve_joins_what_was_earned_to_when(tmp_path):
     (tmp_path / "metrics.jsonl").write_text(
         '{"samples": 10, "lr": 1}\n{"samples": 20, "episode/return": 3.5}\n'
@@ -175,7 +188,7 @@ def test_a_curve_joins_what_was_earned_to_when(tmp_path):
     (tmp_path / "perf.jsonl").write_text(
         '{"samples": 10, "perf/seconds": 1.0}\n{"samples": 20, "perf/seconds": 2.0}\n'
     )
-    assert workloads.curve(tmp_path) == [(2.0, 20, 3.5)]
+    assert trainings.curve(tmp_path) == [(2.0, 20, 3.5)]
 
 
 def test_an_unknown_benchmark_ends_with_one_sentence():

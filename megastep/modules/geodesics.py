@@ -1,8 +1,8 @@
 """Shortest paths of an agent between walls: goals, a field of distances to each, and how long the
 ways to them from spawn points are.
 
-A field is Dijkstra's algorithm on square cells that are joined to 16 neighbours each: a few per cent
-too long, and steady, so progress is counted on it. The length of a way is that of the shortest
+A field is Dijkstra's algorithm on square cells joined to 16 neighbours each: a few per cent too
+long, and steady, so progress is counted on it. The length of a way is that of the shortest
 polyline along which the agent's disc touches no wall, from a visibility graph (Lozano-Perez and
 Wesley 1979) of goals, spawn points and points about the ends of walls.
 
