@@ -1,10 +1,11 @@
 """Statistics of whole episodes, summed lane by lane on the device.
 
-Axes: T time, B lanes, R roles.
+Axes: T time, B lanes, G groups of lanes.
 """
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 
@@ -15,8 +16,8 @@ class Episodes:
     """Return, length and metrics of the episodes that end, each summed from its first step; only
     `take` synchronises.
 
-    Args: `metrics`, the names of those that worlds carry; `roles`, a name for each lane of an
-    environment in turn, several of which may share one.
+    Args: `metrics`, the names of those that worlds carry; `groups`, by name, which lanes (B,) bool
+    have means of their own as well.
     """
 
     def __init__(
@@ -24,15 +25,17 @@ class Episodes:
         n_lanes: int,
         device: torch.device | str,
         metrics: Sequence[str] = (),
-        roles: Sequence[str] | None = None,
+        groups: Mapping[str, torch.Tensor] | None = None,
     ):
-        self.metrics, self.roles = tuple(metrics), tuple(roles or ())
+        self.metrics, self.groups = tuple(metrics), tuple(groups or ())
+        every = torch.ones(n_lanes, dtype=torch.bool, device=device)
+        self.members = torch.stack([every, *(groups or {}).values()], 1).double()  # (B, 1 + G)
         # of the episodes that go on, (B,)
         self.returns = torch.zeros(n_lanes, dtype=torch.float64, device=device)
         self.lengths = torch.zeros(n_lanes, dtype=torch.float64, device=device)
-        # of those that ended, for each lane of an environment if they have roles, else for all:
-        # their number, sums of returns, of squared returns, of lengths, of each metric
-        shape = 4 + len(self.metrics), len(self.roles) or 1
+        # of those that ended, in all lanes and in each group: their number, sums of returns, of
+        # squared returns, of lengths, of each metric
+        shape = 4 + len(self.metrics), 1 + len(self.groups)
         self.sums = torch.zeros(shape, dtype=torch.float64, device=device)
 
     def add(
@@ -62,21 +65,18 @@ class Episodes:
             _since(lengths, before),
             *(metrics[name].double() for name in self.metrics),
         ]
-        self.sums += torch.stack([self._sum(torch.where(ended, each, 0.0)) for each in values])
+        sums = torch.stack([torch.where(ended, each, 0.0).sum(0) for each in values])
+        self.sums += sums @ self.members
         self.returns = _since(returns, last, slice(-1, None))[0]
         self.lengths = _since(lengths, last, slice(-1, None))[0]
 
-    def _sum(self, values):
-        """(T, B) to sums for each lane of an environment, or for all."""
-        return values.view(-1, self.sums.shape[1]).sum(0)
-
     def take(self) -> dict[str, float]:
         """Of the episodes that ended since the last call: how many, mean and standard deviation of
-        the return, means of length and metrics; means by role too, such as `episode/return/leader`.
+        the return, means of length and metrics; means by group, too: `episode/return/leader`.
         """
-        columns = self.sums.T.tolist()
+        totals, *groups = self.sums.T.tolist()
         self.sums.zero_()
-        n, _, squares, *_ = totals = _added(columns)
+        n, _, squares, *_ = totals
         if not n:
             return {"episode/count": 0}
         means = self._means(totals)
@@ -85,9 +85,8 @@ class Episodes:
             **means,
             "episode/return_std": math.sqrt(max(squares / n - means["episode/return"] ** 2, 0.0)),
         }
-        for role in dict.fromkeys(self.roles):
-            own = [column for column, name in zip(columns, self.roles, strict=True) if name == role]
-            found |= {f"{name}/{role}": mean for name, mean in self._means(_added(own)).items()}
+        for group, own in zip(self.groups, groups, strict=True):
+            found |= {f"{name}/{group}": mean for name, mean in self._means(own).items()}
         return found
 
     def _means(self, totals):
@@ -109,8 +108,16 @@ class Episodes:
             self.sums.copy_(state["sums"])
 
 
-def _added(columns):
-    return [sum(values) for values in zip(*columns, strict=True)]
+def lane_groups(env: Any, chosen: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    """Groups of an environment's lanes, by name, or of those `chosen`: its roles, several agents
+    may share one, and the `kinds` of opponents that they meet.
+    """
+    groups, roles = {}, getattr(env, "roles", None) or ()
+    for role in dict.fromkeys(roles):
+        own = torch.tensor([name == role for name in roles], device=env.device)
+        groups[role] = own.repeat(env.n_envs)
+    groups |= getattr(env, "kinds", {})
+    return groups if chosen is None else {name: own[chosen] for name, own in groups.items()}
 
 
 def _since(totals, ends, rows=slice(None)):

@@ -12,11 +12,13 @@
 n_steps, n_lanes   how many there were, T steps of B lanes
 reward, reset, terminal, truncated   (T, B), of the worlds that followed; metrics, by name
 learns             (T+1, B) bool, whether the learner learns from the lane then
+learners           which of the environment's lanes these B are, a bool for each, or None for all
 numbers()          all that may stop being finite, by name: what the learner's `check` looked over
 
 `collect.rollout` is the one returned last, before the first call an empty one. A replay memory
 belongs to the learner, which fills it in `update`, or to its collector; one that acts ahead on a
-stream of its own returns an earlier rollout. Neither call synchronises host and device. A
+stream of its own returns an earlier rollout. An environment with opponents in it has `learners`:
+only those lanes need to be acted in and stored. Neither call synchronises host and device. A
 constructor that takes `graph` is told to capture its update.
 """
 

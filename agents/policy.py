@@ -5,6 +5,7 @@ Axes: T time, B lanes. On a GPU matrix products run in bfloat16 with float32 wei
 float32.
 """
 
+import copy
 from typing import Annotated, Any, Literal
 
 import torch
@@ -147,6 +148,13 @@ class Policy(nn.Module):
         return torch.autocast(
             self.device.type, torch.bfloat16, enabled=self.bf16 and self.device.type == "cuda"
         )
+
+    def actor(self) -> "Policy":
+        """A copy that only acts, with weights of its own that need no gradient."""
+        absent = {id(getattr(self, name, None)): None for name in ("critic", "prediction")}
+        actor = copy.deepcopy(self, {id(self.random): RandomStream(self.random.seed), **absent})
+        actor.privileged_space = None
+        return actor.requires_grad_(False)
 
     def update_stats(
         self, obs: Any, privileged: Any = None, taken: torch.Tensor | bool = True

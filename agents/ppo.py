@@ -127,8 +127,11 @@ class PPO:
         self._lr.fill_(lr)
 
     def collector(self, env: Any) -> Collector:
-        """What acts in `env`, and the memory of `n_steps` steps of all its lanes."""
-        n_lanes = env.n_envs * env.n_agents
+        """What acts in `env`, and the memory of `n_steps` steps of all its lanes, or of those that
+        learn where others are `opponents.Opponents`.
+        """
+        learners = getattr(env, "learners", None)
+        n_lanes = env.n_envs * env.n_agents if learners is None else int(learners.sum())
         rollout = Rollout(
             self.n_steps,
             n_lanes,
@@ -137,6 +140,7 @@ class PPO:
             self.policy.initial(n_lanes),
             env.device,
             self.policy.privileged_space,
+            learners=learners,
         )
         return Collector(env, self.policy, rollout)
 

@@ -52,8 +52,9 @@ class Rollout:
     state      the policy's state before row 0, leaves (B, ...)
 
     Args: `state`, the policy's state of B lanes, such as `policy.initial(B)`, of which a copy is
-    made; `obs_dtype`, of all observations that are not integers and whose space names none.
-    ValueError if it has no row.
+    made; `obs_dtype`, of all observations that are not integers and whose space names none;
+    `learners`, for an environment where opponents play too, which of its lanes are the B that are
+    stored, a bool each. ValueError if it has no row.
     """
 
     def __init__(
@@ -66,12 +67,14 @@ class Rollout:
         device: torch.device | str | None = None,
         privileged_space: Any = None,
         obs_dtype: torch.dtype = torch.float16,
+        learners: torch.Tensor | None = None,
     ):
         if n_steps < 1 or n_lanes < 1:
             raise ValueError(
                 f"a rollout needs at least one step and one lane, not {n_steps} and {n_lanes}"
             )
-        self.n_steps, self.n_lanes = n_steps, n_lanes
+        self.n_steps, self.n_lanes, self.learners = n_steps, n_lanes, learners
+        self.stored = None if learners is None else learners.nonzero()[:, 0]
         rows, more = (n_steps, n_lanes), (n_steps + 1, n_lanes)
         self.obs = _zeros(obs_space, more, device, obs_dtype)
         self.privileged = None
@@ -97,6 +100,20 @@ class Rollout:
     def reset(self) -> torch.Tensor:
         """(T, B) bool: whether row t's action was ignored because an episode started instead."""
         return self.starts[1:]
+
+    def own(self, world: arrdict) -> arrdict:
+        """Of an environment's world, the lanes that are stored."""
+        return world if self.stored is None else _rows(world, self.stored)
+
+    def for_all(self, actions: Any) -> Any:
+        """Actions of the lanes that are stored as actions of all that the environment has, 0 for
+        those that act for themselves.
+        """
+        if self.stored is None:
+            return actions
+        n = len(self.learners)
+        put = mapping(lambda own: own.new_zeros(n, *own.shape[1:]).index_copy(0, self.stored, own))
+        return put(actions)
 
     def store_world(self, t: int, world: arrdict) -> arrdict:
         """Stores the world at time t, and returns it as it was stored, for the policy to act on."""
@@ -151,7 +168,7 @@ class Rollout:
             actions=select(self.actions),
             logprobs=select(self.logprobs),
             value=select(self.values),
-            state=self.state.map(lambda leaf: leaf.index_select(0, rows)),
+            state=_rows(self.state, rows),
         )
         if self.privileged is not None:
             batch["privileged"] = select(self.privileged)
@@ -163,10 +180,14 @@ def initial_actor_state(env: Any, policy: Any, rollout: Rollout) -> arrdict:
     the actor_state that `collect` begins with: arrdict(world, state), of the world what
     `store_world` stores. It shares no memory with the environment.
     """
-    first = env.reset()
+    first = rollout.own(env.reset())
     rollout.make_room(first)
     world = _stored(first).map(torch.clone)
     return arrdict(world=world, state=policy.initial(len(world.reset)))
+
+
+def _rows(tree, rows):
+    return mapping(lambda leaf: leaf.index_select(0, rows))(tree)
 
 
 def _stored(world):
@@ -191,7 +212,8 @@ def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> ar
             rollout.actions[t], rollout.logprobs[t] = decision["actions"], decision["logprobs"]
             features.append(decision["features"])
             with torch.autocast(rollout.reward.device.type, enabled=False):
-                world = env.step(arrdict(actions=decision["actions"]))
+                world = env.step(arrdict(actions=rollout.for_all(decision["actions"])))
+                world = rollout.own(world)
             rollout.store_outcome(t, world)
 
         last = rollout.store_world(rollout.n_steps, world)

@@ -53,3 +53,18 @@ class Saver:
             f"The checkpoint at {step:,} samples could not be saved ({error.strerror}): it needs "
             f"about {needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free in {self.folder.parent}"
         )
+
+
+class Snapshots:
+    """Keeps a run's weights at the ends of `n` equal parts of its budget, with a `Saver` of its
+    own: what `evaluate.py ratings=true` compares. A trainer calls it with itself.
+    """
+
+    def __init__(self, save: Saver, n: int):
+        self.save, self.n, self.n_past = save, n, None
+
+    def __call__(self, trainer: Any) -> None:
+        n_past = int((1 - trainer.left) * self.n + 1e-9)
+        if self.n_past is not None and n_past > self.n_past:
+            self.save(trainer.samples, {"policy": trainer.policy.state_dict()})
+        self.n_past = n_past

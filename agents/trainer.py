@@ -1,6 +1,7 @@
 """The training loop: collect, update, report, save."""
 
 import contextlib
+import dataclasses
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import torch
 
 from agents.budget import Budget, Stopwatch
-from agents.episodes import Episodes
+from agents.episodes import Episodes, lane_groups
 from agents.finite import NonFiniteError
 
 #: So many skipped updates in a row end a run.
@@ -26,6 +27,8 @@ class Trainer:
     budget       when to end, and how the learning rate falls
     report_every, save_every  updates between two reports, and seconds between two checkpoints
     on_report    called with the trainer after each report, to show how far it is
+    opponents    the environment, where it is `opponents.Opponents`
+    snapshots    called with the trainer before the first update and after each: `saver.Snapshots`
     """
 
     def __init__(
@@ -40,17 +43,20 @@ class Trainer:
         report_every: int = 1,
         save_every: float = 30.0,
         on_report: Callable[["Trainer"], None] = lambda trainer: None,
+        opponents: Any = None,
+        snapshots: Callable[["Trainer"], None] = lambda trainer: None,
     ):
         self.env, self.policy, self.learner = env, policy, learner
         self.metrics, self.save_checkpoint, self.budget = metrics, save, budget
         self.report_every, self.save_every, self.on_report = report_every, save_every, on_report
+        self.opponents, self.snapshots = opponents, snapshots
         self.collect = learner.collector(env)
         self.rollout = self.collect.rollout  # what was collected last
         self.episodes = Episodes(
-            env.n_envs * env.n_agents,
+            self.rollout.n_lanes,
             env.device,
             tuple(self.rollout.metrics),
-            getattr(env, "roles", None),
+            lane_groups(env, self.rollout.learners),
         )
         self.clock = Stopwatch()
         self.samples = self.updates = 0
@@ -77,9 +83,11 @@ class Trainer:
         learnt is saved; so does NonFiniteError, of which only what came before it is saved.
         """
         try:
+            self.snapshots(self)
             while self.left > 0 and not stop():
                 self.rollout = self.collect()
                 losses = self.update()
+                self.snapshots(self)
                 if self.updates % self.report_every == 0:
                     self.report(losses)
                 is_due = self.clock.seconds - self.saved_at >= self.save_every
@@ -110,6 +118,8 @@ class Trainer:
         )
         self.samples += rollout.n_steps * rollout.n_lanes
         self.updates += 1
+        if self.opponents is not None:
+            self.opponents.refresh(self.policy, self.updates)
         if not self.clock.is_running:
             if torch.device(self.env.device).type == "cuda":
                 torch.cuda.synchronize(self.env.device)
@@ -127,8 +137,10 @@ class Trainer:
         values = torch.stack(list(losses.values())).tolist()
         episodes = self.episodes.take()
         self.latest.update(episodes)
+        won = {} if self.opponents is None else self.opponents.take()
         found = {
             **episodes,
+            **won,
             **dict(zip(losses, values, strict=True)),
             "updates": self.updates,
             "lr": self.lr,
@@ -150,6 +162,9 @@ class Trainer:
         from; NonFiniteError if none of the last `MAX_SKIPPED` rollouts could. Synchronises.
         """
         bad, n_skipped = self.learner.check.read(self.rollout.numbers())
+        if bad and self.rollout.learners is not None:
+            lanes = self.rollout.learners.nonzero()[:, 0]
+            bad = dataclasses.replace(bad, lane=int(lanes[bad.lane]))
         if bad and self.bad_number is None:
             self.bad_number = bad
             warnings.warn(f"{bad}; its rollout was not learnt from", stacklevel=2)
@@ -172,7 +187,9 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         """All that a run goes on from, as plain dicts of tensors and numbers."""
+        others = {} if self.opponents is None else {"opponents": self.opponents.state_dict()}
         return dict(
+            **others,
             policy=self.policy.state_dict(),
             learner=self.learner.state_dict(),
             episodes=self.episodes.state_dict(),
@@ -186,6 +203,8 @@ class Trainer:
         self.policy.load_state_dict(state["policy"])
         self.learner.load_state_dict(state["learner"])
         self.episodes.load_state_dict(state["episodes"])
+        if self.opponents is not None:
+            self.opponents.load_state_dict(state["opponents"])
         self.samples, self.updates = state["samples"], state["updates"]
         self.clock.before = state["seconds"]
         self.saved_updates = self.updates

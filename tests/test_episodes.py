@@ -1,9 +1,11 @@
 """Episode statistics, against a slow count."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
-from agents.episodes import Episodes
+from agents.episodes import Episodes, lane_groups
 
 
 def counted(reward, reset, done, partial):
@@ -79,8 +81,8 @@ def test_a_reward_that_is_not_finite_counts_as_nothing(bad):
 
 def test_metrics_are_read_where_episodes_end_and_split_by_role():
     """Two environments of three agents; the two followers share a role."""
-    roles = "leader", "follower", "follower"
-    episodes = Episodes(6, "cpu", ["laps", "falls"], roles)
+    env = SimpleNamespace(n_envs=2, device="cpu", roles=("leader", "follower", "follower"))
+    episodes = Episodes(6, "cpu", ["laps", "falls"], lane_groups(env))
     done = torch.zeros(2, 6, dtype=torch.bool)
     done[0, 0] = done[1, 3] = done[1, 4] = done[1, 5] = True
     reward = torch.tensor([[1.0, 0, 0, 2, 3, 4], [0, 0, 0, 5, 6, 7]])
@@ -112,6 +114,18 @@ def test_metrics_are_read_where_episodes_end_and_split_by_role():
     episodes.add(reward, torch.zeros_like(done), done, metrics=metrics)
     found = episodes.take()
     assert found["episode/return/leader"] == 1 and "episode/return/follower" not in found
+
+
+def test_lanes_are_in_groups_by_role_and_by_whom_they_meet():
+    past = torch.tensor([False, False, True, True])
+    env = SimpleNamespace(n_envs=2, device="cpu", roles=("left", "right"), kinds={"past": past})
+    groups = lane_groups(env, torch.tensor([True, True, False, True]))
+    assert {name: lanes.tolist() for name, lanes in groups.items()} == {
+        "left": [True, False, False],
+        "right": [False, True, True],
+        "past": [False, False, True],
+    }
+    assert lane_groups(SimpleNamespace(roles=None)) == {}
 
 
 def test_an_episode_counts_where_its_lane_learns():

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import torch
 
     from agents.checkpoint import Checkpoint
+    from agents.opponents import Opponents
     from agents.policy import Policy
 
 #: Environments that are made to measure how much memory one takes.
@@ -210,6 +211,62 @@ def make_learner(learner: settings.Learner, policy: Policy, seed: int = 1) -> An
     except LearnerError as error:
         raise UserError(f"{learner.name} is no learner: {error}") from None
     return made
+
+
+def make_opponents(
+    chosen: settings.Opposition, env: Any, sample: Any, policy: Policy, seed: int = 1
+) -> Opponents | None:
+    """The environment with opponents in it, or None where there shall be none. UserError that says
+    how many snapshots fit, if they are too many for the memory; `sample` is a small environment, in
+    which a scripted opponent is tried.
+    """
+    import torch
+
+    from agents.opponents import Opponents
+    from megastep import engine
+
+    if not (chosen.past or chosen.bot):
+        return None
+    if chosen.bot:
+        make_bot(chosen.bot_class, sample)
+    with errors():
+        if chosen.past:
+            weights = policy.actor().state_dict().values()
+            copies = 2 if torch.device(env.device).type == "cuda" else 1  # of which one to capture
+            each = copies * sum(weight.nbytes for weight in weights)
+            engine.fit(chosen.snapshots, each, env.device, "snapshots")
+        return Opponents(env, policy, seed=seed, **_arguments(chosen))
+
+
+def make_bot(name: str, env: Any) -> Any:
+    """A policy that needs no weights, by import path or `random`: it takes one step in `env`, whose
+    episodes start anew. UserError if it cannot play there.
+    """
+    from agents.evaluation import RandomActions
+
+    if name == "random":
+        return RandomActions(env.action_space)
+    with errors():
+        made = imported(name)
+    try:
+        bot, n_lanes = made(), env.n_envs * env.n_agents
+        decision, _ = bot(env.reset(), bot.initial(n_lanes, env.device))
+        if not _are_of(env.action_space, decision["actions"], n_lanes):
+            raise ValueError(f"its actions are not those of {env.action_space!r}")
+    except Exception as error:  # whatever it does where it was not made for
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise UserError(
+            f"{name} cannot play in {type(env).__name__}: {reason}; name one that is made for it"
+        ) from error
+    return bot
+
+
+def _are_of(space, actions, n_lanes):
+    """Whether actions of all lanes are of a space."""
+    if isinstance(space, dict):
+        return all(_are_of(child, actions[key], n_lanes) for key, child in space.items())
+    fits = tuple(actions.shape) == (n_lanes, *space.shape) and not actions.is_floating_point()
+    return fits and bool(((actions >= 0) & (actions < space.n_actions)).all())
 
 
 def load(path: Path, device: torch.device | str = "cpu") -> Checkpoint:

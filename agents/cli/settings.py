@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from agents.cli.registry import Choice, Group
+from agents.opponents import Opponents
 from agents.policy import Policy
 from megastep.settings import frozen, located, settings_of
 
@@ -73,6 +74,8 @@ Env, Geometry, Learner, Logger = (
 )
 #: Arguments of `agents.policy.Policy`.
 Agent = settings_of(Policy, ("obs_space", "action_space", "privileged_space", "seed"))
+#: Arguments of `agents.opponents.Opponents`.
+Opposition = settings_of(Opponents, ("env", "policy", "seed"))
 
 
 @frozen
@@ -93,6 +96,7 @@ class Train:
     geometry: Geometry
     agent: Agent
     learner: Learner
+    opponents: Opposition = Opposition()
     logger: Logger
     finish: Finish
     seed: Seed
@@ -102,6 +106,7 @@ class Train:
     report: Count
     checkpoint: Above0
     keep: Annotated[int, Field(ge=2, le=1000)]
+    snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
     folder: str | None
     resume: str | None
     init: str | None
@@ -120,6 +125,8 @@ class Train:
         over = self.learner.anneal
         if over in ("samples", "seconds") and getattr(self, over) is None:
             yield "learner.anneal", f"is {over}: lr falls over {over}, which are not given"
+        if self.snapshots and self.samples is None and self.seconds is None:
+            yield "snapshots", "they are spaced over the budget: give samples or seconds"
         if self.resume and self.init:
             yield (
                 "init",
@@ -139,6 +146,8 @@ class Evaluate:
     lanes: Count
     greedy: bool
     baseline: bool
+    against: tuple[str, ...] | None = None
+    ratings: bool = False
     seed: Seed
     device: Device
 
@@ -154,6 +163,7 @@ class Record:
     steps: Steps
     home: Annotated[int, Field(ge=0, le=1_000_000)]
     greedy: bool
+    against: str | None = None
     seed: Seed
     device: Device
     file: str | None
@@ -164,4 +174,6 @@ class Record:
             raise located([("run", "is missing; without a run, env=explorer films random actions")])
         if self.run is not None and self.env is not None:
             raise located([("env", "cannot be given together with run, which has its own")])
+        if self.run is None and self.against is not None:
+            raise located([("against", "needs run=, who plays against it")])
         return self

@@ -21,7 +21,7 @@ from agents.cli.lock import locked
 from agents.cli.settings import Evaluate, Record, Train, WandbLogger
 from agents.cli.signals import Interrupted, Interruptions
 from agents.finite import NonFiniteError
-from agents.saver import Saver
+from agents.saver import Saver, Snapshots
 from agents.trainer import Trainer
 from megastep import engine
 
@@ -35,11 +35,14 @@ The commonest:
   learner.lr=3e-4 seed=2       any key that --cfg job prints
   finish.evaluate=true finish.record=true
                                a table and a video at the end
+  opponents.past=0.4 opponents.bot=0.1
+                               of environments with several agents, shares against past selves and
+                               a scripted policy; snapshots=8 keeps what ratings compare
   resume=RUN                   continue a run (its folder, or latest) under its own configuration
   init=RUN                     start a new run from its weights, in its environment
   env=my_package.rover:Rover   a class of your own; so too geometry, learner, agent.memory
   logger=wandb logger.mode=offline"""
-#: Metrics and roles that are shown beside the return.
+#: Metrics and groups of lanes that are shown beside the return.
 FEW = 4
 #: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
 #: what it learns.
@@ -51,6 +54,7 @@ RESUMABLE = (
     "report",
     "checkpoint",
     "keep",
+    "snapshots",
     "logger",
     "finish",
 )
@@ -72,21 +76,21 @@ def make_trainer(
     if cfg.resume or cfg.init:
         loaded = components.load(run_folders.find(cfg.resume or cfg.init), device)
         components.load_weights(policy, env, loaded)
+    opponents = components.make_opponents(cfg.opponents, env, sample, policy, cfg.seed)
     wandb = None
     if isinstance(cfg.logger, WandbLogger):
         project, mode = cfg.logger.project, cfg.logger.mode
         wandb = dict(project=project, mode=mode, name=folder.name, config=as_tree(cfg))
     if cfg.resume:
-        checkpoint.rewind(folder / "checkpoints", loaded.step)
+        for name in ("checkpoints", "snapshots"):
+            checkpoint.rewind(folder / name, loaded.step)
     with components.errors():
         sinks = metrics.Metrics(folder, loaded.step if cfg.resume else 0, wandb)
-    saver = Saver(
-        folder / "checkpoints",
-        {"train": as_tree(cfg), "spaces": components.spaces_of(env)},
-        cfg.keep,
-    )
+    config = {"train": as_tree(cfg), "spaces": components.spaces_of(env)}
+    saver = Saver(folder / "checkpoints", config, cfg.keep)
+    snapshots = Saver(folder / "snapshots", config, keep=10**9)
     trainer = Trainer(
-        env,
+        opponents or env,
         policy,
         learner,
         sinks,
@@ -95,6 +99,8 @@ def make_trainer(
         report_every=cfg.report,
         save_every=cfg.checkpoint,
         on_report=on_report,
+        opponents=opponents,
+        snapshots=Snapshots(snapshots, cfg.snapshots),
     )
     if cfg.resume:
         trainer.load_state_dict(loaded.state)
@@ -108,17 +114,17 @@ def show(progress: Progress, trainer: Trainer) -> None:
         words.append(f"{number(trainer.rate)}/s")
     if trainer.score is not None:
         words.append(f"return {trainer.score:.2f}")
-        words += few_means(trainer.latest, trainer.episodes.metrics, trainer.episodes.roles)
+        words += few_means(trainer.latest, trainer.episodes.metrics, trainer.episodes.groups)
     left = trainer.left
     if trainer.budget.is_limited and left < 1:
         words.append(f"{duration(trainer.clock.seconds * left / (1 - left))} left")
     progress.show(1 - left if trainer.budget.is_limited else None, "  ".join(words))
 
 
-def few_means(latest: dict[str, float], metrics: Sequence[str], roles: Sequence[str]) -> list[str]:
-    """Returns by role, and metrics, as text, where they are few enough for one line."""
-    by_role = {role: f"episode/return/{role}" for role in dict.fromkeys(roles)}
-    names = {**by_role, **{name: f"episode/{name}" for name in metrics}}
+def few_means(latest: dict[str, float], metrics: Sequence[str], groups: Sequence[str]) -> list[str]:
+    """Returns by group of lanes, and metrics, as text, where they are few enough for one line."""
+    by_group = {group: f"episode/return/{group}" for group in groups}
+    names = {**by_group, **{name: f"episode/{name}" for name in metrics}}
     if len(names) > FEW:
         return []
     return [f"{name} {latest[key]:.3g}" for name, key in names.items() if key in latest]
@@ -224,6 +230,11 @@ def _resumed(tree, given):
     ]:
         raise ConfigErrors(refused)
     loaded = components.load(run_folders.find(tree["resume"]))
+    if "learner" not in loaded.state:
+        raise UserError(
+            f"{loaded.path} is a snapshot, the weights alone; init={loaded.path} starts a new run "
+            "from it, and the run's folder goes on"
+        )
     own = loaded.config["train"]
     for path in given:
         *groups, key = path.split(".")
