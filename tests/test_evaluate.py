@@ -13,7 +13,7 @@ import tiny
 import torch
 
 from agents import evaluation
-from agents.cli import evaluate, run_folders, train
+from agents.cli import evaluate, run_folders, tables, train
 from agents.cli.build import build
 from agents.cli.compose import ConfigLoader
 from agents.cli.errors import UserError
@@ -371,7 +371,7 @@ def test_a_table_that_cannot_be_written_is_one_sentence(trained, monkeypatch, tm
     place = tmp_path / "file"
     place.write_text("")
     with pytest.raises(UserError, match="cannot be written to .*file"):
-        evaluate.write(place, "name", dict(title="", rows=[]))
+        tables.write(place, "name", dict(title=""), (), ())
 
 
 def test_a_checkpoint_of_another_environment_is_refused_with_both_shapes(trained, tmp_path):

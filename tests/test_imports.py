@@ -51,6 +51,7 @@ USERS = {
     "wandb": ("agents/metrics.py",),
     "tensorboard": ("agents/metrics.py",),
     "rich": ("agents/cli/",),
+    "openskill": ("agents/ratings.py",),
     "loky": ("megastep/recording.py",),
     "IPython": ("megastep/recording.py",),
 }

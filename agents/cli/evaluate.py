@@ -3,19 +3,20 @@ from Python.
 """
 
 import dataclasses
-import json
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents import evaluation, files
-from agents.cli import components, run_folders
+from agents import evaluation
+from agents.cli import arena, components, run_folders, tables
+from agents.cli.arena import source
 from agents.cli.command import run_command
 from agents.cli.console import duration, say, table
-from agents.cli.errors import UserError
 from agents.cli.registry import label
-from agents.cli.settings import Evaluate, Geometry
+from agents.cli.settings import Evaluate
+from agents.cli.tables import INTERVAL
 
 HELP = """Prints and writes what a run's agent earns in the first episode of each lane, with a 95 %
 interval over homes. Each table is a file of its own in the run's folder: evaluations/*.md.
@@ -27,15 +28,22 @@ The commonest:
   env=pong             another environment of the same spaces: the tracker, after self-play
   greedy=true          the likeliest actions instead of sampled ones
   lanes=256            fewer episodes
-  baseline=false       no row for random actions"""
-INTERVAL = "95 % interval"
+  baseline=false       no row for random actions
+  against=RUN,bot      duels instead: with other runs or checkpoints, the scripted policy, random
+                       actions, or an import path
+  ratings=true         ratings of the run's snapshots, by duels of each with each"""
 
 
 def run(cfg: Evaluate) -> Path:
     """Evaluates as `cfg` says, each environment in one home throughout. Writes the table to the
     run's folder `evaluations`, one .json and .md per geometry source (the environment's name if it
-    has none), split and checkpoint; returns the path of the .json.
+    has none), split and checkpoint; returns the path of the .json. With `against` or `ratings`, it
+    is `arena` that does.
     """
+    if cfg.ratings:
+        return arena.rate(cfg)
+    if cfg.against is not None:
+        return arena.run(cfg)
     device, path = components.make_device(cfg.device), run_folders.find(cfg.run)
     loaded = components.load(path, device)
     trained = components.config_of(loaded)
@@ -62,7 +70,8 @@ def run(cfg: Evaluate) -> Path:
         f"{env.n_envs * env.n_agents:,} lanes"
     )
     say(title)
-    say(table(columns(rows), [cells(row) for row in rows]))
+    head, lines = columns(rows), [cells(row) for row in rows]
+    say(table(head, lines))
     say(f"evaluated in {duration(time.monotonic() - start)}")
     other = "-env" if cfg.env else ""
     name = f"{name}{other}-{cfg.split}-{loaded.step}{'-greedy' if cfg.greedy else ''}"
@@ -73,19 +82,13 @@ def run(cfg: Evaluate) -> Path:
         evaluation=dataclasses.asdict(cfg),
         rows=rows,
     )
-    return write(run_folders.folder_of(path) / "evaluations", name, result)
+    return tables.write(run_folders.folder_of(path) / "evaluations", name, result, head, lines)
 
 
 def settled(env: Any, n_envs: int) -> Any:
     """An environment's settings for `n_envs` environments that stay in the homes they start in."""
     moving = {"resample": False} if hasattr(env, "resample") else {}
     return dataclasses.replace(env, n_envs=n_envs, **moving)
-
-
-def source(geometry: Geometry) -> str:
-    """The name of the geometries evaluated in, for titles and file names."""
-    name, path = label(geometry.name), getattr(geometry, "path", None)
-    return name if path is None else f"{name}-{Path(path).stem}"
 
 
 def columns(rows: Sequence[dict]) -> tuple[str, ...]:
@@ -114,29 +117,7 @@ def metric_cells(mean: float | None, lower: float | None, upper: float | None) -
     return ("none", "none") if mean is None else (f"{mean:.3g}", f"{lower:.3g} to {upper:.3g}")
 
 
-def write(folder: Path, name: str, result: dict) -> Path:
-    """Writes a result for machines and for people, `name`.json and .md, each whole or not at all.
-    Returns the .json's path.
-    """
-    head = columns(result["rows"])
-    lines = [
-        "| " + " | ".join(line) + " |"
-        for line in (head, ("---",) * len(head), *map(cells, result["rows"]))
-    ]
-    texts = {
-        ".md": "\n".join([result["title"], "", *lines]) + "\n",
-        ".json": json.dumps(result, indent=2) + "\n",
-    }
-    try:
-        folder.mkdir(exist_ok=True)
-        for suffix, text in texts.items():
-            files.replace(folder / f"{name}{suffix}", text.encode())
-    except OSError as error:
-        raise UserError(
-            f"The evaluation cannot be written to {folder} ({error.strerror})"
-        ) from error
-    return folder / f"{name}.json"
-
-
 def main(argv: list[str] | None = None) -> int:
-    return run_command("evaluate", Evaluate, run, HELP, argv)
+    words = sys.argv[1:] if argv is None else argv
+    words = [arena.listed(word) if word.startswith("against=") else word for word in words]
+    return run_command("evaluate", Evaluate, run, HELP, words)

@@ -9,12 +9,15 @@ from typing import Any
 
 import torch
 
-from agents.cli import components, run_folders
+from agents import duels
+from agents.checkpoint import Checkpoint
+from agents.cli import arena, components, run_folders
 from agents.cli.command import run_command
 from agents.cli.console import say
 from agents.cli.errors import UserError
 from agents.cli.settings import GROUPS, Record
 from agents.evaluation import RandomActions
+from agents.lineup import Lineup
 from agents.metrics import missing
 from megastep.arrdict import numpyify
 
@@ -24,6 +27,7 @@ The commonest:
   run=RUN          a run folder, one of its checkpoints, or latest
   env=explorer     random actions in an environment, without a run
   steps=400        frames
+  against=RUN      its duel with another run's agent, `bot`, or an import path, in one home
   home=3           another of the unseen homes; split=training: one it was trained in
   file=out.mp4     instead of video.mp4 in the run folder; out.png: the last frame alone"""
 
@@ -45,6 +49,8 @@ def run(cfg: Record) -> Path:
         folder, loaded = run_folders.folder_of(path), components.load(path, device)
         trained = components.config_of(loaded)
         chosen, geometry = trained.env, cfg.geometry or trained.geometry
+    if cfg.against is not None:
+        chosen = arena.for_duels(chosen)
     homes = components.homes(chosen, geometry, cfg.split)
     home = [homes[cfg.home % len(homes)]] if homes else []
     env = components.make_sample(dataclasses.replace(chosen, n_envs=1), home, cfg.seed, device)
@@ -53,6 +59,8 @@ def run(cfg: Record) -> Path:
     else:
         policy = components.make_actor(trained.agent, env)
         components.load_weights(policy, env, loaded)
+    if cfg.against is not None:
+        policy = against(cfg.against, env, policy, loaded)
 
     place = Path(cfg.file) if cfg.file else folder / "video.mp4"
     try:
@@ -62,6 +70,15 @@ def run(cfg: Record) -> Path:
         raise UserError(f"The video {place} could not be made: {reason}") from error
     say(f"Filmed {cfg.steps} steps: {place}")
     return place
+
+
+def against(name: str, env: Any, policy: Any, loaded: Checkpoint) -> Lineup:
+    """The policy of a run's checkpoint as the first agent, and another, by name, as all others."""
+    arena.check_agents(env)
+    opponent = arena.Players(loaded, env).named(name)
+    say(f"The first agent is that of {loaded.path}, the other {opponent.name}")
+    seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
+    return duels.lineup(policy, opponent.policy, seat, env.n_agents)
 
 
 @torch.no_grad()

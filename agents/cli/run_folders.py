@@ -141,8 +141,8 @@ def folder_of(path: Path) -> Path:
 
 def headline(result: Path | None) -> str:
     """What a finished job achieved, in a few words: the return in its table (an evaluation's file,
-    or the one of a run's last checkpoint), else the last return seen in training. `result` is what
-    the job returned, None if it failed.
+    or the one of a run's last checkpoint), or the share of duels won in it, else the last return
+    seen in training. `result` is what the job returned, None if it failed.
     """
     from agents.metrics import read
 
@@ -151,9 +151,11 @@ def headline(result: Path | None) -> str:
     tables = [result] if result.is_file() else sorted(result.glob("evaluations/*.json"))
     try:
         tables = [json.loads(path.read_text()) for path in tables if path.suffix == ".json"]
+        tables = [table for table in tables if result.is_file() or "return" in table["rows"][0]]
         last = max(tables, key=lambda table: (table["step"], not table["evaluation"]["greedy"]))
         row = last["rows"][0]
-        return f"{row['return']:.2f} ({row['lower']:.2f} to {row['upper']:.2f})"
+        value = f"{row['return']:.2f}" if "return" in row else f"{row['won']:.2f} won"
+        return f"{value} ({row['lower']:.2f} to {row['upper']:.2f})"
     except (OSError, ValueError):
         pass
     try:

@@ -1,0 +1,32 @@
+"""Tables of results: on the terminal, and in a run's folder for people and for machines."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from agents import files
+from agents.cli.errors import UserError
+
+INTERVAL = "95 % interval"
+
+
+def write(
+    folder: Path, name: str, result: dict, head: Sequence[str], lines: Sequence[Sequence[str]]
+) -> Path:
+    """Writes a result for machines and its table for people, `name`.json and .md, each whole or not
+    at all. Returns the .json's path.
+    """
+    rows = ["| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *lines)]
+    texts = {
+        ".md": "\n".join([result["title"], "", *rows]) + "\n",
+        ".json": json.dumps(result, indent=2) + "\n",
+    }
+    try:
+        folder.mkdir(exist_ok=True)
+        for suffix, text in texts.items():
+            files.replace(folder / f"{name}{suffix}", text.encode())
+    except OSError as error:
+        raise UserError(
+            f"The evaluation cannot be written to {folder} ({error.strerror})"
+        ) from error
+    return folder / f"{name}.json"
