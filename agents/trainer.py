@@ -136,11 +136,11 @@ class Trainer:
             self.env.check()
         values = torch.stack(list(losses.values())).tolist()
         episodes = self.episodes.take()
+        if self.opponents is not None:
+            episodes |= self.opponents.take()
         self.latest.update(episodes)
-        won = {} if self.opponents is None else self.opponents.take()
         found = {
             **episodes,
-            **won,
             **dict(zip(losses, values, strict=True)),
             "updates": self.updates,
             "lr": self.lr,

@@ -1,5 +1,6 @@
 """Training against opponents as the command line does it."""
 
+import pages
 import pytest
 import torch
 from games import Always
@@ -7,7 +8,9 @@ from test_arena import PONG, UPDATE
 from test_train import configured
 
 from agents import checkpoint, metrics
-from agents.cli import evaluate, train
+from agents.cli import arena, evaluate, train
+from agents.cli.compose import ConfigLoader
+from agents.cli.settings import Evaluate, Record, Train
 from megastep import capture, devices, engine
 
 SHARES = ["opponents.past=0.5", "opponents.bot=0.25", "opponents.snapshots=2", "opponents.every=2"]
@@ -28,6 +31,29 @@ def actors(folder):
 
 def same(a, b):
     return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_every_command_of_the_page_composes_and_its_policy_plays(here, monkeypatch):
+    text = (pages.ROOT / "docs" / "self-play.md").read_text()
+    typed = pages.commands(text)
+    assert {script for script, _ in typed} == set(pages.MAINS)
+    for script, words in typed:
+        name = script.removesuffix(".py")
+        kind = dict(train=Train, evaluate=Evaluate, record=Record)[name]
+        if script == "evaluate.py":
+            words = [arena.listed(word) if word.startswith("against=") else word for word in words]
+        with ConfigLoader(name, kind) as loader:
+            loader.tree(words)
+    folder = train.run(configured("samples=1", tiny=PONG))
+    (here / "tracker.py").write_text(pages.code(text)[0])
+    with pages.inside(here, monkeypatch):
+        against = "against=tracker:Tracker,random"
+        assert evaluate.main([f"run={folder}", against, "lanes=40", "device=cpu"]) == 0
+        first = ["ratings=true", "against=tracker:Tracker,random", "lanes=40", "device=cpu"]
+        assert evaluate.main([f"run={folder}", *first]) == 0
+    ratings = (folder / "ratings.csv").read_text().splitlines()[-2:]
+    tracker, random = (float(row.split(",")[-4]) for row in ratings)
+    assert tracker > random + 5
 
 
 def test_a_run_against_opponents_tells_how_it_does_against_each(here):

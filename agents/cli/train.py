@@ -44,6 +44,8 @@ The commonest:
   logger=wandb logger.mode=offline"""
 #: Metrics and groups of lanes that are shown beside the return.
 FEW = 4
+#: Before the kind of opponent, the share of pairs won.
+WON = "episode/won/"
 #: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
 #: what it learns.
 RESUMABLE = (
@@ -115,6 +117,8 @@ def show(progress: Progress, trainer: Trainer) -> None:
     if trainer.score is not None:
         words.append(f"return {trainer.score:.2f}")
         words += few_means(trainer.latest, trainer.episodes.metrics, trainer.episodes.groups)
+        won = {k.rpartition("/")[2]: v for k, v in trainer.latest.items() if k.startswith(WON)}
+        words += [f"{share:.2f} won against {kind}" for kind, share in won.items()]
     left = trainer.left
     if trainer.budget.is_limited and left < 1:
         words.append(f"{duration(trainer.clock.seconds * left / (1 - left))} left")
