@@ -363,6 +363,15 @@ def test_the_share_won_is_told_by_kind_of_opponent(mortal):
     assert found["episode/won/bot"] == 0.0 and env.take() == {}
 
 
+def test_only_what_an_episode_paid_decides_it():
+    """Two games are lost by a point and the third is won by one: on the whole the return is -1."""
+    env = opposed(4, bot=1.0, past=0.0, bot_class="games:Middle")
+    env.reset()
+    for action in (0, 0, 0, 0, 2):  # every second step is the reset after an end
+        env.step(arrdict(actions=torch.full((8, 1), action)))
+    assert env.take() == {"episode/won/bot": pytest.approx(1 / 3)}
+
+
 def test_roles_and_kinds_of_opponents_have_means_of_their_own(tmp_path):
     env = Matrix(16, roles=("left", "right"))
     run = trainer_of(tmp_path, env, 4 * 4 * 20, past=0.5, bot=0.25, bot_class=HIGH, snapshots=2)
