@@ -9,7 +9,6 @@ import torch
 from pydantic import Field
 
 from agents import duels
-from agents.imports import load
 from agents.lineup import Lineup
 from agents.random_stream import RandomStream
 from megastep.arrdict import arrdict
@@ -26,10 +25,9 @@ class Opponents:
     without opponents: the policy plays itself as it is now.
 
     env, policy  the environment, of two agents or more, and the policy that learns in it
+    scripted     another policy, which acts as policies do
     past         the share of environments against past selves
-    bot          the share against a scripted policy
-    bot_class    that policy, an import path: called without arguments it makes what acts as
-                 policies do
+    bot          the share against the scripted policy
     snapshots    how many past selves there are, in as many environments each; all begin as copies
                  of the policy
     every        updates after which the oldest one becomes a copy of the policy as it is then
@@ -45,10 +43,10 @@ class Opponents:
         self,
         env: Any,
         policy: Any,
+        scripted: Any = None,
         *,
         past: Share = 0.0,
         bot: Share = 0.0,
-        bot_class: str = "agents.bots:Bot",
         snapshots: Annotated[int, Field(ge=1, le=10_000)] = 4,
         every: Annotated[int, Field(ge=1, le=10**9)] = 100,
         seed: int = 1,
@@ -66,9 +64,7 @@ class Opponents:
         learners[-self.n_opposed :].scatter_(1, self.seat, True)
         self.learners = learners.flatten()
         opposing = (~self.learners).nonzero()[:, 0].split([n * (env.n_agents - 1) for n in groups])
-        self.lineup = Lineup(
-            [*self.actors, *(load(bot_class)() for _ in range(n_bot > 0))], opposing
-        )
+        self.lineup = Lineup([*self.actors, scripted][: len(groups)], opposing)
         self.kinds = self._kinds({"past": self.n_past, "bot": n_bot})
         # pairs of a learner and an opponent that were won and decided since `take`, by environment
         self.pairs = torch.zeros(2, self.n_opposed, device=device)

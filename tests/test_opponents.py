@@ -4,7 +4,7 @@ and counted, and that a policy learns against it.
 
 import pytest
 import torch
-from games import Always, Matrix
+from games import Always, High, Matrix, Middle
 
 from agents import checkpoint, duels
 from agents.budget import Budget
@@ -16,8 +16,6 @@ from agents.trainer import Trainer
 from megastep import contract
 from megastep.arrdict import arrdict
 
-HIGH = "games:High"
-
 
 def policy_of(env, seed=1, width=8, **options):
     return Policy(env.obs_space, env.action_space, width=width, seed=seed, **options)
@@ -25,7 +23,7 @@ def policy_of(env, seed=1, width=8, **options):
 
 def opposed(n_envs=16, n_agents=2, env=None, policy=None, **options):
     env = env or Matrix(n_envs, n_agents)
-    options = {**dict(past=0.5, bot=0.25, bot_class=HIGH, snapshots=2, every=3), **options}
+    options = {**dict(past=0.5, bot=0.25, scripted=High(), snapshots=2, every=3), **options}
     return Opponents(env, policy or policy_of(env), **options)
 
 
@@ -124,7 +122,6 @@ def test_what_opponents_see_is_what_was_there_before_the_environment_went_on():
         (dict(bot=0.01), "opponents.bot=0.01 of 16 environments are none"),
         (dict(past=1.5), "past: 1.5 is out of range: allowed is from 0 to 1"),
         (dict(snapshots=0), "snapshots: 0 is out of range"),
-        (dict(bot_class="games:Hihg"), "games has no Hihg; did you mean High?"),
     ],
 )
 def test_what_cannot_be_is_one_sentence(options, sentence):
@@ -174,7 +171,7 @@ def test_an_update_is_the_same_bits_whatever_opponents_are_paid(tmp_path, other)
     weights = []
     for pay in (1.0, other):
         env = Rigged(16)
-        run = trainer_of(tmp_path, env, 0, past=0.5, bot=0.25, bot_class=HIGH, snapshots=2)
+        run = trainer_of(tmp_path, env, 0, past=0.5, bot=0.25, scripted=High(), snapshots=2)
         env.mask, env.other = run.env.learners, pay
         for _ in range(3):
             run.rollout = run.collect()
@@ -199,7 +196,7 @@ def test_lanes_that_a_world_masks_teach_nothing(shows):
 
 def test_only_lanes_that_learn_are_stored_and_counted(tmp_path):
     run = trainer_of(
-        tmp_path, Matrix(16), 3 * 4 * 20, past=0.5, bot=0.25, bot_class=HIGH, snapshots=2
+        tmp_path, Matrix(16), 3 * 4 * 20, past=0.5, bot=0.25, scripted=High(), snapshots=2
     )
     run.train()
     assert run.rollout.n_lanes == 2 * 4 + 12 and run.samples == 3 * 4 * 20
@@ -220,7 +217,7 @@ def test_without_opponents_nothing_is_left_out():
 
 def test_a_bad_number_is_named_by_the_lane_of_its_environment(tmp_path):
     env = Rigged(16)
-    run = trainer_of(tmp_path, env, 0, past=0.0, bot=1.0, bot_class=HIGH)
+    run = trainer_of(tmp_path, env, 0, past=0.0, bot=1.0, scripted=High())
     lane = int(run.env.learners.nonzero()[-1, 0])
     env.mask = torch.ones(32, dtype=torch.bool)
     env.scored = lambda reward: reward.index_fill(0, torch.tensor(lane), torch.nan)
@@ -232,7 +229,7 @@ def test_a_bad_number_is_named_by_the_lane_of_its_environment(tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [dict(past=1.0, snapshots=2, every=10), dict(bot=1.0, bot_class="games:Middle")],
+    [dict(past=1.0, snapshots=2, every=10), dict(bot=1.0, scripted=Middle())],
 )
 def test_a_policy_learns_to_beat_its_opponents(tmp_path, options):
     """Who always beats what it was until lately ends at the highest number."""
@@ -297,7 +294,7 @@ def test_an_actor_is_the_policy_without_what_learns():
 
 
 def test_a_resumed_run_has_the_same_pool_and_goes_on_as_it_would_have(tmp_path):
-    options = dict(past=0.5, bot=0.25, bot_class=HIGH, snapshots=2, every=2)
+    options = dict(past=0.5, bot=0.25, scripted=High(), snapshots=2, every=2)
     first = trainer_of(tmp_path, Matrix(16), 5 * 4 * 20, **options)
     first.train()
     again = trainer_of(tmp_path, Matrix(16), 9 * 4 * 20, seed=2, **options)
@@ -365,7 +362,7 @@ def test_the_share_won_is_told_by_kind_of_opponent(mortal):
 
 def test_only_what_an_episode_paid_decides_it():
     """Two games are lost by a point and the third is won by one: on the whole the return is -1."""
-    env = opposed(4, bot=1.0, past=0.0, bot_class="games:Middle")
+    env = opposed(4, bot=1.0, past=0.0, scripted=Middle())
     env.reset()
     for action in (0, 0, 0, 0, 2):  # every second step is the reset after an end
         env.step(arrdict(actions=torch.full((8, 1), action)))
@@ -374,7 +371,7 @@ def test_only_what_an_episode_paid_decides_it():
 
 def test_roles_and_kinds_of_opponents_have_means_of_their_own(tmp_path):
     env = Matrix(16, roles=("left", "right"))
-    run = trainer_of(tmp_path, env, 4 * 4 * 20, past=0.5, bot=0.25, bot_class=HIGH, snapshots=2)
+    run = trainer_of(tmp_path, env, 4 * 4 * 20, past=0.5, bot=0.25, scripted=High(), snapshots=2)
     run.train()
     row = run.rows[0]
     for name in ("left", "right", "now", "past", "bot"):

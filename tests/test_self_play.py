@@ -68,6 +68,20 @@ def test_a_run_against_opponents_tells_how_it_does_against_each(here):
     assert "games:High" in path.read_text(), "bot is the one that the run has met"
 
 
+class Told(Always):
+    """Is told of the environment what it asks for."""
+
+    def __init__(self, points, limit=7, other=3):
+        super().__init__()
+        assert (points, limit, other) == (2, 5, 3)
+
+
+def test_a_scripted_policy_is_given_the_settings_that_it_takes(here):
+    words = [f"samples={SMALLER}", "env.points=2", "opponents.bot_class=test_self_play:Told"]
+    folder = train.run(configured(*words, tiny=OPPOSED))
+    assert evaluate.main([f"run={folder}", "against=bot", "lanes=2", "device=cpu"]) == 0
+
+
 def test_without_opponents_a_run_is_as_it_was(here):
     """No share: nothing in the checkpoint, in the metrics, and every lane is a sample."""
     folder = train.run(configured(f"samples={2 * UPDATE}", tiny=[*PONG, "env.limit=5"]))

@@ -29,10 +29,12 @@ class Player:
 
 
 class Players:
-    """Those who can play in `env`, which a run's checkpoint, `loaded`, was trained in."""
+    """Those who can play in `env`, of the settings `chosen`: of the kind that a run's checkpoint,
+    `loaded`, was trained in.
+    """
 
-    def __init__(self, loaded: checkpoint.Checkpoint, env: Any):
-        self.loaded, self.env = loaded, env
+    def __init__(self, loaded: checkpoint.Checkpoint, chosen: Any, env: Any):
+        self.loaded, self.chosen, self.env = loaded, chosen, env
         self.trained = components.config_of(loaded)
 
     def named(self, name: str) -> Player:
@@ -42,7 +44,7 @@ class Players:
         if name == "bot":
             name = self.trained.opponents.bot_class
         if name == "random" or (":" in name and not Path(name).exists()):
-            return Player(name, components.make_bot(name, self.env))
+            return Player(name, components.make_bot(name, self.chosen, self.env))
         return self.learnt(components.load(run_folders.find(name), self.env.device))
 
     def learnt(self, loaded: checkpoint.Checkpoint) -> Player:
@@ -77,7 +79,7 @@ class Arena:
         homes = components.homes(chosen, self.geometry, cfg.split)
         sample = components.make_sample(chosen, homes, cfg.seed, device)
         check_agents(sample)
-        self.players = Players(self.loaded, sample)
+        self.players = Players(self.loaded, chosen, sample)
         each = max(1, cfg.lanes // sample.n_agents)
         homes = homes[:each]
         each -= each % max(1, len(homes))

@@ -213,9 +213,7 @@ def make_learner(learner: settings.Learner, policy: Policy, seed: int = 1) -> An
     return made
 
 
-def make_opponents(
-    chosen: settings.Opposition, env: Any, sample: Any, policy: Policy, seed: int = 1
-) -> Opponents | None:
+def make_opponents(cfg: settings.Train, env: Any, sample: Any, policy: Policy) -> Opponents | None:
     """The environment with opponents in it, or None where there shall be none. UserError that says
     how many snapshots fit, if they are too many for the memory; `sample` is a small environment, in
     which a scripted opponent is tried.
@@ -225,22 +223,24 @@ def make_opponents(
     from agents.opponents import Opponents
     from megastep import engine
 
+    chosen = cfg.opponents
     if not (chosen.past or chosen.bot):
         return None
-    if chosen.bot:
-        make_bot(chosen.bot_class, sample)
+    scripted = make_bot(chosen.bot_class, cfg.env, sample) if chosen.bot else None
     with errors():
         if chosen.past:
             weights = policy.actor().state_dict().values()
             copies = 2 if torch.device(env.device).type == "cuda" else 1  # of which one to capture
             each = copies * sum(weight.nbytes for weight in weights)
             engine.fit(chosen.snapshots, each, env.device, "snapshots")
-        return Opponents(env, policy, seed=seed, **_arguments(chosen))
+        shares = _arguments(chosen, "bot_class")
+        return Opponents(env, policy, scripted, seed=cfg.seed, **shares)
 
 
-def make_bot(name: str, env: Any) -> Any:
-    """A policy that needs no weights, by import path or `random`: it takes one step in `env`, whose
-    episodes start anew. UserError if it cannot play there.
+def make_bot(name: str, chosen: settings.Env, env: Any) -> Any:
+    """A policy that needs no weights, by import path or `random`, for an environment of these
+    settings: it is given those that its constructor takes, `fov` say, and takes one step in `env`,
+    whose episodes start anew. UserError if it cannot play there.
     """
     from agents.evaluation import RandomActions
 
@@ -249,7 +249,9 @@ def make_bot(name: str, env: Any) -> Any:
     with errors():
         made = imported(name)
     try:
-        bot, n_lanes = made(), env.n_envs * env.n_agents
+        names = inspect.signature(made).parameters
+        bot = made(**{name: getattr(chosen, name) for name in names if hasattr(chosen, name)})
+        n_lanes = env.n_envs * env.n_agents
         decision, _ = bot(env.reset(), bot.initial(n_lanes, env.device))
         if not _are_of(env.action_space, decision["actions"], n_lanes):
             raise ValueError(f"its actions are not those of {env.action_space!r}")

@@ -60,7 +60,7 @@ def run(cfg: Record) -> Path:
         policy = components.make_actor(trained.agent, env)
         components.load_weights(policy, env, loaded)
     if cfg.against is not None:
-        policy = against(cfg.against, env, policy, loaded)
+        policy = against(cfg.against, chosen, env, policy, loaded)
 
     place = Path(cfg.file) if cfg.file else folder / "video.mp4"
     try:
@@ -72,10 +72,10 @@ def run(cfg: Record) -> Path:
     return place
 
 
-def against(name: str, env: Any, policy: Any, loaded: Checkpoint) -> Lineup:
+def against(name: str, chosen: Any, env: Any, policy: Any, loaded: Checkpoint) -> Lineup:
     """The policy of a run's checkpoint as the first agent, and another, by name, as all others."""
     arena.check_agents(env)
-    opponent = arena.Players(loaded, env).named(name)
+    opponent = arena.Players(loaded, chosen, env).named(name)
     say(f"The first agent is that of {loaded.path}, the other {opponent.name}")
     seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
     return duels.lineup(policy, opponent.policy, seat, env.n_agents)

@@ -74,8 +74,10 @@ Env, Geometry, Learner, Logger = (
 )
 #: Arguments of `agents.policy.Policy`.
 Agent = settings_of(Policy, ("obs_space", "action_space", "privileged_space", "seed"))
-#: Arguments of `agents.opponents.Opponents`.
-Opposition = settings_of(Opponents, ("env", "policy", "seed"))
+#: Arguments of `agents.opponents.Opponents`, and the import path of the scripted policy.
+Opposition = settings_of(
+    Opponents, ("env", "policy", "scripted", "seed"), bot_class=(str, "agents.bots:Bot")
+)
 
 
 @frozen

@@ -78,7 +78,7 @@ def make_trainer(
     if cfg.resume or cfg.init:
         loaded = components.load(run_folders.find(cfg.resume or cfg.init), device)
         components.load_weights(policy, env, loaded)
-    opponents = components.make_opponents(cfg.opponents, env, sample, policy, cfg.seed)
+    opponents = components.make_opponents(cfg, env, sample, policy)
     wandb = None
     if isinstance(cfg.logger, WandbLogger):
         project, mode = cfg.logger.project, cfg.logger.mode
