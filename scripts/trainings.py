@@ -23,6 +23,8 @@ NO_FINISH = "finish.evaluate=false", "finish.record=false"
 MAZES = "geometry=maze geometry.braid=0.3"
 PLACES = {"homes": "geometry=homes", "mazes": MAZES, "a box": "geometry=box"}
 AGENTS = {"Explorer": "env=explorer", "PointGoal": "experiment=pointgoal"}
+#: What learning curves are of.
+METRICS = {"Pong": "points_won", "Explorer": "coverage", "PointGoal": "spl"}
 #: What is trained, how, and where it is evaluated then.
 RECIPES = {
     "Pong from features": ("experiment=pong", {"": ""}),
@@ -59,16 +61,21 @@ def train(device, seeds=SEEDS, budgets=BUDGETS):
                 upper=row["upper"],
                 n=row["homes"],
             )
-        rates = [
-            (samples - before) / (seconds - earlier) / 1e6
-            for (earlier, before, _), (seconds, samples, _) in itertools.pairwise(reports)
-        ]
-        thinned = [
-            [round(seconds, 2), samples, round(earned, 3)]
-            for seconds, samples, earned in reports[:: -(-len(reports) // CURVE)]
-        ]
-        if rates:
-            yield measurement(f"{what}, median rate", "M/s", rates) | dict(curve=thinned)
+        if len(reports) > 1:
+            yield learnt(what, reports)
+
+
+def learnt(what, reports):
+    """The rate of a run, with its learning curve, thinned, from what :func:`curve` gives."""
+    rates = [
+        (samples - before) / (seconds - earlier) / 1e6
+        for (earlier, before, _), (seconds, samples, _) in itertools.pairwise(reports)
+    ]
+    thinned = [
+        [round(seconds, 2), samples, round(earned, 3)]
+        for seconds, samples, earned in reports[:: -(-len(reports) // CURVE)]
+    ]
+    return measurement(f"{what}, median rate", "M/s", rates) | dict(curve=thinned)
 
 
 @contextlib.contextmanager
@@ -98,7 +105,9 @@ def worlds(device):
     """
     for what, (recipe, places) in RECIPES.items():
         with trained(device, *recipe.split(), *NO_FINISH) as run:
-            seconds, samples, _ = curve(run)[-1]
+            reports = curve(run, METRICS[what.split(",")[0].split()[0]])
+            seconds, samples, _ = reports[-1]
+            yield learnt(what, reports)
             for place, given in places.items():
                 told = f"{what}, {seconds:.0f} s, {samples / 1e6:.0f} M samples"
                 told += f", in {place}" if place else ""
@@ -123,8 +132,8 @@ def evaluated(run, overrides):
         return json.loads(evaluate.run(settings).read_text())["rows"]
 
 
-def curve(run):
-    """[(seconds, samples, return), ...]: what a run folder's reports say of the episodes that ended
+def curve(run, metric="return"):
+    """[(seconds, samples, metric), ...]: what a run folder's reports say of the episodes that ended
     while it trained.
     """
     metrics, perf = (
@@ -132,7 +141,7 @@ def curve(run):
         for name in ("metrics.jsonl", "perf.jsonl")
     )
     return [
-        (perf[samples]["perf/seconds"], samples, row["episode/return"])
+        (perf[samples]["perf/seconds"], samples, row[f"episode/{metric}"])
         for samples, row in metrics.items()
-        if samples in perf and "episode/return" in row
+        if samples in perf and f"episode/{metric}" in row
     ]

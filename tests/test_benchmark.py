@@ -171,9 +171,11 @@ def test_the_cpu_is_measured_on_the_cpu_and_keeps_its_threads(tiny):
 
 @pytest.mark.slow
 def test_worlds_are_trained_and_evaluated_where_they_say(monkeypatch):
-    recipe = "env=pong preset=cpu samples=2048 env.n_envs=32 report=1", {"": "", "games": "lanes=7"}
+    recipe = "env=pong preset=cpu samples=8192 env.n_envs=32 report=1", {"": "", "games": "lanes=7"}
     monkeypatch.setattr(trainings, "RECIPES", {"Pong": recipe})
     records = list(trainings.worlds(torch.device("cpu")))
+    rate = records.pop(0)
+    assert rate["unit"] == "M/s" and all(0 <= won <= 1 for _, _, won in rate["curve"])
     assert len(records) == 2 * 2 * 2 and {r["n"] for r in records} == {1024, 7}
     assert all(r["what"].startswith("Pong, ") for r in records)
     words = [r["what"].split(", ")[-2:] for r in records]

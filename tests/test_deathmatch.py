@@ -389,7 +389,7 @@ def test_aim_falls_from_the_middle_of_the_view_to_its_edge(ahead, left, device):
     expected = max(1 - nearest / np.tan(np.radians(35)), 0)
     slack = 2 / 512 + 0.075 / ahead / 2  # a ray, and which of its corners is nearest
     world = ring.step()
-    assert world.reward[0] == pytest.approx(expected, abs=slack) and world.reward[1] == 0
+    assert float(world.reward[0]) == pytest.approx(expected, abs=slack) and world.reward[1] == 0
 
 
 def test_nobody_in_view_is_no_aim(device):

@@ -17,10 +17,10 @@ SOURCES = sorted(
 
 # A module of the simulator may import modules of the layers above its own row only.
 LAYERS = (
-    ("colour", "dotdict", "outputs", "read_only", "settings", "spaces"),
+    ("colour", "dotdict", "outputs", "read_only", "settings", "spaces", "workers"),
     ("arrdict", "ragged", "state"),
     ("checks", "geometry", "capture", "contract", "plotting", "kernels"),
-    ("devices", "scenery_views", "recording"),
+    ("devices", "goal_fields", "scenery_views", "recording"),
     ("geometries", "scenery", "agents"),
     ("launch_params",),
     ("games",),
@@ -50,9 +50,10 @@ USERS = {
     "omegaconf": ("agents/cli/",),
     "wandb": ("agents/metrics.py",),
     "tensorboard": ("agents/metrics.py",),
-    "rich": ("agents/cli/",),
+    "rich": ("agents/cli/", "megastep/workers.py"),
     "openskill": ("agents/ratings.py",),
-    "loky": ("megastep/recording.py",),
+    "loky": ("megastep/recording.py", "megastep/workers.py"),
+    "scipy": ("megastep/modules/geodesics.py",),
     "IPython": ("megastep/recording.py",),
 }
 
