@@ -63,7 +63,15 @@ class Wandb:
     kept in its folder, so that a resumed run goes on as the same run there.
     """
 
-    def __init__(self, folder: Path, project: str, mode: str, name: str, config: dict[str, Any]):
+    def __init__(
+        self,
+        folder: Path,
+        project: str,
+        mode: str,
+        name: str,
+        config: dict[str, Any],
+        group: str | None = None,
+    ):
         os.environ.setdefault("WANDB_SILENT", "true")
         try:
             wandb = importlib.import_module("wandb")
@@ -80,6 +88,7 @@ class Wandb:
                 project=project,
                 mode=mode,
                 name=name,
+                group=group,
                 config=config,
                 dir=str(folder),
                 id=known.read_text() if known.exists() else None,

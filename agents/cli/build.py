@@ -23,7 +23,7 @@ def build(kind: type, tree: dict[str, Any], choices: Iterable[str] = ()) -> Any:
         # As text, for a configuration is text: a list in it stands for a tuple, a word for a path.
         return TypeAdapter(kind).validate_json(json.dumps(_whole(tree)))
     except ValidationError as error:
-        keys, told = [*_keys(kind, tree), *choices], {}
+        keys, told = [*keys_of(kind, tree), *choices], {}
         for one in error.errors():
             path, text = _sentence(kind, tree, one, keys)
             told.setdefault(path, text)
@@ -74,10 +74,10 @@ def _below(key: str, field: Any, tree: Any) -> type | None:
     return kind if dataclasses.is_dataclass(kind) else None
 
 
-def _keys(kind: type, tree: Any, path: str = "") -> Iterator[str]:
+def keys_of(kind: type, tree: Any, path: str = "") -> Iterator[str]:
     """The dotted key of every setting and every group of settings."""
     for name, field in kind.__pydantic_fields__.items():
         yield path + name
         tree_below = tree.get(name) if isinstance(tree, dict) else None
         if below := _below(name, field, tree_below):
-            yield from _keys(below, tree_below, f"{path}{name}.")
+            yield from keys_of(below, tree_below, f"{path}{name}.")

@@ -1,79 +1,112 @@
-"""What train.py, evaluate.py and record.py do with a command line: parse, compose, check, run, exit
-code.
-"""
+"""What train, evaluate and record do with a command line: parse, compose, check, run, exit code."""
 
 import argparse
+import contextlib
+import dataclasses
+import io
 import sys
-import warnings
 from collections.abc import Callable
+from importlib import metadata
 from typing import Any
 
-from omegaconf import OmegaConf
+import hydra
+from hydra._internal.utils import get_args_parser
+from hydra.types import RunMode
 
-from agents.cli.build import build
-from agents.cli.compose import ConfigLoader, Prepare
-from agents.cli.console import say, warn
+from agents.cli import console
+from agents.cli.compose import ConfigLoader, Prepare, as_is
+from agents.cli.console import say
+from agents.cli.doors import told
 from agents.cli.errors import UserError
 from agents.cli.help import help_text
 from agents.cli.signals import Interrupted, Interruptions, interrupt
 from agents.cli.sweep import sweep
 
+#: The name of the distribution, which is not that of the package.
+DISTRIBUTION = "megastep-flatland"
 
-def run_command(
-    script: str,
-    kind: type,
-    run: Callable[[Any], Any],
-    text: str,
-    argv: list[str] | None = None,
-    prepare: Prepare = lambda tree, overrides: tree,
-) -> int:
-    """Parses, composes, checks, runs; returns the exit code.
 
-    `run(settings)` does the work; `prepare(tree, overrides)` may replace a composed tree before it
-    is checked. `text` is the head of `--help`.
+@dataclasses.dataclass(frozen=True)
+class Script:
+    """One of the things that can be done. `run(settings)`, of dataclass `kind`, does it; `prepare`
+    may change a composed tree before it is checked; `help` is the head of `--help`.
     """
-    warnings.showwarning = lambda message, *_, **__: warn(message)
-    options = _options(script, sys.argv[1:] if argv is None else argv)
+
+    name: str
+    kind: type
+    run: Callable[[Any], Any]
+    help: str
+    prepare: Prepare = as_is
+
+
+def run_command(script: Script, argv: list[str] | None = None) -> int:
+    """Parses, composes, checks, runs; returns the exit code."""
+    console.warn_in_lines()
+    options = _options(script.name, sys.argv[1:] if argv is None else argv)
     try:
         with Interruptions(interrupt) as signals:
-            code = _run(script, kind, run, text, options, prepare)
+            code = _run(script, options)
         return code if signals.number is None else 128 + signals.number
     except UserError as error:
-        say(f"{script}.py: {error}", sys.stderr)
+        say(f"{told(script.name)}: {error}", sys.stderr)
         return error.code
     except Interrupted as stop:
-        say(f"{script}.py: {stop}", sys.stderr)
+        say(f"{told(script.name)}: {stop}", sys.stderr)
         return 128 + stop.number
 
 
-def _run(
-    script: str,
-    kind: type,
-    run: Callable,
-    text: str,
-    options: argparse.Namespace,
-    prepare: Prepare,
-) -> int:
-    with ConfigLoader(script, kind, prepare) as loader:
-        if options.help:
-            say(help_text(script, text, loader.groups()))
-            return 0
-        jobs = loader.jobs(options.overrides, options.multirun)
-        settings = [build(kind, tree) for _, tree in jobs]
-    if options.cfg:
-        say("\n---\n".join(OmegaConf.to_yaml(tree) for _, tree in jobs))
-        return 0
-    if options.multirun:
-        return sweep(run, [overrides for overrides, _ in jobs], settings)
-    run(settings[0])
+def _run(script: Script, options: argparse.Namespace) -> int:
+    words, places = options.overrides, (options.config_name, options.config_dir)
+    options.multirun |= "hydra.mode=MULTIRUN" in words
+    with ConfigLoader(
+        script.name, script.kind, script.prepare, *places, options.config_path
+    ) as loader:
+        if text := _text(script, loader, options):
+            say(text.rstrip("\n"))
+        elif options.shell_completion:
+            loader.complete(words)
+        elif options.info:
+            loader.hydra.show_info(options.info, loader.name, words)
+        elif options.multirun:
+            return sweep(loader, script.run, words)
+        else:
+            settings, config = loader.composed(words)
+            if config.hydra.mode == RunMode.MULTIRUN:
+                return sweep(loader, script.run, words)
+            script.run(settings)
     return 0
 
 
+def _text(script: Script, loader: ConfigLoader, options: argparse.Namespace) -> str:
+    """What an option has printed, if it is one of those."""
+    if options.help:
+        return help_text(script.name, script.help, loader.groups())
+    if options.hydra_help:
+        with contextlib.redirect_stdout(io.StringIO()) as text:
+            loader.hydra.hydra_help(loader.name, get_args_parser(), options)
+        return text.getvalue()
+    if not options.cfg:
+        return ""
+    jobs = [options.overrides]
+    if options.multirun:
+        jobs = [words for words, _ in loader.jobs(options.overrides)]
+    printed = [loader.printed(job, options.cfg, options.package, options.resolve) for job in jobs]
+    return "---\n".join(printed)
+
+
 def _options(script: str, argv: list[str]) -> argparse.Namespace:
-    usage = f"{script}.py [-m] [key=value ...]; --help says more"
-    parser = argparse.ArgumentParser(prog=f"{script}.py", add_help=False, usage=usage)
-    parser.add_argument("-h", "--help", action="store_true")
-    parser.add_argument("-m", "--multirun", action="store_true")
-    parser.add_argument("-c", "--cfg", choices=["job"])
-    parser.add_argument("overrides", nargs="*")
-    return parser.parse_intermixed_args(argv)
+    """Hydra's options, and the overrides between them."""
+    parser = get_args_parser()
+    parser.prog, parser.description = told(script), None
+    parser.usage = f"{parser.prog} [-m] [key=value ...]; --help says more"
+    for action in parser._actions:
+        if action.dest == "version":
+            action.version = (
+                f"{DISTRIBUTION} {metadata.version(DISTRIBUTION)}, Hydra {hydra.__version__}"
+            )
+    options = parser.parse_intermixed_args(argv)
+    if options.experimental_rerun:
+        parser.error("--experimental-rerun: a run is continued with resume=RUN")
+    if options.resolve and not options.cfg:
+        parser.error("--resolve goes with --cfg")
+    return options

@@ -1,155 +1,252 @@
 """Command line -> Hydra -> checked settings. Everything is composed and checked before anything is
 written.
 
-Hydra is used through its compose API and its override grammar; `@hydra.main` would make its folder
-first, and exit 1.
+Hydra's own parts do the work, but for `@hydra.main`: it would make its folder first, and exit 1.
 """
 
-from collections.abc import Callable
+import copy
+import dataclasses
+import os
+from collections.abc import Callable, Iterable
 from typing import Any
 
-import yaml
-from hydra import compose, initialize_config_dir
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.config_store import ConfigStore
+from hydra import version
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from agents.cli.build import as_tree, build
+from agents.cli import overrides as words_of
+from agents.cli.build import as_tree, build, keys_of
 from agents.cli.errors import ConfigErrors, UserError
+from agents.cli.loader import Loader, hydra_error, maximise
 from agents.cli.registry import CONFIGS
-from agents.cli.settings import GROUPS
-from megastep.settings import closest
 
 Tree = dict[str, Any]
-#: Changes a composed tree before it is checked, given the overrides.
+#: Changes a composed tree before it is checked, given the keys that were typed.
 Prepare = Callable[[Tree, list[str]], Tree]
+#: What reads the environment of the process.
+FROM_ENVIRONMENT = "${oc.env:"
+
+
+def as_is(tree: Tree, given: list[str]) -> Tree:
+    return tree
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """Makes settings of a composed configuration: those of dataclass `kind`. `prepare` may change
+    what was composed; `groups` are names that may have been meant beside those of keys.
+    """
+
+    kind: type
+    prepare: Prepare = as_is
+    groups: tuple[str, ...] = ()
+
+    def __call__(self, config: DictConfig, words: Iterable[str]) -> Any:
+        """Settings, given the words that were typed. ConfigErrors with all that is wrong."""
+        given = [words_of.key_of(one) for one in words_of.parse(words)]
+        given = [key for key in given if key.partition("/")[0].partition(".")[0] != "hydra"]
+        raw = plain(config, resolve=False)
+        if secret := [key for key, value in leaves(raw) if FROM_ENVIRONMENT in str(value)]:
+            cure = "would be written to config.yaml; give the value itself"
+            raise ConfigErrors((key, f"what the environment holds {cure}") for key in secret)
+        return build(self.kind, self.prepare(plain(config), given), self.groups)
 
 
 class ConfigLoader:
-    """Composes and checks the configuration of one script; a context, as Hydra keeps its state in a
-    global. `prepare` may change what was composed before it is checked.
+    """Composes and checks the configuration of one script; a context, as Hydra keeps its state in
+    globals.
+
+    Args: `script`, the name of its own file; `kind`, the dataclass of its settings; `prepare`, what
+    may change a tree before it is checked; `name`, another file than its own; `folder`, whose files
+    and groups are found beside ours; `main`, a folder in place of ours.
     """
 
-    def __init__(self, script: str, kind: type, prepare: Prepare = lambda tree, overrides: tree):
+    def __init__(
+        self,
+        script: str,
+        kind: type,
+        prepare: Prepare = as_is,
+        name: str | None = None,
+        folder: str | None = None,
+        main: str | None = None,
+    ):
         self.script, self.kind, self.prepare = script, kind, prepare
+        self.name, self.folders = name or script, (main or str(CONFIGS), folder)
 
     def __enter__(self):
-        GlobalHydra.instance().clear()
-        self._context = initialize_config_dir(
-            str(CONFIGS), version_base="1.3", job_name=self.script
-        )
-        self._context.__enter__()
+        for folder in self.folders:
+            if folder is not None and not os.path.isdir(folder):
+                raise UserError(f"There is no folder {folder} with configurations")
+        self._clear()
+        version.setbase("1.3")
+        main, folder = self.folders
+        search_path = create_config_search_path(f"file://{os.path.abspath(main)}")
+        if folder is not None:
+            search_path.prepend(
+                "command-line", f"file://{os.path.abspath(folder)}", SearchPathQuery("schema")
+            )
+        maximise()
+        self.loader = Loader(search_path)
+        self.hydra = Hydra(self.script, self.loader)
+        GlobalHydra.instance().initialize(self.hydra)
+        self.check = Check(self.kind, self.prepare, tuple(self.loader.list_groups("")))
         return self
 
     def __exit__(self, *error):
-        return self._context.__exit__(*error)
+        self._clear()
+
+    @staticmethod
+    def _clear():
+        GlobalHydra.instance().clear()
+        HydraConfig.instance().cfg = None
 
     def groups(self) -> dict[str, list[str]]:
-        """{group: [members]}: those that the script's own file has a default for."""
-        loader = GlobalHydra.instance().config_loader()
-        members = {group: loader.get_group_options(group) for group in self._defaults()}
-        return {group: [m for m in found if ":" not in m] for group, found in members.items()}
-
-    def _defaults(self) -> dict[str, str | None]:
-        """{group: member} of the script's own file, but for what follows from other members."""
-        defaults = yaml.safe_load((CONFIGS / f"{self.script}.yaml").read_text())["defaults"]
-        groups = {
-            k: v for default in defaults if isinstance(default, dict) for k, v in default.items()
-        }
-        return {group: member for group, member in groups.items() if "@" not in group}
-
-    def jobs(self, overrides: list[str], multirun: bool = False) -> list[tuple[list[str], Tree]]:
-        """The composed tree of each job, `[(overrides, nested dict)]`; one job unless multirun."""
-        parsed = _parsed(overrides, multirun)
-        if not multirun:
-            return [(overrides, self.tree(overrides))]
-        try:
-            batches = BasicSweeper.split_arguments(parsed, max_batch_size=None)[0]
-        except HydraException as error:
-            raise UserError(f"This sweep cannot be split: {error}") from None
-        return [(list(job), self.tree(list(job))) for job in batches]
-
-    def tree(self, overrides: list[str]) -> Tree:
-        """Nested dicts for one list of overrides, every setting in them. ConfigErrors names every
-        unknown key and group member, and bad value.
+        """{group: [members]}: those that the script's own file has a default for, and those of the
+        user's folder.
         """
-        errors, good, groups = [], [], self.groups()
-        optional = [group for group, member in self._defaults().items() if member is None]
-        for override in _parsed(overrides):
-            key, member = override.key_or_group, override.value()
-            if key not in groups:
-                good.append(f"++{override.input_line}")  # `build` knows which keys there are
-            elif member is None and key in optional:
-                continue  # it is null already
-            elif member in groups[key] or _is_stored(key, member):
-                good.append(override.input_line)
-            else:
-                errors.append((key, f"{member!r} is unknown; {closest(member, groups[key])}"))
-        try:
-            tree = self.prepare(_plain(self._compose(good)), overrides)
-            settings = build(self.kind, tree, list(groups))
-        except ConfigErrors as error:
-            errors += error.errors
-        except (HydraException, OmegaConfBaseException) as error:
-            errors.append(("configuration", " ".join(str(error).split())))
-        if errors:
-            raise ConfigErrors(errors)
-        return as_tree(settings)
+        found = self.loader.compute_defaults_list(self.name, [], RunMode.RUN)
+        own = [group for group in found.overrides.known_choices if "/" not in group]
+        if folder := self.folders[1]:
+            own += [
+                name for name in self.loader.list_groups("") if os.path.isdir(f"{folder}/{name}")
+            ]
+        members = {group: self.loader.members(group, self.name) for group in dict.fromkeys(own)}
+        return {
+            group: [member for member in found if ":" not in member]
+            for group, found in members.items()
+            if found and group != "hydra"
+        }
 
-    def _compose(self, overrides: list[str]) -> DictConfig:
-        """`preset=auto` is replaced by `preset=gpu` with a GPU to run on, else by `preset=cpu`."""
-        config = compose(self.script, overrides, return_hydra_config=True)
-        if config.hydra.runtime.choices.get("preset") == "auto":
-            preset = "preset=gpu" if _has_gpu(config.device) else "preset=cpu"
-            config = compose(self.script, [*overrides, preset], return_hydra_config=True)
+    def compose(self, words: list[str], mode: RunMode = RunMode.RUN) -> DictConfig:
+        """The configuration as Hydra composes it, its own part included. ConfigErrors names all
+        words that it could not be given.
+        """
+        try:
+            config = self.hydra.compose_config(self.name, words, mode)
+        except (HydraException, OmegaConfBaseException) as error:
+            raise ConfigErrors([hydra_error(error, self._hydras(words))]) from None
+        HydraConfig.instance().set_config(config)
         return config
 
+    def settings(self, words: list[str]) -> Any:
+        """Checked settings for one list of overrides. ConfigErrors names every unknown key and
+        group member, and every bad value.
+        """
+        return self.composed(words)[0]
 
-def _parsed(overrides: list[str], multirun: bool = False) -> list[Override]:
-    """Overrides of keys and groups; ConfigErrors names those that are anything else."""
-    errors, parsed = [], []
-    for text in overrides:
+    def composed(self, words: list[str], known: dict | None = None) -> tuple[Any, DictConfig]:
+        """Checked settings, and the configuration that they are from. Where `known` is given, it
+        keeps what was composed of the same groups, as each time takes 0.2 s.
+        """
+        good, errors = self.loader.translated(words, self.name, RunMode.RUN)
         try:
-            override = OverridesParser.create().parse_override(text)
-        except HydraException:
-            cure = "write key=value, quote blanks and brackets: 'key=\"a b\"'"
-            errors.append((text, f"is not understood; {cure}"))
-            continue
-        if override.type.name != "CHANGE" or override.package is not None:
-            errors.append((text, "keys and groups are fixed; write key=value or group=member"))
-        elif override.is_sweep_override() and not multirun:
-            errors.append((override.key_or_group, f"{text!r} means several runs; add -m"))
-        elif override.key_or_group.partition(".")[0].partition("/")[0] == "hydra":
-            errors.append((override.key_or_group, "no such key; Hydra's own settings are fixed"))
+            config = self.compose(good) if known is None else self._derived(good, known)
+            settings = self.check(config, words)
+        except ConfigErrors as error:
+            raise ConfigErrors([*errors, *error.errors]) from None
+        except (HydraException, OmegaConfBaseException) as error:
+            raise ConfigErrors([*errors, hydra_error(error, None)]) from None
+        if errors:
+            raise ConfigErrors(errors)
+        return settings, config
+
+    def _derived(self, words, known):
+        """What words compose to, from the composition of their groups alone."""
+        keys = [word for word in words if word.startswith("++") and word[:9] != "++device="]
+        groups = tuple(word for word in words if word not in keys)
+        if groups not in known:
+            known[groups] = self.compose([*groups])
+        config = copy.deepcopy(known[groups])
+        Loader._apply_overrides_to_config(words_of.parse(keys), config)
+        return config
+
+    def tree(self, words: list[str]) -> Tree:
+        """Nested dicts for one list of overrides, every setting in them; errors as `settings`."""
+        return as_tree(self.settings(words))
+
+    def jobs(self, words: list[str]) -> list[tuple[list[str], Tree]]:
+        """The tree of each job of a sweep that can be told beforehand, `[(overrides, nested
+        dicts)]`: all of them, or those at its bounds if the sweeper searches.
+        """
+        master = self.compose(words, RunMode.MULTIRUN)
+        is_grid = str(master.hydra.sweeper.get("_target_")).endswith(".BasicSweeper")
+        params = OmegaConf.select(master, "hydra.sweeper.params") or {}
+        words = [*(f"{key}={value}" for key, value in params.items()), *words]
+        try:
+            parsed = words_of.parse(words, self.loader, multirun=True)
+            if is_grid and (wide := [one for one in parsed if one.is_interval_sweep()]):
+                cure = "needs a sweeper that searches, such as hydra/sweeper=optuna"
+                raise ConfigErrors((words_of.key_of(one), f"interval() {cure}") for one in wide)
+            found = list(words_of.combinations(parsed, is_grid))
+        except HydraException as error:
+            raise UserError(f"This sweep cannot be split: {error}") from None
+        known = {}
+        return [(job, as_tree(self.composed(job, known)[0])) for job in found]
+
+    def printed(self, words: list[str], what: str, package: str | None, resolve: bool) -> str:
+        """The configuration as YAML: of the `job`, of `hydra`, or `all`; or a part of it."""
+        settings, config = self.composed(words)
+        own, tree = plain(config, resolve=False), as_tree(settings)
+        if not resolve:
+            for key, value in leaves(own):
+                if isinstance(value, str) and "${" in value:
+                    _put(tree, key, value)
+        whole = OmegaConf.create({} if what == "hydra" else tree)
+        if what != "job":
+            hydras = self.hydra.get_sanitized_hydra_cfg(config)
+            whole.hydra = OmegaConf.to_container(hydras.hydra, resolve=resolve)
+        if package not in (None, "_global_"):
+            found = OmegaConf.select(whole, package)
+            if found is None:
+                raise UserError(f"There is no {package} in the configuration")
+            return str(found) if not OmegaConf.is_config(found) else OmegaConf.to_yaml(found)
+        return OmegaConf.to_yaml(whole)
+
+    def complete(self, words: list[str]) -> None:
+        """Answers a shell that completes words, keys of constructors among them."""
+        self.loader.keys = lambda config: keys_of(self.kind, plain(config, resolve=False))
+        try:
+            self.hydra.shell_completion(self.name, words)
+        except ValueError as error:
+            raise UserError(" ".join(str(error).split())) from None
+        except ConfigErrors:
+            pass  # there is nothing to complete after words that are wrong
+
+    def _hydras(self, words):
+        """Hydra's own settings, but for keys that were typed; None if they do not compose."""
+        groups = [word for word in words if word.startswith("hydra/")]
+        try:
+            return self.hydra.compose_config(self.name, groups, RunMode.RUN).hydra
+        except (HydraException, OmegaConfBaseException, ConfigErrors):
+            return None
+
+
+def plain(config: DictConfig, resolve: bool = True) -> Tree:
+    """Nested dicts of all but Hydra's own part."""
+    own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    return OmegaConf.to_container(own, resolve=resolve)
+
+
+def leaves(tree: Tree, path: str = "") -> list[tuple[str, Any]]:
+    """[(dotted key, value)]"""
+    found = []
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            found += leaves(value, f"{path}{key}.")
         else:
-            parsed.append(override)
-    if errors:
-        raise ConfigErrors(errors)
-    return parsed
+            found.append((f"{path}{key}", value))
+    return found
 
 
-def _is_stored(group: str, member: str) -> bool:
-    """Whether a member of a group is an import path; then Hydra is told of it."""
-    if ":" not in str(member) or not getattr(GROUPS.get(group), "takes_imports", False):
-        return False
-    ConfigStore.instance().store(group=group, name=member, node={"name": member})
-    return True
-
-
-def _has_gpu(device: str) -> bool:
-    if device == "cpu":
-        return False
-    import torch
-
-    return torch.cuda.is_available()
-
-
-def _plain(config: DictConfig) -> Tree:
-    OmegaConf.set_struct(config, False)
-    config.pop("hydra")
-    return OmegaConf.to_container(config, resolve=True)
+def _put(tree, key, value):
+    *groups, last = key.split(".")
+    for group in groups:
+        tree = tree[group]
+    tree[last] = value

@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Sequence
 from io import StringIO
 from typing import Any, TextIO
@@ -19,6 +20,8 @@ from rich.table import Table
 
 #: Seconds between two lines of progress where a line cannot be redrawn.
 LINE_EVERY = 10
+#: What every line begins with.
+_prefix = ""
 
 
 class TolerantStream:
@@ -65,13 +68,25 @@ def open_streams() -> None:
 
 
 def say(text: str = "", file: TextIO | None = None) -> None:
-    """Prints a line."""
-    print(text, file=file or sys.stdout, flush=True)
+    """Prints a line, or several."""
+    lines = "\n".join(f"{_prefix}{line}" for line in text.split("\n"))
+    print(lines, file=file or sys.stdout, flush=True)
+
+
+def prefix_lines(prefix: str) -> None:
+    """Begins every line with `prefix`, and redraws none: where several processes print."""
+    global _prefix
+    _prefix = prefix
 
 
 def warn(sentence: object) -> None:
     """One line on the error stream."""
     say(f"warning: {sentence}", sys.stderr)
+
+
+def warn_in_lines() -> None:
+    """Shows Python's warnings as such lines."""
+    warnings.showwarning = lambda message, *_, **__: warn(message)
 
 
 def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
@@ -83,8 +98,12 @@ def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
 
 
 def is_interactive() -> bool:
-    """Whether stdout can redraw a line: a terminal, and not a dumb one."""
-    return sys.stdout.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown", "")
+    """Whether stdout can redraw a line: a terminal, not a dumb one, and no other process's too."""
+    return (
+        not _prefix
+        and sys.stdout.isatty()
+        and os.environ.get("TERM", "dumb") not in ("dumb", "unknown", "")
+    )
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> str:
@@ -98,6 +117,13 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str | None 
     console = Console(file=StringIO(), width=200, force_terminal=False, color_system=None)
     console.print(grid)
     return console.file.getvalue().rstrip("\n")
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table as Markdown."""
+    lines = (head, ("---",) * len(head), *rows)
+    cells = ([cell.replace("|", "\\|") for cell in line] for line in lines)
+    return "".join("| " + " | ".join(line) + " |\n" for line in cells)
 
 
 class Progress:

@@ -1,13 +1,59 @@
-"""What train.py, evaluate.py and record.py begin with: the GPU wakes up while Python imports, and
-signals and closed streams are taken care of before that.
+"""What train, evaluate and record begin with, as scripts or as `megastep train`: the GPU wakes up
+while Python imports, and signals and closed streams are taken care of before that.
 """
 
 import ctypes
 import importlib
+import os
 import sys
 import threading
 
 from agents.cli import signals
+
+SCRIPTS = {
+    "train": "trains a policy",
+    "evaluate": "measures a trained policy",
+    "record": "films a trained policy",
+}
+#: Options that print something and stop.
+PRINTING = ("-h", "--h", "-c", "--cfg", "-i", "--info", "-s", "--shell", "--version", "--resolve")
+SWEEPING = ("-m", "--multirun")
+
+
+def main() -> int:
+    """The installed command, `megastep`; returns the exit code."""
+    command, *words = sys.argv
+    if words and words[0] in ("-sc", "--shell-completion"):
+        words = _completed(words)
+    if words and words[0] in SCRIPTS:
+        sys.argv = [command, *words[1:]]
+        return run_script(words[0])
+    from agents.cli import console
+    from megastep.settings import closest
+
+    console.open_streams()
+    if words and words[0] not in ("-h", "--help", ""):
+        console.say(f"megastep: {words[0]!r} is unknown; {closest(words[0], SCRIPTS)}", sys.stderr)
+        return 2
+    if not words or words[0]:
+        lines = [f"  megastep {name:<10}{what}; --help says more" for name, what in SCRIPTS.items()]
+        console.say("\n".join(lines))
+    return 0
+
+
+def _completed(words: list[str]) -> list[str]:
+    """What completes a line that a shell has in COMP_LINE: the script that the line is for, and its
+    options. Completes the script's own name itself; then nothing is left to do: ["" ].
+    """
+    line = os.environ.get("COMP_LINE", "")
+    typed = line.split()[1:2]
+    if not any(word.startswith("query=") for word in words):
+        return ["train", *words]
+    if typed and len(line.split()) > 2 or typed and line.endswith(" "):
+        os.environ["COMP_LINE"] = line.replace(typed[0], "", 1)
+        return [typed[0], *words]
+    print(" ".join(name for name in SCRIPTS if name.startswith("".join(typed))))
+    return [""]
 
 
 def run_script(name: str) -> int:
@@ -24,10 +70,12 @@ def run_script(name: str) -> int:
 
 
 def wants_first_gpu(words: list[str]) -> bool:
-    """Whether a command line may lead to work on the first GPU: no other device is named in it."""
+    """Whether a command line may lead to work on the first GPU in this process: no other device is
+    named in it.
+    """
     devices = [word.partition("=")[2] for word in words if word.startswith("device=")]
-    only_prints = {"--help", "-h", "--cfg", "-c"} & set(words)
-    return not only_prints and all(name in ("auto", "cuda", "cuda:0") for name in devices)
+    elsewhere = any(word.startswith(PRINTING) or word in SWEEPING for word in words)
+    return not elsewhere and all(name in ("auto", "cuda", "cuda:0") for name in devices)
 
 
 def create_cuda_context() -> None:

@@ -23,9 +23,18 @@ class ConfigErrors(UserError):
 
     def __init__(self, errors: Iterable[tuple[str, str]]):
         self.errors = list(errors)
-        lines = [f"{path}: {sentence}" for path, sentence in self.errors]
+        lines = [f"{path}: {shortened(sentence, 400)}" for path, sentence in self.errors]
         count = "1 error" if len(lines) == 1 else f"{len(lines)} errors"
         super().__init__("\n  ".join([f"{count} in the configuration", *lines]))
+
+    def __reduce__(self):  # as text between processes it would be taken for the errors
+        return type(self), (self.errors,)
+
+
+def shortened(text: object, length: int = 120) -> str:
+    """A text of at most `length` characters: what was typed may be of any size."""
+    text = str(text)
+    return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
 def closest_key(key: str, keys: list[str]) -> str:
@@ -34,7 +43,7 @@ def closest_key(key: str, keys: list[str]) -> str:
     """
     leaf = key.rsplit(".", 1)[-1]
     same = [k for k in keys if k.rsplit(".", 1)[-1] == leaf]
-    near = same or difflib.get_close_matches(key, keys, n=1, cutoff=0.6)
+    near = difflib.get_close_matches(key, same or keys, n=1, cutoff=0.0 if same else 0.6)
     if not near:
         leaves = {k.rsplit(".", 1)[-1]: k for k in keys}
         near = [leaves[n] for n in difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.5)]

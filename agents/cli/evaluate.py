@@ -1,4 +1,4 @@
-"""Measures a trained policy on unseen homes. `python evaluate.py --help`; `run(cfg)` is the same
+"""Measures a trained policy on unseen homes. `evaluate --help`; `run(cfg)` is the same
 from Python.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 from agents import evaluation
 from agents.cli import arena, components, run_folders, tables
 from agents.cli.arena import source
-from agents.cli.command import run_command
+from agents.cli.command import Script, run_command
 from agents.cli.console import duration, say, table
 from agents.cli.registry import label
 from agents.cli.settings import Evaluate
@@ -120,4 +120,4 @@ def metric_cells(mean: float | None, lower: float | None, upper: float | None) -
 def main(argv: list[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
     words = [arena.listed(word) if word.startswith("against=") else word for word in words]
-    return run_command("evaluate", Evaluate, run, HELP, words)
+    return run_command(Script("evaluate", Evaluate, run, HELP), words)

@@ -12,7 +12,7 @@ import torch
 from agents import duels
 from agents.checkpoint import Checkpoint
 from agents.cli import arena, components, run_folders
-from agents.cli.command import run_command
+from agents.cli.command import Script, run_command
 from agents.cli.console import say
 from agents.cli.errors import UserError
 from agents.cli.settings import GROUPS, Record
@@ -123,4 +123,4 @@ def _save_image(path, image):
 
 
 def main(argv: list[str] | None = None) -> int:
-    return run_command("record", Record, run, HELP, argv)
+    return run_command(Script("record", Record, run, HELP), argv)

@@ -15,7 +15,8 @@ from pydantic import TypeAdapter
 from agents.imports import load
 from megastep.settings import closest, settings_of
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+#: configs/ of the repository, which the package has as its data.
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
 
 class Group:

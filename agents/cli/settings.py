@@ -44,6 +44,7 @@ class WandbLogger:
     name: str
     project: str
     mode: Literal["online", "offline"]
+    group: str | None = None
 
 
 GROUPS = {

@@ -8,7 +8,10 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import NoReturn, TextIO
+
+from agents.cli.doors import told
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: Seconds in which a repeated signal is the same one: `timeout` and closing terminals send two.
@@ -23,6 +26,9 @@ class Interrupted(BaseException):
     def __init__(self, number: int, message: str):
         super().__init__(message)
         self.number = number
+
+    def __reduce__(self):  # between the processes of a sweep
+        return type(self), (self.number, str(self))
 
 
 def announce(number: int) -> None:
@@ -52,7 +58,7 @@ def exit_on_signals(script: str) -> None:
     """
 
     def exit_at_once(number, frame):
-        _write(sys.__stderr__, f"{script}.py: stopped by {signal.Signals(number).name}")
+        _write(sys.__stderr__, f"{told(script)}: stopped by {signal.Signals(number).name}")
         os._exit(128 + number)
 
     for number in SIGNALS:
@@ -85,3 +91,24 @@ class Interruptions:
             self.on_first(number)
         elif number != signal.SIGHUP and time.monotonic() - self.first_at > SAME:
             os._exit(128 + number)
+
+
+def stop(process: int) -> None:
+    """Has another process that is under `Interruptions` stop in good order, though a terminal's
+    Ctrl-C may have reached it as well: a second SIGHUP is no second signal.
+    """
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(process, signal.SIGTERM if is_ignored(signal.SIGHUP) else signal.SIGHUP)
+
+
+def is_below(process: int) -> bool:
+    """Whether a process lives that this one, or one of those that it started, has started."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        while process > 1:
+            if process == os.getpid():
+                return True
+            status = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+            if status[0] == "Z":
+                return False
+            process = int(status[1])
+    return False

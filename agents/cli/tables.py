@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents import files
+from agents.cli.console import markdown
 from agents.cli.errors import UserError
 
 INTERVAL = "95 % interval"
@@ -16,9 +17,8 @@ def write(
     """Writes a result for machines and its table for people, `name`.json and .md, each whole or not
     at all. Returns the .json's path.
     """
-    rows = ["| " + " | ".join(row) + " |" for row in (head, ("---",) * len(head), *lines)]
     texts = {
-        ".md": "\n".join([result["title"], "", *rows]) + "\n",
+        ".md": f"{result['title']}\n\n{markdown(head, lines)}",
         ".json": json.dumps(result, indent=2) + "\n",
     }
     try:

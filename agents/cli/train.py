@@ -1,4 +1,4 @@
-"""Trains a policy. `python train.py --help` lists what can be chosen; `run(cfg)` is the same from
+"""Trains a policy. `train --help` lists what can be chosen; `run(cfg)` is the same from
 Python.
 """
 
@@ -14,7 +14,7 @@ from agents import checkpoint, metrics
 from agents.budget import Budget
 from agents.cli import components, evaluate, record, run_folders
 from agents.cli.build import as_tree
-from agents.cli.command import run_command
+from agents.cli.command import Script, run_command
 from agents.cli.console import Progress, duration, number, say, warn
 from agents.cli.errors import ConfigErrors, NotFinite, UserError
 from agents.cli.lock import locked
@@ -81,8 +81,8 @@ def make_trainer(
     opponents = components.make_opponents(cfg, env, sample, policy)
     wandb = None
     if isinstance(cfg.logger, WandbLogger):
-        project, mode = cfg.logger.project, cfg.logger.mode
-        wandb = dict(project=project, mode=mode, name=folder.name, config=as_tree(cfg))
+        given = {key: getattr(cfg.logger, key) for key in ("project", "mode", "group")}
+        wandb = dict(given, name=folder.name, config=as_tree(cfg))
     if cfg.resume:
         for name in ("checkpoints", "snapshots"):
             checkpoint.rewind(folder / name, loaded.step)
@@ -154,7 +154,7 @@ def run(cfg: Train) -> Path:
     folder = (
         run_folders.folder_of(run_folders.find(cfg.resume)) if cfg.resume else run_folders.new(cfg)
     )
-    with locked(folder):
+    with locked(folder), run_folders.inside(folder):
         progress = Progress()
         with nullcontext() if cfg.resume else run_folders.cleanup_on_error(folder):
             trainer, saver = make_trainer(cfg, folder, device, partial(show, progress))
@@ -201,14 +201,14 @@ def finish(cfg: Train, folder: Path) -> None:
             warn(str(error))
 
 
-def prepared(tree: dict, overrides: list[str]) -> dict:
+def prepared(tree: dict, given: list[str]) -> dict:
     """The tree of a run that goes on, or that starts from the weights of another; that of any
-    other is as it was.
+    other is as it was. `given` are the keys that were typed.
     """
-    given = [word.split("=", 1)[0] for word in overrides]
-    if tree["resume"] is not None and tree["init"] is None:
+    resume, init = tree.get("resume"), tree.get("init")
+    if isinstance(resume, str) and init is None:
         return _resumed(tree, given)
-    if tree["init"] is not None and tree["resume"] is None:
+    if isinstance(init, str) and resume is None:
         return _initialised(tree, given)
     return tree
 
@@ -257,4 +257,4 @@ def _resumed(tree, given):
 
 
 def main(argv: list[str] | None = None) -> int:
-    return run_command("train", Train, run, HELP, argv, prepared)
+    return run_command(Script("train", Train, run, HELP, prepared), argv)
