@@ -5,13 +5,14 @@ run.
 import copy
 import dataclasses
 import inspect
+import re
 
 import pytest
 import yaml
 
-from agents.cli import compose as compose_module
+from agents.cli import loader as loader_module
 from agents.cli.build import as_tree, build
-from agents.cli.command import run_command
+from agents.cli.command import Script, run_command
 from agents.cli.compose import ConfigLoader
 from agents.cli.errors import ConfigErrors
 from agents.cli.registry import CONFIGS
@@ -73,7 +74,7 @@ def compositions():
         with ConfigLoader(script, kind) as loader:
             groups = loader.groups()
             for choice in [[]] + [[f"{group}={m}"] for group in groups for m in groups[group]]:
-                chosen = loader._compose(choice).hydra.runtime.choices
+                chosen = loader.compose(choice).hydra.runtime.choices
                 files = [f"{g}/{chosen[g]}" for g in groups if chosen[g] is not None]
                 last = [f for f in files if f.startswith("preset/")]
                 if last and "cpu" in last[0]:
@@ -88,7 +89,7 @@ def compositions():
 def test_every_value_of_every_file_is_in_force_somewhere_and_none_is_said_twice(monkeypatch):
     written, in_force, twice = set(), set(), set()
     for gpu in (False, True):
-        monkeypatch.setattr(compose_module, "_has_gpu", lambda device, gpu=gpu: gpu)
+        monkeypatch.setattr(loader_module, "has_gpu", lambda device, gpu=gpu: gpu)
         for files in compositions():
             last = {}
             for file, said in files:
@@ -98,7 +99,7 @@ def test_every_value_of_every_file_is_in_force_somewhere_and_none_is_said_twice(
             in_force |= {(file, key) for key, (file, _) in last.items()}
     assert written == in_force and not twice, (written - in_force, twice)
     names = {str(path.relative_to(CONFIGS))[:-5] for path in CONFIGS.rglob("*.yaml")}
-    assert names - {file for file, _ in written} == {"preset/auto"}
+    assert names - {file for file, _ in written} == {"preset/auto", "hydra/default"}
 
 
 def test_settings_are_frozen():
@@ -128,7 +129,7 @@ def test_every_key_of_a_logger_is_an_argument_of_what_it_makes():
 def test_the_preset_follows_the_device(monkeypatch):
     cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
     assert compose("device=cpu") == dataclasses.replace(cpu, device="cpu")
-    monkeypatch.setattr(compose_module, "_has_gpu", lambda device: device != "cpu")
+    monkeypatch.setattr(loader_module, "has_gpu", lambda device: device != "cpu")
     assert compose() == compose("preset=auto") == gpu != cpu
     assert compose("preset=cpu") == cpu
     assert compose("experiment=newcomer").env == gpu.env
@@ -293,14 +294,68 @@ def test_a_minibatch_can_be_one_environment_and_no_less():
     assert found == {"learner.n_minibatches": "9 is more than env.n_envs, 8"}
 
 
-@pytest.mark.parametrize("override", ["+x=1", "~env", "a=[", "env@x=minimal"])
-def test_what_is_no_override_is_refused(override):
-    assert set(errors(override)) == {override}
+@pytest.mark.parametrize(
+    "override, key, sentence",
+    [
+        ("a=[", "a=[", "is not understood; write key=value, quote blanks"),
+        ("=3", "=3", "is not understood"),
+        ("seed=" + 5000 * "1", "seed=" + 112 * "1" + "...", "is not understood"),
+        ("seed=" + 3000 * "[", "seed=" + 112 * "[" + "...", "is not understood"),
+        ("+learner.lrr=1", "learner.lrr", "no such key; did you mean learner.lr?"),
+        ("++lr=1", "lr", "no such key; did you mean learner.lr?"),
+        ("seed=[[1]]", "seed", "expected an integer, got [[1]]"),
+        ("learner.lr={a:{b:1}}", "learner.lr", "expected a number, got {'a': {'b': 1}}"),
+        ("env={a:{b:1}}", "env.a", "no such key; did you mean env.name?"),
+        ("init=[a]", "init", "expected a word, got ['a']"),
+        ("env=null", "env", "cannot be left out; there are explorer"),
+        ("~env", "env", "cannot be left out; there are explorer"),
+        ("~nothing", "nothing", "no such key"),
+        ("env=glob(*)", "env", "means several runs; add -m"),
+        ("env=3", "env", "3 is unknown"),
+        ("env@x=minimal", "env@x", "has no default; +env@x= adds it"),
+        ("+env@x=minimal", "x", "no such key"),
+        ("nope@x=y", "nope@x", "there is no such group"),
+        ("seed=${nothere}", "seed", "Interpolation key 'nothere' not found"),
+        ("hydra=3", "hydra", "3 is unknown"),
+        ("hydra.swep.dir=x", "hydra.swep.dir", "no such key; did you mean hydra.sweep.dir?"),
+        ("hydra.job.chdir=maybe", "hydra.job.chdir", "Value 'maybe' is not a valid bool"),
+        ("hydra/launcher=basik", "hydra/launcher", "'basik' is unknown; did you mean basic?"),
+        ("hydra/lancher=basic", "hydra/lancher", "did you mean hydra/launcher?"),
+    ],
+)
+def test_what_cannot_be_meant_is_one_sentence_at_its_key(override, key, sentence):
+    ((told, text),) = errors(override).items()
+    assert told == key and sentence in text and "\n" not in text
 
 
-def test_hydras_own_settings_are_fixed():
-    typed = ["hydra.run.dir=x", "hydra/launcher=basic"]
-    assert list(errors(*typed)) == [text.split("=")[0] for text in typed]
+def test_a_launcher_that_is_not_installed_names_what_to_install(monkeypatch):
+    monkeypatch.setattr(loader_module.Loader, "members", lambda *_, **__: ["basic"])
+    assert (
+        "pip install 'megastep-flatland[sweep]'"
+        in errors("hydra/launcher=joblib")["hydra/launcher"]
+    )
+
+
+def test_plus_signs_set_what_there_is():
+    expected = compose("seed=3", "env=minimal", "env.n_envs=9", "experiment=newcomer")
+    assert compose("+seed=3", "++env=minimal", "++env.n_envs=9", "+experiment=newcomer") == expected
+    assert compose("experiment=null", "~learner.lr") == compose("learner.lr=3e-4")
+
+
+def test_a_value_with_an_equals_sign_needs_no_quotes():
+    assert compose("folder=sweeps/1/0_seed=1").folder == "sweeps/1/0_seed=1"
+    with ConfigLoader("evaluate", Evaluate) as loader:
+        jobs = loader.jobs(["run=a/0_seed=1,a/1_seed=2"])
+    assert [tree["run"] for _, tree in jobs] == ["a/0_seed=1", "a/1_seed=2"]
+
+
+def test_what_the_environment_holds_is_not_written_down(monkeypatch):
+    monkeypatch.setenv("SECRET", "hush")
+    found = errors("logger=wandb", "logger.project=${oc.env:SECRET}", "folder=x/${oc.env:SECRET}")
+    assert set(found) == {"logger.project", "folder"} and "hush" not in str(found)
+    with ConfigLoader("train", Train) as loader:
+        kept = loader.printed(["hydra.sweep.dir=${oc.env:SECRET}/x"], "hydra", None, False)
+    assert "dir: ${oc.env:SECRET}/x" in kept and "hush" not in kept
 
 
 def test_a_group_of_keys_is_no_single_value():
@@ -314,13 +369,10 @@ def test_several_values_need_multirun():
 
 def test_a_sweep_is_every_combination():
     with ConfigLoader("train", Train) as loader:
-        jobs = [
-            overrides
-            for overrides, _ in loader.jobs(
-                ["env=minimal,explorer", "seed=choice(1,2)", "keep=3"], True
-            )
-        ]
-    assert jobs == [
+        jobs = loader.jobs(["env=minimal,explorer", "seed=choice(1,2)", "keep=3"])
+    names = [tree["env"]["name"] for _, tree in jobs]
+    assert names == 2 * ["megastep.envs.minimal:Minimal"] + 2 * ["megastep.envs.explorer:Explorer"]
+    assert [overrides for overrides, _ in jobs] == [
         [f"env={env}", f"seed={seed}", "keep=3"]
         for env in ("minimal", "explorer")
         for seed in (1, 2)
@@ -329,28 +381,64 @@ def test_a_sweep_is_every_combination():
 
 def test_a_sweep_is_checked_before_its_first_job():
     with ConfigLoader("train", Train) as loader, pytest.raises(ConfigErrors, match="learner.lr"):
-        loader.jobs(["learner.lr=1e-3,-1"], True)
+        loader.jobs(["learner.lr=1e-3,-1"])
+
+
+def test_a_search_is_checked_at_its_first_values_and_at_every_other_alone():
+    optuna = "hydra/sweeper=optuna"
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    base = compose().learner.lr
+    with ConfigLoader("train", Train) as loader:
+        jobs = loader.jobs(
+            [optuna, "learner.lr=interval(1e-4,1e-2)", "keep=2,3", "seed=range(1,9)"]
+        )
+        tried = [(tree["learner"]["lr"], tree["keep"], tree["seed"]) for _, tree in jobs]
+        assert tried[0] == (base, 2, 1) and (1e-4, 2, 1) in tried and (1e-2, 2, 1) in tried
+        assert (base, 3, 1) in tried and (base, 2, 9) in tried and len(tried) == 7
+        for word, told in (
+            ("learner.lr=interval(1e-4,1e9)", "1000000000.0 is out of range"),
+            ("report=interval(1.0,4.0)", "expected an integer"),
+            ("keep=range(1,3)", "1 is out of range"),
+            ("agent.memory=lstm,lstmm", "lstmm"),
+        ):
+            with pytest.raises(ConfigErrors, match=re.escape(told)):
+                loader.jobs([optuna, word])
+        with pytest.raises(ConfigErrors, match="hydra/sweeper=optuna"):
+            loader.jobs(["learner.lr=interval(1e-4,1e-2)"])
+
+
+@pytest.mark.parametrize("word", ["env=glob(zz*)", "seed=range(3,3)"])
+def test_a_sweep_over_nothing_is_refused(word):
+    with ConfigLoader("train", Train) as loader, pytest.raises(ConfigErrors, match="has no value"):
+        loader.jobs([word])
+
+
+def test_a_glob_stands_for_members():
+    with ConfigLoader("train", Train) as loader:
+        jobs = loader.jobs(["env=glob(*,exclude=p*)"])
+    assert [words for words, _ in jobs] == [[f"env={name}"] for name in ("explorer", "minimal")]
 
 
 def test_help_lists_groups_and_members(capsys):
-    assert run_command("train", Train, None, "Trains.", ["--help"]) == 0
+    assert run_command(Script("train", Train, None, "Trains."), ["--help"]) == 0
     text = capsys.readouterr().out
     assert "explorer, minimal" in text and "newcomer" in text and "--multirun" in text
 
 
 def test_the_composed_configuration_is_printed(capsys):
-    assert run_command("train", Train, None, "", ["--cfg", "job", "learner.lr=0.5"]) == 0
-    assert "lr: 0.5" in capsys.readouterr().out
+    def printed(*words):
+        assert run_command(Script("train", Train, None, ""), [*words]) == 0
+        return capsys.readouterr().out
 
-
-def test_a_sweep_goes_past_a_failing_job(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def run(cfg):
-        if cfg.seed == 1:
-            raise ZeroDivisionError("by chance")
-
-    assert run_command("train", Train, run, "", ["-m", "seed=1,2"]) == 1
-    out = capsys.readouterr().out
-    assert "FAILED: ZeroDivisionError: by chance" in out and "done" in out
-    assert run_command("train", Train, run, "", ["-m", "seed=2,3"]) == 0
+    assert "lr: 0.5" in printed("--cfg", "job", "learner.lr=0.5")
+    tree = yaml.safe_load(printed("--cfg", "job", "report=${keep}"))
+    assert tree.pop("report") == "${keep}" and "hydra" not in tree
+    tree = yaml.safe_load(printed("--cfg", "job", "--resolve", "report=${keep}"))
+    assert build(Train, tree) == compose("report=2")
+    assert set(yaml.safe_load(printed("--cfg", "hydra"))) == {"hydra"}
+    assert set(yaml.safe_load(printed("--cfg", "all"))) == {*tree, "hydra"}
+    assert yaml.safe_load(printed("--cfg", "job", "-p", "env")) == tree["env"]
+    assert "seed: 1" in printed("-m", "seed=1,2", "--cfg", "job").split("---")[0]
+    assert "file://" in printed("--info", "searchpath")
+    assert "env: explorer" in printed("--info", "defaults-tree")
+    assert "hydra/launcher: basic" in printed("--hydra-help")

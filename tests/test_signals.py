@@ -119,8 +119,10 @@ def test_after_training_the_checkpoint_stands(here, monkeypatch, capsys, moment,
 def test_a_sweep_stops_as_a_whole_and_shows_what_was_done(here, monkeypatch, capsys):
     signalled(monkeypatch, Collector, "__call__", signal.SIGTERM, call=2)
     assert train.main([*TINY, "-m", f"samples={UPDATE}", "seed=1,2,3"]) == 143
-    out = capsys.readouterr().out
-    assert out.count("Job ") == 2 and "done" in out and "seed=3" not in out
+    table = capsys.readouterr().out.split("Sweep", 1)[1]
+    assert "done" in table and "interrupted: Stopped after 32 samples" in table
+    (folder,) = (here / "sweeps").iterdir()
+    assert len((folder / "sweep.csv").read_text().splitlines()) == 3  # the third never began
 
 
 def test_a_signal_sent_twice_at_once_is_one(here, monkeypatch):

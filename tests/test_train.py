@@ -478,14 +478,6 @@ def test_an_unknown_run_names_the_nearest(here, capsys):
     assert train.main(["resume=file"]) == 2
 
 
-def test_a_sweep_gives_every_job_its_folder(here, capsys):
-    assert train.main([*TINY, "-m", "samples=1", "env=minimal", "seed=1,2"]) == 0
-    jobs = sorted((here / "sweeps").glob("*/*"))
-    assert [job.name[:2] for job in jobs] == ["0_", "1_"]
-    assert [checkpoint.load(job / "checkpoints").config["train"]["seed"] for job in jobs] == [1, 2]
-    assert capsys.readouterr().out.count("done") == 2
-
-
 def test_the_end_of_a_run_can_hold_a_table_and_a_video(here, capsys):
     folder = train.run(
         configured(

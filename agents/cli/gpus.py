@@ -39,7 +39,8 @@ def one_gpu(folder: Path, number: int) -> Iterator[int | None]:
 
 def _taken(folder: Path, n_gpus: int) -> tuple[int, TextIO]:
     """A GPU, and the open file whose lock keeps a place on it."""
-    for place, gpu in itertools.product(itertools.count(), range(n_gpus)):
+    for number in itertools.count():
+        place, gpu = divmod(number, n_gpus)
         file = open(folder / f"{socket.gethostname()}-gpu{gpu}-{place}", "a")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -182,10 +182,11 @@ def hydra_error(error: Exception, config: DictConfig | None) -> tuple[str, str]:
     text, cause = " ".join(str(error).split()), error.__cause__ or error.__context__
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return error.missing_cfg_file, "is in no folder that is searched; --config-dir adds one"
-    if unknown := re.match(r"Could not (?:override|delete from config\.) '([^@]+?)'", text):
-        return unknown[1], f"no such key; {closest_key(unknown[1], _keys(config))}"
-    if unknown := re.match(r"Could not override '(.+?)'", text):
-        return unknown[1], f"has no default; +{unknown[1]}= adds it"
+    if unknown := re.match(r"Could not (override|delete from config\.) '(.+?)'", text):
+        verb, key = unknown.groups()
+        if verb == "override" and not key.startswith("hydra."):  # a group, for keys are added
+            return key, f"has no default; +{key}= adds it"
+        return key, f"no such key; {closest_key(key, _keys(config))}"
     if bad := re.match(r"Error merging override \+*([^=\s]+)=", text):
         return bad[1], _first(cause or error)
     if isinstance(error, HydraException) and not text and cause:

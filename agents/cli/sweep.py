@@ -88,6 +88,10 @@ class Job:
             record["seconds"] = round(time.monotonic() - start, 1)
             record |= run_folders.outcome(result)
             self._write(record)
+        if isinstance(result, Path) and result.is_dir() and record["score"] is None:
+            console.warn(
+                f"job {number} has no mean return, as no episode ended before its last report"
+            )
         return record.get("score")
 
     @property
@@ -195,8 +199,9 @@ def _remove(folder):
     """Deletes the folder of a sweep none of whose jobs began, if nothing else is in it."""
     shutil.rmtree(folder / RECORDS, ignore_errors=True)
     (folder / "multirun.yaml").unlink(missing_ok=True)
-    with contextlib.suppress(OSError):
-        folder.rmdir()
+    for place in (folder, run_folders.SWEEPS):
+        with contextlib.suppress(OSError):  # there are others in it
+            place.rmdir()
 
 
 def _share_modules():
