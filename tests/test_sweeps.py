@@ -19,7 +19,7 @@ import torch
 import yaml
 
 from agents import metrics
-from agents.cli import gpus, run_folders, train
+from agents.cli import evaluate, gpus, run_folders, train
 from agents.cli import loader as loader_module
 from agents.cli import overrides as words_of
 from agents.cli.compose import ConfigLoader
@@ -206,6 +206,13 @@ def test_in_a_folder_of_its_own_a_job_finds_what_paths_meant_at_the_start(here):
     assert train.main(words) == 0
     assert [row["state"] for row in rows("mine")] == ["done", "done"]
     assert run_folders.find("latest") == here / "mine/1_seed=2"
+
+
+def test_a_single_runs_folder_is_hydras_too(here, capsys):
+    assert train.main([*SHORT, "hydra.run.dir=mine/first"]) == 0
+    assert (here / "mine/first/checkpoints").is_dir()
+    assert evaluate.main(["run=mine/first", "lanes=4", "hydra.run.dir=x"]) == 2
+    assert "hydra.run.dir: evaluate makes no folder" in capsys.readouterr().err
 
 
 def test_runs_of_a_sweep_are_a_group_of_wandbs(here, monkeypatch):

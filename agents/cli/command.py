@@ -4,26 +4,23 @@ import argparse
 import contextlib
 import dataclasses
 import io
+import re
 import sys
 from collections.abc import Callable
-from importlib import metadata
 from typing import Any
 
 import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.types import RunMode
 
-from agents.cli import console
+from agents.cli import console, doors
 from agents.cli.compose import ConfigLoader, Prepare, as_is
 from agents.cli.console import say
 from agents.cli.doors import told
-from agents.cli.errors import UserError
+from agents.cli.errors import ConfigErrors, UserError
 from agents.cli.help import help_text
 from agents.cli.signals import Interrupted, Interruptions, interrupt
 from agents.cli.sweep import sweep
-
-#: The name of the distribution, which is not that of the package.
-DISTRIBUTION = "megastep-flatland"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,8 +53,10 @@ def run_command(script: Script, argv: list[str] | None = None) -> int:
 
 
 def _run(script: Script, options: argparse.Namespace) -> int:
+    options.multirun |= "hydra.mode=MULTIRUN" in options.overrides
+    if not options.multirun:
+        options.overrides = _with_folder(script, options.overrides)
     words, places = options.overrides, (options.config_name, options.config_dir)
-    options.multirun |= "hydra.mode=MULTIRUN" in words
     with ConfigLoader(
         script.name, script.kind, script.prepare, *places, options.config_path
     ) as loader:
@@ -75,6 +74,15 @@ def _run(script: Script, options: argparse.Namespace) -> int:
                 return sweep(loader, script.run, words)
             script.run(settings)
     return 0
+
+
+def _with_folder(script: Script, words: list[str]) -> list[str]:
+    """The words of a single run: what Hydra calls hydra.run.dir is its folder."""
+    if not any(word.startswith("hydra.run.dir=") for word in words):
+        return words
+    if "folder" not in script.kind.__dataclass_fields__:
+        raise ConfigErrors([("hydra.run.dir", f"{script.name} makes no folder")])
+    return [re.sub(r"^hydra\.run\.dir=", "folder=", word) for word in words]
 
 
 def _text(script: Script, loader: ConfigLoader, options: argparse.Namespace) -> str:
@@ -101,9 +109,7 @@ def _options(script: str, argv: list[str]) -> argparse.Namespace:
     parser.usage = f"{parser.prog} [-m] [key=value ...]; --help says more"
     for action in parser._actions:
         if action.dest == "version":
-            action.version = (
-                f"{DISTRIBUTION} {metadata.version(DISTRIBUTION)}, Hydra {hydra.__version__}"
-            )
+            action.version = f"{doors.version()}, Hydra {hydra.__version__}"
     options = parser.parse_intermixed_args(argv)
     if options.experimental_rerun:
         parser.error("--experimental-rerun: a run is continued with resume=RUN")

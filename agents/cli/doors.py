@@ -2,9 +2,12 @@
 
 import os
 import sys
+from importlib import metadata
 from pathlib import Path
 
 COMMAND = "megastep"
+#: The distribution, which has another name than the packages.
+DISTRIBUTION = "megastep-flatland"
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -21,6 +24,14 @@ def told(script: str) -> str:
 def typed(script: str) -> str:
     """What to type to run a script."""
     return f"{COMMAND} {script}" if is_command() else f"python {script}.py"
+
+
+def version() -> str:
+    """The distribution's name and version."""
+    try:
+        return f"{DISTRIBUTION} {metadata.version(DISTRIBUTION)}"
+    except metadata.PackageNotFoundError:
+        return f"{DISTRIBUTION}, not installed"
 
 
 def completed(script: str) -> str:

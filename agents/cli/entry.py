@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 
-from agents.cli import signals
+from agents.cli import doors, signals
 
 SCRIPTS = {
     "train": "trains a policy",
@@ -32,6 +32,9 @@ def main() -> int:
     from megastep.settings import closest
 
     console.open_streams()
+    if words == ["--version"]:
+        console.say(doors.version())
+        return 0
     if words and words[0] not in ("-h", "--help", ""):
         console.say(f"megastep: {words[0]!r} is unknown; {closest(words[0], SCRIPTS)}", sys.stderr)
         return 2

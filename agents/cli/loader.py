@@ -16,12 +16,13 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from agents.cli import overrides as words_of
+from agents.cli.doors import DISTRIBUTION
 from agents.cli.errors import ConfigErrors, closest_key
 from agents.cli.settings import GROUPS
 from megastep.settings import closest
 
-#: What to install for members that come with extras.
-EXTRA = "pip install 'megastep-flatland[sweep]'"
+#: Members that come with what this installs.
+EXTRA = f"pip install '{DISTRIBUTION}[sweep]'"
 EXTRAS = ("joblib", "optuna", "submitit_local", "submitit_slurm")
 
 
