@@ -300,16 +300,23 @@ def test_a_minibatch_can_be_one_environment_and_no_less():
         ("a=[", "a=[", "is not understood; write key=value, quote blanks"),
         ("=3", "=3", "is not understood"),
         ("seed=" + 5000 * "1", "seed=" + 112 * "1" + "...", "is not understood"),
-        ("seed=" + 3000 * "[", "seed=" + 112 * "[" + "...", "is not understood"),
+        ("seed=" + 3000 * "[", "seed=" + 112 * "[" + "...", "is nested too deeply"),
+        (
+            "seed=" + 99 * "[" + 99 * "]",
+            "seed=" + 99 * "[" + 13 * "]" + "...",
+            "is nested too deep",
+        ),
+        (300 * "a." + "a=1", 58 * "a." + "a...", "its key is too long"),
+        ("env=" + 5000 * "a" + ":B", "env", "is unknown"),
         ("+learner.lrr=1", "learner.lrr", "no such key; did you mean learner.lr?"),
         ("++lr=1", "lr", "no such key; did you mean learner.lr?"),
         ("seed=[[1]]", "seed", "expected an integer, got [[1]]"),
         ("learner.lr={a:{b:1}}", "learner.lr", "expected a number, got {'a': {'b': 1}}"),
         ("env={a:{b:1}}", "env.a", "no such key; did you mean env.name?"),
         ("init=[a]", "init", "expected a word, got ['a']"),
-        ("env=null", "env", "cannot be left out; there are explorer"),
-        ("~env", "env", "cannot be left out; there are explorer"),
-        ("~nothing", "nothing", "no such key"),
+        ("env=null", "env", "cannot be left out; there are "),
+        ("~env", "env", "cannot be left out; there are "),
+        ("~nothing", "nothing", "cannot be deleted"),
         ("env=glob(*)", "env", "means several runs; add -m"),
         ("env=3", "env", "3 is unknown"),
         ("env@x=minimal", "env@x", "has no default; +env@x= adds it"),
@@ -415,8 +422,8 @@ def test_a_sweep_over_nothing_is_refused(word):
 
 def test_a_glob_stands_for_members():
     with ConfigLoader("train", Train) as loader:
-        jobs = loader.jobs(["env=glob(*,exclude=p*)"])
-    assert [words for words, _ in jobs] == [[f"env={name}"] for name in ("explorer", "minimal")]
+        jobs = loader.jobs(["geometry=glob(b*)"])
+    assert [words for words, _ in jobs] == [["geometry=bench"], ["geometry=box"]]
 
 
 def test_help_lists_groups_and_members(capsys):

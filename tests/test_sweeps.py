@@ -336,7 +336,8 @@ def test_errors_can_be_sent_between_processes():
 
 
 def test_a_job_is_named_by_what_varies_in_characters_that_are_left_alone():
-    fixed = words_of.fixed_keys(["seed=1,2", "+keep=3", "env=minimal", "learner.lr=range(1,3)"])
+    typed = ["seed=1,2", "learner.lr=4", "+keep=3", "env=minimal", "learner.lr=range(1,3)"]
+    fixed = words_of.fixed_keys(typed)
     assert fixed == ["keep", "env"]
     words = ["++learner.lr=2", "keep=3", "env=minimal", "geometry=a/b:C", 'init="x y"', "hydra.a=1"]
     values = words_of.varied(words, fixed)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.cli import settings
 from agents.cli.build import build
-from agents.cli.errors import ConfigErrors, UserError
+from agents.cli.errors import ConfigErrors, UserError, shortened
 from agents.cli.run_folders import is_checkpoint
 from agents.imports import load as imported
 
@@ -48,10 +48,10 @@ def errors() -> Iterator[None]:
         EngineError,
         CheckpointError,
         MetricsError,
-        FileNotFoundError,
+        OSError,
         torch.OutOfMemoryError,
     ) as error:
-        raise UserError(str(error).splitlines()[0]) from error
+        raise UserError(shortened(str(error).splitlines()[0], 400)) from error
 
 
 def make_device(name: str) -> torch.device:

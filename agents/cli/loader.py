@@ -147,7 +147,7 @@ def _member_error(override: Override, options: list[str]) -> str | None:
 
 def _is_stored(group: str, member: Any) -> bool:
     """Whether a member of a group is an import path; then Hydra is told of it."""
-    is_path = isinstance(member, str) and ":" in member
+    is_path = isinstance(member, str) and ":" in member and len(member) <= words_of.LONGEST
     if not is_path or not getattr(GROUPS.get(group), "takes_imports", False):
         return False
     ConfigStore.instance().store(group=group, name=member, node={"name": member})
@@ -185,6 +185,8 @@ def hydra_error(error: Exception, config: DictConfig | None) -> tuple[str, str]:
         return error.missing_cfg_file, "is in no folder that is searched; --config-dir adds one"
     if unknown := re.match(r"Could not (override|delete from config\.) '(.+?)'", text):
         verb, key = unknown.groups()
+        if verb != "override" and not key.startswith("hydra."):
+            return key, "cannot be deleted, as no file has it"
         if verb == "override" and not key.startswith("hydra."):  # a group, for keys are added
             return key, f"has no default; +{key}= adds it"
         return key, f"no such key; {closest_key(key, _keys(config))}"

@@ -13,8 +13,10 @@ from agents.cli.errors import ConfigErrors, shortened
 
 #: What neither a shell, nor Hydra's grammar, nor a file system leaves alone in a name.
 SPECIAL = re.compile(r"[^\w.=+-]+")
-#: The longest part of a job's name, in bytes; file systems allow 255 for all of it.
+#: The longest key, member of a group, and part of a job's name; file systems allow 255 bytes.
 LONGEST = 200
+#: How deep a value may be nested: Python's own limit ends far deeper ones.
+DEEPEST = 20
 #: Where between the bounds of an interval a value is tried as well.
 INSIDE = 0.38
 
@@ -25,6 +27,9 @@ def parse(words: Iterable[str], loader: Any = None, multirun: bool = False) -> l
     """
     errors, found = [], []
     for word in words:
+        if _depth(word) > DEEPEST or len(word.partition("=")[0]) > LONGEST:
+            errors.append((shortened(word), "is nested too deeply, or its key is too long"))
+            continue
         override = _parsed(word) or _parsed(_quoted(word, multirun))
         if override is None or not override.key_or_group:
             cure = "write key=value, quote blanks and brackets: 'key=\"a b\"'"
@@ -35,6 +40,12 @@ def parse(words: Iterable[str], loader: Any = None, multirun: bool = False) -> l
     if errors:
         raise ConfigErrors(errors)
     return found
+
+
+def _depth(word: str) -> int:
+    """How deep brackets are in brackets."""
+    depths = itertools.accumulate((c in "[{(") - (c in "]})") for c in word)
+    return max(depths, default=0)
 
 
 def _parsed(word: str) -> Override | None:
@@ -116,8 +127,8 @@ def varied(words: Iterable[str], fixed: Iterable[str]) -> dict[str, str]:
 
 def fixed_keys(words: Iterable[str]) -> list[str]:
     """The keys of a sweep's words that have one value."""
-    parsed = parse(words, multirun=True)
-    return [key_of(one) for one in parsed if not one.is_sweep_override()]
+    last = {key_of(one): one for one in parse(words, multirun=True)}
+    return [key for key, one in last.items() if not one.is_sweep_override()]
 
 
 def name_of(values: dict[str, str]) -> str:
