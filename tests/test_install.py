@@ -5,6 +5,7 @@ empty folder. Slow, for all that it needs is installed as well.
 import os
 import pathlib
 import re
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -15,13 +16,17 @@ import yaml
 
 ROOT = pathlib.Path(__file__).parents[1]
 NAME = "megastep_flatland"
+#: Without a path to this checkout, which pip would take for an installed package.
+ENVIRONMENT = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
-    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(ROOT)]
-    subprocess.run(pip, check=True)
+    others = shutil.ignore_patterns(".*", "runs", "sweeps", "build", "dist", "*.egg-info")
+    source = shutil.copytree(ROOT, folder / "source", symlinks=True, ignore=others)
+    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(source)]
+    subprocess.run(pip, check=True, env=ENVIRONMENT)
     (path,) = folder.glob(f"{NAME}-*.whl")
     return path
 
@@ -32,8 +37,9 @@ def programs(wheel, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fresh")
     subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
     pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "-q"]
-    subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), "torch==2.13.0"], check=True)
-    subprocess.run([*pip, "-c", str(ROOT / "constraints.txt"), str(wheel)], check=True)
+    for what in ("torch==2.13.0", str(wheel)):
+        constrained = [*pip, "-c", str(ROOT / "constraints.txt"), what]
+        subprocess.run(constrained, check=True, env=ENVIRONMENT)
     return folder / "bin"
 
 
@@ -52,8 +58,7 @@ def test_the_wheel_adds_two_import_names_with_configs_and_kernels_as_data(wheel)
 
 @pytest.mark.slow
 def test_the_installed_command_trains_evaluates_and_films_in_an_empty_folder(programs, tmp_path):
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    environment |= {"MEGASTEP_CACHE": str(tmp_path / "cache")}
+    environment = ENVIRONMENT | {"MEGASTEP_CACHE": str(tmp_path / "cache")}
     (tmp_path / "empty").mkdir()
 
     def typed(*words, code=0):
