@@ -352,6 +352,8 @@ def test_plus_signs_set_what_there_is():
 def test_a_value_with_an_equals_sign_needs_no_quotes():
     assert compose("folder=sweeps/1/0_seed=1").folder == "sweeps/1/0_seed=1"
     with ConfigLoader("evaluate", Evaluate) as loader:
+        tree = loader.tree(["run=x", "against=[a/0_seed=1,bot]"])
+        assert tree["against"] == ["a/0_seed=1", "bot"]
         jobs = loader.jobs(["run=a/0_seed=1,a/1_seed=2"])
     assert [tree["run"] for _, tree in jobs] == ["a/0_seed=1", "a/1_seed=2"]
 

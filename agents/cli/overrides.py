@@ -56,13 +56,17 @@ def _parsed(word: str) -> Override | None:
 
 
 def _quoted(word: str, multirun: bool) -> str:
-    """The word with its value in quotes, one by one in a sweep, if it has = in it, as the names of
-    a sweep's folders do.
+    """The word with its value in quotes, one by one in a list or a sweep, if it has = in it, as the
+    names of a sweep's folders do.
     """
     key, _, value = word.partition("=")
-    if "=" not in value or re.search(r"[\[\](){}'\"]", value):
+    is_list = value.startswith("[") and value.endswith("]")
+    inner = value[1:-1] if is_list else value
+    if "=" not in inner or re.search(r"[\[\](){}'\"]", inner):
         return word
-    return f"{key}=" + ",".join(f'"{one}"' for one in (value.split(",") if multirun else [value]))
+    values = inner.split(",") if is_list or multirun else [inner]
+    quoted = ",".join(f'"{one}"' for one in values)
+    return f"{key}=[{quoted}]" if is_list else f"{key}={quoted}"
 
 
 def is_hydra(override: Override) -> bool:
