@@ -6,13 +6,14 @@ import textwrap
 from pathlib import Path
 
 import numpy as np
+from trainings import METRICS
 from workloads import BENCHMARKS
 
 # Environments and frames per second of the original megastep's Explorer on one H200.
 ORIGINAL = 16_384, 0.86e6
 RUN_COLOURS = "tab:green", "tab:blue", "tab:red"  # by budget
 ALL_SEEN = 59.1  # what 128 looks all round show of a test home, less the first view, on average
-COLOURS = {"explorer": "tab:blue", "minimal": "tab:orange"}
+COLOURS = {"explorer": "tab:blue", "minimal": "tab:orange", "pointgoal": "tab:purple"}
 PAGE = """# Benchmark table
 
 `python scripts/benchmark.py report` writes this page from `benchmarks.jsonl`; `python
@@ -172,6 +173,29 @@ def plot_learning(records, path):
         ax.figure.savefig(path, metadata={"Date": None})
 
 
+def plot_worlds(records, path):
+    """Plots the share that counts in each world against seconds of training, from runs on a GPU."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    ax = Figure(figsize=(7.5, 4.2), layout="constrained").subplots()
+    for record in newest(records):
+        is_self_play = "self-play" in record["what"]  # of whose points each side wins half
+        if record["benchmark"] == "worlds" and "curve" in record and not is_self_play:
+            name = record["what"].removesuffix(", median rate")
+            counted = METRICS[name.split(",")[0].split()[0]].replace("_", " ")
+            counted = counted.upper() if counted == "spl" else counted
+            seconds, _, values = zip(*record["curve"])
+            ax.plot(seconds, values, label=f"{name}: {counted}")
+    ax.set(xscale="log", xlabel="seconds of training", ylabel="in training", ylim=(0, 1))
+    ax.set_xticks([1, 3, 10, 30, 60], ["1", "3", "10", "30", "60"])
+    ax.minorticks_off()
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8, loc="lower right")
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
+        ax.figure.savefig(path, metadata={"Date": None})
+
+
 def read(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
@@ -183,3 +207,4 @@ def report(path: Path) -> None:
     path.with_name("benchmark-table.md").write_text(page(records, image.name))
     plot(records, image)
     plot_learning(records, path.with_name("results.svg"))
+    plot_worlds(records, path.with_name("worlds.svg"))
