@@ -178,15 +178,23 @@ def plot_worlds(records, path):
     import matplotlib
     from matplotlib.figure import Figure
 
+    drawn = [
+        record
+        for record in newest(records)
+        if record["benchmark"] == "worlds"
+        and "curve" in record
+        # in self-play each side wins half of the points
+        and "self-play" not in record["what"]
+    ]
+    if not drawn:
+        return
     ax = Figure(figsize=(7.5, 4.2), layout="constrained").subplots()
-    for record in newest(records):
-        is_self_play = "self-play" in record["what"]  # of whose points each side wins half
-        if record["benchmark"] == "worlds" and "curve" in record and not is_self_play:
-            name = record["what"].removesuffix(", median rate")
-            counted = METRICS[name.split(",")[0].split()[0]].replace("_", " ")
-            counted = counted.upper() if counted == "spl" else counted
-            seconds, _, values = zip(*record["curve"])
-            ax.plot(seconds, values, label=f"{name}: {counted}")
+    for record in drawn:
+        name = record["what"].removesuffix(", median rate")
+        counted = METRICS[name.split(",")[0].split()[0]].replace("_", " ")
+        counted = counted.upper() if counted == "spl" else counted
+        seconds, _, values = zip(*record["curve"])
+        ax.plot(seconds, values, label=f"{name}: {counted}")
     ax.set(xscale="log", xlabel="seconds of training", ylabel="in training", ylim=(0, 1))
     ax.set_xticks([1, 3, 10, 30, 60], ["1", "3", "10", "30", "60"])
     ax.minorticks_off()
