@@ -1,17 +1,18 @@
 """What a step of Pong costs one environment, by how many are stepped at once: in plain Python, in
 NumPy, by the engine, and in the Atari emulator; all with pictures.
 
-    python scripts/pong_chart.py measure       # here, also --device cpu; writes docs/pong.jsonl
-    python scripts/pong_chart.py draw          # all that was measured: docs/pong.svg
+    python scripts/pong_chart.py measure       # on the CPU; writes docs/pong.jsonl
+    python scripts/pong_chart.py draw          # docs/pong.svg
 
-One thread of the CPU each. Atari Pong is measured where ale-py is installed; it is under the GPL
-2.0, so nothing here requires it: pip install ale-py. Its frame has other rules and 160 x 210
-pixels.
+One thread of the CPU each; on a GPU, what `python scripts/benchmark.py pong` measured. Atari Pong is
+measured where ale-py is installed; it is under the GPL 2.0, so nothing here requires it: pip install
+ale-py. Its frame has other rules and 160 x 210 pixels.
 """
 
 import argparse
 import json
 import os
+import re
 import sys
 import time
 from datetime import date
@@ -26,12 +27,15 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "scripts")]
 
 from benchmark import commit, machine  # noqa: E402
+from benchmark_report import newest, read  # noqa: E402
 from pong_twins import NumpyPong, PythonPong  # noqa: E402
 from timing import TURNS, timed  # noqa: E402
 
-from megastep import arrdict, capture, engine, envs  # noqa: E402
+from megastep import arrdict, envs  # noqa: E402
 
 RECORDS, CHART = ROOT / "docs" / "pong.jsonl", ROOT / "docs" / "pong.svg"
+BENCHMARKS = ROOT / "docs" / "benchmarks.jsonl"
+ON_GPU = r"pong, pictures, `env.step`, ([\d,]+) environments"
 STEPS = 300  # before it is timed, so that games are in all their phases
 COLOURS = {
     "Atari emulator": "tab:red",
@@ -41,7 +45,7 @@ COLOURS = {
 }
 
 
-def plain_python(n, device):
+def plain_python(n):
     games, random = [PythonPong(lane) for lane in range(n)], np.random.default_rng(1)
     actions = random.integers(3, size=(TURNS, n)).tolist()
     turn = turns()
@@ -55,22 +59,22 @@ def plain_python(n, device):
     return step
 
 
-def numpy(n, device):
+def numpy(n):
     games, turn = NumpyPong(n), turns()
     actions = np.random.default_rng(1).integers(3, size=(TURNS, 1, n))
     games.reset()
     return lambda: games.step(actions[next(turn)])
 
 
-def megastep(n, device):
-    env, turn = capture.Captured(envs.Pong(n, pixels=True, device=device)), turns()
-    actions = torch.randint(3, (TURNS, n, 1), device=device)
+def megastep(n):
+    env, turn = envs.Pong(n, pixels=True, device="cpu"), turns()
+    actions = torch.randint(3, (TURNS, n, 1))
     decisions = [arrdict.arrdict(actions=some) for some in actions]
     env.reset()
     return lambda: env.step(decisions[next(turn)])
 
 
-def atari(n, device):
+def atari(n):
     """A frame of each of ``n`` emulators, in grey. ImportError where ale-py is not installed."""
     from ale_py import ALEInterface, LoggerMode, roms
 
@@ -97,14 +101,13 @@ def turns():
         yield from range(TURNS)
 
 
-#: What is measured, and how many environments at most; on a GPU megastep alone.
+#: What is measured, and how many environments at most.
 SUBJECTS = {
     "Atari emulator": (atari, 30),
     "plain Python": (plain_python, 1000),
     "NumPy": (numpy, 100_000),
     "megastep": (megastep, 100_000),
 }
-MOST_ON_GPU = 1_048_576
 
 
 def sizes(most):
@@ -113,13 +116,13 @@ def sizes(most):
     return [n for n in found if n < most] + [most]
 
 
-def measure(name, device):
+def measure(name):
     """A record per number of environments: seconds per step and environment, the least of some
     samples of 50 ms each, for whatever else the machine does only adds to them.
     """
-    make, most = SUBJECTS[name]
-    for n in sizes(MOST_ON_GPU if device.type == "cuda" else most):
-        step, cpu = make(n, device), device.type == "cpu"
+    (make, most), device = SUBJECTS[name], torch.device("cpu")
+    for n in sizes(most):
+        step = make(n)
         start, steps = time.perf_counter(), 0
         while steps < STEPS and time.perf_counter() - start < 1:
             step()
@@ -128,7 +131,6 @@ def measure(name, device):
             name=name,
             environments=n,
             seconds=float(f"{min(timed(step, device)) / n:.4g}"),
-            device="CPU" if cpu else "GPU",
             **machine(device),
             commit=commit(),
             date=str(date.today()),
@@ -139,7 +141,7 @@ def store(path, record):
     """Adds a record to the file of JSON lines, in the place of an older one of the same thing."""
 
     def key(one):
-        return one["device"], one["name"], one["environments"]
+        return one["name"], one["environments"]
 
     lines = path.read_text().splitlines() if path.exists() else []
     records = {key(one): one for one in [*map(json.loads, lines), record]}
@@ -147,21 +149,30 @@ def store(path, record):
     path.write_text("\n".join(lines) + "\n")
 
 
-def draw(records, path):
+def on_gpu(records):
+    """The same of the newest records of `benchmark.py pong`: (environments, seconds, GPU), ...."""
+    for record in newest(records):
+        match = re.fullmatch(ON_GPU, record["what"])
+        if match and not record["on"].startswith("CPU"):
+            yield int(match[1].replace(",", "")), 1e-6 / record["value"], record["on"]
+
+
+def draw(records, benchmarks, path):
     """Seconds per step and environment against environments, both logarithmic."""
     import matplotlib
     from matplotlib.figure import Figure
 
     ax = Figure(figsize=(7.5, 4.8), layout="constrained").subplots()
-    for name in COLOURS:
-        for device, line in (("CPU", "-"), ("GPU", "--")):
-            own = [r for r in records if (r["name"], r["device"]) == (name, device)]
-            if not own:
-                continue
+    lines = {name: [r for r in records if r["name"] == name] for name in COLOURS}
+    for name, own in lines.items():
+        if own:
             n, seconds = zip(*sorted((r["environments"], r["seconds"]) for r in own))
-            where = "one CPU thread" if device == "CPU" else own[0]["on"]
-            style = dict(color=COLOURS[name], linestyle=line, marker="o", markersize=4)
-            ax.plot(n, seconds, label=f"{name}, {where}", **style)
+            style = dict(color=COLOURS[name], marker="o", markersize=4)
+            ax.plot(n, seconds, label=f"{name}, one CPU thread", **style)
+    if points := sorted(on_gpu(benchmarks)):
+        n, seconds, where = zip(*points)
+        style = dict(color=COLOURS["megastep"], linestyle="--", marker="o", markersize=4)
+        ax.plot(n, seconds, label=f"megastep, one {where[0]}", **style)
     ax.set(xscale="log", yscale="log", xlabel="environments")
     ax.set_ylabel("seconds per step and environment")
     ax.grid(alpha=0.3)
@@ -175,21 +186,17 @@ def main(argv=None):
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("what", choices=("measure", "draw"))
-    parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
     parser.add_argument("--only", nargs="+", choices=SUBJECTS, default=[*SUBJECTS])
     parser.add_argument("--records", type=Path, default=RECORDS)
     parser.add_argument("--chart", type=Path, default=CHART)
     options = parser.parse_args(argv)
     if options.what == "draw":
-        draw([json.loads(line) for line in options.records.read_text().splitlines()], options.chart)
+        draw(read(options.records), read(BENCHMARKS), options.chart)
         return
     torch.set_num_threads(1)
-    device = engine.device(options.device)
     for name in options.only:
-        if device.type == "cuda" and name != "megastep":
-            continue
         try:
-            for record in measure(name, device):
+            for record in measure(name):
                 store(options.records, record)
                 print(f"{name}, {record['environments']:,}: {record['seconds'] * 1e9:,.1f} ns")
         except ImportError as error:
