@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from openskill.models import PlackettLuce
 
 from agents import files
 
@@ -34,6 +33,8 @@ def rate(
 
 
 def _rate(n_players, games):
+    from openskill.models import PlackettLuce
+
     model = PlackettLuce(tau=0.0)  # players do not change between two duels
     players = [model.rating() for _ in range(n_players)]
     for i, j, score in games:

@@ -4,9 +4,9 @@ NumPy, by the engine, and in the Atari emulator; all with pictures.
     python scripts/pong_chart.py measure       # on the CPU; writes docs/pong.jsonl
     python scripts/pong_chart.py draw          # docs/pong.svg
 
-One thread of the CPU each; on a GPU, what `python scripts/benchmark.py pong` measured. Atari Pong is
-measured where ale-py is installed; it is under the GPL 2.0, so nothing here requires it: pip install
-ale-py. Its frame has other rules and 160 x 210 pixels.
+One thread of the CPU each; on a GPU, what `python scripts/benchmark.py pong` measured. Atari Pong
+is measured where ale-py is installed; it is under the GPL 2.0, so nothing here requires it: pip
+install ale-py. Its frame has other rules and 160 x 210 pixels.
 """
 
 import argparse
