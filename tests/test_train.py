@@ -438,7 +438,10 @@ def test_an_environment_that_cannot_be_made_leaves_no_folder(here, tmp_path):
 
 def test_settings_of_an_environment_that_contradict_each_other_are_one_sentence(here, capsys):
     explorer = [word for word in TINY if "est=" not in word] + ["env=explorer", "env.subsample=3"]
+    elsewhere = [word for word in TINY if "est=" not in word] + ["env=pointgoal"]
     for words, told in (
+        ([*elsewhere, "env.nearest=40", "env.furthest=50"], "geometry 0 has no goal from 40 to 50"),
+        ([*elsewhere, "env.nearest=5", "env.furthest=2"], "nearest < furthest metres, but 5 and 2"),
         ([*TINY, "env.shortest=10"], "shortest <= longest steps, but 10 and 9 were given"),
         (explorer, "subsample must divide the 8 rays of the screen, but 3 was given"),
     ):
