@@ -120,3 +120,8 @@ def test_without_the_encoder_training_goes_on_and_the_package_is_named(
     assert train.main([*TINY, "finish.record=true"]) == 0
     assert "pip install av" in capsys.readouterr().err
     assert len(list(tmp_path.glob("runs/*/curves.png"))) == 1
+
+
+def test_keys_of_a_geometry_need_a_geometry(capsys):
+    assert record.main(["env=minimal", "geometry.n=4"]) == 2
+    assert "geometry: keys of it need a member of it: give geometry= too" in capsys.readouterr().err

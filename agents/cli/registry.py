@@ -61,6 +61,9 @@ class Group:
             return value
         if not isinstance(value, dict):
             raise ValueError(f"is a group of keys, got {value!r}")
+        if "name" not in value:
+            first = sorted((CONFIGS / self.key).glob("*.yaml"))[0].stem
+            raise ValueError(f"keys of it need a member of it: give {self.key}= too, say {first}")
         return TypeAdapter(self.kind(str(value.get("name")))).validate_json(json.dumps(value))
 
     def having(self, key: str) -> str | None:
