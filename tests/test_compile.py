@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from agents.kernels.lstm import LSTM
-from megastep import engine
+from megastep import agents, engine, games
 from megastep.kernels import compile, launch
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -275,9 +275,12 @@ def test_a_thread_without_a_context_takes_the_gpus_and_launches_again(monkeypatc
 
 
 def test_sizes_that_python_and_the_kernels_have_are_the_same():
-    text = "".join((compile.HERE / name).read_text() for name in ("unseen.h", "pong.h", "shoot.h"))
+    names = "unseen.h", "pong.h", "shoot.h", "seek.h", "errors.h"
+    text = "".join((compile.HERE / name).read_text() for name in names)
     found = {name: int(value) for name, value in re.findall(r"\b([A-Z_]+) = (\d+)\b", text)}
     assert (found["BANDS"], found["SECTORS"]) == (engine.BANDS, engine.SECTORS)
     assert found["GAME_FIELDS"] == engine.GAME_FIELDS and found["N_FEATURES"] == engine.FEATURES
     assert found["CELL"] == engine.CELL and found["MAX_SHOOTERS"] == engine.MAX_SHOOTERS
     assert (found["HEIGHT"], found["WIDTH"]) == engine.PIXELS  # in cells
+    assert found["COLLISIONS"] + 1 == engine.JOURNEY and found["TOLD"] == games.TOLD
+    assert found["KINDS"] == agents._KINDS
