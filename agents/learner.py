@@ -20,9 +20,19 @@ belongs to the learner, which fills it in `update`, or to its collector; one tha
 stream of its own returns an earlier rollout. An environment with opponents in it has `learners`:
 only those lanes need to be acted in and stored. Neither call synchronises host and device. A
 constructor that takes `graph` is told to capture its update.
+
+What ours are made of serves others, too: `rollout.make_rollout` and `rollout.Collector`,
+`rollout.bytes_per_step`, `gradient_steps.GradientSteps`, `captured.CapturedUpdate`, `masked`.
 """
 
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
+
+#: Of settings that learners have in common.
+Coefficient = Annotated[float, Field(ge=0, le=10**6)]
+Positive = Annotated[float, Field(gt=0, le=10**6)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 ATTRIBUTES = {
     "collector": "a method that takes an environment and returns what acts in it and stores",

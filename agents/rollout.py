@@ -5,6 +5,7 @@ of time t; `reward`, `reset`, `terminal` and `truncated` at row t are those of t
 followed, t+1. So row t is a valid transition unless its `reset` is set.
 """
 
+import math
 from typing import Any
 
 import torch
@@ -45,8 +46,8 @@ class Rollout:
     learns     (T+1, B) bool, whether the learner learns from the lane then; all do unless worlds
                say otherwise
     actions    (T, B, ...) int64
-    logprobs   (T, B) of those actions, under the policy that chose them
-    values     (T+1, B), as the policy estimated them then
+    logprobs   (T, B) of those actions, under the policy that chose them; 0 of one that gives none
+    values     (T+1, B), as the policy's critic estimated them then, or None if nobody needs them
     reward     (T, B), and `terminal`, `truncated` (T, B) bool: of the world that followed
     metrics    by name, (T, B) float32: of the world that followed, where an episode ended
     state      the policy's state before row 0, leaves (B, ...)
@@ -54,7 +55,7 @@ class Rollout:
     Args: `state`, the policy's state of B lanes, such as `policy.initial(B)`, of which a copy is
     made; `obs_dtype`, of all observations that are not integers and whose space names none;
     `learners`, for an environment where opponents play too, which of its lanes are the B that are
-    stored, a bool each. ValueError if it has no row.
+    stored, a bool each; `values`, whether there are any. ValueError if it has no row.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class Rollout:
         privileged_space: Any = None,
         obs_dtype: torch.dtype = torch.float16,
         learners: torch.Tensor | None = None,
+        values: bool = True,
     ):
         if n_steps < 1 or n_lanes < 1:
             raise ValueError(
@@ -85,7 +87,7 @@ class Rollout:
         self.learns = torch.ones(more, dtype=torch.bool, device=device)
         self.terminal = torch.zeros(rows, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(rows, dtype=torch.bool, device=device)
-        self.values = torch.zeros(more, device=device)
+        self.values = torch.zeros(more, device=device) if values else None
         self.logprobs = torch.zeros(rows, device=device)
         self.reward = torch.zeros(rows, device=device)
         self.metrics = arrdict()
@@ -125,6 +127,12 @@ class Rollout:
             self.privileged[t] = world["privileged"]
         return self.world(t)
 
+    def store_decision(self, t: int, decision: arrdict) -> None:
+        """Stores the actions of time t, and their log-probabilities if the policy has any."""
+        self.actions[t] = decision["actions"]
+        if "logprobs" in decision:
+            self.logprobs[t] = decision["logprobs"]
+
     def store_outcome(self, t: int, world: arrdict) -> None:
         """Stores what the world that followed time t says of the actions of that time."""
         self.reward[t] = world["reward"]
@@ -144,7 +152,10 @@ class Rollout:
         named = _floats(self.obs, "obs")
         if self.privileged is not None:
             named |= _floats(self.privileged, "privileged")
-        return named | dict(reward=self.reward, value=self.values, logprob=self.logprobs)
+        named["reward"] = self.reward
+        if self.values is not None:
+            named["value"] = self.values
+        return named | {"logprob": self.logprobs}
 
     def transitions(self) -> dict[str, torch.Tensor]:
         """The arguments of `returns.gae`, each (T, B), the last value (B,)."""
@@ -157,22 +168,27 @@ class Rollout:
             truncated=self.truncated,
         )
 
-    def lanes(self, rows: torch.Tensor) -> arrdict:
-        """Whole sequences of some lanes, rows (M,) int64: arrdict(obs, starts, actions, logprobs,
-        value, and privileged if there is any), (T, M, ...), and their state (M, ...). A copy.
+    def sequences(self, rows: torch.Tensor) -> arrdict:
+        """Whole sequences of some lanes, rows (M,) int64, as a copy: arrdict of
+
+        obs, starts, learns, privileged if there is any   (T+1, M, ...)
+        actions, logprobs, reward, terminal, truncated    (T, M, ...)
+        state   the policy's before row 0, (M, ...)
         """
-        select = mapping(lambda leaf: leaf[: self.n_steps].index_select(1, rows))
-        batch = arrdict(
-            obs=select(self.obs),
-            starts=select(self.starts),
-            actions=select(self.actions),
-            logprobs=select(self.logprobs),
-            value=select(self.values),
-            state=_rows(self.state, rows),
-        )
+        select = mapping(lambda leaf: leaf.index_select(1, rows))
+        batch = arrdict({name: select(getattr(self, name)) for name in _SEQUENCES})
         if self.privileged is not None:
             batch["privileged"] = select(self.privileged)
+        batch["state"] = _rows(self.state, rows)
         return batch
+
+
+_SEQUENCES = "obs starts learns actions logprobs reward terminal truncated".split()
+
+
+def without_last(tree: Any) -> Any:
+    """The first T of T+1 rows of a tree of tensors, those that were acted on; None is None."""
+    return None if tree is None else mapping(lambda leaf: leaf[:-1])(tree)
 
 
 def initial_actor_state(env: Any, policy: Any, rollout: Rollout) -> arrdict:
@@ -196,6 +212,42 @@ def _stored(world):
     return arrdict({key: world[key] for key in keys if key in world})
 
 
+def make_rollout(env: Any, policy: Any, n_steps: int, values: bool = True) -> Rollout:
+    """Room for T steps of all lanes of an environment, or of those that learn where others are
+    `opponents.Opponents`.
+    """
+    learners = getattr(env, "learners", None)
+    n_lanes = env.n_envs * env.n_agents if learners is None else int(learners.sum())
+    return Rollout(
+        n_steps,
+        n_lanes,
+        env.obs_space,
+        env.action_space,
+        policy.initial(n_lanes),
+        env.device,
+        policy.privileged_space,
+        learners=learners,
+        values=values,
+    )
+
+
+def bytes_per_step(env: Any, policy: Any) -> int:
+    """About how many bytes a rollout takes per step of one lane: observations, what is privileged,
+    and 64 of the rest.
+    """
+    seen, privileged = (
+        sum(math.prod(space.shape) * _itemsize(space, size) for space in leaves(tree or {}))
+        for tree, size in ((env.obs_space, 2), (policy.privileged_space, 4))
+    )
+    return seen + privileged + 64
+
+
+def _itemsize(space, otherwise):
+    """Bytes of one number of a space, `otherwise` where it names no dtype."""
+    dtype = getattr(space, "dtype", None)
+    return dtype.itemsize if dtype else otherwise
+
+
 @torch.no_grad()
 def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> arrdict:
     """Fills a rollout: T times act, env.step, store. Never synchronises, so it can be a CUDA graph.
@@ -209,16 +261,18 @@ def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> ar
     with policy.compute_dtype():
         for t in range(rollout.n_steps):
             decision, state = policy(rollout.store_world(t, world), state)
-            rollout.actions[t], rollout.logprobs[t] = decision["actions"], decision["logprobs"]
-            features.append(decision["features"])
+            rollout.store_decision(t, decision)
+            if rollout.values is not None:
+                features.append(decision["features"])
             with torch.autocast(rollout.reward.device.type, enabled=False):
                 world = env.step(arrdict(actions=rollout.for_all(decision["actions"])))
                 world = rollout.own(world)
             rollout.store_outcome(t, world)
 
         last = rollout.store_world(rollout.n_steps, world)
-        features.append(policy(last, state, sample=False)[0]["features"])
-        rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
+        if rollout.values is not None:
+            features.append(policy(last, state, sample=False)[0]["features"])
+            rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
     # a memory that is not finite starts anew, or it would last until the lane's episode ends
     state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
     after = arrdict(world=_stored(world), state=state)

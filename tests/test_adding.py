@@ -217,9 +217,8 @@ def test_a_learner(outside, capsys):
 
             def update(self, rollout):
                 is_fine = self.check(rollout.numbers())
-                batch = rollout.lanes(torch.arange(rollout.n_lanes))
-                out = self.policy.unroll(batch.obs, batch.starts, batch.state)
-                logprobs = self.policy.output.logprob(out.logits, batch.actions)
+                out = self.policy.unroll(rollout.obs, rollout.starts, rollout.state)
+                logprobs = self.policy.output.logprob(out.logits[:-1], rollout.actions)
                 to_go = rollout.reward.flip(0).cumsum(0).flip(0)
                 loss = -(logprobs * to_go).mean()
                 self.optimizer.zero_grad()

@@ -222,7 +222,7 @@ def test_a_rollout_holds_what_the_critic_was_told_in_single_precision():
         assert values.dtype == torch.float32
         assert torch.equal(values[:, :, 0, 0], expected)
     rows = torch.tensor([4, 1])
-    assert torch.equal(rollout.lanes(rows).privileged.unseen[:, :, 0, 4], expected[:T, rows])
+    assert torch.equal(rollout.sequences(rows).privileged.unseen[..., 0, 4], expected[:, rows])
     out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
     # products in another order, of numbers up to 600
     valued = policy.value(out.features, rollout.privileged)
@@ -233,7 +233,7 @@ def test_a_plain_policys_rollout_stores_nothing_of_it():
     env, policy = Telling(), policy_of("plain")
     rollout = rollout_of(policy)
     collect(env, policy, rollout, initial_actor_state(env, policy, rollout))
-    assert rollout.privileged is None and "privileged" not in rollout.lanes(torch.tensor([0]))
+    assert rollout.privileged is None and "privileged" not in rollout.sequences(torch.tensor([0]))
     assert not any("privileged" in name for name in rollout.numbers())
 
 

@@ -71,7 +71,7 @@ def trainers(monkeypatch):
 
 def is_captured(trainer):
     """Whether collecting and updating replay graphs."""
-    return isinstance(trainer.collect.graph, capture.Graph) and trainer.learner._captured
+    return isinstance(trainer.collect.graph, capture.Graph) and trainer.learner.captured.graph
 
 
 def test_an_interrupted_run_is_saved(stopped):

@@ -60,25 +60,6 @@ def weights(policy):
     )
 
 
-def test_means_and_standard_deviations_are_over_the_valid():
-    x, valid = (
-        torch.tensor([[1.0, 5.0], [torch.nan, 3.0]]),
-        torch.tensor([[True, True], [False, True]]),
-    )
-    assert ppo.masked_mean(x, valid).item() == 3
-    std = math.sqrt(8 / 3)
-    expected = torch.tensor([[-2 / std, 2 / std], [0.0, 0.0]])
-    torch.testing.assert_close(ppo.normalised(x, valid), expected)
-    assert ppo.masked_mean(x, torch.zeros_like(valid)).item() == 0
-
-
-def test_explained_variance_of_the_truth_is_one_and_of_a_constant_zero():
-    targets, valid = torch.tensor([[1.0, 2.0, 6.0]]), torch.tensor([[True, True, True]])
-    assert ppo.explained_variance(targets + 4, targets, valid).item() == pytest.approx(1)
-    assert ppo.explained_variance(torch.zeros(1, 3), targets, valid).item() == pytest.approx(0)
-    assert ppo.explained_variance(-targets, targets, valid).item() == pytest.approx(-3)
-
-
 def test_the_first_pass_finds_the_policy_where_it_was():
     policy, rollout = made_up()
     metrics = ppo.PPO(policy, n_minibatches=1).update(rollout)

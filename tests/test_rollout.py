@@ -1,5 +1,5 @@
 """Rollouts: an environment of numbers that tell their lane, time and key, followed through collect
-and lanes.
+and sequences.
 """
 
 import pytest
@@ -7,7 +7,7 @@ import torch
 
 from agents.policy import Policy
 from agents.returns import gae
-from agents.rollout import Collector, Rollout, collect, initial_actor_state
+from agents.rollout import Collector, Rollout, collect, initial_actor_state, without_last
 from megastep import spaces
 from megastep.arrdict import arrdict
 from megastep.capture import state_tree
@@ -67,11 +67,12 @@ class Telltale:
         )
 
 
-def collected(n_rollouts=1, dtype=torch.float32, env=None):
+def collected(n_rollouts=1, dtype=torch.float32, env=None, values=True):
     env = env or Telltale()
     policy = Policy(env.obs_space, env.action_space, width=16)
     state = policy.initial(B)
-    rollout = Rollout(T, B, env.obs_space, env.action_space, state, obs_dtype=dtype)
+    spaces_of = env.obs_space, env.action_space
+    rollout = Rollout(T, B, *spaces_of, state, obs_dtype=dtype, values=values)
     actor_state = initial_actor_state(env, policy, rollout)
     for _ in range(n_rollouts):
         actor_state = collect(env, policy, rollout, actor_state)
@@ -173,21 +174,47 @@ def test_collecting_allocates_nothing_that_stays():
     assert all(before[path] is after[path] for path in after)
 
 
-def test_a_minibatch_joins_the_rows_of_its_lanes():
-    _, _, rollout, _ = collected(n_rollouts=2)
+@pytest.mark.parametrize("values", [True, False])
+def test_sequences_join_the_rows_of_their_lanes(values):
+    env = Talkative()
+    _, _, rollout, _ = collected(n_rollouts=2, env=env, values=values)
     rollout.logprobs[:] = torch.arange(T)[:, None] + 100.0 * torch.arange(B)
     rollout.state.cell[:] = torch.arange(B)[:, None].float()
     rows = torch.tensor([4, 1, 2])
-    batch = rollout.lanes(rows)
+    batch = rollout.sequences(rows)
     for i, b in enumerate(rows.tolist()):
-        lane = 100.0 * b + T + torch.arange(T)
+        lane = 100.0 * b + T + torch.arange(T + 1)
         assert torch.equal(batch.obs.eye[:, i, 0, 0, 0, 0], lane)
         assert torch.equal(batch.obs.rest.imu[:, i, 0, 0], lane + 0.5)
         assert torch.equal(batch.logprobs[:, i], 100.0 * b + torch.arange(T))
         assert torch.equal(batch.actions.move[:, i], rollout.actions.move[:, b])
-        assert torch.equal(batch.starts[:, i], rollout.starts[:-1, b])
-        assert torch.equal(batch.value[:, i], rollout.values[:-1, b])
+        assert torch.equal(batch.reward[:, i], lane[1:] + 0.25)
+        for name in ("starts", "learns", "terminal", "truncated"):
+            assert torch.equal(batch[name][:, i], getattr(rollout, name)[:, b])
         assert (batch.state.cell[i] == b).all()
+    acted = without_last(batch.obs)
+    assert torch.equal(acted.eye, batch.obs.eye[:T]) and without_last(None) is None
+
+
+def test_a_policy_without_a_critic_acts_as_one_whose_values_are_not_stored():
+    """Nor does it have to tell log-probabilities, as a policy of action values has none."""
+
+    class Silent(Policy):
+        def forward(self, *arguments):
+            decision, state = super().forward(*arguments)
+            return arrdict(actions=decision.actions), state
+
+    stored = []
+    for kind, critic in (Policy, "plain"), (Silent, None):
+        env = Telltale()
+        policy = kind(env.obs_space, env.action_space, width=16, critic=critic)
+        state = policy.initial(B)
+        rollout = Rollout(T, B, env.obs_space, env.action_space, state, values=False)
+        collect(env, policy, rollout, initial_actor_state(env, policy, rollout))
+        assert rollout.values is None and "value" not in rollout.numbers()
+        stored.append(rollout)
+    assert torch.equal(stored[0].actions.move, stored[1].actions.move)
+    assert stored[0].logprobs.all() and not stored[1].logprobs.any()
 
 
 def test_transitions_are_what_returns_are_computed_from():

@@ -175,7 +175,7 @@ def test_snapshots_act_as_they_are_and_on_a_gpu_in_graphs(here, monkeypatch, dev
     folder = train.run(configured(f"samples={12 * 8 * SMALLER}", tiny=tiny))
     ((trainer, _),) = made
     if device == "cuda":
-        assert isinstance(trainer.collect.graph, capture.Graph) and trainer.learner._captured
+        assert isinstance(trainer.collect.graph, capture.Graph) and trainer.learner.captured.graph
     assert trainer.bad_number is None and trainer.updates == 12
     rows = metrics.read(folder / "metrics.jsonl")
     for name in ("return/past", "return/bot", "won/past", "won/bot"):

@@ -1,0 +1,27 @@
+"""Statistics over the valid, by hand."""
+
+import math
+
+import pytest
+import torch
+
+from agents import masked
+
+
+def test_means_and_standard_deviations_are_over_the_valid():
+    x, valid = (
+        torch.tensor([[1.0, 5.0], [torch.nan, 3.0]]),
+        torch.tensor([[True, True], [False, True]]),
+    )
+    assert masked.masked_mean(x, valid).item() == 3
+    std = math.sqrt(8 / 3)
+    expected = torch.tensor([[-2 / std, 2 / std], [0.0, 0.0]])
+    torch.testing.assert_close(masked.normalised(x, valid), expected)
+    assert masked.masked_mean(x, torch.zeros_like(valid)).item() == 0
+
+
+def test_explained_variance_of_the_truth_is_one_and_of_a_constant_zero():
+    targets, valid = torch.tensor([[1.0, 2.0, 6.0]]), torch.tensor([[True, True, True]])
+    assert masked.explained_variance(targets + 4, targets, valid).item() == pytest.approx(1)
+    assert masked.explained_variance(torch.zeros(1, 3), targets, valid).item() == pytest.approx(0)
+    assert masked.explained_variance(-targets, targets, valid).item() == pytest.approx(-3)
