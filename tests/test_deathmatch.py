@@ -397,6 +397,25 @@ def test_nobody_in_view_is_no_aim(device):
     assert ring.step().reward.tolist() == [0, 0]
 
 
+def test_what_is_seen_for_the_first_time_is_paid(device):
+    """In as many lanes as there are agents, each for itself: the bits that a step adds."""
+    prices = dict(hit_reward=0, wound_cost=0, search_reward=64 / 4)
+    env = envs.Deathmatch(3, sample("homes", 3), n_agents=2, device=device, limit=9, **prices)
+
+    def count():
+        return np.unpackbits(env.seen.cpu().numpy().view(np.uint8).reshape(6, -1), axis=1).sum(1)
+
+    env.reset()
+    generator, bits, n_paid, n_reset = torch.Generator().manual_seed(1), count(), 0, 0
+    for _ in range(30):
+        decision = arrdict.arrdict(actions=contract.random_actions(env, generator))
+        world, now = env.step(decision), count()
+        reset = world.reset.cpu().numpy()
+        assert world.reward.tolist() == np.where(reset, 0, (now - bits) / 4).tolist()
+        bits, n_paid, n_reset = now, n_paid + (world.reward > 0).sum(), n_reset + reset.sum()
+    assert n_paid > 60 and n_reset > 12
+
+
 def test_lanes_are_truncated_each_in_its_time(device):
     ring = Ring(device, (2, 2, 180), (5, 5, 0), limit=6)
     ring.env.ages[1] = 2
@@ -539,7 +558,8 @@ def test_more_agents_than_a_home_has_room_for_end_with_a_sentence(tmp_path, monk
 @pytest.mark.cuda
 @pytest.mark.parametrize("n_agents", [2, 4, 16])
 def test_cpu_and_gpu_agree_on_every_bit(n_agents):
-    settings = dict(limit=15, damage=0.3, recovery=0.1, drain=0.05, spoils=0.02, aim_reward=0.1)
+    settings = dict(limit=15, damage=0.3, recovery=0.1, drain=0.05, spoils=0.02)
+    settings |= dict(aim_reward=0.1, search_reward=0.3)
     runs = [
         arrdict.stack(
             contract.rollout(

@@ -22,7 +22,14 @@ SHORT = {
     "deathmatch": dict(limit=20),
     "deathmatch, privileged": dict(limit=20, n_agents=2, damage=1, privileged=True),
     "deathmatch, all rules": dict(
-        limit=20, n_agents=16, recovery=0.1, drain=0.05, spoils=0.1, kill_reward=1, aim_reward=1
+        limit=20,
+        n_agents=16,
+        recovery=0.1,
+        drain=0.05,
+        spoils=0.1,
+        kill_reward=1,
+        aim_reward=1,
+        search_reward=1,
     ),
     "pointgoal": dict(limit=15, res=1, subsample=1),
     "pointgoal, privileged": dict(limit=15, res=1, subsample=1, privileged=True),
@@ -426,7 +433,7 @@ class Launches(TorchDispatchMode):
         ("explorer, cameras", 9),
         ("deathmatch", 1),
         ("deathmatch, privileged", 1),
-        ("deathmatch, all rules", 1),
+        ("deathmatch, all rules", 4),  # three of them for search_reward
         ("pointgoal", 1),
         ("pong", 0),
     ],

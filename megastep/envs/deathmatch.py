@@ -16,6 +16,7 @@ from ..core import Core
 from ..dotdict import dotdict
 from ..scene import scenery
 from ..settings import MAX_ENVS, checked
+from .explorer import TEXELS_PER_POINT
 
 __all__ = ["Deathmatch"]
 
@@ -45,8 +46,9 @@ class Deathmatch:
     1 in all, ``damage`` is what a hit takes, ``spoils`` what it gives whoever scored it,
     ``recovery`` what a second without a wound gives back, ``drain`` what any second takes. A reward
     adds up ``hit_reward`` per hit, ``-wound_cost`` per wound, ``kill_reward`` per kill,
-    ``-death_cost`` at death, and ``aim_reward`` for another agent in the middle of the view, which
-    falls to 0 at its edge. ``res`` rays and ``subsample`` rays per pixel; ``fov`` degrees; ``fps``
+    ``-death_cost`` at death, ``aim_reward`` for another agent in the middle of the view, which falls
+    to 0 at its edge, and ``search_reward`` per 64 texels of the walls that the agent sees for the
+    first time in its episode, as Explorer pays. ``res`` rays and ``subsample`` rays per pixel; ``fov`` degrees; ``fps``
     steps per second; ``privileged``: worlds also tell a critic everyone's health and place.
     """
 
@@ -69,6 +71,7 @@ class Deathmatch:
         kill_reward: Price = 0.0,
         death_cost: Price = 0.0,
         aim_reward: Price = 0.0,
+        search_reward: Price = 0.0,
         res: Annotated[int, Field(ge=1, le=1024)] = 512,
         subsample: Annotated[int, Field(ge=1, le=32)] = 4,
         fov: Annotated[float, Field(gt=0, lt=180)] = 70.0,
@@ -107,7 +110,13 @@ class Deathmatch:
             death_cost=death_cost,
             aim_reward=aim_reward,
         )
-        engine.fit(n_envs, n_agents * (8 * pixels + 4 * told * privileged + 128), self.device)
+        words = -(-made.layouts.max_texels // 32) if search_reward else 0
+        each = 8 * pixels + 4 * told * privileged + 4 * words + 128
+        engine.fit(n_envs, n_agents * each, self.device)
+        self.search_reward, self.seen = search_reward, None
+        if search_reward:
+            on = dict(dtype=torch.int32, device=self.device)
+            self.seen = torch.zeros((n_envs, n_agents, words), **on)
         n_lanes, on = n_envs * n_agents, dict(device=self.device)
         self.health = torch.ones(n_lanes, **on)
         self.tally = torch.zeros((3, n_lanes), **on)
@@ -128,7 +137,7 @@ class Deathmatch:
     def _world(self):
         """Respawns who ended an episode, looks, and shoots."""
         self.spawner(self.ended)
-        view = self._view()
+        view = self._view(**self._search())
         shots = engine.shoot(
             self.core.scenery,
             self.core.agents,
@@ -140,9 +149,13 @@ class Deathmatch:
             told=self.privileged_space is not None,
             **self.rules,
         )
+        reward = shots.reward
+        if self.seen is not None:
+            found = view.newly_seen.flatten() * (self.search_reward / TEXELS_PER_POINT)
+            reward = reward + found.masked_fill_(shots.reset, 0.0)
         world = arrdict(
-            obs=arrdict(self._seen(view), health=shots.vitals),
-            reward=shots.reward,
+            obs=arrdict(self._shown(view), health=shots.vitals),
+            reward=reward,
             reset=shots.reset,
             terminal=shots.terminal,
             truncated=shots.truncated,
@@ -152,7 +165,14 @@ class Deathmatch:
             world["privileged"] = shots.told
         return world
 
-    def _view(self):
+    def _search(self):
+        """What counts the texels that are seen for the first time, if they are paid for."""
+        if self.seen is None:
+            return {}
+        starts = self.ended.view(self.n_envs, self.n_agents)
+        return dict(seen=self.seen, clear_mask=starts)
+
+    def _view(self, **search):
         return engine.observe(
             self.core.scenery,
             self.core.agents,
@@ -160,9 +180,10 @@ class Deathmatch:
             imu=True,
             centre_line=True,
             agent_ray=self.rules["aim_reward"] != 0,
+            **search,
         )
 
-    def _seen(self, view):
+    def _shown(self, view):
         """What of a view each lane is shown, (B, 1, ...)."""
         lanes = self.n_envs * self.n_agents
         return arrdict(
@@ -190,11 +211,11 @@ class Deathmatch:
         view, n_model = self._view(), len(self.core.scenery.model)
         line = view.centre_line[e]
         is_agent = (line >= 0) & (line < self.n_agents * n_model)
-        seen = self._seen(view)
+        shown = self._shown(view)
         return arrdict(
             core=self.core.state(e),
-            rgb=seen.rgb[lanes, 0],
-            d=seen.d[lanes, 0],
+            rgb=shown.rgb[lanes, 0],
+            d=shown.d[lanes, 0],
             health=self.health[lanes].clone(),
             kills=self.tally[0, lanes].clone(),
             age=self.ages[lanes].clone(),
