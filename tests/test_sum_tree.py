@@ -67,6 +67,12 @@ def test_a_priority_of_zero_is_never_drawn(where):
     assert set(drawn) == set(np.flatnonzero(~chosen))
 
 
+def test_what_is_drawn_at_the_very_edge_of_two_priorities(monkeypatch):
+    """Random numbers of exactly 0 lead to the sums themselves."""
+    monkeypatch.setattr(torch, "rand", lambda n, **how: torch.zeros(n, dtype=torch.float64))
+    assert filled(np.array([0.0, 1, 0, 2, 1])).sample(4).tolist() == [1, 3, 3, 4]
+
+
 def test_without_a_positive_priority_the_first_is_drawn_with_probability_zero():
     tree = SumTree(100)
     drawn = tree.sample(8)
