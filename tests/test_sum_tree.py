@@ -96,7 +96,7 @@ def test_sums_do_not_drift_however_often_priorities_change(n):
     """
     generator = torch.Generator().manual_seed(0)
     tree = SumTree(n)
-    for i in range(200):
+    for _ in range(200):
         index = torch.randint(n, (50,), generator=generator)
         tree.set(index, 10 ** (9 * torch.rand(50, generator=generator)))
     tree.set(torch.arange(n), torch.full((n,), 1e-3))
