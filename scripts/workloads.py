@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 from counters import counters
+from replays import replay
 from timing import TURNS, alone, laps, measurement, rate, timed
 from trainings import train, worlds
 
@@ -347,7 +348,7 @@ def twin_frame(c, e):
 BENCHMARKS = {
     benchmark.__name__: benchmark
     for benchmark in (
-        *(step, kernels, counters, observe, agents, deathmatch, memory),
+        *(step, kernels, counters, observe, agents, deathmatch, memory, replay),
         *(pong, compile, first, startup, cpu, train, worlds),
     )
 }

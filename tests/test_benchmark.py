@@ -12,6 +12,7 @@ import benchmark
 import benchmark_report
 import counters
 import pytest
+import replays
 import timing
 import torch
 import trainings
@@ -47,6 +48,8 @@ def tiny(monkeypatch):
         WARM_UP=2,
     ).items():
         monkeypatch.setattr(workloads, name, value)
+    for name, value in dict(N_LANES=8, ROLLOUTS=2, SAMPLED=4).items():
+        monkeypatch.setattr(replays, name, {"cuda": value, "cpu": value})
     monkeypatch.setattr(timing, "REPEATS", 3)
     monkeypatch.setattr(timing, "SECONDS", 1e-3)
 
@@ -141,7 +144,10 @@ def test_a_benchmark_is_a_generator_that_says_what_it_measures(name):
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 @pytest.mark.parametrize(
     ("name", "n"),
-    [("step", 3), ("kernels", 8), ("observe", 2), ("deathmatch", 2), ("memory", 1), ("pong", 2)],
+    [
+        *(("step", 3), ("kernels", 8), ("observe", 2), ("deathmatch", 2), ("memory", 1)),
+        *(("replay", 9), ("pong", 2)),
+    ],
 )
 def test_a_benchmark_leaves_a_line_of_json_per_measurement(name, n, device, tiny, tmp_path, capsys):
     path = tmp_path / "records.jsonl"
