@@ -11,6 +11,7 @@ fill 50 ms after warming up, timed by CUDA events on a GPU and by the clock on t
 
 import argparse
 import difflib
+import inspect
 import json
 import os
 import re
@@ -124,10 +125,13 @@ def main(argv=None):
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
     parser.add_argument(
-        "--seeds", nargs="+", type=int, default=SEEDS, metavar="SEED", help="of train"
+        "--seeds", nargs="+", type=int, default=SEEDS, metavar="SEED", help="of train and duels"
     )
     parser.add_argument(
         "--budgets", nargs="+", type=int, default=BUDGETS, metavar="SECONDS", help="of train"
+    )
+    parser.add_argument(
+        "--samples", type=int, metavar="N", help="that each run of duels and ablation learns from"
     )
     parser.add_argument("--commit", help="what is measured, where git cannot tell")
     parser.add_argument(
@@ -147,7 +151,9 @@ def run(options):
     device, measured = checked(options), options.commit or commit()
     print(benchmark_report.HEADER, flush=True)
     for name in options.benchmarks:
-        only = dict(seeds=options.seeds, budgets=options.budgets) if name == "train" else {}
+        taken = inspect.signature(BENCHMARKS[name]).parameters
+        given = dict(seeds=options.seeds, budgets=options.budgets, samples=options.samples)
+        only = {key: value for key, value in given.items() if key in taken and value is not None}
         for record in measure(name, device, measured, only):
             print(benchmark_report.row(record), flush=True)
             if options.json:

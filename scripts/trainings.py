@@ -1,6 +1,7 @@
 """What the benchmarks train: each is a generator of measurements, as those of ``workloads``."""
 
 import contextlib
+import csv
 import itertools
 import json
 import subprocess
@@ -25,6 +26,21 @@ PLACES = {"homes": "geometry=homes", "mazes": MAZES, "a box": "geometry=box"}
 AGENTS = {"Explorer": "env=explorer", "PointGoal": "experiment=pointgoal"}
 #: What learning curves are of.
 METRICS = {"Pong": "points_won", "Explorer": "coverage", "PointGoal": "spl"}
+DEATHMATCH = "experiment=deathmatch", "seconds=null", *NO_FINISH
+#: What is changed of the recipe of deathmatch.
+ABLATIONS = {
+    "the recipe": "",
+    "hits less wounds alone": "env.aim_reward=0 env.search_reward=0 env.wound_cost=1",
+    "aim not paid": "env.aim_reward=0",
+    "searching not paid": "env.search_reward=0",
+    "wounds as dear as hits": "env.wound_cost=1",
+    "self-play against now alone": "opponents.past=0 opponents.bot=0",
+    "past selves, no bot": "opponents.past=0.8 opponents.bot=0",
+    "a drain of 0.01 per second": "env.drain=0.01",
+    "fov 130": "env.fov=130",
+}
+N_SNAPSHOTS = 5  # of a run, that are rated
+N_DUELS = 1024  # of two policies; a quarter of it of each pair that is rated
 #: What is trained, how, and where it is evaluated then.
 RECIPES = {
     "Pong from features": ("experiment=pong", {"": ""}),
@@ -81,22 +97,34 @@ def learnt(what, reports):
 @contextlib.contextmanager
 def trained(device, *overrides):
     """A run folder, for as long as the context lasts."""
-    with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder) / "run"
-        command = [sys.executable, "train.py", *overrides, f"folder={run}", f"device={device}"]
-        subprocess.run(command, check=True, cwd=ROOT, stdout=sys.stderr)
+    with side_by_side(device, overrides) as (run,):
         yield run
 
 
-HOMES_N, MAZES_N = (
-    "geometry=homes geometry.n=2000",
-    "geometry=maze geometry.n=2000 geometry.braid=0.3",
-)
-PLACES = {
-    "homes": "geometry=homes",
-    "mazes": "geometry=maze geometry.braid=0.3",
-    "a box": "geometry=box",
-}
+@contextlib.contextmanager
+def side_by_side(device, *runs):
+    """The folders of runs that train at the same time, each of overrides, for as long as the
+    context lasts.
+    """
+    with tempfile.TemporaryDirectory() as parent:
+        folders = [Path(parent) / f"run{i}" for i in range(len(runs))]
+        commands = [
+            [sys.executable, "train.py", *overrides, f"folder={folder}", f"device={device}"]
+            for overrides, folder in zip(runs, folders)
+        ]
+        processes = [
+            subprocess.Popen(command, cwd=ROOT, stdout=sys.stderr, stderr=sys.stderr)
+            for command in commands
+        ]
+        try:
+            for process, command in zip(processes, commands):
+                if process.wait():
+                    raise subprocess.CalledProcessError(process.returncode, command)
+        finally:
+            for process in processes:
+                process.terminate()
+                process.wait()
+        yield folders
 
 
 def worlds(device):
@@ -111,7 +139,7 @@ def worlds(device):
             for place, given in places.items():
                 told = f"{what}, {seconds:.0f} s, {samples / 1e6:.0f} M samples"
                 told += f", in {place}" if place else ""
-                for row in evaluated(run, f"{given} device={device}".split()):
+                for row in evaluated(run, device, *given.split()):
                     values = {"return": dict(mean=row["return"], **row), **row["metrics"]}
                     for name, value in values.items():
                         yield dict(
@@ -124,12 +152,71 @@ def worlds(device):
                         )
 
 
-def evaluated(run, overrides):
+def duels(device, seeds=SEEDS, samples=600_000_000):
+    """The recipe of Deathmatch, seeds side by side on one device: the share of duels that each wins
+    on unseen homes, a draw being half, and ratings of its snapshots and the scripted bot.
+    """
+    runs = [
+        (*DEATHMATCH, f"samples={samples}", f"seed={seed}", f"snapshots={N_SNAPSHOTS}")
+        for seed in seeds
+    ]
+    with side_by_side(device, *runs) as folders:
+        for seed, run in zip(seeds, folders):
+            what = f"deathmatch, {samples / 1e6:.0f} M samples, seed {seed}"
+            yield learnt(what, curve(run, "accuracy"))
+            yield from won(what, run, device, "bot", "random")
+            rated = written_by_evaluate(
+                run, device, "ratings=true", "against=[bot]", f"lanes={N_DUELS // 4}"
+            )
+            rows = list(csv.DictReader(rated.read_text().splitlines()))
+            for row in rows:
+                rating, spread = float(row["rating"]), 2 * float(row["sigma"])
+                yield dict(
+                    what=f"{what}, rating of {row['player'].rpartition(':')[2]}",
+                    value=rating,
+                    unit="",
+                    lower=rating - spread,
+                    upper=rating + spread,
+                    n=int(row["duels"]),
+                )
+
+
+def ablation(device, samples=60_000_000):
+    """The recipe of Deathmatch with one thing changed, all side by side on one device, one seed:
+    the share of duels that each wins on unseen homes, a draw being half.
+    """
+    runs = [(*DEATHMATCH, f"samples={samples}", *given.split()) for given in ABLATIONS.values()]
+    with side_by_side(device, *runs) as folders:
+        for name, run in zip(ABLATIONS, folders):
+            what = f"deathmatch, {samples / 1e6:.0f} M samples, {name}"
+            yield from won(what, run, device, "bot", "random")
+
+
+def won(what, run, device, *opponents):
+    """Measurements of a run's duels against each."""
+    for row in evaluated(run, device, f"against=[{','.join(opponents)}]", f"lanes={N_DUELS}"):
+        told = f"{row['wins']} won, {row['draws']} drawn, {row['losses']} lost"
+        yield dict(
+            what=f"{what}: duels against {row['against'].rpartition(':')[2]} ({told})",
+            value=row["won"],
+            unit="",
+            lower=row["lower"],
+            upper=row["upper"],
+            n=row["homes"],
+        )
+
+
+def evaluated(run, device, *overrides):
     """The rows of the table that evaluate.py gives."""
+    return json.loads(written_by_evaluate(run, device, *overrides).read_text())["rows"]
+
+
+def written_by_evaluate(run, device, *overrides):
+    """The file that evaluate.py writes."""
     with ConfigLoader("evaluate", Evaluate) as loader:
-        settings = build(Evaluate, loader.tree([f"run={run}", *overrides]))
+        settings = build(Evaluate, loader.tree([f"run={run}", f"device={device}", *overrides]))
     with contextlib.redirect_stdout(sys.stderr):
-        return json.loads(evaluate.run(settings).read_text())["rows"]
+        return evaluate.run(settings)
 
 
 def curve(run, metric="return"):

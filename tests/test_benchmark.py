@@ -189,6 +189,23 @@ def test_worlds_are_trained_and_evaluated_where_they_say(monkeypatch):
     assert sum("random" in " ".join(w) for w in words) == 4
 
 
+@pytest.mark.slow
+def test_runs_of_deathmatch_are_trained_side_by_side_and_duel(monkeypatch):
+    small = "geometry=box", "env.n_envs=16", "report=1", "preset=cpu"
+    monkeypatch.setattr(trainings, "DEATHMATCH", (*trainings.DEATHMATCH, *small))
+    monkeypatch.setattr(trainings, "ABLATIONS", {"one": "", "other": "env.fov=130"})
+    monkeypatch.setattr(trainings, "N_SNAPSHOTS", 2)
+    monkeypatch.setattr(trainings, "N_DUELS", 16)
+    device = torch.device("cpu")
+    records = list(trainings.duels(device, seeds=(1, 2), samples=8192))
+    for seed in (1, 2):
+        own = [r for r in records if f"seed {seed}" in r["what"]]
+        words = " ".join(r["what"] for r in own)
+        assert len(own) == 6 and "against Bot (" in words and "rating of Bot" in words
+    changed = list(trainings.ablation(device, samples=2048))
+    assert len(changed) == 4 and all(0 <= r["value"] <= 1 for r in changed)
+
+
 def test_a_curve_joins_what_was_earned_to_when(tmp_path):
     (tmp_path / "metrics.jsonl").write_text(
         '{"samples": 10, "lr": 1}\n{"samples": 20, "episode/return": 3.5}\n'
