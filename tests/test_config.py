@@ -158,7 +158,7 @@ def test_a_recipe_differs_on_a_cpu_and_on_a_gpu():
     assert (cpu.agent.memory, cpu.learner.n_epochs) == ("none", 2)
     assert compose("experiment=pong", "preset=cpu", "seconds=7").seconds == 7
     cpu, gpu = (compose("experiment=deathmatch", f"preset={preset}") for preset in ("cpu", "gpu"))
-    assert (cpu.env.n_envs, gpu.env.n_envs) == (64, 4096)
+    assert (cpu.env.n_envs, gpu.env.n_envs) == (64, 8192)
     assert (cpu.samples, gpu.samples, cpu.seconds, gpu.seconds) == (600_000, None, None, 480)
 
 

@@ -46,10 +46,11 @@ class Deathmatch:
     1 in all, ``damage`` is what a hit takes, ``spoils`` what it gives whoever scored it,
     ``recovery`` what a second without a wound gives back, ``drain`` what any second takes. A reward
     adds up ``hit_reward`` per hit, ``-wound_cost`` per wound, ``kill_reward`` per kill,
-    ``-death_cost`` at death, ``aim_reward`` for another agent in the middle of the view, which falls
-    to 0 at its edge, and ``search_reward`` per 64 texels of the walls that the agent sees for the
-    first time in its episode, as Explorer pays. ``res`` rays and ``subsample`` rays per pixel; ``fov`` degrees; ``fps``
-    steps per second; ``privileged``: worlds also tell a critic everyone's health and place.
+    ``-death_cost`` at death, ``aim_reward`` for another agent in the middle of the view, which
+    falls to 0 at its edge, and ``search_reward`` per 64 texels of the walls that the agent sees for
+    the first time in its episode, as Explorer pays. ``res`` rays and ``subsample`` rays per pixel;
+    ``fov`` degrees; ``fps`` steps per second; ``privileged``: worlds also tell a critic everyone's
+    health and place.
     """
 
     @checked
