@@ -30,10 +30,10 @@ DEATHMATCH = "experiment=deathmatch", "seconds=null", *NO_FINISH
 #: What is changed of the recipe of deathmatch.
 ABLATIONS = {
     "the recipe": "",
-    "hits less wounds alone": "env.aim_reward=0 env.search_reward=0 env.wound_cost=1",
+    "hits less wounds alone": "env.aim_reward=0 env.search_reward=0",
     "aim not paid": "env.aim_reward=0",
     "searching not paid": "env.search_reward=0",
-    "wounds as dear as hits": "env.wound_cost=1",
+    "wounds half as dear": "env.wound_cost=0.5",
     "self-play against now alone": "opponents.past=0 opponents.bot=0",
     "past selves, no bot": "opponents.past=0.8 opponents.bot=0",
     "a drain of 0.01 per second": "env.drain=0.01",
