@@ -16,10 +16,11 @@ learners           which of the environment's lanes these B are, a bool for each
 numbers()          all that may stop being finite, by name: what the learner's `check` looked over
 
 `collect.rollout` is the one returned last, before the first call an empty one. A replay memory
-belongs to the learner, which fills it in `update`, or to its collector; one that acts ahead on a
-stream of its own returns an earlier rollout. An environment with opponents in it has `learners`:
-only those lanes need to be acted in and stored. Neither call synchronises host and device. A
-constructor that takes `graph` is told to capture its update.
+belongs to the learner, which fills it in `update`, or to its collector. One that acts ahead on a
+stream of its own returns an earlier rollout, and has a method `wait()`, called before anybody else
+uses the environment, which waits until nobody acts there. An environment with opponents in it has
+`learners`: only those lanes need to be acted in and stored. Neither call synchronises host and
+device. A constructor that takes `graph` is told to capture its update.
 
 What ours are made of serves others, too: `rollout.make_rollout` and `rollout.Collector`,
 `rollout.bytes_per_step`, `gradient_steps.GradientSteps`, `captured.CapturedUpdate`, `masked`.
@@ -45,6 +46,15 @@ ATTRIBUTES = {
     "state_dict": "a method that returns all that changes beside the policy's weights",
     "load_state_dict": "a method that goes on from there",
 }
+
+
+def check_minibatches(n_minibatches: int, n_lanes: int) -> None:
+    """ValueError unless so many lanes can be cut into so many minibatches."""
+    if n_lanes < n_minibatches:
+        raise ValueError(
+            f"{n_lanes} lanes cannot be cut into {n_minibatches} minibatches of whole lanes; use "
+            "fewer minibatches or more lanes"
+        )
 
 
 class LearnerError(AssertionError):

@@ -28,3 +28,11 @@ def explained_variance(
     return 1 - masked_mean(error.square(), valid) / masked_mean(spread.square(), valid).clamp(
         min=1e-8
     )
+
+
+def effective_share(weights: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """The effective sample size of weights >= 0 (Kish 1965), as a share of the number of the valid:
+    1 if all weigh the same, 1/n if one of n weighs alone; 0 where nothing is valid.
+    """
+    mean, square = masked_mean(weights, valid), masked_mean(weights.square(), valid)
+    return mean.square() / square.clamp(min=torch.finfo(square.dtype).tiny)

@@ -13,7 +13,7 @@ from pydantic import Field
 from agents import returns
 from agents.captured import CapturedUpdate
 from agents.gradient_steps import GradientSteps
-from agents.learner import Coefficient, Fraction, Positive
+from agents.learner import Coefficient, Fraction, Positive, check_minibatches
 from agents.masked import explained_variance, masked_mean, normalised
 from agents.random_stream import RandomStream
 from agents.rollout import Collector, Rollout, bytes_per_step, make_rollout, without_last
@@ -97,11 +97,7 @@ class PPO:
         among them `loss/skipped_steps`, how many gradients were not finite and so were not
         followed. ValueError if its lanes cannot be cut into minibatches.
         """
-        if rollout.n_lanes < self.n_minibatches:
-            raise ValueError(
-                f"{rollout.n_lanes} lanes cannot be cut into {self.n_minibatches} minibatches of "
-                f"whole lanes; use fewer minibatches or more lanes"
-            )
+        check_minibatches(self.n_minibatches, rollout.n_lanes)
         return {f"loss/{key}": value for key, value in self.captured(rollout).items()}
 
     def _update(self, rollout):

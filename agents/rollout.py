@@ -103,6 +103,16 @@ class Rollout:
         """(T, B) bool: whether row t's action was ignored because an episode started instead."""
         return self.starts[1:]
 
+    def copy_(self, other: "Rollout") -> None:
+        """Takes over all that another one of the same kind holds."""
+        for own, its in zip(self._tensors(), other._tensors(), strict=True):
+            own.copy_(its)
+
+    def _tensors(self):
+        parts = [getattr(self, name) for name in (*_SEQUENCES, "privileged", "values")]
+        kept = {str(i): part for i, part in enumerate(parts) if part is not None}
+        return leaves({**kept, "metrics": self.metrics, "state": self.state})
+
     def own(self, world: arrdict) -> arrdict:
         """Of an environment's world, the lanes that are stored."""
         return world if self.stored is None else _rows(world, self.stored)
@@ -282,16 +292,18 @@ def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> ar
 
 
 class Collector:
-    """Fills a rollout, again and again, from an environment, which it resets once. Each call
-    returns the rollout.
+    """Fills a rollout, again and again, from an environment, which it resets once, unless it is
+    given the `actor_state` to go on from. Each call returns the rollout.
 
     The first time is eager, so that libraries set themselves up; from the second time on a GPU
     replays a CUDA graph, `graph`.
     """
 
-    def __init__(self, env: Any, policy: Any, rollout: Rollout):
+    def __init__(self, env: Any, policy: Any, rollout: Rollout, actor_state: arrdict | None = None):
         self.rollout = rollout
-        self.parts = env, policy, rollout, initial_actor_state(env, policy, rollout)
+        if actor_state is None:
+            actor_state = initial_actor_state(env, policy, rollout)
+        self.parts = env, policy, rollout, actor_state
         self.on_gpu = torch.device(env.device).type == "cuda"
         self.n_collected = 0
         self.graph = None

@@ -100,7 +100,15 @@ class Trainer:
             with contextlib.suppress(Exception):  # the first error is the one to tell
                 self.save()
             raise
+        finally:
+            with contextlib.suppress(Exception):  # so it is here
+                self.wait()
         self.save()
+
+    def wait(self) -> None:
+        """Waits until nothing acts in the environment, where the learner's collector acts ahead."""
+        if hasattr(self.collect, "wait"):
+            self.collect.wait()
 
     def update(self) -> dict[str, torch.Tensor]:
         """Learns from the rollout and counts it. Returns the learner's metrics."""
@@ -132,6 +140,7 @@ class Trainer:
         """Writes the metrics since the last report. Synchronises; raises what the environment
         flagged since then, if it has `check()`.
         """
+        self.wait()
         if hasattr(self.env, "check"):
             self.env.check()
         values = torch.stack(list(losses.values())).tolist()

@@ -125,6 +125,12 @@ class Train:
         parts, n_envs = getattr(self.learner, "n_minibatches", 1), self.env.n_envs
         if parts > n_envs:
             yield "learner.n_minibatches", f"{parts} is more than env.n_envs, {n_envs}"
+        if getattr(self.learner, "lag", 0) and (self.opponents.past or self.opponents.bot):
+            yield (
+                "learner.lag",
+                "opponents change as the learner learns, so nobody can act ahead of it: give "
+                "learner.lag=0 or no opponents",
+            )
         over = self.learner.anneal
         if over in ("samples", "seconds") and getattr(self, over) is None:
             yield "learner.anneal", f"is {over}: lr falls over {over}, which are not given"

@@ -1,0 +1,205 @@
+"""V-trace actor-critic (IMPALA, Espeholt et al. 2018) for recurrent policies: learns from actions
+that another policy took, one of some updates ago.
+
+Axes: T time, B lanes, M lanes of a minibatch. A minibatch is whole sequences of some lanes. Every
+mean is over valid steps: those that the environment took, of lanes that learn. An update never
+synchronises.
+"""
+
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+
+from agents import returns
+from agents.ahead import AheadCollector
+from agents.captured import CapturedUpdate
+from agents.gradient_steps import GradientSteps
+from agents.learner import Coefficient, Fraction, Positive, check_minibatches
+from agents.masked import effective_share, explained_variance, masked_mean, normalised
+from agents.random_stream import RandomStream
+from agents.rollout import Collector, Rollout, bytes_per_step, make_rollout, without_last
+from megastep.settings import MAX_ENVS, checked
+
+# ratios beyond e^20 count as that in metrics: their squares have to be numbers
+_MAX_LOG_RATIO = 20.0
+
+
+class VTrace:
+    """Improves a policy, in place, from rollouts that it, or itself some updates ago, collected.
+
+    Each minibatch is valued anew: the policy as it is now tells values and how likely each action
+    is, and V-trace weighs what followed by the ratios, cut off at `rho_clip`.
+
+    n_steps           of a rollout
+    lr                Adam's step size; `set_lr` changes it
+    gamma, lambda_    discount per step, and the decay of the traces
+    rho_clip          what the ratio of an action counts at most: at 1, good actions that are
+                      likelier now teach as if they were as likely as then
+    c_clip            what a ratio counts at most in the trace, which carries what is learnt back
+    entropy_coef      what a nat of entropy is worth, in standard deviations of advantage
+    value_coef        weight of the value's squared error, the value measured in its own scale
+    auxiliary_coef    weight of the policy's `prediction_error`, where its critic is asymmetric
+    max_grad_norm     longer gradients are shortened to this
+    n_epochs, n_minibatches  passes over a rollout, and the parts each is cut into by lanes
+    lag               how many updates old the weights are that act: on a GPU with 1 or 2 a stream
+                      of its own acts while the learner works (`agents.ahead`)
+    graph             on a GPU, captures the update as a CUDA graph; always with one and the same
+                      rollout then
+
+    A rollout with a number that is not finite, or beyond `finite.LIMIT`, changes nothing: no
+    weight, no statistic. `check` tells which it was, and how many updates were skipped in a row.
+    """
+
+    @checked
+    def __init__(
+        self,
+        policy: Any,
+        *,
+        n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
+        lr: Positive = 3e-4,
+        gamma: Fraction = 0.99,
+        lambda_: Fraction = 0.95,
+        rho_clip: Positive = 1.0,
+        c_clip: Positive = 1.0,
+        entropy_coef: Coefficient = 0.01,
+        value_coef: Coefficient = 0.5,
+        auxiliary_coef: Coefficient = 0.5,
+        max_grad_norm: Positive = 0.5,
+        n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
+        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 4,
+        lag: Annotated[int, Field(ge=0, le=2)] = 0,
+        graph: bool = False,
+        seed: int = 1,
+    ):
+        if policy.critic is None:
+            raise ValueError("V-trace needs a policy with a critic")
+        self.policy, self.device, self.n_steps, self.lag = policy, policy.device, n_steps, lag
+        self.traces = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
+        self.entropy_coef, self.value_coef = entropy_coef, value_coef
+        self.auxiliary_coef = auxiliary_coef
+        self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
+        self.lr = lr
+        self.steps = GradientSteps(policy.parameters(), lr, max_grad_norm, self.device)
+        self.check, self.optimizer = self.steps.check, self.steps.optimizer
+        self.random = RandomStream(seed)
+        self.captured = CapturedUpdate(self._update, self.device, graph, (self.random,))
+
+    def set_lr(self, lr: float) -> None:
+        """Changes Adam's step size, also for a captured update."""
+        self.steps.set_lr(lr)
+
+    def collector(self, env: Any) -> Collector | AheadCollector:
+        """What acts in `env`, and the memory of `n_steps` steps of its lanes. ValueError if it
+        shall act ahead where others are `opponents.Opponents`.
+        """
+        rollout = make_rollout(env, self.policy, self.n_steps, values=False)
+        if self.lag:
+            return AheadCollector(env, self.policy, rollout, self.lag)
+        return Collector(env, self.policy, rollout)
+
+    def bytes_per_env(self, env: Any) -> float:
+        """About how many bytes the rollouts and a minibatch take per environment."""
+        # a rollout for each update of lag; a minibatch's share of one, and of some 24 activations
+        # of 4 bytes per unit
+        parts = self.n_minibatches
+        each = bytes_per_step(env, self.policy) * (1 + self.lag + 1 / parts)
+        each += 96 / parts * self.policy.width
+        return env.n_agents * (self.n_steps + 1) * each
+
+    def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        """Learns from a rollout. Returns means over its minibatches as tensors () on the device,
+        among them `loss/skipped_steps`, how many gradients were not finite and so were not
+        followed. ValueError if its lanes cannot be cut into minibatches.
+        """
+        check_minibatches(self.n_minibatches, rollout.n_lanes)
+        return {f"loss/{key}": value for key, value in self.captured(rollout).items()}
+
+    def _update(self, rollout):
+        is_fine = self.steps.begin(rollout.numbers())
+        valued = []
+        for _ in range(self.n_epochs):
+            order = torch.rand(
+                rollout.n_lanes, generator=self.random.on(self.device), device=self.device
+            ).argsort()
+            for rows in order.tensor_split(self.n_minibatches):
+                loss, metrics, estimates = self._losses(rollout.sequences(rows))
+                self.steps.take(loss, metrics, estimates.valid.any())
+                valued.append(estimates)
+        # Only now: a rollout is learnt from as it was seen. One row of observations is enough, B
+        # lanes again with every rollout.
+        targets, valid = (torch.cat([e[key] for e in valued], 1) for key in ("targets", "valid"))
+        self.policy.critic.output.update_stats(targets, valid & is_fine)
+        last = rollout.world(-1)
+        self.policy.update_stats(last.obs, last.get("privileged"), is_fine & rollout.learns[-1])
+        return self.steps.end()
+
+    def _losses(self, batch):
+        """The loss of a minibatch, what there is to say about it, each a tensor (), and what
+        V-trace made of it.
+        """
+        output, privileged = self.policy.output, batch.get("privileged")
+        now = self.policy.unroll(batch.obs, batch.starts, batch.state)
+        value = self.policy.value(now.features, privileged)
+        features, logits = without_last(now.features), without_last(now.logits)
+        logprobs = output.logprob(logits, batch.actions)
+        reset = batch.starts[1:]
+        valid = ~reset & batch.learns[:-1]
+        # a trace passes through what does not count as if the policy had acted there
+        log_ratio = (logprobs.detach() - batch.logprobs).masked_fill(~valid, 0.0)
+        estimates = returns.vtrace(
+            log_ratio,
+            batch.reward,
+            *(value[:-1].detach(), value[-1].detach()),
+            *(reset, batch.terminal, batch.truncated),
+            **self.traces,
+        )
+        estimates["valid"] = valid
+        advantages = normalised(estimates.advantages, valid)
+        error = (value[:-1] - estimates.targets) / self.policy.critic.output.scale
+        metrics = dict(
+            policy=-masked_mean(logprobs * advantages, valid),
+            value=masked_mean(error.square(), valid),
+            entropy=masked_mean(output.entropy(logits), valid),
+            **self._of_ratios(log_ratio, valid),
+            explained_variance=explained_variance(value[:-1].detach(), estimates.targets, valid),
+        )
+        loss = (
+            metrics["policy"]
+            + self.value_coef * metrics["value"]
+            - self.entropy_coef * metrics["entropy"]
+        )
+        if self.policy.privileged_space:
+            error = self.policy.prediction_error(features, without_last(privileged))
+            metrics["auxiliary"] = masked_mean(error, valid)
+            loss = loss + self.auxiliary_coef * metrics["auxiliary"]
+        return loss, metrics, estimates
+
+    def _of_ratios(self, log_ratio, valid):
+        """How far the policy is from the one that acted."""
+        log_ratio = log_ratio.clamp(max=_MAX_LOG_RATIO)
+        ratio, rho_clip = log_ratio.exp(), self.traces["rho_clip"]
+        return dict(
+            kl=masked_mean(ratio - 1 - log_ratio, valid),
+            rho=masked_mean(ratio.clamp(max=rho_clip), valid),
+            clip_fraction=masked_mean((ratio > rho_clip).float(), valid),
+            effective_share=effective_share(ratio, valid),
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that an update changes beside the policy's weights, and where the policy's random
+        stream is: dicts of plain tensors and numbers. Rollouts that were collected ahead are not in
+        it: who goes on from it acts anew, on the weights of then.
+        """
+        return dict(
+            **self.steps.state_dict(),
+            random=self.random.state_dict(),
+            policy_random=self.policy.random.state_dict(),
+        )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from a `state_dict`, taken on this device or another."""
+        self.steps.load_state_dict(state)
+        self.random.load_state_dict(state["random"], self.device)
+        self.policy.random.load_state_dict(state["policy_random"], self.device)
+        self.captured.restart()
