@@ -20,7 +20,9 @@ belongs to the learner, which fills it in `update`, or to its collector. One tha
 stream of its own returns an earlier rollout, and has a method `wait()`, called before anybody else
 uses the environment, which waits until nobody acts there. An environment with opponents in it has
 `learners`: only those lanes need to be acted in and stored. Neither call synchronises host and
-device. A constructor that takes `graph` is told to capture its update.
+device. A constructor that takes `graph` is told to capture its update. A learner with a replay
+memory tells its size before there is one, by a method `replay_size(env)`: how many observations it
+holds, and bytes for each, of an environment like this one.
 
 What ours are made of serves others, too: `rollout.make_rollout` and `rollout.Collector`,
 `rollout.bytes_per_step`, `gradient_steps.GradientSteps`, `captured.CapturedUpdate`, `masked`.

@@ -6,9 +6,9 @@ Axes: any, the same for numbers and for `valid`, which is bool.
 import torch
 
 
-def masked_mean(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """The mean of x where valid; 0 where nothing is."""
-    return x.masked_fill(~valid, 0.0).sum() / valid.sum().clamp(min=1)
+def masked_mean(x: torch.Tensor, valid: torch.Tensor, axis: int | None = None) -> torch.Tensor:
+    """The mean of x where valid, of all or along an axis; 0 where nothing is."""
+    return x.masked_fill(~valid, 0.0).sum(axis) / valid.sum(axis).clamp(min=1)
 
 
 def normalised(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
@@ -30,7 +30,7 @@ def explained_variance(
     )
 
 
-def effective_share(weights: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+def effective_sample_size(weights: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """The effective sample size of weights >= 0 (Kish 1965), as a share of the number of the valid:
     1 if all weigh the same, 1/n if one of n weighs alone; 0 where nothing is valid.
     """

@@ -242,6 +242,20 @@ class Replay:
         self.tree.set(index, torch.where((old > 0) & new.isfinite(), new, old))
 
 
+def bytes_per_observation(
+    env: Any, policy: Any, n_steps: int, settings: ReplaySettings, logprobs: bool = True
+) -> float:
+    """What a replay memory of rollouts of T steps takes for each observation, of an environment
+    like this one.
+    """
+    meta = torch.device("meta")
+    spaces_of = env.obs_space, env.action_space
+    state = policy.initial(1, meta)
+    rollout = Rollout(n_steps, 1, *spaces_of, state, meta, policy.privileged_space, values=False)
+    replay = Replay(rollout, *spaces_of, settings, logprobs)
+    return replay.bytes / replay.capacity
+
+
 class _Column:
     """Rows (R, ...) of one part of what is stored, in a dtype of their own."""
 

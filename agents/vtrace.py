@@ -1,28 +1,30 @@
 """V-trace actor-critic (IMPALA, Espeholt et al. 2018) for recurrent policies: learns from actions
-that another policy took, one of some updates ago.
+that another policy took, one of some updates ago or, with a replay memory, of many.
 
-Axes: T time, B lanes, M lanes of a minibatch. A minibatch is whole sequences of some lanes. Every
-mean is over valid steps: those that the environment took, of lanes that learn. An update never
-synchronises.
+Axes: T time, B lanes, M lanes of a minibatch. A minibatch is whole sequences of some lanes, and as
+many more that are replayed as are asked for. Every mean is over valid steps: those that the
+environment took, of lanes that learn. An update never synchronises.
 """
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
 
-from agents import returns
+from agents import joined, returns
 from agents.ahead import AheadCollector
 from agents.captured import CapturedUpdate
 from agents.gradient_steps import GradientSteps
 from agents.learner import Coefficient, Fraction, Positive, check_minibatches
-from agents.masked import effective_share, explained_variance, masked_mean, normalised
+from agents.masked import effective_sample_size, explained_variance, masked_mean, normalised
 from agents.random_stream import RandomStream
+from agents.replay import Replay, ReplaySettings, bytes_per_observation
 from agents.rollout import Collector, Rollout, bytes_per_step, make_rollout, without_last
 from megastep.settings import MAX_ENVS, checked
 
 # ratios beyond e^20 count as that in metrics: their squares have to be numbers
 _MAX_LOG_RATIO = 20.0
+_REPLAY = ReplaySettings()
 
 
 class VTrace:
@@ -44,6 +46,9 @@ class VTrace:
     n_epochs, n_minibatches  passes over a rollout, and the parts each is cut into by lanes
     lag               how many updates old the weights are that act: on a GPU with 1 or 2 a stream
                       of its own acts while the learner works (`agents.ahead`)
+    buffer            "rollout": learns from each rollout once; "replay": also from what was
+                      collected before
+    replay            of the replay memory: `replay.ReplaySettings`
     graph             on a GPU, captures the update as a CUDA graph; always with one and the same
                       rollout then
 
@@ -69,16 +74,28 @@ class VTrace:
         n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
         n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 4,
         lag: Annotated[int, Field(ge=0, le=2)] = 0,
+        buffer: Literal["rollout", "replay"] = "rollout",
+        replay: ReplaySettings = _REPLAY,
         graph: bool = False,
         seed: int = 1,
     ):
         if policy.critic is None:
             raise ValueError("V-trace needs a policy with a critic")
+        if buffer == "rollout" and replay != _REPLAY:
+            raise ValueError("replay's settings are those of buffer=replay: give that, too")
+        if replay.sequence_steps(n_steps) != n_steps + replay.burn_in:
+            raise ValueError(
+                f"replay.length={replay.length} does not fit: V-trace joins what is replayed with "
+                f"rollouts, so behind its burn-in a sequence is as long as one, n_steps={n_steps}; "
+                "leave replay.length out"
+            )
         self.policy, self.device, self.n_steps, self.lag = policy, policy.device, n_steps, lag
         self.traces = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
         self.entropy_coef, self.value_coef = entropy_coef, value_coef
         self.auxiliary_coef = auxiliary_coef
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
+        self.replay_settings = replay if buffer == "replay" else None
+        self.replay = None  # made for an environment's lanes
         self.lr = lr
         self.steps = GradientSteps(policy.parameters(), lr, max_grad_norm, self.device)
         self.check, self.optimizer = self.steps.check, self.steps.optimizer
@@ -90,22 +107,35 @@ class VTrace:
         self.steps.set_lr(lr)
 
     def collector(self, env: Any) -> Collector | AheadCollector:
-        """What acts in `env`, and the memory of `n_steps` steps of its lanes. ValueError if it
-        shall act ahead where others are `opponents.Opponents`.
+        """What acts in `env`, and the memory of `n_steps` steps of its lanes; makes the replay
+        memory, too. ValueError if that holds no sequence of each lane, or if it shall act ahead
+        where others are `opponents.Opponents`.
         """
         rollout = make_rollout(env, self.policy, self.n_steps, values=False)
+        if self.replay_settings:
+            self.replay = Replay(rollout, env.obs_space, env.action_space, self.replay_settings)
         if self.lag:
             return AheadCollector(env, self.policy, rollout, self.lag)
         return Collector(env, self.policy, rollout)
 
     def bytes_per_env(self, env: Any) -> float:
         """About how many bytes the rollouts and a minibatch take per environment."""
-        # a rollout for each update of lag; a minibatch's share of one, and of some 24 activations
-        # of 4 bytes per unit
-        parts = self.n_minibatches
-        each = bytes_per_step(env, self.policy) * (1 + self.lag + 1 / parts)
-        each += 96 / parts * self.policy.width
+        # a rollout for each update of lag; a minibatch's share of one and of what is replayed, and
+        # of some 24 activations of 4 bytes per unit
+        part = 1 / self.n_minibatches
+        if self.replay_settings:
+            part *= 1 + self.replay_settings.ratio
+        each = bytes_per_step(env, self.policy) * (1 + self.lag + part)
+        each += 96 * part * self.policy.width
         return env.n_agents * (self.n_steps + 1) * each
+
+    def replay_size(self, env: Any) -> tuple[int, float]:
+        """How many observations are replayed, and bytes for each."""
+        settings = self.replay_settings
+        if settings is None:
+            return 0, 0.0
+        each = bytes_per_observation(env, self.policy, self.n_steps, settings)
+        return settings.capacity, each
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Learns from a rollout. Returns means over its minibatches as tensors () on the device,
@@ -117,13 +147,15 @@ class VTrace:
 
     def _update(self, rollout):
         is_fine = self.steps.begin(rollout.numbers())
+        if self.replay is not None:
+            self.replay.add(rollout, is_fine)
         valued = []
         for _ in range(self.n_epochs):
             order = torch.rand(
                 rollout.n_lanes, generator=self.random.on(self.device), device=self.device
             ).argsort()
             for rows in order.tensor_split(self.n_minibatches):
-                loss, metrics, estimates = self._losses(rollout.sequences(rows))
+                loss, metrics, estimates = self._losses(self._batch(rollout, rows), len(rows))
                 self.steps.take(loss, metrics, estimates.valid.any())
                 valued.append(estimates)
         # Only now: a rollout is learnt from as it was seen. One row of observations is enough, B
@@ -134,7 +166,15 @@ class VTrace:
         self.policy.update_stats(last.obs, last.get("privileged"), is_fine & rollout.learns[-1])
         return self.steps.end()
 
-    def _losses(self, batch):
+    def _batch(self, rollout, rows):
+        batch = joined.fresh(rollout, rows)
+        if self.replay is None:
+            return batch
+        n = max(1, round(self.replay_settings.ratio * len(rows)))
+        generator = self.random.on(self.device)
+        return joined.with_replayed(batch, self.replay, self.policy, n, generator)
+
+    def _losses(self, batch, n_fresh):
         """The loss of a minibatch, what there is to say about it, each a tensor (), and what
         V-trace made of it.
         """
@@ -143,7 +183,7 @@ class VTrace:
         value = self.policy.value(now.features, privileged)
         features, logits = without_last(now.features), without_last(now.logits)
         logprobs = output.logprob(logits, batch.actions)
-        reset = batch.starts[1:]
+        reset, weight = batch.starts[1:], batch.weight
         valid = ~reset & batch.learns[:-1]
         # a trace passes through what does not count as if the policy had acted there
         log_ratio = (logprobs.detach() - batch.logprobs).masked_fill(~valid, 0.0)
@@ -158,10 +198,10 @@ class VTrace:
         advantages = normalised(estimates.advantages, valid)
         error = (value[:-1] - estimates.targets) / self.policy.critic.output.scale
         metrics = dict(
-            policy=-masked_mean(logprobs * advantages, valid),
-            value=masked_mean(error.square(), valid),
+            policy=-masked_mean(weight * logprobs * advantages, valid),
+            value=masked_mean(weight * error.square(), valid),
             entropy=masked_mean(output.entropy(logits), valid),
-            **self._of_ratios(log_ratio, valid),
+            **self._of_ratios(log_ratio[:, :n_fresh], valid[:, :n_fresh]),
             explained_variance=explained_variance(value[:-1].detach(), estimates.targets, valid),
         )
         loss = (
@@ -170,9 +210,16 @@ class VTrace:
             - self.entropy_coef * metrics["entropy"]
         )
         if self.policy.privileged_space:
-            error = self.policy.prediction_error(features, without_last(privileged))
-            metrics["auxiliary"] = masked_mean(error, valid)
+            wrong = self.policy.prediction_error(features, without_last(privileged))
+            metrics["auxiliary"] = masked_mean(wrong, valid)
             loss = loss + self.auxiliary_coef * metrics["auxiliary"]
+        if self.replay is not None:
+            old = self._of_ratios(log_ratio[:, n_fresh:], valid[:, n_fresh:])
+            metrics |= {f"replayed_{key}": value for key, value in old.items()}
+            age = batch.age[n_fresh:].float().mean() + self.lag
+            metrics["staleness"] = age * self.replay.is_ready
+            size = masked_mean(error.detach().abs(), valid, 0)[n_fresh:]
+            self.replay.set_priorities(batch.index, size)
         return loss, metrics, estimates
 
     def _of_ratios(self, log_ratio, valid):
@@ -183,7 +230,7 @@ class VTrace:
             kl=masked_mean(ratio - 1 - log_ratio, valid),
             rho=masked_mean(ratio.clamp(max=rho_clip), valid),
             clip_fraction=masked_mean((ratio > rho_clip).float(), valid),
-            effective_share=effective_share(ratio, valid),
+            effective_samples=effective_sample_size(ratio, valid),
         )
 
     def state_dict(self) -> dict[str, Any]:

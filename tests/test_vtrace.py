@@ -17,12 +17,12 @@ def test_the_first_pass_finds_the_policy_where_it_was():
     metrics = VTrace(policy, n_minibatches=1).update(rollout)
     assert metrics["loss/kl"].item() == pytest.approx(0, abs=1e-6)
     assert metrics["loss/rho"].item() == pytest.approx(1, abs=1e-5)
-    assert metrics["loss/effective_share"].item() == pytest.approx(1, abs=1e-5)
+    assert metrics["loss/effective_samples"].item() == pytest.approx(1, abs=1e-5)
     assert 0 < metrics["loss/entropy"].item() < math.log(3)
     assert set(metrics) == {
         f"loss/{key}"
         for key in (
-            *("policy", "value", "entropy", "kl", "rho", "clip_fraction", "effective_share"),
+            *("policy", "value", "entropy", "kl", "rho", "clip_fraction", "effective_samples"),
             *("grad_norm", "explained_variance", "skipped_steps"),
         )
     }
@@ -44,13 +44,13 @@ def test_ratios_by_hand(ratio, rho, clip_fraction):
     assert metrics["loss/skipped_steps"].item() == 0
 
 
-def test_the_effective_share_falls_as_ratios_differ():
+def test_the_effective_samples_falls_as_ratios_differ():
     policy, rollout = made_up(values=False)
     rollout.logprobs[:, ::2] += math.log(3)  # half of the lanes weigh a third
     metrics = VTrace(policy, n_minibatches=1).update(rollout)
     # 24 - 0 and 24 - 2 rows are valid, as lanes 1 and 4 have one reset each: 23 weigh 1/3, 23 1
     share = (1 / 3 + 1) ** 2 / (2 * (1 / 9 + 1))
-    assert metrics["loss/effective_share"].item() == pytest.approx(share, abs=1e-4)
+    assert metrics["loss/effective_samples"].item() == pytest.approx(share, abs=1e-4)
 
 
 def test_good_actions_become_likelier_and_bad_ones_rarer():

@@ -213,6 +213,20 @@ def make_learner(learner: settings.Learner, policy: Policy, seed: int = 1) -> An
     return made
 
 
+def replay_bytes(learner: Any, env: Any) -> float:
+    """What a learner's replay memory takes, 0 if it has none. UserError that says how many
+    observations fit, if they are too many for the memory; `env` is a small environment.
+    """
+    from megastep import engine
+
+    if not hasattr(learner, "replay_size"):
+        return 0.0
+    with errors():
+        n, each = learner.replay_size(env)
+        engine.fit(n, each, env.device, "observations of learner.replay.capacity")
+    return n * each
+
+
 def make_opponents(cfg: settings.Train, env: Any, sample: Any, policy: Policy) -> Opponents | None:
     """The environment with opponents in it, or None where there shall be none. UserError that says
     how many snapshots fit, if they are too many for the memory; `sample` is a small environment, in

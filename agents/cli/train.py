@@ -73,7 +73,9 @@ def make_trainer(
     sample = components.make_sample(*wanted)
     policy = components.make_policy(cfg.agent, sample, cfg.seed)
     learner = components.make_learner(cfg.learner, policy, cfg.seed)
-    env = components.make_env(*wanted, sample, bytes_beside=learner.bytes_per_env(sample))
+    replayed = components.replay_bytes(learner, sample) / cfg.env.n_envs
+    beside = learner.bytes_per_env(sample) + replayed
+    env = components.make_env(*wanted, sample, bytes_beside=beside)
     loaded = None
     if cfg.resume or cfg.init:
         loaded = components.load(run_folders.find(cfg.resume or cfg.init), device)
@@ -91,19 +93,20 @@ def make_trainer(
     config = {"train": as_tree(cfg), "spaces": components.spaces_of(env)}
     saver = Saver(folder / "checkpoints", config, cfg.keep)
     snapshots = Saver(folder / "snapshots", config, keep=10**9)
-    trainer = Trainer(
-        opponents or env,
-        policy,
-        learner,
-        sinks,
-        saver,
-        Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
-        report_every=cfg.report,
-        save_every=cfg.checkpoint,
-        on_report=on_report,
-        opponents=opponents,
-        snapshots=Snapshots(snapshots, cfg.snapshots),
-    )
+    with components.errors():
+        trainer = Trainer(
+            opponents or env,
+            policy,
+            learner,
+            sinks,
+            saver,
+            Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
+            report_every=cfg.report,
+            save_every=cfg.checkpoint,
+            on_report=on_report,
+            opponents=opponents,
+            snapshots=Snapshots(snapshots, cfg.snapshots),
+        )
     if cfg.resume:
         trainer.load_state_dict(loaded.state)
     return trainer, saver
