@@ -59,6 +59,18 @@ def check_minibatches(n_minibatches: int, n_lanes: int) -> None:
         )
 
 
+def check_state(learner: Any, state: dict[str, Any]) -> None:
+    """ValueError unless a `state_dict` is of this kind of learner, as far as it says: `learner` in
+    it is the name of the class.
+    """
+    own = type(learner).__name__
+    if state.get("learner", own) != own:
+        raise ValueError(
+            f"the state of a {state['learner']} learner cannot be that of {own}: go on with the "
+            "learner that it is from, or start from the policy's weights alone (init=RUN)"
+        )
+
+
 class LearnerError(AssertionError):
     """A class is no learner. The message names what it lacks."""
 

@@ -15,8 +15,8 @@ from agents import joined, returns
 from agents.ahead import AheadCollector
 from agents.captured import CapturedUpdate
 from agents.gradient_steps import GradientSteps
-from agents.learner import Coefficient, Fraction, Positive, check_minibatches
-from agents.masked import effective_sample_size, explained_variance, masked_mean, normalised
+from agents.learner import Coefficient, Fraction, Positive, check_minibatches, check_state
+from agents.masked import effective_sample_size, explained_variance, masked_mean
 from agents.random_stream import RandomStream
 from agents.replay import Replay, ReplaySettings, bytes_per_observation
 from agents.rollout import Collector, Rollout, bytes_per_step, make_rollout, without_last
@@ -31,7 +31,9 @@ class VTrace:
     """Improves a policy, in place, from rollouts that it, or itself some updates ago, collected.
 
     Each minibatch is valued anew: the policy as it is now tells values and how likely each action
-    is, and V-trace weighs what followed by the ratios, cut off at `rho_clip`.
+    is, and V-trace weighs what followed by the ratios, cut off at `rho_clip`. Advantages are in the
+    value's scale (Hessel et al. 2019). Over their own standard deviation they would be large where
+    all actions are about as good, and unlike PPO this has no clip to hold such steps back.
 
     n_steps           of a rollout
     lr                Adam's step size; `set_lr` changes it
@@ -39,7 +41,7 @@ class VTrace:
     rho_clip          what the ratio of an action counts at most: at 1, good actions that are
                       likelier now teach as if they were as likely as then
     c_clip            what a ratio counts at most in the trace, which carries what is learnt back
-    entropy_coef      what a nat of entropy is worth, in standard deviations of advantage
+    entropy_coef      what a nat of entropy is worth, in standard deviations of the return
     value_coef        weight of the value's squared error, the value measured in its own scale
     auxiliary_coef    weight of the policy's `prediction_error`, where its critic is asymmetric
     max_grad_norm     longer gradients are shortened to this
@@ -195,10 +197,10 @@ class VTrace:
             **self.traces,
         )
         estimates["valid"] = valid
-        advantages = normalised(estimates.advantages, valid)
-        error = (value[:-1] - estimates.targets) / self.policy.critic.output.scale
+        scale = self.policy.critic.output.scale
+        error = (value[:-1] - estimates.targets) / scale
         metrics = dict(
-            policy=-masked_mean(weight * logprobs * advantages, valid),
+            policy=-masked_mean(weight * logprobs * estimates.advantages / scale, valid),
             value=masked_mean(weight * error.square(), valid),
             entropy=masked_mean(output.entropy(logits), valid),
             **self._of_ratios(log_ratio[:, :n_fresh], valid[:, :n_fresh]),
@@ -239,13 +241,17 @@ class VTrace:
         it: who goes on from it acts anew, on the weights of then.
         """
         return dict(
+            learner=type(self).__name__,
             **self.steps.state_dict(),
             random=self.random.state_dict(),
             policy_random=self.policy.random.state_dict(),
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from a `state_dict`, taken on this device or another."""
+        """Goes on from a `state_dict`, taken on this device or another. ValueError if it is that of
+        another kind of learner.
+        """
+        check_state(self, state)
         self.steps.load_state_dict(state)
         self.random.load_state_dict(state["random"], self.device)
         self.policy.random.load_state_dict(state["policy_random"], self.device)

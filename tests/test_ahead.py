@@ -6,46 +6,15 @@ import copy
 
 import pytest
 import torch
+from made_up import B, Numbers
 
 from agents.ahead import AheadCollector
 from agents.policy import Policy
 from agents.rollout import Collector, make_rollout
 from agents.vtrace import VTrace
-from megastep import spaces
-from megastep.arrdict import arrdict
 
-B, T = 6, 5
+T = 5
 HOW = dict(n_steps=T, n_minibatches=2, lr=1e-2)
-
-
-class Numbers:
-    """Shows random numbers; action 1 pays the first of them. An episode is truncated after 7 steps.
-    What is seen does not depend on what is done, so one action that differs changes little.
-    """
-
-    obs_space, action_space = spaces.MultiVector(1, 3), spaces.MultiDiscrete(1, 3)
-    n_envs, n_agents = B, 1
-
-    def __init__(self, device="cpu"):
-        self.device = torch.device(device)
-        self.generator = torch.Generator(device).manual_seed(1)
-        self.age = torch.zeros(B, dtype=torch.int64, device=device)
-        self.obs = torch.zeros(B, 1, 3, device=device)
-
-    def reset(self):
-        return self._world(torch.ones_like(self.age, dtype=torch.bool), torch.zeros_like(self.age))
-
-    def step(self, decision):
-        return self._world(self.age == 7, decision["actions"][:, 0] == 1)
-
-    def _world(self, reset, is_taken):
-        reward = (self.obs[:, 0, 0] * is_taken).masked_fill(reset, 0.0)
-        self.age = (self.age + 1).masked_fill(reset, 0)
-        self.obs = torch.randn(B, 1, 3, generator=self.generator, device=self.device) + 2
-        ended = self.age == 7
-        metrics = arrdict(age=self.age.float())
-        flags = dict(reset=reset, terminal=torch.zeros_like(ended), truncated=ended)
-        return arrdict(obs=self.obs, reward=reward, metrics=metrics, **flags)
 
 
 def policy_of(env):

@@ -1,13 +1,12 @@
-"""PPO learns: small environments, each of which only a learner with one particular ability can
+"""Learners learn: small environments, each of which only a learner with one particular ability can
 solve, in seconds.
 """
 
 import pytest
 import torch
+from learners import LEARNERS
 
 from agents.policy import Policy
-from agents.ppo import PPO
-from agents.rollout import Rollout, collect, initial_actor_state
 from megastep import spaces
 from megastep.arrdict import arrdict
 
@@ -20,6 +19,7 @@ class Env:
     """
 
     n_shown, n_actions = 1, 4
+    n_envs, n_agents, device = B, 1, torch.device("cpu")
 
     def __init__(self, seed=0):
         self.obs_space = spaces.MultiVector(1, self.n_shown)
@@ -58,6 +58,35 @@ class Env:
 
     def show(self):
         return torch.zeros(B, self.n_shown)
+
+
+class Bandit(Env):
+    """One action per episode; action 2 pays 1, the others a tenth of their number."""
+
+    def result(self, action):
+        over = torch.ones(B, dtype=torch.bool)
+        return torch.tensor([0.0, 0.1, 1.0, 0.3])[action], over, ~over
+
+
+class Corridor(Env):
+    """Seven cells in a row, from the first to the last, which pays 1; action 0 goes back, action 1
+    on. An episode is truncated after 40 steps.
+    """
+
+    n_shown = 7
+
+    def begin(self, which):
+        cell = getattr(self, "cell", torch.zeros(B, dtype=torch.int64))
+        self.cell = cell.masked_fill(which, 0)
+
+    def show(self):
+        return torch.nn.functional.one_hot(self.cell, self.n_shown).float()
+
+    def result(self, action):
+        way = (action == 1).long() - (action == 0).long()
+        self.cell = (self.cell + way).clamp(0, self.n_shown - 1)
+        there = self.cell == self.n_shown - 1
+        return there.float(), there, (self.age == 39) & ~there
 
 
 class Cue(Env):
@@ -130,18 +159,20 @@ class Luck(Env):
         return arrdict(super()._world(*flags), privileged=dict(luck=self.luck.view(B, 1, 1)))
 
 
-def learn(env, n_updates, policy=None, n_steps=16, **how):
+def learn(env, n_updates, policy=None, name="ppo", **how):
     """Trains a small policy and counts what happened in the last ten rollouts: (policy, rewards,
-    ends, valid steps, tenths of the returns' variance that the critic explained).
+    ends, valid steps, tenths of the returns' variance that the critic explained, if it has one).
     """
-    policy = policy or Policy(env.obs_space, env.action_space, width=32)
-    state, spaces_of = policy.initial(B), (env.obs_space, env.action_space)
-    rollout = Rollout(n_steps, B, *spaces_of, state, privileged_space=policy.privileged_space)
-    learner = PPO(policy, **{**dict(lr=5e-3, n_epochs=2, n_minibatches=4), **how})
-    actor_state, counts = initial_actor_state(env, policy, rollout), torch.zeros(4)
+    kind = LEARNERS[name]
+    made, learner = kind.make(env, **how)
+    if policy is None:
+        policy = made
+    else:
+        learner = kind.made(policy, **{**kind.how, **how})
+    collect, counts = learner.collector(env), torch.zeros(4)
     for i in range(n_updates):
-        collect(env, policy, rollout, actor_state)
-        explained = learner.update(rollout)["loss/explained_variance"]
+        rollout = collect()
+        explained = learner.update(rollout).get("loss/explained_variance", torch.tensor(0.0))
         if i >= n_updates - 10:
             happened = rollout.reward.sum(), rollout.terminal.sum(), (~rollout.reset).sum()
             counts += torch.stack([*happened, explained])
@@ -155,9 +186,23 @@ class Forgetless(Policy):
         return super().unroll(obs, torch.zeros_like(reset), state)
 
 
-def test_a_cue_is_remembered():
-    # Guessing earns 1/4, and so does any policy without a memory
-    _, rewards, ends, *_ = learn(Cue(), n_updates=60, lr=3e-3)
+@pytest.mark.parametrize("name", LEARNERS)
+def test_the_arm_that_pays_is_found(name):
+    _, rewards, ends, *_ = learn(Bandit(), 30, name=name)
+    assert rewards / ends > 0.9
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_the_end_of_a_corridor_is_reached(name):
+    """The shortest way takes 6 steps; whoever walks at random gets there in a third of episodes."""
+    _, rewards, _, valid, _ = learn(Corridor(), 30, name=name, gamma=0.95)
+    assert valid / rewards < 7
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_cue_is_remembered(name):
+    """Guessing earns 1/4, and so does any policy without a memory."""
+    _, rewards, ends, *_ = learn(Cue(), 60, name=name, lr=3e-3)
     assert rewards / ends > 0.9
 
 

@@ -25,3 +25,17 @@ def test_explained_variance_of_the_truth_is_one_and_of_a_constant_zero():
     assert masked.explained_variance(targets + 4, targets, valid).item() == pytest.approx(1)
     assert masked.explained_variance(torch.zeros(1, 3), targets, valid).item() == pytest.approx(0)
     assert masked.explained_variance(-targets, targets, valid).item() == pytest.approx(-3)
+
+
+def test_the_effective_sample_size_by_hand():
+    weights = torch.tensor([[2.0, 2.0, torch.nan], [2.0, 2.0, 0.0]])
+    valid = ~weights.isnan()
+    assert masked.effective_sample_size(weights, valid).item() == pytest.approx(64 / (5 * 16))
+    alone = torch.tensor([0.0, 3.0, 0.0, 0.0])
+    assert masked.effective_sample_size(alone, alone >= 0).item() == pytest.approx(1 / 4)
+    assert masked.effective_sample_size(alone, alone > 5).item() == 0
+
+
+def test_means_along_an_axis():
+    x, valid = torch.tensor([[1.0, 5.0], [3.0, torch.nan]]), torch.tensor([[True, False]] * 2)
+    assert masked.masked_mean(x, valid, 0).tolist() == [2, 0]

@@ -130,6 +130,26 @@ def test_all_that_a_trainer_has_it_has_from_the_start(tmp_path):
     assert set(vars(run)) == attributes and run.collect is methods
 
 
+def test_nobody_acts_ahead_while_the_environment_is_looked_at_or_when_a_run_has_ended(tmp_path):
+    run, order = made(tmp_path, samples=3 * UPDATE, every=2), []
+    collect = run.collect
+
+    class Ahead:
+        rollout = collect.rollout
+
+        def __call__(self):
+            order.append("collect")
+            return collect()
+
+        def wait(self):
+            order.append("wait")
+
+    run.collect = Ahead()
+    run.env.check = lambda: order.append("check")
+    run.train()
+    assert order == ["collect", "collect", "wait", "check", "collect", "wait"]
+
+
 def test_a_trainer_stops_when_it_is_told_to(tmp_path):
     run = made(tmp_path)
     run.train(lambda: run.updates == 2)

@@ -6,9 +6,10 @@ import math
 
 import pytest
 import torch
-from made_up import MORE, MOVES, OBS, B, made_up, weights
+from made_up import MORE, MOVES, OBS, B, Numbers, made_up, weights
 
 from agents.policy import Policy
+from agents.replay import ReplaySettings
 from agents.vtrace import VTrace
 
 
@@ -144,6 +145,66 @@ def test_returns_set_the_scale_of_values_and_change_no_prediction():
     assert value.scale.item() == pytest.approx(spread, rel=1e-3)
     out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
     assert policy.value(out.features).abs().max() < 5
+
+
+def replaying(n_updates, **how):
+    """After so many updates in `Numbers`: the learner, its metrics, and the rollout."""
+    env = Numbers()
+    policy = Policy(env.obs_space, env.action_space, width=8)
+    settings = ReplaySettings(capacity=3 * 5 * B, **how.pop("replay", {}))
+    learner = VTrace(policy, n_steps=5, n_minibatches=2, buffer="replay", replay=settings, **how)
+    collect = learner.collector(env)
+    for _ in range(n_updates):
+        metrics = learner.update(collect())
+    return learner, {key.removeprefix("loss/"): value.item() for key, value in metrics.items()}
+
+
+@pytest.mark.parametrize("lag", [0, 2])
+def test_how_old_what_is_replayed_was_is_told(lag):
+    """Of three rollouts two can be drawn, 1 and 2 updates old, and as much as they acted late."""
+    learner, metrics = replaying(12, lag=lag)
+    assert 1 + lag < metrics["staleness"] < 2 + lag
+    assert metrics["kl"] < metrics["replayed_kl"]
+    assert metrics["replayed_effective_samples"] <= 1 and metrics["replayed_rho"] <= 1
+    _, first = replaying(1)
+    assert first["staleness"] == first["replayed_rho"] == first["replayed_effective_samples"] == 0
+
+
+def test_what_surprised_most_is_drawn_most():
+    learner, _ = replaying(12, replay=dict(alpha=1.0))
+    priorities = learner.replay.tree.priorities
+    drawn = priorities[priorities > 0]
+    assert len(drawn.unique()) > B, "each has its own"
+    uniform, _ = replaying(12)
+    drawn = uniform.replay.tree.priorities
+    assert set(drawn.tolist()) == {0.0, 1.0}
+
+
+def test_what_is_replayed_is_learnt_from():
+    """From fresh rollouts alone with a share of next to none, and as many replayed."""
+    ends = []
+    for ratio in (1e-6, 1.0):
+        learner, metrics = replaying(6, replay=dict(ratio=ratio), lr=1e-2)
+        assert metrics["skipped_steps"] == 0
+        ends.append(weights(learner.policy))
+    assert not torch.allclose(*ends, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "settings, told",
+    [
+        (dict(replay=ReplaySettings(ratio=2.0)), "those of buffer=replay"),
+        (
+            dict(buffer="replay", replay=ReplaySettings(length=40), n_steps=32),
+            "leave replay.length",
+        ),
+        (dict(buffer="replay", replay=ReplaySettings(burn_in=9, length=9)), "shorter than"),
+        (dict(lag=3), "lag: 3 is out of range"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(settings, told):
+    with pytest.raises(ValueError, match=told):
+        VTrace(made_up()[0], **settings)
 
 
 def test_a_policy_without_a_critic_is_refused():

@@ -108,7 +108,8 @@ def make_trainer(
             snapshots=Snapshots(snapshots, cfg.snapshots),
         )
     if cfg.resume:
-        trainer.load_state_dict(loaded.state)
+        with components.errors():
+            trainer.load_state_dict(loaded.state)
     return trainer, saver
 
 
