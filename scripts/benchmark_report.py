@@ -204,6 +204,39 @@ def plot_worlds(records, path):
         ax.figure.savefig(path, metadata={"Date": None})
 
 
+def plot_ratings(records, path):
+    """Plots ratings of each run's snapshots, and of the scripted bot, against samples."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    runs = {}
+    for record in newest(records):
+        match = re.fullmatch(r"deathmatch, .*, seed (\d+), rating of (.*)", record["what"])
+        if match:
+            runs.setdefault(match[1], []).append((match[2], record["value"], record["upper"]))
+    if not runs:
+        return
+    ax = Figure(figsize=(7.5, 4.2), layout="constrained").subplots()
+    for i, (seed, rows) in enumerate(runs.items()):
+        rated = [
+            (float(name.split()[0].replace(",", "")) / 1e6, value, upper - value)
+            for name, value, upper in rows
+            if name.endswith(" samples")
+        ]
+        samples, values, spreads = zip(*sorted(rated))
+        style = dict(color=f"C{i}", marker="o", markersize=4, capsize=3)
+        ax.errorbar(samples, values, spreads, label=f"seed {seed}", **style)
+        for name, value, _ in rows:
+            if name == "Bot":
+                label = "the scripted bot, with each" if i == 0 else None
+                ax.axhline(value, color=f"C{i}", linestyle="--", linewidth=1, label=label)
+    ax.set(xlabel="million samples", ylabel="rating ± two standard deviations")
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8, loc="lower right")
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
+        ax.figure.savefig(path, metadata={"Date": None})
+
+
 def read(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
@@ -216,3 +249,4 @@ def report(path: Path) -> None:
     plot(records, image)
     plot_learning(records, path.with_name("results.svg"))
     plot_worlds(records, path.with_name("worlds.svg"))
+    plot_ratings(records, path.with_name("ratings.svg"))
