@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "scripts")]
 
 import benchmark_report  # noqa: E402
-from trainings import BUDGETS, SEEDS  # noqa: E402
+from trainings import COMPARED  # noqa: E402
 from workloads import BENCHMARKS  # noqa: E402
 
 from megastep import engine  # noqa: E402
@@ -125,11 +125,12 @@ def main(argv=None):
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
     parser.add_argument(
-        "--seeds", nargs="+", type=int, default=SEEDS, metavar="SEED", help="of train and duels"
+        "--seeds", nargs="+", type=int, metavar="SEED", help="of train, duels and learners"
     )
     parser.add_argument(
-        "--budgets", nargs="+", type=int, default=BUDGETS, metavar="SECONDS", help="of train"
+        "--budgets", nargs="+", type=int, metavar="SECONDS", help="of train and learners"
     )
+    parser.add_argument("--worlds", nargs="+", choices=COMPARED, help="of learners")
     parser.add_argument(
         "--samples", type=int, metavar="N", help="that each run of duels and ablation learns from"
     )
@@ -152,8 +153,7 @@ def run(options):
     print(benchmark_report.HEADER, flush=True)
     for name in options.benchmarks:
         taken = inspect.signature(BENCHMARKS[name]).parameters
-        given = dict(seeds=options.seeds, budgets=options.budgets, samples=options.samples)
-        only = {key: value for key, value in given.items() if key in taken and value is not None}
+        only = {k: v for k, v in vars(options).items() if k in taken and k != "device" and v}
         for record in measure(name, device, measured, only):
             print(benchmark_report.row(record), flush=True)
             if options.json:

@@ -6,7 +6,7 @@ import textwrap
 from pathlib import Path
 
 import numpy as np
-from trainings import METRICS
+from trainings import COMPARED, LEARNERS, METRICS
 from workloads import BENCHMARKS
 
 # Environments and frames per second of the original megastep's Explorer on one H200.
@@ -204,6 +204,42 @@ def plot_worlds(records, path):
         ax.figure.savefig(path, metadata={"Date": None})
 
 
+def plot_learners(records, path):
+    """Plots what counts in each world against samples and against seconds, a colour per learner, a
+    line per seed.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    drawn = [r for r in newest(records) if r["benchmark"] == "learners" and "curve" in r]
+    drawn = [record for record in drawn if not record["on"].startswith("CPU")]
+    named = [(*record["what"].rsplit(", ", 3)[0].split(", ", 1), record) for record in drawn]
+    worlds = [world for world in COMPARED if any(world == name for name, _, _ in named)]
+    if not worlds:
+        return
+    figure = Figure(figsize=(9, 2.9 * len(worlds)), layout="constrained")
+    grid = figure.subplots(len(worlds), 2, squeeze=False, sharey="row")
+    colours = {name: f"C{i}" for i, name in enumerate(LEARNERS)}
+    for world, name, record in named:
+        by_samples, by_seconds = grid[worlds.index(world)]
+        seconds, samples, values = zip(*record["curve"])
+        told = dict(color=colours[name], linewidth=1.2)
+        by_samples.plot([n / 1e6 for n in samples], values, **told)
+        is_first = ", seed 1," in record["what"]
+        by_seconds.plot(seconds, values, label=name if is_first else None, **told)
+    for world, (left, right) in zip(worlds, grid):
+        counted = COMPARED[world][1].replace("_", " ")
+        counted = counted.upper() if counted == "spl" else counted
+        left.set(title=world, ylabel=f"{counted}, in training", xlabel="million samples")
+        left.set(xscale="log", ylim=(0, None))
+        right.set(title=world, xlabel="seconds of training")
+        left.grid(alpha=0.3)
+        right.grid(alpha=0.3)
+    grid[0, 1].legend(fontsize=8)
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
+        figure.savefig(path, metadata={"Date": None})
+
+
 def plot_ratings(records, path):
     """Plots ratings of each run's snapshots, and of the scripted bot, against samples."""
     import matplotlib
@@ -250,3 +286,4 @@ def report(path: Path) -> None:
     plot_learning(records, path.with_name("results.svg"))
     plot_worlds(records, path.with_name("worlds.svg"))
     plot_ratings(records, path.with_name("ratings.svg"))
+    plot_learners(records, path.with_name("learners.svg"))

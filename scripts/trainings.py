@@ -41,6 +41,19 @@ ABLATIONS = {
 }
 N_SNAPSHOTS = 5  # of a run, that are rated
 N_DUELS = 1024  # of two policies; a quarter of it of each pair that is rated
+#: Learners that are compared, and in what: overrides, and what counts.
+LEARNERS = {
+    "PPO": "learner=ppo",
+    "V-trace": "learner=vtrace",
+    "V-trace, a step behind": "learner=vtrace learner.lag=1",
+    "V-trace with replay": "learner=vtrace learner.buffer=replay",
+    "R2D2": "learner=r2d2",
+}
+COMPARED = {
+    "Explorer": ("env=explorer geometry=bench", "return"),
+    "PointGoal": ("env=pointgoal geometry=homes geometry.n=2000 learner.gamma=0.99", "spl"),
+    "Pong": ("env=pong agent.memory=none learner.gamma=0.99", "points_won"),
+}
 #: What is trained, how, and where it is evaluated then.
 RECIPES = {
     "Pong from features": ("experiment=pong", {"": ""}),
@@ -190,6 +203,30 @@ def ablation(device, samples=60_000_000):
         for name, run in zip(ABLATIONS, folders):
             what = f"deathmatch, {samples / 1e6:.0f} M samples, {name}"
             yield from won(what, run, device, "bot", "random")
+
+
+def learners(device, seeds=SEEDS, budgets=(60,), worlds=tuple(COMPARED)):
+    """Learners compared, each by itself on the device for as many seconds: three seeds of Explorer,
+    the first alone of other worlds. What counts there, in unseen homes, with the learning curve.
+    """
+    for world, (name, given) in itertools.product(worlds, LEARNERS.items()):
+        how, counted = COMPARED[world]
+        for seed, budget in itertools.product(seeds if world == "Explorer" else seeds[:1], budgets):
+            what = f"{world}, {name}, {budget} s, seed {seed}"
+            words = f"{how} {given} seconds={budget} seed={seed}".split()
+            with trained(device, *words, *NO_FINISH) as run:
+                yield learnt(what, curve(run, counted))
+                row = evaluated(run, device)[0]
+            value = dict(mean=row["return"], **row) if counted == "return" else None
+            value = value or row["metrics"][counted]
+            yield dict(
+                what=f"{what}: {counted} in unseen homes",
+                value=value["mean"],
+                unit="",
+                lower=value["lower"],
+                upper=value["upper"],
+                n=row["homes"] or row["lanes"],
+            )
 
 
 def won(what, run, device, *opponents):

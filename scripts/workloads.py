@@ -15,7 +15,7 @@ import torch
 from counters import counters
 from replays import replay
 from timing import TURNS, alone, laps, measurement, rate, timed
-from trainings import ablation, duels, train, worlds
+from trainings import ablation, duels, learners, train, worlds
 
 from megastep import arrdict, capture, core, engine, envs, modules, scene
 from megastep.geometries import sample
@@ -349,6 +349,6 @@ BENCHMARKS = {
     benchmark.__name__: benchmark
     for benchmark in (
         *(step, kernels, counters, observe, agents, deathmatch, memory, replay),
-        *(pong, compile, first, startup, cpu, train, worlds, duels, ablation),
+        *(pong, compile, first, startup, cpu, train, worlds, duels, ablation, learners),
     )
 }

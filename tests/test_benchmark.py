@@ -286,3 +286,23 @@ def test_the_page_says_what_the_records_say():
     page = (ROOT / "docs" / "benchmark-table.md").read_text()
     assert benchmark_report.page(records, "benchmark-table.svg") == page
     assert (ROOT / "docs" / "benchmark-table.svg").exists()
+
+
+@pytest.mark.slow
+def test_learners_are_compared_and_drawn(monkeypatch, tmp_path):
+    two = {name: trainings.LEARNERS[name] for name in ("PPO", "V-trace, a step behind")}
+    monkeypatch.setattr(trainings, "LEARNERS", two)
+    how = "env=pong agent.memory=none preset=cpu env.n_envs=64 report=2", "points_won"
+    monkeypatch.setattr(trainings, "COMPARED", {"Pong": how})
+    found = list(trainings.learners(torch.device("cpu"), (1,), (3,), ("Pong",)))
+    assert [r["what"] for r in found] == [
+        f"Pong, {name}, 3 s, seed 1{told}"
+        for name in two
+        for told in (", median rate", ": points_won in unseen homes")
+    ]
+    assert all(0 <= r["value"] <= 1 for r in found[1::2])
+    more = dict(benchmark="learners", on="NVIDIA H200", date="2026-11-22")
+    records = [{**r, **more} for r in found]
+    benchmark_report.plot_learners(records, tmp_path / "learners.svg")
+    drawn = (tmp_path / "learners.svg").read_text()
+    assert all(name in drawn for name in two)
