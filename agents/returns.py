@@ -12,25 +12,15 @@ followed: V counts) set; no sum crosses either.
 
 import torch
 
+from agents.scan import scan
 from megastep import arrdict
 
 
 def discounted_sum(terms: torch.Tensor, discounts: torch.Tensor) -> torch.Tensor:
-    """x_t = terms_t + discounts_t x_{t+1}, x_T = 0, along the first axis.
-
-    Computed by doubling, in log2(T) passes over the whole array: after a pass of stride k, x_t
-    holds the first 2k terms of its sum and d_t the product of the discounts up to the term that
-    comes next. Nothing is divided by a product of discounts, so zeros among them, which is how an
-    episode ends, are exact.
+    """x_t = terms_t + discounts_t x_{t+1}, x_T = 0, along the first axis. A discount of 0, which is
+    how an episode ends, is exact.
     """
-    total, product = terms, discounts
-    stride = 1
-    while stride < len(terms):
-        head = total[:-stride] + product[:-stride] * total[stride:]
-        total = torch.cat([head, total[-stride:]])
-        product = torch.cat([product[:-stride] * product[stride:], product[-stride:]])
-        stride *= 2
-    return total
+    return scan(terms, discounts, reverse=True)
 
 
 def _following(value, last_value):
