@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from agents.heads import compute_dtype
 from agents.kernels import lstm as kernels
+from agents.kernels.program import aligned, check_shapes
 from megastep.arrdict import arrdict
 
 _sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input  # (d, y): d y (1 - y)
@@ -72,13 +73,6 @@ def _steps(x):
     return kernels if x.is_cuda else _WRITTEN_OUT
 
 
-def _aligned(tensor):
-    """The tensor as kernels read it: contiguous, from a multiple of 16 bytes on."""
-    if tensor.data_ptr() % 16:
-        return tensor.clone(memory_format=torch.contiguous_format)
-    return tensor.contiguous()
-
-
 class _Sequence(torch.autograd.Function):
     """The recurrence over time, with its gradient written out.
 
@@ -95,7 +89,7 @@ class _Sequence(torch.autograd.Function):
         steps, x, reset = _steps(x), x.contiguous(), reset.contiguous()
         gates = F.linear(x, input_weight, bias)
         outputs, memories = torch.empty_like(x), torch.empty_like(x)
-        output, cell = _aligned(output), _aligned(cell)
+        output, cell = aligned(output), aligned(cell)
         cells = [torch.empty_like(cell)]
         steps.start(reset[0], output, cell, memories[0], cells[0])
         upcoming = [*zip(reset[1:], memories[1:], strict=True), (None, None)]
@@ -111,7 +105,7 @@ class _Sequence(torch.autograd.Function):
     def backward(ctx, d_outputs, d_cell):
         x, input_weight, weight, reset, gates, memories, *cells = ctx.saved_tensors
         steps = _steps(x)
-        d_outputs, d_cell, d_gates = _aligned(d_outputs), _aligned(d_cell), torch.empty_like(gates)
+        d_outputs, d_cell, d_gates = aligned(d_outputs), aligned(d_cell), torch.empty_like(gates)
         next_reset = d_memory = d_output = None
         for t in reversed(range(len(reset))):
             d_next_cell, d_cell = d_cell, torch.empty_like(d_cell)
@@ -135,20 +129,6 @@ class _Sequence(torch.autograd.Function):
             d_output,
             d_cell,
         )
-
-
-def _check(x, reset, state):
-    """Kernels would read past the end of what is too small, or in another device's memory."""
-    for name, given, shape in (
-        ("reset", reset, x.shape[:2]),
-        ("state.output", state["output"], x.shape[1:]),
-        ("state.cell", state["cell"], x.shape[1:]),
-    ):
-        if given.shape != shape or given.device != x.device:
-            raise ValueError(
-                f"{name} is {tuple(given.shape)} on {given.device}, but x asks for {tuple(shape)} "
-                f"on {x.device}"
-            )
 
 
 class LSTM(nn.Module):
@@ -183,7 +163,7 @@ class LSTM(nn.Module):
         Returns the outputs (T, B, W), in the compute dtype on a GPU and float32 on a CPU, and the
         state after the last step. ValueError if shapes or devices do not fit.
         """
-        _check(x, reset, state)
+        check_shapes(x, reset, state, ("output", "cell"))
         dtype = compute_dtype(self.memory.weight) if x.is_cuda else torch.float32
         weights = self.input.weight, self.input.bias, self.memory.weight
         # autocast would choose dtypes of its own inside

@@ -11,6 +11,7 @@ from torch import nn
 
 from agents.imports import choose
 from agents.lstm import LSTM
+from agents.mingru import MinGRU
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
 
@@ -67,7 +68,7 @@ class Feedforward(nn.Module):
         return self.hidden(x).relu(), state
 
 
-MEMORIES = {"lstm": LSTM, "gru": GRU, "none": Feedforward}
+MEMORIES = {"lstm": LSTM, "gru": GRU, "mingru": MinGRU, "none": Feedforward}
 
 
 def memory(name: str, width: int) -> nn.Module:

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from agents.kernels.lstm import LSTM
+from agents.kernels.program import CORES
 from megastep import agents, engine, games
 from megastep.kernels import compile, launch
 
@@ -135,8 +135,8 @@ def nvrtc(files, flags=compile.CUDA_FLAGS):
 
 def test_nvrtc_builds_the_learners_kernels():
     """With its own flags, and as another program than the engine's."""
-    cubin = nvrtc(compile.sources(".h", ".cu", folder=LSTM.folder), LSTM.flags)
-    assert all(operation.encode() in cubin for operation in LSTM.operations)
+    cubin = nvrtc(compile.sources(".h", ".cu", folder=CORES.folder), CORES.flags)
+    assert all(operation.encode() in cubin for operation in CORES.operations)
 
 
 def test_nvrtc_is_told_files_and_lines():

@@ -4,19 +4,15 @@ The GPU's kernels are compared with what is written out for the CPU: on a GPU, a
 CPU through `cuda_on_cpu.h`, which runs the same source.
 """
 
-import ctypes
-import subprocess
-from pathlib import Path
-
 import pytest
 import torch
 from torch import nn
 
 from agents import lstm as lstm_module
 from agents.kernels import lstm as kernels
+from agents.kernels import program
 from agents.lstm import LSTM
 from megastep.arrdict import arrdict
-from megastep.kernels import compile
 
 T, B, W = 9, 5, 16
 CLOSE = dict(rtol=1e-5, atol=1e-5)  # float32 sums of 16 products, nine steps deep, in another order
@@ -163,39 +159,12 @@ def test_a_gradient_may_be_asked_for_twice():
 # ---- The kernels ----
 
 
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory):
-    """The kernels for a CPU: operation name -> function of packed params and threads."""
-    folder = tmp_path_factory.mktemp("lstm")
-    source, library = folder / "lstm.cpp", folder / "lstm.so"
-    here = Path(__file__).parent
-    structs = {"start": "Start", "forward": "Forward", "backward": "Backward"}
-    lines = [f'#include "{here / "cuda_on_cpu.h"}"', f'#include "{kernels.HERE / "lstm.cu"}"']
-    for operation in kernels.LSTM.operations:
-        params = f"const Lstm{structs[operation.split('_')[1]]}Params* p"
-        lines.append(
-            f'extern "C" void run_{operation}({params}, unsigned int threads) '
-            f"{{ launch({operation}, p, threads); }}"
-        )
-    source.write_text("\n".join(lines))
-    compiler, _ = compile._compiler()
-    command = [compiler, "-std=c++17", "-O1", "-shared", "-fPIC", f"-DBLOCK={compile.BLOCK}"]
-    subprocess.run([*command, str(source), "-o", str(library)], check=True)
-    loaded = ctypes.CDLL(str(library))
-    return {name: getattr(loaded, f"run_{name}") for name in kernels.LSTM.operations}
-
-
 @pytest.fixture(params=["compiled", pytest.param("cuda", marks=pytest.mark.cuda)])
 def where(request, monkeypatch):
     """The device of the kernels: a GPU, or the CPU with the kernels compiled for it."""
     if request.param == "cuda":
         return "cuda"
-    functions = request.getfixturevalue("compiled")
-
-    def launch(operation, packed, device, threads, program):
-        functions[operation](packed, ctypes.c_uint(threads))
-
-    monkeypatch.setattr(kernels, "launch", launch)
+    monkeypatch.setattr(program, "launch", request.getfixturevalue("launch_on_cpu"))
     monkeypatch.setattr(lstm_module, "_steps", lambda x: kernels)
     return "cpu"
 
@@ -253,7 +222,7 @@ def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lan
 def test_kernels_read_words_of_16_bytes(offset, shape):
     tensor = torch.arange(40.0)[offset : offset + 32].view(shape)
     for given in (tensor, tensor.T):
-        found = lstm_module._aligned(given)
+        found = program.aligned(given)
         assert torch.equal(found, given)
         assert found.is_contiguous() and not found.data_ptr() % 16
 

@@ -1,1 +1,3 @@
-"""The LSTM's kernels for the GPU, and :mod:`~agents.kernels.lstm`, which launches them."""
+"""The recurrent cores' kernels for the GPU (:mod:`~agents.kernels.program`), and what launches
+them, a module per core.
+"""

@@ -3,35 +3,17 @@
 //
 // The gates stay as the product left them, and the backward step activates them once more: in
 // bfloat16 a gate of 0.99 is known to 0.002, so its slope, which holds 1 - 0.99, would be lost.
-#include "number.h"
+#include "lanes.h"
 #include "params.h"
-
-#define KERNEL extern "C" __global__ void __launch_bounds__(BLOCK)
-
-// A thread's lane and where its units are in an array (B, W) and in the first gate of (B, 4 W).
-struct Place {
-    int lane;
-    long long unit, gate;
-};
-
-template <class Params>
-DEVICE bool find_place(const Params& p, Place& place) {
-    unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x;
-    unsigned int threads_per_lane = p.width / p.n_units;
-    unsigned int lane = thread / threads_per_lane;
-    long long first = thread % threads_per_lane * p.n_units;
-    place = {(int)lane, (long long)lane * p.width + first, 4ll * lane * p.width + first};
-    return lane < (unsigned int)p.n_lanes;
-}
 
 // The activated gates of N units, the cell before and after the step, and the latter squashed.
 template <int N>
-struct Step {
+struct LstmStep {
     float input[N], forget[N], candidate[N], output[N], before[N], after[N], squashed[N];
 };
 
 template <class T, int N, class Params>
-DEVICE void activate(Step<N>& s, const Params& p, const Place& place) {
+DEVICE void activate(LstmStep<N>& s, const Params& p, const Place& place) {
     read<T>(s.input, p.gates, place.gate);
     read<T>(s.forget, p.gates, place.gate + p.width);
     read<T>(s.candidate, p.gates, place.gate + 2 * p.width);
@@ -47,13 +29,9 @@ DEVICE void activate(Step<N>& s, const Params& p, const Place& place) {
     }
 }
 
-template <int N>
-DEVICE void clear(float (&values)[N]) {
-    for (int n = 0; n < N; n++)
-        values[n] = 0.f;
-}
+struct LstmStart {
+    static constexpr int N_GATES = 4;
 
-struct Start {
     template <class T, int N>
     DEVICE void run(const LstmStartParams& p, const Place& place) {
         float memory[N], cell[N];
@@ -68,11 +46,13 @@ struct Start {
     }
 };
 
-struct Forward {
+struct LstmForward {
+    static constexpr int N_GATES = 4;
+
     template <class T, int N>
     DEVICE void run(const LstmForwardParams& p, const Place& place) {
         bool forgotten = p.next_reset && p.next_reset[place.lane];
-        Step<N> s;
+        LstmStep<N> s;
         activate<T>(s, p, place);
         float output[N];
         for (int n = 0; n < N; n++)
@@ -88,7 +68,9 @@ struct Forward {
     }
 };
 
-struct Backward {
+struct LstmBackward {
+    static constexpr int N_GATES = 4;
+
     template <class T, int N>
     DEVICE void run(const LstmBackwardParams& p, const Place& place) {
         float d_output[N], d_memory[N], d_after[N];
@@ -100,7 +82,7 @@ struct Backward {
             read<T>(d_memory, p.d_next_memory, place.unit);
             forgotten = p.next_reset[place.lane];
         }
-        Step<N> s;
+        LstmStep<N> s;
         activate<T>(s, p, place);
         if (forgotten) {
             clear(d_memory);
@@ -124,20 +106,9 @@ struct Backward {
     }
 };
 
-template <class Operation, class T, class Params>
-DEVICE void run(const Params& p) {
-    Place place;
-    if (!find_place(p, place))
-        return;
-    if (p.n_units == 4)
-        Operation::template run<T, 4>(p, place);
-    else
-        Operation::template run<T, 1>(p, place);
-}
-
-KERNEL lstm_start_float32(LstmStartParams p) { run<Start, float>(p); }
-KERNEL lstm_start_bfloat16(LstmStartParams p) { run<Start, Bfloat16>(p); }
-KERNEL lstm_forward_float32(LstmForwardParams p) { run<Forward, float>(p); }
-KERNEL lstm_forward_bfloat16(LstmForwardParams p) { run<Forward, Bfloat16>(p); }
-KERNEL lstm_backward_float32(LstmBackwardParams p) { run<Backward, float>(p); }
-KERNEL lstm_backward_bfloat16(LstmBackwardParams p) { run<Backward, Bfloat16>(p); }
+KERNEL lstm_start_float32(LstmStartParams p) { run<LstmStart, float>(p); }
+KERNEL lstm_start_bfloat16(LstmStartParams p) { run<LstmStart, Bfloat16>(p); }
+KERNEL lstm_forward_float32(LstmForwardParams p) { run<LstmForward, float>(p); }
+KERNEL lstm_forward_bfloat16(LstmForwardParams p) { run<LstmForward, Bfloat16>(p); }
+KERNEL lstm_backward_float32(LstmBackwardParams p) { run<LstmBackward, float>(p); }
+KERNEL lstm_backward_bfloat16(LstmBackwardParams p) { run<LstmBackward, Bfloat16>(p); }

@@ -1,0 +1,40 @@
+// What the kernels of recurrent cores share: one thread per lane and n_units neighbouring units.
+#pragma once
+#include "number.h"
+
+#define KERNEL extern "C" __global__ void __launch_bounds__(BLOCK)
+
+// A thread's lane and where its units are in an array (B, W) and in the first gate of one
+// (B, gates W).
+struct Place {
+    int lane;
+    long long unit, gate;
+};
+
+template <int N_GATES, class Params>
+DEVICE bool find_place(const Params& p, Place& place) {
+    unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x;
+    unsigned int threads_per_lane = p.width / p.n_units;
+    unsigned int lane = thread / threads_per_lane;
+    long long first = thread % threads_per_lane * p.n_units, row = (long long)lane * p.width;
+    place = {(int)lane, row + first, N_GATES * row + first};
+    return lane < (unsigned int)p.n_lanes;
+}
+
+template <int N>
+DEVICE void clear(float (&values)[N]) {
+    for (int n = 0; n < N; n++)
+        values[n] = 0.f;
+}
+
+// An operation on numbers of type T, for a thread with units of its own.
+template <class Operation, class T, class Params>
+DEVICE void run(const Params& p) {
+    Place place;
+    if (!find_place<Operation::N_GATES>(p, place))
+        return;
+    if (p.n_units == 4)
+        Operation::template run<T, 4>(p, place);
+    else
+        Operation::template run<T, 1>(p, place);
+}
