@@ -71,14 +71,34 @@ class Feedforward(nn.Module):
 MEMORIES = {"lstm": LSTM, "gru": GRU, "mingru": MinGRU, "none": Feedforward}
 
 
-def memory(name: str, width: int) -> nn.Module:
-    """The core called `name`: one of `MEMORIES`, or an import path. ValueError that names the
-    clause, if it is not as the head of this file says.
+class Stack(nn.ModuleList):
+    """Cores one above the other, each added to what it was given (He et al. 2016), and together a
+    core: its outputs are the sum of theirs. Its state is that of each, by its number.
     """
-    core = choose(name, MEMORIES)(width)
+
+    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        return arrdict({str(i): core.initial(n_lanes, device) for i, core in enumerate(self)})
+
+    def forward(
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+    ) -> tuple[torch.Tensor, arrdict]:
+        total, after = None, arrdict()
+        for i, core in enumerate(self):
+            given = x if total is None else x + total
+            outputs, after[str(i)] = core(given, reset, state[str(i)])
+            total = outputs if total is None else total + outputs
+        return total, after
+
+
+def memory(name: str, width: int, layers: int = 1) -> nn.Module:
+    """The core called `name`: one of `MEMORIES`, or an import path; or a `Stack` of `layers` of
+    them. ValueError that names the clause, if it is not as the head of this file says.
+    """
+    made = choose(name, MEMORIES)
+    cores = [made(width) for _ in range(layers)]
     if ":" in name:
-        _check(name, core, width)
-    return core
+        _check(name, cores[0], width)
+    return cores[0] if layers == 1 else Stack(cores)
 
 
 @torch.no_grad()

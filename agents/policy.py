@@ -37,15 +37,15 @@ class Policy(nn.Module):
     A world is what an environment's `step` returns, a decision what it takes.
 
     `memory` and `encoder` are names in `memory.MEMORIES` and `heads.ENCODERS`, or import paths of
-    others. `critic` is "asymmetric", which also sees a world's `privileged` of `privileged_space`
-    where there is such a space; "plain", which sees what the actor sees; or None, for a policy that
-    only acts. Nothing privileged reaches the actions; but `prediction_error` can teach the memory
-    what the critic knows.
+    others; `layers` is how many cores stand one above the other. `critic` is "asymmetric", which
+    also sees a world's `privileged` of `privileged_space` where there is such a space; "plain",
+    which sees what the actor sees; or None, for a policy that only acts. Nothing privileged reaches
+    the actions; but `prediction_error` can teach the memory what the critic knows.
 
     `seed` decides the first weights and, where no generator is given, the sampled actions. The
     weights are in `state_dict()`, those that only training needs under "critic." and "prediction.";
     where the random stream is, is in `random.state_dict()`, which a learner saves. ValueError if
-    the width is less than 1 or a space is of no known kind.
+    the width or the layers are out of range, or a space is of no known kind.
     """
 
     @checked
@@ -57,19 +57,20 @@ class Policy(nn.Module):
         *,
         width: Annotated[int, Field(ge=1, le=8192)] = 128,
         memory: Annotated[str, _known(cores.MEMORIES)] = "lstm",
+        layers: Annotated[int, Field(ge=1, le=8)] = 1,
         encoder: Annotated[str, _known(heads.ENCODERS)] = "linear",
         critic: Literal["asymmetric", "plain"] | None = "asymmetric",
         bf16: bool = True,
         seed: int = 1,
     ):
         super().__init__()
-        self.width, self.bf16 = width, bf16
+        self.width, self.layers, self.bf16 = width, layers, bf16
         self.privileged_space = privileged_space if critic == "asymmetric" else None
         self.random = RandomStream(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.intake = heads.intake(obs_space, width, encoder)
-            self.memory = cores.memory(memory, width)
+            self.memory = cores.memory(memory, width, layers)
             self.output = heads.output(action_space, width)
             self.critic = None if critic is None else Critic(width, self.privileged_space)
             if self.privileged_space:
@@ -78,6 +79,13 @@ class Policy(nn.Module):
     @property
     def device(self) -> torch.device:
         return next(self.parameters()).device
+
+    @property
+    def activation_bytes(self) -> int:
+        """About how many bytes learning takes per step of one lane, beside the step itself: some 24
+        activations of 4 bytes per unit, and 8 for each layer above the first.
+        """
+        return 4 * (24 + 8 * (self.layers - 1)) * self.width
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """The state of B lanes at the start of an episode: arrdict of (B, ...) float32."""

@@ -86,10 +86,10 @@ class PPO:
 
     def bytes_per_env(self, env: Any) -> float:
         """About how many bytes a rollout and a minibatch of it take per environment."""
-        # a minibatch's share of the rollout, and of some 24 activations of 4 bytes per unit; the
-        # features that values are made of
+        # a minibatch's share of the rollout, and of activations; the features that values are made
+        # of, 4 bytes per unit
         each, parts = bytes_per_step(env, self.policy), self.n_minibatches
-        each = each * (1 + 1 / parts) + (96 / parts + 4) * self.policy.width
+        each += (each + self.policy.activation_bytes) / parts + 4 * self.policy.width
         return env.n_agents * (self.n_steps + 1) * each
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:

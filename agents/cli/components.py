@@ -315,6 +315,10 @@ def spaces_of(env: Any) -> dict[str, str]:
     return {**flat(env.obs_space, "obs"), **flat(env.action_space, "actions")}
 
 
+def _shapes(tensors):
+    return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+
+
 def load_weights(policy: Policy, env: Any, checkpoint: Checkpoint) -> None:
     """Loads a checkpoint's weights into a policy made for `env`, the critic's too if it has one.
     UserError that names what differs if they do not fit.
@@ -338,15 +342,18 @@ def load_weights(policy: Policy, env: Any, checkpoint: Checkpoint) -> None:
             f"The critic of {checkpoint.path} is {kinds[had]} and this run's is {kinds[has]}: give "
             f"agent.critic={kinds[had]}"
         )
-    shapes = {name: tuple(weights[name].shape) if name in weights else "absent" for name in own}
-    shapes = [
-        f"{name} is {shapes[name]} and should be {tuple(value.shape)}"
-        for name, value in own.items()
-        if shapes[name] != tuple(value.shape)
-    ]
-    if shapes:
-        raise UserError(
-            f"The weights of {checkpoint.path} do not fit this agent: {shapes[0]}; choose the "
-            f"agent it has"
-        )
+    # what only training needs may be left over where there is no critic
+    needed = {
+        name: value
+        for name, value in weights.items()
+        if policy.critic is not None or not name.startswith(("critic.", "prediction."))
+    }
+    saved, present = _shapes(needed), _shapes(own)
+    for name in {**present, **saved}:
+        was, should = saved.get(name, "absent"), present.get(name, "absent")
+        if was != should:
+            raise UserError(
+                f"The weights of {checkpoint.path} do not fit this agent: {name} is {was} and "
+                f"should be {should}; choose the agent it has"
+            )
     policy.load_state_dict({name: weights[name] for name in own})
