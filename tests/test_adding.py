@@ -382,6 +382,8 @@ def refused(capsys, *words, main=train.main):
         (["learner=counter:Counter"], "counter:Counter cannot be used: it takes no policy"),
         (["learner=counter:Idle"], "counter:Idle is no learner: it has no collector: "),
         (["agent.memory=lstmm"], "agent.memory: 'lstmm' is unknown; did you mean lstm?"),
+        (["agent.memory=mingu"], "agent.memory: 'mingu' is unknown; did you mean mingru?"),
+        (["agent.layers=0"], "agent.layers: 0 is out of range: allowed is from 1 to 8"),
         (["agent.memory=counter:torch"], "agent.memory: counter:torch is a module"),
         (["agent.encoder=counter:nothing"], "agent.encoder: counter:nothing cannot be imported"),
     ],

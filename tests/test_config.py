@@ -226,6 +226,8 @@ NAN, INFINITY = float("nan"), float("inf")
         ("learner.n_steps", 0),
         ("learner.n_minibatches", 0),
         ("agent.width", 0),
+        ("agent.layers", 0),
+        ("agent.layers", 9),
         ("agent.encoder", "cnv"),
         ("geometry.n", 0),
         ("seed", -1),

@@ -412,6 +412,17 @@ def test_a_critic_that_is_none_is_refused(word, error):
         configured(word, tiny=EXPLORER)
 
 
+def test_memory_is_reckoned_with_layers():
+    env = Telling()
+    env.n_agents = 1
+    policies = [Policy(OBS, MOVES, width=WIDTH, critic="plain", layers=n) for n in (1, 2)]
+    one, two = (
+        ppo.PPO(policy, n_steps=T, n_minibatches=2).bytes_per_env(env) for policy in policies
+    )
+    # 8 numbers of 4 bytes per unit, in a minibatch of half of 9 rows
+    assert two - one == 8 * 4 * WIDTH * 9 / 2
+
+
 def test_memory_is_reckoned_with_what_is_told():
     env = Telling()
     env.n_agents = 1

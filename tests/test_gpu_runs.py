@@ -165,8 +165,11 @@ def test_a_number_that_is_not_finite_is_named_in_a_captured_run(
     assert bad_leaf(checkpoint.load(tmp_path / "run" / "checkpoints").state) is None
 
 
-@pytest.mark.parametrize("memory", ["gru", "none"])
-def test_every_core_acts_and_learns_in_graphs(memory, trainers, monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    "memory, layers", [("gru", 1), ("mingru", 1), ("none", 1), ("lstm", 2), ("mingru", 2)]
+)
+def test_every_core_acts_and_learns_in_graphs(memory, layers, trainers, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert train.main([*TINY, f"agent.memory={memory}", f"samples={6 * UPDATE}"]) == 0
+    words = f"agent.memory={memory}", f"agent.layers={layers}", f"samples={6 * UPDATE}"
+    assert train.main([*TINY, *words]) == 0
     assert is_captured(trainers[0]) and trainers[0].bad_number is None

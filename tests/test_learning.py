@@ -206,6 +206,16 @@ def test_a_cue_is_remembered(name):
     assert rewards / ends > 0.9
 
 
+@pytest.mark.parametrize(
+    "memory, least, most", [("gru", 0.9, 1), ("mingru", 0.9, 1), ("none", 0.1, 0.4)]
+)
+def test_every_recurrent_core_remembers_a_cue(memory, least, most):
+    env = Cue()
+    policy = Policy(env.obs_space, env.action_space, width=32, memory=memory)
+    _, rewards, ends, *_ = learn(env, 40, policy, lr=3e-3)
+    assert least < rewards / ends <= most
+
+
 def test_memory_starts_anew_with_every_episode():
     how, env = dict(n_updates=60, lr=1e-2, entropy_coef=0.03), Clock()
     _, rewards, _, valid, _ = learn(env, **how)

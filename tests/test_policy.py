@@ -5,10 +5,12 @@ import io
 import pytest
 import torch
 
+from agents.memory import MEMORIES
 from agents.policy import Policy
 from agents.random_stream import RandomStream
 from megastep import spaces
 from megastep.arrdict import arrdict, stack
+from megastep.dotdict import leaves
 
 T, B = 7, 5
 OBS = arrdict(rgb=spaces.MultiImage(1, 3, 1, 16), imu=spaces.MultiVector(1, 3))
@@ -42,6 +44,46 @@ def test_acting_step_by_step_gives_what_an_unroll_gives(encoder):
     torch.testing.assert_close(state.cell, unrolled.state.cell, **close)
     logprobs = policy.output.logprob(unrolled.logits, decisions.actions)
     torch.testing.assert_close(decisions.logprobs, logprobs, **close)
+
+
+@pytest.mark.parametrize("layers", [1, 3])
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_every_core_acts_as_it_unrolls(memory, layers):
+    policy, world = Policy(OBS, MOVES, width=16, memory=memory, layers=layers), worlds()
+    decisions, state = play(policy, world)
+    unrolled = policy.unroll(world.obs, world.reset, policy.initial(B))
+    close = dict(rtol=1e-5, atol=1e-5)  # as above
+    torch.testing.assert_close(decisions.features, unrolled.features, **close)
+    for found, expected in zip(leaves(state), leaves(unrolled.state), strict=True):
+        torch.testing.assert_close(found, expected, **close)
+
+
+def test_activations_are_reckoned_with_by_layer():
+    # 24 numbers of 4 bytes per unit, 8 for each further layer
+    sizes = [Policy(OBS, MOVES, width=32, layers=n).activation_bytes for n in (1, 2, 4)]
+    assert sizes == [32 * 4 * 24, 32 * 4 * 32, 32 * 4 * 48]
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_a_further_layer_saves_no_more_for_its_gradient_than_is_reckoned_with(memory):
+    def saved_by(policy):
+        weights, sizes = {p.data_ptr() for p in policy.parameters()}, {}
+
+        def pack(tensor):
+            if tensor.data_ptr() not in weights:
+                sizes[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+            held.append(tensor)
+            return tensor
+
+        held, world = [], worlds()
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+            policy.unroll(world.obs, world.reset, policy.initial(B))
+        return sum(sizes.values()) / (T * B)
+
+    policies = [Policy(OBS, MOVES, width=32, memory=memory, layers=n) for n in (1, 2)]
+    more = saved_by(policies[1]) - saved_by(policies[0])
+    reckoned = policies[1].activation_bytes - policies[0].activation_bytes
+    assert reckoned / 8 <= more <= 1.1 * reckoned  # beside them stand the state and its resets
 
 
 def test_a_decision_has_the_shapes_of_the_contract():

@@ -234,6 +234,23 @@ def test_weights_of_another_environment_are_refused_with_both_shapes(here):
     assert only_run(here) == here / first  # the refused runs left nothing behind
 
 
+def test_a_run_of_several_layers_is_saved_evaluated_and_resumed(here):
+    run = train.run(configured("agent.memory=mingru", "agent.layers=2", "samples=1"))
+    assert {"memory.0.input.weight", "memory.1.input.weight"} <= set(weights(run))
+    assert evaluate.main([f"run={run}", "lanes=4"]) == 0
+    train.run(configured(f"resume={run}", f"samples={2 * UPDATE}", tiny=[]))
+    assert checkpoint.load(run / "checkpoints").step == 2 * UPDATE
+    for layers, odd in (1, "memory.input.weight is absent"), (3, "memory.2.input.weight is absent"):
+        with pytest.raises(UserError, match=f"do not fit this agent: {odd} and should be"):
+            train.run(configured(f"init={run}", "samples=1", f"agent.layers={layers}"))
+
+
+def test_a_layer_too_many_is_refused(here):
+    run = train.run(configured("agent.memory=mingru", "agent.layers=3", "samples=1"))
+    with pytest.raises(UserError, match=r"memory.2.input.weight is \(16, 8\) and should be absent"):
+        train.run(configured(f"init={run}", "samples=1", "agent.layers=2"))
+
+
 def test_a_run_that_a_signal_stopped_goes_on(here, monkeypatch, capsys):
     real = metrics.Metrics.write
 
