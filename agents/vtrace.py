@@ -123,12 +123,12 @@ class VTrace:
     def bytes_per_env(self, env: Any) -> float:
         """About how many bytes the rollouts and a minibatch take per environment."""
         # a rollout for each update of lag; a minibatch's share of one and of what is replayed, and
-        # of some 24 activations of 4 bytes per unit
+        # of activations
         part = 1 / self.n_minibatches
         if self.replay_settings:
             part *= 1 + self.replay_settings.ratio
         each = bytes_per_step(env, self.policy) * (1 + self.lag + part)
-        each += 96 * part * self.policy.width
+        each += self.policy.activation_bytes * part
         return env.n_agents * (self.n_steps + 1) * each
 
     def replay_size(self, env: Any) -> tuple[int, float]:
