@@ -16,7 +16,6 @@ from ..core import Core
 from ..dotdict import dotdict
 from ..scene import scenery
 from ..settings import MAX_ENVS, checked
-from .explorer import TEXELS_PER_POINT
 
 __all__ = ["Deathmatch"]
 
@@ -152,7 +151,7 @@ class Deathmatch:
         )
         reward = shots.reward
         if self.seen is not None:
-            found = view.newly_seen.flatten() * (self.search_reward / TEXELS_PER_POINT)
+            found = view.newly_seen.flatten() * (self.search_reward / modules.TEXELS_PER_POINT)
             reward = reward + found.masked_fill_(shots.reset, 0.0)
         world = arrdict(
             obs=arrdict(self._shown(view), health=shots.vitals),

@@ -19,8 +19,6 @@ from ..settings import MAX_ENVS, checked
 
 __all__ = ["Explorer"]
 
-TEXELS_PER_POINT = 64  # newly seen texels that earn a reward of 1
-
 
 class Explorer:
     """Reward for wall texels seen for the first time in an episode, / 64; what the first view shows
@@ -108,7 +106,7 @@ class Explorer:
         clear_mask = modules.to_agents(reset, self.n_agents)
         obs, newly_seen = self._observation(seen=self.seen, clear_mask=clear_mask)
         self.lifecycle.limits.masked_fill_(reset, self.patience).add_(newly_seen)
-        reward = (newly_seen / TEXELS_PER_POINT).masked_fill_(reset, 0.0)
+        reward = (newly_seen / modules.TEXELS_PER_POINT).masked_fill_(reset, 0.0)
         flags = self.lifecycle(reset)
         world = arrdict(obs=obs, reward=reward, metrics=self._metrics(flags.truncated), **flags)
         if self.privileged_space is not None:
@@ -133,7 +131,7 @@ class Explorer:
         return arrdict(
             episode=torch.stack(columns, -1)[:, None] / self.units,
             # in double precision, as PyTorch's root of a float has other last bits on a CPU
-            unseen=(counts.double() / TEXELS_PER_POINT).sqrt_().float(),
+            unseen=(counts.double() / modules.TEXELS_PER_POINT).sqrt_().float(),
         )
 
     @property

@@ -8,12 +8,13 @@ from .lifecycle import Lifecycle, RandomLifespans, RandomStream
 from .movement import MOVES, TURNS, MomentumMovement, SimpleMovement, to_global, to_local
 from .sensors import IMU, RGB, Depth, downsample, render
 from .spawning import RandomSpawns, spawn_points
-from .visibility import visible_texels
+from .visibility import TEXELS_PER_POINT, visible_texels
 
 __all__ = [
     "IMU",
     "MOVES",
     "RGB",
+    "TEXELS_PER_POINT",
     "TURNS",
     "Depth",
     "Lifecycle",

@@ -23,6 +23,7 @@ AWAY = 1e4  # metres
 PREFIX = "visible-texels-"  # of their files in the cache
 MAX_FILES = 32  # of them, half a kilobyte per layout
 MIN_CACHED = 32  # layouts; the texels of fewer are found in no time
+TEXELS_PER_POINT = 64  # newly seen texels that earn a reward of 1
 
 
 def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
