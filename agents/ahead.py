@@ -80,10 +80,15 @@ class AheadCollector:
         if not self.on_gpu:
             slot.collect()
             return
-        self.stream.wait_stream(torch.cuda.current_stream(self.stream.device))
+        current = torch.cuda.current_stream(self.stream.device)
+        self.stream.wait_stream(current)
         with torch.cuda.stream(self.stream):
             slot.collect()
             slot.end = self.stream.record_event()
+        if slot.collect.graph is None:
+            # An environment may replace tensors in its first steps, which frees memory of the
+            # current stream: it must not be used again before those steps are done.
+            current.wait_event(slot.end)
 
     def wait(self) -> None:
         """Waits until nothing is being collected: the environment may be looked at, or go."""

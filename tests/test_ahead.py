@@ -97,6 +97,20 @@ def test_all_that_a_rollout_holds_is_handed_over():
     assert not state.any() and collect().state.cell.any()
 
 
+def test_who_goes_on_acts_with_the_weights_of_then():
+    """A trainer makes its collector first and loads weights later."""
+    env, other = Numbers(), policy_of(Numbers())
+    policy = policy_of(env)
+    collect = VTrace(policy, lag=2, **HOW).collector(env)
+    with torch.no_grad():
+        other.output.core.weight.mul_(100)
+    policy.load_state_dict(other.state_dict())
+    rollout = collect()
+    logits = other.unroll(rollout.obs, rollout.starts, rollout.state).logits[:-1]
+    expected = other.output.logprob(logits, rollout.actions)
+    torch.testing.assert_close(rollout.logprobs, expected, rtol=1e-4, atol=1e-4)
+
+
 def test_opponents_are_refused():
     env = Numbers()
     env.learners = torch.ones(B, dtype=torch.bool)

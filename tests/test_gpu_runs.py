@@ -173,3 +173,28 @@ def test_every_core_acts_and_learns_in_graphs(memory, layers, trainers, monkeypa
     words = f"agent.memory={memory}", f"agent.layers={layers}", f"samples={6 * UPDATE}"
     assert train.main([*TINY, *words]) == 0
     assert is_captured(trainers[0]) and trainers[0].bad_number is None
+
+
+@pytest.mark.parametrize(
+    "more",
+    [["learner.lag=1"], ["learner.lag=2", "learner.buffer=replay", "learner.replay.capacity=4096"]],
+)
+def test_a_run_that_acts_ahead_is_interrupted_and_goes_on(more, trainers, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as patch:
+        write = metrics.Metrics.write
+
+        def interrupting(self, step, *values):
+            write(self, step, *values)
+            if step == STOPPED:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        patch.setattr(metrics.Metrics, "write", interrupting)
+        assert train.main([*TINY, "learner=vtrace", *more, "folder=run"]) == 130
+    assert is_captured(trainers[0])
+    assert train.main(["resume=run", f"samples={2 * STOPPED}"]) == 0
+    assert is_captured(trainers[1]) and trainers[1].bad_number is None
+    found = rows(tmp_path / "run")
+    assert [row["updates"] for row in found] == list(range(1, 13))
+    assert all(row["loss/skipped_steps"] == 0 for row in found)
+    assert evaluate.main(["run=run", "lanes=16", "device=cuda"]) == 0

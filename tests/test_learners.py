@@ -164,6 +164,31 @@ def test_a_checkpoint_of_another_learner_is_refused_in_a_sentence(tmp_path, monk
     assert "Traceback" not in error
 
 
+REPLAY = ["learner=vtrace", "learner.buffer=replay"]
+
+
+@pytest.mark.parametrize(
+    "words, told",
+    [
+        (
+            ["learner=vtrace", "learner.lag=1", "opponents.past=0.5"],
+            "learner.lag=0 or no opponents",
+        ),
+        ([*REPLAY, "learner.replay.capacity=40_000_000_000"], "on cpu: at most"),
+        ([*REPLAY, "learner.replay.capacity=40"], "it needs at least 64"),
+        ([*REPLAY, "learner.replay.burn_in=9", "learner.replay.length=9"], "leaves nothing"),
+        ([*REPLAY, "learner.replay.capcity=9"], "did you mean learner.replay.capacity?"),
+        (["learner=vtrace", "learner.replay.ratio=2"], "those of buffer=replay"),
+    ],
+)
+def test_what_does_not_fit_is_told_in_a_sentence(words, told, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert train.main([*TINY, *words, f"samples={UPDATE}"]) == 2
+    error = capsys.readouterr().err
+    assert told in error and "Traceback" not in error
+    assert not list(tmp_path.glob("runs/*"))
+
+
 @pytest.mark.cuda
 @NAMES
 def test_collecting_and_learning_never_synchronise(name):

@@ -147,15 +147,15 @@ def test_returns_set_the_scale_of_values_and_change_no_prediction():
     assert policy.value(out.features).abs().max() < 5
 
 
-def replaying(n_updates, **how):
-    """After so many updates in `Numbers`: the learner, its metrics, and the rollout."""
-    env = Numbers()
+def replaying(n_updates, env=None, **how):
+    """After so many updates in `Numbers`: the learner, with what collects for it, and metrics."""
+    env = env or Numbers()
     policy = Policy(env.obs_space, env.action_space, width=8)
     settings = ReplaySettings(capacity=3 * 5 * B, **how.pop("replay", {}))
     learner = VTrace(policy, n_steps=5, n_minibatches=2, buffer="replay", replay=settings, **how)
-    collect = learner.collector(env)
+    learner.collect = learner.collector(env)
     for _ in range(n_updates):
-        metrics = learner.update(collect())
+        metrics = learner.update(learner.collect())
     return learner, {key.removeprefix("loss/"): value.item() for key, value in metrics.items()}
 
 
@@ -178,6 +178,27 @@ def test_what_surprised_most_is_drawn_most():
     uniform, _ = replaying(12)
     drawn = uniform.replay.tree.priorities
     assert set(drawn.tolist()) == {0.0, 1.0}
+
+
+def test_sequences_count_in_the_loss_by_their_weights():
+    policy, rollout = made_up(values=False)
+    learner, rows = VTrace(policy), torch.arange(B)
+    batch = learner._batch(rollout, rows)
+    _, ones, _ = learner._losses(batch, B)
+    batch["weight"] = 2 * batch.weight
+    _, twos, _ = learner._losses(batch, B)
+    for name in ("policy", "value"):
+        assert twos[name].item() == pytest.approx(2 * ones[name].item(), rel=1e-5)
+    assert twos["entropy"] == ones["entropy"] and ones["policy"].abs() > 1e-3
+
+
+def test_a_rollout_with_a_bad_number_is_never_replayed():
+    learner, metrics = replaying(5, Numbers(bad_steps=(22,)), replay=dict(ratio=10.0))
+    assert metrics["skipped_steps"] == 2
+    for _ in range(4):
+        metrics = learner.update(learner.collect())
+        assert metrics["loss/skipped_steps"] == 0
+    assert metrics["loss/staleness"] > 0
 
 
 def test_what_is_replayed_is_learnt_from():

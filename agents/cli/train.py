@@ -33,6 +33,8 @@ The commonest:
   seconds=60 samples=1e6       when to stop, whichever comes first; Ctrl-C stops too, and saves
   preset=gpu env.n_envs=256    the sizes for a GPU, or your own
   learner.lr=3e-4 seed=2       any key that --cfg job prints
+  learner=vtrace               instead of ppo: learner.lag=1 acts while it learns,
+                               learner.buffer=replay learns from old experience, too
   finish.evaluate=true finish.record=true
                                a table and a video at the end
   opponents.past=0.4 opponents.bot=0.1
