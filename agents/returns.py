@@ -1,4 +1,4 @@
-"""Advantages and returns: GAE and V-trace as pure functions.
+"""Advantages and returns: GAE, V-trace and n-step returns as pure functions.
 
 Axes: T time, B lanes. Everything is (T, B); row t is the action of time t, and `reward`, `reset`,
 `terminal`, `truncated` at row t belong to the world that followed it, t+1. `value` at row t is V_t,
@@ -100,3 +100,45 @@ def vtrace(
     return arrdict.arrdict(
         advantages=advantages.masked_fill(reset, 0.0), targets=targets, valid=~reset
     )
+
+
+def n_step(
+    reward: torch.Tensor,
+    value: torch.Tensor,
+    last_value: torch.Tensor,
+    reset: torch.Tensor,
+    terminal: torch.Tensor,
+    truncated: torch.Tensor,
+    *,
+    gamma: float,
+    n: int,
+) -> torch.Tensor:
+    """n-step returns (T, B): G^n with
+
+        G^0_t = V_t
+        G^k_t = r_{t+1} + gamma (1 - terminal_{t+1}) G',    G' = V_{t+1} at a truncation and at the
+        last row, else G^{k-1}_{t+1}
+
+    So fewer steps count where an episode or the rows end. Where the action was not valid it is V.
+    """
+    following = _following(value, last_value)
+    total = value
+    for _ in range(n):
+        beyond = torch.where(truncated, following, _following(total, last_value))
+        total = reward + gamma * beyond.masked_fill(terminal, 0.0)
+        total = torch.where(reset, value, total)
+    return total
+
+
+def rescaled(x: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
+    """h(x) = sign(x) (sqrt(|x| + 1) - 1) + eps x, in which large returns differ less and small ones
+    as much (Pohlen et al. 2018).
+    """
+    return x.sign() * ((x.abs() + 1).sqrt() - 1) + eps * x
+
+
+def unscaled(y: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
+    """The inverse of `rescaled`, in the form that subtracts no two numbers close to each other."""
+    size = y.abs()
+    root = 2 * (size + 1 + eps) / ((1 + 4 * eps * (size + 1 + eps)).sqrt() + 1)
+    return y.sign() * (root.square() - 1)

@@ -212,8 +212,51 @@ def test_what_an_invalid_row_holds_changes_nothing():
     """The environment ignored that action; even a NaN there must not leak."""
     case, log_ratio = episodes(seed=3)
     corrupted = dict(case, reward=torch.where(case["reset"], torch.nan, case["reward"]))
+    clean, dirty = (returns.n_step(**c, gamma=0.9, n=3) for c in (case, corrupted))
+    assert torch.equal(clean, dirty)
     for f in (returns.gae, lambda **k: returns.vtrace(log_ratio, **k)):
         clean, dirty = (f(**c, gamma=0.9, lambda_=0.8) for c in (case, corrupted))
         assert torch.equal(clean.advantages, dirty.advantages) and torch.equal(
             clean.targets, dirty.targets
         )
+
+
+def test_n_step_returns_by_hand():
+    # gamma = 1/2. Three rows, then the last observation, worth 8: with two steps row 0 counts 1 +
+    # 2/2 + 2/4, row 1 counts 2 + 4/2 + 8/4, and row 2 has but one step, 4 + 8/2.
+    case = lane(value=[1, 4, 2], last_value=8, reward=[1, 2, 4])
+    found = returns.n_step(**case, gamma=0.5, n=2)
+    assert found[:, 0].tolist() == [2.5, 6.0, 8.0]
+    assert returns.n_step(**case, gamma=0.5, n=1)[:, 0].tolist() == [3.0, 3.0, 8.0]
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 40])
+def test_n_step_returns_cross_no_end(n):
+    case, _ = episodes()
+    found, gamma = returns.n_step(**case, gamma=0.9, n=n), 0.9
+    for b in range(case["reward"].shape[1]):
+        for rows in split(case, b):
+            for i, t in enumerate(rows):
+                taken = rows[i : i + n]
+                total = sum(gamma**k * case["reward"][s, b] for k, s in enumerate(taken))
+                if not case["terminal"][taken[-1], b]:
+                    total = total + gamma ** len(taken) * beyond(case, taken[-1], b)
+                torch.testing.assert_close(found[t, b], total, **F64_CLOSE)
+    assert torch.equal(found[case["reset"]], case["value"][case["reset"]])
+
+
+def test_n_step_returns_over_all_rows_are_lambda_one():
+    case, _ = episodes(seed=5)
+    expected = returns.gae(**case, gamma=0.9, lambda_=1.0).targets
+    found = returns.n_step(**case, gamma=0.9, n=len(case["reward"]))
+    torch.testing.assert_close(found, expected, **F64_CLOSE)
+
+
+def test_rescaling_is_undone_also_in_single_precision():
+    assert returns.rescaled(torch.tensor(3.0)).item() == pytest.approx(1 + 3e-3)
+    x = torch.tensor([0.0, 1e-4, 1e-2, 1, 30, 1e4])
+    x = torch.cat([-x, x])
+    there = returns.rescaled(x)
+    assert (there[6:].diff() > 0).all() and torch.equal(there[:6], -there[6:])
+    # a root of 1 + x is rounded to 1e-7, and what remains of it squared
+    torch.testing.assert_close(returns.unscaled(there), x, rtol=1e-6, atol=1e-6)
