@@ -89,13 +89,6 @@ def _rollouts_of(length, rollout_steps):
     return length // rollout_steps + 1
 
 
-def effective_sample_size(weight: torch.Tensor) -> torch.Tensor:
-    """How many samples of equal weight tell as much as these (M,), as a fraction of M (Kish
-    1965).
-    """
-    return weight.sum().square() / (weight.square().sum() * len(weight))
-
-
 class Replay:
     """A replay memory for rollouts like a given one. Nothing synchronises and no shape depends on
     what is stored: adding and sampling can be part of a CUDA graph.
@@ -143,6 +136,8 @@ class Replay:
         self.is_fine = torch.zeros(self.n_rollouts, dtype=torch.bool, device=device)
         self.n_added = torch.zeros(1, dtype=torch.int64, device=device)  # rollouts, ever
         self.n_available = torch.zeros((), dtype=torch.int64, device=device)  # sequences
+        # the priority of sequences that were not learnt from: the largest of the last sample
+        self.fresh = torch.ones((), dtype=torch.float64, device=device)
 
     @property
     def capacity(self) -> int:
@@ -153,7 +148,7 @@ class Replay:
     def bytes(self) -> int:
         """All that is allocated."""
         columns = [*leaves(self.columns), *leaves(self.state), self.flags]
-        others = self.is_fine, self.n_added, self.n_available
+        others = self.is_fine, self.n_added, self.n_available, self.fresh
         return (
             sum(column.rows.nbytes for column in columns)
             + sum(tensor.nbytes for tensor in others)
@@ -188,11 +183,8 @@ class Replay:
         within = torch.arange(_rollouts_of(self.length, self.n_steps), device=slot.device)
         first = self.n_added - len(within)
         is_whole = (first >= 0) & self.is_fine[(first + within) % self.n_rollouts].all()
-        # at least as likely as any other, until a learner says how surprising it is
-        largest = self.tree.priorities.amax()
-        fresh = torch.where(largest > 0, largest, 1.0) * is_whole
         slot = first % self.n_rollouts
-        self.tree.set(slot * self.n_lanes + lanes, fresh.expand(self.n_lanes))
+        self.tree.set(slot * self.n_lanes + lanes, (self.fresh * is_whole).expand(self.n_lanes))
         self.n_available.copy_((self.tree.priorities > 0).sum())
 
     @torch.no_grad()
@@ -238,8 +230,10 @@ class Replay:
             return
         old = self.tree.priorities.index_select(0, index)
         new = values.double().clamp(min=_MIN_PRIORITY) ** self.settings.alpha
-        # 0: what cannot be drawn
-        self.tree.set(index, torch.where((old > 0) & new.isfinite(), new, old))
+        is_set = (old > 0) & new.isfinite()  # 0: what cannot be drawn
+        self.tree.set(index, torch.where(is_set, new, old))
+        largest = torch.where(is_set, new, 0.0).amax()
+        self.fresh.copy_(torch.where(largest > 0, largest, self.fresh))
 
 
 def bytes_per_observation(

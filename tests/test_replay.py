@@ -5,7 +5,7 @@ import torch
 from torch import testing
 
 from agents.policy import Policy
-from agents.replay import Replay, ReplaySettings, _cast, effective_sample_size
+from agents.replay import Replay, ReplaySettings, _cast
 from agents.rollout import Rollout
 from megastep import spaces
 from megastep.arrdict import arrdict
@@ -209,7 +209,7 @@ def test_sequences_are_drawn_by_their_priorities_and_weighed_against_them():
     )
 
 
-def test_new_sequences_are_as_likely_as_the_likeliest():
+def test_new_sequences_are_as_likely_as_the_likeliest_of_the_last_sample():
     world = World(4)
     replay = memory(world, 3, length=4, alpha=1.0)
     for _ in range(2):
@@ -217,6 +217,9 @@ def test_new_sequences_are_as_likely_as_the_likeliest():
     replay.set_priorities(torch.arange(B), torch.tensor([5.0, 7.0, 6.0]))
     replay.add(world.next())
     assert replay.tree.priorities.tolist() == [5, 7, 6, 7, 7, 7, 0, 0, 0]
+    replay.set_priorities(torch.tensor([3, 8]), torch.tensor([2.0, 99.0]))
+    replay.add(world.next())
+    assert replay.tree.priorities.tolist() == [0, 0, 0, 2, 7, 7, 2, 2, 2], "8 cannot be drawn yet"
 
 
 def test_what_cannot_be_drawn_gets_no_priority():
@@ -364,11 +367,6 @@ def test_learning_starts_once_enough_was_collected():
         replay.add(world.next())
         ready.append(replay.is_ready.item())
     assert ready == [False] * 3 + [True] * 3
-
-
-def test_effective_sample_size():
-    assert effective_sample_size(torch.tensor([1.0, 1, 1, 1])).item() == 1
-    assert effective_sample_size(torch.tensor([1.0, 0, 0, 0])).item() == 0.25
 
 
 @pytest.mark.cuda
