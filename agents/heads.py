@@ -278,12 +278,67 @@ class MultiDiscreteOutput(nn.Module):
         return -(logits.exp() * logits).sum((-1, -2))
 
 
-class DictOutput(nn.Module):
-    """A dict of choices, made independently; `logprob` and `entropy` (...,) are summed over it."""
+class DuellingOutput(nn.Module):
+    """The value of each choice out of n for every agent, (..., A, n), in whatever scale a learner
+    fits: the lane's value, which all choices share, and what each is better than their mean, each
+    behind a hidden layer (Wang et al. 2016).
+
+    `logits` are these values, and the policy that samples takes the best action, but for one in a
+    hundred: what always does the best it knows may stand before a wall for ever. `action_value` is
+    that of the lane's joint action, (...,): the sum over its agents (Sunehag et al. 2018).
+    """
+
+    epsilon = 0.01
 
     def __init__(self, space, width):
         super().__init__()
-        self.outputs = nn.ModuleDict({key: output(child, width) for key, child in space.items()})
+        self.shape = (space.n_agents, space.n_actions)
+        self.hidden = nn.Linear(width, 2 * width)
+        self.value = nn.Linear(width, space.n_agents)
+        self.advantage = nn.Linear(width, math.prod(self.shape))
+        # its bias is random: with none, features of 0 would leave every unit at the edge of what
+        # it can learn from
+        nn.init.orthogonal_(self.hidden.weight, gain=2**0.5)
+        for layer in self.value, self.advantage:
+            nn.init.orthogonal_(layer.weight, gain=0.1)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, x):
+        hidden = F.relu(self.hidden(x.to(compute_dtype(self.hidden.weight))))
+        value, advantage = hidden.chunk(2, -1)
+        value = self.value(value).float()[..., None]
+        advantage = self.advantage(advantage).float().unflatten(-1, self.shape)
+        return value + advantage - advantage.mean(-1, keepdim=True)
+
+    def sample(self, logits, generator=None, epsilon=None):
+        """The best actions, or any, with probability epsilon (...,), by lane."""
+        epsilon = self.epsilon if epsilon is None else epsilon[..., None]
+        best = self.greedy(logits)
+        how = dict(generator=generator, device=logits.device)
+        drawn = torch.randint(logits.shape[-1], best.shape, **how)
+        is_drawn = torch.rand(best.shape, **how) < epsilon
+        return torch.where(is_drawn, drawn, best)
+
+    def greedy(self, logits):
+        return logits.argmax(-1)
+
+    def logprob(self, logits, actions):
+        n, is_best = logits.shape[-1], actions == self.greedy(logits)
+        return ((1 - self.epsilon) * is_best + self.epsilon / n).log().sum(-1)
+
+    def action_value(self, logits, actions):
+        return logits.gather(-1, actions.long()[..., None]).squeeze(-1).sum(-1)
+
+
+class DictOutput(nn.Module):
+    """A dict of choices, made independently; `logprob`, `entropy` and `action_value` (...,) are
+    summed over it.
+    """
+
+    def __init__(self, space, width, kind):
+        super().__init__()
+        outputs = {key: output(child, width, kind) for key, child in space.items()}
+        self.outputs = nn.ModuleDict(outputs)
 
     def _each(self, f):
         return arrdict({key: f(key, child) for key, child in self.outputs.items()})
@@ -291,8 +346,8 @@ class DictOutput(nn.Module):
     def forward(self, x):
         return self._each(lambda key, child: child(x))
 
-    def sample(self, logits, generator=None):
-        return self._each(lambda key, child: child.sample(logits[key], generator))
+    def sample(self, logits, generator=None, **how):
+        return self._each(lambda key, child: child.sample(logits[key], generator, **how))
 
     def greedy(self, logits):
         return self._each(lambda key, child: child.greedy(logits[key]))
@@ -303,16 +358,25 @@ class DictOutput(nn.Module):
     def entropy(self, logits):
         return sum(self._each(lambda key, child: child.entropy(logits[key])).values())
 
+    def action_value(self, logits, actions):
+        each = self._each(lambda key, child: child.action_value(logits[key], actions[key]))
+        return sum(each.values())
 
-def output(space: Any, width: int) -> MultiDiscreteOutput | DictOutput:
+
+#: What gives actions, by name: one that chooses them by probabilities, one by their values.
+OUTPUTS = {"softmax": MultiDiscreteOutput, "duelling": DuellingOutput}
+
+
+def output(space: Any, width: int, kind: str = "softmax") -> nn.Module:
     """A module from vectors (..., width) to logits of this action space, or dict of spaces, that
-    can also `sample` them, pick the likeliest (`greedy`) and compute `logprob` and `entropy`.
-    ValueError if the space is of no known kind.
+    can also `sample` them, pick the likeliest (`greedy`) and compute `logprob`; `entropy`, if its
+    kind is softmax, or `action_value`, if it is duelling. ValueError if the space is of no known
+    kind.
     """
     if isinstance(space, dict) and space:
-        return DictOutput(space, width)
+        return DictOutput(space, width, kind)
     if isinstance(space, spaces.MultiDiscrete):
-        return MultiDiscreteOutput(space, width)
+        return OUTPUTS[kind](space, width)
     raise ValueError(
         f"no output is known for the action space {space!r}; there are MultiDiscrete and dicts of "
         f"it"

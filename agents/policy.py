@@ -37,10 +37,12 @@ class Policy(nn.Module):
     A world is what an environment's `step` returns, a decision what it takes.
 
     `memory` and `encoder` are names in `memory.MEMORIES` and `heads.ENCODERS`, or import paths of
-    others; `layers` is how many cores stand one above the other. `critic` is "asymmetric", which
-    also sees a world's `privileged` of `privileged_space` where there is such a space; "plain",
-    which sees what the actor sees; or None, for a policy that only acts. Nothing privileged reaches
-    the actions; but `prediction_error` can teach the memory what the critic knows.
+    others; `layers` is how many cores stand one above the other. `output` is "softmax", which
+    samples actions by their probabilities, or "duelling", which takes the one of most value.
+    `critic` is "asymmetric", which also sees a world's `privileged` of `privileged_space` where
+    there is such a space; "plain", which sees what the actor sees; or None, for a policy that only
+    acts, as one of action values always is. Nothing privileged reaches the actions; but
+    `prediction_error` can teach the memory what the critic knows.
 
     `seed` decides the first weights and, where no generator is given, the sampled actions. The
     weights are in `state_dict()`, those that only training needs under "critic." and "prediction.";
@@ -59,19 +61,21 @@ class Policy(nn.Module):
         memory: Annotated[str, _known(cores.MEMORIES)] = "lstm",
         layers: Annotated[int, Field(ge=1, le=8)] = 1,
         encoder: Annotated[str, _known(heads.ENCODERS)] = "linear",
+        output: Literal["softmax", "duelling"] = "softmax",
         critic: Literal["asymmetric", "plain"] | None = "asymmetric",
         bf16: bool = True,
         seed: int = 1,
     ):
         super().__init__()
-        self.width, self.layers, self.bf16 = width, layers, bf16
+        critic = None if output == "duelling" else critic
+        self.width, self.layers, self.bf16, self.output_kind = width, layers, bf16, output
         self.privileged_space = privileged_space if critic == "asymmetric" else None
         self.random = RandomStream(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.intake = heads.intake(obs_space, width, encoder)
             self.memory = cores.memory(memory, width, layers)
-            self.output = heads.output(action_space, width)
+            self.output = heads.output(action_space, width, output)
             self.critic = None if critic is None else Critic(width, self.privileged_space)
             if self.privileged_space:
                 self.prediction = nn.Linear(width, self.critic.intake.n_features)

@@ -64,7 +64,7 @@ class PPO:
         seed: int = 1,
     ):
         if policy.critic is None:
-            raise ValueError("PPO needs a policy with a critic")
+            raise ValueError("PPO needs a policy with a critic, and so agent.output=softmax")
         self.policy, self.device, self.n_steps = policy, policy.device, n_steps
         self.gamma, self.lambda_, self.clip, self.entropy_coef = gamma, lambda_, clip, entropy_coef
         self.value_coef, self.auxiliary_coef = value_coef, auxiliary_coef

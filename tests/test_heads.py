@@ -162,6 +162,52 @@ def test_a_generator_decides_all_samples():
     assert torch.equal(before, torch.get_rng_state())
 
 
+def test_action_values_are_a_value_and_advantages_over_their_mean():
+    output = heads.output(spaces.MultiDiscrete(2, 3), WIDTH, "duelling")
+    x = torch.randn(5, WIDTH)
+    hidden = output.hidden(x).relu()
+    value = hidden[:, :WIDTH] @ output.value.weight.T + output.value.bias
+    q = output(x)
+    torch.testing.assert_close(q.mean(-1), value)
+    advantage = (hidden[:, WIDTH:] @ output.advantage.weight.T).view(5, 2, 3)
+    torch.testing.assert_close(q.diff(dim=-1), advantage.diff(dim=-1))
+
+
+def test_the_value_of_a_joint_action_is_the_sum_over_its_parts():
+    output = heads.output(MOVES, WIDTH, "duelling")
+    logits = output(torch.randn(4, 6, WIDTH))
+    actions = output.greedy(logits)
+    best = sum(logits[key].amax(-1).sum(-1) for key in logits)
+    torch.testing.assert_close(output.action_value(logits, actions), best)
+    other = arrdict(actions, fire=1 - actions.fire)
+    loss = logits.fire.diff(dim=-1).abs().sum((-1, -2))
+    torch.testing.assert_close(output.action_value(logits, other), best - loss)
+
+
+def test_of_action_values_the_best_is_taken_and_now_and_then_any():
+    n = 100_000
+    output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
+    logits = torch.tensor([0.1, 0.9, 0.3, -2.0]).expand(n, 1, 4)
+    epsilon = torch.tensor([0.0, 0.5]).repeat_interleave(n // 2)
+    generator = torch.Generator().manual_seed(0)
+    actions = output.sample(logits, generator, epsilon=epsilon)
+    assert (actions[: n // 2] == 1).all()
+    shares = actions[n // 2 :].flatten().bincount(minlength=4) / (n / 2)
+    expected = torch.tensor([0.125, 0.625, 0.125, 0.125])
+    torch.testing.assert_close(shares, expected, rtol=0, atol=0.008)  # 4 standard errors
+    shares = output.sample(logits, generator).flatten().bincount(minlength=4) / n
+    likely = output.logprob(logits[:4], torch.arange(4)[:, None]).exp()
+    torch.testing.assert_close(likely, torch.tensor([0.0025, 0.9925, 0.0025, 0.0025]))
+    torch.testing.assert_close(shares, likely, rtol=0, atol=0.001)
+
+
+def test_features_of_zero_leave_action_values_something_to_learn_from():
+    output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
+    x = torch.zeros(1, WIDTH, requires_grad=True)
+    output(x)[0, 0, 1].backward()
+    assert x.grad.abs().sum() > 0
+
+
 @pytest.mark.parametrize(
     "make, words",
     [
