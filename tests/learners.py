@@ -8,6 +8,7 @@ from typing import Any
 
 from agents.policy import Policy
 from agents.ppo import PPO
+from agents.r2d2 import R2D2
 from agents.replay import ReplaySettings
 from agents.vtrace import VTrace
 
@@ -31,9 +32,14 @@ class Kind:
 _HOW = dict(n_steps=16, lr=5e-3, n_minibatches=4)
 _REPLAY = ReplaySettings(capacity=2**14, burn_in=2, ratio=0.5, alpha=0.5)
 
+_OFTEN = ReplaySettings(capacity=2**14, burn_in=1, ratio=2.0, alpha=0.9)
+_R2D2 = dict(n_steps=16, lr=3e-3, n_minibatches=8, target_period=20, return_steps=3)
+_R2D2 |= dict(epsilon_spread=3.0, replay=_OFTEN)  # in a corridor chance has to find the way first
+
 LEARNERS = {
     "ppo": Kind(PPO, dict(_HOW, n_epochs=2)),
     "vtrace": Kind(VTrace, _HOW),
     "vtrace-ahead": Kind(VTrace, dict(_HOW, lag=1)),
     "vtrace-replay": Kind(VTrace, dict(_HOW, buffer="replay", replay=_REPLAY)),
+    "r2d2": Kind(R2D2, _R2D2, dict(output="duelling")),
 }

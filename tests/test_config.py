@@ -79,6 +79,8 @@ def compositions():
                 last = [f for f in files if f.startswith("preset/")]
                 if last and "cpu" in last[0]:
                     last.append(f"preset/learner/cpu_{chosen['learner']}")
+                if (CONFIGS / f"preset/agent/{chosen.get('learner')}.yaml").exists():
+                    last.append(f"preset/agent/{chosen['learner']}")
                 last += [f for f in files if f.startswith("experiment/")]
                 for_recipe = f"preset/experiment/{chosen.get('preset')}_{chosen.get('experiment')}"
                 last += [for_recipe] if (CONFIGS / f"{for_recipe}.yaml").exists() else []
