@@ -134,11 +134,11 @@ class R2D2:
 
     def bytes_per_env(self, env: Any) -> float:
         """About how many bytes a rollout and a minibatch take per environment."""
-        # a minibatch's share of what is replayed for a rollout, and of some 48 activations of 4
-        # bytes per unit, of two networks
+        # a minibatch's share of what is replayed for a rollout, and of the activations of two
+        # networks
         part = self.replay_settings.ratio / self.n_minibatches
         rollout = (self.n_steps + 1) * bytes_per_step(env, self.policy)
-        each = bytes_per_step(env, self.policy) + 4 * 48 * self.policy.width
+        each = bytes_per_step(env, self.policy) + 2 * self.policy.activation_bytes
         return env.n_agents * (rollout + part * (self.length + 1) * each)
 
     def replay_size(self, env: Any) -> tuple[int, float]:
