@@ -57,13 +57,18 @@ def leaves(tree, prefix=""):
     return found
 
 
+#: Groups whose files are part of another.
+PACKAGES = {"recipe": "learner"}
+
+
 def values(file, script):
     """What a file of configs/ says, by dotted key; `defaults` are choices, no values."""
     text = (CONFIGS / f"{file}.yaml").read_text()
     tree = yaml.safe_load(text) or {}
     tree.pop("defaults", None)
     own = file == script or "@package _global_" in text
-    return leaves(tree if own else {file.split("/")[-2]: tree})
+    group = file.split("/")[-2]
+    return leaves(tree if own else {PACKAGES.get(group, group): tree})
 
 
 def compositions():
@@ -83,7 +88,9 @@ def compositions():
                     last.append(f"preset/agent/{chosen['learner']}")
                 last += [f for f in files if f.startswith("experiment/")]
                 for_recipe = f"preset/experiment/{chosen.get('preset')}_{chosen.get('experiment')}"
-                last += [for_recipe] if (CONFIGS / f"{for_recipe}.yaml").exists() else []
+                by_learner = f"preset/recipe/{chosen.get('learner')}_{chosen.get('experiment')}"
+                for name in (for_recipe, by_learner):
+                    last += [name] if (CONFIGS / f"{name}.yaml").exists() else []
                 order = [f for f in files if f not in last] + [script] + last
                 yield [(file, values(file, script)) for file in order]
 
@@ -159,6 +166,7 @@ def test_a_recipe_differs_on_a_cpu_and_on_a_gpu():
     assert (cpu.seconds, gpu.seconds) == (240, 12) and cpu.env.n_envs == 256
     assert (cpu.agent.memory, cpu.learner.n_epochs) == ("none", 2)
     assert compose("experiment=pong", "preset=cpu", "seconds=7").seconds == 7
+    assert compose("experiment=pong", "learner=r2d2", "preset=cpu").learner.name.endswith(":R2D2")
     cpu, gpu = (compose("experiment=deathmatch", f"preset={preset}") for preset in ("cpu", "gpu"))
     assert (cpu.env.n_envs, gpu.env.n_envs) == (64, 8192)
     assert (cpu.samples, gpu.samples, cpu.seconds, gpu.seconds) == (600_000, None, None, 480)
