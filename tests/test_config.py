@@ -67,8 +67,10 @@ def values(file, script):
     tree = yaml.safe_load(text) or {}
     tree.pop("defaults", None)
     own = file == script or "@package _global_" in text
+    if own:
+        return leaves(tree)
     group = file.split("/")[-2]
-    return leaves(tree if own else {PACKAGES.get(group, group): tree})
+    return leaves({PACKAGES.get(group, group): tree})
 
 
 def compositions():
