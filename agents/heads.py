@@ -283,12 +283,12 @@ class DuellingOutput(nn.Module):
     fits: the lane's value, which all choices share, and what each is better than their mean, each
     behind a hidden layer (Wang et al. 2016).
 
-    `logits` are these values, and the policy that samples takes the best action, but for one in a
-    hundred: what always does the best it knows may stand before a wall for ever. `action_value` is
+    `logits` are these values, and the policy that samples takes the best action, but for one in
+    twenty: what always does the best it knows may stand before a wall for ever. `action_value` is
     that of the lane's joint action, (...,): the sum over its agents (Sunehag et al. 2018).
     """
 
-    epsilon = 0.01
+    epsilon = 0.05
 
     def __init__(self, space, width):
         super().__init__()
