@@ -305,9 +305,11 @@ class DuellingOutput(nn.Module):
 
     def forward(self, x):
         hidden = F.relu(self.hidden(x.to(compute_dtype(self.hidden.weight))))
-        value, advantage = hidden.chunk(2, -1)
-        value = self.value(value).float()[..., None]
-        advantage = self.advantage(advantage).float().unflatten(-1, self.shape)
+        # in bfloat16 a large return would be off by more than one action is better than another
+        with torch.autocast(x.device.type, enabled=False):
+            value, advantage = hidden.float().chunk(2, -1)
+            value = self.value(value)[..., None]
+            advantage = self.advantage(advantage).unflatten(-1, self.shape)
         return value + advantage - advantage.mean(-1, keepdim=True)
 
     def sample(self, logits, generator=None, epsilon=None):

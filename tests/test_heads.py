@@ -201,6 +201,17 @@ def test_of_action_values_the_best_is_taken_and_now_and_then_any():
     torch.testing.assert_close(shares, likely, rtol=0, atol=0.0025)
 
 
+def test_action_values_are_in_single_precision_where_products_are_not():
+    output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
+    with torch.no_grad():
+        output.value.bias += 300.0
+        with torch.autocast("cpu", torch.bfloat16):
+            found = output(torch.randn(50, WIDTH))
+    assert found.dtype == torch.float32
+    # about 300 neighbours are 2 apart in bfloat16
+    assert 0.01 < found.std() < 1 and len(found.mean(-1).unique()) > 40
+
+
 def test_features_of_zero_leave_action_values_something_to_learn_from():
     output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
     x = torch.zeros(1, WIDTH, requires_grad=True)
