@@ -23,7 +23,8 @@ class _Slot:
     """
 
     def __init__(self, env, policy, rollout, actor_state):
-        self.actor = policy.actor()
+        # autocast keeps the cast of a weight only where it could need a gradient
+        self.actor = policy.actor().requires_grad_(True)
         self.actor.random = policy.random  # one random stream for all, which is saved with it
         theirs = policy.state_dict()
         self.own = self.actor.state_dict()

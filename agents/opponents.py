@@ -53,7 +53,9 @@ class Opponents:
     ):
         self.env, self.every, device = env, every, env.device
         each, n_bot = shared(env, past, bot, snapshots)
-        self.actors = [policy.actor() for _ in range(snapshots if past else 0)]
+        # autocast keeps the cast of a weight only where it could need a gradient
+        n_actors = snapshots if past else 0
+        self.actors = [policy.actor().requires_grad_(True) for _ in range(n_actors)]
         self.random = RandomStream(seed)
         groups = [each for _ in self.actors] + [n_bot] * (n_bot > 0)  # environments, by opponent
         self.n_past, self.n_opposed = each * len(self.actors), sum(groups)

@@ -46,7 +46,7 @@ LEARNERS = {
     "PPO": "learner=ppo",
     "V-trace": "learner=vtrace",
     "V-trace, a step behind": "learner=vtrace learner.lag=1",
-    "V-trace with replay": "learner=vtrace learner.buffer=replay",
+    "V-trace with replay": "learner=vtrace learner.buffer=replay learner.replay.capacity=8e6",
     "R2D2": "learner=r2d2",
 }
 COMPARED = {
