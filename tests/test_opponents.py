@@ -75,8 +75,8 @@ def test_a_snapshot_plays_as_the_policy_did_and_remembers_its_own_episodes():
     """Two snapshots that always choose 0 and 1, of which one sees only its lanes' observations."""
     env = opposed(past=1.0, bot=0.0)
     for choice, actor in enumerate(env.actors):
-        actor.output.core.weight.zero_()
-        actor.output.core.bias.copy_(
+        actor.output.core.weight.data.zero_()
+        actor.output.core.bias.data.copy_(
             torch.tensor([-50.0] * 3).index_fill(0, torch.tensor(choice), 50)
         )
     env.reset()
@@ -347,8 +347,8 @@ def test_pairs_are_won_by_who_survives_and_else_by_who_earned_more(n_agents):
 def test_the_share_won_is_told_by_kind_of_opponent(mortal):
     env = opposed(16, mortal and 3 or 2, env=Matrix(16, 3 if mortal else 2, mortal), bot=0.25)
     for actor in env.actors:
-        actor.output.core.weight.zero_()
-        actor.output.core.bias.copy_(torch.tensor([0.0, 99, 0]))
+        actor.output.core.weight.data.zero_()
+        actor.output.core.bias.data.copy_(torch.tensor([0.0, 99, 0]))
     env.reset()
     lanes = len(env.learners)
     for action in (1, 2, 2, 2):  # every second step is the reset after an end
