@@ -165,7 +165,8 @@ class R2D2:
             store(self.n_taken % self.target_period == 0, self._copies)
             batch = self.replay.sample(n_sequences, generator)
             loss, metrics, priorities, valid = self._losses(batch)
-            self.n_taken += self.steps.take(loss, metrics, valid.any(), is_ready)
+            # a bad rollout counts as skipped, also where it is why there is nothing to draw
+            self.n_taken += self.steps.take(loss, metrics, valid.any(), is_ready | ~is_fine)
             self.replay.set_priorities(batch.index, priorities)
         last = rollout.world(-1)
         self.policy.update_stats(last.obs, taken=is_fine & rollout.learns[-1])

@@ -107,6 +107,20 @@ def test_a_bad_number_changes_no_bit_and_is_named(name):
 
 
 @NAMES
+@pytest.mark.parametrize("bad_steps", [range(1, 999), range(4 * T + 1, 999), (1,)], ids=str)
+def test_skipped_updates_are_counted_and_end_with_the_bad_numbers(name, bad_steps):
+    """Whether or not there is anything to replay."""
+    _, learner, collect = made(name, Numbers(bad_steps=bad_steps))
+    counts = []
+    for _ in range(9):
+        learner.update(collect())
+        counts.append(learner.check.read(collect.rollout.numbers())[1])
+    first = (min(bad_steps) - 1) // T
+    n_bad = 9 - first if len(bad_steps) > 1 else 1
+    assert counts == [0] * first + [*range(1, n_bad + 1)] + [0] * (9 - first - n_bad)
+
+
+@NAMES
 def test_memory_is_estimated_from_above_and_grows_with_what_is_stored(name):
     env = Numbers()
     (_, few, collect), (_, many, _) = made(name), made(name, n_steps=4 * T)
