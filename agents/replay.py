@@ -164,18 +164,21 @@ class Replay:
     @torch.no_grad()
     def add(self, rollout: Rollout, is_fine: torch.Tensor | bool = True) -> None:
         """Stores the rollout that followed the one added last, in place of the oldest. No sequence
-        with a row of a rollout that is not fine, a bool (), will be drawn.
+        with a row of a rollout that is not fine, a bool (), will be drawn; its rows are stored as
+        zeros, as a sample holds some of them while nothing can be drawn.
         """
+        is_fine = torch.ones_like(self.is_fine[:1]) & is_fine
         steps = torch.arange(self.n_steps, device=self.n_added.device)
         lanes = torch.arange(self.n_lanes, device=self.n_added.device)
         slot = self.n_added % self.n_rollouts
         rows = slot * self.n_steps + steps
         for name, columns in self.columns.items():
-            _each(lambda column, leaf: column.write(rows, leaf), columns, getattr(rollout, name))
+            kept = _each(lambda leaf: torch.where(is_fine, leaf, 0), getattr(rollout, name))
+            _each(lambda column, leaf: column.write(rows, leaf), columns, kept)
         bits = [getattr(rollout, name)[: self.n_steps].byte() << i for i, name in enumerate(_FLAGS)]
         self.flags.write(rows, sum(bits))
         _each(lambda column, leaf: column.write(slot, leaf[None]), self.state, rollout.state)
-        self.is_fine.index_copy_(0, slot, torch.ones_like(self.is_fine[:1]) & is_fine)
+        self.is_fine.index_copy_(0, slot, is_fine)
         self.n_added += 1
 
         self.tree.set(slot * self.n_lanes + lanes, torch.zeros_like(lanes))
@@ -198,7 +201,7 @@ class Replay:
                      (importance sampling; Schaul et al. 2016), the largest 1
         age          int64, rollouts that were added after the one it starts in
 
-        While nothing can be drawn, it holds what was never stored.
+        While nothing can be drawn, it holds numbers that mean nothing, all of them finite.
         """
         index = self.tree.sample(n, generator)
         probability = self.tree.probability(index)
@@ -224,13 +227,14 @@ class Replay:
     @torch.no_grad()
     def set_priorities(self, index: torch.Tensor, values: torch.Tensor) -> None:
         """Says how much sequences, of the last sample, are worth being drawn again: values (M,),
-        of which a power is taken. What is not finite changes nothing. Uniform memories ignore it.
+        of which a power is taken. What is not finite changes nothing. Uniform memories ignore it,
+        as all do until they are ready: what was drawn until then was not learnt from.
         """
         if self.settings.alpha == 0:
             return
         old = self.tree.priorities.index_select(0, index)
         new = values.double().clamp(min=_MIN_PRIORITY) ** self.settings.alpha
-        is_set = (old > 0) & new.isfinite()  # 0: what cannot be drawn
+        is_set = self.is_ready & (old > 0) & new.isfinite()  # 0: what cannot be drawn
         self.tree.set(index, torch.where(is_set, new, old))
         largest = torch.where(is_set, new, 0.0).amax()
         self.fresh.copy_(torch.where(largest > 0, largest, self.fresh))

@@ -369,6 +369,35 @@ def test_learning_starts_once_enough_was_collected():
     assert ready == [False] * 3 + [True] * 3
 
 
+def test_priorities_stay_alike_until_learning_starts():
+    world, found = World(4), []
+    replay = memory(world, 5, length=4, start=4 * 4 * B, alpha=1.0)
+    for _ in range(4):
+        replay.add(world.next())
+        replay.set_priorities(torch.arange(B), torch.full((B,), 0.5))
+        found.append((replay.tree.priorities.tolist(), replay.fresh.item()))
+    one, none = [1.0] * B, [0.0] * B
+    assert found == [
+        (none * 5, 1),
+        (one + none * 4, 1),
+        (one * 2 + none * 3, 1),
+        ([0.5] * B + one * 2 + none * 2, 0.5),
+    ]
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, 1e30])
+def test_a_sample_of_an_empty_memory_is_finite_whatever_was_added(bad):
+    world = World(4)
+    replay = memory(world, 3, length=8)
+    rollout = world.next()
+    rollout.obs.eye[1], rollout.reward[2], rollout.privileged.goal[3] = bad, bad, bad
+    replay.add(rollout, torch.tensor(False))
+    batch = replay.sample(4, torch.Generator().manual_seed(0))
+    assert not batch.index.any() and not batch.probability.any()
+    for leaf in leaves(batch):
+        assert (leaf.float().abs() <= 100).all()
+
+
 @pytest.mark.cuda
 def test_a_captured_memory_is_the_eager_one_and_never_synchronises():
     found = []
