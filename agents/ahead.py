@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from agents.rollout import Collector, Rollout, initial_actor_state
+from megastep.capture import Graph
 
 
 class _Slot:
@@ -86,7 +87,7 @@ class AheadCollector:
         with torch.cuda.stream(self.stream):
             slot.collect()
             slot.end = self.stream.record_event()
-        if slot.collect.graph is None:
+        if not isinstance(slot.collect.graph, Graph):
             # An environment may replace tensors in its first steps, which frees memory of the
             # current stream: it must not be used again before those steps are done.
             current.wait_event(slot.end)

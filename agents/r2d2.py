@@ -70,7 +70,7 @@ class R2D2:
     eta               a sequence's priority is that of its largest error with this weight, and of
                       its mean error with the rest
     max_grad_norm     longer gradients are shortened to this
-    n_minibatches     gradient steps per rollout
+    gradient_steps    per rollout
     replay            of the replay memory: `replay.ReplaySettings`
     graph             on a GPU, captures the update as a CUDA graph; always with one and the same
                       rollout then
@@ -94,7 +94,7 @@ class R2D2:
         epsilon_spread: Annotated[float, Field(ge=0, le=100)] = 7.0,
         eta: Fraction = 0.9,
         max_grad_norm: Positive = 10.0,
-        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 4,
+        gradient_steps: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 4,
         replay: ReplaySettings = _REPLAY,
         graph: bool = False,
         seed: int = 1,
@@ -105,7 +105,7 @@ class R2D2:
         self.gamma, self.return_steps = gamma, return_steps
         self.target_period, self.eta = target_period, eta
         self.epsilon, self.epsilon_spread = epsilon, epsilon_spread
-        self.n_minibatches, self.replay_settings = n_minibatches, replay
+        self.gradient_steps, self.replay_settings = gradient_steps, replay
         self.length = replay.sequence_steps(n_steps)
         self.replay = None  # made for an environment's lanes
         self.lr = lr
@@ -124,9 +124,16 @@ class R2D2:
 
     def collector(self, env: Any) -> Collector:
         """What acts in `env`, with a memory of `n_steps` steps of its lanes; makes the replay
-        memory. ValueError if that holds no sequence of each lane.
+        memory. ValueError if that holds no sequence of each lane, or a gradient step would be of
+        less than one.
         """
         rollout = make_rollout(env, self.policy, self.n_steps, values=False)
+        ratio, lanes = self.replay_settings.ratio, rollout.n_lanes
+        if ratio * lanes < self.gradient_steps:
+            raise ValueError(
+                f"replay.ratio={ratio:g} of {lanes:,} lanes is less than a sequence for each of "
+                f"{self.gradient_steps:,} gradient steps: give fewer gradient_steps, or more lanes"
+            )
         spaces_of = env.obs_space, env.action_space
         self.replay = Replay(rollout, *spaces_of, self.replay_settings, logprobs=False)
         epsilon = epsilons(rollout.n_lanes, self.epsilon, self.epsilon_spread).to(self.device)
@@ -136,7 +143,7 @@ class R2D2:
         """About how many bytes a rollout and a minibatch take per environment."""
         # a minibatch's share of what is replayed for a rollout, and of the activations of two
         # networks
-        part = self.replay_settings.ratio / self.n_minibatches
+        part = self.replay_settings.ratio / self.gradient_steps
         rollout = (self.n_steps + 1) * bytes_per_step(env, self.policy)
         each = bytes_per_step(env, self.policy) + 2 * self.policy.activation_bytes
         return env.n_agents * (rollout + part * (self.length + 1) * each)
@@ -160,8 +167,8 @@ class R2D2:
         is_ready = self.replay.is_ready
         generator = self.random.on(self.device)
         ratio = self.replay_settings.ratio
-        n_sequences = max(1, round(ratio * rollout.n_lanes / self.n_minibatches))
-        for _ in range(self.n_minibatches):
+        n_sequences = round(ratio * rollout.n_lanes / self.gradient_steps)
+        for _ in range(self.gradient_steps):
             store(self.n_taken % self.target_period == 0, self._copies)
             batch = self.replay.sample(n_sequences, generator)
             loss, metrics, priorities, valid = self._losses(batch)

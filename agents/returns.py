@@ -138,7 +138,9 @@ def rescaled(x: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
 
 
 def unscaled(y: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
-    """The inverse of `rescaled`, in the form that subtracts no two numbers close to each other."""
+    """The inverse of `rescaled`, in the form that is exact for large values; near 0 it is off by a
+    float's last digit of 1.
+    """
     size = y.abs()
     root = 2 * (size + 1 + eps) / ((1 + 4 * eps * (size + 1 + eps)).sqrt() + 1)
     return y.sign() * (root.square() - 1)

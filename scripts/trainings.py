@@ -213,7 +213,7 @@ def learners(device, seeds=SEEDS, budgets=(60,), worlds=tuple(COMPARED)):
         how, counted = COMPARED[world]
         for seed, budget in itertools.product(seeds if world == "Explorer" else seeds[:1], budgets):
             what = f"{world}, {name}, {budget} s, seed {seed}"
-            words = f"{how} {given} seconds={budget} seed={seed}".split()
+            words = f"{how} {given} seconds={budget} seed={seed} report=10".split()
             with trained(device, *words, *NO_FINISH) as run:
                 yield learnt(what, curve(run, counted))
                 row = evaluated(run, device)[0]

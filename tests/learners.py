@@ -26,6 +26,8 @@ class Kind:
         spaces_of = env.obs_space, env.action_space, getattr(env, "privileged_space", None)
         policy = Policy(*spaces_of, width=width, seed=seed, bf16=False, **self.agent)
         policy = policy.to(env.device)
+        if self.made is R2D2 and "n_minibatches" in how:
+            how["gradient_steps"] = how.pop("n_minibatches")
         return policy, self.made(policy, seed=seed, **{**self.how, **how})
 
 
@@ -33,7 +35,7 @@ _HOW = dict(n_steps=16, lr=5e-3, n_minibatches=4)
 _REPLAY = ReplaySettings(capacity=2**14, burn_in=2, ratio=0.5, alpha=0.5)
 
 _OFTEN = ReplaySettings(capacity=2**14, burn_in=1, ratio=2.0, alpha=0.9)
-_R2D2 = dict(n_steps=16, lr=3e-3, n_minibatches=8, target_period=20, return_steps=3)
+_R2D2 = dict(n_steps=16, lr=3e-3, gradient_steps=8, target_period=20, return_steps=3)
 _R2D2 |= dict(epsilon_spread=3.0, replay=_OFTEN)  # in a corridor chance has to find the way first
 
 LEARNERS = {

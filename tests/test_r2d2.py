@@ -277,7 +277,8 @@ def test_a_captured_update_is_the_eager_one():
     testing.assert_close(ends[1], ends[0], rtol=1e-2, atol=1e-3)  # bf16 products, chosen anew
 
 
-RUN = [*TINY, "learner=r2d2", "learner.replay.burn_in=2", "learner.replay.capacity=320"]
+OWN = [word.replace("n_minibatches", "gradient_steps") for word in TINY]
+RUN = [*OWN, "learner=r2d2", "learner.replay.burn_in=2", "learner.replay.capacity=320"]
 
 
 def test_a_run_is_trained_resumed_evaluated_and_used(tmp_path, monkeypatch):
@@ -301,6 +302,7 @@ def test_a_run_is_trained_resumed_evaluated_and_used(tmp_path, monkeypatch):
         (["learner.replay.burn_in=9", "learner.replay.length=9"], "burn_in=9 leaves nothing"),
         (["learner.replay.capacity=30"], "replay.capacity=30 is too small"),
         (["learner.replay.capacity=1e12"], "observations of learner.replay.capacity need"),
+        (["learner.gradient_steps=1000"], "less than a sequence for each of 1,000 gradient steps"),
         (["learner.replay.pictures=fp8"], "learner.replay.pictures: 'fp8' is unknown"),
         (["learner.replay.capaciti=9"], "did you mean learner.replay.capacity?"),
     ],
