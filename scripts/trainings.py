@@ -213,10 +213,12 @@ def learners(device, seeds=SEEDS, budgets=(60,), worlds=tuple(COMPARED)):
         how, counted = COMPARED[world]
         for seed, budget in itertools.product(seeds if world == "Explorer" else seeds[:1], budgets):
             what = f"{world}, {name}, {budget} s, seed {seed}"
-            words = f"{how} {given} seconds={budget} seed={seed} report=10".split()
+            words = f"report=10 {how} {given} seconds={budget} seed={seed}".split()
             with trained(device, *words, *NO_FINISH) as run:
-                yield learnt(what, curve(run, counted))
+                reports = curve(run, counted)
                 row = evaluated(run, device)[0]
+            if len(reports) > 1:
+                yield learnt(what, reports)
             value = dict(mean=row["return"], **row) if counted == "return" else None
             value = value or row["metrics"][counted]
             yield dict(
