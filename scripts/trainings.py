@@ -45,7 +45,7 @@ N_DUELS = 1024  # of two policies; a quarter of it of each pair that is rated
 LEARNERS = {
     "PPO": "learner=ppo",
     "V-trace": "learner=vtrace",
-    "V-trace, a step behind": "learner=vtrace learner.lag=1",
+    "V-trace, an update behind": "learner=vtrace learner.lag=1",
     "V-trace with replay": "learner=vtrace learner.buffer=replay learner.replay.capacity=8e6",
     "R2D2": "learner=r2d2",
 }

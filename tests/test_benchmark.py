@@ -290,7 +290,7 @@ def test_the_page_says_what_the_records_say():
 
 @pytest.mark.slow
 def test_learners_are_compared_and_drawn(monkeypatch, tmp_path):
-    two = {name: trainings.LEARNERS[name] for name in ("PPO", "V-trace, a step behind")}
+    two = {name: trainings.LEARNERS[name] for name in ("PPO", "V-trace, an update behind")}
     monkeypatch.setattr(trainings, "LEARNERS", two)
     how = "env=pong agent.memory=none preset=cpu env.n_envs=64 report=2", "points_won"
     monkeypatch.setattr(trainings, "COMPARED", {"Pong": how})
