@@ -41,7 +41,9 @@ class VTrace:
     rho_clip          what the ratio of an action counts at most: at 1, good actions that are
                       likelier now teach as if they were as likely as then
     c_clip            what a ratio counts at most in the trace, which carries what is learnt back
-    entropy_coef      what a nat of entropy is worth, in standard deviations of the return
+    advantage_floor   the least that advantages are divided by, in standard deviations of the
+                      return
+    entropy_coef      what a nat of entropy is worth, in what advantages are measured in
     value_coef        weight of the value's squared error, the value measured in its own scale
     auxiliary_coef    weight of the policy's `prediction_error`, where its critic is asymmetric
     max_grad_norm     longer gradients are shortened to this
@@ -69,6 +71,7 @@ class VTrace:
         lambda_: Fraction = 0.95,
         rho_clip: Positive = 1.0,
         c_clip: Positive = 1.0,
+        advantage_floor: Positive = 0.3,
         entropy_coef: Coefficient = 0.01,
         value_coef: Coefficient = 0.5,
         auxiliary_coef: Coefficient = 0.5,
@@ -93,8 +96,8 @@ class VTrace:
             )
         self.policy, self.device, self.n_steps, self.lag = policy, policy.device, n_steps, lag
         self.traces = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
-        self.entropy_coef, self.value_coef = entropy_coef, value_coef
-        self.auxiliary_coef = auxiliary_coef
+        self.advantage_floor, self.entropy_coef = advantage_floor, entropy_coef
+        self.value_coef, self.auxiliary_coef = value_coef, auxiliary_coef
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
         self.replay_settings = replay if buffer == "replay" else None
         self.replay = None  # made for an environment's lanes
@@ -199,10 +202,14 @@ class VTrace:
         estimates["valid"] = valid
         scale = self.policy.critic.output.scale
         error = (value[:-1] - estimates.targets) / scale
+        advantages = estimates.advantages / scale  # in standard deviations of the return
+        size = masked_mean(advantages.square(), valid).sqrt()
+        advantages = advantages / size.clamp(min=self.advantage_floor)
         metrics = dict(
-            policy=-masked_mean(weight * logprobs * estimates.advantages / scale, valid),
+            policy=-masked_mean(weight * logprobs * advantages, valid),
             value=masked_mean(weight * error.square(), valid),
             entropy=masked_mean(output.entropy(logits), valid),
+            advantage=size,
             **self._of_ratios(log_ratio[:, :n_fresh], valid[:, :n_fresh]),
             explained_variance=explained_variance(value[:-1].detach(), estimates.targets, valid),
         )
@@ -220,8 +227,8 @@ class VTrace:
             metrics |= {f"replayed_{key}": value for key, value in old.items()}
             age = batch.age[n_fresh:].float().mean() + self.lag
             metrics["staleness"] = age * self.replay.is_ready
-            size = masked_mean(error.detach().abs(), valid, 0)[n_fresh:]
-            self.replay.set_priorities(batch.index, size)
+            mean_error = masked_mean(error.detach().abs(), valid, 0)[n_fresh:]
+            self.replay.set_priorities(batch.index, mean_error)
         return loss, metrics, estimates
 
     def _of_ratios(self, log_ratio, valid):

@@ -24,7 +24,7 @@ def test_the_first_pass_finds_the_policy_where_it_was():
         f"loss/{key}"
         for key in (
             *("policy", "value", "entropy", "kl", "rho", "clip_fraction", "effective_samples"),
-            *("grad_norm", "explained_variance", "skipped_steps"),
+            *("advantage", "grad_norm", "explained_variance", "skipped_steps"),
         )
     }
 
@@ -52,6 +52,19 @@ def test_the_effective_samples_falls_as_ratios_differ():
     # 24 - 0 and 24 - 2 rows are valid, as lanes 1 and 4 have one reset each: 23 weigh 1/3, 23 1
     share = (1 / 3 + 1) ** 2 / (2 * (1 / 9 + 1))
     assert metrics["loss/effective_samples"].item() == pytest.approx(share, abs=1e-4)
+
+
+def test_advantages_are_measured_in_their_own_size_or_the_floor():
+    def losses(floor):
+        policy, rollout = made_up(values=False)
+        made = VTrace(policy, n_minibatches=1, lr=1e-30, advantage_floor=floor).update(rollout)
+        return made["loss/policy"].item(), made["loss/advantage"].item()
+
+    own, size = losses(1e-6)
+    assert size > 0
+    assert losses(size / 2)[0] == pytest.approx(own, rel=1e-5)
+    for times in (2, 5):
+        assert losses(times * size)[0] == pytest.approx(own / times, rel=1e-5)
 
 
 def test_good_actions_become_likelier_and_bad_ones_rarer():
