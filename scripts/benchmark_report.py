@@ -206,16 +206,18 @@ def plot_worlds(records, path):
 
 def plot_learners(records, path):
     """Plots what counts in each world against samples and against seconds, a colour per learner, a
-    line per seed, of the runs that were given longest.
+    line per seed, of the runs that were given longest in that world.
     """
     import matplotlib
     from matplotlib.figure import Figure
 
     drawn = [r for r in newest(records) if r["benchmark"] == "learners" and "curve" in r]
     drawn = [record for record in drawn if not record["on"].startswith("CPU")]
-    longest = max((record["curve"][-1][0] for record in drawn), default=0)
-    drawn = [record for record in drawn if record["curve"][-1][0] > longest / 2]
     named = [(*record["what"].rsplit(", ", 3)[0].split(", ", 1), record) for record in drawn]
+    longest = {}
+    for world, _, record in named:
+        longest[world] = max(longest.get(world, 0), record["curve"][-1][0])
+    named = [one for one in named if one[2]["curve"][-1][0] > 0.75 * longest[one[0]]]
     worlds = [world for world in COMPARED if any(world == name for name, _, _ in named)]
     if not worlds:
         return

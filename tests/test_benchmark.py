@@ -290,11 +290,12 @@ def test_the_page_says_what_the_records_say():
 
 @pytest.mark.slow
 def test_learners_are_compared_and_drawn(monkeypatch, tmp_path):
-    two = {name: trainings.LEARNERS[name] for name in ("PPO", "V-trace, an update behind")}
-    monkeypatch.setattr(trainings, "LEARNERS", two)
-    how = "env=pong agent.memory=none preset=cpu env.n_envs=64 report=2", "points_won"
+    two = {name: trainings.LEARNERS[name] for name in ("PPO", "R2D2")}
+    ahead = {trainings.AHEAD: trainings.LEARNERS[trainings.AHEAD]}  # in Explorer alone
+    monkeypatch.setattr(trainings, "LEARNERS", two | ahead)
+    how = "env=pong agent.memory=none preset=cpu env.n_envs=64 report=2", "points_won", 3
     monkeypatch.setattr(trainings, "COMPARED", {"Pong": how})
-    found = list(trainings.learners(torch.device("cpu"), (1,), (3,), ("Pong",)))
+    found = list(trainings.learners(torch.device("cpu"), (1, 2), worlds=("Pong",)))
     assert [r["what"] for r in found] == [
         f"Pong, {name}, 3 s, seed 1{told}"
         for name in two
