@@ -47,9 +47,10 @@ LEARNERS = {
     "PPO": "learner=ppo",
     "V-trace": "learner=vtrace",
     AHEAD: "learner=vtrace learner.lag=1",
-    "V-trace with replay": "learner=vtrace learner.buffer=replay learner.replay.capacity=8e6",
+    "V-trace with replay": "learner=vtrace learner.buffer=replay learner.replay.capacity={stored}",
     "R2D2": "learner=r2d2",
 }
+STORED = {"cuda": 8_000_000, "cpu": 100_000}  # observations that V-trace replays
 #: In what they are: overrides, what counts, and for how many seconds.
 COMPARED = {
     "Explorer": ("env=explorer geometry=bench", "return", 25),
@@ -220,6 +221,7 @@ def learners(device, seeds=SEEDS, budgets=None, worlds=tuple(COMPARED)):
                 if name == AHEAD and (world != "Explorer" or seed != seeds[0]):
                     continue
                 what = f"{world}, {name}, {budget} s, seed {seed}"
+                given = given.format(stored=STORED[device.type])
                 words = f"report=10 {how} {given} seconds={budget} seed={seed}".split()
                 with trained(device, *words, *NO_FINISH) as run:
                     reports = curve(run, counted)
