@@ -17,9 +17,9 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from agents.heads import compute_dtype
 from agents.kernels import lstm as kernels
 from agents.kernels.program import aligned, check_shapes
+from agents.precision import compute_dtype
 from megastep.arrdict import arrdict
 
 _sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input  # (d, y): d y (1 - y)

@@ -12,7 +12,7 @@ import torch
 from pydantic import AfterValidator, Field
 from torch import nn
 
-from agents import heads
+from agents import encoders, heads
 from agents import memory as cores
 from agents.critic import Critic
 from agents.imports import choose
@@ -36,8 +36,8 @@ class Policy(nn.Module):
     """Acts on worlds: `decision, state = policy(world, state)`, starting from `policy.initial(B)`.
     A world is what an environment's `step` returns, a decision what it takes.
 
-    `memory` and `encoder` are names in `memory.MEMORIES` and `heads.ENCODERS`, or import paths of
-    others; `layers` is how many cores stand one above the other. `output` is "softmax", which
+    `memory` and `encoder` are names in `memory.MEMORIES` and `encoders.ENCODERS`, or import paths
+    of others; `layers` is how many cores stand one above the other. `output` is "softmax", which
     samples actions by their probabilities, or "duelling", which takes the one of most value.
     `critic` is "asymmetric", which also sees a world's `privileged` of `privileged_space` where
     there is such a space; "plain", which sees what the actor sees; or None, for a policy that only
@@ -60,7 +60,7 @@ class Policy(nn.Module):
         width: Annotated[int, Field(ge=1, le=8192)] = 128,
         memory: Annotated[str, _known(cores.MEMORIES)] = "lstm",
         layers: Annotated[int, Field(ge=1, le=8)] = 1,
-        encoder: Annotated[str, _known(heads.ENCODERS)] = "linear",
+        encoder: Annotated[str, _known(encoders.ENCODERS)] = "linear",
         output: Literal["softmax", "duelling"] = "softmax",
         critic: Literal["asymmetric", "plain"] | None = "asymmetric",
         bf16: bool = True,

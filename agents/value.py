@@ -6,7 +6,7 @@ Axes: `...` any leading axes, such as (B,) lanes or (T, B) time and lanes.
 import torch
 from torch import nn
 
-from agents.heads import compute_dtype
+from agents.precision import compute_dtype
 from agents.running_norm import mixed_moments, store
 
 

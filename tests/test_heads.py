@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from agents import heads
+from agents import encoders, heads
 from megastep import spaces
 from megastep.arrdict import arrdict
 
@@ -32,7 +32,7 @@ def sample_of(space, *lead, seed=0, dtype=torch.float32):
     return space.map(leaf) if isinstance(space, dict) else leaf(space)
 
 
-@pytest.mark.parametrize("encoder", heads.ENCODERS)
+@pytest.mark.parametrize("encoder", encoders.ENCODERS)
 @pytest.mark.parametrize(
     "space", [IMAGE, VECTOR, spaces.MultiDiscrete(2, 4), TREE, spaces.MultiImage(1, 3, 4, 1)]
 )
@@ -43,7 +43,7 @@ def test_an_intake_gives_width_numbers_whatever_it_is_shown(space, encoder, lead
     assert out.shape == (*lead, WIDTH) and out.dtype == torch.float32 and out.isfinite().all()
 
 
-@pytest.mark.parametrize("encoder", heads.ENCODERS)
+@pytest.mark.parametrize("encoder", encoders.ENCODERS)
 def test_every_pixel_and_every_leaf_matters(encoder):
     torch.manual_seed(0)
     intake = heads.intake(TREE, 512, encoder)
@@ -270,31 +270,3 @@ def test_what_was_learned_about_observations_is_saved_with_the_weights():
     intake.update_stats(obs)
     other.load_state_dict(intake.state_dict())
     assert torch.equal(other(obs), intake(obs))
-
-
-@pytest.mark.parametrize("shape", [(3, 128), (1, 64), (6, 37), (1, 5)])
-def test_a_convolution_is_a_product_with_a_banded_matrix(shape):
-    channels, n_columns = shape
-    conv = heads.Conv(spaces.MultiImage(1, channels, 1, n_columns))
-    rows = torch.rand(6, channels, n_columns, generator=torch.Generator().manual_seed(1))
-    for layer in conv.first, conv.second:
-        wanted, found = layer(rows), layer.as_product(rows)
-        torch.testing.assert_close(found, wanted)
-        weights = torch.rand(wanted.shape, generator=torch.Generator().manual_seed(2))
-        parameters = layer.weight, layer.bias
-        torch.testing.assert_close(
-            torch.autograd.grad((found * weights).sum(), parameters),
-            torch.autograd.grad((wanted * weights).sum(), parameters),
-            rtol=1e-4,
-            atol=1e-4,
-        )
-        rows = wanted.detach()
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("n_columns", [128, 2 * heads.BandedConv1d.MAX_BANDED])
-def test_gpu_and_cpu_convolve_alike(n_columns):
-    conv = heads.Conv(spaces.MultiImage(1, 3, 1, n_columns))
-    image = torch.rand(7, 1, 3, 1, n_columns, generator=torch.Generator().manual_seed(1))
-    wanted = conv(image)
-    torch.testing.assert_close(conv.cuda()(image.cuda()).cpu(), wanted, rtol=1e-3, atol=1e-3)
