@@ -66,12 +66,15 @@ def row(record):
 
 def newest(records):
     """The newest record of each measurement on each GPU and on the CPU, in order of benchmark,
-    place and name.
+    place and name. Names that differ in counts in brackets, or within a million of samples, are of
+    the same measurement.
     """
     found = {}
     for record in sorted(records, key=lambda record: record["date"]):
         kind = "CPU" if record["on"].startswith("CPU") else record["on"]
-        found[record["benchmark"], kind, record["what"]] = record
+        what = re.sub(r" \(.*?\)", "", record["what"])
+        what = re.sub(r",\d{3},\d{3} samples", " M samples", what)
+        found[record["benchmark"], kind, what] = record
 
     def order(key):
         benchmark, kind, what = key
