@@ -208,38 +208,38 @@ def plot_worlds(records, path):
 
 
 def plot_learners(records, path):
-    """Plots what counts in each world against samples and against seconds, a colour per learner, a
-    line per seed, of the runs that were given longest in that world.
+    """Plots what counts in each world, on a GPU and on a CPU, against samples and against seconds,
+    a colour per learner, a line per seed, of the runs that were given longest there.
     """
     import matplotlib
     from matplotlib.figure import Figure
 
-    drawn = [r for r in newest(records) if r["benchmark"] == "learners" and "curve" in r]
-    drawn = [record for record in drawn if not record["on"].startswith("CPU")]
-    named = [(*record["what"].rsplit(", ", 3)[0].split(", ", 1), record) for record in drawn]
-    longest = {}
-    for world, _, record in named:
-        longest[world] = max(longest.get(world, 0), record["curve"][-1][0])
-    named = [one for one in named if one[2]["curve"][-1][0] > 0.75 * longest[one[0]]]
-    worlds = [world for world in COMPARED if any(world == name for name, _, _ in named)]
-    if not worlds:
+    runs = {}
+    for record in newest(records):
+        if record["benchmark"] == "learners" and "curve" in record:
+            world, name = record["what"].rsplit(", ", 3)[0].split(", ", 1)
+            runs.setdefault((world, record["on"].split(",")[0]), []).append((name, record))
+    if not runs:
         return
-    figure = Figure(figsize=(9, 2.9 * len(worlds)), layout="constrained")
-    grid = figure.subplots(len(worlds), 2, squeeze=False, sharey="row")
+    figure = Figure(figsize=(9, 2.9 * len(runs)), layout="constrained")
+    grid = figure.subplots(len(runs), 2, squeeze=False, sharey="row")
     colours = {name: f"C{i}" for i, name in enumerate(LEARNERS)}
-    for world, name, record in named:
-        by_samples, by_seconds = grid[worlds.index(world)]
-        seconds, samples, values = zip(*record["curve"])
-        told = dict(color=colours[name], linewidth=1.2)
-        by_samples.plot([n / 1e6 for n in samples], values, **told)
-        is_first = ", seed 1," in record["what"]
-        by_seconds.plot(seconds, values, label=name if is_first else None, **told)
-    for world, (left, right) in zip(worlds, grid):
+    order = sorted(runs, key=lambda place: (place[1] == "CPU", list(COMPARED).index(place[0])))
+    for (world, on), (left, right) in zip(order, grid):
+        longest = max(record["curve"][-1][0] for _, record in runs[world, on])
+        for name, record in runs[world, on]:
+            seconds, samples, values = zip(*record["curve"])
+            if seconds[-1] < 0.75 * longest:
+                continue
+            told = dict(color=colours[name], linewidth=1.2)
+            is_first = ", seed 1," in record["what"]
+            left.plot([n / 1e6 for n in samples], values, **told)
+            right.plot(seconds, values, label=name if is_first else None, **told)
         counted = COMPARED[world][1].replace("_", " ")
         counted = counted.upper() if counted == "spl" else counted
-        left.set(title=world, ylabel=f"{counted}, in training", xlabel="million samples")
+        left.set(title=f"{world}, {on}", ylabel=f"{counted}, in training", xlabel="million samples")
         left.set(xscale="log", ylim=(0, None))
-        right.set(title=world, xlabel="seconds of training")
+        right.set(title=f"{world}, {on}", xlabel="seconds of training")
         left.grid(alpha=0.3)
         right.grid(alpha=0.3)
     grid[0, 1].legend(fontsize=8)

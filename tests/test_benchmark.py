@@ -280,6 +280,17 @@ def test_the_newest_record_of_a_measurement_is_shown_and_sizes_are_in_order():
     assert [r["value"] for r in benchmark_report.newest(records)] == [4.0, 2.0, 6.0]
 
 
+def test_records_that_differ_in_counts_are_of_one_measurement():
+    records = [
+        record("duels (3 won, 1 lost)", 1.0),
+        record("rating of 120,198,592 samples", 2.0),
+        record("rating of 240,198,592 samples", 3.0),
+        record("duels (2 won, 2 lost)", 4.0),
+        record("rating of 120,223,040 samples", 5.0),
+    ]
+    assert [r["value"] for r in benchmark_report.newest(records)] == [4.0, 5.0, 3.0]
+
+
 def test_the_page_says_what_the_records_say():
     """If this fails: python scripts/benchmark.py report."""
     records = benchmark_report.read(ROOT / "docs" / "benchmarks.jsonl")
