@@ -227,7 +227,7 @@ def plot_learners(records, path):
     order = sorted(runs, key=lambda place: (place[1] == "CPU", list(COMPARED).index(place[0])))
     for (world, on), (left, right) in zip(order, grid):
         longest = max(record["curve"][-1][0] for _, record in runs[world, on])
-        for name, record in runs[world, on]:
+        for name, record in sorted(runs[world, on], key=lambda one: list(LEARNERS).index(one[0])):
             seconds, samples, values = zip(*record["curve"])
             if seconds[-1] < 0.75 * longest:
                 continue
@@ -275,7 +275,7 @@ def plot_ratings(records, path):
                 ax.axhline(value, color=f"C{i}", linestyle="--", linewidth=1, label=label)
     ax.set(xlabel="million samples", ylabel="rating ± two standard deviations")
     ax.grid(alpha=0.3)
-    ax.legend(fontsize=8, loc="lower right")
+    ax.legend(fontsize=8, loc="upper left")
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
         ax.figure.savefig(path, metadata={"Date": None})
 
