@@ -104,9 +104,9 @@ class ConcatIntake(nn.Module):
 def intake(space: Any, width: int, encoder: str = "linear") -> ConcatIntake:
     """A module from observations of this space, or dict of spaces, to vectors (..., width).
 
-    Observations may be of any dtype; they are cast to the weights'. `encoder` is that of images:
-    'linear', as so many numbers; 'conv', by convolutions; or an import path. ValueError if the
-    space is of no known kind.
+    Observations may be of any dtype; their features are cast to the one that is computed in
+    (`precision.compute_dtype`). `encoder` is that of images: 'linear', as so many numbers; 'conv',
+    by convolutions; or an import path. ValueError if the space is of no known kind.
     """
     return ConcatIntake(space, width, encoder)
 

@@ -157,7 +157,8 @@ class R2D2:
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Stores a rollout that its collector gave, and learns from what is stored. Returns means
         over its gradient steps as tensors () on the device, 0 before learning starts, among them
-        `loss/skipped_steps`, how many gradients were not finite and so were not followed.
+        `loss/skipped_steps`, how many gradients were not finite and so were not followed, and the
+        largest and the mean priority of what is stored.
         """
         return {f"loss/{key}": value for key, value in self.captured(rollout).items()}
 

@@ -31,9 +31,9 @@ class VTrace:
     """Improves a policy, in place, from rollouts that it, or itself some updates ago, collected.
 
     Each minibatch is valued anew: the policy as it is now tells values and how likely each action
-    is, and V-trace weighs what followed by the ratios, cut off at `rho_clip`. Advantages are in the
-    value's scale (Hessel et al. 2019). Over their own standard deviation they would be large where
-    all actions are about as good, and unlike PPO this has no clip to hold such steps back.
+    is, and V-trace weighs what followed by the ratios, cut off at `rho_clip`. Advantages are
+    divided by their root mean square, or by the floor where that is more: where all actions are
+    about as good they stay small, as unlike PPO this has no clip to hold large steps back.
 
     n_steps           of a rollout
     lr                Adam's step size; `set_lr` changes it

@@ -76,9 +76,10 @@ def machine(device):
 def measure(name, device, commit, options=None):
     """The records of a benchmark, as they come; `options` are arguments of it."""
     device = torch.device("cpu") if name == "cpu" else device
-    command = f"python scripts/benchmark.py {name}" + (
-        "" if device.type == "cuda" else " --device cpu"
-    )
+    words = ["python scripts/benchmark.py", name]
+    for key, value in (options or {}).items():
+        words += [f"--{key}", *map(str, value if isinstance(value, list) else [value])]
+    words += ["--device cpu"] * (device.type == "cpu")
     where = machine(device)
     for found in BENCHMARKS[name](device, **options or {}):
         numbers = {key: rounded(found[key]) for key in ("value", "lower", "upper")}
@@ -88,7 +89,7 @@ def measure(name, device, commit, options=None):
             **where,
             commit=commit,
             date=str(date.today()),
-            command=command,
+            command=" ".join(words),
         )
 
 

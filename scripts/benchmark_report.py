@@ -24,8 +24,9 @@ CPU. [Benchmarks](benchmarks.md) says what the measurements mean.
 
 A measurement is the median of n samples, beside it their 10th and 90th percentiles. A sample is the
 mean over as many calls as fill 50 ms after warming up, timed by CUDA events on a GPU; or one
-process; or one report of a training run. A return is a mean with its 95 % bootstrap interval over n
-homes. What has no spread was counted, or read once by Nsight Compute.
+process; or one report of a training run. A return, or a share, is a mean with its 95 % bootstrap
+interval over n homes, or lanes where there are none; a rating has two standard deviations to either
+side. What has no spread was counted, or read once by Nsight Compute.
 
 {benchmarks}
 
@@ -66,13 +67,13 @@ def row(record):
 
 def newest(records):
     """The newest record of each measurement on each GPU and on the CPU, in order of benchmark,
-    place and name. Names that differ in counts in brackets, or within a million of samples, are of
-    the same measurement.
+    place and name. Names that differ in duels won, or within a million of samples, are of the
+    same measurement.
     """
     found = {}
     for record in sorted(records, key=lambda record: record["date"]):
         kind = "CPU" if record["on"].startswith("CPU") else record["on"]
-        what = re.sub(r" \(.*?\)", "", record["what"])
+        what = re.sub(r" \(\d+ won, .*?\)", "", record["what"])
         what = re.sub(r",\d{3},\d{3} samples", " M samples", what)
         found[record["benchmark"], kind, what] = record
 

@@ -33,7 +33,7 @@ ABLATIONS = {
     "hits less wounds alone": "env.aim_reward=0 env.search_reward=0",
     "aim not paid": "env.aim_reward=0",
     "searching not paid": "env.search_reward=0",
-    "wounds half as dear": "env.wound_cost=0.5",
+    "wounds at half the cost": "env.wound_cost=0.5",
     "self-play against now alone": "opponents.past=0 opponents.bot=0",
     "past selves, no bot": "opponents.past=0.8 opponents.bot=0",
     "a drain of 0.01 per second": "env.drain=0.01",
@@ -210,8 +210,8 @@ def ablation(device, samples=60_000_000):
 
 def learners(device, seeds=SEEDS, budgets=None, worlds=tuple(COMPARED)):
     """Learners compared, each by itself on the device for as many seconds: three seeds of Explorer,
-    the first alone of other worlds and of acting an update behind. What counts there, in unseen
-    homes, with the learning curve.
+    the first alone of other worlds and of acting an update behind. What counts there, evaluated in
+    unseen homes, with the learning curve.
     """
     for world in worlds:
         how, counted, own = COMPARED[world]
@@ -230,8 +230,9 @@ def learners(device, seeds=SEEDS, budgets=None, worlds=tuple(COMPARED)):
                     yield learnt(what, reports)
                 value = dict(mean=row["return"], **row) if counted == "return" else None
                 value = value or row["metrics"][counted]
+                where = "in unseen homes" if row["homes"] else "in first episodes"
                 yield dict(
-                    what=f"{what}: {counted} in unseen homes",
+                    what=f"{what}: {counted} {where}",
                     value=value["mean"],
                     unit="",
                     lower=value["lower"],

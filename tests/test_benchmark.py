@@ -282,10 +282,10 @@ def test_the_newest_record_of_a_measurement_is_shown_and_sizes_are_in_order():
 
 def test_records_that_differ_in_counts_are_of_one_measurement():
     records = [
-        record("duels (3 won, 1 lost)", 1.0),
+        record("duels (3 won, 0 drawn, 1 lost)", 1.0),
         record("rating of 120,198,592 samples", 2.0),
         record("rating of 240,198,592 samples", 3.0),
-        record("duels (2 won, 2 lost)", 4.0),
+        record("duels (2 won, 1 drawn, 1 lost)", 4.0),
         record("rating of 120,223,040 samples", 5.0),
     ]
     assert [r["value"] for r in benchmark_report.newest(records)] == [4.0, 5.0, 3.0]
@@ -310,7 +310,7 @@ def test_learners_are_compared_and_drawn(monkeypatch, tmp_path):
     assert [r["what"] for r in found] == [
         f"Pong, {name}, 3 s, seed 1{told}"
         for name in two
-        for told in (", median rate", ": points_won in unseen homes")
+        for told in (", median rate", ": points_won in first episodes")
     ]
     assert all(0 <= r["value"] <= 1 for r in found[1::2])
     more = dict(benchmark="learners", on="NVIDIA H200", date="2026-11-22")
