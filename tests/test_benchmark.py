@@ -299,6 +299,16 @@ def test_the_page_says_what_the_records_say():
     assert (ROOT / "docs" / "benchmark-table.svg").exists()
 
 
+def test_a_record_says_the_command_that_measures_it_again(monkeypatch):
+    def duels(device, seeds=(1, 2, 3), samples=10):
+        yield dict(what="a", value=1.0, unit="", lower=None, upper=None, n=None)
+
+    monkeypatch.setitem(benchmark.BENCHMARKS, "duels", duels)
+    (found,) = benchmark.measure("duels", torch.device("cpu"), "abc", dict(seeds=[3, 4], samples=5))
+    told = "python scripts/benchmark.py duels --seeds 3 4 --samples 5 --device cpu"
+    assert found["command"] == told
+
+
 @pytest.mark.slow
 def test_learners_are_compared_and_drawn(monkeypatch, tmp_path):
     two = {name: trainings.LEARNERS[name] for name in ("PPO", "R2D2")}
