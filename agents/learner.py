@@ -25,7 +25,8 @@ memory tells its size before there is one, by a method `replay_size(env)`: how m
 holds, and bytes for each, of an environment like this one.
 
 What ours are made of serves others, too: `rollout.make_rollout` and `rollout.Collector`,
-`rollout.bytes_per_step`, `gradient_steps.GradientSteps`, `captured.CapturedUpdate`, `masked`.
+`rollout.bytes_per_step`, `gradient_steps.GradientSteps`, `captured.CapturedUpdate`, `masked`, and
+`own_state` here.
 """
 
 from typing import Annotated, Any
@@ -69,6 +70,29 @@ def check_state(learner: Any, state: dict[str, Any]) -> None:
             f"the state of a {state['learner']} learner cannot be that of {own}: go on with the "
             "learner that it is from, or start from the policy's weights alone (init=RUN)"
         )
+
+
+def own_state(learner: Any) -> dict[str, Any]:
+    """The `state_dict` of a learner with `steps`, `random`, `policy` and `captured`: all that an
+    update changes beside the policy's weights, and where the policy's random stream is.
+    """
+    return dict(
+        learner=type(learner).__name__,
+        **learner.steps.state_dict(),
+        random=learner.random.state_dict(),
+        policy_random=learner.policy.random.state_dict(),
+    )
+
+
+def load_own_state(learner: Any, state: dict[str, Any]) -> None:
+    """Goes on from an `own_state`, taken on this device or another. ValueError if it is that of
+    another kind of learner.
+    """
+    check_state(learner, state)
+    learner.steps.load_state_dict(state)
+    learner.random.load_state_dict(state["random"], learner.device)
+    learner.policy.random.load_state_dict(state["policy_random"], learner.device)
+    learner.captured.restart()
 
 
 class LearnerError(AssertionError):

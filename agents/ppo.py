@@ -13,7 +13,14 @@ from pydantic import Field
 from agents import returns
 from agents.captured import CapturedUpdate
 from agents.gradient_steps import GradientSteps
-from agents.learner import Coefficient, Fraction, Positive, check_minibatches, check_state
+from agents.learner import (
+    Coefficient,
+    Fraction,
+    Positive,
+    check_minibatches,
+    load_own_state,
+    own_state,
+)
 from agents.masked import explained_variance, masked_mean, normalised
 from agents.random_stream import RandomStream
 from agents.rollout import Collector, Rollout, bytes_per_step, make_rollout, without_last
@@ -163,19 +170,10 @@ class PPO:
         """All that an update changes beside the policy's weights, and where the policy's random
         stream is: dicts of plain tensors and numbers.
         """
-        return dict(
-            learner=type(self).__name__,
-            **self.steps.state_dict(),
-            random=self.random.state_dict(),
-            policy_random=self.policy.random.state_dict(),
-        )
+        return own_state(self)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on from a `state_dict`, taken on this device or another. ValueError if it is that of
         another kind of learner.
         """
-        check_state(self, state)
-        self.steps.load_state_dict(state)
-        self.random.load_state_dict(state["random"], self.device)
-        self.policy.random.load_state_dict(state["policy_random"], self.device)
-        self.captured.restart()
+        load_own_state(self, state)

@@ -13,7 +13,7 @@ from pydantic import Field
 from agents import returns
 from agents.captured import CapturedUpdate
 from agents.gradient_steps import GradientSteps
-from agents.learner import Fraction, Positive, check_state
+from agents.learner import Fraction, Positive, load_own_state, own_state
 from agents.masked import effective_sample_size, masked_mean
 from agents.random_stream import RandomStream
 from agents.replay import Replay, ReplaySettings, bytes_per_observation
@@ -242,23 +242,12 @@ class R2D2:
         """All that an update changes beside the policy's weights and what is replayed, and where
         the policy's random stream is: dicts of plain tensors and numbers.
         """
-        return dict(
-            learner=type(self).__name__,
-            **self.steps.state_dict(),
-            target=self.target.state_dict(),
-            n_taken=self.n_taken.clone(),
-            random=self.random.state_dict(),
-            policy_random=self.policy.random.state_dict(),
-        )
+        return dict(own_state(self), target=self.target.state_dict(), n_taken=self.n_taken.clone())
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on from a `state_dict`, taken on this device or another. ValueError if it is that of
         another kind of learner.
         """
-        check_state(self, state)
-        self.steps.load_state_dict(state)
+        load_own_state(self, state)
         self.target.load_state_dict(state["target"])
         self.n_taken.copy_(state["n_taken"])
-        self.random.load_state_dict(state["random"], self.device)
-        self.policy.random.load_state_dict(state["policy_random"], self.device)
-        self.captured.restart()

@@ -34,7 +34,7 @@ class ReplaySettings:
     """What learners that have a replay memory let one choose.
 
     capacity  observations that it holds, all lanes together, less what does not fill a rollout
-    pictures  how images of numbers from 0 to 1 are stored: fp16, as they are; uint8, in steps of
+    images    how images of numbers from 0 to 1 are stored: fp16, as they are; uint8, in steps of
               1/255, in half of the memory. Numbers beyond 0 and 1 are clipped then.
     burn_in   so many steps at the start of a sequence only warm up the memory
     length    steps of a sequence, those of its burn-in included; null: as many as make every step
@@ -46,7 +46,7 @@ class ReplaySettings:
     """
 
     capacity: Annotated[int, Field(ge=1, le=10**12)] = 1_000_000
-    pictures: Literal["fp16", "uint8"] = "fp16"
+    images: Literal["fp16", "uint8"] = "fp16"
     burn_in: Annotated[int, Field(ge=0, le=65_536)] = 0
     length: Annotated[int, Field(ge=1, le=131_072)] | None = None
     ratio: Annotated[float, Field(gt=0, le=1000)] = 1.0
@@ -116,7 +116,7 @@ class Replay:
             return _Column(n_rows, leaf.shape[1:], leaf.dtype, dtype or leaf.dtype, device)
 
         def column_of(leaf, space):
-            return column(leaf, _stored_dtype(space, settings.pictures))
+            return column(leaf, _stored_dtype(space, settings.images))
 
         self.columns = arrdict(
             obs=_each(column_of, rollout.obs, obs_space),
@@ -287,12 +287,12 @@ def _cast(values, dtype):
     return values.to(dtype)
 
 
-def _stored_dtype(space, pictures):
+def _stored_dtype(space, images):
     """What values of a space are stored in; None: in what they have."""
     if isinstance(space, spaces.MultiDiscrete):
         dtypes = torch.uint8, torch.int16, torch.int32
         return next(d for d in dtypes if space.n_actions - 1 <= torch.iinfo(d).max)
-    if isinstance(space, spaces.MultiImage) and pictures == "uint8":
+    if isinstance(space, spaces.MultiImage) and images == "uint8":
         return torch.uint8
     return None
 

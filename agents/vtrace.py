@@ -15,7 +15,14 @@ from agents import joined, returns
 from agents.ahead import AheadCollector
 from agents.captured import CapturedUpdate
 from agents.gradient_steps import GradientSteps
-from agents.learner import Coefficient, Fraction, Positive, check_minibatches, check_state
+from agents.learner import (
+    Coefficient,
+    Fraction,
+    Positive,
+    check_minibatches,
+    load_own_state,
+    own_state,
+)
 from agents.masked import effective_sample_size, explained_variance, masked_mean
 from agents.random_stream import RandomStream
 from agents.replay import Replay, ReplaySettings, bytes_per_observation
@@ -247,19 +254,10 @@ class VTrace:
         stream is: dicts of plain tensors and numbers. Rollouts that were collected ahead are not in
         it: who goes on from it acts anew, on the weights of then.
         """
-        return dict(
-            learner=type(self).__name__,
-            **self.steps.state_dict(),
-            random=self.random.state_dict(),
-            policy_random=self.policy.random.state_dict(),
-        )
+        return own_state(self)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on from a `state_dict`, taken on this device or another. ValueError if it is that of
         another kind of learner.
         """
-        check_state(self, state)
-        self.steps.load_state_dict(state)
-        self.random.load_state_dict(state["random"], self.device)
-        self.policy.random.load_state_dict(state["policy_random"], self.device)
-        self.captured.restart()
+        load_own_state(self, state)

@@ -96,9 +96,21 @@ def page(records: list[dict], plot: str) -> str:
     return PAGE.format(plot=plot, benchmarks="\n".join(lines), table=table)
 
 
+def words(metric):
+    """What a plot calls a metric."""
+    return "SPL" if metric == "spl" else metric.replace("_", " ")
+
+
+def save(figure, path):
+    """Writes an SVG; the same figure gives the same file."""
+    import matplotlib
+
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
+        figure.savefig(path, metadata={"Date": None})
+
+
 def plot(records, path):
     """Plots frames per second against environments, log-log; the same records give the same SVG."""
-    import matplotlib
     from matplotlib.figure import Figure
 
     series = {}
@@ -121,8 +133,7 @@ def plot(records, path):
     ax.minorticks_off()
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8)
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
-        ax.figure.savefig(path, metadata={"Date": None})
+    save(ax.figure, path)
 
 
 def learning_curves(records: list[dict]) -> dict[int, dict]:
@@ -152,7 +163,6 @@ def learning_curves(records: list[dict]) -> dict[int, dict]:
 
 def plot_learning(records, path):
     """Plots returns against seconds of training, a colour per budget."""
-    import matplotlib
     from matplotlib.figure import Figure
 
     ax = Figure(figsize=(7.5, 4.8), layout="constrained").subplots()
@@ -173,13 +183,11 @@ def plot_learning(records, path):
     ax.minorticks_off()
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8, loc="lower right")
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
-        ax.figure.savefig(path, metadata={"Date": None})
+    save(ax.figure, path)
 
 
 def plot_worlds(records, path):
     """Plots the share that counts in each world against seconds of training, from runs on a GPU."""
-    import matplotlib
     from matplotlib.figure import Figure
 
     drawn = [
@@ -195,8 +203,7 @@ def plot_worlds(records, path):
     ax = Figure(figsize=(7.5, 4.2), layout="constrained").subplots()
     for record in drawn:
         name = record["what"].removesuffix(", median rate")
-        counted = METRICS[name.split(",")[0].split()[0]].replace("_", " ")
-        counted = counted.upper() if counted == "spl" else counted
+        counted = words(METRICS[name.split(",")[0].split()[0]])
         seconds, _, values = zip(*record["curve"])
         ax.plot(seconds, values, label=f"{name}: {counted}")
     ax.set(xscale="log", xlabel="seconds of training", ylabel="in training", ylim=(0, 1))
@@ -204,15 +211,13 @@ def plot_worlds(records, path):
     ax.minorticks_off()
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8, loc="lower right")
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
-        ax.figure.savefig(path, metadata={"Date": None})
+    save(ax.figure, path)
 
 
 def plot_learners(records, path):
     """Plots what counts in each world, on a GPU and on a CPU, against samples and against seconds,
     a colour per learner, a line per seed, of the runs that were given longest there.
     """
-    import matplotlib
     from matplotlib.figure import Figure
 
     runs = {}
@@ -236,21 +241,18 @@ def plot_learners(records, path):
             is_first = ", seed 1," in record["what"]
             left.plot([n / 1e6 for n in samples], values, **told)
             right.plot(seconds, values, label=name if is_first else None, **told)
-        counted = COMPARED[world][1].replace("_", " ")
-        counted = counted.upper() if counted == "spl" else counted
+        counted = words(COMPARED[world][1])
         left.set(title=f"{world}, {on}", ylabel=f"{counted}, in training", xlabel="million samples")
         left.set(xscale="log", ylim=(0, None))
         right.set(title=f"{world}, {on}", xlabel="seconds of training")
         left.grid(alpha=0.3)
         right.grid(alpha=0.3)
     grid[0, 1].legend(fontsize=8)
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
-        figure.savefig(path, metadata={"Date": None})
+    save(figure, path)
 
 
 def plot_ratings(records, path):
     """Plots ratings of each run's snapshots, and of the scripted bot, against samples."""
-    import matplotlib
     from matplotlib.figure import Figure
 
     runs = {}
@@ -277,8 +279,7 @@ def plot_ratings(records, path):
     ax.set(xlabel="million samples", ylabel="rating ± two standard deviations")
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8, loc="upper left")
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
-        ax.figure.savefig(path, metadata={"Date": None})
+    save(ax.figure, path)
 
 
 def read(path: Path) -> list[dict]:

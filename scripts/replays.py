@@ -15,7 +15,7 @@ SAMPLED = {"cuda": 4096, "cpu": 64}
 OBS, ACTIONS = spaces.MultiImage(1, 3, 1, 64), spaces.MultiDiscrete(1, 7)
 
 
-def filled(device, pictures):
+def filled(device, images):
     """A full memory of sequences of 64 steps, each with an LSTM's state of 256 units, and the
     rollout that it is filled from.
     """
@@ -24,7 +24,7 @@ def filled(device, pictures):
     rollout = Rollout(N_STEPS, n_lanes, OBS, ACTIONS, state, device, values=False)
     rollout.obs.uniform_()
     capacity = ROLLOUTS[device.type] * N_STEPS * n_lanes
-    settings = ReplaySettings(capacity=capacity, pictures=pictures, alpha=0.9)
+    settings = ReplaySettings(capacity=capacity, images=images, alpha=0.9)
     before = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
     memory = Replay(rollout, OBS, ACTIONS, settings)
     allocated = memory.bytes
@@ -36,20 +36,20 @@ def filled(device, pictures):
 
 
 def replay(device):
-    """The replay memory, of pictures of 64 pixels and three colours: observations per GB, all that
+    """The replay memory, of images of 64 pixels and three colours: observations per GB, all that
     is stored with them included, and how fast it is filled and drawn from, by priorities.
     """
     n_sampled = SAMPLED[device.type]
-    for pictures in ("fp16", "uint8"):
-        memory, rollout, allocated = filled(device, pictures)
+    for images in ("fp16", "uint8"):
+        memory, rollout, allocated = filled(device, images)
         for unit, size in (("GB", 1e9), ("GiB", 2**30)):
-            what = f"replay, {pictures}, 64 steps, LSTM of 256: observations per {unit}"
+            what = f"replay, {images}, 64 steps, LSTM of 256: observations per {unit}"
             yield measurement(what, "M", [memory.capacity / allocated * size / 1e6])
         n_added = rollout.n_steps * rollout.n_lanes
         times = alone(lambda i, add=memory.add, rollout=rollout: add(rollout), device)
-        yield rate(f"replay, {pictures}, samples added", n_added, times)
+        yield rate(f"replay, {images}, samples added", n_added, times)
         times = alone(lambda i, sample=memory.sample: sample(n_sampled), device)
-        what = f"replay, {pictures}, {n_sampled:,} at a time, sequences of 64 drawn"
+        what = f"replay, {images}, {n_sampled:,} at a time, sequences of 64 drawn"
         yield rate(what, n_sampled, times)
     index = memory.sample(n_sampled).index
     values = torch.rand(n_sampled, device=device)

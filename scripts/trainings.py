@@ -85,14 +85,7 @@ def train(device, seeds=SEEDS, budgets=BUDGETS):
             rows = json.loads(written.read_text())["rows"][:2]
             reports = curve(run)
         for whose, row in zip(("return", "return of random actions"), rows):
-            yield dict(
-                what=f"{what}, {whose} in unseen homes",
-                value=row["return"],
-                unit="",
-                lower=row["lower"],
-                upper=row["upper"],
-                n=row["homes"],
-            )
+            yield mean(f"{what}, {whose} in unseen homes", row, row["return"])
         if len(reports) > 1:
             yield learnt(what, reports)
 
@@ -156,16 +149,8 @@ def worlds(device):
                 told = f"{what}, {seconds:.0f} s, {samples / 1e6:.0f} M samples"
                 told += f", in {place}" if place else ""
                 for row in evaluated(run, device, *given.split()):
-                    values = {"return": dict(mean=row["return"], **row), **row["metrics"]}
-                    for name, value in values.items():
-                        yield dict(
-                            what=f"{told}: {name}, {row['agent']}",
-                            value=value["mean"],
-                            unit="",
-                            lower=value["lower"],
-                            upper=value["upper"],
-                            n=row["homes"] or row["lanes"],
-                        )
+                    for name in ("return", *row["metrics"]):
+                        yield metric(f"{told}: {name}, {row['agent']}", row, name)
 
 
 def duels(device, seeds=SEEDS, samples=600_000_000):
@@ -228,31 +213,32 @@ def learners(device, seeds=SEEDS, budgets=None, worlds=tuple(COMPARED)):
                     row = evaluated(run, device)[0]
                 if len(reports) > 1:
                     yield learnt(what, reports)
-                value = dict(mean=row["return"], **row) if counted == "return" else None
-                value = value or row["metrics"][counted]
                 where = "in unseen homes" if row["homes"] else "in first episodes"
-                yield dict(
-                    what=f"{what}: {counted} {where}",
-                    value=value["mean"],
-                    unit="",
-                    lower=value["lower"],
-                    upper=value["upper"],
-                    n=row["homes"] or row["lanes"],
-                )
+                yield metric(f"{what}: {counted} {where}", row, counted)
 
 
 def won(what, run, device, *opponents):
     """Measurements of a run's duels against each."""
     for row in evaluated(run, device, f"against=[{','.join(opponents)}]", f"lanes={N_DUELS}"):
         told = f"{row['wins']} won, {row['draws']} drawn, {row['losses']} lost"
-        yield dict(
-            what=f"{what}: duels against {row['against'].rpartition(':')[2]} ({told})",
-            value=row["won"],
-            unit="",
-            lower=row["lower"],
-            upper=row["upper"],
-            n=row["homes"],
-        )
+        told = f"{what}: duels against {row['against'].rpartition(':')[2]} ({told})"
+        yield mean(told, row, row["won"])
+
+
+def mean(what, row, value):
+    """A mean of a row of evaluate.py's table, with its interval over homes, or lanes where there
+    are none.
+    """
+    bounds = {key: row[key] for key in ("lower", "upper")}
+    return dict(what=what, value=value, unit="", **bounds, n=row["homes"] or row["lanes"])
+
+
+def metric(what, row, name):
+    """A metric of such a row, or its return."""
+    if name == "return":
+        return mean(what, row, row["return"])
+    found = row["metrics"][name]
+    return mean(what, {**row, **found}, found["mean"])
 
 
 def evaluated(run, device, *overrides):

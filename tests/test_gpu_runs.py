@@ -38,10 +38,11 @@ def weights(folder):
     return checkpoint.load(folder / "checkpoints").state["policy"]
 
 
-@pytest.fixture(scope="module")
-def stopped(tmp_path_factory):
-    """A run that Ctrl-C stopped after six updates: two warm up a graph, the third captures it."""
-    base, write = tmp_path_factory.mktemp("runs"), metrics.Metrics.write
+def train_until_interrupted(folder, *words):
+    """A run in a folder that Ctrl-C stops after six updates: two warm up a graph, the third
+    captures it.
+    """
+    write = metrics.Metrics.write
 
     def interrupting(self, step, *values):
         write(self, step, *values)
@@ -50,9 +51,14 @@ def stopped(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(metrics.Metrics, "write", interrupting)
-        patch.chdir(base)
-        assert train.main([*TINY, "folder=run"]) == 130
-    return base / "run"
+        patch.chdir(folder)
+        assert train.main([*TINY, *words, "folder=run"]) == 130
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    return train_until_interrupted(tmp_path_factory.mktemp("runs"))
 
 
 @pytest.fixture
@@ -175,23 +181,23 @@ def test_every_core_acts_and_learns_in_graphs(memory, layers, trainers, monkeypa
     assert is_captured(trainers[0]) and trainers[0].bad_number is None
 
 
+REPLAY = "learner.replay.capacity=4096"
+
+
 @pytest.mark.parametrize(
-    "more",
-    [["learner.lag=1"], ["learner.lag=2", "learner.buffer=replay", "learner.replay.capacity=4096"]],
+    "words",
+    [
+        ["learner=vtrace", "learner.lag=1"],
+        ["learner=vtrace", "learner.lag=2", "learner.buffer=replay", REPLAY],
+        ["learner=r2d2", REPLAY, "learner.replay.burn_in=4"],
+    ],
 )
-def test_a_run_that_acts_ahead_is_interrupted_and_goes_on(more, trainers, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    with monkeypatch.context() as patch:
-        write = metrics.Metrics.write
-
-        def interrupting(self, step, *values):
-            write(self, step, *values)
-            if step == STOPPED:
-                os.kill(os.getpid(), signal.SIGINT)
-
-        patch.setattr(metrics.Metrics, "write", interrupting)
-        assert train.main([*TINY, "learner=vtrace", *more, "folder=run"]) == 130
+def test_every_learner_is_interrupted_goes_on_and_is_evaluated(
+    words, trainers, monkeypatch, tmp_path
+):
+    train_until_interrupted(tmp_path, *words)
     assert is_captured(trainers[0])
+    monkeypatch.chdir(tmp_path)
     assert train.main(["resume=run", f"samples={2 * STOPPED}"]) == 0
     assert is_captured(trainers[1]) and trainers[1].bad_number is None
     found = rows(tmp_path / "run")

@@ -194,11 +194,11 @@ def test_the_arm_that_pays_is_found(name):
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_the_end_of_a_corridor_is_reached(name):
-    """The shortest way takes 6 steps; whoever walks at random gets there in a third of episodes,
-    and now and then an action may be drawn.
+    """The shortest way takes 6 steps; whoever walks at random gets there in a third of episodes.
+    R2D2 draws some actions by chance while it learns.
     """
     _, rewards, _, valid, _ = learn(Corridor(), 30, name=name, gamma=0.95)
-    assert valid / rewards < 8
+    assert valid / rewards < (8 if name == "r2d2" else 7)
 
 
 @pytest.mark.parametrize("name", LEARNERS)

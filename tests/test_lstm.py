@@ -6,6 +6,7 @@ CPU through `cuda_on_cpu.h`, which runs the same source.
 
 import pytest
 import torch
+from recurrent import assert_close, check_captured
 from torch import nn
 
 from agents import lstm as lstm_module
@@ -210,11 +211,7 @@ def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lan
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lstm_module, "_steps", lambda x: lstm_module._WRITTEN_OUT)
         expected = sequence("cpu", torch.float32, **given)
-    for name, ours, theirs in zip(NAMES, found, expected, strict=True):
-        slack = SLACK[dtype] * theirs.abs().max().item()
-        torch.testing.assert_close(
-            ours, theirs, rtol=0, atol=slack, msg=lambda text, name=name: f"{name}: {text}"
-        )
+    assert_close(NAMES, found, expected, SLACK[dtype])
 
 
 @pytest.mark.parametrize("offset", [0, 1])
@@ -296,39 +293,6 @@ def test_rounding_to_bfloat16_is_pytorchs(where):
 @pytest.mark.cuda
 @pytest.mark.parametrize("bf16", [False, True])
 def test_on_a_gpu_a_captured_graph_unrolls_as_steps_do(bf16):
-    """Inputs, resets and the state are changed between capture and replay."""
-    torch.manual_seed(0)
-    lstm = LSTM(256).cuda()
-    x = torch.randn(T, 64, 256, device="cuda", requires_grad=True)
-    reset = torch.rand(T, 64, device="cuda") < 0.3
-    state = lstm.initial(64, "cuda")
-    wanted = [x, *lstm.parameters()]
-
-    def unroll():
-        with torch.autocast("cuda", torch.bfloat16, enabled=bf16):
-            outputs, after = lstm(x, reset, state)
-        loss = outputs.float().square().sum() + after.cell.sum()
-        return [outputs, after.cell, *torch.autograd.grad(loss, wanted)]
-
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        unroll()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        captured = unroll()
-    with torch.no_grad():
-        for tensor in (x, state.output, state.cell):
-            tensor.normal_()
-        reset.copy_(torch.rand(T, 64, device="cuda") < 0.3)
-    graph.replay()
+    lstm = LSTM(256)
     slack = SLACK[torch.bfloat16 if bf16 else torch.float32]
-    for found, expected in zip(captured, unroll(), strict=True):
-        torch.testing.assert_close(
-            found.float(), expected.float(), rtol=0, atol=slack * expected.abs().max().item()
-        )
-    with torch.no_grad(), torch.autocast("cuda", torch.bfloat16, enabled=bf16):
-        for t in range(T):
-            output, state = lstm.step(x[t], reset[t], state)
-            torch.testing.assert_close(output.float(), captured[0][t].float(), rtol=0, atol=slack)
+    check_captured(lstm, "cell", lstm.step, slack, bf16)

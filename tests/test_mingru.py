@@ -6,6 +6,7 @@ CPU through `cuda_on_cpu.h`, which runs the same source.
 
 import pytest
 import torch
+from recurrent import assert_close, check_captured
 
 from agents import mingru as mingru_module
 from agents.kernels import mingru as kernels
@@ -175,11 +176,7 @@ def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lan
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mingru_module, "_recurrence", lambda gates: mingru_module._WRITTEN_OUT)
         expected = sequence("cpu", torch.float32, **given)
-    for name, ours, theirs in zip(NAMES, found, expected, strict=True):
-        slack = SLACK[dtype] * theirs.abs().max().item()
-        torch.testing.assert_close(
-            ours, theirs, rtol=0, atol=slack, msg=lambda text, name=name: f"{name}: {text}"
-        )
+    assert_close(NAMES, found, expected, SLACK[dtype])
 
 
 @pytest.mark.parametrize("dtype", SLACK, ids=str)
@@ -232,41 +229,11 @@ def test_kernels_refuse_other_dtypes(where):
 @pytest.mark.cuda
 @pytest.mark.parametrize("bf16", [False, True])
 def test_on_a_gpu_a_captured_graph_unrolls_as_steps_do(bf16):
-    """Inputs, resets and the state are changed between capture and replay."""
-    torch.manual_seed(0)
-    core = MinGRU(256).cuda()
-    x = torch.randn(T, 64, 256, device="cuda", requires_grad=True)
-    reset = torch.rand(T, 64, device="cuda") < 0.3
-    state = core.initial(64, "cuda")
-    wanted = [x, *core.parameters()]
+    core = MinGRU(256)
 
-    def unroll():
-        with torch.autocast("cuda", torch.bfloat16, enabled=bf16):
-            outputs, after = core(x, reset, state)
-        loss = outputs.float().square().sum() + after.output.sum()
-        return [outputs, after.output, *torch.autograd.grad(loss, wanted)]
+    def step(x, reset, state):
+        outputs, state = core(x[None], reset[None], state)
+        return outputs[0], state
 
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        unroll()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        captured = unroll()
-    with torch.no_grad():
-        x.normal_(), state.output.normal_()
-        reset.copy_(torch.rand(T, 64, device="cuda") < 0.3)
-    graph.replay()
     slack = 2e-2 if bf16 else 2e-3  # bfloat16's rounding, and TF32's, of products of 256 numbers
-    for found, expected in zip(captured, unroll(), strict=True):
-        torch.testing.assert_close(
-            found.float(), expected.float(), rtol=0, atol=slack * expected.abs().max().item()
-        )
-    with torch.no_grad(), torch.autocast("cuda", torch.bfloat16, enabled=bf16):
-        for t in range(T):
-            outputs, state = core(x[t : t + 1], reset[t : t + 1], state)
-            atol = slack * captured[0].abs().max().item()
-            torch.testing.assert_close(
-                outputs[0].float(), captured[0][t].float(), rtol=0, atol=atol
-            )
+    check_captured(core, "output", step, slack, bf16)

@@ -304,7 +304,7 @@ def test_a_run_is_trained_resumed_evaluated_and_used(tmp_path, monkeypatch):
         (["learner.replay.capacity=30"], "replay.capacity=30 is too small"),
         (["learner.replay.capacity=1e12"], "observations of learner.replay.capacity need"),
         (["learner.gradient_steps=1000"], "less than a sequence for each of 1,000 gradient steps"),
-        (["learner.replay.pictures=fp8"], "learner.replay.pictures: 'fp8' is unknown"),
+        (["learner.replay.images=fp8"], "learner.replay.images: 'fp8' is unknown"),
         (["learner.replay.capaciti=9"], "did you mean learner.replay.capacity?"),
     ],
 )

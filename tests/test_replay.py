@@ -244,7 +244,7 @@ def test_a_uniform_memory_draws_all_alike_whatever_it_is_told():
 
 def test_pictures_in_bytes_are_as_close_as_said_and_clipped():
     world = World(4)
-    replay = memory(world, 2, length=4, pictures="uint8")
+    replay = memory(world, 2, length=4, images="uint8")
     assert replay.columns.obs.eye.rows.dtype == torch.uint8
     rollout = world.next()
     rollout.obs.eye[1, :, 0, 0, 0, 0], rollout.obs.eye[1, :, 0, 0, 0, 1] = -3.0, 9.0
@@ -322,19 +322,19 @@ def test_bytes_are_those_that_are_allocated():
 @pytest.mark.parametrize(
     "how, least, most",
     [
-        (dict(pictures="fp16"), 2.43e6, 2.45e6),
-        (dict(pictures="fp16", logprobs=False), 2.45e6, 2.47e6),
-        (dict(pictures="uint8"), 4.58e6, 4.60e6),
+        (dict(images="fp16"), 2.43e6, 2.45e6),
+        (dict(images="fp16", logprobs=False), 2.45e6, 2.47e6),
+        (dict(images="uint8"), 4.58e6, 4.60e6),
     ],
 )
 def test_observations_per_gigabyte(how, least, most):
-    """All that a sequence needs is counted, not the pictures alone: 384 or 192 bytes of 64 pixels
+    """All that a sequence needs is counted, not the images alone: 384 or 192 bytes of 64 pixels
     of 3 colours, 16 of an LSTM's state every 64 steps, 5 or 9 of reward, action and probability, 1
     of flags.
     """
     replay = sixty_four_pixels(64, 256, n_rollouts=100, **how)
     assert least < 1e9 * replay.capacity / replay.bytes < most
-    if how["pictures"] == "fp16":
+    if how["images"] == "fp16":
         assert 2**30 * replay.capacity / replay.bytes > 2.5e6
 
 
