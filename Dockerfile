@@ -7,4 +7,4 @@ RUN pip install --no-cache-dir -c constraints.txt torch==2.13.0 && pip install -
 WORKDIR /megastep
 VOLUME /megastep/runs
 ENTRYPOINT ["megastep"]
-CMD ["train", "experiment=newcomer"]
+CMD ["train", "experiment=quickstart"]

@@ -6,12 +6,12 @@ CORES := $(shell nproc 2>/dev/null || echo 1)
 # The virtual environment is made only when it is the interpreter in use.
 SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 
-KERNELS := $(wildcard $(foreach suffix,h cu cpp,*/kernels/*.$(suffix)) tests/*.h)
+KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
 .PHONY: train test test-all lint setup clean
 
 train: $(SETUP)            ## train Explorer in homes, evaluate it in unseen ones, film it
-	$(PYTHON) train.py experiment=newcomer
+	$(PYTHON) train.py experiment=quickstart
 
 test: $(SETUP)             ## the tests, without those marked slow
 	$(PYTHON) -m pytest -q -n $(CORES)

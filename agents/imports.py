@@ -9,7 +9,7 @@ from typing import Any
 from megastep.settings import closest
 
 
-def load(name: str) -> Callable:
+def import_object(name: str) -> Callable:
     """The class or function called `module:attribute`; the current folder is searched, too.
     ValueError, one sentence, if there is none.
     """
@@ -34,12 +34,12 @@ def load(name: str) -> Callable:
     return found
 
 
-def choose(name: str, table: dict[str, Any]) -> Callable:
+def resolve(name: str, table: dict[str, Any]) -> Callable:
     """What `name` stands for: a word of the table, or an import path. ValueError, one sentence, if
     it is neither.
     """
     if name in table:
         return table[name]
     if ":" in name:
-        return load(name)
+        return import_object(name)
     raise ValueError(f"{name!r} is unknown; {closest(name, [*table, 'module:Class'])}")

@@ -10,6 +10,7 @@ round::
 import importlib
 
 _MODULES = (
+    "agents",
     "arrdict",
     "capture",
     "contract",
@@ -28,7 +29,6 @@ _MODULES = (
     "recording",
     "scene",
     "spaces",
-    "state",
     "toys",
 )
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch.utils import _pytree
 
-from .dotdict import _map, dotdict, leaves, mapping
+from megastep.dotdict import _map, dotdict, leaves, mapping
 
 __all__ = ["arrdict", "stack", "cat", "torchify", "numpyify", "clone", "leaves", "mapping"]
 

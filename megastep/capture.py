@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch.utils import _pytree
 
-from .state import SCALARS, rebind, restore, snapshot, state_tree, walk
+from megastep.engine.state_tree import SCALARS, rebind, restore, snapshot, state_tree, walk
 
 __all__ = ["CaptureError", "Captured", "Graph", "capture", "restore", "snapshot", "state_tree"]
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from .arrdict import arrdict
-from .spaces import MultiDiscrete
+from megastep.arrdict import arrdict
+from megastep.spaces import MultiDiscrete
 
 __all__ = [
     "ATTRIBUTES",

@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from . import checks, engine
-from .agents import AGENT_RADIUS, AGENT_WIDTH
-from .arrdict import arrdict
-from .colour import gamma_decode, gamma_encode
-from .scene import TEXEL
+from megastep import engine
+from megastep.arrdict import arrdict
+from megastep.colour import gamma_decode, gamma_encode
+from megastep.engine import checks
+from megastep.engine.agents import AGENT_RADIUS, AGENT_WIDTH
+from megastep.scene import TEXEL
 
 __all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "TEXEL", "Core", "gamma_decode", "gamma_encode"]
 
@@ -82,7 +83,7 @@ class Core:
         Args: ``seen`` (T,) bools, dims static texels that are False; ``distances`` (A, C, R)
         metres, to draw what is in view instead of a wedge.
         """
-        from . import plotting
+        from megastep import plotting
 
         ends = state.widths.cumsum()
         colours = np.split(state.texels, ends[:-1])

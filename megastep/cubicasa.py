@@ -6,8 +6,8 @@ CubiCasa5k's licence (CC BY-NC) keeps it out of this package. These are the home
 it.
 """
 
-from .dotdict import dotdict
-from .geometries import sample as _sample
+from megastep.dotdict import dotdict
+from megastep.geometries import sample as _sample
 
 __all__ = ["sample"]
 

@@ -5,8 +5,8 @@ The name is historical. The tensors' device decides where the work is done, so t
 GPU too.
 """
 
-from . import engine
-from .core import Core
+from megastep import engine
+from megastep.core import Core
 
 
 def __getattr__(name):

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .colour import gamma_decode, gamma_encode
+from megastep.colour import gamma_decode, gamma_encode
 
 __all__ = [
     "camera_colours",

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from .read_only import SetOnce
+from megastep.read_only import SetOnce
 
 __all__ = ["Ragged", "RaggedNumpy", "RaggedTorch"]
 

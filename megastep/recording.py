@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from . import workers
-from .arrdict import clone, numpyify
+from megastep import workers
+from megastep.arrdict import clone, numpyify
 
 __all__ = ["ParallelEncoder", "draw"]
 
@@ -327,7 +327,7 @@ def draw(plot_state: Callable, state: Any) -> np.ndarray:
             f"plot_state must return a matplotlib figure or an array, but it returned a "
             f"{type(drawn).__name__}"
         )
-    from . import plotting
+    from megastep import plotting
 
     try:
         return plotting.rasterise(drawn)

@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from . import checks, engine
-from .colour import gamma_decode
-from .ragged import Ragged
-from .scenery import Layouts, Scenery
+from megastep import engine
+from megastep.colour import gamma_decode
+from megastep.engine import checks
+from megastep.engine.scenery import Layouts, Scenery
+from megastep.ragged import Ragged
 
 __all__ = ["TEXEL", "agent_model", "display", "scenery", "texel_widths", "wall_textures"]
 
@@ -190,7 +191,7 @@ def display(scenery: Scenery, e: int = 0, ax: Any = None) -> Any:
     """Draws environment ``e`` in its lit colours, with its lights and agents. Returns the
     matplotlib axes.
     """
-    from . import plotting
+    from megastep import plotting
 
     lines, colours, lights = scenery.env(e)
     return plotting.plot_scenery(

@@ -1,4 +1,4 @@
-"""Has agents try to pass walls and, when stopped, to leave, on the courses of tests/walls.py:
+"""Has agents try to pass walls and, when stopped, to leave, on the courses of tests/helpers/walls.py:
 
     python scripts/check_walls.py --steps 1e9 --device auto
 
@@ -12,12 +12,11 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import wall_courses
-import walls
 
 from megastep import engine
+from tests.helpers import walls
 
 INTERVAL = 10  # seconds between lines within a course
 

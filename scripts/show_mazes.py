@@ -29,7 +29,7 @@ def sheet(first=0, size=8, corridor=1.0, thickness=0.2):
     for braid, row in zip(BRAIDS, axes):
         for seed, ax in enumerate(row, first):
             g = mazes.generate(seed, size, corridor, thickness, braid)
-            opened = mazes.passages(size, braid, mazes.RandomStream(seed))
+            opened = mazes.passages(size, braid, mazes.PortableGenerator(seed))
             n_dead_ends = sum(len(others) == 1 for others in opened)
             geometry.display(g, ax)
             ax.set_axis_off()

@@ -33,12 +33,15 @@ def launch_on_cpu(tmp_path_factory):
     """What launches the learner's kernels on a CPU: their source, compiled for it through
     `cuda_on_cpu.h`.
     """
-    from agents.kernels.program import CORES, DTYPES, STRUCTS
-    from megastep.kernels import compile
+    from megastep.agents.networks.kernels.program import CORES, DTYPES, STRUCTS
+    from megastep.kernels.build import compile
 
     folder = tmp_path_factory.mktemp("kernels")
     source, library = folder / "kernels.cpp", folder / "kernels.so"
-    included = [Path(__file__).parent / "cuda_on_cpu.h", *sorted(CORES.folder.glob("*.cu"))]
+    included = [
+        Path(__file__).parent / "helpers" / "cuda_on_cpu.h",
+        *sorted(CORES.folder.glob("*.cu")),
+    ]
     lines = [f'#include "{path}"' for path in included]
     lines += [
         f'extern "C" void run_{name}_{dtype}(const {struct}* p, unsigned int threads) '

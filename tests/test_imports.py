@@ -1,4 +1,4 @@
-"""Imports go one way: entry scripts -> agents.cli -> agents -> trees and spaces of megastep;
+"""Imports go one way: entry scripts -> megastep.agents.cli -> agents -> trees and spaces of megastep;
 environments -> modules, core, plotting -> engine -> kernels. Hydra stays in agents/cli, wandb in
 metrics.py. Read from the sources, not from what is loaded.
 """
@@ -53,7 +53,7 @@ USERS = {
     "rich": ("agents/cli/", "megastep/workers.py"),
     "openskill": ("agents/ratings.py",),
     "loky": ("megastep/recording.py", "megastep/workers.py"),
-    "scipy": ("megastep/modules/geodesics.py",),
+    "scipy": ("megastep/envs/pointgoal/geodesics.py",),
     "IPython": ("megastep/recording.py",),
 }
 
@@ -142,7 +142,7 @@ def an_environment_is_one_file(graph):
 
 
 def is_command_line(name):
-    return name == "agents.cli" or name.startswith("agents.cli.")
+    return name == "megastep.agents.cli" or name.startswith("megastep.agents.cli.")
 
 
 def the_learner_knows_trees_and_spaces_only(graph):
@@ -160,8 +160,8 @@ def the_command_line_imports_no_entry_script(graph):
 
 def entry_scripts_open_the_command_line_and_no_more(graph):
     for script in SCRIPTS:
-        for target in sorted(graph[script] ^ {"sys", "agents.cli.entry"}):
-            yield f"{script} must import sys and agents.cli.entry alone: {target}"
+        for target in sorted(graph[script] ^ {"sys", "megastep.agents.cli.entry"}):
+            yield f"{script} must import sys and megastep.agents.cli.entry alone: {target}"
 
 
 def outside_packages_stay_with_their_users(graph):
@@ -211,18 +211,22 @@ PLANTED = [
     (the_simulator_imports_downwards, "megastep.plotting", "megastep.scenery"),
     (the_simulator_imports_downwards, "megastep.kernels.compile", "megastep.engine"),
     (the_simulator_imports_downwards, "megastep.scenery_views", "megastep.geometries.toys"),
-    (the_simulator_knows_no_learner, "megastep.envs.minimal", "agents.heads"),
+    (the_simulator_knows_no_learner, "megastep.envs.minimal", "megastep.agents.networks.heads"),
     (the_simulator_knows_no_learner, "megastep.core", "train"),
     (an_environment_is_one_file, "megastep.envs.minimal", "megastep.envs.explorer"),
-    (the_learner_knows_trees_and_spaces_only, "agents.ppo", "megastep.engine"),
-    (the_learner_knows_trees_and_spaces_only, "agents.policy", "megastep.envs"),
-    (the_learner_knows_trees_and_spaces_only, "agents.rollout", "agents.cli.settings"),
-    (the_learner_knows_trees_and_spaces_only, "agents.metrics", "train"),
-    (the_command_line_imports_no_entry_script, "agents.cli.sweep", "train"),
+    (the_learner_knows_trees_and_spaces_only, "megastep.agents.algorithms.ppo", "megastep.engine"),
+    (the_learner_knows_trees_and_spaces_only, "megastep.agents.networks.policy", "megastep.envs"),
+    (
+        the_learner_knows_trees_and_spaces_only,
+        "megastep.agents.storage.rollout",
+        "megastep.agents.cli.settings",
+    ),
+    (the_learner_knows_trees_and_spaces_only, "megastep.agents.training.loggers", "train"),
+    (the_command_line_imports_no_entry_script, "megastep.agents.cli.sweep", "train"),
     (entry_scripts_open_the_command_line_and_no_more, "train", "torch"),
-    (entry_scripts_open_the_command_line_and_no_more, "record", "agents.cli.train"),
-    (outside_packages_stay_with_their_users, "agents.ppo", "hydra.core"),
-    (outside_packages_stay_with_their_users, "agents.cli.train", "wandb"),
+    (entry_scripts_open_the_command_line_and_no_more, "record", "megastep.agents.cli.train"),
+    (outside_packages_stay_with_their_users, "megastep.agents.algorithms.ppo", "hydra.core"),
+    (outside_packages_stay_with_their_users, "megastep.agents.cli.train", "wandb"),
     (outside_packages_stay_with_their_users, "megastep.core", "loky"),
 ]
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from agents.cli.build import as_tree, build
-from agents.cli.errors import ConfigErrors
 from megastep import envs
+from megastep.agents.cli.build import as_tree, build
+from megastep.agents.cli.errors import ConfigErrors
 from megastep.settings import checked, settings_of
 
 NAN = float("nan")

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from agents.cli.build import build
-from agents.cli.compose import ConfigLoader
-from agents.cli.settings import Evaluate, Record, Train
 from megastep import envs
+from megastep.agents.cli.build import build
+from megastep.agents.cli.compose import ConfigLoader
+from megastep.agents.cli.settings import Evaluate, Record, Train
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = (DOCS / "worlds.md").read_text()

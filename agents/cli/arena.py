@@ -6,12 +6,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from agents import checkpoint, duels, evaluation, ratings
-from agents.cli import components, run_folders, tables
-from agents.cli.console import duration, say, table
-from agents.cli.errors import UserError
-from agents.cli.registry import label
-from agents.cli.settings import Evaluate, Geometry
+from megastep.agents.cli import factory, run_folders, tables
+from megastep.agents.cli.console import duration, say, table
+from megastep.agents.cli.errors import UserError
+from megastep.agents.cli.registry import label
+from megastep.agents.cli.settings import Evaluate, Geometry
+from megastep.agents.selfplay import duels, ratings
+from megastep.agents.training import checkpoint, evaluation
 
 HEAD = "against", "won", tables.INTERVAL, "wins", "draws", "losses", "length", "duels", "homes"
 RATED = "player", "rating", "sigma", "won", "duels"
@@ -35,7 +36,7 @@ class Players:
 
     def __init__(self, loaded: checkpoint.Checkpoint, chosen: Any, env: Any):
         self.loaded, self.chosen, self.env = loaded, chosen, env
-        self.trained = components.config_of(loaded)
+        self.trained = factory.config_of(loaded)
 
     def named(self, name: str) -> Player:
         """A run's agent, by its folder or a checkpoint; or who needs no weights: an import path,
@@ -44,19 +45,19 @@ class Players:
         if name == "bot":
             name = self.trained.opponents.bot_class
         if name == "random" or (":" in name and not Path(name).exists()):
-            return Player(name, components.make_bot(name, self.chosen, self.env))
-        return self.learnt(components.load(run_folders.find(name), self.env.device))
+            return Player(name, factory.make_bot(name, self.chosen, self.env))
+        return self.learnt(factory.load_checkpoint(run_folders.find(name), self.env.device))
 
     def learnt(self, loaded: checkpoint.Checkpoint) -> Player:
         """The player that a checkpoint holds. UserError if it is from another environment."""
-        trained = components.config_of(loaded)
+        trained = factory.config_of(loaded)
         if trained.env.name != self.trained.env.name:
             raise UserError(
                 f"{loaded.path} was trained in {label(trained.env.name)} and {self.loaded.path} in "
                 f"{label(self.trained.env.name)}; name a run in the same environment"
             )
-        policy = components.make_actor(trained.agent, self.env)
-        components.load_weights(policy, self.env, loaded)
+        policy = factory.make_actor(trained.agent, self.env)
+        factory.load_weights(policy, self.env, loaded)
         run = run_folders.folder_of(loaded.path).name
         return Player(f"{run}, {loaded.step:,} samples", policy, loaded.step)
 
@@ -65,32 +66,35 @@ class Arena:
     """An environment in unseen homes where a run's agent meets others: of two agents, or of as many
     as it has if that is fixed.
 
-    Each home is played in from every agent's place, equally often: of `cfg.lanes` duels as many as
+    Each home is played in from every agent's place, equally often: of `cfg.episodes` duels as many as
     can be.
     """
 
     def __init__(self, cfg: Evaluate):
-        self.cfg, device = cfg, components.make_device(cfg.device)
+        self.cfg, device = cfg, factory.make_device(cfg.device)
         path = run_folders.find(cfg.run)
-        self.folder, self.loaded = run_folders.folder_of(path), components.load(path, device)
-        trained = components.config_of(self.loaded)
+        self.folder, self.loaded = (
+            run_folders.folder_of(path),
+            factory.load_checkpoint(path, device),
+        )
+        trained = factory.config_of(self.loaded)
         chosen = for_duels(cfg.env or trained.env)
         self.geometry = cfg.geometry or trained.geometry
-        homes = components.homes(chosen, self.geometry, cfg.split)
-        sample = components.make_sample(chosen, homes, cfg.seed, device)
+        homes = factory.homes(chosen, self.geometry, cfg.split)
+        sample = factory.make_sample(chosen, homes, cfg.seed, device)
         check_agents(sample)
         self.players = Players(self.loaded, chosen, sample)
-        each = max(1, cfg.lanes // sample.n_agents)
+        each = max(1, cfg.episodes // sample.n_agents)
         homes = homes[:each]
         each -= each % max(1, len(homes))
         self.chosen = dataclasses.replace(chosen, n_envs=each * sample.n_agents)
         self.homes = homes
-        self.env = components.make_env(self.chosen, homes, cfg.seed, device)
+        self.env = factory.make_env(self.chosen, homes, cfg.seed, device)
 
     def play(self, player: Player, opponent: Player) -> Any:
         """Their duels, as `duels.play` gives them."""
         cfg = self.cfg
-        with components.errors():
+        with factory.errors():
             return duels.play(self.env, player.policy, opponent.policy, cfg.seed, cfg.greedy)
 
     @property
@@ -210,7 +214,7 @@ def rate(cfg: Evaluate) -> Path:
             f"{arena.folder} has one checkpoint and nobody to compare it with: train with "
             "snapshots=8, or name others with against="
         )
-    loaded = [components.load(path, arena.env.device) for path in paths]
+    loaded = [factory.load_checkpoint(path, arena.env.device) for path in paths]
     players = [
         dataclasses.replace(arena.players.learnt(each), name=f"{each.step:,} samples")
         for each in loaded

@@ -7,8 +7,8 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from agents.cli.errors import ConfigErrors, closest_key
-from agents.cli.settings import GROUPS
+from megastep.agents.cli.errors import ConfigErrors, closest_key
+from megastep.agents.cli.settings import GROUPS
 from megastep.settings import sentence
 
 #: Keys that no setting has.

@@ -13,14 +13,14 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from hydra.types import RunMode
 
-from agents.cli import console, doors
-from agents.cli.compose import ConfigLoader, Prepare, as_is
-from agents.cli.console import say
-from agents.cli.doors import told
-from agents.cli.errors import ConfigErrors, UserError
-from agents.cli.help import help_text
-from agents.cli.signals import Interrupted, Interruptions, interrupt
-from agents.cli.sweep import sweep
+from megastep.agents.cli import console, doors
+from megastep.agents.cli.compose import ConfigLoader, Prepare, as_is
+from megastep.agents.cli.console import say
+from megastep.agents.cli.doors import told
+from megastep.agents.cli.errors import ConfigErrors, UserError
+from megastep.agents.cli.help import help_text
+from megastep.agents.cli.signals import Interrupted, Interruptions, interrupt
+from megastep.agents.cli.sweep import sweep
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,11 +21,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from agents.cli import overrides as words_of
-from agents.cli.build import as_tree, build, keys_of
-from agents.cli.errors import ConfigErrors, UserError
-from agents.cli.loader import Loader, hydra_error, maximise
-from agents.cli.registry import CONFIGS
+from megastep.agents.cli import overrides as words_of
+from megastep.agents.cli.build import as_tree, build, keys_of
+from megastep.agents.cli.errors import ConfigErrors, UserError
+from megastep.agents.cli.loader import Loader, hydra_error, maximise
+from megastep.agents.cli.registry import CONFIGS
 
 Tree = dict[str, Any]
 #: Changes a composed tree before it is checked, given the keys that were typed.

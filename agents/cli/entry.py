@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 
-from agents.cli import doors, signals
+from megastep.agents.cli import doors, signals
 
 SCRIPTS = {
     "train": "trains a policy",
@@ -28,7 +28,7 @@ def main() -> int:
     if words and words[0] in SCRIPTS:
         sys.argv = [command, *words[1:]]
         return run_script(words[0])
-    from agents.cli import console
+    from megastep.agents.cli import console
     from megastep.settings import closest
 
     console.open_streams()
@@ -65,11 +65,11 @@ def run_script(name: str) -> int:
     waking = threading.Thread(target=create_cuda_context)
     if wants_first_gpu(sys.argv[1:]):
         waking.start()  # the interpreter waits for it: a process must not end within the driver
-    from agents.cli import console  # its imports take a while, too
+    from megastep.agents.cli import console  # its imports take a while, too
 
     console.open_streams()
     threading.excepthook = console.warn_of_thread
-    return importlib.import_module(f"agents.cli.{name}").main()
+    return importlib.import_module(f"megastep.agents.cli.{name}").main()
 
 
 def wants_first_gpu(words: list[str]) -> bool:

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents import evaluation
-from agents.cli import arena, components, run_folders, tables
-from agents.cli.arena import source
-from agents.cli.command import Script, run_command
-from agents.cli.console import duration, say, table
-from agents.cli.registry import label
-from agents.cli.settings import Evaluate
-from agents.cli.tables import INTERVAL
+from megastep.agents.cli import arena, factory, run_folders, tables
+from megastep.agents.cli.arena import source
+from megastep.agents.cli.command import Script, run_command
+from megastep.agents.cli.console import duration, say, table
+from megastep.agents.cli.registry import label
+from megastep.agents.cli.settings import Evaluate
+from megastep.agents.cli.tables import INTERVAL
+from megastep.agents.training import evaluation
 
 HELP = """Prints and writes what a run's agent earns in the first episode of each lane, with a 95 %
 interval over homes. Each table is a file of its own in the run's folder: evaluations/*.md.
@@ -27,7 +27,7 @@ The commonest:
   geometry=bench       other homes altogether
   env=pong             another environment of the same spaces: the tracker, after self-play
   greedy=true          the likeliest actions instead of sampled ones
-  lanes=256            fewer episodes
+  episodes=256            fewer episodes
   baseline=false       no row for random actions
   against=RUN,bot      duels instead: with other runs or checkpoints, the scripted policy, random
                        actions, or an import path
@@ -44,14 +44,14 @@ def run(cfg: Evaluate) -> Path:
         return arena.rate(cfg)
     if cfg.against is not None:
         return arena.run(cfg)
-    device, path = components.make_device(cfg.device), run_folders.find(cfg.run)
-    loaded = components.load(path, device)
-    trained = components.config_of(loaded)
+    device, path = factory.make_device(cfg.device), run_folders.find(cfg.run)
+    loaded = factory.load_checkpoint(path, device)
+    trained = factory.config_of(loaded)
     chosen, geometry = cfg.env or trained.env, cfg.geometry or trained.geometry
-    homes = components.homes(chosen, geometry, cfg.split, cfg.lanes)
-    env = components.make_env(settled(chosen, cfg.lanes), homes, cfg.seed, device)
-    policy = components.make_actor(trained.agent, env)
-    components.load_weights(policy, env, loaded)
+    homes = factory.homes(chosen, geometry, cfg.split, cfg.episodes)
+    env = factory.make_env(settled(chosen, cfg.episodes), homes, cfg.seed, device)
+    policy = factory.make_actor(trained.agent, env)
+    factory.load_weights(policy, env, loaded)
     players = {"trained, greedy" if cfg.greedy else "trained": policy}
     if cfg.baseline:
         players["random"] = evaluation.RandomActions(env.action_space)

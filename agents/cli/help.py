@@ -1,6 +1,6 @@
 """What `--help` prints."""
 
-from agents.cli.doors import completed, typed
+from megastep.agents.cli.doors import completed, typed
 
 
 def help_text(script: str, text: str, groups: dict[str, list[str]]) -> str:

@@ -15,10 +15,10 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from agents.cli import overrides as words_of
-from agents.cli.doors import DISTRIBUTION
-from agents.cli.errors import ConfigErrors, closest_key
-from agents.cli.settings import GROUPS
+from megastep.agents.cli import overrides as words_of
+from megastep.agents.cli.doors import DISTRIBUTION
+from megastep.agents.cli.errors import ConfigErrors, closest_key
+from megastep.agents.cli.settings import GROUPS
 from megastep.settings import closest
 
 #: Members that come with what this installs.

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
-from agents.cli.console import warn
-from agents.cli.errors import UserError
+from megastep.agents.cli.console import warn
+from megastep.agents.cli.errors import UserError
 
 #: What file systems without locks answer.
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)

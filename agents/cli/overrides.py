@@ -9,7 +9,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from agents.cli.errors import ConfigErrors, shortened
+from megastep.agents.cli.errors import ConfigErrors, shortened
 
 #: What neither a shell, nor Hydra's grammar, nor a file system leaves alone in a name.
 SPECIAL = re.compile(r"[^\w.=+-]+")

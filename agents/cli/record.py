@@ -9,16 +9,16 @@ from typing import Any
 
 import torch
 
-from agents import duels
-from agents.checkpoint import Checkpoint
-from agents.cli import arena, components, run_folders
-from agents.cli.command import Script, run_command
-from agents.cli.console import say
-from agents.cli.errors import UserError
-from agents.cli.settings import GROUPS, Record
-from agents.evaluation import RandomActions
-from agents.lineup import Lineup
-from agents.metrics import missing
+from megastep.agents.cli import arena, factory, run_folders
+from megastep.agents.cli.command import Script, run_command
+from megastep.agents.cli.console import say
+from megastep.agents.cli.errors import UserError
+from megastep.agents.cli.settings import GROUPS, Record
+from megastep.agents.selfplay import duels
+from megastep.agents.selfplay.mixed_policy import MixedPolicy
+from megastep.agents.training.checkpoint import Checkpoint
+from megastep.agents.training.evaluation import RandomActions
+from megastep.agents.training.loggers import missing
 from megastep.arrdict import numpyify
 
 HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
@@ -42,23 +42,23 @@ def run(cfg: Record) -> Path:
             import av  # noqa: F401, what the recorder encodes with
         except ImportError:
             raise UserError(missing("av")) from None
-    device, folder = components.make_device(cfg.device), Path()
+    device, folder = factory.make_device(cfg.device), Path()
     chosen, geometry, loaded = cfg.env, cfg.geometry or GROUPS["geometry"].settings(HOMES), None
     if cfg.run is not None:
         path = run_folders.find(cfg.run)
-        folder, loaded = run_folders.folder_of(path), components.load(path, device)
-        trained = components.config_of(loaded)
+        folder, loaded = run_folders.folder_of(path), factory.load_checkpoint(path, device)
+        trained = factory.config_of(loaded)
         chosen, geometry = trained.env, cfg.geometry or trained.geometry
     if cfg.against is not None:
         chosen = arena.for_duels(chosen)
-    homes = components.homes(chosen, geometry, cfg.split)
+    homes = factory.homes(chosen, geometry, cfg.split)
     home = [homes[cfg.home % len(homes)]] if homes else []
-    env = components.make_sample(dataclasses.replace(chosen, n_envs=1), home, cfg.seed, device)
+    env = factory.make_sample(dataclasses.replace(chosen, n_envs=1), home, cfg.seed, device)
     if loaded is None:
         policy = RandomActions(env.action_space)
     else:
-        policy = components.make_actor(trained.agent, env)
-        components.load_weights(policy, env, loaded)
+        policy = factory.make_actor(trained.agent, env)
+        factory.load_weights(policy, env, loaded)
     if cfg.against is not None:
         policy = against(cfg.against, chosen, env, policy, loaded)
 
@@ -72,7 +72,7 @@ def run(cfg: Record) -> Path:
     return place
 
 
-def against(name: str, chosen: Any, env: Any, policy: Any, loaded: Checkpoint) -> Lineup:
+def against(name: str, chosen: Any, env: Any, policy: Any, loaded: Checkpoint) -> MixedPolicy:
     """The policy of a run's checkpoint as the first agent, and another, by name, as all others."""
     arena.check_agents(env)
     opponent = arena.Players(loaded, chosen, env).named(name)

@@ -12,7 +12,7 @@ from typing import Any
 import yaml
 from pydantic import TypeAdapter
 
-from agents.imports import load
+from megastep.agents.imports import import_object
 from megastep.settings import closest, settings_of
 
 #: configs/ of the repository, which the package has as its data.
@@ -45,7 +45,7 @@ class Group:
         """The settings of the member with this import path, a dataclass; ValueError if there is
         none.
         """
-        made = load(name)
+        made = import_object(name)
         try:
             present = inspect.signature(made).parameters
             for argument, meaning in self.needed.items():

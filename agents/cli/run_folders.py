@@ -16,13 +16,13 @@ from pathlib import Path
 import yaml
 from hydra.core.hydra_config import HydraConfig
 
-from agents import files
-from agents.cli.build import as_tree
-from agents.cli.console import warn
-from agents.cli.doors import typed
-from agents.cli.errors import UserError, shortened
-from agents.cli.registry import label
-from agents.cli.settings import Train
+from megastep.agents.cli.build import as_tree
+from megastep.agents.cli.console import warn
+from megastep.agents.cli.doors import typed
+from megastep.agents.cli.errors import UserError, shortened
+from megastep.agents.cli.registry import label
+from megastep.agents.cli.settings import Train
+from megastep.agents.training import atomic_files
 
 RUNS = Path("runs")
 SWEEPS = Path("sweeps")
@@ -230,7 +230,7 @@ def outcome(result: Path | None) -> dict[str, float | None]:
 
 def mean_return(folder: Path) -> float | None:
     """The mean of the returns of a run's last `REPORTS` reports that have one."""
-    from agents.metrics import read
+    from megastep.agents.training.loggers import read
 
     try:
         rows = read(folder / "metrics.jsonl")
@@ -244,7 +244,7 @@ def write_config(folder: Path, cfg: Train) -> None:
     """Writes the composed configuration, config.yaml."""
     text = yaml.safe_dump(as_tree(cfg), sort_keys=False, allow_unicode=True)
     try:
-        files.replace(folder / "config.yaml", text.encode())
+        atomic_files.replace(folder / "config.yaml", text.encode())
     except OSError as error:
         raise UserError(
             f"The run folder {folder} cannot be written to ({error.strerror}); choose another with "

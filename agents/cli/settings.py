@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from agents.cli.registry import Choice, Group
-from agents.opponents import Opponents
-from agents.policy import Policy
+from megastep.agents.cli.registry import Choice, Group
+from megastep.agents.networks.policy import Policy
+from megastep.agents.selfplay.opponents import Opponents
 from megastep.settings import frozen, located, settings_of
 
 Above0 = Annotated[float, Field(gt=0)]
@@ -73,11 +73,13 @@ Env, Geometry, Learner, Logger = (
     Annotated[Any, BeforeValidator(GROUPS[key].settings)]
     for key in ("env", "geometry", "learner", "logger")
 )
-#: Arguments of `agents.policy.Policy`.
+#: Arguments of `megastep.agents.networks.policy.Policy`.
 Agent = settings_of(Policy, ("obs_space", "action_space", "privileged_space", "seed"))
-#: Arguments of `agents.opponents.Opponents`, and the import path of the scripted policy.
+#: Arguments of `megastep.agents.selfplay.opponents.Opponents`, and the import path of the scripted policy.
 Opposition = settings_of(
-    Opponents, ("env", "policy", "scripted", "seed"), bot_class=(str, "agents.bots:Bot")
+    Opponents,
+    ("env", "policy", "scripted", "seed"),
+    bot_class=(str, "megastep.envs.deathmatch:Bot"),
 )
 
 
@@ -86,7 +88,7 @@ class Finish:
     """What happens to the trained agent at the end of a run."""
 
     evaluate: bool
-    lanes: Count
+    episodes: Count
     record: bool
     steps: Steps
 
@@ -106,9 +108,9 @@ class Train:
     device: Device
     samples: Annotated[int, Field(ge=1, le=10**18)] | None
     seconds: Above0 | None
-    report: Count
-    checkpoint: Above0
-    keep: Annotated[int, Field(ge=2, le=1000)]
+    log_every: Count
+    checkpoint_seconds: Above0
+    keep_checkpoints: Annotated[int, Field(ge=2, le=1000)]
     snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
     folder: str | None
     resume: str | None
@@ -152,7 +154,7 @@ class Evaluate:
     env: Env | None = None
     geometry: Geometry | None = None
     split: Split
-    lanes: Count
+    episodes: Count
     greedy: bool
     baseline: bool
     against: tuple[str, ...] | None = None

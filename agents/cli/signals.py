@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn, TextIO
 
-from agents.cli.doors import told
+from megastep.agents.cli.doors import told
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: Seconds in which a repeated signal is the same one: `timeout` and closing terminals send two.

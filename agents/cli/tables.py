@@ -4,9 +4,9 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from agents import files
-from agents.cli.console import markdown
-from agents.cli.errors import UserError
+from megastep.agents.cli.console import markdown
+from megastep.agents.cli.errors import UserError
+from megastep.agents.training import atomic_files
 
 INTERVAL = "95 % interval"
 
@@ -24,7 +24,7 @@ def write(
     try:
         folder.mkdir(exist_ok=True)
         for suffix, text in texts.items():
-            files.replace(folder / f"{name}{suffix}", text.encode())
+            atomic_files.replace(folder / f"{name}{suffix}", text.encode())
     except OSError as error:
         raise UserError(
             f"The evaluation cannot be written to {folder} ({error.strerror})"

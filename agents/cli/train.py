@@ -10,25 +10,25 @@ from pathlib import Path
 
 import torch
 
-from agents import checkpoint, metrics
-from agents.budget import Budget
-from agents.cli import components, evaluate, record, run_folders
-from agents.cli.build import as_tree
-from agents.cli.command import Script, run_command
-from agents.cli.console import Progress, duration, number, say, warn
-from agents.cli.errors import ConfigErrors, NotFinite, UserError
-from agents.cli.lock import locked
-from agents.cli.settings import Evaluate, Record, Train, WandbLogger
-from agents.cli.signals import Interrupted, Interruptions
-from agents.finite import NonFiniteError
-from agents.saver import Saver, Snapshots
-from agents.trainer import Trainer
 from megastep import engine
+from megastep.agents.algorithms.nonfinite import NonFiniteError
+from megastep.agents.cli import evaluate, factory, record, run_folders
+from megastep.agents.cli.build import as_tree
+from megastep.agents.cli.command import Script, run_command
+from megastep.agents.cli.console import Progress, duration, number, say, warn
+from megastep.agents.cli.errors import ConfigErrors, NotFinite, UserError
+from megastep.agents.cli.lock import locked
+from megastep.agents.cli.settings import Evaluate, Record, Train, WandbLogger
+from megastep.agents.cli.signals import Interrupted, Interruptions
+from megastep.agents.training import checkpoint, loggers
+from megastep.agents.training.budget import Budget
+from megastep.agents.training.saver import Saver, Snapshots
+from megastep.agents.training.trainer import Trainer
 
 HELP = """Trains a policy in an environment.
 
 The commonest:
-  experiment=newcomer          the recipe of `make train`: train, evaluate on unseen homes, film
+  experiment=quickstart          the recipe of `make train`: train, evaluate on unseen homes, film
   env=minimal geometry=box     another environment, other homes
   seconds=60 samples=1e6       when to stop, whichever comes first; Ctrl-C stops too, and saves
   preset=gpu env.n_envs=256    the sizes for a GPU, or your own
@@ -42,7 +42,7 @@ The commonest:
                                a scripted policy; snapshots=8 keeps what ratings compare
   resume=RUN                   continue a run (its folder, or latest) under its own configuration
   init=RUN                     start a new run from its weights, in its environment
-  env=my_package.rover:Rover   a class of your own; so too geometry, learner, agent.memory
+  env=my_package.rover:Rover   a class of your own; so too geometry, learner, agent.core
   logger=wandb logger.mode=offline"""
 #: Metrics and groups of lanes that are shown beside the return.
 FEW = 4
@@ -55,9 +55,9 @@ RESUMABLE = (
     "samples",
     "seconds",
     "device",
-    "report",
-    "checkpoint",
-    "keep",
+    "log_every",
+    "checkpoint_seconds",
+    "keep_checkpoints",
     "snapshots",
     "logger",
     "finish",
@@ -70,19 +70,19 @@ def make_trainer(
     """A Trainer as `cfg` describes it, and its Saver: going on where a run stopped, or from the
     weights of another, if `cfg` says so.
     """
-    homes = components.homes(cfg.env, cfg.geometry, "training")
+    homes = factory.homes(cfg.env, cfg.geometry, "training")
     wanted = cfg.env, homes, cfg.seed, device, cfg.agent.critic == "asymmetric"
-    sample = components.make_sample(*wanted)
-    policy = components.make_policy(cfg.agent, sample, cfg.seed)
-    learner = components.make_learner(cfg.learner, policy, cfg.seed)
-    replayed = components.replay_bytes(learner, sample) / cfg.env.n_envs
+    sample = factory.make_sample(*wanted)
+    policy = factory.make_policy(cfg.agent, sample, cfg.seed)
+    learner = factory.make_learner(cfg.learner, policy, cfg.seed)
+    replayed = factory.replay_bytes(learner, sample) / cfg.env.n_envs
     beside = learner.bytes_per_env(sample) + replayed
-    env = components.make_env(*wanted, sample, bytes_beside=beside)
+    env = factory.make_env(*wanted, sample, bytes_beside=beside)
     loaded = None
     if cfg.resume or cfg.init:
-        loaded = components.load(run_folders.find(cfg.resume or cfg.init), device)
-        components.load_weights(policy, env, loaded)
-    opponents = components.make_opponents(cfg, env, sample, policy)
+        loaded = factory.load_checkpoint(run_folders.find(cfg.resume or cfg.init), device)
+        factory.load_weights(policy, env, loaded)
+    opponents = factory.make_opponents(cfg, env, sample, policy)
     wandb = None
     if isinstance(cfg.logger, WandbLogger):
         given = {key: getattr(cfg.logger, key) for key in ("project", "mode", "group")}
@@ -90,12 +90,12 @@ def make_trainer(
     if cfg.resume:
         for name in ("checkpoints", "snapshots"):
             checkpoint.rewind(folder / name, loaded.step)
-    with components.errors():
-        sinks = metrics.Metrics(folder, loaded.step if cfg.resume else 0, wandb)
-    config = {"train": as_tree(cfg), "spaces": components.spaces_of(env)}
-    saver = Saver(folder / "checkpoints", config, cfg.keep)
+    with factory.errors():
+        sinks = loggers.Loggers(folder, loaded.step if cfg.resume else 0, wandb)
+    config = {"train": as_tree(cfg), "spaces": factory.spaces_of(env)}
+    saver = Saver(folder / "checkpoints", config, cfg.keep_checkpoints)
     snapshots = Saver(folder / "snapshots", config, keep=10**9)
-    with components.errors():
+    with factory.errors():
         trainer = Trainer(
             opponents or env,
             policy,
@@ -103,14 +103,14 @@ def make_trainer(
             sinks,
             saver,
             Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
-            report_every=cfg.report,
-            save_every=cfg.checkpoint,
+            report_every=cfg.log_every,
+            save_every=cfg.checkpoint_seconds,
             on_report=on_report,
             opponents=opponents,
             snapshots=Snapshots(snapshots, cfg.snapshots),
         )
     if cfg.resume:
-        with components.errors():
+        with factory.errors():
             trainer.load_state_dict(loaded.state)
     return trainer, saver
 
@@ -122,7 +122,9 @@ def show(progress: Progress, trainer: Trainer) -> None:
         words.append(f"{number(trainer.rate)}/s")
     if trainer.score is not None:
         words.append(f"return {trainer.score:.2f}")
-        words += few_means(trainer.latest, trainer.episodes.metrics, trainer.episodes.groups)
+        words += few_means(
+            trainer.latest, trainer.episode_stats.metrics, trainer.episode_stats.groups
+        )
         won = {k.rpartition("/")[2]: v for k, v in trainer.latest.items() if k.startswith(WON)}
         words += [f"{share:.2f} won against {kind}" for kind, share in won.items()]
     left = trainer.left
@@ -156,7 +158,7 @@ def run(cfg: Train) -> Path:
     raises Interrupted.
     """
     cfg = settled(cfg)
-    device = components.make_device(cfg.device)
+    device = factory.make_device(cfg.device)
     folder = (
         run_folders.folder_of(run_folders.find(cfg.resume)) if cfg.resume else run_folders.new(cfg)
     )
@@ -180,16 +182,16 @@ def run(cfg: Train) -> Path:
                 saved = f"All {trainer.samples:,} samples are saved"
             raise UserError(f"{reason}. {saved}. {resume}") from error
         finally:
-            metrics.curves(folder)
+            loggers.curves(folder)
         if stop.number is not None:
             raise Interrupted(stop.number, f"Stopped after {trainer.samples:,} samples. {resume}")
         if saver.unsaved:
             raise UserError(saver.unsaved)
-        bad_number = trainer.bad_number
+        nonfinite_value = trainer.nonfinite_value
         del trainer  # its memory is the evaluation's now
         finish(cfg, folder)
-        if bad_number and bad_number.is_from_env:
-            raise NotFinite(f"{bad_number}. All else was learnt from, and is in {folder}")
+        if nonfinite_value and nonfinite_value.is_from_env:
+            raise NotFinite(f"{nonfinite_value}. All else was learnt from, and is in {folder}")
     return folder
 
 
@@ -199,7 +201,7 @@ def finish(cfg: Train, folder: Path) -> None:
         run=str(folder), geometry=None, split="test", greedy=False, seed=cfg.seed, device=cfg.device
     )
     if cfg.finish.evaluate:
-        evaluate.run(Evaluate(lanes=cfg.finish.lanes, baseline=True, **common))
+        evaluate.run(Evaluate(episodes=cfg.finish.episodes, baseline=True, **common))
     if cfg.finish.record:
         try:
             record.run(Record(steps=cfg.finish.steps, home=0, file=None, **common))
@@ -223,7 +225,7 @@ def _initialised(tree, given):
     """The environment and the agent are those of the run that the weights are from, but for the
     keys that are given; a group that is given whole is as it was.
     """
-    own = components.load(run_folders.find(tree["init"])).config["train"]
+    own = factory.load_checkpoint(run_folders.find(tree["init"])).config["train"]
     for group in ("env", "agent"):
         if group not in given:
             keys = [key.split(".", 1)[1] for key in given if key.startswith(f"{group}.")]
@@ -239,7 +241,7 @@ def _resumed(tree, given):
         if key.split(".")[0] not in RESUMABLE
     ]:
         raise ConfigErrors(refused)
-    loaded = components.load(run_folders.find(tree["resume"]))
+    loaded = factory.load_checkpoint(run_folders.find(tree["resume"]))
     if "learner" not in loaded.state:
         raise UserError(
             f"{loaded.path} is a snapshot, the weights alone; init={loaded.path} starts a new run "

@@ -1,9 +1,9 @@
-"""The environments: one file, one environment. ``ENVS`` names them after their files."""
+"""The environments. ``ENVS`` has the classes by the names of their modules."""
 
 import importlib
 import pkgutil
 
-#: By the name of its file, the class that the file's ``__all__`` names.
+#: The environments' classes by module: the first name in the module's ``__all__``.
 ENVS = {}
 for _file in pkgutil.iter_modules(__path__):
     _module = importlib.import_module(f"{__name__}.{_file.name}")

@@ -9,13 +9,13 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 
-from .. import engine, modules, plotting, spaces
-from .. import geometries as sources
-from ..arrdict import arrdict, numpyify
-from ..core import Core
-from ..dotdict import dotdict
-from ..scene import scenery
-from ..settings import MAX_ENVS, checked
+from megastep import engine, modules, plotting, spaces
+from megastep import geometries as sources
+from megastep.arrdict import arrdict, numpyify
+from megastep.core import Core
+from megastep.dotdict import dotdict
+from megastep.scene import scenery
+from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Explorer"]
 

@@ -9,11 +9,11 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 
-from .. import engine, modules, plotting, toys
-from ..arrdict import arrdict, numpyify
-from ..core import Core
-from ..scene import scenery
-from ..settings import MAX_ENVS, checked
+from megastep import engine, modules, plotting, toys
+from megastep.arrdict import arrdict, numpyify
+from megastep.core import Core
+from megastep.scene import scenery
+from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Minimal"]
 

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ..dotdict import dotdict
-from ..geometry import centers, indices, masks
-from . import files as files
-from . import mazes as mazes
-from . import sources
-from . import toys as toys
+from megastep.dotdict import dotdict
+from megastep.geometries import files as files
+from megastep.geometries import mazes as mazes
+from megastep.geometries import sources
+from megastep.geometries import toys as toys
+from megastep.geometry import centers, indices, masks
 
 __all__ = ["SOURCES", "SPLITS", "centers", "indices", "masks", "sample"]
 

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import geometry
-from ..dotdict import dotdict
+from megastep import geometry
+from megastep.dotdict import dotdict
 
 KEYS = ("walls", "lights", "masks", "res", "id")
 MAX_GEOMETRIES = 16_384

@@ -12,10 +12,10 @@ import functools
 
 import numpy as np
 
-from .. import geometry
-from ..dotdict import dotdict
-from .homes.random_stream import RandomStream
-from .homes.walls import INDOORS, WALL, segments
+from megastep import geometry
+from megastep.dotdict import dotdict
+from megastep.geometries.homes.portable_generator import PortableGenerator
+from megastep.geometries.homes.walls import INDOORS, WALL, segments
 
 COUNT = 5_000  # mazes of each kind, those of seeds 0 to 4,999; as many as there are homes
 # Metres; an agent's disc and 5 cm on either side of it are 0.312 m wide, and where it spawns is a
@@ -71,7 +71,7 @@ def _neighbours(size):
     ]
 
 
-def passages(size: int, braid: float, stream: RandomStream) -> list[list[int]]:
+def passages(size: int, braid: float, stream: PortableGenerator) -> list[list[int]]:
     """The cells that each cell opens to. Of the dead ends the share `braid` is opened, each to a
     random neighbour.
     """
@@ -156,7 +156,7 @@ def generate(
     """
     wide, thick = checked(size, corridor, thickness)
     pitch = wide + thick
-    opened = passages(size, braid, RandomStream(seed))
+    opened = passages(size, braid, PortableGenerator(seed))
     grid = _painted(size, opened)
     lines = np.cumsum([0] + [thick, wide] * size + [thick])
 

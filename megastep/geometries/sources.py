@@ -9,11 +9,11 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from ..dotdict import dotdict
-from ..settings import checked
-from . import files as npz
-from . import mazes, toys
-from .homes import database
+from megastep.dotdict import dotdict
+from megastep.geometries import files as npz
+from megastep.geometries import mazes, toys
+from megastep.geometries.homes import database
+from megastep.settings import checked
 
 __all__ = ["bench", "box", "column", "files", "homes", "maze"]
 
@@ -94,7 +94,7 @@ def maze(
     """From 5,000 mazes of `size` x `size` cells, `corridor` metres wide between walls of
     `thickness`, with the share `braid` of their dead ends opened.
     """
-    from ..devices import fit  # brings PyTorch, without which settings are read
+    from megastep.engine.devices import fit  # brings PyTorch, without which settings are read
 
     mazes.checked(size, corridor, thickness)
     indices = _selected(mazes.COUNT, n, split, seed)

@@ -4,8 +4,8 @@ from numbers import Real
 
 import numpy as np
 
-from .. import geometry
-from ..dotdict import dotdict
+from megastep import geometry
+from megastep.dotdict import dotdict
 
 CORNER = 1.0  # metres; where the lower-left corner of every toy is
 

@@ -4,15 +4,15 @@
 #include "errors.h"
 #include "params.h"
 
-constexpr int MAX_SHOOTERS = 16;
+constexpr int MAX_AGENTS = 16;
 constexpr float SPENT = 1e-4f;  // of health: as much is rounding, and counts as none
 
 // A step of an environment's agents, by agent.
 struct Shots {
-    int target[MAX_SHOOTERS];  // whom it hits; -1: nobody
-    int wounds[MAX_SHOOTERS];  // how many hit it
-    float loss[MAX_SHOOTERS];  // health that these take
-    int dies[MAX_SHOOTERS];
+    int target[MAX_AGENTS];  // whom it hits; -1: nobody
+    int wounds[MAX_AGENTS];  // how many hit it
+    float loss[MAX_AGENTS];  // health that these take
+    int dies[MAX_AGENTS];
 };
 
 // The agent in the middle of agent a's view, if both are past their first observation; else -1.

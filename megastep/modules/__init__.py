@@ -2,13 +2,19 @@
 Callables with a ``.space`` where there is one to declare.
 """
 
-from .goals import goal_fields
-from .lanes import to_agents, to_lanes
-from .lifecycle import Lifecycle, RandomLifespans, RandomStream
-from .movement import MOVES, TURNS, MomentumMovement, SimpleMovement, to_global, to_local
-from .sensors import IMU, RGB, Depth, downsample, render
-from .spawning import RandomSpawns, spawn_points
-from .visibility import TEXELS_PER_POINT, visible_texels
+from megastep.modules.lanes import to_agents, to_lanes
+from megastep.modules.lifecycle import CounterGenerator, Lifecycle, RandomLifespans
+from megastep.modules.movement import (
+    MOVES,
+    TURNS,
+    MomentumMovement,
+    SimpleMovement,
+    to_global,
+    to_local,
+)
+from megastep.modules.sensors import IMU, RGB, Depth, downsample, render
+from megastep.modules.spawning import RandomSpawns, spawn_points
+from megastep.modules.visibility import TEXELS_PER_POINT, visible_texels
 
 __all__ = [
     "IMU",
@@ -21,10 +27,9 @@ __all__ = [
     "MomentumMovement",
     "RandomLifespans",
     "RandomSpawns",
-    "RandomStream",
+    "CounterGenerator",
     "SimpleMovement",
     "downsample",
-    "goal_fields",
     "render",
     "spawn_points",
     "to_agents",

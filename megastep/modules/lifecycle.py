@@ -7,13 +7,13 @@ from typing import Any
 
 import torch
 
-from .. import engine
-from ..arrdict import arrdict
+from megastep import engine
+from megastep.arrdict import arrdict
 
 ENDLESS = 2**31 - 1  # steps; the longest an int32 age can tell
 
 
-class RandomStream:
+class CounterGenerator:
     """Random numbers by lane: the k-th draw of a lane depends on the seed, the lane and k alone, so
     it is the same on every device, captured or not.
     """
@@ -43,7 +43,7 @@ class RandomLifespans:
             )
         self.shortest, self.longest = shortest, longest
         seed = (core.seed if seed is None else seed) + (1 << 32)  # other draws than the spawns'
-        self.random = RandomStream(core.n_envs * core.n_agents, seed, core.device)
+        self.random = CounterGenerator(core.n_envs * core.n_agents, seed, core.device)
 
     def draw(self, reset: torch.Tensor, limits: torch.Tensor) -> None:
         """Writes lifespans into ``limits`` (B,) int32: new ones where ``reset`` (B,) bool."""

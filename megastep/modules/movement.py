@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from .. import engine, spaces
-from .lanes import to_agents
+from megastep import engine, spaces
+from megastep.modules.lanes import to_agents
 
 # What each action adds to the velocity in the agent's frame, ahead and left, and to its turn:
 # 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from .. import engine, plotting, spaces
-from .movement import to_local
+from megastep import engine, plotting, spaces
+from megastep.modules.movement import to_local
 
 
 def render(core: Any) -> engine.Render:

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from .. import engine
-from ..geometry import centers, hashed
-from ..kernels import cache
-from .lanes import to_agents
+from megastep import cache, engine
+from megastep.geometry import centers, hashed
+from megastep.modules.lanes import to_agents
 
 CLEARANCE = 0.05  # metres from a spawned agent's collision disc to walls and to others spawned
 PREFIX = "spawn-points-"  # of their files in the cache

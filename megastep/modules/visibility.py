@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .. import checks, engine
-from ..kernels import cache
-from ..kernels.compile import sources
-from ..scenery import Scenery
+from megastep import cache, engine
+from megastep.engine import checks
+from megastep.engine.scenery import Scenery
+from megastep.kernels.build.compile import sources
 
 __all__ = ["visible_texels"]
 

@@ -7,10 +7,10 @@ ready ones, those of seeds 0 to 4,999.
 
 import numpy as np
 
-from ... import geometry
-from ...dotdict import dotdict
-from . import openings, partition, plan, walls
-from .random_stream import RandomStream
+from megastep import geometry
+from megastep.dotdict import dotdict
+from megastep.geometries.homes import openings, partition, plan, walls
+from megastep.geometries.homes.portable_generator import PortableGenerator
 
 ATTEMPTS = 60  # plans tried before a home is given one room less
 # The best of three plans is taken; with more than ten rooms, which are expensive, the first.
@@ -70,7 +70,7 @@ def generate(seed: int, outer: bool = True) -> dotdict:
     and without a door; `n_outer`, how many of the walls, the last ones, are the envelope's outer
     face.
     """
-    stream = RandomStream(seed)
+    stream = PortableGenerator(seed)
     _, footprint, rooms, meetings, depth, gaps = _best_plan(stream)
     thickness = THICK[stream.below(len(THICK))]
     grid = walls.paint(

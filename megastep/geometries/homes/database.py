@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ... import geometry
-from ...dotdict import dotdict
+from megastep import geometry
+from megastep.dotdict import dotdict
 
 COUNT = 5_000
 PATH = Path(__file__).parents[1] / "data" / "homes.npz"

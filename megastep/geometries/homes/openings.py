@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 from typing import Any, NamedTuple
 
-from .random_stream import RandomStream
+from megastep.geometries.homes.portable_generator import PortableGenerator
 
 # How often a door has each width.
 DOORS = {60: 0.06, 65: 0.12, 70: 0.16, 75: 0.18, 80: 0.24, 85: 0.14, 90: 0.10}
@@ -123,7 +123,7 @@ def _cost(a, b):
 
 
 def connections(
-    rooms: Sequence[Any], spans: dict[Contact, tuple[int, int]], stream: RandomStream
+    rooms: Sequence[Any], spans: dict[Contact, tuple[int, int]], stream: PortableGenerator
 ) -> tuple[float, list[Contact]] | None:
     """The contacts to open: a cheapest tree over the rooms and some loops.
 
@@ -155,7 +155,7 @@ def connections(
 
 
 def opening(
-    contact: Contact, span: tuple[int, int], kinds: tuple[str, str], stream: RandomStream
+    contact: Contact, span: tuple[int, int], kinds: tuple[str, str], stream: PortableGenerator
 ) -> Opening:
     """The Opening made in a contact between rooms of two kinds, somewhere within the clear span
     (low, high).

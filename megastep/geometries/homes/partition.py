@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
-from . import regions
-from .plan import ALLOWANCE, KINDS
-from .random_stream import RandomStream, exp
+from megastep.geometries.homes import regions
+from megastep.geometries.homes.plan import ALLOWANCE, KINDS
+from megastep.geometries.homes.portable_generator import PortableGenerator, exp
 
 PORTAL = 120  # cm; the minimum neck between the parts of a region that is still to be cut
 MIN_FILL = 0.55  # of a room's bounding box
@@ -58,7 +58,7 @@ class Failure(Exception):
 
 
 def partition(
-    region: regions.Region, rooms: Sequence[tuple[str, int]], stream: RandomStream
+    region: regions.Region, rooms: Sequence[tuple[str, int]], stream: PortableGenerator
 ) -> tuple[list[Room], dict]:
     """Rooms, a list of (kind, area), laid out in a region.
 

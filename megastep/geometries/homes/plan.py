@@ -8,8 +8,8 @@ integer centimetres, areas cm2.
 from math import sqrt
 from typing import NamedTuple
 
-from . import regions
-from .random_stream import RandomStream
+from megastep.geometries.homes import regions
+from megastep.geometries.homes.portable_generator import PortableGenerator
 
 
 class Kind(NamedTuple):
@@ -53,13 +53,13 @@ MIN_NECK = 220  # cm between two notches, or a notch and the side across
 STEP = 10  # cm; the lattice of outlines
 
 
-def room_count(stream: RandomStream) -> int:
+def room_count(stream: PortableGenerator) -> int:
     """How many rooms a home has."""
     count = int(stream.lognormal(MEDIAN_ROOMS, SIGMA_ROOMS) + 0.5)
     return min(max(count, MIN_ROOMS), MAX_ROOMS)
 
 
-def programme(count: int, stream: RandomStream) -> list[tuple[str, int]]:
+def programme(count: int, stream: PortableGenerator) -> list[tuple[str, int]]:
     """`count` rooms as a list of (kind, area in cm2)."""
     kinds = list(CORE[:count])
     most = {"bedroom": 1 + count // 4, "bath": 1 + count // 6, "lobby": 1, "utility": 1}
@@ -97,7 +97,7 @@ def _apart(a, b):
     return max(max(a[0], b[0]) - min(a[2], b[2]), max(a[1], b[1]) - min(a[3], b[3]))
 
 
-def footprint(total: int, stream: RandomStream) -> regions.Region:
+def footprint(total: int, stream: PortableGenerator) -> regions.Region:
     """The inner outline, as a region, of a home whose rooms have `total` cm2: a box less up to
     three notches.
     """

@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from . import regions
-from .openings import Contact, Opening
-from .random_stream import RandomStream
+from megastep.geometries.homes import regions
+from megastep.geometries.homes.openings import Contact, Opening
+from megastep.geometries.homes.portable_generator import PortableGenerator
 
 Grid = tuple[np.ndarray, np.ndarray, np.ndarray]  # xs, ys, cells
 
@@ -156,7 +156,7 @@ def slanted(
     ys: np.ndarray,
     cells: np.ndarray,
     thickness: int,
-    stream: RandomStream,
+    stream: PortableGenerator,
 ) -> tuple[np.ndarray, np.ndarray, list]:
     """A home with one outer corner cut off at 45 degrees: the new segments inside and outside, and
     the triangle lost.

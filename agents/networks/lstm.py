@@ -1,0 +1,184 @@
+"""A long short-term memory (Hochreiter and Schmidhuber 1997) whose state is cleared inside a
+sequence where an episode starts.
+
+Axes: T time, B lanes, W width. Gates are laid out (..., 4 W): input, forget, candidate, output, as
+PyTorch's own are. On a GPU matrix products run in the compute dtype (autocast's), on a CPU in
+float32; the cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell would
+round small additions away.
+
+What happens between two matrix products is written out here for the CPU; on a GPU it is a kernel of
+the same arguments (`megastep.agents.networks.kernels.lstm`).
+"""
+
+from types import SimpleNamespace
+
+import torch
+from torch import nn
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
+
+from megastep.agents.networks.kernels import lstm as kernels
+from megastep.agents.networks.kernels.program import aligned, check_shapes
+from megastep.agents.networks.precision import compute_dtype
+from megastep.arrdict import arrdict
+
+_sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input  # (d, y): d y (1 - y)
+_tanh_backward = torch.ops.aten.tanh_backward.grad_input  # (d, y): d (1 - y^2)
+
+
+def _split(gates):
+    return gates.view(len(gates), 4, -1).unbind(1)
+
+
+def _start(reset, last_output, last_cell, memory, cell):
+    reset = reset[:, None]
+    memory.copy_(last_output).masked_fill_(reset, 0.0)
+    cell.copy_(last_cell).masked_fill_(reset, 0.0)
+
+
+def _forward(gates, cell, next_reset, output, next_memory, next_cell):
+    """Leaves the gates activated, for `_backward`; kernels activate them twice."""
+    i, f, g, o = _split(gates)
+    gates[:, : 2 * i.shape[1]].sigmoid_()
+    g.tanh_()
+    o.sigmoid_()
+    torch.mul(f, cell, out=next_cell).addcmul_(i, g)
+    torch.tanh(next_cell, out=output).mul_(o)
+    if next_reset is not None:
+        reset = next_reset[:, None]
+        next_memory.copy_(output).masked_fill_(reset, 0.0)
+        next_cell.masked_fill_(reset, 0.0)
+
+
+def _backward(gates, cell, next_reset, d_output, d_next_memory, d_next_cell, d_gates, d_cell):
+    i, f, g, o = _split(gates)
+    d_i, d_f, d_g, d_o = _split(d_gates)
+    squashed = (f * cell).addcmul_(i, g).tanh_()
+    if next_reset is not None:
+        reset = next_reset[:, None]
+        d_output = d_output + d_next_memory.masked_fill(reset, 0.0)
+        d_next_cell = d_next_cell.masked_fill(reset, 0.0)
+    d_after = _tanh_backward(d_output * o, squashed, grad_input=d_cell).add_(d_next_cell)
+    _sigmoid_backward(d_after * g, i, grad_input=d_i)
+    _sigmoid_backward(d_after * cell, f, grad_input=d_f)
+    _tanh_backward(d_after * i, g, grad_input=d_g)
+    _sigmoid_backward(squashed.mul_(d_output), o, grad_input=d_o)
+    d_cell.mul_(f)
+
+
+_WRITTEN_OUT = SimpleNamespace(start=_start, forward=_forward, backward=_backward)
+
+
+def _steps(x):
+    return kernels if x.is_cuda else _WRITTEN_OUT
+
+
+class _Sequence(torch.autograd.Function):
+    """The recurrence over time, with its gradient written out.
+
+    Autograd would add up the weights' gradients step by step; here each is one matrix product for
+    all of time.
+    """
+
+    @staticmethod
+    def forward(ctx, x, input_weight, bias, weight, reset, output, cell):
+        """x (T, B, W), weights (4 W, W) and bias (4 W) in the compute dtype, reset (T, B) bool,
+        output and cell (B, W) float32. Returns outputs (T, B, W) in the compute dtype and the last
+        cell.
+        """
+        steps, x, reset = _steps(x), x.contiguous(), reset.contiguous()
+        gates = F.linear(x, input_weight, bias)
+        outputs, memories = torch.empty_like(x), torch.empty_like(x)
+        output, cell = aligned(output), aligned(cell)
+        cells = [torch.empty_like(cell)]
+        steps.start(reset[0], output, cell, memories[0], cells[0])
+        upcoming = [*zip(reset[1:], memories[1:], strict=True), (None, None)]
+        for t, (next_reset, next_memory) in enumerate(upcoming):
+            gates[t].addmm_(memories[t], weight.T)
+            cells.append(torch.empty_like(cells[t]))
+            steps.forward(gates[t], cells[t], next_reset, outputs[t], next_memory, cells[t + 1])
+        ctx.save_for_backward(x, input_weight, weight, reset, gates, memories, *cells[:-1])
+        return outputs, cells[-1]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_outputs, d_cell):
+        x, input_weight, weight, reset, gates, memories, *cells = ctx.saved_tensors
+        steps = _steps(x)
+        d_outputs, d_cell, d_gates = aligned(d_outputs), aligned(d_cell), torch.empty_like(gates)
+        next_reset = d_memory = d_output = None
+        for t in reversed(range(len(reset))):
+            d_next_cell, d_cell = d_cell, torch.empty_like(d_cell)
+            steps.backward(
+                *(gates[t], cells[t], next_reset),
+                *(d_outputs[t], d_memory, d_next_cell),
+                *(d_gates[t], d_cell),
+            )
+            if t or any(ctx.needs_input_grad[-2:]):
+                next_reset, d_memory = reset[t], d_gates[t] @ weight
+        if any(ctx.needs_input_grad[-2:]):
+            d_output = d_memory.float().masked_fill_(reset[0, :, None], 0.0)
+            d_cell.masked_fill_(reset[0, :, None], 0.0)
+        flat = d_gates.flatten(0, 1)
+        return (
+            d_gates @ input_weight,
+            flat.T @ x.flatten(0, 1),
+            flat.sum(0),
+            flat.T @ memories.flatten(0, 1),
+            None,
+            d_output,
+            d_cell,
+        )
+
+
+class LSTM(nn.Module):
+    """An LSTM of `width` units. Between calls its state is arrdict(output, cell), each (B, W)
+    float32.
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.width = width
+        self.input = nn.Linear(width, 4 * width)
+        self.memory = nn.Linear(width, 4 * width, bias=False)
+        with torch.no_grad():
+            for block in (*self.input.weight.split(width), *self.memory.weight.split(width)):
+                nn.init.orthogonal_(block)
+            # A forget gate that starts open, so that gradients reach back from the start
+            # (Jozefowicz et al. 2015)
+            self.input.bias.zero_()[width : 2 * width] = 1.0
+
+    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """The state of lanes at the start of an episode."""
+        return arrdict(
+            {key: torch.zeros(n_lanes, self.width, device=device) for key in ("output", "cell")}
+        )
+
+    def forward(
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+    ) -> tuple[torch.Tensor, arrdict]:
+        """Runs over x (T, B, W) from a state; a lane's state is cleared before each step where
+        reset (T, B).
+
+        Returns the outputs (T, B, W), in the compute dtype on a GPU and float32 on a CPU, and the
+        state after the last step. ValueError if shapes or devices do not fit.
+        """
+        check_shapes(x, reset, state, ("output", "cell"))
+        dtype = compute_dtype(self.memory.weight) if x.is_cuda else torch.float32
+        weights = self.input.weight, self.input.bias, self.memory.weight
+        # autocast would choose dtypes of its own inside
+        with torch.autocast(x.device.type, enabled=False):
+            outputs, cell = _Sequence.apply(
+                x.to(dtype),
+                *(weight.to(dtype) for weight in weights),
+                reset.bool(),
+                *(state["output"].float(), state["cell"].float()),
+            )
+        return outputs, arrdict(output=outputs[-1].float(), cell=cell)
+
+    def step(
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+    ) -> tuple[torch.Tensor, arrdict]:
+        """One step, x (B, W) and reset (B,): the outputs (B, W) and the state after it."""
+        outputs, state = self(x[None], reset[None], state)
+        return outputs[0], state

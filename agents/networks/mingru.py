@@ -1,0 +1,127 @@
+"""A minimal gated recurrent unit (Feng et al. 2024, "Were RNNs all we needed?") whose state is
+cleared inside a sequence where an episode starts.
+
+    z_t = sigmoid(W_z x_t + b_z)             the update gate
+    c_t = W_c x_t + b_c                      the candidate
+    h_t = (1 - z_t) h_{t-1} + z_t c_t        h_{t-1} = 0 at a reset
+
+Gate and candidate see the input alone, not h. So a sequence takes one matrix product, for all of
+its steps, and the rest is a linear recurrence: a scan, whose gradient is a scan from the end on.
+This is the paper's plain form. Its other one is in logarithms, with a candidate that is never
+negative, for a scan that divides by products of 1 - z; ours does not, and a reset, a factor of 0,
+has no logarithm.
+
+Axes: T time, B lanes, W width. Gates are laid out (..., 2 W): update gate, before its sigmoid, and
+candidate. Matrix products run in the compute dtype (autocast's), the recurrence in float32: over
+hundreds of steps a bfloat16 state would round small additions away.
+
+The recurrence is written out here for the CPU; on a GPU it is a kernel of the same arguments
+(`megastep.agents.networks.kernels.mingru`).
+"""
+
+from types import SimpleNamespace
+
+import torch
+from torch import nn
+from torch.autograd.function import once_differentiable
+
+from megastep.agents.networks.kernels import mingru as kernels
+from megastep.agents.networks.kernels.program import aligned, check_shapes
+from megastep.agents.networks.scan import scan
+from megastep.arrdict import arrdict
+
+
+def _split(gates):
+    update, candidate = gates.float().chunk(2, -1)
+    return update.sigmoid(), candidate
+
+
+def _forward(gates, reset, start, outputs, last):
+    (z, candidate), reset = _split(gates), reset[..., None]
+    terms, kept = z * candidate, 1 - z
+    terms[0].addcmul_(kept[0], start.masked_fill(reset[0], 0.0))
+    states = scan(terms, kept, reset)
+    outputs.copy_(states)
+    last.copy_(states[-1])
+
+
+def _backward(gates, reset, start, outputs, d_outputs, d_last, d_gates, d_start):
+    (z, candidate), reset = _split(gates), reset[..., None]
+    kept, before = 1 - z, torch.cat([start[None], outputs[:-1]]).masked_fill(reset, 0.0)
+    terms = torch.cat([d_outputs[:-1], (d_outputs[-1] + d_last)[None]])
+    # row t of both is that of the step after t; what stands in the last row counts for nothing
+    d = scan(terms, kept.roll(-1, 0), reset.roll(-1, 0), reverse=True)
+    d_update, d_candidate = d_gates.chunk(2, -1)
+    d_update.copy_(d * (candidate - before) * z * kept)
+    d_candidate.copy_(d * z)
+    d_start.copy_((d[0] * kept[0]).masked_fill(reset[0], 0.0))
+
+
+_WRITTEN_OUT = SimpleNamespace(forward=_forward, backward=_backward)
+
+
+def _recurrence(gates):
+    return kernels if gates.is_cuda else _WRITTEN_OUT
+
+
+class _Sequence(torch.autograd.Function):
+    """The recurrence over time, with its gradient written out. It saves what it is given and what
+    it gives, no more; where outputs are bfloat16, its gradient knows states to as many bits.
+    """
+
+    @staticmethod
+    def forward(ctx, gates, reset, start):
+        """gates (T, B, 2 W) in the compute dtype, reset (T, B) bool, start (B, W) float32. Returns
+        outputs (T, B, W) in the compute dtype and the last state (B, W) float32.
+        """
+        gates, reset, start = aligned(gates), reset.contiguous(), aligned(start)
+        outputs = gates.new_empty((*gates.shape[:2], start.shape[1]))
+        last = torch.empty_like(start)
+        _recurrence(gates).forward(gates, reset, start, outputs, last)
+        ctx.save_for_backward(gates, reset, start, outputs)
+        return outputs, last
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_outputs, d_last):
+        gates, reset, start, outputs = ctx.saved_tensors
+        d_gates, d_start = torch.empty_like(gates), torch.empty_like(start)
+        _recurrence(gates).backward(
+            *(gates, reset, start, outputs),
+            *(aligned(d_outputs), aligned(d_last)),
+            *(d_gates, d_start),
+        )
+        return d_gates, None, d_start
+
+
+class MinGRU(nn.Module):
+    """A minGRU of `width` units. Between calls its state is arrdict(output (B, W)) float32."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.width = width
+        self.input = nn.Linear(width, 2 * width)
+        for block in self.input.weight.split(width):
+            nn.init.orthogonal_(block)
+        # Each unit starts with a time of its own over which it remembers, from 1 to 32 steps
+        # (Tallec and Ollivier 2018): with all at 1, a cue that counts after 12 steps is learnt late
+        nn.init.zeros_(self.input.bias)
+        with torch.no_grad():
+            self.input.bias[:width] = -torch.linspace(1, 32, width).log()
+
+    def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """The state of lanes at the start of an episode."""
+        return arrdict(output=torch.zeros(n_lanes, self.width, device=device))
+
+    def forward(
+        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+    ) -> tuple[torch.Tensor, arrdict]:
+        """Runs over x (T, B, W) from a state; a lane's state is cleared before each step where
+        reset (T, B).
+
+        Returns the outputs (T, B, W) in the compute dtype, and the state after the last step.
+        ValueError if shapes or devices do not fit.
+        """
+        check_shapes(x, reset, state, ("output",))
+        outputs, last = _Sequence.apply(self.input(x), reset.bool(), state["output"].float())
+        return outputs, arrdict(output=last)

@@ -1,0 +1,129 @@
+"""From tensors to what a launch is given: addresses, checked by name, without synchronisation."""
+
+import operator
+
+import torch
+
+from megastep.engine import checks, devices
+from megastep.engine.agents import Agents
+from megastep.engine.scenery import Scenery
+from megastep.kernels.build.launch import params
+
+__all__ = ["error_flag", "lanes_of", "scenery_params", "seed_params", "state_params"]
+
+_address, _shape = torch.Tensor.data_ptr, operator.attrgetter("shape")
+
+
+class _Packed:
+    """The packed params of a scenery, of which tensors, and the memory for which they hold. It has
+    no ``__dict__``, as it is no state.
+    """
+
+    __slots__ = ("tensors", "memory", "params")
+
+    def __init__(self, scenery):
+        layouts = scenery.layouts
+        self.memory = self.params = None
+        self.tensors = (
+            layouts.lines.vals,
+            layouts.lights.vals,
+            layouts.texels,
+            layouts.textures.vals,
+            layouts.baked.vals,
+            layouts.agent_textures,
+            scenery.layout,
+            scenery.agent_lines,
+            scenery.agent_light,
+        )
+
+
+def scenery_params(scenery: Scenery, radius: float) -> bytes:
+    """The params of a scenery. Its tensors cannot be replaced, so they are checked again only where
+    the memory or the shape of one has changed: ValueError, naming it, if it no longer fits.
+    """
+    packed = vars(scenery).get("_packed")
+    if packed is None:
+        packed = vars(scenery)["_packed"] = _Packed(scenery)
+    n_threads = devices.threads()
+    memory = [*map(_address, packed.tensors), *map(_shape, packed.tensors), radius, n_threads]
+    if packed.memory != memory:
+        packed.params = _pack(scenery, radius, n_threads)
+        packed.memory = memory
+    return packed.params
+
+
+def _pack(scenery, radius, n_threads):
+    layouts, n, k = scenery.layouts, scenery.n_envs, scenery.n_agent_texels
+    n_model = len(scenery.model)
+
+    def address(name, tensor, *shape, dtype=torch.float32):
+        return checks.address(name, tensor, shape, dtype, scenery.device)
+
+    texels = address("scenery.layouts.texels", layouts.texels, layouts.n_texels, 4)
+    for name, column in (("textures", 0), ("baked", 3)):
+        vals = getattr(layouts, name).vals
+        if vals.data_ptr() != texels + column * vals.element_size() * bool(len(vals)):
+            raise ValueError(
+                f"scenery.layouts.texels and the vals of scenery.layouts.{name} must share their "
+                f"memory, but one of them was given other memory"
+            )
+    return params.SceneryParams(
+        walls=address("scenery.layouts.lines.vals", layouts.lines.vals, layouts.n_walls, 2, 2),
+        wall_starts=layouts.wall_starts.data_ptr(),
+        texel_starts=layouts.texel_starts.data_ptr(),
+        boxes=layouts.boxes.data_ptr(),
+        box_starts=layouts.box_starts.data_ptr(),
+        texels=texels,
+        lights=address("scenery.layouts.lights.vals", layouts.lights.vals, layouts.n_lights, 3),
+        light_starts=layouts.light_starts.data_ptr(),
+        layout=address("scenery.layout", scenery.layout, n, dtype=torch.int32),
+        model=scenery.model.data_ptr(),
+        model_texels=scenery.model_texels.data_ptr(),
+        agent_textures=address(
+            "scenery.layouts.agent_textures", layouts.agent_textures, len(layouts), k, 3
+        ),
+        agent_lines=address(
+            "scenery.agent_lines", scenery.agent_lines, n, scenery.n_agents * n_model, 2, 2
+        ),
+        agent_light=address("scenery.agent_light", scenery.agent_light, n, k),
+        n_envs=n,
+        n_layouts=len(layouts),
+        n_agents=scenery.n_agents,
+        n_model=n_model,
+        n_agent_texels=k,
+        n_threads=n_threads,
+        radius=radius,
+        reach=1.001 * scenery.reach,
+    )
+
+
+_STATE = {"positions": (2,), "angles": (), "velocity": (2,), "angvelocity": ()}
+
+
+def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int]:
+    """The addresses of these tensors of the agents, by name. TypeError or ValueError, naming the
+    first, if they do not fit the scenery.
+    """
+    lanes, on, given = (scenery.n_envs, scenery.n_agents), scenery.device, vars(agents)
+    return {
+        name: checks.address(f"agents.{name}", given[name], lanes + _STATE[name], torch.float32, on)
+        for name in names
+    }
+
+
+def error_flag(scenery: Scenery, agents: Agents) -> int:
+    """The address of the flag that the device raises; see :func:`~megastep.engine.check`."""
+    return checks.address("agents.error_flag", agents.error_flag, (1,), torch.int32, scenery.device)
+
+
+def lanes_of(scenery: Scenery, agents: Agents) -> tuple[int, int]:
+    """(N, A), after a look at the types."""
+    checks.instance("scenery", scenery, Scenery)
+    checks.instance("agents", agents, Agents)
+    return scenery.n_envs, scenery.n_agents
+
+
+def seed_params(seed: int) -> dict[str, int]:
+    """A seed's two words."""
+    seed = checks.integer("seed", seed, 0, 2**64 - 1)
+    return dict(key0=seed & 0xFFFFFFFF, key1=seed >> 32)

@@ -1,0 +1,157 @@
+"""Scenery as each environment sees it: read-only views that join its agents' part and its layout's.
+
+N environments, A agents per environment, M lines of the agent model, K texels of one environment's
+agents, W walls of all layouts, L lines of all environments.
+"""
+
+from functools import cached_property
+
+import torch
+
+from megastep.ragged import Ragged, RaggedNumpy, RaggedTorch
+from megastep.read_only import ReadOnlyTensor
+
+__all__ = ["JoinedRagged", "baked", "lights", "lines", "textures"]
+
+_SHARED = "which reaches every environment that shows the layout"
+LINES = (
+    "scenery.lines is a read-only copy: write walls into scenery.layouts.lines, "
+    f"{_SHARED}, and call bake; agents' lines follow agents.positions when they are rendered"
+)
+LIGHTS = (
+    "scenery.lights is a read-only copy: write into scenery.layouts.lights, "
+    f"{_SHARED}, and call bake"
+)
+TEXTURES = (
+    "scenery.textures is a read-only copy: write walls' into scenery.layouts.textures and agents' "
+    f"into scenery.layouts.agent_textures, {_SHARED}"
+)
+BAKED = (
+    "scenery.baked is a read-only copy: write walls' light into scenery.layouts.baked, "
+    f"{_SHARED}; agents' light is calculated when they are rendered"
+)
+
+
+class JoinedRagged(RaggedTorch):
+    """A read-only Ragged whose subarrays join pieces of several tensors, made when looked at.
+
+    Args: for each part its vals (V, ...) and where in them the pieces lie, ``starts`` (D,) and
+    ``widths`` (D,); the ``refusal`` to be raised where somebody writes into what was read.
+    """
+
+    def __init__(self, refusal: str, *parts: tuple[torch.Tensor, torch.Tensor, torch.Tensor]):
+        self._sentence, self._parts = refusal, parts
+        self.widths = self._guarded(sum(widths for _, _, widths in parts))
+
+    def _guarded(self, tensor):
+        return ReadOnlyTensor(tensor, self._sentence)
+
+    @cached_property
+    def vals(self) -> torch.Tensor:
+        """(V, ...) a copy of all subarrays, end to end."""
+        vals, starts, widths = zip(*self._parts)
+        lengths = torch.tensor([0, *map(len, vals)])
+        starts = torch.stack([s + int(before) for s, before in zip(starts, lengths.cumsum(0))], 1)
+        return self._guarded(
+            torch.cat(vals)[_ranges(starts.flatten(), torch.stack(widths, 1).flatten())]
+        )
+
+    @cached_property
+    def ends(self) -> torch.Tensor:
+        return self._guarded(self.widths.cumsum(0))
+
+    @cached_property
+    def starts(self) -> torch.Tensor:
+        return self._guarded(self.ends - self.widths)
+
+    @cached_property
+    def inverse(self) -> torch.Tensor:
+        each = torch.arange(len(self), device=self.device)
+        return self._guarded(torch.repeat_interleave(each, self.widths))
+
+    @property
+    def device(self) -> torch.device:
+        return self._parts[0][0].device
+
+    def __getitem__(self, index: int | slice) -> torch.Tensor | Ragged:
+        if isinstance(index, slice):
+            chosen = range(len(self))[index]
+            pieces = [self[i] for i in chosen] or [self._parts[0][0][:0]]
+            return Ragged(
+                self._guarded(torch.cat(pieces)), self._guarded(self.widths[list(chosen)])
+            )
+        i = self._index(index)
+        pieces = [vals[int(s[i]) : int(s[i]) + int(w[i])] for vals, s, w in self._parts]
+        return self._guarded(torch.cat(pieces))
+
+    def numpyify(self) -> RaggedNumpy:
+        """A copy on numpy arrays, to be written at will."""
+        return self.clone().numpyify()
+
+
+def _ranges(starts, widths):
+    """Indices of the ranges [start, start + width), end to end."""
+    offsets = widths.cumsum(0) - widths
+    return torch.arange(int(widths.sum()), device=widths.device) + torch.repeat_interleave(
+        starts - offsets, widths
+    )
+
+
+def lines(scenery) -> JoinedRagged:
+    """Per environment, all its lines (l, 2, 2): the agents' first, as last rendered."""
+    layout, walls = scenery.layout.long(), scenery.layouts.lines
+    n = scenery.agent_lines.shape[1]
+    agents = torch.arange(scenery.n_envs, device=scenery.device) * n
+    return JoinedRagged(
+        LINES,
+        (scenery.agent_lines.flatten(0, 1), agents, torch.full_like(agents, n)),
+        (walls.vals, walls.starts[layout], walls.widths[layout]),
+    )
+
+
+def lights(scenery) -> JoinedRagged:
+    """Per environment, its lights (l, 3)."""
+    layout, lights = scenery.layout.long(), scenery.layouts.lights
+    return JoinedRagged(LIGHTS, (lights.vals, lights.starts[layout], lights.widths[layout]))
+
+
+def textures(scenery) -> JoinedRagged:
+    """Per line of all environments, its texels (w, 3)."""
+    agents = scenery.layouts.agent_textures
+    starts = scenery.layout.long() * agents.shape[1]
+    return _by_line(scenery, TEXTURES, agents.flatten(0, 1), starts, scenery.layouts.textures.vals)
+
+
+def baked(scenery) -> JoinedRagged:
+    """Per line of all environments, the light on its texels (w,)."""
+    agents = scenery.agent_light
+    starts = torch.arange(scenery.n_envs, device=scenery.device) * agents.shape[1]
+    return _by_line(scenery, BAKED, agents.flatten(), starts, scenery.layouts.baked.vals)
+
+
+def _by_line(scenery, refusal, agents, agent_starts, texels):
+    """Texels by line: ``agents`` holds those of each environment from ``agent_starts`` (N,) on.
+
+    A line is an agent's or a wall; its part of the other kind is the empty one that both tables
+    end in.
+    """
+    walls, wall_texels = scenery.layouts.lines, scenery.layouts.textures
+    layout, bounds = scenery.layout.long(), scenery.model_texels.long()
+    n_agents_lines, n_walls = len(bounds) - 1, len(walls.vals)
+    n_lines = n_agents_lines + walls.widths[layout]
+    e = torch.repeat_interleave(torch.arange(scenery.n_envs, device=scenery.device), n_lines)
+    line = torch.arange(len(e), device=scenery.device) - (n_lines.cumsum(0) - n_lines)[e]
+    agent_line = line.clamp(max=n_agents_lines)
+    wall = torch.where(
+        line < n_agents_lines, n_walls, walls.starts[layout[e]] + line - n_agents_lines
+    )
+    return JoinedRagged(
+        refusal,
+        (agents, agent_starts[e] + bounds[agent_line], _ended(bounds.diff())[agent_line]),
+        (texels, _ended(wall_texels.starts)[wall], _ended(wall_texels.widths)[wall]),
+    )
+
+
+def _ended(table):
+    """A table with a zero at its end."""
+    return torch.cat([table, table.new_zeros(1)])

@@ -1,0 +1,287 @@
+"""Shortest paths of an agent between walls: goals, a field of distances to each, and how long the
+ways to them from spawn points are.
+
+A field is Dijkstra's algorithm on square cells joined to 16 neighbours each: a few per cent too
+long, and steady, so progress is counted on it. The length of a way is that of the shortest
+polyline along which the agent's disc touches no wall, from a visibility graph (Lozano-Perez and
+Wesley 1979) of goals, spawn points and points about the ends of walls.
+
+M walls, H x W cells, G goals, S spawn points, P points, K pairs of points.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from megastep.modules.spawning import distances, spawn_points
+
+CELL = 0.1  # metres, of fields
+FINE = 2  # times finer are the cells of which the clearance is known
+FAR = 0.5  # metres; no clearance above it is told apart
+RINGS = 3  # of cells beside walls that take over a neighbour's distance, to interpolate from
+ARC = 8  # points about the end of a wall
+STEP = 0.05  # metres between the points of a way that are looked at
+# Metres that a way may come nearer to a wall than the agent does: what an interpolated clearance
+# may be short of the true one, and the chord of an arc lies inside of it.
+TOLERANCE = 0.015
+SPARE = 4  # times as many points are drawn as are needed, as some may lie in rooms without a door
+# Half of the moves between neighbours, as ways go both ways: rows up and columns right, and the
+# cells that a move passes.
+MOVES = {
+    (0, 1): [],
+    (1, 0): [],
+    (1, 1): [(0, 1), (1, 0)],
+    (1, -1): [(0, -1), (1, 0)],
+    (1, 2): [(0, 1), (1, 1)],
+    (1, -2): [(0, -1), (1, -1)],
+    (2, 1): [(1, 0), (1, 1)],
+    (2, -1): [(1, 0), (1, -1)],
+}
+
+
+class Geodesics(NamedTuple):
+    """Of one geometry, in metres."""
+
+    origin: np.ndarray  # (2,) float32: the centre of the first cell
+    fields: np.ndarray  # (G, H, W) float16: distances to the goals, row 0 at the bottom, or inf
+    spawns: np.ndarray  # (S, 2) float32; each has a way to each goal
+    goals: np.ndarray  # (G, 2) float32
+    lengths: np.ndarray  # (S, G) float32: of the shortest ways
+
+
+class _Grid:
+    """Square cells (H, W), and the clearance of `FINE` times finer ones: metres from their centres
+    to the nearest wall, at most `FAR`.
+    """
+
+    def __init__(self, walls):
+        low, high = walls.min((0, 1)), walls.max((0, 1))
+        self.origin = low.astype(np.float32).astype(np.float64)
+        width, height = np.ceil((high - low) / CELL).astype(int) + 2
+        self.clearance = np.full((FINE * height, FINE * width), FAR)
+        for start, end in walls:
+            self._take(start, end)
+
+    def _take(self, start, end):
+        """Takes a wall into account, where it is near."""
+        side = CELL / FINE
+        low, high = np.minimum(start, end) - FAR, np.maximum(start, end) + FAR
+        column, row = np.floor((low - self.origin) / side).astype(int).clip(0)
+        last_column, last_row = np.ceil((high - self.origin) / side).astype(int)
+        near = self.clearance[row : last_row + 1, column : last_column + 1]
+        y, x = np.ogrid[row : row + near.shape[0], column : column + near.shape[1]]
+        dx = self.origin[0] + side * x - start[0]
+        dy = self.origin[1] + side * y - start[1]
+        vx, vy = end - start
+        along = ((dx * vx + dy * vy) / max(vx * vx + vy * vy, 1e-12)).clip(0, 1)
+        dx, dy = dx - along * vx, dy - along * vy
+        np.minimum(near, np.sqrt(dx * dx + dy * dy), out=near)
+
+    def free(self, radius):
+        """(H, W) bool: the cells whose centre has room for a disc."""
+        return self.clearance[::FINE, ::FINE] >= radius
+
+    def read(self, values, points):
+        """(..., P) what `values` (..., H, W) of cells, or of finer ones, are at points (P, 2)."""
+        height, width = values.shape[-2:]
+        side = CELL * len(self.clearance) / (FINE * height)
+        at = (points - self.origin) / side
+        x = at[:, 0].clip(0, width - 1.001)
+        y = at[:, 1].clip(0, height - 1.001)
+        column, row = x.astype(int), y.astype(int)
+        x, y = x - column, y - row
+        index = row * width + column
+        flat = values.reshape(*values.shape[:-2], -1)
+        found = 0.0
+        for offset, weight in (
+            (0, (1 - x) * (1 - y)),
+            (1, x * (1 - y)),
+            (width, (1 - x) * y),
+            (width + 1, x * y),
+        ):
+            found = found + np.where(weight > 0, flat[..., index + offset], 0.0) * weight
+        return found
+
+    def sees(self, starts, ends, least):
+        """(K,) whether all of the way straight from a start to an end, (K, 2) each, is at least
+        `least` metres from all walls.
+        """
+        across = ends - starts
+        n_steps = np.ceil(np.sqrt((across**2).sum(1)) / STEP).astype(int) + 1
+        clear = np.ones(len(starts), bool)
+        for rough in (1, 3, 7, None):  # most that are not clear are soon found out
+            left = clear.nonzero()[0]
+            counts = n_steps[left] if rough is None else np.full(len(left), rough)
+            way = np.repeat(left, counts)
+            step = np.arange(len(way)) - np.repeat(np.cumsum(counts) - counts, counts)
+            part = (step + 1) / (np.repeat(counts, counts) + 1)
+            places = starts[way] + part[:, None] * across[way]
+            clear[way[self.read(self.clearance, places) < least]] = False
+        return clear
+
+
+def _graph(free):
+    """The number of each `free` cell (H, W), else -1, and the moves between them: from, to, (E,)
+    each, and metres (E,).
+    """
+    height, width = free.shape
+    numbers = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
+    padded = np.pad(free, 2)
+
+    def at(i, j):
+        return padded[2 + i : 2 + i + height, 2 + j : 2 + j + width]
+
+    moves = []
+    for (i, j), passed in MOVES.items():
+        open_ = free & at(i, j)
+        for cell in passed:
+            open_ &= at(*cell)
+        rows, columns = open_.nonzero()
+        to = numbers[rows + i, columns + j]
+        moves.append((numbers[rows, columns], to, np.full(len(to), CELL * np.hypot(i, j))))
+    return numbers, *map(np.concatenate, zip(*moves))
+
+
+def _entries(grid, numbers, points):
+    """Moves from points (P, 2) to the free cells about them: point, cell, metres, (E,) each."""
+    nearest = np.rint((points - grid.origin) / CELL).astype(int)
+    offsets = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 2)
+    cells = (nearest[:, None] + offsets).reshape(-1, 2)
+    height, width = numbers.shape
+    inside = ((cells >= 0) & (cells < (width, height))).all(1)
+    point, cells = np.repeat(np.arange(len(points)), 9)[inside], cells[inside]
+    number = numbers[cells[:, 1], cells[:, 0]]
+    metres = np.sqrt(((grid.origin + CELL * cells - points[point]) ** 2).sum(1))
+    chosen = (number >= 0) & (metres <= 1.5 * CELL)
+    return point[chosen], number[chosen], metres[chosen]
+
+
+def _sparse(n, *moves):
+    from scipy.sparse import csr_array
+
+    starts, ends, metres = map(np.concatenate, zip(*moves))
+    return csr_array((metres, (starts, ends)), shape=(n, n))
+
+
+def _filled(fields, passable):
+    """Fields (G, H, W) whose cells beside walls hold a neighbour's distance and a cell more."""
+    for _ in range(RINGS):
+        padded = np.pad(fields, ((0, 0), (1, 1), (1, 1)), constant_values=np.inf)
+        around = np.minimum(
+            np.minimum(padded[:, 2:, 1:-1], padded[:, :-2, 1:-1]),
+            np.minimum(padded[:, 1:-1, 2:], padded[:, 1:-1, :-2]),
+        )
+        fields = np.where(np.isinf(fields) & ~passable, around + CELL, fields)
+    return fields
+
+
+def _corners(walls, radius):
+    """(C, 2) places where a shortest way may bend, touching the ends of walls, and (C, 2) the
+    directions to them from those ends.
+    """
+    ends = np.unique(walls.reshape(-1, 2), axis=0)
+    angles = 2 * np.pi * np.arange(ARC) / ARC
+    away = np.tile(np.stack([np.cos(angles), np.sin(angles)], 1), (len(ends), 1))
+    points = np.repeat(ends, ARC, axis=0) + radius * away
+    touching = distances(points, walls) > radius - 1e-4
+    points, away = points[touching], away[touching]
+    aside = STEP * np.stack([-away[:, 1], away[:, 0]], 1)
+    # beside a straight wall a step to either side is as near to it as before: nothing bends there
+    further = np.sqrt(radius**2 + STEP**2) - 1e-3
+    bends = (distances(points + aside, walls) > further) | (
+        distances(points - aside, walls) > further
+    )
+    return points[bends], away[bends]
+
+
+def _pairs(points, away, n_goals, n_ends, to_goals):
+    """(K,), (K,) numbers of points (P, 2), of which two and two may be neighbours on a shortest
+    way: goals, then from `n_goals` spawns, then from `n_ends` corners, with `away` (P, 2) the
+    directions from the walls they touch, 0 elsewhere. `to_goals` (G, P) are distances.
+
+    Left out are those that cannot see each other, as their distances to a goal differ by more than
+    the way between them, and those where a way would not bend round the end of the wall.
+    """
+    tangent = np.sin(np.pi / ARC) + 0.05
+    found = []
+    for i in range(n_ends, len(points)):
+        across = points[:i] - points[i]
+        straight = np.sqrt((across**2).sum(1))
+        bent = np.maximum(np.abs(across @ away[i]), np.abs((across * away[:i]).sum(1)))
+        others = (bent <= tangent * straight).nonzero()[0]
+        apart = np.abs(to_goals[:, others] - to_goals[:, i, None]).max(0)
+        others = others[apart <= 1.03 * straight[others] + 2 * CELL]
+        found.append(np.stack([np.full(len(others), i), others], 1))
+    direct = np.indices((n_goals, n_ends - n_goals)).reshape(2, -1).T + (0, n_goals)
+    starts, ends = np.concatenate([direct, *found]).T
+    return starts, ends
+
+
+def _lengths(grid, goals, spawns, corners, away, fields, radius):
+    """(S, G) lengths of the shortest ways from spawns (S, 2) to goals (G, 2), bending at corners
+    (C, 2). `fields` (G, H, W) are distances to the goals.
+    """
+    from scipy.sparse.csgraph import dijkstra
+
+    reached = np.isfinite(grid.read(fields, corners)).all(0)
+    points = np.concatenate([goals, spawns, corners[reached]])
+    n_goals, n_ends = len(goals), len(goals) + len(spawns)
+    away = np.concatenate([np.zeros((n_ends, 2)), away[reached]])
+    to_goals = grid.read(fields, points)
+    starts, ends = _pairs(points, away, n_goals, n_ends, to_goals)
+    clear = grid.sees(points[starts], points[ends], radius - TOLERANCE)
+    starts, ends = starts[clear], ends[clear]
+    metres = np.sqrt(((points[ends] - points[starts]) ** 2).sum(1))
+    graph = _sparse(len(points), (starts, ends, metres))
+    found = dijkstra(graph, directed=False, indices=np.arange(n_goals))[:, n_goals:n_ends].T
+    return np.where(np.isfinite(found), found, to_goals[:, n_goals:n_ends].T)
+
+
+def geodesics(
+    g: Any, n_spawns: int, n_goals: int, radius: float, random: np.random.Generator
+) -> Geodesics:
+    """The goals and spawn points of a geometry, drawn from its largest part that is connected, and
+    the ways between them. ValueError, naming the geometry, if it has no room for an agent.
+    """
+    from scipy.sparse.csgraph import connected_components, dijkstra
+
+    walls = g.walls.astype(np.float64)
+    grid = _Grid(walls)
+    numbers, *moves = _graph(grid.free(radius))
+    n_cells = int(numbers.max()) + 1
+    points = spawn_points(g, SPARE * (n_spawns + n_goals), 1, radius, random)
+    entries = _entries(grid, numbers, points)
+    _, parts = connected_components(_sparse(n_cells, moves), directed=False)
+    of_point = np.full(len(points), -1)
+    of_point[entries[0]] = parts[entries[1]]
+    if (of_point < 0).all():
+        raise ValueError(
+            f"geometry {g.id} has no room for an agent to walk in: no gap is "
+            f"{2 * radius + CELL:.2f} m wide"
+        )
+    largest = np.bincount(of_point[of_point >= 0]).argmax()
+    points = points[of_point == largest]
+    goals = np.resize(points[:n_goals], (n_goals, 2))
+    spawns = points[n_goals:] if len(points) > n_goals else points
+    spawns = np.resize(spawns, (n_spawns, 2))
+
+    starts, ends, metres = _entries(grid, numbers, goals)
+    graph = _sparse(n_cells + n_goals, moves, (starts + n_cells, ends, metres))
+    found = dijkstra(graph, directed=False, indices=n_cells + np.arange(n_goals))
+    free = numbers >= 0
+    fields = np.full((n_goals, *free.shape), np.inf)
+    fields[:, free] = found[:, :n_cells]
+    reached = np.isfinite(fields[0])
+    fields = _filled(fields, free)
+    lengths = _lengths(grid, goals, spawns, *_corners(walls, radius), fields, radius)
+
+    rows, columns = (reached.any(axis).nonzero()[0] for axis in (1, 0))
+    row, column = max(rows[0] - RINGS, 0), max(columns[0] - RINGS, 0)
+    fields = fields[:, row : rows[-1] + RINGS + 1, column : columns[-1] + RINGS + 1]
+    return Geodesics(
+        origin=(grid.origin + CELL * np.array([column, row])).astype(np.float32),
+        fields=fields.astype(np.float16),
+        spawns=spawns.astype(np.float32),
+        goals=goals.astype(np.float32),
+        lengths=lengths.astype(np.float32),
+    )

@@ -1,0 +1,5 @@
+"""Pong: the environment, and its step as one operation."""
+
+from megastep.envs.pong.env import Pong
+
+__all__ = ["Pong"]

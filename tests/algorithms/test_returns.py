@@ -1,0 +1,262 @@
+"""Returns: against numbers worked out by hand, identities, and loops that share no code with
+agents/returns.py.
+"""
+
+import pytest
+import torch
+
+from megastep.agents.algorithms import returns
+
+F64_CLOSE = dict(
+    rtol=1e-10, atol=1e-10
+)  # two orders of summing the same few hundred float64 numbers
+
+
+def column(*values):
+    """One lane over time, (T, 1)."""
+    return torch.tensor(values, dtype=torch.float64)[:, None]
+
+
+def flags(*values):
+    return torch.tensor(values, dtype=torch.bool)[:, None]
+
+
+def lane(value, last_value, reward, reset=None, terminal=None, truncated=None):
+    none = torch.zeros(len(value), 1, dtype=torch.bool)
+    return dict(
+        value=column(*value),
+        last_value=torch.tensor([last_value], dtype=torch.float64),
+        reward=column(*reward),
+        reset=none if reset is None else flags(*reset),
+        terminal=none if terminal is None else flags(*terminal),
+        truncated=none if truncated is None else flags(*truncated),
+    )
+
+
+def episodes(T=37, B=64, seed=0):
+    """Random lanes as an autoresetting env makes them: an end is followed by a reset, some lanes
+    end twice in a row.
+    """
+    g = torch.Generator().manual_seed(seed)
+    reset, terminal, truncated = (torch.zeros(T, B, dtype=torch.bool) for _ in range(3))
+    ended = torch.rand(B, generator=g) < 0.3
+    for t in range(T):
+        reset[t] = ended
+        end = ~reset[t] & (torch.rand(B, generator=g) < 0.25)
+        terminal[t] = end & (torch.rand(B, generator=g) < 0.5)
+        truncated[t] = end & ~terminal[t]
+        ended = end
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    return dict(
+        reward=torch.where(reset, 0.0, normal(T, B)),
+        value=normal(T, B),
+        last_value=normal(B),
+        reset=reset,
+        terminal=terminal,
+        truncated=truncated,
+    ), normal(T, B)
+
+
+def test_gae_by_hand():
+    # gamma = lambda = 1/2. Backwards: delta_2 = 4 + 8/2 - 2 = 6, delta_1 = 2 + 2/2 - 4 = -1,
+    # delta_0 = 1 + 4/2 - 1 = 2. A_2 = 6, A_1 = -1 + 6/4 = 1/2, A_0 = 2 + 1/8.
+    r = returns.gae(**lane(value=[1, 4, 2], last_value=8, reward=[1, 2, 4]), gamma=0.5, lambda_=0.5)
+    assert r.advantages[:, 0].tolist() == [2.125, 0.5, 6.0]
+    assert r.targets[:, 0].tolist() == [3.125, 4.5, 8.0]
+    assert r.valid.all()
+
+
+def test_a_terminal_end_drops_the_value_of_gae_and_a_truncated_one_does_not():
+    # The episode's last observation is that of row 1; row 2 is the transition to the next episode's
+    # first.
+    case = dict(value=[1, 4, 100, 6], last_value=8, reward=[1, 2, 0, 3], reset=[0, 0, 1, 0])
+    died = returns.gae(**lane(**case, terminal=[0, 1, 0, 0]), gamma=0.5, lambda_=0.5)
+    # A_3 = 3 + 4 - 6 = 1, A_2 is masked, A_1 = 2 - 4 = -2, A_0 = 1 + 2 - 1 - 2/4 = 1.5
+    assert died.advantages[:, 0].tolist() == [1.5, -2.0, 0.0, 1.0]
+    cut = returns.gae(**lane(**case, truncated=[0, 1, 0, 0]), gamma=0.5, lambda_=0.5)
+    # A_1 = 2 + .5*100 - 4 = 48, A_0 = 2 + 48/4 = 14
+    assert cut.advantages[:, 0].tolist() == [14.0, 48.0, 0.0, 1.0]
+    assert died.valid[:, 0].tolist() == cut.valid[:, 0].tolist() == [True, True, False, True]
+
+
+def test_vtrace_by_hand():
+    # gamma = 1, ratios 2, 1/2, 4: rho = c = 1, 1/2, 1.
+    # delta_2 = 4 + 8 - 2 = 10, delta_1 = (2 + 2 - 4)/2 = 0, delta_0 = 1 + 4 - 1 = 4.
+    # v - V: 10; 0 + 10/2 = 5; 4 + 5 = 9. So v = 10, 9, 12 and A = 1 + 9 - 1, (2 + 12 - 4)/2, 4 + 8
+    # - 2.
+    case = lane(value=[1, 4, 2], last_value=8, reward=[1, 2, 4])
+    r = returns.vtrace(column(2, 0.5, 4).log(), **case, gamma=1.0)
+    torch.testing.assert_close(r.targets[:, 0], column(10, 9, 12)[:, 0], **F64_CLOSE)
+    torch.testing.assert_close(r.advantages[:, 0], column(9, 5, 10)[:, 0], **F64_CLOSE)
+
+
+@pytest.mark.parametrize("T", [1, 2, 3, 8, 13])
+def test_discounted_sum_is_the_recursion(T):
+    terms, discounts = torch.randn(2, T, 5, dtype=torch.float64)
+    discounts[torch.rand(T, 5) < 0.3] = 0.0
+    expected, tail = torch.empty_like(terms), torch.zeros(5, dtype=torch.float64)
+    for t in reversed(range(T)):
+        tail = expected[t] = terms[t] + discounts[t] * tail
+    torch.testing.assert_close(returns.discounted_sum(terms, discounts), expected, **F64_CLOSE)
+
+
+def test_lambda_one_is_the_n_step_return():
+    case, _ = episodes()
+    for name in ("reset", "terminal", "truncated"):
+        case[name] = torch.zeros_like(case[name])
+    T = len(case["reward"])
+    powers = 0.9 ** torch.arange(T + 1, dtype=torch.float64)
+    r = returns.gae(**case, gamma=0.9, lambda_=1.0)
+    for t in range(T):
+        n_step = (powers[: T - t, None] * case["reward"][t:]).sum(0) + powers[T - t] * case[
+            "last_value"
+        ]
+        torch.testing.assert_close(r.targets[t], n_step, **F64_CLOSE)
+
+
+def test_lambda_zero_is_the_one_step_error():
+    case, _ = episodes()
+    r = returns.gae(**case, gamma=0.9, lambda_=0.0)
+    following = torch.cat([case["value"][1:], case["last_value"][None]])
+    delta = case["reward"] + 0.9 * following * ~case["terminal"] - case["value"]
+    torch.testing.assert_close(r.advantages, delta * ~case["reset"], **F64_CLOSE)
+
+
+@pytest.mark.parametrize("lambda_", [0.0, 0.7, 1.0])
+def test_vtrace_on_its_own_policy_is_the_lambda_return(lambda_):
+    case, _ = episodes()
+    on_policy = returns.vtrace(torch.zeros_like(case["reward"]), **case, gamma=0.9, lambda_=lambda_)
+    expected = returns.gae(**case, gamma=0.9, lambda_=lambda_)
+    torch.testing.assert_close(on_policy.targets, expected.targets, **F64_CLOSE)
+
+
+def test_vtrace_never_taken_actions_teach_nothing():
+    case, _ = episodes()
+    r = returns.vtrace(torch.full_like(case["reward"], -torch.inf), **case, gamma=0.9)
+    assert torch.equal(r.targets, case["value"]) and not r.advantages.any()
+
+
+def split(case, b):
+    """Yields lane b's episodes as lists of row numbers, invalid rows left out."""
+    rows = []
+    for t in range(len(case["reward"])):
+        if case["reset"][t, b]:
+            if rows:
+                yield rows
+            rows = []
+        else:
+            rows.append(t)
+    if rows:
+        yield rows
+
+
+def beyond(case, t, b):
+    """The value of the observation after row t."""
+    last = t + 1 == len(case["reward"])
+    value = case["last_value"][b] if last else case["value"][t + 1, b]
+    return 0.0 if case["terminal"][t, b] else value.item()
+
+
+def test_gae_matches_a_slow_loop_over_episodes():
+    case, _ = episodes(seed=1)
+    gamma, lambda_ = 0.97, 0.9
+    r = returns.gae(**case, gamma=gamma, lambda_=lambda_)
+    expected = torch.zeros_like(case["reward"])
+    for b in range(case["reward"].shape[1]):
+        for rows in split(case, b):
+            for i, t in enumerate(rows):
+                for j, s in enumerate(rows[i:]):
+                    delta = case["reward"][s, b] + gamma * beyond(case, s, b) - case["value"][s, b]
+                    expected[t, b] += (gamma * lambda_) ** j * delta
+    assert case["terminal"].any() and case["truncated"].any() and case["reset"].any()
+    torch.testing.assert_close(r.advantages, expected, **F64_CLOSE)
+
+
+def test_vtrace_matches_the_sums_and_products_of_the_paper():
+    """v_s = V_s + sum_{t >= s} gamma^{t-s} (prod_{i=s}^{t-1} c_i) rho_t (r_t + gamma V_{t+1} -
+    V_t), by episodes.
+    """
+    case, log_ratio = episodes(seed=2)
+    gamma, lambda_, rho_clip, c_clip = 0.97, 0.9, 1.3, 0.8
+    r = returns.vtrace(
+        log_ratio, **case, gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip
+    )
+    ratio = log_ratio.exp()
+    targets, advantages = case["value"].clone(), torch.zeros_like(case["value"])
+    for b in range(case["reward"].shape[1]):
+        for rows in split(case, b):
+            for i, s in enumerate(rows):
+                for j, t in enumerate(rows[i:]):
+                    product = 1.0
+                    for k in rows[i : i + j]:
+                        product *= lambda_ * min(c_clip, ratio[k, b].item())
+                    rho = min(rho_clip, ratio[t, b].item())
+                    delta = rho * (
+                        case["reward"][t, b] + gamma * beyond(case, t, b) - case["value"][t, b]
+                    )
+                    targets[s, b] += gamma**j * product * delta
+            for i, s in enumerate(rows):
+                following = targets[rows[i + 1], b] if i + 1 < len(rows) else beyond(case, s, b)
+                rho = min(rho_clip, ratio[s, b].item())
+                advantages[s, b] = rho * (
+                    case["reward"][s, b] + gamma * following - case["value"][s, b]
+                )
+    torch.testing.assert_close(r.targets, targets, **F64_CLOSE)
+    torch.testing.assert_close(r.advantages, advantages, **F64_CLOSE)
+
+
+def test_what_an_invalid_row_holds_changes_nothing():
+    """The environment ignored that action; even a NaN there must not leak."""
+    case, log_ratio = episodes(seed=3)
+    corrupted = dict(case, reward=torch.where(case["reset"], torch.nan, case["reward"]))
+    clean, dirty = (returns.n_step(**c, gamma=0.9, n=3) for c in (case, corrupted))
+    assert torch.equal(clean, dirty)
+    for f in (returns.gae, lambda **k: returns.vtrace(log_ratio, **k)):
+        clean, dirty = (f(**c, gamma=0.9, lambda_=0.8) for c in (case, corrupted))
+        assert torch.equal(clean.advantages, dirty.advantages) and torch.equal(
+            clean.targets, dirty.targets
+        )
+
+
+def test_n_step_returns_by_hand():
+    # gamma = 1/2. Three rows, then the last observation, worth 8: with two steps row 0 counts 1 +
+    # 2/2 + 2/4, row 1 counts 2 + 4/2 + 8/4, and row 2 has but one step, 4 + 8/2.
+    case = lane(value=[1, 4, 2], last_value=8, reward=[1, 2, 4])
+    found = returns.n_step(**case, gamma=0.5, n=2)
+    assert found[:, 0].tolist() == [2.5, 6.0, 8.0]
+    assert returns.n_step(**case, gamma=0.5, n=1)[:, 0].tolist() == [3.0, 3.0, 8.0]
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 40])
+def test_n_step_returns_cross_no_end(n):
+    case, _ = episodes()
+    found, gamma = returns.n_step(**case, gamma=0.9, n=n), 0.9
+    for b in range(case["reward"].shape[1]):
+        for rows in split(case, b):
+            for i, t in enumerate(rows):
+                taken = rows[i : i + n]
+                total = sum(gamma**k * case["reward"][s, b] for k, s in enumerate(taken))
+                if not case["terminal"][taken[-1], b]:
+                    total = total + gamma ** len(taken) * beyond(case, taken[-1], b)
+                torch.testing.assert_close(found[t, b], total, **F64_CLOSE)
+    assert torch.equal(found[case["reset"]], case["value"][case["reset"]])
+
+
+def test_n_step_returns_over_all_rows_are_lambda_one():
+    case, _ = episodes(seed=5)
+    expected = returns.gae(**case, gamma=0.9, lambda_=1.0).targets
+    found = returns.n_step(**case, gamma=0.9, n=len(case["reward"]))
+    torch.testing.assert_close(found, expected, **F64_CLOSE)
+
+
+def test_rescaling_is_undone_also_in_single_precision():
+    assert returns.rescaled(torch.tensor(3.0)).item() == pytest.approx(1 + 3e-3)
+    x = torch.tensor([0.0, 1e-4, 1e-2, 1, 30, 1e4])
+    x = torch.cat([-x, x])
+    there = returns.rescaled(x)
+    assert (there[6:].diff() > 0).all() and torch.equal(there[:6], -there[6:])
+    # a root of 1 + x is rounded to 1e-7, and what remains of it squared
+    torch.testing.assert_close(returns.unscaled(there), x, rtol=1e-6, atol=1e-6)

@@ -1,0 +1,517 @@
+"""What a stranger adds from outside the repository, through the real command line: each thing with
+as few files as the table below says, of which one is its test; and what is said of what cannot be
+used.
+"""
+
+import importlib.util
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from megastep.agents.cli import evaluate, record, train
+from megastep.agents.training import checkpoint
+from tests.helpers import tiny
+
+ROOT = pathlib.Path(__file__).parents[2]
+#: The most files that adding one takes, its test among them.
+FILES = {"environment": 3, "geometry": 3, "learner": 3, "core": 2, "encoder": 2, "kernel": 6}
+SMALL = [word for word in tiny.TINY if not word.startswith(("env=", "env.res"))]
+RUN = [*SMALL, "samples=64", "log_every=1"]
+
+COUNTER = '''
+from typing import Annotated
+
+import torch
+from pydantic import Field
+
+from megastep import arrdict, spaces
+
+
+class Counter:
+    """A board of one number: action 1 counts up, which pays 1. Truncated after `limit` steps."""
+
+    n_agents, fps = 1, 5.0
+    action_space = spaces.MultiDiscrete(1, 2)
+
+    def __init__(
+        self,
+        n_envs: int,
+        *,
+        seed: int = 1,
+        device: torch.device | str | None = None,
+        limit: Annotated[int, Field(ge=1, le=100)] = 6,
+        sizes: tuple[int, ...] = (1, 2),
+    ):
+        self.n_envs, self.device = n_envs, torch.device("cpu" if device is None else device)
+        self.limit, self.sizes = limit, sizes
+        self.obs_space = spaces.MultiVector(1, 2)
+        self.age = torch.zeros(n_envs, dtype=torch.int32, device=self.device)
+        self.count = torch.zeros(n_envs, device=self.device)
+
+    def reset(self):
+        everyone = torch.ones(self.n_envs, dtype=torch.bool, device=self.device)
+        return self._world(everyone, torch.zeros_like(self.count))
+
+    def step(self, decision):
+        return self._world(self.age >= self.limit, decision.actions[:, 0].float())
+
+    def _world(self, reset, up):
+        reward = up.masked_fill(reset, 0.0)
+        self.age.add_(1).masked_fill_(reset, 0)
+        self.count.add_(reward).masked_fill_(reset, 0.0)
+        return arrdict.arrdict(
+            obs=torch.stack([self.count, self.age.float()], -1)[:, None],
+            reward=reward,
+            reset=reset,
+            terminal=torch.zeros_like(reset),
+            truncated=self.age >= self.limit,
+        )
+
+    def check(self):
+        pass
+
+    def state(self, e=0):
+        return arrdict.arrdict(count=self.count[e].clone())
+
+    @classmethod
+    def plot_state(cls, state):
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(2, 2))
+        figure.text(0.5, 0.5, str(state.count))
+        return figure
+'''
+
+
+@pytest.fixture
+def outside(tmp_path, monkeypatch):
+    """Writes files into a folder of their own, the current one; gives the number written."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(ROOT), *sys.path])
+    before = set(sys.modules)
+
+    def write(files):
+        for name, text in files.items():
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(textwrap.dedent(text))
+        importlib.invalidate_caches()
+        return len(files)
+
+    yield write
+    for name in set(sys.modules) - before:
+        if str(getattr(sys.modules[name], "__file__", None)).startswith(str(tmp_path)):
+            del sys.modules[name]
+
+
+def add(outside, what, files):
+    """Writes what is added; its test is this one."""
+    assert outside(files) + 1 <= FILES[what]
+
+
+def saved():
+    """The checkpoint of the latest run."""
+    return checkpoint.load_latest(train.run_folders.find("latest") / "checkpoints")
+
+
+def leftovers():
+    """Run folders."""
+    return [path for path in pathlib.Path("runs").glob("*") if path.is_dir()]
+
+
+# ---- One test per row of the table ----
+
+
+def test_an_environment(outside, capsys):
+    add(outside, "environment", {"board/__init__.py": "", "board/counter.py": COUNTER})
+    name = "board.counter:Counter"
+    assert train.main([f"env={name}", *RUN, "env.limit=9", "env.sizes=[3]"]) == 0
+    config = saved().config["train"]["env"]
+    assert config == {"name": name, "n_envs": 4, "limit": 9, "sizes": [3]}
+    assert "-counter-" in leftovers()[0].name
+    assert train.main(["resume=latest", "samples=128"]) == 0
+    assert saved().step == 128
+    assert evaluate.main(["run=latest", "episodes=8"]) == 0
+    (table,) = (leftovers()[0] / "evaluations").glob("*.json")
+    rows = json.loads(table.read_text())["rows"]
+    assert [row["length"] for row in rows] == [9, 9] and all(0 <= r["return"] <= 9 for r in rows)
+    if importlib.util.find_spec("av"):
+        assert record.main(["run=latest", "steps=3"]) == 0
+        assert record.main([f"env={name}", "steps=3", "device=cpu", "file=random.mp4"]) == 0
+        assert pathlib.Path("random.mp4").exists()
+    sizes = f"-m env={name} env.limit=3,4".split()
+    capsys.readouterr()
+    assert train.main([*sizes, *RUN]) == 0 and capsys.readouterr().out.count("done") >= 2
+
+
+def test_an_environment_as_a_file_of_a_group(outside, monkeypatch, tmp_path):
+    """As ours are: configs/env/counter.yaml holds the import path and what differs."""
+    from megastep.agents.cli import compose, registry
+
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    for module in (compose, registry):
+        monkeypatch.setattr(module, "CONFIGS", tmp_path / "configs")
+    yaml = "name: counter:Counter\nlimit: 4\n"
+    add(outside, "environment", {"counter.py": COUNTER, "configs/env/counter.yaml": yaml})
+    assert train.main(["env=counter", *RUN]) == 0
+    assert saved().config["train"]["env"]["limit"] == 4
+
+
+def test_a_geometry_source(outside):
+    source = """
+        from megastep import toys
+
+
+        def rooms(n=3, split="training", seed=1, width: float = 4.0):
+            assert split in ("training", "test", "all")
+            return [toys.box(width + i) for i in range(n)]
+        """
+    add(outside, "geometry", {"plans.py": source})
+    words = ["env=minimal", "env.res=8", *SMALL, "samples=64", "log_every=1"]
+    assert train.main([*words, "geometry=plans:rooms", "geometry.width=6"]) == 0
+    expected = {"name": "plans:rooms", "n": 3, "seed": 1, "width": 6.0}
+    assert saved().config["train"]["geometry"] == expected
+    assert evaluate.main(["run=latest", "episodes=4", "baseline=false"]) == 0
+    (table,) = (leftovers()[0] / "evaluations").glob("rooms-test-64.json")
+    assert json.loads(table.read_text())["rows"][0]["homes"] == 3
+
+
+def test_a_learner(outside, capsys):
+    """REINFORCE without a baseline, with storage and an estimate of its own."""
+    learner = '''
+        from typing import Annotated
+
+        import torch
+        from pydantic import Field
+
+        from megastep.agents.algorithms.nonfinite import NonFiniteCheck
+        from megastep.agents.storage.rollout import Collector, Rollout
+
+
+        class Reinforce:
+            """Follows the rewards of a rollout, discounted by gamma."""
+
+            def __init__(self, policy, *, lr: Annotated[float, Field(gt=0)] = 0.1, length: int = 5):
+                self.policy, self.lr, self.length = policy, lr, length
+                self.check = NonFiniteCheck(policy.device)
+                self.optimizer = torch.optim.SGD(policy.parameters(), lr)
+
+            def collector(self, env):
+                lanes, policy = env.n_envs * env.n_agents, self.policy
+                spaces = env.obs_space, env.action_space
+                rollout = Rollout(self.length, lanes, *spaces, policy.initial(lanes), env.device)
+                return Collector(env, policy, rollout)
+
+            def bytes_per_env(self, env):
+                return 1000.0 * self.length
+
+            def set_lr(self, lr):
+                for group in self.optimizer.param_groups:
+                    group["lr"] = lr
+
+            def update(self, rollout):
+                is_fine = self.check(rollout.numbers())
+                out = self.policy.unroll(rollout.obs, rollout.starts, rollout.state)
+                logprobs = self.policy.output.logprob(out.logits[:-1], rollout.actions)
+                to_go = rollout.reward.flip(0).cumsum(0).flip(0)
+                loss = -(logprobs * to_go).mean()
+                self.optimizer.zero_grad()
+                loss.backward()
+                self.optimizer.step()
+                self.check.count(~is_fine)
+                return {"loss/policy": loss.detach()}
+
+            def state_dict(self):
+                return dict(random=self.policy.random.state_dict())
+
+            def load_state_dict(self, state):
+                self.policy.random.load_state_dict(state["random"], self.policy.device)
+        '''
+    add(outside, "learner", {"counter.py": COUNTER, "reinforce.py": learner})
+    words = ["env=counter:Counter", *(w for w in SMALL if not w.startswith("learner."))]
+    chosen = ["learner=reinforce:Reinforce", "learner.length=4", "learner.anneal=never"]
+    assert train.main([*words, *chosen, "samples=48", "log_every=1"]) == 0
+    config = saved().config["train"]["learner"]
+    assert config == {
+        "name": "reinforce:Reinforce",
+        "anneal": "never",
+        "lr": 0.1,
+        "length": 4,
+    }
+    rows = [json.loads(line) for line in (leftovers()[0] / "metrics.jsonl").open()]
+    assert [row["samples"] for row in rows] == [16, 32, 48] and "loss/policy" in rows[-1]
+    assert train.main(["resume=latest", "samples=64"]) == 0
+    assert evaluate.main(["run=latest", "episodes=4"]) == 0
+    capsys.readouterr()
+    many = [*words, *chosen, "env.n_envs=100", "folder=many", "learner.length=1000000000"]
+    assert train.main(many) == 2  # 100 times 1e12 bytes, by its own estimate
+    assert "100 environments" in capsys.readouterr().err and not pathlib.Path("many").exists()
+
+
+MEAN = '''
+    import torch
+    from torch import nn
+
+    from megastep.arrdict import arrdict
+
+
+    class Mean(nn.Module):
+        """The sum of all that was seen in the episode, through a layer."""
+
+        def __init__(self, width):
+            super().__init__()
+            self.layer = nn.Linear(width, width)
+
+        def initial(self, n_lanes, device=None):
+            return arrdict(total=torch.zeros(n_lanes, self.layer.in_features, device=device))
+
+        def forward(self, x, reset, state):
+            total, outputs = state.total, []
+            for t in range(len(x)):
+                total = total.masked_fill(reset[t, :, None], 0.0) + x[t]
+                outputs.append(self.layer(total))
+            return torch.stack(outputs), arrdict(total=total)
+    '''
+
+
+def test_a_recurrent_core(outside):
+    add(outside, "core", {"mean.py": MEAN})
+    words = ["env=minimal", "env.res=8", *SMALL, "samples=64", "agent.core=mean:Mean"]
+    assert train.main(words) == 0
+    assert saved().config["train"]["agent"]["core"] == "mean:Mean"
+    assert "core.layer.weight" in saved().state["policy"]
+    assert evaluate.main(["run=latest", "episodes=4"]) == 0
+    assert train.main(["resume=latest", "samples=96"]) == 0
+
+
+def test_an_encoder(outside):
+    encoder = '''
+        from torch import nn
+
+
+        class Rows(nn.Module):
+            """The mean of each row of an image: (..., A, C, H, W) -> (..., A C H)."""
+
+            def __init__(self, space):
+                super().__init__()
+                self.n_features = space.n_agents * space.C * space.H
+
+            def forward(self, obs):
+                return obs.mean(-1).flatten(-3)
+        '''
+    add(outside, "encoder", {"rows.py": encoder})
+    words = ["env=minimal", "env.res=8", *SMALL, "samples=64", "agent.encoder=rows:Rows"]
+    assert train.main(words) == 0
+    assert saved().state["policy"]["intake.project.weight"].shape[0] == 8
+    assert evaluate.main(["run=latest", "episodes=4"]) == 0
+
+
+def test_a_kernel(tmp_path):
+    """In a copy of the simulator: four files of kernels/ and a function of engine.py."""
+    shutil.copytree(ROOT / "megastep", tmp_path / "megastep")
+    kernels, engine = tmp_path / "megastep" / "kernels", tmp_path / "megastep" / "engine.py"
+    params = "struct TwiceParams {\n    const float* x;\n    float* out;\n    int n;\n};\n"
+    added = {
+        kernels / "params.h": (kernels / "params.h").read_text() + params,
+        kernels / "twice.h": '#pragma once\n#include "common.h"\n#include "params.h"\n'
+        "HD void twice_one(const TwiceParams& p, int i) {\n    p.out[i] = 2.f * p.x[i];\n}\n",
+        kernels / "twice.cpp": '#include "twice.h"\nKERNEL twice(const TwiceParams& p) {\n'
+        "    for (int i = 0; i < p.n; i++)\n        twice_one(p, i);\n}\n",
+        kernels / "twice.cu": '#include "twice.h"\nKERNEL twice(TwiceParams p) {\n'
+        "    int i = blockIdx.x * blockDim.x + threadIdx.x;\n    if (i < p.n)\n"
+        "        twice_one(p, i);\n}\n",
+        engine: engine.read_text()
+        + textwrap.dedent("""
+
+            def twice(x):
+                out, n = torch.empty_like(x), len(x)
+                packed = params.TwiceParams(x=x.data_ptr(), out=out.data_ptr(), n=n)
+                launch("twice", packed, x.device, threads=n)
+                return out
+            """),
+    }
+    assert len(added) + 1 <= FILES["kernel"]
+    for path, text in added.items():
+        path.write_text(text)
+    code = (
+        "import torch; from megastep import engine as e; print(e.twice(torch.arange(3.)).tolist())"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "CUDA_VISIBLE_DEVICES": ""}
+    environment["MEGASTEP_CACHE"] = str(tmp_path / "cache")
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment
+    )
+    assert done.stdout == "[0.0, 2.0, 4.0]\n", done.stderr
+
+
+# ---- What cannot be used ----
+
+
+def refused(capsys, *words, main=train.main):
+    """The sentence of a command that is refused; it leaves no run folder."""
+    capsys.readouterr()
+    assert main([*words]) == 2
+    assert not leftovers()
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words, sentence",
+    [
+        (["env=nowhere:Counter"], "env: nowhere:Counter cannot be imported (No module named"),
+        (["env=broken:Counter"], "env: broken:Counter cannot be imported (SyntaxError: "),
+        (["env=needs:Counter"], "cannot be imported (No module named 'nothing_of_this_name')"),
+        (["env=counter:Conter"], "counter has no Conter; did you mean Counter?"),
+        (["env=counter:torch"], "counter:torch is a module, neither a class nor a function"),
+        (["env=counter:none"], "counter has no none"),
+        (["env=counter:Bare"], "counter:Bare cannot be used: it takes no n_envs"),
+        (["env=counter:Unread"], "cannot be used: its arguments cannot be read: name 'Nowhere'"),
+        (["env=counter"], "env: 'counter' is unknown; "),
+        (["env=counter:Counter", "env.limit=0"], "env.limit: 0 is out of range: allowed is from 1"),
+        (["env=counter:Counter", "env.limit=x"], "env.limit: expected an integer, got 'x'"),
+        (["env=counter:Counter", "env.sizes=3"], "env.sizes: expected a list, got 3"),
+        (["env=counter:Counter", "env.limt=3"], "env.limt: no such key; did you mean env.limit?"),
+        (["env=counter:Counter", "env.seed=3"], "env.seed: no such key"),
+        (["geometry=counter:rooms"], "geometry: counter:rooms cannot be imported"),
+        (["learner=counter:Counter"], "counter:Counter cannot be used: it takes no policy"),
+        (["learner=counter:Idle"], "counter:Idle is no learner: it has no collector: "),
+        (["agent.core=lstmm"], "agent.core: 'lstmm' is unknown; did you mean lstm?"),
+        (["agent.core=mingu"], "agent.core: 'mingu' is unknown; did you mean mingru?"),
+        (["agent.layers=0"], "agent.layers: 0 is out of range: allowed is from 1 to 8"),
+        (["agent.core=counter:torch"], "agent.core: counter:torch is a module"),
+        (["agent.encoder=counter:nothing"], "agent.encoder: counter:nothing cannot be imported"),
+    ],
+)
+def test_what_cannot_be_used_is_one_sentence(outside, capsys, words, sentence):
+    more = """
+
+        class Bare:
+            pass
+
+
+        class Unread:
+            def __init__(self, n_envs: int, x: "Nowhere" = 1):
+                pass
+
+
+        class Idle:
+            def __init__(self, policy):
+                pass
+        """
+    outside(
+        {
+            "counter.py": COUNTER + textwrap.dedent(more),
+            "broken.py": "def f(:\n",
+            "needs.py": "import nothing_of_this_name\n",
+        }
+    )
+    told = refused(capsys, *(word for word in SMALL if not word.startswith("learner.")), *words)
+    assert sentence in told, told
+
+
+@pytest.mark.parametrize(
+    "change, clause",
+    [
+        (("n_agents, fps = 1, 5.0", "n_agents = 1"), "it has no fps"),
+        (("reward=reward,", "reward=reward.double(),"), "rewards are float32"),
+        (("torch.zeros_like(reset),", "self.age >= self.limit,"), "exclude each other"),
+        (("[:, None],", ","), "observation is as its space says"),
+        (
+            ("reset=reset,", "reset=reset, metrics=dict(up=up[:1]),"),
+            "metric up has one float32",
+        ),
+        (("reset=reset,", ""), "a world has reset"),
+    ],
+)
+def test_a_class_that_breaks_a_clause_of_the_contract_is_told_which(
+    outside, capsys, change, clause
+):
+    assert change[0] in COUNTER
+    outside({"counter.py": COUNTER.replace(*change)})
+    told = refused(capsys, "env=counter:Counter", *SMALL)
+    assert "Counter breaks the contract: " in told and clause in told, told
+    assert "counter:Counter" in told and len(told.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "change, clause",
+    [
+        (("masked_fill(reset[t, :, None], 0.0)", "clone()"), "what came before a reset is forgot"),
+        (("self.layer(total)", "self.layer(total)[:, :1]"), "outputs are (T, B, width)"),
+        (("arrdict(total=total)", "arrdict()"), "a state is like the one before it"),
+        (("def initial", "def start"), "it has a method initial(B, device)"),
+    ],
+)
+def test_a_core_that_breaks_a_clause_is_told_which(outside, capsys, change, clause):
+    assert change[0] in MEAN
+    outside({"mean.py": MEAN.replace(*change)})
+    told = refused(capsys, "env=minimal", *SMALL, "agent.core=mean:Mean")
+    assert f"mean:Mean breaks the contract of recurrent cores: {clause}" in told, told
+
+
+def test_an_encoder_that_breaks_its_word_is_told(outside, capsys):
+    text = "from torch import nn\n\n\nclass Half(nn.Flatten):\n    n_features = 3\n\n"
+    outside({"half.py": text + "    def __init__(self, space):\n        super().__init__(-4)\n"})
+    told = refused(capsys, "env=minimal", "env.res=8", *SMALL, "agent.encoder=half:Half")
+    assert "half:Half breaks the contract of encoders" in told and "(3, 3), not (3, 24)" in told
+
+
+def test_a_checkpoint_whose_class_is_gone_says_so(outside, capsys):
+    outside({"counter.py": COUNTER})
+    assert train.main(["env=counter:Counter", *RUN]) == 0
+    os.remove("counter.py")
+    del sys.modules["counter"]
+    shutil.rmtree("__pycache__", ignore_errors=True)
+    from megastep.agents.cli.settings import GROUPS
+
+    GROUPS["env"].kind.cache_clear()
+    for main, words in (
+        (evaluate.main, ["run=latest"]),
+        (record.main, ["run=latest"]),
+        (train.main, ["resume=latest", "samples=128"]),
+    ):
+        capsys.readouterr()
+        assert main(words) == 2
+        assert "counter:Counter cannot be imported (No module named" in capsys.readouterr().err
+    assert saved().step == 64
+
+
+# ---- A run from another's weights; random actions ----
+
+
+def test_a_run_from_anothers_weights_takes_its_environment_and_agent_unless_given(outside):
+    outside({"counter.py": COUNTER})
+    own = ["env=counter:Counter", "env.limit=7", "agent.core=gru", "agent.critic=plain"]
+    assert train.main([*RUN, *own, "folder=first"]) == 0
+    common = [w for w in RUN if not w.startswith(("agent.", "env."))]
+    assert train.main([*common, "init=first", "env.n_envs=8", "folder=second"]) == 0
+    config = checkpoint.load_latest("second/checkpoints").config["train"]
+    assert config["env"] == {
+        "name": "counter:Counter",
+        "n_envs": 8,
+        "limit": 7,
+        "sizes": [1, 2],
+    }
+    assert config["agent"]["core"] == "gru" and config["agent"]["width"] == 8
+    words = ["init=first", "env=counter:Counter", "env.n_envs=4", "folder=third"]
+    assert train.main([*common, *words]) == 0
+    assert checkpoint.load_latest("third/checkpoints").config["train"]["env"]["limit"] == 6
+
+
+def test_random_actions_are_filmed_without_a_run(outside, capsys):
+    pytest.importorskip("av")
+    words = ["env=minimal", "env.res=8", "steps=2", "device=cpu"]
+    assert record.main([*words, "geometry=box", "file=box.mp4"]) == 0
+    assert record.main(words) == 0
+    assert pathlib.Path("box.mp4").exists() and pathlib.Path("video.mp4").exists()
+    capsys.readouterr()
+    assert record.main(["steps=2"]) == 2
+    assert "run: is missing; without a run, env=explorer films" in capsys.readouterr().err
+    assert record.main(["run=x", "env=minimal"]) == 2
+    assert "env: cannot be given together with run" in capsys.readouterr().err

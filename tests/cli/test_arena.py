@@ -1,0 +1,352 @@
+"""Duels, ratings and films of two policies: players whose chances are known, and the scripts on
+runs of Pong.
+"""
+
+import csv
+import json
+import math
+import re
+import xml.etree.ElementTree
+
+import numpy as np
+import pytest
+import torch
+from test_train import configured
+
+from megastep.agents.cli import arena, evaluate, record, run_folders, train
+from megastep.agents.selfplay import duels, ratings
+from megastep.agents.selfplay.mixed_policy import MixedPolicy
+from megastep.agents.training import checkpoint
+from megastep.agents.training.evaluation import interval
+from megastep.arrdict import arrdict
+from tests.helpers.games import Always, Matrix
+
+# ---- Duels ----
+
+
+def test_the_stronger_wins_from_every_place():
+    played = duels.play(Matrix(64), Always(2), Always(0))
+    assert (played.score == 1).all() and (played.lengths == 1).all()
+    assert duels.play(Matrix(64), Always(0), Always(2)).score.sum() == 0
+    assert played.seat.tolist() == [0] * 32 + [1] * 32
+
+
+@pytest.mark.parametrize("mortal", [False, True])
+def test_the_share_won_is_what_an_independent_count_says(mortal):
+    """The higher of two numbers, of which one is 2 for sure or by a third of a half."""
+    env = Matrix(2000, mortal=mortal)
+    played = duels.play(env, Always(2, chance=0.5), Always(0, chance=0.5))
+    # the first step whose numbers differ decides: counted from what was played
+    actions = torch.stack(env.played)  # (T, E, 2)
+    first = (actions[:, :, 0] != actions[:, :, 1]).int().argmax(0)
+    chosen = actions[first, torch.arange(2000)]
+    mine = chosen.gather(1, played.seat[:, None])[:, 0]
+    assert torch.equal(played.score, (mine == chosen.amax(1)).float())
+    assert torch.equal(played.lengths, first + 1.0)
+    # on paper: me 2, 1, 0 with 4/6, 1/6, 1/6, the other the other way round
+    me, other = np.array([1, 1, 4]) / 6, np.array([4, 1, 1]) / 6
+    win, lose = (
+        sum(a[i] * b[j] for i in range(3) for j in range(i)) for a, b in ((me, other), (other, me))
+    )
+    mean, lower, upper = interval(played.score.numpy())
+    assert lower < win / (win + lose) < upper and upper - lower < 0.04
+    row = arena.summary(played)
+    assert row["won"] == mean and row["wins"] + row["losses"] == row["duels"] == 2000
+
+
+def test_a_duel_that_nothing_ends_is_a_draw():
+    played = duels.play(Matrix(4), Always(1), Always(1), max_steps=70)
+    assert (played.score == 0.5).all() and (played.lengths == 70).all()
+    row = arena.summary(played)
+    assert (row["draws"], row["wins"], row["losses"], row["won"]) == (4, 0, 0, 0.5)
+    cut = duels.play(Matrix(4, limit=3), Always(1), Always(1))
+    assert (cut.score == 0.5).all() and (cut.lengths == 3).all()
+
+
+def test_only_the_first_duel_of_an_environment_counts():
+    class Turning(Always):
+        """Wins at first, and then loses again and again."""
+
+        def __call__(self, world, state, *rest):
+            decision, state = super().__call__(world, state, *rest)
+            self.action = 0
+            return decision, state
+
+    played = duels.play(Matrix(4), Turning(2), Always(1), max_steps=200)
+    assert (played.score == 1).all() and (played.lengths == 1).all()
+
+
+def test_whoever_dies_first_loses_and_the_others_are_one_opponent():
+    """Four agents: who chose less than the highest number dies."""
+    env = Matrix(16, 4, mortal=True)
+    assert (duels.play(env, Always(2), Always(1)).score == 1).all()
+    assert (duels.play(env, Always(1), Always(2)).score == 0).all()
+    played = duels.play(env, Always(2), Always(1))
+    assert played.seat.bincount().tolist() == [4, 4, 4, 4]
+
+
+def test_homes_are_those_of_the_environment_and_intervals_are_over_them():
+    env = Matrix(8)
+    env.layout = torch.arange(4, dtype=torch.int32).repeat(2)
+    played = duels.play(env, Always(2), Always(0))
+    assert played.homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
+    # each home was played in from both places
+    pairs = set(zip(played.homes.tolist(), played.seat.tolist(), strict=True))
+    assert len(pairs) == 8
+    assert arena.summary(played)["homes"] == 4
+    score = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0])
+    row = arena.summary(arrdict(played, score=score))
+    assert (row["won"], row["lower"], row["upper"]) == interval(score.numpy(), played.homes.numpy())
+
+
+def test_a_duel_is_reproducible_and_a_seed_changes_it():
+    def scores(seed):
+        return duels.play(Matrix(64), Always(2, 0.9), Always(0, 0.9), seed).score.tolist()
+
+    assert scores(1) == scores(1) != scores(2)
+
+
+# ---- Lineups ----
+
+
+class Echo:
+    """Does what it is shown, and remembers what it was shown first."""
+
+    def initial(self, n_lanes, device=None):
+        return arrdict(first=torch.zeros(n_lanes, 1))
+
+    def __call__(self, world, state, sample=True, generator=None):
+        first = torch.where(world["reset"][:, None], world["obs"], state.first)
+        return arrdict(actions=world["obs"].long() + self.more), arrdict(first=first)
+
+
+@pytest.mark.parametrize("split", [[[0, 1, 2, 3], [4, 5]], [[5, 0, 3], [4], [1, 2]]])
+def test_each_policy_acts_at_its_lanes_and_remembers_them(split):
+    players = [Echo() for _ in split]
+    for i, player in enumerate(players):
+        player.more = 100 * i
+    lineup = MixedPolicy(players, [torch.tensor(lanes) for lanes in split])
+    state = lineup.initial(6, "cpu")
+    expected = [10 * lane + 100 * i for i, lanes in enumerate(split) for lane in lanes]
+    order = [lane for lanes in split for lane in lanes]
+    for step, reset in ((0, True), (1, False)):
+        obs = 10 * torch.arange(6.0)[:, None] + step
+        world = arrdict(obs=obs, reset=torch.full((6,), reset), privileged=None)
+        decision, state = lineup(world, state)
+        told = dict(zip(order, expected, strict=True))
+        assert decision.actions[:, 0].tolist() == [told[lane] + step for lane in range(6)]
+    for i, lanes in enumerate(split):
+        assert state[str(i)].first[:, 0].tolist() == [10 * lane for lane in lanes]
+
+
+def test_actions_may_be_trees():
+    class Both:
+        def initial(self, n_lanes, device=None):
+            return arrdict()
+
+        def __call__(self, world, state, sample=True, generator=None):
+            n = len(world["reset"])
+            return arrdict(actions=arrdict(move=world["obs"], fire=torch.zeros(n, 1))), state
+
+    lineup = MixedPolicy([Both(), Both()], [torch.tensor([2, 0]), torch.tensor([1])])
+    world = arrdict(obs=torch.arange(3)[:, None], reset=torch.ones(3, dtype=torch.bool))
+    decision, _ = lineup(world, lineup.initial(3))
+    assert decision.actions.move[:, 0].tolist() == [0, 1, 2]
+
+
+# ---- Ratings ----
+
+
+def test_ratings_are_in_the_order_of_strength_and_as_far_apart_as_the_model_says():
+    """Each wins 73 % against the next, e to 1: by the model that is 25 / 6 times 2**.5 apart."""
+    random = np.random.default_rng(1)
+    strength, gap = [2, 0, 1, 3], 25 / 6 * 2**0.5
+    scores = {
+        (i, j): (random.random(1000) < 1 / (1 + math.exp(strength[j] - strength[i]))).astype(float)
+        for i in range(4)
+        for j in range(i)
+    }
+    means = [mean for mean, _ in ratings.rate(4, scores)]
+    assert sorted(range(4), key=means.__getitem__) == [1, 2, 0, 3]
+    found = np.sort(means)
+    assert np.diff(found) == pytest.approx([gap] * 3, abs=1)  # a standard deviation
+    assert ratings.rate(4, scores) == ratings.rate(4, scores) != ratings.rate(4, scores, seed=2)
+
+
+def test_draws_leave_equals_equal_and_shares_are_counted_from_both_sides():
+    table = ratings.rows(
+        [("a", 10), ("b", 20), ("c", None)], {(0, 1): [0.5] * 50, (1, 2): [1, 0.5]}
+    )
+    a, b, c = table
+    assert abs(ratings.rate(2, {(0, 1): [0.5] * 50})[0][0] - 25) < 1e-9
+    assert (a["won"], b["won"], c["won"]) == (0.5, 26.5 / 52, 0.25)
+    assert (a["duels"], b["duels"], c["duels"]) == (50, 52, 2)
+    assert c["rating"] < a["rating"]
+
+
+# ---- The scripts ----
+
+PONG = [
+    *("env=pong", "env.self_play=true", "env.n_envs=8", "preset=cpu", "agent.width=8"),
+    *("agent.core=none", "learner.n_steps=16", "learner.n_minibatches=2", "device=cpu"),
+    "log_every=1",
+]
+UPDATE = 16 * 16
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two runs of self-play, the first with snapshots; and the folder that they are in."""
+    base = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(base)
+        four = [f"samples={4 * UPDATE}", "snapshots=2", "folder=a"]
+        train.run(configured(*four, tiny=PONG))
+        train.run(configured(f"samples={UPDATE}", "folder=b", "seed=2", tiny=PONG))
+        wider = [f"samples={UPDATE}", "folder=pixels", "env.pixels=true"]
+        train.run(configured(*wider, tiny=PONG))
+        train.run(configured("samples=1", "folder=minimal"))
+    return base
+
+
+@pytest.fixture
+def here(runs, monkeypatch):
+    monkeypatch.chdir(runs)
+    return runs
+
+
+def test_snapshots_are_kept_along_the_budget_beside_the_checkpoints(here):
+    names = {path.name for path in (here / "a" / "snapshots").iterdir()}
+    assert names == {f"step_{2 * UPDATE}", f"step_{4 * UPDATE}"}
+    assert not (here / "b" / "snapshots").exists()
+    last = checkpoint.load_latest(here / "a" / "snapshots").state
+    assert set(last) == {"policy"}
+    weights = checkpoint.load_latest(here / "a" / "checkpoints").state["policy"]
+    assert all(torch.equal(weights[name], last["policy"][name]) for name in weights)
+
+
+def test_duels_are_printed_and_written(here, capsys):
+    names = f"a/snapshots/step_{2 * UPDATE},b,random,tests.helpers.games:High"
+    assert evaluate.main(["run=a", f"against={names}", "episodes=20", "device=cpu"]) == 0
+    (path,) = (here / "a" / "evaluations").glob("duels-*.json")
+    result = json.loads(path.read_text())
+    assert [row["against"] for row in result["rows"]] == [
+        f"a, {2 * UPDATE:,} samples",
+        f"b, {UPDATE:,} samples",
+        "random",
+        "tests.helpers.games:High",
+    ]
+    for row in result["rows"]:
+        assert row["duels"] == row["wins"] + row["draws"] + row["losses"] == 20
+        assert row["lower"] <= row["won"] <= row["upper"] and row["homes"] is None
+    text = path.with_suffix(".md").read_text()
+    assert "95 % interval" in text and "95 % interval" in capsys.readouterr().out
+    row = result["rows"][0]
+    expected = dict(score=row["won"], evaluated=row["won"], lower=row["lower"])
+    assert expected.items() <= run_folders.outcome(path).items()
+    assert "evaluated" not in run_folders.outcome(here / "a"), "a duel's table has no return"
+
+
+def test_ratings_are_printed_written_and_drawn(here, capsys):
+    assert (
+        evaluate.main(["run=a", "ratings=true", "against=random", "episodes=8", "device=cpu"]) == 0
+    )
+    with open(here / "a" / "ratings.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["player"] for row in rows] == [
+        f"{2 * UPDATE:,} samples",
+        f"{4 * UPDATE:,} samples",
+        "random",
+    ]
+    assert [row["samples"] for row in rows] == [str(2 * UPDATE), str(4 * UPDATE), ""]
+    assert all(row["duels"] == "16" for row in rows)
+    assert "rating" in capsys.readouterr().out
+    xml.etree.ElementTree.parse(here / "a" / "ratings.svg")
+
+
+def test_one_agent_is_filmed_against_another(here, capsys, monkeypatch):
+    drawn = []
+
+    def film(env, policy, place, steps, *rest):
+        drawn.append((env, policy))
+        return place
+
+    assert record.main(["run=a", "against=b", "steps=2", "file=c.png", "device=cpu"]) == 0
+    assert (here / "c.png").exists()
+    monkeypatch.setattr(record, "film", film)
+    assert (
+        record.main(
+            ["run=a", "against=tests.helpers.games:High", "steps=2", "file=c.png", "device=cpu"]
+        )
+        == 0
+    )
+    ((env, lineup),) = drawn
+    assert env.n_envs == 1 and lineup.sizes == [1, 1] and lineup.lanes.tolist() == [0, 1]
+    assert type(lineup.policies[1]).__name__ == "High"
+    assert "the other tests.helpers.games:High" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("script", [evaluate, record])
+@pytest.mark.parametrize(
+    "name, sentence",
+    [
+        ("pixels", "was trained in another environment: obs was MultiImage.* and is MultiVector"),
+        ("minimal", "was trained in minimal and .* in pong; name a run in the same"),
+        ("tests.helpers.games:Hihg", "tests.helpers.games has no Hihg; did you mean High"),
+        ("tests.helpers.games:Matrix", "tests.helpers.games:Matrix cannot play in Pong"),
+        ("test_arena:Elsewhere", "cannot play in Pong: its actions are not those of MultiDiscrete"),
+        ("nowhere", "There is no run nowhere"),
+    ],
+)
+def test_who_cannot_play_is_one_sentence(here, capsys, name, sentence, script):
+    assert script.main(["run=a", f"against={name}", "device=cpu"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(sentence, line)
+
+
+class Elsewhere(Always):
+    def __init__(self):
+        super().__init__(3)
+
+
+def test_one_agent_alone_has_no_duels(here, capsys):
+    assert evaluate.main(["run=a", "env=pong", "against=b", "device=cpu"]) == 2
+    assert "two agents or more, and Pong as it is set has one" in capsys.readouterr().err
+    assert record.main(["run=null", "env=pong", "against=b"]) == 2
+    assert "against: needs run=" in capsys.readouterr().err
+
+
+def test_a_run_with_one_checkpoint_has_nobody_to_be_compared_with(here, capsys):
+    assert evaluate.main(["run=b", "ratings=true", "device=cpu"]) == 2
+    assert "train with snapshots=8" in capsys.readouterr().err
+
+
+def test_a_duel_is_of_two_in_unseen_homes_each_from_both_places(tmp_path, monkeypatch):
+    """Three agents learn; two duel. Seven homes and 40 duels: twice each home from each place."""
+    monkeypatch.chdir(tmp_path)
+    words = ["env=tests.helpers.games:Matrix", "env.n_agents=3", "env.n_envs=4", "geometry=homes"]
+    options = ["geometry.n=7", "samples=1", "folder=run", *PONG[4:]]
+    train.run(configured(*words, *options, tiny=["preset=cpu", "agent.width=8"]))
+    played, real = [], duels.play
+
+    def play(env, *rest):
+        played.append((env, real(env, *rest)))
+        return played[-1][1]
+
+    monkeypatch.setattr(duels, "play", play)
+    assert (
+        evaluate.main(["run=run", "against=tests.helpers.games:High", "episodes=40", "device=cpu"])
+        == 0
+    )
+    ((env, found),) = played
+    assert (env.n_envs, env.n_agents) == (28, 2)
+    counts = torch.stack([found.homes, found.seat.int()], 1).unique(dim=0, return_counts=True)[1]
+    assert counts.tolist() == [2] * 14
+    (path,) = (tmp_path / "run" / "evaluations").glob("*.json")
+    assert json.loads(path.read_text())["rows"][0]["homes"] == 7
+
+
+def test_a_list_of_opponents_is_no_sweep():
+    assert arena.listed("against=a,b,bot") == "against=[a,b,bot]"
+    assert arena.listed("against=[a,b]") == "against=[a,b]"
+    assert arena.listed("against=null") == "against=null"

@@ -1,0 +1,121 @@
+"""The scripts in processes of their own: exit codes, signals, closed pipes. Few tests, as a process
+costs seconds.
+"""
+
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from megastep.agents.training import checkpoint
+from tests.helpers import tiny
+
+ROOT = pathlib.Path(__file__).parents[2]
+TINY = [*tiny.TINY, "checkpoint_seconds=0.2"]
+
+
+def start(script, *arguments, cwd, **environment):
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / f"{script}.py"), *arguments],
+        cwd=cwd,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, **environment},
+        # where the tests themselves run under nohup
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
+    )
+
+
+def finished(script, *arguments, cwd, **environment):
+    """(exit code, stdout, stderr)"""
+    process = start(script, *arguments, cwd=cwd, **environment)
+    out, err = process.communicate(timeout=120)
+    return process.returncode, out, err
+
+
+def test_a_typo_is_exit_code_2_and_leaves_nothing(tmp_path):
+    code, out, err = finished("train", "env=explorr", "learner.lrr=1", "env.n_envs=0", cwd=tmp_path)
+    assert code == 2 and out == ""
+    assert err.splitlines() == [
+        "train.py: 3 errors in the configuration",
+        "  env: 'explorr' is unknown; did you mean explorer?",
+        "  env.n_envs: 0 is out of range: allowed is from 1 to 67,108,864",
+        "  learner.lrr: no such key; did you mean learner.lr?",
+    ]
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_gpu_that_is_not_there_and_a_compiler_that_is_not_there_are_one_sentence(tmp_path):
+    code, _, err = finished("train", *TINY, "device=cuda", cwd=tmp_path, CUDA_VISIBLE_DEVICES="")
+    assert code == 2 and "device=cpu" in err and len(err.splitlines()) == 1
+    code, _, err = finished(
+        "train",
+        *TINY,
+        cwd=tmp_path,
+        CXX="/nonexistent",
+        XDG_CACHE_HOME=str(tmp_path / "cache"),
+        MEGASTEP_CACHE=str(tmp_path / "cache"),
+    )
+    assert code == 2 and "compiler" in err and len(err.splitlines()) == 1
+    assert not any(tmp_path.glob("runs/*"))
+
+
+def test_a_run_keeps_others_out_of_its_folder_and_saves_when_its_terminal_is_closed(tmp_path):
+    process = start("train", *TINY, "folder=run", cwd=tmp_path)
+    metrics, deadline = tmp_path / "run" / "metrics.jsonl", time.monotonic() + 60
+    while not metrics.exists() or not metrics.stat().st_size:
+        assert time.monotonic() < deadline and process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    while not any((tmp_path / "run" / "checkpoints").glob("step_*")):
+        time.sleep(0.05)
+    code, _, err = finished("train", "resume=run", cwd=tmp_path)
+    assert code == 2 and f"in use by process {process.pid}" in err and len(err.splitlines()) == 1
+    process.send_signal(signal.SIGHUP)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 129
+    assert "python train.py resume=run" in err and "Traceback" not in err
+    rows = [json.loads(line)["samples"] for line in metrics.read_text().splitlines()]
+    assert rows == sorted(set(rows)), "no row twice"
+    saved = checkpoint.load_latest(tmp_path / "run" / "checkpoints")
+    assert saved.step >= rows[-1] and saved.path.name == f"step_{saved.step}"
+
+
+@pytest.mark.parametrize(
+    "redirected",
+    [
+        "{command} | true",
+        "{command} >/dev/full 2>/dev/full",
+        "{command} >&- 2>&-",
+        "{command} <&- | head -1 >/dev/full",
+    ],
+)
+def test_a_run_that_cannot_print_goes_on_and_says_nothing(tmp_path, redirected):
+    overrides = [*TINY, "samples=64", "folder=run", "finish.evaluate=true", "finish.episodes=4"]
+    command = f"{{ {sys.executable} {ROOT / 'train.py'} {' '.join(overrides)}; echo $? >code; }}"
+    subprocess.run(
+        ["bash", "-c", redirected.format(command=command)],
+        cwd=tmp_path,
+        timeout=120,
+        env={**os.environ, "TERM": "dumb"},
+    )
+    assert (tmp_path / "code").read_text() == "0\n"
+    assert list((tmp_path / "run" / "evaluations").glob("box-test-*.json"))
+    for name in ("metrics.jsonl", "perf.jsonl"):  # no line of stdout's is in a file
+        assert all(json.loads(line) for line in (tmp_path / "run" / name).read_text().splitlines())
+    assert checkpoint.load_latest(tmp_path / "run" / "checkpoints").step == 64
+
+
+def test_where_only_ascii_can_be_shown_tables_and_names_are_ascii(tmp_path):
+    overrides = [*TINY, "samples=1", 'folder="ü"', "finish.evaluate=true", "finish.episodes=4"]
+    code, out, err = finished(
+        "train", *overrides, cwd=tmp_path, PYTHONIOENCODING="ascii", TERM="dumb", COLUMNS="20"
+    )
+    assert (code, err) == (0, "") and (out + err).isascii()
+    assert "Training on cpu in \\xfc" in out and "| trained |" in out and "95 % interval" in out
+    assert list((tmp_path / "ü" / "evaluations").iterdir())

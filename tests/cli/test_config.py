@@ -1,0 +1,474 @@
+"""The configuration: what composes, what is refused, and in which words. Nothing here starts a
+run.
+"""
+
+import copy
+import dataclasses
+import inspect
+import re
+
+import pytest
+import yaml
+
+from megastep import envs, geometries
+from megastep.agents.cli import loader as loader_module
+from megastep.agents.cli.build import as_tree, build
+from megastep.agents.cli.command import Script, run_command
+from megastep.agents.cli.compose import ConfigLoader
+from megastep.agents.cli.errors import ConfigErrors
+from megastep.agents.cli.registry import CONFIGS
+from megastep.agents.cli.settings import GROUPS, Agent, Evaluate, Record, Train, WandbLogger
+from megastep.agents.training.loggers import Wandb
+
+SCRIPTS = {"train": Train, "evaluate": Evaluate, "record": Record}
+
+
+def compose(*overrides, script="train"):
+    with ConfigLoader(script, SCRIPTS[script]) as loader:
+        return build(SCRIPTS[script], loader.tree(list(overrides)))
+
+
+def errors(*overrides, script="train"):
+    with pytest.raises(ConfigErrors) as error:
+        compose(*overrides, script=script)
+    return dict(error.value.errors)
+
+
+#: What a member of a group needs beside itself.
+MORE = {"geometry=files": ["geometry.path=plans.npz"]}
+
+
+def test_every_member_of_every_group_composes():
+    with ConfigLoader("train", Train) as loader:
+        groups = loader.groups()
+    assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "preset", "experiment"}
+    assert set(groups["env"]) == set(envs.ENVS)
+    assert set(groups["geometry"]) == set(geometries.SOURCES)
+    for choice in [f"{group}={member}" for group in groups for member in groups[group]]:
+        assert isinstance(compose(choice, *MORE.get(choice, ())), Train)
+
+
+def leaves(tree, prefix=""):
+    """{dotted key: value}"""
+    found = {}
+    for key, value in tree.items():
+        nested = leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {}
+        found |= nested or {prefix + key: value}
+    return found
+
+
+#: Groups whose files are part of another.
+PACKAGES = {"recipe": "learner"}
+
+
+def values(file, script):
+    """What a file of configs/ says, by dotted key; `defaults` are choices, no values."""
+    text = (CONFIGS / f"{file}.yaml").read_text()
+    tree = yaml.safe_load(text) or {}
+    tree.pop("defaults", None)
+    own = file == script or "@package _global_" in text
+    if own:
+        return leaves(tree)
+    group = file.split("/")[-2]
+    return leaves({PACKAGES.get(group, group): tree})
+
+
+def compositions():
+    """For each member of each group: the files that it is composed of, `[(file, {key: value})]`,
+    those that win last.
+    """
+    for script, kind in SCRIPTS.items():
+        with ConfigLoader(script, kind) as loader:
+            groups = loader.groups()
+            for choice in [[]] + [[f"{group}={m}"] for group in groups for m in groups[group]]:
+                chosen = loader.compose(choice).hydra.runtime.choices
+                files = [f"{g}/{chosen[g]}" for g in groups if chosen[g] is not None]
+                last = [f for f in files if f.startswith("preset/")]
+                if last and "cpu" in last[0]:
+                    last.append(f"preset/learner/cpu_{chosen['learner']}")
+                if (CONFIGS / f"preset/agent/{chosen.get('learner')}.yaml").exists():
+                    last.append(f"preset/agent/{chosen['learner']}")
+                last += [f for f in files if f.startswith("experiment/")]
+                for_recipe = f"preset/experiment/{chosen.get('preset')}_{chosen.get('experiment')}"
+                by_learner = f"preset/recipe/{chosen.get('learner')}_{chosen.get('experiment')}"
+                for name in (for_recipe, by_learner):
+                    last += [name] if (CONFIGS / f"{name}.yaml").exists() else []
+                order = [f for f in files if f not in last] + [script] + last
+                yield [(file, values(file, script)) for file in order]
+
+
+def test_every_value_of_every_file_is_in_force_somewhere_and_none_is_said_twice(monkeypatch):
+    written, in_force, twice = set(), set(), set()
+    for gpu in (False, True):
+        monkeypatch.setattr(loader_module, "has_gpu", lambda device, gpu=gpu: gpu)
+        for files in compositions():
+            last = {}
+            for file, said in files:
+                written |= {(file, key) for key in said}
+                twice |= {(file, key) for key in said if key in last and last[key][1] == said[key]}
+                last |= {key: (file, value) for key, value in said.items()}
+            in_force |= {(file, key) for key, (file, _) in last.items()}
+    assert written == in_force and not twice, (written - in_force, twice)
+    names = {str(path.relative_to(CONFIGS))[:-5] for path in CONFIGS.rglob("*.yaml")}
+    assert names - {file for file, _ in written} == {"preset/auto", "hydra/default"}
+
+
+def test_settings_are_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        compose().seed = 2
+
+
+def test_what_is_written_can_be_read_again():
+    cfg = compose("env=minimal", "samples=1e6")
+    assert build(Train, as_tree(cfg)) == cfg
+
+
+@pytest.mark.parametrize("group", ["env", "geometry", "learner", "agent"])
+def test_a_file_says_what_differs_from_the_defaults_of_the_constructor(group):
+    for path in (CONFIGS / group).glob("*.yaml"):
+        said = {k.split(".")[1]: v for k, v in values(f"{group}/{path.stem}", "train").items()}
+        kind = GROUPS[group].kind(said["name"]) if group in GROUPS else Agent
+        defaults = {field.name: field.default for field in dataclasses.fields(kind)}
+        assert not [key for key in said if said[key] == defaults[key]], path
+
+
+def test_every_key_of_a_logger_is_an_argument_of_what_it_makes():
+    keys = {field.name for field in dataclasses.fields(WandbLogger)}
+    assert keys - {"name"} <= set(inspect.signature(Wandb).parameters)
+
+
+def test_the_preset_follows_the_device(monkeypatch):
+    cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
+    assert compose("device=cpu") == dataclasses.replace(cpu, device="cpu")
+    monkeypatch.setattr(loader_module, "has_gpu", lambda device: device != "cpu")
+    assert compose() == compose("preset=auto") == gpu != cpu
+    assert compose("preset=cpu") == cpu
+    assert compose("experiment=quickstart").env == gpu.env
+    assert compose("device=cpu") == dataclasses.replace(cpu, device="cpu")
+    assert compose("env.n_envs=7", "learner.n_minibatches=1").env.n_envs == 7
+
+
+def test_what_a_cpu_and_a_gpu_train_with():
+    """The recipes behind the measurements in README: changed together with them only."""
+    same = dict(
+        name="megastep.agents.algorithms.ppo:PPO",
+        n_steps=32,
+        n_minibatches=4,
+        n_epochs=1,
+        clip=0.2,
+        value_coef=0.5,
+    )
+    same |= dict(max_grad_norm=0.5, target_kl=None, auxiliary_coef=0.5, lambda_=0.95, anneal="auto")
+    cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
+    assert dataclasses.asdict(cpu.learner) == same | dict(lr=3e-3, gamma=0.98, entropy_coef=0.02)
+    assert dataclasses.asdict(gpu.learner) == same | dict(lr=1e-3, gamma=0.995, entropy_coef=0.01)
+    assert (cpu.env.n_envs, cpu.agent.width, cpu.report) == (256, 64, 4)
+    assert (gpu.env.n_envs, gpu.agent.width, gpu.report) == (4096, 256, 50)
+    assert dataclasses.replace(cpu.env, n_envs=4096) == gpu.env
+    assert compose("experiment=quickstart").seconds == 160
+
+
+def test_a_recipe_differs_on_a_cpu_and_on_a_gpu():
+    cpu, gpu = (compose("experiment=pong", f"preset={preset}") for preset in ("cpu", "gpu"))
+    assert (cpu.seconds, gpu.seconds) == (240, 12) and cpu.env.n_envs == 256
+    assert (cpu.agent.core, cpu.learner.n_epochs) == ("none", 2)
+    assert compose("experiment=pong", "preset=cpu", "seconds=7").seconds == 7
+    assert compose("experiment=pong", "learner=r2d2", "preset=cpu").learner.name.endswith(":R2D2")
+    cpu, gpu = (compose("experiment=deathmatch", f"preset={preset}") for preset in ("cpu", "gpu"))
+    assert (cpu.env.n_envs, gpu.env.n_envs) == (64, 8192)
+    assert (cpu.samples, gpu.samples, cpu.seconds, gpu.seconds) == (600_000, None, None, 480)
+
+
+def test_a_typo_names_the_nearest_key():
+    assert "learner.lr?" in errors("learner.lrr=1")["learner.lrr"]
+    assert "learner.lr?" in errors("lr=1")["lr"]
+    assert "env.n_envs?" in errors("n_envs=8")["n_envs"]
+    assert "device?" in errors("devise=cpu")["devise"]
+    assert "geometry?" in errors("geometri=box")["geometri"]
+
+
+def test_a_key_of_another_member_names_that_member():
+    assert errors("logger.mode=offline")["logger.mode"] == "no such key here; logger=wandb has it"
+    found = errors("env=minimal", "env.patience=3", "geometry=box", "geometry.outer=false")
+    assert found["env.patience"] == "no such key here; env=explorer has it"
+    assert found["geometry.outer"] == "no such key here; geometry=homes has it"
+
+
+def test_an_unknown_member_names_the_nearest_one():
+    assert "explorer?" in errors("env=explorr")["env"]
+    assert "homes?" in errors("geometry=home")["geometry"]
+    assert "quickstart?" in errors("experiment=newcomr")["experiment"]
+    assert "test?" in errors("run=x", "split=tset", script="evaluate")["split"]
+    assert "import path" in errors("env.name=zzz")["env"]
+    assert "wandb" in errors("logger.name=zzz")["logger"]
+
+
+def test_all_errors_are_listed_at_once():
+    found = errors(
+        "env=explorr", "learner.lrr=1", "learner.lr=-1", "learner.gamma=nan", "seed=x", "device=gpu"
+    )
+    assert set(found) == {"env", "learner.lrr", "learner.lr", "learner.gamma", "seed", "device"}
+
+
+@pytest.fixture(scope="module")
+def tree():
+    with ConfigLoader("train", Train) as loader:
+        return loader.tree([])
+
+
+NAN, INFINITY = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    "key, value",
+    [
+        ("env.n_envs", 0),
+        ("env.n_envs", 10**12),
+        ("env.n_envs", 2.5),
+        ("env.n_envs", "many"),
+        ("env.n_envs", None),
+        ("env.n_envs", True),
+        ("env.n_envs", {}),
+        ("env.res", 0),
+        ("env.res", 1025),
+        ("env.fov", 0),
+        ("env.fov", 180),
+        ("env.fov", NAN),
+        ("env.fps", 0),
+        ("learner.lr", -1),
+        ("learner.lr", 0),
+        ("learner.lr", INFINITY),
+        ("learner.lr", 1e300),
+        ("learner.gamma", 1.01),
+        ("learner.n_steps", 0),
+        ("learner.n_minibatches", 0),
+        ("agent.width", 0),
+        ("agent.layers", 0),
+        ("agent.layers", 9),
+        ("agent.encoder", "cnv"),
+        ("geometry.n", 0),
+        ("seed", -1),
+        ("samples", 0),
+        ("samples", INFINITY),
+        ("seconds", 0),
+        ("seconds", INFINITY),
+        ("seconds", -INFINITY),
+        ("checkpoint", INFINITY),
+        ("seconds", NAN),
+        ("checkpoint", -3),
+        ("keep", 1),
+        ("report", 0),
+        ("finish.episodes", 0),
+        ("finish.record", 1),
+        ("logger.mode", "often"),
+        ("env", "explorer"),
+        ("learner.typo", 1),
+    ],
+)
+def test_values_out_of_range_are_named_with_their_key(tree, key, value):
+    *groups, last = key.split(".")
+    changed = copy.deepcopy(tree)
+    target = changed
+    for group in groups:
+        target = target[group]
+    target[last] = value
+    with pytest.raises(ConfigErrors) as error:
+        build(Train, changed)
+    assert [path for path, _ in error.value.errors] == [key]
+
+
+def test_a_missing_key_is_named(tree):
+    with pytest.raises(ConfigErrors, match="seed: is missing"):
+        build(Train, {key: value for key, value in tree.items() if key != "seed"})
+
+
+def test_a_range_is_told():
+    assert errors("env.res=1025")["env.res"] == "1025 is out of range: allowed is from 1 to 1,024"
+    assert (
+        errors("env.fov=180")["env.fov"] == "180 is out of range: allowed is above 0 and below 180"
+    )
+
+
+def test_a_list_may_be_too_short():
+    assert compose("env.cameras=[0,120,240]").env.cameras == [0, 120, 240]
+    found = errors("env.cameras=[]")["env.cameras"]
+    assert found == "a list of 0 is out of range: allowed is at least 1"
+
+
+def test_settings_that_contradict_each_other_are_named():
+    assert "2" in errors("env.n_envs=2")["learner.n_minibatches"]
+    assert errors("geometry=files") == {"geometry.path": "is missing"}
+    assert "resume" in errors("resume=a", "init=b")["init"]
+
+
+def test_infinity_is_refused_as_it_is_typed():
+    found = errors("seconds=inf", "samples=.inf", "learner.lr=inf", "checkpoint=inf")
+    assert set(found) == {"seconds", "samples", "learner.lr", "checkpoint"}
+    assert found["seconds"] == "inf is out of range: allowed is more than 0"
+
+
+def test_a_minibatch_can_be_one_environment_and_no_less():
+    assert compose("env.n_envs=8", "learner.n_minibatches=8").learner.n_minibatches == 8
+    found = errors("env.n_envs=8", "learner.n_minibatches=9")
+    assert found == {"learner.n_minibatches": "9 is more than env.n_envs, 8"}
+
+
+@pytest.mark.parametrize(
+    "override, key, sentence",
+    [
+        ("a=[", "a=[", "is not understood; write key=value, quote blanks"),
+        ("=3", "=3", "is not understood"),
+        ("seed=" + 5000 * "1", "seed=" + 112 * "1" + "...", "is not understood"),
+        ("seed=" + 3000 * "[", "seed=" + 112 * "[" + "...", "is nested too deeply"),
+        (
+            "seed=" + 99 * "[" + 99 * "]",
+            "seed=" + 99 * "[" + 13 * "]" + "...",
+            "is nested too deep",
+        ),
+        (300 * "a." + "a=1", 58 * "a." + "a...", "its key is too long"),
+        ("env=" + 5000 * "a" + ":B", "env", "is unknown"),
+        ("+learner.lrr=1", "learner.lrr", "no such key; did you mean learner.lr?"),
+        ("++lr=1", "lr", "no such key; did you mean learner.lr?"),
+        ("seed=[[1]]", "seed", "expected an integer, got [[1]]"),
+        ("learner.lr={a:{b:1}}", "learner.lr", "expected a number, got {'a': {'b': 1}}"),
+        ("env={a:{b:1}}", "env.a", "no such key; did you mean env.name?"),
+        ("init=[a]", "init", "expected a word, got ['a']"),
+        ("env=null", "env", "cannot be left out; there are "),
+        ("~env", "env", "cannot be left out; there are "),
+        ("~nothing", "nothing", "cannot be deleted"),
+        ("env=glob(*)", "env", "means several runs; add -m"),
+        ("env=3", "env", "3 is unknown"),
+        ("env@x=minimal", "env@x", "has no default; +env@x= adds it"),
+        ("+env@x=minimal", "x", "no such key"),
+        ("nope@x=y", "nope@x", "there is no such group"),
+        ("seed=${nothere}", "seed", "Interpolation key 'nothere' not found"),
+        ("hydra=3", "hydra", "3 is unknown"),
+        ("hydra.swep.dir=x", "hydra.swep.dir", "no such key; did you mean hydra.sweep.dir?"),
+        ("hydra.job.chdir=maybe", "hydra.job.chdir", "Value 'maybe' is not a valid bool"),
+        ("hydra/launcher=basik", "hydra/launcher", "'basik' is unknown; did you mean basic?"),
+        ("hydra/lancher=basic", "hydra/lancher", "did you mean hydra/launcher?"),
+    ],
+)
+def test_what_cannot_be_meant_is_one_sentence_at_its_key(override, key, sentence):
+    ((told, text),) = errors(override).items()
+    assert told == key and sentence in text and "\n" not in text
+
+
+def test_a_launcher_that_is_not_installed_names_what_to_install(monkeypatch):
+    monkeypatch.setattr(loader_module.Loader, "members", lambda *_, **__: ["basic"])
+    assert (
+        "pip install 'megastep-flatland[sweep]'"
+        in errors("hydra/launcher=joblib")["hydra/launcher"]
+    )
+
+
+def test_plus_signs_set_what_there_is():
+    expected = compose("seed=3", "env=minimal", "env.n_envs=9", "experiment=quickstart")
+    assert (
+        compose("+seed=3", "++env=minimal", "++env.n_envs=9", "+experiment=quickstart") == expected
+    )
+    assert compose("experiment=null", "~learner.lr") == compose("learner.lr=3e-4")
+
+
+def test_a_value_with_an_equals_sign_needs_no_quotes():
+    assert compose("folder=sweeps/1/0_seed=1").folder == "sweeps/1/0_seed=1"
+    with ConfigLoader("evaluate", Evaluate) as loader:
+        tree = loader.tree(["run=x", "against=[a/0_seed=1,bot]"])
+        assert tree["against"] == ["a/0_seed=1", "bot"]
+        jobs = loader.jobs(["run=a/0_seed=1,a/1_seed=2"])
+    assert [tree["run"] for _, tree in jobs] == ["a/0_seed=1", "a/1_seed=2"]
+
+
+def test_what_the_environment_holds_is_not_written_down(monkeypatch):
+    monkeypatch.setenv("SECRET", "hush")
+    found = errors("logger=wandb", "logger.project=${oc.env:SECRET}", "folder=x/${oc.env:SECRET}")
+    assert set(found) == {"logger.project", "folder"} and "hush" not in str(found)
+    with ConfigLoader("train", Train) as loader:
+        kept = loader.printed(["hydra.sweep.dir=${oc.env:SECRET}/x"], "hydra", None, False)
+    assert "dir: ${oc.env:SECRET}/x" in kept and "hush" not in kept
+
+
+def test_a_group_of_keys_is_no_single_value():
+    assert "finish" in errors("finish=1")
+    assert compose("finish={steps:3}").finish == dataclasses.replace(compose().finish, steps=3)
+
+
+def test_several_values_need_multirun():
+    assert "add -m" in errors("seed=1,2")["seed"]
+
+
+def test_a_sweep_is_every_combination():
+    with ConfigLoader("train", Train) as loader:
+        jobs = loader.jobs(["env=minimal,explorer", "seed=choice(1,2)", "keep_checkpoints=3"])
+    names = [tree["env"]["name"] for _, tree in jobs]
+    assert names == 2 * ["megastep.envs.minimal:Minimal"] + 2 * ["megastep.envs.explorer:Explorer"]
+    assert [overrides for overrides, _ in jobs] == [
+        [f"env={env}", f"seed={seed}", "keep_checkpoints=3"]
+        for env in ("minimal", "explorer")
+        for seed in (1, 2)
+    ]
+
+
+def test_a_sweep_is_checked_before_its_first_job():
+    with ConfigLoader("train", Train) as loader, pytest.raises(ConfigErrors, match="learner.lr"):
+        loader.jobs(["learner.lr=1e-3,-1"])
+
+
+def test_a_search_is_checked_at_its_first_values_and_at_every_other_alone():
+    optuna = "hydra/sweeper=optuna"
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    base = compose().learner.lr
+    with ConfigLoader("train", Train) as loader:
+        jobs = loader.jobs(
+            [optuna, "learner.lr=interval(1e-4,1e-2)", "keep_checkpoints=2,3", "seed=range(1,9)"]
+        )
+        tried = [(tree["learner"]["lr"], tree["keep"], tree["seed"]) for _, tree in jobs]
+        assert tried[0] == (base, 2, 1) and (1e-4, 2, 1) in tried and (1e-2, 2, 1) in tried
+        assert (base, 3, 1) in tried and (base, 2, 9) in tried and len(tried) == 7
+        for word, told in (
+            ("learner.lr=interval(1e-4,1e9)", "1000000000.0 is out of range"),
+            ("log_every=interval(1.0,4.0)", "expected an integer"),
+            ("keep=range(1,3)", "1 is out of range"),
+            ("agent.core=lstm,lstmm", "lstmm"),
+        ):
+            with pytest.raises(ConfigErrors, match=re.escape(told)):
+                loader.jobs([optuna, word])
+        with pytest.raises(ConfigErrors, match="hydra/sweeper=optuna"):
+            loader.jobs(["learner.lr=interval(1e-4,1e-2)"])
+
+
+@pytest.mark.parametrize("word", ["env=glob(zz*)", "seed=range(3,3)"])
+def test_a_sweep_over_nothing_is_refused(word):
+    with ConfigLoader("train", Train) as loader, pytest.raises(ConfigErrors, match="has no value"):
+        loader.jobs([word])
+
+
+def test_a_glob_stands_for_members():
+    with ConfigLoader("train", Train) as loader:
+        jobs = loader.jobs(["geometry=glob(b*)"])
+    assert [words for words, _ in jobs] == [["geometry=bench"], ["geometry=box"]]
+
+
+def test_help_lists_groups_and_members(capsys):
+    assert run_command(Script("train", Train, None, "Trains."), ["--help"]) == 0
+    text = capsys.readouterr().out
+    assert "explorer, minimal" in text and "quickstart" in text and "--multirun" in text
+
+
+def test_the_composed_configuration_is_printed(capsys):
+    def printed(*words):
+        assert run_command(Script("train", Train, None, ""), [*words]) == 0
+        return capsys.readouterr().out
+
+    assert "lr: 0.5" in printed("--cfg", "job", "learner.lr=0.5")
+    tree = yaml.safe_load(printed("--cfg", "job", "log_every=${keep}"))
+    assert tree.pop("report") == "${keep}" and "hydra" not in tree
+    tree = yaml.safe_load(printed("--cfg", "job", "--resolve", "log_every=${keep}"))
+    assert build(Train, tree) == compose("log_every=2")
+    assert set(yaml.safe_load(printed("--cfg", "hydra"))) == {"hydra"}
+    assert set(yaml.safe_load(printed("--cfg", "all"))) == {*tree, "hydra"}
+    assert yaml.safe_load(printed("--cfg", "job", "-p", "env")) == tree["env"]
+    assert "seed: 1" in printed("-m", "seed=1,2", "--cfg", "job").split("---")[0]
+    assert "file://" in printed("--info", "searchpath")
+    assert "env: explorer" in printed("--info", "defaults-tree")
+    assert "hydra/launcher: basic" in printed("--hydra-help")

@@ -1,0 +1,393 @@
+"""Evaluation: first episodes counted where returns are known, intervals checked on paper, and the
+script.
+"""
+
+import dataclasses
+import itertools
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from megastep import envs, spaces
+from megastep.agents.cli import evaluate, run_folders, tables, train
+from megastep.agents.cli.build import build
+from megastep.agents.cli.compose import ConfigLoader
+from megastep.agents.cli.errors import UserError
+from megastep.agents.cli.settings import Evaluate, Train
+from megastep.agents.training import evaluation
+from megastep.arrdict import arrdict
+from megastep.geometries import files, sample
+from tests.helpers import tiny
+
+TINY = [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=1"]
+
+
+class Counting:
+    """Lane b lives b + 1 steps, again and again; a step pays 1 in the first life and 100 later."""
+
+    n_agents, device = 1, torch.device("cpu")
+    action_space = spaces.MultiDiscrete(1, 7)
+
+    def __init__(self, n_envs, mortal):
+        self.n_envs, self.mortal = n_envs, mortal
+
+    def reset(self):
+        self.age, self.lives = torch.zeros(self.n_envs), torch.zeros(self.n_envs)
+        self.ended = torch.zeros(self.n_envs, dtype=torch.bool)
+        return self.world(~self.ended, torch.zeros(self.n_envs))
+
+    def step(self, decision):
+        assert decision.actions.shape == (self.n_envs, 1)
+        reset, reward = self.ended, torch.where(self.lives > 0, 100.0, 1.0)
+        self.age = torch.where(reset, 0.0, self.age + 1)
+        self.ended = (self.age == torch.arange(self.n_envs) + 1) & ~reset
+        self.lives += self.ended
+        return self.world(reset, torch.where(reset, 0.0, reward))
+
+    def world(self, reset, reward):
+        never = torch.zeros_like(reset)
+        terminal, truncated = (self.ended, never) if self.mortal else (never, self.ended)
+        return arrdict(
+            obs=self.age, reward=reward, reset=reset, terminal=terminal, truncated=truncated
+        )
+
+
+@pytest.mark.parametrize("mortal", [False, True])
+def test_only_the_first_episode_of_a_lane_counts(mortal):
+    env = Counting(100, mortal)
+    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    assert episodes.returns.tolist() == episodes.lengths.tolist() == list(range(1, 101))
+    assert bool(episodes.done.all())
+
+
+def test_an_episode_that_does_not_end_is_reported_as_it_stands():
+    env = Counting(100, False)
+    episodes = evaluation.first_episodes(
+        env, evaluation.RandomActions(env.action_space), max_steps=64
+    )
+    assert int((~episodes.done).sum()) == 36 and float(episodes.returns.max()) == 64
+    (row,) = evaluation.summaries(episodes)
+    assert row["unfinished"] == 36
+
+
+class Teams(Counting):
+    """Environments of a leader and two followers, of whom the second follower does not learn. Its
+    metric is how old a lane is, and 1000 in a second life; anything where no episode ends.
+    """
+
+    n_agents, roles = 3, ("leader", "follower", "follower")
+
+    def reset(self):
+        self.n_lanes = 3 * self.n_envs
+        env = Counting(self.n_lanes, False)
+        self.env, world = env, env.reset()
+        return self.told(world)
+
+    def step(self, decision):
+        return self.told(self.env.step(decision))
+
+    def told(self, world):
+        ended = world.terminal | world.truncated
+        learns = torch.arange(self.n_lanes) % 3 < 2
+        life = 1000 * (self.env.lives - 1)
+        metrics = arrdict(age=torch.where(ended, life + self.env.age, -1e9))
+        return arrdict(world, learns=learns, metrics=metrics)
+
+
+def test_metrics_and_returns_are_split_by_role_among_lanes_that_learn():
+    env = Teams(20, False)
+    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    ages = torch.arange(1, 61)
+    assert episodes.metrics.age.tolist() == ages.tolist()
+    every, leader, follower = evaluation.summaries(episodes, env.roles)
+    for row, chosen in ((every, ages[ages % 3 > 0]), (leader, ages[::3]), (follower, ages[1::3])):
+        mean = pytest.approx(chosen.float().mean())
+        assert row["return"] == row["length"] == row["metrics"]["age"]["mean"] == mean
+        assert row["metrics"]["age"]["lower"] == row["lower"] < row["return"] < row["upper"]
+        assert row["lanes"] == len(chosen)
+    assert (leader["role"], follower["role"]) == ("leader", "follower") and "role" not in every
+
+
+def test_the_agents_of_one_environment_are_one_draw():
+    """Two agents that always earn the same: half as many draws as there are episodes."""
+    alike = torch.arange(100.0).repeat_interleave(2)
+    episodes = arrdict(
+        returns=alike,
+        lengths=alike,
+        done=alike >= 0,
+        learns=alike >= 0,
+        metrics=arrdict(laps=alike),
+        envs=torch.arange(100).repeat_interleave(2),
+    )
+    (row,) = evaluation.summaries(episodes)
+    expected = evaluation.interval(np.arange(100.0), np.arange(100))
+    assert (row["return"], row["lower"], row["upper"]) == pytest.approx(expected)
+    assert row["metrics"]["laps"]["lower"] == row["lower"] and row["lanes"] == 200
+    in_one_home = arrdict(episodes, homes=torch.full((200,), 7))
+    assert evaluation.summaries(in_one_home)[0]["lower"] == row["lower"]
+
+
+def test_a_metric_is_the_mean_over_episodes_that_ended():
+    env = Teams(20, False)
+    random = evaluation.RandomActions(env.action_space)
+    (row,) = evaluation.summaries(evaluation.first_episodes(env, random, max_steps=10))
+    assert (
+        row["unfinished"] == 40 - 7
+        and row["metrics"]["age"]["mean"] == (1 + 2 + 4 + 5 + 7 + 8 + 10) / 7
+    )
+    (row,) = evaluation.summaries(evaluation.first_episodes(env, random, max_steps=0))
+    assert row["metrics"]["age"] == dict(mean=None, lower=None, upper=None)
+    assert evaluate.cells({"agent": "a", **row})[3:5] == ("none", "none")
+
+
+def test_metrics_stand_beside_the_return_of_a_table():
+    env = Teams(20, False)
+    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    rows = [{"agent": "trained", **row} for row in evaluation.summaries(episodes, env.roles)]
+    head = "agent", "return", "95 % interval", "age", "95 % interval", "length", "episodes", "homes"
+    assert evaluate.columns(rows) == head
+    name, earned, within, age, its, *_ = evaluate.cells(rows[2])
+    assert (name, earned, age) == ("trained: follower", "30.50", "30.5")
+    lower, upper = rows[2]["lower"], rows[2]["upper"]
+    assert within == f"{lower:.2f} to {upper:.2f}" and its == f"{lower:.3g} to {upper:.3g}"
+
+
+def test_random_actions_are_spread_evenly_over_every_action():
+    space = {"move": spaces.MultiDiscrete(2, 7), "fire": spaces.MultiDiscrete(1, 2)}
+    policy = evaluation.RandomActions(arrdict(space))
+    decision, _ = policy(
+        None, policy.initial(10_000, "cpu"), generator=torch.Generator().manual_seed(1)
+    )
+    assert decision.actions.move.shape == (10_000, 2) and decision.actions.fire.shape == (10_000, 1)
+    shares = torch.bincount(decision.actions.move.flatten(), minlength=7) / 20_000
+    assert shares.sub(1 / 7).abs().max() < 0.015  # six standard errors
+
+
+def lanes_of_homes(sizes, random):
+    """Returns of ``sizes[h]`` lanes in each home h, and the lanes' homes."""
+    homes = np.repeat(np.arange(len(sizes)), sizes)
+    return random.normal(np.arange(len(sizes))[homes], 1.0), homes
+
+
+class Moving:
+    """An Explorer that writes down in which home each lane's first episode ends."""
+
+    def __init__(self, *args, **settings):
+        self.env = envs.Explorer(*args, res=1, subsample=1, patience=1, **settings)
+        self.last = torch.full((self.env.n_envs,), -1)
+
+    def __getattr__(self, name):
+        return getattr(self.env, name)
+
+    def step(self, decision):
+        world, scenery = self.env.step(decision), self.env.core.scenery
+        ended = (world.terminal | world.truncated) & (self.last < 0)
+        self.last = torch.where(ended, scenery.layout.long(), self.last)
+        return world
+
+
+@pytest.mark.parametrize("resample", [False, True])
+def test_a_lane_is_labelled_with_the_home_its_first_episode_is_played_in(resample):
+    env = Moving(10, sample("bench", 4), device="cpu", resample=resample)
+    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    assert bool(episodes.done.all())
+    assert torch.equal(episodes.homes.long(), env.last)
+    assert torch.equal(env.layout, torch.arange(10) % 4) != resample
+
+
+def test_agents_of_one_environment_share_its_home():
+    class Pairs(Counting):
+        """Two agents in each of three environments."""
+
+        n_agents, layout = 2, torch.tensor([7, 8, 7])
+
+        def reset(self):
+            return Counting(6, False).reset()
+
+    env = Pairs(3, False)
+    episodes = evaluation.first_episodes(
+        env, evaluation.RandomActions(env.action_space), max_steps=0
+    )
+    assert episodes.homes.tolist() == [7, 7, 8, 8, 7, 7]
+
+
+def test_the_mean_is_exact_and_the_interval_holds_it():
+    values = np.random.default_rng(1).normal(5, 2, 400)
+    mean, lower, upper = evaluation.interval(values, np.arange(400))
+    assert mean == pytest.approx(values.mean())
+    # 2 / sqrt(400) = 0.1 is the standard error; the interval is 1.96 of it to each side, within the
+    # bootstrap's noise
+    assert mean - lower == pytest.approx(0.196, abs=0.03) and upper - mean == pytest.approx(
+        0.196, abs=0.03
+    )
+
+
+def test_lanes_of_one_home_count_as_one_draw():
+    homes = np.random.default_rng(1).normal(0, 1, 50)
+    alone = evaluation.interval(homes, np.arange(50))
+    again = evaluation.interval(np.repeat(homes, 20), np.repeat(np.arange(50), 20))
+    assert again == pytest.approx(alone)
+
+
+@pytest.mark.parametrize("groups", [None, np.zeros(400)])
+def test_without_homes_or_in_one_alone_lanes_are_drawn(groups):
+    mean, lower, upper = evaluation.interval([0.0, 1.0] * 200, groups)
+    assert mean == 0.5 and upper - lower == pytest.approx(4 * 0.5 / 20, rel=0.15)
+
+
+def test_an_environment_without_homes_has_an_interval_over_episodes():
+    env = Counting(400, False)
+    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    (row,) = evaluation.summaries(episodes)
+    assert "homes" not in episodes and row["homes"] is None
+    error = np.std(np.arange(1, 401)) / 20
+    assert row["upper"] - row["lower"] == pytest.approx(2 * 1.96 * error, rel=0.1)
+
+
+def test_a_home_with_more_lanes_weighs_more():
+    """One lane that earned 0 in one home, three that earned 4 in another. Of the resamples of two
+    homes half hold both: (0 + 3 * 4) / 4 = 3, not the mean of the homes' means, 2.
+    """
+    mean, lower, upper = evaluation.interval([0.0, 4.0, 4.0, 4.0], [0, 1, 1, 1], level=0.4)
+    assert mean == lower == upper == 3
+
+
+@pytest.mark.parametrize("sizes", [(1, 5, 2), (3, 3, 3), (1, 1, 7, 2)])
+def test_the_interval_is_that_of_an_evaluator_that_tries_every_resample(sizes):
+    values, homes = lanes_of_homes(sizes, np.random.default_rng(3))
+    tries = []
+    for chosen in itertools.product(range(len(sizes)), repeat=len(sizes)):
+        drawn = [value for home in chosen for value in values[homes == home]]
+        tries.append(sum(drawn) / len(drawn))
+    found = evaluation.interval(values, homes, level=0.8, n_resamples=200_000)
+    assert found == pytest.approx((values.mean(), *np.quantile(tries, [0.1, 0.9])), abs=0.02)
+
+
+def configured(**changes):
+    with ConfigLoader("evaluate", Evaluate) as loader:
+        return dataclasses.replace(
+            build(Evaluate, loader.tree(["run=latest", "episodes=6", "device=cpu"])), **changes
+        )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run folder, and the folder it was trained from."""
+    with ConfigLoader("train", Train) as loader, pytest.MonkeyPatch.context() as patch:
+        base = tmp_path_factory.mktemp("trained")
+        patch.chdir(base)
+        return base / train.run(build(Train, loader.tree(TINY)))
+
+
+def test_the_table_is_printed_and_written(trained, capsys):
+    written = evaluate.run(configured(run=str(trained)))
+    assert written == trained / "evaluations" / "box-test-32.json"
+    result = json.loads(written.read_text())
+    first, second = result["rows"]
+    assert (first["agent"], second["agent"]) == ("trained", "random")
+    assert (
+        first["lanes"] == 6
+        and first["homes"] == 1
+        and first["return"] == 0
+        and 5 <= first["length"] <= 9
+    )
+    assert result["checkpoint"].endswith("step_32") and result["evaluation"]["split"] == "test"
+    for text in (capsys.readouterr().out, written.with_suffix(".md").read_text()):
+        assert "95 % interval" in text and "random" in text
+        assert (
+            "minimal in the test homes of box, after 32 samples (step_32), seed 1, 6 lanes" in text
+        )
+    row = dict(evaluated=0.0, lower=0.0, upper=0.0)
+    assert run_folders.outcome(written) == dict(score=0.0, **row)
+    assert row.items() <= run_folders.outcome(trained).items()
+
+
+def test_it_is_reproducible_and_each_has_a_file_of_its_own(trained):
+    shutil.rmtree(trained / "evaluations", ignore_errors=True)  # of other tests
+
+    def lengths(**changes):
+        written = evaluate.run(configured(run=str(trained), **changes))
+        return [row["length"] for row in json.loads(written.read_text())["rows"]]
+
+    with ConfigLoader("evaluate", Evaluate) as loader:
+        bench = build(Evaluate, loader.tree(["run=x", "geometry=bench", "geometry.n=3"])).geometry
+    assert lengths() == lengths() != lengths(seed=2)
+    written = evaluate.run(
+        configured(
+            run=str(trained / "checkpoints" / "step_32"),
+            geometry=bench,
+            baseline=False,
+            greedy=True,
+        )
+    )
+    result = json.loads(written.read_text())
+    assert [(row["agent"], row["homes"]) for row in result["rows"]] == [("trained, greedy", 3)]
+    evaluate.run(configured(run=str(trained), split="training", baseline=False))
+    names = {path.name for path in (trained / "evaluations").iterdir()}
+    assert names == {
+        f"{name}.{kind}"
+        for name in ("box-test-32", "box-training-32", "bench-test-32-greedy")
+        for kind in ("json", "md")
+    }
+
+
+def test_a_file_of_homes_is_named_in_title_and_file_name(trained, tmp_path):
+    files.save(tmp_path / "plans.npz", sample("homes", 3))
+    with ConfigLoader("evaluate", Evaluate) as loader:
+        words = ["run=x", "geometry=files", f"geometry.path={tmp_path / 'plans.npz'}"]
+        plans = build(Evaluate, loader.tree(words)).geometry
+    written = evaluate.run(
+        configured(run=str(trained), geometry=plans, split="all", baseline=False)
+    )
+    assert written.name == "files-plans-all-32.json"
+    result = json.loads(written.read_text())
+    assert "in all homes of files-plans" in result["title"] and result["rows"][0]["homes"] == 3
+
+
+def test_a_lane_stays_in_one_home_whatever_the_training_did(tmp_path, monkeypatch):
+    """Ten lanes in four homes: three, three, two and two, each at home where its label says."""
+    monkeypatch.chdir(tmp_path)
+    shape = ["env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1", "agent.width=8"]
+    learner = ["learner.n_steps=8", "learner.n_minibatches=2", "device=cpu", "samples=1"]
+    homes = ["geometry=bench", "geometry.n=4", "env.resample=true"]
+    with ConfigLoader("train", Train) as loader:
+        tree = loader.tree(["env=explorer", "preset=cpu", *homes, *shape, *learner])
+        run = train.run(build(Train, tree))
+    seen = {}
+
+    def spied(env, *args):
+        seen["env"], seen["episodes"] = env, first_episodes(env, *args)
+        return seen["episodes"]
+
+    first_episodes = evaluation.first_episodes
+    monkeypatch.setattr(evaluation, "first_episodes", spied)
+    evaluate.run(configured(run=str(run), split="all", episodes=10, baseline=False))
+    assert seen["episodes"].homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1]
+    assert torch.equal(seen["env"].core.scenery.layout, seen["episodes"].homes)
+
+
+def test_a_table_that_cannot_be_written_is_one_sentence(trained, monkeypatch, tmp_path):
+    place = tmp_path / "file"
+    place.write_text("")
+    with pytest.raises(UserError, match="cannot be written to .*file"):
+        tables.write(place, "name", dict(title=""), (), ())
+
+
+def test_a_checkpoint_of_another_environment_is_refused_with_both_shapes(trained, tmp_path):
+    from megastep.agents.training import checkpoint
+
+    loaded = checkpoint.load_latest(trained / "checkpoints")
+    loaded.config["train"]["env"]["res"] = 16
+    checkpoint.save(tmp_path / "checkpoints", 32, loaded.state, loaded.config)
+    with pytest.raises(UserError, match=r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)"):
+        evaluate.run(configured(run=str(tmp_path)))
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path, capsys):
+    assert evaluate.main([f"run={tmp_path}"]) == 2
+    assert "is no run" in capsys.readouterr().err
+    assert evaluate.main([]) == 2
+    assert "run:" in capsys.readouterr().err

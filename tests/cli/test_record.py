@@ -1,0 +1,126 @@
+"""Videos of trained agents."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+
+from megastep import plotting, recording
+from megastep.agents.cli import record, train
+from megastep.agents.cli.build import build
+from megastep.agents.cli.compose import ConfigLoader
+from megastep.agents.cli.settings import Train
+from tests.helpers import faults, tiny
+
+TINY = [*tiny.TINY, "samples=1"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    with ConfigLoader("train", Train) as loader, pytest.MonkeyPatch.context() as patch:
+        base = tmp_path_factory.mktemp("trained")
+        patch.chdir(base)
+        return base / train.run(build(Train, loader.tree(TINY)))
+
+
+def test_a_video_has_a_frame_for_every_step(trained):
+    import av
+
+    assert record.main([f"run={trained}", "steps=3", "device=cpu"]) == 0
+    with av.open(str(trained / "video.mp4")) as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+        assert video.streams.video[0].average_rate == 10  # the environment's
+    assert len(frames) == 3 and frames[0].std() > 10
+    assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
+
+
+def test_an_image_is_the_last_frame_and_needs_no_encoder(trained, tmp_path, monkeypatch):
+    import av
+
+    video, still = tmp_path / "a.mp4", tmp_path / "folder" / "a.png"
+    common = [f"run={trained}", "steps=4", "device=cpu"]
+    assert record.main([*common, f"file={video}"]) == 0
+    with av.open(str(video)) as file:
+        *_, last = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    faults.not_installed(monkeypatch, "av")
+    assert record.main([*common, f"file={still}"]) == 0
+    drawn = (255 * plt.imread(still)[..., :3]).round()
+    height, width = drawn.shape[:2]  # of the video, sizes are even
+    errors = np.abs(drawn - last[:height, :width])
+    assert drawn.std() > 10 and errors.mean() < 3, "compression loses as much"
+
+
+def test_a_video_of_several_cameras_shows_each(tmp_path):
+    options = ["env=explorer", "geometry=box", "env.cameras=[0,120,240]", "device=cpu", "steps=1"]
+    heights = []
+    for cameras in options[2], "env.cameras=[0]":
+        file = tmp_path / "a.png"
+        assert record.main([*options[:2], cameras, *options[3:], f"file={file}"]) == 0
+        heights.append(len(plt.imread(file)))
+    strip = 100 * plotting.STRIP * (6 - 2 * 0.55)
+    assert heights[0] - heights[1] == pytest.approx(2 * 2 * strip, abs=2), (
+        "two rows more in each of two strips"
+    )
+
+
+def test_a_place_that_cannot_be_written_is_one_sentence(trained, capsys):
+    assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=/proc/video.mp4"]) == 2
+    assert "/proc/video.mp4 could not be made" in capsys.readouterr().err
+
+
+def test_another_kind_of_file_is_one_sentence(trained, capsys):
+    assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=video.gif"]) == 2
+    assert "video.gif could not be made: videos are mp4 files" in capsys.readouterr().err
+
+
+@pytest.fixture
+def handlers():
+    """Puts the handlers of signals back."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("script", ["record", "train"])
+def test_a_signal_while_filming_is_no_fault_of_the_video(
+    script, number, code, trained, tmp_path, handlers, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(recording._Video, "add", lambda *_: os.kill(os.getpid(), number))
+    if script == "record":
+        assert record.main([f"run={trained}", "steps=9", "device=cpu"]) == code
+    else:
+        assert train.main([*TINY, "finish.record=true"]) == code
+    assert "could not be" not in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.mp4"))
+
+
+def failing(*_, **__):
+    raise RuntimeError("Frame 0 could not be drawn: by chance")
+
+
+def test_training_survives_a_video_that_fails(trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(recording.ParallelEncoder, "__call__", failing)
+    assert train.main([*TINY, "finish.record=true"]) == 0
+    assert "Frame 0 could not be drawn" in capsys.readouterr().err
+    assert not list(tmp_path.glob("runs/*/*.mp4"))
+
+
+def test_without_the_encoder_training_goes_on_and_the_package_is_named(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    faults.not_installed(monkeypatch, "av")
+    assert train.main([*TINY, "finish.record=true"]) == 0
+    assert "pip install av" in capsys.readouterr().err
+    assert len(list(tmp_path.glob("runs/*/curves.png"))) == 1
+
+
+def test_keys_of_a_geometry_need_a_geometry(capsys):
+    assert record.main(["env=minimal", "geometry.n=4"]) == 2
+    assert "geometry: keys of it need a member of it: give geometry= too" in capsys.readouterr().err

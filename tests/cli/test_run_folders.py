@@ -1,0 +1,209 @@
+"""Run folders: made once each, however many programs start at a time; found by name; locked."""
+
+import errno
+import fcntl
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from megastep.agents.cli import run_folders
+from megastep.agents.cli.errors import UserError
+from megastep.agents.cli.lock import locked
+
+ROOT = pathlib.Path(__file__).parents[2]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(name):
+    """A run folder with a checkpoint folder, as one that has trained."""
+    path = pathlib.Path(name)
+    (path / "checkpoints").mkdir(parents=True)
+    run_folders.record_start(path)
+    return path
+
+
+def test_a_taken_name_gets_a_number():
+    made = [run_folders.make(pathlib.Path("runs/a")) for _ in range(3)]
+    assert [str(path) for path in made] == ["runs/a", "runs/a-2", "runs/a-3"]
+
+
+def test_programs_that_start_in_the_same_second_get_folders_of_their_own():
+    for round in range(20):
+        made, start = [], threading.Barrier(8)
+
+        def launch(name=f"runs/{round}", made=made, start=start):
+            start.wait()
+            made.append(run_folders.make(pathlib.Path(name)))
+
+        threads = [threading.Thread(target=launch) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(set(made)) == 8 and all(path.is_dir() for path in made)
+
+
+@pytest.mark.parametrize(
+    "name", ["runs/2026-1-1_a-b", "r n ü", 'a"b', "a\\b", "it's", "[x,y]={$HOME}"]
+)
+def test_the_command_that_is_told_can_be_typed(name):
+    from megastep.agents.cli.compose import ConfigLoader
+    from megastep.agents.cli.settings import Train
+
+    typed = subprocess.run(
+        ["bash", "-c", f"printf '%s\\n' {run_folders.resume_command(pathlib.Path(name))}"],
+        text=True,
+        stdout=subprocess.PIPE,
+    )
+    python, script, override = typed.stdout.splitlines()
+    with ConfigLoader("train", Train) as loader:
+        assert (python, script) == ("python", "train.py")
+        assert loader.tree([override])["resume"] == name
+
+
+# ---- latest ----
+
+
+def test_the_latest_run_is_the_one_started_last_whatever_is_written_later():
+    first, second = run("runs/b"), run("runs/a")
+    assert run_folders.find("latest") == second
+    (first / "checkpoints" / "step_1").mkdir()
+    (first / "evaluations").mkdir()
+    assert run_folders.find("latest") == second
+    run_folders.record_start(first)  # it goes on
+    assert run_folders.find("latest") == first
+
+
+def test_the_latest_run_may_be_a_sweeps_or_in_any_folder():
+    for name in ("runs/a", "sweeps/2026-01-01/0_seed=1", "else where/ü"):
+        path = run(name)
+        assert run_folders.find("latest") == path
+
+
+def test_neither_clocks_nor_copies_nor_deletion_change_which_run_is_the_latest():
+    first, second, third = run("runs/2026-03-01-a"), run("runs/2026-01-01-b"), run("runs/c")
+    for path in (first, second, third):
+        os.utime(path / "checkpoints", (0, 0))
+    shutil.copytree(first, "runs/z-copy")
+    assert run_folders.find("latest") == third
+    shutil.rmtree(third)
+    assert run_folders.find("latest") == second
+    shutil.rmtree("runs/2026-01-01-b")
+    assert run_folders.find("latest") == first
+
+
+def test_runs_whose_start_is_not_known_are_ordered_by_their_names():
+    for name in ("2026-01-02", "2026-01-01"):
+        pathlib.Path("runs", name, "checkpoints").mkdir(parents=True)
+    assert str(run_folders.find("latest")) == "runs/2026-01-02"
+    known = run("runs/2025")
+    assert run_folders.find("latest") == known
+
+
+def test_a_start_that_cannot_be_noted_is_one_warning(capsys):
+    pathlib.Path("runs").write_text("a file")
+    run_folders.record_start(pathlib.Path("elsewhere"))
+    assert capsys.readouterr().err.startswith("warning: runs/started.txt cannot be written")
+
+
+# ---- The lock ----
+
+
+def test_a_folder_in_use_is_refused_with_the_process_that_has_it(here):
+    with locked(here):
+        assert (here / "lock").read_text() == str(os.getpid())
+        with pytest.raises(
+            UserError, match=f"in use by process {os.getpid()};.*kill {os.getpid()}"
+        ):
+            with locked(here):
+                pass
+        assert (here / "lock").read_text() == str(os.getpid()), "the refused one leaves it"
+    assert not (here / "lock").exists()
+    with locked(here):
+        pass
+
+
+HOLDS = """
+import pathlib, sys, time
+from megastep.agents.cli.lock import locked
+with locked(pathlib.Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_the_lock_of_a_killed_process_is_no_obstacle(here):
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLDS, here], cwd=ROOT, text=True, stdout=subprocess.PIPE
+    )
+    assert holder.stdout.readline() == "held\n"
+    with pytest.raises(UserError, match=f"process {holder.pid}"), locked(here):
+        pass
+    holder.kill()
+    holder.communicate()
+    assert (here / "lock").read_text() == str(holder.pid)
+    with locked(here):
+        assert (here / "lock").read_text() == str(os.getpid())
+
+
+def test_a_lock_left_with_the_number_of_another_living_process_is_no_obstacle(here):
+    (here / "lock").write_text(str(os.getppid()))
+    with locked(here):
+        assert (here / "lock").read_text() == str(os.getpid())
+
+
+def test_a_lock_file_that_its_owner_deletes_meanwhile_is_made_anew(here, monkeypatch):
+    real, calls = fcntl.flock, []
+
+    def flock(file, how):
+        calls.append(1)
+        if len(calls) == 1:
+            (here / "lock").unlink()
+        return real(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with locked(here):
+        assert (here / "lock").read_text() == str(os.getpid())
+    assert len(calls) == 2
+
+
+def test_on_a_file_system_without_locks_a_run_is_warned(here, monkeypatch, capsys):
+    def flock(file, how):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with locked(here):
+        assert "file system without locks" in capsys.readouterr().err
+
+
+def test_only_one_of_many_has_the_lock_at_a_time(here):
+    inside, most, refused = [], [], []
+
+    def work():
+        for _ in range(50):
+            try:
+                with locked(here):
+                    inside.append(1)
+                    most.append(len(inside))
+                    time.sleep(1e-4)
+                    inside.pop()
+            except UserError:
+                refused.append(1)
+
+    threads = [threading.Thread(target=work) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert set(most) == {1} and refused and not (here / "lock").exists()

@@ -1,0 +1,271 @@
+"""Signals at every moment of a run: the exit code is 128 + the number, what was learnt is saved,
+and nothing is mistaken for another error.
+"""
+
+import json
+import os
+import pathlib
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from megastep import recording
+from megastep.agents.cli import factory, train
+from megastep.agents.storage.rollout import Collector
+from megastep.agents.training import checkpoint, evaluation, loggers
+from tests.helpers import tiny
+
+ROOT = pathlib.Path(__file__).parents[2]
+TINY = [*tiny.TINY, "log_every=1"]
+UPDATE = tiny.UPDATE
+WHOLE = ["finish.evaluate=true", "finish.episodes=4", "finish.record=true", "finish.steps=3"]
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    """A folder of its own, and signals as a shell leaves them."""
+    monkeypatch.chdir(tmp_path)
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in SIGNALS}
+    yield tmp_path
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def signalled(monkeypatch, owner, name, *numbers, call=2):
+    """From now on the `call`-th call of `owner.name` gets the signals in its middle: after its
+    work, before it returns.
+    """
+    real, calls = getattr(owner, name), []
+
+    def interrupted(*arguments, **options):
+        result = real(*arguments, **options)
+        calls.append(1)
+        if len(calls) == call:
+            for number in numbers:
+                os.kill(os.getpid(), number)
+        return result
+
+    monkeypatch.setattr(owner, name, interrupted)
+
+
+def composing(monkeypatch, number):
+    from omegaconf import DictConfig
+
+    signalled(monkeypatch, DictConfig, "_validate_set", number, call=20)
+
+
+def setting_up(monkeypatch, number):
+    signalled(monkeypatch, factory, "make_learner", number, call=1)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("moment", [composing, setting_up])
+def test_before_anything_is_learnt_nothing_is_left(here, monkeypatch, capsys, moment, number):
+    moment(monkeypatch, number)
+    assert train.main([*TINY, "seconds=60", "folder=run"]) == 128 + number
+    assert capsys.readouterr().err == f"train.py: stopped by {number.name}\n"
+    assert not (here / "run").exists()
+
+
+def collecting(monkeypatch, number):
+    signalled(monkeypatch, Collector, "__call__", number)
+
+
+def reporting(monkeypatch, number):
+    signalled(monkeypatch, loggers.Loggers, "write", number)
+
+
+def saving(monkeypatch, number):
+    signalled(monkeypatch, checkpoint, "_write", number, call=4)  # in the second checkpoint
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("moment", [collecting, reporting, saving])
+def test_while_training_the_step_is_finished_and_saved(here, monkeypatch, capsys, moment, number):
+    moment(monkeypatch, number)
+    assert (
+        train.main([*TINY, "seconds=60", "folder=run", "checkpoint_seconds=1e-9"]) == 128 + number
+    )
+    told = f"train.py: Stopped after {2 * UPDATE} samples. To go on: python train.py resume=run\n"
+    assert capsys.readouterr().err == told
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step == 2 * UPDATE
+    assert not list((here / "run" / "checkpoints").glob("*tmp*"))
+    assert not (here / "run" / "lock").exists()
+
+
+def evaluating(monkeypatch, number):
+    signalled(monkeypatch, evaluation, "first_episodes", number, call=1)
+
+
+def filming(monkeypatch, number):
+    signalled(monkeypatch, recording._Video, "add", number)
+
+
+# filming, which is slow, gets the others in test_record.py
+@pytest.mark.parametrize(
+    "moment, number", [*((evaluating, number) for number in SIGNALS), (filming, signal.SIGHUP)]
+)
+def test_after_training_the_checkpoint_stands(here, monkeypatch, capsys, moment, number):
+    moment(monkeypatch, number)
+    assert train.main([*TINY, f"samples={UPDATE}", "folder=run", *WHOLE]) == 128 + number
+    assert capsys.readouterr().err == f"train.py: stopped by {number.name}\n"
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step == UPDATE
+    assert not list((here / "run").glob("*.mp4")) and not list((here / "run").glob(".*"))
+
+
+def test_a_sweep_stops_as_a_whole_and_shows_what_was_done(here, monkeypatch, capsys):
+    signalled(monkeypatch, Collector, "__call__", signal.SIGTERM, call=2)
+    assert train.main([*TINY, "-m", f"samples={UPDATE}", "seed=1,2,3"]) == 143
+    table = capsys.readouterr().out.split("Sweep", 1)[1]
+    assert "done" in table and "interrupted: Stopped after 32 samples" in table
+    (folder,) = (here / "sweeps").iterdir()
+    assert len((folder / "sweep.csv").read_text().splitlines()) == 3  # the third never began
+
+
+def test_a_signal_sent_twice_at_once_is_one(here, monkeypatch):
+    """As coreutils' timeout does, and as a shell and the system do when a terminal is closed."""
+    signalled(monkeypatch, Collector, "__call__", signal.SIGTERM, signal.SIGTERM)
+    assert train.main([*TINY, "seconds=60", "folder=run"]) == 143
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step == 2 * UPDATE
+
+
+def test_under_nohup_a_closed_terminal_does_not_stop_a_run(here, monkeypatch):
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    signalled(monkeypatch, Collector, "__call__", signal.SIGHUP)
+    assert train.main([*TINY, f"samples={4 * UPDATE}", "folder=run"]) == 0
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step == 4 * UPDATE
+
+
+# ---- In processes of their own ----
+
+STUCK = """
+import os, signal, sys, time
+from megastep.agents.training import loggers
+from megastep.agents.cli import train
+
+def write(*arguments):
+    print("stuck", flush=True)
+    time.sleep(60)
+
+loggers.Loggers.write = write
+sys.exit(train.main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_a_run_that_is_stuck_at_once(here, number):
+    process = subprocess.Popen(
+        [sys.executable, "-c", STUCK, *TINY, "seconds=60", "folder=run"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        text=True,
+        stdout=subprocess.PIPE,
+    )
+    while process.stdout.readline() != "stuck\n":
+        assert process.poll() is None
+    process.send_signal(number)
+    assert "once more" in process.stdout.readline() + process.stdout.readline()
+    time.sleep(0.5)
+    process.send_signal(number)
+    assert process.wait(timeout=5) == 128 + number
+
+
+def launched(*arguments, script="train", **environment):
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / f"{script}.py"), *arguments],
+        env={**os.environ, **environment},
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+
+
+def is_caught(process, number):
+    """Whether a process has a handler for a signal."""
+    status = pathlib.Path(f"/proc/{process.pid}/status").read_text()
+    (mask,) = (line.split()[1] for line in status.splitlines() if line.startswith("SigCgt"))
+    return bool(int(mask, 16) >> number - 1 & 1)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_while_python_imports_a_signal_is_one_line(here, number):
+    process = launched(*TINY, "seconds=60")
+    while not is_caught(process, signal.SIGTERM) or not is_caught(process, number):
+        assert process.poll() is None
+        time.sleep(0.005)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 128 + number and out == ""
+    assert err == f"train.py: stopped by {number.name}\n"
+    assert not any(here.iterdir())
+
+
+def test_ctrl_c_while_compiling_is_no_missing_compiler(here):
+    """A terminal's Ctrl-C reaches the compiler as well, which then fails."""
+    compiler = here / "compiler"
+    lines = ["#!/bin/sh", '[ "$1" = --version ] && exit', "kill -INT $PPID", "exit 1"]
+    compiler.write_text("\n".join(lines) + "\n")
+    compiler.chmod(0o755)
+    cache = str(here / "cache")
+    process = launched(*TINY, "seconds=60", "folder=run", CXX=str(compiler), MEGASTEP_CACHE=cache)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "train.py: stopped by SIGINT\n")
+    assert not (here / "run").exists()
+
+
+def test_a_terminal_that_is_closed_while_filming_ends_every_process_with_one_line(here):
+    """Its signal reaches them all: this one, its workers, and what watches over these."""
+    filming = ["finish.record=true", "finish.steps=5000"]
+    process = launched(*TINY, f"samples={UPDATE}", "folder=run", *filming)
+    children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    while len(children.read_text().split()) < 2:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGHUP)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (129, "train.py: stopped by SIGHUP\n")
+
+
+def at_any_moment(here, seed):
+    """One run that gets a signal at a random time, and what has to hold whenever that is."""
+    draw = random.Random(seed)
+    number, folder = draw.choice(SIGNALS), here / str(seed)
+    process = launched(
+        *TINY, f"samples={8 * UPDATE}", "checkpoint_seconds=1e-9", f"folder={folder}", *WHOLE
+    )
+    time.sleep(draw.uniform(0.1, 12))
+    if draw.random() < 0.5:
+        os.killpg(process.pid, number)  # as a terminal does: workers get it, too
+    else:
+        process.send_signal(number)
+    out, err = process.communicate(timeout=60)
+    case = (seed, number.name, process.returncode, out, err)
+    if process.returncode == -number or (number == signal.SIGINT and "runpy" in err):
+        assert not folder.exists(), case  # before the script's first line
+        return
+    assert process.returncode in (0, 128 + number), case
+    assert not {"Traceback", "could not", "cannot", "warning"} & set(
+        err.replace(":", "").split()
+    ), case
+    if folder.exists() and "Training on" in out:
+        steps = [p.name for p in (folder / "checkpoints").glob("*")]
+        assert not any("tmp" in name for name in steps), case
+        if "Stopped after 0 samples" not in err:
+            assert checkpoint.load_latest(folder / "checkpoints").step > 0, case
+        assert not (folder / "lock").exists() and not list(folder.glob(".*")), case
+        for name in ("metrics.jsonl", "perf.jsonl"):
+            for line in (folder / name).read_text().splitlines():
+                json.loads(line)
+    elif process.returncode:
+        assert not folder.exists(), case
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(100))
+def test_at_whichever_moment_a_signal_comes_nothing_is_lost(here, seed):
+    at_any_moment(here, seed)

@@ -1,0 +1,430 @@
+"""Sweeps through Hydra's launchers and sweepers: what their jobs leave and return, what a failing
+job and a signal do. Jobs run an environment that pays a known return in milliseconds.
+"""
+
+import csv
+import dataclasses
+import json
+import logging
+import os
+import pathlib
+import pickle
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+import yaml
+
+from megastep.agents.cli import evaluate, gpus, run_folders, train
+from megastep.agents.cli import loader as loader_module
+from megastep.agents.cli import overrides as words_of
+from megastep.agents.cli.compose import ConfigLoader
+from megastep.agents.cli.errors import ConfigErrors
+from megastep.agents.cli.settings import GROUPS, Train
+from megastep.agents.cli.signals import Interrupted
+from megastep.agents.training import loggers
+
+ROOT = pathlib.Path(__file__).parents[2]
+PAYER = '''
+import os
+
+import torch
+
+from megastep import arrdict, spaces
+
+
+class Payer:
+    """Episodes of four steps, each of which pays `pay`; may fail as it is made."""
+
+    n_agents, fps = 1, 5.0
+    action_space, obs_space = spaces.MultiDiscrete(1, 2), spaces.MultiVector(1, 2)
+
+    def __init__(self, n_envs: int, *, device=None, pay: float = 1.0, mood: str = "fine"):
+        if mood == "cross":
+            raise RuntimeError("by chance")
+        if mood == "dead":
+            os._exit(3)
+        self.n_envs, self.device, self.pay = n_envs, torch.device(device or "cpu"), pay
+        self.age = torch.zeros(n_envs, dtype=torch.int32, device=self.device)
+
+    def reset(self):
+        return self._world(torch.ones_like(self.age, dtype=torch.bool))
+
+    def step(self, decision):
+        return self._world(self.age >= 4)
+
+    def _world(self, reset):
+        self.age.add_(1).masked_fill_(reset, 0)
+        obs = torch.zeros(self.n_envs, 1, 2, device=self.device)
+        reward = torch.full_like(self.age, self.pay, dtype=torch.float32).masked_fill(reset, 0.0)
+        terminal = torch.zeros_like(reset)
+        flags = dict(reset=reset, terminal=terminal, truncated=self.age >= 4)
+        return arrdict.arrdict(obs=obs, reward=reward, **flags)
+
+    def check(self):
+        pass
+'''
+UPDATE = 4 * 8  # samples
+SMALL = [
+    "env=payer:Payer",
+    "preset=cpu",
+    "env.n_envs=4",
+    "learner.n_steps=8",
+    "learner.n_minibatches=2",
+    "agent.width=8",
+    "device=cpu",
+    "log_every=1",
+]
+SHORT = [*SMALL, f"samples={2 * UPDATE}"]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    """An empty folder with the environment; what Hydra changes in the process is put back."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    (tmp_path / "payer.py").write_text(PAYER)
+    yield tmp_path
+    root = logging.getLogger()
+    for handler in list(root.handlers):
+        if type(handler) in (logging.StreamHandler, logging.FileHandler):
+            root.removeHandler(handler)
+    sys.modules.pop("payer", None)
+    GROUPS["env"].kind.cache_clear()
+
+
+def rows(folder):
+    """The lines of a sweep's table, for machines."""
+    with open(pathlib.Path(folder) / "sweep.csv") as file:
+        return list(csv.DictReader(file))
+
+
+def start(*words, **environment):
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / "train.py"), *words],
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+    )
+
+
+def finished(*words):
+    """(exit code, stdout, stderr)"""
+    process = start(*words)
+    out, err = process.communicate(timeout=120)
+    return process.returncode, out, err
+
+
+# ---- Hydra's own launcher and sweeper ----
+
+
+def test_a_sweep_leaves_a_folder_per_job_and_a_table(here, capsys):
+    words = [*SHORT, "-m", "seed=1,2", "env.pay=0.5,3", "finish.evaluate=true", "finish.episodes=4"]
+    assert train.main([*words, "hydra.sweep.dir=mine"]) == 0
+    found = rows("mine")
+    names = ["0_seed=1_env.pay=0.5", "1_seed=1_env.pay=3", "2_seed=2_env.pay=0.5"]
+    assert [pathlib.Path(row["folder"]).name for row in found[:3]] == names
+    assert all((here / "mine" / name / "checkpoints").is_dir() for name in names)
+    told = [(row["job"], row["seed"], row["env.pay"], row["state"]) for row in found]
+    assert told[1:3] == [("1", "1", "3", "done"), ("2", "2", "0.5", "done")]
+    for row in found:  # four steps of a known reward
+        numbers = [float(row[key]) for key in ("score", "evaluated", "lower", "upper")]
+        assert numbers == 4 * [4 * float(row["env.pay"])]
+    lines = (here / "mine" / "sweep.md").read_text().splitlines()
+    assert lines[0].startswith("| job | seed | env.pay | state | mean return | evaluated |")
+    assert "| 1 | 1 | 3 | done | 12.00 | 12.00 | 12.00 to 12.00 |" in lines[3]
+    config = yaml.safe_load((here / "mine" / names[0] / "config.yaml").read_text())
+    assert config["folder"] == f"mine/{names[0]}"
+    assert "sweep.md" in capsys.readouterr().out
+    assert run_folders.find("latest") == pathlib.Path("mine/3_seed=2_env.pay=3")
+
+
+@pytest.mark.parametrize("more", [[], ["hydra.sweeper.max_batch_size=1"]])
+def test_a_sweep_goes_past_failed_jobs_marks_them_and_exits_with_1(here, capsys, more):
+    words = [*SHORT, "-m", "env.mood=cross,fine,cross", "hydra.sweep.dir=mine", *more]
+    assert train.main(words) == 1
+    assert [row["state"] for row in rows("mine")] == [
+        "FAILED: RuntimeError: by chance",
+        "done",
+        "FAILED: RuntimeError: by chance",
+    ]
+    assert "Job 0 FAILED: RuntimeError: by chance" in capsys.readouterr().err
+    assert "by chance" in (here / "mine/0_env.mood=cross/error.txt").read_text()
+    assert not (here / "mine/0_env.mood=cross/checkpoints").exists()
+
+
+def test_a_sweep_that_is_wrong_leaves_nothing(here, capsys):
+    for words, told in (
+        (["seed=1,2", "learner.lr=1e-3,-1"], "learner.lr: -1 is out of range"),
+        (["seed=1,2", "folder=x"], "folder: each job of a sweep has a folder of its own; hydra.sw"),
+        (["hydra.launcher.n_job=3"], "hydra.launcher.n_job: no such key"),
+        (["hydra.sweep.dir=payer.py/x"], "payer.py/x cannot be made"),
+        (["hydra.sweeper.max_batch_size=0"], "The sweep cannot start: "),
+    ):
+        assert train.main([*SHORT, "-m", *words]) == 2
+        assert told in capsys.readouterr().err
+        left = {path.name for path in here.rglob("*")} - {"payer.py", "__pycache__"}
+        assert not {name for name in left if not name.startswith("payer.")}, words
+
+
+def test_sweeps_of_one_second_have_folders_of_their_own(here, monkeypatch):
+    monkeypatch.setattr(train, "run", lambda cfg: None)
+    monkeypatch.setattr(
+        "hydra.core.utils.datetime", type("Clock", (), {"now": staticmethod(lambda: NOON)})
+    )
+    for _ in range(2):
+        assert train.main([*SHORT, "-m", "seed=1,2"]) == 0
+    assert sorted(path.name for path in (here / "sweeps").iterdir()) == ["noon", "noon-2"]
+    assert len(list((here / "sweeps").glob("*/0_seed=1"))) == 2
+
+
+class NOON:
+    @staticmethod
+    def strftime(pattern):
+        return "noon"
+
+
+def test_a_folder_that_holds_a_run_is_no_jobs_again(here):
+    words = [*SHORT, "-m", "seed=1", "hydra.sweep.dir=mine"]
+    assert train.main(words) == 0
+    before = (here / "mine/0_default/metrics.jsonl").read_bytes()
+    assert train.main(words) == 1
+    (row,) = rows("mine")
+    assert "is not empty" in row["state"] and "resume=mine/0_default" in row["state"]
+    assert (here / "mine/0_default/metrics.jsonl").read_bytes() == before
+
+
+def test_in_a_folder_of_its_own_a_job_finds_what_paths_meant_at_the_start(here):
+    assert train.main([*SHORT, "folder=first", "hydra.job.chdir=true"]) == 0
+    assert os.getcwd() == str(here) and (here / "first/checkpoints").is_dir()
+    words = [*SHORT, "-m", "init=first", "seed=1,2", "hydra.job.chdir=true", "hydra.sweep.dir=mine"]
+    assert train.main(words) == 0
+    assert [row["state"] for row in rows("mine")] == ["done", "done"]
+    assert run_folders.find("latest") == here / "mine/1_seed=2"
+
+
+def test_a_single_runs_folder_is_hydras_too(here, capsys):
+    assert train.main([*SHORT, "hydra.run.dir=mine/first"]) == 0
+    assert (here / "mine/first/checkpoints").is_dir()
+    assert evaluate.main(["run=mine/first", "episodes=4", "hydra.run.dir=x"]) == 2
+    assert "hydra.run.dir: evaluate makes no folder" in capsys.readouterr().err
+
+
+def test_runs_of_a_sweep_are_a_group_of_wandbs(here, monkeypatch):
+    given = []
+    monkeypatch.setattr(
+        loggers.Loggers, "_open", lambda self, sink, *_, **known: given.append(known)
+    )
+    wandb = ["logger=wandb", "logger.mode=offline"]
+    assert train.main([*SHORT, *wandb, "-m", "seed=1", "hydra.sweep.dir=mine"]) == 0
+    assert train.main([*SHORT, *wandb, "-m", "seed=1", "hydra.sweep.dir=x", "logger.group=g"]) == 0
+    assert train.main([*SHORT, *wandb, "folder=alone"]) == 0
+    assert [known["group"] for known in given if "group" in known] == ["mine", "g", None]
+
+
+# ---- Other launchers and sweepers ----
+
+
+def test_joblib_runs_two_jobs_at_a_time(here):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
+    code, out, err = finished(*SHORT, "-m", "env.pay=1,2", *words)
+    assert code == 0 and "Traceback" not in err, err
+    assert [(row["env.pay"], float(row["score"])) for row in rows("mine")] == [("1", 4), ("2", 8)]
+    records = [json.loads(path.read_text()) for path in (here / "mine/.jobs").glob("*.json")]
+    assert len({record["process"] for record in records}) == 2
+    assert "job 0: Training on cpu in mine/0_env.pay=1" in out
+
+
+def test_a_signal_has_jobs_in_other_processes_save(here):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
+    process, deadline = start(*SMALL, "seconds=100", "-m", "seed=1,2,3", *words), time.time() + 60
+    while sum(path.stat().st_size > 0 for path in here.glob("mine/*/metrics.jsonl")) < 2:
+        assert process.poll() is None and time.time() < deadline, process.communicate()
+        time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 143 and err.splitlines()[-1] == "train.py: stopped by SIGTERM"
+    assert [row["state"][:11] for row in rows("mine")] == ["interrupted", "interrupted"]
+    assert len(list(here.glob("mine/*/checkpoints/step_*"))) == 2
+
+
+def test_optuna_looks_for_high_returns_and_goes_past_a_failed_trial(here):
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
+    words = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=4", "hydra.sweeper.n_jobs=1"]
+    words += ["hydra.sweeper.storage=sqlite:///study.db", "hydra.sweeper.study_name=pay"]
+    words += ["hydra.sweeper.sampler.seed=1", "env.pay=interval(0.5,8.0)", "env.mood=fine,cross"]
+    code = train.main([*SHORT, "-m", *words, "hydra.sweep.dir=mine"])
+    found = rows("mine")
+    assert len(found) == 4 and (here / "study.db").exists()
+    assert code == (1 if any(row["state"] != "done" for row in found) else 0)
+    scores = [float(row["score"]) for row in found if row["score"]]
+    assert scores and all(
+        float(row["score"]) == pytest.approx(4 * float(row["env.pay"]), rel=1e-5)
+        for row in found
+        if row["score"]
+    )
+    best = yaml.safe_load((here / "mine/optimization_results.yaml").read_text())
+    assert best["best_value"] == max(scores)
+    assert set(best["best_params"]) == {"env.pay", "env.mood"}
+
+
+def test_submitit_runs_a_job(here):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    code, _, err = finished(
+        *SHORT, "-m", "env.pay=2", "hydra/launcher=submitit_local", "hydra.sweep.dir=mine"
+    )
+    assert code == 0, err
+    (row,) = rows("mine")
+    assert (row["state"], float(row["score"])) == ("done", 8)
+    assert list((here / "mine/.submitit").rglob("*_log.out"))
+
+
+def test_a_job_whose_process_is_killed_is_marked(here):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
+    code, _, err = finished(*SHORT, "-m", "env.mood=dead", *words)
+    assert code == 1 and "The sweep ended early" in err and "Traceback" not in err
+    assert [row["state"] for row in rows("mine")] == ["FAILED: its process ended without a word"]
+
+
+# ---- Where jobs run ----
+
+
+def test_the_preset_is_chosen_where_the_job_runs(monkeypatch):
+    with ConfigLoader("train", Train) as loader:
+        monkeypatch.setattr(loader_module, "has_gpu", lambda device: False)
+        master = loader.compose(["seed=1,2"], loader_module.RunMode.MULTIRUN)
+        sent = pickle.loads(pickle.dumps((loader.loader, loader.check)))
+    monkeypatch.setattr(loader_module, "has_gpu", lambda device: device != "cpu")
+    job_loader, check = sent
+    for words, n_envs in ((["seed=1"], 4096), (["seed=1", "device=cpu"], 256)):
+        assert check(job_loader.load_sweep_config(master, words), words).env.n_envs == n_envs
+
+
+def test_jobs_of_one_machine_take_the_gpu_with_the_fewest_jobs(here, monkeypatch):
+    current = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "set_device", current.append)
+    jobs = [gpus.one_gpu(here, number) for number in range(6)]
+    assert [job.__enter__() for job in jobs[:5]] == [0, 1, 2, 0, 1]
+    jobs[1].__exit__(None, None, None)  # one job of two on GPU 1 ends
+    assert jobs[5].__enter__() == 1 and current[-1] == 1
+    for job in (jobs[0], *jobs[2:]):
+        job.__exit__(None, None, None)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with gpus.one_gpu(here, 0) as gpu:
+        assert gpu is None
+
+
+def test_errors_can_be_sent_between_processes():
+    errors = pickle.loads(pickle.dumps(ConfigErrors([("seed", "is missing")])))
+    assert errors.errors == [("seed", "is missing")] and "seed: is missing" in str(errors)
+    stop = pickle.loads(pickle.dumps(Interrupted(15, "saved")))
+    assert (stop.number, str(stop)) == (15, "saved")
+
+
+# ---- Names and scores ----
+
+
+def test_a_job_is_named_by_what_varies_in_characters_that_are_left_alone():
+    typed = [
+        "seed=1,2",
+        "learner.lr=4",
+        "+keep_checkpoints=3",
+        "env=minimal",
+        "learner.lr=range(1,3)",
+    ]
+    fixed = words_of.fixed_keys(typed)
+    assert fixed == ["keep", "env"]
+    words = [
+        "++learner.lr=2",
+        "keep_checkpoints=3",
+        "env=minimal",
+        "geometry=a/b:C",
+        'init="x y"',
+        "hydra.a=1",
+    ]
+    values = words_of.varied(words, fixed)
+    assert values == {"learner.lr": "2", "geometry": "a/b:C", "init": "x y"}
+    assert words_of.name_of(values) == "learner.lr=2_geometry=a-b-C_init=x-y"
+    assert words_of.name_of({}) == "default"
+    assert len(words_of.name_of({"folder": 1000 * "ü"}).encode()) <= 200
+
+
+def test_the_score_of_a_run_is_the_mean_of_its_last_reports(here):
+    lines = [{"samples": n, "episode/return": float(n)} for n in range(1, 13)]
+    lines.insert(5, {"samples": 5, "loss/value": 1.0})
+    (here / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert run_folders.mean_return(here) == 7.5  # of 3 to 12
+    assert run_folders.mean_return(here / "nowhere") is None
+
+
+# ---- A folder of one's own; shells ----
+
+
+def test_a_folder_of_ones_own_adds_groups_members_and_files(here, capsys):
+    files = {
+        "env/mine.yaml": "name: payer:Payer\npay: 7\n",
+        "size/small.yaml": "# @package _global_\nagent:\n  width: 8\n",
+        "whole.yaml": "defaults:\n  - train\n  - override env: mine\n  - _self_\nseed: 5\n",
+    }
+    for name, text in files.items():
+        (here / "conf" / name).parent.mkdir(parents=True, exist_ok=True)
+        (here / "conf" / name).write_text(text)
+
+    def printed(*words):
+        assert train.main(["--config-dir", "conf", *words]) == 0
+        return capsys.readouterr().out
+
+    tree = yaml.safe_load(printed("env=mine", "+size=small", "--cfg", "job"))
+    assert (tree["env"]["pay"], tree["agent"]["width"]) == (7, 8)
+    tree = yaml.safe_load(printed("--config-name", "whole", "--cfg", "job"))
+    assert (tree["env"]["pay"], tree["seed"]) == (7, 5)
+    lines = printed("--help").splitlines()
+    assert any(line.startswith("  env ") and " mine," in line for line in lines)
+    assert any(line.split() == ["size", "small"] for line in lines)
+    words = ["--config-dir", "conf", *SHORT[1:], "-m", "env=mine", "+size=small", "seed=1"]
+    assert train.main([*words, "hydra.sweep.dir=mine"]) == 0
+    assert float(rows("mine")[0]["score"]) == 28
+    for words, told in (
+        (["-cd", "conf", "env=mien"], "did you mean mine?"),
+        (["-cd", "conf", "size=small"], "size: has no default; +size= adds it"),
+        (["-cd", "conf", "+siz=small"], "siz: no such key; did you mean size?"),
+        (["-cd", "nowhere"], "There is no folder nowhere"),
+        (["-cn", "nowhere"], "nowhere: is in no folder that is searched"),
+    ):
+        assert train.main(words) == 2
+        assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "line, expected",
+    [
+        ("env=ex", "env=explorer"),
+        ("learner.la", "learner.lambda_="),
+        ("env=minimal env.long", "env.longest="),
+        ("hydra.sweep.d", "hydra.sweep.dir="),
+        ("-m hydra/launcher=ba", "hydra/launcher=basic"),
+        ("folder=./pay", "folder=./payer.py"),
+        ("env=explorr learner.la", ""),
+    ],
+)
+def test_a_shell_completes_words(monkeypatch, capsys, line, expected):
+    monkeypatch.setenv("COMP_LINE", f"python train.py {line}")
+    assert train.main(["-sc", "query=bash"]) == 0
+    assert capsys.readouterr().out.strip() == expected
+
+
+def test_a_run_that_is_not_in_a_sweep_has_no_group():
+    with ConfigLoader("train", Train) as loader:
+        settings = loader.settings(["logger=wandb"])
+    assert dataclasses.asdict(settings.logger)["group"] is None

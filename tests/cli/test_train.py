@@ -1,0 +1,567 @@
+"""Training, in this process: the configuration is composed as the command line does it, the
+environments are four boxes.
+"""
+
+import contextlib
+import itertools
+import json
+import os
+import pathlib
+import re
+import shlex
+import signal
+import time
+
+import pytest
+import torch
+import yaml
+
+from megastep import engine, envs
+from megastep.agents.algorithms import ppo
+from megastep.agents.algorithms.nonfinite import nonfinite_leaf
+from megastep.agents.cli import evaluate, factory, train
+from megastep.agents.cli.build import build
+from megastep.agents.cli.compose import ConfigLoader
+from megastep.agents.cli.errors import ConfigErrors, UserError
+from megastep.agents.cli.lock import locked
+from megastep.agents.cli.settings import Train
+from megastep.agents.cli.signals import Interrupted
+from megastep.agents.training import checkpoint, loggers
+from megastep.settings import MAX_ENVS
+from tests.helpers import faults, tiny
+
+TINY = [*tiny.TINY, *tiny.SHORT_EPISODES, "log_every=1"]
+UPDATE = tiny.UPDATE
+
+
+def configured(*overrides, tiny=TINY):
+    """The settings as train.main makes them."""
+    overrides = [*tiny, *overrides]
+    with ConfigLoader("train", Train, train.prepared) as loader:
+        return build(Train, loader.tree(overrides))
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def only_run(here):
+    """The one run folder there is."""
+    (folder,) = (path for path in (here / "runs").iterdir() if path.is_dir())
+    return folder
+
+
+def weights(folder):
+    return checkpoint.load_latest(folder / "checkpoints").state["policy"]
+
+
+def same(a, b):
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_a_run_leaves_what_it_promises(here):
+    folder = train.run(configured(f"samples={3 * UPDATE}"))
+    assert folder.parent.name == "runs" and "minimal-box-1" in folder.name
+    assert {path.name for path in folder.iterdir()} == {
+        "config.yaml",
+        "checkpoints",
+        "tensorboard",
+        "metrics.jsonl",
+        "perf.jsonl",
+        "curves.png",
+    }
+    written = build(Train, yaml.safe_load((folder / "config.yaml").read_text()))
+    assert written == train.settled(configured(f"samples={3 * UPDATE}"))
+    rows = loggers.read(folder / "metrics.jsonl")
+    assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
+    assert [row["updates"] for row in rows] == [1, 2, 3]
+    # episodes of 5 to 9 steps, and one step for the reset: two or three episodes end in 24 steps of
+    # each of 4 lanes
+    assert 8 <= sum(row["episode/count"] for row in rows) <= 16
+    assert all(5 <= row["episode/length"] <= 9 for row in rows if row["episode/count"])
+    assert not any("perf" in name for row in rows for name in row)
+    assert "perf/rate" in loggers.read(folder / "perf.jsonl")[-1]
+    loaded = checkpoint.load_latest(folder / "checkpoints")
+    assert loaded.step == loaded.state["samples"] == 3 * UPDATE
+    assert loaded.config["spaces"]["obs"].startswith("MultiImage")
+
+
+def test_a_seed_determines_a_run_and_another_changes_it(here):
+    folders = [train.run(configured("samples=100", f"seed={seed}")) for seed in (1, 1, 2)]
+    one, again, other = [(folder / "metrics.jsonl").read_bytes() for folder in folders]
+    assert one == again != other
+    assert same(weights(folders[0]), weights(folders[1])) and not same(
+        weights(folders[0]), weights(folders[2])
+    )
+
+
+def test_seconds_stop_a_run_and_a_report_comes_every_so_many_updates(here):
+    folder = train.run(configured("seconds=0.5", "log_every=2"))
+    updates = [row["updates"] for row in loggers.read(folder / "metrics.jsonl")]
+    assert updates == list(range(2, len(updates) * 2 + 1, 2))
+    assert 0.5 <= checkpoint.load_latest(folder / "checkpoints").state["seconds"] < 5
+
+
+def test_a_run_goes_on_under_its_own_configuration(here):
+    folder = train.run(configured(f"samples={2 * UPDATE}", "learner.lr=0.123"))
+    cfg = configured(f"resume={folder}", f"samples={4 * UPDATE}", tiny=[])
+    assert cfg.learner.lr == 0.123 and cfg.env.n_envs == 4
+    assert train.run(cfg) == folder
+    rows = loggers.read(folder / "metrics.jsonl")
+    assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE, 4 * UPDATE]
+    assert [row["updates"] for row in rows] == [1, 2, 3, 4]
+    assert yaml.safe_load((folder / "config.yaml").read_text())["samples"] == 4 * UPDATE
+
+
+def test_episodes_start_anew_when_a_run_goes_on(here):
+    # every episode lasts 9 steps, and 8 are left over from the first rollout
+    folder = train.run(configured(f"samples={UPDATE}", "env.shortest=9", "env.longest=9"))
+    train.run(configured(f"resume={folder}", f"samples={5 * UPDATE}", tiny=[]))
+    rows = loggers.read(folder / "metrics.jsonl")
+    assert [row["episode/length"] for row in rows if row["episode/count"]] == [9, 9, 9]
+
+
+def test_episodes_that_ended_before_a_run_was_stopped_are_reported_when_it_goes_on(here):
+    lengths = "env.shortest=7", "env.longest=7"
+    folder = train.run(configured(f"samples={UPDATE}", "log_every=2", *lengths))
+    train.run(configured(f"resume={folder}", f"samples={2 * UPDATE}", tiny=[]))
+    (row,) = loggers.read(folder / "metrics.jsonl")
+    assert row["episode/count"] == 2 * 4 and row["episode/length"] == 7
+
+
+def clock_jumps(monkeypatch, seconds):
+    """From its 12th reading on, in the first updates of a run, the clock shows so much more."""
+    readings = itertools.count()
+    monkeypatch.setattr(
+        time, "monotonic", lambda: 1e-3 * (n := next(readings)) + seconds * (n >= 12)
+    )
+
+
+def test_the_learning_rate_falls_over_samples_where_both_budgets_are_given(here, monkeypatch):
+    clock_jumps(monkeypatch, 900)  # most of the seconds are gone before most of the samples are
+    lr, n = 0.01, 4
+    folder = train.run(configured(f"samples={n * UPDATE}", "seconds=1000", f"learner.lr={lr}"))
+    rows = loggers.read(folder / "metrics.jsonl")
+    assert [row["lr"] for row in rows] == pytest.approx([lr * (1 - i / n) for i in range(n)])
+    assert {row["anneal"] for row in rows} == {"samples"}
+    written = yaml.safe_load((folder / "config.yaml").read_text())
+    assert written["learner"]["anneal"] == "samples"
+
+
+def test_a_seed_determines_the_file_whatever_the_clock_shows(here, monkeypatch):
+    files = []
+    for seconds in (0, 900):
+        clock_jumps(monkeypatch, seconds)
+        folder = train.run(configured(f"samples={4 * UPDATE}", "seconds=1000"))
+        files.append((folder / "metrics.jsonl").read_bytes())
+    assert files[0] == files[1]
+
+
+def test_the_learning_rate_falls_over_seconds_where_they_are_the_only_budget(here):
+    folder = train.run(configured("seconds=0.3"))
+    rows = loggers.read(folder / "metrics.jsonl")
+    assert rows[0]["lr"] > rows[-1]["lr"] and {row["anneal"] for row in rows} == {"seconds"}
+    written = yaml.safe_load((folder / "config.yaml").read_text())
+    assert written["learner"]["anneal"] == "seconds"
+
+
+def test_a_learning_rate_cannot_fall_over_a_budget_that_is_not_given(here):
+    with pytest.raises(ConfigErrors, match="learner.anneal: is samples: .* which are not given"):
+        configured("seconds=1", "learner.anneal=samples")
+
+
+def test_what_is_learnt_cannot_change_when_a_run_goes_on(here):
+    folder = train.run(configured("samples=1"))
+    with pytest.raises(ConfigErrors) as error:
+        configured(f"resume={folder}", "learner.lr=1", "env=explorer", "finish.episodes=3", tiny=[])
+    assert {key for key, _ in error.value.errors} == {"learner.lr", "env"}
+    assert "init=RUN" in str(error.value)
+
+
+def test_a_damaged_checkpoint_is_named_and_the_run_goes_on_from_the_one_before(here):
+    folder = train.run(configured(f"samples={2 * UPDATE}", "checkpoint_seconds=1e-9"))
+    os.truncate(folder / "checkpoints" / f"step_{2 * UPDATE}" / "state.pt", 50)
+    with pytest.warns(
+        UserWarning, match=f"step_{2 * UPDATE} is damaged.*using step_{UPDATE} instead"
+    ):
+        train.run(configured("resume=latest", tiny=[]))
+    assert [row["samples"] for row in loggers.read(folder / "metrics.jsonl")] == [
+        UPDATE,
+        2 * UPDATE,
+    ]
+    assert checkpoint.load_latest(folder / "checkpoints").step == 2 * UPDATE
+
+
+def test_going_back_to_an_earlier_checkpoint_leaves_no_hole_in_the_metrics(here):
+    folder = train.run(
+        configured(f"samples={4 * UPDATE}", "checkpoint_seconds=1e-9", "keep_checkpoints=9")
+    )
+    before = (folder / "metrics.jsonl").read_bytes()
+    first = folder / "checkpoints" / f"step_{UPDATE}"
+    train.run(configured(f"resume={first}", f"samples={2 * UPDATE}", tiny=[]))
+    assert checkpoint.load_latest(folder / "checkpoints").step == 2 * UPDATE
+    train.run(configured("resume=latest", f"samples={5 * UPDATE}", tiny=[]))
+    rows = loggers.read(folder / "metrics.jsonl")
+    assert [row["samples"] for row in rows] == [n * UPDATE for n in (1, 2, 3, 4, 5)]
+    assert (folder / "metrics.jsonl").read_bytes().startswith(before[: len(before) // 4])
+    assert checkpoint.load_latest(folder / "checkpoints").step == 5 * UPDATE
+
+
+def test_a_run_that_goes_back_and_is_lost_before_it_saves_goes_on_from_there(here, monkeypatch):
+    folder = train.run(
+        configured(f"samples={3 * UPDATE}", "checkpoint_seconds=1e-9", "keep_checkpoints=9")
+    )
+    first = folder / "checkpoints" / f"step_{UPDATE}"
+    with monkeypatch.context() as patch:
+        patch.setattr(train.Trainer, "train", lambda *_: None)  # as if killed at once
+        train.run(configured(f"resume={first}", tiny=[]))
+    assert [row["samples"] for row in loggers.read(folder / "metrics.jsonl")] == [UPDATE]
+    assert checkpoint.load_latest(folder / "checkpoints").step == UPDATE
+
+
+def test_a_new_run_can_start_from_the_weights_of_another(here):
+    first = train.run(configured("samples=1"))
+    second = train.run(configured("samples=1", "learner.lr=1e-12", f"init={first}", "seed=2"))
+    name = next(name for name in weights(first) if "weight" in name)
+    torch.testing.assert_close(weights(first)[name], weights(second)[name], atol=1e-6, rtol=0)
+    assert checkpoint.load_latest(second / "checkpoints").step == UPDATE  # it counts from zero
+
+
+def test_weights_of_another_environment_are_refused_with_both_shapes(here):
+    first = train.run(configured("samples=1"))
+    with pytest.raises(UserError, match=r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)"):
+        train.run(configured("samples=1", f"init={first}", "env.res=16"))
+    with pytest.raises(UserError, match="is .*8.* and should be .*16.*; choose the agent"):
+        train.run(configured("samples=1", f"init={first}", "agent.width=16"))
+    assert only_run(here) == here / first  # the refused runs left nothing behind
+
+
+def test_a_run_of_several_layers_is_saved_evaluated_and_resumed(here):
+    run = train.run(configured("agent.core=mingru", "agent.layers=2", "samples=1"))
+    assert {"core.0.input.weight", "core.1.input.weight"} <= set(weights(run))
+    assert evaluate.main([f"run={run}", "episodes=4"]) == 0
+    train.run(configured(f"resume={run}", f"samples={2 * UPDATE}", tiny=[]))
+    assert checkpoint.load_latest(run / "checkpoints").step == 2 * UPDATE
+    for layers, odd in (1, "core.input.weight is absent"), (3, "core.2.input.weight is absent"):
+        with pytest.raises(UserError, match=f"do not fit this agent: {odd} and should be"):
+            train.run(configured(f"init={run}", "samples=1", f"agent.layers={layers}"))
+
+
+def test_a_layer_too_many_is_refused(here):
+    run = train.run(configured("agent.core=mingru", "agent.layers=3", "samples=1"))
+    with pytest.raises(UserError, match=r"core.2.input.weight is \(16, 8\) and should be absent"):
+        train.run(configured(f"init={run}", "samples=1", "agent.layers=2"))
+
+
+def test_a_run_that_a_signal_stopped_goes_on(here, monkeypatch, capsys):
+    real = loggers.Loggers.write
+
+    def write(self, step, *values):
+        real(self, step, *values)
+        if step == 2 * UPDATE:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(loggers.Loggers, "write", write)
+    assert train.main([*TINY, "seconds=20", 'folder="r n ü"']) == 143
+    (command,) = re.findall("To go on: python train.py (.*)", capsys.readouterr().err)
+    assert train.main([*shlex.split(command), f"samples={3 * UPDATE}"]) == 0
+    rows = loggers.read(here / "r n ü" / "metrics.jsonl")
+    assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
+    assert checkpoint.load_latest(here / "r n ü" / "checkpoints").step == 3 * UPDATE
+
+
+def test_a_budget_that_is_spent_is_told_and_nothing_changes(here, capsys):
+    folder = train.run(configured(f"samples={2 * UPDATE}", "seconds=600"))
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    capsys.readouterr()
+    for more, told in (
+        ([], "samples: the run has had 64 of 64; to go on, give samples= more"),
+        (["samples=40"], "samples: the run has had 64 of 40; to go on, give samples= more"),
+        (
+            ["samples=9e3", "seconds=1e-9"],
+            "seconds: .* of 1e-09; to go on, give seconds= more",
+        ),
+    ):
+        assert train.main([f"resume={folder}", *more]) == 2
+        assert re.search(told, capsys.readouterr().err)
+    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    assert train.main([f"resume={folder}", f"samples={3 * UPDATE}"]) == 0
+
+
+def test_the_latest_run_is_the_one_trained_last_not_evaluated_last(here):
+    first = train.run(configured("samples=1"))
+    second = train.run(configured("samples=1", "seed=2"))
+    assert evaluate.main([f"run={first}", "episodes=2", "device=cpu"]) == 0
+    assert train.run(configured("resume=latest", f"samples={2 * UPDATE}", tiny=[])) == second
+    assert train.run(configured(f"resume={first}", f"samples={2 * UPDATE}", tiny=[])) == first
+    assert train.run(configured("resume=latest", f"samples={3 * UPDATE}", tiny=[])) == first
+
+
+def test_a_second_training_in_one_folder_is_refused_and_harms_nothing(here, capsys):
+    folder = train.run(configured("samples=1"))
+    (here / "new").mkdir()
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    for name, words in ((folder, [f"resume={folder}", "samples=99"]), ("new", ["folder=new"])):
+        with locked(here / name):
+            capsys.readouterr()
+            assert train.main([*(TINY if name == "new" else []), *words]) == 2
+            (sentence,) = capsys.readouterr().err.splitlines()
+            assert "in use by process" in sentence or "is not empty" in sentence
+    assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_environment(
+    here, monkeypatch, capsys
+):
+    real = train.Trainer.report
+
+    def report(self, losses):
+        real(self, losses)
+        self.env.core.agents.positions[2] = float("nan")
+
+    monkeypatch.setattr(train.Trainer, "report", report)
+    assert train.main([*TINY, "seconds=20", "folder=run"]) == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert "environment 2" in sentence and "not a finite number" in sentence and "run" in sentence
+    assert len(loggers.read(here / "run" / "metrics.jsonl")) == 1
+
+
+def inject(monkeypatch, name, step, value, lane=2):
+    """In the environment's `step`-th step and, if it is given as a range, in others, a lane's
+    number is another.
+    """
+    real, steps = envs.Minimal.step, itertools.count(1)
+    faulty = step if isinstance(step, range) else [step]
+
+    def with_fault(self, decision):
+        world = real(self, decision)
+        if next(steps) in faulty:
+            world[name][lane] = value
+        return world
+
+    monkeypatch.setattr(envs.Minimal, "step", with_fault)
+
+
+@pytest.mark.parametrize("value", [float("nan"), 1e30])
+@pytest.mark.parametrize("name", ["reward", "obs"])
+def test_a_number_that_is_not_finite_is_named_and_the_exit_code_says_so(
+    here, monkeypatch, capsys, name, value
+):
+    inject(monkeypatch, name, step=13, value=value)
+    assert train.main([*TINY, f"samples={8 * UPDATE}", "folder=run"]) == 1
+    warning, sentence = capsys.readouterr().err.splitlines()
+    named = f"{name} of lane 2 was {'inf' if name == 'obs' and value > 0 else f'{value:g}'} at step"
+    assert named in warning and named in sentence
+    rows = loggers.read(here / "run" / "metrics.jsonl")
+    assert [row["loss/skipped_steps"] for row in rows] == [0, 2, 0, 0, 0, 0, 0, 0]
+    loaded = checkpoint.load_latest(here / "run" / "checkpoints")
+    assert loaded.step == 8 * UPDATE and nonfinite_leaf(loaded.state) is None
+
+
+def test_numbers_that_are_never_finite_end_a_run_with_one_sentence(here, monkeypatch, capsys):
+    inject(monkeypatch, "reward", step=range(17, 10**6), value=float("nan"))
+    assert train.main([*TINY, "seconds=60", "folder=run", "log_every=8"]) == 1
+    _, sentence = capsys.readouterr().err.splitlines()
+    assert "The last 22 updates were skipped" in sentence and "reward of lane 2 was nan" in sentence
+    loaded = checkpoint.load_latest(here / "run" / "checkpoints")
+    assert loaded.step == 24 * UPDATE and nonfinite_leaf(loaded.state) is None
+    monkeypatch.undo()
+    monkeypatch.chdir(here)
+    assert train.main(["resume=run", f"samples={26 * UPDATE}"]) == 0
+
+
+def test_a_learning_rate_that_is_too_large_ends_a_run_with_advice(here, capsys):
+    assert (
+        train.main([*TINY, "learner.lr=1e3", "seconds=60", "checkpoint_seconds=1e-9", "folder=run"])
+        == 1
+    )
+    sentence = capsys.readouterr().err.splitlines()[-1]
+    assert "the policy diverged, so try a learning rate smaller than 1000" in sentence
+    assert len(loggers.read(here / "run" / "metrics.jsonl")) < 100
+    assert nonfinite_leaf(checkpoint.load_latest(here / "run" / "checkpoints").state) is None
+
+
+def test_memory_that_runs_out_is_one_sentence_and_the_run_can_go_on(here, monkeypatch, capsys):
+    real = ppo.PPO.update
+
+    def update(self, rollout):
+        if self.check.record[0] == 2:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nMore")
+        return real(self, rollout)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo.PPO, "update", update)
+        assert train.main([*TINY, "seconds=60", "folder=run"]) == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert "out of memory" in sentence and f"All {2 * UPDATE} samples are saved" in sentence
+    assert "python train.py resume=run" in sentence
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step == 2 * UPDATE
+    assert train.main(["resume=run", f"samples={3 * UPDATE}"]) == 0
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step == 3 * UPDATE
+
+
+def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, monkeypatch):
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch, pytest.warns(UserWarning) as caught:
+        patch.setattr(checkpoint, "save", full)
+        with pytest.raises(
+            UserError, match="could not be saved .No space left on device.*MB are free"
+        ):
+            train.run(configured(f"samples={3 * UPDATE}", "checkpoint_seconds=1e-9"))
+    assert len([w for w in caught if "could not be saved" in str(w.message)]) == 1
+    assert len(loggers.read(only_run(here) / "metrics.jsonl")) == 3
+
+
+def test_on_a_disk_that_fills_up_training_goes_on_and_the_last_checkpoint_stays(
+    here, monkeypatch, capsys
+):
+    real, full = train.Trainer.report, contextlib.ExitStack()
+
+    def report(self, losses):
+        real(self, losses)
+        if self.updates == 2:  # the first checkpoint is written
+            full.enter_context(faults.full_disk(5000))
+
+    with full, monkeypatch.context() as patch:
+        patch.setattr(train.Trainer, "report", report)
+        code = train.main([*TINY, f"samples={5 * UPDATE}", "checkpoint_seconds=1e-9", "folder=run"])
+    warning, *others, error = capsys.readouterr().err.splitlines()
+    assert code == 2 and all("curves.png" in line for line in others)
+    assert "at 64 samples could not be saved (File too large)" in warning
+    assert "at 160 samples could not be saved" in error and "MB are free in run" in error
+    assert len(loggers.read(here / "run" / "metrics.jsonl")) == 5
+    assert train.main(["resume=run"]) == 0
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step == 5 * UPDATE
+
+
+def test_a_disk_that_is_free_again_gets_the_checkpoint(here, monkeypatch):
+    real, calls = checkpoint.save, []
+
+    def save(*arguments):
+        calls.append(arguments)
+        if len(calls) == 1:
+            raise OSError(28, "No space left on device")
+        return real(*arguments)
+
+    monkeypatch.setattr(checkpoint, "save", save)
+    with pytest.warns(UserWarning, match="tries again"):
+        folder = train.run(configured(f"samples={3 * UPDATE}", "checkpoint_seconds=1e-9"))
+    assert checkpoint.load_latest(folder / "checkpoints").step == 3 * UPDATE
+
+
+def test_an_environment_that_cannot_be_made_leaves_no_folder(here, tmp_path):
+    (tmp_path / "bad.npz").write_bytes(b"no archive")
+    assert train.main([*TINY, "geometry=files", "geometry.path=bad.npz"]) == 2
+    assert train.main([*TINY, "geometry=files", "geometry.path=absent.npz"]) == 2
+    assert not any((here / "runs").iterdir())
+
+
+def test_settings_of_an_environment_that_contradict_each_other_are_one_sentence(here, capsys):
+    explorer = [word for word in TINY if "est=" not in word] + ["env=explorer", "env.subsample=3"]
+    elsewhere = [word for word in TINY if "est=" not in word] + ["env=pointgoal"]
+    for words, told in (
+        ([*elsewhere, "env.nearest=40", "env.furthest=50"], "geometry 0 has no goal from 40 to 50"),
+        ([*elsewhere, "env.nearest=5", "env.furthest=2"], "nearest < furthest metres, but 5 and 2"),
+        ([*TINY, "env.shortest=10"], "shortest <= longest steps, but 10 and 9 were given"),
+        (explorer, "subsample must divide the 8 rays of the screen, but 3 was given"),
+    ):
+        assert train.main(words) == 2
+        (sentence,) = capsys.readouterr().err.splitlines()
+        assert told in sentence and not any((here / "runs").iterdir())
+
+
+def test_too_many_environments_are_refused_with_the_number_that_fits(here, capsys):
+    assert train.main([*TINY, f"env.n_envs={MAX_ENVS}", "learner.n_steps=4096"]) == 2
+    told = re.search(
+        "67,108,864 environments need .* free on cpu: at most ([0-9,]+) fit",
+        capsys.readouterr().err,
+    )
+    assert 10 < int(told[1].replace(",", "")) < MAX_ENVS
+    assert not any((here / "runs").iterdir())
+
+
+@pytest.mark.parametrize("folder", ["file", "file/below", "/proc/run", "full"])
+def test_a_folder_that_cannot_be_used_is_one_sentence_before_anything_is_made(
+    here, monkeypatch, capsys, folder
+):
+    (here / "file").write_text("")
+    (here / "full").mkdir()
+    (here / "full" / "mine.txt").write_text("")
+    monkeypatch.setattr(train, "make_trainer", None)
+    assert train.main([*TINY, f"folder={folder}"]) == 2
+    error = capsys.readouterr().err.strip()
+    assert folder in error and "folder=" in error and "\n" not in error
+    assert (here / "full" / "mine.txt").exists()
+
+
+def test_an_unknown_run_names_the_nearest(here, capsys):
+    folder = train.run(configured("samples=1", "folder=runs/first"))
+    assert train.main(["resume=runs/frist"]) == 2
+    assert f"did you mean {folder}?" in capsys.readouterr().err
+    assert train.main(["resume=file"]) == 2
+
+
+def test_the_end_of_a_run_can_hold_a_table_and_a_video(here, capsys):
+    folder = train.run(
+        configured(
+            "samples=1",
+            "finish.evaluate=true",
+            "finish.episodes=4",
+            "finish.record=true",
+            "finish.steps=2",
+        )
+    )
+    (written,) = (folder / "evaluations").glob("*.json")
+    result = json.loads(written.read_text())
+    assert [row["agent"] for row in result["rows"]] == ["trained", "random"]
+    assert (folder / "video.mp4").stat().st_size > 1000
+    assert "random" in capsys.readouterr().out
+
+
+def test_interrupted_carries_the_signal():
+    assert Interrupted(signal.SIGTERM, "x").number == 15
+
+
+@pytest.mark.slow
+def test_a_long_run_leaks_neither_memory_nor_files(here, monkeypatch):
+    real, seen = train.Trainer.report, {}
+
+    def report(self, losses):
+        real(self, losses)
+        pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
+        seen[self.updates] = pages * 4096 / 1e6, len(os.listdir("/proc/self/fd"))
+
+    monkeypatch.setattr(train.Trainer, "report", report)
+    train.run(configured(f"samples={2000 * UPDATE}", "checkpoint_seconds=0.5"))
+    (early, files), (late, files_late) = seen[500], seen[2000]
+    assert late - early < 4 and files_late == files, seen  # megabytes in 1,500 updates
+
+
+def test_few_metrics_and_roles_are_shown_beside_the_return():
+    latest = {
+        "episode/return/leader": 12.345,
+        "episode/return/follower": 2.0,
+        "episode/coverage": 0.8371,
+        "episode/length": 9.0,
+    }
+    shown = train.few_means(latest, ["coverage"], ("leader", "follower", "follower"))
+    assert shown == ["leader 12.3", "follower 2", "coverage 0.837"]
+    assert train.few_means({}, ["coverage"], ()) == []
+    assert train.few_means(latest, ["coverage", *"abcd"], ()) == []
+
+
+def test_on_a_cpu_the_engine_takes_all_threads_and_a_small_network_one():
+    before = torch.get_num_threads()
+    try:
+        for width, expected in ((64, 1), (256, 2), (4096, 3)):
+            torch.set_num_threads(3)
+            engine.set_threads(None)
+            factory.share_threads(width)
+            assert (torch.get_num_threads(), engine.threads()) == (expected, 3)
+    finally:
+        torch.set_num_threads(before)
+        engine.set_threads(None)

@@ -1,0 +1,148 @@
+"""Errors that only the device can see: ids out of range and values that are not finite. A kernel
+never reads out of bounds for them; it raises a flag, and ``engine.check`` names the environment.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from megastep import core, engine, scene, toys
+from megastep.envs.pointgoal.goal_fields import GoalFields
+from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
+
+LAST = 3  # of four environments, so that they end where memory does
+
+
+def boxes(device, n_agents=1):
+    """Four environments of two layouts, whose agents stand apart in the middle of their box."""
+    geometries = [toys.box(4), toys.box(6)]
+    c = core.Core(scene.scenery(geometries, n_agents, n_envs=LAST + 1, device=device), res=32)
+    c.agents.positions[:] = 2 + torch.arange(n_agents, device=device)[:, None] / 2
+    c.agents.velocity.fill_(1.0)
+    return c
+
+
+def physics(c):
+    return engine.physics(c.scenery, c.agents).progress
+
+
+def render(c):
+    return engine.render(c.scenery, c.agents).distances
+
+
+def observe(c):
+    return engine.observe(c.scenery, c.agents, imu=True).depth
+
+
+def geometry(c):
+    engine.update_agent_geometry(c.scenery, c.agents)
+    return c.scenery.agent_light
+
+
+def unseen(c):
+    layouts = c.scenery.layouts
+    words = -(-layouts.max_texels // 32)
+    seen = torch.zeros((LAST + 1, c.n_agents, words), dtype=torch.int32, device=c.device)
+    visible = torch.full((len(layouts), words), -1, dtype=torch.int32, device=c.device)
+    return engine.unseen(c.scenery, c.agents, seen, visible)
+
+
+def coverage(c):
+    layouts, lanes = c.scenery.layouts, (LAST + 1, c.n_agents)
+    words = -(-layouts.max_texels // 32)
+    seen = torch.full((*lanes, words), 1, dtype=torch.int32, device=c.device)
+    visible = torch.full((len(layouts), words), -1, dtype=torch.int32, device=c.device)
+    mask = torch.ones(lanes, dtype=torch.bool, device=c.device)
+    return engine.coverage(c.scenery, c.agents, seen, visible, mask)
+
+
+def seek(c):
+    goals = GoalFields(
+        points=2 * [np.ones((1, 2))],
+        fields=2 * [np.arange(36, dtype=np.float16).reshape(1, 6, 6)],
+        origins=2 * [np.ones(2)],
+        spawns=2 * [np.ones((1, 2))],
+        lengths=2 * [np.ones((1, 1))],
+        allowed=2 * [np.ones((1, 1), bool)],
+        cell=1.0,
+        device=c.device,
+    )
+    n, on = (LAST + 1) * c.n_agents, dict(device=c.device)
+    chosen, ages, draws = (torch.zeros(n, dtype=torch.int32, **on) for _ in range(3))
+    found = pointgoal_step(
+        c.scenery,
+        c.agents,
+        goals,
+        chosen,
+        torch.zeros((PROGRESS_ROWS, n), **on),
+        ages,
+        torch.zeros(n, dtype=torch.bool, **on),
+        draws,
+        torch.zeros((LAST + 1, c.n_agents), dtype=torch.int32, **on),
+    )
+    return found.reward.view(LAST + 1, -1)
+
+
+def spawn(c):
+    n, a, device = c.scenery.n_envs, c.n_agents, c.scenery.device
+    mask = torch.ones((n, a), dtype=torch.bool, device=device)
+    points = torch.full((2, 4, 2), 2.5, device=device)
+    counts = torch.zeros((n, a), dtype=torch.int32, device=device)
+    engine.spawn(c.scenery, c.agents, mask, points, counts, seed=1)
+    return c.agents.positions
+
+
+@pytest.mark.parametrize("layout", [2, -1, 2**31 - 1, -(2**31)])
+@pytest.mark.parametrize("n_agents", [1, 3])
+@pytest.mark.parametrize(
+    "operation", [physics, render, observe, geometry, unseen, coverage, seek, spawn]
+)
+def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, layout, device):
+    expected = operation(boxes(device, n_agents))
+    c = boxes(device, n_agents)
+    c.scenery.layout[LAST] = layout
+    found = expected  # of the CPU, which raises before it can return anything
+    with pytest.raises(engine.EngineError, match=f"^Environment {LAST} .* layout"):
+        found = operation(c)
+        engine.check(c.agents)
+    assert torch.equal(found[:LAST], expected[:LAST])
+    c.scenery.layout[LAST] = 1
+    operation(c)
+    engine.check(c.agents)
+
+
+@pytest.mark.parametrize("operation", [physics, render, observe, unseen, seek])
+@pytest.mark.parametrize("field", ["positions", "angles"])
+def test_a_place_that_is_not_finite_is_named_by_whatever_reads_it(operation, field, device):
+    expected = operation(boxes(device, 2))
+    c = boxes(device, 2)
+    getattr(c.agents, field)[LAST, 1] = math.nan
+    found = expected
+    with pytest.raises(engine.EngineError, match=f"environment {LAST} .* not a finite number"):
+        found = operation(c)
+        engine.check(c.agents)
+    assert torch.equal(found[:LAST], expected[:LAST])
+
+
+@pytest.mark.parametrize("action", [7, -1, 2**40])
+def test_an_action_that_is_none_is_named(action, device):
+    c = boxes(device, 2)
+    moves = torch.zeros((7, 3), device=device)
+    actions = torch.zeros((LAST + 1, 2), dtype=torch.int64, device=device)
+    actions[2, 1] = action
+    with pytest.raises(engine.EngineError, match="environment 2 .* action"):
+        engine.physics(c.scenery, c.agents, actions, moves)
+        engine.check(c.agents)
+
+
+@pytest.mark.parametrize("field", ["positions", "angles", "velocity", "angvelocity"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_value_that_is_not_finite_is_named(value, field, device):
+    c = boxes(device, 2)
+    getattr(c.agents, field)[1] = value
+    with pytest.raises(engine.EngineError, match="environment 1 .* not a finite number"):
+        engine.physics(c.scenery, c.agents)
+        engine.check(c.agents)
+    engine.check(c.agents)

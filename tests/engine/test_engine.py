@@ -1,0 +1,198 @@
+"""The engine against the laws: the original's golden outputs, the brute-force twin on random
+environments, and the public pieces that `observe` fuses. Outputs are poisoned first.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from megastep import cuda, engine
+from megastep.modules import IMU, RGB, Depth
+from tests.helpers import compare, random_scenery
+from tests.helpers.outputs import Poison, seen_of
+
+
+def core_of(envs, device, **settings):
+    """A Core of a test's environments."""
+    core = cuda.Core(cuda.Scenery(**envs.scenery_arguments(), device=device), **settings)
+    for name in ("positions", "angles", "velocity", "angvelocity"):
+        getattr(core.agents, name).copy_(getattr(envs, name))
+    return core
+
+
+@pytest.fixture
+def poison(monkeypatch):
+    found = Poison(torch.empty)
+    monkeypatch.setattr(torch, "empty", found.allocate)
+    return found
+
+
+def state_of(core, physics):
+    agents = core.agents
+    return dict(
+        progress=physics.progress,
+        positions=agents.positions,
+        angles=agents.angles,
+        velocity=agents.velocity,
+        angvelocity=agents.angvelocity,
+    )
+
+
+def baked_and_rendered(core, poison):
+    """A render's fields, after a bake; all that either must write was poisoned."""
+    baked = core.scenery.layouts.baked.vals
+    baked.fill_(math.nan)
+    cuda.bake(core.scenery)
+    assert not baked.isnan().any(), "light that bake did not write"
+    poison.scenery(core.scenery)
+    r = cuda.render(core.scenery, core.agents)._asdict()
+    poison.check(**r, lines=core.scenery.agent_lines, light=core.scenery.agent_light)
+    return r
+
+
+# ---- Golden: what the original computed, within the tolerances its README gives ----
+
+
+@pytest.mark.parametrize("case", random_scenery.CASES)
+def test_golden(case, device, poison):
+    envs, settings, _ = random_scenery.golden(case)
+    core = core_of(envs, device, **settings)
+    r = baked_and_rendered(core, poison)
+    compare.check_golden(
+        case, dict(r, lines=core.scenery.lines.vals, baked=core.scenery.baked.vals)
+    )
+    physics = cuda.physics(core.scenery, core.agents)
+    poison.check(**physics._asdict())
+    compare.check_golden(case, state_of(core, physics))
+
+
+# ---- The twin: random environments, all degenerate cases ----
+
+VIEWS = [
+    dict(res=1, fov=130.0),
+    dict(res=64, fov=20.0),
+    dict(res=63, fov=130.0),
+    dict(res=256, fov=170.0),
+    dict(res=1024, fov=90.0),
+    dict(res=64, fov=70.0, cameras=(0.0, 120.0, 240.0)),
+]
+
+
+@pytest.mark.parametrize("n_agents", [1, 4])
+@pytest.mark.parametrize("view", VIEWS, ids=str)
+@pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
+def test_twin_render(view, n_agents, degenerate, device, poison):
+    for seed in range(2):
+        envs = random_scenery.random_environments(
+            seed,
+            n_agents=n_agents,
+            degenerate=degenerate,
+            res=view["res"],
+            fov=view["fov"],
+            origin=190.0 if seed else 1.0,
+        )
+        core = core_of(envs, device, **view)
+        r = baked_and_rendered(core, poison)
+        compare.check_render(r, envs, **view)
+        compare.check_baked(core.scenery.baked.vals, envs, static_only=False)
+
+
+@pytest.mark.parametrize("n_agents", [1, 4])
+@pytest.mark.parametrize("name", [None, *random_scenery.DEGENERATE, "overlap"])
+def test_twin_physics(name, n_agents, device, poison):
+    for seed in range(6):
+        envs = random_scenery.random_environments(
+            seed,
+            n_envs=16,
+            n_agents=n_agents,
+            degenerate=(name,) if name else (),
+            origin=190.0 if seed % 2 else 1.0,
+        )
+        core = core_of(envs, device)
+        physics = cuda.physics(core.scenery, core.agents)
+        poison.check(**physics._asdict())
+        compare.check_physics(state_of(core, physics), envs)
+
+
+def test_an_output_that_is_not_written_is_named(poison, monkeypatch):
+    """What the checks above would say of kernels that write nothing."""
+    core = core_of(random_scenery.random_environments(0), "cpu")
+    monkeypatch.setattr(engine, "launch", lambda *args, **kwargs: None)
+    outputs = [
+        cuda.render(core.scenery, core.agents),
+        cuda.physics(core.scenery, core.agents),
+        engine.observe(
+            core.scenery,
+            core.agents,
+            imu=True,
+            centre_line=True,
+            agent_ray=True,
+            seen=seen_of(core),
+        ),
+    ]
+    for output in outputs:
+        for name, tensor in output._asdict().items():
+            with pytest.raises(AssertionError, match=rf"wrote: {name}: {tensor.numel()}\b"):
+                poison.check(**{name: tensor})
+
+
+# ---- The fused pass is the composition of the public pieces ----
+
+
+@pytest.mark.parametrize("n_agents", [1, 3])
+@pytest.mark.parametrize("subsample", [1, 4])
+def test_observe_composes(n_agents, subsample, device, poison):
+    envs = random_scenery.random_environments(
+        5, n_envs=8, n_agents=n_agents, degenerate=random_scenery.EVERYTHING, res=64
+    )
+    core = core_of(envs, device, res=64)
+    cuda.bake(core.scenery)
+    seen = seen_of(core)
+    o = engine.observe(core.scenery, core.agents, subsample, imu=True, centre_line=True, seen=seen)
+    poison.check(**o._asdict())
+    r = cuda.render(core.scenery, core.agents)
+    # half a unit of fp16's last place, and the mean's rounding
+    assert torch.allclose(o.rgb.float(), RGB(core, subsample)(r)[:, :, :, 0], atol=6e-4), "rgb"
+    assert torch.allclose(o.depth.float(), Depth(core, subsample)(r)[:, :, 0, 0], atol=6e-4), (
+        "depth"
+    )
+    assert torch.equal(o.centre_line, r.indices[..., 32]), "centre_line"
+    assert torch.allclose(o.imu.float(), IMU(core)(), rtol=1e-3, atol=1e-6), "imu"
+    assert torch.equal(bits_seen(core, r), seen), "seen"
+    assert torch.equal(
+        torch.tensor(
+            [[bin(int(w) & 0xFFFFFFFF).count("1") for w in a] for e in seen.tolist() for a in e]
+        )
+        .sum(1)
+        .view(8, n_agents),
+        o.newly_seen.cpu().long(),
+    ), "newly_seen"
+    again = engine.observe(core.scenery, core.agents, subsample, seen=seen)
+    assert not again.newly_seen.any(), "a texel is new only once"
+    cleared = engine.observe(
+        core.scenery, core.agents, subsample, seen=seen, clear_mask=core.agent_full(True)
+    )
+    assert torch.equal(cleared.newly_seen, o.newly_seen), "a cleared mask starts anew"
+
+
+def bits_seen(core, r):
+    """What `seen` must hold after one view, from a full render, agent by agent."""
+    scenery, layouts = core.scenery, core.scenery.layouts
+    out = torch.zeros((core.n_envs, core.n_agents, -(-layouts.max_texels // 32)), dtype=torch.int64)
+    own, starts = scenery.agent_lines.shape[1], layouts.texel_starts.tolist()
+    for e in range(core.n_envs):
+        first = int(layouts.wall_starts[int(scenery.layout[e])])
+        for a in range(core.n_agents):
+            for line, location in zip(r.indices[e, a].tolist(), r.locations[e, a].tolist()):
+                if line >= own:
+                    wall = first + line - own
+                    width = starts[wall + 1] - starts[wall]
+                    texel = (
+                        starts[wall]
+                        - starts[first]
+                        + min(int(np.float32(location) * np.float32(width)), width - 1)
+                    )
+                    out[e, a, texel // 32] |= 1 << (texel % 32)
+    return torch.where(out >= 1 << 31, out - (1 << 32), out).int().to(core.device)

@@ -1,0 +1,97 @@
+"""The CPU's numbers are the GPU's, and one thread's are those of many, on every bit."""
+
+import pytest
+import torch
+
+from megastep import cuda, engine, scene
+from megastep.geometries import sample
+from megastep.modules import RandomSpawns, visible_texels
+from tests.helpers.outputs import seen_of
+
+
+def trajectory(device, n_agents, subsample=1, **settings):
+    """All tensors of a few steps in generated homes."""
+    homes = sample("homes", 8)
+    core = cuda.Core(scene.scenery(homes, n_agents, n_envs=24, device=device), **settings)
+    spawn, seen = RandomSpawns(homes, core), seen_of(core)
+    hide = RandomSpawns(homes, core, hidden=True, resample=True)
+    visible = visible_texels(core.scenery, spawn.points[:, :4])
+    random = torch.Generator().manual_seed(1)
+    moves = torch.tensor(
+        [(0, 0, 0), (3, 0, 0), (0, 3, 40), (9, 1, -40)], dtype=torch.float32, device=device
+    )
+    out = [core.scenery.layouts.baked.vals, visible]
+    for step in range(12):
+        some = torch.rand((24, n_agents), generator=random).to(device)
+        spawn(some < (1 if step == 0 else 0.1))
+        hide(some > 0.8)
+        actions = torch.randint(4, (24, n_agents), generator=random).to(device)
+        out += engine.physics(core.scenery, core.agents, actions, moves, 0.9)
+        out += engine.observe(
+            core.scenery,
+            core.agents,
+            subsample,
+            imu=True,
+            centre_line=True,
+            agent_ray=True,
+            seen=seen,
+        )
+        out.append(engine.unseen(core.scenery, core.agents, seen, visible))
+        mask = torch.rand((24, n_agents), generator=random).to(device) < 0.3
+        out.append(engine.coverage(core.scenery, core.agents, seen, visible, mask))
+    out += [
+        *engine.render(core.scenery, core.agents),
+        *engine.observe(core.scenery, core.agents, subsample, rgb=False)[1:2],
+        *engine.observe(core.scenery, core.agents, subsample, depth=False)[:1],
+        *(
+            core.agents.positions,
+            core.agents.angles,
+            core.scenery.agent_lines,
+            core.scenery.agent_light,
+            seen,
+        ),
+    ]
+    return [tensor.cpu() for tensor in out]
+
+
+def differing(a, b):
+    return [int(((x != y) & ~((x != x) & (y != y))).sum()) for x, y in zip(a, b, strict=True)]
+
+
+SETTINGS = [
+    dict(n_agents=1, res=64),
+    dict(n_agents=4, res=128, fov=70.0),
+    dict(n_agents=2, res=32, fov=90.0, cameras=[0, 120, 240]),
+    dict(
+        n_agents=1, res=256, subsample=4
+    ),  # the usual one; then batches that do not fill a warp, or lie across blocks
+    dict(n_agents=1, res=60, subsample=3),
+    dict(n_agents=2, res=160, subsample=5),
+    dict(n_agents=1, res=96, subsample=32),
+    dict(n_agents=1, res=63),
+]
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_cpu_and_gpu_agree_on_every_bit(settings):
+    assert not any(differing(trajectory("cpu", **settings), trajectory("cuda", **settings)))
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_gpus_agree_on_every_bit_whichever_is_current():
+    here, there = trajectory("cuda:0", n_agents=2, res=64), trajectory("cuda:1", n_agents=2, res=64)
+    assert torch.cuda.current_device() == 0 and not any(differing(here, there))
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_threads_do_not_matter(settings):
+    runs = []
+    try:
+        for n in (1, 2, 4):
+            engine.set_threads(n)
+            runs.append(trajectory("cpu", **settings))
+    finally:
+        engine.set_threads(None)
+    assert not any(differing(runs[0], runs[1])) and not any(differing(runs[0], runs[2]))

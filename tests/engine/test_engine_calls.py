@@ -1,0 +1,284 @@
+"""The engine's calls: facts to check on paper, bad input, and what a GPU must not wait for."""
+
+import math
+
+import pytest
+import torch
+
+from megastep import capture, cuda, engine, scene, toys
+from megastep.engine import devices
+from megastep.geometries import sample
+from megastep.modules import RandomSpawns
+from tests.helpers.outputs import seen_of
+
+# ---- Facts to check on paper ----
+
+
+def box(device, **settings):
+    core = cuda.Core(scene.scenery(2 * [toys.box()], n_agents=1, device=device), **settings)
+    core.agents.positions[:] = 3.0
+    return core
+
+
+def test_two_metres_from_a_wall_depth_reads_two_metres(device):
+    core = box(device, res=63)
+    core.agents.positions[:, :, 0] = 4.0
+    r = cuda.render(core.scenery, core.agents)
+    assert torch.allclose(r.distances[:, 0, 31].cpu(), torch.tensor(2.0), atol=1e-6)
+    o = engine.observe(core.scenery, core.agents)
+    assert abs(float(o.depth[0, 0, 31]) - (1 - (2 - engine.AGENT_RADIUS) / 10)) < 5e-4
+
+
+def test_depth_falls_to_0_at_max_depth_beyond_the_radius(device):
+    core = box(device, res=63)
+    core.agents.positions[:, :, 0] = 4.0
+    for max_depth, expected in ((4.0, 1 - (2 - engine.AGENT_RADIUS) / 4), (1.5, 0.0)):
+        o = engine.observe(core.scenery, core.agents, max_depth=max_depth)
+        assert abs(float(o.depth[0, 0, 31]) - expected) < 5e-4
+
+
+def test_the_tutorials_wall(device):
+    core = box(device)
+    core.agents.velocity[:] = torch.tensor([1000.0, 0.0])
+    p = cuda.physics(core.scenery, core.agents)
+    assert torch.allclose(core.agents.positions.cpu(), torch.tensor([5.8649, 3.0]), atol=1e-3)
+    assert not core.agents.velocity.any() and bool((p.progress < 1).all())
+
+
+@pytest.mark.parametrize("speed", [1.0, 10.0, 1000.0])
+def test_no_agent_leaves_a_closed_box(speed, device):
+    core = cuda.Core(scene.scenery([toys.box()], n_agents=1, n_envs=512, device=device))
+    core.agents.positions[:] = 3.5
+    random = torch.Generator().manual_seed(2)
+    for _ in range(200):
+        core.agents.velocity.copy_(speed * torch.randn((512, 1, 2), generator=random))
+        cuda.physics(core.scenery, core.agents)
+    clearance = torch.minimum(core.agents.positions - 1, 6 - core.agents.positions).amin()
+    assert float(clearance) >= engine.AGENT_RADIUS, "cameras stay on their side of the wall"
+
+
+def test_two_cores_live_side_by_side(device):
+    narrow, wide = box(device, res=16, fov=30.0), box(device, res=64, fov=150.0, cameras=[0, 180])
+    before = cuda.render(narrow.scenery, narrow.agents)
+    assert cuda.render(wide.scenery, wide.agents).screen.shape == (2, 1, 2, 64, 3)
+    after = cuda.render(narrow.scenery, narrow.agents)
+    assert before.screen.shape == (2, 1, 16, 3) and torch.equal(before.screen, after.screen)
+
+
+def test_layouts_are_shared(device):
+    scenery = scene.scenery([toys.box(), toys.column()], n_agents=1, n_envs=6, device=device)
+    assert scenery.layout.tolist() == [0, 1, 0, 1, 0, 1] and len(scenery.layouts) == 2
+    lines, textures, baked = scenery.lines, scenery.textures, scenery.baked
+    assert (
+        len(lines) == 6
+        and torch.equal(lines[1], lines[3])
+        and torch.equal(lines.vals[lines.starts[2] : lines.ends[2]], lines[2])
+    )
+    assert len(textures) == len(lines.vals) == len(baked) and torch.equal(lines[-1], lines[5])
+    wall = int(lines.starts[3]) + 8  # after the agent's eight
+    assert torch.equal(textures[wall], textures[int(lines.starts[1]) + 8]) and len(
+        baked[wall]
+    ) == len(textures[wall])
+    assert (
+        torch.equal(textures.vals[textures.inverse == wall], textures[wall])
+        and len(lines[1:3]) == 2
+    )
+
+
+def test_random_streams_are_philox(device):
+    """Against the published vector for key 0, counter 0 (Random123's kat_vectors)."""
+    counts = torch.zeros(1, dtype=torch.int32, device=device)
+    out = engine.uniform(
+        counts,
+        torch.ones(1, dtype=torch.bool, device=device),
+        0,
+        torch.zeros((1, 4), device=device),
+    )
+    words = (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)
+    assert out[0].tolist() == [(word >> 8) / 2**24 for word in words] and counts.tolist() == [1]
+
+
+def test_lanes_draw_where_they_are_masked(device):
+    counts = torch.tensor([5, 5, 5], dtype=torch.int32, device=device)
+    mask = torch.tensor([True, False, True], device=device)
+    out = engine.uniform(counts, mask, 3, torch.full((3, 4), -1.0, device=device))
+    assert counts.tolist() == [6, 5, 6] and (out[1] == -1).all() and (out[::2] >= 0).all()
+
+
+def test_seeds_that_differ_in_either_word_draw_differently(device):
+    drawn = [
+        engine.uniform(
+            torch.zeros(1, dtype=torch.int32, device=device),
+            torch.ones(1, dtype=torch.bool, device=device),
+            seed,
+            torch.zeros((1, 4), device=device),
+        )
+        for seed in (1, 2, 1 + (1 << 32))
+    ]
+    assert len(torch.cat(drawn).unique(dim=0)) == 3
+
+
+def test_an_action_damps_the_velocities_and_adds_its_move_in_the_agents_frame(device):
+    core = box(device)
+    core.agents.angles[:] = 90.0  # ahead is +y, left is -x
+    core.agents.velocity[:] = torch.tensor([2.0, 0.0])
+    core.agents.angvelocity[:] = 8.0
+    moves = torch.tensor([(0, 0, 0), (1, 0.5, 40)], dtype=torch.float32, device=device)
+    actions = torch.tensor([[0], [1]], device=device)
+    engine.physics(core.scenery, core.agents, actions, moves, damping=0.25)
+    expected = torch.tensor([[1.5, 0.0], [1.0, 1.0]])
+    assert torch.allclose(core.agents.velocity[:, 0].cpu(), expected, atol=1e-6)
+    assert core.agents.angvelocity.flatten().tolist() == [6.0, 46.0]
+    assert torch.allclose(core.agents.positions[:, 0].cpu(), 3 + expected / 10, atol=1e-6)
+
+
+def test_a_spawn_leaves_others_alone_and_layouts_too(device):
+    scenery = scene.scenery([toys.box(), toys.column()], 1, 8, device=device)
+    core = cuda.Core(scenery)
+    points = torch.full((2, 4, 2), 2.5, device=device)
+    mask = core.agent_full(True)
+    mask[::2] = False
+    counts = torch.zeros((8, 1), dtype=torch.int32, device=device)
+    engine.spawn(scenery, core.agents, mask, points, counts, seed=1)
+    assert core.agents.positions[:, 0, 0].tolist() == [0, 2.5] * 4
+    assert counts.flatten().tolist() == [0, 1] * 4 and scenery.layout.tolist() == [0, 1] * 4
+    for _ in range(8):
+        engine.spawn(scenery, core.agents, mask, points, counts, seed=1, resample=True)
+    assert scenery.layout[::2].tolist() == [0] * 4, "who does not respawn stays"
+    assert scenery.layout[1::2].unique().tolist() == [0, 1], "who does moves"
+
+
+def test_as_many_points_as_agents_are_enough(device):
+    core = cuda.Core(scene.scenery([toys.box()], 2, 1, device=device))
+    points = torch.tensor([[[2.0, 2.0], [4.0, 4.0]]], device=device)
+    counts = torch.zeros((1, 2), dtype=torch.int32, device=device)
+    engine.spawn(core.scenery, core.agents, core.agent_full(True), points, counts, seed=1)
+    assert sorted(core.agents.positions[0].tolist()) == [[2, 2], [4, 4]]
+
+
+# ---- Bad input ----
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [dict(res=0), dict(res=1025), dict(fov=180.0), dict(fov=0.0), dict(fps=0.0), dict(cameras=[])],
+    ids=str,
+)
+def test_bad_settings_are_refused(settings):
+    with pytest.raises(ValueError, match="but"):
+        box("cpu", **settings)
+
+
+@pytest.mark.parametrize("radius", [0.0, -1.0, math.nan, math.inf])
+def test_a_disc_needs_a_radius(radius):
+    with pytest.raises(ValueError, match="radius must be a number of metres above 0"):
+        engine.Agents(1, 1, radius=radius)
+
+
+@pytest.mark.parametrize("max_depth", [0.0, -1.0, math.nan])
+def test_depth_needs_a_range(max_depth):
+    core = box("cpu")
+    with pytest.raises(ValueError, match="max_depth must be a number of metres above 0"):
+        engine.observe(core.scenery, core.agents, max_depth=max_depth)
+
+
+def test_a_position_that_is_not_finite_is_named(device):
+    core = box(device)
+    core.agents.positions[1, 0, 0] = math.nan
+    with pytest.raises(engine.EngineError, match="environment 1 .* not a finite number"):
+        cuda.render(core.scenery, core.agents)
+        engine.check(core.agents)
+    core.agents.positions[:] = 3.0
+    cuda.render(core.scenery, core.agents)
+    engine.check(core.agents)
+
+
+@pytest.mark.parametrize(
+    "broken, found",
+    [
+        (lambda good: good.double(), r"a torch.float64 tensor of shape \(2, 1, 2\)"),
+        (lambda good: good[:1].clone(), r"a torch.float32 tensor of shape \(1, 1, 2\)"),
+        (lambda good: torch.stack([good, good], -1)[..., 0], "a non-contiguous torch.float32"),
+        (lambda good: None, "None was given"),
+    ],
+    ids=["dtype", "shape", "not contiguous", "None"],
+)
+def test_wrong_tensors_are_named(broken, found):
+    core = box("cpu")
+    good = core.agents.positions
+    core.agents.positions = broken(good)
+    with pytest.raises((TypeError, ValueError), match=f"agents.positions must be .*but {found}"):
+        cuda.render(core.scenery, core.agents)
+    core.agents.positions = good.clone()
+    cuda.render(core.scenery, core.agents)
+
+
+def test_unknown_devices_are_refused():
+    with pytest.raises(engine.EngineError, match="device=tpu is unknown"):
+        engine.device("tpu")
+    if not torch.cuda.is_available():
+        with pytest.raises(engine.EngineError, match="no GPU"):
+            engine.device("cuda")
+
+
+def test_too_many_environments_are_counted(monkeypatch):
+    monkeypatch.setattr(devices, "free_memory", lambda device: 10**6)
+    with pytest.raises(engine.EngineError, match="at most [0-9,]+ fit"):
+        scene.scenery([toys.box()], n_agents=1, n_envs=10**6, device="cpu")
+
+
+# ---- What needs a GPU ----
+
+
+def no_synchronisation(act):
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        act()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+@pytest.mark.cuda
+def test_no_operation_synchronises():
+    homes = sample("homes", 3)
+    core = cuda.Core(scene.scenery(homes, 2, n_envs=6, device="cuda"), res=64)
+    spawn, seen, mask = (
+        RandomSpawns(homes, core, resample=True),
+        seen_of(core),
+        core.agent_full(True),
+    )
+    moves, visible = torch.zeros((7, 3), device="cuda"), seen[:3, 0].clone()
+    actions = torch.zeros((6, 2), dtype=torch.long, device="cuda")
+
+    def everything():
+        engine.bake(core.scenery)
+        spawn(mask)
+        engine.physics(core.scenery, core.agents, actions, moves, 0.5)
+        engine.render(core.scenery, core.agents)
+        engine.observe(core.scenery, core.agents, 4, imu=True, seen=seen, clear_mask=mask)
+        engine.unseen(core.scenery, core.agents, seen, visible)
+        engine.coverage(core.scenery, core.agents, seen, visible, mask)
+        core.agents.positions = core.agents.positions + 0.01
+        engine.physics(core.scenery, core.agents)
+
+    everything()  # compiles, and fills caches
+    no_synchronisation(everything)
+    engine.check(core.agents)
+
+
+@pytest.mark.cuda
+def test_a_recorded_bake_follows_walls_and_lights_that_move():
+    recorded, eager = (
+        scene.scenery([toys.box(), toys.column()], 1, 4, device="cuda") for _ in range(2)
+    )
+    graph = capture.Graph(lambda: engine.bake(recorded), (), (recorded,))
+    for scenery in (recorded, eager):
+        scenery.layouts.lines.vals.add_(0.25)
+        scenery.layouts.lights.vals[:, 2].mul_(0.5)
+    graph()
+    engine.bake(eager)
+    assert torch.equal(recorded.layouts.boxes, eager.layouts.boxes)
+    assert torch.equal(recorded.layouts.baked.vals, eager.layouts.baked.vals)
+    images = [cuda.render(s, cuda.Core(s).agents).screen for s in (recorded, eager)]
+    assert torch.equal(*images)

@@ -1,0 +1,343 @@
+"""Scenery: views by environment, what may be written and what refuses, layouts that are shared."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+from megastep import core, engine, scene, toys
+from megastep.engine import scenery as scenery_module
+from megastep.engine.scenery import Layouts, Scenery
+from megastep.ragged import Ragged
+from megastep.read_only import ReadOnlyTensor
+from tests.helpers import random_scenery
+
+VIEWS = "lines", "lights", "textures", "baked"
+
+
+@pytest.fixture
+def shared():
+    """Six environments of two agents that share two layouts."""
+    return scene.scenery([toys.box(), toys.column()], n_agents=2, n_envs=6, device="cpu")
+
+
+def image(scenery):
+    """What an agent in the middle of each environment sees."""
+    c = core.Core(scenery)
+    c.agents.positions[:] = torch.tensor([2.0, 3.0])
+    return engine.render(scenery, c.agents).screen.clone()
+
+
+# ---- Views by environment ----
+
+
+def expected(scenery):
+    """All views, by loops over environments and lines."""
+    layouts, out = scenery.layouts, {name: [] for name in VIEWS}
+    for e, d in enumerate(scenery.layout.tolist()):
+        out["lines"].append(torch.cat([scenery.agent_lines[e], layouts.lines[d]]))
+        out["lights"].append(layouts.lights[d])
+        own = scenery.model_texels.diff().tolist()
+        out["textures"] += layouts.agent_textures[d].split(own)
+        out["baked"] += scenery.agent_light[e].split(own)
+        for wall in range(*layouts.wall_starts[d : d + 2].tolist()):
+            out["textures"].append(layouts.textures[wall])
+            out["baked"].append(layouts.baked[wall])
+    return out
+
+
+def wallless(n_agents):
+    """Two environments of one layout that has no walls, and of another that has two."""
+    made = random_scenery.random_environments(3, n_envs=2, n_agents=n_agents)
+    arguments = made.scenery_arguments()
+    walls = Layouts(
+        Ragged(torch.tensor([[[1.0, 1], [2, 1]], [[2, 1], [2, 2]]]), [0, 2]),
+        Ragged(torch.rand(5, 3), [2, 3]),
+        Ragged(torch.zeros(0, 3), [0, 0]),
+        torch.rand(2, 8 * n_agents, 3),
+        "cpu",
+    )
+    widths = [1] * 8 * n_agents
+    return Scenery.of_layouts(n_agents, walls, arguments["model"], widths, [0, 1, 1])
+
+
+@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: scene.scenery([toys.box(), toys.column()], 2, 6, device="cpu"),
+        lambda: scene.scenery([toys.box()], 0, 3, device="cpu"),
+        lambda: wallless(1),
+        lambda: wallless(0),
+    ],
+    ids=["shared", "no agents", "no walls", "no agents nor walls"],
+)
+def test_views_join_the_agents_part_and_the_layouts(make, name):
+    scenery = make()
+    scenery.agent_light.copy_(torch.rand_like(scenery.agent_light))
+    view, parts = getattr(scenery, name), expected(scenery)[name]
+    assert isinstance(view, Ragged) and len(view) == len(parts)
+    assert view.widths.tolist() == [len(part) for part in parts]
+    assert torch.equal(view.vals, torch.cat(parts))
+    assert all(torch.equal(piece, part) for piece, part in zip(view, parts, strict=True))
+    assert view.starts.tolist() == np.cumsum([0, *map(len, parts)])[:-1].tolist()
+    assert view.ends.tolist() == np.cumsum([0, *map(len, parts)])[1:].tolist()
+    assert view.inverse.tolist() == [i for i, part in enumerate(parts) for _ in part]
+    assert torch.equal(view[-1], parts[-1]) and torch.equal(view[1:3].vals, torch.cat(parts[1:3]))
+    assert [piece.tolist() for piece in view[::-2]] == [part.tolist() for part in parts[::-2]]
+
+
+def test_a_view_is_of_the_moment_it_is_read(shared):
+    before = shared.lines[0]
+    image(shared)
+    assert not torch.equal(before, shared.lines[0])
+
+
+@pytest.mark.parametrize("index", [6, -7])
+def test_environments_out_of_range_are_named(shared, index):
+    with pytest.raises(IndexError, match=f"index {index} is out of range"):
+        shared.lines[index]
+    with pytest.raises(ValueError, match=f"e must be an integer from -6 to 5, but {index}"):
+        shared.env(index)
+
+
+# ---- Writing ----
+
+
+def statements():
+    """Ways to write into a view."""
+
+    def add(tensor):
+        tensor += 1
+
+    return {
+        "vals[:]": lambda view: view.vals.__setitem__(slice(None), 1),
+        "vals[...]": lambda view: view.vals.__setitem__(..., 0),
+        "vals[mask]": lambda view: view.vals.__setitem__(view.vals > 0, 0),
+        "vals.mul_": lambda view: view.vals.mul_(2),
+        "vals +=": lambda view: add(view.vals),
+        "vals[0] +=": lambda view: add(view.vals[0]),
+        "vals.copy_": lambda view: view.vals.copy_(torch.zeros_like(view.vals)),
+        "vals.view": lambda view: view.vals.view(-1).zero_(),
+        "vals.data": lambda view: view.vals.data.zero_(),
+        "vals.data =": lambda view: setattr(view.vals, "data", torch.zeros(1)),
+        "vals.resize_": lambda view: view.vals.resize_(0),
+        "vals.set_": lambda view: view.vals.set_(torch.zeros(1)),
+        "vals.numpy()": lambda view: view.vals.numpy().fill(0),
+        "np.asarray": lambda view: np.asarray(view.vals).fill(0),
+        "out=": lambda view: torch.add(view.vals, 1, out=view.vals),
+        "foreach": lambda view: torch._foreach_add_([view.vals], 1.0),
+        "init": lambda view: torch.nn.init.zeros_(view.vals),
+        "[0][:]": lambda view: view[0].__setitem__(slice(None), 0),
+        "[-1].fill_": lambda view: view[-1].fill_(0),
+        "[1:3].vals": lambda view: view[1:3].vals.zero_(),
+        "[1:3][0]": lambda view: view[1:3][0].zero_(),
+        "unbind": lambda view: view.vals.unbind(0)[0].zero_(),
+        "split": lambda view: view.vals.split(1)[0].zero_(),
+        "torchify": lambda view: view.torchify().vals.zero_(),
+        "cpu": lambda view: view.cpu().vals.zero_(),
+        "widths": lambda view: view.widths.zero_(),
+        "starts": lambda view: view.starts.zero_(),
+        "ends": lambda view: view.ends.zero_(),
+        "inverse": lambda view: view.inverse.zero_(),
+    }
+
+
+@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("statement", statements())
+def test_writing_into_a_view_raises_with_the_cure(shared, name, statement):
+    with pytest.raises(ValueError, match=rf"scenery.{name} is a read-only|read-only"):
+        statements()[statement](getattr(shared, name))
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_replacing_a_view_or_its_vals_raises(shared, name):
+    view = getattr(shared, name)
+    with pytest.raises(AttributeError):
+        setattr(shared, name, view)
+    for attribute in ("vals", "widths", "starts", "ends", "inverse"):
+        getattr(view, attribute)
+        with pytest.raises(AttributeError, match=f"{attribute} of a JoinedRagged"):
+            setattr(view, attribute, torch.zeros(1))
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_copies_of_a_view_are_written_at_will(shared, name):
+    view = getattr(shared, name)
+    before = view.vals.clone()
+    view.clone().vals.zero_()
+    view.vals.clone().zero_()
+    view.numpyify().vals[:] = 0
+    copy.deepcopy(view).vals.zero_()
+    (view.vals * 1).zero_()
+    assert torch.equal(getattr(shared, name).vals, before)
+
+
+def test_what_is_calculated_from_a_read_only_tensor_is_plain(shared):
+    vals = shared.textures.vals
+    for made in (vals + 1, vals.half(), torch.cat([vals, vals]), vals.sum(), vals.clone()):
+        assert type(made) is torch.Tensor
+    assert isinstance(vals[:1], ReadOnlyTensor) and isinstance(vals.detach(), ReadOnlyTensor)
+    assert type(torch.zeros_like(vals).copy_(vals)) is torch.Tensor
+    assert vals.shape == torch.Size(vals.shape) and type(vals.shape) is torch.Size
+
+
+def test_what_is_written_into_a_layout_reaches_every_environment_of_it(shared):
+    before = image(shared)
+    shared.layouts.textures.vals[: int(shared.layouts.texel_starts[4])] = 0  # the box's four walls
+    after = image(shared)
+    assert (after[0::2] != before[0::2]).flatten(1).any(1).all(), "the boxes are black now"
+    assert torch.equal(after[1::2], before[1::2]), "the columns are as they were"
+    assert torch.equal(after[0], after[2])
+
+
+def test_lights_and_walls_that_move_are_seen_after_baking(shared):
+    before = image(shared)
+    shared.layouts.lights.vals[:, 2] *= 0.25
+    assert torch.equal(image(shared)[:, :, :, 0].isnan(), before[:, :, :, 0].isnan())
+    engine.bake(shared)
+    darker = image(shared)
+    assert darker.sum() < before.sum()
+    shared.layouts.lines.vals[:4] += 0.5
+    engine.bake(shared)
+    assert (image(shared) != darker).any()
+
+
+def test_memory_that_was_exchanged_is_read_where_it_is_now(shared):
+    image(shared)
+    lights = shared.layouts.lights.vals
+    lights.data = lights * torch.tensor([1.0, 1.0, 0.0])
+    engine.bake(shared)
+    assert (shared.layouts.baked.vals == 0.1).all(), "ambient light alone"
+
+
+def test_bounding_boxes_are_updated_in_place(shared):
+    layouts, address = shared.layouts, shared.layouts.boxes.data_ptr()
+    before = layouts.boxes.clone()
+    assert before.tolist()[0] == [1, 1, 6, 6]
+    layouts.lines.vals += 1
+    engine.bake(shared)
+    assert layouts.boxes.data_ptr() == address, "a recorded graph reads where they always were"
+    assert torch.equal(layouts.boxes, before + 1)
+
+
+def test_boxes_hold_32_walls_of_one_layout_each():
+    made = random_scenery.random_environments(1, n_envs=3, n_walls=70)
+    layouts = Scenery(**made.scenery_arguments()).layouts
+    starts = layouts.box_starts.tolist()
+    for d in range(3):
+        groups = layouts.lines[d].split(32)
+        assert len(groups) == starts[d + 1] - starts[d] == 3
+        for box, walls in zip(layouts.boxes[starts[d] :], groups):
+            assert box.tolist() == [*walls.amin((0, 1)).tolist(), *walls.amax((0, 1)).tolist()]
+
+
+@pytest.mark.parametrize("n_walls, n_boxes", [(0, 0), (1, 1), (31, 1), (32, 1), (33, 2), (64, 2)])
+def test_a_layout_has_as_many_boxes_as_its_walls_need(n_walls, n_boxes):
+    walls = Ragged(torch.rand(n_walls, 2, 2), [n_walls])
+    texels, lights = Ragged(torch.rand(n_walls, 3), [1] * n_walls), Ragged(torch.rand(0, 3), [0])
+    layouts = Layouts(walls, texels, lights, torch.rand(1, 8, 3), "cpu")
+    assert layouts.box_starts.tolist() == [0, n_boxes] and len(layouts.boxes) == n_boxes
+
+
+TABLES = "wall_starts", "texel_starts", "light_starts", "box_starts", "boxes"
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_tables_of_layouts_are_read_only(shared, name):
+    with pytest.raises(ValueError, match=f"{name} (is|are) read-only"):
+        getattr(shared.layouts, name)[0] = 10**6
+
+
+@pytest.mark.parametrize("name", ["lines", "textures", "baked", "lights"])
+def test_the_widths_of_layouts_are_read_only(shared, name):
+    with pytest.raises(ValueError, match=f"{name}.widths is read-only.*: make another Scenery"):
+        getattr(shared.layouts, name).widths[0] = 10**6
+
+
+@pytest.mark.parametrize("name", ["model", "model_texels"])
+def test_the_model_is_read_only(shared, name):
+    with pytest.raises(ValueError, match=f"{name} is read-only.*: make another Scenery"):
+        getattr(shared, name)[0] = 7
+
+
+def attributes(thing):
+    return [name for name in vars(thing) if not name.startswith("_")]
+
+
+def test_what_scenery_and_layouts_hold_is_never_replaced(shared):
+    for thing in (shared, shared.layouts, shared.layouts.lines):
+        for name in attributes(thing):
+            with pytest.raises(AttributeError, match=name):
+                setattr(thing, name, None)
+            with pytest.raises(AttributeError, match=name):
+                delattr(thing, name)
+    assert {"layout", "agent_lines", "agent_light", "model", "layouts", "n_agents"} <= set(
+        attributes(shared)
+    )
+
+
+def test_an_environment_moves_to_another_layout_in_place(shared):
+    before = image(shared)
+    shared.layout[:] = shared.layout.flip(0)
+    after = image(shared)
+    assert shared.layout.tolist() == [1, 0] * 3 and torch.equal(after, before.flip(0))
+
+
+def test_an_environment_alone_is_a_copy(shared):
+    before = [view.clone() for view in (shared.layouts.lines.vals, shared.layouts.lights.vals)]
+    lines, colours, lights = shared.env(1)
+    for tensor in (lines, lights, *colours):
+        tensor.zero_()
+    after = [shared.layouts.lines.vals, shared.layouts.lights.vals]
+    assert all(map(torch.equal, before, after))
+    assert torch.equal(shared.env(-1)[0], shared.env(5)[0])
+
+
+# ---- Parts that do not fit ----
+
+
+def parts(**changes):
+    """The arguments of a Scenery of two environments with one agent each."""
+    return random_scenery.random_environments(0, n_envs=2).scenery_arguments() | changes
+
+
+def test_agents_textures_must_have_the_same_widths_everywhere():
+    good = parts()
+    widths = good["textures"].widths.clone()
+    second = int(good["lines"].widths[0])
+    widths[second] += 1  # of the second environment's first agent line
+    widths[second + 1] -= 1
+    with pytest.raises(ValueError, match="textures of the agents' lines must have the same widths"):
+        Scenery(**parts(textures=Ragged(good["textures"].vals, widths)))
+
+
+def test_every_wall_needs_a_texel():
+    good = parts()
+    widths = good["textures"].widths.clone()
+    widths[-2:] += torch.tensor([widths[-1], -widths[-1]])
+    with pytest.raises(ValueError, match="textures must have at least one texel per wall"):
+        Scenery(**parts(textures=Ragged(good["textures"].vals, widths)))
+
+
+def test_every_environment_begins_with_its_agents_lines():
+    good = parts()
+    with pytest.raises(ValueError, match="lines must begin, .* with the 1600 lines of its 200"):
+        Scenery(**parts(n_agents=200))
+    assert Scenery(**good).n_agents == 1
+
+
+def test_parts_of_one_scenery_make_another():
+    good = Scenery(**parts())
+    views = {name: getattr(good, name) for name in ("lights", "lines", "textures")}
+    made = Scenery(1, **views, model=good.model)
+    for name in VIEWS:
+        assert torch.equal(getattr(made, name).vals, getattr(good, name).vals), name
+    made.layouts.lights.vals.zero_()
+    assert good.lights.vals.any(), "memory of its own"
+
+
+def test_tables_that_outgrow_32_bits_are_refused():
+    with pytest.raises(ValueError, match="at most 2,147,483,647 .* but 2147483648 were given"):
+        scenery_module._starts("texel_starts", torch.tensor([2**31 - 1, 1]))

@@ -1,0 +1,266 @@
+"""No agent ever passes a wall, and none that was stopped is stuck: ten million agent-steps that try
+on a CPU, a hundred million on a GPU. `scripts/check_walls.py` makes a thousand million.
+"""
+
+import math
+from fractions import Fraction
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+
+from megastep import core, engine, scene
+from megastep.dotdict import dotdict
+from megastep.modules import MomentumMovement
+from tests.helpers import random_scenery, wall_courses, wall_crossings, walls
+from tests.helpers.wall_courses import BODY, COURSES, RADIUS, make_course
+from tests.helpers.wall_crossings import crossed
+
+STEPS = 10**7  # agent-steps of all courses
+STEPS_PER_COURSE = -(-STEPS // len(COURSES))
+# the least fraction of steps that a wall or an agent stops, or the test is too easy; some 0.65 are
+STOPPED = 0.5
+ACUTE = dict(
+    wedges=10, slivers=8, spokes=4, zigzags=4, crossing=8, fragments=8
+)  # layouts with acute corners
+
+
+def alone(*ends, n_envs=1, fps=10.0):
+    """A Core of environments with one agent each and walls (W, 2, 2) alone."""
+    g = dotdict(walls=np.float32(ends), lights=np.zeros((0, 2)))
+    return core.Core(scene.scenery([g], 1, n_envs, device=torch.device("cpu")), res=1, fps=fps)
+
+
+def check(total, n_steps):
+    """Asserts that a run was long and hard enough, and that no agent passed, sank or stuck."""
+    assert total["steps"] >= n_steps and total["collisions"] >= STOPPED * total["steps"], total
+    failures = {key: total[key] for key in ("crossings", "sunk", "stuck")}
+    assert not any(failures.values()), f"{failures} in {total['steps']:,} steps: " + "; ".join(
+        total["descriptions"][:3]
+    )
+
+
+# ---- The law ----
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_no_agent_passes_a_wall_and_none_is_stuck(name):
+    total = walls.run(name, STEPS_PER_COURSE, 2048)
+    check(total, STEPS_PER_COURSE)
+    assert total["tried"] > 10_000 and total["held"] < 0.1 * total["tried"]
+    reached = sum(n > 0 for n in total["cornered"])
+    assert reached >= ACUTE.get(name, 0), (
+        f"agents reached the acute corners of {reached} layouts only"
+    )
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("name", COURSES)
+def test_no_agent_passes_a_wall_on_a_gpu(name):
+    check(
+        walls.run(name, 10 * STEPS_PER_COURSE, 2**20, "cuda", seed=1, tries=256),
+        10 * STEPS_PER_COURSE,
+    )
+
+
+def test_the_courses_make_ten_million_steps_at_the_rates_and_accelerations_wanted():
+    fps, accel = zip(*walls.SETTINGS)
+    assert STEPS_PER_COURSE * len(COURSES) >= 10**7
+    assert (min(fps), max(fps), min(accel), max(accel)) == (1, 200, 1, 100)
+    assert all(setting in walls.SETTINGS for setting in product((1, 200), (1, 100)))
+    momentum = MomentumMovement(alone([(1, 1), (2, 1)], fps=1.0))
+    assert momentum.moves.max(0).values[0] == walls.ACCEL and momentum.damping == walls.DECAY
+
+
+def test_a_disc_that_touches_a_slanted_wall_is_held():
+    c = alone([(2.3560333251953125, 2.9257616996765137), (5.024743556976318, 0.9436310529708862)])
+    c.agents.positions[:] = torch.tensor([3.7575743198394775, 2.0170488357543945])
+    c.agents.velocity[:] = torch.tensor([-4.205398082733154, -9.07274055480957])
+    assert engine.physics(c.scenery, c.agents).progress.item() < 1e-3
+
+
+def test_an_agent_that_all_but_touches_a_wall_does_not_slip_through_along_it():
+    c = alone([(6, 1), (6, 6)], fps=1.0)
+    c.agents.positions[:] = torch.tensor([5.999889850616455, 4.891547679901123])
+    c.agents.velocity[:] = torch.tensor([0.004166539758443832, -40.0])
+    assert engine.physics(c.scenery, c.agents).progress.item() == 0
+
+
+def test_a_disc_beside_a_wall_that_rounding_puts_at_its_end_is_held():
+    """Along the wall its centre lies within 1e-6 m of the end; it goes back along the wall, and
+    ever nearer.
+    """
+    c = alone([(2.0, 10.595815658569336), (4.6668243408203125, 2.0)], fps=1.0)
+    c.agents.positions[:] = torch.tensor([4.6665940284729, 1.999928593635559])
+    c.agents.velocity[:] = torch.tensor([-11.850244522094727, 38.204341888427734])
+    assert engine.physics(c.scenery, c.agents).progress.item() == 0
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_steps_smaller_than_float32_resolves_do_not_add_up_to_a_way_into_a_wall(side):
+    """Far from the origin a short step along a slanted wall is rounded to one along an axis."""
+    along = torch.tensor([math.cos(0.5), math.sin(0.5)])
+    c = alone([(30, 30), (30 + 8 * along[0], 30 + 8 * along[1])], n_envs=64, fps=200.0)
+    normal = side * torch.tensor([-along[1], along[0]])
+    c.agents.positions[:] = 30 + 4 * along + 1.001 * BODY * normal
+    way = torch.linspace(1e-6, 2e-5, 32)[
+        :, None
+    ]  # metres per step; a unit in the last place is 1.9e-6 m there
+    velocity = 200 * torch.cat(
+        [way * (0.01 * normal + sign * along) for sign in (1, -1)]
+    )  # and very slightly away
+    for _ in range(2000):
+        c.agents.velocity[:, 0] = velocity
+        engine.physics(c.scenery, c.agents)
+    assert ((c.agents.positions[:, 0] - 30) @ normal).min().item() > RADIUS
+
+
+# ---- Whether these tests can fail ----
+
+
+def without_walls(scenery, agents, *rest):
+    """Physics without walls."""
+    agents.positions += agents.velocity / agents.fps
+    return engine.Physics(torch.ones_like(agents.angles))
+
+
+def without_motion(scenery, agents, *rest):
+    """Physics in which no agent moves."""
+    return engine.Physics(torch.zeros_like(agents.angles))
+
+
+def test_agents_that_pass_walls_are_caught(monkeypatch):
+    monkeypatch.setattr(engine, "physics", without_walls)
+    total = walls.run("box", 20_000, 512)
+    assert total["crossings"] > 0.05 * total["steps"] and "box at 1 fps" in total["descriptions"][0]
+
+
+def test_the_description_of_a_crossing_is_enough_to_repeat_it(monkeypatch):
+    monkeypatch.setattr(engine, "physics", without_walls)
+    course = make_course("wedges")
+    walk = walls.Walk(
+        course,
+        scene.scenery(course.geometries, 1, 48, device=torch.device("cpu")),
+        10,
+        1,
+        False,
+        seed=3,
+    )
+    walk.phase()
+    b, d, a = (~walk.records[..., 0].isnan()).nonzero()[0].tolist()
+    record = dict(zip(walls.RECORDED, walk.records[b, d, a].tolist()))
+    before, after = (
+        torch.tensor([record[f"x {when}"], record[f"y {when}"]]) for when in ("before", "after")
+    )
+    assert crossed(before.view(1, 1, 1, 2), after.view(1, 1, 1, 2), course.walls[d : d + 1]).all()
+    velocity = torch.tensor([record["velocity x"], record["velocity y"]])
+    assert torch.equal(before + velocity / walk.fps, after)
+    assert all(f"{x!r}" in walk.describe_crossings()[0] for x in record.values())
+
+
+def test_agents_that_cannot_move_are_stuck(monkeypatch):
+    monkeypatch.setattr(engine, "physics", without_motion)
+    total = walls.run("box", 10_000, 256)
+    assert (
+        total["stuck"] > 0.3 * total["tried"]
+        and total["held"] + total["stuck"] == total["tried"] > 0
+    )
+
+
+def brute(p, q, a, b):
+    """Whether closed segments meet, in fractions, by where each one's line cuts the other."""
+    p, q, a, b = ([Fraction(x) for x in point] for point in (p, q, a, b))
+    d, e, g = ((y[0] - x[0], y[1] - x[1]) for x, y in ((p, q), (a, b), (p, a)))
+    area = d[0] * e[1] - d[1] * e[0]
+    if area:
+        s, t = (g[0] * e[1] - g[1] * e[0]) / area, (g[0] * d[1] - g[1] * d[0]) / area
+        return 0 <= s <= 1 and 0 <= t <= 1
+    way = d if any(d) else e
+    if g[0] * way[1] - g[1] * way[0]:
+        return False
+    if not any(way):
+        return p == a
+    place = lambda point: point[0] * way[0] + point[1] * way[1]  # noqa: E731
+    one, other = sorted(map(place, (p, q))), sorted(map(place, (a, b)))
+    return one[0] <= other[1] and other[0] <= one[1]
+
+
+@pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
+def test_paths_cross_as_fractions_say(dense):
+    """On a grid of four by four points they touch, lie in line and shrink to points; off it they
+    cross or do not.
+    """
+    random = random_scenery.CounterGenerator(0)
+    grid = random.pick(range(4), 3000, 4, 2)
+    fine = random.uniform(0, 4, 1000, 4, 2).float().double()
+    cases = torch.cat(
+        [grid, fine, fine * torch.tensor([1e-3, 1.0]) + torch.tensor([190.0, 0.0])]
+    ).float()
+    p, q, a, b = cases.unbind(1)
+    right = torch.tensor([brute(*case) for case in cases.tolist()])
+    mine = crossed(p[None, :, None], q[None, :, None], torch.stack([a, b], 1)[:, None], dense)[
+        0, :, 0
+    ]
+    assert torch.equal(mine, right) and 500 < right.sum() < 4500
+
+
+def test_a_layout_of_few_walls_is_filled_up_with_what_no_path_meets():
+    course = make_course("remote")
+    filling = course.walls.isnan().all((-1, -2))
+    assert filling.any() and torch.equal(filling.sum(1), len(filling[0]) - course.counts)
+    everywhere = 200 * torch.rand(
+        (50, len(course.walls), 2, 1, 2), generator=torch.Generator().manual_seed(0)
+    )
+    nothing = torch.where(filling[..., None, None], course.walls, math.nan)
+    for dense in (False, True):
+        assert not crossed(everywhere[:, :, 0], everywhere[:, :, 1], nothing, dense).any()
+
+
+def test_chunks_do_not_matter(monkeypatch):
+    course, random = make_course("crossing"), torch.Generator().manual_seed(0)
+    before, after = (
+        1 + 8 * torch.rand((40, len(course.walls), 3, 2), generator=random) for _ in range(2)
+    )
+    whole = crossed(before, after, course.walls)
+    monkeypatch.setitem(wall_crossings.MAX_PAIRS, "cpu", 1)
+    assert (
+        torch.equal(crossed(before, after, course.walls), whole) and whole.any() and not whole.all()
+    )
+
+
+def test_agents_are_placed_touching_overlapping_and_clear():
+    for name in COURSES:
+        course = make_course(name)
+        for layout in range(len(course.walls)):
+            mine = course.walls[layout, : course.counts[layout]].double()
+            gap = wall_courses.clearances(course.spots[layout].double(), mine).amin(1)
+            touching = (gap - RADIUS).abs() < 2e-4
+            assert (
+                gap.min() > wall_courses.MIN_GAP and (gap < RADIUS - 1e-3).any() and touching.any()
+            ), name
+            assert torch.equal(course.clear[layout], gap > BODY) and course.clear[layout].any(), (
+                name
+            )
+
+
+@pytest.mark.parametrize(
+    "shape, position, held",
+    [
+        (wall_courses.slit(0.1, 20.0), (1.5, 0.05), True),
+        (wall_courses.slit(0.3, 0.0), (1.5, 0.1), False),
+        (wall_courses.wedge(2.0, 0.0), (5.9, 0.0), False),
+        (wall_courses.wedge(90.0, 0.0), (0.1, 0.0), False),
+        (
+            wall_courses.path([(-0.1, -0.1), (0.1, -0.1), (0.0, 0.1), (-0.1, -0.1)]),
+            (0.0, 0.0),
+            True,
+        ),
+    ],
+    ids=["slit", "wide slit", "wedge", "corner", "cell"],
+)
+def test_geometry_holds_a_disc_in_a_slit_and_a_cell_but_not_in_a_corner(shape, position, held):
+    if shape.shape[0] == 2 and held:
+        position = wall_courses.turned([position], 20.0)[0]
+    at = torch.tensor(position, dtype=torch.float64)
+    assert walls.held_by_geometry(at, at.new_zeros((0, 2)), torch.as_tensor(shape)) == held

@@ -1,0 +1,142 @@
+"""A world without walls, homes or engine: a board of bytes, from a file outside the repository. It
+is trained, evaluated and filmed like any other.
+"""
+
+import json
+import sys
+
+import pytest
+import torch
+
+from megastep.agents.cli import evaluate, record, train
+from megastep.agents.training import checkpoint
+
+BOARD = '''
+import torch
+from matplotlib.figure import Figure
+
+from megastep import arrdict, spaces
+
+
+class Board:
+    """One of three squares is lit, as bright as a byte can be; naming it pays 1. Six turns."""
+
+    n_agents, fps = 1, 4
+    obs_space = spaces.MultiImage(1, 1, 1, 3, dtype=torch.uint8)
+    action_space = spaces.MultiDiscrete(1, 3)
+
+    def __init__(self, n_envs: int = 16, *, seed=1, device="cpu", turns: int = 6):
+        self.n_envs, self.device, self.turns = n_envs, torch.device(device), turns
+        self.start = seed + torch.arange(n_envs, device=self.device)
+        self.age = torch.zeros_like(self.start)
+        self.right = torch.zeros(n_envs, device=self.device)
+
+    def lit(self):
+        return (self.start + self.age) % 3
+
+    def reset(self):
+        return self._world(torch.ones_like(self.age, dtype=torch.bool), 0 * self.right)
+
+    def step(self, decision):
+        hit = (decision.actions[:, 0] == self.lit()).float()
+        return self._world(self.age == self.turns, hit)
+
+    def _world(self, reset, hit):
+        self.age.add_(1).masked_fill_(reset, 0)
+        self.right.add_(hit).masked_fill_(reset, 0.0)
+        board = torch.nn.functional.one_hot(self.lit(), 3).byte() * 255
+        ends = self.age == self.turns
+        return arrdict.arrdict(
+            obs=board.view(self.n_envs, 1, 1, 1, 3),
+            reward=hit.masked_fill(reset, 0.0),
+            reset=reset,
+            terminal=ends,
+            truncated=torch.zeros_like(ends),
+            metrics=arrdict.arrdict(right=self.right / self.turns),
+        )
+
+    def check(self):
+        pass
+
+    def state(self, e=0):
+        return arrdict.arrdict(lit=self.lit()[e].clone())
+
+    @classmethod
+    def plot_state(cls, state):
+        figure = Figure(figsize=(2, 1))
+        figure.subplots().bar([0, 1, 2], [int(state.lit) == i for i in range(3)])
+        return figure
+'''
+WORDS = ["env=board:Board", "env.n_envs=32", "preset=cpu", "agent.width=16", "device=cpu"]
+WORDS += ["learner.n_steps=16", "learner.n_minibatches=2", "learner.lr=0.01", "samples=20000"]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "board.py").write_text(BOARD)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    sys.modules.pop("board", None)
+
+
+def test_a_board_game_is_learnt_evaluated_and_filmed(folder, capsys):
+    assert train.main([*WORDS, "folder=run"]) == 0
+    rows = [json.loads(line) for line in (folder / "run/metrics.jsonl").read_text().splitlines()]
+    told = [row for row in rows if row["episode/count"]]
+    assert all(row["episode/right"] == pytest.approx(row["episode/return"] / 6) for row in told)
+    assert told[-1]["episode/right"] > 0.9 > told[0]["episode/right"], "a third by chance"
+    config = checkpoint.load_latest(folder / "run/checkpoints").config
+    assert config["spaces"]["obs"].endswith("W=3, dtype=torch.uint8)")
+
+    assert evaluate.main(["run=run", "episodes=30", "device=cpu"]) == 0
+    table = json.loads(
+        (folder / f"run/evaluations/board-test-{rows[-1]['samples']}.json").read_text()
+    )
+    assert table["title"].startswith("board, after ") and table["rows"][0]["homes"] is None
+    trained, random = (row["metrics"]["right"] for row in table["rows"])
+    assert trained["lower"] > 0.8 > 0.5 > random["upper"] > random["mean"] > random["lower"] > 0.1
+    said = capsys.readouterr().out
+    assert "right" in said and "homes of" not in said
+
+    pytest.importorskip("av")
+    assert record.main(["run=run", "steps=4", "file=board.mp4", "device=cpu"]) == 0
+    assert (folder / "board.mp4").stat().st_size > 500
+
+
+def test_bytes_are_stored_as_bytes_and_standardised(folder):
+    import board
+
+    from megastep.agents.algorithms.ppo import PPO
+    from megastep.agents.networks.policy import Policy
+    from megastep.agents.storage.rollout import Collector, Rollout
+
+    env = board.Board(6)
+    policy = Policy(env.obs_space, env.action_space, width=8)
+    learner = PPO(policy, n_minibatches=2)
+    rollout = Rollout(6, 6, env.obs_space, env.action_space, policy.initial(6))
+    Collector(env, policy, rollout)()
+    assert rollout.obs.dtype == torch.uint8 and rollout.obs.amax(-1).eq(255).all()
+    learner.update(rollout)
+    norm, seen = policy.intake.norms[0], rollout.obs[-1].float()
+    assert norm.mean.item() == pytest.approx(85) and norm.scale.item() == pytest.approx(
+        seen.std(correction=0).item()
+    )
+
+
+def test_a_byte_is_half_the_memory_of_a_half(folder):
+    import board
+
+    from megastep import spaces
+    from megastep.agents.algorithms.ppo import PPO
+    from megastep.agents.networks.policy import Policy
+
+    env = board.Board(6)
+    policy = Policy(env.obs_space, env.action_space, width=8)
+    learner = PPO(policy, n_steps=15, n_minibatches=2)
+    sizes = []
+    for dtype in (torch.uint8, None, torch.float32):
+        env.obs_space = spaces.MultiImage(1, 1, 1, 3, dtype=dtype)
+        sizes.append(learner.bytes_per_env(env))
+    each = 16 * 3 * 1.5  # rows, numbers, the rollout and a minibatch of half of it
+    assert (sizes[1] - sizes[0], sizes[2] - sizes[0]) == (each, 3 * each)

@@ -1,0 +1,148 @@
+"""The scripted fighter: what it does in front of others and of walls, on what it acts, and what it
+is worth.
+"""
+
+import pytest
+import torch
+
+from megastep import arrdict, capture, envs, toys
+from megastep.agents.training.evaluation import RandomActions
+from megastep.envs.deathmatch.bot import FORWARD, LEFT, NOTHING, RIGHT, Bot
+from megastep.geometries import sample
+
+AHEAD = (2.0, 3.5, 0.0)
+
+
+def ring(device, *poses, **settings):
+    """A deathmatch in a box from 1 to 6 with agents at (x, y, degrees), and what they see there."""
+    env = envs.Deathmatch(1, [toys.box()], n_agents=len(poses), device=device, **settings)
+    env.reset()
+    poses = torch.tensor(poses, device=env.device)
+    agents = env.core.agents
+    agents.positions[0], agents.angles[0] = poses[:, :2], poses[:, 2]
+    nobody = arrdict.arrdict(actions=torch.zeros((len(poses), 1), dtype=int, device=env.device))
+    return env, env.step(nobody)
+
+
+def first_actions(device, *poses):
+    env, world = ring(device, *poses)
+    decision, _ = Bot()(world, Bot().initial(len(poses), env.device))
+    return decision.actions[:, 0].tolist()
+
+
+@pytest.mark.parametrize("other, action", [((4.0, 4.3), LEFT), ((4.0, 2.7), RIGHT)])
+def test_it_turns_to_who_is_in_view(other, action, device):
+    assert first_actions(device, AHEAD, (*other, 0.0))[0] == action
+
+
+@pytest.mark.parametrize("metres, action", [(3.5, FORWARD), (2.0, NOTHING)])
+def test_it_approaches_who_is_in_the_middle_and_far(metres, action, device):
+    assert first_actions(device, AHEAD, (2.0 + metres, 3.5, 0.0))[0] == action
+
+
+@pytest.mark.parametrize("bearing", [25, -25, 8, 0])
+def test_it_holds_a_target_in_the_middle(bearing, device):
+    """Two metres away, where an agent is four degrees wide and a turn comes to fourteen: in more
+    than half of 60 steps, those of turning there included.
+    """
+    target = (4.0, 3.5, 0.0)
+    env, world = ring(device, (2.0, 3.5, -bearing), target, damage=0)
+    bot, hits = Bot(), 0
+    state = bot.initial(2, env.device)
+    for _ in range(60):
+        decision, state = bot(world, state)
+        decision.actions[1] = NOTHING
+        world = env.step(decision)
+        hits += float(world.reward[0])
+    assert hits > 30
+
+
+def test_it_looks_round_then_walks_and_turns_where_a_wall_comes_near(device):
+    """Both look away from each other: the first at a wall a metre off, the second down the room."""
+    env, world = ring(device, (1.9, 3.5, 180.0), (2.4, 3.5, 0.0))
+    bot = Bot()
+    state = bot.initial(2, env.device)
+    state["lost"] -= 20
+    looking, _ = bot(world, state)
+    assert looking.actions.flatten().tolist() == [LEFT, LEFT]
+    state["lost"] += 40
+    walking, _ = bot(world, state)
+    assert walking.actions.flatten().tolist() == [LEFT, FORWARD]
+
+
+def test_who_is_stopped_turns_to_the_wider_side(device):
+    """A push that did not move it: towards the east wall's far end, which is on its right."""
+    env, world = ring(device, (3.0, 5.0, 0.0), (2.0, 2.0, 180.0))
+    bot = Bot()
+    state = bot.initial(2, env.device)
+    state["lost"] += 40
+    state["pushed"].fill_(True)
+    decision, state = bot(world, state)
+    assert decision.actions[0] == RIGHT and state.around[0] > 5 and not state.pushed[0]
+
+
+def test_an_episode_begins_without_a_memory(device):
+    env, world = ring(device, AHEAD, (2.5, 3.5, 0.0))
+    bot = Bot()
+    state = bot.initial(2, env.device)
+    state["lost"] += 7
+    state["pushed"].fill_(True)
+    _, state = bot(arrdict.arrdict(world, reset=torch.ones_like(world.reset)), state)
+    assert state.lost.tolist() == [0, bot.initial(1).lost.item()], "one sees the other"
+    assert not state.around.any()
+
+
+def test_it_acts_on_observations_alone_and_lane_by_lane():
+    env = envs.Deathmatch(8, sample("homes", 8), device="cpu", limit=30)
+    bot, world = Bot(), env.reset()
+    state, halves = bot.initial(32), [bot.initial(16), bot.initial(16)]
+    for _ in range(60):
+        decision, state = bot(world, state)
+        for i, part in enumerate((slice(0, 16), slice(16, 32))):
+            seen = arrdict.arrdict(obs=world.obs[part], reset=world.reset[part])
+            own, halves[i] = bot(seen, halves[i], sample=False)
+            assert torch.equal(own.actions, decision.actions[part])
+        world = env.step(decision)
+
+
+def test_another_world_is_refused():
+    env = envs.Pong(2, device="cpu")
+    with pytest.raises(ValueError, match="observations of rgb, d and imu, as deathmatch's are"):
+        Bot()(env.reset(), Bot().initial(2))
+
+
+def test_it_beats_random_actions_in_a_room():
+    """First deaths of 32 duels; the bot is the first agent in half of them."""
+    env = envs.Deathmatch(32, [toys.box()], n_agents=2, device="cpu")
+    players = Bot(), RandomActions(env.action_space)
+    mine = torch.arange(64) % 2 == torch.arange(64) // 32  # lanes that the bot plays
+    states = [player.initial(64, "cpu") for player in players]
+    world, won, over = env.reset(), torch.zeros(32), torch.zeros(32, dtype=torch.bool)
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(300):
+        acts = []
+        for i, player in enumerate(players):
+            decision, states[i] = player(world, states[i], generator=generator)
+            acts.append(decision.actions)
+        world = env.step(arrdict.arrdict(actions=torch.where(mine[:, None], *acts)))
+        dead = world.terminal.view(32, 2)
+        ours = (dead & mine.view(32, 2)).any(1)
+        won += ((dead.any(1) & ~ours) & ~over).float()
+        over |= dead.any(1)
+    assert won.mean() > 0.9
+
+
+@pytest.mark.cuda
+def test_it_never_synchronises_and_can_be_captured():
+    env = envs.Deathmatch(8, [toys.box()], device="cuda")
+    bot, world = Bot(), env.reset()
+    state = bot.initial(32, "cuda")
+    bot(world, state)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        plain, _ = bot(world, state)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    graph = capture.capture(lambda world, state: bot(world, state), (world, state), ())
+    assert isinstance(graph, capture.Graph)
+    assert torch.equal(graph(world, state)[0].actions, plain.actions)

@@ -1,0 +1,374 @@
+"""Pong: against its twins on every bit, and what its rules say."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from megastep import arrdict, contract, engine, envs
+from megastep.agents.cli import evaluate, record, train
+from megastep.engine import EngineError
+from megastep.envs.pong.step import pong_step
+from tests.helpers.pong_twins import NumpyPong, PythonPong, philox
+
+N, STEPS = 40, 500
+HALF = 2**-10  # of numbers up to 2 that are rounded to fp16
+SETTINGS = {
+    "points": dict(),
+    "games, slow tracker": dict(points=3, tracker_speed=0.125, limit=60),
+    "self-play": dict(self_play=True),
+    "self-play, games": dict(self_play=True, points=2, limit=40),
+}
+
+
+def actions_of(n_lanes, steps=STEPS):
+    """(T, B, 1): each lane's change now and then, so that paddles reach the walls and hit balls."""
+    random = torch.Generator().manual_seed(1)
+    drawn = torch.randint(3, (steps, n_lanes, 1), generator=random)
+    kept = torch.rand((steps, n_lanes, 1), generator=random) < 0.8
+    for t in range(1, steps):
+        drawn[t] = torch.where(kept[t], drawn[t - 1], drawn[t])
+    return drawn
+
+
+def played(device, seed=5, **settings):
+    """The worlds of a reset and of STEPS steps, stacked: leaves (T + 1, B, ...)."""
+    env = envs.Pong(N, seed=seed, device=device, **settings)
+    worlds = [env.reset().clone()]
+    for actions in actions_of(N * env.n_agents):
+        worlds.append(env.step(arrdict.arrdict(actions=actions.to(device))).clone())
+    return arrdict.stack(worlds)
+
+
+def twins_settings(settings):
+    tracker = round(256 * settings.get("tracker_speed", 0.5))
+    points, limit = settings.get("points", 1), settings.get("limit", 1000)
+    both = dict(seed=5, points=points, limit=points * limit, tracker=tracker)
+    return both | dict(self_play=settings.get("self_play", False))
+
+
+def copied(world):
+    return {name: np.copy(values) for name, values in world.items()}
+
+
+def assert_same(worlds, twin):
+    """Worlds, leaves (T, B, ...), against what a twin tells of them, by name."""
+    told = dict(worlds, points_won=worlds["metrics"]["points_won"])
+    for name, values in twin.items():
+        ours = told[name].cpu().numpy().reshape(values.shape)
+        assert (ours == values).all(), f"{name} differs first at {np.argwhere(ours != values)[0]}"
+
+
+@pytest.mark.parametrize("pixels", [False, True], ids=["features", "pixels"])
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_the_engine_is_the_numpy_twin_on_every_bit(settings, pixels, device):
+    worlds = played(device, pixels=pixels, **settings)
+    sides = 2 if settings.get("self_play") else 1
+    twin = NumpyPong(N, pixels=pixels, **twins_settings(settings))
+    actions = actions_of(N * sides).view(STEPS, N, sides).numpy()
+    told = [copied(twin.reset())] + [copied(twin.step(a.T)) for a in actions]
+    for name in ("reset", "terminal", "truncated"):
+        for world in told:
+            world[name] = np.repeat(world[name], sides)
+    assert_same(worlds, {name: np.stack([w[name] for w in told]) for name in told[0]})
+    assert worlds.terminal.any() and (worlds.reward > 0).any() and (worlds.reward < 0).any()
+
+
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+def test_the_engine_is_the_python_twin_on_every_bit(settings):
+    worlds = played("cpu", pixels=True, **settings)
+    sides = 2 if settings.get("self_play") else 1
+    actions = actions_of(N * sides).view(STEPS, N, sides).tolist()
+    worlds = {key: worlds[key].unflatten(1, (N, sides)) for key in worlds if key != "metrics"}
+    told_features = played("cpu", **settings).obs.view(STEPS + 1, N, sides, 8).float().numpy()
+    for game in (0, N - 1):
+        twin = PythonPong(game, **twins_settings(settings))
+        for t in range(STEPS + 1):
+            told = twin.reset() if t == 0 else twin.step(actions[t - 1][game])
+            for name in ("reset", "terminal", "truncated"):
+                assert worlds[name][t, game].tolist() == sides * [told[name]], (name, t)
+            assert worlds["reward"][t, game].tolist() == told["reward"], t
+            features = [twin.features(side) for side in range(sides)]
+            assert np.abs(told_features[t, game] - features).max() < HALF
+            for side in range(sides):
+                assert bytes(worlds["obs"][t, game, side].flatten().numpy()) == told["obs"][side]
+
+
+def test_the_twins_draw_the_published_numbers():
+    """Random123's kat_vectors, key 0 and counter 0."""
+    assert philox(0, 0, 0) == [0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8]
+
+
+# ---- The rules, on paper ----
+
+
+class Court:
+    """One environment whose ball and paddles are placed by hand, in cells."""
+
+    FIELDS = dict(x=0, y=1, vx=2, vy=3, last_x=4, last_y=5, left=6, right=7)
+    SCORES = slice(8, 10)
+
+    def __init__(self, device="cpu", **settings):
+        self.env = envs.Pong(1, device=device, **settings)
+        self.env.reset()
+
+    def place(self, **cells):
+        for name, value in cells.items():
+            self.env.games[self.FIELDS[name]] = round(256 * value)
+        return self
+
+    def step(self, *actions):
+        actions = torch.tensor(actions or (0,) * self.env.n_agents, device=self.env.device)
+        return self.env.step(arrdict.arrdict(actions=actions[:, None]))
+
+    def __getattr__(self, name):
+        return int(self.env.games[self.FIELDS[name]]) / 256
+
+
+def test_the_ball_flies_a_cell_per_step(device):
+    court = Court(device).place(x=20, y=10, vx=1, vy=0.25)
+    court.step()
+    assert (court.x, court.y, court.last_x, court.last_y) == (21, 10.25, 20, 10)
+
+
+@pytest.mark.parametrize("y, vy, after", [(0.25, -1, 0.75), (29.5, 1, 29.5)])
+def test_walls_reflect(y, vy, after, device):
+    """A wall lies at 0 and at 30; a place is the upper end of its 256th of a cell."""
+    court = Court(device).place(x=20, y=y, vx=1, vy=vy)
+    court.step()
+    assert court.vy == -vy and court.y == pytest.approx(after, abs=1 / 256)
+
+
+@pytest.mark.parametrize(
+    "action, left, after", [(0, 5, 5), (1, 5, 4), (2, 5, 6), (1, 0.5, 0), (2, 25.5, 26)]
+)
+def test_a_paddle_moves_a_cell_and_stays_on_the_court(action, left, after, device):
+    court = Court(device).place(x=20, vx=1, left=left)
+    court.step(action)
+    assert court.left == after
+
+
+@pytest.mark.parametrize("speed", [0, 0.5, 1.25])
+def test_the_tracker_follows_the_ball_at_its_speed(speed, device):
+    court = Court(device, tracker_speed=speed).place(x=20, y=20, vx=1, vy=0, right=5)
+    court.step()
+    assert court.right == 5 + speed
+    court.place(right=17.75).step()
+    assert court.right == 17.75 + min(speed, 0.25), "its middle is at the ball then"
+
+
+@pytest.mark.parametrize(
+    "below, steepness", [(0.25, -0.875), (1, -0.5), (2, 0), (3, 0.5), (3.75, 0.875)]
+)
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_paddle_returns_the_ball_the_steeper_the_further_from_its_middle(
+    side, below, steepness, device
+):
+    x, vx = (1.5, -1) if side == "left" else (38.5, 1)
+    court = Court(device, self_play=True).place(x=x, y=10 + below, vx=vx, vy=0, **{side: 10})
+    world = court.step()
+    assert court.vx == -vx and court.vy == pytest.approx(steepness, abs=1 / 256)
+    assert court.x == pytest.approx(x, abs=1 / 256), "half a cell there, and half a cell back"
+    assert not world.reward.any() and not world.terminal.any()
+
+
+@pytest.mark.parametrize("below", [-1 / 256, 4])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_miss_is_a_point_for_the_other_side(side, below, device):
+    x, vx = (1.5, -1) if side == "left" else (38.5, 1)
+    court = Court(device, self_play=True).place(x=x, y=10 + below, vx=vx, vy=0, **{side: 10})
+    world = court.step()
+    lost, won = (0, 1) if side == "left" else (1, 0)
+    assert world.reward[won] == 1 and world.reward[lost] == -1
+    assert world.metrics.points_won[won] == 1 and world.metrics.points_won[lost] == 0
+    assert world.terminal.all() and not world.truncated.any()
+
+
+def test_a_game_goes_on_until_a_side_has_its_points(device):
+    court, shares = Court(device, points=2, self_play=True), []
+    for x, vx, rewards, ends in [
+        (1.5, -1, [-1, 1], False),
+        (38.5, 1, [1, -1], False),
+        (1.5, -1, [-1, 1], True),
+    ]:
+        world = court.place(x=x, y=20, vx=vx, vy=0, left=1, right=1).step()
+        assert world.reward.tolist() == rewards and world.terminal.tolist() == [ends] * 2
+        shares.append(world.metrics.points_won.tolist())
+        if not ends:
+            assert court.x in (20, 20 - 1 / 256), "the next ball is served"
+            assert (court.left, court.right) == (1, 1), "and the paddles stay where they are"
+    assert shares[:2] == [[0, 0], [0, 0]] and shares[2] == pytest.approx([1 / 3, 2 / 3])
+    world = court.step(1, 2)
+    assert world.reset.all() and not world.reward.any()
+    assert court.left == court.right == 13 and not court.env.games[Court.SCORES].any()
+
+
+def test_a_rally_that_never_ends_is_truncated(device):
+    env = envs.Pong(8, device=device, limit=7, points=2)
+    world = env.reset()
+    for age in range(1, 15):
+        assert not world.truncated.any()
+        world = env.step(arrdict.arrdict(actions=torch.zeros((8, 1), dtype=int, device=device)))
+        assert torch.equal(env.games[10].cpu(), torch.full((8,), age))
+    assert world.truncated.all() and not world.terminal.any(), "7 steps for each of 2 points"
+    assert (world.metrics.points_won == 0.5).all(), "no ball has crossed half the court in 14 steps"
+
+
+def test_serves_go_either_way_at_any_height_and_half_a_cell_up_or_down(device):
+    env = envs.Pong(4096, device=device)
+    env.reset()
+    x, y, vx, vy = env.games[:4].cpu()
+    to_right = vx > 0
+    assert set(vx.tolist()) == {-256, 256} and 0.45 < to_right.float().mean() < 0.55
+    assert set(x[to_right].tolist()) == {5119} and set(x[~to_right].tolist()) == {5120}
+    assert y.min() < 64 and y.max() >= 7680 - 64 and vy.min() == -128 and vy.max() == 128
+    assert not torch.equal(y[:2048], y[2048:])
+
+
+@pytest.mark.parametrize("pixels", [False, True], ids=["features", "pixels"])
+def test_both_sides_are_shown_the_same_court(pixels, device):
+    """Mirror the court and exchange the paddles: each lane sees what the other saw."""
+    place = dict(x=3.5, y=12.25, vx=-1, vy=0.5, last_x=4.5, last_y=11.75, left=9, right=20.5)
+    mirrored = dict(
+        place, x=40 - 1 / 256 - 3.5, last_x=40 - 1 / 256 - 4.5, vx=1, left=20.5, right=9
+    )
+    seen = [
+        Court(device, self_play=True, pixels=pixels).place(**court).step().obs.cpu()
+        for court in (place, mirrored)
+    ]
+    assert torch.equal(seen[0][0], seen[1][1]) and torch.equal(seen[0][1], seen[1][0])
+    assert not torch.equal(seen[0][0], seen[0][1])
+
+
+def test_features_are_paddles_ball_and_speed(device):
+    court = Court(device).place(x=9, y=15, vx=1, vy=-0.5, left=0, right=26)
+    (features,) = court.step().obs[0].tolist()
+    assert features == pytest.approx([-1, 0.9615, -0.5, -0.0333, 1, -0.5, 2, -2], abs=5e-4)
+    court.place(y=10.5, vy=0, left=8, right=10)
+    assert court.step().obs[0, 0, 6:].tolist() == pytest.approx([0.25, -0.5], abs=1e-3)
+
+
+def test_a_picture_shows_paddles_ball_and_where_it_was(device):
+    court = Court(device, pixels=True).place(x=20.5, y=9.25, vx=1, vy=0.75, left=5, right=7)
+    picture = court.step().obs[0, 0, 0].cpu()
+    drawn = {(row, column): int(picture[row, column]) for row, column in picture.nonzero().tolist()}
+    paddles = {(row, 0): 170 for row in range(5, 9)} | {(row, 39): 170 for row in range(7, 11)}
+    assert drawn == paddles | {(9, 20): 85, (10, 21): 255}
+
+
+def test_pictures_are_one_buffer():
+    env = envs.Pong(3, pixels=True, device="cpu")
+    first = env.reset().obs
+    assert env.step(arrdict.arrdict(actions=torch.zeros((3, 1), dtype=int))).obs is first
+
+
+# ---- What it looks like ----
+
+
+def test_the_picture_of_a_state_is_what_the_left_side_sees():
+    env = envs.Pong(5, pixels=True, self_play=True, device="cpu")
+    worlds = contract.rollout(env, 30)
+    state = arrdict.numpyify(env.state(2))
+    assert (env.picture(state) == worlds[-1].obs[4, 0, 0].numpy()).all()
+
+
+def test_text_shows_the_score_and_the_court():
+    court = Court(points=3).place(x=20.5, y=9.25, vx=1, vy=0.75, left=5, right=6)
+    court.env.games[8] = 2
+    court.step()
+    lines = court.env.text().splitlines()
+    assert len(lines) == 33 and lines[0].strip() == "2 : 0" and lines[1] == lines[32] == 40 * "-"
+    assert lines[2 + 4] == "" and lines[2 + 5] == "|"
+    assert lines[2 + 9] == 20 * " " + "." + 18 * " " + "|" and lines[2 + 10] == 21 * " " + "o"
+
+
+# ---- Errors ----
+
+
+@pytest.mark.parametrize("action", [-1, 3, 2**40])
+def test_an_action_that_is_none_is_named(action, device):
+    env = envs.Pong(4, device=device)
+    env.reset()
+    actions = torch.zeros((4, 1), dtype=torch.int64, device=device)
+    actions[2] = action
+    with pytest.raises(EngineError, match="environment 2 was given an action"):
+        env.step(arrdict.arrdict(actions=actions))
+        env.check()
+    env.check()
+
+
+def test_pixels_that_begin_between_words_are_refused(device):
+    env = envs.Pong(1, pixels=True, device=device)
+    odd = torch.zeros(1201, dtype=torch.uint8, device=device)[1:].view(1, 1, 1, 30, 40)
+    with pytest.raises(ValueError, match="^pixels must begin at a multiple of 8 bytes"):
+        pong_step(env.games, env.no_actions, env.error_flag, 1, pixels=odd)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
+@pytest.mark.parametrize("pixels", [False, True], ids=["features", "pixels"])
+def test_cpu_and_gpu_agree_on_every_bit(pixels, settings):
+    """70 environments, which do not fill their second block."""
+    runs = [
+        arrdict.stack(
+            contract.rollout(envs.Pong(70, device=on, pixels=pixels, **settings), 300, check=False)
+        )
+        for on in ("cpu", "cuda")
+    ]
+    assert contract.same(*runs)
+
+
+def test_threads_do_not_matter():
+    runs = []
+    try:
+        for n in (1, 3):
+            engine.set_threads(n)
+            runs.append(played("cpu", pixels=True, self_play=True))
+    finally:
+        engine.set_threads(None)
+    assert contract.same(*runs)
+
+
+# ---- Learning ----
+
+
+def rows_of(run):
+    """The newest table of a run."""
+    newest = max(Path(run).glob("evaluations/*.json"), key=lambda path: path.stat().st_mtime_ns)
+    return json.loads(newest.read_text())["rows"]
+
+
+def test_self_play_is_evaluated_against_itself_and_against_the_tracker(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small = ["env.n_envs=8", "learner.n_minibatches=2", "agent.width=8", "device=cpu"]
+    words = ["env=pong", "env.self_play=true", "env.limit=30", "samples=1000", "folder=run", *small]
+    assert train.main(words) == 0
+    table = ["run=run", "episodes=16", "device=cpu", "baseline=false"]
+    assert evaluate.main(table) == 0
+    assert [row.get("role") for row in rows_of("run")] == [None, "left", "right"]
+    assert evaluate.main([*table, "env=pong", "env.limit=30"]) == 0
+    (row,) = rows_of("run")
+    assert row["lanes"] == 16 and row["homes"] is None and 0 <= row["metrics"]["points_won"]["mean"]
+    assert len(list(Path("run").glob("evaluations/*.json"))) == 2
+    assert record.main(["run=run", "steps=3", "device=cpu"]) == 0 and Path("run/video.mp4").exists()
+
+
+def test_a_run_is_not_evaluated_in_an_environment_of_other_spaces(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    small = ["env.n_envs=4", "agent.width=8", "device=cpu", "samples=100", "folder=run"]
+    assert train.main(["env=pong", *small]) == 0
+    assert evaluate.main(["run=run", "env=pong", "env.pixels=true", "device=cpu"]) == 2
+    assert "was trained in another environment: obs was" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_recipe_wins_most_points_against_the_tracker(tmp_path, monkeypatch):
+    """Of which random actions win 0.15, and following the ball 0.7. The whole recipe wins 0.98."""
+    monkeypatch.chdir(tmp_path)
+    words = ["experiment=pong", "samples=3e6", "device=cpu", "finish.record=false", "folder=run"]
+    assert train.main(words) == 0
+    trained, random = rows_of("run")
+    assert trained["metrics"]["points_won"]["lower"] > 0.8
+    assert random["metrics"]["points_won"]["upper"] < 0.2

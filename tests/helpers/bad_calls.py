@@ -1,0 +1,594 @@
+"""Calls of the engine's and the scenery's public functions with one argument or buffer wrong each:
+dtype, shape, layout in memory, device, None, other types, numbers out of range, buffers that were
+replaced or resized. Run as a script it makes them all, so that a crash of the interpreter can be
+told by the last line printed:
+
+    python tests/bad_calls.py cpu
+
+Axes: N environments, A agents, D layouts.
+"""
+
+import json
+import math
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+
+from megastep import core, cuda, engine, modules, scene, toys
+from megastep.engine.scenery import Layouts, Scenery
+from megastep.envs.deathmatch.step import deathmatch_step
+from megastep.envs.pointgoal.goal_fields import GoalFields
+from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
+from megastep.envs.pong.step import GAME_FIELDS, PIXELS, pong_step
+from megastep.ragged import Ragged
+
+ALLOWED = (ValueError, TypeError, AttributeError, IndexError, engine.EngineError)
+N, A, D = 3, 2, 2
+
+
+def fixture(device):
+    """Small environments in which every call below succeeds as it is."""
+    scenery = scene.scenery([toys.box(), toys.column()], A, N, device=device)
+    c = core.Core(scenery, res=16, cameras=[0, 180])
+    c.agents.positions[:] = torch.tensor([[2.0, 3.0], [3.0, 2.0]])
+    words = -(-scenery.layouts.max_texels // 32)
+    return SimpleNamespace(
+        core=c,
+        scenery=scenery,
+        agents=c.agents,
+        layouts=scenery.layouts,
+        device=scenery.device,
+        lanes=torch.ones((N, A), dtype=torch.int64, device=device),
+        mask=torch.ones((N, A), dtype=torch.bool, device=device),
+        counts=torch.zeros((N, A), dtype=torch.int32, device=device),
+        seen=torch.zeros((N, A, words), dtype=torch.int32, device=device),
+        moves=torch.zeros((7, 3), device=device),
+        visible=torch.zeros((D, words), dtype=torch.int32, device=device),
+        points=torch.full((D, 4, 2), 3.0, device=device),
+        out=torch.zeros((N * A, 4), device=device),
+        games=torch.zeros((GAME_FIELDS, N), dtype=torch.int32, device=device),
+        actions=torch.zeros((N, 1), dtype=torch.int64, device=device),
+        error_flag=torch.zeros(1, dtype=torch.int32, device=device),
+        goals=GoalFields(
+            points=D * [np.ones((2, 2))],
+            fields=D * [np.ones((2, 3, 3), np.float16)],
+            origins=D * [np.ones(2)],
+            spawns=D * [np.ones((4, 2))],
+            lengths=D * [np.ones((4, 2))],
+            allowed=D * [np.ones((4, 2), bool)],
+            cell=1.0,
+            device=scenery.device,
+        ),
+        numbers=torch.zeros(N * A, dtype=torch.int32, device=device),
+        journey=torch.zeros((PROGRESS_ROWS, N * A), device=device),
+        free=torch.ones((N, A), device=device),
+        pixels=torch.zeros((N, 1, 1, *PIXELS), dtype=torch.uint8, device=device),
+        one_eyed=(one_eyed := core.Core(scenery, res=16)).agents,
+        view=engine.observe(scenery, one_eyed.agents, centre_line=True, agent_ray=True),
+        health=torch.ones(N * A, device=device),
+        tally=torch.zeros((3, N * A), device=device),
+        ages=torch.zeros(N * A, dtype=torch.int32, device=device),
+        ended=torch.zeros(N * A, dtype=torch.bool, device=device),
+    )
+
+
+# ---- Wrong values, by what is right: (label, value) ----
+
+
+def not_tensors(good):
+    yield from [("None", None), ("a string", "text"), ("a number", 3.5), ("a list", good.tolist())]
+
+
+def wrong_tensors(good):
+    """What is not a contiguous tensor of that dtype and shape on that device."""
+    for dtype in (
+        torch.float64,
+        torch.float16,
+        torch.float32,
+        torch.int64,
+        torch.int32,
+        torch.bool,
+    ):
+        if dtype != good.dtype:
+            yield f"of {dtype}", good.to(dtype)
+    yield "an axis more", good[None]
+    yield "flat", good.flatten() if good.ndim > 1 else good[0]
+    yield "a row less", good[1:].clone()
+    yield "a row more", torch.cat([good, good[:1]])
+    yield "empty", good[:0].clone()
+    yield "a column less", good[..., 1:].contiguous()
+    yield "not contiguous", torch.stack([good, good], -1)[..., 0]
+    yield "on another device", good.to("cpu" if good.device.type == "cuda" else "meta")
+
+
+def tensors(good):
+    yield from not_tensors(good)
+    yield from wrong_tensors(good)
+
+
+def of_any_length(good):
+    yield from (case for case in tensors(good) if case[0] not in ("a row less", "a row more"))
+
+
+def optional_tensors(good):
+    yield from [*not_tensors(good)][1:]
+    yield from wrong_tensors(good)
+
+
+def arrays(good):
+    """What is not an array of finite numbers of that shape; any dtype of real numbers is right."""
+    yield from [("None", None), ("a string", "text"), ("a number", 3.5), ("words", ["a", "b"])]
+    yield "an axis more", good[None]
+    yield "an axis less", good[0]
+    yield "a column less", good[..., 1:]
+    yield "complex", good.to(torch.complex64)
+    yield "meta", good.to("meta")
+    if good.numel():
+        yield "NaN", good * math.nan
+        yield "infinite", good + math.inf
+        yield "too large", good + 1e12
+
+
+def raggeds(good):
+    yield from [("None", None), ("a string", "text"), ("a tensor", good.vals), ("a list", [1.0])]
+    yield "an axis more", Ragged(good.vals[..., None], good.widths)
+    yield "a column less", Ragged(good.vals[..., 1:], good.widths)
+    yield "NaN", Ragged(good.vals * math.nan, good.widths)
+    yield "a subarray less", good[1:]
+    yield "complex", Ragged(good.vals.to(torch.complex64), good.widths)
+
+
+def integers(min, max=None):
+    def wrong(good):
+        yield from [("None", None), ("a string", "3"), ("a half", 2.5), ("NaN", math.nan)]
+        yield from [("a list", [1]), ("true", True), ("too small", min - 1), ("two", torch.ones(2))]
+        if max is not None:
+            yield "too large", max + 1
+
+    return wrong
+
+
+def numbers(*more):
+    def wrong(good):
+        yield from [("None", None), ("a string", "1"), ("NaN", math.nan), ("infinite", math.inf)]
+        yield from [("a list", [1.0]), ("two", torch.ones(2)), ("minus infinite", -math.inf)]
+        yield from [(str(value), value) for value in more]
+
+    return wrong
+
+
+def flags(good):
+    yield from [
+        ("a string", "yes"),
+        ("two", torch.ones(2)),
+        ("a list", []),
+        ("two numbers", (0, 1)),
+    ]
+
+
+def objects(good):
+    yield from [("None", None), ("a number", 3), ("a string", "x"), ("another", SimpleNamespace())]
+
+
+def views(good):
+    yield from objects(good)
+    for name in ("centre_line", "agent_ray"):
+        for label, wrong in tensors(getattr(good, name)):
+            yield f"{name} {label}", good._replace(**{name: wrong})
+
+
+def ids(good):
+    yield from [("None", None), ("a string", "text"), ("floats", good.float()), ("2d", good[None])]
+    yield from [("bools", good.bool()), ("negative", good - 9), ("too large", good + 10**6)]
+    yield from [("none", good[:0]), ("huge", good.long() + 2**40)]
+
+
+# ---- The calls: function, its right arguments, and what is wrong for each ----
+
+OPERANDS = dict(scenery=objects, agents=objects)
+
+
+def operations(f):
+    both = dict(scenery=f.scenery, agents=f.agents)
+    yield (
+        engine.physics,
+        dict(both, actions=f.lanes, moves=f.moves, damping=0.5),
+        dict(OPERANDS, actions=tensors, moves=of_any_length, damping=numbers()),
+    )
+    yield engine.render, both, OPERANDS
+    yield engine.update_agent_geometry, dict(both, lit=True), dict(OPERANDS, lit=flags)
+    yield (
+        engine.observe,
+        dict(both, subsample=4, seen=f.seen, clear_mask=f.mask, max_depth=10.0, imu=True),
+        dict(
+            OPERANDS,
+            subsample=integers(1, 32),
+            seen=tensors,
+            clear_mask=optional_tensors,
+            max_depth=numbers(0, -1),
+            imu=flags,
+            rgb=flags,
+            depth=flags,
+            centre_line=flags,
+            agent_ray=flags,
+        ),
+    )
+    yield (
+        engine.unseen,
+        dict(both, seen=f.seen, visible=f.visible),
+        dict(OPERANDS, seen=tensors, visible=tensors),
+    )
+    yield (
+        engine.coverage,
+        dict(both, seen=f.seen, visible=f.visible, mask=f.mask),
+        dict(OPERANDS, seen=tensors, visible=tensors, mask=tensors),
+    )
+    yield (
+        engine.spawn,
+        dict(
+            both,
+            mask=f.mask,
+            points=f.points,
+            counts=f.counts,
+            seed=1,
+            resample=True,
+            chosen=f.counts,
+        ),
+        dict(
+            OPERANDS,
+            mask=tensors,
+            points=tensors,
+            counts=tensors,
+            seed=lambda good: [*integers(0)(good)][:6],
+            resample=flags,
+            hidden=flags,
+            chosen=optional_tensors,
+        ),
+    )
+    yield (
+        pointgoal_step,
+        dict(
+            both,
+            goals=f.goals,
+            chosen=f.numbers,
+            journey=f.journey,
+            ages=f.ages,
+            ended=f.ended,
+            draws=f.numbers,
+            spawned=f.counts,
+            free=f.free,
+            seed=1,
+        ),
+        dict(
+            OPERANDS,
+            goals=objects,
+            chosen=tensors,
+            journey=tensors,
+            ages=tensors,
+            ended=tensors,
+            draws=tensors,
+            spawned=tensors,
+            free=optional_tensors,
+            seed=lambda good: [*integers(0)(good)][:6],
+            reach=numbers(),
+            bonus=numbers(),
+            cost=numbers(),
+            limit=lambda good: integers(1, 2**31 - 1)(1),
+            told=flags,
+        ),
+    )
+    yield (
+        engine.uniform,
+        dict(counts=f.counts.view(-1), mask=f.mask.view(-1), seed=1, out=f.out),
+        dict(counts=tensors, mask=tensors, seed=lambda g: [*integers(0)(g)][:6], out=tensors),
+    )
+    yield (
+        pong_step,
+        dict(games=f.games, actions=f.actions, error_flag=f.error_flag, seed=1, pixels=f.pixels),
+        dict(
+            games=tensors,
+            actions=tensors,
+            error_flag=lambda good: [c for c in tensors(good) if c[0] != "not contiguous"],
+            seed=lambda good: [*integers(0)(2)][:6],
+            restart=flags,
+            points=lambda good: integers(1, 2**31 - 1)(1),
+            limit=lambda good: integers(1, 2**31 - 1)(1),
+            tracker_speed=numbers(-0.1, 40),
+            pixels=optional_tensors,
+        ),
+    )
+    yield (
+        deathmatch_step,
+        dict(
+            scenery=f.scenery, agents=f.one_eyed, view=f.view, health=f.health, tally=f.tally,
+            ages=f.ages, ended=f.ended, limit=9, aim_reward=1.0, told=True,
+        ),
+        dict(
+            OPERANDS,
+            view=views,
+            **dict.fromkeys(("health", "tally", "ages", "ended"), tensors),
+            **dict.fromkeys(("damage", "recovery", "drain", "spoils"), numbers(-0.1)),
+            **dict.fromkeys(("hit_reward", "wound_cost", "kill_reward", "death_cost"), numbers()),
+            aim_reward=numbers(),
+            limit=lambda good: integers(1, 2**31 - 1)(1),
+            told=flags,
+        ),
+    )  # fmt: skip
+    yield (
+        modules.visible_texels,
+        dict(scenery=f.scenery, points=f.points),
+        dict(scenery=objects, points=arrays),
+    )
+    yield engine.bake, dict(scenery=f.scenery), dict(scenery=objects)
+    yield engine.check, dict(agents=f.agents), dict(agents=objects)
+
+
+def constructors(f):
+    model, widths = f.scenery.model.clone(), f.scenery.model_texels.diff()
+    layouts = dict(
+        lines=f.layouts.lines,
+        textures=f.layouts.textures,
+        lights=f.layouts.lights,
+        agent_textures=f.layouts.agent_textures,
+        device=f.device,
+    )
+    device = lambda good: [("a string", "tpu"), ("a half", 0.5), ("a list", [])]  # noqa: E731
+    parts = dict(lines=raggeds, textures=raggeds, lights=raggeds, device=device)
+    yield Layouts, layouts, dict(parts, agent_textures=arrays)
+    yield (
+        Scenery.of_layouts,
+        dict(
+            n_agents=A,
+            layouts=f.layouts,
+            model=model,
+            model_widths=widths,
+            layout=f.scenery.layout.clone(),
+        ),
+        dict(
+            n_agents=integers(0),
+            layouts=objects,
+            model=arrays,
+            model_widths=ids,
+            layout=lambda good: [*ids(good), ("the next", good + D)],
+        ),
+    )
+    yield (
+        Scenery,
+        dict(
+            n_agents=A,
+            lights=f.scenery.lights,
+            lines=f.scenery.lines,
+            textures=f.scenery.textures,
+            model=model,
+            device=f.device,
+        ),
+        dict(parts, n_agents=integers(0), model=arrays),
+    )
+    yield (
+        engine.Agents,
+        dict(
+            n_envs=N, n_agents=A, res=16, fov=90.0, fps=10.0, cameras=[0, 90], radius=0.1,
+            device=f.device,
+        ),
+        dict(
+            n_envs=integers(1),
+            n_agents=integers(0),
+            res=integers(1, 1024),
+            fov=numbers(0, 180),
+            fps=numbers(0, -1),
+            cameras=lambda good: [
+                ("a string", "ahead"), ("a number", 3.0), ("none", []), ("NaN", [math.nan]),
+                ("2d", [[0.0, 1.0]]),
+            ],
+            radius=numbers(0, -1),
+            device=device,
+        ),
+    )  # fmt: skip
+    yield (
+        scene.scenery,
+        dict(geometries=[toys.box()], n_agents=A, n_envs=N, seed=1, device=f.device),
+        dict(
+            geometries=lambda good: [
+                ("None", None), ("a number", 3), ("none", []), ("of None", [None]),
+                ("one", toys.box()), ("without walls", [dict(lights=[])]),
+                ("walls of one end", [toys.box() | dict(walls=torch.zeros(4, 2).numpy())]),
+                ("a wall of NaN", [toys.box() | dict(walls=toys.box().walls * math.nan)]),
+                ("lights of three", [toys.box() | dict(lights=torch.ones(1, 4).numpy())]),
+            ],
+            n_agents=integers(0),
+            n_envs=lambda good: [*integers(1)(good)][1:],
+            seed=integers(0),
+            device=device,
+        ),
+    )  # fmt: skip
+    yield f.scenery.env, dict(e=0), dict(e=integers(-N, N - 1))
+
+
+# ---- Buffers that were replaced or resized before a call ----
+
+CALLS = {
+    "render": lambda f: engine.render(f.scenery, f.agents),
+    "physics": lambda f: engine.physics(f.scenery, f.agents),
+    "observe": lambda f: engine.observe(f.scenery, f.agents, imu=True),
+    "unseen": lambda f: engine.unseen(f.scenery, f.agents, f.seen, f.visible),
+}
+STATE = "positions", "angles", "velocity", "angvelocity"
+SETTINGS = dict(res=10**6, fov=0.0, fps=0.0, radius=-1.0)
+BUFFERS = {
+    "layout": lambda f: f.scenery.layout,
+    "agent_lines": lambda f: f.scenery.agent_lines,
+    "agent_light": lambda f: f.scenery.agent_light,
+    "model": lambda f: f.scenery.model,
+    "model_texels": lambda f: f.scenery.model_texels,
+    "texels": lambda f: f.layouts.texels,
+    "agent_textures": lambda f: f.layouts.agent_textures,
+    "wall_starts": lambda f: f.layouts.wall_starts,
+    "texel_starts": lambda f: f.layouts.texel_starts,
+    "light_starts": lambda f: f.layouts.light_starts,
+    "box_starts": lambda f: f.layouts.box_starts,
+    "lines": lambda f: f.layouts.lines.vals,
+    "lights": lambda f: f.layouts.lights.vals,
+    "yaws": lambda f: f.agents.yaws,
+    "ray_lengths": lambda f: f.agents.ray_lengths,
+    "error_flag": lambda f: f.agents.error_flag,
+}
+
+
+def replacements(device):
+    """(label, name, act): an attribute is set to something wrong, and a call follows."""
+    f = fixture(device)
+    for name in STATE:
+        for label, value in tensors(getattr(f.agents, name)):
+            for call in CALLS:
+                if call == "physics" or name in ("positions", "angles"):
+                    yield f"{call}, agents.{name} {label}", name, _set("agents", name, value, call)
+    for name, value in SETTINGS.items():
+        yield f"agents.{name} = {value}", name, _set("agents", name, value, "render")
+    for name in ("yaws", "ray_lengths", "error_flag"):
+        yield f"agents.{name} = None", name, _set("agents", name, None, "render")
+    for owner in ("scenery", "layouts"):
+        for name in vars(getattr(f, owner)):
+            if not name.startswith("_"):
+                yield f"{owner}.{name} = None", name, _set(owner, name, None, "render")
+    for name in ("lines", "textures", "baked", "lights"):
+        act = lambda f, name=name: setattr(getattr(f.layouts, name), "vals", None)  # noqa: E731
+        yield f"layouts.{name}.vals = None", "vals", act
+        act = lambda f, name=name: setattr(f.scenery, name, None)  # noqa: E731
+        yield f"scenery.{name} = None", name, act
+
+
+def _set(owner, name, value, call):
+    def act(f):
+        setattr(getattr(f, owner), name, value)
+        CALLS[call](f)
+
+    return act
+
+
+def resizings(device):
+    """(label, name, act): after a good call a buffer's own memory is exchanged, and a call
+    follows.
+    """
+
+    def between_calls(change):
+        return lambda f: (CALLS["render"](f), change(f), CALLS["render"](f))
+
+    def exchange(buffer, make):
+        return between_calls(lambda f: setattr(buffer(f), "data", make(buffer(f))))
+
+    for name, buffer in BUFFERS.items():
+        yield f"{name}.resize_(0)", name, between_calls(lambda f, b=buffer: b(f).resize_(0))
+        shorten = lambda f, b=buffer: b(f).resize_(len(b(f)) - 1, *b(f).shape[1:])  # noqa: E731
+        yield f"{name}.resize_ by a row", name, between_calls(shorten)
+        yield f"{name}.data a row less", name, exchange(buffer, lambda t: t[1:].clone())
+        yield f"{name}.data of float64", name, exchange(buffer, lambda t: t.clone().double())
+        yield f"{name}.data empty", name, exchange(buffer, lambda t: t.new_empty(0))
+    for name in ("textures", "baked"):
+        views = lambda f, name=name: getattr(f.layouts, name).vals  # noqa: E731
+        yield f"{name}.vals.data elsewhere", name, exchange(views, torch.clone)
+    texels = lambda f: f.layouts.texels  # noqa: E731
+    yield "texels.data elsewhere", "texels", exchange(texels, torch.clone)
+
+
+def others(device):
+    yield "physics without moves", "moves", lambda f: engine.physics(f.scenery, f.agents, f.lanes)
+    yield (
+        "physics without actions",
+        "actions",
+        lambda f: engine.physics(f.scenery, f.agents, moves=f.moves),
+    )
+    yield (
+        "observe without seen",
+        "clear_mask",
+        lambda f: engine.observe(f.scenery, f.agents, clear_mask=f.mask),
+    )
+    yield (
+        "subsample no divisor",
+        "subsample",
+        lambda f: engine.observe(f.scenery, f.agents, subsample=3),
+    )
+    yield (
+        "too few points",
+        "points",
+        lambda f: engine.spawn(
+            f.scenery, f.agents, f.mask, f.points[:, :1].contiguous(), f.counts, 1
+        ),
+    )
+    yield (
+        "agents of fewer environments",
+        "positions",
+        lambda f: engine.render(f.scenery, engine.Agents(N - 1, A, device=f.device)),
+    )
+    for name in ("lines", "lights", "textures", "baked"):
+        yield f"scenery.{name}[99]", "99", lambda f, name=name: getattr(f.scenery, name)[999]
+        yield f"scenery.{name}['a']", "str", lambda f, name=name: getattr(f.scenery, name)["a"]
+    yield "device tpu", "device", lambda f: engine.device("tpu")
+    yield "device None", "device", lambda f: engine.device(None)
+    yield "Core of no scenery", "scenery", lambda f: cuda.Core(None)
+    for name, value in dict(res=0, fov=200.0, fps=-1.0, cameras=[], seed=0.5).items():
+        yield (
+            f"Core({name}={value})",
+            "camera" if name == "cameras" else name,
+            lambda f, name=name, value=value: cuda.Core(f.scenery, **{name: value}),
+        )
+
+
+def wrong_arguments(device):
+    """(label, name, act) of every call with every argument wrong in every way."""
+    for table in (operations, constructors):
+        for i, (function, right, wrong) in enumerate(table(fixture(device))):
+            title = function.__qualname__
+            yield f"{title} as it is", None, _call(table, i, None, None)
+            for name, kinds in wrong.items():
+                for label, value in kinds(right.get(name)):
+                    yield f"{title}({name}: {label})", name, _call(table, i, name, value)
+
+
+def _call(table, i, name, value):
+    def act(f):
+        function, right, _ = [*table(f)][i]
+        return function(**(right if name is None else {**right, name: value}))
+
+    return act
+
+
+def cases(device):
+    for source in (wrong_arguments, replacements, resizings, others):
+        yield from source(device)
+
+
+def verdict(name, act, f):
+    """What is wrong with how a call ended, or None: it must name its argument (or the mask, which
+    must be as long as counts) and change nothing; where there is no name, it must succeed.
+    """
+    before = [getattr(f.agents, state).clone() for state in STATE]
+    held = [getattr(f.agents, state) for state in STATE]
+    try:
+        act(f)
+    except ALLOWED as error:
+        if name is None:
+            return f"refused: {error}"
+        if name not in str(error) and not (name == "counts" and "mask" in str(error)):
+            return f"{type(error).__name__} does not name {name}: {error}"
+        if not all(map(torch.equal, before, held)):
+            return "refused, but the agents have changed"
+        return None
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return None if name is None else "accepted"
+
+
+def main(device):
+    torch.set_num_threads(1)
+    for label, name, act in cases(device):
+        print(json.dumps(dict(call=label)), flush=True)
+        found = verdict(name, act, fixture(device))
+        if device != "cpu":
+            torch.cuda.synchronize()
+        print(json.dumps(dict(call=label, wrong=found)), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,131 @@
+"""Deathmatch twice more: who is hit, what it costs and pays, and who is in whose sight, in plain
+Python and NumPy. Slow, obvious, and nothing shared with the kernels.
+
+N environments, A agents, M lines of the agent model, W walls.
+"""
+
+import numpy as np
+
+from tests.helpers.pong_twins import philox
+
+ONE, SPENT = np.float32(1), np.float32(1e-4)
+F = np.float32
+
+
+def shots(line, ray, health, tally, ages, ended, *, n_model, res, rules):
+    """A step of one environment: ``line``, ``ray``, ``health``, ``ages``, ``ended`` (A,), ``tally``
+    (3, A), kills, damage, hits. Returns what the engine writes, by name, and the new state.
+    """
+    n, rules = len(line), {name: F(value) for name, value in rules.items()}
+    hits = {}  # shooter: target
+    for a in range(n):
+        target = int(line[a]) // n_model if 0 <= line[a] < n * n_model else None
+        if target is not None and not ended[a] and not ended[target]:
+            hits[a] = target
+    by = {a: [shooter for shooter, target in hits.items() if target == a] for a in range(n)}
+    left, lost, dies = {}, {}, {}
+    for a in range(n):
+        before = ONE if ended[a] else health[a]
+        wounds = F(len(by[a])) * rules["damage"]
+        left[a] = ONE if ended[a] else before - wounds - rules["drain"]
+        lost[a], dies[a] = min(wounds, before), bool(left[a] <= SPENT)
+    rows = []
+    for a in range(n):
+        begins, target = bool(ended[a]), hits.get(a)
+        gain = rules["spoils"] if a in hits else F(0)
+        gain = gain if by[a] else gain + rules["recovery"]
+        hit, wounds, kill, damage = F(a in hits), F(len(by[a])), F(0), F(0)
+        if target is not None:
+            share = ONE / F(len(by[target]))
+            kill, damage = share * F(dies[target]), lost[target] * share
+        aim = F(0)
+        if rules["aim_reward"] and ray[a] >= 0:
+            aim = max(ONE - F(abs(int(ray[a]) - res // 2)) / (F(res) * F(0.5)), F(0))
+        reward = (
+            rules["hit_reward"] * hit
+            - rules["wound_cost"] * wounds
+            + rules["kill_reward"] * kill
+            - rules["death_cost"] * F(dies[a])
+            + rules["aim_reward"] * aim
+        )
+        age = 0 if begins else int(ages[a]) + 1
+        ends = not begins and (dies[a] or age >= rules["limit"])
+        sums = [F(0) if begins else tally[k, a] + x for k, x in enumerate((kill, damage, hit))]
+        after = F(0) if dies[a] else min(left[a] + gain, ONE)
+        rows.append(
+            dict(
+                reward=F(0) if begins else reward,
+                reset=begins,
+                terminal=ends and dies[a],
+                truncated=ends and not dies[a],
+                kills=sums[0] if ends else F(0),
+                deaths=F(ends and dies[a]),
+                damage=sums[1] if ends else F(0),
+                accuracy=sums[2] / F(age) if ends else F(0),
+                vitals=np.array([after, hit, wounds], np.float16),
+                health=after,
+                tally=np.array(sums),
+                ages=age,
+                ended=ends,
+            )
+        )
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+def told(health, positions, angles):
+    """What critics are told of one environment, (A, 1 + 5 (A - 1)) float64: own health, and of each
+    other, the next one first, health, place ahead and left / 10 m, cosine and sine of its heading.
+    """
+    rows, n = [], len(health)
+    for a in range(n):
+        row, heading = [health[a]], np.radians(float(angles[a]))
+        turn = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
+        for k in range(1, n):
+            b = (a + k) % n
+            other = np.radians(float(angles[b])) - heading
+            place = turn @ (positions[b].astype(float) - positions[a]) / 10
+            row += [health[b], *place, np.cos(other), np.sin(other)]
+        rows.append(row)
+    return np.array(rows)
+
+
+# ---- Spawning out of sight ----
+
+
+def meets(walls, start, end):
+    """(W,) bool: which walls (W, 2, 2) a line of sight meets, by solving for where they cross."""
+    along, step = walls[:, 1] - walls[:, 0], end - start
+    area = step[0] * along[:, 1] - step[1] * along[:, 0]
+    away = walls[:, 0] - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        on_sight = (away[:, 0] * along[:, 1] - away[:, 1] * along[:, 0]) / area
+        on_wall = (away[:, 0] * step[1] - away[:, 1] * step[0]) / area
+    return (on_sight >= 0) & (on_sight <= 1) & (on_wall >= 0) & (on_wall <= 1) & (area != 0)
+
+
+def in_sight(walls, eye, place, radius):
+    """Whether somebody at ``eye`` (2,) sees the middle or either side of a disc at ``place``."""
+    away = place - eye
+    side = radius * np.array([-away[1], away[0]]) / max(np.linalg.norm(away), radius)
+    return any(not meets(walls, eye, place + k * side).any() for k in (-1, 0, 1))
+
+
+def spawned(walls, points, positions, mask, draws, first_lane, seed, radius):
+    """Where the agents of one environment stand, (A, 2), once those of ``mask`` (A,) have respawned
+    among the points (A, P, 2) of each; ``draws`` (A,) are their numbers drawn before.
+    """
+    walls, positions = walls.astype(float), positions.astype(float).copy()
+    stands = [not gone for gone in mask]
+    for a in np.nonzero(mask)[0]:
+        word = philox(first_lane + int(a), int(draws[a]), seed)[0]
+        first = int((word >> 8) / 2**24 * len(points[a]))
+        own = np.roll(points[a].astype(float), -first, axis=0)
+        others = [positions[b] for b in range(len(mask)) if stands[b] and b != a]
+        hidden = [not any(in_sight(walls, eye, at, radius) for eye in others) for at in own]
+        if any(hidden):
+            positions[a] = own[hidden.index(True)]
+        else:
+            gaps = [min(np.linalg.norm(at - eye) for eye in others) for at in own]
+            positions[a] = own[int(np.argmax(gaps))]
+        stands[a] = True
+    return positions

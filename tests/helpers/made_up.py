@@ -1,0 +1,90 @@
+"""Random worlds, rollouts of them, and what is compared after learning from these."""
+
+import torch
+
+from megastep import spaces
+from megastep.agents.networks.policy import Policy
+from megastep.agents.storage.rollout import Rollout
+from megastep.arrdict import arrdict
+
+T, B, WIDTH = 8, 6, 16
+OBS, MOVES = spaces.MultiVector(1, 4), spaces.MultiDiscrete(1, 3)
+MORE = spaces.MultiVector(1, 2)  # what a critic may see beside
+
+
+class Numbers:
+    """Shows random numbers; action 1 pays the first of them. An episode is truncated after 7 steps.
+    What is seen does not depend on what is done, so one action that differs changes little.
+
+    Args: `bad_steps`, those that pay lane 3 nan; the first is 1.
+    """
+
+    obs_space, action_space = spaces.MultiVector(1, 3), spaces.MultiDiscrete(1, 3)
+    n_envs, n_agents = B, 1
+
+    def __init__(self, device="cpu", bad_steps=()):
+        self.n_steps, self.bad_steps = 0, bad_steps
+        self.device = torch.device(device)
+        self.generator = torch.Generator(device).manual_seed(1)
+        self.age = torch.zeros(B, dtype=torch.int64, device=device)
+        self.obs = torch.zeros(B, 1, 3, device=device)
+
+    def reset(self):
+        return self._world(torch.ones_like(self.age, dtype=torch.bool), torch.zeros_like(self.age))
+
+    def step(self, decision):
+        world = self._world(self.age == 7, decision["actions"][:, 0] == 1)
+        if self.bad_steps:
+            self.n_steps += 1
+            world.reward[3] *= torch.nan if self.n_steps in self.bad_steps else 1.0
+        return world
+
+    def _world(self, reset, is_taken):
+        reward = (self.obs[:, 0, 0] * is_taken).masked_fill(reset, 0.0)
+        self.age = (self.age + 1).masked_fill(reset, 0)
+        self.obs = torch.randn(B, 1, 3, generator=self.generator, device=self.device) + 2
+        ended = self.age == 7
+        metrics = arrdict(age=self.age.float())
+        flags = dict(reset=reset, terminal=torch.zeros_like(ended), truncated=ended)
+        return arrdict(obs=self.obs, reward=reward, metrics=metrics, **flags)
+
+
+def made_up(seed=0, device="cpu", privileged=None, values=True):
+    """A policy and a rollout of random worlds, acted in by that policy. Lanes 1 and 4 have resets
+    in the middle.
+    """
+    policy = Policy(OBS, MOVES, privileged, width=WIDTH, seed=seed).to(device)
+    with torch.no_grad():
+        # a policy far from uniform, so that gradients differ by action
+        policy.output.core.weight.mul_(100)
+    state = policy.initial(B)
+    rollout = Rollout(*(T, B, OBS, MOVES, state, device, privileged, torch.float32), values=values)
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator).to(device)
+
+    rollout.obs[:] = normal(T + 1, B, 1, 4)
+    rollout.starts[3, 1] = rollout.starts[5, 4] = True
+    rollout.terminal[1, 1] = rollout.truncated[3, 4] = True
+    rollout.reward[:] = normal(T, B)
+    if privileged:
+        rollout.privileged[:] = normal(T + 1, B, *privileged.shape)
+    with torch.no_grad():
+        out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
+        if values:
+            rollout.values[:] = policy.value(out.features, rollout.privileged)
+        rollout.actions[:] = policy.output.sample(out.logits[:-1], policy.random.on(policy.device))
+        rollout.logprobs[:] = policy.output.logprob(out.logits[:-1], rollout.actions)
+    return policy, rollout
+
+
+def weights(policy):
+    """All but the value's own layer, which `update_stats` changes with no prediction."""
+    return torch.cat(
+        [
+            p.detach().flatten()
+            for name, p in policy.named_parameters()
+            if not name.startswith("critic.output")
+        ]
+    )

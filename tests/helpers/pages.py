@@ -1,0 +1,41 @@
+"""Pages of docs/ as a reader follows them: files written into a folder, commands typed there."""
+
+import contextlib
+import re
+import shlex
+import sys
+from pathlib import Path
+
+from megastep.agents.cli import evaluate, record, train
+
+ROOT = Path(__file__).resolve().parents[2]
+MAINS = {"train.py": train.main, "evaluate.py": evaluate.main, "record.py": record.main}
+
+
+def code(text):
+    """The Python blocks of a page or a part of it."""
+    return re.findall(r"```python\n(.*?)```", text, re.S)
+
+
+def commands(text):
+    """Its commands, `(script, words)` each, in order."""
+    return [(s, shlex.split(words)) for s, words in re.findall(r"^python (\S+) (.*)$", text, re.M)]
+
+
+@contextlib.contextmanager
+def inside(folder, patch):
+    """A folder as the current one; what is imported from it is forgotten afterwards."""
+    patch.chdir(folder)
+    patch.syspath_prepend(folder)
+    yield
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None)).startswith(str(folder)):
+            del sys.modules[name]
+
+
+def type_all(text, folder, patch):
+    """Types the commands of a page in a folder; they must succeed. Returns the scripts typed."""
+    with inside(folder, patch):
+        for script, words in commands(text):
+            assert MAINS[script](words) == 0, (script, words)
+    return [script for script, _ in commands(text)]

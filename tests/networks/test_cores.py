@@ -1,0 +1,193 @@
+"""Recurrent cores, each held to the same: resets clear them, and stepping is unrolling. On a GPU in
+bfloat16, as policies run them there.
+"""
+
+import pytest
+import torch
+from torch import nn
+
+from megastep.agents.networks.cores import CORES, GRU, Stack, make_core
+from megastep.arrdict import arrdict
+from megastep.dotdict import leaves
+
+T, B, W = 9, 5, 8
+# On the CPU float32 sums of 8 products, nine steps deep, in another order; on a GPU roundings of
+# bfloat16's 8 bits, which feed on themselves through layers and steps.
+CLOSE = {"cpu": dict(rtol=1e-5, atol=1e-5), "cuda": dict(rtol=0, atol=5e-2)}
+
+each_core = pytest.mark.parametrize("name", CORES)
+each_depth = pytest.mark.parametrize("layers", [1, 2])
+
+
+def case(name, layers, device="cpu", n_steps=T):
+    """A core, inputs (T, B, W), resets (T, B), and a state that is not zero."""
+    torch.manual_seed(0)
+    core = make_core(name, W, layers)
+    state = core.initial(B).map(torch.randn_like)
+    x, reset = torch.randn(n_steps, B, W), torch.rand(n_steps, B) < 0.3
+    return core.to(device), x.to(device), reset.to(device), state.map(lambda s: s.to(device))
+
+
+def run(core, x, reset, state):
+    """As a policy calls it; outputs as float32."""
+    with torch.autocast(x.device.type, torch.bfloat16, enabled=x.is_cuda):
+        outputs, after = core(x, reset, state)
+    return outputs.float(), after
+
+
+def assert_close(found, expected, device):
+    for a, b in zip(leaves(found), leaves(expected), strict=True):
+        torch.testing.assert_close(a, b, **CLOSE[device])
+
+
+@each_depth
+@each_core
+def test_episodes_spliced_into_lanes_are_what_each_is_alone(name, layers, device):
+    """Episodes of 1 to 7 steps, one after the other in each lane, each at a place of its own."""
+    n_steps = 30
+    core, _, _, dirty = case(name, layers, device)
+    lengths = torch.randint(1, 8, (B, n_steps), generator=torch.Generator().manual_seed(1))
+    expected = torch.empty(n_steps, B, W, device=device)
+    x, reset = torch.randn_like(expected), torch.zeros(n_steps, B, dtype=torch.bool, device=device)
+    last = []
+    for b in range(B):
+        ends = lengths[b].cumsum(0)
+        for start, end in zip([0, *ends.tolist()], ends.tolist(), strict=False):
+            if start < n_steps:
+                reset[start, b] = True
+                episode = x[start:end, b : b + 1]
+                alone = torch.zeros(len(episode), 1, dtype=torch.bool, device=device)
+                outputs, after = run(core, episode, alone, core.initial(1, device))
+                expected[start:end, b] = outputs[:, 0]
+        last.append(after)
+    assert reset[1:].any(0).all() and reset.sum(0).unique().numel() > 1
+    outputs, after = run(core, x, reset, dirty)
+    assert_close(outputs, expected, device)
+    for leaf, *alone in zip(leaves(after), *map(leaves, last), strict=True):
+        assert_close(leaf, torch.cat(alone), device)
+
+
+@each_depth
+@each_core
+@pytest.mark.parametrize("p_reset", [0.2, 1.0])
+def test_what_came_before_a_reset_changes_no_bit_after_it(name, layers, device, p_reset):
+    core, x, reset, state = case(name, layers, device, n_steps=16)
+    generator = torch.Generator().manual_seed(2)
+    reset = (torch.rand(16, B, generator=generator) < p_reset).to(device)
+    reset[7] = True
+    outputs, after = run(core, x, reset, state)
+    for scale in (1e3, torch.nan):
+        other = x.clone()
+        other[:7] = scale * torch.randn(7, B, W, generator=generator).to(device)
+        others, after_other = run(core, other, reset, state * scale)
+        assert torch.equal(others[7:], outputs[7:]) and not torch.equal(others[:7], outputs[:7])
+        for a, b in zip(leaves(after_other), leaves(after), strict=True):
+            assert torch.equal(a, b)
+
+
+@each_depth
+@each_core
+def test_no_gradient_passes_a_reset(name, layers, device):
+    core, x, _, state = case(name, layers, device)
+    given = [x.requires_grad_(), *(leaf.requires_grad_() for leaf in leaves(state))]
+    reset = torch.zeros(T, B, dtype=torch.bool, device=device)
+    reset[4, :2] = True
+    outputs, after = run(core, x, reset, state)
+    loss = outputs[4:].sum() + sum(leaf.sum() for leaf in leaves(after))
+    d_x, *d_state = torch.autograd.grad(loss, given)
+    assert not d_x[:4, :2].any() and d_x[4:].any()
+    assert not any(leaf[:2].any() for leaf in d_state)
+    assert bool(d_x[:4, 2:].any()) == (name != "none"), "the other lanes remember"
+    assert all(leaf[2:].any() for leaf in d_state)
+
+
+@each_depth
+@each_core
+def test_unrolling_is_stepping(name, layers, device):
+    core, x, reset, state = case(name, layers, device)
+    outputs, after = run(core, x, reset, state)
+    for t in range(T):
+        output, state = run(core, x[t : t + 1], reset[t : t + 1], state)
+        assert_close(output[0], outputs[t], device)
+    assert_close(state, after, device)
+
+
+@each_depth
+@each_core
+def test_lanes_do_not_mix(name, layers, device):
+    core, x, reset, state = case(name, layers, device)
+    outputs, _ = run(core, x, reset, state)
+    one, _ = run(core, x[:, 2:3], reset[:, 2:3], state.map(lambda leaf: leaf[2:3]))
+    assert_close(one[:, 0], outputs[:, 2], device)
+    other = x.clone()
+    other[:, [0, 1, 3, 4]] = torch.nan
+    others, _ = run(core, other, reset, state)
+    assert torch.equal(others[:, 2], outputs[:, 2])
+
+
+@each_core
+def test_each_layer_is_added_to_what_it_was_given(name):
+    core, x, reset, state = case(name, layers=3)
+    features = x
+    for i, layer in enumerate(core):
+        outputs, after = layer(features, reset, state[str(i)])
+        features = features + outputs
+    outputs, state = core(x, reset, state)
+    torch.testing.assert_close(x + outputs, features, **CLOSE["cpu"])
+    assert_close(state["2"], after, "cpu")
+
+
+@each_core
+def test_one_layer_is_the_core_itself(name):
+    core, alone = case(name, layers=1)[0], CORES[name]
+    assert type(core) is alone and list(core.state_dict()) == list(alone(W).state_dict())
+    stack = make_core(name, W, 2)
+    assert isinstance(stack, Stack) and list(stack.initial(B)) == ["0", "1"]
+    assert list(stack.state_dict()) == [f"{i}.{key}" for i in (0, 1) for key in core.state_dict()]
+
+
+def test_a_gru_is_torchs_own():
+    core, x, _, state = case("gru", layers=1)
+    theirs = nn.GRU(W, W)
+    with torch.no_grad():
+        core.input.bias.normal_(), core.memory.bias.normal_()
+        theirs.weight_ih_l0.copy_(core.input.weight), theirs.bias_ih_l0.copy_(core.input.bias)
+        theirs.weight_hh_l0.copy_(core.memory.weight), theirs.bias_hh_l0.copy_(core.memory.bias)
+    outputs, after = core(x, torch.zeros(T, B, dtype=torch.bool), state)
+    expected, last = theirs(x, state.output[None])
+    torch.testing.assert_close(outputs, expected, **CLOSE["cpu"])
+    torch.testing.assert_close(after.output, last[0], **CLOSE["cpu"])
+
+
+@each_depth
+def test_without_a_memory_there_is_no_state(layers):
+    core, x, reset, state = case("none", layers)
+    assert not leaves(state) and not leaves(core(x, reset, state)[1])
+
+
+def test_an_unknown_core_names_the_nearest():
+    with pytest.raises(ValueError, match="'gruu' is unknown; did you mean gru"):
+        make_core("gruu", W)
+    with pytest.raises(ValueError, match="'mingu' is unknown; did you mean mingru"):
+        make_core("mingu", W)
+    assert isinstance(make_core("gru", W), GRU)
+
+
+class Leaky(nn.Module):
+    """A core that counts its steps across resets."""
+
+    def __init__(self, width):
+        super().__init__()
+
+    def initial(self, n_lanes, device=None):
+        return arrdict(total=torch.zeros(n_lanes, 1, device=device))
+
+    def forward(self, x, reset, state):
+        totals = state.total + x.cumsum(0)
+        return totals, arrdict(total=totals[-1, :, :1])
+
+
+def test_a_core_that_leaks_is_refused_in_any_number_of_layers():
+    for layers in (1, 2):
+        with pytest.raises(ValueError, match="what came before a reset is forgotten"):
+            make_core("test_cores:Leaky", W, layers)

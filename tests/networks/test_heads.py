@@ -1,0 +1,272 @@
+"""Heads: networks made from spaces, and the distributions over actions they stand for."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from megastep import spaces
+from megastep.agents.networks import encoders, heads
+from megastep.arrdict import arrdict
+
+IMAGE, DEPTH, VECTOR = (
+    spaces.MultiImage(2, 3, 1, 16),
+    spaces.MultiImage(2, 1, 1, 16),
+    spaces.MultiVector(2, 5),
+)
+TREE = arrdict(eyes=arrdict(rgb=IMAGE, d=DEPTH), imu=VECTOR, team=spaces.MultiDiscrete(2, 4))
+MOVES = arrdict(movement=spaces.MultiDiscrete(2, 7), fire=spaces.MultiDiscrete(2, 2))
+WIDTH = 24
+
+
+def sample_of(space, *lead, seed=0, dtype=torch.float32):
+    """Something that an environment with this space might show."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def leaf(child):
+        if isinstance(child, spaces.MultiDiscrete):
+            return torch.randint(child.n_actions, (*lead, *child.shape), generator=generator)
+        return torch.rand(*lead, *child.shape, generator=generator).to(dtype)
+
+    return space.map(leaf) if isinstance(space, dict) else leaf(space)
+
+
+@pytest.mark.parametrize("encoder", encoders.ENCODERS)
+@pytest.mark.parametrize(
+    "space", [IMAGE, VECTOR, spaces.MultiDiscrete(2, 4), TREE, spaces.MultiImage(1, 3, 4, 1)]
+)
+@pytest.mark.parametrize("lead", [(), (6,), (3, 6)])
+def test_an_intake_gives_width_numbers_whatever_it_is_shown(space, encoder, lead):
+    intake = heads.intake(space, WIDTH, encoder)
+    out = intake(sample_of(space, *lead))
+    assert out.shape == (*lead, WIDTH) and out.dtype == torch.float32 and out.isfinite().all()
+
+
+@pytest.mark.parametrize("encoder", encoders.ENCODERS)
+def test_every_pixel_and_every_leaf_matters(encoder):
+    torch.manual_seed(0)
+    intake = heads.intake(TREE, 512, encoder)
+    obs = sample_of(TREE, 1)
+    for leaf in (obs.eyes.rgb, obs.eyes.d, obs.imu):
+        leaf.requires_grad_()
+    intake(obs).sum().backward()
+    for leaf in (obs.eyes.rgb, obs.eyes.d, obs.imu):
+        assert (leaf.grad != 0).all()
+    other = arrdict({**obs, "team": (obs.team + 1) % 4})
+    assert not torch.equal(intake(other), intake(obs))
+
+
+def test_the_order_of_keys_does_not_matter():
+    intake = heads.intake(TREE, WIDTH)
+    obs = sample_of(TREE, 6)
+    backwards = arrdict({key: obs[key] for key in reversed(obs)})
+    assert torch.equal(intake(backwards), intake(obs))
+
+
+def test_half_precision_images_meet_single_precision_weights():
+    intake = heads.intake(TREE, WIDTH)
+    half = sample_of(TREE, 6, dtype=torch.float16)
+    single = half.map(lambda leaf: leaf.float() if leaf.is_floating_point() else leaf)
+    assert torch.equal(intake(half), intake(single))
+
+
+def test_autocast_decides_the_dtype_of_the_products_but_not_of_the_logits():
+    intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
+    with torch.autocast("cpu", torch.bfloat16):
+        x = intake(sample_of(TREE, 6, dtype=torch.float16))
+        assert x.dtype == torch.bfloat16
+        assert output(x).movement.dtype == torch.float32
+
+
+def test_leaves_weigh_the_same_at_the_start():
+    # An image of 3 x 64 numbers and a vector of 3, all 1: each leaf's part of the sum has variance
+    # 2/2
+    torch.manual_seed(0)
+    intake = heads.intake(
+        arrdict(rgb=spaces.MultiImage(1, 3, 1, 64), imu=spaces.MultiVector(1, 3)), 4096
+    )
+    of_rgb, of_imu, padding = intake.project.weight.split([192, 3, 5], dim=1)
+    assert not padding.any()
+    for part in (of_rgb, of_imu):
+        assert part.sum(1).var().item() == pytest.approx(
+            1, abs=0.1
+        )  # 4096 samples: 4.5 standard errors
+
+
+def test_logits_are_log_probabilities_that_an_env_can_be_given():
+    intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
+    logits = nn.Sequential(intake, output)(sample_of(TREE, 6))
+    assert logits.movement.shape == (6, 2, 7) and logits.fire.shape == (6, 2, 2)
+    torch.testing.assert_close(logits.movement.exp().sum(-1), torch.ones(6, 2))
+    actions = output.sample(logits)
+    assert (
+        actions.movement.shape == actions.fire.shape == (6, 2) and actions.fire.dtype == torch.int64
+    )
+    assert output.logprob(logits, actions).shape == output.entropy(logits).shape == (6,)
+
+
+def test_a_bare_space_gives_bare_actions():
+    output = heads.output(spaces.MultiDiscrete(1, 7), WIDTH)
+    logits = output(torch.randn(3, 5, WIDTH))
+    assert logits.shape == (3, 5, 1, 7) and output.sample(logits).shape == (3, 5, 1)
+
+
+def test_logprob_and_entropy_by_hand():
+    output = heads.output(MOVES, WIDTH)
+    even = arrdict(
+        movement=torch.full((1, 2, 7), 1 / 7).log(),
+        fire=torch.tensor([[[0.25, 0.75], [0.5, 0.5]]]).log(),
+    )
+    actions = arrdict(movement=torch.tensor([[6, 0]]), fire=torch.tensor([[1, 0]]))
+    # two agents move evenly among 7, one fires with 3/4, the other with 1/2
+    assert output.logprob(even, actions).item() == pytest.approx(
+        2 * math.log(1 / 7) + math.log(0.75) + math.log(0.5)
+    )
+    uneven = -0.25 * math.log(0.25) - 0.75 * math.log(0.75)
+    assert output.entropy(even).item() == pytest.approx(2 * math.log(7) + uneven + math.log(2))
+    assert output.greedy(even).fire.tolist() == [[1, 0]]
+
+
+def test_the_first_policy_is_close_to_uniform():
+    output = heads.output(spaces.MultiDiscrete(1, 7), WIDTH)
+    assert output.entropy(output(torch.randn(100, WIDTH))).min().item() == pytest.approx(
+        math.log(7), abs=0.01
+    )
+
+
+def test_actions_are_sampled_as_often_as_they_are_probable():
+    probabilities = torch.tensor([0.5, 0.3, 0.15, 0.05])
+    output, n = heads.output(spaces.MultiDiscrete(1, 4), WIDTH), 100_000
+    logits = probabilities.log().expand(n, 1, 4)
+    sampled = (
+        output.sample(logits, torch.Generator().manual_seed(0)).flatten().bincount(minlength=4) / n
+    )
+    error = (probabilities * (1 - probabilities) / n).sqrt()
+    assert ((sampled - probabilities).abs() < 4 * error).all()
+
+
+def test_what_is_impossible_is_never_sampled():
+    output = heads.output(spaces.MultiDiscrete(1, 3), WIDTH)
+    logits = torch.tensor([0.0, 1.0, 0.0]).log().expand(100_000, 1, 3)
+    assert (output.sample(logits, torch.Generator().manual_seed(0)) == 1).all()
+
+
+def test_a_generator_decides_all_samples():
+    output = heads.output(MOVES, WIDTH)
+    logits = output(torch.randn(50, WIDTH))
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    first, second = (output.sample(logits, torch.Generator().manual_seed(3)) for _ in range(2))
+    assert torch.equal(first.movement, second.movement) and torch.equal(first.fire, second.fire)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_action_values_are_a_value_and_advantages_over_their_mean():
+    output = heads.output(spaces.MultiDiscrete(2, 3), WIDTH, "duelling")
+    x = torch.randn(5, WIDTH)
+    hidden = output.hidden(x).relu()
+    value = hidden[:, :WIDTH] @ output.value.weight.T + output.value.bias
+    q = output(x)
+    torch.testing.assert_close(q.mean(-1), value)
+    advantage = (hidden[:, WIDTH:] @ output.advantage.weight.T).view(5, 2, 3)
+    torch.testing.assert_close(q.diff(dim=-1), advantage.diff(dim=-1))
+
+
+def test_the_value_of_a_joint_action_is_the_sum_over_its_parts():
+    output = heads.output(MOVES, WIDTH, "duelling")
+    logits = output(torch.randn(4, 6, WIDTH))
+    actions = output.greedy(logits)
+    best = sum(logits[key].amax(-1).sum(-1) for key in logits)
+    torch.testing.assert_close(output.action_value(logits, actions), best)
+    other = arrdict(actions, fire=1 - actions.fire)
+    loss = logits.fire.diff(dim=-1).abs().sum((-1, -2))
+    torch.testing.assert_close(output.action_value(logits, other), best - loss)
+
+
+def test_of_action_values_the_best_is_taken_and_now_and_then_any():
+    n = 100_000
+    output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
+    logits = torch.tensor([0.1, 0.9, 0.3, -2.0]).expand(n, 1, 4)
+    epsilon = torch.tensor([0.0, 0.5]).repeat_interleave(n // 2)
+    generator = torch.Generator().manual_seed(0)
+    actions = output.sample(logits, generator, epsilon=epsilon)
+    assert (actions[: n // 2] == 1).all()
+    shares = actions[n // 2 :].flatten().bincount(minlength=4) / (n / 2)
+    expected = torch.tensor([0.125, 0.625, 0.125, 0.125])
+    torch.testing.assert_close(shares, expected, rtol=0, atol=0.008)  # 4 standard errors
+    shares = output.sample(logits, generator).flatten().bincount(minlength=4) / n
+    likely = output.logprob(logits[:4], torch.arange(4)[:, None]).exp()
+    torch.testing.assert_close(likely, torch.tensor([0.0125, 0.9625, 0.0125, 0.0125]))
+    torch.testing.assert_close(shares, likely, rtol=0, atol=0.0025)
+
+
+def test_action_values_are_in_single_precision_where_products_are_not():
+    output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
+    with torch.no_grad():
+        output.value.bias += 300.0
+        with torch.autocast("cpu", torch.bfloat16):
+            found = output(torch.randn(50, WIDTH))
+    assert found.dtype == torch.float32
+    # about 300 neighbours are 2 apart in bfloat16
+    assert 0.01 < found.std() < 1 and len(found.mean(-1).unique()) > 40
+
+
+def test_features_of_zero_leave_action_values_something_to_learn_from():
+    output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
+    x = torch.zeros(1, WIDTH, requires_grad=True)
+    output(x)[0, 0, 1].backward()
+    assert x.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: heads.intake("images", WIDTH), "observation space itself = 'images'"),
+        (lambda: heads.intake(arrdict(imu=VECTOR, x=3), WIDTH), "observation space x = 3"),
+        (lambda: heads.intake(arrdict(nothing=spaces.MultiEmpty()), WIDTH), "nothing in it"),
+        (
+            lambda: heads.intake(IMAGE, WIDTH, "resnet"),
+            "'resnet' is unknown; there are conv, linear, module:Class",
+        ),
+        (lambda: heads.output(VECTOR, WIDTH), "there are MultiDiscrete and dicts of it"),
+        (lambda: heads.output(arrdict(), WIDTH), "there are MultiDiscrete and dicts of it"),
+    ],
+)
+def test_a_space_that_no_head_is_known_for_is_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+def test_images_are_standardised_by_channel_and_vectors_by_number():
+    space = arrdict(rgb=spaces.MultiImage(1, 2, 1, 3), imu=spaces.MultiVector(1, 2))
+    intake = heads.intake(space, WIDTH)
+    rgb = (
+        torch.tensor([[1.0, 2.0, 3.0], [10.0, 10.0, 40.0]])
+        .view(1, 1, 2, 1, 3)
+        .expand(4, -1, -1, -1, -1)
+    )
+    imu = torch.tensor([[5.0, 0.0], [7.0, 0.0], [5.0, 0.0], [7.0, 0.0]])[:, None]
+    intake.update_stats(arrdict(rgb=rgb.half(), imu=imu.half()))
+    of_rgb, of_imu = intake.norms
+    torch.testing.assert_close(
+        of_rgb(rgb)[0, 0, 0, 0], torch.tensor([-(1.5**0.5), 0.0, 1.5**0.5])
+    )  # std sqrt 2/3
+    torch.testing.assert_close(
+        of_rgb(rgb)[0, 0, 1, 0], torch.tensor([-(0.5**0.5), -(0.5**0.5), 2**0.5])
+    )
+    torch.testing.assert_close(of_imu(imu)[:, 0, 0], torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    assert not of_imu(imu)[..., 1].any()  # what never varies divides by no zero
+
+    # A second call weighs a half: mean (6 + 10) / 2, mean square (37 + 100) / 2
+    intake.update_stats(arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
+    assert of_imu.mean[0, 0].item() == 8 and of_imu.scale[0, 0].item() == pytest.approx(
+        (137 / 2 - 64) ** 0.5
+    )
+
+
+def test_what_was_learned_about_observations_is_saved_with_the_weights():
+    intake, other, obs = heads.intake(TREE, WIDTH), heads.intake(TREE, WIDTH), sample_of(TREE, 6)
+    intake.update_stats(obs)
+    other.load_state_dict(intake.state_dict())
+    assert torch.equal(other(obs), intake(obs))

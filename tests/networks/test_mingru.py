@@ -1,0 +1,239 @@
+"""The minGRU against its equations step by step, and its resets against sequences cut by hand.
+
+The GPU's kernels are compared with what is written out for the CPU: on a GPU, and compiled for a
+CPU through `cuda_on_cpu.h`, which runs the same source.
+"""
+
+import pytest
+import torch
+
+from megastep.agents.networks import mingru as mingru_module
+from megastep.agents.networks.kernels import mingru as kernels
+from megastep.agents.networks.kernels import program
+from megastep.agents.networks.mingru import MinGRU
+from megastep.arrdict import arrdict
+from megastep.kernels.build.compile import EngineError
+from tests.helpers.recurrent import assert_close, check_captured
+
+T, B, W = 9, 5, 16
+CLOSE = dict(rtol=1e-5, atol=1e-5)  # float32 sums of nine terms in another order
+
+
+def case(n_steps=T, p_reset=0.3):
+    """Gates (T, B, 2 W), resets (T, B) and a state that is not zero."""
+    torch.manual_seed(0)
+    gates = torch.randn(n_steps, B, 2 * W, requires_grad=True)
+    return gates, torch.rand(n_steps, B) < p_reset, torch.randn(B, W, requires_grad=True)
+
+
+def by_hand(gates, reset, start):
+    """One lane and one step at a time, starting from zeros where an episode starts."""
+    lanes, lasts = [], []
+    for b in range(gates.shape[1]):
+        h, states = start[b], []
+        for t in range(len(gates)):
+            if reset[t, b]:
+                h = torch.zeros(W)
+            z = 1 / (1 + (-gates[t, b, :W]).exp())
+            h = (1 - z) * h + z * gates[t, b, W:]
+            states.append(h)
+        lanes.append(torch.stack(states))
+        lasts.append(h)
+    return torch.stack(lanes, 1), torch.stack(lasts)
+
+
+@pytest.mark.parametrize("n_steps, p_reset", [(1, 0.3), (9, 0.0), (9, 0.3), (9, 1.0), (32, 0.1)])
+def test_outputs_and_gradients_are_those_of_the_equations(n_steps, p_reset):
+    gates, reset, start = case(n_steps, p_reset)
+    found, expected = (
+        mingru_module._Sequence.apply(gates, reset, start),
+        by_hand(gates, reset, start),
+    )
+    weights = torch.randn(n_steps, B, W), torch.randn(B, W)
+    ours, theirs = (
+        torch.autograd.grad(results, (gates, start), weights, materialize_grads=True)
+        for results in (found, expected)
+    )
+    for name, a, b in zip(
+        ("outputs", "last", "d gates", "d start"),
+        (*found, *ours),
+        (*expected, *theirs),
+        strict=True,
+    ):
+        torch.testing.assert_close(a, b, **CLOSE, msg=lambda text, name=name: f"{name}: {text}")
+
+
+def test_half_open_gates_halve_the_way_to_the_candidate():
+    core = MinGRU(2)
+    with torch.no_grad():
+        core.input.weight.zero_()
+        core.input.bias.copy_(torch.tensor([0.0, 0.0, 1.0, -8.0]))  # gates of 1/2; candidates
+    reset = torch.tensor([0, 0, 0, 1, 0], dtype=torch.bool)[:, None]
+    outputs, state = core(torch.randn(5, 1, 2), reset, core.initial(1))
+    halves = torch.tensor([1 / 2, 3 / 4, 7 / 8, 1 / 2, 3 / 4])
+    assert torch.equal(outputs[:, 0], halves[:, None] * torch.tensor([1.0, -8.0]))
+    assert torch.equal(state.output, outputs[-1])
+
+
+def test_units_start_with_times_from_1_to_32_steps():
+    # sigmoid(-log(tau)) = 1 / (1 + tau): of a unit's state tau / (1 + tau) is left after a step
+    core = MinGRU(W)
+    x, reset = torch.zeros(1, B, W), torch.zeros(1, B, dtype=torch.bool)
+    outputs, _ = core(x, reset, arrdict(output=torch.ones(B, W)))
+    taus = torch.linspace(1, 32, W)
+    torch.testing.assert_close(outputs[0], (taus / (1 + taus)).expand(B, W), **CLOSE)
+
+
+def test_a_sequence_saves_four_numbers_per_unit_and_step_for_its_gradient():
+    """Its input, two gates and the output: none of the scan's passes."""
+    core, saved = MinGRU(W), {}
+
+    def pack(tensor):
+        saved[tensor.data_ptr()] = tensor.numel()
+        return tensor
+
+    x, reset, state = torch.randn(32, B, W), torch.zeros(32, B, dtype=torch.bool), core.initial(B)
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        core(x, reset, state)
+    beside = reset.numel() + B * W + core.input.weight.numel()
+    assert 4 * x.numel() <= sum(saved.values()) <= 4 * x.numel() + beside
+
+
+def test_a_state_or_reset_of_another_shape_is_named():
+    core, x, reset = MinGRU(W), torch.randn(T, B, W), torch.zeros(T, B, dtype=torch.bool)
+    state = core.initial(B)
+    with pytest.raises(
+        ValueError, match=r"reset is \(9, 4\) on cpu, but x asks for \(9, 5\) on cpu"
+    ):
+        core(x, reset[:, :4], state)
+    with pytest.raises(
+        ValueError, match=r"state.output is \(1, 16\) on cpu, but x asks for \(5, 16\)"
+    ):
+        core(x, reset, state[:1])
+    with pytest.raises(ValueError, match=r"x is \(0, 5, 16\), but a sequence has at least one"):
+        core(x[:0], reset[:0], state)
+
+
+def test_a_gradient_may_be_asked_for_twice():
+    gates, reset, start = case()
+    loss = mingru_module._Sequence.apply(gates, reset, start)[0].square().sum()
+    first, second = (torch.autograd.grad(loss, gates, retain_graph=True)[0] for _ in range(2))
+    assert torch.equal(first, second)
+
+
+# ---- The kernels ----
+
+
+@pytest.fixture(params=["compiled", pytest.param("cuda", marks=pytest.mark.cuda)])
+def where(request, monkeypatch):
+    """The device of the kernels: a GPU, or the CPU with the kernels compiled for it."""
+    if request.param == "cuda":
+        return "cuda"
+    monkeypatch.setattr(program, "launch", request.getfixturevalue("launch_on_cpu"))
+    monkeypatch.setattr(mingru_module, "_recurrence", lambda gates: kernels)
+    return "cpu"
+
+
+def sequence(device, dtype, gates, reset, start, d_outputs, d_last):
+    """Outputs, last state and gradients of the bare recurrence, on the CPU in float32."""
+    gates = gates.to(device, dtype).requires_grad_()
+    start = start.to(device).requires_grad_()
+    outputs, last = mingru_module._Sequence.apply(gates, reset.to(device), start)
+    assert outputs.dtype == dtype and last.dtype == torch.float32
+    grads = torch.autograd.grad(
+        [outputs, last], [gates, start], [d_outputs.to(device, dtype), d_last.to(device)]
+    )
+    return [leaf.detach().float().cpu() for leaf in (outputs, last, *grads)]
+
+
+NAMES = ("outputs", "last", "d gates", "d start")
+# Per dtype, the share of an array's greatest magnitude by which an element may be off: approximate
+# exponentials; numbers of 8 bits.
+SLACK = {torch.float32: 1e-5, torch.bfloat16: 1e-2}
+
+
+@pytest.mark.parametrize("dtype", SLACK, ids=str)
+@pytest.mark.parametrize(
+    "n_steps, n_lanes, width", [(9, 5, 16), (9, 5, 7), (1, 3, 16), (9, 1, 1), (3, 40, 256)]
+)
+def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lanes, width):
+    torch.manual_seed(0)
+
+    def rounded(*shape):
+        """So that both begin with the same numbers; of another layout in memory than the
+        kernels'.
+        """
+        return torch.randn(*reversed(shape)).movedim((0, 1, 2), (2, 1, 0)).bfloat16().float()
+
+    given = dict(
+        gates=rounded(n_steps, n_lanes, 2 * width),
+        reset=(torch.rand(n_lanes, n_steps) < 0.3).T,
+        start=torch.randn(width, n_lanes).T,
+        d_outputs=rounded(n_steps, n_lanes, width),
+        d_last=torch.randn(width, n_lanes).T,
+    )
+    found = sequence(where, dtype, **given)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mingru_module, "_recurrence", lambda gates: mingru_module._WRITTEN_OUT)
+        expected = sequence("cpu", torch.float32, **given)
+    assert_close(NAMES, found, expected, SLACK[dtype])
+
+
+@pytest.mark.parametrize("dtype", SLACK, ids=str)
+@pytest.mark.parametrize("width", [16, 7])
+def test_the_kernels_forget_even_a_nan(where, dtype, width):
+    torch.manual_seed(0)
+    given = dict(
+        gates=torch.randn(T, B, 2 * width),
+        reset=torch.zeros(T, B, dtype=torch.bool),
+        start=torch.randn(B, width),
+        d_outputs=torch.randn(T, B, width),
+        d_last=torch.randn(B, width),
+    )
+    given["reset"][[0, 4]] = True
+    clean = sequence(where, dtype, **given)
+    broken = dict(given, gates=given["gates"].clone(), start=torch.full((B, width), torch.nan))
+    broken["gates"][:4] = torch.nan
+    outputs, last, d_gates, d_start = sequence(where, dtype, **broken)
+    assert torch.equal(outputs[4:], clean[0][4:]) and outputs[:4].isnan().all()
+    assert torch.equal(last, clean[1]) and torch.equal(d_gates[4:], clean[2][4:])
+    assert not d_start.any()  # cleared at once
+    # nor does a gradient that is not a number come back through a reset
+    given["d_outputs"][4:] = torch.nan
+    d_gates = sequence(where, dtype, **given)[2]
+    assert torch.equal(d_gates[:4], clean[2][:4]) and d_gates[4:].isnan().all()
+
+
+@pytest.mark.parametrize("width", [4, 3])
+def test_gates_saturate_and_a_nan_stays_one(where, width):
+    """By hand: all update gates of a lane before their activation are one number."""
+    inf, nan = torch.inf, torch.nan
+    values = torch.tensor([-inf, -1e30, -100.0, -20.0, 0.0, 20.0, 100.0, 1e30, inf, nan])
+    gates = torch.full((1, len(values), 2 * width), 3.0)
+    gates[0, :, :width] = values[:, None]
+    start, reset = torch.full((len(values), width), 5.0), torch.zeros(1, len(values)).bool()
+    gates, start, reset = (tensor.to(where) for tensor in (gates, start, reset))
+    outputs, last = torch.full_like(gates[..., :width], 7.0).contiguous(), torch.empty_like(start)
+    kernels.forward(gates, reset, start, outputs, last)
+    expected = (5.0 - 2.0 * values.double().sigmoid()).float()[:, None].expand(-1, width)
+    for found in (outputs[0], last):
+        torch.testing.assert_close(found.cpu(), expected, rtol=0, atol=2e-6, equal_nan=True)
+
+
+def test_kernels_refuse_other_dtypes(where):
+    gates, reset, start = (tensor.to(where) for tensor in case())
+    with pytest.raises(EngineError, match="float32 or bfloat16, not in torch.float16: choose one"):
+        mingru_module._Sequence.apply(gates.half(), reset, start)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("bf16", [False, True])
+def test_on_a_gpu_a_captured_graph_unrolls_as_steps_do(bf16):
+    core = MinGRU(256)
+
+    def step(x, reset, state):
+        outputs, state = core(x[None], reset[None], state)
+        return outputs[0], state
+
+    slack = 2e-2 if bf16 else 2e-3  # bfloat16's rounding, and TF32's, of products of 256 numbers
+    check_captured(core, "output", step, slack, bf16)

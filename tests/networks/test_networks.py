@@ -1,0 +1,50 @@
+"""docs/networks.md: its classes, and its commands as they are typed."""
+
+import json
+import pathlib
+
+import pytest
+import torch
+
+from megastep.agents.networks import cores
+from tests.helpers import pages
+
+PAGE = pages.ROOT / "docs" / "networks.md"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("networks")
+    text = PAGE.read_text()
+    for name, body in zip(("cores.py", "encoders.py"), pages.code(text), strict=True):
+        assert f"`{name}`" in text
+        (place / name).write_text(body)
+    return place
+
+
+def test_its_commands_train_and_evaluate(folder, monkeypatch):
+    typed = pages.type_all(PAGE.read_text(), folder, monkeypatch)
+    assert typed == 2 * ["train.py", "evaluate.py"]
+    runs = sorted(path for path in (folder / "runs").iterdir() if path.is_dir())
+    agents = [config(run)["agent"] for run in runs]
+    assert [agent["core"] for agent in agents] == ["cores:Trace", "lstm"]
+    assert [agent["encoder"] for agent in agents] == ["linear", "encoders:Patches"]
+
+
+def config(run):
+    (checkpoint, *_) = sorted(pathlib.Path(run, "checkpoints").glob("step_*"))
+    return json.loads((checkpoint / "config.json").read_text())["train"]
+
+
+def test_its_core_is_a_decaying_mean(folder, monkeypatch):
+    with pages.inside(folder, monkeypatch):
+        core = cores.make_core("cores:Trace", 2)
+    with torch.no_grad():
+        core.input.weight.copy_(torch.eye(2)), core.input.bias.zero_()
+        core.rate.zero_()  # keeps half
+    x = torch.tensor([1.0, 0.0, 0.0, 8.0]).view(4, 1, 1).expand(4, 1, 2)
+    reset = torch.tensor([True, False, True, False])[:, None]
+    outputs, state = core(x, reset, core.initial(1))
+    expected = torch.tensor([0.5, 0.25, 0.0, 4.0])
+    torch.testing.assert_close(outputs[:, 0, 0], expected.tanh())
+    assert state.trace.tolist() == [[4.0, 4.0]]

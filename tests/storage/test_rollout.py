@@ -1,0 +1,289 @@
+"""Rollouts: an environment of numbers that tell their lane, time and key, followed through collect
+and sequences.
+"""
+
+import pytest
+import torch
+
+from megastep import spaces
+from megastep.agents.algorithms.returns import gae
+from megastep.agents.networks.policy import Policy
+from megastep.agents.storage.rollout import (
+    Collector,
+    Rollout,
+    collect,
+    initial_actor_state,
+    without_last,
+)
+from megastep.arrdict import arrdict
+from megastep.capture import state_tree
+from megastep.dotdict import leaves
+
+B, T = 6, 5
+
+
+class Telltale:
+    """Every number is 100 * lane + time, plus a tenth for each key; lane b ends at times divisible
+    by b + 2.
+    """
+
+    obs_space = arrdict(
+        eye=spaces.MultiImage(1, 1, 1, 2), rest=arrdict(imu=spaces.MultiVector(1, 3))
+    )
+    action_space = arrdict(move=spaces.MultiDiscrete(1, 7), fire=spaces.MultiDiscrete(1, 2))
+
+    device = "cpu"
+
+    def __init__(self):
+        self.time = 0
+        self.actions = []
+        self.obs = None
+
+    def reset(self):
+        return self._world(torch.ones(B, dtype=torch.bool))
+
+    def step(self, decision):
+        self.actions.append(decision.actions)
+        self.time += 1
+        return self._world(self.ends(self.time - 1))
+
+    def ends(self, time):
+        return torch.tensor([time > 0 and time % (b + 2) == 0 for b in range(B)])
+
+    def label(self, time):
+        return 100.0 * torch.arange(B) + time
+
+    def _world(self, reset):
+        label, ended = self.label(self.time), self.ends(self.time) & ~reset
+        if self.obs is None:
+            self.obs = arrdict(
+                eye=torch.zeros(B, 1, 1, 1, 2), rest=arrdict(imu=torch.zeros(B, 1, 3))
+            )
+        self.obs.eye[:] = label.view(
+            B, 1, 1, 1, 1
+        )  # in the same memory every time, as an engine would
+        self.obs.rest.imu[:] = label.view(B, 1, 1) + 0.5
+        odd = torch.arange(B) % 2 == 1
+        return arrdict(
+            obs=self.obs,
+            reset=reset,
+            reward=label + 0.25,
+            terminal=ended & odd,
+            truncated=ended & ~odd,
+        )
+
+
+def collected(n_rollouts=1, dtype=torch.float32, env=None, values=True):
+    env = env or Telltale()
+    policy = Policy(env.obs_space, env.action_space, width=16)
+    state = policy.initial(B)
+    spaces_of = env.obs_space, env.action_space
+    rollout = Rollout(T, B, *spaces_of, state, obs_dtype=dtype, values=values)
+    actor_state = initial_actor_state(env, policy, rollout)
+    for _ in range(n_rollouts):
+        actor_state = collect(env, policy, rollout, actor_state)
+    return env, policy, rollout, actor_state
+
+
+@pytest.mark.parametrize("n_rollouts", [1, 3])
+def test_rows_hold_what_was_seen_and_what_followed(n_rollouts):
+    env, _, rollout, _ = collected(n_rollouts)
+    first = (n_rollouts - 1) * T
+    for row in range(T + 1):
+        time = first + row
+        assert torch.equal(rollout.obs.eye[row, :, 0, 0, 0, 1], env.label(time))
+        assert torch.equal(rollout.obs.rest.imu[row, :, 0, 2], env.label(time) + 0.5)
+        assert torch.equal(
+            rollout.starts[row], env.ends(time - 1) if time else torch.ones(B, dtype=torch.bool)
+        )
+    for row in range(T):
+        time = first + row
+        assert torch.equal(rollout.reward[row], env.label(time + 1) + 0.25)
+        assert torch.equal(rollout.reset[row], env.ends(time))
+        ended = env.ends(time + 1) & ~env.ends(time)
+        assert torch.equal(rollout.terminal[row] | rollout.truncated[row], ended)
+        assert not rollout.terminal[row, ::2].any() and not rollout.truncated[row, 1::2].any()
+        assert torch.equal(rollout.actions.move[row], env.actions[time].move)
+        assert torch.equal(rollout.actions.fire[row], env.actions[time].fire)
+
+
+def test_a_rollout_begins_where_the_one_before_ended():
+    env, policy, rollout, actor_state = collected()
+    last, state = rollout.obs.eye[-1].clone(), actor_state.state.map(torch.clone)
+    collect(env, policy, rollout, actor_state)
+    assert torch.equal(rollout.obs.eye[0], last)
+    assert torch.equal(rollout.state.cell, state.cell) and state.cell.any()
+
+
+def test_an_actor_state_stays_in_its_own_memory():
+    env, policy, rollout, actor_state = collected()
+    places = [leaf.data_ptr() for leaf in leaves(actor_state)]
+    again = collect(env, policy, rollout, actor_state)
+    assert [leaf.data_ptr() for leaf in leaves(again)] == places
+    assert actor_state.world.obs.eye.data_ptr() != env.obs.eye.data_ptr()
+    assert torch.equal(actor_state.world.obs.eye[:, 0, 0, 0, 0], env.label(2 * T))
+
+
+def test_probabilities_and_values_are_those_of_an_unroll_over_what_was_written():
+    _, policy, rollout, actor_state = collected(n_rollouts=2, dtype=torch.float16)
+    out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
+    close = dict(rtol=1e-4, atol=1e-4)  # products of numbers up to 500 in another order
+    torch.testing.assert_close(rollout.values, policy.value(out.features), **close)
+    logprobs = policy.output.logprob(out.logits[:-1], rollout.actions)
+    torch.testing.assert_close(rollout.logprobs, logprobs, **close)
+    last = policy.unroll(rollout.obs[-1:], rollout.starts[-1:], actor_state.state)
+    torch.testing.assert_close(rollout.values[-1:], policy.value(last.features), **close)
+
+
+class Faulty(Telltale):
+    """Lane 4, whose episode lasts from time 7 to time 12, sees no number at time 9."""
+
+    def _world(self, reset):
+        world = super()._world(reset)
+        if self.time == 9:
+            world.obs.eye[4] = torch.nan
+        return world
+
+
+def test_a_memory_that_is_not_finite_starts_anew_with_the_next_rollout():
+    env, policy, rollout, actor_state = collected(n_rollouts=2, env=Faulty())
+    assert rollout.values[4:, 4].isnan().all() and rollout.values[:4].isfinite().all()
+    assert rollout.values[:, :4].isfinite().all()
+    collect(env, policy, rollout, actor_state)
+    assert not rollout.state.cell[4].any() and rollout.state.cell[3].any()
+    assert rollout.values.isfinite().all() and rollout.logprobs.isfinite().all()
+
+
+def test_a_collector_begins_each_rollout_where_the_one_before_ended():
+    env = Telltale()
+    policy = Policy(env.obs_space, env.action_space, width=16)
+    rollout = Rollout(T, B, env.obs_space, env.action_space, policy.initial(B))
+    collector = Collector(env, policy, rollout)
+    places = [leaf.data_ptr() for leaf in leaves(rollout.state)]
+    for _ in range(3):
+        collector()
+    _, _, expected, _ = collected(n_rollouts=3, dtype=torch.float16)
+    assert torch.equal(rollout.values, expected.values) and collector.graph is None
+    assert torch.equal(rollout.state.cell, expected.state.cell)
+    assert [leaf.data_ptr() for leaf in leaves(rollout.state)] == places
+
+
+def test_collecting_allocates_nothing_that_stays():
+    """A graph writes where its capture wrote, so all must be there before."""
+    env = Telltale()
+    policy = Policy(env.obs_space, env.action_space, width=16)
+    rollout = Rollout(T, B, env.obs_space, env.action_space, policy.initial(B))
+    before = state_tree(rollout)
+    collect(env, policy, rollout, initial_actor_state(env, policy, rollout))
+    after = state_tree(rollout)
+    assert before.keys() == after.keys() and ".state['cell']" in after
+    assert all(before[path] is after[path] for path in after)
+
+
+@pytest.mark.parametrize("values", [True, False])
+def test_sequences_join_the_rows_of_their_lanes(values):
+    env = Talkative()
+    _, _, rollout, _ = collected(n_rollouts=2, env=env, values=values)
+    rollout.logprobs[:] = torch.arange(T)[:, None] + 100.0 * torch.arange(B)
+    rollout.state.cell[:] = torch.arange(B)[:, None].float()
+    rows = torch.tensor([4, 1, 2])
+    batch = rollout.sequences(rows)
+    for i, b in enumerate(rows.tolist()):
+        lane = 100.0 * b + T + torch.arange(T + 1)
+        assert torch.equal(batch.obs.eye[:, i, 0, 0, 0, 0], lane)
+        assert torch.equal(batch.obs.rest.imu[:, i, 0, 0], lane + 0.5)
+        assert torch.equal(batch.logprobs[:, i], 100.0 * b + torch.arange(T))
+        assert torch.equal(batch.actions.move[:, i], rollout.actions.move[:, b])
+        assert torch.equal(batch.reward[:, i], lane[1:] + 0.25)
+        for name in ("starts", "learns", "terminal", "truncated"):
+            assert torch.equal(batch[name][:, i], getattr(rollout, name)[:, b])
+        assert (batch.state.cell[i] == b).all()
+    acted = without_last(batch.obs)
+    assert torch.equal(acted.eye, batch.obs.eye[:T]) and without_last(None) is None
+
+
+def test_a_policy_without_a_critic_acts_as_one_whose_values_are_not_stored():
+    """Nor does it have to tell log-probabilities, as a policy of action values has none."""
+
+    class Silent(Policy):
+        def forward(self, *arguments):
+            decision, state = super().forward(*arguments)
+            return arrdict(actions=decision.actions), state
+
+    stored = []
+    for kind, critic in (Policy, "plain"), (Silent, None):
+        env = Telltale()
+        policy = kind(env.obs_space, env.action_space, width=16, critic=critic)
+        state = policy.initial(B)
+        rollout = Rollout(T, B, env.obs_space, env.action_space, state, values=False)
+        collect(env, policy, rollout, initial_actor_state(env, policy, rollout))
+        assert rollout.values is None and "value" not in rollout.numbers()
+        stored.append(rollout)
+    assert torch.equal(stored[0].actions.move, stored[1].actions.move)
+    assert stored[0].logprobs.all() and not stored[1].logprobs.any()
+
+
+def test_transitions_are_what_returns_are_computed_from():
+    env, _, rollout, _ = collected(n_rollouts=2)
+    estimates = gae(**rollout.transitions(), gamma=0.0, lambda_=1.0)
+    assert torch.equal(estimates.valid, ~rollout.reset)
+    # With gamma 0 an advantage is the reward that followed less the value before
+    expected = (rollout.reward - rollout.values[:-1]) * ~rollout.reset
+    assert torch.equal(estimates.advantages, expected)
+
+
+def test_the_same_seed_collects_the_same():
+    (_, _, first, _), (_, _, second, _) = collected(2), collected(2)
+    assert torch.equal(first.actions.move, second.actions.move) and torch.equal(
+        first.values, second.values
+    )
+
+
+def test_images_are_stored_in_half_precision_and_integers_as_integers():
+    space = arrdict(rgb=spaces.MultiImage(1, 3, 1, 4), team=spaces.MultiDiscrete(1, 5000))
+    rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
+    assert rollout.obs.rgb.dtype == torch.float16 and rollout.obs.team.dtype == torch.int64
+    assert rollout.actions.shape == (T, B, 1)
+
+
+def test_what_a_space_names_its_dtype_is_stored_as_such():
+    space = arrdict(
+        sky=spaces.MultiImage(1, 3, 1, 4, dtype=torch.uint8),
+        gauge=spaces.MultiVector(1, 2, dtype=torch.float32),
+    )
+    rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
+    assert rollout.obs.sky.dtype == torch.uint8 and rollout.obs.gauge.dtype == torch.float32
+    assert rollout.numbers().keys() == {"obs.gauge", "reward", "value", "logprob"}
+
+
+class Talkative(Telltale):
+    """Lane b learns at times divisible by b + 1. Two metrics tell lane and time, and a half."""
+
+    def _world(self, reset):
+        world, label = super()._world(reset), self.label(self.time)
+        metrics = arrdict(laps=label, falls=label + 0.5)
+        return arrdict(world, learns=self.learns(self.time), metrics=metrics)
+
+    def learns(self, time):
+        return torch.tensor([time % (b + 1) == 0 for b in range(B)])
+
+
+@pytest.mark.parametrize("n_rollouts", [1, 3])
+def test_rows_hold_who_learnt_then_and_the_metrics_that_followed(n_rollouts):
+    env, _, rollout, _ = collected(n_rollouts, env=Talkative())
+    first = (n_rollouts - 1) * T
+    for row in range(T + 1):
+        assert torch.equal(rollout.learns[row], env.learns(first + row))
+    for row in range(T):
+        assert torch.equal(rollout.metrics.laps[row], env.label(first + row + 1))
+        assert torch.equal(rollout.metrics.falls[row], env.label(first + row + 1) + 0.5)
+
+
+def test_all_lanes_learn_unless_a_world_says_otherwise():
+    _, _, rollout, _ = collected()
+    assert rollout.learns.all() and not rollout.metrics
+
+
+def test_a_rollout_of_nothing_is_refused():
+    with pytest.raises(ValueError, match="not 0 and 6"):
+        Rollout(0, B, Telltale.obs_space, Telltale.action_space, arrdict())

@@ -1,0 +1,314 @@
+"""The training loop, around an environment of a few lines: what it counts, and what becomes of it
+when numbers, memory or disks fail.
+"""
+
+import pytest
+import torch
+
+from megastep import spaces
+from megastep.agents.algorithms import nonfinite
+from megastep.agents.algorithms.nonfinite import NonFiniteError
+from megastep.agents.algorithms.ppo import PPO
+from megastep.agents.networks.policy import Policy
+from megastep.agents.training import checkpoint, trainer
+from megastep.agents.training.budget import Budget
+from megastep.agents.training.saver import Saver
+from megastep.agents.training.trainer import Trainer
+from megastep.arrdict import arrdict
+
+B, T, UPDATE = 6, 4, 24  # lanes, steps of a rollout, samples of an update
+
+
+class Numbers:
+    """Shows two random numbers; an episode is truncated after 7 steps and pays 1 at each.
+
+    Args: `faults`, {(tensor, step, lane): value}, where the first step after `reset` is 1.
+    """
+
+    obs_space, action_space = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 3)
+    n_envs, n_agents, device = B, 1, torch.device("cpu")
+
+    def __init__(self, faults=()):
+        self.faults, self.generator = dict(faults), torch.Generator().manual_seed(1)
+        self.steps, self.checked = 0, 0
+        self.age = torch.zeros(B, dtype=torch.int64)
+
+    def reset(self):
+        return self._world(torch.ones(B, dtype=torch.bool))
+
+    def step(self, decision):
+        self.steps += 1
+        return self._world(self.age == 7)
+
+    def _world(self, reset):
+        self.age = (self.age + 1).masked_fill(reset, 0)
+        none = torch.zeros(B, dtype=torch.bool)
+        obs = torch.randn(B, 1, 2, generator=self.generator)
+        reward = torch.ones(B).masked_fill(reset, 0.0)
+        world = dict(obs=obs, reward=reward, reset=reset, terminal=none, truncated=self.age == 7)
+        for (name, step, lane), value in self.faults.items():
+            if self.steps == step:
+                world[name][lane] = value
+        return arrdict(world)
+
+    def check(self):
+        self.checked += 1
+
+
+class Rows(list):
+    """Metrics as a list."""
+
+    def write(self, samples, metrics, perf):
+        self.append({"samples": samples, **metrics})
+
+
+class Pairs(Numbers):
+    """The same lanes as three environments of a leader and a follower; its metric is how many steps
+    each lane's number has seen, and a follower's episodes end a step later.
+    """
+
+    n_envs, n_agents, roles = B // 2, 2, ("leader", "follower")
+
+    def step(self, decision):
+        self.steps += 1
+        return self._world(self.age == 7 + torch.arange(B) % 2)
+
+    def _world(self, reset):
+        world = super()._world(reset)
+        ends = self.age == 7 + torch.arange(B) % 2
+        age = torch.where(ends, 10.0 * self.age, torch.nan)
+        return arrdict(world, truncated=ends, learns=torch.arange(B) < 4, metrics=arrdict(age=age))
+
+
+def made(folder, faults=(), samples=None, every=1, lr=1e-3, env=None, **options):
+    """A trainer in `Numbers` that saves into a folder."""
+    env = env or Numbers(faults)
+    policy = Policy(env.obs_space, env.action_space, width=8)
+    learner = PPO(policy, n_steps=T, n_minibatches=2, lr=lr)
+    saver, budget = Saver(folder, {}), Budget(samples)
+    return Trainer(env, policy, learner, Rows(), saver, budget, report_every=every, **options)
+
+
+def always(name, lane, value, n=1000):
+    return {(name, step, lane): value for step in range(1, n)}
+
+
+def copied(module):
+    return {name: value.clone() for name, value in module.state_dict().items()}
+
+
+def same(a, b):
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_a_trainer_collects_updates_reports_and_saves(tmp_path):
+    run = made(tmp_path, samples=5 * UPDATE, every=2)
+    run.train()
+    assert [row["samples"] for row in run.metrics] == [2 * UPDATE, 4 * UPDATE]
+    assert [row["updates"] for row in run.metrics] == [2, 4]
+    assert run.env.steps == 5 * T and run.env.checked == 2
+    assert checkpoint.load_latest(tmp_path).step == 5 * UPDATE
+    # episodes of 7 steps and one for the reset: the first ends in step 7, the second in step 15
+    assert [row["episode/count"] for row in run.metrics] == [B, B]
+    assert [row["episode/return"] for row in run.metrics] == [7, 7]
+    assert run.score == 7 and run.left == 0
+
+
+def test_metrics_are_reported_by_name_and_role_from_lanes_that_learn(tmp_path):
+    run = made(tmp_path, samples=2 * UPDATE, every=2, env=Pairs())
+    run.train()
+    (row,) = run.metrics
+    assert row["episode/count"] == 4 and row["episode/age"] == 75 and run.score == 7.5
+    assert (row["episode/age/leader"], row["episode/age/follower"]) == (70, 80)
+    assert (row["episode/return/leader"], row["episode/return/follower"]) == (7, 8)
+    assert run.latest["episode/age"] == 75
+
+
+def test_all_that_a_trainer_has_it_has_from_the_start(tmp_path):
+    run = made(tmp_path, samples=3 * UPDATE)
+    attributes, methods = set(vars(run)), run.collect
+    run.train()
+    assert set(vars(run)) == attributes and run.collect is methods
+
+
+def test_nobody_acts_ahead_while_the_environment_is_looked_at_or_when_a_run_has_ended(tmp_path):
+    run, order = made(tmp_path, samples=3 * UPDATE, every=2), []
+    collect = run.collect
+
+    class Ahead:
+        rollout = collect.rollout
+
+        def __call__(self):
+            order.append("collect")
+            return collect()
+
+        def wait(self):
+            order.append("wait")
+
+    run.collect = Ahead()
+    run.env.check = lambda: order.append("check")
+    run.train()
+    assert order == ["collect", "collect", "wait", "check", "collect", "wait"]
+
+
+def test_a_trainer_stops_when_it_is_told_to(tmp_path):
+    run = made(tmp_path)
+    run.train(lambda: run.updates == 2)
+    assert run.samples == checkpoint.load_latest(tmp_path).step == 2 * UPDATE
+
+
+def test_what_was_saved_goes_on_and_is_not_saved_again(tmp_path):
+    first = made(tmp_path, samples=2 * UPDATE)
+    first.train()
+    second = made(tmp_path / "second", samples=2 * UPDATE, lr=0.5)
+    second.load_state_dict(checkpoint.load_latest(tmp_path).state)
+    assert same(copied(second.policy), copied(first.policy))
+    assert (second.samples, second.updates) == (2 * UPDATE, 2)
+    assert second.clock.seconds == pytest.approx(first.clock.seconds, abs=1)
+    second.train()
+    assert second.env.steps == 0 and not (tmp_path / "second").exists()
+
+
+def test_the_budget_that_is_nearer_its_end_counts():
+    budget = Budget(samples=100, seconds=10.0)
+    assert budget.left(50, 2.0) == 0.5 and budget.left(20, 9.0) == pytest.approx(0.1)
+    assert Budget().left(10**9, 1e9) == 1 and not Budget().is_limited
+    assert budget.lr_fraction(50, 9.0) == 1
+    assert Budget(100, 10.0, "samples").lr_fraction(50, 9.0) == 0.5
+    assert Budget(100, 10.0, "seconds").lr_fraction(50, 9.0) == pytest.approx(0.1)
+    assert Budget(100, 10.0, "samples").lr_fraction(120, 9.0) == 0
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e30])
+@pytest.mark.parametrize("name", ["reward", "obs"])
+def test_one_bad_number_is_named_costs_its_rollouts_and_changes_nothing_else(tmp_path, name, value):
+    step, lane = 6, 3  # in the second rollout
+    run = made(tmp_path, {(name, step, lane): value}, samples=8 * UPDATE)
+    run.collect()
+    run.update()
+    before = copied(run.policy), [m.clone() for m in run.learner.optimizer.means]
+    run.collect()
+    run.update()
+    assert same(copied(run.policy), before[0])
+    assert all(map(torch.equal, run.learner.optimizer.means, before[1]))
+    with pytest.warns(UserWarning, match=rf"{name} of lane 3 was (nan|inf|1e\+30) at step"):
+        run.train()
+    # an observation is seen in the step that follows the one that gave it
+    assert (run.nonfinite_value.name, run.nonfinite_value.lane) == (name, lane)
+    assert run.nonfinite_value.step == step + (name == "obs") and run.nonfinite_value.is_from_env
+    assert not same(copied(run.policy), before[0])
+    skipped = [row["loss/skipped_steps"] for row in run.metrics]
+    assert skipped == [0] * 6  # of the third and later updates
+    assert nonfinite.nonfinite_leaf(checkpoint.load_latest(tmp_path).state) is None
+    returns = [row["episode/return"] for row in run.metrics if row["episode/count"]]
+    assert all(0 < r <= 7 for r in returns)
+
+
+def test_a_bad_number_is_named_though_no_report_follows(tmp_path):
+    run = made(tmp_path, {("reward", 6, 3): torch.nan}, samples=8 * UPDATE, every=100)
+    with pytest.warns(UserWarning, match="reward of lane 3 was nan at step 6"):
+        run.train()
+    assert run.nonfinite_value.step == 6
+
+
+@pytest.mark.parametrize("every", [1, 7])
+def test_an_environment_that_gives_no_more_good_numbers_ends_the_run(tmp_path, every):
+    run = made(tmp_path, always("reward", 2, float("nan")), every=every)
+    before = copied(run.policy)
+    with pytest.warns(UserWarning, match="lane 2"), pytest.raises(NonFiniteError) as error:
+        run.train()
+    assert "reward of lane 2 was nan" in str(error.value)
+    assert "the environment gave it" in str(error.value)
+    first_report = -(-trainer.MAX_SKIPPED // every) * every
+    assert run.updates == first_report
+    assert same(copied(run.policy), before)
+    assert same(checkpoint.load_latest(tmp_path).state["policy"], before)
+
+
+def test_gradients_that_are_never_finite_end_the_run_with_advice(tmp_path):
+    run = made(tmp_path, lr=0.25)
+    next(run.policy.parameters()).register_hook(lambda grad: grad * torch.nan)
+    with pytest.raises(NonFiniteError, match=r"\(gradients\).*learning rate smaller than 0.25"):
+        run.train()
+    assert run.updates == trainer.MAX_SKIPPED
+    assert [row["loss/skipped_steps"] for row in run.metrics] == [2] * trainer.MAX_SKIPPED
+    assert nonfinite.nonfinite_leaf(run.state_dict()) is None
+
+
+def test_a_gradient_that_is_finite_again_starts_the_count_anew(tmp_path):
+    run = made(tmp_path, samples=50 * UPDATE)
+    bad = lambda: run.updates % 25 < trainer.MAX_SKIPPED - 1  # noqa: E731
+    next(run.policy.parameters()).register_hook(lambda grad: grad * torch.nan if bad() else grad)
+    run.train()
+    assert run.updates == 50
+
+
+@pytest.mark.parametrize("lr", [10.0, 1e3])
+@pytest.mark.filterwarnings("ignore:value of lane")
+def test_a_policy_that_diverged_ends_the_run_with_advice_and_leaves_the_checkpoint_before(
+    tmp_path, lr
+):
+    run = made(tmp_path, lr=lr, save_every=0.0)
+    with pytest.raises(NonFiniteError, match=f"learning rate smaller than {lr:g}"):
+        run.train()
+    assert run.updates < 200
+    loaded = checkpoint.load_latest(tmp_path)
+    assert nonfinite.nonfinite_leaf(loaded.state) is None
+    assert loaded.step <= (run.updates - trainer.MAX_SKIPPED) * UPDATE
+
+
+@pytest.mark.parametrize(
+    "path, spoil",
+    [
+        ("policy.critic.output.scale", lambda run: run.policy.critic.output.scale.fill_(torch.nan)),
+        (
+            "policy.intake.norms.0.mean",
+            lambda run: run.policy.intake.norms[0].mean.fill_(torch.inf),
+        ),
+        (
+            "learner.optimizer.squares.0",
+            lambda run: run.learner.optimizer.squares[0].fill_(torch.inf),
+        ),
+    ],
+)
+def test_a_state_that_is_not_finite_is_never_saved(tmp_path, path, spoil):
+    run = made(tmp_path)
+    run.train(lambda: run.updates == 1)
+    spoil(run)
+    run.updates += 1
+    with pytest.raises(NonFiniteError, match=f"was not saved, for {path} is not finite"):
+        run.save()
+    assert [path.name for path in checkpoint.checkpoints(tmp_path)] == [f"step_{UPDATE}"]
+
+
+@pytest.mark.parametrize("method", ["collect", "learner.update"])
+def test_memory_that_runs_out_ends_the_run_with_all_that_was_learnt(tmp_path, monkeypatch, method):
+    run = made(tmp_path)
+    owner, name = (run, method) if "." not in method else (run.learner, "update")
+    real = getattr(owner, name)
+
+    def fails_later(*arguments):
+        if run.updates == 3:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+        return real(*arguments)
+
+    monkeypatch.setattr(owner, name, fails_later)
+    with pytest.raises(torch.OutOfMemoryError):
+        run.train()
+    assert checkpoint.load_latest(tmp_path).step == 3 * UPDATE
+
+
+def test_the_error_that_ended_a_run_is_the_one_told_though_nothing_can_be_saved(
+    tmp_path, monkeypatch
+):
+    def fails(sentence):
+        def method(*arguments):
+            raise RuntimeError(sentence)
+
+        return method
+
+    run = made(tmp_path)
+    monkeypatch.setattr(run, "collect", fails("a device that is lost"))
+    monkeypatch.setattr(run, "save_checkpoint", fails("it cannot be read"))
+    with pytest.raises(RuntimeError, match="lost"):
+        run.train()
