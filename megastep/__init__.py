@@ -30,6 +30,7 @@ _MODULES = (
     "scene",
     "spaces",
     "toys",
+    "types",
 )
 
 

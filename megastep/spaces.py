@@ -6,11 +6,15 @@ layers. A vector or an image may name its ``dtype``, in which it is given and st
 ``MultiImage(1, 3, 1, 64, dtype=torch.uint8)``. Without one, any float will do.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import torch
 
-__all__ = ["MultiDiscrete", "MultiEmpty", "MultiImage", "MultiVector"]
+from megastep.arrdict import arrdict
+
+__all__ = ["MultiDiscrete", "MultiEmpty", "MultiImage", "MultiVector", "leaves", "map"]
 
 
 DTYPES = torch.uint8, torch.float16, torch.float32
@@ -88,3 +92,33 @@ class MultiEmpty(_Space):
     @property
     def shape(self) -> tuple[int, ...]:
         return (0,)
+
+
+def leaves(space: Any, name: str = "") -> dict[str, Any]:
+    """Returns the leaf spaces of a tree of spaces by dotted path, such as ``{"obs.rgb": ...}``.
+
+    ``name`` is the path of the tree itself. A space that is no dict is its own only leaf.
+    """
+    if not isinstance(space, Mapping):
+        return {name: space}
+    paths = {}
+    for key, child in space.items():
+        paths |= leaves(child, f"{name}.{key}" if name else key)
+    return paths
+
+
+def map(function: Callable, space: Any, *trees: Any) -> Any:
+    """Returns ``function(leaf_space, *leaf_values)`` for each leaf, as an arrdict with the keys of
+    the space; for a space that is no dict, the function's result itself.
+
+    ``trees`` are dicts with the same keys as the space, such as observations or actions. KeyError
+    if a key is missing from one.
+    """
+    if not isinstance(space, Mapping):
+        return function(space, *trees)
+    return arrdict(
+        {
+            key: map(function, child, *(tree[key] for tree in trees))
+            for key, child in space.items()
+        }
+    )
