@@ -1,118 +1,147 @@
-"""What train, evaluate and record do with a command line: parse, compose, check, run, exit code."""
+"""Runs a script from a command line: options, help, exit codes."""
 
 import argparse
-import contextlib
-import dataclasses
-import io
-import re
+import os
 import sys
-from collections.abc import Callable
-from typing import Any
+import warnings
 
 import hydra
-from hydra._internal.utils import get_args_parser
+from hydra.core.config_store import ConfigStore
 from hydra.types import RunMode
+from omegaconf import OmegaConf
 
-from megastep.agents.cli import console, doors
-from megastep.agents.cli.compose import ConfigLoader, Prepare, as_is
-from megastep.agents.cli.console import say
-from megastep.agents.cli.doors import told
-from megastep.agents.cli.errors import ConfigErrors, UserError
-from megastep.agents.cli.help import help_text
-from megastep.agents.cli.signals import Interrupted, Interruptions, interrupt
-from megastep.agents.cli.sweep import sweep
+from megastep.agents.cli import compose, console, program, signals, sweeps
+from megastep.agents.cli.check import as_tree, fields_of
+from megastep.agents.cli.compose import Composer, Script
 
-
-@dataclasses.dataclass(frozen=True)
-class Script:
-    """One of the things that can be done. `run(settings)`, of dataclass `kind`, does it; `prepare`
-    may change a composed tree before it is checked; `help` is the head of `--help`.
-    """
-
-    name: str
-    kind: type
-    run: Callable[[Any], Any]
-    help: str
-    prepare: Prepare = as_is
+#: Hydra's options: their names, and argparse's arguments.
+OPTIONS = {
+    "-m --multirun": {
+        "action": "store_true",
+        "help": "a sweep: -m seed=1,2,3; hydra/launcher=joblib runs jobs side by side, "
+        "submitit_slurm on a cluster; hydra/sweeper=optuna searches "
+        "learner.lr='interval(1e-4,1e-2)'; hydra.sweep.dir=FOLDER is where it goes",
+    },
+    "-c --cfg": {
+        "choices": ("job", "hydra", "all"),
+        "help": "print the composed configuration and stop; hydra, all: with Hydra's part of it",
+    },
+    "--resolve": {"action": "store_true", "help": "with --cfg: print interpolated values"},
+    "-p --package": {"metavar": "KEY", "help": "with --cfg: print a part, such as env"},
+    "-cd --config-dir": {"metavar": "DIR", "help": "groups and files of your own beside ours"},
+    "-cn --config-name": {"metavar": "FILE", "help": "another file than the script's own"},
+    "-cp --config-path": {"metavar": "DIR", "help": "a folder in place of ours"},
+    "-i --info": {
+        "nargs": "?",
+        "const": "all",
+        "help": "print what the configuration is composed of: defaults-tree, searchpath, ...",
+    },
+    "-sc --shell-completion": {
+        "action": "store_true",
+        "help": 'tab completion: eval "$({command} -sc install=bash)"',
+    },
+    "-h --help": {"action": "store_true", "help": "print this and stop"},
+    "--hydra-help": {"action": "store_true", "help": "print Hydra's own help and stop"},
+    "-r --run": {"action": "store_true", "help": argparse.SUPPRESS},
+}
 
 
 def run_command(script: Script, argv: list[str] | None = None) -> int:
-    """Parses, composes, checks, runs; returns the exit code."""
-    console.warn_in_lines()
-    options = _options(script.name, sys.argv[1:] if argv is None else argv)
+    """Parses, composes, checks and runs. Returns the exit code."""
+    warnings.showwarning, arguments = console.warn, sys.argv
     try:
-        with Interruptions(interrupt) as signals:
-            code = _run(script, options)
-        return code if signals.number is None else 128 + signals.number
-    except UserError as error:
-        say(f"{told(script.name)}: {error}", sys.stderr)
+        with signals.handled(signals.interrupt) as numbers:
+            code = _run(script, argv)
+        return 128 + numbers[0] if numbers else code
+    except SystemExit as end:  # of argparse, and of Hydra's help
+        return end.code or 0
+    except program.UserError as error:
+        console.say(f"{program.name(script.name)}: {error}", sys.stderr)
         return error.code
-    except Interrupted as stop:
-        say(f"{told(script.name)}: {stop}", sys.stderr)
+    except signals.Interrupted as stop:
+        console.say(f"{program.name(script.name)}: {stop}", sys.stderr)
         return 128 + stop.number
+    finally:
+        sys.argv = arguments
 
 
-def _run(script: Script, options: argparse.Namespace) -> int:
-    options.multirun |= "hydra.mode=MULTIRUN" in options.overrides
-    if not options.multirun:
-        options.overrides = _with_folder(script, options.overrides)
-    words, places = options.overrides, (options.config_name, options.config_dir)
-    with ConfigLoader(
-        script.name, script.kind, script.prepare, *places, options.config_path
-    ) as loader:
-        if text := _text(script, loader, options):
-            say(text.rstrip("\n"))
-        elif options.shell_completion:
-            loader.complete(words)
-        elif options.info:
-            loader.hydra.show_info(options.info, loader.name, words)
-        elif options.multirun:
-            return sweep(loader, script.run, words)
-        else:
-            settings, config = loader.composed(words)
-            if config.hydra.mode == RunMode.MULTIRUN:
-                return sweep(loader, script.run, words)
-            script.run(settings)
+def _run(script: Script, argv: list[str] | None) -> int:
+    parser = _parser(script)
+    options = parser.parse_intermixed_args(argv)
+    composer = Composer(script, options.config_name, options.config_dir, options.config_path)
+    words = [word.replace("hydra.run.dir=", "folder=") for word in options.overrides]
+    if options.help:
+        members = [f"  {name:<11} {', '.join(m)}" for name, m in composer.groups().items()]
+        parser.epilog = "\n".join(["groups, chosen with group=member:", *members])
+        console.say(parser.format_help().rstrip())
+    elif options.cfg:
+        jobs = sweeps.jobs_of(composer, words) if options.multirun else [words]
+        console.say("---\n".join(_printed(composer, job, options) for job in jobs).rstrip())
+    elif options.shell_completion:
+        _complete(composer, words)
+    elif options.info or options.hydra_help:
+        option = f"--info={options.info}" if options.info else "--hydra-help"
+        composer.call_hydra([option, *words])
+    elif options.multirun or "hydra.mode=MULTIRUN" in words:
+        return sweeps.sweep(composer, words)
+    else:
+        settings, config = composer.compose(words)
+        if config.hydra.mode == RunMode.MULTIRUN:
+            return sweeps.sweep(composer, words)
+        script.run(settings)
     return 0
 
 
-def _with_folder(script: Script, words: list[str]) -> list[str]:
-    """The words of a single run: what Hydra calls hydra.run.dir is its folder."""
-    if not any(word.startswith("hydra.run.dir=") for word in words):
-        return words
-    if "folder" not in script.kind.__dataclass_fields__:
-        raise ConfigErrors([("hydra.run.dir", f"{script.name} makes no folder")])
-    return [re.sub(r"^hydra\.run\.dir=", "folder=", word) for word in words]
+def _parser(script: Script) -> argparse.ArgumentParser:
+    command = program.name(script.name, "python ")
+    parser = argparse.ArgumentParser(
+        program.name(script.name),
+        f"{command} [-m] [key=value ...]",
+        script.help,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        add_help=False,
+        allow_abbrev=False,
+    )
+    for names, arguments in OPTIONS.items():
+        text = arguments["help"].replace("{command}", command)
+        parser.add_argument(*names.split(), **arguments | {"help": text})
+    versions = f"{program.version()}, Hydra {hydra.__version__}"
+    parser.add_argument("--version", action="version", version=versions)
+    parser.add_argument("overrides", nargs="*", help=argparse.SUPPRESS)
+    return parser
 
 
-def _text(script: Script, loader: ConfigLoader, options: argparse.Namespace) -> str:
-    """What an option has printed, if it is one of those."""
-    if options.help:
-        return help_text(script.name, script.help, loader.groups())
-    if options.hydra_help:
-        with contextlib.redirect_stdout(io.StringIO()) as text:
-            loader.hydra.hydra_help(loader.name, get_args_parser(), options)
-        return text.getvalue()
-    if not options.cfg:
-        return ""
-    jobs = [options.overrides]
-    if options.multirun:
-        jobs = [words for words, _ in loader.jobs(options.overrides)]
-    printed = [loader.printed(job, options.cfg, options.package, options.resolve) for job in jobs]
-    return "---\n".join(printed)
+def _printed(composer: Composer, words: list[str], options: argparse.Namespace) -> str:
+    """Returns YAML of the composed configuration, or of the part that `--package` names."""
+    settings, config = composer.compose(words)
+    tree = OmegaConf.create({} if options.cfg == "hydra" else as_tree(settings))
+    for key, value in compose.leaves(compose.own(config)):
+        if "${" in str(value) and tree and not options.resolve:
+            OmegaConf.update(tree, key, value)
+    if options.cfg != "job":
+        part = compose.plain(config.hydra, options.resolve)
+        tree.hydra = {key: part[key] for key in part if key not in ("help", "hydra_help")}
+    if options.package not in (None, "_global_"):
+        tree = OmegaConf.select(tree, options.package)
+    if tree is None:
+        raise program.UserError(f"There is no {options.package} in the configuration")
+    return OmegaConf.to_yaml(tree) if OmegaConf.is_config(tree) else f"{tree}\n"
 
 
-def _options(script: str, argv: list[str]) -> argparse.Namespace:
-    """Hydra's options, and the overrides between them."""
-    parser = get_args_parser()
-    parser.prog, parser.description = told(script), None
-    parser.usage = f"{parser.prog} [-m] [key=value ...]; --help says more"
-    for action in parser._actions:
-        if action.dest == "version":
-            action.version = f"{doors.version()}, Hydra {hydra.__version__}"
-    options = parser.parse_intermixed_args(argv)
-    if options.experimental_rerun:
-        parser.error("--experimental-rerun: a run is continued with resume=RUN")
-    if options.resolve and not options.cfg:
-        parser.error("--resolve goes with --cfg")
-    return options
+def _complete(composer: Composer, words: list[str]) -> None:
+    """Has Hydra complete the line in COMP_LINE, in a configuration that has every key there is."""
+    line = os.environ.get("COMP_LINE", "") + "|"
+    overrides = composer.parse(word for word in line.split()[:-1] if "=" in word)
+    config, errors = composer.config(overrides)
+    if errors:
+        return  # nothing completes what follows words that are wrong
+    tree = OmegaConf.create(compose.own(config))
+    for key, _ in fields_of(composer.script.kind, compose.own(config)):
+        if OmegaConf.select(tree, key) is None:
+            OmegaConf.update(tree, key, None, force_add=True)
+    node = {"defaults": [composer.name, "_self_"], **tree}
+    ConfigStore.instance().store(name="every-key", node=node)
+    try:
+        composer.call_hydra(["--shell-completion", *words], name="every-key")
+    except ValueError as error:
+        raise program.UserError(program.shortened(error, 400)) from None

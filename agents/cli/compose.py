@@ -1,252 +1,267 @@
-"""Command line -> Hydra -> checked settings. Everything is composed and checked before anything is
-written.
+"""The words of a command line -> Hydra -> checked settings, before anything is written.
 
-Hydra's own parts do the work, but for `@hydra.main`: it would make its folder first, and exit 1.
+Only Hydra's public API is used: its grammar reads the words, `hydra.compose` composes the groups,
+and keys are set in what comes out, so that every error has its own word. Jobs of sweeps compose in
+the same way, in whichever process they run.
 """
 
 import copy
 import dataclasses
+import functools
 import os
+import re
+import sys
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Any
 
-from hydra import version
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path
-from hydra.core.config_search_path import SearchPathQuery
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
-from hydra.types import RunMode
+import hydra
+import torch
+from hydra.core import config_store, global_hydra, plugins
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException, MissingConfigException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from megastep.agents.cli import overrides as words_of
-from megastep.agents.cli.build import as_tree, build, keys_of
-from megastep.agents.cli.errors import ConfigErrors, UserError
-from megastep.agents.cli.loader import Loader, hydra_error, maximise
-from megastep.agents.cli.registry import CONFIGS
+from megastep.agents.cli.check import CONFIGS, check, closest_key
+from megastep.agents.cli.program import (
+    DISTRIBUTION,
+    ConfigErrors,
+    UserError,
+    first_line,
+    shortened,
+)
+from megastep.agents.cli.settings import GROUPS
+from megastep.settings import closest
 
 Tree = dict[str, Any]
-#: Changes a composed tree before it is checked, given the keys that were typed.
-Prepare = Callable[[Tree, list[str]], Tree]
-#: What reads the environment of the process.
-FROM_ENVIRONMENT = "${oc.env:"
+#: The longest key and member of a group, and the most brackets of a word: Python's recursion ends
+#: not far above.
+LONGEST, MOST_BRACKETS = 200, 40
+#: An element of a value with = in it, as folders of sweeps have, and what quotes it.
+WITH_EQUALS, QUOTED = re.compile(r"[^\[\],]*=[^\[\],]*"), r'"\g<0>"'
+#: Members of Hydra's own groups that come with the optional dependencies.
+EXTRAS = ("joblib", "optuna", "submitit_local", "submitit_slurm")
+#: Groups with keys that no file has: the arguments of constructors.
+OPEN = ("env", "geometry", "agent", "learner", "opponents", "logger")
 
-
-def as_is(tree: Tree, given: list[str]) -> Tree:
-    return tree
+config_store.ConfigStore.instance().store(
+    name="open",
+    node=OmegaConf.create({key: OmegaConf.create({}, flags={"struct": False}) for key in OPEN}),
+)
 
 
 @dataclasses.dataclass(frozen=True)
-class Check:
-    """Makes settings of a composed configuration: those of dataclass `kind`. `prepare` may change
-    what was composed; `groups` are names that may have been meant beside those of keys.
+class Script:
+    """One of the programs: train, evaluate, record.
+
+    Args:
+        name: the file of its configuration.
+        kind: the dataclass of its settings.
+        run: does the work, given settings.
+        help: the head of `--help`.
+        prepare: changes the composed tree before it is checked, given the typed keys.
     """
 
+    name: str
     kind: type
-    prepare: Prepare = as_is
-    groups: tuple[str, ...] = ()
-
-    def __call__(self, config: DictConfig, words: Iterable[str]) -> Any:
-        """Settings, given the words that were typed. ConfigErrors with all that is wrong."""
-        given = [words_of.key_of(one) for one in words_of.parse(words)]
-        given = [key for key in given if key.partition("/")[0].partition(".")[0] != "hydra"]
-        raw = plain(config, resolve=False)
-        if secret := [key for key, value in leaves(raw) if FROM_ENVIRONMENT in str(value)]:
-            cure = "would be written to config.yaml; give the value itself"
-            raise ConfigErrors((key, f"what the environment holds {cure}") for key in secret)
-        return build(self.kind, self.prepare(plain(config), given), self.groups)
+    run: Callable[[Any], Any]
+    help: str
+    prepare: Callable[[Tree, list[str]], Tree] = lambda tree, typed: tree
 
 
-class ConfigLoader:
-    """Composes and checks the configuration of one script; a context, as Hydra keeps its state in
-    globals.
+class FolderOfUser(SearchPathPlugin):
+    """Has Hydra find files and groups in the folder given by `--config-dir`, beside ours."""
 
-    Args: `script`, the name of its own file; `kind`, the dataclass of its settings; `prepare`, what
-    may change a tree before it is checked; `name`, another file than its own; `folder`, whose files
-    and groups are found beside ours; `main`, a folder in place of ours.
+    path: str | None = None
+
+    def manipulate_search_path(self, search_path):
+        if self.path:
+            search_path.append("command-line", f"file://{self.path}")
+
+
+class Composer:
+    """Composes and checks the configuration of one script.
+
+    Args:
+        script: whose settings they are.
+        name: another file than the script's own.
+        folder: a folder whose files and groups are found beside ours.
+        main: a folder in place of ours.
     """
 
     def __init__(
-        self,
-        script: str,
-        kind: type,
-        prepare: Prepare = as_is,
-        name: str | None = None,
-        folder: str | None = None,
-        main: str | None = None,
+        self, script: Script, name: str | None = None, folder: str | None = None, main: Any = None
     ):
-        self.script, self.kind, self.prepare = script, kind, prepare
-        self.name, self.folders = name or script, (main or str(CONFIGS), folder)
-
-    def __enter__(self):
-        for folder in self.folders:
-            if folder is not None and not os.path.isdir(folder):
-                raise UserError(f"There is no folder {folder} with configurations")
-        self._clear()
-        version.setbase("1.3")
-        main, folder = self.folders
-        search_path = create_config_search_path(f"file://{os.path.abspath(main)}")
-        if folder is not None:
-            search_path.prepend(
-                "command-line", f"file://{os.path.abspath(folder)}", SearchPathQuery("schema")
-            )
-        maximise()
-        self.loader = Loader(search_path)
-        self.hydra = Hydra(self.script, self.loader)
-        GlobalHydra.instance().initialize(self.hydra)
-        self.check = Check(self.kind, self.prepare, tuple(self.loader.list_groups("")))
-        return self
-
-    def __exit__(self, *error):
-        self._clear()
-
-    @staticmethod
-    def _clear():
-        GlobalHydra.instance().clear()
-        HydraConfig.instance().cfg = None
+        self.script, self.name, self.folder = script, name or script.name, folder
+        self.main = os.path.abspath(main or CONFIGS)
+        for path in filter(None, (folder, self.main)):
+            if not os.path.isdir(path):
+                raise UserError(f"There is no folder {path} with configurations")
+        FolderOfUser.path = folder and os.path.abspath(folder)
+        plugins.Plugins.instance().register(FolderOfUser)
+        global_hydra.GlobalHydra.instance().clear()
+        hydra.initialize_config_dir(self.main, job_name=script.name, version_base="1.3")
+        self.loader = global_hydra.GlobalHydra.instance().config_loader()
+        self.members = functools.cache(self.loader.get_group_options)
+        self.composed = functools.cache(self._composed)
 
     def groups(self) -> dict[str, list[str]]:
-        """{group: [members]}: those that the script's own file has a default for, and those of the
-        user's folder.
-        """
-        found = self.loader.compute_defaults_list(self.name, [], RunMode.RUN)
-        own = [group for group in found.overrides.known_choices if "/" not in group]
-        if folder := self.folders[1]:
-            own += [
-                name for name in self.loader.list_groups("") if os.path.isdir(f"{folder}/{name}")
-            ]
-        members = {group: self.loader.members(group, self.name) for group in dict.fromkeys(own)}
-        return {
-            group: [member for member in found if ":" not in member]
-            for group, found in members.items()
-            if found and group != "hydra"
-        }
+        """Returns {group: members} of the groups to choose from."""
+        names = [group for group in self.composed().hydra.runtime.choices if "/" not in group]
+        names += [name for name in self.loader.list_groups("") if self.folder and name not in names]
+        members = {name: [m for m in self.members(name) if ":" not in m] for name in names}
+        return {name: members[name] for name in names if members[name] and name != "hydra"}
 
-    def compose(self, words: list[str], mode: RunMode = RunMode.RUN) -> DictConfig:
-        """The configuration as Hydra composes it, its own part included. ConfigErrors names all
-        words that it could not be given.
+    def parse(self, words: Iterable[str]) -> list[Override]:
+        """Returns words as Hydra's grammar reads them. Raises ConfigErrors naming all unreadable
+        ones.
         """
+        overrides, errors, parser = [], [], OverridesParser.create(self.loader)
+        for word in words:
+            key, _, value = word.partition("=")
+            fits = len(key) <= LONGEST and value.count("[") + value.count("{") <= MOST_BRACKETS
+            for text in (word, f"{key}={WITH_EQUALS.sub(QUOTED, value)}") if key and fits else ():
+                with suppress(HydraException, ValueError):
+                    overrides.append(parser.parse_override(text))
+                    break
+            else:
+                cure = "write key=value, and quote blanks and brackets: 'key=\"a b\"'"
+                errors.append((shortened(word), f"cannot be read; {cure}"))
+        if errors:
+            raise ConfigErrors(errors)
+        return overrides
+
+    def compose(self, words: Iterable[str]) -> tuple[Any, DictConfig]:
+        """Returns checked settings, and the configuration they are from, Hydra's part included.
+        Raises ConfigErrors with everything that is wrong.
+        """
+        overrides = self.parse(words)
+        config, errors = self.config(overrides)
         try:
-            config = self.hydra.compose_config(self.name, words, mode)
-        except (HydraException, OmegaConfBaseException) as error:
-            raise ConfigErrors([hydra_error(error, self._hydras(words))]) from None
-        HydraConfig.instance().set_config(config)
-        return config
-
-    def settings(self, words: list[str]) -> Any:
-        """Checked settings for one list of overrides. ConfigErrors names every unknown key and
-        group member, and every bad value.
-        """
-        return self.composed(words)[0]
-
-    def composed(self, words: list[str], known: dict | None = None) -> tuple[Any, DictConfig]:
-        """Checked settings, and the configuration that they are from. Where `known` is given, it
-        keeps what was composed of the same groups, as each time takes 0.2 s.
-        """
-        good, errors = self.loader.translated(words, self.name, RunMode.RUN)
-        try:
-            config = self.compose(good) if known is None else self._derived(good, known)
-            settings = self.check(config, words)
+            settings = self._checked(config, [key_of(one) for one in overrides])
         except ConfigErrors as error:
-            raise ConfigErrors([*errors, *error.errors]) from None
-        except (HydraException, OmegaConfBaseException) as error:
-            raise ConfigErrors([*errors, hydra_error(error, None)]) from None
+            errors += error.errors
         if errors:
             raise ConfigErrors(errors)
         return settings, config
 
-    def _derived(self, words, known):
-        """What words compose to, from the composition of their groups alone."""
-        keys = [word for word in words if word.startswith("++") and word[:9] != "++device="]
-        groups = tuple(word for word in words if word not in keys)
-        if groups not in known:
-            known[groups] = self.compose([*groups])
-        config = copy.deepcopy(known[groups])
-        Loader._apply_overrides_to_config(words_of.parse(keys), config)
+    def settings(self, words: Iterable[str]) -> Any:
+        """Returns checked settings."""
+        return self.compose(words)[0]
+
+    def config(self, overrides: list[Override]) -> tuple[DictConfig, list[tuple[str, str]]]:
+        """Returns (the configuration, the errors of words that are not in it)."""
+        groups, keys, errors = [], {}, []
+        for one in overrides:
+            if one.is_sweep_override():
+                cure = "has several values; add -m for a sweep"
+                errors.append((key_of(one), f"{one.input_line!r} {cure}"))
+            elif not self.members(one.key_or_group) or isinstance(one.value(), dict):
+                keys[key_of(one)] = one
+            elif error := self._member_error(one.key_or_group, one.value()):
+                errors.append((key_of(one), error))
+            else:
+                groups.append(one.input_line)
+        if "hydra.searchpath" in keys:
+            groups.append(keys.pop("hydra.searchpath").input_line)
+        device = keys["device"].value() if "device" in keys else None
+        try:
+            config = copy.deepcopy(self.composed(*groups, device=device))
+        except MissingConfigException as error:
+            cure = "is in none of the folders searched; --config-dir adds one"
+            raise ConfigErrors([(error.missing_cfg_file or self.name, cure)]) from None
+        except (HydraException, OmegaConfBaseException) as error:
+            raise ConfigErrors([*errors, ("configuration", shortened(error, 400))]) from None
+        for key, one in keys.items():
+            try:
+                _apply(one, key, config)
+            except (ConfigKeyError, ConfigAttributeError):
+                names = [name for name, _ in leaves({"hydra": plain(config.hydra)})]
+                errors.append((key, f"no such key; {closest_key(key, names)}"))
+            except OmegaConfBaseException as error:
+                errors.append((key, first_line(error)))
+        return config, errors
+
+    def _composed(self, *groups: str, device: str | None = None) -> DictConfig:
+        """Returns what Hydra composes; `preset=auto` stands for gpu or cpu, by the device."""
+        config = hydra.compose(self.name, [*groups], return_hydra_config=True)
+        if config.hydra.runtime.choices.get("preset") == "auto":
+            preset = "preset=gpu" if has_gpu(device or config.get("device")) else "preset=cpu"
+            config = hydra.compose(self.name, [*groups, preset], return_hydra_config=True)
+        OmegaConf.set_struct(config, False)
         return config
 
-    def tree(self, words: list[str]) -> Tree:
-        """Nested dicts for one list of overrides, every setting in them; errors as `settings`."""
-        return as_tree(self.settings(words))
-
-    def jobs(self, words: list[str]) -> list[tuple[list[str], Tree]]:
-        """The tree of each job of a sweep that can be told beforehand, `[(overrides, nested
-        dicts)]`: all of them, or those at its bounds if the sweeper searches.
-        """
-        master = self.compose(words, RunMode.MULTIRUN)
-        is_grid = str(master.hydra.sweeper.get("_target_")).endswith(".BasicSweeper")
-        params = OmegaConf.select(master, "hydra.sweeper.params") or {}
-        words = [*(f"{key}={value}" for key, value in params.items()), *words]
-        try:
-            parsed = words_of.parse(words, self.loader, multirun=True)
-            if is_grid and (wide := [one for one in parsed if one.is_interval_sweep()]):
-                cure = "needs a sweeper that searches, such as hydra/sweeper=optuna"
-                raise ConfigErrors((words_of.key_of(one), f"interval() {cure}") for one in wide)
-            found = list(words_of.combinations(parsed, is_grid))
-        except HydraException as error:
-            raise UserError(f"This sweep cannot be split: {error}") from None
-        known = {}
-        return [(job, as_tree(self.composed(job, known)[0])) for job in found]
-
-    def printed(self, words: list[str], what: str, package: str | None, resolve: bool) -> str:
-        """The configuration as YAML: of the `job`, of `hydra`, or `all`; or a part of it."""
-        settings, config = self.composed(words)
-        own, tree = plain(config, resolve=False), as_tree(settings)
-        if not resolve:
-            for key, value in leaves(own):
-                if isinstance(value, str) and "${" in value:
-                    _put(tree, key, value)
-        whole = OmegaConf.create({} if what == "hydra" else tree)
-        if what != "job":
-            hydras = self.hydra.get_sanitized_hydra_cfg(config)
-            whole.hydra = OmegaConf.to_container(hydras.hydra, resolve=resolve)
-        if package not in (None, "_global_"):
-            found = OmegaConf.select(whole, package)
-            if found is None:
-                raise UserError(f"There is no {package} in the configuration")
-            return str(found) if not OmegaConf.is_config(found) else OmegaConf.to_yaml(found)
-        return OmegaConf.to_yaml(whole)
-
-    def complete(self, words: list[str]) -> None:
-        """Answers a shell that completes words, keys of constructors among them."""
-        self.loader.keys = lambda config: keys_of(self.kind, plain(config, resolve=False))
-        try:
-            self.hydra.shell_completion(self.name, words)
-        except ValueError as error:
-            raise UserError(" ".join(str(error).split())) from None
-        except ConfigErrors:
-            pass  # there is nothing to complete after words that are wrong
-
-    def _hydras(self, words):
-        """Hydra's own settings, but for keys that were typed; None if they do not compose."""
-        groups = [word for word in words if word.startswith("hydra/")]
-        try:
-            return self.hydra.compose_config(self.name, groups, RunMode.RUN).hydra
-        except (HydraException, OmegaConfBaseException, ConfigErrors):
+    def _member_error(self, group: str, member: Any) -> str | None:
+        """Returns what is wrong with a member of a group; tells Hydra of an import path."""
+        options, is_path = self.members(group), ":" in str(member) and len(str(member)) <= LONGEST
+        if member is None or member in options:
             return None
+        if is_path and group in GROUPS and not GROUPS[group].kinds:
+            return config_store.ConfigStore.instance().store(group=group, name=member, node={"name": member})
+        if member in EXTRAS:
+            return f"{member} is not installed: pip install '{DISTRIBUTION}[sweep]'"
+        return f"{member!r} is unknown; {closest(member, options)}"
+
+    def _checked(self, config: DictConfig, typed: list[str]) -> Any:
+        cure = "is an environment variable, and would be written to config.yaml; type the value"
+        if secret := [key for key, value in leaves(own(config)) if "${oc.env:" in str(value)]:
+            raise ConfigErrors((key, cure) for key in secret)
+        try:
+            tree = own(config, resolve=True)
+        except OmegaConfBaseException as error:
+            raise ConfigErrors([(error.full_key or "configuration", first_line(error))]) from None
+        tree = self.script.prepare(tree, [key for key in typed if not key.startswith("hydra")])
+        groups = self.loader.list_groups("") + [f"hydra/{g}" for g in self.loader.list_groups("hydra")]
+        return check(self.script.kind, tree, groups)
+
+    def call_hydra(
+        self, arguments: list[str], task: Callable | None = None, name: str | None = None
+    ) -> None:
+        """Calls Hydra's own main with these arguments. Its errors are raised; it sets sys.argv."""
+        os.environ["HYDRA_FULL_ERROR"] = "1"
+        sys.argv = [sys.argv[0], *arguments]
+        global_hydra.GlobalHydra.instance().clear()
+        main = hydra.main(config_path=self.main, config_name=name or self.name, version_base="1.3")
+        main(task or self.script.run)()
 
 
-def plain(config: DictConfig, resolve: bool = True) -> Tree:
-    """Nested dicts of all but Hydra's own part."""
-    own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
-    return OmegaConf.to_container(own, resolve=resolve)
+def has_gpu(device: object) -> bool:
+    """Returns whether a run on `device` would use a GPU of this machine."""
+    return device != "cpu" and torch.cuda.is_available()
 
 
-def leaves(tree: Tree, path: str = "") -> list[tuple[str, Any]]:
-    """[(dotted key, value)]"""
-    found = []
+def key_of(override: Override) -> str:
+    """Returns the key or group@package of a word, without the sign before it."""
+    return override.get_key_element().lstrip("+~")
+
+
+def own(config: DictConfig, resolve: bool = False) -> Tree:
+    """Returns nested dicts of all but Hydra's part, without groups that nothing is in."""
+    tree = plain(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]), resolve)
+    return {key: value for key, value in tree.items() if value != {}}
+
+
+def plain(config: DictConfig, resolve: bool = False) -> Tree:
+    return OmegaConf.to_container(config, resolve=resolve)
+
+
+def leaves(tree: Tree, prefix: str = "") -> list[tuple[str, Any]]:
+    """Returns [(dotted key, value)] of nested dicts."""
+    pairs = []
     for key, value in tree.items():
-        if isinstance(value, dict):
-            found += leaves(value, f"{path}{key}.")
-        else:
-            found.append((f"{path}{key}", value))
-    return found
+        nested = isinstance(value, dict)
+        pairs += leaves(value, f"{prefix}{key}.") if nested else [(f"{prefix}{key}", value)]
+    return pairs
 
 
-def _put(tree, key, value):
-    *groups, last = key.split(".")
-    for group in groups:
-        tree = tree[group]
-    tree[last] = value
+def _apply(override: Override, key: str, config: DictConfig) -> None:
+    """Sets or deletes a key in a configuration. Raises OmegaConfBaseException."""
+    if override.is_delete():
+        parent, _, leaf = key.rpartition(".")
+        del (OmegaConf.select(config, parent) if parent else config)[leaf]
+    else:
+        force_add = override.is_add() or override.is_force_add() or not key.startswith("hydra.")
+        OmegaConf.update(config, key, override.value(), force_add=force_add)

@@ -1,5 +1,5 @@
-"""Lines, warnings, tables and progress for whoever watches, on a terminal or not. What cannot be
-written, as its reader has left or its disk is full, never ends the work.
+"""Lines, warnings, tables and progress, on a terminal or not. Output that cannot be written, as on
+a full disk or a closed pipe, never ends the work.
 """
 
 import contextlib
@@ -12,16 +12,14 @@ from collections.abc import Sequence
 from io import StringIO
 from typing import Any, TextIO
 
-from rich import box
+from rich import box, progress
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn
-from rich.progress import Progress as Bars
 from rich.table import Table
 
 #: Seconds between two lines of progress where a line cannot be redrawn.
 LINE_EVERY = 10
-#: What every line begins with.
-_prefix = ""
+#: The beginning of every line, where one of several processes prints.
+prefix = ""
 
 
 class TolerantStream:
@@ -31,32 +29,29 @@ class TolerantStream:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        try:
-            return self._stream.write(text)
-        except (OSError, ValueError):
-            self._silence()
-            return len(text)
+        self._attempt(self._stream.write, text)
+        return len(text)
 
     def flush(self) -> None:
-        try:
-            self._stream.flush()
-        except (OSError, ValueError):
-            self._silence()
+        self._attempt(self._stream.flush)
 
-    def _silence(self) -> None:
-        """What is buffered goes to the null device, or the interpreter's last flush would fail."""
-        null = os.open(os.devnull, os.O_WRONLY)
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(null, self._stream.fileno())
-        os.close(null)
+    def _attempt(self, method, *arguments):
+        try:
+            method(*arguments)
+        except (OSError, ValueError):
+            # the buffer goes to the null device, or the interpreter's last flush would fail
+            null = os.open(os.devnull, os.O_WRONLY)
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(null, self._stream.fileno())
+            os.close(null)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
 
 def open_streams() -> None:
-    """Makes stdout and stderr tolerant, whatever their encoding, and opens those that are closed,
-    so that no file takes their number.
+    """Makes stdout and stderr tolerant of errors and encodings, and opens those that are closed, so
+    that no file takes their number.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
@@ -68,50 +63,33 @@ def open_streams() -> None:
 
 
 def say(text: str = "", file: TextIO | None = None) -> None:
-    """Prints a line, or several."""
-    lines = "\n".join(f"{_prefix}{line}" for line in text.split("\n"))
+    """Prints one line or several."""
+    lines = "\n".join(f"{prefix}{line}" for line in text.split("\n"))
     print(lines, file=file or sys.stdout, flush=True)
 
 
-def prefix_lines(prefix: str) -> None:
-    """Begins every line with `prefix`, and redraws none: where several processes print."""
-    global _prefix
-    _prefix = prefix
-
-
-def warn(sentence: object) -> None:
-    """One line on the error stream."""
+def warn(sentence: object, *_: Any, **__: Any) -> None:
+    """Prints one line on stderr. Can stand in for `warnings.showwarning`."""
     say(f"warning: {sentence}", sys.stderr)
 
 
-def warn_in_lines() -> None:
-    """Shows Python's warnings as such lines."""
-    warnings.showwarning = lambda message, *_, **__: warn(message)
-
-
 def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
-    """What ended a thread; of a disk that is full, as TensorBoard's may meet, in one line."""
+    """Prints why a thread ended, in one line if the disk is full, as TensorBoard's may find it."""
     if isinstance(failure.exc_value, OSError):
         warn(f"{failure.thread.name} stopped: {failure.exc_value}")
     else:
         threading.__excepthook__(failure)
 
 
-def is_interactive() -> bool:
-    """Whether stdout can redraw a line: a terminal, not a dumb one, and no other process's too."""
-    return (
-        not _prefix
-        and sys.stdout.isatty()
-        and os.environ.get("TERM", "dumb") not in ("dumb", "unknown", "")
-    )
+def is_unicode() -> bool:
+    """Returns whether stdout can show more than ASCII."""
+    return (sys.stdout.encoding or "").lower().startswith("utf")
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> str:
-    """A table as text, as wide as its contents, in characters that stdout can show."""
-    is_unicode = (sys.stdout.encoding or "").lower().startswith("utf")
-    grid = Table(
-        *head, title=title, title_justify="left", box=box.HEAVY_HEAD if is_unicode else box.ASCII
-    )
+    """Returns a table as text, as wide as its contents, in characters that stdout can show."""
+    style = box.HEAVY_HEAD if is_unicode() else box.ASCII
+    grid = Table(*head, title=title, title_justify="left", box=style)
     for row in rows:
         grid.add_row(*row)
     console = Console(file=StringIO(), width=200, force_terminal=False, color_system=None)
@@ -120,43 +98,38 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str | None 
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table as Markdown."""
+    """Returns a table as Markdown."""
     lines = (head, ("---",) * len(head), *rows)
     cells = ([cell.replace("|", "\\|") for cell in line] for line in lines)
     return "".join("| " + " | ".join(line) + " |\n" for line in cells)
 
 
-class Progress:
-    """A bar with a line of text on a terminal, a plain line every `LINE_EVERY` seconds elsewhere. A
-    context.
-    """
+class Progress(contextlib.ExitStack):
+    """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds."""
 
-    def __init__(self):
-        self.bars, self.last = None, -LINE_EVERY
+    bars, shown_at = None, -LINE_EVERY
 
     def __enter__(self):
-        if is_interactive():
-            self.bars = Bars(BarColumn(24), TextColumn("{task.description}"))
+        is_terminal = sys.stdout.isatty() and not prefix
+        if is_terminal and os.environ.get("TERM", "dumb") not in ("dumb", "unknown", ""):
+            columns = progress.BarColumn(24), progress.TextColumn("{task.description}")
+            self.bars = self.enter_context(progress.Progress(*columns))
             self.task = self.bars.add_task("starting", total=1)
-            self.bars.start()
         return self
 
-    def __exit__(self, *error):
-        if self.bars:
-            self.bars.stop()
-
-    def show(self, fraction: float | None, text: str) -> None:
-        """`fraction` of the work is done, or None if it has no end."""
+    def show(self, fraction: float | None, words: Sequence[str]) -> None:
+        """Shows words on one line; `fraction` of the work is done, None if it has no end."""
+        text = (" · " if is_unicode() else "  ").join(words)
         if self.bars:
             total = None if fraction is None else 1
             self.bars.update(self.task, completed=fraction or 0, total=total, description=text)
-        elif time.monotonic() - self.last >= LINE_EVERY:
-            self.last = time.monotonic()
+        elif time.monotonic() - self.shown_at >= LINE_EVERY:
+            self.shown_at = time.monotonic()
             say(text)
 
 
 def number(value: float) -> str:
-    """A count in three digits: 1.23M."""
+    """Returns a count in three digits: 1.23M."""
     for limit, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if value >= limit:
             return f"{value / limit:.3g}{unit}"
@@ -164,7 +137,9 @@ def number(value: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """m:ss, or h:mm:ss."""
+    """Returns a time in its two largest units: 5 s, 2 min 5 s, 1 h 2 min."""
     minutes, seconds = divmod(max(0, round(seconds)), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"

@@ -1,5 +1,6 @@
-"""What train, evaluate and record begin with, as scripts or as `megastep train`: the GPU wakes up
-while Python imports, and signals and closed streams are taken care of before that.
+"""Starts train, evaluate and record, as scripts or as the command `megastep`.
+
+The GPU wakes up while Python imports; signals and closed streams are handled before that.
 """
 
 import ctypes
@@ -8,23 +9,22 @@ import os
 import sys
 import threading
 
-from megastep.agents.cli import doors, signals
+from megastep.agents.cli import program, signals
 
 SCRIPTS = {
     "train": "trains a policy",
     "evaluate": "measures a trained policy",
     "record": "films a trained policy",
 }
-#: Options that print something and stop.
-PRINTING = ("-h", "--h", "-c", "--cfg", "-i", "--info", "-s", "--shell", "--version", "--resolve")
-SWEEPING = ("-m", "--multirun")
+#: Options that need no GPU in this process: they print something, or start jobs elsewhere.
+WITHOUT_GPU = ("-h", "--h", "-c", "--cfg", "-i", "--info", "-s", "--shell", "--version", "-m", "--m")
 
 
 def main() -> int:
-    """The installed command, `megastep`; returns the exit code."""
+    """Runs the installed command, `megastep`. Returns the exit code."""
     command, *words = sys.argv
     if words and words[0] in ("-sc", "--shell-completion"):
-        words = _completed(words)
+        words = _script_to_complete(words)
     if words and words[0] in SCRIPTS:
         sys.argv = [command, *words[1:]]
         return run_script(words[0])
@@ -33,38 +33,37 @@ def main() -> int:
 
     console.open_streams()
     if words == ["--version"]:
-        console.say(doors.version())
-        return 0
-    if words and words[0] not in ("-h", "--help", ""):
+        console.say(program.version())
+    elif words and words[0] not in ("-h", "--help", ""):
         console.say(f"megastep: {words[0]!r} is unknown; {closest(words[0], SCRIPTS)}", sys.stderr)
         return 2
-    if not words or words[0]:
-        lines = [f"  megastep {name:<10}{what}; --help says more" for name, what in SCRIPTS.items()]
-        console.say("\n".join(lines))
+    elif words != [""]:
+        for name, text in SCRIPTS.items():
+            console.say(f"  megastep {name:<10}{text}; --help says more")
     return 0
 
 
-def _completed(words: list[str]) -> list[str]:
-    """What completes a line that a shell has in COMP_LINE: the script that the line is for, and its
-    options. Completes the script's own name itself; then nothing is left to do: ["" ].
+def _script_to_complete(words: list[str]) -> list[str]:
+    """Returns the words that complete the line which the shell has in COMP_LINE: a script, and its
+    options. Completes the script's own name itself, and returns [""] then.
     """
     line = os.environ.get("COMP_LINE", "")
-    typed = line.split()[1:2]
+    script = "".join(line.split()[1:2])
     if not any(word.startswith("query=") for word in words):
         return ["train", *words]
-    if typed and len(line.split()) > 2 or typed and line.endswith(" "):
-        os.environ["COMP_LINE"] = line.replace(typed[0], "", 1)
-        return [typed[0], *words]
-    print(" ".join(name for name in SCRIPTS if name.startswith("".join(typed))))
+    if script and (len(line.split()) > 2 or line.endswith(" ")):
+        os.environ["COMP_LINE"] = line.replace(script, "", 1)
+        return [script, *words]
+    print(" ".join(name for name in SCRIPTS if name.startswith(script)))
     return [""]
 
 
 def run_script(name: str) -> int:
-    """Runs a script of this package by its name; returns the exit code."""
+    """Runs a script of this package by its name. Returns the exit code."""
     signals.exit_on_signals(name)
-    waking = threading.Thread(target=create_cuda_context)
     if wants_first_gpu(sys.argv[1:]):
-        waking.start()  # the interpreter waits for it: a process must not end within the driver
+        # the interpreter waits for this thread: a process must not end within the driver
+        threading.Thread(target=create_cuda_context).start()
     from megastep.agents.cli import console  # its imports take a while, too
 
     console.open_streams()
@@ -73,18 +72,16 @@ def run_script(name: str) -> int:
 
 
 def wants_first_gpu(words: list[str]) -> bool:
-    """Whether a command line may lead to work on the first GPU in this process: no other device is
-    named in it.
-    """
+    """Returns whether a command line may use the first GPU in this process."""
     devices = [word.partition("=")[2] for word in words if word.startswith("device=")]
-    elsewhere = any(word.startswith(PRINTING) or word in SWEEPING for word in words)
+    elsewhere = any(word.startswith(WITHOUT_GPU) for word in words)
     return not elsewhere and all(name in ("auto", "cuda", "cuda:0") for name in devices)
 
 
 def create_cuda_context() -> None:
-    """Creates the primary context of the first GPU, which PyTorch then finds there: half a second
-    that passes beside the imports, as the driver needs no Python. Without a driver or a GPU,
-    nothing.
+    """Creates the primary context of the first GPU, if there is one; PyTorch finds it there later.
+
+    It takes half a second in the driver, which passes beside Python's imports.
     """
     try:
         driver = ctypes.CDLL("libcuda.so.1")

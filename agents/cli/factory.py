@@ -1,361 +1,276 @@
-"""The objects a run is made of, from its settings: device, homes, environment, policy, learner,
-rollout, weights. PyTorch is imported where it is used: composing a configuration needs none.
-"""
-
-from __future__ import annotations
+"""Builds the objects of a run from its settings: device, homes, environment, policy, learner."""
 
 import dataclasses
 import inspect
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from megastep.agents.cli import settings
-from megastep.agents.cli.build import build
-from megastep.agents.cli.errors import ConfigErrors, UserError, shortened
-from megastep.agents.cli.run_folders import is_checkpoint
+import torch
+
+from megastep import contract, engine, spaces
+from megastep.agents.algorithms.learner import LearnerError, check_learner
+from megastep.agents.cli import runs
+from megastep.agents.cli.check import check
+from megastep.agents.cli.program import ConfigErrors, UserError, first_line, shortened
+from megastep.agents.cli.settings import Agent, Env, Geometry, Learner, Train
 from megastep.agents.imports import import_object
+from megastep.agents.networks.policy import Policy
+from megastep.agents.selfplay.opponents import Opponents
+from megastep.agents.training import checkpoint
+from megastep.agents.training.evaluation import RandomActions
+from megastep.agents.training.loggers import LoggerError
+from megastep.capture import state_tree
 
-if TYPE_CHECKING:
-    import torch
-
-    from megastep.agents.networks.policy import Policy
-    from megastep.agents.selfplay.opponents import Opponents
-    from megastep.agents.training.checkpoint import Checkpoint
-
-#: Environments that are made to measure how much memory one takes.
+#: Number of environments in which the memory of one is measured.
 PROBE = 65
-#: Environments of a sample, and steps that they take where they have to keep the contract.
+#: Environments of a sample, and the steps in which they must keep the contract.
 SAMPLE, SAMPLE_STEPS = 4, 16
+#: What the library raises for bad arguments, files, devices and for missing memory.
+KINDS = (
+    ValueError,
+    OSError,
+    engine.EngineError,
+    torch.OutOfMemoryError,
+    checkpoint.CheckpointError,
+    LoggerError,
+    LearnerError,
+    contract.ContractError,
+)
 
 
 @contextmanager
-def errors() -> Iterator[None]:
-    """Turns what the library says about bad arguments, files, devices and memory into a UserError.
-    For setting up only.
-    """
-    import torch
-
-    from megastep.agents.training.checkpoint import CheckpointError
-    from megastep.agents.training.loggers import LoggerError
-    from megastep.engine import EngineError
-
+def errors(prefix: str = "", kinds: tuple[type, ...] = KINDS) -> Iterator[None]:
+    """Turns errors of the library into a UserError that begins with `prefix`. For setting up."""
     try:
         yield
-    except (
-        ValueError,
-        EngineError,
-        CheckpointError,
-        LoggerError,
-        OSError,
-        torch.OutOfMemoryError,
-    ) as error:
-        raise UserError(shortened(str(error).splitlines()[0], 400)) from error
+    except kinds as error:
+        raise UserError(prefix + shortened(first_line(error), 400)) from error
+
+
+def construct(settings: Any, **arguments: Any) -> Any:
+    """Calls the class or function that settings name, with all of both that it takes."""
+    with errors():
+        constructor = import_object(settings.name)
+        taken = inspect.signature(constructor).parameters
+        return constructor(**{k: v for k, v in (vars(settings) | arguments).items() if k in taken})
+
+
+def changed(settings: Any, **changes: Any) -> Any:
+    """Returns settings with those changed that they have."""
+    known = {name: value for name, value in changes.items() if hasattr(settings, name)}
+    return dataclasses.replace(settings, **known)
 
 
 def make_device(name: str) -> torch.device:
-    """The device called `name`; a GPU becomes PyTorch's current one, on which graphs are
-    captured.
-    """
-    import torch
-
-    from megastep import engine
-
+    """Returns a device by name. A GPU becomes PyTorch's current one, on which graphs are captured."""
     with errors():
-        chosen = engine.device(name)
-    if chosen.type == "cuda":
-        torch.cuda.set_device(chosen)
-    return chosen
+        device = engine.device(name)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    return device
 
 
-def homes(
-    env: settings.Env, geometry: settings.Geometry, split: str, max_homes: int | None = None
-) -> list[dict]:
-    """The different geometries of a split, in order; the source repeats them when it runs out. None
-    for an environment that takes no geometries.
-    """
-    if not _takes(env, "geometries"):
+def homes(env: Env, geometry: Geometry, split: str, max_homes: int | None = None) -> list[dict]:
+    """Returns the different geometries of a split, in order; none if `env` takes no geometries."""
+    if "geometries" not in inspect.signature(import_object(env.name)).parameters:
         return []
-    with errors():
-        found = import_object(geometry.name)(split=split, **_arguments(geometry, "name"))
-    return list({id(home): home for home in found}.values())[:max_homes]
+    sampled = construct(geometry, split=split)
+    return list({id(home): home for home in sampled}.values())[:max_homes]
 
 
 def make_env(
-    chosen: settings.Env,
-    homes: list[dict],
-    seed: int,
-    device: torch.device,
-    privileged: bool = False,
-    sample: Any = None,
-    bytes_beside: float = 0,
+    env: Env, homes: list[dict], seed: int, device: torch.device, privileged: bool = False
 ) -> Any:
-    """The environment that settings describe, in these homes. It is given what its constructor
-    takes of geometries, seed and device, and of `privileged`: whether a critic wants to see that.
+    """Returns the environment that settings describe, in these homes.
 
-    UserError that says how many environments fit, if these are too many for the memory;
-    `bytes_beside` is what each needs beside its own, in a rollout. Before a large one is made, two
-    small ones tell what one environment takes; the `sample` of `make_sample` may be one of them.
+    `privileged`: whether a critic wants the privileged observation.
     """
-    from megastep import engine
-    from megastep.capture import state_tree
-
-    constructor = import_object(chosen.name)
-
-    def make(n_envs, homes):
-        run = dict(geometries=homes, seed=seed, device=device, privileged=privileged)
-        run = {name: value for name, value in run.items() if _takes(chosen, name)}
-        return constructor(n_envs=n_envs, **_arguments(chosen, "name", "n_envs"), **run)
-
-    with errors():
-        if chosen.n_envs > PROBE:
-            few, many = sample or make(1, homes[:1]), make(PROBE, homes[:1])
-            sizes = [
-                sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())
-                for env in (few, many)
-            ]
-            each = (sizes[1] - sizes[0]) / (many.n_envs - few.n_envs)
-            engine.fit(chosen.n_envs, each + bytes_beside, device)
-        return make(chosen.n_envs, homes)
+    return construct(env, geometries=homes, seed=seed, device=device, privileged=privileged)
 
 
-def make_sample(
-    chosen: settings.Env,
-    homes: list[dict],
-    seed: int,
-    device: torch.device,
-    privileged: bool = False,
-) -> Any:
-    """An environment of the kind that settings describe, which tells spaces and sizes; a few if the
-    class is not ours, which is tested elsewhere. UserError that names the clause of the contract
-    that they break.
+def make_sample(env: Env, homes: list[dict], *arguments: Any) -> Any:
+    """Returns a small environment of the same kind, which tells spaces and sizes.
+
+    Raises:
+        UserError: naming the clause of the contract that a class of the user's breaks.
     """
-    from megastep import contract
-
-    is_ours = chosen.name.startswith("megastep.")
-    few = dataclasses.replace(chosen, n_envs=1 if is_ours else min(SAMPLE, chosen.n_envs))
-    env = make_env(few, homes[:1], seed, device, privileged)
+    is_ours = env.name.startswith("megastep.")
+    n_envs = 1 if is_ours else min(SAMPLE, env.n_envs)
+    sample = make_env(dataclasses.replace(env, n_envs=n_envs), homes[:1], *arguments)
     if not is_ours:
-        try:
-            contract.rollout(env, SAMPLE_STEPS)
-        except contract.ContractError as error:
-            raise UserError(f"{error} ({chosen.name})") from error
-    return env
+        with errors(f"{env.name}: "):
+            contract.rollout(sample, SAMPLE_STEPS)
+    return sample
 
 
-def _takes(chosen: Any, argument: str) -> bool:
-    """Whether the class or function that settings name takes an argument."""
-    return argument in inspect.signature(import_object(chosen.name)).parameters
+def check_memory(
+    env: Env, sample: Any, n_bytes: float, homes: list[dict], seed: int, device: Any, *rest: Any
+) -> None:
+    """Raises UserError with the number that fits, if there are too many environments for the memory.
+
+    `n_bytes` is what each takes beside its own memory, in a rollout. `sample` gives an upper bound,
+    as it counts what environments share; only if that does not fit, more of them are made.
+    """
+
+    def total(env):
+        return sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())
+
+    try:
+        engine.fit(env.n_envs, total(sample) + n_bytes, device)
+    except engine.EngineError:
+        probe = dataclasses.replace(env, n_envs=PROBE)
+        more = total(make_env(probe, homes[:1], seed, device, *rest)) - total(sample)
+        with errors():
+            engine.fit(env.n_envs, more / (PROBE - sample.n_envs) + n_bytes, device)
 
 
-def _arguments(chosen: Any, *others: str) -> dict[str, Any]:
-    """Settings as keyword arguments, but for `others`, which are used elsewhere."""
-    names = [field.name for field in dataclasses.fields(chosen)]
-    return {name: getattr(chosen, name) for name in names if name not in others}
-
-
-def make_policy(agent: settings.Agent, env: Any, seed: int = 1) -> Policy:
-    """The actor and its critic, to be trained."""
-    return _make_policy(agent, env, seed, agent.critic)
-
-
-def make_actor(agent: settings.Agent, env: Any) -> Policy:
-    """The actor alone."""
-    return _make_policy(agent, env, 1, None)
+def make_policy(agent: Agent, env: Any, seed: int = 1, critic: str | None = None) -> Policy:
+    """Returns a policy on the environment's device; without a `critic` it can only act."""
+    if torch.device(env.device).type == "cpu":
+        share_threads(agent.width)
+    privileged, arguments = getattr(env, "privileged_space", None), vars(agent) | {"critic": critic}
+    with errors():
+        policy = Policy(env.obs_space, env.action_space, privileged, seed=seed, **arguments)
+    return policy.to(env.device)
 
 
 def share_threads(width: int) -> None:
-    """Gives the engine all threads of the CPU, and PyTorch one for every 128 units of a network
-    there: where layers are smaller, waiting for each other costs threads more than they do.
+    """Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer: in smaller
+    layers, threads lose more by waiting for each other than they gain.
     """
-    import torch
-
-    from megastep import engine
-
     n_threads = engine.threads()
     engine.set_threads(n_threads)
     torch.set_num_threads(max(1, min(n_threads, width // 128)))
 
 
-def _make_policy(agent, env, seed, critic):
-    import torch
-
-    from megastep.agents.networks.policy import Policy
-
-    if torch.device(env.device).type == "cpu":
-        share_threads(agent.width)
-    with errors():
-        policy = Policy(
-            env.obs_space,
-            env.action_space,
-            getattr(env, "privileged_space", None),
-            critic=critic,
-            seed=seed,
-            **_arguments(agent, "critic"),
-        )
-        return policy.to(env.device)
-
-
-def make_learner(learner: settings.Learner, policy: Policy, seed: int = 1) -> Any:
-    """What improves the policy, which `megastep.agents.algorithms.learner` describes. It is given what its constructor
-    takes of seed and of `graph`: whether to capture its update.
-    """
-    from megastep.agents.algorithms.learner import LearnerError, check_learner
-
-    run = {k: v for k, v in dict(seed=seed, graph=True).items() if _takes(learner, k)}
-    with errors():
-        made = import_object(learner.name)(
-            policy=policy, **_arguments(learner, "name", "anneal"), **run
-        )
-    try:
-        check_learner(made)
-    except LearnerError as error:
-        raise UserError(f"{learner.name} is no learner: {error}") from None
-    return made
+def make_learner(learner: Learner, policy: Policy, seed: int = 1) -> Any:
+    """Returns the learner that settings describe, to improve a policy."""
+    learns = construct(learner, policy=policy, seed=seed, graph=True)
+    with errors(f"{learner.name} is no learner: "):
+        check_learner(learns)
+    return learns
 
 
 def replay_bytes(learner: Any, env: Any) -> float:
-    """What a learner's replay memory takes, 0 if it has none. UserError that says how many
-    observations fit, if they are too many for the memory; `env` is a small environment.
-    """
-    from megastep import engine
+    """Returns the bytes of a learner's replay buffer, 0 without one; `env` is a small environment.
 
+    Raises:
+        UserError: with the number of observations that fits.
+    """
     if not hasattr(learner, "replay_size"):
         return 0.0
     with errors():
-        n, each = learner.replay_size(env)
-        engine.fit(n, each, env.device, "observations of learner.replay.capacity")
-    return n * each
+        n, n_bytes = learner.replay_size(env)
+        engine.fit(n, n_bytes, env.device, "observations of learner.replay.capacity")
+    return n * n_bytes
 
 
-def make_opponents(cfg: settings.Train, env: Any, sample: Any, policy: Policy) -> Opponents | None:
-    """The environment with opponents in it, or None where there shall be none. UserError that says
-    how many snapshots fit, if they are too many for the memory; `sample` is a small environment, in
-    which a scripted opponent is tried.
+def make_opponents(cfg: Train, env: Any, sample: Any, policy: Policy) -> Opponents | None:
+    """Returns the environment with opponents in it, None if there are to be none.
+
+    `sample` is a small environment, in which a scripted opponent is tried.
+
+    Raises:
+        UserError: if the opponent cannot play there; with the number of snapshots that fits.
     """
-    import torch
-
-    from megastep import engine
-    from megastep.agents.selfplay.opponents import Opponents
-
-    chosen = cfg.opponents
-    if not (chosen.past or chosen.bot):
+    opponents = cfg.opponents
+    if not (opponents.past or opponents.bot):
         return None
-    scripted = make_bot(chosen.bot_class, cfg.env, sample) if chosen.bot else None
+    bot = make_bot(opponents.bot_class, cfg.env, sample) if opponents.bot else None
     with errors():
-        if chosen.past:
-            weights = policy.actor().state_dict().values()
-            copies = 2 if torch.device(env.device).type == "cuda" else 1  # of which one to capture
-            each = copies * sum(weight.nbytes for weight in weights)
-            engine.fit(chosen.snapshots, each, env.device, "snapshots")
-        shares = _arguments(chosen, "bot_class")
-        return Opponents(env, policy, scripted, seed=cfg.seed, **shares)
+        if opponents.past:
+            n_copies = 2 if torch.device(env.device).type == "cuda" else 1  # one for the graph
+            n_bytes = n_copies * sum(w.nbytes for w in policy.actor().state_dict().values())
+            engine.fit(opponents.snapshots, n_bytes, env.device, "snapshots")
+        shares = {name: value for name, value in vars(opponents).items() if name != "bot_class"}
+        return Opponents(env, policy, bot, seed=cfg.seed, **shares)
 
 
-def make_bot(name: str, chosen: settings.Env, env: Any) -> Any:
-    """A policy that needs no weights, by import path or `random`, for an environment of these
-    settings: it is given those that its constructor takes, `fov` say, and takes one step in `env`,
-    whose episodes start anew. UserError if it cannot play there.
+def make_bot(name: str, settings: Env, env: Any) -> Any:
+    """Returns a policy that needs no weights: `random`, or a class by import path.
+
+    The class is given the environment's settings that it takes, such as `fov`, and takes one step
+    in `env`. Raises UserError if it cannot play there.
     """
-    from megastep.agents.training.evaluation import RandomActions
-
     if name == "random":
         return RandomActions(env.action_space)
     with errors():
-        made = import_object(name)
-    try:
-        names = inspect.signature(made).parameters
-        bot = made(**{name: getattr(chosen, name) for name in names if hasattr(chosen, name)})
+        taken = inspect.signature(constructor := import_object(name)).parameters
+    cure = f"{name} cannot play in {type(env).__name__}; name a policy made for it: "
+    with errors(cure, (Exception,)):  # whatever it does where it was not made for
+        bot = constructor(**{key: value for key, value in vars(settings).items() if key in taken})
         n_lanes = env.n_envs * env.n_agents
-        decision, _ = bot(env.reset(), bot.initial(n_lanes, env.device))
-        if not _are_of(env.action_space, decision["actions"], n_lanes):
-            raise ValueError(f"its actions are not those of {env.action_space!r}")
-    except Exception as error:  # whatever it does where it was not made for
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise UserError(
-            f"{name} cannot play in {type(env).__name__}: {reason}; name one that is made for it"
-        ) from error
+        actions = bot(env.reset(), bot.initial(n_lanes, env.device))[0]["actions"]
+        spaces.map(lambda space, leaf: _check_actions(space, leaf, n_lanes), env.action_space, actions)
     return bot
 
 
-def _are_of(space, actions, n_lanes):
-    """Whether actions of all lanes are of a space."""
-    if isinstance(space, dict):
-        return all(_are_of(child, actions[key], n_lanes) for key, child in space.items())
-    fits = tuple(actions.shape) == (n_lanes, *space.shape) and not actions.is_floating_point()
-    return fits and bool(((actions >= 0) & (actions < space.n_actions)).all())
+def _check_actions(space, actions, n_lanes):
+    has_shape = tuple(actions.shape) == (n_lanes, *space.shape) and not actions.is_floating_point()
+    if not has_shape or not ((actions >= 0) & (actions < space.n_actions)).all():
+        raise ValueError(f"its actions are not those of {space!r}")
 
 
-def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> Checkpoint:
-    """The checkpoint of a run found with `find`; damaged ones are named in warnings and skipped."""
-    from megastep.agents.training import checkpoint
-
+def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> checkpoint.Checkpoint:
+    """Returns the checkpoint of a run found with `runs.find`. Warns of damaged ones it skips."""
     with errors():
-        return checkpoint.load_latest(path if is_checkpoint(path) else path / "checkpoints", device)
+        return checkpoint.load_latest(runs.checkpoints_of(path), device)
 
 
-def config_of(checkpoint: Checkpoint) -> settings.Train:
-    """The settings that a checkpoint was trained with. UserError if they cannot be used here."""
+def config_of(loaded: checkpoint.Checkpoint) -> Train:
+    """Returns the settings that a checkpoint was trained with. Raises UserError if they cannot be
+    used here.
+    """
     try:
-        return build(settings.Train, checkpoint.config["train"])
+        return check(Train, loaded.config["train"])
     except ConfigErrors as error:
         (key, sentence), *_ = error.errors
-        raise UserError(f"{checkpoint.path} cannot be used: {key}: {sentence}") from None
+        raise UserError(f"{loaded.path} cannot be used: {key}: {sentence}") from None
 
 
 def spaces_of(env: Any) -> dict[str, str]:
-    """The spaces of an environment by name, as text: {'obs.rgb': 'MultiImage(...)', ...}."""
-
-    def flat(space, name):
-        if not isinstance(space, dict):
-            return {name: repr(space)}
-        return {
-            k: v for key, child in space.items() for k, v in flat(child, f"{name}.{key}").items()
-        }
-
-    return {**flat(env.obs_space, "obs"), **flat(env.action_space, "actions")}
+    """Returns the spaces of an environment as text: {'obs.rgb': 'MultiImage(...)', ...}."""
+    leaves = spaces.leaves(env.obs_space, "obs") | spaces.leaves(env.action_space, "actions")
+    return {name: repr(space) for name, space in leaves.items()}
 
 
-def _shapes(tensors):
-    return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-
-
-def load_weights(policy: Policy, env: Any, checkpoint: Checkpoint) -> None:
+def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> None:
     """Loads a checkpoint's weights into a policy made for `env`, the critic's too if it has one.
-    UserError that names what differs if they do not fit.
+
+    Raises:
+        UserError: naming what differs, if they do not fit.
     """
-    saved, present = checkpoint.config["spaces"], spaces_of(env)
-    differing = [
+    if differing := _differences(loaded.config["spaces"], spaces_of(env)):
+        raise UserError(
+            f"{loaded.path} was trained in another environment: {'; '.join(differing)}. "
+            "Choose the env it was trained in"
+        )
+    saved, present = loaded.state["policy"], policy.state_dict()
+    kinds = [
+        "asymmetric" if "critic.intake.project.weight" in weights else "plain"
+        for weights in (saved, present)
+    ]
+    if policy.critic is None:  # what only training needs
+        saved = {k: v for k, v in saved.items() if not k.startswith(("critic.", "prediction."))}
+    elif kinds[0] != kinds[1]:
+        raise UserError(
+            f"The critic of {loaded.path} is {kinds[0]} and this run's is {kinds[1]}; "
+            f"use agent.critic={kinds[0]}"
+        )
+    shapes = ({k: tuple(v.shape) for k, v in weights.items()} for weights in (saved, present))
+    if differing := _differences(*shapes):
+        raise UserError(
+            f"The weights of {loaded.path} do not fit this agent: {differing[0]}. "
+            "Use the agent settings it was trained with"
+        )
+    policy.load_state_dict({name: saved[name] for name in present})
+
+
+def _differences(saved: dict, present: dict) -> list[str]:
+    return [
         f"{name} was {saved.get(name, 'absent')} and is {present.get(name, 'absent')}"
-        for name in {**saved, **present}
+        for name in {**present, **saved}
         if saved.get(name) != present.get(name)
     ]
-    if differing:
-        raise UserError(
-            f"{checkpoint.path} was trained in another environment: {'; '.join(differing)}; "
-            "choose the env it was trained in"
-        )
-    weights, own = checkpoint.state["policy"], policy.state_dict()
-    had, has = ("critic.intake.project.weight" in found for found in (weights, own))
-    if policy.critic is not None and had != has:
-        kinds = {True: "asymmetric", False: "plain"}
-        raise UserError(
-            f"The critic of {checkpoint.path} is {kinds[had]} and this run's is {kinds[has]}: give "
-            f"agent.critic={kinds[had]}"
-        )
-    # what only training needs may be left over where there is no critic
-    needed = {
-        name: value
-        for name, value in weights.items()
-        if policy.critic is not None or not name.startswith(("critic.", "prediction."))
-    }
-    saved, present = _shapes(needed), _shapes(own)
-    for name in {**present, **saved}:
-        was, should = saved.get(name, "absent"), present.get(name, "absent")
-        if was != should:
-            raise UserError(
-                f"The weights of {checkpoint.path} do not fit this agent: {name} is {was} and "
-                f"should be {should}; choose the agent it has"
-            )
-    policy.load_state_dict({name: weights[name] for name in own})

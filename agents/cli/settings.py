@@ -1,18 +1,22 @@
-"""The settings of a run as frozen dataclasses, checked by their annotations. Knows no Hydra.
+"""The settings of the scripts as frozen dataclasses, checked by their annotations. Knows no Hydra.
 
-Defaults are those of configs/; but what a run is made of (environment, geometries, learner, agent)
-has its settings, their bounds and defaults from the arguments of its constructor.
+configs/ holds the defaults of a run. The settings of environments, geometries, learners, agents and
+opponents are the arguments of their constructors, with the bounds and defaults given there.
 """
 
+import dataclasses
+import functools
+import inspect
+import json
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_validator
 
-from megastep.agents.cli.registry import Choice, Group
+from megastep.agents.imports import import_object
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.opponents import Opponents
-from megastep.settings import frozen, located, settings_of
+from megastep.settings import closest, frozen, located, settings_of
 
 Above0 = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
@@ -23,7 +27,7 @@ Split = Literal["training", "test", "all"]
 
 def _device(name: str) -> str:
     if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
-        raise ValueError(f"{name!r} is no device: allowed are auto, cpu, cuda and cuda:<number>")
+        raise ValueError(f"{name!r} is no device; use auto, cpu, cuda or cuda:<number>")
     return name
 
 
@@ -32,14 +36,14 @@ Device = Annotated[str, AfterValidator(_device)]
 
 @frozen
 class LocalLogger:
-    """Metrics go to TensorBoard and JSON lines, which are always written."""
+    """TensorBoard and JSON lines, which are always written."""
 
     name: str
 
 
 @frozen
 class WandbLogger:
-    """They go to Weights & Biases as well."""
+    """Weights & Biases as well."""
 
     name: str
     project: str
@@ -47,35 +51,88 @@ class WandbLogger:
     group: str | None = None
 
 
+# ---- Groups ----
+
+
+class Group(NamedTuple):
+    """A group of configs/. The member that is chosen decides which settings the group has.
+
+    A member has `name`, the import path of a class or function, whose arguments are its settings.
+    """
+
+    reserved: tuple[str, ...] = ()  # arguments that the program passes itself
+    required: dict[str, str] = {}  # arguments it must take: what each means
+    defaults: dict[str, Any] = {}  # for arguments without a default
+    more: dict[str, Any] = {}  # settings beside the arguments
+    kinds: dict[str, type] = {}  # the dataclass of each name, where names are no import paths
+
+
 GROUPS = {
     "env": Group(
-        "env",
         reserved=("geometries", "seed", "device", "privileged"),
-        needed={"n_envs": "the number of its environments"},
-        missing={"n_envs": 128},
+        required={"n_envs": "the number of environments"},
+        defaults={"n_envs": 128},
     ),
     "geometry": Group(
-        "geometry",
         reserved=("split",),
-        needed={"n": "how many geometries", "split": "training, test or all", "seed": "a number"},
-        missing={"n": 512, "seed": 1},
+        required={"n": "the number of geometries", "split": "training, test or all", "seed": "an integer"},
+        defaults={"n": 512, "seed": 1},
     ),
     "learner": Group(
-        "learner",
         reserved=("policy", "seed", "graph"),
-        needed={"policy": "the policy that it improves"},
+        required={"policy": "the policy to improve"},
         # what lr falls to 0 over; auto: samples if given, else seconds if given
-        anneal=(Literal["auto", "never", "samples", "seconds"], "auto"),
+        more={"anneal": (Literal["auto", "never", "samples", "seconds"], "auto")},
     ),
-    "logger": Choice("logger", {"none": LocalLogger, "wandb": WandbLogger}),
+    "logger": Group(kinds={"none": LocalLogger, "wandb": WandbLogger}),
 }
-Env, Geometry, Learner, Logger = (
-    Annotated[Any, BeforeValidator(GROUPS[key].settings)]
-    for key in ("env", "geometry", "learner", "logger")
-)
-#: Arguments of `megastep.agents.networks.policy.Policy`.
+
+
+@functools.cache
+def kind_of(group: str, name: str) -> type:
+    """Returns the dataclass of the settings of a group's member, by the member's `name`.
+
+    Raises:
+        ValueError: if nothing can be imported under this name, or it takes other arguments.
+    """
+    spec = GROUPS[group]
+    if spec.kinds:
+        if name not in spec.kinds:
+            raise ValueError(f"{name!r} is unknown; {closest(name, spec.kinds)}")
+        return spec.kinds[name]
+    constructor = import_object(name)
+    try:
+        present = inspect.signature(constructor).parameters
+        for argument, meaning in spec.required.items():
+            if argument not in present:
+                raise ValueError(f"it takes no {argument} ({meaning})")
+        return settings_of(constructor, spec.reserved, spec.defaults, name=str, **spec.more)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{name} cannot be used: {error}") from error
+
+
+def _settings_of_group(group: str) -> Any:
+    """Returns the type of a field that holds the settings of a group's member."""
+
+    def settings(value):
+        if dataclasses.is_dataclass(value):
+            return value
+        if not isinstance(value, dict):
+            raise ValueError(f"is a group of keys, got {value!r}")
+        if "name" not in value:
+            raise ValueError(f"its keys need a member: give {group}= as well")
+        return TypeAdapter(kind_of(group, str(value["name"]))).validate_json(json.dumps(value))
+
+    return Annotated[Any, BeforeValidator(settings)]
+
+
+def label(name: str) -> str:
+    """Returns an import path in short: `explorer` for megastep.envs.explorer:Explorer."""
+    return name.rpartition(":")[2].rpartition(".")[2].lower()
+
+
+Env, Geometry, Learner, Logger = map(_settings_of_group, GROUPS)
 Agent = settings_of(Policy, ("obs_space", "action_space", "privileged_space", "seed"))
-#: Arguments of `megastep.agents.selfplay.opponents.Opponents`, and the import path of the scripted policy.
 Opposition = settings_of(
     Opponents,
     ("env", "policy", "scripted", "seed"),
@@ -83,9 +140,12 @@ Opposition = settings_of(
 )
 
 
+# ---- Scripts ----
+
+
 @frozen
 class Finish:
-    """What happens to the trained agent at the end of a run."""
+    """What follows training."""
 
     evaluate: bool
     episodes: Count
@@ -118,32 +178,38 @@ class Train:
 
     @model_validator(mode="after")
     def _agrees(self):
-        if errors := list(self._errors()):
-            raise located(errors)
-        return self
-
-    def _errors(self):
-        # of learners that cut lanes into minibatches
-        parts, n_envs = getattr(self.learner, "n_minibatches", 1), self.env.n_envs
-        if parts > n_envs:
-            yield "learner.n_minibatches", f"{parts} is more than env.n_envs, {n_envs}"
-        if getattr(self.learner, "lag", 0) and (self.opponents.past or self.opponents.bot):
-            yield (
+        n_minibatches, over = getattr(self.learner, "n_minibatches", 1), self.learner.anneal
+        has_opponents = self.opponents.past or self.opponents.bot
+        is_endless = self.samples is None and self.seconds is None
+        _refuse(
+            (
+                n_minibatches > self.env.n_envs,
+                "learner.n_minibatches",
+                f"{n_minibatches} is more than env.n_envs={self.env.n_envs}",
+            ),
+            (
+                getattr(self.learner, "lag", 0) and has_opponents,
                 "learner.lag",
-                "opponents change as the learner learns, so nobody can act ahead of it: give "
-                "learner.lag=0 or no opponents",
-            )
-        over = self.learner.anneal
-        if over in ("samples", "seconds") and getattr(self, over) is None:
-            yield "learner.anneal", f"is {over}: lr falls over {over}, which are not given"
-        if self.snapshots and self.samples is None and self.seconds is None:
-            yield "snapshots", "they are spaced over the budget: give samples or seconds"
-        if self.resume and self.init:
-            yield (
+                "opponents change with every update, so collecting cannot run ahead of learning; "
+                "use learner.lag=0, or no opponents",
+            ),
+            (
+                over in ("samples", "seconds") and getattr(self, over) is None,
+                "learner.anneal",
+                f"is {over}, and no {over}= is given for the learning rate to fall over",
+            ),
+            (
+                self.snapshots and is_endless,
+                "snapshots",
+                "are spread over the budget; give samples= or seconds=",
+            ),
+            (
+                self.resume and self.init,
                 "init",
-                "cannot be given together with resume: one starts a new run, the other continues "
-                "one",
-            )
+                "cannot be combined with resume: init starts a new run, resume continues one",
+            ),
+        )
+        return self
 
 
 @frozen
@@ -181,10 +247,28 @@ class Record:
 
     @model_validator(mode="after")
     def _agrees(self):
-        if self.run is None and self.env is None:
-            raise located([("run", "is missing; without a run, env=explorer films random actions")])
-        if self.run is not None and self.env is not None:
-            raise located([("env", "cannot be given together with run, which has its own")])
-        if self.run is None and self.against is not None:
-            raise located([("against", "needs run=, who plays against it")])
+        no_run = self.run is None
+        _refuse(
+            (
+                no_run and self.env is None,
+                "run",
+                "is missing; without a run, env=explorer records random actions",
+            ),
+            (
+                not no_run and self.env is not None,
+                "env",
+                "cannot be combined with run, which has its own",
+            ),
+            (
+                no_run and self.env is not None and self.against is not None,
+                "against",
+                "needs run=, the agent that plays against it",
+            ),
+        )
         return self
+
+
+def _refuse(*rules: tuple[Any, str, str]) -> None:
+    """Raises all rules (is broken, dotted key, sentence) that are broken."""
+    if errors := [(key, text) for is_broken, key, text in rules if is_broken]:
+        raise located(errors)

@@ -1,52 +1,48 @@
-"""Trains a policy. `train --help` lists what can be chosen; `run(cfg)` is the same from
-Python.
-"""
+"""Trains a policy. `train --help` lists the choices; `run(cfg)` is the same from Python."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing, nullcontext
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from megastep import engine
 from megastep.agents.algorithms.nonfinite import NonFiniteError
-from megastep.agents.cli import evaluate, factory, record, run_folders
-from megastep.agents.cli.build import as_tree
-from megastep.agents.cli.command import Script, run_command
+from megastep.agents.cli import evaluate, factory, record, runs, settings, signals
+from megastep.agents.cli.check import as_tree
+from megastep.agents.cli.command import run_command
+from megastep.agents.cli.compose import Script
 from megastep.agents.cli.console import Progress, duration, number, say, warn
-from megastep.agents.cli.errors import ConfigErrors, NotFinite, UserError
-from megastep.agents.cli.lock import locked
-from megastep.agents.cli.settings import Evaluate, Record, Train, WandbLogger
-from megastep.agents.cli.signals import Interrupted, Interruptions
-from megastep.agents.training import checkpoint, loggers
+from megastep.agents.cli.program import ConfigErrors, UserError, first_line
+from megastep.agents.training import checkpoint, loggers, trainer
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.saver import Saver, Snapshots
-from megastep.agents.training.trainer import Trainer
 
 HELP = """Trains a policy in an environment.
 
-The commonest:
-  experiment=quickstart          the recipe of `make train`: train, evaluate on unseen homes, film
+The most common words:
+  experiment=quickstart        the recipe of `make train`: train, evaluate on unseen homes, film
   env=minimal geometry=box     another environment, other homes
   seconds=60 samples=1e6       when to stop, whichever comes first; Ctrl-C stops too, and saves
   preset=gpu env.n_envs=256    the sizes for a GPU, or your own
   learner.lr=3e-4 seed=2       any key that --cfg job prints
   learner=vtrace               instead of ppo: learner.lag=1 acts while it learns,
-                               learner.buffer=replay learns from old experience, too
+                               learner.buffer=replay also learns from old experience
   finish.evaluate=true finish.record=true
                                a table and a video at the end
   opponents.past=0.4 opponents.bot=0.1
-                               of environments with several agents, shares against past selves and
-                               a scripted policy; snapshots=8 keeps what ratings compare
+                               in environments with several agents: shares of environments against
+                               past selves and a scripted policy; snapshots=8 keeps what ratings
+                               compare
   resume=RUN                   continue a run (its folder, or latest) under its own configuration
   init=RUN                     start a new run from its weights, in its environment
-  env=my_package.rover:Rover   a class of your own; so too geometry, learner, agent.core
+  env=my_package.rover:Rover   a class of your own; also for geometry, learner, agent.core
   logger=wandb logger.mode=offline"""
-#: Metrics and groups of lanes that are shown beside the return.
+#: The most metrics and groups of lanes that are shown beside the return.
 FEW = 4
-#: Before the kind of opponent, the share of pairs won.
+#: The prefix of metrics with the share of pairs won, by kind of opponent.
 WON = "episode/won/"
 #: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
 #: what it learns.
@@ -65,204 +61,181 @@ RESUMABLE = (
 
 
 def make_trainer(
-    cfg: Train, folder: Path, device: torch.device, on_report: Callable[[Trainer], None]
-) -> tuple[Trainer, Saver]:
-    """A Trainer as `cfg` describes it, and its Saver: going on where a run stopped, or from the
-    weights of another, if `cfg` says so.
+    cfg: settings.Train, folder: Path, device: torch.device, progress: Progress
+) -> trainer.Trainer:
+    """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
+    says so.
     """
     homes = factory.homes(cfg.env, cfg.geometry, "training")
-    wanted = cfg.env, homes, cfg.seed, device, cfg.agent.critic == "asymmetric"
-    sample = factory.make_sample(*wanted)
-    policy = factory.make_policy(cfg.agent, sample, cfg.seed)
+    where = homes, cfg.seed, device, cfg.agent.critic == "asymmetric"
+    sample = factory.make_sample(cfg.env, *where)
+    policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
     learner = factory.make_learner(cfg.learner, policy, cfg.seed)
     replayed = factory.replay_bytes(learner, sample) / cfg.env.n_envs
-    beside = learner.bytes_per_env(sample) + replayed
-    env = factory.make_env(*wanted, sample, bytes_beside=beside)
-    loaded = None
+    factory.check_memory(cfg.env, sample, learner.bytes_per_env(sample) + replayed, *where)
+    env = factory.make_env(cfg.env, *where)
     if cfg.resume or cfg.init:
-        loaded = factory.load_checkpoint(run_folders.find(cfg.resume or cfg.init), device)
+        loaded = factory.load_checkpoint(runs.find(cfg.resume or cfg.init), device)
         factory.load_weights(policy, env, loaded)
     opponents = factory.make_opponents(cfg, env, sample, policy)
     wandb = None
-    if isinstance(cfg.logger, WandbLogger):
-        given = {key: getattr(cfg.logger, key) for key in ("project", "mode", "group")}
-        wandb = dict(given, name=folder.name, config=as_tree(cfg))
+    if cfg.logger.name == "wandb":
+        wandb = dict(vars(cfg.logger), name=folder.name, config=as_tree(cfg))
     if cfg.resume:
         for name in ("checkpoints", "snapshots"):
             checkpoint.rewind(folder / name, loaded.step)
-    with factory.errors():
-        sinks = loggers.Loggers(folder, loaded.step if cfg.resume else 0, wandb)
     config = {"train": as_tree(cfg), "spaces": factory.spaces_of(env)}
-    saver = Saver(folder / "checkpoints", config, cfg.keep_checkpoints)
-    snapshots = Saver(folder / "snapshots", config, keep=10**9)
     with factory.errors():
-        trainer = Trainer(
+        trains = trainer.Trainer(
             opponents or env,
             policy,
             learner,
-            sinks,
-            saver,
+            loggers.Loggers(folder, loaded.step if cfg.resume else 0, wandb),
+            Saver(folder / "checkpoints", config, cfg.keep_checkpoints),
             Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
             report_every=cfg.log_every,
             save_every=cfg.checkpoint_seconds,
-            on_report=on_report,
+            on_report=lambda trains: progress.show(*progress_of(trains)),
             opponents=opponents,
-            snapshots=Snapshots(snapshots, cfg.snapshots),
+            snapshots=Snapshots(Saver(folder / "snapshots", config, keep=10**9), cfg.snapshots),
         )
-    if cfg.resume:
-        with factory.errors():
-            trainer.load_state_dict(loaded.state)
-    return trainer, saver
+        if cfg.resume:
+            trains.load_state_dict(loaded.state)
+    return trains
 
 
-def show(progress: Progress, trainer: Trainer) -> None:
-    """Shows the few numbers that people watch."""
-    words = [f"{number(trainer.samples)} samples"]
-    if trainer.rate is not None:
-        words.append(f"{number(trainer.rate)}/s")
-    if trainer.score is not None:
-        words.append(f"return {trainer.score:.2f}")
-        words += few_means(
-            trainer.latest, trainer.episode_stats.metrics, trainer.episode_stats.groups
-        )
-        won = {k.rpartition("/")[2]: v for k, v in trainer.latest.items() if k.startswith(WON)}
-        words += [f"{share:.2f} won against {kind}" for kind, share in won.items()]
-    left = trainer.left
-    if trainer.budget.is_limited and left < 1:
-        words.append(f"{duration(trainer.clock.seconds * left / (1 - left))} left")
-    progress.show(1 - left if trainer.budget.is_limited else None, "  ".join(words))
+def progress_of(trains: trainer.Trainer) -> tuple[float | None, list[str]]:
+    """Returns the fraction of the budget that is spent, None without one, and the few numbers that
+    people watch.
+    """
+    words, left, latest = [f"{number(trains.samples)} samples"], trains.left, trains.latest
+    if trains.rate is not None:
+        words.append(f"{number(trains.rate)}/s")
+    if trains.score is not None:
+        words.append(f"return {trains.score:.3g}")
+        words += few_means(latest, trains.episode_stats.metrics, trains.episode_stats.groups)
+        won = {name.removeprefix(WON): latest[name] for name in latest if name.startswith(WON)}
+        words += [f"won vs {opponent} {share:.0%}".replace("%", " %") for opponent, share in won.items()]
+    if not trains.budget.is_limited:
+        return None, words
+    if left < 1:
+        words.append(f"{duration(trains.clock.seconds * left / (1 - left))} left")
+    return 1 - left, words
 
 
 def few_means(latest: dict[str, float], metrics: Sequence[str], groups: Sequence[str]) -> list[str]:
-    """Returns by group of lanes, and metrics, as text, where they are few enough for one line."""
-    by_group = {group: f"episode/return/{group}" for group in groups}
-    names = {**by_group, **{name: f"episode/{name}" for name in metrics}}
-    if len(names) > FEW:
-        return []
-    return [f"{name} {latest[key]:.3g}" for name, key in names.items() if key in latest]
+    """Returns the returns of groups of lanes, and metrics, if they are few enough for one line."""
+    names = {group: f"episode/return/{group}" for group in groups}
+    names |= {name: f"episode/{name}" for name in metrics}
+    shown = [f"{name} {latest[key]:.3g}" for name, key in names.items() if key in latest]
+    return shown if len(names) <= FEW else []
 
 
-def settled(cfg: Train) -> Train:
-    """`cfg` with learner.anneal=auto replaced by what it stands for: samples if they are limited,
-    else seconds, else never.
-    """
+def annealed(cfg: settings.Train) -> settings.Train:
+    """Returns `cfg` with learner.anneal=auto replaced: samples if limited, else seconds, else never."""
     if cfg.learner.anneal != "auto":
         return cfg
-    limited = [name for name in ("samples", "seconds") if getattr(cfg, name) is not None]
-    anneal = [*limited, "never"][0]
-    return dataclasses.replace(cfg, learner=dataclasses.replace(cfg.learner, anneal=anneal))
+    limits = [name for name in ("samples", "seconds") if getattr(cfg, name) is not None]
+    learner = dataclasses.replace(cfg.learner, anneal=[*limits, "never"][0])
+    return dataclasses.replace(cfg, learner=learner)
 
 
-def run(cfg: Train) -> Path:
-    """Trains as `cfg`, a settings.Train, says. Returns the run folder; after a signal, saves and
-    raises Interrupted.
-    """
-    cfg = settled(cfg)
-    device = factory.make_device(cfg.device)
-    folder = (
-        run_folders.folder_of(run_folders.find(cfg.resume)) if cfg.resume else run_folders.new(cfg)
-    )
-    with locked(folder), run_folders.inside(folder):
-        progress = Progress()
-        with nullcontext() if cfg.resume else run_folders.cleanup_on_error(folder):
-            trainer, saver = make_trainer(cfg, folder, device, partial(show, progress))
-            run_folders.write_config(folder, cfg)
-        run_folders.record_start(folder)
+def run(cfg: settings.Train) -> Path:
+    """Trains as `cfg` says. Returns the run folder; after a signal, saves and raises Interrupted."""
+    cfg, device = annealed(cfg), factory.make_device(cfg.device)
+    folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
+    with runs.locked(folder):
+        with nullcontext() if cfg.resume else runs.cleanup_on_error(folder):
+            progress = Progress()
+            trains = make_trainer(cfg, folder, device, progress)
+            runs.write_config(folder, cfg)
+        runs.record_start(folder)
         say(f"Training on {device} in {folder}")
-        resume = f"To go on: {run_folders.resume_command(folder)}"
+        resume, saver = f"To continue: {runs.resume_command(folder)}", trains.save_checkpoint
         try:
-            with Interruptions() as stop, progress, closing(trainer.metrics):
-                trainer.train(lambda: stop.number is not None)
+            with signals.handled() as numbers, progress, closing(trains.metrics):
+                trains.train(lambda: bool(numbers))
         except NonFiniteError as error:
-            raise NotFinite(f"{error}. What was saved before is in {folder}") from error
+            raise UserError(f"{error}. What was saved before is in {folder}", 1) from error
         except (engine.EngineError, torch.OutOfMemoryError) as error:
-            reason = str(error).splitlines()[0].rstrip(".")
             saved = saver.unsaved or "What was learnt last could not be saved"
-            if trainer.is_saved:
-                saved = f"All {trainer.samples:,} samples are saved"
-            raise UserError(f"{reason}. {saved}. {resume}") from error
+            if trains.is_saved:
+                saved = f"All {trains.samples:,} samples are saved"
+            raise UserError(f"{first_line(error).rstrip('.')}. {saved}. {resume}") from error
         finally:
             loggers.curves(folder)
-        if stop.number is not None:
-            raise Interrupted(stop.number, f"Stopped after {trainer.samples:,} samples. {resume}")
+        if numbers:
+            stopped = f"Stopped after {trains.samples:,} samples. {resume}"
+            raise signals.Interrupted(numbers[0], stopped)
         if saver.unsaved:
             raise UserError(saver.unsaved)
-        nonfinite_value = trainer.nonfinite_value
-        del trainer  # its memory is the evaluation's now
+        nonfinite = trains.nonfinite_value
+        del trains  # its memory is the evaluation's now
         finish(cfg, folder)
-        if nonfinite_value and nonfinite_value.is_from_env:
-            raise NotFinite(f"{nonfinite_value}. All else was learnt from, and is in {folder}")
+        if nonfinite and nonfinite.is_from_env:
+            raise UserError(f"{nonfinite}. All else was learnt from, and is in {folder}", 1)
     return folder
 
 
-def finish(cfg: Train, folder: Path) -> None:
-    """What the run leaves behind beside its checkpoints: a table and a video, if asked for."""
-    common = dict(
-        run=str(folder), geometry=None, split="test", greedy=False, seed=cfg.seed, device=cfg.device
-    )
+def finish(cfg: settings.Train, folder: Path) -> None:
+    """Evaluates and films the trained agent, if asked to."""
+    common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
     if cfg.finish.evaluate:
-        evaluate.run(Evaluate(episodes=cfg.finish.episodes, baseline=True, **common))
+        evaluate.run(settings.Evaluate(episodes=cfg.finish.episodes, baseline=True, **common))
     if cfg.finish.record:
         try:
-            record.run(Record(steps=cfg.finish.steps, home=0, file=None, **common))
+            record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
         except UserError as error:
-            warn(str(error))
+            warn(error)
 
 
-def prepared(tree: dict, given: list[str]) -> dict:
-    """The tree of a run that goes on, or that starts from the weights of another; that of any
-    other is as it was. `given` are the keys that were typed.
+def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
+    """Returns the tree of a run that resumes another or starts from its weights; any other is
+    returned as it is.
+
+    A run that is resumed keeps its own settings, except for typed keys. A run that starts from the
+    weights of another has its environment and agent, except for typed keys and groups.
     """
     resume, init = tree.get("resume"), tree.get("init")
-    if isinstance(resume, str) and init is None:
-        return _resumed(tree, given)
-    if isinstance(init, str) and resume is None:
-        return _initialised(tree, given)
-    return tree
-
-
-def _initialised(tree, given):
-    """The environment and the agent are those of the run that the weights are from, but for the
-    keys that are given; a group that is given whole is as it was.
-    """
-    own = factory.load_checkpoint(run_folders.find(tree["init"])).config["train"]
-    for group in ("env", "agent"):
-        if group not in given:
-            keys = [key.split(".", 1)[1] for key in given if key.startswith(f"{group}.")]
-            tree[group] = own[group] | {key: tree[group][key] for key in keys}
-    return tree
-
-
-def _resumed(tree, given):
-    """The run's own tree, but for what may change."""
-    if refused := [
-        (key, "cannot change when a run goes on; init=RUN starts a new one from its weights")
-        for key in given
-        if key.split(".")[0] not in RESUMABLE
-    ]:
-        raise ConfigErrors(refused)
-    loaded = factory.load_checkpoint(run_folders.find(tree["resume"]))
-    if "learner" not in loaded.state:
+    if not isinstance(resume or init, str) or (resume and init):
+        return tree
+    if refused := [key for key in typed if resume and key.split(".")[0] not in RESUMABLE]:
+        cure = "cannot change when a run is resumed; init=RUN starts a new one from its weights"
+        raise ConfigErrors((key, cure) for key in refused)
+    loaded = factory.load_checkpoint(runs.find(resume or init))
+    saved, state = loaded.config["train"], loaded.state
+    if init:
+        groups = [group for group in ("env", "agent") if group not in typed]
+        keys = [key for key in typed if key.partition(".")[0] in groups]
+        return tree | _copied(tree, {group: saved[group] for group in groups}, keys)
+    if "learner" not in state:
         raise UserError(
-            f"{loaded.path} is a snapshot, the weights alone; init={loaded.path} starts a new run "
-            "from it, and the run's folder goes on"
+            f"{loaded.path} is a snapshot, which has the weights alone. init={loaded.path} starts a "
+            "new run from it; resume= takes the run's folder"
         )
-    own = loaded.config["train"]
-    for path in given:
-        *groups, key = path.split(".")
-        target, source = own, tree
-        for group in groups:
-            target, source = target[group], source[group]
-        target[key] = source[key]
-    had = {name: loaded.state[name] for name in ("samples", "seconds")}
+    saved = _copied(tree, saved, typed) | {"init": None}
     if spent := [
-        (name, f"the run has had {round(n, 1):,} of {own[name]:,}; to go on, give {name}= more")
-        for name, n in had.items()
-        if own[name] is not None and n >= own[name]
+        (name, f"the run has had {round(state[name], 1):,} of {saved[name]:,}; give {name}= more")
+        for name in ("samples", "seconds")
+        if saved[name] is not None and state[name] >= saved[name]
     ]:
         raise ConfigErrors(spent)
-    return {**own, "init": None}
+    return saved
+
+
+def _copied(source: dict, target: dict, keys: list[str]) -> dict:
+    """Copies dotted keys from one tree to another, and returns it."""
+    for key in keys:
+        *groups, leaf = key.split(".")
+        below, above = target, source
+        for group in groups:
+            below, above = below[group], above[group]
+        below[leaf] = above[leaf]
+    return target
+
+
+SCRIPT = Script("train", settings.Train, run, HELP, prepare)
 
 
 def main(argv: list[str] | None = None) -> int:
-    return run_command(Script("train", Train, run, HELP, prepared), argv)
+    return run_command(SCRIPT, argv)
