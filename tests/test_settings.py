@@ -11,8 +11,8 @@ import pytest
 from pydantic import Field
 
 from megastep import envs
-from megastep.agents.cli.build import as_tree, build
-from megastep.agents.cli.errors import ConfigErrors
+from megastep.agents.cli.check import as_tree, check
+from megastep.agents.cli.program import ConfigErrors
 from megastep.settings import checked, settings_of
 
 NAN = float("nan")
@@ -21,7 +21,7 @@ NAN = float("nan")
 def told(kind, **values):
     """What is said of values that are not allowed, by key."""
     with pytest.raises(ConfigErrors) as error:
-        build(kind, values)
+        check(kind, values)
     return dict(error.value.errors)
 
 
@@ -44,7 +44,7 @@ def test_a_value_outside_is_told_what_is_allowed(bounds, inside, outside, allowe
     def f(x: hint | None if optional else hint): ...
 
     kind = settings_of(f)
-    assert [build(kind, {"x": value}).x for value in inside] == list(inside)
+    assert [check(kind, {"x": value}).x for value in inside] == list(inside)
     for value in outside:
         assert told(kind, x=value) == {"x": f"{value} is out of range: allowed is {allowed}"}
 
@@ -68,7 +68,7 @@ def rover(
 
 def test_arguments_are_settings_with_types_and_defaults():
     kind = settings_of(rover, ("seed",), name=str)
-    made = build(kind, {"name": "r", "must": "x", "sizes": [5], "limit": 7, "n_envs": 1e3})
+    made = check(kind, {"name": "r", "must": "x", "sizes": [5], "limit": 7, "n_envs": 1e3})
     assert dataclasses.astuple(made) == (
         "r",
         1000,
@@ -82,8 +82,8 @@ def test_arguments_are_settings_with_types_and_defaults():
         2,
         "x",
     )
-    assert build(kind, as_tree(made)) == made and as_tree(made)["sizes"] == [5]
-    assert as_tree(build(kind, {"name": "r", "must": "x", "plan": "a/b"}))["plan"] == "a/b"
+    assert check(kind, as_tree(made)) == made and as_tree(made)["sizes"] == [5]
+    assert as_tree(check(kind, {"name": "r", "must": "x", "plan": "a/b"}))["plan"] == "a/b"
     with pytest.raises(dataclasses.FrozenInstanceError):
         made.limit = 3
 

@@ -1,5 +1,6 @@
 """Settings from nested dicts, checked in one pass: `check(Train, tree)`. Knows no Hydra."""
 
+import contextlib
 import dataclasses
 import difflib
 import json
@@ -10,17 +11,18 @@ from typing import Any
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
+from megastep.agents.cli import settings
 from megastep.agents.cli.program import ConfigErrors
-from megastep.agents.cli.settings import GROUPS, kind_of
 from megastep.settings import sentence
 
+Tree = dict[str, Any]
 #: configs/ of the repository, which the package carries as data.
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 #: pydantic's errors for a key that does not exist.
 UNKNOWN = ("unexpected_keyword_argument", "extra_forbidden")
 
 
-def check(kind: type, tree: dict[str, Any], names: Iterable[str] = ()) -> Any:
+def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:
     """Returns the settings of dataclass `kind` from nested dicts.
 
     Args:
@@ -31,12 +33,15 @@ def check(kind: type, tree: dict[str, Any], names: Iterable[str] = ()) -> Any:
     Raises:
         ConfigErrors: with everything that is wrong.
     """
-    tree = json.loads(json.dumps(tree), parse_float=_number)
+    fields, errors = dict(fields_of(kind, tree)), {}
+    tree = json.loads(
+        json.dumps(tree),
+        parse_float=lambda text: int(float(text)) if float(text).is_integer() else float(text),
+    )
     try:
         # JSON is text, as YAML is: pydantic takes its lists for tuples and its strings for paths
         return TypeAdapter(kind).validate_json(json.dumps(tree))
     except ValidationError as error:
-        fields, errors = dict(fields_of(kind, tree)), {}
         for line in error.errors():
             path = [str(part) for part in line["loc"]]
             if line["type"] in UNKNOWN:
@@ -49,9 +54,9 @@ def check(kind: type, tree: dict[str, Any], names: Iterable[str] = ()) -> Any:
         raise ConfigErrors(errors.items()) from None
 
 
-def as_tree(settings: Any) -> dict[str, Any]:
-    """Returns nested plain dicts, the inverse of `check`."""
-    return TypeAdapter(type(settings)).dump_python(settings, mode="json")
+def as_tree(chosen: Any) -> Tree:
+    """Returns settings as nested plain dicts, the inverse of `check`."""
+    return TypeAdapter(type(chosen)).dump_python(chosen, mode="json")
 
 
 def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -59,38 +64,29 @@ def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, An
 
     `tree` names the members of groups: which keys `env.` has depends on `env.name`.
     """
-    tree = tree if isinstance(tree, dict) else {}
     for name, field in kind.__pydantic_fields__.items():
         yield prefix + name, field
-        below = field.annotation
-        if name in GROUPS:
-            try:
-                below = kind_of(name, str(tree[name]["name"]))
-            except (KeyError, TypeError, ValueError):
-                continue
+        below, value = field.annotation, tree.get(name) if isinstance(tree, dict) else None
+        if name in settings.GROUPS:
+            with contextlib.suppress(KeyError, TypeError, ValueError):
+                below = settings.kind_of(name, str(value["name"]))
         if dataclasses.is_dataclass(below):
-            yield from fields_of(below, tree.get(name), f"{prefix}{name}.")
+            yield from fields_of(below, value, f"{prefix}{name}.")
 
 
 def closest_key(key: str, keys: Iterable[str]) -> str:
     """Returns a hint with the nearest of dotted keys: `lr` and `learner.lrr` find `learner.lr`."""
-    leaf, names = key.rpartition(".")[2], list(keys)
-    names = {name.rpartition(".")[2]: name for name in names} | {name: name for name in names}
-    near = difflib.get_close_matches(key, names, n=1, cutoff=0.6)
-    near = near or difflib.get_close_matches(leaf, names, n=1, cutoff=0.5)
-    return f"did you mean {names[near[0]]}?" if near else "--cfg job prints all keys"
+    keys = {name.rpartition(".")[2]: name for name in keys} | {name: name for name in keys}
+    near = difflib.get_close_matches(key, keys, n=1, cutoff=0.6)
+    near = near or difflib.get_close_matches(key.rpartition(".")[2], keys, n=1, cutoff=0.5)
+    return f"did you mean {keys[near[0]]}?" if near else "--cfg job prints all keys"
 
 
 def _unknown(path: list[str], keys: list[str]) -> str:
     """Returns what to say of a key that does not exist: another member may have it."""
     group, leaf = path[0], path[-1]
-    if group in GROUPS and len(path) == 2:
-        for file in sorted((CONFIGS / group).glob("*.yaml")):
-            name = yaml.safe_load(file.read_text())["name"]
-            if leaf in kind_of(group, name).__pydantic_fields__:
-                return f"no such key here; {group}={file.stem} has it"
+    for file in (CONFIGS / group).glob("*.yaml") if group in settings.GROUPS else ():
+        name = yaml.safe_load(file.read_text())["name"]
+        if path[1:] == [leaf] and leaf in settings.kind_of(group, name).__pydantic_fields__:
+            return f"no such key here; {group}={file.stem} has it"
     return f"no such key; {closest_key('.'.join(path), keys)}"
-
-
-def _number(text: str) -> int | float:
-    return int(float(text)) if float(text).is_integer() else float(text)

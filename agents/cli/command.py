@@ -6,12 +6,10 @@ import sys
 import warnings
 
 import hydra
-from hydra.core.config_store import ConfigStore
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from megastep.agents.cli import compose, console, program, signals, sweeps
-from megastep.agents.cli.check import as_tree, fields_of
+from megastep.agents.cli import check, compose, console, factory, program, signals, sweeps
 from megastep.agents.cli.compose import Composer, Script
 
 #: Hydra's options: their names, and argparse's arguments.
@@ -43,6 +41,12 @@ OPTIONS = {
     "-h --help": {"action": "store_true", "help": "print this and stop"},
     "--hydra-help": {"action": "store_true", "help": "print Hydra's own help and stop"},
     "-r --run": {"action": "store_true", "help": argparse.SUPPRESS},
+    "--version": {
+        "action": "version",
+        "version": f"{program.version()}, Hydra {hydra.__version__}",
+        "help": "print the versions and stop",
+    },
+    "overrides": {"nargs": "*", "help": argparse.SUPPRESS},
 }
 
 
@@ -59,8 +63,8 @@ def run_command(script: Script, argv: list[str] | None = None) -> int:
         console.say(f"{program.name(script.name)}: {error}", sys.stderr)
         return error.code
     except signals.Interrupted as stop:
-        console.say(f"{program.name(script.name)}: {stop}", sys.stderr)
-        return 128 + stop.number
+        console.say(f"{program.name(script.name)}: {stop.args[1]}", sys.stderr)
+        return 128 + stop.args[0]
     finally:
         sys.argv = arguments
 
@@ -71,17 +75,17 @@ def _run(script: Script, argv: list[str] | None) -> int:
     composer = Composer(script, options.config_name, options.config_dir, options.config_path)
     words = [word.replace("hydra.run.dir=", "folder=") for word in options.overrides]
     if options.help:
-        members = [f"  {name:<11} {', '.join(m)}" for name, m in composer.groups().items()]
-        parser.epilog = "\n".join(["groups, chosen with group=member:", *members])
+        parser.epilog = "groups, chosen with group=member:" + "".join(
+            f"\n  {name:<11} {', '.join(members)}" for name, members in composer.groups().items()
+        )
         console.say(parser.format_help().rstrip())
     elif options.cfg:
-        jobs = sweeps.jobs_of(composer, words) if options.multirun else [words]
+        jobs = sweeps.jobs_of(composer, words)[0] if options.multirun else [words]
         console.say("---\n".join(_printed(composer, job, options) for job in jobs).rstrip())
     elif options.shell_completion:
         _complete(composer, words)
     elif options.info or options.hydra_help:
-        option = f"--info={options.info}" if options.info else "--hydra-help"
-        composer.call_hydra([option, *words])
+        composer.call_hydra([f"--info={options.info}" if options.info else "--hydra-help", *words])
     elif options.multirun or "hydra.mode=MULTIRUN" in words:
         return sweeps.sweep(composer, words)
     else:
@@ -103,45 +107,36 @@ def _parser(script: Script) -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     for names, arguments in OPTIONS.items():
-        text = arguments["help"].replace("{command}", command)
-        parser.add_argument(*names.split(), **arguments | {"help": text})
-    versions = f"{program.version()}, Hydra {hydra.__version__}"
-    parser.add_argument("--version", action="version", version=versions)
-    parser.add_argument("overrides", nargs="*", help=argparse.SUPPRESS)
+        arguments = arguments | {"help": arguments["help"].replace("{command}", command)}
+        parser.add_argument(*names.split(), **arguments)
     return parser
 
 
 def _printed(composer: Composer, words: list[str], options: argparse.Namespace) -> str:
     """Returns YAML of the composed configuration, or of the part that `--package` names."""
     settings, config = composer.compose(words)
-    tree = OmegaConf.create({} if options.cfg == "hydra" else as_tree(settings))
+    tree, hydras = OmegaConf.create(check.as_tree(settings)), compose.plain(config.hydra, options.resolve)
     for key, value in compose.leaves(compose.own(config)):
-        if "${" in str(value) and tree and not options.resolve:
+        if "${" in str(value) and not options.resolve:
             OmegaConf.update(tree, key, value)
     if options.cfg != "job":
-        part = compose.plain(config.hydra, options.resolve)
-        tree.hydra = {key: part[key] for key in part if key not in ("help", "hydra_help")}
+        tree = tree if options.cfg == "all" else OmegaConf.create()
+        tree.hydra = {key: hydras[key] for key in hydras if key not in ("help", "hydra_help")}
     if options.package not in (None, "_global_"):
         tree = OmegaConf.select(tree, options.package)
-    if tree is None:
-        raise program.UserError(f"There is no {options.package} in the configuration")
     return OmegaConf.to_yaml(tree) if OmegaConf.is_config(tree) else f"{tree}\n"
 
 
 def _complete(composer: Composer, words: list[str]) -> None:
     """Has Hydra complete the line in COMP_LINE, in a configuration that has every key there is."""
-    line = os.environ.get("COMP_LINE", "") + "|"
-    overrides = composer.parse(word for word in line.split()[:-1] if "=" in word)
-    config, errors = composer.config(overrides)
-    if errors:
-        return  # nothing completes what follows words that are wrong
+    line = f"{os.environ.get('COMP_LINE', '')}|"  # whose last word is to be completed
+    config, errors = composer.config(composer.parse(w for w in line.split()[:-1] if "=" in w))
     tree = OmegaConf.create(compose.own(config))
-    for key, _ in fields_of(composer.script.kind, compose.own(config)):
+    for key, _ in check.fields_of(composer.script.kind, compose.own(config)):
         if OmegaConf.select(tree, key) is None:
             OmegaConf.update(tree, key, None, force_add=True)
-    node = {"defaults": [composer.name, "_self_"], **tree}
-    ConfigStore.instance().store(name="every-key", node=node)
-    try:
-        composer.call_hydra(["--shell-completion", *words], name="every-key")
-    except ValueError as error:
-        raise program.UserError(program.shortened(error, 400)) from None
+    tree.defaults = [composer.name, "_self_"]
+    compose.STORE.store(name="every-key", node=tree)
+    with factory.errors():
+        if not errors:  # nothing completes what follows words that are wrong
+            composer.call_hydra(["--shell-completion", *words], name="every-key")

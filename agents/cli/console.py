@@ -5,9 +5,9 @@ a full disk or a closed pipe, never ends the work.
 import contextlib
 import os
 import sys
+import textwrap
 import threading
 import time
-import warnings
 from collections.abc import Sequence
 from io import StringIO
 from typing import Any, TextIO
@@ -28,6 +28,9 @@ class TolerantStream:
     def __init__(self, stream: TextIO):
         self._stream = stream
 
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
     def write(self, text: str) -> int:
         self._attempt(self._stream.write, text)
         return len(text)
@@ -40,13 +43,8 @@ class TolerantStream:
             method(*arguments)
         except (OSError, ValueError):
             # the buffer goes to the null device, or the interpreter's last flush would fail
-            null = os.open(os.devnull, os.O_WRONLY)
-            with contextlib.suppress(OSError, ValueError):
-                os.dup2(null, self._stream.fileno())
-            os.close(null)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
+            with contextlib.suppress(OSError, ValueError), open(os.devnull, "w") as null:
+                os.dup2(null.fileno(), self._stream.fileno())
 
 
 def open_streams() -> None:
@@ -62,10 +60,9 @@ def open_streams() -> None:
         setattr(sys, name, TolerantStream(stream))
 
 
-def say(text: str = "", file: TextIO | None = None) -> None:
+def say(text: str, file: TextIO | None = None) -> None:
     """Prints one line or several."""
-    lines = "\n".join(f"{prefix}{line}" for line in text.split("\n"))
-    print(lines, file=file or sys.stdout, flush=True)
+    print(textwrap.indent(text, prefix, bool), file=file or sys.stdout, flush=True)
 
 
 def warn(sentence: object, *_: Any, **__: Any) -> None:
@@ -82,48 +79,36 @@ def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
 
 
 def is_unicode() -> bool:
-    """Returns whether stdout can show more than ASCII."""
     return (sys.stdout.encoding or "").lower().startswith("utf")
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> str:
-    """Returns a table as text, as wide as its contents, in characters that stdout can show."""
-    style = box.HEAVY_HEAD if is_unicode() else box.ASCII
-    grid = Table(*head, title=title, title_justify="left", box=style)
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], style: box.Box | None = None) -> str:
+    """Returns a table as text, by default in characters that stdout can show. In Markdown with
+    `style=box.MARKDOWN`.
+    """
+    grid, text = Table(*head, box=style or (box.HEAVY_HEAD if is_unicode() else box.ASCII)), StringIO()
     for row in rows:
-        grid.add_row(*row)
-    console = Console(file=StringIO(), width=200, force_terminal=False, color_system=None)
-    console.print(grid)
-    return console.file.getvalue().rstrip("\n")
+        grid.add_row(*(cell.replace("|", "\\|") if style is box.MARKDOWN else cell for cell in row))
+    Console(file=text, width=10_000, force_terminal=False, color_system=None).print(grid)
+    return text.getvalue().strip()
 
 
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Returns a table as Markdown."""
-    lines = (head, ("---",) * len(head), *rows)
-    cells = ([cell.replace("|", "\\|") for cell in line] for line in lines)
-    return "".join("| " + " | ".join(line) + " |\n" for line in cells)
-
-
-class Progress(contextlib.ExitStack):
+class Progress(progress.Progress):
     """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds."""
 
-    bars, shown_at = None, -LINE_EVERY
+    shown_at = -LINE_EVERY
 
-    def __enter__(self):
-        is_terminal = sys.stdout.isatty() and not prefix
-        if is_terminal and os.environ.get("TERM", "dumb") not in ("dumb", "unknown", ""):
-            columns = progress.BarColumn(24), progress.TextColumn("{task.description}")
-            self.bars = self.enter_context(progress.Progress(*columns))
-            self.task = self.bars.add_task("starting", total=1)
-        return self
+    def __init__(self):
+        is_dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
+        columns = progress.BarColumn(24), progress.TextColumn("{task.description}")
+        super().__init__(*columns, disable=is_dumb or bool(prefix) or not sys.stdout.isatty())
+        self.bar = self.add_task("starting", total=1)
 
     def show(self, fraction: float | None, words: Sequence[str]) -> None:
         """Shows words on one line; `fraction` of the work is done, None if it has no end."""
-        text = (" · " if is_unicode() else "  ").join(words)
-        if self.bars:
-            total = None if fraction is None else 1
-            self.bars.update(self.task, completed=fraction or 0, total=total, description=text)
-        elif time.monotonic() - self.shown_at >= LINE_EVERY:
+        text, total = (" · " if is_unicode() else "  ").join(words), fraction and 1
+        self.update(self.bar, completed=fraction or 0, total=total, description=text)
+        if self.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
             self.shown_at = time.monotonic()
             say(text)
 
@@ -139,7 +124,6 @@ def number(value: float) -> str:
 def duration(seconds: float) -> str:
     """Returns a time in its two largest units: 5 s, 2 min 5 s, 1 h 2 min."""
     minutes, seconds = divmod(max(0, round(seconds)), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
+    if minutes < 60:
+        return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
+    return f"{minutes // 60} h {minutes % 60} min"

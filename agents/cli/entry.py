@@ -3,6 +3,7 @@
 The GPU wakes up while Python imports; signals and closed streams are handled before that.
 """
 
+import contextlib
 import ctypes
 import importlib
 import os
@@ -22,30 +23,30 @@ WITHOUT_GPU = ("-h", "--h", "-c", "--cfg", "-i", "--info", "-s", "--shell", "--v
 
 def main() -> int:
     """Runs the installed command, `megastep`. Returns the exit code."""
-    command, *words = sys.argv
-    if words and words[0] in ("-sc", "--shell-completion"):
-        words = _script_to_complete(words)
-    if words and words[0] in SCRIPTS:
-        sys.argv = [command, *words[1:]]
+    words = sys.argv[1:] or ["--help"]
+    if words[0] in ("-sc", "--shell-completion"):
+        words = _words_to_complete(words)
+    if words[0] in SCRIPTS:
+        sys.argv[1:] = words[1:]
         return run_script(words[0])
     from megastep.agents.cli import console
     from megastep.settings import closest
 
     console.open_streams()
-    if words == ["--version"]:
-        console.say(program.version())
-    elif words and words[0] not in ("-h", "--help", ""):
-        console.say(f"megastep: {words[0]!r} is unknown; {closest(words[0], SCRIPTS)}", sys.stderr)
-        return 2
-    elif words != [""]:
+    if words[0] in ("-h", "--help"):
         for name, text in SCRIPTS.items():
             console.say(f"  megastep {name:<10}{text}; --help says more")
+    elif words[0] == "--version":
+        console.say(program.version())
+    elif words[0]:
+        console.say(f"megastep: {words[0]!r} is unknown; {closest(words[0], SCRIPTS)}", sys.stderr)
+        return 2
     return 0
 
 
-def _script_to_complete(words: list[str]) -> list[str]:
+def _words_to_complete(words: list[str]) -> list[str]:
     """Returns the words that complete the line which the shell has in COMP_LINE: a script, and its
-    options. Completes the script's own name itself, and returns [""] then.
+    options. The names of scripts are completed here.
     """
     line = os.environ.get("COMP_LINE", "")
     script = "".join(line.split()[1:2])
@@ -74,8 +75,8 @@ def run_script(name: str) -> int:
 def wants_first_gpu(words: list[str]) -> bool:
     """Returns whether a command line may use the first GPU in this process."""
     devices = [word.partition("=")[2] for word in words if word.startswith("device=")]
-    elsewhere = any(word.startswith(WITHOUT_GPU) for word in words)
-    return not elsewhere and all(name in ("auto", "cuda", "cuda:0") for name in devices)
+    is_elsewhere = any(word.startswith(WITHOUT_GPU) for word in words)
+    return not is_elsewhere and all(name in ("auto", "cuda", "cuda:0") for name in devices)
 
 
 def create_cuda_context() -> None:
@@ -83,10 +84,8 @@ def create_cuda_context() -> None:
 
     It takes half a second in the driver, which passes beside Python's imports.
     """
-    try:
-        driver = ctypes.CDLL("libcuda.so.1")
-    except OSError:
-        return
     device, context = ctypes.c_int(), ctypes.c_void_p()
-    if driver.cuInit(0) == 0 and driver.cuDeviceGet(ctypes.byref(device), 0) == 0:
-        driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
+    with contextlib.suppress(OSError):  # no driver
+        driver = ctypes.CDLL("libcuda.so.1")
+        if driver.cuInit(0) == 0 and driver.cuDeviceGet(ctypes.byref(device), 0) == 0:
+            driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)

@@ -1,16 +1,18 @@
-"""Measures a trained policy on unseen homes. `evaluate --help`; `run(cfg)` is the same from Python."""
+"""Measures a trained policy on unseen homes, or against others in duels. `evaluate --help`; `run(cfg)`
+is the same from Python.
+"""
 
+import itertools
 import re
 import sys
 import time
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from megastep.agents.cli import duels, factory, runs
-from megastep.agents.cli.command import run_command
-from megastep.agents.cli.compose import Script
-from megastep.agents.cli.console import duration, say
-from megastep.agents.cli.settings import Evaluate
+from megastep.agents.cli import command, compose, console, factory, program, runs, settings
+from megastep.agents.selfplay import duels, ratings
 from megastep.agents.training import evaluation
+from megastep.agents.training.checkpoint import Checkpoint, checkpoints
 
 HELP = """Measures what a run's agent earns in the first episode of each lane, with a 95 % interval over
 homes. Prints a table and writes it to the run's folder: evaluations/*.md.
@@ -26,9 +28,26 @@ The most common words:
   against=RUN,bot      duels instead: with other runs or checkpoints, the scripted policy, random
                        actions, or an import path
   ratings=true         ratings of the run's snapshots, by duels of each with each"""
+#: Columns of a table of duels, and of one of ratings, as templates.
+DUELS = {
+    "against": "{against}",
+    "won": "{won:.3f}",
+    runs.INTERVAL: "{lower:.3f} to {upper:.3f}",
+    **{name: f"{{{name}}}" for name in ("wins", "draws", "losses")},
+    "length": "{length:.0f}",
+    "duels": "{duels}",
+    "homes": "{homes}",
+}
+RATINGS = {
+    "player": "{player}",
+    "rating": "{rating:.2f}",
+    "sigma": "{sigma:.2f}",
+    "won": "{won:.3f}",
+    "duels": "{duels}",
+}
 
 
-def run(cfg: Evaluate) -> Path:
+def run(cfg: settings.Evaluate) -> Path:
     """Evaluates a run, each environment in one home throughout. Returns the path of the table.
 
     Writes .json and .md into the run's folder `evaluations`, one of each per source of geometries
@@ -38,48 +57,44 @@ def run(cfg: Evaluate) -> Path:
     start, device = time.monotonic(), factory.make_device(cfg.device)
     loaded = factory.load_checkpoint(runs.find(cfg.run), device)
     trained = factory.config_of(loaded)
-    settings, geometry = cfg.env or trained.env, cfg.geometry or trained.geometry
+    where = cfg.env or trained.env, cfg.geometry or trained.geometry
     if cfg.ratings or cfg.against is not None:
-        arena = duels.Arena(cfg, loaded, settings, geometry, device)
+        arena = Arena(cfg, loaded, *where, device)
         path = arena.rate() if cfg.ratings else arena.duel()
     else:
-        path = _evaluate(cfg, loaded, trained, settings, geometry, device)
-    say(f"Evaluated in {duration(time.monotonic() - start)}")
+        path = _evaluate(cfg, loaded, trained, *where, device)
+    console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
 
 
-def _evaluate(cfg, loaded, trained, settings, geometry, device):
-    homes = factory.homes(settings, geometry, cfg.split, cfg.episodes)
-    settings = factory.changed(settings, n_envs=cfg.episodes, resample=False)
-    env = factory.make_env(settings, homes, cfg.seed, device)
+def _evaluate(cfg, loaded, trained, env_settings, geometry, device):
+    homes = factory.homes(env_settings, geometry, cfg.split, cfg.episodes)
+    env_settings = factory.changed(env_settings, n_envs=cfg.episodes, resample=False)
+    env, rows = factory.make_env(env_settings, homes, cfg.seed, device), []
     policy = factory.make_policy(trained.agent, env)
     factory.load_weights(policy, env, loaded)
     players = {"trained, greedy" if cfg.greedy else "trained": policy}
     if cfg.baseline:
         players["random"] = evaluation.RandomActions(env.action_space)
-    rows = []
     for name, player in players.items():
         episodes = evaluation.first_episodes(env, player, cfg.seed, cfg.greedy and player is policy)
-        summaries = evaluation.summaries(episodes, getattr(env, "roles", None))
-        rows += [{"agent": name, **row} for row in summaries]
-    where, source = runs.place(settings, geometry, homes, cfg.split)
+        roles = getattr(env, "roles", None)
+        rows += [{"agent": name, **row} for row in evaluation.summaries(episodes, roles)]
+    place, source = runs.place(env_settings, geometry, homes, cfg.split)
     title = (
-        f"{where}, after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, "
+        f"{place}, after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, "
         f"{env.n_envs * env.n_agents:,} lanes"
     )
     names = [source, "env" if cfg.env else "", cfg.split, str(loaded.step)]
-    return runs.write_table(cfg, loaded, names, title, rows, [cells(row) for row in rows])
+    return runs.write_table(cfg, loaded, names, title, rows, [*map(cells, rows)])
 
 
 def cells(row: dict) -> dict[str, str]:
-    """Returns a row of the table as text by column: each metric, and its interval, on its own."""
-    cut = f", {row['unfinished']} cut short" if row["unfinished"] else ""
-    metrics = {}
+    """Returns a row of the table as text by column: each metric beside its interval."""
+    cut, metrics = f", {row['unfinished']} cut short" if row["unfinished"] else "", {}
     for name, metric in row["metrics"].items():
-        has_mean = metric["mean"] is not None
-        metrics[name] = f"{metric['mean']:.3g}" if has_mean else "none"
-        interval = f"{metric['lower']:.3g} to {metric['upper']:.3g}" if has_mean else "none"
-        metrics[f"{name}: {runs.INTERVAL}"] = interval
+        texts = [f"{value:.3g}" for value in metric.values() if value is not None] or 3 * ["none"]
+        metrics |= {name: texts[0], f"{name}: {runs.INTERVAL}": " to ".join(texts[1:])}
     return {
         "agent": f"{row['agent']}: {row['role']}" if "role" in row else row["agent"],
         "return": f"{row['return']:.2f}",
@@ -91,11 +106,151 @@ def cells(row: dict) -> dict[str, str]:
     }
 
 
+# ---- Duels and ratings ----
+
+
+class Player(NamedTuple):
+    """A policy under a name, and the number of samples it has learnt from."""
+
+    name: str
+    policy: Any
+    step: int | None = None
+
+
+#: Settings of an environment for duels, where it has them.
+FOR_TWO = {"n_agents": 2, "resample": False}
+
+
+def load_player(loaded: Checkpoint, env: Any, run: Checkpoint) -> Player:
+    """Returns the player of a checkpoint, to meet the agent of `run` in `env`.
+
+    Raises:
+        UserError: if one was trained in another environment.
+    """
+    trained, own = factory.config_of(loaded), factory.config_of(run)
+    if trained.env.name != own.env.name:
+        raise program.UserError(
+            f"{loaded.path} was trained in {settings.label(trained.env.name)} and {run.path} in "
+            f"{settings.label(own.env.name)}; choose a run in the same environment"
+        )
+    policy = factory.make_policy(trained.agent, env)
+    factory.load_weights(policy, env, loaded)
+    name = f"{runs.folder_of(loaded.path).name}, {loaded.step:,} samples"
+    return Player(name, policy, loaded.step)
+
+
+def find_player(name: str, run: Checkpoint, env_settings: settings.Env, env: Any) -> Player:
+    """Returns who is to meet the agent of `run` in `env`.
+
+    Args:
+        name: a run's folder or checkpoint; an import path, `random`, or `bot`, the scripted policy
+            of the run, none of which needs weights.
+
+    Raises:
+        UserError: if nobody can be met there, or this player cannot play there.
+    """
+    if env.n_agents < 2:
+        raise program.UserError(
+            f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
+            "one here; choose another with env= and its settings"
+        )
+    name = factory.config_of(run).opponents.bot_class if name == "bot" else name
+    if name == "random" or (":" in name and not Path(name).exists()):
+        return Player(name, factory.make_bot(name, env_settings, env))
+    return load_player(factory.load_checkpoint(runs.find(name), env.device), env, run)
+
+
+class Arena:
+    """An environment in unseen homes, where the agent of a run meets others.
+
+    It has two agents, or as many as it has if their number is fixed. Each home is played in from
+    every agent's place, equally often, in up to `cfg.episodes` duels.
+    """
+
+    def __init__(self, cfg, run: Checkpoint, env: settings.Env, geometry: Any, device: Any):
+        self.cfg, self.run, env = cfg, run, factory.changed(env, **FOR_TWO)
+        homes = factory.homes(env, geometry, cfg.split)
+        sample = factory.make_sample(env, homes, cfg.seed, device)
+        self.others = [find_player(name, run, env, sample) for name in cfg.against or ()]
+        self.agent = load_player(run, sample, run)
+        n_duels = max(1, cfg.episodes // sample.n_agents)  # from each place
+        homes = homes[:n_duels]
+        n_duels -= n_duels % max(1, len(homes))
+        env = factory.changed(env, n_envs=n_duels * sample.n_agents)
+        self.env, self.sample = factory.make_env(env, homes, cfg.seed, device), sample
+        self.place, self.source = runs.place(env, geometry, homes, cfg.split)
+
+    def play(self, player: Player, opponent: Player) -> Any:
+        """Returns their duels, as `duels.play` does."""
+        with factory.errors():
+            options = self.cfg.seed, self.cfg.greedy
+            return duels.play(self.env, player.policy, opponent.policy, *options)
+
+    def duel(self) -> Path:
+        """Plays the run's agent against each of `cfg.against`. Prints and writes a table, and
+        returns the path of its .json.
+        """
+        rows = [{"against": p.name, **summary(self.play(self.agent, p))} for p in self.others]
+        title = f"{self.agent.name}: duels of {self.place}, seed {self.cfg.seed}"
+        names = ["duels", self.source, self.cfg.split, str(self.run.step), "against"]
+        names += self.cfg.against
+        cells = [{key: form.format_map(row) for key, form in DUELS.items()} for row in rows]
+        return runs.write_table(self.cfg, self.run, names, title, rows, cells)
+
+    def rate(self) -> Path:
+        """Rates the run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels
+        of each with each. Prints a table, writes ratings.csv and ratings.svg into the run's folder,
+        and returns the path of the first.
+        """
+        folder, players = runs.folder_of(self.run.path), []
+        for path in checkpoints(folder / "snapshots") or checkpoints(folder / "checkpoints"):
+            player = load_player(factory.load_checkpoint(path, self.env.device), self.sample, self.run)
+            players.append(player._replace(name=f"{player.step:,} samples"))
+        players += self.others
+        if len(players) < 2:
+            raise program.UserError(
+                f"{folder} has one checkpoint and nothing to compare it with: train with "
+                "snapshots=8, or name others with against="
+            )
+        scores = {
+            (i, j): self.play(players[i], players[j])["score"].tolist()
+            for i, j in itertools.combinations(range(len(players)), 2)
+        }
+        rows = ratings.rows([(player.name, player.step) for player in players], scores, self.cfg.seed)
+        title = f"Ratings by duels of {self.place}, seed {self.cfg.seed}"
+        lines = [[form.format_map(row) for form in RATINGS.values()] for row in rows]
+        console.say(f"{title}\n{console.table([*RATINGS], lines)}")
+        with runs.writing(folder, "they are only printed"):
+            ratings.write(folder, rows, title)
+        console.say(f"Plot: {folder / 'ratings.svg'}")
+        return folder / "ratings.csv"
+
+
+def summary(played: dict) -> dict:
+    """Returns a table's row for what `duels.play` returned: the share won, a draw counting half,
+    with its 95 % interval over homes, or over duels where there are none.
+    """
+    score = played["score"].cpu().numpy()
+    homes = played["homes"].cpu().numpy() if "homes" in played else None
+    mean, lower, upper = evaluation.interval(score, homes)
+    return {
+        "won": mean,
+        "lower": lower,
+        "upper": upper,
+        "wins": int((score == 1).sum()),
+        "losses": int((score == 0).sum()),
+        "draws": int(((score != 1) & (score != 0)).sum()),
+        "length": float(played["lengths"].mean()),
+        "duels": len(score),
+        "homes": None if homes is None else len(set(homes.tolist())),
+    }
+
+
+SCRIPT = compose.Script("evaluate", settings.Evaluate, run, HELP)
+
+
 def main(argv: list[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
     # a list of names, not the sweep that Hydra takes it for
     words = [re.sub(r"^against=(?!\[|null$)(.*)", r"against=[\1]", word) for word in words]
-    return run_command(SCRIPT, words)
-
-
-SCRIPT = Script("evaluate", Evaluate, run, HELP)
+    return command.run_command(SCRIPT, words)

@@ -12,17 +12,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def name(script: str, python: str = "") -> str:
-    """Returns what a script is called, `megastep train` or `train.py`, the latter after `python`."""
+    """Returns what a script is called: `megastep train`, or `train.py` after `python`."""
     is_installed = os.path.basename(sys.argv[0]) == "megastep" or not (ROOT / "train.py").exists()
     return f"megastep {script}" if is_installed else f"{python}{script}.py"
 
 
 def version() -> str:
-    """Returns the distribution's name and version."""
-    try:
-        return f"{DISTRIBUTION} {metadata.version(DISTRIBUTION)}"
-    except metadata.PackageNotFoundError:
-        return f"{DISTRIBUTION}, not installed"
+    versions = [found.version for found in metadata.distributions(name=DISTRIBUTION)]
+    return f"{DISTRIBUTION} {(versions or ['(not installed)'])[0]}"
 
 
 class UserError(Exception):
@@ -30,9 +27,13 @@ class UserError(Exception):
     without a traceback.
     """
 
-    def __init__(self, message: object, code: int = 2):
-        super().__init__(message)
-        self.code = code
+    code = 2
+
+
+class NonFinite(UserError):
+    """Training stopped on numbers that are not finite, or went on without them."""
+
+    code = 1
 
 
 class ConfigErrors(UserError):
@@ -43,17 +44,14 @@ class ConfigErrors(UserError):
         super().__init__(self.errors)
 
     def __str__(self):
-        count = "1 error" if len(self.errors) == 1 else f"{len(self.errors)} errors"
-        lines = [f"{key}: {shortened(sentence, 400)}" for key, sentence in self.errors]
-        return "\n  ".join([f"{count} in the configuration", *lines])
+        head = f"{len(self.errors)} error{'s' * (len(self.errors) > 1)} in the configuration"
+        return "\n  ".join([head, *(f"{key}: {shortened(text, 400)}" for key, text in self.errors)])
 
 
 def shortened(text: object, length: int = 120) -> str:
-    """Returns a text on one line of at most `length` characters."""
     text = " ".join(str(text).split())
     return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
 def first_line(error: BaseException) -> str:
-    """Returns the first line of an error's message, or the name of its type."""
     return (str(error).splitlines() or [type(error).__name__])[0]

@@ -1,24 +1,25 @@
 """Films a trained policy, or random actions. `record --help`; `run(cfg)` is the same from Python."""
 
 import collections
-import importlib.util
 from pathlib import Path
 from typing import Any
 
 import torch
 from matplotlib.image import imsave
 
-from megastep.agents.cli import duels, factory, runs
-from megastep.agents.cli.command import run_command
-from megastep.agents.cli.compose import Script
-from megastep.agents.cli.console import say
-from megastep.agents.cli.program import UserError
-from megastep.agents.cli.settings import Record, kind_of
-from megastep.agents.selfplay import duels as lineups
+from megastep import recording
+from megastep.agents.cli import (
+    command,
+    compose,
+    console,
+    evaluate,
+    factory,
+    runs,
+    settings,
+)
+from megastep.agents.selfplay import duels
 from megastep.agents.training.evaluation import RandomActions
-from megastep.agents.training.loggers import missing
 from megastep.arrdict import numpyify
-from megastep.recording import ParallelEncoder, draw
 
 HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
 
@@ -34,37 +35,32 @@ The most common words:
 HOMES = "megastep.geometries.sources:homes"
 
 
-def run(cfg: Record) -> Path:
+def run(cfg: settings.Record) -> Path:
     """Films a run's agent, or random actions. Returns the path of the video."""
-    if not (cfg.file or "").endswith(".png"):
-        try:
-            importlib.import_module("av")  # what the recorder encodes with
-        except ImportError:
-            raise UserError(missing("av")) from None
-    device, loaded, settings, geometry = factory.make_device(cfg.device), None, cfg.env, cfg.geometry
-    path = Path(cfg.file or "video.mp4")
+    path, env_settings, geometry = Path(cfg.file or "video.mp4"), cfg.env, cfg.geometry
+    device = factory.make_device(cfg.device)
     if cfg.run is not None:
         loaded = factory.load_checkpoint(runs.find(cfg.run), device)
         trained = factory.config_of(loaded)
-        settings, geometry = trained.env, geometry or trained.geometry
+        env_settings, geometry = trained.env, geometry or trained.geometry
         path = path if cfg.file else runs.folder_of(loaded.path) / path
     if cfg.against is not None:
-        settings = duels.for_two(settings)
-    geometry = geometry or kind_of("geometry", HOMES)(name=HOMES)
-    homes = factory.homes(settings, geometry, cfg.split)
-    home = [homes[cfg.home % len(homes)]] if homes else []
-    env = factory.make_sample(factory.changed(settings, n_envs=1), home, cfg.seed, device)
-    policy = RandomActions(env.action_space) if loaded is None else duels.load_player(loaded, env)[1]
+        env_settings = factory.changed(env_settings, **evaluate.FOR_TWO)
+    geometry = geometry or settings.kind_of("geometry", HOMES)(name=HOMES)
+    homes = factory.homes(env_settings, geometry, cfg.split)
+    homes = [homes[cfg.home % len(homes)]] if homes else []
+    env = factory.make_sample(factory.changed(env_settings, n_envs=1), homes, cfg.seed, device)
+    random = RandomActions(env.action_space)
+    policy = evaluate.load_player(loaded, env, loaded).policy if cfg.run else random
     if cfg.against is not None:
-        duels.check_agents(env)
-        opponent = duels.find_player(cfg.against, loaded, settings, env)
-        say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
+        opponent = evaluate.find_player(cfg.against, loaded, env_settings, env)
+        console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
         seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
-        policy = lineups.lineup(policy, opponent.policy, seat, env.n_agents)
+        policy = duels.lineup(policy, opponent.policy, seat, env.n_agents)
     # a video is the last thing that a run should fail for
     with factory.errors(f"The video {path} could not be made: ", (Exception,)):
         film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)
-    say(f"Filmed {cfg.steps} steps: {path}")
+    console.say(f"Filmed {cfg.steps} steps: {path}")
     return path
 
 
@@ -82,22 +78,21 @@ def film(
         ValueError: for another kind of file.
         RuntimeError: naming the first frame that failed.
     """
-    path = Path(path)
-    states = _states(env, policy, steps, greedy, torch.Generator(env.device).manual_seed(seed))
+    path, states = Path(path), _states(env, policy, steps, greedy, seed)
     if path.suffix == ".png":
         (last,) = collections.deque(states, maxlen=1)
         path.parent.mkdir(parents=True, exist_ok=True)
-        imsave(path, draw(env.plot_state, numpyify(last)))
+        imsave(path, recording.draw(env.plot_state, numpyify(last)))
         return path
-    with ParallelEncoder(env.plot_state, fps=env.fps) as encoder:
+    with recording.ParallelEncoder(env.plot_state, fps=env.fps) as encoder:
         for state in states:
             encoder(state)
     return encoder.save(path)
 
 
-def _states(env, policy, steps, greedy, generator):
-    """Yields the state of environment 0 at its reset and after each of `steps` - 1 steps."""
+def _states(env, policy, steps, greedy, seed):
     world, hidden = env.reset(), policy.initial(env.n_envs * env.n_agents, env.device)
+    generator = torch.Generator(env.device).manual_seed(seed)
     yield env.state(0)
     for _ in range(steps - 1):
         decision, hidden = policy(world, hidden, sample=not greedy, generator=generator)
@@ -105,8 +100,8 @@ def _states(env, policy, steps, greedy, generator):
         yield env.state(0)
 
 
-SCRIPT = Script("record", Record, run, HELP)
+SCRIPT = compose.Script("record", settings.Record, run, HELP)
 
 
 def main(argv: list[str] | None = None) -> int:
-    return run_command(SCRIPT, argv)
+    return command.run_command(SCRIPT, argv)

@@ -1,7 +1,6 @@
 """Run folders: new ones, existing ones by name, their locks, tables and scores."""
 
 import contextlib
-import dataclasses
 import difflib
 import errno
 import itertools
@@ -9,21 +8,19 @@ import json
 import os
 import re
 import shlex
-import shutil
 import statistics
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import filelock
-import yaml
+from rich import box
 
 from megastep.agents.cli import console, program
 from megastep.agents.cli.check import as_tree
 from megastep.agents.cli.program import UserError, shortened
 from megastep.agents.cli.settings import Env, Evaluate, Geometry, Train, label
-from megastep.agents.training import atomic_files, loggers
-from megastep.agents.training.checkpoint import Checkpoint
+from megastep.agents.training import atomic_files, checkpoint, loggers
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: One line for each start of a run: its folder.
@@ -66,37 +63,19 @@ def new(cfg: Train) -> Path:
     the time and the settings.
     """
     if cfg.folder is None:
-        names = label(cfg.env.name), label(cfg.geometry.name), str(cfg.seed)
-        return make(RUNS / "-".join([time.strftime("%Y-%m-%d_%H-%M-%S"), *names]))
+        name = f"{label(cfg.env.name)}-{label(cfg.geometry.name)}-{cfg.seed}"
+        return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{name}")
     folder = Path(cfg.folder)
     with writing(folder):
         if not os.path.exists(folder):
             return make(folder)
-        if contents(folder):
+        # Hydra writes .hydra/ and a log before the job of a sweep starts
+        if [path for path in folder.iterdir() if path.name != ".hydra" and path.suffix != ".log"]:
             raise UserError(
-                f"The run folder {folder} is not empty; choose another with folder=, "
-                f"or continue its run: {resume_command(folder)}"
+                f"The run folder {folder} is not empty; choose another with folder=, or continue "
+                f"its run: {resume_command(folder)}"
             )
     return folder
-
-
-def contents(folder: Path) -> list[Path]:
-    """Returns what is in a folder, except what Hydra writes there before a job starts."""
-    return [path for path in folder.iterdir() if path.name != ".hydra" and path.suffix != ".log"]
-
-
-@contextlib.contextmanager
-def cleanup_on_error(folder: Path) -> Iterator[None]:
-    """Deletes a new folder again if setting up fails."""
-    try:
-        yield
-    except BaseException:
-        for path in contents(folder):
-            shutil.rmtree(path, ignore_errors=True)
-            path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # Hydra's files are in it
-            folder.rmdir()
-        raise
 
 
 @contextlib.contextmanager
@@ -114,9 +93,10 @@ def locked(folder: Path) -> Iterator[None]:
         lock.acquire()
         path.write_text(str(os.getpid()))
     except filelock.Timeout:
-        owner = path.read_text()
-        cure = f"wait for process {owner}, or end it: kill {owner}"
-        raise UserError(f"The run folder {folder} is in use by process {owner}; {cure}") from None
+        raise UserError(
+            f"The run folder {folder} is in use by process {path.read_text()}; wait for it, or end "
+            f"it: kill {path.read_text()}"
+        ) from None
     except OSError as error:
         with writing(folder):
             if error.errno not in NO_LOCKS:
@@ -134,19 +114,12 @@ def record_start(folder: Path) -> None:
     times change with whatever is written there, and clocks are moved.
     """
     try:
-        RUNS.mkdir(exist_ok=True)
-        with open(STARTED, "ab") as file:
-            file.write(os.fsencode(folder) + b"\n")
-    except OSError as error:
-        reason = f"cannot be written ({error.strerror})"
-        console.warn(f"{STARTED} {reason}; `latest` will not find {folder}")
-
-
-def write_config(folder: Path, cfg: Train) -> None:
-    """Writes the composed configuration, config.yaml."""
-    text = yaml.safe_dump(as_tree(cfg), sort_keys=False, allow_unicode=True)
-    with writing(folder):
-        atomic_files.replace(folder / "config.yaml", text.encode())
+        with writing(STARTED, f"`latest` will not find {folder}"):
+            RUNS.mkdir(exist_ok=True)
+            with open(STARTED, "ab") as file:
+                file.write(os.fsencode(folder) + b"\n")
+    except UserError as error:
+        console.warn(error)
 
 
 # ---- Existing folders ----
@@ -158,8 +131,8 @@ def known() -> list[Path]:
     """
     lines = STARTED.read_bytes().split(b"\n") if STARTED.exists() else []
     order = {Path(os.fsdecode(line)): n for n, line in enumerate(lines) if line}
-    here = {path for path in [*RUNS.glob("*"), *SWEEPS.glob("*/*"), *order]}
-    folders = [path for path in here if (path / "checkpoints").is_dir()]
+    folders = {*RUNS.glob("*"), *SWEEPS.glob("*/*"), *order}
+    folders = [path for path in folders if (path / "checkpoints").is_dir()]
     return sorted(folders, key=lambda path: (order.get(path, -1), str(path)))
 
 
@@ -170,18 +143,14 @@ def find(name: str) -> Path:
         UserError: naming the nearest run.
     """
     path, folders = Path(name), known()
-    if name == "latest":
-        if folders:
-            return folders[-1]
-        cure = f"{program.name('train', 'python ')} makes one"
-        raise UserError(f"There is no run in {RUNS}/ or {SWEEPS}/; {cure}")
+    if name == "latest" and folders:
+        return folders[-1]
     if any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints")):
         return path
-    if os.path.exists(path):
-        raise UserError(f"{path} is no run: it has no folder named checkpoints")
     near = difflib.get_close_matches(name, map(str, folders), n=1, cutoff=0.4)
-    hint = f"; did you mean {near[0]}?" if near else ""
-    raise UserError(f"There is no run {shortened(path)}{hint}")
+    hint = f"did you mean {near[0]}?" if near else "train.py makes runs"
+    problem = "has no folder named checkpoints" if os.path.exists(path) else "does not exist"
+    raise UserError(f"The run {shortened(name)} {problem}; {hint}")
 
 
 def resume_command(folder: Path) -> str:
@@ -207,60 +176,47 @@ def folder_of(path: Path) -> Path:
 
 def place(env: Env, geometry: Geometry, homes: list, split: str) -> tuple[str, str]:
     """Returns where a run is evaluated, for titles, and the source of homes, for file names."""
-    if not homes:
-        return label(env.name), label(env.name)
-    path = getattr(geometry, "path", None)
-    source = label(geometry.name) + (f"-{Path(path).stem}" if path else "")
+    stem = Path(getattr(geometry, "path", None) or "").stem
+    source = "-".join(filter(None, [label(geometry.name), stem])) if homes else label(env.name)
     which = "all" if split == "all" else f"the {split}"
-    return f"{label(env.name)} in {which} homes of {source}", source
+    return label(env.name) + (f" in {which} homes of {source}" if homes else ""), source
 
 
 def write_table(
-    cfg: Evaluate, loaded: Checkpoint, names: list[str], title: str, rows: list, cells: list[dict]
+    cfg: Evaluate, loaded: checkpoint.Checkpoint, names: list[str], title: str, rows: list, cells: list[dict]
 ) -> Path:
     """Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
     and `rows` for programs, .json. Returns the latter's path.
     """
-    names = [name for name in (*names, "greedy" if cfg.greedy else "") if name]
-    path = folder_of(loaded.path) / "evaluations" / re.sub(r"[^\w.-]", "-", "-".join(names))[:200]
+    name = "-".join(filter(None, [*names, "greedy" if cfg.greedy else ""]))
+    folder, name = folder_of(loaded.path) / "evaluations", re.sub(r"[^\w.-]", "-", name)[:200]
     head, lines = [*cells[0]], [[*row.values()] for row in cells]
     result = dict(title=title, checkpoint=str(loaded.path), step=loaded.step, rows=rows)
-    text = json.dumps(result | {"evaluation": dataclasses.asdict(cfg)}, indent=2) + "\n"
+    result["evaluation"] = as_tree(cfg)
     console.say(f"{title}\n{console.table(head, lines)}")
-    with writing(path.parent, "the evaluation is only printed"):
-        path.parent.mkdir(exist_ok=True)
-        table = f"{title}\n\n{console.markdown(head, lines)}"
-        for suffix, content in ((".md", table), (".json", text)):
-            atomic_files.replace(path.parent / f"{path.name}{suffix}", content.encode())
-    return path.parent / f"{path.name}.json"
+    with writing(folder, "it is only printed"):
+        folder.mkdir(exist_ok=True)
+        markdown = f"{title}\n\n{console.table(head, lines, box.MARKDOWN)}\n"
+        atomic_files.replace(folder / f"{name}.md", markdown.encode())
+        atomic_files.replace(folder / f"{name}.json", json.dumps(result, indent=2).encode())
+    return folder / f"{name}.json"
 
 
-def outcome(result: Path | None) -> dict[str, float | None]:
-    """Returns what a job achieved; `result` is what it returned, None if it failed.
+def outcome(result: Path) -> dict[str, float | None]:
+    """Returns what a job achieved, from what it returned.
 
     score: for a sweeper: a training run's mean return over its last reports, an evaluation's
         return, the share of duels won against the first opponent.
-    evaluated, lower, upper: the last of these that was measured, with its interval; sampled actions
-        come before greedy ones. Of a training run the return.
+    evaluated, lower, upper: the evaluated one of these with its interval; of a run its return.
     """
-    if result is None:
-        return {}
-    row, is_run = {}, result.is_dir()
-    with contextlib.suppress(OSError, ValueError):  # of no table, or a damaged one
-        files = result.glob("evaluations/*.json") if is_run else [result]
-        tables = [json.loads(path.read_text()) for path in files]
-        tables = [table for table in tables if not is_run or "return" in table["rows"][0]]
-        last = max(tables, key=lambda table: (table["step"], not table["evaluation"]["greedy"]))
-        row = {key: last["rows"][0].get(key) for key in ("lower", "upper", "return", "won")}
-        row["evaluated"] = row.pop("return") if row["won"] is None else row["won"]
-        del row["won"]
-    return {"score": mean_return(result) if is_run else row.get("evaluated"), **row}
-
-
-def mean_return(folder: Path) -> float | None:
-    """Returns the mean return of a run's last `REPORTS` reports that have one."""
-    with contextlib.suppress(OSError, statistics.StatisticsError):
-        rows = loggers.read(folder / "metrics.jsonl")
-        returns = [row["episode/return"] for row in rows if row.get("episode/return") is not None]
-        return statistics.fmean(returns[-REPORTS:])
-    return None
+    files, returns = [result], []
+    if is_run := result.is_dir():
+        files = sorted(result.glob("evaluations/*.json"))
+        with contextlib.suppress(OSError):
+            rows = loggers.read(result / "metrics.jsonl")
+            returns = [row["episode/return"] for row in rows if row.get("episode/return") is not None]
+    rows = [json.loads(file.read_text())["rows"][0] for file in files if file.suffix == ".json"]
+    row = next((row for row in rows if not is_run or "return" in row), {})
+    evaluated = row.get("return", row.get("won"))
+    score = statistics.fmean(returns[-REPORTS:]) if returns else None if is_run else evaluated
+    return dict(score=score, evaluated=evaluated, lower=row.get("lower"), upper=row.get("upper"))

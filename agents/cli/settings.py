@@ -9,7 +9,7 @@ import functools
 import inspect
 import json
 import re
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_validator
 
@@ -18,12 +18,6 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.settings import closest, frozen, located, settings_of
 
-Above0 = Annotated[float, Field(gt=0)]
-Count = Annotated[int, Field(ge=1, le=1_000_000)]
-Steps = Annotated[int, Field(ge=1, le=100_000)]
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
-Split = Literal["training", "test", "all"]
-
 
 def _device(name: str) -> str:
     if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
@@ -31,61 +25,57 @@ def _device(name: str) -> str:
     return name
 
 
-Device = Annotated[str, AfterValidator(_device)]
+Above0 = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Steps = Annotated[int, Field(ge=1, le=100_000)]
+Split = Literal["training", "test", "all"]
 
 
+# ---- Groups ----
+
+
+# TensorBoard and JSON lines, which are always written
 @frozen
 class LocalLogger:
-    """TensorBoard and JSON lines, which are always written."""
-
     name: str
 
 
+# Weights & Biases as well
 @frozen
 class WandbLogger:
-    """Weights & Biases as well."""
-
     name: str
     project: str
     mode: Literal["online", "offline"]
     group: str | None = None
 
 
-# ---- Groups ----
-
-
-class Group(NamedTuple):
-    """A group of configs/. The member that is chosen decides which settings the group has.
-
-    A member has `name`, the import path of a class or function, whose arguments are its settings.
-    """
-
-    reserved: tuple[str, ...] = ()  # arguments that the program passes itself
-    required: dict[str, str] = {}  # arguments it must take: what each means
-    defaults: dict[str, Any] = {}  # for arguments without a default
-    more: dict[str, Any] = {}  # settings beside the arguments
-    kinds: dict[str, type] = {}  # the dataclass of each name, where names are no import paths
-
-
-GROUPS = {
-    "env": Group(
+LOGGERS = {"none": LocalLogger, "wandb": WandbLogger}
+#: Groups of configs/ whose member has `name`, the import path of a class or function, and decides
+#: which settings there are: its arguments. Of these, `reserved` are passed by the program,
+#: `required` must be there (with what each means), and `defaults` are for those without a default;
+#: `more` are settings beside them.
+IMPORTED = {
+    "env": dict(
         reserved=("geometries", "seed", "device", "privileged"),
         required={"n_envs": "the number of environments"},
         defaults={"n_envs": 128},
+        more={},
     ),
-    "geometry": Group(
+    "geometry": dict(
         reserved=("split",),
-        required={"n": "the number of geometries", "split": "training, test or all", "seed": "an integer"},
+        required={"n": "the number of geometries", "split": "its split", "seed": "an integer"},
         defaults={"n": 512, "seed": 1},
+        more={},
     ),
-    "learner": Group(
+    "learner": dict(
         reserved=("policy", "seed", "graph"),
         required={"policy": "the policy to improve"},
+        defaults={},
         # what lr falls to 0 over; auto: samples if given, else seconds if given
         more={"anneal": (Literal["auto", "never", "samples", "seconds"], "auto")},
     ),
-    "logger": Group(kinds={"none": LocalLogger, "wandb": WandbLogger}),
 }
+GROUPS = (*IMPORTED, "logger")
 
 
 @functools.cache
@@ -95,23 +85,22 @@ def kind_of(group: str, name: str) -> type:
     Raises:
         ValueError: if nothing can be imported under this name, or it takes other arguments.
     """
-    spec = GROUPS[group]
-    if spec.kinds:
-        if name not in spec.kinds:
-            raise ValueError(f"{name!r} is unknown; {closest(name, spec.kinds)}")
-        return spec.kinds[name]
-    constructor = import_object(name)
+    if group == "logger":
+        if name not in LOGGERS:
+            raise ValueError(f"{name!r} is unknown; {closest(name, LOGGERS)}")
+        return LOGGERS[name]
+    constructor, spec = import_object(name), IMPORTED[group]
     try:
-        present = inspect.signature(constructor).parameters
-        for argument, meaning in spec.required.items():
-            if argument not in present:
-                raise ValueError(f"it takes no {argument} ({meaning})")
-        return settings_of(constructor, spec.reserved, spec.defaults, name=str, **spec.more)
+        taken = inspect.signature(constructor).parameters
+        if missing := [f"{k}, {text}" for k, text in spec["required"].items() if k not in taken]:
+            raise ValueError(f"it takes no {missing[0]}")
+        more = {"name": str, **spec["more"]}
+        return settings_of(constructor, spec["reserved"], spec["defaults"], **more)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name} cannot be used: {error}") from error
 
 
-def _settings_of_group(group: str) -> Any:
+def _group(group: str) -> Any:
     """Returns the type of a field that holds the settings of a group's member."""
 
     def settings(value):
@@ -131,7 +120,7 @@ def label(name: str) -> str:
     return name.rpartition(":")[2].rpartition(".")[2].lower()
 
 
-Env, Geometry, Learner, Logger = map(_settings_of_group, GROUPS)
+Env, Geometry, Learner, Logger = map(_group, GROUPS)
 Agent = settings_of(Policy, ("obs_space", "action_space", "privileged_space", "seed"))
 Opposition = settings_of(
     Opponents,
@@ -143,10 +132,28 @@ Opposition = settings_of(
 # ---- Scripts ----
 
 
+# settings of every script
+@frozen
+class Common:
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    device: Annotated[str, AfterValidator(_device)]
+
+    def errors(self) -> dict[str, Any]:
+        """Returns {dotted key: sentence} of settings that contradict each other, or a false value
+        for those that do not.
+        """
+        return {}
+
+    @model_validator(mode="after")
+    def _agree(self):
+        if errors := [(key, text) for key, text in self.errors().items() if text]:
+            raise located(errors)
+        return self
+
+
+# what follows training
 @frozen
 class Finish:
-    """What follows training."""
-
     evaluate: bool
     episodes: Count
     record: bool
@@ -154,9 +161,7 @@ class Finish:
 
 
 @frozen
-class Train:
-    """A training run."""
-
+class Train(Common):
     env: Env
     geometry: Geometry
     agent: Agent
@@ -164,8 +169,6 @@ class Train:
     opponents: Opposition = Opposition()
     logger: Logger
     finish: Finish
-    seed: Seed
-    device: Device
     samples: Annotated[int, Field(ge=1, le=10**18)] | None
     seconds: Above0 | None
     log_every: Count
@@ -176,99 +179,61 @@ class Train:
     resume: str | None
     init: str | None
 
-    @model_validator(mode="after")
-    def _agrees(self):
+    def errors(self):
         n_minibatches, over = getattr(self.learner, "n_minibatches", 1), self.learner.anneal
-        has_opponents = self.opponents.past or self.opponents.bot
-        is_endless = self.samples is None and self.seconds is None
-        _refuse(
-            (
-                n_minibatches > self.env.n_envs,
-                "learner.n_minibatches",
-                f"{n_minibatches} is more than env.n_envs={self.env.n_envs}",
-            ),
-            (
-                getattr(self.learner, "lag", 0) and has_opponents,
-                "learner.lag",
-                "opponents change with every update, so collecting cannot run ahead of learning; "
-                "use learner.lag=0, or no opponents",
-            ),
-            (
-                over in ("samples", "seconds") and getattr(self, over) is None,
-                "learner.anneal",
-                f"is {over}, and no {over}= is given for the learning rate to fall over",
-            ),
-            (
-                self.snapshots and is_endless,
-                "snapshots",
-                "are spread over the budget; give samples= or seconds=",
-            ),
-            (
-                self.resume and self.init,
-                "init",
-                "cannot be combined with resume: init starts a new run, resume continues one",
-            ),
-        )
-        return self
+        is_async = getattr(self.learner, "lag", 0) and (self.opponents.past or self.opponents.bot)
+        return {
+            "learner.n_minibatches": n_minibatches > self.env.n_envs
+            and f"{n_minibatches} is more than env.n_envs={self.env.n_envs}",
+            "learner.lag": is_async
+            and "opponents change with every update, so nothing can be collected ahead of it; use "
+            "learner.lag=0, or no opponents",
+            "learner.anneal": over in ("samples", "seconds")
+            and getattr(self, over) is None
+            and f"is {over}, and no {over}= is given for the learning rate to fall over",
+            "snapshots": self.snapshots
+            and self.samples is None
+            and self.seconds is None
+            and "are spread over the budget; give samples= or seconds=",
+            "init": self.resume
+            and self.init
+            and "cannot be combined with resume: init starts a new run, resume continues one",
+        }
 
 
+# settings of what plays with a trained agent
 @frozen
-class Evaluate:
-    """An evaluation of a run's checkpoint."""
-
-    run: str
+class Played(Common):
     env: Env | None = None
     geometry: Geometry | None = None
     split: Split
-    episodes: Count
     greedy: bool
+
+
+@frozen
+class Evaluate(Played):
+    run: str
+    episodes: Count
     baseline: bool
     against: tuple[str, ...] | None = None
     ratings: bool = False
-    seed: Seed
-    device: Device
 
 
 @frozen
-class Record:
-    """A video of a run's checkpoint, or of random actions in an environment."""
-
+class Record(Played):
     run: str | None
-    env: Env | None = None
-    geometry: Geometry | None = None
-    split: Split
     steps: Steps
     home: Annotated[int, Field(ge=0, le=1_000_000)]
-    greedy: bool
     against: str | None = None
-    seed: Seed
-    device: Device
     file: str | None
 
-    @model_validator(mode="after")
-    def _agrees(self):
-        no_run = self.run is None
-        _refuse(
-            (
-                no_run and self.env is None,
-                "run",
-                "is missing; without a run, env=explorer records random actions",
-            ),
-            (
-                not no_run and self.env is not None,
-                "env",
-                "cannot be combined with run, which has its own",
-            ),
-            (
-                no_run and self.env is not None and self.against is not None,
-                "against",
-                "needs run=, the agent that plays against it",
-            ),
-        )
-        return self
-
-
-def _refuse(*rules: tuple[Any, str, str]) -> None:
-    """Raises all rules (is broken, dotted key, sentence) that are broken."""
-    if errors := [(key, text) for is_broken, key, text in rules if is_broken]:
-        raise located(errors)
+    def errors(self):
+        has_run, has_env = self.run is not None, self.env is not None
+        return {
+            "run": not (has_run or has_env)
+            and "is missing; without a run, env=explorer records random actions",
+            "env": has_run and has_env and "cannot be combined with run, which has its own",
+            "against": has_env
+            and self.against is not None
+            and "needs run=, the agent that plays against it",
+        }

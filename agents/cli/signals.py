@@ -20,17 +20,11 @@ SAME = 0.3
 
 
 class Interrupted(BaseException):
-    """A signal stopped the work; the message says what is saved and how to continue.
+    """A signal stopped the work: Interrupted(number, message), where the message says what is saved
+    and how to continue.
 
     It is no Exception, so that nothing takes it for an error of what it interrupted.
     """
-
-    def __init__(self, number: int, message: str):
-        super().__init__(number, message)
-        self.number = number
-
-    def __str__(self):
-        return self.args[1]
 
 
 def announce(number: int) -> None:
@@ -44,9 +38,8 @@ def interrupt(number: int) -> NoReturn:
 
 
 def exit_on_signals(script: str) -> None:
-    """From here on a signal ends the program at once, with one line.
-
-    For imports and the interpreter's end, which have nothing to save.
+    """From here on a signal ends the program at once, with one line: for imports and the
+    interpreter's end, which have nothing to save.
     """
 
     def exit_at_once(number, frame):
@@ -63,14 +56,15 @@ def handled(on_first: Callable[[int], None] = announce) -> Iterator[list[int]]:
     Ending harms nothing: checkpoints are renamed into place when whole. Yields a list that gets the
     number of the first signal.
     """
-    numbers, first_at = [], []
+    numbers, ends_after = [], time.monotonic()
 
     def handle(number, frame):
+        nonlocal ends_after
         if not numbers:
-            first_at.append(time.monotonic())
             numbers.append(number)
+            ends_after = time.monotonic() + SAME
             on_first(number)
-        elif number != signal.SIGHUP and time.monotonic() - first_at[0] > SAME:
+        elif number != signal.SIGHUP and time.monotonic() > ends_after:
             os._exit(128 + number)
 
     before = _install(handle)
@@ -85,26 +79,25 @@ def stop(process: int) -> None:
     """Has another process stop in good order, once, though a terminal's Ctrl-C may have reached it
     as well: a second SIGHUP never ends a program.
     """
+    is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     with contextlib.suppress(ProcessLookupError):
-        os.kill(process, signal.SIGTERM if _is_ignored(signal.SIGHUP) else signal.SIGHUP)
-
-
-def _is_ignored(number: int) -> bool:
-    """Returns whether a signal is kept from the program: `nohup` does so with SIGHUP."""
-    return number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
+        os.kill(process, signal.SIGTERM if is_ignored else signal.SIGHUP)
 
 
 def _install(handler: Callable) -> dict[int, object]:
-    """Handles all signals, in the main thread. Returns the handlers there were."""
-    is_main = threading.current_thread() is threading.main_thread()
-    numbers = [number for number in SIGNALS if is_main and not _is_ignored(number)]
-    before = {number: signal.getsignal(number) for number in numbers}
-    for number in numbers:
-        signal.signal(number, handler)
-    return before
+    """Handles all signals, in the main thread. Returns the handlers there were.
+
+    `nohup` has SIGHUP ignored, which stays so.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    if before[signal.SIGHUP] is signal.SIG_IGN:
+        del before[signal.SIGHUP]
+    return {number: signal.signal(number, handler) for number in before}
 
 
 def _write(stream: TextIO | None, line: str) -> None:
-    """Prints from a signal handler: past the stream's buffer, which may be in use."""
+    # from a signal handler: past the stream's buffer, which may be in use
     with contextlib.suppress(OSError, ValueError, AttributeError):
         os.write(stream.fileno(), f"{line}\n".encode())

@@ -1,24 +1,31 @@
 """Trains a policy. `train --help` lists the choices; `run(cfg)` is the same from Python."""
 
-import dataclasses
+import contextlib
+import shutil
 from collections.abc import Sequence
-from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 
 from megastep import engine
 from megastep.agents.algorithms.nonfinite import NonFiniteError
-from megastep.agents.cli import evaluate, factory, record, runs, settings, signals
+from megastep.agents.cli import (
+    command,
+    compose,
+    console,
+    evaluate,
+    factory,
+    program,
+    record,
+    runs,
+    settings,
+    signals,
+)
 from megastep.agents.cli.check import as_tree
-from megastep.agents.cli.command import run_command
-from megastep.agents.cli.compose import Script
-from megastep.agents.cli.console import Progress, duration, number, say, warn
-from megastep.agents.cli.program import ConfigErrors, UserError, first_line
-from megastep.agents.training import checkpoint, loggers, trainer
-from megastep.agents.training.budget import Budget
-from megastep.agents.training.saver import Saver, Snapshots
+from megastep.agents.training import atomic_files, budget, checkpoint, loggers, saver
+from megastep.agents.training.trainer import Trainer
 
 HELP = """Trains a policy in an environment.
 
@@ -61,8 +68,8 @@ RESUMABLE = (
 
 
 def make_trainer(
-    cfg: settings.Train, folder: Path, device: torch.device, progress: Progress
-) -> trainer.Trainer:
+    cfg: settings.Train, folder: Path, device: torch.device, progress: console.Progress
+) -> Trainer:
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
     """
@@ -71,56 +78,55 @@ def make_trainer(
     sample = factory.make_sample(cfg.env, *where)
     policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
     learner = factory.make_learner(cfg.learner, policy, cfg.seed)
-    replayed = factory.replay_bytes(learner, sample) / cfg.env.n_envs
-    factory.check_memory(cfg.env, sample, learner.bytes_per_env(sample) + replayed, *where)
+    factory.check_memory(cfg.env, sample, learner, *where)
     env = factory.make_env(cfg.env, *where)
     if cfg.resume or cfg.init:
         loaded = factory.load_checkpoint(runs.find(cfg.resume or cfg.init), device)
         factory.load_weights(policy, env, loaded)
     opponents = factory.make_opponents(cfg, env, sample, policy)
-    wandb = None
-    if cfg.logger.name == "wandb":
-        wandb = dict(vars(cfg.logger), name=folder.name, config=as_tree(cfg))
-    if cfg.resume:
-        for name in ("checkpoints", "snapshots"):
-            checkpoint.rewind(folder / name, loaded.step)
+    for name in ("checkpoints", "snapshots") if cfg.resume else ():
+        checkpoint.rewind(folder / name, loaded.step)
+    wandb = dict(vars(cfg.logger)) if cfg.logger.name == "wandb" else None
     config = {"train": as_tree(cfg), "spaces": factory.spaces_of(env)}
+    snapshots = saver.Saver(folder / "snapshots", config, keep=10**9)
     with factory.errors():
-        trains = trainer.Trainer(
+        improves = Trainer(
             opponents or env,
             policy,
             learner,
-            loggers.Loggers(folder, loaded.step if cfg.resume else 0, wandb),
-            Saver(folder / "checkpoints", config, cfg.keep_checkpoints),
-            Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
+            loggers.Loggers(
+                folder,
+                loaded.step if cfg.resume else 0,
+                wandb and wandb | {"name": folder.name, "config": as_tree(cfg)},
+            ),
+            saver.Saver(folder / "checkpoints", config, cfg.keep_checkpoints),
+            budget.Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
             report_every=cfg.log_every,
             save_every=cfg.checkpoint_seconds,
-            on_report=lambda trains: progress.show(*progress_of(trains)),
+            on_report=lambda running: progress.show(*progress_of(running)),
             opponents=opponents,
-            snapshots=Snapshots(Saver(folder / "snapshots", config, keep=10**9), cfg.snapshots),
+            snapshots=saver.Snapshots(snapshots, cfg.snapshots),
         )
         if cfg.resume:
-            trains.load_state_dict(loaded.state)
-    return trains
+            improves.load_state_dict(loaded.state)
+    return improves
 
 
-def progress_of(trains: trainer.Trainer) -> tuple[float | None, list[str]]:
+def progress_of(running: Trainer) -> tuple[float | None, list[str]]:
     """Returns the fraction of the budget that is spent, None without one, and the few numbers that
     people watch.
     """
-    words, left, latest = [f"{number(trains.samples)} samples"], trains.left, trains.latest
-    if trains.rate is not None:
-        words.append(f"{number(trains.rate)}/s")
-    if trains.score is not None:
-        words.append(f"return {trains.score:.3g}")
-        words += few_means(latest, trains.episode_stats.metrics, trains.episode_stats.groups)
-        won = {name.removeprefix(WON): latest[name] for name in latest if name.startswith(WON)}
-        words += [f"won vs {opponent} {share:.0%}".replace("%", " %") for opponent, share in won.items()]
-    if not trains.budget.is_limited:
-        return None, words
-    if left < 1:
-        words.append(f"{duration(trains.clock.seconds * left / (1 - left))} left")
-    return 1 - left, words
+    words, left, latest = [f"{console.number(running.samples)} samples"], running.left, running.latest
+    if running.rate is not None:
+        words.append(f"{console.number(running.rate)}/s")
+    if running.score is not None:
+        words.append(f"return {running.score:.3g}")
+        words += few_means(latest, running.episode_stats.metrics, running.episode_stats.groups)
+        won = [(name, share) for name, share in latest.items() if name.startswith(WON)]
+        words += [f"won vs {name.removeprefix(WON)} {100 * share:.0f} %" for name, share in won]
+    if running.budget.is_limited and left < 1:
+        words.append(f"{console.duration(running.clock.seconds * left / (1 - left))} left")
+    return 1 - left if running.budget.is_limited else None, words
 
 
 def few_means(latest: dict[str, float], metrics: Sequence[str], groups: Sequence[str]) -> list[str]:
@@ -132,48 +138,53 @@ def few_means(latest: dict[str, float], metrics: Sequence[str], groups: Sequence
 
 
 def annealed(cfg: settings.Train) -> settings.Train:
-    """Returns `cfg` with learner.anneal=auto replaced: samples if limited, else seconds, else never."""
-    if cfg.learner.anneal != "auto":
-        return cfg
+    """Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
+    limited, else by never.
+    """
     limits = [name for name in ("samples", "seconds") if getattr(cfg, name) is not None]
-    learner = dataclasses.replace(cfg.learner, anneal=[*limits, "never"][0])
-    return dataclasses.replace(cfg, learner=learner)
+    anneal = [*limits, "never"][0] if cfg.learner.anneal == "auto" else cfg.learner.anneal
+    return factory.changed(cfg, learner=factory.changed(cfg.learner, anneal=anneal))
 
 
 def run(cfg: settings.Train) -> Path:
     """Trains as `cfg` says. Returns the run folder; after a signal, saves and raises Interrupted."""
-    cfg, device = annealed(cfg), factory.make_device(cfg.device)
+    cfg, device, progress = annealed(cfg), factory.make_device(cfg.device), console.Progress()
     folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
     with runs.locked(folder):
-        with nullcontext() if cfg.resume else runs.cleanup_on_error(folder):
-            progress = Progress()
-            trains = make_trainer(cfg, folder, device, progress)
-            runs.write_config(folder, cfg)
+        with contextlib.ExitStack() as undo:
+            if not cfg.resume:
+                undo.callback(shutil.rmtree, folder, ignore_errors=True)
+            running = make_trainer(cfg, folder, device, progress)
+            with runs.writing(folder):
+                text = yaml.safe_dump(as_tree(cfg), sort_keys=False, allow_unicode=True)
+                atomic_files.replace(folder / "config.yaml", text.encode())
+            undo.pop_all()
         runs.record_start(folder)
-        say(f"Training on {device} in {folder}")
-        resume, saver = f"To continue: {runs.resume_command(folder)}", trains.save_checkpoint
+        console.say(f"Training on {device} in {folder}")
+        resume = f"To continue: {runs.resume_command(folder)}"
         try:
-            with signals.handled() as numbers, progress, closing(trains.metrics):
-                trains.train(lambda: bool(numbers))
+            with signals.handled() as numbers, progress, contextlib.closing(running.metrics):
+                running.train(lambda: bool(numbers))
         except NonFiniteError as error:
-            raise UserError(f"{error}. What was saved before is in {folder}", 1) from error
+            raise program.NonFinite(f"{error}. What was saved before is in {folder}") from error
         except (engine.EngineError, torch.OutOfMemoryError) as error:
-            saved = saver.unsaved or "What was learnt last could not be saved"
-            if trains.is_saved:
-                saved = f"All {trains.samples:,} samples are saved"
-            raise UserError(f"{first_line(error).rstrip('.')}. {saved}. {resume}") from error
+            saved = running.save_checkpoint.unsaved or "What was learnt last could not be saved"
+            saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
+            reason = program.first_line(error).rstrip(".")
+            raise program.UserError(f"{reason}. {saved}. {resume}") from error
         finally:
             loggers.curves(folder)
         if numbers:
-            stopped = f"Stopped after {trains.samples:,} samples. {resume}"
-            raise signals.Interrupted(numbers[0], stopped)
-        if saver.unsaved:
-            raise UserError(saver.unsaved)
-        nonfinite = trains.nonfinite_value
-        del trains  # its memory is the evaluation's now
+            raise signals.Interrupted(
+                numbers[0], f"Stopped after {running.samples:,} samples. {resume}"
+            )
+        if running.save_checkpoint.unsaved:
+            raise program.UserError(running.save_checkpoint.unsaved)
+        nonfinite = running.nonfinite_value
+        del running  # its memory is the evaluation's now
         finish(cfg, folder)
         if nonfinite and nonfinite.is_from_env:
-            raise UserError(f"{nonfinite}. All else was learnt from, and is in {folder}", 1)
+            raise program.NonFinite(f"{nonfinite}. All else was learnt from, and is in {folder}")
     return folder
 
 
@@ -185,8 +196,8 @@ def finish(cfg: settings.Train, folder: Path) -> None:
     if cfg.finish.record:
         try:
             record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
-        except UserError as error:
-            warn(error)
+        except program.UserError as error:
+            console.warn(error)
 
 
 def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
@@ -201,41 +212,34 @@ def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
         return tree
     if refused := [key for key in typed if resume and key.split(".")[0] not in RESUMABLE]:
         cure = "cannot change when a run is resumed; init=RUN starts a new one from its weights"
-        raise ConfigErrors((key, cure) for key in refused)
+        raise program.ConfigErrors((key, cure) for key in refused)
     loaded = factory.load_checkpoint(runs.find(resume or init))
     saved, state = loaded.config["train"], loaded.state
     if init:
-        groups = [group for group in ("env", "agent") if group not in typed]
-        keys = [key for key in typed if key.partition(".")[0] in groups]
-        return tree | _copied(tree, {group: saved[group] for group in groups}, keys)
-    if "learner" not in state:
-        raise UserError(
+        groups = {group: saved[group] for group in ("env", "agent") if group not in typed}
+        saved, typed = tree | groups, [key for key in typed if key.partition(".")[0] in groups]
+    elif "learner" not in state:
+        raise program.UserError(
             f"{loaded.path} is a snapshot, which has the weights alone. init={loaded.path} starts a "
             "new run from it; resume= takes the run's folder"
         )
-    saved = _copied(tree, saved, typed) | {"init": None}
+    for key in typed:
+        *groups, leaf = key.split(".")
+        source, target = tree, saved
+        for group in groups:
+            source, target = source[group], target[group]
+        target[leaf] = source[leaf]
     if spent := [
         (name, f"the run has had {round(state[name], 1):,} of {saved[name]:,}; give {name}= more")
         for name in ("samples", "seconds")
-        if saved[name] is not None and state[name] >= saved[name]
+        if resume and saved[name] is not None and state[name] >= saved[name]
     ]:
-        raise ConfigErrors(spent)
-    return saved
+        raise program.ConfigErrors(spent)
+    return saved | {"init": init}
 
 
-def _copied(source: dict, target: dict, keys: list[str]) -> dict:
-    """Copies dotted keys from one tree to another, and returns it."""
-    for key in keys:
-        *groups, leaf = key.split(".")
-        below, above = target, source
-        for group in groups:
-            below, above = below[group], above[group]
-        below[leaf] = above[leaf]
-    return target
-
-
-SCRIPT = Script("train", settings.Train, run, HELP, prepare)
+SCRIPT = compose.Script("train", settings.Train, run, HELP, prepare)
 
 
 def main(argv: list[str] | None = None) -> int:
-    return run_command(SCRIPT, argv)
+    return command.run_command(SCRIPT, argv)

@@ -15,6 +15,7 @@ import textwrap
 import pytest
 
 from megastep.agents.cli import evaluate, record, train
+from megastep.agents.cli.settings import kind_of
 from megastep.agents.training import checkpoint
 from tests.helpers import tiny
 
@@ -117,7 +118,7 @@ def add(outside, what, files):
 
 def saved():
     """The checkpoint of the latest run."""
-    return checkpoint.load_latest(train.run_folders.find("latest") / "checkpoints")
+    return checkpoint.load_latest(train.runs.find("latest") / "checkpoints")
 
 
 def leftovers():
@@ -152,11 +153,10 @@ def test_an_environment(outside, capsys):
 
 def test_an_environment_as_a_file_of_a_group(outside, monkeypatch, tmp_path):
     """As ours are: configs/env/counter.yaml holds the import path and what differs."""
-    from megastep.agents.cli import compose, registry
+    from megastep.agents.cli import check
 
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
-    for module in (compose, registry):
-        monkeypatch.setattr(module, "CONFIGS", tmp_path / "configs")
+    monkeypatch.setattr(check, "CONFIGS", tmp_path / "configs")
     yaml = "name: counter:Counter\nlimit: 4\n"
     add(outside, "environment", {"counter.py": COUNTER, "configs/env/counter.yaml": yaml})
     assert train.main(["env=counter", *RUN]) == 0
@@ -468,9 +468,7 @@ def test_a_checkpoint_whose_class_is_gone_says_so(outside, capsys):
     os.remove("counter.py")
     del sys.modules["counter"]
     shutil.rmtree("__pycache__", ignore_errors=True)
-    from megastep.agents.cli.settings import GROUPS
-
-    GROUPS["env"].kind.cache_clear()
+    kind_of.cache_clear()
     for main, words in (
         (evaluate.main, ["run=latest"]),
         (record.main, ["run=latest"]),

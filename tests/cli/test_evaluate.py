@@ -12,15 +12,13 @@ import pytest
 import torch
 
 from megastep import envs, spaces
-from megastep.agents.cli import evaluate, run_folders, tables, train
-from megastep.agents.cli.build import build
-from megastep.agents.cli.compose import ConfigLoader
-from megastep.agents.cli.errors import UserError
-from megastep.agents.cli.settings import Evaluate, Train
+from megastep.agents.cli import evaluate, runs, train
+from megastep.agents.cli.program import UserError
 from megastep.agents.training import evaluation
 from megastep.arrdict import arrdict
 from megastep.geometries import files, sample
 from tests.helpers import tiny
+from tests.helpers.tiny import settings
 
 TINY = [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=1"]
 
@@ -140,19 +138,25 @@ def test_a_metric_is_the_mean_over_episodes_that_ended():
     )
     (row,) = evaluation.summaries(evaluation.first_episodes(env, random, max_steps=0))
     assert row["metrics"]["age"] == dict(mean=None, lower=None, upper=None)
-    assert evaluate.cells({"agent": "a", **row})[3:5] == ("none", "none")
+    shown = evaluate.cells({"agent": "a", **row})
+    assert shown["age"] == shown["age: 95 % interval"] == "none"
 
 
 def test_metrics_stand_beside_the_return_of_a_table():
     env = Teams(20, False)
     episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
     rows = [{"agent": "trained", **row} for row in evaluation.summaries(episodes, env.roles)]
-    head = "agent", "return", "95 % interval", "age", "95 % interval", "length", "episodes", "homes"
-    assert evaluate.columns(rows) == head
-    name, earned, within, age, its, *_ = evaluate.cells(rows[2])
-    assert (name, earned, age) == ("trained: follower", "30.50", "30.5")
     lower, upper = rows[2]["lower"], rows[2]["upper"]
-    assert within == f"{lower:.2f} to {upper:.2f}" and its == f"{lower:.3g} to {upper:.3g}"
+    assert evaluate.cells(rows[2]) == {
+        "agent": "trained: follower",
+        "return": "30.50",
+        "95 % interval": f"{lower:.2f} to {upper:.2f}",
+        "age": "30.5",
+        "age: 95 % interval": f"{lower:.3g} to {upper:.3g}",
+        "length": "30",
+        "episodes": "20",
+        "homes": "none",
+    }
 
 
 def test_random_actions_are_spread_evenly_over_every_action():
@@ -267,19 +271,17 @@ def test_the_interval_is_that_of_an_evaluator_that_tries_every_resample(sizes):
 
 
 def configured(**changes):
-    with ConfigLoader("evaluate", Evaluate) as loader:
-        return dataclasses.replace(
-            build(Evaluate, loader.tree(["run=latest", "episodes=6", "device=cpu"])), **changes
-        )
+    words = ["run=latest", "episodes=6", "device=cpu"]
+    return dataclasses.replace(settings(*words, script="evaluate"), **changes)
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A run folder, and the folder it was trained from."""
-    with ConfigLoader("train", Train) as loader, pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         base = tmp_path_factory.mktemp("trained")
         patch.chdir(base)
-        return base / train.run(build(Train, loader.tree(TINY)))
+        return base / train.run(settings(*TINY))
 
 
 def test_the_table_is_printed_and_written(trained, capsys):
@@ -301,8 +303,8 @@ def test_the_table_is_printed_and_written(trained, capsys):
             "minimal in the test homes of box, after 32 samples (step_32), seed 1, 6 lanes" in text
         )
     row = dict(evaluated=0.0, lower=0.0, upper=0.0)
-    assert run_folders.outcome(written) == dict(score=0.0, **row)
-    assert row.items() <= run_folders.outcome(trained).items()
+    assert runs.outcome(written) == dict(score=0.0, **row)
+    assert row.items() <= runs.outcome(trained).items()
 
 
 def test_it_is_reproducible_and_each_has_a_file_of_its_own(trained):
@@ -312,8 +314,8 @@ def test_it_is_reproducible_and_each_has_a_file_of_its_own(trained):
         written = evaluate.run(configured(run=str(trained), **changes))
         return [row["length"] for row in json.loads(written.read_text())["rows"]]
 
-    with ConfigLoader("evaluate", Evaluate) as loader:
-        bench = build(Evaluate, loader.tree(["run=x", "geometry=bench", "geometry.n=3"])).geometry
+    words = ["run=x", "geometry=bench", "geometry.n=3"]
+    bench = settings(*words, script="evaluate").geometry
     assert lengths() == lengths() != lengths(seed=2)
     written = evaluate.run(
         configured(
@@ -336,9 +338,8 @@ def test_it_is_reproducible_and_each_has_a_file_of_its_own(trained):
 
 def test_a_file_of_homes_is_named_in_title_and_file_name(trained, tmp_path):
     files.save(tmp_path / "plans.npz", sample("homes", 3))
-    with ConfigLoader("evaluate", Evaluate) as loader:
-        words = ["run=x", "geometry=files", f"geometry.path={tmp_path / 'plans.npz'}"]
-        plans = build(Evaluate, loader.tree(words)).geometry
+    words = ["run=x", "geometry=files", f"geometry.path={tmp_path / 'plans.npz'}"]
+    plans = settings(*words, script="evaluate").geometry
     written = evaluate.run(
         configured(run=str(trained), geometry=plans, split="all", baseline=False)
     )
@@ -353,9 +354,7 @@ def test_a_lane_stays_in_one_home_whatever_the_training_did(tmp_path, monkeypatc
     shape = ["env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1", "agent.width=8"]
     learner = ["learner.n_steps=8", "learner.n_minibatches=2", "device=cpu", "samples=1"]
     homes = ["geometry=bench", "geometry.n=4", "env.resample=true"]
-    with ConfigLoader("train", Train) as loader:
-        tree = loader.tree(["env=explorer", "preset=cpu", *homes, *shape, *learner])
-        run = train.run(build(Train, tree))
+    run = train.run(settings("env=explorer", "preset=cpu", *homes, *shape, *learner))
     seen = {}
 
     def spied(env, *args):
@@ -370,10 +369,11 @@ def test_a_lane_stays_in_one_home_whatever_the_training_did(tmp_path, monkeypatc
 
 
 def test_a_table_that_cannot_be_written_is_one_sentence(trained, monkeypatch, tmp_path):
-    place = tmp_path / "file"
-    place.write_text("")
-    with pytest.raises(UserError, match="cannot be written to .*file"):
-        tables.write(place, "name", dict(title=""), (), ())
+    copy = shutil.copytree(trained, tmp_path / "copy")
+    shutil.rmtree(copy / "evaluations", ignore_errors=True)
+    (copy / "evaluations").write_text("")
+    with pytest.raises(UserError, match="copy/evaluations cannot be written"):
+        evaluate.run(configured(run=str(copy), baseline=False))
 
 
 def test_a_checkpoint_of_another_environment_is_refused_with_both_shapes(trained, tmp_path):

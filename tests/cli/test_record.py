@@ -1,6 +1,7 @@
 """Videos of trained agents."""
 
 import os
+import re
 import signal
 
 import numpy as np
@@ -9,20 +10,18 @@ from matplotlib import pyplot as plt
 
 from megastep import plotting, recording
 from megastep.agents.cli import record, train
-from megastep.agents.cli.build import build
-from megastep.agents.cli.compose import ConfigLoader
-from megastep.agents.cli.settings import Train
 from tests.helpers import faults, tiny
+from tests.helpers.tiny import settings
 
 TINY = [*tiny.TINY, "samples=1"]
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    with ConfigLoader("train", Train) as loader, pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         base = tmp_path_factory.mktemp("trained")
         patch.chdir(base)
-        return base / train.run(build(Train, loader.tree(TINY)))
+        return base / train.run(settings(*TINY))
 
 
 def test_a_video_has_a_frame_for_every_step(trained):
@@ -123,4 +122,4 @@ def test_without_the_encoder_training_goes_on_and_the_package_is_named(
 
 def test_keys_of_a_geometry_need_a_geometry(capsys):
     assert record.main(["env=minimal", "geometry.n=4"]) == 2
-    assert "geometry: keys of it need a member of it: give geometry= too" in capsys.readouterr().err
+    assert re.search("geometry: .*give geometry=", capsys.readouterr().err)

@@ -1,4 +1,7 @@
-"""The smallest run, as overrides of the command line: an update takes milliseconds."""
+"""The smallest run, as words of the command line: an update takes milliseconds."""
+
+from megastep.agents.cli import evaluate, record, train
+from megastep.agents.cli.compose import Composer
 
 TINY = [
     "env=minimal",
@@ -13,3 +16,9 @@ TINY = [
 ]
 SHORT_EPISODES = ["env.shortest=5", "env.longest=9"]
 UPDATE = 4 * 8  # samples of one update
+SCRIPTS = {script.name: script for script in (train.SCRIPT, evaluate.SCRIPT, record.SCRIPT)}
+
+
+def settings(*words, script="train"):
+    """Returns the settings that a script makes of words."""
+    return Composer(SCRIPTS[script]).settings(words)
