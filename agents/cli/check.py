@@ -54,8 +54,8 @@ def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:
         raise ConfigErrors(errors.items()) from None
 
 
+# the inverse of `check`
 def as_tree(chosen: Any) -> Tree:
-    """Returns settings as nested plain dicts, the inverse of `check`."""
     return TypeAdapter(type(chosen)).dump_python(chosen, mode="json")
 
 
@@ -75,7 +75,7 @@ def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, An
 
 
 def closest_key(key: str, keys: Iterable[str]) -> str:
-    """Returns a hint with the nearest of dotted keys: `lr` and `learner.lrr` find `learner.lr`."""
+    # by the whole key or its last part: `lr` and `learner.lrr` find `learner.lr`
     keys = {name.rpartition(".")[2]: name for name in keys} | {name: name for name in keys}
     near = difflib.get_close_matches(key, keys, n=1, cutoff=0.6)
     near = near or difflib.get_close_matches(key.rpartition(".")[2], keys, n=1, cutoff=0.5)
@@ -83,7 +83,6 @@ def closest_key(key: str, keys: Iterable[str]) -> str:
 
 
 def _unknown(path: list[str], keys: list[str]) -> str:
-    """Returns what to say of a key that does not exist: another member may have it."""
     group, leaf = path[0], path[-1]
     for file in (CONFIGS / group).glob("*.yaml") if group in settings.GROUPS else ():
         name = yaml.safe_load(file.read_text())["name"]

@@ -4,13 +4,13 @@ import argparse
 import os
 import sys
 import warnings
+from typing import Any
 
 import hydra
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from megastep.agents.cli import check, compose, console, factory, program, signals, sweeps
-from megastep.agents.cli.compose import Composer, Script
 
 #: Hydra's options: their names, and argparse's arguments.
 OPTIONS = {
@@ -50,12 +50,12 @@ OPTIONS = {
 }
 
 
-def run_command(script: Script, argv: list[str] | None = None) -> int:
+def run_command(script: compose.Script, argv: list[str] | None = None) -> int:
     """Parses, composes, checks and runs. Returns the exit code."""
-    warnings.showwarning, arguments = console.warn, sys.argv
+    warnings.showwarning, arguments = console.warn, sys.argv[:]
     try:
         with signals.handled(signals.interrupt) as numbers:
-            code = _run(script, argv)
+            code = _run(script, sys.argv[1:] if argv is None else argv)
         return 128 + numbers[0] if numbers else code
     except SystemExit as end:  # of argparse, and of Hydra's help
         return end.code or 0
@@ -66,37 +66,10 @@ def run_command(script: Script, argv: list[str] | None = None) -> int:
         console.say(f"{program.name(script.name)}: {stop.args[1]}", sys.stderr)
         return 128 + stop.args[0]
     finally:
-        sys.argv = arguments
+        sys.argv[:] = arguments
 
 
-def _run(script: Script, argv: list[str] | None) -> int:
-    parser = _parser(script)
-    options = parser.parse_intermixed_args(argv)
-    composer = Composer(script, options.config_name, options.config_dir, options.config_path)
-    words = [word.replace("hydra.run.dir=", "folder=") for word in options.overrides]
-    if options.help:
-        parser.epilog = "groups, chosen with group=member:" + "".join(
-            f"\n  {name:<11} {', '.join(members)}" for name, members in composer.groups().items()
-        )
-        console.say(parser.format_help().rstrip())
-    elif options.cfg:
-        jobs = sweeps.jobs_of(composer, words)[0] if options.multirun else [words]
-        console.say("---\n".join(_printed(composer, job, options) for job in jobs).rstrip())
-    elif options.shell_completion:
-        _complete(composer, words)
-    elif options.info or options.hydra_help:
-        composer.call_hydra([f"--info={options.info}" if options.info else "--hydra-help", *words])
-    elif options.multirun or "hydra.mode=MULTIRUN" in words:
-        return sweeps.sweep(composer, words)
-    else:
-        settings, config = composer.compose(words)
-        if config.hydra.mode == RunMode.MULTIRUN:
-            return sweeps.sweep(composer, words)
-        script.run(settings)
-    return 0
-
-
-def _parser(script: Script) -> argparse.ArgumentParser:
+def _run(script: compose.Script, argv: list[str]) -> int:
     command = program.name(script.name, "python ")
     parser = argparse.ArgumentParser(
         program.name(script.name),
@@ -109,34 +82,43 @@ def _parser(script: Script) -> argparse.ArgumentParser:
     for names, arguments in OPTIONS.items():
         arguments = arguments | {"help": arguments["help"].replace("{command}", command)}
         parser.add_argument(*names.split(), **arguments)
-    return parser
-
-
-def _printed(composer: Composer, words: list[str], options: argparse.Namespace) -> str:
-    """Returns YAML of the composed configuration, or of the part that `--package` names."""
-    settings, config = composer.compose(words)
-    tree, hydras = OmegaConf.create(check.as_tree(settings)), compose.plain(config.hydra, options.resolve)
-    for key, value in compose.leaves(compose.own(config)):
-        if "${" in str(value) and not options.resolve:
-            OmegaConf.update(tree, key, value)
-    if options.cfg != "job":
-        tree = tree if options.cfg == "all" else OmegaConf.create()
-        tree.hydra = {key: hydras[key] for key in hydras if key not in ("help", "hydra_help")}
-    if options.package not in (None, "_global_"):
-        tree = OmegaConf.select(tree, options.package)
-    return OmegaConf.to_yaml(tree) if OmegaConf.is_config(tree) else f"{tree}\n"
-
-
-def _complete(composer: Composer, words: list[str]) -> None:
-    """Has Hydra complete the line in COMP_LINE, in a configuration that has every key there is."""
-    line = f"{os.environ.get('COMP_LINE', '')}|"  # whose last word is to be completed
-    config, errors = composer.config(composer.parse(w for w in line.split()[:-1] if "=" in w))
-    tree = OmegaConf.create(compose.own(config))
-    for key, _ in check.fields_of(composer.script.kind, compose.own(config)):
-        if OmegaConf.select(tree, key) is None:
-            OmegaConf.update(tree, key, None, force_add=True)
-    tree.defaults = [composer.name, "_self_"]
-    compose.STORE.store(name="every-key", node=tree)
-    with factory.errors():
+    options = parser.parse_intermixed_args(argv)
+    composer = compose.Composer(
+        script, options.config_name, options.config_dir, options.config_path
+    )
+    words = [word.replace("hydra.run.dir=", "folder=") for word in options.overrides]
+    flags = [one for one in argv if one not in (*options.overrides, "-m", "--multirun")]
+    if options.help:
+        parser.epilog = "groups, chosen with group=member:" + "".join(
+            f"\n  {name:<11} {', '.join(members)}" for name, members in composer.groups().items()
+        )
+        console.say(parser.format_help().rstrip())
+    elif options.shell_completion:
+        line = f"{os.environ.get('COMP_LINE', '')}|"  # whose last word is to be completed
+        config, errors = composer.config(composer.parse(w for w in line.split()[:-1] if "=" in w))
         if not errors:  # nothing completes what follows words that are wrong
-            composer.call_hydra(["--shell-completion", *words], name="every-key")
+            tree = compose.own(config)
+            keys = [f"{key}=null" for key, _ in check.fields_of(script.kind, tree)]
+            _show(composer, OmegaConf.merge(OmegaConf.from_dotlist(keys), tree), flags + words)
+    elif options.cfg:
+        for i, job in enumerate(sweeps.jobs_of(composer, words)[0] if options.multirun else [words]):
+            print("---\n" * (i > 0), end="", flush=True)
+            _show(composer, check.as_tree(composer.settings(job)), flags + job)
+    elif options.info or options.hydra_help:
+        composer.call_hydra(flags + words)
+    elif options.multirun or "hydra.mode=MULTIRUN" in words:
+        return sweeps.sweep(composer, words)
+    else:
+        settings, config = composer.compose(words)
+        if config.hydra.mode == RunMode.MULTIRUN:
+            return sweeps.sweep(composer, words)
+        script.run(settings)
+    return 0
+
+
+# has Hydra show or complete a configuration that has every key there is
+def _show(composer: compose.Composer, tree: Any, arguments: list[str]) -> None:
+    node = {"defaults": [composer.name, "_self_"], **tree}
+    compose.STORE.store(name="every-key", node=node)
+    with factory.errors():
+        composer.call_hydra([*arguments, "--config-name=every-key"])

@@ -54,9 +54,8 @@ class Script(NamedTuple):
     prepare: Callable[[check.Tree, list[str]], check.Tree] = lambda tree, typed: tree
 
 
+# has Hydra find files and groups in the folder given by --config-dir, beside ours
 class FolderOfUser(SearchPathPlugin):
-    """Has Hydra find files and groups in the folder given by `--config-dir`, beside ours."""
-
     path: str | None = None
 
     def manipulate_search_path(self, search_path):
@@ -133,7 +132,7 @@ class Composer:
             groups += [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
             chosen = check.check(self.script.kind, tree, groups)
         except OmegaConfBaseException as error:
-            errors.append((error.full_key or "configuration", program.first_line(error)))
+            errors.append((error.full_key or "configuration", program.shortened(error, 400)))
         except ConfigErrors as error:
             errors += error.errors
         if errors:
@@ -179,11 +178,11 @@ class Composer:
                 names = dict(leaves({"hydra": plain(config.hydra)}))
                 errors.append((key, f"no such key; {check.closest_key(key, names)}"))
             except OmegaConfBaseException as error:
-                errors.append((key, program.first_line(error)))
+                errors.append((key, program.shortened(error, 400)))
         return config, errors
 
     def _composed(self, *groups: str, device: str | None = None) -> DictConfig:
-        """Returns what Hydra composes; `preset=auto` stands for gpu or cpu, by the device."""
+        # preset=auto stands for gpu or cpu, by the device of the process that composes
         config = hydra.compose(self.name, [*groups], return_hydra_config=True)
         if config.hydra.runtime.choices.get("preset") == "auto":
             on_gpu = (device or config.get("device")) != "cpu" and torch.cuda.is_available()
@@ -192,23 +191,22 @@ class Composer:
         OmegaConf.set_struct(config, False)
         return config
 
-    def call_hydra(
-        self, arguments: list[str], task: Callable | None = None, name: str | None = None
-    ) -> None:
+    def call_hydra(self, arguments: list[str], task: Callable | None = None) -> None:
         """Calls Hydra's own main with these arguments. Its errors are raised; it sets sys.argv."""
         os.environ["HYDRA_FULL_ERROR"] = "1"
         sys.argv[1:] = arguments
         global_hydra.GlobalHydra.instance().clear()
-        main = hydra.main(config_path=self.main, config_name=name or self.name, version_base="1.3")
+        main = hydra.main(config_path=self.main, config_name=self.name, version_base="1.3")
         main(task or self.script.run)()
 
 
+# the key or group@package of a word, without the sign before it
 def key_of(override: types.Override) -> str:
     return override.get_key_element().lstrip("+~")
 
 
+# nested dicts of all but Hydra's part, without groups that nothing is in
 def own(config: DictConfig, resolve: bool = False) -> check.Tree:
-    """Returns nested dicts of all but Hydra's part, without groups that nothing is in."""
     tree = plain(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]), resolve)
     return {key: value for key, value in tree.items() if value != {}}
 
@@ -217,8 +215,8 @@ def plain(config: DictConfig, resolve: bool = False) -> check.Tree:
     return OmegaConf.to_container(config, resolve=resolve)
 
 
+# [(dotted key, value)] of nested dicts
 def leaves(tree: check.Tree, prefix: str = "") -> list[tuple[str, Any]]:
-    """Returns [(dotted key, value)] of nested dicts."""
     if not isinstance(tree, dict):
         return [(prefix[1:], tree)]
     return [leaf for key, below in tree.items() for leaf in leaves(below, f"{prefix}.{key}")]

@@ -8,13 +8,15 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from io import StringIO
 from typing import Any, TextIO
 
 from rich import box, progress
 from rich.console import Console
 from rich.table import Table
+
+from megastep.agents.cli import program
 
 #: Seconds between two lines of progress where a line cannot be redrawn.
 LINE_EVERY = 10
@@ -61,13 +63,21 @@ def open_streams() -> None:
 
 
 def say(text: str, file: TextIO | None = None) -> None:
-    """Prints one line or several."""
     print(textwrap.indent(text, prefix, bool), file=file or sys.stdout, flush=True)
 
 
+# one line on stderr; can stand in for `warnings.showwarning`
 def warn(sentence: object, *_: Any, **__: Any) -> None:
-    """Prints one line on stderr. Can stand in for `warnings.showwarning`."""
     say(f"warning: {sentence}", sys.stderr)
+
+
+@contextlib.contextmanager
+def warned(prefix: str = "") -> Iterator[None]:
+    """Turns an OSError or a UserError into a warning that begins with `prefix`."""
+    try:
+        yield
+    except (OSError, program.UserError) as error:
+        warn(f"{prefix}{error}")
 
 
 def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
@@ -113,16 +123,16 @@ class Progress(progress.Progress):
             say(text)
 
 
+# a count in three digits: 1.23M
 def number(value: float) -> str:
-    """Returns a count in three digits: 1.23M."""
     for limit, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if value >= limit:
             return f"{value / limit:.3g}{unit}"
     return f"{value:.0f}"
 
 
+# a time in its two largest units: 5 s, 2 min 5 s, 1 h 2 min
 def duration(seconds: float) -> str:
-    """Returns a time in its two largest units: 5 s, 2 min 5 s, 1 h 2 min."""
     minutes, seconds = divmod(max(0, round(seconds)), 60)
     if minutes < 60:
         return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"

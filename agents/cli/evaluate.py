@@ -90,7 +90,6 @@ def _evaluate(cfg, loaded, trained, env_settings, geometry, device):
 
 
 def cells(row: dict) -> dict[str, str]:
-    """Returns a row of the table as text by column: each metric beside its interval."""
     cut, metrics = f", {row['unfinished']} cut short" if row["unfinished"] else "", {}
     for name, metric in row["metrics"].items():
         texts = [f"{value:.3g}" for value in metric.values() if value is not None] or 3 * ["none"]
@@ -110,11 +109,9 @@ def cells(row: dict) -> dict[str, str]:
 
 
 class Player(NamedTuple):
-    """A policy under a name, and the number of samples it has learnt from."""
-
     name: str
     policy: Any
-    step: int | None = None
+    step: int | None = None  # the number of samples it has learnt from
 
 
 #: Settings of an environment for duels, where it has them.
@@ -181,7 +178,6 @@ class Arena:
         self.place, self.source = runs.place(env, geometry, homes, cfg.split)
 
     def play(self, player: Player, opponent: Player) -> Any:
-        """Returns their duels, as `duels.play` does."""
         with factory.errors():
             options = self.cfg.seed, self.cfg.greedy
             return duels.play(self.env, player.policy, opponent.policy, *options)
@@ -220,7 +216,7 @@ class Arena:
         title = f"Ratings by duels of {self.place}, seed {self.cfg.seed}"
         lines = [[form.format_map(row) for form in RATINGS.values()] for row in rows]
         console.say(f"{title}\n{console.table([*RATINGS], lines)}")
-        with runs.writing(folder, "they are only printed"):
+        with program.errors("The ratings are only printed: "):
             ratings.write(folder, rows, title)
         console.say(f"Plot: {folder / 'ratings.svg'}")
         return folder / "ratings.csv"

@@ -2,8 +2,7 @@
 
 import dataclasses
 import inspect
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -23,18 +22,24 @@ from megastep.capture import state_tree
 PROBE = 65
 #: Environments of a sample, and the steps in which they must keep the contract.
 SAMPLE, SAMPLE_STEPS = 4, 16
+#: Parts of a policy that only training needs.
+CRITIC = ("critic", "prediction")
 #: What the library raises for bad arguments, files and devices, and for too little memory.
-KINDS = (ValueError, OSError, engine.EngineError, torch.OutOfMemoryError, checkpoint.CheckpointError)
-KINDS += (loggers.LoggerError, LearnerError, contract.ContractError)
+KINDS = (
+    ValueError,
+    OSError,
+    torch.OutOfMemoryError,
+    engine.EngineError,
+    checkpoint.CheckpointError,
+    loggers.LoggerError,
+    LearnerError,
+    contract.ContractError,
+)
 
 
-@contextmanager
-def errors(prefix: str = "", kinds: tuple[type, ...] = KINDS) -> Iterator[None]:
+def errors(prefix: str = "") -> AbstractContextManager:
     """Turns errors of the library into a UserError that begins with `prefix`. For setting up."""
-    try:
-        yield
-    except kinds as error:
-        raise program.UserError(prefix + program.shortened(program.first_line(error), 400)) from error
+    return program.errors(prefix, KINDS)
 
 
 def construct(settings: Any, name: str | None = None, **arguments: Any) -> Any:
@@ -52,11 +57,10 @@ def changed(settings: Any, **changes: Any) -> Any:
 
 
 def make_device(name: str) -> torch.device:
-    """Returns a device by name. A GPU becomes PyTorch's current one, on which graphs are captured."""
     with errors():
         device = engine.device(name)
     if device.type == "cuda":
-        torch.cuda.set_device(device)
+        torch.cuda.set_device(device)  # on which graphs are captured
     return device
 
 
@@ -131,7 +135,6 @@ def share_threads(width: int) -> None:
 
 
 def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
-    """Returns the learner that settings describe, to improve a policy."""
     learner = construct(settings, policy=policy, seed=seed, graph=True)
     with errors(f"{settings.name} is no learner: "):
         check_learner(learner)
@@ -174,7 +177,7 @@ def make_bot(name: str, settings: Env, env: Any) -> Any:
             raise ValueError(f"its actions are not those of {space!r}")
 
     # a policy may do whatever, where it was not made for
-    with errors(f"{name} cannot play in {where}; name a policy made for it: ", (Exception,)):
+    with program.errors(f"{name} cannot play in {where}; name one made for it: ", (Exception,)):
         bot = construct(settings, name)
         decision, _ = bot(env.reset(), bot.initial(n_lanes, env.device))
         spaces.map(check_actions, env.action_space, decision["actions"])
@@ -189,10 +192,8 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> checkpoin
 
 def config_of(loaded: checkpoint.Checkpoint) -> Train:
     """Returns the settings that a checkpoint was trained with. UserError if they cannot be used."""
-    try:
+    with program.errors(f"{loaded.path} cannot be used: ", (program.ConfigErrors,)):
         return check.check(Train, loaded.config["train"])
-    except program.ConfigErrors as error:
-        raise program.UserError(f"{loaded.path} cannot be used: {program.shortened(error, 400)}") from None
 
 
 def spaces_of(env: Any) -> dict[str, str]:
@@ -207,31 +208,21 @@ def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Non
     Raises:
         UserError: naming what differs, if they do not fit.
     """
-    if differing := _differences(loaded.config["spaces"], spaces_of(env)):
+    saved, present = loaded.config["spaces"], spaces_of(env)
+    if differing := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]:
+        changes = [f"{k} was {saved.get(k)} and is {present.get(k)}" for k in differing]
         raise program.UserError(
-            f"{loaded.path} was trained in another environment: {'; '.join(differing)}. Choose the "
+            f"{loaded.path} was trained in another environment: {'; '.join(changes)}. Choose the "
             "env it was trained in"
         )
-    saved, present = loaded.state["policy"], policy.state_dict()
+    weights = loaded.state["policy"]
     if policy.critic is None:  # what only training needs
-        saved = {k: v for k, v in saved.items() if not k.startswith(("critic.", "prediction."))}
-    shapes = ({k: tuple(v.shape) for k, v in weights.items()} for weights in (saved, present))
-    if differing := _differences(*shapes):
-        agent = " ".join(f"agent.{k}={v}" for k, v in loaded.config["train"]["agent"].items())
-        raise program.UserError(
-            f"The weights of {loaded.path} do not fit this agent: {differing[0]}. It was trained "
-            f"with {agent}"
-        )
-    policy.load_state_dict({name: saved[name] for name in present})
+        weights = {k: v for k, v in weights.items() if k.split(".")[0] not in CRITIC}
+    agent = " ".join(f"agent.{k}={v}" for k, v in loaded.config["train"]["agent"].items())
+    prefix = f"{loaded.path} does not fit this agent, but one with {agent}: "
+    with program.errors(prefix, (RuntimeError,)):
+        policy.load_state_dict(weights)
 
 
 def _nbytes(env):
     return sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())
-
-
-def _differences(saved, present):
-    return [
-        f"{name} was {saved.get(name, 'absent')} and is {present.get(name, 'absent')}"
-        for name in {**present, **saved}
-        if saved.get(name) != present.get(name)
-    ]

@@ -1,8 +1,9 @@
 """The program as its user sees it: what it is called, and the errors it ends with."""
 
+import contextlib
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -11,8 +12,8 @@ DISTRIBUTION = "megastep-flatland"
 ROOT = Path(__file__).resolve().parents[2]
 
 
+# `megastep train`, or `train.py` after `python`
 def name(script: str, python: str = "") -> str:
-    """Returns what a script is called: `megastep train`, or `train.py` after `python`."""
     is_installed = os.path.basename(sys.argv[0]) == "megastep" or not (ROOT / "train.py").exists()
     return f"megastep {script}" if is_installed else f"{python}{script}.py"
 
@@ -48,10 +49,17 @@ class ConfigErrors(UserError):
         return "\n  ".join([head, *(f"{key}: {shortened(text, 400)}" for key, text in self.errors)])
 
 
+@contextlib.contextmanager
+def errors(
+    prefix: str = "", kinds: tuple[type[BaseException], ...] = (OSError, ValueError)
+) -> Iterator[None]:
+    """Turns errors of these kinds into a UserError that begins with `prefix`."""
+    try:
+        yield
+    except kinds as error:
+        raise UserError(prefix + shortened(error, 400)) from error
+
+
 def shortened(text: object, length: int = 120) -> str:
-    text = " ".join(str(text).split())
+    text = " ".join(str(text).split()) or type(text).__name__
     return text if len(text) <= length else f"{text[: length - 3]}..."
-
-
-def first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

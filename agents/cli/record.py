@@ -14,6 +14,7 @@ from megastep.agents.cli import (
     console,
     evaluate,
     factory,
+    program,
     runs,
     settings,
 )
@@ -58,7 +59,7 @@ def run(cfg: settings.Record) -> Path:
         seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
         policy = duels.lineup(policy, opponent.policy, seat, env.n_agents)
     # a video is the last thing that a run should fail for
-    with factory.errors(f"The video {path} could not be made: ", (Exception,)):
+    with program.errors(f"The video {path} could not be made: ", (Exception,)):
         film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)
     console.say(f"Filmed {cfg.steps} steps: {path}")
     return path

@@ -32,16 +32,8 @@ LOCK_TIMEOUT = 0.2
 #: What file systems without locks answer.
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 INTERVAL = "95 % interval"
-
-
-@contextlib.contextmanager
-def writing(path: Path, cure: str = "choose another with folder=") -> Iterator[None]:
-    """Turns an OSError into a UserError that names what cannot be written, and the cure."""
-    try:
-        yield
-    except (OSError, ValueError) as error:  # ValueError: a NUL byte
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{shortened(path)} cannot be written ({reason}); {cure}") from error
+#: The beginning of an error's message.
+CANNOT = "{} cannot be written; choose another with folder=: "
 
 
 # ---- New folders ----
@@ -49,7 +41,7 @@ def writing(path: Path, cure: str = "choose another with folder=") -> Iterator[N
 
 def make(path: Path) -> Path:
     """Makes a new folder and returns it; a taken name gets -2, -3, ..."""
-    with writing(path):
+    with program.errors(CANNOT.format(shortened(path))):
         path.parent.mkdir(parents=True, exist_ok=True)
         for number in itertools.count(1):
             folder = path if number == 1 else path.with_name(f"{path.name}-{number}")
@@ -66,7 +58,7 @@ def new(cfg: Train) -> Path:
         name = f"{label(cfg.env.name)}-{label(cfg.geometry.name)}-{cfg.seed}"
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{name}")
     folder = Path(cfg.folder)
-    with writing(folder):
+    with program.errors(CANNOT.format(shortened(folder))):
         if not os.path.exists(folder):
             return make(folder)
         # Hydra writes .hydra/ and a log before the job of a sweep starts
@@ -98,7 +90,7 @@ def locked(folder: Path) -> Iterator[None]:
             f"it: kill {path.read_text()}"
         ) from None
     except OSError as error:
-        with writing(folder):
+        with program.errors(CANNOT.format(folder)):
             if error.errno not in NO_LOCKS:
                 raise
         console.warn(f"{folder} is on a file system without locks; train in it only once at a time")
@@ -113,13 +105,10 @@ def record_start(folder: Path) -> None:
     """Notes that training starts in a folder now. `latest` follows these notes, since folders'
     times change with whatever is written there, and clocks are moved.
     """
-    try:
-        with writing(STARTED, f"`latest` will not find {folder}"):
-            RUNS.mkdir(exist_ok=True)
-            with open(STARTED, "ab") as file:
-                file.write(os.fsencode(folder) + b"\n")
-    except UserError as error:
-        console.warn(error)
+    with console.warned(f"`latest` will not find {folder}: "):
+        RUNS.mkdir(exist_ok=True)
+        with open(STARTED, "ab") as file:
+            file.write(os.fsencode(folder) + b"\n")
 
 
 # ---- Existing folders ----
@@ -147,27 +136,25 @@ def find(name: str) -> Path:
         return folders[-1]
     if any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints")):
         return path
-    near = difflib.get_close_matches(name, map(str, folders), n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]}?" if near else "train.py makes runs"
     problem = "has no folder named checkpoints" if os.path.exists(path) else "does not exist"
-    raise UserError(f"The run {shortened(name)} {problem}; {hint}")
+    near = difflib.get_close_matches(name, map(str, folders), n=1, cutoff=0.4) or ["runs/..."]
+    raise UserError(f"The run {shortened(name)} {problem}; did you mean {near[0]}?")
 
 
 def resume_command(folder: Path) -> str:
-    """Returns what to type to continue a run, quoted for the shell and for Hydra where needed."""
-    word = f"resume={folder}"
-    if not re.fullmatch(r"[A-Za-z0-9_./:=+-]+", word):
-        word = shlex.quote('resume="{}"'.format(str(folder).replace('"', '\\"')))
-    return f"{program.name('train', 'python ')} {word}"
+    # quoted for the shell and for Hydra where needed
+    quoted = shlex.quote('resume="{}"'.format(str(folder).replace('"', '\\"')))
+    is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
+    return f"{program.name('train', 'python ')} {f'resume={folder}' if is_plain else quoted}"
 
 
+# a checkpoint, or the folder of a run's checkpoints
 def checkpoints_of(path: Path) -> Path:
-    """Returns where to load from a path that `find` returned: a checkpoint, or a folder of them."""
     return path if (path / "manifest.json").exists() else path / "checkpoints"
 
 
+# the folder of the run that a path belongs to
 def folder_of(path: Path) -> Path:
-    """Returns the run folder of a path that `find` returned, or of a checkpoint."""
     return path.parent.parent if checkpoints_of(path) == path else path
 
 
@@ -194,7 +181,7 @@ def write_table(
     result = dict(title=title, checkpoint=str(loaded.path), step=loaded.step, rows=rows)
     result["evaluation"] = as_tree(cfg)
     console.say(f"{title}\n{console.table(head, lines)}")
-    with writing(folder, "it is only printed"):
+    with program.errors("The evaluation is only printed: "):
         folder.mkdir(exist_ok=True)
         markdown = f"{title}\n\n{console.table(head, lines, box.MARKDOWN)}\n"
         atomic_files.replace(folder / f"{name}.md", markdown.encode())

@@ -139,9 +139,7 @@ class Common:
     device: Annotated[str, AfterValidator(_device)]
 
     def errors(self) -> dict[str, Any]:
-        """Returns {dotted key: sentence} of settings that contradict each other, or a false value
-        for those that do not.
-        """
+        # {dotted key: sentence} of settings that contradict each other, false for those that do not
         return {}
 
     @model_validator(mode="after")

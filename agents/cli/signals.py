@@ -28,12 +28,10 @@ class Interrupted(BaseException):
 
 
 def announce(number: int) -> None:
-    """Says that the work will stop soon."""
     _write(sys.__stdout__, "\nStopping after this update (Ctrl-C again to quit now).")
 
 
 def interrupt(number: int) -> NoReturn:
-    """Raises Interrupted out of whatever is going on."""
     raise Interrupted(number, f"stopped by {signal.Signals(number).name}")
 
 
@@ -85,10 +83,7 @@ def stop(process: int) -> None:
 
 
 def _install(handler: Callable) -> dict[int, object]:
-    """Handles all signals, in the main thread. Returns the handlers there were.
-
-    `nohup` has SIGHUP ignored, which stays so.
-    """
+    # in the main thread; nohup has SIGHUP ignored, which stays so; returns the handlers there were
     if threading.current_thread() is not threading.main_thread():
         return {}
     before = {number: signal.getsignal(number) for number in SIGNALS}

@@ -12,6 +12,7 @@ import re
 import shutil
 import socket
 import sys
+import tempfile
 import time
 import traceback
 import uuid
@@ -79,8 +80,8 @@ def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], Any]
     return jobs, config
 
 
+# the words that a word of a sweep may become; None where a search leaves it out
 def _values(override: Override) -> list[str | None]:
-    """Returns the words that a word of a sweep may become; None where a search leaves it out."""
     key, sweep = override.get_key_element(), override.value()
     if override.is_interval_sweep():
         inside = sweep.start + INSIDE * (sweep.end - sweep.start)
@@ -103,7 +104,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
     config = jobs_of(composer, words)[1]
     folder = Path(config.sweep.dir)
     is_new = not folder.exists()
-    with runs.writing(folder, "choose another with hydra.sweep.dir="):
+    with program.errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
         if "hydra.sweep.dir" not in overrides:
             folder = runs.make(folder)  # another sweep may start in the same second
         folder.mkdir(parents=True, exist_ok=True)
@@ -124,7 +125,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
         with signals.handled(job.interrupt):
             composer.call_hydra(["--multirun", *words], job)
     except Exception as error:  # a launcher's or a sweeper's, as when a process is killed
-        problem = shortened(program.first_line(error), 400)
+        problem = shortened(error, 400)
     finally:
         if rows := job.rows():
             report(folder, rows)
@@ -158,8 +159,8 @@ class Job:
         """Returns the job's score, None if it failed: a sweeper is to go on. Raises Interrupted
         alone.
         """
-        hydra, result = HydraConfig.get(), None
-        words, number, began = [*hydra.overrides.task], hydra.job.num, time.monotonic()
+        hydra, began, result = HydraConfig.get(), time.monotonic(), None
+        words, number = [*hydra.overrides.task], hydra.job.num
         os.chdir(self.start)  # where paths are relative to, whatever hydra.job.chdir says
         if os.getpid() != self.process:  # its lines are among those of others
             warnings.showwarning, console.prefix = console.warn, f"job {number}: "
@@ -179,7 +180,7 @@ class Job:
                 atomic_files.replace(path, json.dumps(row).encode())
             try:
                 stack.enter_context(signals.handled(signals.interrupt))
-                gpu = stack.enter_context(one_gpu(self.records, number))
+                gpu = stack.enter_context(one_gpu())
                 words += [word for word in hydra.overrides.hydra if "searchpath" in word]
                 cfg, changes = Composer(*self.source).settings(words), {}
                 if cfg.device == "cuda" and gpu is not None:
@@ -233,31 +234,23 @@ class Job:
 
 
 @contextlib.contextmanager
-def one_gpu(folder: Path, number: int) -> Iterator[int | None]:
+def one_gpu() -> Iterator[int | None]:
     """Makes a GPU with the fewest jobs on it PyTorch's current one, which device=auto means.
 
-    Yields its index, None where there is no choice. Jobs know of each other by locks on files in
-    `folder`, one for each place on each GPU of this machine; the system drops them when a process
-    ends. Where files cannot be locked, job `number` takes the GPUs in turn.
+    Yields its index, None where there is no choice. Jobs know of each other by locks on temporary
+    files, one for each place on each GPU of this machine; the system drops them when a process
+    ends.
     """
     n_gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if n_gpus < 2:
-        yield None
-        return
     with contextlib.ExitStack() as stack:
-        for place in itertools.count():
-            try:
-                path = folder.parent / f"{socket.gethostname()}-gpu-{place}"
+        for place in itertools.count() if n_gpus > 1 else ():
+            path = Path(tempfile.gettempdir(), f"megastep-{os.getuid()}-gpu-{place}.lock")
+            with contextlib.suppress(filelock.Timeout):
                 stack.enter_context(filelock.FileLock(path, blocking=False))
+                stack.callback(torch.cuda.set_device, torch.cuda.current_device())
+                torch.cuda.set_device(place % n_gpus)
                 break
-            except filelock.Timeout:
-                continue
-            except OSError:
-                place = number
-                break
-        stack.callback(torch.cuda.set_device, torch.cuda.current_device())
-        torch.cuda.set_device(place % n_gpus)
-        yield place % n_gpus
+        yield place % n_gpus if n_gpus > 1 else None
 
 
 # ---- The table ----
@@ -273,17 +266,14 @@ def report(folder: Path, rows: list[dict[str, Any]]) -> None:
     csv.writer(text).writerows([head, *([row.get(name) for name in head] for row in rows)])
     cells = [[_brief(row.get(name)) for name in head[:-1]] for row in rows]
     console.say(f"Sweep\n{console.table(head[:-1], cells)}")
-    try:
-        with runs.writing(folder, "the table is only printed"):
-            atomic_files.replace(folder / "sweep.csv", text.getvalue().encode())
-            markdown = console.table(head[:-1], cells, box.MARKDOWN)
-            atomic_files.replace(folder / "sweep.md", f"{markdown}\n".encode())
+    with console.warned("the table is only printed: "):
+        atomic_files.replace(folder / "sweep.csv", text.getvalue().encode())
+        markdown = console.table(head[:-1], cells, box.MARKDOWN)
+        atomic_files.replace(folder / "sweep.md", f"{markdown}\n".encode())
         console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")
-    except UserError as error:
-        console.warn(error)
 
 
 def _brief(value: Any) -> str:
     # with at most four digits: what a search tries has up to 17
     text = "" if value is None else str(value)
-    return f"{float(text):.4g}" if re.fullmatch(r"-?[\d.e-]{7,}", text) else text
+    return f"{float(text):.4g}" if re.fullmatch(r"-?\d*\.\d{5,}(e-?\d+)?", text) else text

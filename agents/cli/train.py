@@ -86,9 +86,8 @@ def make_trainer(
     opponents = factory.make_opponents(cfg, env, sample, policy)
     for name in ("checkpoints", "snapshots") if cfg.resume else ():
         checkpoint.rewind(folder / name, loaded.step)
-    wandb = dict(vars(cfg.logger)) if cfg.logger.name == "wandb" else None
     config = {"train": as_tree(cfg), "spaces": factory.spaces_of(env)}
-    snapshots = saver.Saver(folder / "snapshots", config, keep=10**9)
+    wandb = vars(cfg.logger) | {"name": folder.name, "config": config["train"]}
     with factory.errors():
         improves = Trainer(
             opponents or env,
@@ -97,7 +96,7 @@ def make_trainer(
             loggers.Loggers(
                 folder,
                 loaded.step if cfg.resume else 0,
-                wandb and wandb | {"name": folder.name, "config": as_tree(cfg)},
+                wandb if cfg.logger.name == "wandb" else None,
             ),
             saver.Saver(folder / "checkpoints", config, cfg.keep_checkpoints),
             budget.Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
@@ -105,7 +104,9 @@ def make_trainer(
             save_every=cfg.checkpoint_seconds,
             on_report=lambda running: progress.show(*progress_of(running)),
             opponents=opponents,
-            snapshots=saver.Snapshots(snapshots, cfg.snapshots),
+            snapshots=saver.Snapshots(
+                saver.Saver(folder / "snapshots", config, keep=10**9), cfg.snapshots
+            ),
         )
         if cfg.resume:
             improves.load_state_dict(loaded.state)
@@ -129,8 +130,8 @@ def progress_of(running: Trainer) -> tuple[float | None, list[str]]:
     return 1 - left if running.budget.is_limited else None, words
 
 
+# the returns of groups of lanes, and metrics, if they are few enough for one line
 def few_means(latest: dict[str, float], metrics: Sequence[str], groups: Sequence[str]) -> list[str]:
-    """Returns the returns of groups of lanes, and metrics, if they are few enough for one line."""
     names = {group: f"episode/return/{group}" for group in groups}
     names |= {name: f"episode/{name}" for name in metrics}
     shown = [f"{name} {latest[key]:.3g}" for name, key in names.items() if key in latest]
@@ -155,7 +156,7 @@ def run(cfg: settings.Train) -> Path:
             if not cfg.resume:
                 undo.callback(shutil.rmtree, folder, ignore_errors=True)
             running = make_trainer(cfg, folder, device, progress)
-            with runs.writing(folder):
+            with program.errors(runs.CANNOT.format(folder)):
                 text = yaml.safe_dump(as_tree(cfg), sort_keys=False, allow_unicode=True)
                 atomic_files.replace(folder / "config.yaml", text.encode())
             undo.pop_all()
@@ -170,17 +171,16 @@ def run(cfg: settings.Train) -> Path:
         except (engine.EngineError, torch.OutOfMemoryError) as error:
             saved = running.save_checkpoint.unsaved or "What was learnt last could not be saved"
             saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
-            reason = program.first_line(error).rstrip(".")
+            reason = str(error).partition("\n")[0].rstrip(".")
             raise program.UserError(f"{reason}. {saved}. {resume}") from error
         finally:
             loggers.curves(folder)
         if numbers:
-            raise signals.Interrupted(
-                numbers[0], f"Stopped after {running.samples:,} samples. {resume}"
-            )
-        if running.save_checkpoint.unsaved:
-            raise program.UserError(running.save_checkpoint.unsaved)
-        nonfinite = running.nonfinite_value
+            text = f"Stopped after {running.samples:,} samples. {resume}"
+            raise signals.Interrupted(numbers[0], text)
+        nonfinite, unsaved = running.nonfinite_value, running.save_checkpoint.unsaved
+        if unsaved:
+            raise program.UserError(unsaved)
         del running  # its memory is the evaluation's now
         finish(cfg, folder)
         if nonfinite and nonfinite.is_from_env:
@@ -189,15 +189,12 @@ def run(cfg: settings.Train) -> Path:
 
 
 def finish(cfg: settings.Train, folder: Path) -> None:
-    """Evaluates and films the trained agent, if asked to."""
     common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
     if cfg.finish.evaluate:
         evaluate.run(settings.Evaluate(episodes=cfg.finish.episodes, baseline=True, **common))
     if cfg.finish.record:
-        try:
+        with console.warned():
             record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
-        except program.UserError as error:
-            console.warn(error)
 
 
 def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
