@@ -124,19 +124,17 @@ class Composer:
         config, errors = self.config(overrides)
         cure = "is an environment variable, and would be written to config.yaml; type its value"
         secret = [(k, cure) for k, value in leaves(own(config)) if "${oc.env:" in str(value)]
-        errors += secret
         try:
             typed = [key for key in map(key_of, overrides) if not key.startswith("hydra")]
             tree = self.script.prepare(own(config, resolve=not secret), typed)
-            groups = self.loader.list_groups("")
-            groups += [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
-            chosen = check.check(self.script.kind, tree, groups)
+            groups = [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
+            chosen = check.check(self.script.kind, tree, groups + self.loader.list_groups(""))
         except OmegaConfBaseException as error:
             errors.append((error.full_key or "configuration", program.shortened(error, 400)))
         except ConfigErrors as error:
             errors += error.errors
-        if errors:
-            raise ConfigErrors(errors)
+        if errors + secret:
+            raise ConfigErrors(errors + secret)
         return chosen, config
 
     def config(self, overrides: list[types.Override]) -> tuple[DictConfig, list[tuple[str, str]]]:

@@ -45,9 +45,7 @@ def main() -> int:
 
 
 def _words_to_complete(words: list[str]) -> list[str]:
-    """Returns the words that complete the line which the shell has in COMP_LINE: a script, and its
-    options. The names of scripts are completed here.
-    """
+    # the line is in COMP_LINE: a script, completed here, and its options
     line = os.environ.get("COMP_LINE", "")
     script = "".join(line.split()[1:2])
     if not any(word.startswith("query=") for word in words):
@@ -74,9 +72,9 @@ def run_script(name: str) -> int:
 
 def wants_first_gpu(words: list[str]) -> bool:
     """Returns whether a command line may use the first GPU in this process."""
-    devices = [word.partition("=")[2] for word in words if word.startswith("device=")]
     is_elsewhere = any(word.startswith(WITHOUT_GPU) for word in words)
-    return not is_elsewhere and all(name in ("auto", "cuda", "cuda:0") for name in devices)
+    devices = {word.partition("=")[2] for word in words if word.startswith("device=")}
+    return not is_elsewhere and devices <= {"auto", "cuda", "cuda:0"}
 
 
 def create_cuda_context() -> None:

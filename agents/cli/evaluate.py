@@ -62,24 +62,23 @@ def run(cfg: settings.Evaluate) -> Path:
         arena = Arena(cfg, loaded, *where, device)
         path = arena.rate() if cfg.ratings else arena.duel()
     else:
-        path = _evaluate(cfg, loaded, trained, *where, device)
+        path = first_episodes(cfg, loaded, trained, *where, device)
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
 
 
-def _evaluate(cfg, loaded, trained, env_settings, geometry, device):
+def first_episodes(cfg, loaded, trained, env_settings, geometry, device) -> Path:
     homes = factory.homes(env_settings, geometry, cfg.split, cfg.episodes)
     env_settings = factory.changed(env_settings, n_envs=cfg.episodes, resample=False)
     env, rows = factory.make_env(env_settings, homes, cfg.seed, device), []
     policy = factory.make_policy(trained.agent, env)
     factory.load_weights(policy, env, loaded)
-    players = {"trained, greedy" if cfg.greedy else "trained": policy}
-    if cfg.baseline:
-        players["random"] = evaluation.RandomActions(env.action_space)
-    for name, player in players.items():
-        episodes = evaluation.first_episodes(env, player, cfg.seed, cfg.greedy and player is policy)
-        roles = getattr(env, "roles", None)
-        rows += [{"agent": name, **row} for row in evaluation.summaries(episodes, roles)]
+    players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
+    players += [("random", evaluation.RandomActions(env.action_space), False)] * cfg.baseline
+    for name, player, greedy in players:
+        episodes = evaluation.first_episodes(env, player, cfg.seed, greedy)
+        summaries = evaluation.summaries(episodes, getattr(env, "roles", None))
+        rows += [{"agent": name, **row} for row in summaries]
     place, source = runs.place(env_settings, geometry, homes, cfg.split)
     title = (
         f"{place}, after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, "

@@ -165,8 +165,8 @@ def place(env: Env, geometry: Geometry, homes: list, split: str) -> tuple[str, s
     """Returns where a run is evaluated, for titles, and the source of homes, for file names."""
     stem = Path(getattr(geometry, "path", None) or "").stem
     source = "-".join(filter(None, [label(geometry.name), stem])) if homes else label(env.name)
-    which = "all" if split == "all" else f"the {split}"
-    return label(env.name) + (f" in {which} homes of {source}" if homes else ""), source
+    place = f" in {'all' if split == 'all' else f'the {split}'} homes of {source}" if homes else ""
+    return label(env.name) + place, source
 
 
 def write_table(
@@ -178,8 +178,13 @@ def write_table(
     name = "-".join(filter(None, [*names, "greedy" if cfg.greedy else ""]))
     folder, name = folder_of(loaded.path) / "evaluations", re.sub(r"[^\w.-]", "-", name)[:200]
     head, lines = [*cells[0]], [[*row.values()] for row in cells]
-    result = dict(title=title, checkpoint=str(loaded.path), step=loaded.step, rows=rows)
-    result["evaluation"] = as_tree(cfg)
+    result = dict(
+        title=title,
+        checkpoint=str(loaded.path),
+        step=loaded.step,
+        evaluation=as_tree(cfg),
+        rows=rows,
+    )
     console.say(f"{title}\n{console.table(head, lines)}")
     with program.errors("The evaluation is only printed: "):
         folder.mkdir(exist_ok=True)

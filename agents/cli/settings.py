@@ -115,8 +115,8 @@ def _group(group: str) -> Any:
     return Annotated[Any, BeforeValidator(settings)]
 
 
+# `explorer` for megastep.envs.explorer:Explorer
 def label(name: str) -> str:
-    """Returns an import path in short: `explorer` for megastep.envs.explorer:Explorer."""
     return name.rpartition(":")[2].rpartition(".")[2].lower()
 
 

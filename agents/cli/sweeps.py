@@ -182,13 +182,13 @@ class Job:
                 stack.enter_context(signals.handled(signals.interrupt))
                 gpu = stack.enter_context(one_gpu())
                 words += [word for word in hydra.overrides.hydra if "searchpath" in word]
-                cfg, changes = Composer(*self.source).settings(words), {}
+                cfg = Composer(*self.source).settings(words)
+                cfg = factory.changed(cfg, folder=os.path.relpath(row["folder"]))
                 if cfg.device == "cuda" and gpu is not None:
-                    changes["device"] = f"cuda:{gpu}"
+                    cfg = factory.changed(cfg, device=f"cuda:{gpu}")
                 if getattr(getattr(cfg, "logger", None), "group", "") is None:
-                    changes["logger"] = factory.changed(cfg.logger, group=self.group)
-                changes["folder"] = os.path.relpath(row["folder"])
-                result = self.source[0].run(factory.changed(cfg, **changes))
+                    cfg = factory.changed(cfg, logger=factory.changed(cfg.logger, group=self.group))
+                result = self.source[0].run(cfg)
                 row |= {"state": DONE, **(runs.outcome(result) if result else {})}
             except signals.Interrupted as stop:
                 row["state"] = f"interrupted: {stop.args[1]}"
@@ -229,8 +229,8 @@ class Job:
 
     def running(self) -> list[int]:
         here = RUNNING, socket.gethostname()
-        rows = [row for row in self.rows() if (row["state"], row["host"]) == here]
-        return [row["process"] for row in rows if row["process"] != os.getpid()]
+        pids = [row["process"] for row in self.rows() if (row["state"], row["host"]) == here]
+        return [pid for pid in pids if pid != os.getpid()]
 
 
 @contextlib.contextmanager
@@ -260,8 +260,8 @@ def report(folder: Path, rows: list[dict[str, Any]]) -> None:
     """Prints the table of a sweep and writes it into its folder: sweep.md as it is printed, and
     sweep.csv with all digits.
     """
-    keys = dict.fromkeys(key for row in rows for key in row["varied"])
-    head, text = ["job", *keys, *COLUMNS], io.StringIO()
+    head, text = ["job", *dict.fromkeys(k for row in rows for k in row["varied"])], io.StringIO()
+    head += COLUMNS
     rows = [{**row, **row["varied"], "job": row["number"]} for row in rows]
     csv.writer(text).writerows([head, *([row.get(name) for name in head] for row in rows)])
     cells = [[_brief(row.get(name)) for name in head[:-1]] for row in rows]

@@ -1,6 +1,7 @@
 """Trains a policy. `train --help` lists the choices; `run(cfg)` is the same from Python."""
 
 import contextlib
+import functools
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -222,9 +223,7 @@ def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
         )
     for key in typed:
         *groups, leaf = key.split(".")
-        source, target = tree, saved
-        for group in groups:
-            source, target = source[group], target[group]
+        source, target = (functools.reduce(dict.get, groups, one) for one in (tree, saved))
         target[leaf] = source[leaf]
     if spent := [
         (name, f"the run has had {round(state[name], 1):,} of {saved[name]:,}; give {name}= more")
