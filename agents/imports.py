@@ -1,4 +1,4 @@
-"""Classes and functions by import path, `module:attribute`, from wherever Python finds them."""
+"""Imports classes and functions by path: `module:attribute`."""
 
 import importlib
 import os
@@ -10,8 +10,10 @@ from megastep.settings import closest
 
 
 def import_object(name: str) -> Callable:
-    """The class or function called `module:attribute`; the current folder is searched, too.
-    ValueError, one sentence, if there is none.
+    """Returns the class or function at `module:attribute`. Also searches the current folder.
+
+    Raises:
+        ValueError: if it cannot be imported, in one sentence.
     """
     module, _, attribute = name.partition(":")
     if not (module and attribute):
@@ -19,24 +21,26 @@ def import_object(name: str) -> Callable:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     try:
-        found: Any = importlib.import_module(module)
+        imported: Any = importlib.import_module(module)
     except Exception as error:  # whatever a module does as it is imported
         reason = (str(error).splitlines() or [""])[0]
         kind = "" if isinstance(error, ModuleNotFoundError) else f"{type(error).__name__}: "
         raise ValueError(f"{name} cannot be imported ({kind}{reason})") from error
     for part in attribute.split("."):
-        if not hasattr(found, part):
-            near = closest(part, [word for word in dir(found) if not word.startswith("_")])
+        if not hasattr(imported, part):
+            near = closest(part, [word for word in dir(imported) if not word.startswith("_")])
             raise ValueError(f"{name} cannot be imported: {module} has no {part}; {near}")
-        found = getattr(found, part)
-    if not callable(found):
-        raise ValueError(f"{name} is a {type(found).__name__}, neither a class nor a function")
-    return found
+        imported = getattr(imported, part)
+    if not callable(imported):
+        raise ValueError(f"{name} is a {type(imported).__name__}, neither a class nor a function")
+    return imported
 
 
 def resolve(name: str, table: dict[str, Any]) -> Callable:
-    """What `name` stands for: a word of the table, or an import path. ValueError, one sentence, if
-    it is neither.
+    """Returns the entry of `table` called `name`, or the class or function at this import path.
+
+    Raises:
+        ValueError: if it is neither, in one sentence.
     """
     if name in table:
         return table[name]

@@ -1,12 +1,12 @@
-"""Settings: the arguments of a constructor or a function, checked by annotations and defaults.
+"""Settings: arguments of constructors and functions, checked by pydantic from their annotations.
 
-pydantic reads the annotations, whoever wrote them::
+::
 
     @checked
     def __init__(self, n_envs: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 128): ...
 
-A command line makes a dataclass of them with `settings_of`. Kinds are kept apart: true is no
-integer, "3" no number, and neither nan nor infinity is a number.
+The command line makes a dataclass of the same arguments with `settings_of`. Types are strict: true
+is not an integer, "3" is not a number, and numbers are finite.
 """
 
 import dataclasses
@@ -26,16 +26,15 @@ from pydantic_core import InitErrorDetails, PydanticCustomError, ValidationError
 
 __all__ = ["MAX_ENVS", "checked", "closest", "frozen", "located", "sentence", "settings_of"]
 
-#: 2**26 copies of the smallest environment fill the largest accelerator there is; more is a typing
-#: mistake.
+#: 2**26 copies of the smallest environment fill the largest GPU there is; more is a typing error.
 MAX_ENVS = 2**26
 CONFIG = pydantic.ConfigDict(
     strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True
 )
-#: Decorates a class: a frozen dataclass whose fields are checked by their annotations.
+#: Class decorator: a frozen dataclass whose fields are checked against their annotations.
 frozen = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=CONFIG)
 
-# What a value should have been, by the first part of pydantic's name of the error
+# the expected type, by the first part of pydantic's name of the error
 WANTED = {
     "int": "an integer",
     "float": "a number",
@@ -58,23 +57,30 @@ RANGES = {"ge": "from {:,}", "gt": "above {:,}", "le": "to {:,}", "lt": "and bel
 
 
 def settings_of(
-    made: Callable,
+    constructor: Callable,
     reserved: Sequence[str] = (),
     missing: Mapping[str, Any] | None = None,
     **more: Any,
 ) -> type:
-    """A frozen dataclass of the arguments of a class or a function, but for those `reserved`, with
-    their types, bounds and defaults. An argument without an annotation has its default's type.
-    `missing` has defaults of some that may have none.
+    """Returns a frozen dataclass of the arguments of a class or function: types, bounds, defaults.
 
-    `more` are fields beside them: a type, or (type, default). ValueError if an annotation cannot be
-    read, or an argument is called like one of `more`.
+    An argument without an annotation has the type of its default.
+
+    Args:
+        constructor: the class or function.
+        reserved: arguments to leave out.
+        missing: defaults for arguments that may have none.
+        more: fields to add: a type, or (type, default).
+
+    Raises:
+        ValueError: if an annotation cannot be read, or an argument has the name of a field of
+            `more`.
     """
-    function = made.__init__ if inspect.isclass(made) else made
+    function = constructor.__init__ if inspect.isclass(constructor) else constructor
     fields = {name: f if isinstance(f, tuple) else (f,) for name, f in more.items()}
     try:
         hints = typing.get_type_hints(function, include_extras=True)
-        for name, argument in inspect.signature(made).parameters.items():
+        for name, argument in inspect.signature(constructor).parameters.items():
             if name in reserved or argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
                 continue
             if name in more:
@@ -83,13 +89,13 @@ def settings_of(
             if default is inspect.Parameter.empty:
                 default = (missing or {}).get(name, default)
             fields[name] = _field(hints.get(name), default)
-        return frozen(_class(made.__name__, fields))
+        return frozen(_class(constructor.__name__, fields))
     except (NameError, TypeError, pydantic.errors.PydanticUserError) as error:
         raise ValueError(f"its arguments cannot be read: {str(error).splitlines()[0]}") from None
 
 
 def _field(hint, default):
-    """An argument's type, and its default if it has one."""
+    """Returns (type,) or (type, default) of an argument."""
     if default is inspect.Parameter.empty:
         return (Any if hint is None else hint,)
     if hint is None:
@@ -98,47 +104,51 @@ def _field(hint, default):
 
 
 def _class(name, fields):
-    """What a dataclass is made from: annotations, and defaults as attributes."""
+    """Returns a class with annotations, and defaults as attributes, for `dataclass` to decorate."""
     body = {"__annotations__": {key: field[0] for key, field in fields.items()}}
     for key, (_, *default) in fields.items():
         if default and type(default[0]).__hash__ is None:  # one that could change, such as a list
-            body[key] = dataclasses.field(default_factory=functools.partial(_same, default[0]))
+            body[key] = dataclasses.field(default_factory=functools.partial(_identity, default[0]))
         elif default:
             body[key] = default[0]
     return type(name, (), body)
 
 
-def _same(value):
+def _identity(value):
     return value
 
 
 def checked(function: Callable) -> Callable:
-    """The function, which raises ValueError for arguments that are not as its annotations say; the
-    message names each.
+    """Decorator: checks a function's arguments against its annotations.
+
+    The function gets its arguments as they are, not copies, unlike with `pydantic.validate_call`.
+
+    Raises:
+        ValueError: naming every argument that is wrong, and what is allowed.
     """
     signature = inspect.signature(function)
     settings = functools.cache(functools.partial(settings_of, function, ("self",)))
 
     @functools.wraps(function)
     def wrapped(*args, **kwargs):
-        given = signature.bind(*args, **kwargs).arguments
+        arguments = signature.bind(*args, **kwargs).arguments
         fields = settings().__pydantic_fields__
-        values = {name: _plain(value) for name, value in given.items() if name in fields}
+        values = {name: _plain(value) for name, value in arguments.items() if name in fields}
         try:
             settings()(**values)
         except ValidationError as error:
-            told = {}
-            for one in error.errors():
-                name = one["loc"][0]
-                told.setdefault(name, sentence(one, fields[name], values[name]))
-            raise ValueError("; ".join(f"{k}: {text}" for k, text in told.items())) from None
+            errors = {}
+            for line in error.errors():
+                name = line["loc"][0]
+                errors.setdefault(name, sentence(line, fields[name], values[name]))
+            raise ValueError("; ".join(f"{k}: {text}" for k, text in errors.items())) from None
         return function(*args, **kwargs)
 
     return wrapped
 
 
 def _plain(value):
-    """NumPy's numbers as Python's."""
+    """Converts NumPy's numbers to Python's."""
     if isinstance(value, numbers.Real) and not isinstance(value, (bool, int, float)):
         return int(value) if isinstance(value, numbers.Integral) else float(value)
     return value
@@ -148,8 +158,8 @@ def _plain(value):
 
 
 def sentence(error: dict[str, Any], field: FieldInfo | None, value: Any) -> str:
-    """What one of pydantic's errors says of the `value` of a `field`: what is allowed, what
-    came.
+    """Returns what is wrong with the `value` of a `field`, from one of pydantic's errors: what is
+    allowed, and what was given.
     """
     kind, got = error["type"], "nothing" if value is None else repr(value)
     if kind == "missing":
@@ -173,7 +183,7 @@ def sentence(error: dict[str, Any], field: FieldInfo | None, value: Any) -> str:
 
 
 def allowed(field: FieldInfo) -> str:
-    """The bounds of a number in words."""
+    """Returns the bounds of a number in words."""
     bounds = {
         key: getattr(extra, key)
         for extra in _metadata(field)
@@ -181,12 +191,12 @@ def allowed(field: FieldInfo) -> str:
         if isinstance(extra, annotated_types.BaseMetadata) and hasattr(extra, key)
     }
     words = RANGES if len(bounds) == 2 else BOUNDS
-    told = [words[key].format(bounds[key]) for key in BOUNDS if key in bounds]
-    return " ".join(told) or "any finite number"
+    texts = [words[key].format(bounds[key]) for key in BOUNDS if key in bounds]
+    return " ".join(texts) or "any finite number"
 
 
 def _metadata(field):
-    """All that `Annotated` says of a field, also inside `X | None`."""
+    """Yields the metadata of `Annotated`, also inside `X | None`."""
     yield from field.metadata
     for option in typing.get_args(field.annotation):
         for extra in getattr(option, "__metadata__", ()):
@@ -194,20 +204,20 @@ def _metadata(field):
 
 
 def _words(hint):
-    """The words of a Literal, also of `Literal | None`."""
+    """Yields the words of a Literal, also of `Literal | None`."""
     for option in typing.get_args(hint):
         yield from [option] if isinstance(option, str) else _words(option)
 
 
 def closest(word: object, words: Iterable[object]) -> str:
-    """The sentence part that names the nearest of `words`, or lists them all when none is near."""
+    """Returns a hint that names the nearest of `words`, or lists all if none is near."""
     names = sorted(str(w) for w in words)
     near = difflib.get_close_matches(str(word), names, n=1, cutoff=0.5)
     return f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
 
 
 def located(errors: Iterable[tuple[str, str]]) -> ValidationError:
-    """An error of pydantic's that says so of each dotted key: `(key, sentence)`."""
+    """Returns a pydantic error with a sentence for each dotted key."""
     return ValidationError.from_exception_data(
         "settings",
         [

@@ -7,21 +7,16 @@ from pathlib import Path
 import pytest
 
 from megastep import envs
-from megastep.agents.cli.build import build
-from megastep.agents.cli.compose import ConfigLoader
-from megastep.agents.cli.settings import Evaluate, Record, Train
+from tests.helpers.tiny import SCRIPTS, settings
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = (DOCS / "worlds.md").read_text()
 COMMANDS = re.findall(r"^python (\w+)\.py ([^#\n]*)", PAGE, re.MULTILINE)
-SCRIPTS = {"train": Train, "evaluate": Evaluate, "record": Record}
 
 
 @pytest.mark.parametrize("script, arguments", [c for c in COMMANDS if c[0] in SCRIPTS])
 def test_a_command_is_a_configuration(script, arguments):
-    with ConfigLoader(script, SCRIPTS[script]) as loader:
-        kind = SCRIPTS[script]
-        assert isinstance(build(kind, loader.tree(shlex.split(arguments))), kind)
+    assert isinstance(settings(*shlex.split(arguments), script=script), SCRIPTS[script].kind)
 
 
 def test_pictures_are_there_and_every_environment_is_told_of():

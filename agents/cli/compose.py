@@ -104,14 +104,19 @@ class Composer:
             fits = len(key) <= LONGEST and value.count("[") + value.count("{") <= MOST_BRACKETS
             for text in (word, f"{key}={WITH_EQUALS.sub(QUOTED, value)}") if key and fits else ():
                 with suppress(HydraException, ValueError):
-                    overrides.append(parser.parse_override(text))
+                    overrides += parser.parse_overrides([text])
                     break
             else:
                 cure = "cannot be read; write key=value, and quote blanks: 'key=\"a b\"'"
                 errors.append((program.shortened(word), cure))
         if errors:
             raise ConfigErrors(errors)
-        return overrides
+        return [override for override in overrides if not self._is_null(override)]
+
+    # whether a word leaves out a group that is left out anyway: Hydra has no word for it
+    def _is_null(self, override: types.Override) -> bool:
+        is_null = override.value() is None and self.members(override.key_or_group)
+        return is_null and self.composed().hydra.runtime.choices.get(key_of(override)) is None
 
     def settings(self, words: Iterable[str]) -> Any:
         return self.compose(words)[0]
@@ -145,7 +150,7 @@ class Composer:
             options = self.members(group)
             if override.is_sweep_override():
                 errors.append((key, f"{override.input_line!r} has several values; add -m to sweep"))
-            elif key == "hydra.searchpath" or options and (value is None or value in options):
+            elif key == "hydra.searchpath" or options and value in options:
                 groups.append(override.input_line)
             elif not options or isinstance(value, dict):
                 keys[key] = override
@@ -163,7 +168,8 @@ class Composer:
         except (HydraException, OmegaConfBaseException) as error:
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
             text = "is in none of the folders searched; --config-dir adds one" if absent else error
-            raise ConfigErrors([*errors, (absent or "configuration", str(text))]) from None
+            text = program.shortened(text, 400)
+            raise ConfigErrors([*errors, (absent or "configuration", text)]) from None
         for key, override in keys.items():
             try:
                 if override.is_delete():

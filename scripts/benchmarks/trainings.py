@@ -12,9 +12,7 @@ from pathlib import Path
 from timing import measurement
 
 from megastep.agents.cli import evaluate
-from megastep.agents.cli.build import build
-from megastep.agents.cli.compose import ConfigLoader
-from megastep.agents.cli.settings import Evaluate
+from megastep.agents.cli.compose import Composer
 
 ROOT = Path(__file__).resolve().parents[2]
 BUDGETS = 10, 60, 240  # seconds of training
@@ -248,8 +246,7 @@ def evaluated(run, device, *overrides):
 
 def written_by_evaluate(run, device, *overrides):
     """The file that evaluate.py writes."""
-    with ConfigLoader("evaluate", Evaluate) as loader:
-        settings = build(Evaluate, loader.tree([f"run={run}", f"device={device}", *overrides]))
+    settings = Composer(evaluate.SCRIPT).settings([f"run={run}", f"device={device}", *overrides])
     with contextlib.redirect_stdout(sys.stderr):
         return evaluate.run(settings)
 

@@ -1,19 +1,20 @@
 """Training against opponents as the command line does it."""
 
+import re
+
 import pytest
 import torch
-from test_arena import PONG, UPDATE
+from test_duels import PONG, UPDATE
 from test_train import configured
 
 from megastep import capture
-from megastep.agents.cli import arena, evaluate, train
-from megastep.agents.cli.compose import ConfigLoader
-from megastep.agents.cli.settings import Evaluate, Record, Train
+from megastep.agents.cli import evaluate, train
 from megastep.agents.training import checkpoint, loggers
 from megastep.engine import devices
 from megastep.envs.pong.step import CELL
 from tests.helpers import pages
 from tests.helpers.games import Always
+from tests.helpers.tiny import settings
 
 SHARES = ["opponents.past=0.5", "opponents.bot=0.25", "opponents.snapshots=2", "opponents.every=2"]
 OPPOSED = [*PONG, *SHARES, "opponents.bot_class=tests.helpers.games:High", "env.limit=5"]
@@ -40,12 +41,9 @@ def test_every_command_of_the_page_composes_and_its_policy_plays(here, monkeypat
     typed = pages.commands(text)
     assert {script for script, _ in typed} == set(pages.MAINS)
     for script, words in typed:
-        name = script.removesuffix(".py")
-        kind = dict(train=Train, evaluate=Evaluate, record=Record)[name]
         if script == "evaluate.py":
-            words = [arena.listed(word) if word.startswith("against=") else word for word in words]
-        with ConfigLoader(name, kind) as loader:
-            loader.tree(words)
+            words = [re.sub("^against=(.*)", r"against=[\1]", word) for word in words]
+        settings(*words, script=script.removesuffix(".py"))
     folder = train.run(configured("samples=1", tiny=PONG))
     (here / "tracker.py").write_text(pages.code(text)[0])
     with pages.inside(here, monkeypatch):

@@ -11,9 +11,11 @@ import xml.etree.ElementTree
 import numpy as np
 import pytest
 import torch
+import yaml
 from test_train import configured
 
-from megastep.agents.cli import arena, evaluate, record, run_folders, train
+from megastep.agents.cli import evaluate, record, train
+from megastep.agents.cli import runs as run_folders
 from megastep.agents.selfplay import duels, ratings
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.training import checkpoint
@@ -50,14 +52,14 @@ def test_the_share_won_is_what_an_independent_count_says(mortal):
     )
     mean, lower, upper = interval(played.score.numpy())
     assert lower < win / (win + lose) < upper and upper - lower < 0.04
-    row = arena.summary(played)
+    row = evaluate.summary(played)
     assert row["won"] == mean and row["wins"] + row["losses"] == row["duels"] == 2000
 
 
 def test_a_duel_that_nothing_ends_is_a_draw():
     played = duels.play(Matrix(4), Always(1), Always(1), max_steps=70)
     assert (played.score == 0.5).all() and (played.lengths == 70).all()
-    row = arena.summary(played)
+    row = evaluate.summary(played)
     assert (row["draws"], row["wins"], row["losses"], row["won"]) == (4, 0, 0, 0.5)
     cut = duels.play(Matrix(4, limit=3), Always(1), Always(1))
     assert (cut.score == 0.5).all() and (cut.lengths == 3).all()
@@ -93,9 +95,9 @@ def test_homes_are_those_of_the_environment_and_intervals_are_over_them():
     # each home was played in from both places
     pairs = set(zip(played.homes.tolist(), played.seat.tolist(), strict=True))
     assert len(pairs) == 8
-    assert arena.summary(played)["homes"] == 4
+    assert evaluate.summary(played)["homes"] == 4
     score = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0])
-    row = arena.summary(arrdict(played, score=score))
+    row = evaluate.summary(arrdict(played, score=score))
     assert (row["won"], row["lower"], row["upper"]) == interval(score.numpy(), played.homes.numpy())
 
 
@@ -244,7 +246,7 @@ def test_duels_are_printed_and_written(here, capsys):
     row = result["rows"][0]
     expected = dict(score=row["won"], evaluated=row["won"], lower=row["lower"])
     assert expected.items() <= run_folders.outcome(path).items()
-    assert "evaluated" not in run_folders.outcome(here / "a"), "a duel's table has no return"
+    assert run_folders.outcome(here / "a")["evaluated"] is None, "a duel's table has no return"
 
 
 def test_ratings_are_printed_written_and_drawn(here, capsys):
@@ -346,7 +348,10 @@ def test_a_duel_is_of_two_in_unseen_homes_each_from_both_places(tmp_path, monkey
     assert json.loads(path.read_text())["rows"][0]["homes"] == 7
 
 
-def test_a_list_of_opponents_is_no_sweep():
-    assert arena.listed("against=a,b,bot") == "against=[a,b,bot]"
-    assert arena.listed("against=[a,b]") == "against=[a,b]"
-    assert arena.listed("against=null") == "against=null"
+@pytest.mark.parametrize(
+    "word, names",
+    [("a,b,bot", ["a", "b", "bot"]), ("[a,b]", ["a", "b"]), ("a", ["a"]), ("null", None)],
+)
+def test_a_list_of_opponents_is_no_sweep(capsys, word, names):
+    assert evaluate.main(["run=x", f"against={word}", "--cfg", "job"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["against"] == names
