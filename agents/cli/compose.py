@@ -88,8 +88,8 @@ class Composer:
         self.members = functools.cache(self.loader.get_group_options)
         self.composed = functools.cache(self._composed)
 
+    # Returns {group: members} of the groups to choose from.
     def groups(self) -> dict[str, list[str]]:
-        """Returns {group: members} of the groups to choose from."""
         names = {group for group in self.composed().hydra.runtime.choices if "/" not in group}
         names |= {*self.loader.list_groups("")} if self.folder else set()
         return {name: self.members(name) for name in sorted(names - {"hydra"}) if self.members(name)}
@@ -111,12 +111,14 @@ class Composer:
                 errors.append((program.shortened(word), cure))
         if errors:
             raise ConfigErrors(errors)
-        return [override for override in overrides if not self._is_null(override)]
-
-    # whether a word leaves out a group that is left out anyway: Hydra has no word for it
-    def _is_null(self, override: types.Override) -> bool:
-        is_null = override.value() is None and self.members(override.key_or_group)
-        return is_null and self.composed().hydra.runtime.choices.get(key_of(override)) is None
+        return [
+            one
+            for one in overrides
+            if one.value() is not None
+            or not self.members(one.key_or_group)
+            # Hydra has no word for leaving out a group that is left out anyway
+            or self.composed().hydra.runtime.choices.get(key_of(one)) is not None
+        ]
 
     def settings(self, words: Iterable[str]) -> Any:
         return self.compose(words)[0]
@@ -195,8 +197,8 @@ class Composer:
         OmegaConf.set_struct(config, False)
         return config
 
+    # Calls Hydra's own main with these arguments. Its errors are raised; it sets sys.argv.
     def call_hydra(self, arguments: list[str], task: Callable | None = None) -> None:
-        """Calls Hydra's own main with these arguments. Its errors are raised; it sets sys.argv."""
         os.environ["HYDRA_FULL_ERROR"] = "1"
         sys.argv[1:] = arguments
         global_hydra.GlobalHydra.instance().clear()

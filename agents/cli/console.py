@@ -49,10 +49,9 @@ class TolerantStream:
                 os.dup2(null.fileno(), self._stream.fileno())
 
 
+# Makes stdout and stderr tolerant of errors and encodings, and opens those that are closed, so
+# that no file takes their number.
 def open_streams() -> None:
-    """Makes stdout and stderr tolerant of errors and encodings, and opens those that are closed, so
-    that no file takes their number.
-    """
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     os.close(number)
@@ -71,17 +70,17 @@ def warn(sentence: object, *_: Any, **__: Any) -> None:
     say(f"warning: {sentence}", sys.stderr)
 
 
+# Turns an OSError or a UserError into a warning that begins with `prefix`.
 @contextlib.contextmanager
 def warned(prefix: str = "") -> Iterator[None]:
-    """Turns an OSError or a UserError into a warning that begins with `prefix`."""
     try:
         yield
     except (OSError, program.UserError) as error:
         warn(f"{prefix}{error}")
 
 
+# Prints why a thread ended, in one line if the disk is full, as TensorBoard's may find it.
 def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
-    """Prints why a thread ended, in one line if the disk is full, as TensorBoard's may find it."""
     if isinstance(failure.exc_value, OSError):
         warn(f"{failure.thread.name} stopped: {failure.exc_value}")
     else:
@@ -92,10 +91,9 @@ def is_unicode() -> bool:
     return (sys.stdout.encoding or "").lower().startswith("utf")
 
 
+# Returns a table as text, by default in characters that stdout can show. In Markdown with
+# `style=box.MARKDOWN`.
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], style: box.Box | None = None) -> str:
-    """Returns a table as text, by default in characters that stdout can show. In Markdown with
-    `style=box.MARKDOWN`.
-    """
     grid, text = Table(*head, box=style or (box.HEAVY_HEAD if is_unicode() else box.ASCII)), StringIO()
     for row in rows:
         grid.add_row(*(cell.replace("|", "\\|") if style is box.MARKDOWN else cell for cell in row))
@@ -114,8 +112,8 @@ class Progress(progress.Progress):
         super().__init__(*columns, disable=is_dumb or bool(prefix) or not sys.stdout.isatty())
         self.bar = self.add_task("starting", total=1)
 
+    # Shows words on one line; `fraction` of the work is done, None if it has no end.
     def show(self, fraction: float | None, words: Sequence[str]) -> None:
-        """Shows words on one line; `fraction` of the work is done, None if it has no end."""
         text, total = (" · " if is_unicode() else "  ").join(words), fraction and 1
         self.update(self.bar, completed=fraction or 0, total=total, description=text)
         if self.disable and time.monotonic() - self.shown_at >= LINE_EVERY:

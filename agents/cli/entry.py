@@ -23,9 +23,17 @@ WITHOUT_GPU = ("-h", "--h", "-c", "--cfg", "-i", "--info", "-s", "--shell", "--v
 
 def main() -> int:
     """Runs the installed command, `megastep`. Returns the exit code."""
-    words = sys.argv[1:] or ["--help"]
+    words, line = sys.argv[1:] or ["--help"], os.environ.get("COMP_LINE", "")
     if words[0] in ("-sc", "--shell-completion"):
-        words = _words_to_complete(words)
+        script = "".join(line.split()[1:2])  # which is completed here, its options elsewhere
+        if "query=" not in " ".join(words):
+            words = ["train", *words]
+        elif script and (len(line.split()) > 2 or line.endswith(" ")):
+            os.environ["COMP_LINE"] = line.replace(script, "", 1)
+            words = [script, *words]
+        else:
+            print(" ".join(name for name in SCRIPTS if name.startswith(script)))
+            words = [""]
     if words[0] in SCRIPTS:
         sys.argv[1:] = words[1:]
         return run_script(words[0])
@@ -44,21 +52,8 @@ def main() -> int:
     return 0
 
 
-def _words_to_complete(words: list[str]) -> list[str]:
-    # the line is in COMP_LINE: a script, completed here, and its options
-    line = os.environ.get("COMP_LINE", "")
-    script = "".join(line.split()[1:2])
-    if not any(word.startswith("query=") for word in words):
-        return ["train", *words]
-    if script and (len(line.split()) > 2 or line.endswith(" ")):
-        os.environ["COMP_LINE"] = line.replace(script, "", 1)
-        return [script, *words]
-    print(" ".join(name for name in SCRIPTS if name.startswith(script)))
-    return [""]
-
-
+# Runs a script of this package by its name. Returns the exit code.
 def run_script(name: str) -> int:
-    """Runs a script of this package by its name. Returns the exit code."""
     signals.exit_on_signals(name)
     if wants_first_gpu(sys.argv[1:]):
         # the interpreter waits for this thread: a process must not end within the driver
@@ -70,18 +65,17 @@ def run_script(name: str) -> int:
     return importlib.import_module(f"megastep.agents.cli.{name}").main()
 
 
+# Returns whether a command line may use the first GPU in this process.
 def wants_first_gpu(words: list[str]) -> bool:
-    """Returns whether a command line may use the first GPU in this process."""
     is_elsewhere = any(word.startswith(WITHOUT_GPU) for word in words)
     devices = {word.partition("=")[2] for word in words if word.startswith("device=")}
     return not is_elsewhere and devices <= {"auto", "cuda", "cuda:0"}
 
 
+# Creates the primary context of the first GPU, if there is one; PyTorch finds it there later.
+#
+# It takes half a second in the driver, which passes beside Python's imports.
 def create_cuda_context() -> None:
-    """Creates the primary context of the first GPU, if there is one; PyTorch finds it there later.
-
-    It takes half a second in the driver, which passes beside Python's imports.
-    """
     device, context = ctypes.c_int(), ctypes.c_void_p()
     with contextlib.suppress(OSError):  # no driver
         driver = ctypes.CDLL("libcuda.so.1")

@@ -70,7 +70,8 @@ def run(cfg: settings.Evaluate) -> Path:
 def first_episodes(cfg, loaded, trained, env_settings, geometry, device) -> Path:
     homes = factory.homes(env_settings, geometry, cfg.split, cfg.episodes)
     env_settings = factory.changed(env_settings, n_envs=cfg.episodes, resample=False)
-    env, rows = factory.make_env(env_settings, homes, cfg.seed, device), []
+    where = dict(geometries=homes, seed=cfg.seed, device=device)
+    env, rows = factory.construct(env_settings, **where), []
     policy = factory.make_policy(trained.agent, env)
     factory.load_weights(policy, env, loaded)
     players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
@@ -117,12 +118,11 @@ class Player(NamedTuple):
 FOR_TWO = {"n_agents": 2, "resample": False}
 
 
+# Returns the player of a checkpoint, to meet the agent of `run` in `env`.
+#
+# Raises:
+#     UserError: if one was trained in another environment.
 def load_player(loaded: Checkpoint, env: Any, run: Checkpoint) -> Player:
-    """Returns the player of a checkpoint, to meet the agent of `run` in `env`.
-
-    Raises:
-        UserError: if one was trained in another environment.
-    """
     trained, own = factory.config_of(loaded), factory.config_of(run)
     if trained.env.name != own.env.name:
         raise program.UserError(
@@ -135,16 +135,15 @@ def load_player(loaded: Checkpoint, env: Any, run: Checkpoint) -> Player:
     return Player(name, policy, loaded.step)
 
 
+# Returns who is to meet the agent of `run` in `env`.
+#
+# Args:
+#     name: a run's folder or checkpoint; an import path, `random`, or `bot`, the scripted policy
+#         of the run, none of which needs weights.
+#
+# Raises:
+#     UserError: if nobody can be met there, or this player cannot play there.
 def find_player(name: str, run: Checkpoint, env_settings: settings.Env, env: Any) -> Player:
-    """Returns who is to meet the agent of `run` in `env`.
-
-    Args:
-        name: a run's folder or checkpoint; an import path, `random`, or `bot`, the scripted policy
-            of the run, none of which needs weights.
-
-    Raises:
-        UserError: if nobody can be met there, or this player cannot play there.
-    """
     if env.n_agents < 2:
         raise program.UserError(
             f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
@@ -166,14 +165,15 @@ class Arena:
     def __init__(self, cfg, run: Checkpoint, env: settings.Env, geometry: Any, device: Any):
         self.cfg, self.run, env = cfg, run, factory.changed(env, **FOR_TWO)
         homes = factory.homes(env, geometry, cfg.split)
-        sample = factory.make_sample(env, homes, cfg.seed, device)
+        where = dict(seed=cfg.seed, device=device)
+        sample = factory.make_sample(env, homes, **where)
         self.others = [find_player(name, run, env, sample) for name in cfg.against or ()]
         self.agent = load_player(run, sample, run)
         n_duels = max(1, cfg.episodes // sample.n_agents)  # from each place
         homes = homes[:n_duels]
         n_duels -= n_duels % max(1, len(homes))
         env = factory.changed(env, n_envs=n_duels * sample.n_agents)
-        self.env, self.sample = factory.make_env(env, homes, cfg.seed, device), sample
+        self.env, self.sample = factory.construct(env, geometries=homes, **where), sample
         self.place, self.source = runs.place(env, geometry, homes, cfg.split)
 
     def play(self, player: Player, opponent: Player) -> Any:
@@ -181,10 +181,9 @@ class Arena:
             options = self.cfg.seed, self.cfg.greedy
             return duels.play(self.env, player.policy, opponent.policy, *options)
 
+    # Plays the run's agent against each of `cfg.against`. Prints and writes a table, and
+    # returns the path of its .json.
     def duel(self) -> Path:
-        """Plays the run's agent against each of `cfg.against`. Prints and writes a table, and
-        returns the path of its .json.
-        """
         rows = [{"against": p.name, **summary(self.play(self.agent, p))} for p in self.others]
         title = f"{self.agent.name}: duels of {self.place}, seed {self.cfg.seed}"
         names = ["duels", self.source, self.cfg.split, str(self.run.step), "against"]
@@ -192,11 +191,10 @@ class Arena:
         cells = [{key: form.format_map(row) for key, form in DUELS.items()} for row in rows]
         return runs.write_table(self.cfg, self.run, names, title, rows, cells)
 
+    # Rates the run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels
+    # of each with each. Prints a table, writes ratings.csv and ratings.svg into the run's folder,
+    # and returns the path of the first.
     def rate(self) -> Path:
-        """Rates the run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels
-        of each with each. Prints a table, writes ratings.csv and ratings.svg into the run's folder,
-        and returns the path of the first.
-        """
         folder, players = runs.folder_of(self.run.path), []
         for path in checkpoints(folder / "snapshots") or checkpoints(folder / "checkpoints"):
             player = load_player(factory.load_checkpoint(path, self.env.device), self.sample, self.run)
@@ -221,10 +219,9 @@ class Arena:
         return folder / "ratings.csv"
 
 
+# Returns a table's row for what `duels.play` returned: the share won, a draw counting half,
+# with its 95 % interval over homes, or over duels where there are none.
 def summary(played: dict) -> dict:
-    """Returns a table's row for what `duels.play` returned: the share won, a draw counting half,
-    with its 95 % interval over homes, or over duels where there are none.
-    """
     score = played["score"].cpu().numpy()
     homes = played["homes"].cpu().numpy() if "homes" in played else None
     mean, lower, upper = evaluation.interval(score, homes)

@@ -49,11 +49,11 @@ class ConfigErrors(UserError):
         return "\n  ".join([head, *(f"{key}: {shortened(text, 400)}" for key, text in self.errors)])
 
 
+# Turns errors of these kinds into a UserError that begins with `prefix`.
 @contextlib.contextmanager
 def errors(
     prefix: str = "", kinds: tuple[type[BaseException], ...] = (OSError, ValueError)
 ) -> Iterator[None]:
-    """Turns errors of these kinds into a UserError that begins with `prefix`."""
     try:
         yield
     except kinds as error:

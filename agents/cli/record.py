@@ -50,7 +50,8 @@ def run(cfg: settings.Record) -> Path:
     geometry = geometry or settings.kind_of("geometry", HOMES)(name=HOMES)
     homes = factory.homes(env_settings, geometry, cfg.split)
     homes = [homes[cfg.home % len(homes)]] if homes else []
-    env = factory.make_sample(factory.changed(env_settings, n_envs=1), homes, cfg.seed, device)
+    env_settings = factory.changed(env_settings, n_envs=1)
+    env = factory.make_sample(env_settings, homes, seed=cfg.seed, device=device)
     random = RandomActions(env.action_space)
     policy = evaluate.load_player(loaded, env, loaded).policy if cfg.run else random
     if cfg.against is not None:

@@ -39,8 +39,8 @@ CANNOT = "{} cannot be written; choose another with folder=: "
 # ---- New folders ----
 
 
+# Makes a new folder and returns it; a taken name gets -2, -3, ...
 def make(path: Path) -> Path:
-    """Makes a new folder and returns it; a taken name gets -2, -3, ..."""
     with program.errors(CANNOT.format(shortened(path))):
         path.parent.mkdir(parents=True, exist_ok=True)
         for number in itertools.count(1):
@@ -50,10 +50,9 @@ def make(path: Path) -> Path:
                 return folder
 
 
+# Returns the folder of a new run: `cfg.folder`, which must be new or empty, or one named after
+# the time and the settings.
 def new(cfg: Train) -> Path:
-    """Returns the folder of a new run: `cfg.folder`, which must be new or empty, or one named after
-    the time and the settings.
-    """
     if cfg.folder is None:
         name = f"{label(cfg.env.name)}-{label(cfg.geometry.name)}-{cfg.seed}"
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{name}")
@@ -101,10 +100,9 @@ def locked(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+# Notes that training starts in a folder now. `latest` follows these notes, since folders'
+# times change with whatever is written there, and clocks are moved.
 def record_start(folder: Path) -> None:
-    """Notes that training starts in a folder now. `latest` follows these notes, since folders'
-    times change with whatever is written there, and clocks are moved.
-    """
     with console.warned(f"`latest` will not find {folder}: "):
         RUNS.mkdir(exist_ok=True)
         with open(STARTED, "ab") as file:
@@ -114,10 +112,9 @@ def record_start(folder: Path) -> None:
 # ---- Existing folders ----
 
 
+# Returns the runs here, and those elsewhere that were started here; the one started or resumed
+# last comes last.
 def known() -> list[Path]:
-    """Returns the runs here, and those elsewhere that were started here; the one started or resumed
-    last comes last.
-    """
     lines = STARTED.read_bytes().split(b"\n") if STARTED.exists() else []
     order = {Path(os.fsdecode(line)): n for n, line in enumerate(lines) if line}
     folders = {*RUNS.glob("*"), *SWEEPS.glob("*/*"), *order}
@@ -161,20 +158,19 @@ def folder_of(path: Path) -> Path:
 # ---- Results ----
 
 
+# Returns where a run is evaluated, for titles, and the source of homes, for file names.
 def place(env: Env, geometry: Geometry, homes: list, split: str) -> tuple[str, str]:
-    """Returns where a run is evaluated, for titles, and the source of homes, for file names."""
     stem = Path(getattr(geometry, "path", None) or "").stem
     source = "-".join(filter(None, [label(geometry.name), stem])) if homes else label(env.name)
     place = f" in {'all' if split == 'all' else f'the {split}'} homes of {source}" if homes else ""
     return label(env.name) + place, source
 
 
+# Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
+# and `rows` for programs, .json. Returns the latter's path.
 def write_table(
     cfg: Evaluate, loaded: checkpoint.Checkpoint, names: list[str], title: str, rows: list, cells: list[dict]
 ) -> Path:
-    """Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
-    and `rows` for programs, .json. Returns the latter's path.
-    """
     name = "-".join(filter(None, [*names, "greedy" if cfg.greedy else ""]))
     folder, name = folder_of(loaded.path) / "evaluations", re.sub(r"[^\w.-]", "-", name)[:200]
     head, lines = [*cells[0]], [[*row.values()] for row in cells]
@@ -194,13 +190,12 @@ def write_table(
     return folder / f"{name}.json"
 
 
+# Returns what a job achieved, from what it returned.
+#
+# score: for a sweeper: a training run's mean return over its last reports, an evaluation's
+#     return, the share of duels won against the first opponent.
+# evaluated, lower, upper: the evaluated one of these with its interval; of a run its return.
 def outcome(result: Path) -> dict[str, float | None]:
-    """Returns what a job achieved, from what it returned.
-
-    score: for a sweeper: a training run's mean return over its last reports, an evaluation's
-        return, the share of duels won against the first opponent.
-    evaluated, lower, upper: the evaluated one of these with its interval; of a run its return.
-    """
     files, returns = [result], []
     if is_run := result.is_dir():
         files = sorted(result.glob("evaluations/*.json"))

@@ -100,9 +100,8 @@ def kind_of(group: str, name: str) -> type:
         raise ValueError(f"{name} cannot be used: {error}") from error
 
 
+# Returns the type of a field that holds the settings of a group's member.
 def _group(group: str) -> Any:
-    """Returns the type of a field that holds the settings of a group's member."""
-
     def settings(value):
         if dataclasses.is_dataclass(value):
             return value

@@ -155,10 +155,9 @@ class Job:
         self.records = folder.absolute() / ".jobs" / uuid.uuid4().hex[:8]
         self.records.mkdir(parents=True)
 
+    # Returns the job's score, None if it failed: a sweeper is to go on. Raises Interrupted
+    # alone.
     def __call__(self, config: Any) -> float | None:
-        """Returns the job's score, None if it failed: a sweeper is to go on. Raises Interrupted
-        alone.
-        """
         hydra, began, result = HydraConfig.get(), time.monotonic(), None
         words, number = [*hydra.overrides.task], hydra.job.num
         os.chdir(self.start)  # where paths are relative to, whatever hydra.job.chdir says
@@ -207,8 +206,8 @@ class Job:
             console.warn(f"job {number}: no episode finished, so it has no score; train longer")
         return row.get("score")
 
+    # Returns what the jobs of this sweep recorded, in order.
     def rows(self) -> list[dict[str, Any]]:
-        """Returns what the jobs of this sweep recorded, in order."""
         rows = []
         for path in self.records.glob("*.json"):
             state = RUNNING
@@ -218,8 +217,8 @@ class Job:
             rows.append(row | {"state": state} if row["state"] == RUNNING else row)
         return sorted(rows, key=lambda row: row["number"])
 
+    # Has jobs in other processes save and end, then raises Interrupted.
     def interrupt(self, number: int) -> NoReturn:
-        """Has jobs in other processes save and end, then raises Interrupted."""
         deadline = time.monotonic() + GRACE
         for process in self.running():
             signals.stop(process)
@@ -233,14 +232,13 @@ class Job:
         return [pid for pid in pids if pid != os.getpid()]
 
 
+# Makes a GPU with the fewest jobs on it PyTorch's current one, which device=auto means.
+#
+# Yields its index, None where there is no choice. Jobs know of each other by locks on temporary
+# files, one for each place on each GPU of this machine; the system drops them when a process
+# ends.
 @contextlib.contextmanager
 def one_gpu() -> Iterator[int | None]:
-    """Makes a GPU with the fewest jobs on it PyTorch's current one, which device=auto means.
-
-    Yields its index, None where there is no choice. Jobs know of each other by locks on temporary
-    files, one for each place on each GPU of this machine; the system drops them when a process
-    ends.
-    """
     n_gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     with contextlib.ExitStack() as stack:
         for place in itertools.count() if n_gpus > 1 else ():
@@ -256,10 +254,9 @@ def one_gpu() -> Iterator[int | None]:
 # ---- The table ----
 
 
+# Prints the table of a sweep and writes it into its folder: sweep.md as it is printed, and
+# sweep.csv with all digits.
 def report(folder: Path, rows: list[dict[str, Any]]) -> None:
-    """Prints the table of a sweep and writes it into its folder: sweep.md as it is printed, and
-    sweep.csv with all digits.
-    """
     head, text = ["job", *dict.fromkeys(k for row in rows for k in row["varied"])], io.StringIO()
     head += COLUMNS
     rows = [{**row, **row["varied"], "job": row["number"]} for row in rows]

@@ -74,13 +74,17 @@ def make_trainer(
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
     """
-    homes = factory.homes(cfg.env, cfg.geometry, "training")
-    where = homes, cfg.seed, device, cfg.agent.critic == "asymmetric"
-    sample = factory.make_sample(cfg.env, *where)
+    where = {
+        "geometries": factory.homes(cfg.env, cfg.geometry, "training"),
+        "seed": cfg.seed,
+        "device": device,
+        "privileged": cfg.agent.critic == "asymmetric",
+    }
+    sample = factory.make_sample(cfg.env, **where)
     policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
     learner = factory.make_learner(cfg.learner, policy, cfg.seed)
-    factory.check_memory(cfg.env, sample, learner, *where)
-    env = factory.make_env(cfg.env, *where)
+    factory.check_memory(cfg.env, sample, learner, **where)
+    env = factory.construct(cfg.env, **where)
     if cfg.resume or cfg.init:
         loaded = factory.load_checkpoint(runs.find(cfg.resume or cfg.init), device)
         factory.load_weights(policy, env, loaded)
@@ -114,10 +118,9 @@ def make_trainer(
     return improves
 
 
+# Returns the fraction of the budget that is spent, None without one, and the few numbers that
+# people watch.
 def progress_of(running: Trainer) -> tuple[float | None, list[str]]:
-    """Returns the fraction of the budget that is spent, None without one, and the few numbers that
-    people watch.
-    """
     words, left, latest = [f"{console.number(running.samples)} samples"], running.left, running.latest
     if running.rate is not None:
         words.append(f"{console.number(running.rate)}/s")
@@ -139,10 +142,9 @@ def few_means(latest: dict[str, float], metrics: Sequence[str], groups: Sequence
     return shown if len(names) <= FEW else []
 
 
+# Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
+# limited, else by never.
 def annealed(cfg: settings.Train) -> settings.Train:
-    """Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
-    limited, else by never.
-    """
     limits = [name for name in ("samples", "seconds") if getattr(cfg, name) is not None]
     anneal = [*limits, "never"][0] if cfg.learner.anneal == "auto" else cfg.learner.anneal
     return factory.changed(cfg, learner=factory.changed(cfg.learner, anneal=anneal))
@@ -198,13 +200,12 @@ def finish(cfg: settings.Train, folder: Path) -> None:
             record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
 
 
+# Returns the tree of a run that resumes another or starts from its weights; any other is
+# returned as it is.
+#
+# A run that is resumed keeps its own settings, except for typed keys. A run that starts from the
+# weights of another has its environment and agent, except for typed keys and groups.
 def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
-    """Returns the tree of a run that resumes another or starts from its weights; any other is
-    returned as it is.
-
-    A run that is resumed keeps its own settings, except for typed keys. A run that starts from the
-    weights of another has its environment and agent, except for typed keys and groups.
-    """
     resume, init = tree.get("resume"), tree.get("init")
     if not isinstance(resume or init, str) or (resume and init):
         return tree

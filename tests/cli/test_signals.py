@@ -91,7 +91,7 @@ def test_while_training_the_step_is_finished_and_saved(here, monkeypatch, capsys
     assert (
         train.main([*TINY, "seconds=60", "folder=run", "checkpoint_seconds=1e-9"]) == 128 + number
     )
-    told = f"train.py: Stopped after {2 * UPDATE} samples. To go on: python train.py resume=run\n"
+    told = f"train.py: Stopped after {2 * UPDATE} samples. To continue: python train.py resume=run\n"
     assert capsys.readouterr().err == told
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == 2 * UPDATE
     assert not list((here / "run" / "checkpoints").glob("*tmp*"))

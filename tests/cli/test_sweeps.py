@@ -385,7 +385,7 @@ def test_a_folder_of_ones_own_adds_groups_members_and_files(here, capsys):
         (["-cd", "conf", "size=small"], "+size=small"),
         (["-cd", "conf", "+siz=small"], "siz: no such key; did you mean size?"),
         (["-cd", "nowhere"], "There is no folder nowhere"),
-        (["-cn", "nowhere"], "nowhere: is in no folder that is searched"),
+        (["-cn", "nowhere"], "nowhere: is in none of the folders"),
     ):
         assert train.main(words) == 2
         assert told in capsys.readouterr().err
