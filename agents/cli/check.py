@@ -18,8 +18,6 @@ from megastep.settings import sentence
 Tree = dict[str, Any]
 #: configs/ of the repository, which the package carries as data.
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-#: pydantic's errors for a key that does not exist.
-UNKNOWN = ("unexpected_keyword_argument", "extra_forbidden")
 
 
 def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:
@@ -44,7 +42,7 @@ def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:
     except ValidationError as error:
         for line in error.errors():
             path = [str(part) for part in line["loc"]]
-            if line["type"] in UNKNOWN:
+            if line["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
                 text = _unknown(path, [*fields, *names])
             else:
                 while ".".join(path) not in fields:  # inside a list, or an option of a union

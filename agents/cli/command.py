@@ -86,8 +86,8 @@ def _run(script: compose.Script, argv: list[str]) -> int:
     composer = compose.Composer(
         script, options.config_name, options.config_dir, options.config_path
     )
-    words = [word.replace("hydra.run.dir=", "folder=") for word in options.overrides]
     flags = [one for one in argv if one not in (*options.overrides, "-m", "--multirun")]
+    words = [word.replace("hydra.run.dir=", "folder=") for word in options.overrides]
     if options.help:
         parser.epilog = "groups, chosen with group=member:" + "".join(
             f"\n  {name:<11} {', '.join(members)}" for name, members in composer.groups().items()
@@ -101,7 +101,9 @@ def _run(script: compose.Script, argv: list[str]) -> int:
             keys = [f"{key}=null" for key, _ in check.fields_of(script.kind, tree)]
             _show(composer, OmegaConf.merge(OmegaConf.from_dotlist(keys), tree), flags + words)
     elif options.cfg:
-        for i, job in enumerate(sweeps.jobs_of(composer, words)[0] if options.multirun else [words]):
+        for i, job in enumerate(
+            sweeps.jobs_of(composer, words)[0] if options.multirun else [words]
+        ):
             print("---\n" * (i > 0), end="", flush=True)
             _show(composer, check.as_tree(composer.settings(job)), flags + job)
     elif options.info or options.hydra_help:

@@ -85,19 +85,21 @@ class Composer:
         global_hydra.GlobalHydra.instance().clear()
         hydra.initialize_config_dir(self.main, job_name=script.name, version_base="1.3")
         self.loader = global_hydra.GlobalHydra.instance().config_loader()
-        self.members = functools.cache(self.loader.get_group_options)
-        self.composed = functools.cache(self._composed)
+        self.members, self.composed = map(
+            functools.cache, (self.loader.get_group_options, self._composed)
+        )
 
     # Returns {group: members} of the groups to choose from.
     def groups(self) -> dict[str, list[str]]:
         names = {group for group in self.composed().hydra.runtime.choices if "/" not in group}
         names |= {*self.loader.list_groups("")} if self.folder else set()
-        return {name: self.members(name) for name in sorted(names - {"hydra"}) if self.members(name)}
+        return {
+            name: self.members(name) for name in sorted(names - {"hydra"}) if self.members(name)
+        }
 
+    # Returns words as Hydra's grammar reads them. Raises ConfigErrors with all unreadable
+    # ones.
     def parse(self, words: Iterable[str]) -> list[types.Override]:
-        """Returns words as Hydra's grammar reads them. Raises ConfigErrors with all unreadable
-        ones.
-        """
         overrides, errors, parser = [], [], overrides_parser.OverridesParser.create(self.loader)
         for word in words:
             key, _, value = word.partition("=")
@@ -123,10 +125,9 @@ class Composer:
     def settings(self, words: Iterable[str]) -> Any:
         return self.compose(words)[0]
 
+    # Returns checked settings, and the configuration they are from, Hydra's part included.
+    # Raises ConfigErrors with everything that is wrong.
     def compose(self, words: Iterable[str]) -> tuple[Any, DictConfig]:
-        """Returns checked settings, and the configuration they are from, Hydra's part included.
-        Raises ConfigErrors with everything that is wrong.
-        """
         overrides = self.parse(words)
         config, errors = self.config(overrides)
         cure = "is an environment variable, and would be written to config.yaml; type its value"
@@ -144,8 +145,8 @@ class Composer:
             raise ConfigErrors(errors + secret)
         return chosen, config
 
+    # Returns (the configuration, the errors of words that are not in it).
     def config(self, overrides: list[types.Override]) -> tuple[DictConfig, list[tuple[str, str]]]:
-        """Returns (the configuration, the errors of words that are not in it)."""
         groups, keys, errors = [], {}, []
         for override in overrides:
             key, group, value = key_of(override), override.key_or_group, override.value()
@@ -181,8 +182,8 @@ class Composer:
                     force = override.is_add() or override.is_force_add() or key[:6] != "hydra."
                     OmegaConf.update(config, key, override.value(), force_add=force)
             except (ConfigKeyError, ConfigAttributeError):
-                names = dict(leaves({"hydra": plain(config.hydra)}))
-                errors.append((key, f"no such key; {check.closest_key(key, names)}"))
+                hint = check.closest_key(key, dict(leaves({"hydra": plain(config.hydra)})))
+                errors.append((key, f"no such key; {hint}"))
             except OmegaConfBaseException as error:
                 errors.append((key, program.shortened(error, 400)))
         return config, errors
@@ -199,11 +200,11 @@ class Composer:
 
     # Calls Hydra's own main with these arguments. Its errors are raised; it sets sys.argv.
     def call_hydra(self, arguments: list[str], task: Callable | None = None) -> None:
-        os.environ["HYDRA_FULL_ERROR"] = "1"
-        sys.argv[1:] = arguments
+        os.environ["HYDRA_FULL_ERROR"], sys.argv[1:] = "1", arguments
         global_hydra.GlobalHydra.instance().clear()
-        main = hydra.main(config_path=self.main, config_name=self.name, version_base="1.3")
-        main(task or self.script.run)()
+        hydra.main(config_path=self.main, config_name=self.name, version_base="1.3")(
+            task or self.script.run
+        )()
 
 
 # the key or group@package of a word, without the sign before it

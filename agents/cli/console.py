@@ -94,7 +94,10 @@ def is_unicode() -> bool:
 # Returns a table as text, by default in characters that stdout can show. In Markdown with
 # `style=box.MARKDOWN`.
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], style: box.Box | None = None) -> str:
-    grid, text = Table(*head, box=style or (box.HEAVY_HEAD if is_unicode() else box.ASCII)), StringIO()
+    grid, text = (
+        Table(*head, box=style or (box.HEAVY_HEAD if is_unicode() else box.ASCII)),
+        StringIO(),
+    )
     for row in rows:
         grid.add_row(*(cell.replace("|", "\\|") if style is box.MARKDOWN else cell for cell in row))
     Console(file=text, width=10_000, force_terminal=False, color_system=None).print(grid)
@@ -108,13 +111,16 @@ class Progress(progress.Progress):
 
     def __init__(self):
         is_dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
-        columns = progress.BarColumn(24), progress.TextColumn("{task.description}")
-        super().__init__(*columns, disable=is_dumb or bool(prefix) or not sys.stdout.isatty())
+        super().__init__(
+            progress.BarColumn(24),
+            progress.TextColumn("{task.description}"),
+            disable=is_dumb or bool(prefix) or not sys.stdout.isatty(),
+        )
         self.bar = self.add_task("starting", total=1)
 
     # Shows words on one line; `fraction` of the work is done, None if it has no end.
     def show(self, fraction: float | None, words: Sequence[str]) -> None:
-        text, total = (" · " if is_unicode() else "  ").join(words), fraction and 1
+        text, total = (" · " if is_unicode() else "  ").join(words), None if fraction is None else 1
         self.update(self.bar, completed=fraction or 0, total=total, description=text)
         if self.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
             self.shown_at = time.monotonic()

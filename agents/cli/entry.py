@@ -18,11 +18,23 @@ SCRIPTS = {
     "record": "films a trained policy",
 }
 #: Options that need no GPU in this process: they print something, or start jobs elsewhere.
-WITHOUT_GPU = ("-h", "--h", "-c", "--cfg", "-i", "--info", "-s", "--shell", "--version", "-m", "--m")
+WITHOUT_GPU = (
+    "-h",
+    "--h",
+    "-c",
+    "--cfg",
+    "-i",
+    "--info",
+    "-s",
+    "--shell",
+    "--version",
+    "-m",
+    "--m",
+)
 
 
+# Runs the installed command, `megastep`. Returns the exit code.
 def main() -> int:
-    """Runs the installed command, `megastep`. Returns the exit code."""
     words, line = sys.argv[1:] or ["--help"], os.environ.get("COMP_LINE", "")
     if words[0] in ("-sc", "--shell-completion"):
         script = "".join(line.split()[1:2])  # which is completed here, its options elsewhere
@@ -67,9 +79,9 @@ def run_script(name: str) -> int:
 
 # Returns whether a command line may use the first GPU in this process.
 def wants_first_gpu(words: list[str]) -> bool:
-    is_elsewhere = any(word.startswith(WITHOUT_GPU) for word in words)
     devices = {word.partition("=")[2] for word in words if word.startswith("device=")}
-    return not is_elsewhere and devices <= {"auto", "cuda", "cuda:0"}
+    is_elsewhere = any(word.startswith(WITHOUT_GPU) for word in words)
+    return devices <= {"auto", "cuda", "cuda:0"} and not is_elsewhere
 
 
 # Creates the primary context of the first GPU, if there is one; PyTorch finds it there later.

@@ -1,5 +1,6 @@
-"""Measures a trained policy on unseen homes, or against others in duels. `evaluate --help`; `run(cfg)`
-is the same from Python.
+"""Measures a trained policy on unseen homes, or against others in duels.
+
+`evaluate --help`; `run(cfg)` is the same from Python.
 """
 
 import itertools
@@ -14,8 +15,8 @@ from megastep.agents.selfplay import duels, ratings
 from megastep.agents.training import evaluation
 from megastep.agents.training.checkpoint import Checkpoint, checkpoints
 
-HELP = """Measures what a run's agent earns in the first episode of each lane, with a 95 % interval over
-homes. Prints a table and writes it to the run's folder: evaluations/*.md.
+HELP = """Measures what a run's agent earns in the first episode of each lane, with a 95 % interval
+over homes. Prints a table and writes it to the run's folder: evaluations/*.md.
 
 The most common words:
   run=RUN              a run folder, one of its checkpoints, or latest
@@ -57,42 +58,40 @@ def run(cfg: settings.Evaluate) -> Path:
     start, device = time.monotonic(), factory.make_device(cfg.device)
     loaded = factory.load_checkpoint(runs.find(cfg.run), device)
     trained = factory.config_of(loaded)
-    where = cfg.env or trained.env, cfg.geometry or trained.geometry
+    env_settings, geometry = cfg.env or trained.env, cfg.geometry or trained.geometry
     if cfg.ratings or cfg.against is not None:
-        arena = Arena(cfg, loaded, *where, device)
+        arena = Arena(cfg, loaded, env_settings, geometry, device)
         path = arena.rate() if cfg.ratings else arena.duel()
     else:
-        path = first_episodes(cfg, loaded, trained, *where, device)
+        homes = factory.homes(env_settings, geometry, cfg.split, cfg.episodes)
+        env_settings = factory.changed(env_settings, n_envs=cfg.episodes, resample=False)
+        where = dict(geometries=homes, seed=cfg.seed, device=device)
+        env, rows = factory.construct(env_settings, **where), []
+        policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+        players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
+        players += [("random", evaluation.RandomActions(env.action_space), False)] * cfg.baseline
+        for name, player, greedy in players:
+            episodes = evaluation.first_episodes(env, player, cfg.seed, greedy)
+            summaries = evaluation.summaries(episodes, getattr(env, "roles", None))
+            rows += [{"agent": name, **row} for row in summaries]
+        place, source = runs.place(env_settings, geometry, homes, cfg.split)
+        path = runs.write_table(
+            cfg,
+            loaded,
+            [source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
+            f"{place}, after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, "
+            f"{env.n_envs * env.n_agents:,} lanes",
+            rows,
+            [*map(cells, rows)],
+        )
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
-
-
-def first_episodes(cfg, loaded, trained, env_settings, geometry, device) -> Path:
-    homes = factory.homes(env_settings, geometry, cfg.split, cfg.episodes)
-    env_settings = factory.changed(env_settings, n_envs=cfg.episodes, resample=False)
-    where = dict(geometries=homes, seed=cfg.seed, device=device)
-    env, rows = factory.construct(env_settings, **where), []
-    policy = factory.make_policy(trained.agent, env)
-    factory.load_weights(policy, env, loaded)
-    players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
-    players += [("random", evaluation.RandomActions(env.action_space), False)] * cfg.baseline
-    for name, player, greedy in players:
-        episodes = evaluation.first_episodes(env, player, cfg.seed, greedy)
-        summaries = evaluation.summaries(episodes, getattr(env, "roles", None))
-        rows += [{"agent": name, **row} for row in summaries]
-    place, source = runs.place(env_settings, geometry, homes, cfg.split)
-    title = (
-        f"{place}, after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, "
-        f"{env.n_envs * env.n_agents:,} lanes"
-    )
-    names = [source, "env" if cfg.env else "", cfg.split, str(loaded.step)]
-    return runs.write_table(cfg, loaded, names, title, rows, [*map(cells, rows)])
 
 
 def cells(row: dict) -> dict[str, str]:
     cut, metrics = f", {row['unfinished']} cut short" if row["unfinished"] else "", {}
     for name, metric in row["metrics"].items():
-        texts = [f"{value:.3g}" for value in metric.values() if value is not None] or 3 * ["none"]
+        texts = [f"{value:.3g}" for value in metric.values() if value is not None] or 2 * ["none"]
         metrics |= {name: texts[0], f"{name}: {runs.INTERVAL}": " to ".join(texts[1:])}
     return {
         "agent": f"{row['agent']}: {row['role']}" if "role" in row else row["agent"],
@@ -129,10 +128,10 @@ def load_player(loaded: Checkpoint, env: Any, run: Checkpoint) -> Player:
             f"{loaded.path} was trained in {settings.label(trained.env.name)} and {run.path} in "
             f"{settings.label(own.env.name)}; choose a run in the same environment"
         )
-    policy = factory.make_policy(trained.agent, env)
-    factory.load_weights(policy, env, loaded)
-    name = f"{runs.folder_of(loaded.path).name}, {loaded.step:,} samples"
-    return Player(name, policy, loaded.step)
+    policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+    return Player(
+        f"{runs.folder_of(loaded.path).name}, {loaded.step:,} samples", policy, loaded.step
+    )
 
 
 # Returns who is to meet the agent of `run` in `env`.
@@ -178,18 +177,29 @@ class Arena:
 
     def play(self, player: Player, opponent: Player) -> Any:
         with factory.errors():
-            options = self.cfg.seed, self.cfg.greedy
-            return duels.play(self.env, player.policy, opponent.policy, *options)
+            return duels.play(
+                self.env, player.policy, opponent.policy, self.cfg.seed, self.cfg.greedy
+            )
 
     # Plays the run's agent against each of `cfg.against`. Prints and writes a table, and
     # returns the path of its .json.
     def duel(self) -> Path:
         rows = [{"against": p.name, **summary(self.play(self.agent, p))} for p in self.others]
-        title = f"{self.agent.name}: duels of {self.place}, seed {self.cfg.seed}"
-        names = ["duels", self.source, self.cfg.split, str(self.run.step), "against"]
-        names += self.cfg.against
-        cells = [{key: form.format_map(row) for key, form in DUELS.items()} for row in rows]
-        return runs.write_table(self.cfg, self.run, names, title, rows, cells)
+        return runs.write_table(
+            self.cfg,
+            self.run,
+            [
+                "duels",
+                self.source,
+                self.cfg.split,
+                str(self.run.step),
+                "against",
+                *self.cfg.against,
+            ],
+            f"{self.agent.name}: duels of {self.place}, seed {self.cfg.seed}",
+            rows,
+            [{key: form.format_map(row) for key, form in DUELS.items()} for row in rows],
+        )
 
     # Rates the run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels
     # of each with each. Prints a table, writes ratings.csv and ratings.svg into the run's folder,
@@ -197,7 +207,7 @@ class Arena:
     def rate(self) -> Path:
         folder, players = runs.folder_of(self.run.path), []
         for path in checkpoints(folder / "snapshots") or checkpoints(folder / "checkpoints"):
-            player = load_player(factory.load_checkpoint(path, self.env.device), self.sample, self.run)
+            player = find_player(str(path), self.run, None, self.sample)
             players.append(player._replace(name=f"{player.step:,} samples"))
         players += self.others
         if len(players) < 2:
@@ -209,11 +219,15 @@ class Arena:
             (i, j): self.play(players[i], players[j])["score"].tolist()
             for i, j in itertools.combinations(range(len(players)), 2)
         }
-        rows = ratings.rows([(player.name, player.step) for player in players], scores, self.cfg.seed)
+        rows = ratings.rows(
+            [(player.name, player.step) for player in players], scores, self.cfg.seed
+        )
         title = f"Ratings by duels of {self.place}, seed {self.cfg.seed}"
-        lines = [[form.format_map(row) for form in RATINGS.values()] for row in rows]
-        console.say(f"{title}\n{console.table([*RATINGS], lines)}")
-        with program.errors("The ratings are only printed: "):
+        table = console.table(
+            [*RATINGS], [[form.format_map(row) for form in RATINGS.values()] for row in rows]
+        )
+        console.say(f"{title}\n{table}")
+        with program.errors(f"{folder} cannot be written: "):
             ratings.write(folder, rows, title)
         console.say(f"Plot: {folder / 'ratings.svg'}")
         return folder / "ratings.csv"
@@ -222,9 +236,8 @@ class Arena:
 # Returns a table's row for what `duels.play` returned: the share won, a draw counting half,
 # with its 95 % interval over homes, or over duels where there are none.
 def summary(played: dict) -> dict:
-    score = played["score"].cpu().numpy()
-    homes = played["homes"].cpu().numpy() if "homes" in played else None
-    mean, lower, upper = evaluation.interval(score, homes)
+    score, *homes = (played[k].cpu().numpy() for k in ("score", "homes") if k in played)
+    mean, lower, upper = evaluation.interval(score, *homes)
     return {
         "won": mean,
         "lower": lower,
@@ -234,7 +247,7 @@ def summary(played: dict) -> dict:
         "draws": int(((score != 1) & (score != 0)).sum()),
         "length": float(played["lengths"].mean()),
         "duels": len(score),
-        "homes": None if homes is None else len(set(homes.tolist())),
+        "homes": len(set(homes[0].tolist())) if homes else None,
     }
 
 

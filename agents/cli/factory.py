@@ -22,8 +22,6 @@ from megastep.capture import state_tree
 PROBE = 65
 #: Environments of a sample, and the steps in which they must keep the contract.
 SAMPLE, SAMPLE_STEPS = 4, 16
-#: Parts of a policy that only training needs.
-CRITIC = ("critic", "prediction")
 #: What the library raises for bad arguments, files and devices, and for too little memory.
 KINDS = (
     ValueError,
@@ -51,7 +49,9 @@ def construct(settings: Any, name: str | None = None, **arguments: Any) -> Any:
 
 
 def changed(settings: Any, **changes: Any) -> Any:
-    return dataclasses.replace(settings, **{k: v for k, v in changes.items() if hasattr(settings, k)})
+    return dataclasses.replace(
+        settings, **{k: v for k, v in changes.items() if hasattr(settings, k)}
+    )
 
 
 def make_device(name: str) -> torch.device:
@@ -186,11 +186,11 @@ def spaces_of(env: Any) -> dict[str, str]:
     return {name: repr(space) for name, space in spaces.leaves(tree).items()}
 
 
-# Loads a checkpoint's weights into a policy made for `env`, the critic's too if it has one.
+# Returns a policy made for `env` with a checkpoint's weights, the critic's too if it has one.
 #
 # Raises:
 #     UserError: naming what differs, if they do not fit.
-def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> None:
+def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Policy:
     saved, present = loaded.config["spaces"], spaces_of(env)
     if differing := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]:
         changes = [f"{k} was {saved.get(k)} and is {present.get(k)}" for k in differing]
@@ -200,11 +200,11 @@ def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Non
         )
     weights = loaded.state["policy"]
     if policy.critic is None:  # what only training needs
-        weights = {k: v for k, v in weights.items() if k.split(".")[0] not in CRITIC}
+        weights = {k: v for k, v in weights.items() if not k.startswith(("critic.", "prediction."))}
     agent = " ".join(f"agent.{k}={v}" for k, v in loaded.config["train"]["agent"].items())
-    prefix = f"{loaded.path} does not fit this agent, but one with {agent}: "
-    with program.errors(prefix, (RuntimeError,)):
+    with program.errors(f"{loaded.path} needs an agent with {agent}: ", (RuntimeError,)):
         policy.load_state_dict(weights)
+    return policy
 
 
 def _nbytes(env):

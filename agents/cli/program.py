@@ -24,16 +24,16 @@ def version() -> str:
 
 
 class UserError(Exception):
-    """Something the user can put right, in one sentence. Ends the program with the exit code `code`,
-    without a traceback.
+    """Something the user can put right, in one sentence.
+
+    Ends the program with the exit code `code`, without a traceback.
     """
 
     code = 2
 
 
+# training stopped on numbers that are not finite, or went on without them
 class NonFinite(UserError):
-    """Training stopped on numbers that are not finite, or went on without them."""
-
     code = 1
 
 

@@ -1,4 +1,7 @@
-"""Films a trained policy, or random actions. `record --help`; `run(cfg)` is the same from Python."""
+"""Films a trained policy, or random actions.
+
+`record --help`; `run(cfg)` is the same from Python.
+"""
 
 import collections
 from pathlib import Path
@@ -38,8 +41,8 @@ HOMES = "megastep.geometries.sources:homes"
 
 def run(cfg: settings.Record) -> Path:
     """Films a run's agent, or random actions. Returns the path of the video."""
-    path, env_settings, geometry = Path(cfg.file or "video.mp4"), cfg.env, cfg.geometry
-    device = factory.make_device(cfg.device)
+    path, device = Path(cfg.file or "video.mp4"), factory.make_device(cfg.device)
+    env_settings, geometry = cfg.env, cfg.geometry
     if cfg.run is not None:
         loaded = factory.load_checkpoint(runs.find(cfg.run), device)
         trained = factory.config_of(loaded)

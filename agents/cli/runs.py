@@ -25,12 +25,6 @@ from megastep.agents.training import atomic_files, checkpoint, loggers
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: One line for each start of a run: its folder.
 STARTED = RUNS / "started.txt"
-#: Number of reports whose mean return is the score of a run.
-REPORTS = 10
-#: Seconds to try for the lock of a folder: its last owner may be deleting it.
-LOCK_TIMEOUT = 0.2
-#: What file systems without locks answer.
-NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK)
 INTERVAL = "95 % interval"
 #: The beginning of an error's message.
 CANNOT = "{} cannot be written; choose another with folder=: "
@@ -69,17 +63,17 @@ def new(cfg: Train) -> Path:
     return folder
 
 
+# Keeps other processes from training in a run folder.
+#
+# The system holds the lock for as long as this process lives, so none is ever stale: neither
+# after kill -9, nor when another process gets the number in the file.
+#
+# Raises:
+#     UserError: naming the process that trains there, or that the folder cannot be written.
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keeps other processes from training in a run folder.
-
-    The system holds the lock for as long as this process lives, so none is ever stale: neither
-    after kill -9, nor when another process gets the number in the file.
-
-    Raises:
-        UserError: naming the process that trains there, or that the folder cannot be written.
-    """
-    lock = filelock.FileLock(path := folder / "lock", timeout=LOCK_TIMEOUT)
+    # its last owner may just be deleting it
+    lock = filelock.FileLock(path := folder / "lock", timeout=0.2)
     try:
         lock.acquire()
         path.write_text(str(os.getpid()))
@@ -90,7 +84,7 @@ def locked(folder: Path) -> Iterator[None]:
         ) from None
     except OSError as error:
         with program.errors(CANNOT.format(folder)):
-            if error.errno not in NO_LOCKS:
+            if error.errno not in (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK):
                 raise
         console.warn(f"{folder} is on a file system without locks; train in it only once at a time")
     try:
@@ -103,7 +97,7 @@ def locked(folder: Path) -> Iterator[None]:
 # Notes that training starts in a folder now. `latest` follows these notes, since folders'
 # times change with whatever is written there, and clocks are moved.
 def record_start(folder: Path) -> None:
-    with console.warned(f"`latest` will not find {folder}: "):
+    with console.warned(f"{STARTED} cannot be written, so `latest` will not find {folder}: "):
         RUNS.mkdir(exist_ok=True)
         with open(STARTED, "ab") as file:
             file.write(os.fsencode(folder) + b"\n")
@@ -122,27 +116,29 @@ def known() -> list[Path]:
     return sorted(folders, key=lambda path: (order.get(path, -1), str(path)))
 
 
+# Returns an existing run's folder, or one of its checkpoints, from a path or `latest`.
+#
+# Raises:
+#     UserError: naming the nearest run.
 def find(name: str) -> Path:
-    """Returns an existing run's folder, or one of its checkpoints, from a path or `latest`.
-
-    Raises:
-        UserError: naming the nearest run.
-    """
     path, folders = Path(name), known()
     if name == "latest" and folders:
         return folders[-1]
     if any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints")):
         return path
-    problem = "has no folder named checkpoints" if os.path.exists(path) else "does not exist"
-    near = difflib.get_close_matches(name, map(str, folders), n=1, cutoff=0.4) or ["runs/..."]
-    raise UserError(f"The run {shortened(name)} {problem}; did you mean {near[0]}?")
+    near = difflib.get_close_matches(name, map(str, folders), n=1, cutoff=0.4)
+    problem = "is no run, with a folder checkpoints" if os.path.exists(path) else "does not exist"
+    raise UserError(
+        f"{shortened(name)} {problem}; "
+        + (f"did you mean {near[0]}?" if near else "train.py makes runs")
+    )
 
 
 def resume_command(folder: Path) -> str:
     # quoted for the shell and for Hydra where needed
-    quoted = shlex.quote('resume="{}"'.format(str(folder).replace('"', '\\"')))
     is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
-    return f"{program.name('train', 'python ')} {f'resume={folder}' if is_plain else quoted}"
+    name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
+    return f"{program.name('train', 'python ')} {shlex.quote(f'resume={name}')}"
 
 
 # a checkpoint, or the folder of a run's checkpoints
@@ -169,10 +165,15 @@ def place(env: Env, geometry: Geometry, homes: list, split: str) -> tuple[str, s
 # Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
 # and `rows` for programs, .json. Returns the latter's path.
 def write_table(
-    cfg: Evaluate, loaded: checkpoint.Checkpoint, names: list[str], title: str, rows: list, cells: list[dict]
+    cfg: Evaluate,
+    loaded: checkpoint.Checkpoint,
+    names: list[str],
+    title: str,
+    rows: list,
+    cells: list[dict],
 ) -> Path:
-    name = "-".join(filter(None, [*names, "greedy" if cfg.greedy else ""]))
-    folder, name = folder_of(loaded.path) / "evaluations", re.sub(r"[^\w.-]", "-", name)[:200]
+    names = [name for name in (*names, "greedy" * cfg.greedy) if name]
+    folder, name = folder_of(loaded.path) / "evaluations", re.sub(r"[^\w.-]", "-", "-".join(names))
     head, lines = [*cells[0]], [[*row.values()] for row in cells]
     result = dict(
         title=title,
@@ -182,17 +183,19 @@ def write_table(
         rows=rows,
     )
     console.say(f"{title}\n{console.table(head, lines)}")
-    with program.errors("The evaluation is only printed: "):
+    with program.errors(f"{folder} cannot be written: "):
         folder.mkdir(exist_ok=True)
-        markdown = f"{title}\n\n{console.table(head, lines, box.MARKDOWN)}\n"
-        atomic_files.replace(folder / f"{name}.md", markdown.encode())
-        atomic_files.replace(folder / f"{name}.json", json.dumps(result, indent=2).encode())
-    return folder / f"{name}.json"
+        atomic_files.replace(
+            folder / f"{name[:200]}.md",
+            f"{title}\n\n{console.table(head, lines, box.MARKDOWN)}\n".encode(),
+        )
+        atomic_files.replace(folder / f"{name[:200]}.json", json.dumps(result, indent=2).encode())
+    return folder / f"{name[:200]}.json"
 
 
 # Returns what a job achieved, from what it returned.
 #
-# score: for a sweeper: a training run's mean return over its last reports, an evaluation's
+# score: for a sweeper: a training run's mean return over its last 10 reports, an evaluation's
 #     return, the share of duels won against the first opponent.
 # evaluated, lower, upper: the evaluated one of these with its interval; of a run its return.
 def outcome(result: Path) -> dict[str, float | None]:
@@ -201,9 +204,11 @@ def outcome(result: Path) -> dict[str, float | None]:
         files = sorted(result.glob("evaluations/*.json"))
         with contextlib.suppress(OSError):
             rows = loggers.read(result / "metrics.jsonl")
-            returns = [row["episode/return"] for row in rows if row.get("episode/return") is not None]
+            returns = [
+                row["episode/return"] for row in rows if row.get("episode/return") is not None
+            ]
     rows = [json.loads(file.read_text())["rows"][0] for file in files if file.suffix == ".json"]
     row = next((row for row in rows if not is_run or "return" in row), {})
     evaluated = row.get("return", row.get("won"))
-    score = statistics.fmean(returns[-REPORTS:]) if returns else None if is_run else evaluated
+    score = statistics.fmean(returns[-10:]) if returns else None if is_run else evaluated
     return dict(score=score, evaluated=evaluated, lower=row.get("lower"), upper=row.get("upper"))

@@ -78,13 +78,12 @@ IMPORTED = {
 GROUPS = (*IMPORTED, "logger")
 
 
+# Returns the dataclass of the settings of a group's member, by the member's `name`.
+#
+# Raises:
+#     ValueError: if nothing can be imported under this name, or it takes other arguments.
 @functools.cache
 def kind_of(group: str, name: str) -> type:
-    """Returns the dataclass of the settings of a group's member, by the member's `name`.
-
-    Raises:
-        ValueError: if nothing can be imported under this name, or it takes other arguments.
-    """
     if group == "logger":
         if name not in LOGGERS:
             raise ValueError(f"{name!r} is unknown; {closest(name, LOGGERS)}")
@@ -94,8 +93,9 @@ def kind_of(group: str, name: str) -> type:
         taken = inspect.signature(constructor).parameters
         if missing := [f"{k}, {text}" for k, text in spec["required"].items() if k not in taken]:
             raise ValueError(f"it takes no {missing[0]}")
-        more = {"name": str, **spec["more"]}
-        return settings_of(constructor, spec["reserved"], spec["defaults"], **more)
+        return settings_of(
+            constructor, spec["reserved"], spec["defaults"], name=str, **spec["more"]
+        )
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name} cannot be used: {error}") from error
 

@@ -73,19 +73,17 @@ def handled(on_first: Callable[[int], None] = announce) -> Iterator[list[int]]:
 # Has another process stop in good order, once, though a terminal's Ctrl-C may have reached it
 # as well: a second SIGHUP never ends a program.
 def stop(process: int) -> None:
-    is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     with contextlib.suppress(ProcessLookupError):
-        os.kill(process, signal.SIGTERM if is_ignored else signal.SIGHUP)
+        os.kill(process, signal.SIGTERM if ignored else signal.SIGHUP)
 
 
 def _install(handler: Callable) -> dict[int, object]:
     # in the main thread; nohup has SIGHUP ignored, which stays so; returns the handlers there were
     if threading.current_thread() is not threading.main_thread():
         return {}
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    if before[signal.SIGHUP] is signal.SIG_IGN:
-        del before[signal.SIGHUP]
-    return {number: signal.signal(number, handler) for number in before}
+    is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return {n: signal.signal(n, handler) for n in SIGNALS[: 2 if is_ignored else 3]}
 
 
 def _write(stream: TextIO | None, line: str) -> None:

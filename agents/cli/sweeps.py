@@ -34,18 +34,16 @@ from megastep.agents.cli.program import ConfigErrors, UserError, shortened
 from megastep.agents.training import atomic_files
 
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
-#: Seconds that jobs have to save once the sweep is interrupted.
-GRACE = 30
 #: Columns of the table beside the job and the keys that vary.
 COLUMNS = ("state", "score", "evaluated", "lower", "upper", "seconds", "folder")
 #: What a search is to do, if nothing else is typed: look for high returns, and go past failed jobs.
 SEARCH = {"hydra.sweeper.direction": "maximize", "hydra.sweeper.max_failure_rate": "1.0"}
-#: A point of an interval that is no integer where its bounds are.
-INSIDE = 0.38
 
 OmegaConf.register_new_resolver(
     "file_name",  # of characters that shells and Hydra leave alone, and at most 255 bytes
-    lambda text: re.sub(r"[^\w.=-]+", "-", text).encode()[:200].decode(errors="ignore") or "default",
+    lambda text: (
+        re.sub(r"[^\w.=-]+", "-", text).encode()[:200].decode(errors="ignore") or "default"
+    ),
     replace=True,
 )
 
@@ -53,16 +51,15 @@ OmegaConf.register_new_resolver(
 # ---- Before the first job ----
 
 
+# Returns (the words of each job that is known beforehand, all of them checked; the
+# configuration of the first).
+#
+# Of a grid these are all jobs; of a search, the first of all values, and each other value and
+# bound alone.
+#
+# Raises:
+#     ConfigErrors: with all that is wrong in the first wrong job.
 def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], Any]:
-    """Returns (the words of each job that is known beforehand, all of them checked; the
-    configuration of the first).
-
-    Of a grid these are all jobs; of a search, the first of all values, and each other value and
-    bound alone.
-
-    Raises:
-        ConfigErrors: with all that is wrong in the first wrong job.
-    """
     values = {key_of(override): _values(override) for override in composer.parse(words)}
     config = composer.compose([options[0] for options in values.values() if options[0]])[1].hydra
     params = composer.parse(f"{k}={v}" for k, v in (config.sweeper.get("params") or {}).items())
@@ -84,7 +81,8 @@ def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], Any]
 def _values(override: Override) -> list[str | None]:
     key, sweep = override.get_key_element(), override.value()
     if override.is_interval_sweep():
-        inside = sweep.start + INSIDE * (sweep.end - sweep.start)
+        # a point inside that is no integer, even if the bounds are 1.0 and 4.0
+        inside = sweep.start + 0.38 * (sweep.end - sweep.start)
         inside = round(inside) if isinstance(sweep.start + sweep.end, int) else inside
         return [None, *(f"{key}={value}" for value in (sweep.start, sweep.end, inside))]
     if not override.is_sweep_override():
@@ -94,10 +92,9 @@ def _values(override: Override) -> list[str | None]:
     raise ConfigErrors([(key, f"{override.input_line!r} has no value")])
 
 
+# Checks all jobs, then hands the sweep over to Hydra, past jobs that fail. Returns the exit
+# code.
 def sweep(composer: Composer, words: list[str]) -> int:
-    """Checks all jobs, then hands the sweep over to Hydra, past jobs that fail. Returns the exit
-    code.
-    """
     overrides = {key_of(override): override for override in composer.parse(words)}
     if "folder" in overrides:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])
@@ -118,8 +115,10 @@ def sweep(composer: Composer, words: list[str]) -> int:
     }
     words = [f"{key}={value}" for key, value in options.items() if key not in overrides]
     words += [override.input_line for override in overrides.values()]
-    paths = [str(program.ROOT), os.getcwd(), os.environ.get("PYTHONPATH")]  # of launchers' processes
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, dict.fromkeys(paths)))
+    # processes of launchers find the modules that this one finds
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        filter(None, [str(program.ROOT), os.getcwd(), os.environ.get("PYTHONPATH")])
+    )
     job, problem = Job(composer, folder), ""
     try:
         with signals.handled(job.interrupt):
@@ -164,7 +163,10 @@ class Job:
         if os.getpid() != self.process:  # its lines are among those of others
             warnings.showwarning, console.prefix = console.warn, f"job {number}: "
         pairs = (word.lstrip("+~").partition("=") for word in words)
-        fixed, path = hydra.job.config.override_dirname.exclude_keys, self.records / f"{number}.json"
+        fixed, path = (
+            hydra.job.config.override_dirname.exclude_keys,
+            self.records / f"{number}.json",
+        )
         row = dict(
             number=number,
             varied={key: value.strip("\"'") for key, _, value in pairs if key not in fixed},
@@ -211,7 +213,10 @@ class Job:
         rows = []
         for path in self.records.glob("*.json"):
             state = RUNNING
-            with contextlib.suppress(OSError), filelock.FileLock(path.with_suffix(".lock"), timeout=0):
+            with (
+                contextlib.suppress(OSError),
+                filelock.FileLock(path.with_suffix(".lock"), timeout=0),
+            ):
                 state = LOST  # if it says that it is running, for no process holds its lock
             row = json.loads(path.read_text())
             rows.append(row | {"state": state} if row["state"] == RUNNING else row)
@@ -219,7 +224,7 @@ class Job:
 
     # Has jobs in other processes save and end, then raises Interrupted.
     def interrupt(self, number: int) -> NoReturn:
-        deadline = time.monotonic() + GRACE
+        deadline = time.monotonic() + 30  # seconds, for jobs to save
         for process in self.running():
             signals.stop(process)
         while self.running() and time.monotonic() < deadline:
@@ -263,10 +268,11 @@ def report(folder: Path, rows: list[dict[str, Any]]) -> None:
     csv.writer(text).writerows([head, *([row.get(name) for name in head] for row in rows)])
     cells = [[_brief(row.get(name)) for name in head[:-1]] for row in rows]
     console.say(f"Sweep\n{console.table(head[:-1], cells)}")
-    with console.warned("the table is only printed: "):
+    with console.warned(f"{folder} cannot be written: "):
         atomic_files.replace(folder / "sweep.csv", text.getvalue().encode())
-        markdown = console.table(head[:-1], cells, box.MARKDOWN)
-        atomic_files.replace(folder / "sweep.md", f"{markdown}\n".encode())
+        atomic_files.replace(
+            folder / "sweep.md", console.table(head[:-1], cells, box.MARKDOWN).encode()
+        )
         console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")
 
 

