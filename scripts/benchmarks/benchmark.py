@@ -1,12 +1,12 @@
-"""Measures what docs/benchmarks.md and docs/benchmark-table.md say.
+"""Measures what docs/lab/benchmarks.md and docs/lab/benchmark-table.md say.
 
-    python scripts/benchmarks/benchmark.py step kernels --json docs/benchmarks.jsonl
+    python scripts/benchmarks/benchmark.py step kernels --json docs/lab/benchmarks.jsonl
     python scripts/benchmarks/benchmark.py report
 
 The first prints a table and appends a line per measurement to a file of JSON lines; the second
-turns docs/benchmarks.jsonl into docs/benchmark-table.md and its plot. A measurement is the median
-of its samples, its spread their 10th and 90th percentiles. A sample is the mean of as many calls as
-fill 50 ms after warming up, timed by CUDA events on a GPU and by the clock on the CPU.
+turns docs/lab/benchmarks.jsonl into docs/lab/benchmark-table.md and its plots. A measurement is the
+median of its samples, its spread their 10th and 90th percentiles. A sample is the mean of as many
+calls as fill 50 ms after warming up, timed by CUDA events on a GPU and by the clock on the CPU.
 """
 
 import argparse
@@ -137,7 +137,7 @@ def main(argv=None):
     )
     parser.add_argument("--commit", help="what is measured, where git cannot tell")
     parser.add_argument(
-        "--json", type=Path, help="a file to append records to; report reads docs/benchmarks.jsonl"
+        "--json", type=Path, help="a file to append records to; report reads docs/lab/*.jsonl"
     )
     try:
         run(parser.parse_args(argv))
@@ -149,7 +149,7 @@ def main(argv=None):
 
 def run(options):
     if options.benchmarks == ["report"]:
-        return benchmark_report.report(options.json or ROOT / "docs" / "benchmarks.jsonl")
+        return benchmark_report.report(options.json or ROOT / "docs" / "lab" / "benchmarks.jsonl")
     device, measured = checked(options), options.commit or commit()
     print(benchmark_report.HEADER, flush=True)
     for name in options.benchmarks:

@@ -16,9 +16,9 @@ ALL_SEEN = 59.1  # what 128 looks all round show of a test home, less the first 
 COLOURS = {"explorer": "tab:blue", "minimal": "tab:orange", "pointgoal": "tab:purple"}
 PAGE = """# Benchmark table
 
-`python scripts/benchmarks/benchmark.py report` writes this page from `benchmarks.jsonl`; `python
-scripts/benchmarks/benchmark.py BENCHMARK --json docs/benchmarks.jsonl` measures, with `--device cpu` on the
-CPU. [Benchmarks](benchmarks.md) says what the measurements mean.
+Written by `python scripts/benchmarks/benchmark.py report` from `benchmarks.jsonl`. To measure:
+`python scripts/benchmarks/benchmark.py BENCHMARK --json docs/lab/benchmarks.jsonl`, with `--device cpu`
+for the CPU. [Benchmarks](benchmarks.md) explains the measurements.
 
 ![Frames per second against environments, both logarithmic]({plot})
 

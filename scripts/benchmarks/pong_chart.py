@@ -1,12 +1,12 @@
 """What a step of Pong costs one environment, by how many are stepped at once: in plain Python, in
 NumPy, by the engine, and in the Atari emulator; all with pictures.
 
-    python scripts/benchmarks/pong_chart.py measure       # on the CPU; writes docs/pong.jsonl
-    python scripts/benchmarks/pong_chart.py draw          # docs/pong.svg
+    python scripts/benchmarks/pong_chart.py measure       # on the CPU; writes docs/lab/pong.jsonl
+    python scripts/benchmarks/pong_chart.py draw          # docs/lab/pong.svg
 
-One thread of the CPU each; on a GPU, what `python scripts/benchmarks/benchmark.py pong` measured. Atari Pong
-is measured where ale-py is installed; it is under the GPL 2.0, so nothing here requires it: pip
-install ale-py. Its frame has other rules and 160 x 210 pixels.
+One thread of the CPU each; on a GPU, the records of `python scripts/benchmarks/benchmark.py pong`.
+Atari Pong is measured if ale-py is installed (pip install ale-py). It is under the GPL 2.0, so
+nothing here requires it. Its frame has other rules and 160 x 210 pixels.
 """
 
 import argparse
@@ -33,8 +33,9 @@ from timing import TURNS, timed  # noqa: E402
 from megastep import arrdict, envs  # noqa: E402
 from tests.helpers.pong_twins import NumpyPong, PythonPong  # noqa: E402
 
-RECORDS, CHART = ROOT / "docs" / "pong.jsonl", ROOT / "docs" / "pong.svg"
-BENCHMARKS = ROOT / "docs" / "benchmarks.jsonl"
+LAB = ROOT / "docs" / "lab"
+RECORDS, CHART = LAB / "pong.jsonl", LAB / "pong.svg"
+BENCHMARKS = LAB / "benchmarks.jsonl"
 ON_GPU = r"pong, pictures, `env.step`, ([\d,]+) environments"
 STEPS = 300  # before it is timed, so that games are in all their phases
 COLOURS = {

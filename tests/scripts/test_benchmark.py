@@ -299,10 +299,10 @@ def test_records_that_differ_in_counts_are_of_one_measurement():
 
 def test_the_page_says_what_the_records_say():
     """If this fails: python scripts/benchmarks/benchmark.py report."""
-    records = benchmark_report.read(ROOT / "docs" / "benchmarks.jsonl")
-    page = (ROOT / "docs" / "benchmark-table.md").read_text()
+    records = benchmark_report.read(ROOT / "docs" / "lab" / "benchmarks.jsonl")
+    page = (ROOT / "docs" / "lab" / "benchmark-table.md").read_text()
     assert benchmark_report.page(records, "benchmark-table.svg") == page
-    assert (ROOT / "docs" / "benchmark-table.svg").exists()
+    assert (ROOT / "docs" / "lab" / "benchmark-table.svg").exists()
 
 
 def test_a_record_says_the_command_that_measures_it_again(monkeypatch):
