@@ -15,14 +15,14 @@ N_ENVS = {
 }
 N_ENVS_AS_TRAINED = {"cuda": (1024, 4096, 16_384), "cpu": (1024,)}
 N_ARENAS = {"cuda": (1024, 8192, 65_536), "cpu": (1024,)}  # homes of four agents each
-#: How training sets up Explorer: a new home for every episode, and what only the critic sees.
+#: Explorer's settings in training: a new home per episode, a privileged observation.
 AS_TRAINED = dict(resample=True, privileged=True)
 
 
 def step(device: torch.device) -> Iterator[dict]:
-    """Frames per second of `env.step` with everything that it does, with the environments' default
-    settings. "As trained" is Explorer as training sets it up: with a new home for every episode and
-    the privileged observation of the critic.
+    """Frames per second of the whole `env.step` with default settings. "As trained" is Explorer
+    with the settings of training: a new home for every episode, and a privileged observation for
+    the critic.
     """
     for name in ("explorer", "minimal", "pointgoal"):
         for n_envs in N_ENVS[device.type]:

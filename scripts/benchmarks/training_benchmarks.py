@@ -23,6 +23,7 @@ from training_runs import (
 BUDGETS = 10, 60, 240  # seconds of training
 SEEDS = 1, 2, 3
 NO_FINISH = "finish.evaluate=false", "finish.record=false"
+EXPLORER = "geometry=bench", "finish.evaluate=true"  # overrides of `train`
 
 # ---- worlds: a recipe per environment ----
 
@@ -105,8 +106,7 @@ def train(
     """
     for budget, seed in itertools.product(budgets, seeds):
         what = f"training, {budget} s, seed {seed}"
-        overrides = "geometry=bench", f"seconds={budget}", f"seed={seed}", "finish.evaluate=true"
-        with trained(device, overrides) as (run,):
+        with trained(device, (*EXPLORER, f"seconds={budget}", f"seed={seed}")) as (run,):
             rows, curve = newest_evaluation(run), learning_curve(run)
         for agent, row in zip(("return", "return of random actions"), rows):
             yield metric_mean(f"{what}, {agent} in unseen homes", row, "return")
@@ -174,9 +174,9 @@ def learners(
     budgets: Sequence[int] | None = None,
     envs: Sequence[str] = tuple(COMPARED),
 ) -> Iterator[dict]:
-    """A comparison of learners that train for equally many seconds, one at a time: three seeds in
-    Explorer, the first seed alone in the other environments and for acting an update behind. Has
-    learning curves, and an evaluation in unseen homes.
+    """A comparison of learners that train for equally long, one at a time, with learning curves and
+    an evaluation in unseen homes. Three seeds in Explorer; one in the other environments, and one
+    for acting an update behind.
     """
     for env in envs:
         env_overrides, metric, default_budget = COMPARED[env]

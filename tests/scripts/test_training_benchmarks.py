@@ -58,7 +58,10 @@ def test_recipes_are_trained_and_evaluated_in_each_place(monkeypatch):
 
 
 @pytest.mark.slow
-def test_train_evaluates_in_unseen_homes():
+def test_train_evaluates_in_unseen_homes(monkeypatch):
+    small = "preset=cpu", "env.n_envs=32", "log_every=1", "finish.episodes=16"
+    overrides = *training_benchmarks.EXPLORER, *small
+    monkeypatch.setattr(training_benchmarks, "EXPLORER", overrides)
     rows = list(training_benchmarks.train(CPU, seeds=(1,), budgets=(2,)))
     assert [row["what"] for row in rows[:2]] == [
         "training, 2 s, seed 1, return in unseen homes",
