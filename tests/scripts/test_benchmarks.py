@@ -15,6 +15,7 @@ import pytest
 import random_walks
 import records
 import replay_buffer
+import startup_times
 import timing
 import torch
 
@@ -116,6 +117,15 @@ def test_step_benchmark_measures_explorer_as_trained(tiny_benchmarks, monkeypatc
     assert [settings for _, settings in walks] == [{}, {}, {}, dict(resample=True, privileged=True)]
     decision = arrdict.arrdict(actions=torch.zeros((8, 1), dtype=torch.long))
     assert ["privileged" in env.step(decision) for env, _ in (walks[0], walks[-1])] == [False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "n_records"), [("compile", 1), ("first", 2), ("startup", 1)])
+def test_startup_benchmark_measures_new_processes(name, n_records, monkeypatch):
+    monkeypatch.setattr(startup_times, "N_PROCESSES", 1)
+    rows = list(benchmark.measure(name, torch.device("cpu"), "abc"))
+    assert len(rows) == n_records
+    assert all(0 < row["value"] < 600 and row["unit"] == "s" for row in rows)
 
 
 def test_cpu_benchmark_restores_number_of_threads(tiny_benchmarks):

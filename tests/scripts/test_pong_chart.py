@@ -31,9 +31,9 @@ def test_installed_implementations_are_measured_and_drawn(tiny_measurements, tmp
     output, rows = capsys.readouterr().out, records.read(path)
     assert ("Atari emulator, 1" in output) != ("pip install ale-py" in output)
     for name in ("plain Python", "NumPy", "megastep"):
-        own_rows = [row for row in rows if row["name"] == name]
-        assert [row["environments"] for row in own_rows] == [1, 3]
-        assert all(row["seconds"] > 0 for row in own_rows)
+        measured_rows = [row for row in rows if row["name"] == name]
+        assert [row["environments"] for row in measured_rows] == [1, 3]
+        assert all(row["seconds"] > 0 for row in measured_rows)
     pong_chart.main(["draw", *arguments])
     svg = chart.read_text()
     assert "megastep, one CPU thread" in svg and "megastep, one NVIDIA" in svg
