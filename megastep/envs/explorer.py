@@ -11,16 +11,17 @@ from pydantic import Field
 
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
-from megastep.arrdict import arrdict, numpyify
+from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
+from megastep.envs.common import SceneryEnv
 from megastep.scene import scenery
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Explorer"]
 
 
-class Explorer:
+class Explorer(SceneryEnv):
     """Reward for wall texels seen for the first time in an episode, / 64; what the first view shows
     pays nothing.
 
@@ -150,17 +151,6 @@ class Explorer:
         )
         return obs, modules.to_lanes(view.newly_seen) if seen else None
 
-    def check(self) -> None:
-        """EngineError if the engine has flagged an error since the last check. Waits for the
-        device, so not for inside a step.
-        """
-        engine.check(self.core.agents)
-
-    @property
-    def layout(self) -> torch.Tensor:
-        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
-        return self.core.scenery.layout
-
     def state(self, e: int = 0) -> arrdict:
         """What :meth:`plot_state` draws of environment ``e``."""
         return arrdict(
@@ -196,7 +186,3 @@ class Explorer:
         modules.RGB.plot_state(state.obs.rgb, strips[:1], yaws)
         modules.Depth.plot_state(state.obs.d, strips[1:], yaws)
         return figure
-
-    def display(self, e: int = 0) -> Any:
-        """Environment ``e`` as it is now, as a matplotlib figure."""
-        return self.plot_state(numpyify(self.state(e)))

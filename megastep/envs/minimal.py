@@ -10,15 +10,16 @@ import torch
 from pydantic import Field
 
 from megastep import engine, modules, plotting, toys
-from megastep.arrdict import arrdict, numpyify
+from megastep.arrdict import arrdict
 from megastep.core import Core
+from megastep.envs.common import SceneryEnv
 from megastep.scene import scenery
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Minimal"]
 
 
-class Minimal:
+class Minimal(SceneryEnv):
     """The environment to start others from: RGB of 64 pixels, seven actions, no reward, truncated
     after a random 128 to 256 steps.
 
@@ -77,17 +78,6 @@ class Minimal:
         view = engine.observe(self.core.scenery, self.core.agents, depth=False)
         return view.rgb.view(self.n_envs, *self.obs_space.shape)
 
-    def check(self) -> None:
-        """EngineError if the engine has flagged an error since the last check. Waits for the
-        device, so not for inside a step.
-        """
-        engine.check(self.core.agents)
-
-    @property
-    def layout(self) -> torch.Tensor:
-        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
-        return self.core.scenery.layout
-
     def state(self, e: int = 0) -> arrdict:
         """What :meth:`plot_state` draws of environment ``e``."""
         return arrdict(
@@ -102,7 +92,3 @@ class Minimal:
         Core.plot_state(state.core, plan)
         modules.RGB.plot_state(state.rgb, strips)
         return figure
-
-    def display(self, e: int = 0) -> Any:
-        """Environment ``e`` as it is now, as a matplotlib figure."""
-        return self.plot_state(numpyify(self.state(e)))
