@@ -1,4 +1,4 @@
-"""The page on worlds: its commands can be typed, its pictures are there, its rules hold."""
+"""docs/worlds.md: its commands are valid, its images exist, and it lists every environment."""
 
 import re
 import shlex
@@ -18,13 +18,13 @@ SCRIPTS = {"train": Train, "evaluate": Evaluate, "record": Record}
 
 
 @pytest.mark.parametrize("script, arguments", [c for c in COMMANDS if c[0] in SCRIPTS])
-def test_a_command_is_a_configuration(script, arguments):
+def test_commands_are_valid(script, arguments):
     with ConfigLoader(script, SCRIPTS[script]) as loader:
         kind = SCRIPTS[script]
         assert isinstance(build(kind, loader.tree(shlex.split(arguments))), kind)
 
 
-def test_pictures_are_there_and_every_environment_is_told_of():
-    pictures = re.findall(r"!\[[^]]+\]\(([^)]+)\)", PAGE)
-    assert len(pictures) >= 4 and all((DOCS / name).exists() for name in pictures)
+def test_images_exist_and_every_environment_has_a_section():
+    images = re.findall(r"!\[[^]]+\]\(([^)]+)\)", PAGE)
+    assert len(images) >= 4 and all((DOCS / name).exists() for name in images)
     assert set(envs.ENVS) <= set(map(str.lower, re.findall(r"^## (\w+)$", PAGE, re.MULTILINE)))
