@@ -41,8 +41,8 @@ def components(free):
 
 
 def clearance(g, limit=0.3):
-    """Returns the metres, at most `limit`, from each cell's centre on the fine raster to the nearest
-    wall.
+    """Returns the metres, at most `limit`, from each cell's centre on the fine raster to the
+    nearest wall.
     """
     ratio = round(g.res / FINE)
     height, width = g.masks.shape[0] * ratio, g.masks.shape[1] * ratio

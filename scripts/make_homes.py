@@ -94,8 +94,8 @@ def fingerprint(g):
 
 
 def similarity(plans):
-    """Returns, for each home, the largest Jaccard index of its wall cells with those of another, over
-    the 8 symmetries.
+    """Returns, for each home, the largest Jaccard index of its wall cells with those of another,
+    over the 8 symmetries.
     """
     side = int(np.ceil(max(np.ptp(g.walls, axis=(0, 1)).max() for g in plans) / NEAR)) + 2
     cells = np.zeros((8, len(plans), side * side), np.float32)

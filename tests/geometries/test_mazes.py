@@ -64,7 +64,7 @@ def crosses(walls, a, b):
 
 
 def graph(g, size, corridor, thickness):
-    """{cell: the cells that it opens to}, by testing every pair of neighbours against every wall."""
+    """{cell: the cells that it opens to}, by testing all pairs of neighbours against all walls."""
     opened = {cell: [] for cell in cells(size)}
     for x, y in cells(size):
         for other in ((x + 1, y), (x, y + 1)):
