@@ -1,4 +1,4 @@
-"""What all tests share: one thread a process, no screen, and no GPU tests where there is no GPU."""
+"""Fixtures and settings of all tests: one thread per process, no display, no GPU tests on a CPU."""
 
 import os
 
@@ -24,25 +24,22 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request):
-    """Either device, for tests that hold on both."""
+    """The CPU and, marked `cuda`, the GPU."""
     return request.param
 
 
 @pytest.fixture(scope="session")
 def launch_on_cpu(tmp_path_factory):
-    """What launches the learner's kernels on a CPU: their source, compiled for it through
-    `cuda_on_cpu.h`.
+    """A launcher of the networks' CUDA kernels, compiled for the CPU with `cuda_on_cpu.h`. It takes
+    the place of `launch`.
     """
     from megastep.agents.networks.kernels.program import CORES, DTYPES, STRUCTS
     from megastep.kernels.build import compile
 
     folder = tmp_path_factory.mktemp("kernels")
     source, library = folder / "kernels.cpp", folder / "kernels.so"
-    included = [
-        Path(__file__).parent / "helpers" / "cuda_on_cpu.h",
-        *sorted(CORES.folder.glob("*.cu")),
-    ]
-    lines = [f'#include "{path}"' for path in included]
+    header = Path(__file__).parent / "helpers" / "cuda_on_cpu.h"
+    lines = [f'#include "{path}"' for path in [header, *sorted(CORES.folder.glob("*.cu"))]]
     lines += [
         f'extern "C" void run_{name}_{dtype}(const {struct}* p, unsigned int threads) '
         f"{{ launch({name}_{dtype}, p, threads); }}"
@@ -53,10 +50,10 @@ def launch_on_cpu(tmp_path_factory):
     compiler, _ = compile._compiler()
     command = [compiler, "-std=c++17", "-O1", "-shared", "-fPIC", f"-DBLOCK={compile.BLOCK}"]
     subprocess.run([*command, str(source), "-o", str(library)], check=True)
-    loaded = ctypes.CDLL(str(library))
+    compiled = ctypes.CDLL(str(library))
 
     def launch(operation, packed, device, threads, program):
         assert program is CORES and device.type == "cpu"
-        getattr(loaded, f"run_{operation}")(packed, ctypes.c_uint(threads))
+        getattr(compiled, f"run_{operation}")(packed, ctypes.c_uint(threads))
 
     return launch

@@ -419,14 +419,14 @@ def test_what_cannot_be_used_is_one_sentence(outside, capsys, words, sentence):
     "change, clause",
     [
         (("n_agents, fps = 1, 5.0", "n_agents = 1"), "it has no fps"),
-        (("reward=reward,", "reward=reward.double(),"), "rewards are float32"),
+        (("reward=reward,", "reward=reward.double(),"), "reward must be torch.float32"),
         (("torch.zeros_like(reset),", "self.age >= self.limit,"), "exclude each other"),
-        (("[:, None],", ","), "observation is as its space says"),
+        (("[:, None],", ","), "obs must be "),
         (
             ("reset=reset,", "reset=reset, metrics=dict(up=up[:1]),"),
-            "metric up has one float32",
+            "metrics.up must be torch.float32",
         ),
-        (("reset=reset,", ""), "a world has reset"),
+        (("reset=reset,", ""), "the world has no reset"),
     ],
 )
 def test_a_class_that_breaks_a_clause_of_the_contract_is_told_which(

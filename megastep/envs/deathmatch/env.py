@@ -11,9 +11,10 @@ from pydantic import Field
 
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
-from megastep.arrdict import arrdict, numpyify
+from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
+from megastep.envs.common import SceneryEnv
 from megastep.envs.deathmatch.step import MAX_AGENTS, deathmatch_step
 from megastep.scene import scenery
 from megastep.settings import MAX_ENVS, checked
@@ -28,7 +29,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Price = Annotated[float, Field(ge=-1000, le=1000)]
 
 
-class Deathmatch:
+class Deathmatch(SceneryEnv):
     """A reward of 1 for each step with another agent in the middle of the view, a hit, and -1 for
     each hit by another, a wound.
 
@@ -193,17 +194,6 @@ class Deathmatch:
             imu=view.imu.view(lanes, 1, 3),
         )
 
-    def check(self) -> None:
-        """EngineError if the engine has flagged an error since the last check. Waits for the
-        device, so not for inside a step.
-        """
-        engine.check(self.core.agents)
-
-    @property
-    def layout(self) -> torch.Tensor:
-        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
-        return self.core.scenery.layout
-
     def state(self, e: int = 0) -> arrdict:
         """What :meth:`plot_state` draws of environment ``e``, (A, ...) each; ``target`` is the
         agent in the middle of another's view, or -1, and ``kills`` those of the episodes under way.
@@ -244,7 +234,3 @@ class Deathmatch:
                 strip.set(xlabel="", xticks=[], box_aspect=None)
             plotting.plot_level(colour, state.health[agent])
         return figure
-
-    def display(self, e: int = 0) -> Any:
-        """Environment ``e`` as it is now, as a matplotlib figure."""
-        return self.plot_state(numpyify(self.state(e)))

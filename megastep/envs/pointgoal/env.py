@@ -11,9 +11,10 @@ from pydantic import Field
 
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
-from megastep.arrdict import arrdict, numpyify
+from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
+from megastep.envs.common import SceneryEnv
 from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
 from megastep.scene import scenery
@@ -25,7 +26,7 @@ METRICS = "success", "spl", "soft_spl", "collisions"
 REACH = 0.2  # metres from the goal: there
 
 
-class PointGoal:
+class PointGoal(SceneryEnv):
     """Reward for every metre by which the shortest way to the goal becomes shorter, and ``bonus``
     within 0.2 m of it, which ends the episode; each step costs ``cost``.
 
@@ -150,17 +151,6 @@ class PointGoal:
             imu=view.imu,
         )
 
-    def check(self) -> None:
-        """EngineError if the engine has flagged an error since the last check. Waits for the
-        device, so not for inside a step.
-        """
-        engine.check(self.core.agents)
-
-    @property
-    def layout(self) -> torch.Tensor:
-        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
-        return self.core.scenery.layout
-
     def state(self, e: int = 0) -> arrdict:
         """What :meth:`plot_state` draws of environment ``e``."""
         layout, goal = self.layout[e].long(), self.chosen[e].long()
@@ -192,7 +182,3 @@ class PointGoal:
         modules.RGB.plot_state(state.rgb, strips[:1], yaws)
         modules.Depth.plot_state(state.d, strips[1:], yaws)
         return figure
-
-    def display(self, e: int = 0) -> Any:
-        """Environment ``e`` as it is now, as a matplotlib figure."""
-        return self.plot_state(numpyify(self.state(e)))

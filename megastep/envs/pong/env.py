@@ -13,6 +13,7 @@ from pydantic import Field
 
 from megastep import engine, spaces
 from megastep.arrdict import arrdict, numpyify
+from megastep.envs.common import DisplayedEnv
 from megastep.envs.pong.step import CELL, FEATURES, GAME_FIELDS, PIXELS, pong_step
 from megastep.settings import MAX_ENVS, checked
 
@@ -23,7 +24,7 @@ PADDLE = 4  # cells that a paddle is high
 TEXT = {0: " ", 85: ".", 170: "|", 255: "o"}  # by the grey of a pixel
 
 
-class Pong:
+class Pong(DisplayedEnv):
     """A reward of 1 for a point won, -1 for a point lost.
 
     The ball flies a cell per step across the court, and up to a cell up or down: the further from
@@ -159,7 +160,3 @@ class Pong:
         court.set_xticks([])
         court.set_yticks([])
         return figure
-
-    def display(self, e: int = 0) -> Any:
-        """Environment ``e`` as it is now, as a matplotlib figure."""
-        return self.plot_state(numpyify(self.state(e)))

@@ -1,6 +1,6 @@
-"""The original megastep's tutorial "A Minimal Env" as its readers type it: all its code cells in
-one notebook, top to bottom, on the CPU, and what it prints and promises. The cells and their
-repairs are in data/a_minimal_env.md.
+"""The original megastep's tutorial "A Minimal Env": its code cells run from top to bottom in one
+notebook, on the CPU, and give what the page says. data/a_minimal_env.md holds the cells and their
+repairs.
 """
 
 import re
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib import pyplot as plt
-from test_seeds_concepts import session
+from test_original_concepts import session
 
 from megastep import arrdict, core, cuda, modules, recording
 
@@ -31,8 +31,8 @@ def _on_the_cpu(monkeypatch):
 
 
 def run(title, names):
-    """Runs the cell of that title in a notebook's names; a session also has to print what it
-    says.
+    """Runs the cell of that title with a notebook's variables. A cell of `>>>` lines must also
+    print what the page shows.
     """
     if CELLS[title].startswith(">>>"):
         names.update(session(CELLS[title], **names))
@@ -41,7 +41,7 @@ def run(title, names):
 
 
 def notebook(last):
-    """What a notebook holds after the cell of that title, all before it having been run."""
+    """The variables of a notebook after running its cells up to and including that title."""
     names, titles = {"__name__": "__main__"}, list(CELLS)
     for title in titles[: titles.index(last) + 1]:
         run(title, names)
@@ -49,30 +49,24 @@ def notebook(last):
 
 
 def agent_centre(c, e):
-    """(x, y) of the middle of the agent's model in the scenery of environment e."""
+    """(x, y) of the centre of the agent's model in the scenery of environment e."""
     return c.scenery.lines[e][: len(c.scenery.model)].mean((0, 1)).tolist()
 
 
-def test_every_cell_is_read():
+def test_all_cells_are_found():
     assert len(CELLS) == PAGE.read_text().count("```python") == 30
 
 
 def test_scenery_is_displayed():
     names = notebook("scenery")
     scenery, ax = names["scenery"], plt.gca()
-    segments = np.concatenate(
-        [
-            np.reshape(lines.get_segments(), (-1, 2))
-            for lines in ax.collections
-            if hasattr(lines, "get_segments")
-        ]
-    )
+    lines = [lines for lines in ax.collections if hasattr(lines, "get_segments")]
+    segments = np.concatenate([np.reshape(line.get_segments(), (-1, 2)) for line in lines])
     assert segments.max(0).tolist() == [6, 6]  # the walls
     assert np.abs(segments).sum(1).min() < 0.1  # a model of an agent at the origin
-    colours = [
-        scenery.textures[int(scenery.lines.starts[e]) + len(scenery.model)] for e in (125, 126)
-    ]
-    assert not torch.equal(*colours)  # each with a randomly-chosen colour scheme
+    first_walls = [int(scenery.lines.starts[e]) + len(scenery.model) for e in (125, 126)]
+    colours = [scenery.textures[wall] for wall in first_walls]
+    assert not torch.equal(*colours), "each environment has random colours"
 
 
 def test_agents_see():
@@ -115,7 +109,7 @@ def test_the_basic_loop_moves_agents_by_their_velocities():
 
 
 class Moving:
-    """The engine, but for cores whose agents stand at (3, 3) and walk along +y."""
+    """The engine, with cores whose agents start at (3, 3) and move along +y at 1 m/s."""
 
     def __getattr__(self, name):
         return getattr(cuda, name)
@@ -133,21 +127,21 @@ def test_the_skeleton_steps():
     assert torch.equal(names["world"].obs, first.obs) and first.obs.max() > 0  # nothing moves yet
 
 
-def test_the_finished_class_is_part_of_the_library_and_its_import_replaces_nothing_else():
-    before = notebook("skeleton's loop")
-    held = dict(before)
-    run("library", before)
-    changed = {name for name in before if before[name] is not held.get(name)}
+def test_importing_the_finished_class_replaces_no_other_name():
+    names = notebook("skeleton's loop")
+    before = dict(names)
+    run("library", names)
+    changed = {name for name in names if names[name] is not before.get(name)}
     assert changed == {"Minimal", "self", "world"}
-    assert before["self"].core.n_envs == 128 and before["world"].obs.shape == (128, 1, 3, 1, 64)
+    assert names["self"].core.n_envs == 128 and names["world"].obs.shape == (128, 1, 3, 1, 64)
 
 
 def test_spawning():
     names = notebook("render the spawned")
     c, reset = names["self"].core, names["reset"]
     positions = c.agents.positions
-    assert ((positions > 1 + 0.1) & (positions < 6 - 0.1)).all()  # in the room, clear of its walls
-    assert len(positions.unique(dim=0)) > 64  # each somewhere of its own
+    assert ((positions > 1 + 0.1) & (positions < 6 - 0.1)).all()  # in the room, clear of the walls
+    assert len(positions.unique(dim=0)) > 64  # at different points
     assert c.env_full(1.0).shape == (128,)
     assert reset.shape == (128, 1) and reset.dtype == torch.bool
     assert agent_centre(c, 5) == pytest.approx(positions[5, 0].tolist(), abs=1e-3)
@@ -167,7 +161,7 @@ def test_movement():
     c.agents.positions[:] = 3.0
     c.agents.angles[:] = 0.0
     run("movement", names)
-    # Forward is along the agent's +x; 10 m/s for 0.1 s.
+    # forward is the agent's +x: 10 m/s for 0.1 s
     assert torch.allclose(c.agents.positions, torch.tensor([4.0, 3.0]), atol=1e-3)
 
 
@@ -179,7 +173,7 @@ def test_heads():
     assert ((decision.actions >= 0) & (decision.actions < 7)).all()
 
 
-def test_trying_it_out():
+def test_random_actions_run():
     names = notebook("trying it out")
     world, positions = names["world"], names["env"].core.agents.positions
     assert world.obs.shape == (128, 1, 3, 1, 64) and world.obs.isfinite().all()
@@ -190,14 +184,14 @@ def test_the_whole_notebook_records_a_video(tmp_path):
     import av
 
     names = notebook("plot state")
-    names["range"] = lambda n: range(n // 8)  # 64 frames take ten seconds
+    names["range"] = lambda n: range(n // 8)  # 8 frames instead of 64, which take ten seconds
     run("recording", names)
     with av.open(str(names["encoder"].save(tmp_path / "minimal.mp4"))) as container:
         assert container.streams.video[0].frames == 8
 
 
-def test_the_methods_typed_make_an_environment_that_is_filmed(tmp_path):
-    """The tutorial's own functions as methods of a class; its `plot_state` is no classmethod."""
+def test_the_tutorial_functions_make_an_environment_that_can_be_recorded(tmp_path):
+    """The functions become methods of a class whose `plot_state` is not a classmethod."""
     names = notebook("plot state")
     methods = {name: names[name] for name in ("reset", "step", "state", "plot_state")}
     env = type("Typed", (), methods)()
