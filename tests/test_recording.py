@@ -239,7 +239,7 @@ class Stopped(BaseException):
 
 @pytest.mark.parametrize("moment", ["waiting", "drawing", "encoding"])
 def test_signal_is_not_changed(moment, monkeypatch):
-    """While waiting for a worker, drawing here, or encoding, even if closing the video fails too."""
+    """While waiting for a worker, drawing here, or encoding, and if closing the video fails too."""
 
     def stop(*args, **options):
         raise Stopped
