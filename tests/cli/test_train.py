@@ -378,7 +378,7 @@ def test_a_learning_rate_that_is_too_large_ends_a_run_with_advice(here, capsys):
         == 1
     )
     sentence = capsys.readouterr().err.splitlines()[-1]
-    assert "the policy diverged, so try a learning rate smaller than 1000" in sentence
+    assert "learning rate smaller than 1000" in sentence
     assert len(json_lines.read(here / "run" / "metrics.jsonl")) < 100
     assert nonfinite_leaf(checkpoint.load_latest(here / "run" / "checkpoints").state) is None
 

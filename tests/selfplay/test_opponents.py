@@ -378,6 +378,6 @@ def test_means_by_role_and_matchup(tmp_path):
     run.train()
     row = run.rows[0]
     for name in ("left", "right", "now", "past", "bot"):
-        assert row[f"episode/paid/{name}"] == row[f"episode/return/{name}"]
+        assert row[f"episode/points/{name}"] == row[f"episode/return/{name}"]
     assert row["episode/return/bot"] == -1, "the bot always chooses the highest number"
     assert row["episode/return/now"] == pytest.approx(0, abs=1e-9)

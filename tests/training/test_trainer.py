@@ -1,5 +1,5 @@
-"""The training loop: what it counts, logs and saves, and what it does on NaN, full memory and other
-errors.
+"""The training loop: what it counts, logs and saves, and what it does on NaN, out of memory and
+other errors.
 """
 
 import pytest
