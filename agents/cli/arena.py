@@ -206,7 +206,7 @@ def rate(cfg: Evaluate) -> Path:
     """
     arena, start = Arena(cfg), time.monotonic()
     snapshots, checkpoints = (
-        checkpoint.checkpoints(arena.folder / name) for name in ("snapshots", "checkpoints")
+        checkpoint.list_checkpoints(arena.folder / name) for name in ("snapshots", "checkpoints")
     )
     paths, names = snapshots or checkpoints, cfg.against or ()
     if len(paths) + len(names) < 2:

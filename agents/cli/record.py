@@ -18,7 +18,7 @@ from megastep.agents.selfplay import duels
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.training.checkpoint import Checkpoint
 from megastep.agents.training.evaluation import RandomActions
-from megastep.agents.training.loggers import missing
+from megastep.agents.training.optional_packages import not_installed
 from megastep.arrdict import numpyify
 
 HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
@@ -41,7 +41,7 @@ def run(cfg: Record) -> Path:
         try:
             import av  # noqa: F401, what the recorder encodes with
         except ImportError:
-            raise UserError(missing("av")) from None
+            raise UserError(not_installed("av")) from None
     device, folder = factory.make_device(cfg.device), Path()
     chosen, geometry, loaded = cfg.env, cfg.geometry or GROUPS["geometry"].settings(HOMES), None
     if cfg.run is not None:
@@ -78,7 +78,7 @@ def against(name: str, chosen: Any, env: Any, policy: Any, loaded: Checkpoint) -
     opponent = arena.Players(loaded, chosen, env).named(name)
     say(f"The first agent is that of {loaded.path}, the other {opponent.name}")
     seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
-    return duels.lineup(policy, opponent.policy, seat, env.n_agents)
+    return duels.duel_policy(policy, opponent.policy, seat, env.n_agents)
 
 
 @torch.no_grad()

@@ -22,7 +22,7 @@ from megastep.agents.cli.doors import typed
 from megastep.agents.cli.errors import UserError, shortened
 from megastep.agents.cli.registry import label
 from megastep.agents.cli.settings import Train
-from megastep.agents.training import atomic_files
+from megastep.agents.training.atomic_files import write_atomically
 
 RUNS = Path("runs")
 SWEEPS = Path("sweeps")
@@ -230,7 +230,7 @@ def outcome(result: Path | None) -> dict[str, float | None]:
 
 def mean_return(folder: Path) -> float | None:
     """The mean of the returns of a run's last `REPORTS` reports that have one."""
-    from megastep.agents.training.loggers import read
+    from megastep.agents.training.json_lines import read
 
     try:
         rows = read(folder / "metrics.jsonl")
@@ -244,7 +244,7 @@ def write_config(folder: Path, cfg: Train) -> None:
     """Writes the composed configuration, config.yaml."""
     text = yaml.safe_dump(as_tree(cfg), sort_keys=False, allow_unicode=True)
     try:
-        atomic_files.replace(folder / "config.yaml", text.encode())
+        write_atomically(folder / "config.yaml", text.encode())
     except OSError as error:
         raise UserError(
             f"The run folder {folder} cannot be written to ({error.strerror}); choose another with "

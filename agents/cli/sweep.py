@@ -30,7 +30,7 @@ from megastep.agents.cli.doors import ROOT
 from megastep.agents.cli.errors import ConfigErrors, UserError, shortened
 from megastep.agents.cli.gpus import one_gpu
 from megastep.agents.cli.signals import Interrupted, Interruptions, interrupt, is_below, stop
-from megastep.agents.training import atomic_files
+from megastep.agents.training.atomic_files import write_atomically
 
 #: Where jobs say what became of them, in the folder of their sweep.
 RECORDS = ".jobs"
@@ -114,7 +114,7 @@ class Job:
         with contextlib.suppress(OSError):  # a full disk: the job is worth more than its record
             self._records.mkdir(parents=True, exist_ok=True)
             path = self._records / f"{self.sweep}-{record['number']}.json"
-            atomic_files.replace(path, json.dumps(record).encode())
+            write_atomically(path, json.dumps(record).encode())
 
     def rows(self) -> list[dict[str, Any]]:
         """What the jobs of this sweep recorded, in order."""
@@ -230,8 +230,8 @@ def report(folder: Path, rows: list[dict[str, Any]]) -> None:
     writer.writeheader()
     writer.writerows(numbers)
     try:
-        atomic_files.replace(folder / "sweep.csv", text.getvalue().encode())
-        atomic_files.replace(folder / "sweep.md", console.markdown(head, cells).encode())
+        write_atomically(folder / "sweep.csv", text.getvalue().encode())
+        write_atomically(folder / "sweep.md", console.markdown(head, cells).encode())
         say(f"The table is in {folder / 'sweep.md'}, and its numbers in sweep.csv")
     except OSError as error:
         console.warn(f"the table cannot be written to {folder} ({error.strerror})")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from megastep.agents.cli.console import markdown
 from megastep.agents.cli.errors import UserError
-from megastep.agents.training import atomic_files
+from megastep.agents.training.atomic_files import write_atomically
 
 INTERVAL = "95 % interval"
 
@@ -24,7 +24,7 @@ def write(
     try:
         folder.mkdir(exist_ok=True)
         for suffix, text in texts.items():
-            atomic_files.replace(folder / f"{name}{suffix}", text.encode())
+            write_atomically(folder / f"{name}{suffix}", text.encode())
     except OSError as error:
         raise UserError(
             f"The evaluation cannot be written to {folder} ({error.strerror})"

@@ -20,9 +20,9 @@ from megastep.agents.cli.errors import ConfigErrors, NotFinite, UserError
 from megastep.agents.cli.lock import locked
 from megastep.agents.cli.settings import Evaluate, Record, Train, WandbLogger
 from megastep.agents.cli.signals import Interrupted, Interruptions
-from megastep.agents.training import checkpoint, loggers
+from megastep.agents.training import checkpoint, curves, loggers
 from megastep.agents.training.budget import Budget
-from megastep.agents.training.saver import Saver, Snapshots
+from megastep.agents.training.saver import Saver, SnapshotSaver
 from megastep.agents.training.trainer import Trainer
 
 HELP = """Trains a policy in an environment.
@@ -89,12 +89,12 @@ def make_trainer(
         wandb = dict(given, name=folder.name, config=as_tree(cfg))
     if cfg.resume:
         for name in ("checkpoints", "snapshots"):
-            checkpoint.rewind(folder / name, loaded.step)
+            checkpoint.set_aside_after(folder / name, loaded.step)
     with factory.errors():
         sinks = loggers.Loggers(folder, loaded.step if cfg.resume else 0, wandb)
     config = {"train": as_tree(cfg), "spaces": factory.spaces_of(env)}
     saver = Saver(folder / "checkpoints", config, cfg.keep_checkpoints)
-    snapshots = Saver(folder / "snapshots", config, keep=10**9)
+    snapshots = Saver(folder / "snapshots", config, keep_checkpoints=10**9)
     with factory.errors():
         trainer = Trainer(
             opponents or env,
@@ -103,11 +103,11 @@ def make_trainer(
             sinks,
             saver,
             Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
-            report_every=cfg.log_every,
-            save_every=cfg.checkpoint_seconds,
-            on_report=on_report,
+            log_every=cfg.log_every,
+            checkpoint_seconds=cfg.checkpoint_seconds,
+            on_log=on_report,
             opponents=opponents,
-            snapshots=Snapshots(snapshots, cfg.snapshots),
+            snapshot_saver=SnapshotSaver(snapshots, cfg.snapshots),
         )
     if cfg.resume:
         with factory.errors():
@@ -118,16 +118,18 @@ def make_trainer(
 def show(progress: Progress, trainer: Trainer) -> None:
     """Shows the few numbers that people watch."""
     words = [f"{number(trainer.samples)} samples"]
-    if trainer.rate is not None:
-        words.append(f"{number(trainer.rate)}/s")
+    if trainer.samples_per_second is not None:
+        words.append(f"{number(trainer.samples_per_second)}/s")
     if trainer.score is not None:
         words.append(f"return {trainer.score:.2f}")
         words += few_means(
-            trainer.latest, trainer.episode_stats.metrics, trainer.episode_stats.groups
+            trainer.latest_stats, trainer.episode_stats.metrics, trainer.episode_stats.groups
         )
-        won = {k.rpartition("/")[2]: v for k, v in trainer.latest.items() if k.startswith(WON)}
+        won = {
+            k.rpartition("/")[2]: v for k, v in trainer.latest_stats.items() if k.startswith(WON)
+        }
         words += [f"{share:.2f} won against {kind}" for kind, share in won.items()]
-    left = trainer.left
+    left = trainer.fraction_left
     if trainer.budget.is_limited and left < 1:
         words.append(f"{duration(trainer.clock.seconds * left / (1 - left))} left")
     progress.show(1 - left if trainer.budget.is_limited else None, "  ".join(words))
@@ -171,22 +173,22 @@ def run(cfg: Train) -> Path:
         say(f"Training on {device} in {folder}")
         resume = f"To go on: {run_folders.resume_command(folder)}"
         try:
-            with Interruptions() as stop, progress, closing(trainer.metrics):
+            with Interruptions() as stop, progress, closing(trainer.logger):
                 trainer.train(lambda: stop.number is not None)
         except NonFiniteError as error:
             raise NotFinite(f"{error}. What was saved before is in {folder}") from error
         except (engine.EngineError, torch.OutOfMemoryError) as error:
             reason = str(error).splitlines()[0].rstrip(".")
-            saved = saver.unsaved or "What was learnt last could not be saved"
+            saved = saver.error or "What was learnt last could not be saved"
             if trainer.is_saved:
                 saved = f"All {trainer.samples:,} samples are saved"
             raise UserError(f"{reason}. {saved}. {resume}") from error
         finally:
-            loggers.curves(folder)
+            curves.plot_curves(folder)
         if stop.number is not None:
             raise Interrupted(stop.number, f"Stopped after {trainer.samples:,} samples. {resume}")
-        if saver.unsaved:
-            raise UserError(saver.unsaved)
+        if saver.error:
+            raise UserError(saver.error)
         nonfinite_value = trainer.nonfinite_value
         del trainer  # its memory is the evaluation's now
         finish(cfg, folder)

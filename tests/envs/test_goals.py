@@ -314,17 +314,17 @@ def test_files_are_kept_up_to_a_gigabyte(folder, monkeypatch):
 
 
 def test_many_are_found_by_several_processes_and_are_the_same(folder, monkeypatch, capfd):
-    boxes_ = [room(width=2 + 0.01 * i, height=1.5, id=i) for i in range(workers.MANY)]
+    boxes_ = [room(width=2 + 0.01 * i, height=1.5, id=i) for i in range(workers.MIN_PARALLEL)]
     found = all_of(boxes_)
     assert "shortest ways in 48 layouts" in capfd.readouterr().err
-    monkeypatch.setattr(workers, "MANY", 1000)
+    monkeypatch.setattr(workers, "MIN_PARALLEL", 1000)
     monkeypatch.setenv("MEGASTEP_CACHE", str(folder / "other"))
     alone = all_of(boxes_)
     assert all((x == y).all() for a, b in zip(found, alone) for x, y in zip(a, b))
 
 
 def test_an_error_in_a_process_names_the_geometry(folder):
-    boxes_ = [room(width=2 + 0.01 * i, height=1.5, id=i) for i in range(workers.MANY)]
+    boxes_ = [room(width=2 + 0.01 * i, height=1.5, id=i) for i in range(workers.MIN_PARALLEL)]
     boxes_[40]["masks"] = boxes_[40].masks * 0
     with pytest.raises(ValueError, match="geometry 40 has no room to spawn in"):
         all_of(boxes_)

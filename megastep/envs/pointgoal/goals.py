@@ -16,7 +16,7 @@ from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.geometry import hashed
 from megastep.modules import spawning
-from megastep.workers import mapped
+from megastep.workers import parallel_map
 
 PREFIX = "geodesics-"  # of their files in the cache
 MAX_FILES, MAX_BYTES = 64, 10**9  # of all of them
@@ -110,7 +110,9 @@ def all_geodesics(geometries: Sequence[Any], radius: float, seed: int) -> list[G
 
     def build():
         items = [(g, radius, seed, d) for d, g in enumerate(different)]
-        packed = mapped(_packed, items, f"Finding the shortest ways in {len(items):,} layouts")
+        packed = parallel_map(
+            _packed, items, f"Finding the shortest ways in {len(items):,} layouts"
+        )
         sizes = np.array([len(items), *map(len, packed)], np.int64)
         cache.prune(PREFIX, MAX_FILES - 1, MAX_BYTES - sum(sizes[1:].tolist()))
         return b"".join([sizes.tobytes(), *packed])
