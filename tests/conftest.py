@@ -1,4 +1,4 @@
-"""Fixtures and settings of all tests: one thread per process, no display, no GPU tests on a CPU."""
+"""Fixtures and settings of all tests: one thread per process, no display, no GPU needed."""
 
 import os
 
@@ -24,36 +24,36 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request):
-    """The CPU and, marked `cuda`, the GPU."""
+    """Each device in turn, for tests that hold on both."""
     return request.param
 
 
 @pytest.fixture(scope="session")
 def launch_on_cpu(tmp_path_factory):
-    """A launcher of the networks' CUDA kernels, compiled for the CPU with `cuda_on_cpu.h`. It takes
-    the place of `launch`.
+    """A stand-in for `launch` that runs the learner's CUDA kernels on a CPU.
+
+    Their source is compiled for the CPU through `cuda_on_cpu.h`.
     """
-    from megastep.agents.networks.kernels.program import CORES, DTYPES, STRUCTS
+    from megastep.agents.networks.kernels.program import CORES
     from megastep.kernels.build import compile
 
     folder = tmp_path_factory.mktemp("kernels")
     source, library = folder / "kernels.cpp", folder / "kernels.so"
-    header = Path(__file__).parent / "helpers" / "cuda_on_cpu.h"
-    lines = [f'#include "{path}"' for path in [header, *sorted(CORES.folder.glob("*.cu"))]]
+    files = [Path(__file__).parent / "helpers" / "cuda_on_cpu.h", *CORES.folder.glob("*.cu")]
+    lines = [f'#include "{path}"' for path in files]
     lines += [
-        f'extern "C" void run_{name}_{dtype}(const {struct}* p, unsigned int threads) '
-        f"{{ launch({name}_{dtype}, p, threads); }}"
-        for name, struct in STRUCTS.items()
-        for dtype in DTYPES.values()
+        f'extern "C" void run_{operation}(const {struct}* p, unsigned int threads) '
+        f"{{ launch({operation}, p, threads); }}"
+        for operation, struct in CORES.cuda_operations.items()
     ]
     source.write_text("\n".join(lines))
-    compiler, _ = compile._compiler()
-    command = [compiler, "-std=c++17", "-O1", "-shared", "-fPIC", f"-DBLOCK={compile.BLOCK}"]
-    subprocess.run([*command, str(source), "-o", str(library)], check=True)
-    compiled = ctypes.CDLL(str(library))
+    command = [compile.compiler()[0], "-std=c++17", "-O1", "-shared", "-fPIC"]
+    command += [f"-I{compile.KERNELS}", str(source), "-o", str(library)]
+    subprocess.run(command, check=True)
+    loaded = ctypes.CDLL(str(library))
 
-    def launch(operation, packed, device, threads, program):
+    def launch(program, operation, packed, device, threads):
         assert program is CORES and device.type == "cpu"
-        getattr(compiled, f"run_{operation}")(packed, ctypes.c_uint(threads))
+        getattr(loaded, f"run_{operation}")(packed, ctypes.c_uint(threads))
 
     return launch

@@ -15,12 +15,13 @@ import torch
 
 from megastep.engine import checks, views
 from megastep.engine.views import JoinedRagged
+from megastep.kernels.build.launch import ENGINE
 from megastep.ragged import Ragged
 from megastep.read_only import ReadOnlyTensor, SetOnce
 
 __all__ = ["Layouts", "Scenery"]
 
-BOX = 32  # walls per bounding box, as the kernels have it: one for each lane of a warp
+BOX_WALLS = ENGINE.constants["BOX_WALLS"]  # walls per bounding box
 
 
 class Layouts(SetOnce):
@@ -63,7 +64,7 @@ class Layouts(SetOnce):
         self.wall_starts = _starts("wall_starts", lines.widths)
         self.light_starts = _starts("light_starts", lights.widths)
         self.texel_starts = _starts("texel_starts", textures.widths)
-        self.box_starts = _starts("box_starts", -(-lines.widths // BOX))
+        self.box_starts = _starts("box_starts", -(-lines.widths // BOX_WALLS))
         self.n_walls, self.n_texels, self.n_lights = (
             len(r.vals) for r in (lines, textures, lights)
         )
@@ -87,7 +88,7 @@ class Layouts(SetOnce):
         """Fits ``boxes`` to where the walls are now, in place. ``bake`` does it too."""
         layout = self.lines.inverse
         wall = torch.arange(len(layout), device=layout.device)
-        box = self.box_starts.long()[layout] + (wall - self.lines.starts[layout]) // BOX
+        box = self.box_starts.long()[layout] + (wall - self.lines.starts[layout]) // BOX_WALLS
         box, ends = box[:, None].expand(-1, 2), self.lines.vals
         self._boxes[:, :2].fill_(torch.inf).scatter_reduce_(0, box, ends.amin(1), "amin")
         self._boxes[:, 2:].fill_(-torch.inf).scatter_reduce_(0, box, ends.amax(1), "amax")

@@ -12,7 +12,7 @@ import torch
 from megastep import cache, engine
 from megastep.engine import checks
 from megastep.engine.scenery import Scenery
-from megastep.kernels.build.compile import sources
+from megastep.kernels.build.launch import ENGINE
 
 __all__ = ["visible_texels"]
 
@@ -46,7 +46,7 @@ def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
     if device.type != "cpu" or len(layouts) < MIN_CACHED:
         return _visible_from(scenery, points)
     key = hashlib.sha256(Path(__file__).read_bytes() + repr(engine.AGENT_RADIUS).encode())
-    for name, text in sources(".h", ".cpp").items():
+    for name, text in ENGINE.sources(".h", ".cpp").items():
         key.update(f"{name}\0{text}\0".encode())
     for tensor in (layouts.lines.vals, layouts.wall_starts, layouts.texel_starts, points):
         key.update(repr((tensor.shape, tensor.dtype)).encode() + tensor.numpy().tobytes())

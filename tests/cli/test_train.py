@@ -324,7 +324,7 @@ def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_environm
     monkeypatch.setattr(train.Trainer, "log", report)
     assert train.main([*TINY, "seconds=20", "folder=run"]) == 2
     (sentence,) = capsys.readouterr().err.splitlines()
-    assert "environment 2" in sentence and "not a finite number" in sentence and "run" in sentence
+    assert "environment 2" in sentence and "non-finite" in sentence and "run" in sentence
     assert len(json_lines.read(here / "run" / "metrics.jsonl")) == 1
 
 

@@ -58,7 +58,7 @@ def coverage(c):
     return engine.coverage(c.scenery, c.agents, seen, visible, mask)
 
 
-def seek(c):
+def pointgoal(c):
     goals = GoalFields(
         points=2 * [np.ones((1, 2))],
         fields=2 * [np.arange(36, dtype=np.float16).reshape(1, 6, 6)],
@@ -70,16 +70,16 @@ def seek(c):
         device=c.device,
     )
     n, on = (LAST + 1) * c.n_agents, dict(device=c.device)
-    chosen, ages, draws = (torch.zeros(n, dtype=torch.int32, **on) for _ in range(3))
+    goal_index, ages, n_draws = (torch.zeros(n, dtype=torch.int32, **on) for _ in range(3))
     found = pointgoal_step(
         c.scenery,
         c.agents,
         goals,
-        chosen,
+        goal_index,
         torch.zeros((PROGRESS_ROWS, n), **on),
         ages,
         torch.zeros(n, dtype=torch.bool, **on),
-        draws,
+        n_draws,
         torch.zeros((LAST + 1, c.n_agents), dtype=torch.int32, **on),
     )
     return found.reward.view(LAST + 1, -1)
@@ -97,7 +97,7 @@ def spawn(c):
 @pytest.mark.parametrize("layout", [2, -1, 2**31 - 1, -(2**31)])
 @pytest.mark.parametrize("n_agents", [1, 3])
 @pytest.mark.parametrize(
-    "operation", [physics, render, observe, geometry, unseen, coverage, seek, spawn]
+    "operation", [physics, render, observe, geometry, unseen, coverage, pointgoal, spawn]
 )
 def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, layout, device):
     expected = operation(boxes(device, n_agents))
@@ -113,14 +113,14 @@ def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, la
     engine.check(c.agents)
 
 
-@pytest.mark.parametrize("operation", [physics, render, observe, unseen, seek])
+@pytest.mark.parametrize("operation", [physics, render, observe, unseen, pointgoal])
 @pytest.mark.parametrize("field", ["positions", "angles"])
 def test_a_place_that_is_not_finite_is_named_by_whatever_reads_it(operation, field, device):
     expected = operation(boxes(device, 2))
     c = boxes(device, 2)
     getattr(c.agents, field)[LAST, 1] = math.nan
     found = expected
-    with pytest.raises(engine.EngineError, match=f"environment {LAST} .* not a finite number"):
+    with pytest.raises(engine.EngineError, match=f"environment {LAST} .* non-finite"):
         found = operation(c)
         engine.check(c.agents)
     assert torch.equal(found[:LAST], expected[:LAST])
@@ -142,7 +142,7 @@ def test_an_action_that_is_none_is_named(action, device):
 def test_a_value_that_is_not_finite_is_named(value, field, device):
     c = boxes(device, 2)
     getattr(c.agents, field)[1] = value
-    with pytest.raises(engine.EngineError, match="environment 1 .* not a finite number"):
+    with pytest.raises(engine.EngineError, match="environment 1 .* non-finite"):
         engine.physics(c.scenery, c.agents)
         engine.check(c.agents)
     engine.check(c.agents)

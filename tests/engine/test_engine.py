@@ -119,7 +119,8 @@ def test_twin_physics(name, n_agents, device, poison):
 def test_an_output_that_is_not_written_is_named(poison, monkeypatch):
     """What the checks above would say of kernels that write nothing."""
     core = core_of(random_scenery.random_environments(0), "cpu")
-    monkeypatch.setattr(engine, "launch", lambda *args, **kwargs: None)
+    for module in ("movement", "rendering"):
+        monkeypatch.setattr(f"megastep.engine.{module}.launch", lambda *args, **kwargs: None)
     outputs = [
         cuda.render(core.scenery, core.agents),
         cuda.physics(core.scenery, core.agents),

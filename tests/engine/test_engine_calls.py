@@ -185,7 +185,7 @@ def test_depth_needs_a_range(max_depth):
 def test_a_position_that_is_not_finite_is_named(device):
     core = box(device)
     core.agents.positions[1, 0, 0] = math.nan
-    with pytest.raises(engine.EngineError, match="environment 1 .* not a finite number"):
+    with pytest.raises(engine.EngineError, match="environment 1 .* non-finite"):
         cuda.render(core.scenery, core.agents)
         engine.check(core.agents)
     core.agents.positions[:] = 3.0

@@ -12,7 +12,7 @@ from megastep.agents.cli import evaluate, record, train
 from megastep.engine.outputs import Observation
 from megastep.envs.deathmatch.step import deathmatch_step
 from megastep.geometries import sample
-from tests.helpers.deathmatch_twins import in_sight, shots, spawned, told
+from tests.helpers.deathmatch_twins import hits_of, is_visible, privileged, respawned
 
 RADIUS = engine.AGENT_RADIUS
 METRICS = "kills", "deaths", "damage", "accuracy"
@@ -22,7 +22,7 @@ RULES = {
         damage=0.31,
         recovery=0.01,
         drain=0.003,
-        spoils=0.05,
+        health_per_hit=0.05,
         limit=7,
         hit_reward=0.3,
         wound_cost=0.7,
@@ -36,7 +36,7 @@ ALL = dict(
     damage=0.1,
     recovery=0.0,
     drain=0.0,
-    spoils=0.0,
+    health_per_hit=0.0,
     limit=1000,
     hit_reward=1.0,
     wound_cost=1.0,
@@ -76,7 +76,7 @@ def fight(device, n_envs, n_agents, steps=30, **rules):
             agent_ray=torch.from_numpy(ray).to(device),
         )
         given = dict(line=line, ray=ray, **{k: v.cpu().numpy().copy() for k, v in state.items()})
-        out = deathmatch_step(made, c.agents, view, **state, **rules, told=True)._asdict()
+        out = deathmatch_step(made, c.agents, view, **state, **rules, privileged=True)._asdict()
         came = {k: v.cpu().numpy().copy() for k, v in (out | state).items()}
         came |= dict(zip(METRICS, came["metrics"], strict=True))
         yield given, came, c.agents.positions.cpu().numpy(), c.agents.angles.cpu().numpy()
@@ -90,15 +90,15 @@ def test_shots_are_the_twins_on_every_bit(rules, n_agents, device):
         for e in range(5):
             lanes = slice(e * n_agents, (e + 1) * n_agents)
             own = {k: v[..., lanes] for k, v in given.items() if k not in ("line", "ray")}
-            expected = shots(
+            expected = hits_of(
                 given["line"][e], given["ray"][e], **own, n_model=8, res=512, rules=ALL | rules
             )
             for name, values in expected.items():
                 ours = came[name][..., lanes] if name == "tally" else came[name][lanes]
                 ours = ours.T if name == "tally" else ours.reshape(values.shape)
                 assert (ours == values).all(), f"{name}: {ours} is not {values}"
-            close = told(expected["health"], positions[e], angles[e])
-            np.testing.assert_allclose(came["told"][lanes, 0], close, rtol=0, atol=2e-6)
+            close = privileged(expected["health"], positions[e], angles[e])
+            np.testing.assert_allclose(came["privileged"][lanes, 0], close, rtol=0, atol=2e-6)
             dead += int(expected["terminal"].sum())
     assert dead > 5
 
@@ -109,7 +109,7 @@ def test_what_shoot_is_not_asked_for_it_leaves_out():
     state = torch.ones(2), torch.zeros((3, 2)), torch.zeros(2, dtype=torch.int32)
     view = engine.observe(made, agents, centre_line=True)
     out = deathmatch_step(made, agents, view, *state, torch.zeros(2, dtype=torch.bool))
-    assert out.told is None and view.agent_ray is None
+    assert out.privileged is None and view.agent_ray is None
     with pytest.raises(TypeError, match=r"view.agent_ray"):
         deathmatch_step(
             made, agents, view, *state, torch.zeros(2, dtype=torch.bool), aim_reward=1.0
@@ -122,7 +122,7 @@ def test_shoot_takes_two_to_sixteen_agents(n_agents, cameras, told):
     agents, n = core.Core(made).agents, n_agents
     view = engine.observe(made, agents, centre_line=True)
     state = torch.ones(n), torch.zeros((3, n)), torch.zeros(n, dtype=torch.int32)
-    with pytest.raises(ValueError, match=f"^shoot takes 2 to 16 agents per environment, {told}$"):
+    with pytest.raises(ValueError, match=told):
         deathmatch_step(made, agents, view, *state, torch.zeros(n, dtype=torch.bool))
 
 
@@ -168,7 +168,7 @@ def test_agents_respawn_where_the_twin_says(source, n_agents, device):
         for e, d in enumerate(c.scenery.layout.tolist()):
             walls = c.scenery.layouts.lines[d].cpu().numpy()
             drawn = dict(draws=draws[e], first_lane=e * n_agents, seed=3, radius=RADIUS)
-            expected = spawned(walls, points[d], before[e], mask[e], **drawn)
+            expected = respawned(walls, points[d], before[e], mask[e], **drawn)
             ours = c.agents.positions[e].cpu().numpy()
             assert (ours == expected.astype(np.float32)).all(), f"environment {e}, step {step}"
 
@@ -209,7 +209,7 @@ def has_hidden_point(c, spawner, e, a):
     walls = c.scenery.layouts.lines[d].cpu().numpy().astype(float)
     own = spawner.points[d].view(c.n_agents, -1, 2)[a].cpu().numpy().astype(float)
     eyes = np.delete(c.agents.positions[e].cpu().numpy().astype(float), a, 0)
-    return any(not any(in_sight(walls, eye, at, RADIUS) for eye in eyes) for at in own)
+    return any(not any(is_visible(walls, eye, at, RADIUS) for eye in eyes) for at in own)
 
 
 def test_in_an_empty_room_who_respawns_is_furthest_from_whoever_is_nearest(device):
@@ -374,8 +374,8 @@ def test_health_drains_and_recovers_by_the_second(device):
     assert ring.health == [1, 1], "and never more than all"
 
 
-def test_spoils_heal_whoever_hits(device):
-    ring = Ring(device, *AMBUSH, spoils=0.05, drain=1.0)
+def test_a_hit_heals_whoever_hits(device):
+    ring = Ring(device, *AMBUSH, health_per_hit=0.05, drain=1.0)
     ring.step(3)
     assert ring.health == pytest.approx([1 - 3 * 0.1 + 3 * 0.05, 1 - 3 * 0.1 - 3 * 0.1])
 
@@ -561,7 +561,7 @@ def test_more_agents_than_a_home_has_room_for_end_with_a_sentence(tmp_path, monk
 @pytest.mark.cuda
 @pytest.mark.parametrize("n_agents", [2, 4, 16])
 def test_cpu_and_gpu_agree_on_every_bit(n_agents):
-    settings = dict(limit=15, damage=0.3, recovery=0.1, drain=0.05, spoils=0.02)
+    settings = dict(limit=15, damage=0.3, recovery=0.1, drain=0.05, health_per_hit=0.02)
     settings |= dict(aim_reward=0.1, search_reward=0.3)
     runs = [
         arrdict.stack(

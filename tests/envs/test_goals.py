@@ -60,19 +60,19 @@ def boxes(device, n_envs, n_agents=1):
     )
 
 
-def seek(c, goals, chosen, spawned=None, **settings):
+def step(c, goals, goal_index, spawn_index=None, **settings):
     """What agents are told that are in the middle of an episode of their `chosen` goals (N, A)."""
-    n, on = chosen.numel(), dict(device=c.device)
+    n, on = goal_index.numel(), dict(device=c.device)
     state = dict(
-        chosen=chosen.flatten().clone(),
-        journey=torch.zeros((PROGRESS_ROWS, n), **on),
+        goal_index=goal_index.flatten().clone(),
+        progress=torch.zeros((PROGRESS_ROWS, n), **on),
         ages=torch.zeros(n, dtype=torch.int32, **on),
-        ended=torch.full((n,), spawned is not None, **on),
-        draws=torch.zeros(n, dtype=torch.int32, **on),
+        ended=torch.full((n,), spawn_index is not None, **on),
+        n_draws=torch.zeros(n, dtype=torch.int32, **on),
     )
-    spawned = torch.zeros_like(chosen) if spawned is None else spawned
+    spawn_index = torch.zeros_like(goal_index) if spawn_index is None else spawn_index
     found = pointgoal_step(
-        c.scenery, c.agents, goals, **state, spawned=spawned, told=True, **settings
+        c.scenery, c.agents, goals, **state, spawn_index=spawn_index, privileged=True, **settings
     )
     return found, SimpleNamespace(**state)
 
@@ -116,10 +116,10 @@ def test_where_a_goal_lies_is_as_defined(n_agents, device, monkeypatch):
     poison = Poison(torch.empty)
     with monkeypatch.context() as patch:
         patch.setattr(torch, "empty", poison.allocate)
-        found, state = seek(c, goals, chosen)
-        outputs = "reward", "metrics", "bearing", "told"
+        found, state = step(c, goals, chosen)
+        outputs = "reward", "metrics", "goal_obs", "privileged"
         poison.check(**{name: getattr(found, name) for name in outputs})
-    bearing, told = found.bearing.cpu().double(), found.told.cpu().double()
+    bearing, told = found.goal_obs.cpu().double(), found.privileged.cpu().double()
     n_unknown = 0
     for lane, (e, a) in enumerate(np.ndindex(shape)):
         d, g = int(c.scenery.layout[e]), int(chosen[e, a])
@@ -132,7 +132,7 @@ def test_where_a_goal_lies_is_as_defined(n_agents, device, monkeypatch):
             float(c.agents.angles[e, a]),
         )
         assert bearing[lane, 0].tolist() == pytest.approx([straight / 10, *way], abs=2e-3)
-        assert float(state.journey[2, lane]) == pytest.approx(distance, rel=1e-4)
+        assert float(state.progress[2, lane]) == pytest.approx(distance, rel=1e-4)
         assert float(told[lane, 0, 0]) == pytest.approx(distance / 10, rel=1e-4)
         assert told[lane, 0, 1:3].tolist() == pytest.approx(descent.tolist(), abs=2e-2)
         n_unknown += distance == 0
@@ -149,14 +149,14 @@ def test_ahead_left_behind_and_right(device):
     made |= dict(points=3 * [np.array([[1.5, 3.5]])], fields=3 * [field], origins=3 * [np.ones(2)])
     goals = GoalFields(**made, cell=CELL, device=device)
     chosen = torch.zeros((4, 1), dtype=torch.int32, device=device)
-    found, state = seek(c, goals, chosen)
+    found, state = step(c, goals, chosen)
     turned = [[0, 1], [1, 0], [0, -1], [-1, 0]]
-    assert found.bearing[:, 0].tolist() == [pytest.approx([0.2, *way], abs=1e-3) for way in turned]
-    assert found.told[:, 0, 1:3].tolist() == [pytest.approx(way, abs=0.1) for way in turned]
-    assert state.journey[2].tolist() == pytest.approx(4 * [9.5], abs=1e-2)
+    assert found.goal_obs[:, 0].tolist() == [pytest.approx([0.2, *way], abs=1e-3) for way in turned]
+    assert found.privileged[:, 0, 1:3].tolist() == [pytest.approx(way, abs=0.1) for way in turned]
+    assert state.progress[2].tolist() == pytest.approx(4 * [9.5], abs=1e-2)
     c.agents.positions.copy_(torch.tensor([1.5, 3.5]))
-    there, _ = seek(c, goals, chosen)
-    assert there.bearing[:, 0].tolist() == 4 * [[0, 1, 0]] and there.terminal.all()
+    there, _ = step(c, goals, chosen)
+    assert there.goal_obs[:, 0].tolist() == 4 * [[0, 1, 0]] and there.terminal.all()
 
 
 @pytest.mark.parametrize("number", [5, -1, 2**31 - 1])
@@ -168,9 +168,9 @@ def test_a_goal_or_spawn_point_that_is_none_is_named_and_others_go_on(which, num
     zeros = torch.zeros((4, 1), dtype=torch.int32, device=device)
     wrong = zeros.clone()
     wrong[3] = number
-    right = found = seek(c, goals, zeros, None if which == "goal" else zeros)[0]
+    right = found = step(c, goals, zeros, None if which == "goal" else zeros)[0]
     with pytest.raises(engine.EngineError, match="environment 3 has a goal or a spawn point that"):
-        found = seek(c, goals, *((wrong, None) if which == "goal" else (zeros, wrong)))[0]
+        found = step(c, goals, *((wrong, None) if which == "goal" else (zeros, wrong)))[0]
         engine.check(c.agents)
     assert all(
         torch.equal(a[..., :3, :, :], b[..., :3, :, :]) for a, b in zip(found[5:], right[5:])
@@ -187,7 +187,7 @@ def test_half_precision_is_read_as_pytorch_reads_it(device):
     made |= dict(fields=[fields], origins=[np.ones(2)])
     chosen = torch.arange(len(halves), dtype=torch.int32, device=device)[:, None]
     goals = GoalFields(**made, cell=CELL, device=device)
-    found = seek(c, goals, chosen)[1].journey[2].cpu()
+    found = step(c, goals, chosen)[1].progress[2].cpu()
     torch.testing.assert_close(found[:-1], halves[:-1].float(), rtol=1e-6, atol=0)
     assert found[-1] == 0
 
@@ -210,8 +210,8 @@ def test_fields_that_do_not_fit_are_refused(key, wrong, words):
 
 def test_goals_of_other_layouts_are_refused():
     goals = GoalFields(**fields_of(np.random.default_rng(1), 2), cell=CELL)
-    with pytest.raises(ValueError, match="goals must be of the scenery's 3 layouts .* 2 on cpu"):
-        seek(boxes("cpu", 2), goals, torch.zeros((2, 1), dtype=torch.int32))
+    with pytest.raises(ValueError, match="goals .* 3 layouts .* 2 on cpu"):
+        step(boxes("cpu", 2), goals, torch.zeros((2, 1), dtype=torch.int32))
 
 
 # ---- Goals that are drawn ----
@@ -231,11 +231,11 @@ def test_goals_are_in_range_and_lengths_are_theirs(n_agents, device):
     ]
     drawn = set()
     spawner(c.agent_full(True))
-    _, state = seek(c, goals, torch.zeros_like(spawner.chosen), spawner.chosen)
-    lengths = state.journey[4].cpu()
-    assert 2 <= lengths.min() and lengths.max() <= 4 and (state.draws == 1).all()
+    _, state = step(c, goals, torch.zeros_like(spawner.chosen), spawner.chosen)
+    lengths = state.progress[4].cpu()
+    assert 2 <= lengths.min() and lengths.max() <= 4 and (state.n_draws == 1).all()
     for lane, (e, a) in enumerate(np.ndindex(n, n_agents)):
-        d, goal = int(c.scenery.layout[e]), int(state.chosen[lane])
+        d, goal = int(c.scenery.layout[e]), int(state.goal_index[lane])
         place = c.agents.positions[e, a].cpu().numpy()
         spawn = (truth[d].spawns == place).all(1).nonzero()[0][0]
         assert float(lengths[lane]) == truth[d].lengths[spawn, goal]

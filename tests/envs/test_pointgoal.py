@@ -31,13 +31,13 @@ def decided(env, action):
 
 def place(env, metres):
     """Puts each agent `metres` west of its goal, at rest, looking at it, in mid-episode."""
-    goals = env.goals.points[env.layout.long(), env.chosen.long()]
+    goals = env.goals.points[env.layout.long(), env.goal_index.long()]
     agents = env.core.agents
     agents.positions[:, 0] = goals - torch.tensor([metres, 0.0], device=env.device)
     agents.velocity.zero_()
     agents.angles.zero_()
     agents.angvelocity.zero_()
-    env.journey[:2] = agents.positions[:, 0].T
+    env.progress[:2] = agents.positions[:, 0].T
 
 
 def test_a_metre_nearer_pays_one_and_a_step_costs():
@@ -46,9 +46,9 @@ def test_a_metre_nearer_pays_one_and_a_step_costs():
     env.reset()
     place(env, 0.6)
     env.step(decided(env, 0))
-    before = env.journey[2].clone()
+    before = env.progress[2].clone()
     world = env.step(decided(env, FORWARD))
-    torch.testing.assert_close(world.reward, before - env.journey[2] - 0.02)
+    torch.testing.assert_close(world.reward, before - env.progress[2] - 0.02)
     torch.testing.assert_close(world.reward + 0.02, torch.full((4,), 0.05), atol=0.01, rtol=0)
     away = env.step(decided(env, 4))  # back: at rest again, almost
     assert (away.reward.abs() < 0.03).all()
@@ -65,7 +65,7 @@ def test_within_two_decimetres_the_episode_ends_with_a_bonus(device):
     assert ((world.reward > 6.4) & (world.reward < 6.7)).all(), "and some centimetres"
     after = env.step(decided(env, FORWARD))
     assert after.reset.all() and not after.reward.any() and not after.terminal.any()
-    assert not env.journey[5].any() and not env.journey[6].any()
+    assert not env.progress[5].any() and not env.progress[6].any()
 
 
 def test_an_episode_is_truncated_at_its_limit():
@@ -81,8 +81,8 @@ def test_spl_is_the_shortest_over_the_walked(device):
     env.reset()
     for walked, spl in ((2.0, 0.5), (0.5, 1.0)):
         place(env, 0.23)
-        env.journey[4].fill_(1.0)
-        env.journey[5].fill_(walked - 0.05)
+        env.progress[4].fill_(1.0)
+        env.progress[5].fill_(walked - 0.05)
         world = env.step(decided(env, FORWARD))
         assert world.terminal.all()
         np.testing.assert_allclose(world.metrics.spl.cpu(), spl, rtol=1e-4)
@@ -95,9 +95,9 @@ def test_soft_spl_pays_for_the_part_of_the_way_that_was_made():
     env.reset()
     place(env, 1.0)
     env.step(decided(env, 0))
-    env.journey[3].copy_(env.journey[2] * 4)
-    env.journey[4].fill_(2.0)
-    env.journey[5].fill_(5.0)
+    env.progress[3].copy_(env.progress[2] * 4)
+    env.progress[4].fill_(2.0)
+    env.progress[5].fill_(5.0)
     world = env.step(decided(env, 0))
     assert world.truncated.all() and not world.metrics.spl.any()
     np.testing.assert_allclose(world.metrics.soft_spl, 0.75 * 0.4, rtol=1e-3)
@@ -121,8 +121,8 @@ def test_what_is_walked_is_the_sum_of_steps_and_collisions_are_counted(device):
             for total, more in ((walked, moved), (hits, stopped.cpu()))
         )
         before = now
-        torch.testing.assert_close(env.journey[5].cpu(), walked, rtol=1e-4, atol=1e-5)
-        collisions = env.journey[6].cpu()
+        torch.testing.assert_close(env.progress[5].cpu(), walked, rtol=1e-4, atol=1e-5)
+        collisions = env.progress[6].cpu()
         assert (collisions >= hits).all(), "at rest beside a wall an idle step is none"
         ends = (world.terminal | world.truncated).cpu()
         assert torch.equal(world.metrics.collisions.cpu(), torch.where(ends, collisions, 0.0))
@@ -135,7 +135,7 @@ def test_the_goal_is_told_in_the_agents_frame_at_each_step(device):
     world = env.reset()
     generator = torch.Generator().manual_seed(1)
     for _ in range(20):
-        goals = env.goals.points[env.layout.long(), env.chosen.long()]
+        goals = env.goals.points[env.layout.long(), env.goal_index.long()]
         across = (goals - env.core.agents.positions[:, 0]).cpu().double()
         radians = torch.deg2rad(env.core.agents.angles[:, 0].cpu().double())
         bearing = torch.atan2(across[:, 1], across[:, 0]) - radians
@@ -151,7 +151,7 @@ def test_a_critic_is_told_the_shortest_way_and_where_it_falls(device):
     env = made(device, 64, sample("homes", 4), privileged=True, resample=True)
     world = env.reset()
     told = world.privileged.way[:, 0].cpu()
-    torch.testing.assert_close(told[:, 0] * 10, env.journey[2].cpu())
+    torch.testing.assert_close(told[:, 0] * 10, env.progress[2].cpu())
     assert (told[:, 3] == 1).all()
     slope = told[:, 1:3].norm(dim=1)
     assert ((slope > 0.6) & (slope < 1.6)).float().mean() > 0.9
@@ -159,21 +159,21 @@ def test_a_critic_is_told_the_shortest_way_and_where_it_falls(device):
     ahead = torch.stack([angles.cos(), angles.sin()], 1)
     left = torch.stack([-angles.sin(), angles.cos()], 1)
     way = (told[:, 1:2] * ahead + told[:, 2:3] * left) / slope[:, None]
-    before = env.journey[2].clone()
+    before = env.progress[2].clone()
     env.core.agents.positions[:, 0] += 0.02 * way.to(device)
     env.core.agents.velocity.zero_()
     env.step(decided(env, 0))
-    fell = (before - env.journey[2]).cpu() / 0.02
+    fell = (before - env.progress[2]).cpu() / 0.02
     assert torch.allclose(fell, slope, atol=0.35, rtol=0.1) or (fell > 0.5).float().mean() > 0.9
 
 
 def test_where_no_way_is_known_the_distance_stays_as_it_was():
     env = made()
     env.reset()
-    before = env.journey[2].clone()
+    before = env.progress[2].clone()
     env.goals._tensors["fields"].fill_(torch.inf)
     world = env.step(decided(env, 0))
-    assert torch.equal(env.journey[2], before)
+    assert torch.equal(env.progress[2], before)
     torch.testing.assert_close(world.reward, torch.full((4,), -0.02))
 
 

@@ -271,7 +271,7 @@ def test_the_picture_of_a_state_is_what_the_left_side_sees():
     env = envs.Pong(5, pixels=True, self_play=True, device="cpu")
     worlds = contract.rollout(env, 30)
     state = arrdict.numpyify(env.state(2))
-    assert (env.picture(state) == worlds[-1].obs[4, 0, 0].numpy()).all()
+    assert (env.image(state) == worlds[-1].obs[4, 0, 0].numpy()).all()
 
 
 def test_text_shows_the_score_and_the_court():
@@ -302,7 +302,7 @@ def test_an_action_that_is_none_is_named(action, device):
 def test_pixels_that_begin_between_words_are_refused(device):
     env = envs.Pong(1, pixels=True, device=device)
     odd = torch.zeros(1201, dtype=torch.uint8, device=device)[1:].view(1, 1, 1, 30, 40)
-    with pytest.raises(ValueError, match="^pixels must begin at a multiple of 8 bytes"):
+    with pytest.raises(ValueError, match="pixels .* multiple of 8 bytes"):
         pong_step(env.games, env.no_actions, env.error_flag, 1, pixels=odd)
 
 

@@ -14,7 +14,7 @@ from megastep.kernels.build import compile
 
 CANONICAL_NAN = 0x7FFF  # what a GPU's conversion gives for every NaN
 SOURCE = """
-#include "backend_cpu.h"
+#include "common/backend_cpu.h"
 extern "C" void halves(const float* values, unsigned short* out, int n) {
     for (int i = 0; i < n; i++)
         out[i] = HALF_BITS(values[i]);
@@ -28,8 +28,8 @@ def halves(tmp_path_factory):
     """The kernels' conversion: floats to the bits of halves."""
     folder = tmp_path_factory.mktemp("half")
     (folder / "half.cpp").write_text(SOURCE)
-    compiler, _ = compile._compiler()
-    flags = [*compile.CPU_FLAGS, f"-I{compile.HERE}"]
+    compiler, _ = compile.compiler()
+    flags = [*compile.CPU_FLAGS, f"-I{compile.KERNELS}"]
     subprocess.run(
         [compiler, *flags, str(folder / "half.cpp"), "-o", str(folder / "half.so")], check=True
     )

@@ -17,6 +17,7 @@ from test_compile import ROOT, STEP, run
 
 from megastep import cache
 from megastep.kernels.build import compile
+from megastep.kernels.build.launch import ENGINE
 
 UNUSED = "the kernel cache is not used"
 BODY = b"what was built " * 10_000
@@ -200,7 +201,7 @@ def test_no_room_to_build_is_one_sentence_with_the_cure(monkeypatch):
 
     monkeypatch.setattr(compile.tempfile, "mkdtemp", full)
     with pytest.raises(compile.EngineError, match="No space left on device.*set TMPDIR") as error:
-        compile._build_cpu(compile._compiler()[0])
+        compile._build_cpu(ENGINE, compile.compiler()[0])
     assert "\n" not in str(error.value)
 
 
@@ -231,7 +232,7 @@ def test_a_planted_library_is_never_loaded(built, tmp_path, monkeypatch):
     folder.mkdir()
     source.write_text(PLANTED)
     library = tmp_path / "planted.so"
-    compiler, _ = compile._compiler()
+    compiler, _ = compile.compiler()
     command = [compiler, "-x", "c", "-shared", "-fPIC", str(source), "-o", str(library)]
     subprocess.run(command, check=True)
     body = library.read_bytes()
@@ -298,5 +299,5 @@ def test_a_compiler_that_a_signal_stopped_is_not_called_missing(stop, tmp_path):
     stopped.write_text(f"#!/bin/sh\n{stop}\n")
     stopped.chmod(0o755)
     with pytest.raises(compile.EngineError, match=r"stopped by a signal \((SIGTERM|Killed)\)") as e:
-        compile._build_cpu(str(stopped))
+        compile._build_cpu(ENGINE, str(stopped))
     assert "install" not in str(e.value) and "\n" not in str(e.value)

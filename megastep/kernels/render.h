@@ -1,13 +1,12 @@
-// What `render` writes: each ray at full resolution, pixels that are means of rays, texels seen for
-// the first time, inertia.
+// The outputs of `render`: rays at full resolution, pixels (means of rays), newly seen texels, IMU.
 #pragma once
-#include "common.h"
+#include "common/math.h"
 #include "params.h"
 #include "raster.h"
 #include "shading.h"
 
-// Number k of an agent's three of inertia: angular velocity / 360, its velocity ahead and left /
-// 10.
+// Writes component k of an agent's IMU: angular velocity / 360, own velocity ahead / 10 and left
+// / 10.
 HD void write_imu(const RenderParams& p, int agent, int k) {
     float x = p.velocity[2 * agent], y = p.velocity[2 * agent + 1];
     float turning = p.angvelocity[agent];
@@ -18,18 +17,19 @@ HD void write_imu(const RenderParams& p, int agent, int k) {
     p.imu[3 * (long long)agent + k] = HALF_BITS(value);
 }
 
-// Marks a texel as seen; 1 if it was not before. Most were, so a plain read comes first.
+// Marks a texel as seen and returns 1 if it was not before. Most are seen already, so it reads
+// first.
 HD int mark_seen(unsigned int* seen, int texel) {
     unsigned int bit = 1u << (texel & 31);
     return !(seen[texel >> 5] & bit) && !(OR_BITS(seen + (texel >> 5), bit) & bit);
 }
 
-// 1 at the agent's radius, falling to 0 at max_depth beyond it.
+// Falls from 1 at the agent's radius to 0 at max_depth beyond it.
 HD float depth_reading(float distance, float radius, float inv_max_depth) {
     return 1.f - clamp((distance - radius) * inv_max_depth, 0.f, 1.f);
 }
 
-// A ray's share of its pixel.
+// What a ray contributes to its pixel.
 struct RaySample {
     float red, green, blue, depth;
 };
@@ -38,7 +38,7 @@ HD RaySample plus(const RaySample& a, const RaySample& b) {
     return {a.red + b.red, a.green + b.green, a.blue + b.blue, a.depth + b.depth};
 }
 
-// A ray that hits no line. `ray` counts over all cameras.
+// Writes a ray that hits no line. `ray` is its index over all cameras.
 HD void write_miss(const RenderParams& p, long long ray) {
     if (p.locations)
         p.locations[ray] = NAN_VALUE;
@@ -54,8 +54,9 @@ HD void write_miss(const RenderParams& p, long long ray) {
     }
 }
 
-// Ray r of camera `view`, which hits a surface at this inverse depth. Writes what is wanted at full
-// resolution if `full_res`, and counts in newly_seen a texel that is seen for the first time.
+// Shades ray r of camera `view`, which hits a surface at this inverse depth. Writes the
+// full-resolution outputs if `full_res`, and adds to newly_seen a texel that is seen for the first
+// time.
 template <int full_res>
 HD RaySample shade_ray(const RenderParams& p, const Screen& screen, const EnvScenery& scenery,
                        const Surface& surface, int view, unsigned int* seen, int r,
@@ -66,13 +67,13 @@ HD RaySample shade_ray(const RenderParams& p, const Screen& screen, const EnvSce
     Hit hit = hit_of(surface, y, length);
     RaySample sample = {0.f, 0.f, 0.f, depth_reading(distance, screen.radius, p.inv_max_depth)};
     if (p.rgb || (full_res && p.screen)) {
-        Colour colour = surface.of_agent ? agent_colour(scenery, first, width, hit)
+        Colour colour = surface.is_agent ? agent_colour(scenery, first, width, hit)
                                          : wall_colour(p.scenery, first, width, hit);
         sample.red = colour.red;
         sample.green = colour.green;
         sample.blue = colour.blue;
     }
-    if (seen && !surface.of_agent)
+    if (seen && !surface.is_agent)
         newly_seen += mark_seen(seen, first - scenery.first_texel + texel_at(hit.location, width));
     if (!full_res)
         return sample;
@@ -92,8 +93,8 @@ HD RaySample shade_ray(const RenderParams& p, const Screen& screen, const EnvSce
     return sample;
 }
 
-// A pixel is the mean of its rays, which are summed in order; four of them, the usual number, by
-// pairs.
+// Writes a pixel: the mean of its rays. Rays are summed in order, except that four rays, the usual
+// number, are summed in pairs.
 HD void write_pixel(const RenderParams& p, int view, int pixel, const RaySample& sum) {
     int n_pixels = p.n_pixels;
     float inv_subsample = p.inv_subsample;

@@ -1,8 +1,8 @@
 // One thread per agent.
-#include "seek.h"
+#include "pointgoal_step.h"
 
-KERNEL seek(SeekParams p) {
+KERNEL pointgoal_step(PointgoalStepParams p) {
     int agent = blockIdx.x * blockDim.x + threadIdx.x;
     if (agent < p.scenery.n_envs * p.scenery.n_agents)
-        seek_goal(p, agent);
+        pointgoal_agent(p, agent);
 }

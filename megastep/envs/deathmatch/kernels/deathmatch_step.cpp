@@ -1,8 +1,8 @@
 // A loop over environments.
-#include "shoot.h"
+#include "deathmatch_step.h"
 
-KERNEL shoot(const ShootParams& p) {
+KERNEL deathmatch_step(const DeathmatchStepParams& p) {
 #pragma omp parallel for schedule(static) num_threads(p.n_threads)
     for (int env = 0; env < p.n_envs; env++)
-        shoot_env(p, env);
+        deathmatch_env(p, env);
 }

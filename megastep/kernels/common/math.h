@@ -1,8 +1,8 @@
-// Arithmetic that several operations share: scalars, angles, poses.
+// Arithmetic on scalars, angles and poses.
 #pragma once
-#include "backend.h"
+#include "common/backend.h"
 
-// Not the compilers' min and max, whose treatment of NaN and of -0 differs between backends.
+// Not the compilers' min and max, which treat NaN and -0 differently on CPU and GPU.
 HD float minf(float a, float b) { return a < b ? a : b; }
 
 HD float maxf(float a, float b) { return a > b ? a : b; }
@@ -19,13 +19,13 @@ HD float cross(float ax, float ay, float bx, float by) { return ax * by - ay * b
 
 HD int is_finite(float x) { return x - x == 0.f; }
 
-// Four floats that are read and written in one instruction.
+// Four floats, read and written in one instruction.
 struct ALIGNED Float4 {
     float x, y, z, w;
 };
 
-// The quarter turns leave exactly, in degrees; the rest, within 45 degrees, goes through Cephes'
-// polynomials (1 ulp).
+// Quarter turns are subtracted exactly, in degrees. The remaining angle, within 45 degrees, goes
+// through the polynomials of Cephes (error: 1 ulp).
 HD void sincos_degrees(float degrees, float& sine, float& cosine) {
     float quarters = RINT(degrees * (1.f / 90.f));
     float x = (degrees - 90.f * quarters) * 0.017453292519943295f;
@@ -41,7 +41,7 @@ HD void sincos_degrees(float degrees, float& sine, float& cosine) {
     cosine = (quadrant + 1) & 2 ? -turned_c : turned_c;
 }
 
-// An angle's equal within [-180, 180).
+// The same angle in [-180, 180).
 HD float wrap_degrees(float angle) {
     float wrapped = angle - 360.f * FLOOR((angle + 180.f) * (1.f / 360.f));
     if (wrapped >= 180.f)
@@ -49,7 +49,7 @@ HD float wrap_degrees(float angle) {
     return wrapped < -180.f ? wrapped + 360.f : wrapped;
 }
 
-// Where an agent or a camera stands, and which way it looks.
+// Position and heading of an agent or a camera.
 struct Pose {
     float x, y, sine, cosine;
 };

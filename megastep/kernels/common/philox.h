@@ -1,7 +1,7 @@
-// Random numbers without state: Philox 4x32-10 (Salmon et al. 2011). The key is the seed, the
-// counter is (lane, draw), so a lane's k-th draw is the same on every device and in any order.
+// Philox 4x32-10 (Salmon et al. 2011), a random generator without state. The key is the seed and
+// the counter is (lane, draw), so a lane's k-th draw is the same on every device and in any order.
 #pragma once
-#include "backend.h"
+#include "common/backend.h"
 
 struct Philox {
     unsigned int a, b, c, d;
@@ -20,5 +20,5 @@ HD Philox philox(unsigned int lane, unsigned int draw, unsigned int key0, unsign
     return x;
 }
 
-// 24 bits, which a float holds exactly, as a number in [0, 1).
+// A number in [0, 1) from the upper 24 bits, which a float holds exactly.
 HD float unit_float(unsigned int bits) { return (float)(bits >> 8) * (1.f / 16777216.f); }

@@ -1,9 +1,9 @@
-// How the CPU spells what backend.h lists.
+// The macros of backend.h on the CPU.
 #pragma once
 
 #define HD static inline
 #define KERNEL extern "C" void
-// The CPU reads tensors wherever they start, so 16-byte records are not aligned.
+// A tensor may start anywhere in the CPU's memory, so 16-byte records are not aligned.
 #define ALIGNED
 #define SQRT(x) __builtin_sqrtf(x)
 #define CEIL(x) __builtin_ceilf(x)
@@ -19,7 +19,7 @@
 #define NAN_VALUE __builtin_nanf("")
 #define INF_VALUE __builtin_inff()
 
-// Sets bits of a word and returns what it held. Not atomic: one thread owns an agent's words.
+// Sets bits of a word and returns its old value. Not atomic: one thread owns an agent's words.
 static inline unsigned int or_bits(unsigned int* word, unsigned int bits) {
     unsigned int old = *word;
     *word = old | bits;
@@ -34,16 +34,16 @@ static inline unsigned int float_bits(float value) {
     return same.bits;
 }
 
-// Rounds to half precision, to nearest even, with integer instructions that every processor has.
+// Rounds to fp16, to nearest even, with integer instructions that every processor has.
 static inline unsigned short half_bits(float value) {
     unsigned int bits = float_bits(value);
     unsigned int sign = (bits >> 16) & 0x8000u;
     unsigned int magnitude = bits & 0x7fffffffu;
-    if (magnitude > 0x7f800000u)  // NaN: the one that a GPU makes of all
+    if (magnitude > 0x7f800000u)  // NaN: a GPU turns all of them into this one
         return 0x7fff;
-    if (magnitude >= 0x477ff000u)  // rounds to more than 65504, the largest half
+    if (magnitude >= 0x477ff000u)  // rounds to more than 65504, the largest fp16 value
         return (unsigned short)(sign | 0x7c00u);
-    if (magnitude < 0x38800000u) {  // subnormal as a half: adding 0.5 shifts and rounds it
+    if (magnitude < 0x38800000u) {  // subnormal in fp16: adding 0.5 shifts and rounds it
         float shifted = __builtin_fabsf(value) + 0.5f;
         return (unsigned short)(sign | (float_bits(shifted) - 0x3f000000u));
     }
@@ -56,7 +56,7 @@ static inline float half_value(unsigned short bits) {
         unsigned int bits;
         float value;
     } same = {(bits & 0x7fffu) << 13};
-    same.value *= 0x1p112f;  // the difference of the exponents, subnormals too
+    same.value *= 0x1p112f;  // the difference of the exponents, for subnormals too
     if ((bits & 0x7c00u) == 0x7c00u)
         same.bits |= 0x7f800000u;
     same.bits |= (bits & 0x8000u) << 16;

@@ -1,8 +1,8 @@
 // One thread per environment.
-#include "shoot.h"
+#include "deathmatch_step.h"
 
-KERNEL shoot(ShootParams p) {
+KERNEL deathmatch_step(DeathmatchStepParams p) {
     int env = blockIdx.x * blockDim.x + threadIdx.x;
     if (env < p.n_envs)
-        shoot_env(p, env);
+        deathmatch_env(p, env);
 }

@@ -1,11 +1,12 @@
-// Where an agent's lines and texels lie.
+// Positions of an agent's lines and texels.
 #pragma once
-#include "common.h"
+#include "common/math.h"
+#include "common/scenery.h"
 #include "light.h"
 #include "params.h"
 
-// Carries line m of the model to where the agent stands. Sums alone: GCC 12 fuses a sum and a
-// difference side by side as it vectorises, whatever -ffp-contract says.
+// Moves line m of the model to the agent's pose. Written with sums alone: GCC 12, when it
+// vectorises a sum beside a difference, fuses them with the products in spite of -ffp-contract=off.
 HD void update_line(const SceneryParams& s, const Pose& pose, int agent, int m) {
     float minus_sine = -pose.sine;
     float* line = s.agent_lines + 4 * (agent * (long long)s.n_model + m);
@@ -17,7 +18,8 @@ HD void update_line(const SceneryParams& s, const Pose& pose, int agent, int m) 
     }
 }
 
-// The centre of a texel of agent a, one of the K of its environment, once its lines are updated.
+// The centre of texel `texel` of the environment's K, which belongs to agent a. Call update_line
+// first.
 HD void agent_texel_centre(const SceneryParams& s, int env, int a, int texel, float& x, float& y) {
     int l = a * s.n_model;
     while (texel >= s.model_texels[l + 1])
