@@ -16,7 +16,7 @@ SCRIPTS = ("train", "evaluate", "record")
 
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
-    ("cache", "colour", "dotdict", "read_only", "settings", "types", "workers"),
+    ("cache", "colour", "dotdict", "read_only", "settings", "types", "video", "workers"),
     ("arrdict", "geometry", "kernels", "plotting", "ragged"),
     ("engine", "recording", "spaces"),
     ("capture", "contract", "geometries", "scene"),
@@ -28,7 +28,8 @@ ENGINE = (
     ("checks", "devices", "outputs", "state_tree", "views"),
     ("agents", "scenery"),
     ("launch_params",),
-    ("ops",),
+    ("lighting", "movement", "spawning", "texels"),
+    ("rendering",),
 )
 AGENTS = (
     ("distributed", "generator", "imports", "types"),
@@ -57,13 +58,14 @@ OWN_USERS = {
         "megastep/engine/*.py",
         "megastep/envs/*/step.py",
         "megastep/kernels/build/*.py",
+        "megastep/modules/visibility.py",  # its cache depends on the kernels' sources
         "agents/networks/kernels/*.py",
     ),
 }
 # The files that may import these packages, directly or through importlib, as glob patterns.
 OUTSIDE_USERS = {
     "IPython": ("megastep/recording.py",),
-    "av": ("megastep/recording.py", "agents/cli/record.py"),
+    "av": ("megastep/video.py", "agents/cli/record.py"),
     "cloudpickle": ("megastep/recording.py",),
     "cuda": ("megastep/kernels/build/compile.py",),
     "hydra": ("agents/cli/*.py",),
@@ -287,13 +289,13 @@ def test_tests_and_scripts_import_megastep_agents():
 
 
 PLANTED = [
-    (simulator_rows, "megastep.engine.ops", "megastep.modules"),
+    (simulator_rows, "megastep.engine.rendering", "megastep.modules"),
     (simulator_rows, "megastep.plotting", "megastep.engine.scenery"),
     (simulator_rows, "megastep.kernels.build.compile", "megastep.engine"),
     (simulator_rows, "megastep.engine.views", "megastep.geometries.toys"),
-    (simulator_rows, "megastep.engine.ops", "megastep.envs.pong.step"),
+    (simulator_rows, "megastep.engine.rendering", "megastep.envs.pong.step"),
     (engine_rows, "megastep.engine.checks", "megastep.engine.agents"),
-    (engine_rows, "megastep.engine.scenery", "megastep.engine.ops"),
+    (engine_rows, "megastep.engine.scenery", "megastep.engine.rendering"),
     (agents_rows, "megastep.agents.networks.policy", "megastep.agents.storage.rollout"),
     (agents_rows, "megastep.agents.storage.rollout", "megastep.agents.algorithms.ppo"),
     (agents_rows, "megastep.agents.algorithms.ppo", "megastep.agents.training.trainer"),
