@@ -170,7 +170,7 @@ class Trainer:
         """Whether the last update was followed. Warns of the first number that could not be learnt
         from; NonFiniteError if none of the last `MAX_SKIPPED` rollouts could. Synchronises.
         """
-        bad, n_skipped = self.learner.check.read(self.rollout.numbers())
+        bad, n_skipped = self.learner.check.read(self.rollout.floats())
         if bad and self.rollout.learners is not None:
             lanes = self.rollout.learners.nonzero()[:, 0]
             bad = dataclasses.replace(bad, lane=int(lanes[bad.lane]))

@@ -5,7 +5,8 @@ from timing import alone, measurement, rate
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.replay import Replay, ReplaySettings
+from megastep.agents.storage.replay import ReplayBuffer
+from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout
 
 N_LANES = {"cuda": 16_384, "cpu": 256}
@@ -26,7 +27,7 @@ def filled(device, images):
     capacity = ROLLOUTS[device.type] * N_STEPS * n_lanes
     settings = ReplaySettings(capacity=capacity, images=images, alpha=0.9)
     before = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
-    memory = Replay(rollout, OBS, ACTIONS, settings)
+    memory = ReplayBuffer(rollout, OBS, ACTIONS, settings)
     allocated = memory.bytes
     if device.type == "cuda":
         allocated = torch.cuda.memory_allocated(device) - before

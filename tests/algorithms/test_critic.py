@@ -28,7 +28,7 @@ def policy_of(critic="asymmetric", seed=0):
     """A policy far from uniform, so that whatever reached the logits would show."""
     policy = Policy(OBS, MOVES, TOLD, width=WIDTH, critic=critic, seed=seed)
     with torch.no_grad():
-        policy.output.core.weight.mul_(100)
+        policy.output.linear.weight.mul_(100)
     return policy
 
 
@@ -235,7 +235,7 @@ def test_a_plain_policys_rollout_stores_nothing_of_it():
     rollout = rollout_of(policy)
     collect(env, policy, rollout, initial_actor_state(env, policy, rollout))
     assert rollout.privileged is None and "privileged" not in rollout.sequences(torch.tensor([0]))
-    assert not any("privileged" in name for name in rollout.numbers())
+    assert not any("privileged" in name for name in rollout.floats())
 
 
 def collected(critic="asymmetric"):
@@ -261,7 +261,7 @@ def test_without_an_auxiliary_loss_the_prediction_stays_as_it_was(critic, coef):
     metrics = ppo.PPO(policy, auxiliary_coef=coef).update(rollout)
     after = policy.state_dict()
     assert all(torch.equal(after[k], before[k]) for k in after if k.startswith("prediction"))
-    assert not torch.equal(after["core.memory.weight"], before["core.memory.weight"])
+    assert not torch.equal(after["core.recurrent.weight"], before["core.recurrent.weight"])
     assert ("loss/auxiliary" in metrics) == (critic == "asymmetric")
 
 
@@ -274,7 +274,7 @@ def test_a_bad_number_that_a_critic_is_told_is_named_and_changes_no_bit(value):
     learner.update(rollout)
     after = policy.state_dict()
     assert all(torch.equal(after[name], before[name]) for name in before)
-    bad, n_skipped = learner.check.read(rollout.numbers())
+    bad, n_skipped = learner.check.read(rollout.floats())
     assert (bad.name, bad.lane, bad.step) == ("privileged.episode", 3, 3) and n_skipped == 1
     assert str(bad).startswith("privileged.episode of lane 3 was ") and bad.is_from_env
 

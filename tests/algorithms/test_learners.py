@@ -41,7 +41,7 @@ def test_it_is_a_learner_whose_metrics_are_numbers(name):
         losses = learner.update(collect())
     assert all(key.startswith("loss/") for key in losses) and "loss/skipped_steps" in losses
     assert all(value.shape == () and value.isfinite() for value in losses.values())
-    assert learner.check.read(collect.rollout.numbers()) == (None, 0)
+    assert learner.check.read(collect.rollout.floats()) == (None, 0)
 
 
 @NAMES
@@ -61,7 +61,7 @@ def test_a_saved_learner_goes_on_bit_by_bit(name):
     other.load_state_dict(saved["policy"])
     resumed.load_state_dict(saved["learner"])
     assert torch.equal(
-        other.random.on(other.device).get_state(), policy.random.on(policy.device).get_state()
+        other.generator.on(other.device).get_state(), policy.generator.on(policy.device).get_state()
     )
     rollout = collect()
     before = flat(policy)
@@ -98,7 +98,7 @@ def test_a_bad_number_changes_no_bit_and_is_named(name):
     assert all(map(torch.equal, policy.state_dict().values(), before))
     assert all(map(torch.equal, learner.optimizer.means, optimizer))
     assert losses["loss/skipped_steps"] > 0
-    bad, n_skipped = learner.check.read(collect.rollout.numbers())
+    bad, n_skipped = learner.check.read(collect.rollout.floats())
     assert (bad.name, bad.lane, bad.step, n_skipped) == ("reward", 3, 2 * T + 1, 1)
     for _ in range(4):
         losses = learner.update(collect())
@@ -114,7 +114,7 @@ def test_skipped_updates_are_counted_and_end_with_the_bad_numbers(name, bad_step
     counts = []
     for _ in range(9):
         learner.update(collect())
-        counts.append(learner.check.read(collect.rollout.numbers())[1])
+        counts.append(learner.check.read(collect.rollout.floats())[1])
     first = (min(bad_steps) - 1) // T
     n_bad = 9 - first if len(bad_steps) > 1 else 1
     assert counts == [0] * first + [*range(1, n_bad + 1)] + [0] * (9 - first - n_bad)
@@ -156,7 +156,7 @@ def test_a_run_starts_from_the_weights_of_another_learner_unless_they_do_not_fit
     first, second = (
         checkpoint.load_latest(tmp_path / run / "checkpoints") for run in ("first", "second")
     )
-    name = "output.core.weight"
+    name = "output.linear.weight"
     assert torch.equal(first.state["policy"][name], second.state["policy"][name])
     kinds = [each.state["learner"]["learner"] for each in (first, second)]
     assert kinds == ["PPO", "VTrace"]

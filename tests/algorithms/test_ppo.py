@@ -115,7 +115,7 @@ def test_an_update_without_a_lane_that_learns_changes_nothing():
     learner.update(rollout)
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
     assert all(map(torch.equal, learner.optimizer.means, means))
-    assert learner.check.read(rollout.numbers()) == (None, 0), "nor is it counted as skipped"
+    assert learner.check.read(rollout.floats()) == (None, 0), "nor is it counted as skipped"
 
 
 def test_lanes_that_learn_do_change_the_weights():
@@ -139,7 +139,7 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
     assert metrics["loss/skipped_steps"].item() == 1
     assert not torch.equal(weights(policy), before) and weights(policy).isfinite().all()
     assert all(value.isfinite() for value in metrics.values())
-    assert learner.check.read(rollout.numbers()) == (None, 0)  # the update was not skipped
+    assert learner.check.read(rollout.floats()) == (None, 0)  # the update was not skipped
 
 
 @pytest.mark.parametrize("name", ["obs", "reward", "value", "logprob"])
@@ -152,14 +152,14 @@ def test_a_bad_number_in_a_rollout_changes_no_bit_of_weights_or_statistics(name,
     lists = learner.optimizer.means, learner.optimizer.squares
     before = [{key: tensor.clone() for key, tensor in part.items()} for part in parts]
     before_lists = [[tensor.clone() for tensor in each] for each in lists]
-    rollout.numbers()[name][2, 3] = value
+    rollout.floats()[name][2, 3] = value
     metrics = learner.update(rollout)
     assert metrics["loss/skipped_steps"].item() == 2 * B
     for part, old in zip(parts, before, strict=True):
         assert all(torch.equal(part[key], old[key]) for key in old)
     for each, old in zip(lists, before_lists, strict=True):
         assert all(map(torch.equal, each, old))
-    bad, n_skipped = learner.check.read(rollout.numbers())
+    bad, n_skipped = learner.check.read(rollout.floats())
     assert (bad.name, bad.lane, bad.step, n_skipped) == (name, 3, T + 3, 1)
 
 
@@ -171,10 +171,10 @@ def test_what_comes_after_a_stop_is_not_counted_as_skipped():
     next(policy.parameters()).register_hook(lambda grad: grad * math.nan)
     stopped = ppo.PPO(policy, n_minibatches=B, target_kl=0.1)
     assert stopped.update(rollout)["loss/skipped_steps"].item() == 0
-    assert stopped.check.read(rollout.numbers()) == (None, 0)
+    assert stopped.check.read(rollout.floats()) == (None, 0)
     going_on = ppo.PPO(policy, n_minibatches=B, target_kl=1.0)
     assert going_on.update(rollout)["loss/skipped_steps"].item() == B
-    assert going_on.check.read(rollout.numbers()) == (None, 1)
+    assert going_on.check.read(rollout.floats()) == (None, 1)
 
 
 def test_an_update_stops_once_the_policy_has_gone_too_far():
@@ -228,7 +228,7 @@ def test_a_saved_learner_goes_on_bit_by_bit(n_before):
     resumed.update(rollout)
     assert torch.equal(weights(other), weights(policy))
     assert torch.equal(
-        other.random.on(other.device).get_state(), policy.random.on(policy.device).get_state()
+        other.generator.on(other.device).get_state(), policy.generator.on(policy.device).get_state()
     )
     resumed.set_lr(0.0)  # still reaches the optimizer
     resumed.update(rollout)
@@ -296,12 +296,12 @@ def test_a_captured_update_skips_a_rollout_that_is_not_finite():
     for _ in range(2):
         assert learner.update(rollout)["loss/skipped_steps"].item() == 3
     assert torch.equal(weights(policy), before)
-    bad, n_skipped = learner.check.read(rollout.numbers())
+    bad, n_skipped = learner.check.read(rollout.floats())
     assert (bad.name, bad.lane, bad.step, n_skipped) == ("reward", 3, 4 * T + 3, 2)
     rollout.reward[2, 3] = good
     learner.update(rollout)
     assert not torch.equal(weights(policy), before)
-    assert learner.check.read(rollout.numbers()) == (None, 0)
+    assert learner.check.read(rollout.floats()) == (None, 0)
 
 
 @pytest.mark.cuda

@@ -211,8 +211,8 @@ def test_a_bad_number_changes_nothing_and_is_never_drawn(name):
     before = {key: value.clone() for key, value in learner.policy.state_dict().items()}
     target = {key: value.clone() for key, value in learner.target.state_dict().items()}
     rollout = collect()
-    kept = rollout.numbers()[name][2, 3].clone()
-    rollout.numbers()[name][2, 3] = torch.nan
+    kept = rollout.floats()[name][2, 3].clone()
+    rollout.floats()[name][2, 3] = torch.nan
     losses = learner.update(rollout)
     assert losses["loss/skipped_steps"].item() == 4
     assert all(
@@ -221,9 +221,9 @@ def test_a_bad_number_changes_nothing_and_is_never_drawn(name):
     assert all(
         torch.equal(value, target[key]) for key, value in learner.target.state_dict().items()
     )
-    bad, n_skipped = learner.check.read(rollout.numbers())
+    bad, n_skipped = learner.check.read(rollout.floats())
     assert (bad.name, bad.lane, n_skipped) == (name, 3, 1)
-    rollout.numbers()[name][2, 3] = kept
+    rollout.floats()[name][2, 3] = kept
     skipped = [updated(learner, collect, 1)["loss/skipped_steps"].item() for _ in range(12)]
     assert not any(skipped) and weights(learner.policy).isfinite().all()
     assert not torch.equal(

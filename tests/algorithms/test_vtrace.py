@@ -98,8 +98,8 @@ def test_values_are_told_what_follows_the_last_row(ended, error):
     rollout.starts[1:] = False
     rollout.terminal[-1] = ended
     with torch.no_grad():
-        policy.critic.output.core.weight.zero_()
-        policy.critic.output.core.bias.fill_(1.0)
+        policy.critic.output.linear.weight.zero_()
+        policy.critic.output.linear.bias.fill_(1.0)
         logits = policy.unroll(rollout.obs, rollout.starts, rollout.state).logits[:-1]
         rollout.logprobs[:] = policy.output.logprob(logits, rollout.actions)
     metrics = VTrace(policy, n_minibatches=1, gamma=1.0, lambda_=1.0).update(rollout)

@@ -109,7 +109,8 @@ def test_bytes_are_stored_as_bytes_and_standardised(folder):
 
     from megastep.agents.algorithms.ppo import PPO
     from megastep.agents.networks.policy import Policy
-    from megastep.agents.storage.rollout import Collector, Rollout
+    from megastep.agents.storage.collector import Collector
+    from megastep.agents.storage.rollout import Rollout
 
     env = board.Board(6)
     policy = Policy(env.obs_space, env.action_space, width=8)

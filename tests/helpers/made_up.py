@@ -56,7 +56,7 @@ def made_up(seed=0, device="cpu", privileged=None, values=True):
     policy = Policy(OBS, MOVES, privileged, width=WIDTH, seed=seed).to(device)
     with torch.no_grad():
         # a policy far from uniform, so that gradients differ by action
-        policy.output.core.weight.mul_(100)
+        policy.output.linear.weight.mul_(100)
     state = policy.initial(B)
     rollout = Rollout(*(T, B, OBS, MOVES, state, device, privileged, torch.float32), values=values)
     generator = torch.Generator().manual_seed(seed)
@@ -74,7 +74,7 @@ def made_up(seed=0, device="cpu", privileged=None, values=True):
         out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
         if values:
             rollout.values[:] = policy.value(out.features, rollout.privileged)
-        rollout.actions[:] = policy.output.sample(out.logits[:-1], policy.random.on(policy.device))
+        rollout.actions[:] = policy.output.sample(out.logits[:-1], policy.generator.on(policy.device))
         rollout.logprobs[:] = policy.output.logprob(out.logits[:-1], rollout.actions)
     return policy, rollout
 

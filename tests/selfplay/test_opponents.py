@@ -76,8 +76,8 @@ def test_a_snapshot_plays_as_the_policy_did_and_remembers_its_own_episodes():
     """Two snapshots that always choose 0 and 1, of which one sees only its lanes' observations."""
     env = opposed(past=1.0, bot=0.0)
     for choice, actor in enumerate(env.actors):
-        actor.output.core.weight.data.zero_()
-        actor.output.core.bias.data.copy_(
+        actor.output.linear.weight.data.zero_()
+        actor.output.linear.bias.data.copy_(
             torch.tensor([-50.0] * 3).index_fill(0, torch.tensor(choice), 50)
         )
     env.reset()
@@ -213,7 +213,7 @@ def test_without_opponents_nothing_is_left_out():
     rollout = PPO(policy_of(env)).collector(env).rollout
     assert rollout.learners is None and rollout.n_lanes == 8
     world = env.reset()
-    assert rollout.own(world) is world and rollout.for_all(world.obs) is world.obs
+    assert rollout.select_lanes(world) is world and rollout.scatter_actions(world.obs) is world.obs
 
 
 def test_a_bad_number_is_named_by_the_lane_of_its_environment(tmp_path):
@@ -348,8 +348,8 @@ def test_pairs_are_won_by_who_survives_and_else_by_who_earned_more(n_agents):
 def test_the_share_won_is_told_by_kind_of_opponent(mortal):
     env = opposed(16, mortal and 3 or 2, env=Matrix(16, 3 if mortal else 2, mortal), bot=0.25)
     for actor in env.actors:
-        actor.output.core.weight.data.zero_()
-        actor.output.core.bias.data.copy_(torch.tensor([0.0, 99, 0]))
+        actor.output.linear.weight.data.zero_()
+        actor.output.linear.bias.data.copy_(torch.tensor([0.0, 99, 0]))
     env.reset()
     lanes = len(env.learners)
     for action in (1, 2, 2, 2):  # every second step is the reset after an end

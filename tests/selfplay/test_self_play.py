@@ -190,8 +190,8 @@ def test_snapshots_act_as_they_are_and_on_a_gpu_in_graphs(here, monkeypatch, dev
     assert not torch.equal(played[0][1], played[1][1]), "snapshots remember"
     # now one snapshot that only moves up and one that only moves down, written in place
     for up, actor in zip((50.0, -50.0), trainer.opponents.actors, strict=True):
-        actor.output.core.weight.data.zero_()
-        actor.output.core.bias.data.copy_(torch.tensor([-90.0, up, -up]))
+        actor.output.linear.weight.data.zero_()
+        actor.output.linear.bias.data.copy_(torch.tensor([-90.0, up, -up]))
     for _ in range(4):
         trainer.collect()
     tops = trainer.env.env.games[6:8].T  # of the left and the right paddle

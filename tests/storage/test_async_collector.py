@@ -30,7 +30,7 @@ def by_hand(lag, n_updates, device="cpu"):
     env = Numbers(device)
     policy, seen, old = policy_of(env), [], []
     learner, actor = VTrace(policy, **HOW), policy_of(env)
-    actor.random = policy.random
+    actor.generator = policy.generator
     collect = Collector(env, actor, make_rollout(env, policy, T, values=False))
     for n in range(n_updates):
         old.append(copy.deepcopy(policy.state_dict()))
@@ -103,7 +103,7 @@ def test_who_goes_on_acts_with_the_weights_of_then():
     policy = policy_of(env)
     collect = VTrace(policy, lag=2, **HOW).collector(env)
     with torch.no_grad():
-        other.output.core.weight.mul_(100)
+        other.output.linear.weight.mul_(100)
     policy.load_state_dict(other.state_dict())
     rollout = collect()
     logits = other.unroll(rollout.obs, rollout.starts, rollout.state).logits[:-1]

@@ -217,7 +217,7 @@ def test_a_policy_without_a_critic_acts_as_one_whose_values_are_not_stored():
         state = policy.initial(B)
         rollout = Rollout(T, B, env.obs_space, env.action_space, state, values=False)
         collect(env, policy, rollout, initial_actor_state(env, policy, rollout))
-        assert rollout.values is None and "value" not in rollout.numbers()
+        assert rollout.values is None and "value" not in rollout.floats()
         stored.append(rollout)
     assert torch.equal(stored[0].actions.move, stored[1].actions.move)
     assert stored[0].logprobs.all() and not stored[1].logprobs.any()
@@ -253,7 +253,7 @@ def test_what_a_space_names_its_dtype_is_stored_as_such():
     )
     rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
     assert rollout.obs.sky.dtype == torch.uint8 and rollout.obs.gauge.dtype == torch.float32
-    assert rollout.numbers().keys() == {"obs.gauge", "reward", "value", "logprob"}
+    assert rollout.floats().keys() == {"obs.gauge", "reward", "value", "logprob"}
 
 
 class Talkative(Telltale):
