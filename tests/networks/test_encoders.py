@@ -8,7 +8,7 @@ from megastep.agents.networks import encoders
 
 
 @pytest.mark.parametrize("shape", [(3, 128), (1, 64), (6, 37), (1, 5)])
-def test_a_convolution_is_a_product_with_a_banded_matrix(shape):
+def test_banded_matrix_matches_convolution(shape):
     channels, n_columns = shape
     conv = encoders.Conv(spaces.MultiImage(1, channels, 1, n_columns))
     rows = torch.rand(6, channels, n_columns, generator=torch.Generator().manual_seed(1))
@@ -28,7 +28,7 @@ def test_a_convolution_is_a_product_with_a_banded_matrix(shape):
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("n_columns", [128, 2 * encoders.BandedConv1d.MAX_BANDED])
-def test_gpu_and_cpu_convolve_alike(n_columns):
+def test_gpu_matches_cpu(n_columns):
     conv = encoders.Conv(spaces.MultiImage(1, 3, 1, n_columns))
     image = torch.rand(7, 1, 3, 1, n_columns, generator=torch.Generator().manual_seed(1))
     wanted = conv(image)

@@ -37,14 +37,14 @@ def sample_of(space, *lead, seed=0, dtype=torch.float32):
     "space", [IMAGE, VECTOR, spaces.MultiDiscrete(2, 4), TREE, spaces.MultiImage(1, 3, 4, 1)]
 )
 @pytest.mark.parametrize("lead", [(), (6,), (3, 6)])
-def test_an_intake_gives_width_numbers_whatever_it_is_shown(space, encoder, lead):
+def test_intake_shape(space, encoder, lead):
     intake = heads.intake(space, WIDTH, encoder)
     out = intake(sample_of(space, *lead))
     assert out.shape == (*lead, WIDTH) and out.dtype == torch.float32 and out.isfinite().all()
 
 
 @pytest.mark.parametrize("encoder", encoders.ENCODERS)
-def test_every_pixel_and_every_leaf_matters(encoder):
+def test_every_pixel_and_leaf_has_a_gradient(encoder):
     torch.manual_seed(0)
     intake = heads.intake(TREE, 512, encoder)
     obs = sample_of(TREE, 1)
@@ -57,21 +57,21 @@ def test_every_pixel_and_every_leaf_matters(encoder):
     assert not torch.equal(intake(other), intake(obs))
 
 
-def test_the_order_of_keys_does_not_matter():
+def test_order_of_keys_does_not_matter():
     intake = heads.intake(TREE, WIDTH)
     obs = sample_of(TREE, 6)
     backwards = arrdict({key: obs[key] for key in reversed(obs)})
     assert torch.equal(intake(backwards), intake(obs))
 
 
-def test_half_precision_images_meet_single_precision_weights():
+def test_float16_observations():
     intake = heads.intake(TREE, WIDTH)
     half = sample_of(TREE, 6, dtype=torch.float16)
     single = half.map(lambda leaf: leaf.float() if leaf.is_floating_point() else leaf)
     assert torch.equal(intake(half), intake(single))
 
 
-def test_autocast_decides_the_dtype_of_the_products_but_not_of_the_logits():
+def test_autocast_changes_features_not_logits():
     intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
     with torch.autocast("cpu", torch.bfloat16):
         x = intake(sample_of(TREE, 6, dtype=torch.float16))
@@ -79,7 +79,7 @@ def test_autocast_decides_the_dtype_of_the_products_but_not_of_the_logits():
         assert output(x).movement.dtype == torch.float32
 
 
-def test_leaves_weigh_the_same_at_the_start():
+def test_leaves_have_equal_initial_weight():
     # An image of 3 x 64 numbers and a vector of 3, all 1: each leaf's part of the sum has variance
     # 2/2
     torch.manual_seed(0)
@@ -94,7 +94,7 @@ def test_leaves_weigh_the_same_at_the_start():
         )  # 4096 samples: 4.5 standard errors
 
 
-def test_logits_are_log_probabilities_that_an_env_can_be_given():
+def test_shapes_of_logits_and_actions():
     intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
     logits = nn.Sequential(intake, output)(sample_of(TREE, 6))
     assert logits.movement.shape == (6, 2, 7) and logits.fire.shape == (6, 2, 2)
@@ -106,13 +106,13 @@ def test_logits_are_log_probabilities_that_an_env_can_be_given():
     assert output.logprob(logits, actions).shape == output.entropy(logits).shape == (6,)
 
 
-def test_a_bare_space_gives_bare_actions():
+def test_bare_action_space():
     output = heads.output(spaces.MultiDiscrete(1, 7), WIDTH)
     logits = output(torch.randn(3, 5, WIDTH))
     assert logits.shape == (3, 5, 1, 7) and output.sample(logits).shape == (3, 5, 1)
 
 
-def test_logprob_and_entropy_by_hand():
+def test_logprob_and_entropy_match_hand_calculation():
     output = heads.output(MOVES, WIDTH)
     even = arrdict(
         movement=torch.full((1, 2, 7), 1 / 7).log(),
@@ -128,14 +128,14 @@ def test_logprob_and_entropy_by_hand():
     assert output.greedy(even).fire.tolist() == [[1, 0]]
 
 
-def test_the_first_policy_is_close_to_uniform():
+def test_initial_policy_is_almost_uniform():
     output = heads.output(spaces.MultiDiscrete(1, 7), WIDTH)
     assert output.entropy(output(torch.randn(100, WIDTH))).min().item() == pytest.approx(
         math.log(7), abs=0.01
     )
 
 
-def test_actions_are_sampled_as_often_as_they_are_probable():
+def test_sample_frequencies_match_probabilities():
     probabilities = torch.tensor([0.5, 0.3, 0.15, 0.05])
     output, n = heads.output(spaces.MultiDiscrete(1, 4), WIDTH), 100_000
     logits = probabilities.log().expand(n, 1, 4)
@@ -146,13 +146,13 @@ def test_actions_are_sampled_as_often_as_they_are_probable():
     assert ((sampled - probabilities).abs() < 4 * error).all()
 
 
-def test_what_is_impossible_is_never_sampled():
+def test_probability_zero_is_never_sampled():
     output = heads.output(spaces.MultiDiscrete(1, 3), WIDTH)
     logits = torch.tensor([0.0, 1.0, 0.0]).log().expand(100_000, 1, 3)
     assert (output.sample(logits, torch.Generator().manual_seed(0)) == 1).all()
 
 
-def test_a_generator_decides_all_samples():
+def test_generator_determines_samples():
     output = heads.output(MOVES, WIDTH)
     logits = output(torch.randn(50, WIDTH))
     torch.manual_seed(0)
@@ -162,7 +162,7 @@ def test_a_generator_decides_all_samples():
     assert torch.equal(before, torch.get_rng_state())
 
 
-def test_action_values_are_a_value_and_advantages_over_their_mean():
+def test_duelling_is_value_plus_centred_advantages():
     output = heads.output(spaces.MultiDiscrete(2, 3), WIDTH, "duelling")
     x = torch.randn(5, WIDTH)
     hidden = output.hidden(x).relu()
@@ -173,7 +173,7 @@ def test_action_values_are_a_value_and_advantages_over_their_mean():
     torch.testing.assert_close(q.diff(dim=-1), advantage.diff(dim=-1))
 
 
-def test_the_value_of_a_joint_action_is_the_sum_over_its_parts():
+def test_joint_action_value_is_sum():
     output = heads.output(MOVES, WIDTH, "duelling")
     logits = output(torch.randn(4, 6, WIDTH))
     actions = output.greedy(logits)
@@ -184,7 +184,7 @@ def test_the_value_of_a_joint_action_is_the_sum_over_its_parts():
     torch.testing.assert_close(output.action_value(logits, other), best - loss)
 
 
-def test_of_action_values_the_best_is_taken_and_now_and_then_any():
+def test_duelling_sample_is_epsilon_greedy():
     n = 100_000
     output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
     logits = torch.tensor([0.1, 0.9, 0.3, -2.0]).expand(n, 1, 4)
@@ -201,7 +201,7 @@ def test_of_action_values_the_best_is_taken_and_now_and_then_any():
     torch.testing.assert_close(shares, likely, rtol=0, atol=0.0025)
 
 
-def test_action_values_are_in_single_precision_where_products_are_not():
+def test_action_values_are_float32_under_autocast():
     output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
     with torch.no_grad():
         output.value.bias += 300.0
@@ -212,7 +212,7 @@ def test_action_values_are_in_single_precision_where_products_are_not():
     assert 0.01 < found.std() < 1 and len(found.mean(-1).unique()) > 40
 
 
-def test_features_of_zero_leave_action_values_something_to_learn_from():
+def test_zero_features_have_a_gradient():
     output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
     x = torch.zeros(1, WIDTH, requires_grad=True)
     output(x)[0, 0, 1].backward()
@@ -233,12 +233,12 @@ def test_features_of_zero_leave_action_values_something_to_learn_from():
         (lambda: heads.output(arrdict(), WIDTH), "there are MultiDiscrete and dicts of it"),
     ],
 )
-def test_a_space_that_no_head_is_known_for_is_refused(make, words):
+def test_unknown_spaces_raise(make, words):
     with pytest.raises(ValueError, match=words):
         make()
 
 
-def test_images_are_standardised_by_channel_and_vectors_by_number():
+def test_normalises_images_per_channel_and_vectors_per_number():
     space = arrdict(rgb=spaces.MultiImage(1, 2, 1, 3), imu=spaces.MultiVector(1, 2))
     intake = heads.intake(space, WIDTH)
     rgb = (
@@ -265,7 +265,7 @@ def test_images_are_standardised_by_channel_and_vectors_by_number():
     )
 
 
-def test_what_was_learned_about_observations_is_saved_with_the_weights():
+def test_statistics_are_saved_with_weights():
     intake, other, obs = heads.intake(TREE, WIDTH), heads.intake(TREE, WIDTH), sample_of(TREE, 6)
     intake.update_stats(obs)
     other.load_state_dict(intake.state_dict())

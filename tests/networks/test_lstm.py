@@ -34,7 +34,7 @@ def torchs_own(lstm):
     cell = nn.LSTMCell(W, W)
     with torch.no_grad():
         cell.weight_ih.copy_(lstm.input.weight)
-        cell.weight_hh.copy_(lstm.memory.weight)
+        cell.weight_hh.copy_(lstm.recurrent.weight)
         cell.bias_ih.copy_(lstm.input.bias)
         cell.bias_hh.zero_()
     return cell
@@ -55,7 +55,7 @@ def by_hand(cell, x, reset, state):
 
 
 @pytest.mark.parametrize("p_reset", [0.0, 0.3, 1.0])
-def test_outputs_and_gradients_are_those_of_torchs_own_cell(p_reset):
+def test_outputs_and_gradients_match_torch(p_reset):
     lstm, x, reset, state = case(p_reset=p_reset)
     cell = torchs_own(lstm)
     outputs, after = lstm(x, reset, state)
@@ -68,7 +68,7 @@ def test_outputs_and_gradients_are_those_of_torchs_own_cell(p_reset):
     of = (x, state.output, state.cell)
     ours = torch.autograd.grad(
         (outputs * weights[0]).sum() + (after.cell * weights[1]).sum(),
-        (*of, lstm.input.weight, lstm.memory.weight, lstm.input.bias),
+        (*of, lstm.input.weight, lstm.recurrent.weight, lstm.input.bias),
     )
     theirs = torch.autograd.grad(
         (expected * weights[0]).sum() + (expected_cell * weights[1]).sum(),
@@ -83,7 +83,7 @@ def test_outputs_and_gradients_are_those_of_torchs_own_cell(p_reset):
         )
 
 
-def test_steps_and_a_sequence_agree():
+def test_sequence_matches_steps():
     lstm, x, reset, state = case()
     outputs, after = lstm(x, reset, state)
     for t in range(T):
@@ -92,7 +92,7 @@ def test_steps_and_a_sequence_agree():
     torch.testing.assert_close(state.cell, after.cell, **CLOSE)
 
 
-def test_a_sequence_may_be_cut_anywhere():
+def test_sequence_can_be_split():
     lstm, x, reset, state = case()
     whole, _ = lstm(x, reset, state)
     first, between = lstm(x[:4], reset[:4], state)
@@ -100,7 +100,7 @@ def test_a_sequence_may_be_cut_anywhere():
     torch.testing.assert_close(torch.cat([first, second]), whole, **CLOSE)
 
 
-def test_nothing_before_a_reset_is_remembered_not_even_a_nan():
+def test_reset_clears_even_nan():
     lstm, x, _, state = case()
     reset = torch.zeros(T, B, dtype=torch.bool)
     reset[4] = True
@@ -112,7 +112,7 @@ def test_nothing_before_a_reset_is_remembered_not_even_a_nan():
     assert not d_x[:4].any() and d_x[4:].all()
 
 
-def test_without_a_reset_the_first_input_reaches_the_last_output():
+def test_first_input_reaches_last_output_without_reset():
     lstm, x, _, state = case()
     (d_x,) = torch.autograd.grad(
         lstm(x, torch.zeros(T, B, dtype=torch.bool), state)[0][-1].sum(), x
@@ -126,7 +126,7 @@ def test_lanes_do_not_mix():
     assert d_x[-1, 2].all() and not d_x[:, [0, 1, 3, 4]].any()
 
 
-def test_forget_gates_start_open_and_no_other_gate():
+def test_forget_gates_start_open():
     # Jozefowicz et al. 2015: a bias of 1; in the order of torch.nn.LSTM, forget is the second of
     # four. With no input and no output yet, a cell then retains sigmoid(1) of itself per step.
     lstm = LSTM(W)
@@ -138,7 +138,7 @@ def test_forget_gates_start_open_and_no_other_gate():
     torch.testing.assert_close(after.cell, torch.full((B, W), retained), **CLOSE)
 
 
-def test_a_state_or_reset_of_another_shape_is_named():
+def test_wrong_shapes_raise():
     lstm, x, reset, state = case()
     with pytest.raises(
         ValueError, match=r"reset is \(9, 4\) on cpu, but x asks for \(9, 5\) on cpu"
@@ -150,7 +150,7 @@ def test_a_state_or_reset_of_another_shape_is_named():
         lstm(x, reset, arrdict(state, cell=state.cell[:1]))
 
 
-def test_a_gradient_may_be_asked_for_twice():
+def test_gradient_can_be_computed_twice():
     lstm, x, reset, state = case()
     loss = lstm(x, reset, state)[0].square().sum()
     first, second = (torch.autograd.grad(loss, x, retain_graph=True)[0] for _ in range(2))
@@ -192,7 +192,7 @@ SLACK = {torch.float32: 2e-3, torch.bfloat16: 6e-2}
 @pytest.mark.parametrize(
     "n_steps, n_lanes, width", [(9, 5, 16), (9, 5, 7), (1, 3, 16), (9, 1, 1), (3, 40, 256)]
 )
-def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lanes, width):
+def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width):
     torch.manual_seed(0)
     given = dict(
         # Rounded beforehand, so that all begin with the same numbers, and of another layout in
@@ -209,14 +209,14 @@ def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lan
     )
     found = sequence(where, dtype, **given)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lstm_module, "_steps", lambda x: lstm_module._WRITTEN_OUT)
+        patch.setattr(lstm_module, "_steps", lambda x: lstm_module._CPU_STEPS)
         expected = sequence("cpu", torch.float32, **given)
     assert_close(NAMES, found, expected, SLACK[dtype])
 
 
 @pytest.mark.parametrize("offset", [0, 1])
 @pytest.mark.parametrize("shape", [(4, 8), (8, 4)])
-def test_kernels_read_words_of_16_bytes(offset, shape):
+def test_aligned_is_contiguous_in_16_byte_words(offset, shape):
     tensor = torch.arange(40.0)[offset : offset + 32].view(shape)
     for given in (tensor, tensor.T):
         found = program.aligned(given)
@@ -226,7 +226,7 @@ def test_kernels_read_words_of_16_bytes(offset, shape):
 
 @pytest.mark.parametrize("dtype", SLACK, ids=str)
 @pytest.mark.parametrize("width", [16, 7])
-def test_the_kernels_forget_even_a_nan(where, dtype, width):
+def test_kernels_clear_even_nan_at_reset(where, dtype, width):
     torch.manual_seed(0)
     given = dict(
         x=torch.randn(T, B, width),
@@ -257,7 +257,7 @@ def test_the_kernels_forget_even_a_nan(where, dtype, width):
 
 
 @pytest.mark.parametrize("width", [4, 3])
-def test_gates_saturate_and_a_nan_stays_one(where, width):
+def test_gates_saturate_and_nan_propagates(where, width):
     """By hand: all gates of a lane before their activation are one number."""
     inf, nan = torch.inf, torch.nan
     values = torch.tensor([-inf, -1e30, -100.0, -20.0, 0.0, 20.0, 100.0, 1e30, inf, nan])
@@ -277,7 +277,7 @@ def test_gates_saturate_and_a_nan_stays_one(where, width):
         )
 
 
-def test_rounding_to_bfloat16_is_pytorchs(where):
+def test_kernels_round_to_bfloat16_like_torch(where):
     """Through `start`, which rounds and no more: ties, infinities, the greatest float and NaN."""
     inf, nan = torch.inf, torch.nan
     values = torch.tensor([0.0, -0.0, 1 + 2**-8, 1 + 3 * 2**-8, -1 - 2**-8, 3.3e38, inf, -inf, nan])
@@ -292,7 +292,7 @@ def test_rounding_to_bfloat16_is_pytorchs(where):
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("bf16", [False, True])
-def test_on_a_gpu_a_captured_graph_unrolls_as_steps_do(bf16):
+def test_captured_unroll_matches_steps(bf16):
     lstm = LSTM(256)
     slack = SLACK[torch.bfloat16 if bf16 else torch.float32]
     check_captured(lstm, "cell", lstm.step, slack, bf16)

@@ -43,7 +43,7 @@ def by_hand(gates, reset, start):
 
 
 @pytest.mark.parametrize("n_steps, p_reset", [(1, 0.3), (9, 0.0), (9, 0.3), (9, 1.0), (32, 0.1)])
-def test_outputs_and_gradients_are_those_of_the_equations(n_steps, p_reset):
+def test_outputs_and_gradients_match_equations(n_steps, p_reset):
     gates, reset, start = case(n_steps, p_reset)
     found, expected = (
         mingru_module._Sequence.apply(gates, reset, start),
@@ -63,7 +63,7 @@ def test_outputs_and_gradients_are_those_of_the_equations(n_steps, p_reset):
         torch.testing.assert_close(a, b, **CLOSE, msg=lambda text, name=name: f"{name}: {text}")
 
 
-def test_half_open_gates_halve_the_way_to_the_candidate():
+def test_half_open_gates_match_hand_calculation():
     core = MinGRU(2)
     with torch.no_grad():
         core.input.weight.zero_()
@@ -75,7 +75,7 @@ def test_half_open_gates_halve_the_way_to_the_candidate():
     assert torch.equal(state.output, outputs[-1])
 
 
-def test_units_start_with_times_from_1_to_32_steps():
+def test_initial_time_constants():
     # sigmoid(-log(tau)) = 1 / (1 + tau): of a unit's state tau / (1 + tau) is left after a step
     core = MinGRU(W)
     x, reset = torch.zeros(1, B, W), torch.zeros(1, B, dtype=torch.bool)
@@ -84,7 +84,7 @@ def test_units_start_with_times_from_1_to_32_steps():
     torch.testing.assert_close(outputs[0], (taus / (1 + taus)).expand(B, W), **CLOSE)
 
 
-def test_a_sequence_saves_four_numbers_per_unit_and_step_for_its_gradient():
+def test_saved_for_backward_is_four_numbers_per_unit():
     """Its input, two gates and the output: none of the scan's passes."""
     core, saved = MinGRU(W), {}
 
@@ -99,7 +99,7 @@ def test_a_sequence_saves_four_numbers_per_unit_and_step_for_its_gradient():
     assert 4 * x.numel() <= sum(saved.values()) <= 4 * x.numel() + beside
 
 
-def test_a_state_or_reset_of_another_shape_is_named():
+def test_wrong_shapes_raise():
     core, x, reset = MinGRU(W), torch.randn(T, B, W), torch.zeros(T, B, dtype=torch.bool)
     state = core.initial(B)
     with pytest.raises(
@@ -114,7 +114,7 @@ def test_a_state_or_reset_of_another_shape_is_named():
         core(x[:0], reset[:0], state)
 
 
-def test_a_gradient_may_be_asked_for_twice():
+def test_gradient_can_be_computed_twice():
     gates, reset, start = case()
     loss = mingru_module._Sequence.apply(gates, reset, start)[0].square().sum()
     first, second = (torch.autograd.grad(loss, gates, retain_graph=True)[0] for _ in range(2))
@@ -156,7 +156,7 @@ SLACK = {torch.float32: 1e-5, torch.bfloat16: 1e-2}
 @pytest.mark.parametrize(
     "n_steps, n_lanes, width", [(9, 5, 16), (9, 5, 7), (1, 3, 16), (9, 1, 1), (3, 40, 256)]
 )
-def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lanes, width):
+def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width):
     torch.manual_seed(0)
 
     def rounded(*shape):
@@ -174,14 +174,14 @@ def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lan
     )
     found = sequence(where, dtype, **given)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mingru_module, "_recurrence", lambda gates: mingru_module._WRITTEN_OUT)
+        patch.setattr(mingru_module, "_recurrence", lambda gates: mingru_module._CPU_RECURRENCE)
         expected = sequence("cpu", torch.float32, **given)
     assert_close(NAMES, found, expected, SLACK[dtype])
 
 
 @pytest.mark.parametrize("dtype", SLACK, ids=str)
 @pytest.mark.parametrize("width", [16, 7])
-def test_the_kernels_forget_even_a_nan(where, dtype, width):
+def test_kernels_clear_even_nan_at_reset(where, dtype, width):
     torch.manual_seed(0)
     given = dict(
         gates=torch.randn(T, B, 2 * width),
@@ -205,7 +205,7 @@ def test_the_kernels_forget_even_a_nan(where, dtype, width):
 
 
 @pytest.mark.parametrize("width", [4, 3])
-def test_gates_saturate_and_a_nan_stays_one(where, width):
+def test_gates_saturate_and_nan_propagates(where, width):
     """By hand: all update gates of a lane before their activation are one number."""
     inf, nan = torch.inf, torch.nan
     values = torch.tensor([-inf, -1e30, -100.0, -20.0, 0.0, 20.0, 100.0, 1e30, inf, nan])
@@ -220,7 +220,7 @@ def test_gates_saturate_and_a_nan_stays_one(where, width):
         torch.testing.assert_close(found.cpu(), expected, rtol=0, atol=2e-6, equal_nan=True)
 
 
-def test_kernels_refuse_other_dtypes(where):
+def test_unsupported_dtype_raises(where):
     gates, reset, start = (tensor.to(where) for tensor in case())
     with pytest.raises(EngineError, match="float32 or bfloat16, not in torch.float16: choose one"):
         mingru_module._Sequence.apply(gates.half(), reset, start)
@@ -228,7 +228,7 @@ def test_kernels_refuse_other_dtypes(where):
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("bf16", [False, True])
-def test_on_a_gpu_a_captured_graph_unrolls_as_steps_do(bf16):
+def test_captured_unroll_matches_steps(bf16):
     core = MinGRU(256)
 
     def step(x, reset, state):

@@ -22,7 +22,7 @@ def folder(tmp_path_factory):
     return place
 
 
-def test_its_commands_train_and_evaluate(folder, monkeypatch):
+def test_commands_of_page_train_and_evaluate(folder, monkeypatch):
     typed = pages.type_all(PAGE.read_text(), folder, monkeypatch)
     assert typed == 2 * ["train.py", "evaluate.py"]
     runs = sorted(path for path in (folder / "runs").iterdir() if path.is_dir())
@@ -36,7 +36,7 @@ def config(run):
     return json.loads((checkpoint / "config.json").read_text())["train"]
 
 
-def test_its_core_is_a_decaying_mean(folder, monkeypatch):
+def test_core_of_page_is_decaying_mean(folder, monkeypatch):
     with pages.inside(folder, monkeypatch):
         core = cores.make_core("cores:Trace", 2)
     with torch.no_grad():

@@ -32,7 +32,7 @@ def play(policy, world, **how):
 
 
 @pytest.mark.parametrize("encoder", ["linear", "conv"])
-def test_acting_step_by_step_gives_what_an_unroll_gives(encoder):
+def test_steps_match_unroll(encoder):
     policy, world = Policy(OBS, MOVES, width=32, encoder=encoder), worlds()
     decisions, state = play(policy, world)
     unrolled = policy.unroll(world.obs, world.reset, policy.initial(B))
@@ -48,7 +48,7 @@ def test_acting_step_by_step_gives_what_an_unroll_gives(encoder):
 
 @pytest.mark.parametrize("layers", [1, 3])
 @pytest.mark.parametrize("core", CORES)
-def test_every_core_acts_as_it_unrolls(core, layers):
+def test_steps_match_unroll_for_every_core(core, layers):
     policy, world = Policy(OBS, MOVES, width=16, core=core, layers=layers), worlds()
     decisions, state = play(policy, world)
     unrolled = policy.unroll(world.obs, world.reset, policy.initial(B))
@@ -58,14 +58,14 @@ def test_every_core_acts_as_it_unrolls(core, layers):
         torch.testing.assert_close(found, expected, **close)
 
 
-def test_activations_are_reckoned_with_by_layer():
+def test_activation_bytes_count_layers():
     # 24 numbers of 4 bytes per unit, 8 for each further layer
     sizes = [Policy(OBS, MOVES, width=32, layers=n).activation_bytes for n in (1, 2, 4)]
     assert sizes == [32 * 4 * 24, 32 * 4 * 32, 32 * 4 * 48]
 
 
 @pytest.mark.parametrize("core", CORES)
-def test_a_further_layer_saves_no_more_for_its_gradient_than_is_reckoned_with(core):
+def test_activation_bytes_bound_saved_tensors(core):
     def saved_by(policy):
         weights, sizes = {p.data_ptr() for p in policy.parameters()}, {}
 
@@ -86,7 +86,7 @@ def test_a_further_layer_saves_no_more_for_its_gradient_than_is_reckoned_with(co
     assert reckoned / 8 <= more <= 1.1 * reckoned  # beside them stand the state and its resets
 
 
-def test_a_decision_has_the_shapes_of_the_contract():
+def test_shapes_of_decision():
     policy = Policy(OBS, MOVES, width=32)
     decision, state = policy(worlds()[0], policy.initial(B))
     assert decision.actions.movement.shape == (B, 1) and decision.logits.fire.shape == (B, 1, 2)
@@ -95,14 +95,14 @@ def test_a_decision_has_the_shapes_of_the_contract():
     assert state.cell.shape == (B, 32)
 
 
-def test_bare_spaces_work_too():
+def test_bare_spaces():
     policy = Policy(spaces.MultiVector(1, 4), spaces.MultiDiscrete(1, 3), width=8)
     world = arrdict(obs=torch.randn(B, 1, 4), reset=torch.ones(B, dtype=torch.bool))
     decision, _ = policy(world, policy.initial(B), sample=False)
     assert torch.equal(decision.actions, decision.logits.argmax(-1))
 
 
-def test_a_seed_decides_weights_and_actions_and_leaves_torchs_own_generator_alone():
+def test_seed_determines_weights_and_actions():
     before = torch.get_rng_state()
     first, second, other = (
         play(Policy(OBS, MOVES, width=32, seed=seed), worlds())[0] for seed in (1, 1, 2)
@@ -114,7 +114,7 @@ def test_a_seed_decides_weights_and_actions_and_leaves_torchs_own_generator_alon
     assert not torch.equal(first.actions.movement, other.actions.movement)
 
 
-def test_a_generator_of_ones_own_decides_the_actions():
+def test_own_generator_determines_actions():
     policy, world = Policy(OBS, MOVES, width=32), worlds()
     first, second = (
         play(policy, world, generator=torch.Generator().manual_seed(5))[0].actions for _ in range(2)
@@ -122,7 +122,7 @@ def test_a_generator_of_ones_own_decides_the_actions():
     assert torch.equal(first.movement, second.movement) and torch.equal(first.fire, second.fire)
 
 
-def test_weights_load_from_plain_tensors():
+def test_weights_load_with_weights_only():
     policy, twin = Policy(OBS, MOVES, width=32, seed=1), Policy(OBS, MOVES, width=32, seed=2)
     policy.critic.output.update_stats(torch.tensor([1.0, 9.0]), torch.tensor([True, True]))
     file = io.BytesIO()
@@ -136,12 +136,12 @@ def test_weights_load_from_plain_tensors():
     )
 
 
-def test_a_width_of_zero_is_refused():
+def test_zero_width_raises():
     with pytest.raises(ValueError, match="width: 0 is out of range"):
         Policy(OBS, MOVES, width=0)
 
 
-def test_a_random_stream_goes_on_where_it_was_saved():
+def test_generator_resumes():
     stream, cpu = SeededGenerator(3), torch.device("cpu")
     untouched = stream.state_dict()
     start = torch.rand(4, generator=stream.on(cpu))
@@ -159,7 +159,7 @@ def test_a_random_stream_goes_on_where_it_was_saved():
 
 
 @pytest.mark.cuda
-def test_a_random_stream_on_a_gpu_goes_on_from_a_state_that_was_loaded_onto_the_gpu():
+def test_gpu_generator_resumes_from_state_on_gpu():
     device = torch.device("cuda", torch.cuda.current_device())
     stream, other = SeededGenerator(3), SeededGenerator(8)
     torch.rand(4, device=device, generator=stream.on(device))
@@ -170,7 +170,7 @@ def test_a_random_stream_on_a_gpu_goes_on_from_a_state_that_was_loaded_onto_the_
 
 
 @pytest.mark.cuda
-def test_on_a_gpu_acting_never_synchronises_and_stays_close_to_single_precision():
+def test_gpu_never_synchronises_and_bf16_is_close():
     world, results = worlds().cuda(), []
     for bf16 in (False, True):
         policy = Policy(OBS, MOVES, width=64, bf16=bf16).cuda()

@@ -10,7 +10,7 @@ from megastep.agents.networks.running_norm import RunningNorm
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
-def test_observations_that_are_not_finite_change_nothing(bad):
+def test_nonfinite_observations_change_nothing(bad):
     norm = RunningNorm(spaces.MultiVector(1, 2))
     norm.update_stats(torch.randn(64, 1, 2) + 5)
     before = {name: tensor.clone() for name, tensor in norm.state_dict().items()}
@@ -20,7 +20,7 @@ def test_observations_that_are_not_finite_change_nothing(bad):
     assert all(torch.equal(norm.state_dict()[name], before[name]) for name in before)
 
 
-def test_lanes_that_are_left_out_do_not_count():
+def test_masked_lanes_do_not_count():
     image = spaces.MultiImage(2, 3, 1, 5, dtype=torch.uint8)
     norm, fewer = RunningNorm(image), RunningNorm(image)
     obs, taken = torch.randint(256, (40, 2, 3, 1, 5), dtype=torch.uint8), torch.rand(40) < 0.5
@@ -35,7 +35,7 @@ def test_lanes_that_are_left_out_do_not_count():
     assert torch.equal(norm.mean, before) and norm.count == 1
 
 
-def test_batches_weigh_the_same():
+def test_batches_have_equal_weight():
     norm, batches = RunningNorm(spaces.MultiVector(1, 1)), torch.randn(5, 8, 1, 1) * 3 + 2
     for batch in batches:
         norm.update_stats(batch)
