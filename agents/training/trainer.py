@@ -212,7 +212,7 @@ class Trainer:
         Raises:
             NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
         """
-        value, n_skipped = self.learner.check.read(self.rollout.numbers())
+        value, n_skipped = self.learner.check.read(self.rollout.floats())
         if value and self.rollout.learners is not None:
             lanes = self.rollout.learners.nonzero()[:, 0]
             value = dataclasses.replace(value, lane=int(lanes[value.lane]))

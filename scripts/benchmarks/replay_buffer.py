@@ -7,7 +7,8 @@ from timing import graph_seconds_per_call, measurement, rate
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.replay import Replay, ReplaySettings
+from megastep.agents.storage.replay import ReplayBuffer
+from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout
 
 N_LANES = {"cuda": 16_384, "cpu": 256}
@@ -30,7 +31,7 @@ def full_buffer(device: torch.device, images: str) -> tuple[Replay, Rollout, int
     capacity = N_ROLLOUTS[device.type] * N_STEPS * n_lanes
     settings = ReplaySettings(capacity=capacity, images=images, alpha=0.9)
     before = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
-    buffer = Replay(rollout, OBS_SPACE, ACTION_SPACE, settings)
+    buffer = ReplayBuffer(rollout, OBS_SPACE, ACTION_SPACE, settings)
     n_bytes = buffer.bytes
     if device.type == "cuda":
         n_bytes = torch.cuda.memory_allocated(device) - before

@@ -191,7 +191,8 @@ def test_a_learner(outside, capsys):
         from pydantic import Field
 
         from megastep.agents.algorithms.nonfinite import NonFiniteCheck
-        from megastep.agents.storage.rollout import Collector, Rollout
+        from megastep.agents.storage.collector import Collector
+        from megastep.agents.storage.rollout import Rollout
 
 
         class Reinforce:
@@ -216,7 +217,7 @@ def test_a_learner(outside, capsys):
                     group["lr"] = lr
 
             def update(self, rollout):
-                is_fine = self.check(rollout.numbers())
+                is_fine = self.check(rollout.floats())
                 out = self.policy.unroll(rollout.obs, rollout.starts, rollout.state)
                 logprobs = self.policy.output.logprob(out.logits[:-1], rollout.actions)
                 to_go = rollout.reward.flip(0).cumsum(0).flip(0)
@@ -228,10 +229,10 @@ def test_a_learner(outside, capsys):
                 return {"loss/policy": loss.detach()}
 
             def state_dict(self):
-                return dict(random=self.policy.random.state_dict())
+                return dict(generator=self.policy.generator.state_dict())
 
             def load_state_dict(self, state):
-                self.policy.random.load_state_dict(state["random"], self.policy.device)
+                self.policy.generator.load_state_dict(state["generator"], self.policy.device)
         '''
     add(outside, "learner", {"counter.py": COUNTER, "reinforce.py": learner})
     words = ["env=counter:Counter", *(w for w in SMALL if not w.startswith("learner."))]

@@ -15,7 +15,7 @@ import pytest
 
 from megastep import recording
 from megastep.agents.cli import factory, train
-from megastep.agents.storage.rollout import Collector
+from megastep.agents.storage.collector import Collector
 from megastep.agents.training import checkpoint, checkpoint_format, evaluation, loggers
 from tests.helpers import tiny
 

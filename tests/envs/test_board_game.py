@@ -106,7 +106,8 @@ def test_uint8_observations_are_stored_as_uint8_and_normalised(folder):
 
     from megastep.agents.algorithms.ppo import PPO
     from megastep.agents.networks.policy import Policy
-    from megastep.agents.storage.rollout import Collector, Rollout
+    from megastep.agents.storage.collector import Collector
+    from megastep.agents.storage.rollout import Rollout
 
     env = board.Board(6)
     policy = Policy(env.obs_space, env.action_space, width=8)

@@ -76,8 +76,8 @@ def test_snapshots_act_in_their_own_lanes_with_their_own_hidden_state():
     """Of two snapshots, one always chooses 0 and the other always 1."""
     env = make_opponents(past=1.0, bot=0.0)
     for choice, snapshot in enumerate(env.snapshots):
-        snapshot.output.core.weight.data.zero_()
-        snapshot.output.core.bias.data.copy_(
+        snapshot.output.linear.weight.data.zero_()
+        snapshot.output.linear.bias.data.copy_(
             torch.tensor([-50.0] * 3).index_fill(0, torch.tensor(choice), 50)
         )
     env.reset()
@@ -213,7 +213,7 @@ def test_without_opponents_every_lane_is_stored():
     rollout = PPO(policy_of(env)).collector(env).rollout
     assert rollout.learners is None and rollout.n_lanes == 8
     world = env.reset()
-    assert rollout.own(world) is world and rollout.for_all(world.obs) is world.obs
+    assert rollout.select_lanes(world) is world and rollout.scatter_actions(world.obs) is world.obs
 
 
 def test_nonfinite_number_is_named_by_its_lane_in_the_environment(tmp_path):
@@ -350,8 +350,8 @@ def test_pairs_are_won_by_survival_and_else_by_return(n_agents):
 def test_win_rates_by_kind_of_opponent(mortal):
     env = make_opponents(env=Matrix(16, 3 if mortal else 2, mortal), bot=0.25)
     for snapshot in env.snapshots:
-        snapshot.output.core.weight.data.zero_()
-        snapshot.output.core.bias.data.copy_(torch.tensor([0.0, 99, 0]))
+        snapshot.output.linear.weight.data.zero_()
+        snapshot.output.linear.bias.data.copy_(torch.tensor([0.0, 99, 0]))
     env.reset()
     lanes = len(env.learners)
     for action in (1, 2, 2, 2):  # every second step is the reset after an end

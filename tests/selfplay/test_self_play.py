@@ -199,8 +199,8 @@ def test_snapshots_act_with_their_current_weights(here, monkeypatch, device):
     assert not torch.equal(played[0][1], played[1][1]), "the hidden state advances"
     # change the weights in place: the first snapshot only moves up, the second only down
     for up, snapshot in zip((50.0, -50.0), trainer.opponents.snapshots, strict=True):
-        snapshot.output.core.weight.data.zero_()
-        snapshot.output.core.bias.data.copy_(torch.tensor([-90.0, up, -up]))
+        snapshot.output.linear.weight.data.zero_()
+        snapshot.output.linear.bias.data.copy_(torch.tensor([-90.0, up, -up]))
     for _ in range(4):
         trainer.collect()
     tops = trainer.env.env.games[6:8].T  # of the left and the right paddle
