@@ -18,7 +18,7 @@ N_SAMPLED = {"cuda": 4096, "cpu": 64}
 OBS_SPACE, ACTION_SPACE = spaces.MultiImage(1, 3, 1, 64), spaces.MultiDiscrete(1, 7)
 
 
-def full_buffer(device: torch.device, images: str) -> tuple[Replay, Rollout, int]:
+def full_buffer(device: torch.device, images: str) -> tuple[ReplayBuffer, Rollout, int]:
     """Returns a full replay buffer, the rollout that fills it, and the buffer's size in bytes.
 
     Sequences have 64 steps, each with the hidden state of an LSTM of 256 units.
