@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from megastep.dotdict import dotdict
+
 __all__ = ["centers", "display", "hashed", "indices", "masks", "validate_geometry"]
 
 # Metres per cell, as in the original: coarse enough to be cheap, fine enough for a 0.6 m door.
@@ -186,7 +188,7 @@ def _coordinates(g, key, shape, limit):
     return points
 
 
-def validate_geometry(g: dict) -> Any:
+def validate_geometry(g: dict) -> dict:
     """Returns a copy of a geometry with the documented dtypes and without walls of length 0.
 
     Raises:
@@ -214,7 +216,7 @@ def validate_geometry(g: dict) -> Any:
     return type(g)(g, id=number, walls=walls, lights=lights, masks=cells.astype(np.int16), res=res)
 
 
-def hashed(geometries: Sequence[Any]) -> Any:
+def hashed(geometries: Sequence[dotdict]) -> "hashlib._Hash":
     """Returns a SHA-256 hash object of the walls and rooms of geometries. It can be updated
     further.
     """
@@ -225,7 +227,7 @@ def hashed(geometries: Sequence[Any]) -> Any:
     return key
 
 
-def display(g: Any, ax: Any = None) -> Any:
+def display(g: dotdict, ax: Any = None) -> Any:
     """Draws the floor plan of a geometry: rooms tinted, walls black, lights yellow. Returns the
     matplotlib axes.
     """

@@ -466,8 +466,8 @@ def test_settings_of_an_environment_that_contradict_each_other_are_one_sentence(
     for words, told in (
         ([*elsewhere, "env.nearest=40", "env.furthest=50"], "geometry 0 has no goal from 40 to 50"),
         ([*elsewhere, "env.nearest=5", "env.furthest=2"], "nearest < furthest metres, but 5 and 2"),
-        ([*TINY, "env.shortest=10"], "shortest <= longest steps, but 10 and 9 were given"),
-        (explorer, "subsample must divide the 8 rays of the screen, but 3 was given"),
+        ([*TINY, "env.shortest=10"], "shortest=10 and longest=9"),
+        (explorer, "subsample=3 does not divide the 8 rays"),
     ):
         assert train.main(words) == 2
         (sentence,) = capsys.readouterr().err.splitlines()

@@ -118,8 +118,10 @@ def test_visible_texels_of_many_homes_are_found_once(folder, monkeypatch):
     assert not unpacked(found)[
         torch.arange(32 * found.shape[1]) >= n_texels(c.scenery.layouts)[:, None]
     ].any()
-    looked, looks = visibility._looked, []
-    monkeypatch.setattr(visibility, "_looked", lambda *parts: looks.append(1) or looked(*parts))
+    looked, looks = visibility._visible_from, []
+    monkeypatch.setattr(
+        visibility, "_visible_from", lambda *parts: looks.append(1) or looked(*parts)
+    )
     again = modules.visible_texels(c.scenery, points)
     assert torch.equal(again, found) and again.dtype == torch.int32 and not looks
     again[0, 0] = 0  # it may be written

@@ -1,4 +1,7 @@
-"""A board game in bytes, without floor plans or engine, from a file outside the repository. trained, evaluated and recorded like any other environment."""
+"""A board game in bytes, without floor plans or engine, from a file outside the repository.
+
+It is trained, evaluated and recorded like any other environment.
+"""
 
 import json
 import sys
