@@ -58,7 +58,7 @@ def test_keeps_a_target_at_the_centre(bearing, device):
 
 
 def test_looks_round_then_walks_and_avoids_walls(device):
-    """The first looks at a wall one metre away, the second down the room; neither sees the other."""
+    """The first looks at a wall one metre away, the second down the room; none sees the other."""
     env, world = ring(device, (1.9, 3.5, 180.0), (2.4, 3.5, 0.0))
     bot = Bot()
     state = bot.initial(2, env.device)
