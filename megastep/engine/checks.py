@@ -133,8 +133,8 @@ def integers(
         tensor = None
     if tensor is None or not _fits(tensor, (size,)):
         raise ValueError(
-            f"{name} must be an array of integers of shape ({size},), but {_described(value)} was "
-            f"given"
+            f"{name} must be an array of integers of shape ({size},), but "
+            f"{_described(value)} was given"
         )
     outside = tensor[(tensor < min) | (tensor > max)]
     if len(outside):
