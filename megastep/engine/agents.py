@@ -80,25 +80,17 @@ class Agents(SetOnce):
         self.error_flag = torch.zeros(1, dtype=torch.int32, device=device)
 
 
-_CONSTANTS = ENGINE.constants
-_ERRORS = {
-    _CONSTANTS[
-        "NONFINITE"
-    ]: "An agent of environment {env} has a non-finite position, angle or velocity: "
-    "check what was last written to them.",
-    _CONSTANTS[
-        "BAD_ACTION"
-    ]: "An agent of environment {env} was given an action outside of its action space: "
+_MESSAGES = dict(
+    NONFINITE="An agent of environment {env} has a non-finite position, angle or velocity: check "
+    "what was last written to them.",
+    BAD_ACTION="An agent of environment {env} was given an action outside of its action space: "
     "actions are integers from 0.",
-    _CONSTANTS[
-        "BAD_LAYOUT"
-    ]: "Environment {env} shows a layout that the scenery does not have: entries of "
+    BAD_LAYOUT="Environment {env} shows a layout that the scenery does not have: entries of "
     "scenery.layout must be from 0 to the number of layouts - 1.",
-    _CONSTANTS[
-        "BAD_GOAL"
-    ]: "An agent of environment {env} has a goal or a spawn point that its layout does "
-    "not have: indices must be from 0 to the number per layout - 1.",
-}
+    BAD_GOAL="An agent of environment {env} has a goal or a spawn point that its layout does not "
+    "have: indices must be from 0 to the number per layout - 1.",
+)
+_ERRORS = {ENGINE.constants[name]: message for name, message in _MESSAGES.items()}
 
 
 def check(agents: Agents) -> None:
@@ -122,7 +114,7 @@ def check_flag(error_flag: torch.Tensor) -> None:
     flag = int(error_flag)
     if flag:
         error_flag.zero_()
-        env, kind = divmod(flag, _CONSTANTS["ERROR_KINDS"])
+        env, kind = divmod(flag, ENGINE.constants["ERROR_KINDS"])
         raise EngineError(_ERRORS[kind].format(env=env))
 
 

@@ -1,7 +1,8 @@
-"""Calls of public engine functions with one wrong argument or buffer each: dtype, shape, memory layout,
-device, None, other types, numbers out of range, buffers that were replaced or resized.
+"""Calls of public engine functions with one wrong argument or buffer each: dtype, shape, memory
+layout, device, None, other types, numbers out of range, buffers that were replaced or resized.
 
-Run as a script, it makes them all and prints each first, so a crash of the interpreter shows its call:
+Run as a script, it makes them all and prints each first, so a crash of the interpreter shows its
+call:
 
     python tests/helpers/bad_calls.py cpu
 
@@ -118,7 +119,7 @@ def optional_tensors(good):
 
 
 def arrays(good):
-    """Values that are not an array of finite real numbers of that shape. Any real dtype is right."""
+    """Values that are not an array of finite real numbers of that shape. Any real dtype is fine."""
     yield from [("None", None), ("a string", "text"), ("a number", 3.5), ("words", ["a", "b"])]
     yield "an axis more", good[None]
     yield "an axis less", good[0]

@@ -1,5 +1,5 @@
-"""A twin of Deathmatch in plain Python and NumPy: hits, health, rewards, hidden spawns. Slow and obvious,
-and shares no code with the kernels.
+"""A twin of Deathmatch in plain Python and NumPy: hits, health, rewards, hidden spawns. Slow and
+obvious, and shares no code with the kernels.
 
 N environments, A agents, M lines of the agent model, W walls.
 """
@@ -13,8 +13,8 @@ F = np.float32
 
 
 def hits_of(line, ray, health, tally, ages, ended, *, n_model, res, rules):
-    """Steps one environment. ``line``, ``ray``, ``health``, ``ages``, ``ended`` are (A,); ``tally`` is
-    (3, A): kills, damage, hits. Returns {name: values} of the outputs and the new state.
+    """Steps one environment. ``line``, ``ray``, ``health``, ``ages``, ``ended`` are (A,); ``tally``
+    is (3, A): kills, damage, hits. Returns {name: values} of the outputs and the new state.
     """
     n, rules = len(line), {name: F(value) for name, value in rules.items()}
     hits = {}  # attacker: target
@@ -73,9 +73,9 @@ def hits_of(line, ray, health, tally, ages, ended, *, n_model, res, rules):
 
 
 def privileged(health, positions, angles):
-    """Returns the privileged observation of one environment, (A, 1 + 5 (A - 1)) float64: own health;
-    then, for each other agent from the next one on, health, position ahead and left / 10 m, cosine and
-    sine of its relative heading.
+    """Returns the privileged observation of one environment, (A, 1 + 5 (A - 1)) float64: own
+    health; then, for each other agent from the next one on, health, position ahead and left / 10 m,
+    cosine and sine of its relative heading.
     """
     rows, n = [], len(health)
     for a in range(n):
@@ -94,7 +94,7 @@ def privileged(health, positions, angles):
 
 
 def cuts(walls, start, end):
-    """(W,) bool: the walls (W, 2, 2) that cut a line of sight, found by solving for the crossings."""
+    """(W,) bool: walls (W, 2, 2) that cut a line of sight, by solving for the crossings."""
     along, step = walls[:, 1] - walls[:, 0], end - start
     area = step[0] * along[:, 1] - step[1] * along[:, 0]
     away = walls[:, 0] - start

@@ -101,7 +101,7 @@ def test_nvrtc_reports_file_and_line():
         nvrtc(broken)
 
 
-def test_nothing_is_built_at_import(tmp_path):
+def test_import_builds_nothing(tmp_path):
     status, _, err = run(
         "import megastep.envs, megastep.cuda, megastep.modules, megastep.recording",
         tmp_path / "cache",
