@@ -79,8 +79,9 @@ def test_reset_clears_hidden_state_bit_for_bit(name, layers, device, p_reset):
     for scale in (1e3, torch.nan):
         other = x.clone()
         other[:7] = scale * torch.randn(7, B, W, generator=generator).to(device)
-        others, after_other = run(core, other, reset, state * scale)
-        assert torch.equal(others[7:], outputs[7:]) and not torch.equal(others[:7], outputs[:7])
+        other_outputs, after_other = run(core, other, reset, state * scale)
+        assert torch.equal(other_outputs[7:], outputs[7:])
+        assert not torch.equal(other_outputs[:7], outputs[:7])
         for a, b in zip(leaves(after_other), leaves(after), strict=True):
             assert torch.equal(a, b)
 
@@ -89,12 +90,12 @@ def test_reset_clears_hidden_state_bit_for_bit(name, layers, device, p_reset):
 @each_core
 def test_gradients_stop_at_reset(name, layers, device):
     core, x, _, state = case(name, layers, device)
-    given = [x.requires_grad_(), *(leaf.requires_grad_() for leaf in leaves(state))]
+    inputs = [x.requires_grad_(), *(leaf.requires_grad_() for leaf in leaves(state))]
     reset = torch.zeros(T, B, dtype=torch.bool, device=device)
     reset[4, :2] = True
     outputs, after = run(core, x, reset, state)
     loss = outputs[4:].sum() + sum(leaf.sum() for leaf in leaves(after))
-    d_x, *d_state = torch.autograd.grad(loss, given)
+    d_x, *d_state = torch.autograd.grad(loss, inputs)
     assert not d_x[:4, :2].any() and d_x[4:].any()
     assert not any(leaf[:2].any() for leaf in d_state)
     assert bool(d_x[:4, 2:].any()) == (name != "none"), "lanes without a reset keep gradients"
@@ -121,8 +122,8 @@ def test_lanes_do_not_mix(name, layers, device):
     assert_close(one[:, 0], outputs[:, 2], device)
     other = x.clone()
     other[:, [0, 1, 3, 4]] = torch.nan
-    others, _ = run(core, other, reset, state)
-    assert torch.equal(others[:, 2], outputs[:, 2])
+    other_outputs, _ = run(core, other, reset, state)
+    assert torch.equal(other_outputs[:, 2], outputs[:, 2])
 
 
 @each_core
@@ -148,16 +149,16 @@ def test_one_layer_is_not_stacked(name):
 
 def test_gru_matches_torch():
     core, x, _, state = case("gru", layers=1)
-    theirs = nn.GRU(W, W)
+    torch_gru = nn.GRU(W, W)
     with torch.no_grad():
-        core.input.bias.normal_(), core.recurrent.bias.normal_()
-        theirs.weight_ih_l0.copy_(core.input.weight), theirs.bias_ih_l0.copy_(core.input.bias)
-        (
-            theirs.weight_hh_l0.copy_(core.recurrent.weight),
-            theirs.bias_hh_l0.copy_(core.recurrent.bias),
-        )
+        for layer in (core.input, core.recurrent):
+            layer.bias.normal_()
+        torch_gru.weight_ih_l0.copy_(core.input.weight)
+        torch_gru.bias_ih_l0.copy_(core.input.bias)
+        torch_gru.weight_hh_l0.copy_(core.recurrent.weight)
+        torch_gru.bias_hh_l0.copy_(core.recurrent.bias)
     outputs, after = core(x, torch.zeros(T, B, dtype=torch.bool), state)
-    expected, last = theirs(x, state.output[None])
+    expected, last = torch_gru(x, state.output[None])
     torch.testing.assert_close(outputs, expected, **CLOSE["cpu"])
     torch.testing.assert_close(after.output, last[0], **CLOSE["cpu"])
 

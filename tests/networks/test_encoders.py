@@ -1,4 +1,4 @@
-"""Convolutions as products with banded matrices. test_heads.py tests encoders as part of intakes."""
+"""Convolutions as banded matrices. test_heads.py tests encoders as part of intakes."""
 
 import pytest
 import torch
