@@ -14,11 +14,12 @@ T time, B lanes, W width.
 import torch
 from torch import nn
 
+from megastep import spaces
 from megastep.agents.imports import resolve
 from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.mingru import MinGRU
 from megastep.arrdict import arrdict
-from megastep.dotdict import leaves, mapping
+from megastep.dotdict import leaves
 
 
 class GRU(nn.Module):
@@ -139,10 +140,15 @@ def _check(name, core, width, n_steps=3, n_lanes=2):
     _require(
         name, shape == expected, f"outputs must be (T, B, width), here {expected}, not {shape}"
     )
-    shapes = [mapping(lambda leaf: tuple(leaf.shape))(tree) for tree in (after, state)]
-    _require(name, shapes[0] == shapes[1], "the hidden state must keep its keys and shapes")
+    _require(
+        name, _shapes(after) == _shapes(state), "the hidden state must keep its keys and shapes"
+    )
     is_cleared = torch.equal(outputs[1:], other_outputs[1:])
     _require(name, is_cleared, "a reset must clear the hidden state")
+
+
+def _shapes(state):
+    return {path: tuple(leaf.shape) for path, leaf in spaces.leaves(state).items()}
 
 
 def _require(name, condition, clause):

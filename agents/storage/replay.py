@@ -9,11 +9,10 @@ rollouts. Its last row is the observation to bootstrap from. A sequence can be d
 row arrives until its first row is overwritten.
 """
 
-from typing import Any
-
 import torch
 
 from megastep import spaces
+from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.replay_columns import Column, stored_dtype
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout
@@ -197,7 +196,7 @@ class ReplayBuffer:
 
 
 def bytes_per_observation(
-    env: Env, policy: Any, n_steps: int, settings: ReplaySettings, logprobs: bool = True
+    env: Env, policy: Policy, n_steps: int, settings: ReplaySettings, logprobs: bool = True
 ) -> float:
     """Returns the bytes that a replay buffer takes per observation, everything included."""
     meta = torch.device("meta")

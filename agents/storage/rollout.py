@@ -6,11 +6,11 @@ t+1. So row t is a valid transition unless its `reset` is set.
 """
 
 import math
-from typing import Any
 
 import torch
 
 from megastep import spaces
+from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, clone
 from megastep.dotdict import leaves, mapping
 from megastep.types import Env, Space, Tree
@@ -204,7 +204,7 @@ class Rollout:
         return batch
 
 
-def make_rollout(env: Env, policy: Any, n_steps: int, values: bool = True) -> Rollout:
+def make_rollout(env: Env, policy: Policy, n_steps: int, values: bool = True) -> Rollout:
     """Allocates a rollout of T steps for an environment and a policy.
 
     It holds all lanes, or only those that learn if the environment has `learners` (opponents).
@@ -224,7 +224,7 @@ def make_rollout(env: Env, policy: Any, n_steps: int, values: bool = True) -> Ro
     )
 
 
-def bytes_per_step(env: Env, policy: Any) -> int:
+def bytes_per_step(env: Env, policy: Policy) -> int:
     """Returns about how many bytes a rollout takes per step and lane."""
     obs = _bytes(env.obs_space, default_itemsize=2)
     privileged = 0

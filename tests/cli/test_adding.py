@@ -443,17 +443,17 @@ def test_a_class_that_breaks_a_clause_of_the_contract_is_told_which(
 @pytest.mark.parametrize(
     "change, clause",
     [
-        (("masked_fill(reset[t, :, None], 0.0)", "clone()"), "what came before a reset is forgot"),
-        (("self.layer(total)", "self.layer(total)[:, :1]"), "outputs are (T, B, width)"),
-        (("arrdict(total=total)", "arrdict()"), "a state is like the one before it"),
-        (("def initial", "def start"), "it has a method initial(B, device)"),
+        (("masked_fill(reset[t, :, None], 0.0)", "clone()"), "reset must clear"),
+        (("self.layer(total)", "self.layer(total)[:, :1]"), "(T, B, width)"),
+        (("arrdict(total=total)", "arrdict()"), "keep its keys and shapes"),
+        (("def initial", "def start"), "initial(B, device)"),
     ],
 )
 def test_a_core_that_breaks_a_clause_is_told_which(outside, capsys, change, clause):
     assert change[0] in MEAN
     outside({"mean.py": MEAN.replace(*change)})
     told = refused(capsys, "env=minimal", *SMALL, "agent.core=mean:Mean")
-    assert f"mean:Mean breaks the contract of recurrent cores: {clause}" in told, told
+    assert "mean:Mean" in told and clause in told, told
 
 
 def test_an_encoder_that_breaks_its_word_is_told(outside, capsys):
