@@ -41,11 +41,11 @@ class JoinedRagged(RaggedTorch):
     """
 
     def __init__(self, refusal: str, *parts: tuple[torch.Tensor, torch.Tensor, torch.Tensor]):
-        self._refusal, self._parts = refusal, parts
+        self._message, self._parts = refusal, parts
         self.widths = self._guarded(sum(widths for _, _, widths in parts))
 
     def _guarded(self, tensor):
-        return ReadOnlyTensor(tensor, self._refusal)
+        return ReadOnlyTensor(tensor, self._message)
 
     @cached_property
     def vals(self) -> torch.Tensor:
