@@ -33,7 +33,8 @@ ENGINE = (
 )
 AGENTS = (
     ("distributed", "generator", "imports", "types"),
-    ("networks", "storage"),
+    ("networks",),
+    ("storage",),
     ("algorithms",),
     ("training",),
     ("selfplay",),
@@ -99,13 +100,22 @@ SOURCES = [*sorted(ROOT.glob("*.py")), *source_files("megastep", "agents")]
 MODULES = {module_name(path): path for path in SOURCES}
 
 
+def running_nodes(tree):
+    """All nodes of a syntax tree, without the bodies of `if TYPE_CHECKING:`."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            continue
+        yield node
+        yield from running_nodes(node)
+
+
 def imports(path):
-    """The dotted names that a file imports, anywhere in it. `from a import b` is a.b if that is a
-    module, else a.
+    """The dotted names that a file imports when it runs, anywhere in it. `from a import b` is a.b
+    if that is a module, else a. Imports for type checkers alone (`if TYPE_CHECKING:`) do not count.
     """
     names, package = set(), module_name(path).split(".")
     package = package if path.name == "__init__.py" else package[:-1]
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in running_nodes(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
