@@ -1,4 +1,5 @@
-# NVRTC comes with PyTorch, so no CUDA base image; run with --gpus all to use a GPU, without to use the CPU.
+# Runs `megastep` on a GPU with `docker run --gpus all`, otherwise on the CPU. There is no CUDA base
+# image because PyTorch's wheels include NVRTC; g++ compiles the CPU kernels at first use.
 FROM python:3.12-slim
 RUN apt-get update && apt-get install -y --no-install-recommends g++ libgomp1 && rm -rf /var/lib/apt/lists/*
 WORKDIR /source

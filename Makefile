@@ -1,38 +1,40 @@
-# Every target sets up .venv first. An interpreter that already has the packages can be used instead: make train PYTHON=python3
+# Every target creates .venv first. To use an interpreter that already has the packages instead:
+#   make train PYTHON=python3
 BASE ?= python3
 PYTHON ?= .venv/bin/python
 CORES := $(shell nproc 2>/dev/null || echo 1)
 
-# The virtual environment is made only when it is the interpreter in use.
+# Create the virtual environment only if it is the interpreter in use.
 SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 
+# `find` does not follow links, so agents/ is not listed twice through megastep/agents.
 KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
 .PHONY: train test test-all lint setup clean
 
-train: $(SETUP)            ## train Explorer in homes, evaluate it in unseen ones, film it
+train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
 
-test: $(SETUP)             ## the tests, without those marked slow
+test: $(SETUP)             ## run the tests, except those marked slow
 	$(PYTHON) -m pytest -q -n $(CORES)
 
-test-all: $(SETUP)         ## every test
+test-all: $(SETUP)         ## run every test
 	$(PYTHON) -m pytest -q -n $(CORES) -m "slow or not slow"
 
-lint: $(SETUP)
+lint: $(SETUP)             ## check style and formatting of Python and kernels
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -c "import clang_format; clang_format.clang_format()" --dry-run --Werror $(KERNELS)
 
-setup: $(SETUP)
+setup: $(SETUP)            ## create .venv
 
 .venv/stamp: pyproject.toml constraints.txt
-	@$(BASE) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { echo "megastep needs Python 3.10 or newer; choose one with: make BASE=python3.12"; exit 1; }
-	@$(BASE) -c 'import ensurepip' 2>/dev/null || { echo "This Python cannot make virtual environments; on Debian: apt install python3-venv"; exit 1; }
+	@$(BASE) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { echo "megastep needs Python 3.10 or newer. Choose one with: make BASE=python3.12"; exit 1; }
+	@$(BASE) -c 'import ensurepip' 2>/dev/null || { echo "This Python cannot create virtual environments. On Debian: apt install python3-venv"; exit 1; }
 	$(BASE) -m venv .venv
 	.venv/bin/python -m pip install -c constraints.txt torch==2.13.0
 	.venv/bin/python -m pip install -c constraints.txt -e '.[test]'
 	touch .venv/stamp
 
-clean:
-	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache
+clean:                     ## delete .venv, build folders and caches
+	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache

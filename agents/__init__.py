@@ -1,8 +1,7 @@
-"""The learner: networks from spaces, storage of rollouts, learning algorithms, training, self-play, and
-the command line.
+"""The learner: networks, storage, learning algorithms, training, self-play and the command line.
 
-It knows spaces and the contract of environments, and no concrete environment. The package is
-imported as ``megastep.agents``; the folder lies beside ``megastep/`` in the repository.
+It knows spaces and the contract of environments, and no concrete environment. Import it as
+`megastep.agents`; in the repository the folder lies beside `megastep/`.
 """
 
 if __name__ == "agents":

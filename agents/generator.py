@@ -1,40 +1,43 @@
-"""A seeded source of random numbers that an object can own, take to another device, and save."""
-
-from typing import Any
+"""Random number generators that objects own, move between devices, and save."""
 
 import torch
 
 
 class SeededGenerator:
-    """A torch.Generator made from a seed on the device where it is first used.
+    """A `torch.Generator` that is created from a seed on the device where it is first used.
 
-    Its state is saved as plain numbers and tensors. On a device of another type, where such a state
-    means nothing, the sequence starts again from the seed.
+    A state saved on one type of device means nothing on another: there, the sequence starts again
+    from the seed.
+
+    Args:
+        seed: seed of the generator.
     """
 
     def __init__(self, seed: int):
         self.seed = seed
-        self._generator = None
+        self._generator: torch.Generator | None = None
 
     def on(self, device: torch.device) -> torch.Generator:
-        """The generator on this device, which is named as tensors name theirs: a GPU with its
-        number.
+        """Returns the generator for a device.
+
+        Args:
+            device: device as tensors name theirs, so a GPU with its number (`cuda:0`).
         """
         if self._generator is None or self._generator.device != device:
             self._generator = torch.Generator(device).manual_seed(self.seed)
         return self._generator
 
-    def state_dict(self) -> dict[str, Any]:
-        """The seed and, once the generator was used, its device's type and its state."""
+    def state_dict(self) -> dict:
+        """Returns the seed and, once the generator was used, its type of device and its state."""
         state = {"seed": self.seed}
         if self._generator is not None:
             state["device"] = self._generator.device.type
             state["generator"] = self._generator.get_state()
         return state
 
-    def load_state_dict(self, state: dict[str, Any], device: torch.device) -> None:
-        """Goes on from a `state_dict`, which may have been moved to any device."""
+    def load_state_dict(self, state: dict, device: torch.device) -> None:
+        """Continues from a `state_dict`, whose tensors may be on any device."""
         self.seed, self._generator = state["seed"], None
         if state.get("device") == device.type:
-            # a generator takes its state from the CPU, also on a GPU
+            # set_state takes a CPU tensor, also for a generator on a GPU
             self.on(device).set_state(state["generator"].cpu())

@@ -1,56 +1,104 @@
-"""What a learner, a collector and a logger have, as protocols for type checkers and readers.
+"""Protocols of the learner's parts: Actor, Rollout, Collector, Learner and Logger.
 
-Nothing inherits from them; any object with these attributes will do. T steps, B lanes.
+Nothing has to inherit from them: any object with these attributes will do. The rules behind them
+are in :mod:`megastep.agents.algorithms.learner`. T steps, B lanes.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
 
-from megastep.types import Env
+from megastep.types import Env, Policy
 
-__all__ = ["Collector", "Learner", "Logger"]
+if TYPE_CHECKING:
+    from megastep.agents.algorithms.nonfinite import NonFiniteCheck
+
+__all__ = ["Actor", "Collector", "Learner", "Logger", "Rollout"]
+
+
+class Actor(Policy, Protocol):
+    """A policy as :func:`megastep.agents.storage.collector.collect` runs it.
+
+    If the rollout stores values, the actor also needs `value(features, privileged)`, and its
+    decisions need `features`.
+    """
+
+    def compute_dtype(self) -> torch.autocast:
+        """Returns the autocast context in which the actor runs."""
+
+
+class Rollout(Protocol):
+    """T steps of B lanes. Row t of a (T, B) tensor belongs to the action of time t and holds what
+    the world that followed said.
+    """
+
+    n_steps: int  # T
+    n_lanes: int  # B
+    reward: torch.Tensor  # (T, B)
+    reset: torch.Tensor  # (T, B) bool: the action was ignored because an episode started
+    terminal: torch.Tensor  # (T, B) bool
+    truncated: torch.Tensor  # (T, B) bool
+    metrics: Mapping[str, torch.Tensor]  # (T, B) each, read where an episode ends
+    learns: torch.Tensor  # (T+1, B) bool: transitions to learn from
+    learners: torch.Tensor | None  # bool per lane of the environment: the B stored; None: all
+
+    def floats(self) -> dict[str, torch.Tensor]:
+        """Returns the float tensors by name, (T, B, ...) or (T+1, B, ...), for `learner.check`."""
 
 
 class Collector(Protocol):
-    """Acts in an environment and stores what happened. Owned by the learner that made it."""
+    """Acts in an environment and stores what happened.
 
-    rollout: Any  # the rollout that the last call returned
+    A collector that runs in the background also has `wait()`, which blocks until nothing acts in
+    the environment.
+    """
 
-    def __call__(self) -> Any:
-        """Takes T steps in every lane and returns them as a rollout."""
+    rollout: Rollout  # what the last call returned; allocated and empty before the first call
+
+    def __call__(self) -> Rollout:
+        """Takes T steps in every lane and returns them."""
 
 
 @runtime_checkable
 class Learner(Protocol):
-    """Improves a policy: ``rollout = collect(); losses = learner.update(rollout)``, for ever.
+    """Improves a policy: ``rollout = collect()``, ``losses = learner.update(rollout)``, repeat.
 
-    :mod:`megastep.agents.algorithms.learner` says what each part must do.
+    A learner with a replay buffer also has `replay_size(env)`, which returns the number of
+    observations the buffer will hold and the bytes that each takes.
     """
 
-    lr: float
-    check: Any  # a NonFiniteCheck
+    lr: float  # initial learning rate
+    check: NonFiniteCheck  # called by `update`
 
-    def collector(self, env: Env) -> Collector: ...
+    def collector(self, env: Env) -> Collector:
+        """Returns a collector for `env`."""
 
-    def update(self, rollout: Any) -> dict[str, torch.Tensor]: ...
+    def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        """Learns from a rollout and returns metrics, tensors () by name."""
 
-    def bytes_per_env(self, env: Env) -> float: ...
+    def bytes_per_env(self, env: Env) -> float:
+        """Returns the bytes needed per environment like `env`, rollouts included."""
 
-    def set_lr(self, lr: float) -> None: ...
+    def set_lr(self, lr: float) -> None:
+        """Changes the learning rate."""
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> dict[str, Any]:
+        """Returns everything that changes, except the policy's weights."""
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continues from a `state_dict`."""
 
 
 class Logger(Protocol):
-    """Writes the numbers of a run."""
+    """Writes the metrics of a run."""
 
     def write(
         self, step: int, metrics: Mapping[str, float | str], perf: Mapping[str, float]
     ) -> None:
         """Writes one report after ``step`` environment steps."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Writes what is buffered and closes files and connections."""

@@ -1,7 +1,6 @@
-"""megastep: reinforcement learning in thousands of small flat environments on one device.
+"""megastep: reinforcement learning in thousands of small 2D environments on one device.
 
-Importing the package loads nothing else. Its modules arrive when they are first used, either way
-round::
+Importing the package loads nothing else. Its modules are imported at their first use::
 
     from megastep import toys, scene, cuda
     import megastep; megastep.toys.box()

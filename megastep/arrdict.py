@@ -1,7 +1,7 @@
-"""dotdicts of arrays and tensors: they can also be indexed and calculated with, leaf by leaf.
+"""Trees of arrays and tensors, with indexing and arithmetic on every leaf.
 
 Keys are strings; any other index goes to the leaves. Leaves are tensors, numpy arrays, Raggeds or
-plain numbers.
+numbers.
 """
 
 import copy
@@ -21,15 +21,17 @@ __all__ = ["arrdict", "stack", "cat", "torchify", "numpyify", "clone", "leaves",
 class arrdict(dotdict):
     """A :class:`~megastep.dotdict.dotdict` whose indexing and operators act on every leaf.
 
-    ``d[index]`` gives the tree of ``leaf[index]``; ``d[index] = other`` writes into the leaves in
-    place, from a tree with the same keys or from one value for all. The other side of an operator
-    may be a tree with the same keys, or anything that every leaf can be combined with. Comparisons
-    are leaf by leaf too: ``a == b`` is a tree, not a bool.
+    - ``d[index]`` returns the tree of ``leaf[index]``.
+    - ``d[index] = other`` writes into the leaves in place. ``other`` is a tree with the same keys,
+      or one value for all leaves.
+    - ``d + other`` and other operators return a tree. ``other`` is a tree with the same keys, or
+      anything that can be combined with every leaf.
+    - ``a == b`` compares leaf by leaf: it returns a tree, not a bool.
     """
 
     __slots__ = ()
     __hash__ = None
-    __array_ufunc__ = None  # so that numpy leaves `array + tree` to __radd__
+    __array_ufunc__ = None  # makes numpy leave `array + tree` to __radd__
 
     def __getitem__(self, index):
         if isinstance(index, str):
@@ -64,32 +66,13 @@ def _unary(op):
 
 
 def _operators():
-    """The special methods of arithmetic, comparison and sign, by name."""
-    arithmetic = {
-        name: getattr(operator, f"__{name}__")
-        for name in (
-            "add",
-            "sub",
-            "mul",
-            "matmul",
-            "truediv",
-            "floordiv",
-            "mod",
-            "pow",
-            "lshift",
-            "rshift",
-            "and",
-            "or",
-            "xor",
-        )
-    }
+    """Yields (name, method) of the operators of arithmetic, comparison and sign."""
+    names = "add sub mul matmul truediv floordiv mod pow lshift rshift and or xor".split()
+    arithmetic = {name: getattr(operator, f"__{name}__") for name in names}
     for name, op in {**arithmetic, "divmod": divmod}.items():
         yield f"__{name}__", _forward(op)
         yield f"__r{name}__", _reflected(op)
-    yield (
-        "__ior__",
-        _forward(operator.or_),
-    )  # dict's own would merge keys; the others have no in-place form
+    yield "__ior__", _forward(operator.or_)  # dict has |=, which merges keys, and no other
     for name in ("lt", "le", "eq", "ne", "ge", "gt"):
         yield f"__{name}__", _forward(getattr(operator, name))
     for name in ("neg", "pos", "abs", "invert"):
@@ -101,21 +84,19 @@ for _name, _method in _operators():
 
 
 def stack(trees: Iterable, dim: int = 0) -> Any:
-    """Joins trees with the same keys along a new axis ``dim``. Numbers are stacked into a numpy
-    array.
-    """
+    """Joins trees with the same keys along a new axis ``dim``. Numbers become a numpy array."""
     return _join("stack", torch.stack, np.stack, trees, dim)
 
 
 def cat(trees: Iterable, dim: int = 0) -> Any:
-    """Joins trees with the same keys along their existing axis ``dim``."""
+    """Joins trees with the same keys along an existing axis ``dim``."""
     return _join("cat", torch.cat, np.concatenate, trees, dim)
 
 
 def _join(name, torch_join, numpy_join, trees, dim):
     trees = list(trees)
     if not trees:
-        raise ValueError(f"{name} was given no trees; it needs one at least")
+        raise ValueError(f"{name} needs at least one tree, but got none")
 
     def join(*values):
         if isinstance(values[0], torch.Tensor):
@@ -127,11 +108,12 @@ def _join(name, torch_join, numpy_join, trees, dim):
 
 @mapping
 def torchify(leaf: Any) -> Any:
-    """Arrays, numbers and Raggeds as CPU tensors. float64, numpy's default, becomes float32; other
-    dtypes stay.
+    """Converts arrays, numbers and Raggeds to CPU tensors. Tensors are returned unchanged.
 
-    The memory is shared where the dtype stays. Tensors are returned as they are.
-    Raises ValueError for what no tensor can hold, such as strings.
+    float64, numpy's default, becomes float32. Other dtypes stay, and share memory with the result.
+
+    Raises:
+        ValueError: for a leaf that no tensor can hold, such as a string.
     """
     if isinstance(leaf, torch.Tensor):
         return leaf
@@ -144,17 +126,17 @@ def torchify(leaf: Any) -> Any:
         return torch.as_tensor(array)
     except TypeError:
         raise ValueError(
-            f"torchify cannot make a tensor of a value of type {type(leaf).__name__} (dtype "
-            f"{array.dtype}); it takes numbers, bools and arrays of them"
+            f"torchify cannot convert a {type(leaf).__name__} (dtype {array.dtype}) to a tensor; "
+            f"it takes numbers, bools and arrays of them"
         ) from None
 
 
 @mapping
 def numpyify(leaf: Any) -> Any:
-    """Tensors and Raggeds as numpy arrays, also those in lists and tuples; anything else is
-    returned as it is.
+    """Converts tensors and Raggeds to numpy arrays, also in lists and tuples. Other leaves are
+    returned unchanged.
 
-    CPU tensors share their memory with the result. bfloat16, which numpy lacks, becomes float32.
+    CPU tensors share memory with the result. bfloat16, which numpy lacks, becomes float32.
     """
     if isinstance(leaf, torch.Tensor):
         leaf = leaf.detach().cpu()
@@ -169,14 +151,12 @@ def numpyify(leaf: Any) -> Any:
 
 @mapping
 def clone(leaf: Any) -> Any:
-    """A copy that shares no memory with the original."""
+    """Returns a copy that shares no memory with the original."""
     return leaf.clone() if isinstance(leaf, torch.Tensor) else copy.deepcopy(leaf)
 
 
 def _register(cls):
-    """Makes a tree type known to torch's pytrees, and so to torch.compile, torch.func and their
-    like.
-    """
+    """Registers a tree type with torch's pytrees, for torch.compile, torch.func and others."""
     _pytree.register_pytree_node(
         cls,
         lambda tree: (list(tree.values()), list(tree)),

@@ -1,11 +1,11 @@
-"""A private cache of what was built, for this user alone.
+"""A private cache on disk for built kernels and other results that are expensive to compute.
 
-It lies in ``$MEGASTEP_CACHE`` (else ``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``) and
-is made with mode 0700. What is loaded from it runs with the user's rights, so nothing is read that
-another user may write. A cached file ends in its own SHA-256, so a damaged one is seen and built
-again; it is written beside its place and renamed, so that two processes cannot harm each other. The
-digest is of the name too, so no file passes for another. A cache that cannot be used costs a
-warning of one line and a build per start.
+The folder is ``$MEGASTEP_CACHE``, else ``$XDG_CACHE_HOME/megastep``, else ``~/.cache/megastep``,
+created with mode 0700. Libraries loaded from it run with the user's rights, so nothing is read that
+another user could have written. Each file ends in a SHA-256 of its name and content: a damaged or
+renamed file is detected and built again. Files are written under a temporary name and renamed, so
+processes can share the cache. If the cache cannot be used, there is one warning, and everything is
+built at each start.
 """
 
 import hashlib
@@ -21,8 +21,9 @@ DIGEST = 32  # bytes
 
 
 def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
-    """What ``build`` gives, from the file ``name`` if an intact one is cached, and that file's
-    path: None if there is no cache.
+    """Returns a file's content and its path. If it is not cached, ``build`` makes the content.
+
+    The path is None if the cache cannot be used.
     """
     path = _folder() / name
     problem = _problem(path.parent)
@@ -30,7 +31,9 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
     if body is not None:
         return body, path
     if problem is None and path.exists():
-        warnings.warn(f"{path} is damaged or not this user's own: it is made again", stacklevel=2)
+        warnings.warn(
+            f"{path} is damaged or not owned by this user: it is built again", stacklevel=2
+        )
     body = build()
     if problem is None:
         try:
@@ -43,21 +46,24 @@ def fetch(name: str, build: Callable[[], bytes]) -> tuple[bytes, Path | None]:
 
 
 def warn(problem: str) -> None:
+    """Warns that the cache is not used."""
     warnings.warn(
-        f"the kernel cache is not used, so kernels are built, and spawn points, shortest ways and "
-        f"visible texels found, at each start: {problem}; set MEGASTEP_CACHE to another folder of "
-        f"your own",
+        f"the cache is not used, so kernels, spawn points, shortest paths and visible texels are "
+        f"computed at each start: {problem}; set MEGASTEP_CACHE to a folder of your own",
         stacklevel=2,
     )
 
 
 def prune(prefix: str, keep: int, max_bytes: float = math.inf) -> None:
-    """Deletes all files whose names begin with ``prefix`` but the ``keep`` that are newest, and as
-    many of those as it takes until the rest is ``max_bytes`` at most.
+    """Deletes old files whose names start with ``prefix``.
+
+    Args:
+        keep: number of newest files to keep.
+        max_bytes: total size to keep; the oldest files are deleted first.
     """
     try:
-        found = sorted(_folder().glob(f"{prefix}*"), key=lambda path: -path.stat().st_mtime)
-        for number, path in enumerate(found):
+        paths = sorted(_folder().glob(f"{prefix}*"), key=lambda path: -path.stat().st_mtime)
+        for number, path in enumerate(paths):
             max_bytes -= path.stat().st_size
             if number >= keep or max_bytes < 0:
                 path.unlink()
@@ -66,9 +72,7 @@ def prune(prefix: str, keep: int, max_bytes: float = math.inf) -> None:
 
 
 def intact(path: Path) -> bytes | None:
-    """The bytes of a cached file less the digest it ends in; None if it is missing, damaged or not
-    private.
-    """
+    """Returns a file's content without its digest; None if missing, damaged or not private."""
     try:
         with open(path, "rb") as file:
             if not _is_private(os.fstat(file.fileno())):
@@ -87,28 +91,28 @@ def _digest(name, body):
 
 
 def _folder():
-    chosen = os.environ.get("MEGASTEP_CACHE")
+    override = os.environ.get("MEGASTEP_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(chosen) if chosen else Path(base) / "megastep"
+    return Path(override) if override else Path(base) / "megastep"
 
 
 def _problem(folder):
-    """Why the folder, made if need be, is no place for the cache; None if it is one."""
+    """Creates the folder if necessary. Returns why it cannot be the cache, or None if it can."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not _is_private(folder.stat()):
-            return f"other users may write in {folder} (chmod 700 makes it private)"
+            return f"other users can write to {folder} (chmod 700 makes it private)"
         for parent in folder.resolve().parents:
             mode = parent.stat().st_mode
             if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
-                return f"other users may replace {folder}, for they may write in {parent}"
+                return f"other users can replace {folder}, as they can write to {parent}"
     except OSError as error:
         return f"{folder} cannot be used ({error.strerror})"
     return None
 
 
 def _is_private(status):
-    """Can only this user and the administrator write it?"""
+    """True if only this user and root can write to the file."""
     ours = status.st_uid in (os.geteuid(), 0)
     return ours and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 

@@ -1,40 +1,43 @@
-"""Any environment's step, or any function of tensors, as a CUDA graph.
+"""CUDA graphs of an environment's step, or of any function of tensors.
 
-:func:`capture` records a function once and replays it without Python. What the function changes
-must be tensors and generators reachable from the objects it is given as roots (see
-:mod:`~megastep.state`); their values are put back after the recording, so that warming up does not
-advance an environment. :class:`Captured` does this to an environment's ``step``.
+:func:`capture` records a function once; calls replay it without Python. Everything that the
+function changes must be a tensor or a generator reachable from the attributes of its ``roots`` (see
+:mod:`megastep.engine.state_tree`). Their values are restored after the recording, so warming up
+does not advance an environment. :class:`Captured` captures the ``step`` of an environment.
 """
 
 import contextlib
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch.utils import _pytree
 
 from megastep.engine.state_tree import SCALARS, rebind, restore, snapshot, state_tree, walk
+from megastep.types import Env, World
 
 __all__ = ["CaptureError", "Captured", "Graph", "capture", "restore", "snapshot", "state_tree"]
 
 
 class CaptureError(RuntimeError):
-    """A function cannot be replayed as a graph. The message is one sentence with the cure."""
+    """A function cannot be replayed as a CUDA graph. The message names the cure."""
 
 
 class _StateBefore:
-    """Which tensors and scalars some objects held before a call of a function."""
+    """The tensors and Python scalars below some objects before a function is called."""
 
     def __init__(self, roots):
         self.roots = dict(enumerate(roots))
         self.tensors, self.scalars = walk(self.roots, torch.Tensor), walk(self.roots, SCALARS)
 
     def keep_in_place(self):
-        """After the call: copies tensors that were rebound to where they were before, and raises
-        CaptureError for any other change that a graph cannot repeat. A tensor that appears where
-        None stood, or nothing, stays: it is where the function will write from now on.
+        """Call this after the function. Copies each tensor that replaced another into the old
+        one, and puts the old one back.
+
+        A tensor that replaced None, or a new attribute, stays: the function writes there from now
+        on. Raises CaptureError for any other change that a graph cannot repeat.
         """
         tensors, scalars = walk(self.roots, torch.Tensor), walk(self.roots, SCALARS)
         self._refuse_changed_scalars(tensors, scalars)
@@ -44,8 +47,8 @@ class _StateBefore:
                 if id(old) in reachable:
                     continue
                 raise CaptureError(
-                    f"{_readable(path)} was a tensor of shape {tuple(old.shape)} before the call "
-                    f"and is gone after it: keep it, and change it in place."
+                    f"{_readable(path)}, a tensor of shape {tuple(old.shape)}, was removed during "
+                    f"the call: keep it, and change it in place."
                 )
             parent, step, new = tensors[path]
             if new is not old:
@@ -54,18 +57,17 @@ class _StateBefore:
     def _refuse_changed_scalars(self, tensors, scalars):
         for path, (_, _, old) in self.scalars.items():
             new = scalars[path][2] if path in scalars else old
-            tensor = path in tensors and old is not None
-            if tensor or (old != new and not (old != old and new != new)):
-                became = "a tensor" if tensor else repr(new)
+            is_tensor = path in tensors and old is not None
+            both_nan = old != old and new != new
+            if is_tensor or (old != new and not both_nan):
                 raise CaptureError(
-                    f"{_readable(path)} changed from {old!r} to {became} during the call, but a "
-                    f"graph replays tensors only: make it a tensor on the device."
+                    f"{_readable(path)} changed from {old!r} to "
+                    f"{'a tensor' if is_tensor else repr(new)} during the call, but a CUDA graph "
+                    f"replays tensors only: make it a tensor on the device."
                 )
 
     def undo(self):
-        """Puts back every tensor and scalar that is another now than it was, as far as it can be
-        put anywhere.
-        """
+        """Puts back every tensor and scalar that was replaced, wherever assignment works."""
         for before in (self.tensors, self.scalars):
             now = walk(self.roots, (torch.Tensor, *SCALARS))
             for path, (parent, step, leaf) in before.items():
@@ -78,26 +80,25 @@ def _copy_back(path, parent, step, old, new):
     if old.shape != new.shape or old.dtype != new.dtype:
         raise CaptureError(
             f"{_readable(path)} changed its shape or dtype during the call, from "
-            f"{tuple(old.shape)} {old.dtype} to {tuple(new.shape)} {new.dtype}: keep them fixed."
+            f"{tuple(old.shape)} {old.dtype} to {tuple(new.shape)} {new.dtype}: keep both fixed."
         )
     try:
         old.copy_(new)
         rebind(parent, step, old)
     except (TypeError, AttributeError) as error:
         raise CaptureError(
-            f"{_readable(path)} was replaced where it cannot be put back ({error}): change it in "
-            f"place."
+            f"{_readable(path)} was replaced and cannot be put back ({error}): change it in place."
         ) from None
 
 
 def _readable(path):
-    """A path without the number of its root."""
+    """A path for messages, without the number of its root."""
     return path.partition("]")[2].lstrip(".")
 
 
 def _renew_generators(roots):
-    """Replaces the generators on GPUs: those that a failed recording registered stay in the state
-    of being captured.
+    """Replaces the generators on GPUs: a failed recording leaves those that it registered marked as
+    being captured.
     """
     renewed = {}
     for parent, step, old in walk(roots, (torch.Generator,)).values():
@@ -107,8 +108,10 @@ def _renew_generators(roots):
 
 
 class Graph:
-    """A captured function. Calling it copies the arguments' tensors in, replays, and returns the
-    outputs, which are valid until the next call. Arguments are as for :func:`capture`.
+    """A function recorded as a CUDA graph. Arguments are those of :func:`capture`.
+
+    A call copies the tensors of its arguments in, replays the graph, and returns the outputs. They
+    are valid until the next call.
     """
 
     def __init__(self, function: Callable, args: tuple, roots: tuple, warmup: int = 3):
@@ -157,39 +160,40 @@ class Graph:
         leaves, spec = _pytree.tree_flatten(args)
         if spec != self._spec:
             raise ValueError(
-                f"the captured function was recorded with arguments {self._spec}, but was called "
-                f"with {spec}"
+                f"the function was captured with arguments {self._spec}, but called with {spec}"
             )
-        for inside, given in zip(self._leaves, leaves):
-            if isinstance(inside, torch.Tensor):
-                if inside.shape != given.shape:
+        for buffer, leaf in zip(self._leaves, leaves):
+            if isinstance(buffer, torch.Tensor):
+                if buffer.shape != leaf.shape:
                     raise ValueError(
-                        f"the captured function was recorded with an argument of shape "
-                        f"{tuple(inside.shape)}, but was called with {tuple(given.shape)}"
+                        f"the function was captured with an argument of shape "
+                        f"{tuple(buffer.shape)}, but called with {tuple(leaf.shape)}"
                     )
-                inside.copy_(given)
+                buffer.copy_(leaf)
         with torch.cuda.device(self._device):
             self._graph.replay()
         return self._out
 
 
 def capture(function: Callable, args: tuple, roots: tuple, warmup: int = 3) -> Callable:
-    """``function`` recorded as a CUDA graph on the device of its state, or ``function`` itself,
-    with one warning that names the line, if it cannot be.
+    """Records a function as a CUDA graph on the device of its state. Returns the :class:`Graph`, or
+    ``function`` itself with one warning that names the line, if it cannot be captured.
 
-    Args: ``args`` a tuple of example arguments, trees of tensors of fixed shapes; ``roots`` the
-    objects whose tensors and generators the function changes. Their values are as before
-    afterwards. A tensor that appears where None stood is kept, with the value that the last of
-    ``warmup`` calls gave it, because the graph writes into it: what must begin with another value
-    is made before capturing.
+    A tensor that the function creates where an attribute was None is kept, with the value that the
+    last warm-up call gave it, because the graph writes into it. If it must start with another
+    value, create it before capturing.
+
+    Args:
+        function: takes ``args``. Changes only tensors and generators below ``roots``.
+        args: example arguments, trees of tensors whose shapes stay fixed.
+        roots: objects whose state the function changes. Their values are restored afterwards.
+        warmup: number of calls before the recording.
     """
     try:
         return Graph(function, args, roots, warmup)
     except RuntimeError as error:
-        while isinstance(
-            error.__context__, RuntimeError
-        ):  # the end of a failed capture fails once more
-            error = error.__context__
+        while isinstance(error.__context__, RuntimeError):
+            error = error.__context__  # the first error; ending a failed capture raises another
         warnings.warn(
             f"running without a CUDA graph, slower: {str(error).splitlines()[0]}{_line(error)}",
             stacklevel=2,
@@ -198,7 +202,7 @@ def capture(function: Callable, args: tuple, roots: tuple, warmup: int = 3) -> C
 
 
 def _line(error):
-    """Where outside PyTorch and this file an error was raised, to follow a sentence."""
+    """The line outside PyTorch and this file that raised an error, as the end of a sentence."""
     if isinstance(error, CaptureError):
         return ""
     frames = traceback.extract_tb(error.__traceback__)
@@ -207,19 +211,23 @@ def _line(error):
 
 
 class Captured:
-    """An environment whose ``step`` is replayed as a CUDA graph, recorded at the first step; on the
-    CPU the environment as it is. Everything else is the environment's own.
+    """Wraps an environment on a GPU so that ``step`` replays a CUDA graph, recorded at the first
+    step. On the CPU ``step`` is the environment's own. All other attributes are the environment's.
+
+    Args:
+        env: the environment to wrap.
     """
 
-    def __init__(self, env: Any):
+    def __init__(self, env: Env):
         self.env, self._step = env, None
 
-    def __getattr__(self, name):
+    def __getattr__(self, name: str) -> Any:
         return getattr(self.env, name)
 
-    def step(self, decision: dict) -> dict:
-        """As the environment's; on a GPU the world returned is valid until the next step. Only
-        ``decision.actions`` reaches it.
+    def step(self, decision: Mapping) -> World:
+        """Steps the environment by ``decision["actions"]``; other keys are dropped.
+
+        On a GPU the returned world is valid until the next step.
         """
         decision = type(decision)(actions=decision["actions"])
         if self._step is None:

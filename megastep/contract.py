@@ -1,7 +1,7 @@
-"""The contract of environments as a checker: what every world must keep, clause by clause.
+"""Checks that an environment keeps the contract between environments and learners.
 
-``contract.rollout(env, 60)`` steps an environment with random actions and raises ContractError,
-naming its class and the clause, at the first world that breaks one. B lanes, N environments.
+``contract.rollout(env, 60)`` steps an environment with random actions and raises ContractError at
+the first world that breaks a clause. Axes: N environments, A agents, B = N A lanes.
 """
 
 from collections.abc import Iterator, Mapping
@@ -9,8 +9,9 @@ from typing import Any
 
 import torch
 
+from megastep import spaces
 from megastep.arrdict import arrdict
-from megastep.spaces import MultiDiscrete
+from megastep.types import Env, Space, Tree, World
 
 __all__ = [
     "ATTRIBUTES",
@@ -23,64 +24,58 @@ __all__ = [
 ]
 
 FLAGS = "reset", "terminal", "truncated"
-ROOTS = "observation", "privileged"  # what trees of spaces are called, before their keys
-RESERVED = "count", "return", "length", "return_std"  # of every episode, beside its metrics
+FLOATS = torch.float16, torch.float32  # of an observation whose space names no dtype
+INTEGERS = tuple(
+    getattr(torch, f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)
+)
+RESERVED = "count", "return", "length", "return_std"  # reported of every episode
 ATTRIBUTES = {
-    "n_envs": "the number of its environments, N",
-    "n_agents": "the lanes of one environment, agents that are controlled independently",
-    "device": "where its tensors are",
-    "fps": "its steps per second, which videos are played at",
-    "obs_space": "a space, or a dotdict of them, of one lane's observation",
-    "action_space": "a space, or a dotdict of them, of one lane's actions",
-    "reset": "a method that begins every episode and returns a world",
+    "n_envs": "the number of environments, N",
+    "n_agents": "the number of lanes per environment, A",
+    "device": "the device that the tensors are on",
+    "fps": "steps per second of simulated time",
+    "obs_space": "the space, or dict of spaces, of one lane's observation",
+    "action_space": "the space, or dict of spaces, of one lane's actions",
+    "reset": "a method that starts every episode and returns a world",
     "step": "a method that takes a decision and returns a world",
-    "check": "a method that raises the errors that its engine has flagged on the device",
+    "check": "a method that raises the errors flagged on the device",
 }
 
 
 class ContractError(AssertionError):
-    """An environment breaks a clause of the contract. The message names its class and the
-    clause.
-    """
+    """An environment breaks a clause of the contract. The message names class and clause."""
 
 
-def _require(env: Any, kept: bool, clause: str) -> None:
-    if not kept:
+def _require(env: Env, holds: bool, clause: str) -> None:
+    if not holds:
         raise ContractError(f"{type(env).__name__} breaks the contract: {clause}")
 
 
-def _leaves(env: Any, space: Any, values: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
-    """(name, space, values) for every leaf of a tree of spaces; values are None where absent."""
-    if not isinstance(space, Mapping):
-        yield name, space, values
-        return
-    extra = [key for key in values if key not in space] if isinstance(values, Mapping) else []
-    _require(env, not extra, f"{name} has the keys of its space, and not {extra[:1]}")
-    for key, child in space.items():
-        inner = values.get(key) if isinstance(values, Mapping) else None
-        yield from _leaves(env, child, inner, f"{name}{' ' if name in ROOTS else '.'}{key}")
+# ---- The environment ----
 
 
-def check_environment(env: Any) -> None:
-    """What an environment must have beside its worlds, and ``layout`` and ``roles`` if it has
-    them.
+def check_environment(env: Env) -> None:
+    """Checks the attributes of an environment: the required ones, ``layout`` and ``roles``.
+
+    Raises:
+        ContractError: if one is missing or wrong.
     """
     for name, meaning in ATTRIBUTES.items():
         _require(env, hasattr(env, name), f"it has no {name}: {meaning}")
-    _require(env, env.fps > 0, f"fps is a positive number of steps per second, not {env.fps}")
+    _require(env, env.fps > 0, f"fps must be a positive number, not {env.fps}")
     env.check()
     layout = getattr(env, "layout", None)
     _require(
         env,
         layout is None or (layout.shape == (env.n_envs,) and not layout.is_floating_point()),
-        "layout has one integer per environment",
+        f"layout must hold one integer per environment, shape ({env.n_envs},)",
     )
     roles = getattr(env, "roles", None)
+    is_list = isinstance(roles, (tuple, list)) and len(roles) == env.n_agents
     _require(
         env,
-        roles is None
-        or (isinstance(roles, (tuple, list)) and len(roles) == env.n_agents and _are_names(roles)),
-        f"roles has one name per agent of an environment, {env.n_agents} in all, not {roles!r}",
+        roles is None or (is_list and _are_names(roles)),
+        f"roles must hold one name per agent, {env.n_agents} in all, not {roles!r}",
     )
 
 
@@ -88,151 +83,178 @@ def _are_names(words):
     return all(isinstance(word, str) and word.isidentifier() for word in words)
 
 
-def check_world(env: Any, world: Mapping, last: Mapping | None = None) -> None:
-    """One world against the contract; ``last`` is the world before it, None after a reset."""
+# ---- A world ----
+
+
+def check_world(env: Env, world: World, last: World | None = None) -> None:
+    """Checks one world against the contract.
+
+    Args:
+        env: the environment that returned it.
+        world: the world to check.
+        last: the world one step earlier; None if ``world`` came from ``reset``.
+
+    Raises:
+        ContractError: if the world breaks a clause.
+    """
     for key in ("obs", "reward", *FLAGS):
-        _require(env, key in world, f"a world has {key}")
-    for key in ("reward", *FLAGS):
-        _require(env, _has_lanes(env, world[key]), f"{key} has one value per lane")
-        _require(env, _is_there(env, world[key]), f"{key} is on the environment's device")
-    _require(env, world["reward"].dtype == torch.float32, "rewards are float32")
-    _require(env, all(world[key].dtype == torch.bool for key in FLAGS), "flags are bools")
-    for name, space, values in _leaves(env, env.obs_space, world["obs"], "observation"):
-        _check_observation(env, name, space, values)
+        _require(env, key in world, f"the world has no {key}")
+    _check_per_lane(env, "reward", world["reward"], torch.float32)
+    for key in FLAGS:
+        _check_per_lane(env, key, world[key], torch.bool)
+    for path, space, values in _leaves(env, env.obs_space, world["obs"], "obs"):
+        _check_observation(env, path, space, values)
     _check_privileged(env, world)
-    _check_flow(env, world, last)
+    _check_episodes(env, world, last)
     _check_metrics(env, world, last)
     _require(
         env,
         last is None or ("learns" in world) == ("learns" in last),
-        "every world has learns, or none has",
+        "learns must be in every world or in none",
     )
+    if "learns" in world:
+        _check_per_lane(env, "learns", world["learns"], torch.bool)
+
+
+def _check_tensor(env, path, values, shape, dtypes, kind=None):
+    """`values` is a tensor of this shape, of one of the dtypes, on the environment's device."""
+    described = repr(values)
+    if isinstance(values, torch.Tensor):
+        described = f"{values.dtype} {tuple(values.shape)} on {values.device.type}"
+    device = torch.device(env.device).type
+    kind = kind or " or ".join(str(dtype) for dtype in dtypes)
     _require(
         env,
-        "learns" not in world or _is_per_lane(env, world["learns"], torch.bool),
-        "learns has one bool per lane, on the environment's device",
+        isinstance(values, torch.Tensor)
+        and values.shape == shape
+        and values.dtype in dtypes
+        and values.device.type == device,
+        f"{path} must be {kind} {tuple(shape)} on {device}, not {described}",
     )
 
 
-def _has_lanes(env, values):
-    return isinstance(values, torch.Tensor) and values.shape == (env.n_envs * env.n_agents,)
+def _check_per_lane(env, path, values, dtype):
+    _check_tensor(env, path, values, (env.n_envs * env.n_agents,), (dtype,))
 
 
-def _is_there(env, values):
-    return values.device.type == torch.device(env.device).type
+def _leaves(env: Env, space: Space, values: Tree, name: str) -> Iterator[tuple[str, Space, Any]]:
+    """Yields (path, leaf space, leaf value). The values must have the keys of the space."""
+    expected, present = spaces.leaves(space, name), spaces.leaves(values, name)
+    _require(
+        env,
+        expected.keys() == present.keys(),
+        f"the world must have {', '.join(expected)}, as {name}_space has, not {', '.join(present)}",
+    )
+    for path, leaf in expected.items():
+        yield path, leaf, present[path]
 
 
-def _is_per_lane(env, values, dtype):
-    return _has_lanes(env, values) and values.dtype == dtype and _is_there(env, values)
-
-
-def _check_observation(env, name, space, values):
+def _check_observation(env, path, space, values):
     shape = env.n_envs * env.n_agents, *space.shape
-    _require(
-        env,
-        isinstance(values, torch.Tensor) and values.shape == shape,
-        f"{name} is as its space says",
-    )
-    dtype, there = getattr(space, "dtype", None), _is_there(env, values)
-    if isinstance(space, MultiDiscrete):
-        is_integer = not (values.is_floating_point() or values.dtype == torch.bool)
-        _require(env, there and is_integer, f"{name} is integers on the device")
+    if isinstance(space, spaces.MultiDiscrete):
+        _check_tensor(env, path, values, shape, INTEGERS, "integers")
         inside = bool(((values >= 0) & (values < space.n_actions)).all())
-        _require(env, inside, f"{name} is from 0 to {space.n_actions - 1}")
+        _require(env, inside, f"{path} must be from 0 to {space.n_actions - 1}")
         return
-    dtypes = (dtype,) if dtype else (torch.float16, torch.float32)
-    kind = f"of the {dtype} that its space names, and" if dtype else "a float"
-    _require(env, there and values.dtype in dtypes, f"{name} is {kind} on the device")
-    _require(env, bool(values.isfinite().all()), f"{name} is finite")
+    dtype = getattr(space, "dtype", None)
+    _check_tensor(env, path, values, shape, (dtype,) if dtype else FLOATS)
+    _require(env, bool(values.isfinite().all()), f"{path} must be finite")
 
 
 def _check_privileged(env, world):
     space = getattr(env, "privileged_space", None)
+    has_values, has_space = "privileged" in world, space is not None
     _require(
         env,
-        ("privileged" in world) == (space is not None),
-        "a world has privileged values if, and only if, there is a privileged_space",
+        has_values == has_space,
+        "privileged must be in the world if, and only if, privileged_space is not None",
     )
     if space is None:
         return
-    lanes = env.n_envs * env.n_agents
-    root = "privileged" if isinstance(space, Mapping) else "privileged values"
-    for name, leaf, values in _leaves(env, space, world["privileged"], root):
-        _require(
-            env,
-            isinstance(values, torch.Tensor) and values.shape == (lanes, *leaf.shape),
-            f"{name} are as their space says",
-        )
-        _require(
-            env,
-            _is_there(env, values) and values.dtype == torch.float32,
-            f"{name} are float32 on the device",
-        )
-        _require(env, bool(values.isfinite().all()), f"{name} are finite")
+    for path, leaf, values in _leaves(env, space, world["privileged"], "privileged"):
+        shape = env.n_envs * env.n_agents, *leaf.shape
+        _check_tensor(env, path, values, shape, (torch.float32,))
+        _require(env, bool(values.isfinite().all()), f"{path} must be finite")
 
 
-def _check_flow(env, world, last):
-    """Rewards, and how episodes follow each other."""
+def _check_episodes(env, world, last):
+    """Rewards are finite, and episodes begin and end as they should."""
     reward, (reset, terminal, truncated) = world["reward"], (world[key] for key in FLAGS)
-    _require(env, bool(reward.isfinite().all()), "rewards are finite")
-    both, ends = terminal & truncated, terminal | truncated
+    _require(env, bool(reward.isfinite().all()), "reward must be finite")
+    both, ended = terminal & truncated, terminal | truncated
     _require(env, not bool(both.any()), "terminal and truncated exclude each other")
     _require(
-        env, not bool((reset & ends).any()), "an episode does not end at its first observation"
+        env,
+        not bool((reset & ended).any()),
+        "an episode must not end at its first observation: where reset is True, terminal and "
+        "truncated are False",
     )
-    _require(env, not bool(reward[reset].any()), "the first observation of an episode pays nothing")
-    began = torch.ones_like(reset) if last is None else last["terminal"] | last["truncated"]
     _require(
-        env, torch.equal(reset, began), "reset follows the end of an episode, and nothing else"
+        env,
+        not bool(reward[reset].any()),
+        "reward must be 0 at the first observation of an episode",
+    )
+    expected = torch.ones_like(reset) if last is None else last["terminal"] | last["truncated"]
+    _require(
+        env,
+        torch.equal(reset, expected),
+        "reset must be True after env.reset() and in the step after an episode ended, and False "
+        "otherwise",
     )
 
 
 def _check_metrics(env, world, last):
     metrics = world.get("metrics", {})
-    _require(env, isinstance(metrics, Mapping), "metrics is a dict of tensors")
+    _require(env, isinstance(metrics, Mapping), "metrics must be a dict of tensors")
     _require(
         env,
         last is None or metrics.keys() == last.get("metrics", {}).keys(),
-        "every world has the same metrics",
+        "metrics must have the same keys in every world",
     )
-    ends = world["terminal"] | world["truncated"]
+    ended = world["terminal"] | world["truncated"]
     for name, values in metrics.items():
         _require(
             env,
             _are_names([name]) and name not in RESERVED,
-            f"a metric is called by a name other than {', '.join(RESERVED)}, not {name!r}",
+            f"the name of a metric must be an identifier other than {', '.join(RESERVED)}, "
+            f"not {name!r}",
         )
-        given = (
-            f"{values.dtype} {tuple(values.shape)}"
-            if isinstance(values, torch.Tensor)
-            else repr(values)
-        )
+        _check_per_lane(env, f"metrics.{name}", values, torch.float32)
         _require(
             env,
-            _is_per_lane(env, values, torch.float32),
-            f"metric {name} has one float32 per lane, ({env.n_envs * env.n_agents},), on the "
-            f"environment's device, not {given}",
-        )
-        _require(
-            env, bool(values[ends].isfinite().all()), f"metric {name} is finite where episodes end"
+            bool(values[ended].isfinite().all()),
+            f"metrics.{name} must be finite where an episode ends",
         )
 
 
-def random_actions(env: Any, generator: torch.Generator) -> Any:
-    """Uniform actions (B, n) for an environment, drawn on the CPU by a CPU generator."""
+# ---- Stepping ----
+
+
+def random_actions(env: Env, generator: torch.Generator) -> Tree:
+    """Returns uniformly random actions, (B, ...) per leaf of the action space, on the environment's
+    device. ``generator`` is a CPU generator, so the actions are the same on every device.
+    """
+    n_lanes = env.n_envs * env.n_agents
 
     def draw(space):
-        if isinstance(space, Mapping):
-            return arrdict({key: draw(child) for key, child in space.items()})
-        lanes = env.n_envs * env.n_agents
-        actions = torch.randint(space.n_actions, (lanes, *space.shape), generator=generator)
+        actions = torch.randint(space.n_actions, (n_lanes, *space.shape), generator=generator)
         return actions.to(env.device)
 
-    return draw(env.action_space)
+    return spaces.map(draw, env.action_space)
 
 
-def rollout(env: Any, n_steps: int, seed: int = 1, check: bool = True) -> list[arrdict]:
-    """The worlds of a reset and ``n_steps`` random steps, copied; each is checked if ``check``."""
+def rollout(env: Env, n_steps: int, seed: int = 1, check: bool = True) -> list[arrdict]:
+    """Resets an environment and takes random steps. Returns copies of the ``n_steps`` + 1 worlds.
+
+    Args:
+        env: the environment.
+        n_steps: number of steps after the reset.
+        seed: of the random actions.
+        check: check the environment and every world against the contract.
+
+    Raises:
+        ContractError: if a checked world breaks a clause.
+    """
     if check:
         check_environment(env)
     generator, worlds = torch.Generator().manual_seed(seed), []
@@ -250,8 +272,7 @@ def rollout(env: Any, n_steps: int, seed: int = 1, check: bool = True) -> list[a
     return worlds
 
 
-def same(a: Any, b: Any) -> bool:
-    """Are two trees of tensors equal bit by bit?"""
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    return torch.equal(a.cpu(), b.cpu())
+def same(a: Tree, b: Tree) -> bool:
+    """Returns True if two trees of tensors have the same keys and equal bits."""
+    a, b = spaces.leaves(a), spaces.leaves(b)
+    return a.keys() == b.keys() and all(torch.equal(a[path].cpu(), b[path].cpu()) for path in a)

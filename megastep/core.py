@@ -1,4 +1,4 @@
-"""Core: scenery, agents, and the settings of their cameras, in one object."""
+"""Core: scenery, agents and camera settings in one object."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,12 +17,18 @@ __all__ = ["AGENT_RADIUS", "AGENT_WIDTH", "TEXEL", "Core", "gamma_decode", "gamm
 
 
 class Core:
-    """What an environment is built around. All attributes are public: ``scenery``, ``agents``,
-    ``n_envs``, ``n_agents``, ``device``, ``res``, ``fov``, ``fps``, ``seed``.
+    """The object that an environment is built around.
 
-    Args: ``res`` rays per camera; ``fov`` degrees; ``fps`` steps per second; ``cameras`` yaw
-    offsets in degrees, one camera ahead by default; ``seed`` of the random streams of the modules
-    built on this core.
+    Args:
+        scenery: what is rendered and collided with.
+        res: rays per camera.
+        fov: field of view in degrees.
+        fps: steps per second.
+        cameras: yaw offset of each camera in degrees. Default: one camera, straight ahead.
+        seed: default seed of the modules built on this core.
+
+    Attributes:
+        scenery, agents, n_envs, n_agents, device, res, fov, fps, seed: all public.
     """
 
     def __init__(
@@ -49,16 +55,16 @@ class Core:
         self.res, self.fov, self.fps = self.agents.res, self.agents.fov, self.agents.fps
 
     def agent_full(self, value: Any) -> torch.Tensor:
-        """An (N, A) tensor of ``value`` on the device; bools stay bools, ints ints."""
+        """Returns an (N, A) tensor filled with ``value``, of the dtype that suits it."""
         return torch.full((self.n_envs, self.n_agents), value, device=self.device)
 
     def env_full(self, value: Any) -> torch.Tensor:
-        """An (N,) tensor of ``value`` on the device."""
+        """Returns an (N,) tensor filled with ``value``, of the dtype that suits it."""
         return torch.full((self.n_envs,), value, device=self.device)
 
     def state(self, e: int = 0) -> arrdict:
-        """Environment ``e`` as :meth:`plot_state` draws it, in tensors: its lines, their lit texels
-        end to end, lights, and where the agents stand and look.
+        """Returns environment ``e`` for :meth:`plot_state`: lines, lit texels, lights, agents'
+        poses.
         """
         engine.update_agent_geometry(self.scenery, self.agents)
         lines, colours, lights = self.scenery.env(e)
@@ -77,11 +83,16 @@ class Core:
 
     @staticmethod
     def plot_state(state: dict, ax: Any = None, seen: Any = None, distances: Any = None) -> Any:
-        """Draws a numpyified :meth:`state` from above, with each camera's field of view; several
-        agents are numbered. Returns the axes.
+        """Draws a numpyified :meth:`state` from above, with each camera's field of view.
 
-        Args: ``seen`` (T,) bools, dims static texels that are False; ``distances`` (A, C, R)
-        metres, to draw what is in view instead of a wedge.
+        Args:
+            state: from :meth:`state`, as numpy arrays.
+            ax: matplotlib axes to draw on. Default: new ones.
+            seen: (T,) bool; static texels that are False are dimmed.
+            distances: (A, C, R) metres; draws what each camera sees instead of a wedge.
+
+        Returns:
+            The axes.
         """
         from megastep import plotting
 

@@ -1,9 +1,7 @@
-"""Floor plans under the name of the database that the original megastep took its own from:
-``cubicasa.sample(64)``.
+"""Floor plans by the name that the original megastep has for them: ``cubicasa.sample(64)``.
 
-CubiCasa5k's licence (CC BY-NC) keeps it out of this package. These are the homes of
-:mod:`megastep.geometries.homes` instead: as many, and generated to have the statistics measured on
-it.
+The original used CubiCasa5k, whose licence (CC BY-NC) keeps it out of this package. This returns
+the homes of :mod:`megastep.geometries.homes` instead: as many, generated to match its statistics.
 """
 
 from megastep.dotdict import dotdict
@@ -13,5 +11,5 @@ __all__ = ["sample"]
 
 
 def sample(n_geometries: int, split: str = "training", seed: int = 1) -> list[dotdict]:
-    """``n_geometries`` homes, a list of geometries. ``split`` is training, test or all."""
+    """Returns a list of homes. Arguments are those of :func:`megastep.geometries.sample`."""
     return _sample("homes", n_geometries, split, seed)

@@ -1,8 +1,7 @@
-"""The engine under the name that tutorials use: everything in :mod:`megastep.engine`, and
+"""The engine under its historical name: everything in :mod:`megastep.engine`, and
 :class:`~megastep.core.Core`.
 
-The name is historical. The tensors' device decides where the work is done, so this runs without a
-GPU too.
+Tutorials use this name. It needs no GPU: operations run on the device of their tensors.
 """
 
 from megastep import engine

@@ -1,7 +1,6 @@
-"""Dictionaries with attribute access whose unknown attributes are looked up on their values.
+"""Dictionaries with attribute access, which look up unknown attributes on their values.
 
-A *tree* is a dict of dicts of ... of leaves; a leaf is anything that is not a dict. Nothing here
-needs torch.
+A *tree* is a nested dict; a leaf is anything that is not a dict. This file does not import torch.
 """
 
 import difflib
@@ -13,16 +12,15 @@ __all__ = ["dotdict", "leaves", "mapping"]
 
 _INDENT = 4
 _WIDTH = 120
-_MAX_AXES = 8  # a tuple of more integers is data, not a shape
+_MAX_AXES = 8  # a tuple of more integers is printed as data, not as a shape
 
 
 class dotdict(dict):
     """A dict whose items are also attributes: ``d.k`` reads ``d['k']``; assign with ``d['k'] = v``.
 
-    An attribute that is neither a method nor a key is looked up on every value, and the answers
-    come back in a tree with the same keys. That tree can be called, which calls every leaf:
-    ``d.cuda()`` moves a tree of tensors to the GPU. Methods come before keys, keys before the
-    values' attributes. A leading underscore is never forwarded.
+    An attribute that is neither a method nor a key is looked up on every value. The results come
+    back as a tree with the same keys. Calling a tree calls every leaf, so ``d.cuda()`` moves a tree
+    of tensors to the GPU. Names that start with an underscore are not looked up on values.
     """
 
     __slots__ = ()
@@ -33,23 +31,23 @@ class dotdict(dict):
         if name.startswith("_"):
             raise AttributeError(_absent(self, name))
         try:
-            found = {key: _attribute(value, name) for key, value in self.items()}
+            attributes = {key: _attribute(value, name) for key, value in self.items()}
         except _Missing as missing:
             raise AttributeError(_absent(self, name, missing.leaf)) from None
         if not leaves(self):
             raise AttributeError(_absent(self, name))
-        return type(self)(found)
+        return type(self)(attributes)
 
     def __setattr__(self, name, value):
         raise AttributeError(
-            f"{type(self).__name__}s are assigned by key: write d['{name}'] = ..., not d.{name} = "
-            f"..."
+            f"a {type(self).__name__} is assigned by key: write d['{name}'] = ..., not "
+            f"d.{name} = ..."
         )
 
     def __delattr__(self, name):
         raise AttributeError(
-            f"{type(self).__name__}s are deleted from by key: write del d['{name}'], not del "
-            f"d.{name}"
+            f"a {type(self).__name__}'s items are deleted by key: write del d['{name}'], not "
+            f"del d.{name}"
         )
 
     def __missing__(self, key):
@@ -59,7 +57,7 @@ class dotdict(dict):
         return [*super().__dir__(), *(key for key in self if isinstance(key, str))]
 
     def __call__(self, *args, **kwargs):
-        """Calls every leaf with these arguments; returns the tree of results."""
+        """Calls every leaf with these arguments. Returns the tree of results."""
         return self.map(lambda leaf: leaf(*args, **kwargs))
 
     def __or__(self, other):
@@ -69,20 +67,22 @@ class dotdict(dict):
         return type(self)({**other, **self}) if isinstance(other, dict) else NotImplemented
 
     def copy(self) -> "dotdict":
-        """A new tree of the same type holding the same values."""
+        """Returns a new tree of the same type with the same values."""
         return type(self)(self)
 
     def pipe(self, f: Callable, *args, **kwargs) -> Any:
-        """``f(self, ...)``, for calls that read from left to right."""
+        """Returns ``f(self, ...)``, for chains that read from left to right."""
         return f(self, *args, **kwargs)
 
     def map(self, f: Callable, *args, **kwargs) -> "dotdict":
-        """``f(leaf, ...)`` at every leaf."""
+        """Returns the tree of ``f(leaf, ...)``."""
         return _map(lambda leaf: f(leaf, *args, **kwargs), self)
 
     def starmap(self, f: Callable, *others: dict, **kwargs) -> "dotdict":
-        """``f(leaf, other leaf, ...)`` at every leaf, the others being trees with the same keys
-        (ValueError if not).
+        """Returns the tree of ``f(leaf, other_leaf, ...)``.
+
+        Raises:
+            ValueError: if the trees in ``others`` do not have the same keys.
         """
         return _map(functools.partial(f, **kwargs), self, *others)
 
@@ -94,15 +94,15 @@ class dotdict(dict):
 
 
 def leaves(tree: Any) -> list:
-    """The leaves of a tree in order, as a list; a bare leaf is its own only one."""
+    """Returns the list of a tree's leaves in order. A value that is no dict is its own leaf."""
     if isinstance(tree, dict):
         return [leaf for value in tree.values() for leaf in leaves(value)]
     return [tree]
 
 
 def mapping(f: Callable) -> Callable:
-    """Turns ``f(leaf, ...)`` into a function of trees that keeps keys and types. Bare leaves go
-    straight to ``f``.
+    """Decorates a function of a leaf, ``f(leaf, ...)``, to take trees and to keep their keys and
+    types.
     """
 
     @functools.wraps(f)
@@ -125,8 +125,7 @@ def _map(f, tree, *others):
 def _check_keys(tree, other):
     if not isinstance(other, dict):
         raise ValueError(
-            f"a tree with keys {_names(tree)} was matched with one value of type "
-            f"{type(other).__name__}"
+            f"a tree with keys {_names(tree)} needs another tree, but got a {type(other).__name__}"
         )
     if tree.keys() != other.keys():
         raise ValueError(
@@ -141,7 +140,7 @@ class _Missing(Exception):
 
 
 def _attribute(value, name):
-    """``value.name``, or for a dict its item of that name, or else the tree of its values'
+    """Returns ``value.name``. For a dict, returns its item of that name, or the tree of its values'
     attributes.
     """
     if isinstance(value, dict):
@@ -159,34 +158,32 @@ def _names(tree):
 
 
 def _listing(tree, key):
-    near = difflib.get_close_matches(str(key), map(str, tree), n=1)
-    return f"its keys are {_names(tree)}" + (f" (did you mean '{near[0]}'?)" if near else "")
+    nearest = difflib.get_close_matches(str(key), map(str, tree), n=1)
+    hint = f" (did you mean '{nearest[0]}'?)" if nearest else ""
+    return f"its keys are {_names(tree)}{hint}"
 
 
 def _absent(tree, name, leaf=None):
-    values = (
-        "" if leaf is None else f", nor an attribute of its values (type {type(leaf).__name__})"
-    )
+    values = "" if leaf is None else f" or an attribute of its values (type {type(leaf).__name__})"
     return f"'{name}' is not a key of this {type(tree).__name__}{values}; {_listing(tree, name)}"
 
 
 def _rows(tree):
-    """One line an item: the key, a gap, and the value; a tree's own items are indented to start
-    under its name.
+    """Yields one line per item, the key and the value. The items of a nested tree are indented to
+    below its name.
     """
     column = max((len(str(key)) for key in tree), default=0) + _INDENT
     for key, value in tree.items():
-        nested = isinstance(value, dict)
-        yield f"{key!s:<{column}}" + (
-            f"{type(value).__name__}:" if nested else _summary(value, column)
-        )
-        if nested:
+        if isinstance(value, dict):
+            yield f"{key!s:<{column}}{type(value).__name__}:"
             yield from (" " * column + row for row in _rows(value))
+        else:
+            yield f"{key!s:<{column}}{_summary(value, column)}"
 
 
 def _summary(value, column):
-    """A leaf in one line: arrays by shape and dtype, shapes in full, other collections by their
-    length, the rest by their text.
+    """Returns one line for a leaf: shape and dtype of an array, a shape in full, the length of
+    another collection, or the text of any other value.
     """
     name = type(value).__name__
     if hasattr(value, "shape") and hasattr(value, "dtype"):
@@ -196,8 +193,8 @@ def _summary(value, column):
     if isinstance(value, (list, tuple, set, frozenset)):
         return f"{name}(({len(value)},))"
     text = " ".join(str(value).split())
-    room = max(_WIDTH - column, 16)
-    return text if len(text) <= room else f"{text[: room - 3]}..."
+    width = max(_WIDTH - column, 16)
+    return text if len(text) <= width else f"{text[: width - 3]}..."
 
 
 def _is_shape(value):

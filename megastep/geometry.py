@@ -1,18 +1,16 @@
-"""What a geometry is: the walls, lights and rooms of one floor plan, as a dotdict of numpy
-arrays.
+"""Geometries: the walls, lights and rooms of one floor plan, as a dotdict of numpy arrays.
 
 | key | value |
 | --- | --- |
-| `id` | an integer of its own |
-| `walls` | (M, 2, 2) float32, the (x, y) endpoints of M walls in metres, all coordinates strictly
-positive |
-| `lights` | (K, 2) float32, the (x, y) of K lights in metres, strictly positive too |
-| `masks` | (H, W) int16 over square cells: -1 where a wall touches, else the room's number 1, 2,
-..., else 0 |
+| `id` | an integer |
+| `walls` | (M, 2, 2) float32, (x, y) endpoints of M walls in metres, above 0 |
+| `lights` | (K, 2) float32, (x, y) of K lights in metres, above 0 |
+| `masks` | (H, W) int16 over square cells: -1 where a wall touches the cell, else the number of its
+room (1, 2, ...), else 0 |
 | `res` | the side of a cell in metres |
 
-The masks' lower-left corner is at (0, 0) and row 0 is at the top. Further keys are welcome. `shape`
-below is always the (H, W) of the masks, and an index an (i, j) pair of row and column.
+The lower-left corner of the masks is at (0, 0); row 0 is at the top. Further keys are allowed. In
+this file `shape` is the (H, W) of the masks, and an index is an (i, j) pair of row and column.
 """
 
 import hashlib
@@ -22,60 +20,58 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["centers", "checked", "display", "hashed", "indices", "masks"]
+from megastep.dotdict import dotdict
 
-# Metres per cell; the original's, coarse enough to be cheap and fine enough for a 0.6 m door.
+__all__ = ["centers", "display", "hashed", "indices", "masks", "validate_geometry"]
+
+# Metres per cell, as in the original: coarse enough to be cheap, fine enough for a 0.6 m door.
 RES = 0.2
-MARGIN = 1.0  # metres of free cells kept beyond the furthest wall
-MAX_EXTENT = 200.0  # metres; 1,000 x 1,000 cells of the usual side
-MAX_WALLS = 32_768  # some 150 times a dense home
+MARGIN = 1.0  # metres of free cells beyond the furthest wall
+MAX_EXTENT = 200.0  # metres; 1,000 x 1,000 cells of the default size
+MAX_WALLS = 32_768  # about 150 times a dense home
 MAX_LIGHTS = 4_096
 MAX_CELLS = 4_000_000  # 8 MB of masks
-MAX_ROOMS = 32_767  # what int16 numbers
+MAX_ROOMS = 32_767  # the largest int16
 
-# cells; a wall this near to a cell's edge touches the cell: float32 is good to 1e-5 m at 200 m
+# Cells. A wall this close to a cell's edge touches it; float32 is exact to 1e-5 m at 200 m.
 TOLERANCE = 1e-4
 # numpy's kinds of dtype, in words
 NUMBERS = {"iuf": "numbers", "iu": "integers", "iub": "integers"}
-CHUNK = 1_024  # walls rasterised at a time, which bounds the memory at some 100 MB
+CHUNK = 1_024  # walls rasterised at a time, to use at most about 100 MB of memory
 
 
 def centers(indices: ArrayLike, shape: tuple[int, int], res: float = RES) -> np.ndarray:
-    """The (x, y) centres in metres, (..., 2) float32, of the cells at `indices`, (..., 2) of (i,
-    j).
-    """
+    """Returns the centres of cells: (x, y) in metres, (..., 2) float32, for (i, j), (..., 2)."""
     indices = np.asarray(indices)
     i, j = indices[..., 0], indices[..., 1]
     return (np.stack([j + 0.5, shape[0] - i - 0.5], -1) * res).astype(np.float32)
 
 
 def indices(coords: ArrayLike, shape: tuple[int, int], res: float = RES) -> np.ndarray:
-    """The (i, j) indices, (..., 2) int64, of the cells that hold the points `coords`, (..., 2) of
-    (x, y) in metres.
+    """Returns the cells of points: (i, j), (..., 2) int64, for (x, y) in metres, (..., 2).
 
-    The inverse of `centers`. Points outside of the masks give indices outside of `shape`.
+    The inverse of `centers`. Points outside the masks give indices outside `shape`.
     """
     cells = np.floor(np.asarray(coords, np.float64) / res).astype(np.int64)
     return np.stack([shape[0] - 1 - cells[..., 1], cells[..., 0]], -1)
 
 
 def _runs(lows, highs):
-    """Every integer of every closed range low..high (vectors of ints), and the number of the range
-    each comes from.
+    """Returns (the number of the range, the integer) for each integer of the closed ranges
+    low..high, given as vectors of integers.
     """
     counts = np.maximum(highs - lows + 1, 0)
-    which = np.repeat(np.arange(len(lows)), counts)
-    return which, np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts) + lows[
-        which
-    ]
+    ranges = np.repeat(np.arange(len(lows)), counts)
+    offsets = np.arange(len(ranges)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return ranges, offsets + lows[ranges]
 
 
 def _touched(walls, shape):
-    """Cells, bool (H, W) with row 0 at the *bottom*, that some wall touches; walls (M, 2, 2) in
-    units of cells.
+    """Returns the cells that a wall touches, (H, W) bool with row 0 at the *bottom*. Walls
+    (M, 2, 2) are in units of cells.
 
-    Each wall is cut into the rows it crosses; the piece inside a row covers a run of columns,
-    marked by its two ends.
+    Each wall is cut into the rows that it crosses. The piece in a row covers a run of columns; the
+    ends of the runs are counted and summed up along the row.
     """
     height, width = shape
     starts = np.take_along_axis(walls, walls[..., 1:].argsort(1), 1)  # lower end first
@@ -100,8 +96,8 @@ def _touched(walls, shape):
 
 
 def _inside(rings, shape):
-    """Cells, bool (H, W) with row 0 at the bottom, whose centre an odd number of rings encloses;
-    units of cells.
+    """Returns the cells whose centre an odd number of rings encloses, (H, W) bool with row 0 at the
+    bottom. Rings (P, 2) are in units of cells.
     """
     height, width = shape
     edges = np.concatenate([np.stack([ring, np.roll(ring, -1, 0)], 1) for ring in rings])
@@ -120,18 +116,25 @@ def _inside(rings, shape):
 
 
 def masks(walls: ArrayLike, rooms: Sequence[Any], res: float = RES) -> np.ndarray:
-    """The (H, W) int16 masks of a geometry.
+    """Returns the masks of a geometry, (H, W) int16.
 
-    `walls` is (M, 2, 2) in metres. Each of `rooms` is a polygon, (P, 2) in metres, or a list of
-    them of which the further ones are holes; the first room is number 1, and where rooms overlap
-    the later one wins. A room holds the cells whose centre is in it; walls take every cell they
-    touch, its edge included. Raises ValueError beyond 200 m.
+    A room holds the cells whose centre it contains. Walls take every cell that they touch, even at
+    its edge. Where rooms overlap, the later one wins.
+
+    Args:
+        walls: (M, 2, 2) metres.
+        rooms: a polygon (P, 2) in metres per room, or a list of polygons of which all but the first
+            are holes. The first room is number 1.
+        res: the side of a cell in metres.
+
+    Raises:
+        ValueError: if a wall reaches beyond 200 m.
     """
     walls = np.asarray(walls, np.float64).reshape(-1, 2, 2)
     extent = walls.reshape(-1, 2).max(0) if len(walls) else np.zeros(2)
     if not extent.max() <= MAX_EXTENT:
         raise ValueError(
-            f"walls reach {extent.max():g} m, and {MAX_EXTENT:g} m is the limit; check their unit"
+            f"walls reach {extent.max():g} m, but the limit is {MAX_EXTENT:g} m; check the unit"
         )
     width, height = np.ceil((extent + MARGIN) / res - TOLERANCE).astype(int)
 
@@ -147,74 +150,76 @@ def masks(walls: ArrayLike, rooms: Sequence[Any], res: float = RES) -> np.ndarra
 
 
 def _array(g, key, kinds, shape):
-    """Entry `key` of a geometry as an array of one of the numpy `kinds` and of `shape`, where None
-    is any length.
+    """Returns entry `key` of a geometry as an array. It must be of one of numpy's `kinds` and of
+    `shape`, in which None stands for any length.
     """
     if key not in g:
         raise ValueError(f"has no '{key}'")
     value = np.asarray(g[key])
     if value.dtype.kind not in kinds:
-        raise ValueError(f"'{key}' is of dtype {value.dtype}, and {NUMBERS[kinds]} were expected")
+        raise ValueError(f"'{key}' must hold {NUMBERS[kinds]}, but is of dtype {value.dtype}")
     if value.ndim != len(shape) or any(
-        want is not None and have != want for have, want in zip(value.shape, shape)
+        size not in (None, actual) for size, actual in zip(shape, value.shape)
     ):
-        wanted = ", ".join("n" if want is None else str(want) for want in shape)
-        raise ValueError(f"'{key}' has shape {value.shape}, and ({wanted}) was expected")
+        sizes = ", ".join("n" if size is None else str(size) for size in shape)
+        raise ValueError(f"'{key}' must be of shape ({sizes}), but is of shape {value.shape}")
     return value
 
 
 def _coordinates(g, key, shape, limit):
-    """Points of a geometry as float32: finite, strictly positive, within the extent, at most
-    `limit` rows of them.
+    """Returns points of a geometry as float32. They must be finite, above 0, within the extent, and
+    at most `limit`.
     """
     points = _array(g, key, "iuf", shape)
     if len(points) > limit:
-        raise ValueError(f"has {len(points):,} {key}, and the limit is {limit:,}")
+        raise ValueError(f"has {len(points):,} {key}, but the limit is {limit:,}")
     points = points.astype(np.float32)
     if not np.isfinite(points).all():
-        raise ValueError(f"'{key}' holds a number that is not finite")
+        raise ValueError(f"'{key}' holds a NaN or infinity")
     if not (points > 0).all():
         raise ValueError(
-            f"'{key}' reaches down to {points.min():g} m, and above 0 is allowed; shift the "
-            f"geometry"
+            f"'{key}' must be above 0, but reaches down to {points.min():g} m; shift the geometry"
         )
     if not (points <= MAX_EXTENT).all():
         raise ValueError(
-            f"'{key}' reaches up to {points.max():g} m, and the limit is {MAX_EXTENT:g} m; check "
+            f"'{key}' reaches up to {points.max():g} m, but the limit is {MAX_EXTENT:g} m; check "
             f"the unit"
         )
     return points
 
 
-def checked(g: dict) -> Any:
-    """A copy of geometry `g` with the documented dtypes and without walls of no length.
+def validate_geometry(g: dict) -> dict:
+    """Returns a copy of a geometry with the documented dtypes and without walls of length 0.
 
-    Raises ValueError, saying what is wrong and what is allowed, unless it is finite, positive, has
-    a wall and a room, and respects the limits at the head of this file.
+    Raises:
+        ValueError: if a number is not finite or not above 0, if there is no wall or no room, or if
+            the geometry exceeds a limit at the head of this file.
     """
     walls = _coordinates(g, "walls", (None, 2, 2), MAX_WALLS)
     walls = walls[(walls[:, 0] != walls[:, 1]).any(-1)]
     if not len(walls):
-        raise ValueError("has no wall of any length")
+        raise ValueError("has no wall longer than 0")
     lights = _coordinates(g, "lights", (None, 2), MAX_LIGHTS)
     cells = _array(g, "masks", "iub", (None, None))
     if cells.size > MAX_CELLS:
-        raise ValueError(f"has masks of {cells.size:,} cells, and the limit is {MAX_CELLS:,}")
+        raise ValueError(f"has masks of {cells.size:,} cells, but the limit is {MAX_CELLS:,}")
     if not (cells > 0).any():
         raise ValueError("has no room: no cell of 'masks' is above 0")
     if cells.min() < -1 or cells.max() > MAX_ROOMS:
         raise ValueError(
-            f"'masks' holds {cells.min()} to {cells.max()}, and -1 to {MAX_ROOMS:,} is allowed"
+            f"'masks' must be from -1 to {MAX_ROOMS:,}, but is from {cells.min()} to {cells.max()}"
         )
     res = float(_array(g, "res", "iuf", ()))
     if not 0.01 <= res <= 10:
-        raise ValueError(f"'res' is {res:g} m per cell, and 0.01 to 10 is allowed")
+        raise ValueError(f"'res' must be from 0.01 to 10 m per cell, but is {res:g}")
     number = int(_array(g, "id", "iu", ()))
     return type(g)(g, id=number, walls=walls, lights=lights, masks=cells.astype(np.int16), res=res)
 
 
-def hashed(geometries: Sequence[Any]) -> Any:
-    """A SHA-256, to be updated further, of the walls and rooms of geometries."""
+def hashed(geometries: Sequence[dotdict]) -> "hashlib._Hash":
+    """Returns a SHA-256 hash object of the walls and rooms of geometries. It can be updated
+    further.
+    """
     key = hashlib.sha256()
     for g in geometries:
         for array in (g.walls, g.masks, np.asarray(g.res)):
@@ -222,8 +227,8 @@ def hashed(geometries: Sequence[Any]) -> Any:
     return key
 
 
-def display(g: Any, ax: Any = None) -> Any:
-    """Draws the plan of geometry `g`: rooms tinted, walls black, lights yellow. Returns the
+def display(g: dotdict, ax: Any = None) -> Any:
+    """Draws the floor plan of a geometry: rooms tinted, walls black, lights yellow. Returns the
     matplotlib axes.
     """
     from matplotlib import collections, pyplot

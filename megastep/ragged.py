@@ -1,4 +1,4 @@
-"""Arrays of arrays: subarrays of different lengths laid end to end in one backing array.
+"""Arrays of subarrays of different lengths, laid end to end in one backing array.
 
 ``Ragged(vals, widths)`` makes a RaggedTorch of a tensor and a RaggedNumpy of anything else::
 
@@ -21,11 +21,17 @@ Array = np.ndarray | torch.Tensor
 
 
 class Ragged(SetOnce):
-    """``vals`` (V, ...) cut along its first axis into D subarrays of ``widths`` (D,) elements each.
+    """D subarrays of ``widths`` elements each, laid end to end in ``vals``.
 
-    An integer index gives a subarray, a slice gives a Ragged; both share memory with ``vals``,
-    except slices with a step. ``vals`` may be written in place, not replaced. ``widths`` must be
-    integers, none negative, that add up to V (ValueError if not), and become int64.
+    An integer index returns a subarray, a slice returns a Ragged. Both share memory with ``vals``,
+    except for slices with a step. Write into ``vals`` in place; it cannot be replaced.
+
+    Args:
+        vals: (V, ...) backing array.
+        widths: (D,) integers, not negative, that add up to V. They become int64.
+
+    Raises:
+        ValueError: if ``widths`` does not fit.
     """
 
     def __new__(cls, *args):
@@ -41,7 +47,7 @@ class Ragged(SetOnce):
 
     @cached_property
     def ends(self) -> Array:
-        """(D,) index into ``vals`` one past each subarray's last element."""
+        """(D,) index into ``vals`` after each subarray's last element."""
         return self.widths.cumsum(0)
 
     @cached_property
@@ -51,7 +57,7 @@ class Ragged(SetOnce):
 
     @cached_property
     def _host(self):
-        """Starts and ends as lists, so that indexing synchronises with the device only once."""
+        """Starts and ends as lists, so that only the first indexing synchronises."""
         return self.starts.tolist(), self.ends.tolist()
 
     def __len__(self):
@@ -60,23 +66,23 @@ class Ragged(SetOnce):
     def __getitem__(self, index: int | slice) -> "Array | Ragged":
         starts, ends = self._host
         if isinstance(index, slice):
-            chosen = range(len(self))[index]
-            if not chosen:
+            selected = range(len(self))[index]
+            if not selected:
                 return Ragged(self.vals[:0], self.widths[:0])
-            if chosen.step == 1:
+            if selected.step == 1:
                 return Ragged(
-                    self.vals[starts[chosen[0]] : ends[chosen[-1]]],
-                    self.widths[chosen.start : chosen.stop],
+                    self.vals[starts[selected[0]] : ends[selected[-1]]],
+                    self.widths[selected.start : selected.stop],
                 )
             return Ragged(
-                self._cat([self.vals[starts[i] : ends[i]] for i in chosen]),
-                self.widths[list(chosen)],
+                self._cat([self.vals[starts[i] : ends[i]] for i in selected]),
+                self.widths[list(selected)],
             )
         i = self._index(index)
         return self.vals[starts[i] : ends[i]]
 
     def _index(self, index):
-        """A subarray's number from 0 on."""
+        """Returns a subarray's index from 0 up."""
         try:
             i = operator.index(index)
         except TypeError:
@@ -114,7 +120,7 @@ class RaggedNumpy(Ragged):
         return np.repeat(np.arange(len(self)), self.widths)
 
     def torchify(self) -> "RaggedTorch":
-        """The same Ragged on CPU tensors; float64 becomes float32."""
+        """Returns the same Ragged on CPU tensors. float64 becomes float32."""
         vals = self.vals.astype(np.float32) if self.vals.dtype == np.float64 else self.vals
         return Ragged(torch.as_tensor(vals), torch.as_tensor(self.widths))
 
@@ -123,7 +129,7 @@ class RaggedNumpy(Ragged):
 
 
 class RaggedTorch(Ragged):
-    """A Ragged of tensors, all on the device of ``vals``."""
+    """A Ragged of tensors on the device of ``vals``."""
 
     _asarray = staticmethod(torch.as_tensor)
     _cat = staticmethod(torch.cat)
@@ -149,7 +155,7 @@ class RaggedTorch(Ragged):
         return self
 
     def numpyify(self) -> RaggedNumpy:
-        """The same Ragged on numpy arrays."""
+        """Returns the same Ragged on numpy arrays. bfloat16 becomes float32."""
         vals = self.vals.detach().cpu()
         return Ragged(
             (vals.float() if vals.dtype == torch.bfloat16 else vals).numpy(),
@@ -157,7 +163,7 @@ class RaggedTorch(Ragged):
         )
 
     def to(self, *args, **kwargs) -> "RaggedTorch":
-        """``vals.to(...)`` and the widths on the same device."""
+        """Returns a Ragged of ``vals.to(...)``, with the widths on the same device."""
         vals = self.vals.to(*args, **kwargs)
         return Ragged(vals, self.widths.to(vals.device))
 
@@ -173,18 +179,13 @@ class RaggedTorch(Ragged):
 
 def _check(vals, widths):
     if vals.ndim == 0:
-        raise ValueError(
-            "the vals of a Ragged need at least one axis, but a single number was given"
-        )
+        raise ValueError("the vals of a Ragged need at least one axis, but are a single number")
     if widths.ndim != 1:
         raise ValueError(
-            f"the widths of a Ragged need exactly one axis, but theirs have shape "
-            f"{tuple(widths.shape)}"
+            f"the widths of a Ragged need exactly one axis, but have shape {tuple(widths.shape)}"
         )
     if not _are_integers(widths):
-        raise ValueError(
-            f"the widths of a Ragged must be integers, but their dtype is {widths.dtype}"
-        )
+        raise ValueError(f"the widths of a Ragged must be integers, but are {widths.dtype}")
     listed = np.array(widths.tolist(), int)
     if (listed < 0).any():
         i = int(listed.argmin())
@@ -193,8 +194,8 @@ def _check(vals, widths):
         )
     if listed.sum() != len(vals):
         raise ValueError(
-            f"the widths of a Ragged must add up to the length of its vals, but they add up to "
-            f"{listed.sum()} and there are {len(vals)} vals"
+            f"the widths of a Ragged must add up to its {len(vals)} vals, but add up to "
+            f"{listed.sum()}"
         )
 
 

@@ -1,4 +1,4 @@
-"""What may be read, but not written or replaced."""
+"""Read-only tensors, and objects whose attributes cannot be replaced."""
 
 from typing import Any
 
@@ -12,9 +12,12 @@ _WRITING = ("__setitem__", "__delitem__", "__set__", "__delete__")
 
 
 class ReadOnlyTensor(torch.Tensor):
-    """A tensor that raises ValueError, with the sentence it was given, at any operation that would
-    write into it or into a view of it. What is calculated from it is a plain tensor, and
-    ``numpy()`` a read-only array.
+    """A tensor that cannot be written, nor can its views. Results of operations are plain tensors;
+    ``numpy()`` returns a read-only array.
+
+    Args:
+        tensor: the tensor to protect.
+        refusal: message of the ValueError that a write raises.
     """
 
     def __new__(cls, tensor: torch.Tensor, refusal: str):
@@ -46,30 +49,35 @@ class ReadOnlyTensor(torch.Tensor):
             out.setflags(write=False)
         return out if isinstance(out, torch.Size) else tree_map_only(torch.Tensor, guarded, out)
 
-    def set_(self, *args, **kwargs):  # alone of its kind, it does not pass through the above
+    def set_(self, *args, **kwargs):  # the one method that skips __torch_function__
         raise ValueError(self.refusal)
 
 
 def _writes(name):
-    """Whether PyTorch's function of this name writes into its first argument: add_, __iadd__."""
+    """Returns True if the PyTorch function of this name, such as add_ or __iadd__, writes into its
+    first argument.
+    """
     in_place = name.endswith("_") and not name.endswith("__")
     return in_place or name in _WRITING or name.startswith("__i") and name not in _READING
 
 
-# What begins as in-place operators do, but reads.
+# Names that start like in-place operators, but only read.
 _READING = ("__index__", "__int__", "__invert__", "__init__", "__init_subclass__", "__iter__")
 
 
 class SetOnce:
-    """An object whose attributes are set once and then written in place, never replaced: the
-    engine and recorded CUDA graphs hold their addresses. AttributeError, naming the attribute.
+    """An object whose attributes are set once. Tensors may be written in place but not replaced,
+    because the engine and CUDA graphs hold their addresses.
+
+    Raises:
+        AttributeError: if an attribute is replaced or deleted.
     """
 
     _replaceable: tuple[str, ...] = ()
 
     def __setattr__(self, name: str, value: Any) -> None:
-        held = self.__dict__.get(name, value)
-        if held is not value and name not in self._replaceable:
+        current = self.__dict__.get(name, value)
+        if current is not value and name not in self._replaceable:
             raise AttributeError(self._refusal(name))
         super().__setattr__(name, value)
 
@@ -80,4 +88,4 @@ class SetOnce:
         kind = type(self).__name__
         if isinstance(self.__dict__.get(name), torch.Tensor):
             return f"{name} of a {kind} cannot be replaced: write into it, .{name}[...] = ..."
-        return f"{name} of a {kind} is set when it is made: make another {kind}"
+        return f"{name} of a {kind} cannot be changed: make another {kind}"

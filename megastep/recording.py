@@ -1,4 +1,4 @@
-"""Videos of environments: figures drawn in worker processes, encoded as they come.
+"""Records videos of environments. Worker processes draw the frames in parallel.
 
 ::
 
@@ -10,48 +10,55 @@
     encoder.save('video.mp4')
 """
 
+from __future__ import annotations
+
 import base64
 import collections
 import contextlib
 import functools
 import inspect
-import io
 import os
 import pathlib
 import signal
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable
-from fractions import Fraction
-from typing import Any
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from megastep import workers
 from megastep.arrdict import clone, numpyify
+from megastep.types import Tree
+from megastep.video import Mp4Writer, as_image
+
+if TYPE_CHECKING:
+    from IPython.display import HTML
 
 __all__ = ["ParallelEncoder", "draw"]
 
-MAX_WORKERS = 8  # some 80 figures per second; each has torch in memory, about half a gigabyte
-# x264's constant rate factor: 18 looks lossless, 23 is its default, thin coloured lines need more
-QUALITY = "20"
+MAX_WORKERS = 8  # about 80 figures per second; each imports torch, about half a gigabyte of memory
 
 
 class ParallelEncoder:
-    """Turns states into frames and frames into a video, in the order in which they were given.
+    """Draws states as frames of a video, in the order in which they are given.
+
+    Inside its ``with`` block, call it with a state, or :meth:`frame` with a finished image. After
+    the block, use :meth:`save` or :meth:`notebook`.
 
     Args:
         plot_state: takes a numpyified state, returns a matplotlib figure or an (H, W, 3) uint8
             array. Functions, classmethods and staticmethods run in worker processes. A method of an
-            object would drag the object along, so it is called in this process, with a warning.
+            object runs in this process, with a warning, because the whole object would have to be
+            sent to the workers.
         fps: frames per second of the video.
-        n_workers: how many processes draw; by default as many as there are cores, 8 at most.
+        n_workers: number of worker processes; by default one per core, at most 8.
 
-    Inside its ``with`` block, call it with a state, or :meth:`frame` with a finished image; after
-    the block, use :meth:`save` or :meth:`notebook`. RuntimeError, from any of them, names the first
-    frame that could not be drawn; KeyboardInterrupt and its like pass as they are.
+    Raises:
+        RuntimeError: a frame could not be drawn; names the first such frame. Raised by any method.
     """
 
     def __init__(self, plot_state: Callable, fps: float = 20, n_workers: int | None = None):
@@ -61,51 +68,51 @@ class ParallelEncoder:
             )
         if n_workers is not None and n_workers < 1:
             raise ValueError(f"n_workers must be at least 1, but {n_workers} was given")
-        self._plot_state, self._payload = plot_state, _payload(plot_state)
+        self._plot_state, self._pickled_plot_state = plot_state, _pickled(plot_state)
         self._fps, self._n_workers = fps, n_workers
-        self._pool = self._video = self._bytes = None
-        self._pending = collections.deque()  # (number, future or array), oldest first
+        self._pool = self._writer = self._bytes = None
+        self._pending = collections.deque()  # (frame number, image or future), oldest first
 
-    def __enter__(self) -> "ParallelEncoder":
-        self._video, self._bytes, self._n_frames = _Video(self._fps), None, 0
+    def __enter__(self) -> ParallelEncoder:
+        self._writer, self._bytes, self._n_frames = Mp4Writer(self._fps), None, 0
         return self
 
-    def __call__(self, state: Any) -> None:
-        """Draws a tree of tensors or arrays as the next frame; it is copied, so it may change
-        afterwards.
-        """
+    def __call__(self, state: Tree) -> None:
+        """Draws a state, a tree of tensors or arrays, as the next frame. The state is copied."""
         self._check_open()
         state = numpyify(clone(state))
-        if self._payload is None:
-            with _named(self._n_frames):
+        if self._pickled_plot_state is None:
+            with _frame_errors(self._n_frames):
                 self._add(draw(self._plot_state, state))
         else:
-            with _keep_from_terminal():
-                drawn = self._workers().submit(_draw_payload, self._payload, state)
-            self._add(drawn)
+            with _terminal_signals_blocked():
+                future = self._workers().submit(_draw_pickled, self._pickled_plot_state, state)
+            self._add(future)
 
     def frame(self, array: ArrayLike) -> None:
-        """Adds an image as the next frame: (H, W, 3), uint8 or floats from 0 to 1, of the same
-        size as the others.
+        """Adds an image as the next frame: (H, W, 3), uint8 or floats in [0, 1].
+
+        All frames must have the same size.
         """
         self._check_open()
-        self._add(_image(array))
+        self._add(as_image(array))
 
     def __exit__(self, kind, error, trace):
         try:
             if kind is None:
-                self._drain(0)
-                self._bytes = self._video.close()
+                self._encode_until(0)
+                self._bytes = self._writer.close()
         finally:
-            self._stop(kill=bool(self._pending))
-            if self._bytes is None:  # the error that ended the block matters more than one of this
+            self._stop_workers(kill=bool(self._pending))
+            if self._bytes is None:  # raise the error that ended the block, not one of closing
                 with contextlib.suppress(Exception):
-                    self._bytes = self._video.close()
-            self._video = None
+                    self._bytes = self._writer.close()
+            self._writer = None
 
     def save(self, path: str | os.PathLike) -> pathlib.Path:
-        """Writes the video to ``path``, an mp4, whole or not at all; folders are made as needed.
-        Returns the path.
+        """Writes the video to ``path``, an mp4, and returns the path.
+
+        Writes atomically: if it fails, an existing file is unchanged. Creates missing folders.
         """
         video, path = self._finished(), pathlib.Path(path)
         if path.suffix != ".mp4":
@@ -120,15 +127,15 @@ class ParallelEncoder:
                 file.write(video)
                 file.flush()
                 os.fsync(file.fileno())
-                os.chmod(file.name, 0o644)  # temporary files are private, videos need not be
+                os.chmod(file.name, 0o644)  # temporary files are readable by their owner only
                 os.replace(file.name, path)
             except BaseException:
                 os.unlink(file.name)
                 raise
         return path
 
-    def notebook(self) -> Any:
-        """The video as an object that a notebook shows."""
+    def notebook(self) -> HTML:
+        """Returns the video as an object that notebooks display."""
         video = self._finished()
         try:
             from IPython.display import HTML
@@ -143,98 +150,62 @@ class ParallelEncoder:
         )
 
     def _check_open(self):
-        if self._video is None:
+        if self._writer is None:
             raise RuntimeError(
-                "frames are taken inside the encoder's with block: with ParallelEncoder(...) as e"
+                "frames can only be added inside the with block: with ParallelEncoder(...) as "
+                "encoder"
             )
 
     def _finished(self):
         if self._bytes is None:
             raise RuntimeError(
-                "the video is finished when the encoder's with block ends: use it after the block"
+                "the video is finished when the with block ends: call save or notebook after it"
             )
         if not self._bytes:
             raise ValueError(
-                "no frames were recorded, so there is no video: call the encoder with a state first"
+                "the video has no frames: call the encoder with a state inside the with block"
             )
         return self._bytes
 
     def _workers(self):
+        """Returns the pool of worker processes, started at the first call."""
         if self._pool is None:
             import loky
 
             self._n_workers = self._n_workers or min(loky.cpu_count(), MAX_WORKERS)
-            self._pool = loky.ProcessPoolExecutor(self._n_workers, env=workers.ENV)
+            self._pool = loky.ProcessPoolExecutor(self._n_workers, env=workers.WORKER_ENV)
         return self._pool
 
-    def _add(self, source):
-        self._pending.append((self._n_frames, source))
+    def _add(self, image: np.ndarray | Future) -> None:
+        self._pending.append((self._n_frames, image))
         self._n_frames += 1
-        self._drain(2 * self._n_workers if self._pool else 0)
+        self._encode_until(2 * self._n_workers if self._pool else 0)
 
-    def _drain(self, n_left):
-        """Encodes the oldest frames until ``n_left`` are left in flight, and then those that are
-        drawn already.
-        """
-        while self._pending and (len(self._pending) > n_left or _is_done(self._pending[0][1])):
-            number, source = self._pending[0]
-            with _named(number):
-                self._video.add(source if isinstance(source, np.ndarray) else source.result())
+    def _encode_until(self, n_pending: int) -> None:
+        """Encodes the oldest frames until ``n_pending`` are left, then those that are ready."""
+        while self._pending:
+            number, image = self._pending[0]
+            if len(self._pending) <= n_pending and not _is_ready(image):
+                break
+            with _frame_errors(number):
+                self._writer.add(image if isinstance(image, np.ndarray) else image.result())
             self._pending.popleft()
 
-    def _stop(self, kill):
+    def _stop_workers(self, kill):
         self._pending.clear()
         if self._pool is not None:
             self._pool.shutdown(wait=True, kill_workers=kill)
             self._pool = None
 
 
-class _Video:
-    """An mp4 in memory: h264 in yuv420p, which every player knows."""
-
-    def __init__(self, fps):
-        try:
-            import av
-        except ImportError:
-            raise ImportError(
-                "recording videos needs PyAV, which is not installed: pip install av"
-            ) from None
-        self._from_array = av.VideoFrame.from_ndarray
-        self._buffer = io.BytesIO()
-        self._container = av.open(self._buffer, "w", format="mp4")
-        self._stream = self._container.add_stream(
-            "libx264", rate=Fraction(fps).limit_denominator(1000)
-        )
-        self._stream.pix_fmt = "yuv420p"
-        self._stream.options = {"crf": QUALITY, "preset": "veryfast"}
-        self._shape = None
-
-    def add(self, array):
-        if self._shape is None:
-            self._shape = array.shape
-            self._stream.height, self._stream.width = (size + size % 2 for size in array.shape[:2])
-        if array.shape != self._shape:
-            raise ValueError(
-                "all frames must have the size of the first, {1} x {0} pixels, "
-                "but this one has {3} x {2}".format(*self._shape[:2], *array.shape[:2])
-            )
-        odd = [(0, size % 2) for size in array.shape[:2]]  # yuv420p halves both sides
-        frame = self._from_array(np.pad(array, [*odd, (0, 0)], mode="edge"), format="rgb24")
-        self._container.mux(self._stream.encode(frame))
-
-    def close(self):
-        """The finished file as bytes; empty if there were no frames."""
-        if self._shape is None:
-            return b""
-        self._container.mux(self._stream.encode(None))
-        self._container.close()
-        return self._buffer.getvalue()
+def _is_ready(image: np.ndarray | Future) -> bool:
+    return isinstance(image, np.ndarray) or image.done()
 
 
-class _named:
-    """Names the frame in an exception that kept it from the video."""
+class _frame_errors:
+    """A context that adds the frame's number to an exception. Signals pass unchanged."""
 
-    def __init__(self, number):
+    def __init__(self, number: int):
         self.number = number
 
     def __enter__(self):
@@ -242,95 +213,83 @@ class _named:
 
     def __exit__(self, kind, error, trace):
         if isinstance(error, Exception):
-            said = next(iter(str(error).splitlines()), "")
+            first_line = next(iter(str(error).splitlines()), "")
             raise RuntimeError(
-                f"frame {self.number} could not be recorded: {kind.__name__}: {said}"
+                f"frame {self.number} could not be recorded: {kind.__name__}: {first_line}"
             ) from error
 
 
-def _payload(plot_state):
-    """``plot_state`` as bytes for the workers, or None, with a warning, if it has to stay in this
-    process.
+@contextlib.contextmanager
+def _terminal_signals_blocked() -> Iterator[None]:
+    """Processes started inside never receive Ctrl-C or SIGHUP; the encoder stops them instead.
+
+    A terminal sends both to every process it runs, and a child inherits its parent's signal mask.
+    """
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
+
+
+# ---- Drawing ----
+
+
+def _pickled(plot_state: Callable) -> bytes | None:
+    """Returns ``plot_state`` as bytes for the workers. If it must stay in this process, warns and
+    returns None.
     """
     function = plot_state
     while isinstance(function, functools.partial):
         function = function.func
     if inspect.ismethod(function) and not isinstance(function.__self__, type):
-        why = f"{function.__name__} is a method of a {type(function.__self__).__name__} object"
+        reason = f"{function.__name__} is a method of a {type(function.__self__).__name__} object"
     else:
         import cloudpickle
 
         try:
             return cloudpickle.dumps(plot_state)
         except Exception as error:
-            why = f"plot_state cannot be sent to another process ({type(error).__name__}: {error})"
+            reason = (
+                f"plot_state cannot be sent to another process ({type(error).__name__}: {error})"
+            )
     warnings.warn(
-        f"{why}, so frames are drawn in this process, one by one; a classmethod, a staticmethod "
-        f"or a "
-        "function of a module would be drawn in parallel",
+        f"{reason}, so frames are drawn in this process, one by one. Use a classmethod, a "
+        "staticmethod or a function of a module to draw in parallel",
         stacklevel=3,
     )
     return None
 
 
-@contextlib.contextmanager
-def _keep_from_terminal():
-    """Processes that start meanwhile, and theirs, never get what a terminal sends to all it has,
-    Ctrl-C and SIGHUP: the one that owns the workers ends them.
-    """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _is_done(source):
-    return isinstance(source, np.ndarray) or source.done()
-
-
-def _image(array):
-    """An (H, W, 3) uint8 array of a uint8 or float one; ValueError for anything else."""
-    array = np.asarray(array)
-    if array.ndim != 3 or array.shape[-1] != 3 or not array.size:
-        raise ValueError(f"a frame must have shape (H, W, 3), but this one has {array.shape}")
-    if np.issubdtype(array.dtype, np.floating):
-        return (255 * np.clip(np.nan_to_num(array), 0, 1) + 0.5).astype(np.uint8)
-    if array.dtype != np.uint8:
-        raise ValueError(
-            f"a frame must hold uint8 or floats from 0 to 1, but this one holds {array.dtype}"
-        )
-    return array.copy()
-
-
-# ---- In the workers ----
-
-
 @functools.lru_cache(1)
-def _unpickled(payload):
+def _unpickled(pickled: bytes) -> Callable:
     import cloudpickle
 
-    return cloudpickle.loads(payload)
+    return cloudpickle.loads(pickled)
 
 
-def _draw_payload(payload, state):
-    return draw(_unpickled(payload), state)
+def _draw_pickled(pickled: bytes, state: Tree) -> np.ndarray:
+    """Draws a state in a worker process."""
+    return draw(_unpickled(pickled), state)
 
 
-def draw(plot_state: Callable, state: Any) -> np.ndarray:
-    """(H, W, 3) uint8: what ``plot_state`` draws of a numpyified state."""
-    drawn = plot_state(state)
-    if isinstance(drawn, np.ndarray):
-        return _image(drawn)
-    if not hasattr(drawn, "savefig"):
+def draw(plot_state: Callable, state: Tree) -> np.ndarray:
+    """Returns what ``plot_state`` draws of a numpyified state, as (H, W, 3) uint8.
+
+    Closes the figure if pyplot knows it.
+    """
+    drawing = plot_state(state)
+    if isinstance(drawing, np.ndarray):
+        return as_image(drawing)
+    if not hasattr(drawing, "savefig"):
         raise TypeError(
-            f"plot_state must return a matplotlib figure or an array, but it returned a "
-            f"{type(drawn).__name__}"
+            "plot_state must return a matplotlib figure or an array, but it returned a "
+            f"{type(drawing).__name__}"
         )
     from megastep import plotting
 
     try:
-        return plotting.rasterise(drawn)
+        return plotting.rasterise(drawing)
     finally:
         if "matplotlib.pyplot" in sys.modules:
-            sys.modules["matplotlib.pyplot"].close(drawn)
+            sys.modules["matplotlib.pyplot"].close(drawing)

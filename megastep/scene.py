@@ -1,4 +1,4 @@
-"""From geometries to scenery: textures, lights, agents' models, baked light."""
+"""Scenery from geometries: textures, lights, the agents' model, baked light."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,8 +15,8 @@ from megastep.ragged import Ragged
 __all__ = ["TEXEL", "agent_model", "display", "scenery", "texel_widths", "wall_textures"]
 
 TEXEL = 0.05  # metres per texel
-STRIPE = (0.4, 2.0)  # metres, min and max of the period of a wall's pattern
-INTENSITY = (0.5, 1.6)  # of lights
+STRIPE = (0.4, 2.0)  # metres, min and max of the period of a wall's stripes
+INTENSITY = (0.5, 1.6)  # min and max of a light's intensity
 PALETTE = (
     "d9b08c",
     "a3c1ad",
@@ -31,8 +31,8 @@ PALETTE = (
     "7fb0b0",
     "e8e0d8",
 )
-# Saturated, as walls are not: an agent's weakest channel has at most a tenth of its light, a wall's
-# at least an eighth. So a pixel tells one from the other, however bright it is.
+# Saturated, unlike walls: an agent's weakest channel has at most a tenth of its light, a wall's at
+# least an eighth. So a pixel shows which of the two it is at any brightness.
 AGENT_PALETTE = (
     "3b6ea5",
     "a5523b",
@@ -55,20 +55,22 @@ FRONT = "ff3020"
 
 
 def _linear(palette):
-    """(n, 3) linear light of hexadecimal colours."""
+    """Returns the linear light, (n, 3), of hexadecimal colours."""
     return gamma_decode(
         np.array([[int(colour[i : i + 2], 16) / 255 for i in (0, 2, 4)] for colour in palette])
     )
 
 
 def texel_widths(lines: np.ndarray) -> np.ndarray:
-    """(L,) how many texels of 5 cm lines (L, 2, 2) need, at least one."""
+    """Returns the number of 5 cm texels, (L,) int64 and at least 1, of lines (L, 2, 2)."""
     lengths = np.linalg.norm(lines[:, 1].astype(float) - lines[:, 0], axis=-1)
     return np.maximum(np.ceil(lengths / TEXEL - 1e-3), 1).astype(np.int64)
 
 
 def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
-    """(8, 2, 2) lines of an octagon in a square of ``width`` metres, its front (+x) the third."""
+    """Returns the lines, (8, 2, 2), of an octagon in a square of ``width`` metres. The third is its
+    front (+x).
+    """
     w, h = width / 2, width / 4
     corners = np.array(
         [(-h, -w), (h, -w), (w, -h), (w, h), (h, w), (-h, w), (-w, h), (-w, -h)], dtype=np.float32
@@ -77,8 +79,8 @@ def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
 
 
 def _agent_textures(n_agents, model):
-    """(K, 3) colours of an environment's agents, and (A M,) texels per line: a colour for each
-    agent, and a red front.
+    """Returns the texels of an environment's agents, (K, 3), and the number of texels per line,
+    (A M,). Each agent has a colour of its own and a red front.
     """
     widths = texel_widths(model)
     bodies, front = _linear(AGENT_PALETTE), _linear([FRONT])[0]
@@ -89,17 +91,16 @@ def _agent_textures(n_agents, model):
 
 
 def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """(T, 3) texels of walls that have ``widths`` (W,) texels each: two colours per wall, in
-    stripes of random period, phase and duty cycle.
+    """Returns the texels, (T, 3), of walls with ``widths``, (W,), texels each.
+
+    A wall has two colours in stripes of random period, phase and duty cycle.
     """
     n, palette = len(widths), _linear(PALETTE)
     base = palette[random.integers(len(palette), size=n)] * random.uniform(0.6, 1.0, (n, 1))
     stripe = palette[random.integers(len(palette), size=n)] * random.uniform(0.2, 0.8, (n, 1))
-    period, phase, duty = (
-        random.uniform(*STRIPE, n),
-        random.uniform(0, 1, n),
-        random.uniform(0.1, 0.5, n),
-    )
+    period = random.uniform(*STRIPE, n)
+    phase = random.uniform(0, 1, n)
+    duty = random.uniform(0.1, 0.5, n)
     wall = np.repeat(np.arange(n), widths)
     along = (np.arange(len(wall)) - (widths.cumsum() - widths)[wall] + 0.5) * TEXEL
     turns = along / period[wall] + phase[wall]
@@ -107,9 +108,9 @@ def wall_textures(widths: np.ndarray, random: np.random.Generator) -> np.ndarray
     return np.concatenate([base, stripe]).astype(np.float32)[wall + n * striped]
 
 
-def _near_together(walls):
-    """Walls (M, 2, 2) along a Z-order curve through 1 m cells, so that each 32 of them lie in one
-    part of the home.
+def _sort_along_z_curve(walls):
+    """Sorts walls (M, 2, 2) along a Z-order curve through 1 m cells, so that each group of 32 walls
+    lies close together.
     """
     cells = walls.mean(1).astype(np.int64)
     order = sum(
@@ -119,8 +120,8 @@ def _near_together(walls):
 
 
 def _part(geometries, name, shape):
-    """That part of all geometries as arrays; ValueError, naming it, if one is no such array."""
-    found = []
+    """Returns one part of all geometries as arrays. Raises ValueError if one does not fit."""
+    parts = []
     for i, g in enumerate(geometries):
         try:
             array = np.asarray(getattr(g, name, None), float)
@@ -135,8 +136,8 @@ def _part(geometries, name, shape):
                 f"shape {('n', *shape)}: make geometries with megastep.toys or "
                 f"megastep.geometries.sample"
             )
-        found.append(np.reshape(getattr(g, name), (-1, *shape)))
-    return found
+        parts.append(np.reshape(getattr(g, name), (-1, *shape)))
+    return parts
 
 
 def scenery(
@@ -146,13 +147,23 @@ def scenery(
     seed: int = 1,
     device: Any = None,
 ) -> Scenery:
-    """Baked :class:`~megastep.scenery.Scenery` of ``n_envs`` environments (default: one per
-    geometry); environment e starts with geometry ``e % len(geometries)``.
+    """Returns the baked :class:`~megastep.engine.Scenery` of ``n_envs`` environments.
 
-    Each geometry is one layout, with textures and light intensities of its own drawn from ``seed``;
-    the same geometry given twice is two layouts. ``device`` is as in
-    :func:`~megastep.engine.device`. ValueError, naming the argument, if one does not fit;
-    EngineError if the environments do not fit into memory.
+    Each geometry becomes a layout: a floor plan with random textures and light intensities. A
+    geometry that is listed twice becomes two layouts. Environment e starts with layout
+    ``e % len(geometries)``.
+
+    Args:
+        geometries: floor plans.
+        n_agents: agents per environment.
+        n_envs: number of environments. Default: one per geometry.
+        seed: of textures and light intensities.
+        device: where the tensors are, as in :func:`megastep.engine.device`. Default: a GPU if there
+            is one.
+
+    Raises:
+        ValueError: if an argument does not fit. The message names it.
+        EngineError: if the environments do not fit into memory.
     """
     geometries = checks.items("geometries", geometries)
     n_agents = checks.integer("n_agents", n_agents, 0)
@@ -165,12 +176,11 @@ def scenery(
     engine.fit(n_envs, 20 * n_agents * len(model) + 4 * len(agent_textures) + 64, device)
 
     wall_parts, light_parts = _part(geometries, "walls", (2, 2)), _part(geometries, "lights", (2,))
-    walls = np.concatenate([_near_together(part) for part in wall_parts]).astype(np.float32)
+    walls = np.concatenate([_sort_along_z_curve(part) for part in wall_parts]).astype(np.float32)
     widths = texel_widths(walls)
     positions = np.concatenate(light_parts)
-    lights = np.concatenate([positions, random.uniform(*INTENSITY, (len(positions), 1))], 1).astype(
-        np.float32
-    )
+    intensities = random.uniform(*INTENSITY, (len(positions), 1))
+    lights = np.concatenate([positions, intensities], 1).astype(np.float32)
     layouts = Layouts(
         lines=Ragged(torch.as_tensor(walls), torch.tensor([len(part) for part in wall_parts])),
         textures=Ragged(torch.as_tensor(wall_textures(widths, random)), torch.as_tensor(widths)),
@@ -180,16 +190,16 @@ def scenery(
         ),
         device=device,
     )
-    made = Scenery.of_layouts(
-        n_agents, layouts, model, model_widths, torch.arange(n_envs) % len(geometries)
-    )
-    engine.bake(made)
-    return made
+    layout = torch.arange(n_envs) % len(geometries)
+    result = Scenery.of_layouts(n_agents, layouts, model, model_widths, layout)
+    engine.bake(result)
+    return result
 
 
 def display(scenery: Scenery, e: int = 0, ax: Any = None) -> Any:
-    """Draws environment ``e`` in its lit colours, with its lights and agents. Returns the
-    matplotlib axes.
+    """Draws environment ``e`` in its lit colours, with its lights and agents.
+
+    Returns the matplotlib axes.
     """
     from megastep import plotting
 

@@ -1,9 +1,11 @@
-"""Spaces: what observations and actions look like. A space, or a dotdict of spaces, says which
-numbers to expect.
+"""Spaces: the shapes of observations and actions.
 
-A space's ``shape`` is that of one lane, without the leading axis B. Heads turn spaces into network
-layers. A vector or an image may name its ``dtype``, in which it is given and stored:
-``MultiImage(1, 3, 1, 64, dtype=torch.uint8)``. Without one, any float will do.
+A space, or a (nested) dotdict of spaces, describes one lane: its ``shape`` leaves out the leading
+axis B. A vector or an image may name the ``dtype`` that it is observed and stored in, such as
+``MultiImage(1, 3, 1, 64, dtype=torch.uint8)``; without one it is float16 or float32.
+
+:func:`leaves` and :func:`map` walk trees of spaces. A star import leaves them out, since ``map``
+would replace Python's.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,18 +16,17 @@ import torch
 
 from megastep.arrdict import arrdict
 
-__all__ = ["MultiDiscrete", "MultiEmpty", "MultiImage", "MultiVector", "leaves", "map"]
-
+__all__ = ["MultiDiscrete", "MultiEmpty", "MultiImage", "MultiVector"]
 
 DTYPES = torch.uint8, torch.float16, torch.float32
 
 
 class _Space:
     def __post_init__(self):
-        for name, value in self._sizes().items():
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        for name, size in self._sizes().items():
+            if isinstance(size, bool) or not isinstance(size, int) or size < 1:
                 raise ValueError(
-                    f"{type(self).__name__} needs a positive integer for {name}, not {value!r}"
+                    f"{type(self).__name__} needs a positive integer for {name}, not {size!r}"
                 )
 
     def _sizes(self):
@@ -33,6 +34,7 @@ class _Space:
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """The shape of one lane's tensor, without the leading axis B."""
         return tuple(self._sizes().values())
 
 
@@ -43,21 +45,23 @@ class _Numbers(_Space):
     def __post_init__(self):
         super().__post_init__()
         if self.dtype not in (None, *DTYPES):
+            allowed = ", ".join(str(dtype) for dtype in DTYPES)
             raise ValueError(
-                f"{type(self).__name__} can be of dtype {', '.join(map(str, DTYPES))}, not "
-                f"{self.dtype!r}"
+                f"{type(self).__name__} cannot have dtype={self.dtype!r}: allowed are {allowed}"
             )
 
     def __repr__(self):
-        # a dtype only where it is named: checkpoints compare spaces as text
-        named = {**self._sizes(), **({"dtype": self.dtype} if self.dtype else {})}
-        values = ", ".join(f"{name}={value!r}" for name, value in named.items())
+        # without a dtype of None: checkpoints compare spaces as text
+        dtype = {"dtype": self.dtype} if self.dtype else {}
+        values = ", ".join(
+            f"{name}={value!r}" for name, value in {**self._sizes(), **dtype}.items()
+        )
         return f"{type(self).__name__}({values})"
 
 
 @dataclass(frozen=True, repr=False)
 class MultiVector(_Numbers):
-    """A vector of ``dim`` numbers for every agent: shape (n_agents, dim)."""
+    """A vector of ``dim`` numbers per agent: shape (n_agents, dim)."""
 
     n_agents: int
     dim: int
@@ -65,7 +69,7 @@ class MultiVector(_Numbers):
 
 @dataclass(frozen=True, repr=False)
 class MultiImage(_Numbers):
-    """An image of C channels, H rows and W columns for every agent: shape (n_agents, C, H, W)."""
+    """An image of C channels, H rows and W columns per agent: shape (n_agents, C, H, W)."""
 
     n_agents: int
     C: int
@@ -75,7 +79,7 @@ class MultiImage(_Numbers):
 
 @dataclass(frozen=True)
 class MultiDiscrete(_Space):
-    """An integer from 0 to ``n_actions`` - 1 for every agent: shape (n_agents,)."""
+    """An integer from 0 to ``n_actions`` - 1 per agent: shape (n_agents,)."""
 
     n_agents: int
     n_actions: int
@@ -87,7 +91,7 @@ class MultiDiscrete(_Space):
 
 @dataclass(frozen=True)
 class MultiEmpty(_Space):
-    """Nothing at all: shape (0,)."""
+    """No numbers: shape (0,)."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -95,9 +99,11 @@ class MultiEmpty(_Space):
 
 
 def leaves(space: Any, name: str = "") -> dict[str, Any]:
-    """Returns the leaf spaces of a tree of spaces by dotted path, such as ``{"obs.rgb": ...}``.
+    """Returns the leaves of a tree by dotted path, such as ``{"obs.rgb": MultiImage(...)}``.
 
-    ``name`` is the path of the tree itself. A space that is no dict is its own only leaf.
+    Args:
+        space: a space or a (nested) dict of spaces; also any other tree, such as an observation.
+        name: the path of the tree itself. A tree that is no dict is the one leaf of this path.
     """
     if not isinstance(space, Mapping):
         return {name: space}
@@ -109,16 +115,18 @@ def leaves(space: Any, name: str = "") -> dict[str, Any]:
 
 def map(function: Callable, space: Any, *trees: Any) -> Any:
     """Returns ``function(leaf_space, *leaf_values)`` for each leaf, as an arrdict with the keys of
-    the space; for a space that is no dict, the function's result itself.
+    the space. For a space that is no dict, returns the function's result itself.
 
-    ``trees`` are dicts with the same keys as the space, such as observations or actions. KeyError
-    if a key is missing from one.
+    Args:
+        function: takes a leaf space and one value from each of ``trees``.
+        space: a space or a (nested) dict of spaces.
+        trees: dicts with at least the keys of the space, such as observations or actions.
+
+    Raises:
+        KeyError: if a tree lacks a key of the space.
     """
     if not isinstance(space, Mapping):
         return function(space, *trees)
     return arrdict(
-        {
-            key: map(function, child, *(tree[key] for tree in trees))
-            for key, child in space.items()
-        }
+        {key: map(function, child, *(tree[key] for tree in trees)) for key, child in space.items()}
     )

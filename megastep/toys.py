@@ -1,4 +1,4 @@
-"""The toy geometries under their short name: `from megastep import toys; toys.box()`."""
+"""Short name of :mod:`megastep.geometries.toys`: `from megastep import toys; toys.box()`."""
 
 from megastep.geometries.toys import box, column
 

@@ -1,16 +1,16 @@
-"""Work that all cores of the machine share, in processes of their own."""
+"""Maps a function over many items in parallel processes."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-__all__ = ["ENV", "mapped"]
+__all__ = ["MIN_PARALLEL", "WORKER_ENV", "parallel_map"]
 
-MANY = 48  # items from which on starting processes pays
-CHUNK = 8  # items that a process takes at a time
+MIN_PARALLEL = 48  # fewer items than this are faster without starting processes
+CHUNK_SIZE = 8  # items that a process takes at a time
 
-#: The environment variables of a worker: it works on one thread, never draws on a screen, and sees
-#: no GPU, as even an idle CUDA context is half a gigabyte.
-ENV = {
+#: Environment variables of a worker process: one thread, no screen, and no GPU, because even an
+#: idle CUDA context takes half a gigabyte.
+WORKER_ENV = {
     "MPLBACKEND": "Agg",
     "CUDA_VISIBLE_DEVICES": "",
     "OMP_NUM_THREADS": "1",
@@ -19,23 +19,28 @@ ENV = {
 }
 
 
-def mapped(function: Callable[[Any], Any], items: Sequence[Any], what: str) -> list:
-    """``function`` of each item, in their order; of many items in processes, with a bar of progress
-    that is called ``what`` on the error stream. The first error that it raises ends all.
+def parallel_map(function: Callable[[Any], Any], items: Sequence[Any], description: str) -> list:
+    """Returns ``function(item)`` for each item, in order.
+
+    Uses one process per core, and shows a progress bar on stderr, if there are at least
+    `MIN_PARALLEL` items. The first exception stops all processes and is raised.
+
+    Args:
+        description: the label of the progress bar.
     """
-    if len(items) < MANY:
+    if len(items) < MIN_PARALLEL:
         return [function(item) for item in items]
     import loky
     from rich.console import Console
     from rich.progress import track
 
-    pool = loky.ProcessPoolExecutor(loky.cpu_count(), env=ENV)
+    pool = loky.ProcessPoolExecutor(loky.cpu_count(), env=WORKER_ENV)
     try:
-        results = pool.map(function, items, chunksize=CHUNK)
-        bar = dict(total=len(items), description=what, console=Console(stderr=True))
-        found = list(track(results, **bar))
+        results = pool.map(function, items, chunksize=CHUNK_SIZE)
+        bar = dict(total=len(items), description=description, console=Console(stderr=True))
+        results = list(track(results, **bar))
     except BaseException:
         pool.shutdown(wait=True, kill_workers=True)
         raise
     pool.shutdown(wait=True)
-    return found
+    return results

@@ -1,25 +1,25 @@
-"""Checks a home by its walls and masks alone, on a raster of 5 cm; `make_homes.py` uses it."""
+"""Checks of a home, from its walls and masks, on a raster of 5 cm. `make_homes.py` uses them."""
 
 import numpy as np
 
 from megastep import geometry
 
 FINE = 0.05  # metres per cell
-RADIUS = 0.15 / 2**0.5  # metres; an agent's
-GAP = 0.55  # metres; the minimum width of any passage
-SPAWN = 0.15  # metres; in each room some point is this far from all walls
+RADIUS = 0.15 / 2**0.5  # metres; of an agent
+GAP = 0.55  # metres; minimum width of a passage
+SPAWN = 0.15  # metres; each room has a point this far from all walls
 MAX_WALLS, MAX_EXTENT = 400, 40.0
-LIT = 0.05  # metres; the minimum distance of a light from any wall
-MIN_CELLS = 4  # of the masks, per room
+LIT = 0.05  # metres; minimum distance of a light from a wall
+MIN_CELLS = 4  # minimum cells of a room in the masks
 
 
 def components(free):
-    """Labels (H, W) of the 4-connected components of bool (H, W) cells, 0 where not free, and how
-    many there are.
+    """Labels the 4-connected components of cells, (H, W) bool. Returns the labels, (H, W) integers
+    with 0 where not free, and the number of components.
     """
     edges = np.diff(np.pad(free, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     (row, start), end = np.nonzero(edges == 1), np.nonzero(edges == -1)[1]
-    # The runs of free cells, and the first one of each row.
+    # the number of the first run of free cells in each row
     first = np.searchsorted(row, np.arange(len(free) + 1))
     parents = list(range(len(row)))
 
@@ -41,7 +41,7 @@ def components(free):
 
 
 def clearance(g, limit=0.3):
-    """The distance in metres, up to `limit`, from each cell's centre on the fine raster to the
+    """Returns the metres, at most `limit`, from each cell's centre on the fine raster to the
     nearest wall.
     """
     ratio = round(g.res / FINE)
@@ -61,14 +61,16 @@ def clearance(g, limit=0.3):
 
 
 def _reaches(labels, rooms):
-    """Whether one component enters every one of rooms 1..n."""
-    seen = [np.unique(labels[(rooms == room) & (labels > 0)]) for room in range(1, rooms.max() + 1)]
-    return any(all(label in there for there in seen) for label in seen[0])
+    """Returns True if one component enters all rooms 1..n."""
+    by_room = [
+        np.unique(labels[(rooms == room) & (labels > 0)]) for room in range(1, rooms.max() + 1)
+    ]
+    return any(all(label in labels_inside for labels_inside in by_room) for label in by_room[0])
 
 
 def errors(g):
-    """Sentences on what is wrong with a home, none if it is as it must be."""
-    found = []
+    """Returns a sentence for each error in a home."""
+    messages = []
     walls = g.walls.reshape(-1, 4)
     canonical = np.where(
         (walls[:, :2] > walls[:, 2:]).any(-1)[:, None] & (walls[:, 0] >= walls[:, 2])[:, None],
@@ -76,32 +78,32 @@ def errors(g):
         walls,
     )
     if not np.isfinite(walls).all() or (walls[:, :2] == walls[:, 2:]).all(-1).any():
-        found.append("a wall is not finite or has no length")
+        messages.append("a wall is not finite or has no length")
     if len(np.unique(canonical, axis=0)) < len(walls):
-        found.append("two walls are the same")
+        messages.append("two walls are the same")
     if np.abs(g.walls.min((0, 1)) - 1).max() > 1e-3 and g.n_outer:
-        found.append(f"coordinates start at {g.walls.min((0, 1))} and not at 1 m")
+        messages.append(f"coordinates start at {g.walls.min((0, 1))} and not at 1 m")
     if np.ptp(g.walls, axis=(0, 1)).max() > MAX_EXTENT or len(walls) > MAX_WALLS:
-        found.append("it is too large")
+        messages.append("it is too large")
 
     rooms = g.masks.max()
     if min(np.bincount(g.masks[g.masks > 0], minlength=rooms + 1)[1:], default=0) < MIN_CELLS:
-        found.append("a room has too few cells")
+        messages.append("a room has too few cells")
     labels, _ = components(g.masks >= 0)
     if (g.masks[labels == labels[0, 0]] > 0).any():
-        found.append("the envelope is open")
+        messages.append("the envelope is open")
 
     distance = clearance(g)
     ratio = round(g.res / FINE)
     fine = np.maximum(g.masks, 0).repeat(ratio, 0).repeat(ratio, 1)
-    for radius, what in (RADIUS, "an agent"), (GAP / 2, "a disc as wide as the least gap"):
+    for radius, disc in (RADIUS, "an agent"), (GAP / 2, "a disc as wide as the narrowest gap"):
         if not _reaches(components(distance > radius - 1e-3)[0], fine):
-            found.append(f"{what} cannot reach every room")
+            messages.append(f"{disc} cannot reach every room")
     if any(not (distance[fine == room] >= SPAWN).any() for room in range(1, rooms + 1)):
-        found.append("a room has no point to spawn at")
-    at = tuple(geometry.indices(g.lights, g.masks.shape, g.res).T)
-    if not np.array_equal(g.masks[at], np.arange(1, rooms + 1)):
-        found.append("a light is not in its room")
+        messages.append("a room has no point to spawn at")
+    light_cells = tuple(geometry.indices(g.lights, g.masks.shape, g.res).T)
+    if not np.array_equal(g.masks[light_cells], np.arange(1, rooms + 1)):
+        messages.append("a light is not in its room")
     if (distance[tuple(geometry.indices(g.lights, distance.shape, FINE).T)] < LIT).any():
-        found.append("a light is in a wall")
-    return found
+        messages.append("a light is in a wall")
+    return messages

@@ -1,9 +1,9 @@
-"""Has agents try to pass walls and, when stopped, to leave, on the courses of tests/helpers/walls.py:
+"""Checks that no agent passes a wall or gets stuck, on the courses of tests/helpers/walls.py:
 
     python scripts/check_walls.py --steps 1e9 --device auto
 
-Prints a line per course and a last one with the sums. The exit code is 1 if an agent passed a wall,
-sank into one or got stuck; the first few cases are then printed in full, floats to the last bit.
+Prints a line per course, then the sums. The exit code is 1 if an agent passed a wall, sank into one
+or got stuck; the first few cases are then printed in full, with exact floats.
 """
 
 import argparse
@@ -13,10 +13,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import wall_courses
-
 from megastep import engine
-from tests.helpers import walls
+from tests.helpers import wall_courses, walls
 
 INTERVAL = 10  # seconds between lines within a course
 
@@ -31,19 +29,19 @@ def sentence(total, seconds):
 
 def arguments():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--steps", type=float, default=1e7, help="agent-steps in all, say 1e9")
+    parser.add_argument("--steps", type=float, default=1e7, help="total agent steps, such as 1e9")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda")
     parser.add_argument(
         "--agents",
         type=int,
         default=None,
-        help="at once at most; 2,048 on a CPU, 1,048,576 on a GPU",
+        help="maximum at once (default: 2,048 on a CPU, 1,048,576 on a GPU)",
     )
     parser.add_argument(
         "--tries",
         type=int,
         default=1024,
-        help="stopped agents that try to leave after each 16 steps",
+        help="stopped agents that try to get away after every 16 steps",
     )
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()

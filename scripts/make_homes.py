@@ -1,4 +1,4 @@
-"""Makes the 5,000 homes that come with the package, checks every one, and prints statistics.
+"""Generates the 5,000 homes of the package, checks them, and prints statistics.
 
     python scripts/make_homes.py                      # writes homes.npz and homes.sha256
     python scripts/make_homes.py --count 1000 --dry   # prints only
@@ -25,9 +25,9 @@ from megastep.geometries import homes
 from megastep.geometries.homes import database
 from scripts import check_homes
 
-NEAR = 0.3  # metres; cells in which two homes' walls are compared
+NEAR = 0.3  # metres; side of the cells in which the walls of two homes are compared
 
-# Real homes, from CubiCasa5k and Raster-to-Vector: (statistic, percentile, min, max).
+# Of real homes, from CubiCasa5k and Raster-to-Vector: (statistic, percentile, min, max).
 BANDS = [
     ("walls", 5, 30, 55),
     ("walls", 50, 55, 90),
@@ -43,39 +43,39 @@ BANDS = [
 ]
 
 
-def statistics(made):
-    """{statistic: values} of homes as `homes.generate` makes them."""
+def statistics(plans):
+    """Returns {statistic: values} of homes from `homes.generate`."""
     return {
-        "walls": [len(g.walls) for g in made],
+        "walls": [len(g.walls) for g in plans],
         "wall length, m": [
-            np.linalg.norm(g.walls[:, 1] - g.walls[:, 0], axis=-1).sum() for g in made
+            np.linalg.norm(g.walls[:, 1] - g.walls[:, 0], axis=-1).sum() for g in plans
         ],
-        "long side, m": [np.ptp(g.walls, axis=(0, 1)).max() for g in made],
-        "short side, m": [np.ptp(g.walls, axis=(0, 1)).min() for g in made],
-        "rooms": [len(g.rooms) for g in made],
-        "room area, m2": [area for g in made for area in g.areas],
-        "free area, m2": [sum(g.areas) for g in made],
-        "door width, m": [width for g in made for width in g.doors],
-        "doors per room": [len(g.doors) / len(g.rooms) for g in made],
-        "openings": [len(g.openings) for g in made],
+        "long side, m": [np.ptp(g.walls, axis=(0, 1)).max() for g in plans],
+        "short side, m": [np.ptp(g.walls, axis=(0, 1)).min() for g in plans],
+        "rooms": [len(g.rooms) for g in plans],
+        "room area, m2": [area for g in plans for area in g.areas],
+        "free area, m2": [sum(g.areas) for g in plans],
+        "door width, m": [width for g in plans for width in g.doors],
+        "doors per room": [len(g.doors) / len(g.rooms) for g in plans],
+        "openings": [len(g.openings) for g in plans],
     }
 
 
 def outside(values, bands):
-    """Sentences on those of the `bands` that some `statistics` miss."""
-    found = [
-        (name, percent, np.percentile(values[name], percent), low, high)
-        for name, percent, low, high in bands
-    ]
-    return [
-        f"{name}: the {percent} % quantile is {value:.2f}, and {low:g} to {high:g} is real"
-        for name, percent, value, low, high in found
-        if not low <= value <= high
-    ]
+    """Returns a sentence for each of `bands` that the `statistics` are outside of."""
+    messages = []
+    for name, percent, low, high in bands:
+        value = np.percentile(values[name], percent)
+        if not low <= value <= high:
+            messages.append(
+                f"{name}: the {percent} % quantile is {value:.2f}, but {low:g} to {high:g} in real "
+                f"homes"
+            )
+    return messages
 
 
 def symmetries(points):
-    """The 8 images, (8, ..., 2), of integer points (..., 2) under the rotations and reflections of
+    """Returns the 8 images, (8, ..., 2), of points (..., 2) under the rotations and reflections of
     the square.
     """
     flips = [points * np.array(signs) for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
@@ -83,7 +83,9 @@ def symmetries(points):
 
 
 def fingerprint(g):
-    """A hash of a home's walls to 5 cm that its rotations, reflections and translations share."""
+    """Returns a hash of a home's walls, rounded to 5 cm, that does not change under rotation,
+    reflection and translation.
+    """
     images = []
     for image in symmetries(np.rint(g.walls * 20).astype(int)):
         image = np.sort((image - image.min((0, 1))) @ [100_000, 1], axis=1)
@@ -91,23 +93,21 @@ def fingerprint(g):
     return hashlib.sha1(min(images)).hexdigest()
 
 
-def similarity(made):
-    """For each home the largest Jaccard index of its wall cells with those of another, over the 8
-    symmetries.
+def similarity(plans):
+    """Returns, for each home, the largest Jaccard index of its wall cells with those of another,
+    over the 8 symmetries.
     """
-    side = int(np.ceil(max(np.ptp(g.walls, axis=(0, 1)).max() for g in made) / NEAR)) + 2
-    cells = np.zeros((8, len(made), side * side), np.float32)
-    for k, g in enumerate(made):
+    side = int(np.ceil(max(np.ptp(g.walls, axis=(0, 1)).max() for g in plans) / NEAR)) + 2
+    cells = np.zeros((8, len(plans), side * side), np.float32)
+    for k, g in enumerate(plans):
         middle = (g.walls.max((0, 1)) + g.walls.min((0, 1))) / 2
-        steps = np.linspace(0, 1, 2 * side)[
-            :, None, None
-        ]  # along each wall, closer together than the cells
+        steps = np.linspace(0, 1, 2 * side)[:, None, None]  # along each wall, closer than cells
         points = (g.walls[:, 0] + (g.walls[:, 1] - g.walls[:, 0]) * steps - middle) / NEAR
         for s, image in enumerate(symmetries(points.reshape(-1, 2))):
             x, y = np.floor(image + side / 2).astype(int).T
             cells[s, k, y * side + x] = 1
     sizes = cells[0].sum(-1)
-    best = np.zeros(len(made))
+    best = np.zeros(len(plans))
     for image in cells:
         common = image @ cells[0].T
         index = common / (sizes[:, None] + sizes - common)
@@ -117,22 +117,20 @@ def similarity(made):
 
 
 def adjacency(g):
-    """A home's rooms in words, a stand-in for its topology: the sorted kinds and how many gaps
-    there are.
-    """
+    """Returns a summary of a home's topology: the sorted kinds of rooms and the number of gaps."""
     return tuple(sorted(g.rooms)), len(g.doors) + len(g.openings)
 
 
-def made(seed):
-    """The home of a seed, what is wrong with it, and the seconds it took to make."""
+def generate(seed):
+    """Returns (the home of a seed, its errors, the seconds that it took)."""
     start = time.process_time()
     g = homes.generate(seed)
-    took = time.process_time() - start
-    return g, check_homes.errors(g), took
+    seconds = time.process_time() - start
+    return g, check_homes.errors(g), seconds
 
 
-def packed(plans):
-    """The bytes of a database of homes as `generate` makes them."""
+def pack(plans):
+    """Returns the bytes of a database of homes from `homes.generate`."""
     arrays = {
         "walls": np.concatenate([np.rint(g.walls * 100) for g in plans]).astype("<i2"),
         "lights": np.concatenate([np.rint(g.lights * 100) for g in plans]).astype("<i2"),
@@ -144,7 +142,7 @@ def packed(plans):
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, values in arrays.items():
-            entry = zipfile.ZipInfo(f"{name}.npy")  # dated 1980: the same homes give the same bytes
+            entry = zipfile.ZipInfo(f"{name}.npy")  # dated 1980: equal homes give equal bytes
             entry.compress_type = zipfile.ZIP_LZMA
             with archive.open(entry, "w") as file:
                 np.lib.format.write_array(file, values, allow_pickle=False)
@@ -152,10 +150,8 @@ def packed(plans):
 
 
 def write(plans, path=database.PATH):
-    """Writes a database and, beside it, its sha256 in the form of the command sha256sum. Returns
-    the digest.
-    """
-    content = packed(plans)
+    """Writes a database and its sha256, in the format of sha256sum. Returns the digest."""
+    content = pack(plans)
     digest = hashlib.sha256(content).hexdigest()
     Path(path).write_bytes(content)
     Path(path).with_suffix(".sha256").write_text(f"{digest}  {Path(path).name}\n")
@@ -169,19 +165,16 @@ def main(argv=None):
     args = parser.parse_args(argv)
     if args.count < 2 or not args.dry and args.count != database.COUNT:
         parser.error(
-            f"--count {args.count} is not allowed: take 2 or more with --dry; {database.COUNT} "
-            f"are written"
+            f"--count {args.count}: take at least 2 with --dry, and {database.COUNT} without"
         )
 
     with futures.ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
-        results = list(pool.map(made, range(args.count), chunksize=50))
+        results = list(pool.map(generate, range(args.count), chunksize=50))
     plans = [g for g, _, _ in results]
-    wrong = [f"home {g.id}: {error}" for g, found, _ in results for error in found]
+    messages = [f"home {g.id}: {error}" for g, errors, _ in results for error in errors]
     values = statistics(plans)
-    print(
-        f"{args.count} homes, {1e3 * np.mean([took for *_, took in results]):.1f} ms each; "
-        f"quantiles 5/25/50/75/95 %"
-    )
+    milliseconds = 1e3 * np.mean([seconds for *_, seconds in results])
+    print(f"{args.count} homes, {milliseconds:.1f} ms each; quantiles 5/25/50/75/95 %")
     for name, column in values.items():
         print(
             f"  {name:16}",
@@ -189,18 +182,22 @@ def main(argv=None):
         )
     kinds = Counter(kind for g in plans for kind in g.rooms)
     print(
-        "  rooms a home    ",
+        "  rooms per home  ",
         ", ".join(f"{kind} {n / len(plans):.2f}" for kind, n in kinds.most_common()),
     )
-    near = similarity(plans[:1_000])
-    print(f"  nearest other of {len(near)}: median {np.median(near):.2f}, largest {near.max():.2f}")
+    nearest = similarity(plans[:1_000])
+    print(
+        f"  similarity to the nearest other of {len(nearest)}: median {np.median(nearest):.2f}, "
+        f"maximum {nearest.max():.2f}"
+    )
     print(
         f"  {len({fingerprint(g) for g in plans})} different plans, "
         f"{len({adjacency(g) for g in plans})} programmes"
     )
-    wrong += outside(values, BANDS)
-    print("\n".join(wrong) or "  all checks passed, all statistics within the bands of real homes")
-    if wrong:
+    messages += outside(values, BANDS)
+    passed = "  all checks passed, all statistics within the bands of real homes"
+    print("\n".join(messages) or passed)
+    if messages:
         raise SystemExit(1)
     if not args.dry:
         print(f"{write(plans)}  {database.PATH.name}, {database.PATH.stat().st_size:,} bytes")

@@ -1,4 +1,4 @@
-"""Every operation of the engine on small scenery, ids out of range too, for NVIDIA's checkers:
+"""Runs every operation on small scenery, also with bad indices, for NVIDIA's compute-sanitizer:
 
 for tool in memcheck racecheck initcheck; do
     compute-sanitizer --tool $tool python scripts/sanitize.py
@@ -18,7 +18,7 @@ from megastep.modules import RandomSpawns
 
 
 def out_of_range(c, spawn):
-    """Each operation with a layout that does not exist, which raises a flag and reads nothing."""
+    """Runs operations with a layout that does not exist. They must set a flag and read nothing."""
     for layout in (-1, 3, 2**31 - 1):
         c.scenery.layout[4] = layout
         for operation in (engine.physics, engine.observe, engine.render):
@@ -30,7 +30,7 @@ def out_of_range(c, spawn):
         except engine.EngineError:
             c.scenery.layout[4] = 0
         else:
-            raise AssertionError("a layout that does not exist was not flagged")
+            raise AssertionError("a bad layout was not flagged")
 
 
 def main():

@@ -1,4 +1,4 @@
-"""Draws a sheet of homes, all at one scale, as an image.
+"""Draws a sheet of homes at one scale, as an image.
 
 python scripts/show_homes.py homes.png --first 0 --count 20
 """
@@ -34,18 +34,16 @@ LABELS = {
 
 
 def sheet(seeds):
-    """A figure with the plans of the homes of these seeds, each room named and the corner at the
-    same place.
-    """
-    made = [homes.generate(seed) for seed in seeds]
-    rows = -(-len(made) // COLUMNS)
+    """Returns a figure with the floor plans of the homes of these seeds and the names of rooms."""
+    plans = [homes.generate(seed) for seed in seeds]
+    rows = -(-len(plans) // COLUMNS)
     figure, axes = plt.subplots(
         rows, COLUMNS, figsize=(4 * COLUMNS, 4 * rows), squeeze=False, layout="constrained"
     )
-    side = max(np.ptp(g.walls, axis=(0, 1)).max() for g in made) + 1
+    side = max(np.ptp(g.walls, axis=(0, 1)).max() for g in plans) + 1
     for ax in axes.flat:
         ax.set_axis_off()
-    for g, ax in zip(made, axes.flat):
+    for g, ax in zip(plans, axes.flat):
         geometry.display(g, ax)
         ax.set(xlim=(0.5, side + 0.5), ylim=(0.5, side + 0.5))
         ax.set_title(
@@ -59,12 +57,12 @@ def sheet(seeds):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("path", help="the image to write, say homes.png")
-    parser.add_argument("--first", type=int, default=0, help="the seed of the first home")
-    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("path", help="image file to write, such as homes.png")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first home")
+    parser.add_argument("--count", type=int, default=20, help="number of homes")
     args = parser.parse_args()
     if args.count < 1:
-        raise SystemExit(f"--count {args.count} is not allowed: take 1 or more.")
+        raise SystemExit(f"--count {args.count}: take at least 1.")
     sheet(range(args.first, args.first + args.count)).savefig(args.path, dpi=70)
 
 

@@ -1,4 +1,4 @@
-"""Draws a sheet of mazes as an image: a row for each share of dead ends opened, from none to all.
+"""Draws a sheet of mazes as an image, with a row for each fraction of opened dead ends.
 
 python scripts/show_mazes.py mazes.png --size 8 --corridor 1.0 --thickness 0.2
 """
@@ -22,7 +22,7 @@ COLUMNS = 4
 
 
 def sheet(first=0, size=8, corridor=1.0, thickness=0.2):
-    """A figure with the plans of four mazes in each row, those of seeds `first` and on."""
+    """Returns a figure with four mazes per row, of seeds `first` and up."""
     figure, axes = plt.subplots(
         len(BRAIDS), COLUMNS, figsize=(3.2 * COLUMNS, 3.4 * len(BRAIDS)), layout="constrained"
     )
@@ -30,7 +30,7 @@ def sheet(first=0, size=8, corridor=1.0, thickness=0.2):
         for seed, ax in enumerate(row, first):
             g = mazes.generate(seed, size, corridor, thickness, braid)
             opened = mazes.passages(size, braid, mazes.PortableGenerator(seed))
-            n_dead_ends = sum(len(others) == 1 for others in opened)
+            n_dead_ends = sum(len(exits) == 1 for exits in opened)
             geometry.display(g, ax)
             ax.set_axis_off()
             ax.set_title(
@@ -42,11 +42,11 @@ def sheet(first=0, size=8, corridor=1.0, thickness=0.2):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("path", help="the image to write, say mazes.png")
-    parser.add_argument("--first", type=int, default=0, help="the seed of the first maze")
-    parser.add_argument("--size", type=int, default=8, help="cells a side")
-    parser.add_argument("--corridor", type=float, default=1.0, help="width in metres")
-    parser.add_argument("--thickness", type=float, default=0.2, help="of the walls, in metres")
+    parser.add_argument("path", help="image file to write, such as mazes.png")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first maze")
+    parser.add_argument("--size", type=int, default=8, help="cells per side")
+    parser.add_argument("--corridor", type=float, default=1.0, help="width of corridors in metres")
+    parser.add_argument("--thickness", type=float, default=0.2, help="thickness of walls in metres")
     args = parser.parse_args()
     try:
         figure = sheet(args.first, args.size, args.corridor, args.thickness)

@@ -1,4 +1,4 @@
-"""What all tests share: one thread a process, no screen, and no GPU tests where there is no GPU."""
+"""Fixtures and settings of all tests: one thread per process, no display, no GPU needed."""
 
 import os
 
@@ -24,38 +24,35 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def device(request):
-    """Either device, for tests that hold on both."""
+    """Each device in turn, for tests that hold on both."""
     return request.param
 
 
 @pytest.fixture(scope="session")
 def launch_on_cpu(tmp_path_factory):
-    """What launches the learner's kernels on a CPU: their source, compiled for it through
-    `cuda_on_cpu.h`.
+    """A stand-in for `launch` that runs the learner's CUDA kernels on a CPU.
+
+    Their source is compiled for the CPU through `cuda_on_cpu.h`.
     """
-    from megastep.agents.networks.kernels.program import CORES, DTYPES, STRUCTS
+    from megastep.agents.networks.kernels.program import CORES
     from megastep.kernels.build import compile
 
     folder = tmp_path_factory.mktemp("kernels")
     source, library = folder / "kernels.cpp", folder / "kernels.so"
-    included = [
-        Path(__file__).parent / "helpers" / "cuda_on_cpu.h",
-        *sorted(CORES.folder.glob("*.cu")),
-    ]
-    lines = [f'#include "{path}"' for path in included]
+    files = [Path(__file__).parent / "helpers" / "cuda_on_cpu.h", *CORES.folder.glob("*.cu")]
+    lines = [f'#include "{path}"' for path in files]
     lines += [
-        f'extern "C" void run_{name}_{dtype}(const {struct}* p, unsigned int threads) '
-        f"{{ launch({name}_{dtype}, p, threads); }}"
-        for name, struct in STRUCTS.items()
-        for dtype in DTYPES.values()
+        f'extern "C" void run_{operation}(const {struct}* p, unsigned int threads) '
+        f"{{ launch({operation}, p, threads); }}"
+        for operation, struct in CORES.cuda_operations.items()
     ]
     source.write_text("\n".join(lines))
-    compiler, _ = compile._compiler()
-    command = [compiler, "-std=c++17", "-O1", "-shared", "-fPIC", f"-DBLOCK={compile.BLOCK}"]
-    subprocess.run([*command, str(source), "-o", str(library)], check=True)
+    command = [compile.compiler()[0], "-std=c++17", "-O1", "-shared", "-fPIC"]
+    command += [f"-I{compile.KERNELS}", str(source), "-o", str(library)]
+    subprocess.run(command, check=True)
     loaded = ctypes.CDLL(str(library))
 
-    def launch(operation, packed, device, threads, program):
+    def launch(program, operation, packed, device, threads):
         assert program is CORES and device.type == "cpu"
         getattr(loaded, f"run_{operation}")(packed, ctypes.c_uint(threads))
 

@@ -1,5 +1,5 @@
-"""Capture: the walk over state, and what is put back around a recording, run anywhere; the graphs
-themselves need a GPU.
+"""Capture: the walk over an environment's state and its restoration around a recording. The graphs
+themselves need a GPU; most tests replace them and run anywhere.
 """
 
 import contextlib
@@ -11,11 +11,10 @@ import torch
 from megastep import arrdict, capture, envs, spaces
 
 GPU = torch.cuda.is_available()
-on_gpu = [pytest.mark.cuda, pytest.mark.skipif(not GPU, reason="needs a GPU")]
 
 
 class Counter:
-    """An environment in PyTorch alone. ``how`` says how its step changes its state."""
+    """An environment in plain PyTorch. ``how`` selects how its step changes its state."""
 
     n_envs, n_agents = 4, 1
     obs_space, action_space = spaces.MultiVector(1, 1), spaces.MultiDiscrete(1, 3)
@@ -53,7 +52,7 @@ def actions(device, value=1, n=4):
     return arrdict.arrdict(actions=torch.full((n, 1), value, device=device))
 
 
-def test_the_walk_finds_tensors_and_generators_by_path():
+def test_state_tree_finds_tensors_and_generators_by_path():
     tree = capture.state_tree(Counter())
     assert set(tree) == {".parts['total']", ".parts[7]", ".history[0]", ".pair[0]", ".generator"}
     paths = capture.state_tree(envs.Explorer(2, device="cpu"))
@@ -66,7 +65,7 @@ def test_the_walk_finds_tensors_and_generators_by_path():
     } <= set(paths)
 
 
-def test_a_snapshot_brings_an_episode_back():
+def test_restoring_a_snapshot_repeats_the_episode():
     env = envs.Explorer(3, device="cpu")
     env.reset()
     turn = arrdict.arrdict(actions=torch.full((3, 1), 5))
@@ -81,7 +80,7 @@ def test_a_snapshot_brings_an_episode_back():
     )
 
 
-def test_a_snapshot_holds_generators_too():
+def test_snapshot_includes_generators():
     env = Counter()
     saved = capture.snapshot(env)
     first = [env.step(actions("cpu")).reward for _ in range(3)]
@@ -90,7 +89,7 @@ def test_a_snapshot_holds_generators_too():
     assert all(map(torch.equal, first, again)) and not torch.equal(first[0], first[1])
 
 
-def test_a_snapshot_of_another_environment_is_refused():
+def test_restore_refuses_a_snapshot_of_another_environment():
     saved = capture.snapshot(envs.Explorer(3, device="cpu"))
     with pytest.raises(ValueError, match="which this Minimal does not have"):
         capture.restore(envs.Minimal(3, device="cpu"), saved)
@@ -104,20 +103,20 @@ def test_a_snapshot_of_another_environment_is_refused():
         capture.restore(env, capture.snapshot(Counter()))
 
 
-def test_read_only_tensors_are_no_state():
+def test_state_tree_leaves_out_read_only_tensors():
     env = envs.Minimal(2, device="cpu")
     paths = capture.state_tree(env)
     assert ".core.scenery.layouts.wall_starts" not in paths
     assert ".core.scenery.layouts.lines.vals" in paths
 
 
-def test_objects_that_hold_each_other_are_walked_once():
+def test_state_tree_visits_objects_in_cycles_once():
     env = Counter()
     env.itself, env.others = env, [env, {"env": env}]
     assert len(capture.state_tree(env)) == len(capture.state_tree(Counter()))
 
 
-def test_a_module_keeps_its_parameters_in_place():
+def test_parameters_of_a_module_are_kept_in_place():
     module = torch.nn.Linear(2, 1)
     weight, before = module.weight, capture._StateBefore([module])
     module.weight = torch.nn.Parameter(torch.ones(1, 2))
@@ -135,10 +134,10 @@ def test_a_module_keeps_its_parameters_in_place():
         ("scalar to tensor", "steps changed from 0 to a tensor"),
         ("tuple", "cannot be put back"),
         ("grows", "changed its shape"),
-        ("drops", r"parts\['total'\] was a tensor of shape \(4,\) .* is gone after it"),
+        ("drops", r"parts\['total'\], a tensor of shape \(4,\), was removed"),
     ],
 )
-def test_rebound_tensors_are_kept_in_place_and_what_a_graph_cannot_repeat_is_named(how, error):
+def test_rebound_tensors_are_kept_in_place_and_other_changes_are_refused(how, error):
     env = Counter(how)
     state, before = capture._StateBefore([env]), env.parts["total"]
     env.step(actions("cpu"))
@@ -150,7 +149,7 @@ def test_rebound_tensors_are_kept_in_place_and_what_a_graph_cannot_repeat_is_nam
         assert env.parts["total"] is before and before.tolist() == [1.0] * 4
 
 
-def test_a_scalar_that_stays_nan_has_not_changed():
+def test_a_scalar_that_stays_nan_is_accepted():
     env = Counter()
     env.last = float("nan")
     before = capture._StateBefore([env])
@@ -158,7 +157,7 @@ def test_a_scalar_that_stays_nan_has_not_changed():
     before.keep_in_place()
 
 
-def test_a_tensor_that_moved_to_another_attribute_is_not_gone():
+def test_a_tensor_may_move_to_another_attribute():
     env = Counter()
     state = capture._StateBefore([env])
     env.first = env.parts
@@ -167,7 +166,7 @@ def test_a_tensor_that_moved_to_another_attribute_is_not_gone():
 
 
 @pytest.mark.parametrize("how", ["rebound", "scalar", "scalar to tensor", "grows", "drops"])
-def test_undoing_puts_back_what_a_call_replaced(how):
+def test_undo_restores_replaced_attributes(how):
     env = Counter(how)
     state, total = capture._StateBefore([env]), env.parts["total"]
     env.step(actions("cpu"))
@@ -175,32 +174,32 @@ def test_undoing_puts_back_what_a_call_replaced(how):
     assert env.parts["total"] is total and type(env.steps) is int and env.steps == 0
 
 
-def test_undoing_puts_none_back_where_a_tensor_or_a_tree_has_appeared():
+def test_undo_restores_none():
     env = Counter()
-    env.memory, env.tree = None, None
+    env.hidden, env.tree = None, None
     state = capture._StateBefore([env])
-    env.memory, env.tree = torch.zeros(3), {"h": torch.zeros(3)}
+    env.hidden, env.tree = torch.zeros(3), {"h": torch.zeros(3)}
     state.undo()
-    assert env.memory is None and env.tree is None
+    assert env.hidden is None and env.tree is None
 
 
 class Lazy:
-    """A function's state that is made by its first call, as a rollout's memory."""
+    """A function that creates a part of its state in the first call, such as a hidden state."""
 
     def __init__(self):
-        self.memory, self.total = None, torch.zeros(2)
+        self.hidden, self.total = None, torch.zeros(2)
 
     def __call__(self):
-        if self.memory is None:
-            self.memory = {"h": torch.zeros(2)}
-        self.memory["h"].add_(1)
+        if self.hidden is None:
+            self.hidden = {"h": torch.zeros(2)}
+        self.hidden["h"].add_(1)
         self.total.add_(1)
-        return self.memory["h"]
+        return self.hidden["h"]
 
 
-class Recorded:
-    """A stand-in for torch.cuda.CUDAGraph: what runs while it records is done at once, and what
-    replays is only counted.
+class FakeCUDAGraph:
+    """A stand-in for torch.cuda.CUDAGraph. The recorded function runs at once; replays are only
+    counted.
     """
 
     replays = 0
@@ -214,14 +213,14 @@ class Recorded:
 
 @pytest.fixture
 def fake_cuda(monkeypatch):
-    """Graph's recording without a GPU: streams and graphs that do nothing."""
+    """Replaces CUDA streams and graphs, so that Graph records without a GPU."""
 
     class Stream:
         def wait_stream(self, other):
             pass
 
     for name, stand_in in dict(
-        CUDAGraph=Recorded,
+        CUDAGraph=FakeCUDAGraph,
         Stream=Stream,
         current_stream=Stream,
         stream=contextlib.nullcontext,
@@ -231,14 +230,14 @@ def fake_cuda(monkeypatch):
         monkeypatch.setattr(torch.cuda, name, stand_in)
 
 
-def test_a_tensor_that_appears_where_none_stood_stays_for_the_graph_to_write(fake_cuda):
+def test_a_tensor_created_by_the_function_is_kept(fake_cuda):
     lazy = Lazy()
     graph = capture.Graph(lazy, (), (lazy,))
-    assert graph._out is lazy.memory["h"], "the graph writes into what the attribute names"
-    assert lazy.total.tolist() == [0, 0], "all else is as it was"
+    assert graph._out is lazy.hidden["h"], "the graph writes into the attribute's tensor"
+    assert lazy.total.tolist() == [0, 0], "other state is restored"
 
 
-def test_after_a_failed_recording_none_stands_where_it_stood(fake_cuda):
+def test_a_failed_recording_restores_the_state(fake_cuda):
     lazy = Lazy()
 
     def fails():
@@ -247,7 +246,7 @@ def test_after_a_failed_recording_none_stands_where_it_stood(fake_cuda):
 
     with pytest.raises(RuntimeError, match="no graph of this"):
         capture.Graph(fails, (), (lazy,))
-    assert lazy.memory is None and lazy.total.tolist() == [0, 0]
+    assert lazy.hidden is None and lazy.total.tolist() == [0, 0]
 
 
 def test_a_function_is_warmed_up_and_then_recorded(fake_cuda):
@@ -257,18 +256,19 @@ def test_a_function_is_warmed_up_and_then_recorded(fake_cuda):
 
 
 def test_arguments_are_copied_in_before_each_replay(fake_cuda):
-    given, seen = {"x": torch.zeros(2)}, []
-    graph = capture.Graph(lambda tree: seen.append(tree["x"]) or tree["x"], (given,), ())
-    inside = graph({"x": torch.tensor([3.0, 4.0])})
-    assert inside is seen[-1] and inside.tolist() == [3, 4] and given["x"].tolist() == [0, 0]
+    example, inputs = {"x": torch.zeros(2)}, []
+    graph = capture.Graph(lambda tree: inputs.append(tree["x"]) or tree["x"], (example,), ())
+    output = graph({"x": torch.tensor([3.0, 4.0])})
+    assert output is inputs[-1] and output.tolist() == [3, 4]
+    assert example["x"].tolist() == [0, 0]
     assert graph._graph.replays == 1
 
 
 @pytest.mark.parametrize(
     "argument, error",
     [
-        ({"x": torch.zeros(3)}, r"shape \(2,\), but was called with \(3,\)"),
-        ({}, "was recorded with"),
+        ({"x": torch.zeros(3)}, r"shape \(2,\), but called with \(3,\)"),
+        ({}, "captured with arguments"),
     ],
 )
 def test_arguments_of_other_shapes_or_trees_are_refused(fake_cuda, argument, error):
@@ -278,9 +278,9 @@ def test_arguments_of_other_shapes_or_trees_are_refused(fake_cuda, argument, err
     assert not graph._graph.replays
 
 
-def test_the_warning_names_the_line_unless_the_sentence_says_it_all(fake_cuda):
+def test_the_warning_names_the_attribute_or_the_line(fake_cuda):
     env = Counter("scalar")
-    with pytest.warns(UserWarning, match="steps changed from 0 to 1 .* on the device.$"):
+    with pytest.warns(UserWarning, match=r"steps changed from 0 to 1 .*device\.$"):
         assert capture.capture(env.step, (actions("cpu"),), (env,)) == env.step
     assert env.steps == 0
 
@@ -292,15 +292,15 @@ def test_the_warning_names_the_line_unless_the_sentence_says_it_all(fake_cuda):
 
 
 def test_only_the_actions_of_a_decision_reach_the_environment():
-    given = []
+    decisions = []
     env = Counter()
-    env.step = given.append
+    env.step = decisions.append
     decision = arrdict.arrdict(**actions("cpu"), logits=torch.zeros(4))
     capture.Captured(env).step(decision)
-    assert set(given[0]) == {"actions"}
+    assert set(decisions[0]) == {"actions"}
 
 
-def test_on_the_cpu_an_environment_steps_as_it_is():
+def test_on_the_cpu_steps_are_not_captured():
     env = capture.Captured(Counter("scalar"))
     env.step(actions("cpu"))
     env.step(actions("cpu"))
@@ -315,13 +315,9 @@ class TestOnTheGPU:
         eager, env = Counter(how, "cuda"), capture.Captured(Counter(how, "cuda"))
         for value in (1, 2, 0, 2):
             a, b = eager.step(actions("cuda", value)), env.step(actions("cuda", value))
-            assert torch.equal(a.obs, b.obs) and torch.equal(a.reward, b.reward), (
-                "the same numbers, new with each replay"
-            )
-        assert (
-            isinstance(env._step, capture.Graph)
-            and env.parts["total"].tolist() == eager.parts["total"].tolist()
-        )
+            assert torch.equal(a.obs, b.obs) and torch.equal(a.reward, b.reward)
+        assert isinstance(env._step, capture.Graph)
+        assert env.parts["total"].tolist() == eager.parts["total"].tolist()
 
     @pytest.mark.parametrize(
         "how, error",
@@ -332,14 +328,12 @@ class TestOnTheGPU:
             ("grows", "changed its shape"),
         ],
     )
-    def test_what_cannot_be_captured_runs_eagerly_with_one_warning(self, how, error):
+    def test_a_step_that_cannot_be_captured_runs_eagerly_with_one_warning(self, how, error):
         env = capture.Captured(Counter(how, "cuda"))
         with pytest.warns(UserWarning, match=error):
             env.step(actions("cuda"))
         assert not isinstance(env._step, capture.Graph)
-        assert how == "grows" or env.step(actions("cuda")).obs.shape[0] == 4, (
-            "it goes on as it would have"
-        )
+        assert how == "grows" or env.step(actions("cuda")).obs.shape[0] == 4
 
     def test_warming_up_does_not_advance_the_environment(self):
         env = envs.Explorer(8, device="cuda")
@@ -359,7 +353,7 @@ class TestOnTheGPU:
             env.step(decision)
         assert torch.cuda.memory_stats()["allocation.all.allocated"] == before
 
-    def test_any_stream_will_do(self):
+    def test_capture_on_a_side_stream(self):
         results = []
         for side in (False, True):
             env = envs.Explorer(16, device="cuda")
@@ -372,18 +366,17 @@ class TestOnTheGPU:
         assert torch.equal(*results)
 
     @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-    def test_any_device_will_do(self):
-        made = [
+    def test_capture_on_the_second_device(self):
+        pair = [
             capture.Captured(envs.Explorer(16, device=f"cuda:{i}", resample=True)) for i in (0, 1)
         ]
-        for env in made:
+        for env in pair:
             env.reset()
         for k in range(230):
-            here, there = (env.step(actions(env.device, k % 7, 16)) for env in made)
-            assert (
-                there.reward.device == torch.device("cuda:1") and torch.cuda.current_device() == 0
-            )
+            worlds = [env.step(actions(env.device, k % 7, 16)) for env in pair]
+            assert worlds[1].reward.device == torch.device("cuda:1")
+            assert torch.cuda.current_device() == 0
             for name in ("obs.rgb", "obs.d", "obs.imu", "reward", "reset", "truncated"):
-                a, b = (attrgetter(name)(world).cpu() for world in (here, there))
+                a, b = (attrgetter(name)(world).cpu() for world in worlds)
                 assert torch.equal(a, b), name
-        assert all(isinstance(env._step, capture.Graph) for env in made)
+        assert all(isinstance(env._step, capture.Graph) for env in pair)

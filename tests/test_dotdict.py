@@ -1,4 +1,4 @@
-"""Trees with attribute access: what a plain dict does not do."""
+"""Trees with attribute access, beyond what a dict does."""
 
 import copy
 import pickle
@@ -15,56 +15,50 @@ def objs():
     return dotdict(a=dotdict(b=1, c=2), d=3)
 
 
-def lines(*rows):
-    return "\n".join(rows)
-
-
 def test_keys_are_attributes(objs):
     assert objs.d == 3
     assert objs.a.c == 2
 
 
-def test_unknown_attributes_are_looked_up_on_every_leaf():
+def test_unknown_attributes_are_looked_up_on_leaves():
     tree = dotdict(a=1 + 2j, b=dotdict(c=3 - 4j))
     assert tree.imag == dotdict(a=2.0, b=dotdict(c=-4.0))
     assert type(tree.imag.b) is dotdict
 
 
-def test_calls_are_forwarded_with_their_arguments():
+def test_calls_pass_their_arguments_to_leaves():
     tree = dotdict(a="x-y", b=dotdict(c="z"))
     assert tree.split("-") == {"a": ["x", "y"], "b": {"c": ["z"]}}
     assert tree.replace("z", "w").b.c == "w"
 
 
-def test_a_key_shared_by_nested_trees_is_reached_through_their_parent():
+def test_a_key_of_nested_trees_is_an_attribute_of_the_parent():
     assert dotdict(a=dotdict(x=1, y=2), b=dotdict(x=3)).x == {"a": 1, "b": 3}
 
 
-def test_methods_come_before_keys_and_keys_before_the_values_attributes():
+def test_methods_precede_keys_and_keys_precede_attributes_of_values():
     tree = dotdict(items=1, imag=2)
     assert list(tree.items()) == [("items", 1), ("imag", 2)]
     assert tree.imag == 2
 
 
-def test_empty_branches_survive_forwarding():
+def test_empty_trees_are_kept():
     assert dotdict(a="x", b=dotdict()).upper() == {"a": "X", "b": {}}
 
 
-def test_a_misspelt_attribute_names_itself_the_keys_and_the_nearest_one():
-    with pytest.raises(
-        AttributeError, match=r"'rewrd' is not .*type float.* its keys are obs, reward .*'reward'"
-    ):
+def test_an_unknown_attribute_is_named_with_the_nearest_key():
+    with pytest.raises(AttributeError, match=r"'rewrd' .*float.* obs, reward .*mean 'reward'"):
         _ = dotdict(obs=1.0, reward=2.0).rewrd
-    with pytest.raises(AttributeError, match=r"'x' is not a key .*its keys are none"):
+    with pytest.raises(AttributeError, match=r"'x' .*none"):
         _ = dotdict().x
 
 
-def test_a_misspelt_item_names_the_keys():
-    with pytest.raises(KeyError, match=r"'q' is not a key; its keys are a, d"):
+def test_an_unknown_key_is_named_with_the_keys():
+    with pytest.raises(KeyError, match=r"'q' .*a, d"):
         dotdict(a=1, d=2)["q"]
 
 
-def test_assigning_or_deleting_by_attribute_is_refused(objs):
+def test_assignment_and_deletion_by_attribute_are_refused(objs):
     with pytest.raises(AttributeError, match=r"write d\['e'\] = "):
         objs.e = 1
     with pytest.raises(AttributeError, match=r"write del d\['d'\]"):
@@ -72,11 +66,11 @@ def test_assigning_or_deleting_by_attribute_is_refused(objs):
     assert list(objs) == ["a", "d"]
 
 
-def test_private_and_special_names_are_not_forwarded(objs):
-    class Boastful:
+def test_private_and_special_names_are_not_looked_up_on_leaves(objs):
+    class Leaf:
         _private = __special__ = 1
 
-    tree = dotdict(a=Boastful())
+    tree = dotdict(a=Leaf())
     assert not hasattr(tree, "_private")
     assert not hasattr(tree, "__special__")
     assert not hasattr(objs, "__array_interface__")
@@ -84,20 +78,21 @@ def test_private_and_special_names_are_not_forwarded(objs):
 
 
 @pytest.mark.parametrize(
-    "trip", [copy.copy, copy.deepcopy, dotdict.copy, lambda tree: pickle.loads(pickle.dumps(tree))]
+    "make_copy",
+    [copy.copy, copy.deepcopy, dotdict.copy, lambda tree: pickle.loads(pickle.dumps(tree))],
 )
-def test_copies_keep_type_and_values(objs, trip):
-    made = trip(objs)
-    assert type(made) is dotdict and type(made.a) is dotdict
-    assert made == objs and made is not objs
+def test_copies_keep_type_and_values(objs, make_copy):
+    copied = make_copy(objs)
+    assert type(copied) is type(copied.a) is dotdict
+    assert copied == objs and copied is not objs
 
 
-def test_deep_copies_are_deep(objs):
+def test_deepcopy_copies_nested_trees(objs):
     copy.deepcopy(objs).a["b"] = 9
     assert objs.a.b == 1
 
 
-def test_pipe_map_and_starmap_chain(objs):
+def test_pipe_map_and_starmap(objs):
     assert objs.pipe(list) == ["a", "d"]
     assert objs.map(float) == {"a": {"b": 1.0, "c": 2.0}, "d": 3.0}
     assert objs.starmap(int.__add__, objs) == {"a": {"b": 2, "c": 4}, "d": 6}
@@ -106,19 +101,19 @@ def test_pipe_map_and_starmap_chain(objs):
     assert objs.starmap(lambda x, y, z: x + y * z, objs, objs).d == 12
 
 
-def test_starmap_refuses_trees_of_other_keys(objs):
+def test_starmap_refuses_trees_with_other_keys(objs):
     with pytest.raises(ValueError, match="one has b, c and the other b"):
         objs.starmap(max, dotdict(a=dotdict(b=1), d=3))
-    with pytest.raises(ValueError, match="keys a, d was matched with one value of type int"):
+    with pytest.raises(ValueError, match="keys a, d .*int"):
         objs.starmap(max, 3)
 
 
-def test_leaves_come_in_order(objs):
+def test_leaves(objs):
     assert leaves(objs) == [1, 2, 3]
     assert leaves(5) == [5]
 
 
-def test_mapping_makes_a_function_of_trees():
+def test_mapping():
     @mapping
     def scale(x, by, plus=0):
         return by * x + plus
@@ -128,21 +123,18 @@ def test_mapping_makes_a_function_of_trees():
     assert scale.__name__ == "scale"
 
 
-def test_merging_keeps_the_type():
+def test_merge_keeps_the_type():
     merged = dotdict(a=1, b=2) | {"b": 3}
     assert type(merged) is dotdict and merged == {"a": 1, "b": 3}
     assert type({"a": 1} | dotdict(b=2)) is dotdict
 
 
-def test_printing_nests(objs):
-    assert (
-        repr(objs)
-        == str(objs)
-        == lines("dotdict:", "a    dotdict:", "     b    1", "     c    2", "d    3")
-    )
+def test_repr_is_nested(objs):
+    rows = ["dotdict:", "a    dotdict:", "     b    1", "     c    2", "d    3"]
+    assert repr(objs).split("\n") == str(objs).split("\n") == rows
 
 
-def test_printing_aligns_values_and_keeps_leaves_to_a_line():
+def test_repr_aligns_values_and_shortens_long_leaves():
     tree = dotdict(long_key=[1, 2, 3], s="two\nlines", t="x" * 500, e=dotdict())
     first, second, third, fourth, fifth = repr(tree).split("\n")
     assert (first, second, third, fifth) == (
@@ -154,25 +146,25 @@ def test_printing_aligns_values_and_keeps_leaves_to_a_line():
     assert fourth.endswith("...") and len(fourth) <= 120
 
 
-def test_tuples_of_integers_are_printed_in_full_and_other_collections_by_their_length():
+def test_repr_shows_shapes_in_full_and_lengths_of_collections():
     tree = dotdict(shape=(2, 3), flags=(True,), names=("a", "b"), long=tuple(range(9)))
-    assert repr(tree) == lines(
+    assert repr(tree).split("\n") == [
         "dotdict:",
         "shape    (2, 3)",
         "flags    tuple((1,))",
         "names    tuple((2,))",
         "long     tuple((9,))",
-    )
+    ]
 
 
-def test_completion_offers_the_keys(objs):
+def test_dir_includes_the_keys(objs):
     assert {"a", "d", "map"} <= set(dir(objs))
 
 
-def test_importing_it_needs_no_torch():
+def test_import_needs_no_torch():
     code = (
         "import sys; sys.modules['torch'] = sys.modules['numpy'] = None; "
         "from megastep.dotdict import dotdict; print(dotdict(a=1).a)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout == "1\n", done.stderr
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert process.stdout == "1\n", process.stderr

@@ -1,4 +1,4 @@
-"""Drawing: the sRGB curve, and what is drawn where."""
+"""Plots: the sRGB curve, images, floor plans, figures."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ matplotlib.use("Agg")
 
 
 @pytest.fixture(autouse=True)
-def _closed():
+def _figures_closed():
     from matplotlib import pyplot
 
     yield
@@ -34,13 +34,13 @@ def ax():
 @pytest.mark.parametrize(
     ("light", "value"), [(0, 0), (0.001, 0.01292), (0.2140411, 0.5), (0.5, 0.7353569), (1, 1)]
 )
-def test_the_srgb_curve_passes_through_its_published_points(light, value):
+def test_srgb_curve_matches_published_values(light, value):
     assert gamma_encode(light) == pytest.approx(value, abs=1e-6)
     assert gamma_decode(value) == pytest.approx(light, abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", [np.linspace, torch.linspace])
-def test_encoding_and_decoding_undo_each_other(kind):
+def test_gamma_decode_inverts_gamma_encode(kind):
     light = kind(0, 1, 10_001)
     tolerance = 1e-14 if kind is np.linspace else 1e-6  # float64 and float32 rounding
     assert abs(gamma_decode(gamma_encode(light)) - light).max() < tolerance
@@ -48,7 +48,7 @@ def test_encoding_and_decoding_undo_each_other(kind):
     assert (np.diff(gamma_encode(light)) > 0).all()
 
 
-def test_arrays_and_tensors_agree_and_keep_their_dtype():
+def test_gamma_of_arrays_and_tensors_agree_and_keep_the_dtype():
     light = np.linspace(-0.1, 1.5, 101, dtype=np.float32)
     for f in (gamma_encode, gamma_decode):
         assert f(light).dtype == np.float32 and f(torch.tensor(light)).dtype == torch.float32
@@ -61,14 +61,14 @@ def test_arrays_and_tensors_agree_and_keep_their_dtype():
         )
 
 
-def test_core_offers_it_too():
+def test_core_exports_gamma_encode_and_decode():
     assert core.gamma_encode is gamma_encode and core.gamma_decode is gamma_decode
 
 
 # ---- Images and strips ----
 
 
-def test_a_screen_is_shown_encoded_left_to_right_as_typed_in_the_tutorial():
+def test_screen_is_gamma_encoded_and_drawn_left_to_right():
     screen = np.zeros((1, 1, 64, 3), np.float32)
     screen[0, 0, 0] = [0.2140411, 1, 0]
     axes = plotting.plot_images({"rgb": screen}, transpose=True, aspect=0.1)
@@ -85,7 +85,7 @@ def test_a_screen_is_shown_encoded_left_to_right_as_typed_in_the_tutorial():
     )
 
 
-def test_observations_are_channels_first_with_a_panel_for_each_agent():
+def test_observations_are_channels_first_with_one_panel_per_agent():
     rgb, depth = (
         np.random.default_rng(1).random((2, 3, 1, 8)),
         np.linspace(0, 1, 8).reshape(1, 1, 1, 8),
@@ -100,11 +100,11 @@ def test_observations_are_channels_first_with_a_panel_for_each_agent():
     )
     assert np.allclose(
         axes[1, 0].images[0].get_array()[0], depth[0, 0, 0]
-    )  # grey is shown as it is
+    )  # grey is not gamma encoded
     assert axes[1, 0].images[0].get_clim() == (0, 1) and not axes[1, 1].axison
 
 
-def test_given_axes_are_used():
+def test_images_are_drawn_on_given_axes():
     figure, _, strips = plotting.panels(2)
     axes = plotting.plot_images(
         {"rgb": np.zeros((1, 3, 1, 8)), "d": np.zeros((1, 1, 1, 8), np.float16)}, axes=strips
@@ -112,9 +112,10 @@ def test_given_axes_are_used():
     assert list(axes[:, 0]) == strips and all(ax.figure is figure for ax in strips)
 
 
-def test_every_agent_and_camera_is_shown():
-    """Three agents with two cameras: a strip for each agent, in it a row for each camera, which has
-    the colour of its view on the plan; agents are numbered there."""
+def test_panels_per_agent_and_rows_per_camera():
+    """Three agents with two cameras: one strip per agent, one row of pixels per camera. A row's
+    label has the colour of the camera's view on the plan, where agents are numbered.
+    """
     cpu = scene.scenery([toys.column()], 3, device="cpu")
     c = core.Core(cpu, res=16, cameras=[0, 180])
     c.agents.positions[:] = torch.tensor([[2.0, 2.0], [5.0, 2.0], [2.0, 5.0]])
@@ -123,11 +124,11 @@ def test_every_agent_and_camera_is_shown():
     core.Core.plot_state(state, plan)
     modules.RGB.plot_state(rgb, strips, state.yaws)
     assert [ax.get_title("left") for ax in strips] == ["rgb 0", "rgb 1", "rgb 2"]
-    for strip, seen in zip(strips, rgb, strict=True):
-        shown = strip.images[0].get_array()
-        assert np.allclose(shown, gamma_encode(seen.transpose(1, 2, 0)), atol=1e-6)
+    for strip, image in zip(strips, rgb, strict=True):
+        pixels = strip.images[0].get_array()
+        assert np.allclose(pixels, gamma_encode(image.transpose(1, 2, 0)), atol=1e-6)
         assert [label.get_text() for label in strip.get_yticklabels()] == ["0°", "180°"]
-    assert np.ptp(rgb, axis=(0, 2)).min() > 0.01, "what they see differs"
+    assert np.ptp(rgb, axis=(0, 2)).min() > 0.01, "agents see different walls"
     assert [(note.get_text(), list(note.xy)) for note in plan.texts] == [
         ("0", [2, 2]),
         ("1", [5, 2]),
@@ -140,7 +141,7 @@ def test_every_agent_and_camera_is_shown():
     assert views == 3 * labels and labels[0] != labels[1]
 
 
-def test_one_camera_has_no_label_and_one_agent_no_number():
+def test_single_camera_has_no_label_and_single_agent_no_number():
     c = core.Core(scene.scenery([toys.box()], 1, device="cpu"), res=8)
     figure, plan, strips = plotting.panels(1)
     core.Core.plot_state(numpyify(c.state(0)), plan)
@@ -153,14 +154,14 @@ def test_one_camera_has_no_label_and_one_agent_no_number():
     ("shape", "transpose"),
     [((3, 1, 64), True), ((2, 64, 3), False), ((64,), False), ((64, 3), True)],
 )
-def test_other_shapes_are_refused(shape, transpose):
-    with pytest.raises(ValueError, match="image 'rgb' must have shape .* with 1 or 3 channels C"):
+def test_bad_image_shapes_are_refused(shape, transpose):
+    with pytest.raises(ValueError, match=r"image 'rgb' must have shape .*1 or 3 channels"):
         plotting.plot_images({"rgb": np.zeros(shape)}, transpose=transpose)
 
 
 @pytest.mark.parametrize("images", [{}, {"rgb": np.zeros((0, 3, 1, 8))}])
-def test_nothing_to_show_is_refused(images):
-    with pytest.raises(ValueError, match="given no images"):
+def test_no_images_are_refused(images):
+    with pytest.raises(ValueError, match="no images"):
         plotting.plot_images(images)
 
 
@@ -170,13 +171,13 @@ LINES = np.array([[[1, 1], [3, 1]], [[3, 1], [3, 5]]], np.float32)
 COLOURS = [np.array([[0.1, 0, 0], [0, 0.2, 0]]), np.array([[0, 0, 0.3]])]
 
 
-def test_lines_are_cut_into_texels_of_their_lit_colours(ax):
+def test_lines_are_drawn_texel_by_texel_in_lit_colours(ax):
     drawn = plotting.plot_lines(ax, LINES, COLOURS, exposure=2.0)
     assert np.allclose(drawn.get_segments(), [[[1, 1], [2, 1]], [[2, 1], [3, 1]], [[3, 1], [3, 5]]])
     assert np.allclose(drawn.get_colors()[:, :3], gamma_encode(2 * np.concatenate(COLOURS)))
 
 
-def test_bars_stand_side_by_side_a_group_for_each_name(ax):
+def test_bars_are_grouped_by_name(ax):
     drawn = plotting.plot_bars(("turn", "ahead"), [[0.5, -1], [0, 1]], ax)
     assert drawn is ax and [bar.get_height() for bar in ax.patches] == [0.5, -1, 0, 1]
     assert [bar.get_x() for bar in ax.patches] == pytest.approx([-0.4, 0.6, 0, 1])
@@ -184,7 +185,7 @@ def test_bars_stand_side_by_side_a_group_for_each_name(ax):
     assert plotting.plot_bars(("turn",), [0.5]).figure is not ax.figure
 
 
-def test_unseen_texels_are_nearly_background(ax):
+def test_unseen_texels_are_faint(ax):
     drawn = plotting.plot_lines(ax, LINES, COLOURS, seen=[[True, False], [True]])
     full = plotting.plot_lines(ax, LINES, COLOURS)
     contrast = np.abs(
@@ -193,16 +194,16 @@ def test_unseen_texels_are_nearly_background(ax):
     assert np.allclose(contrast[0] / contrast[1], np.array([1, plotting.UNSEEN, 1])[:, None])
 
 
-def test_no_lines_draw_nothing(ax):
+def test_no_lines(ax):
     assert len(plotting.plot_lines(ax, np.zeros((0, 2, 2)), []).get_segments()) == 0
 
 
-def test_every_line_needs_its_colours(ax):
-    with pytest.raises(ValueError, match="2 lines and 1 arrays of colours"):
+def test_lines_without_colours_are_refused(ax):
+    with pytest.raises(ValueError, match="2 lines and 1 arrays"):
         plotting.plot_lines(ax, LINES, COLOURS[:1])
 
 
-def test_a_plan_shows_everything_to_scale_with_units():
+def test_plan_is_to_scale_and_shows_everything():
     ax = plotting.plot_scenery(LINES, COLOURS, lights=np.array([[2.0, 3.0, 1.0]]))
     assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_aspect()) == ("x, m", "y, m", 1)
     ax.figure.canvas.draw()
@@ -211,7 +212,7 @@ def test_a_plan_shows_everything_to_scale_with_units():
     assert [2, 3] in [list(offset) for part in ax.collections for offset in part.get_offsets()]
 
 
-def test_colours_land_where_the_walls_are():
+def test_pixels_have_the_colour_of_their_wall():
     figure, plan, _ = plotting.panels()
     plotting.plot_scenery(LINES, [np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]])], ax=plan)
     image = plotting.rasterise(figure)
@@ -224,14 +225,14 @@ def test_colours_land_where_the_walls_are():
     assert pixel(2, 3) == 3 * [round(255 * plotting.BACKGROUND)]
 
 
-def test_what_is_in_view_reaches_each_hit_leftmost_ray_first(ax):
-    # Facing +y with 90 degrees and two rays, these look along (1, 1/2) and (1, -1/2): left of +y is
-    # -x.
+def test_view_reaches_each_hit_leftmost_ray_first(ax):
+    # Two rays, 90 degrees, facing +y: in the camera frame they point along (1, 1/2) and (1, -1/2),
+    # and left of +y is -x.
     patch = plotting.plot_view(ax, (1, 1), 90, 90, distances=[5**0.5, np.inf], reach=2 * 5**0.5)
     assert np.allclose(patch.get_xy()[:3], [[1, 1], [0, 3], [3, 5]])
 
 
-def test_a_view_without_distances_is_a_wedge_of_its_field_of_view(ax):
+def test_view_without_distances_is_a_wedge(ax):
     rim = plotting.plot_view(ax, (0, 0), 0, 60, reach=2.0).get_xy()[1:-1]
     assert np.allclose(np.linalg.norm(rim, axis=1), 2)
     degrees = np.degrees(np.arctan2(rim[:, 1], rim[:, 0]))
@@ -241,7 +242,7 @@ def test_a_view_without_distances_is_a_wedge_of_its_field_of_view(ax):
 # ---- Figures ----
 
 
-def test_panels_are_unknown_to_pyplot_and_do_not_overlap():
+def test_panels_do_not_overlap_and_are_unknown_to_pyplot():
     from matplotlib import pyplot
 
     figure, plan, strips = plotting.panels(3, title="a title")
@@ -257,7 +258,7 @@ def test_panels_are_unknown_to_pyplot_and_do_not_overlap():
     assert (width, channels) == (600, 3) and abs(height - 100 * figure.get_figheight()) < 1
 
 
-def test_rasterising_leaves_a_pyplot_figure_usable():
+def test_rasterise_keeps_a_pyplot_figure_open():
     from matplotlib import pyplot
 
     figure = pyplot.figure(figsize=(2, 1), dpi=50, facecolor="r")
@@ -267,12 +268,12 @@ def test_rasterising_leaves_a_pyplot_figure_usable():
     assert pyplot.fignum_exists(figure.number)
 
 
-def test_importing_the_simulator_does_not_import_matplotlib_or_compile():
+def test_importing_the_simulator_imports_no_optional_package():
     code = (
         "import sys; import megastep; assert 'torch' not in sys.modules; "
         "from megastep import core, modules, envs, plotting; "
         "print([m for m in ('matplotlib', 'av', 'IPython', 'hydra', 'wandb', 'loky') if m in "
         "sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout == "[]\n", done.stderr
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert process.stdout == "[]\n", process.stderr

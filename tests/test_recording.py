@@ -1,4 +1,4 @@
-"""Videos: order, sizes, workers, errors, files."""
+"""Videos: order and size of frames, worker processes, errors, files."""
 
 import os
 import subprocess
@@ -18,19 +18,17 @@ from megastep.arrdict import arrdict
 from megastep.recording import ParallelEncoder
 
 SIZE = 32
-TOLERANCE = 6  # grey levels: what h264 at this quality loses on flat colour
+TOLERANCE = 6  # grey levels: the loss of h264 at this quality on a flat colour
 
 
 def plot_grey(state):
-    """A flat image of the state's grey level; early frames take longest, so that workers finish
-    out of order.
-    """
+    """Draws a flat grey image. Early frames take longest, so workers finish out of order."""
     time.sleep(0.2 / (1 + state.i))
     return np.full((SIZE, SIZE, 3), state.grey, np.uint8)
 
 
 def plot_facts(state):
-    """Writes what a worker's process is like to the file that the state names."""
+    """Writes facts about the worker process to the file `state.path`."""
     import matplotlib
 
     facts = [
@@ -84,19 +82,19 @@ def record(plot_state, states, **settings):
 
 
 def frames(path):
-    """(n, H, W, 3) of a video file."""
+    """Returns the frames of a video file, (n, H, W, 3)."""
     with av.open(str(path)) as container:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
-def test_frames_come_out_in_the_order_they_went_in(tmp_path):
+def test_frames_keep_their_order(tmp_path):
     greys = [int(grey) for grey in np.linspace(0, 255, 12)]
     states = [arrdict(i=i, grey=torch.tensor(grey)) for i, grey in enumerate(greys)]
     path = record(plot_grey, states, n_workers=2).save(tmp_path / "video.mp4")
     assert np.abs(frames(path).mean((1, 2, 3)) - greys).max() < TOLERANCE
 
 
-def test_the_file_is_h264_in_yuv420p_at_the_rate_asked_for(tmp_path):
+def test_file_is_h264_in_yuv420p_at_the_given_fps(tmp_path):
     with ParallelEncoder(plot_grey, fps=12.5) as encoder:
         for _ in range(25):
             encoder.frame(np.zeros((SIZE, SIZE, 3)))
@@ -109,7 +107,7 @@ def test_the_file_is_h264_in_yuv420p_at_the_rate_asked_for(tmp_path):
     assert os.listdir(tmp_path / "new") == ["video.mp4"]
 
 
-def test_images_and_states_can_be_mixed_and_keep_their_order(tmp_path):
+def test_images_and_states_can_be_mixed(tmp_path):
     with ParallelEncoder(plot_grey, n_workers=1) as encoder:
         encoder(arrdict(i=0, grey=50))
         encoder.frame(np.full((SIZE, SIZE, 3), 100, np.uint8))
@@ -122,11 +120,11 @@ def test_images_and_states_can_be_mixed_and_keep_their_order(tmp_path):
 def test_odd_sizes_are_padded_to_even(tmp_path):
     with ParallelEncoder(plot_grey) as encoder:
         encoder.frame(np.full((33, 47, 3), 200, np.uint8))
-    shot = frames(encoder.save(tmp_path / "video.mp4"))
-    assert shot.shape == (1, 34, 48, 3) and abs(shot[0, -1, -1].mean() - 200) < TOLERANCE
+    video = frames(encoder.save(tmp_path / "video.mp4"))
+    assert video.shape == (1, 34, 48, 3) and abs(video[0, -1, -1].mean() - 200) < TOLERANCE
 
 
-def test_a_state_may_change_once_it_was_given(tmp_path):
+def test_states_are_copied(tmp_path):
     state = arrdict(i=0, grey=torch.tensor(200))
     with ParallelEncoder(plot_grey, n_workers=1) as encoder:
         encoder(state)
@@ -134,14 +132,14 @@ def test_a_state_may_change_once_it_was_given(tmp_path):
     assert abs(frames(encoder.save(tmp_path / "video.mp4")).mean() - 200) < TOLERANCE
 
 
-def test_workers_are_other_processes_with_one_thread_and_no_gpu(tmp_path):
+def test_workers_have_one_thread_and_no_gpu(tmp_path):
     record(plot_facts, [arrdict(path=str(tmp_path / "facts"), x=torch.zeros(1))], n_workers=1)
     pid, *facts = (tmp_path / "facts").read_text().split(" ")
     assert int(pid) != os.getpid()
     assert facts == ["Agg", "1", "False", "", "arrdict", "ndarray"]
 
 
-def test_few_frames_are_in_flight(monkeypatch):
+def test_at_most_two_frames_per_worker_are_pending(monkeypatch):
     submitted = []
 
     class Future:
@@ -171,34 +169,34 @@ def test_few_frames_are_in_flight(monkeypatch):
 @pytest.mark.parametrize(
     "plot_state", [Env.plot_class, Env().plot_class, Env.plot_static, Env().plot_static]
 )
-def test_classmethods_and_staticmethods_go_to_workers_silently(plot_state):
+def test_classmethods_and_staticmethods_run_in_workers(plot_state):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert ParallelEncoder(plot_state)._payload is not None
+        assert ParallelEncoder(plot_state)._pickled_plot_state is not None
 
 
-def test_a_method_of_an_object_draws_here_with_one_warning(tmp_path):
+def test_bound_method_draws_in_this_process_with_a_warning(tmp_path):
     from matplotlib import pyplot
 
     env, open_before = Env(), pyplot.get_fignums()
     with pytest.warns(
         UserWarning,
-        match="plot_state is a method of a Env object, so frames are drawn in this process",
-    ) as caught:
+        match="plot_state is a method of a Env object.*this process",
+    ) as warned:
         encoder = record(env.plot_state, [arrdict(xs=torch.arange(i)) for i in range(3)])
-    assert len(caught) == 1 and caught[0].filename == __file__
+    assert len(warned) == 1 and warned[0].filename == __file__
     assert env.pids == 3 * [os.getpid()] and pyplot.get_fignums() == open_before
     assert frames(encoder.save(tmp_path / "video.mp4")).shape == (3, 66, 102, 3)
 
 
-def test_what_cannot_be_sent_draws_here_with_a_warning(tmp_path):
+def test_unpicklable_function_draws_in_this_process_with_a_warning(tmp_path):
     lock = threading.Lock()
     with pytest.warns(UserWarning, match="cannot be sent to another process"):
         encoder = record(lambda state, lock=lock: np.zeros((SIZE, SIZE, 3)), [arrdict()])
     assert len(frames(encoder.save(tmp_path / "video.mp4"))) == 1
 
 
-def test_a_fault_in_a_worker_names_the_frame():
+def test_error_in_a_worker_names_the_frame():
     states = [arrdict(x=1), arrdict(x=0)]
     with pytest.raises(
         RuntimeError, match="frame 0 could not be recorded: TypeError: plot_state must return"
@@ -210,14 +208,14 @@ def test_a_fault_in_a_worker_names_the_frame():
         record(plot_badly, states[1:], n_workers=1)
 
 
-def test_a_worker_that_dies_names_the_frame():
+def test_killed_worker_names_the_frame():
     with pytest.raises(
         RuntimeError, match="^frame 0 could not be recorded: TerminatedWorkerError: .*"
     ):
         record(plot_fatally, [arrdict()], n_workers=1)
 
 
-def test_a_fault_in_this_process_names_the_frame():
+def test_error_in_this_process_names_the_frame():
     def plot_state(self, state):
         return 1 / state.x
 
@@ -229,19 +227,19 @@ def test_a_fault_in_this_process_names_the_frame():
         record(bound, [arrdict(x=0)])
 
 
-def test_an_exception_in_the_block_is_passed_on_unchanged():
+def test_exception_in_the_block_is_not_changed():
     with pytest.raises(KeyError, match="mine"), ParallelEncoder(plot_grey, n_workers=1) as encoder:
         encoder(arrdict(i=0, grey=0))
         raise KeyError("mine")
 
 
 class Stopped(BaseException):
-    """As signal handlers raise."""
+    """What a signal handler raises."""
 
 
-@pytest.mark.parametrize("how", ["waiting", "drawing", "encoding"])
-def test_a_signal_is_passed_on_unchanged_wherever_it_strikes(how, monkeypatch):
-    """While it waits for a worker, draws here, or encodes; also where closing the video fails."""
+@pytest.mark.parametrize("moment", ["waiting", "drawing", "encoding"])
+def test_signal_is_not_changed(moment, monkeypatch):
+    """While waiting for a worker, drawing here, or encoding, and if closing the video fails too."""
 
     def stop(*args, **options):
         raise Stopped
@@ -249,12 +247,12 @@ def test_a_signal_is_passed_on_unchanged_wherever_it_strikes(how, monkeypatch):
     def broken(self):
         raise OSError("the container is broken")
 
-    plot_state = types.MethodType(stop, Env()) if how == "drawing" else plot_grey
-    if how == "waiting":
-        monkeypatch.setattr(recording, "_is_done", stop)
-    if how == "encoding":
-        monkeypatch.setattr(recording._Video, "add", stop)
-    monkeypatch.setattr(recording._Video, "close", broken)
+    plot_state = types.MethodType(stop, Env()) if moment == "drawing" else plot_grey
+    if moment == "waiting":
+        monkeypatch.setattr(recording, "_is_ready", stop)
+    if moment == "encoding":
+        monkeypatch.setattr(recording.Mp4Writer, "add", stop)
+    monkeypatch.setattr(recording.Mp4Writer, "close", broken)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         encoder = ParallelEncoder(plot_state, n_workers=1)
@@ -263,17 +261,15 @@ def test_a_signal_is_passed_on_unchanged_wherever_it_strikes(how, monkeypatch):
     assert encoder._pool is None
 
 
-def test_what_was_recorded_before_an_error_can_be_saved(tmp_path):
+def test_frames_before_an_error_can_be_saved(tmp_path):
     with pytest.raises(KeyError), ParallelEncoder(plot_grey) as encoder:
         encoder.frame(np.zeros((SIZE, SIZE, 3)))
         raise KeyError
     assert len(frames(encoder.save(tmp_path / "video.mp4"))) == 1
 
 
-def test_frames_of_another_size_are_refused():
-    with pytest.raises(
-        RuntimeError, match="frame 1 .* first, 32 x 16 pixels, but this one has 32 x 32"
-    ):
+def test_frame_of_another_size_is_refused():
+    with pytest.raises(RuntimeError, match="frame 1 .*32 x 16.*32 x 32"):
         with ParallelEncoder(plot_grey) as encoder:
             encoder.frame(np.zeros((16, 32, 3)))
             encoder.frame(np.zeros((32, 32, 3)))
@@ -282,41 +278,42 @@ def test_frames_of_another_size_are_refused():
 @pytest.mark.parametrize(
     ("array", "error"),
     [
-        (np.zeros((4, 4)), r"shape \(H, W, 3\), but this one has \(4, 4\)"),
-        (np.zeros((4, 4, 4)), r"has \(4, 4, 4\)"),
-        (np.zeros((0, 4, 3)), r"has \(0, 4, 3\)"),
-        (np.zeros((4, 4, 3), int), "uint8 or floats from 0 to 1, but this one holds int"),
+        (np.zeros((4, 4)), r"shape \(H, W, 3\).* \(4, 4\)"),
+        (np.zeros((4, 4, 4)), r"\(4, 4, 4\)"),
+        (np.zeros((0, 4, 3)), r"\(0, 4, 3\)"),
+        (np.zeros((4, 4, 3), int), "uint8 or floats.*int"),
     ],
 )
-def test_what_is_no_image_is_refused(array, error):
+def test_bad_images_are_refused(array, error):
     with pytest.raises(ValueError, match=error), ParallelEncoder(plot_grey) as encoder:
         encoder.frame(array)
 
 
-def test_no_frames_no_video(tmp_path):
+def test_video_without_frames_is_refused(tmp_path):
     encoder = record(plot_grey, [])
-    with pytest.raises(ValueError, match="no frames were recorded"):
+    with pytest.raises(ValueError, match="no frames"):
         encoder.save(tmp_path / "video.mp4")
-    with pytest.raises(ValueError, match="no frames were recorded"):
+    with pytest.raises(ValueError, match="no frames"):
         encoder.notebook()
     assert not os.listdir(tmp_path)
 
 
-def test_the_block_comes_first_and_the_video_after(tmp_path):
+def test_frames_inside_the_block_and_save_after_it(tmp_path):
     encoder = ParallelEncoder(plot_grey)
-    with pytest.raises(RuntimeError, match="inside the encoder's with block"):
+    with pytest.raises(RuntimeError, match="inside the with block"):
         encoder(arrdict(i=0, grey=0))
-    with encoder, pytest.raises(RuntimeError, match="use it after the block"):
+    with encoder, pytest.raises(RuntimeError, match="after it"):
         encoder.save(tmp_path / "video.mp4")
 
 
 @pytest.mark.parametrize("settings", [dict(fps=0), dict(fps=float("nan")), dict(n_workers=0)])
-def test_settings_are_checked(settings):
-    with pytest.raises(ValueError, match="must be"):
+def test_bad_settings_are_named(settings):
+    (name,) = settings
+    with pytest.raises(ValueError, match=f"{name} must be"):
         ParallelEncoder(plot_grey, **settings)
 
 
-def test_a_save_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+def test_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
     with ParallelEncoder(plot_grey) as encoder:
         encoder.frame(np.zeros((SIZE, SIZE, 3)))
     (tmp_path / "video.mp4").write_text("old")
@@ -332,7 +329,7 @@ def test_a_save_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
         encoder.save(tmp_path / "video.gif")
 
 
-def test_notebooks_get_an_embedded_video(monkeypatch):
+def test_notebook_embeds_the_video(monkeypatch):
     with ParallelEncoder(plot_grey) as encoder:
         encoder.frame(np.zeros((SIZE, SIZE, 3)))
     monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
@@ -347,7 +344,7 @@ def test_notebooks_get_an_embedded_video(monkeypatch):
         encoder.notebook()
 
 
-def test_without_pyav_one_sentence_says_how_to_get_it(monkeypatch):
+def test_missing_pyav_is_named_with_the_cure(monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(ImportError, match="pip install av$"), ParallelEncoder(plot_grey):
         pass
@@ -373,10 +370,10 @@ encoder.save('video.mp4')
 """
 
 
-def test_a_script_without_a_main_guard_records(tmp_path):
+def test_script_without_a_main_guard_can_record(tmp_path):
     (tmp_path / "script.py").write_text(SCRIPT)
     root = os.path.dirname(os.path.dirname(recording.__file__))
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-W", "error::UserWarning", "script.py"],
         cwd=tmp_path,
         capture_output=True,
@@ -384,5 +381,5 @@ def test_a_script_without_a_main_guard_records(tmp_path):
         timeout=120,
         env={**os.environ, "PYTHONPATH": root},
     )
-    assert (done.returncode, done.stdout) == (0, "started\n"), done.stderr
+    assert (process.returncode, process.stdout) == (0, "started\n"), process.stderr
     assert frames(tmp_path / "video.mp4").shape == (4, 64, 64, 3)

@@ -1,6 +1,6 @@
-"""Adam, as PyTorch's fused operation.
+"""Adam through PyTorch's fused operation.
 
-PyTorch's own class imports its compiler before it does anything, which takes more than a second.
+`torch.optim.Adam` imports PyTorch's compiler first, which takes more than a second.
 """
 
 from collections.abc import Iterable
@@ -10,9 +10,13 @@ import torch
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015) over parameters that always have a gradient.
+    """Adam (Kingma and Ba 2015) for parameters that all have gradients.
 
-    `lr` is a tensor () on their device, changed in place from outside.
+    Args:
+        parameters: parameters to optimise.
+        lr: step size, a tensor () on their device that may be changed in place.
+        betas: decay of the running means of gradients and of squared gradients.
+        eps: added to the denominator.
     """
 
     def __init__(
@@ -30,9 +34,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self, is_taken: torch.Tensor) -> None:
-        """Follows the gradients, or changes nothing at all unless `is_taken`, a bool () on the
-        device.
-        """
+        """Takes one step if `is_taken`, a bool () on the device; otherwise changes nothing."""
         self.n_steps += is_taken
         torch._fused_adam_(
             self.parameters,
@@ -52,13 +54,17 @@ class Adam:
         )
 
     def zero_grad(self) -> None:
+        """Frees the gradients."""
         for p in self.parameters:
             p.grad = None
 
     def state_dict(self) -> dict[str, Any]:
+        """Returns the number of steps and both running means."""
         return dict(n_steps=self.n_steps, means=self.means, squares=self.squares)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from a `state_dict`, in place."""
         self.n_steps.copy_(state["n_steps"])
-        for own, saved in zip(self.means + self.squares, state["means"] + state["squares"]):
-            own.copy_(saved)
+        saved = state["means"] + state["squares"]
+        for target, source in zip(self.means + self.squares, saved):
+            target.copy_(source)

@@ -1,60 +1,70 @@
-"""An update of a learner as a CUDA graph."""
+"""A learner's update as a CUDA graph."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 
 from megastep.agents.generator import SeededGenerator
+from megastep.agents.types import Rollout
 
-# updates done eagerly, and for real, before one is captured: libraries set themselves up in the
-# first
-_WARM_UPS = 2
+# Eager updates, which count like any other, before one is captured: libraries initialise themselves
+# in the first.
+_N_WARM_UPS = 2
+
+Metrics = dict[str, torch.Tensor]
 
 
 class CudaGraphUpdate:
-    """`update(rollout)`, a function that returns a dict of tensors and never synchronises, on a GPU
-    as a CUDA graph; elsewhere, and where not `graph`, as it is.
+    """Calls an update function, on a GPU through a CUDA graph.
 
-    The first updates are eager, on the stream that captures. A graph belongs to the rollout that it
-    was captured with: another one is captured anew, so a learner is given one and the same.
+    The first updates run eagerly, on the stream that captures afterwards. A graph reads the memory
+    of the rollout it was captured with, so another rollout object causes another capture: pass the
+    same object every time.
 
-    Args: `device`, the policy's, whichever GPU is current; `randoms`, the random streams that the
-    update draws from.
+    Args:
+        update: a function of a rollout that returns tensors by name and never synchronises.
+        device: device of the policy; need not be the current GPU.
+        graph: whether to capture. A CPU always runs eagerly.
+        generators: the generators that `update` draws from.
+
+    Attributes:
+        graph: the captured graph, None before the capture.
     """
 
     def __init__(
         self,
-        update: Callable[[Any], dict[str, torch.Tensor]],
+        update: Callable[[Rollout], Metrics],
         device: torch.device,
         graph: bool,
-        randoms: tuple[SeededGenerator, ...] = (),
+        generators: tuple[SeededGenerator, ...] = (),
     ):
-        self.update, self.device, self.randoms = update, device, randoms
+        self.update, self.device, self.generators = update, device, generators
         self.stream = torch.cuda.Stream(device) if graph and device.type == "cuda" else None
         self.restart()
 
     def restart(self) -> None:
-        """Warms up and captures anew: the random streams are others now."""
-        self.graph = self._rollout = self._metrics = None
-        self._warm_ups = _WARM_UPS
+        """Discards the graph, which is then warmed up and captured again. Call it after generators
+        were replaced.
+        """
+        self.graph: torch.cuda.CUDAGraph | None = None
+        self._rollout = self._metrics = None
+        self._n_warm_ups_left = _N_WARM_UPS
 
-    def __call__(self, rollout: Any) -> dict[str, torch.Tensor]:
-        """One update. Returns what the function does, in memory that the next leaves alone."""
+    def __call__(self, rollout: Rollout) -> Metrics:
+        """Performs one update. The tensors it returns are not overwritten by the next one."""
         if self.stream is None:
             return self.update(rollout)
         with torch.cuda.device(self.device):
-            if self._warm_ups:
-                self._warm_ups -= 1
+            if self._n_warm_ups_left:
+                self._n_warm_ups_left -= 1
                 return self._warm_up(rollout)
             if self._rollout is not rollout:
                 self._capture(rollout)
             self.graph.replay()
-            return {key: value.clone() for key, value in self._metrics.items()}
+            return {name: value.clone() for name, value in self._metrics.items()}
 
     def _warm_up(self, rollout):
-        # PyTorch would warn that gradients were first added up on another stream, which this waits
-        # for
+        # PyTorch would warn of gradients accumulated on another stream, which this one waits for
         torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)
         self.stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self.stream):
@@ -64,12 +74,12 @@ class CudaGraphUpdate:
 
     def _capture(self, rollout):
         graph = torch.cuda.CUDAGraph()
-        for random in self.randoms:
-            graph.register_generator_state(random.on(self.device))
+        for generator in self.generators:
+            graph.register_generator_state(generator.on(self.device))
         try:
             with torch.cuda.graph(graph, stream=self.stream):
                 self._metrics = self.update(rollout)
         except RuntimeError as error:
-            # the end of a capture that failed fails as well: the first error is the one to tell
+            # ending a failed capture raises as well; the first error is the informative one
             raise error.__context__ or error from None
         self.graph, self._rollout = graph, rollout

@@ -1,4 +1,4 @@
-"""The gradient steps of an update: followed if they are finite, counted if they are not."""
+"""The gradient steps of an update. Non-finite steps are skipped and counted."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -10,18 +10,24 @@ from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 
 
 class GradientSteps:
-    """Adam's steps on some parameters, none of them with a number that is not finite.
+    """Adam's steps on some parameters, which non-finite numbers never reach.
 
-        is_fine = steps.begin(rollout.numbers())
+        is_finite = steps.begin(rollout.floats())
         for batch in minibatches:
             steps.take(loss, metrics, batch.valid.any())
         return steps.end()
 
-    A rollout with a number that is not finite, or beyond `finite.LIMIT`, and a gradient that is not
-    finite change nothing. `check` tells which number it was, and how many updates were skipped in a
-    row. Nothing synchronises: what would be an `if` is a flag on the device.
+    Nothing changes if the rollout holds a NaN, an infinity or a number beyond `nonfinite.LIMIT`, or
+    if the gradient is not finite. Nothing synchronises: conditions are bool tensors on the device.
 
-    Args: `lr`, Adam's step size; `max_grad_norm`, to which longer gradients are shortened.
+    Args:
+        parameters: parameters to optimise.
+        lr: Adam's step size.
+        max_grad_norm: longer gradients are scaled down to this norm.
+        device: device of the parameters.
+
+    Attributes:
+        check: the first non-finite number, and how many updates were skipped in a row.
     """
 
     def __init__(
@@ -35,45 +41,59 @@ class GradientSteps:
         self._lr = torch.tensor(lr, device=device)
         self.optimizer = Adam(parameters, self._lr)
         self.check = NonFiniteCheck(device)
-        self._is_fine, self._rows, self._names = None, [], ()  # of the update that goes on
+        self._is_finite, self._rows, self._names = None, [], ()  # of the update in progress
 
     def set_lr(self, lr: float) -> None:
         """Changes Adam's step size, also for a captured update."""
         self._lr.fill_(lr)
 
-    def begin(self, numbers: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Begins an update that learns from these numbers, as `NonFiniteCheck` takes them. Returns
-        whether it can, a bool ().
+    def begin(self, floats: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Begins an update.
+
+        Args:
+            floats: the tensors to learn from, as for `NonFiniteCheck`.
+
+        Returns:
+            () bool, whether they are all finite. If not, no step of this update is taken.
         """
-        self._is_fine, self._rows = self.check(numbers), []
-        return self._is_fine
+        self._is_finite, self._rows = self.check(floats), []
+        return self._is_finite
 
     def take(
         self,
         loss: torch.Tensor,
         metrics: dict[str, torch.Tensor],
         has_valid: torch.Tensor,
-        is_wanted: torch.Tensor | bool = True,
+        is_enabled: torch.Tensor | bool = True,
     ) -> torch.Tensor:
-        """One step down a loss (), if it has a valid row, and is wanted: a step that is not is not
-        counted as skipped either. `metrics` are tensors () by name, of which `end` gives the means.
-        Returns whether the step was taken, a bool ().
+        """Takes one step down the gradient of a loss ().
+
+        Args:
+            loss: () tensor.
+            metrics: tensors () by name, which `end` averages over the steps taken.
+            has_valid: () bool, whether the minibatch has a valid transition. No step without one.
+            is_enabled: () bool. A step that is not enabled is neither taken nor counted as skipped.
+
+        Returns:
+            () bool, whether the step was taken.
         """
         self.optimizer.zero_grad()
         loss.backward()
         grad_norm = torch.nn.utils.clip_grad_norm_(self.optimizer.parameters, self.max_grad_norm)
-        finite = grad_norm.isfinite() & self._is_fine
-        taken = finite & is_wanted & has_valid
-        self.optimizer.step(taken)
+        is_finite = grad_norm.isfinite() & self._is_finite
+        is_taken = is_finite & is_enabled & has_valid
+        self.optimizer.step(is_taken)
         metrics = dict(metrics, grad_norm=grad_norm)
-        row = torch.stack([value.detach() for value in metrics.values()]).masked_fill(~taken, 0.0)
-        self._rows.append(torch.cat([row, torch.stack([taken, ~finite & is_wanted]).float()]))
+        row = torch.stack([value.detach() for value in metrics.values()])
+        row = row.masked_fill(~is_taken, 0.0)
+        is_skipped = ~is_finite & is_enabled
+        self._rows.append(torch.cat([row, torch.stack([is_taken, is_skipped]).float()]))
         self._names = tuple(metrics)
-        return taken
+        return is_taken
 
     def end(self) -> dict[str, torch.Tensor]:
-        """Ends the update. Returns the means of the metrics over the steps that were taken, and
-        `skipped_steps`, how many were not finite.
+        """Ends the update. Returns the means of the metrics over the steps taken, and
+        `skipped_steps`, the number of steps skipped because they were not finite.
         """
         *sums, n_taken, n_skipped = sum(self._rows).unbind()
         self.check.count((n_taken == 0) & (n_skipped > 0))
@@ -81,8 +101,10 @@ class GradientSteps:
         return {**means, "skipped_steps": n_skipped}
 
     def state_dict(self) -> dict[str, Any]:
+        """Returns the optimizer's state and the step size."""
         return dict(optimizer=self.optimizer.state_dict(), lr=self._lr.clone())
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from a `state_dict`."""
         self.optimizer.load_state_dict(state["optimizer"])
         self._lr.copy_(state["lr"])

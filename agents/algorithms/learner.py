@@ -1,106 +1,151 @@
-"""What a learner is: the class behind `learner=module:Class`.
+"""The contract of learners, and the base class of the built-in ones.
 
-    learner = Class(policy, seed=1, **settings)    # settings are its own arguments
-    collect = learner.collector(env)               # owns what is stored
-    for ever:
-        rollout = collect()
-        losses = learner.update(rollout)
+A learner is the class behind `learner=module:Class`. It does not have to inherit from anything: it
+needs the attributes of `megastep.agents.types.Learner`, and is used like this:
 
-`collect()` acts in the environment and returns what it stored of the steps just taken, a
-`rollout.Rollout` or what has the same:
+    learner = Class(policy, seed=1, **settings)  # settings: its other constructor arguments
+    collect = learner.collector(env)
+    while training:
+        rollout = collect()                      # T steps of B lanes
+        losses = learner.update(rollout)         # scalar tensors by name
 
-n_steps, n_lanes   how many there were, T steps of B lanes
-reward, reset, terminal, truncated   (T, B), of the worlds that followed; metrics, by name
-learns             (T+1, B) bool, whether the learner learns from the lane then
-learners           which of the environment's lanes these B are, a bool for each, or None for all
-numbers()          all that may stop being finite, by name: what the learner's `check` looked over
+Rules:
 
-`collect.rollout` is the one returned last, before the first call an empty one. A replay memory
-belongs to the learner, which fills it in `update`, or to its collector. One that acts ahead on a
-stream of its own returns an earlier rollout, and has a method `wait()`, called before anybody else
-uses the environment, which waits until nobody acts there. An environment with opponents in it has
-`learners`: only those lanes need to be acted in and stored. Neither call synchronises host and
-device. A constructor that takes `graph` is told to capture its update. A learner with a replay
-memory tells its size before there is one, by a method `replay_size(env)`: how many observations it
-holds, and bytes for each, of an environment like this one.
+- `collect()` returns a `megastep.agents.types.Rollout`; `storage.rollout.Rollout` is one. The
+  collector owns it, may return the same object every time, and has it as `collect.rollout` already
+  before the first call.
+- `collect()` and `update()` do not synchronise host and device.
+- `update()` passes `rollout.floats()` to `learner.check` before it learns, and learns nothing from
+  a rollout that is not finite. The trainer reads the check and stops after many skipped updates.
+- Only transitions with `rollout.learns` and without `rollout.reset` count in a loss. If an
+  environment has an attribute `learners` (there are opponents), only those lanes need to be stored.
+- A collector that acts in the background may return an older rollout. It has a method `wait()`,
+  which blocks until nobody acts in the environment.
+- If the constructor takes `seed` or `graph`, it is given the run's seed, and whether to capture
+  updates as a CUDA graph.
+- A replay buffer belongs to the learner or to its collector. The learner then has a method
+  `replay_size(env)`, which returns (observations, bytes per observation) before the buffer exists.
 
-What ours are made of serves others, too: `rollout.make_rollout` and `rollout.Collector`,
-`rollout.bytes_per_step`, `gradient_steps.GradientSteps`, `captured.CudaGraphUpdate`, `masked`, and
-`own_state` here.
+Building blocks for your own learner: `GradientLearner`, `storage.rollout.make_rollout`,
+`storage.rollout.bytes_per_step`, `storage.collector.Collector`, `gradient_steps.GradientSteps`,
+`cuda_graph.CudaGraphUpdate`, `masked_stats` and `returns`.
 """
 
 from typing import Annotated, Any
 
+import torch
 from pydantic import Field
 
-#: Of settings that learners have in common.
+from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
+from megastep.agents.algorithms.gradient_steps import GradientSteps
+from megastep.agents.generator import SeededGenerator
+from megastep.agents.networks.policy import Policy
+from megastep.agents.storage.rollout import Rollout
+
+# Types of settings that several learners have.
 Coefficient = Annotated[float, Field(ge=0, le=10**6)]
 Positive = Annotated[float, Field(gt=0, le=10**6)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
-ATTRIBUTES = {
-    "collector": "a method that takes an environment and returns what acts in it and stores",
-    "update": "a method that learns from a rollout and returns a dict of tensors ()",
-    "bytes_per_env": "a method that says how many bytes it needs for each environment like a given "
-    "one, what its collector stores included",
-    "check": "a finite.NonFiniteCheck, which its update calls",
-    "lr": "its learning rate, the one that annealing begins with",
-    "set_lr": "a method that changes the learning rate",
-    "state_dict": "a method that returns all that changes beside the policy's weights",
-    "load_state_dict": "a method that goes on from there",
+_ATTRIBUTES = {
+    "collector": "a method collector(env) that returns a collector",
+    "update": "a method update(rollout) that learns and returns scalar tensors by name",
+    "bytes_per_env": "a method bytes_per_env(env) that returns the bytes needed per environment",
+    "check": "a nonfinite.NonFiniteCheck that update calls",
+    "lr": "the initial learning rate",
+    "set_lr": "a method set_lr(lr) that changes the learning rate",
+    "state_dict": "a method state_dict() that returns everything but the policy's weights",
+    "load_state_dict": "a method load_state_dict(state) that continues from a state_dict",
 }
 
 
-def check_minibatches(n_minibatches: int, n_lanes: int) -> None:
-    """ValueError unless so many lanes can be cut into so many minibatches."""
-    if n_lanes < n_minibatches:
-        raise ValueError(
-            f"{n_lanes} lanes cannot be cut into {n_minibatches} minibatches of whole lanes; use "
-            "fewer minibatches or more lanes"
-        )
-
-
-def check_state(learner: Any, state: dict[str, Any]) -> None:
-    """ValueError unless a `state_dict` is of this kind of learner, as far as it says: `learner` in
-    it is the name of the class.
-    """
-    own = type(learner).__name__
-    if state.get("learner", own) != own:
-        raise ValueError(
-            f"the state of a {state['learner']} learner cannot be that of {own}: go on with the "
-            "learner that it is from, or start from the policy's weights alone (init=RUN)"
-        )
-
-
-def own_state(learner: Any) -> dict[str, Any]:
-    """The `state_dict` of a learner with `steps`, `random`, `policy` and `captured`: all that an
-    update changes beside the policy's weights, and where the policy's random stream is.
-    """
-    return dict(
-        learner=type(learner).__name__,
-        **learner.steps.state_dict(),
-        random=learner.random.state_dict(),
-        policy_random=learner.policy.random.state_dict(),
-    )
-
-
-def load_own_state(learner: Any, state: dict[str, Any]) -> None:
-    """Goes on from an `own_state`, taken on this device or another. ValueError if it is that of
-    another kind of learner.
-    """
-    check_state(learner, state)
-    learner.steps.load_state_dict(state)
-    learner.random.load_state_dict(state["random"], learner.device)
-    learner.policy.random.load_state_dict(state["policy_random"], learner.device)
-    learner.cuda_graph.restart()
-
-
 class LearnerError(AssertionError):
-    """A class is no learner. The message names what it lacks."""
+    """A class does not keep the contract of learners. The message names the missing attribute."""
 
 
 def check_learner(learner: Any) -> None:
-    """LearnerError unless it has all that a learner has."""
-    for name, meaning in ATTRIBUTES.items():
+    """Raises LearnerError if an attribute of the contract is missing."""
+    for name, description in _ATTRIBUTES.items():
         if not hasattr(learner, name):
-            raise LearnerError(f"it has no {name}: {meaning}")
+            raise LearnerError(f"it has no {name}: {description}")
+
+
+def check_minibatches(n_minibatches: int, n_lanes: int) -> None:
+    """Raises ValueError if there are fewer lanes than minibatches."""
+    if n_lanes < n_minibatches:
+        raise ValueError(
+            f"{n_lanes} lanes cannot be split into {n_minibatches} minibatches of whole lanes: use "
+            "fewer minibatches (n_minibatches) or more lanes"
+        )
+
+
+class GradientLearner:
+    """Base of the built-in learners: policy, gradient steps, CUDA graph, learning rate and state.
+
+    A subclass adds its settings, `collector`, `bytes_per_env` and `_update`.
+
+    Args:
+        policy: the policy to improve, in place.
+        lr: Adam's step size.
+        max_grad_norm: longer gradients are scaled down to this norm.
+        graph: on a GPU, captures updates as a CUDA graph.
+        seed: seed of the learner's own generator.
+
+    Attributes:
+        steps: the `GradientSteps` of the policy's parameters.
+        check: finds non-finite numbers in rollouts and counts skipped updates.
+        generator: the `SeededGenerator` of everything that an update draws.
+    """
+
+    def __init__(self, policy: Policy, lr: float, max_grad_norm: float, graph: bool, seed: int):
+        self.policy, self.device, self.lr = policy, policy.device, lr
+        self.steps = GradientSteps(policy.parameters(), lr, max_grad_norm, self.device)
+        self.check, self.optimizer = self.steps.check, self.steps.optimizer
+        self.generator = SeededGenerator(seed)
+        self.cuda_graph = CudaGraphUpdate(self._update, self.device, graph, (self.generator,))
+
+    def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        """Learns from a rollout.
+
+        Returns metrics as tensors () on the device, averaged over the gradient steps.
+        `loss/skipped_steps` counts the steps that were skipped because of non-finite numbers.
+        """
+        return {f"loss/{name}": value for name, value in self.cuda_graph(rollout).items()}
+
+    def _update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        """Performs one update without synchronising, so that it can be captured."""
+        raise NotImplementedError
+
+    def set_lr(self, lr: float) -> None:
+        """Changes Adam's step size, also for a captured update."""
+        self.steps.set_lr(lr)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns optimizer, learning rate and generators as plain tensors and numbers.
+
+        Does not include the policy's weights, rollouts or what a replay buffer holds.
+        """
+        return dict(
+            learner=type(self).__name__,
+            **self.steps.state_dict(),
+            generator=self.generator.state_dict(),
+            policy_generator=self.policy.generator.state_dict(),
+        )
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from a `state_dict`, which may come from another device.
+
+        Raises:
+            ValueError: if the state belongs to another class of learner.
+        """
+        present = type(self).__name__
+        saved = state.get("learner", present)
+        if saved != present:
+            raise ValueError(
+                f"the state of a {saved} learner cannot be loaded by {present}: use {saved}, or "
+                "start from the policy's weights alone (init=RUN)"
+            )
+        self.steps.load_state_dict(state)
+        self.generator.load_state_dict(state["generator"], self.device)
+        self.policy.generator.load_state_dict(state["policy_generator"], self.device)
+        self.cuda_graph.restart()

@@ -1,18 +1,18 @@
-"""Statistics over the valid: what they leave out may hold any number, nan too.
+"""Statistics over valid entries. Invalid entries may hold anything, NaN included.
 
-Axes: any, the same for numbers and for `valid`, which is bool.
+`valid` is a bool tensor of the shape of the numbers.
 """
 
 import torch
 
 
 def masked_mean(x: torch.Tensor, valid: torch.Tensor, axis: int | None = None) -> torch.Tensor:
-    """The mean of x where valid, of all or along an axis; 0 where nothing is."""
+    """Returns the mean of the valid entries, overall or along an axis; 0 if none is valid."""
     return x.masked_fill(~valid, 0.0).sum(axis) / valid.sum(axis).clamp(min=1)
 
 
-def normalised(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """x less its mean, over its standard deviation, both over the valid; 0 elsewhere."""
+def masked_normalise(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Returns x minus its mean, divided by its standard deviation; 0 where invalid."""
     centred = (x - masked_mean(x, valid)).masked_fill(~valid, 0.0)
     return centred / (masked_mean(centred.square(), valid).sqrt() + 1e-8)
 
@@ -20,8 +20,10 @@ def normalised(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
 def explained_variance(
     value: torch.Tensor, targets: torch.Tensor, valid: torch.Tensor
 ) -> torch.Tensor:
-    """How much of the targets' variance the value explains: 1 all, 0 no more than their mean,
-    negative: less than it.
+    """Returns the fraction of the targets' variance that a value explains.
+
+    1 is a perfect prediction up to a constant, 0 is as good as predicting the mean, negative is
+    worse than that.
     """
     error, spread = targets - value, targets - masked_mean(targets, valid)
     error = error - masked_mean(error, valid)
@@ -31,8 +33,9 @@ def explained_variance(
 
 
 def effective_sample_size(weights: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """The effective sample size of weights >= 0 (Kish 1965), as a share of the number of the valid:
-    1 if all weigh the same, 1/n if one of n weighs alone; 0 where nothing is valid.
+    """Returns the effective sample size (Kish 1965) as a fraction of the number of valid entries.
+
+    1 if all weights (>= 0) are equal, 1/n if one of n has all the weight, 0 if none is valid.
     """
     mean, square = masked_mean(weights, valid), masked_mean(weights.square(), valid)
     return mean.square() / square.clamp(min=torch.finfo(square.dtype).tiny)

@@ -1,26 +1,26 @@
-"""Advantages and returns: GAE, V-trace and n-step returns as pure functions.
+"""Advantages and returns as pure functions: GAE, V-trace and n-step returns.
 
-Axes: T time, B lanes. Everything is (T, B); row t is the action of time t, and `reward`, `reset`,
-`terminal`, `truncated` at row t belong to the world that followed it, t+1. `value` at row t is V_t,
-the value of the observation *before* the action, and `last_value` (B,) is V_T, that of the last
-observation, so V_{t+1} is the next row.
+T time, B lanes; tensors are (T, B) unless noted. Row t is the action of time t. `reward`, `reset`,
+`terminal` and `truncated` at row t come from the world that followed it, t+1. `value` at row t is
+V_t, the value of the observation *before* the action; `last_value` (B,) is V_T, the value of the
+last observation.
 
-An action is *valid* if the environment took it: valid_t = not reset_{t+1}. An episode's last
-observation has `terminal` (nothing follows: V counts as 0) or `truncated` (something would have
-followed: V counts) set; no sum crosses either.
+An action is *valid* if the environment took it: valid_t = not reset_{t+1}. After a terminal step
+the value is 0; after a truncated step returns bootstrap from V. No sum crosses an episode's end.
 """
 
 import torch
 
 from megastep import arrdict
-from megastep.agents.networks.scan import scan
+from megastep.agents.networks.scan import linear_scan
 
 
 def discounted_sum(terms: torch.Tensor, discounts: torch.Tensor) -> torch.Tensor:
-    """x_t = terms_t + discounts_t x_{t+1}, x_T = 0, along the first axis. A discount of 0, which is
-    how an episode ends, is exact.
+    """Returns x_t = terms_t + discounts_t x_{t+1}, x_T = 0, along the first axis.
+
+    Exact where a discount is 0, as at the end of an episode.
     """
-    return scan(terms, discounts, reverse=True)
+    return linear_scan(terms, discounts, reverse=True)
 
 
 def _following(value, last_value):
@@ -38,13 +38,14 @@ def gae(
     gamma: float,
     lambda_: float,
 ) -> arrdict.arrdict:
-    """Generalised advantage estimates (Schulman et al. 2016), and the lambda returns A + V for the
-    value to fit.
+    """Computes generalised advantage estimates (GAE, Schulman et al. 2016, eq. 16).
 
         delta_t = r_{t+1} + gamma (1 - terminal_{t+1}) V_{t+1} - V_t
         A_t     = delta_t + gamma lambda (1 - done_{t+1}) A_{t+1},   done = terminal or truncated
 
-    A is 0 where the action was not valid. Returns arrdict(advantages, targets, valid), each (T, B).
+    Returns:
+        arrdict(advantages, targets, valid), each (T, B). Targets are the lambda returns A + V,
+        which the value should fit. A is 0 where the action was not valid.
     """
     delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.0) - value
     delta = delta.masked_fill(reset, 0.0)
@@ -69,19 +70,22 @@ def vtrace(
     rho_clip: float = 1.0,
     c_clip: float = 1.0,
 ) -> arrdict.arrdict:
-    """V-trace (Espeholt et al. 2018, IMPALA): returns and advantages of a policy pi from the
-    actions of another, mu.
+    """Computes V-trace returns and advantages of a policy pi from actions of another policy, mu
+    (IMPALA, Espeholt et al. 2018, section 4.1).
 
-    With `log_ratio` = log pi(a_t) - log mu(a_t), rho_t = min(rho_clip, pi/mu), c_t = lambda
-    min(c_clip, pi/mu):
+    With rho_t = min(rho_clip, pi/mu) and c_t = lambda min(c_clip, pi/mu):
 
         delta_t   = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) V_{t+1} - V_t)
-        v_t - V_t = delta_t + gamma c_t (1 - done_{t+1}) (v_{t+1} - V_{t+1}),           v_T = V_T
-        A_t       = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) v'_{t+1} - V_t),        v' = V at a
-        truncation, else v
+        v_t - V_t = delta_t + gamma c_t (1 - done_{t+1}) (v_{t+1} - V_{t+1}),      v_T = V_T
+        A_t       = rho_t (r_{t+1} + gamma (1 - terminal_{t+1}) v'_{t+1} - V_t),   v' = V at a
+                                                                             truncation, else v
 
-    The targets v are what the value should fit; A weighs the policy's gradient. Where the action
-    was not valid v = V and A = 0. Returns arrdict(advantages, targets, valid), each (T, B).
+    Args:
+        log_ratio: log pi(a_t) - log mu(a_t).
+
+    Returns:
+        arrdict(advantages, targets, valid), each (T, B). The value should fit the targets v; the
+        policy's gradient is weighted by A. Where the action was not valid, v = V and A = 0.
     """
     following = _following(value, last_value)
     ratio = log_ratio.exp()
@@ -102,7 +106,7 @@ def vtrace(
     )
 
 
-def n_step(
+def n_step_returns(
     reward: torch.Tensor,
     value: torch.Tensor,
     last_value: torch.Tensor,
@@ -113,13 +117,13 @@ def n_step(
     gamma: float,
     n: int,
 ) -> torch.Tensor:
-    """n-step returns (T, B): G^n with
+    """Computes n-step returns (T, B), G^n in
 
         G^0_t = V_t
         G^k_t = r_{t+1} + gamma (1 - terminal_{t+1}) G',    G' = V_{t+1} at a truncation and at the
-        last row, else G^{k-1}_{t+1}
+                                                            last row, else G^{k-1}_{t+1}
 
-    So fewer steps count where an episode or the rows end. Where the action was not valid it is V.
+    Returns are shorter where an episode or the rows end. Where the action was not valid, G = V.
     """
     following = _following(value, last_value)
     total = value
@@ -130,16 +134,17 @@ def n_step(
     return total
 
 
-def rescaled(x: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
-    """h(x) = sign(x) (sqrt(|x| + 1) - 1) + eps x, in which large returns differ less and small ones
-    as much (Pohlen et al. 2018).
+def rescale(x: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
+    """Returns h(x) = sign(x) (sqrt(|x| + 1) - 1) + eps x, which compresses large returns (value
+    rescaling, Pohlen et al. 2018).
     """
     return x.sign() * ((x.abs() + 1).sqrt() - 1) + eps * x
 
 
-def unscaled(y: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
-    """The inverse of `rescaled`, in the form that is exact for large values; near 0 it is off by a
-    float's last digit of 1.
+def inverse_rescale(y: torch.Tensor, eps: float = 1e-3) -> torch.Tensor:
+    """Returns the inverse of `rescale`.
+
+    This form is exact for large values. Near 0 its error is the rounding error of a float32 near 1.
     """
     size = y.abs()
     root = 2 * (size + 1 + eps) / ((1 + 4 * eps * (size + 1 + eps)).sqrt() + 1)

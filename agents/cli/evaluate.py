@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 from megastep.agents.cli import command, compose, console, factory, program, runs, settings
 from megastep.agents.selfplay import duels, ratings
-from megastep.agents.training import evaluation
-from megastep.agents.training.checkpoint import Checkpoint, checkpoints
+from megastep.agents.training import checkpoint, evaluation
 
 HELP = """Measures what a run's agent earns in the first episode of each lane, with a 95 % interval
 over homes. Prints a table and writes it to the run's folder: evaluations/*.md.
@@ -121,7 +120,7 @@ FOR_TWO = {"n_agents": 2, "resample": False}
 #
 # Raises:
 #     UserError: if one was trained in another environment.
-def load_player(loaded: Checkpoint, env: Any, run: Checkpoint) -> Player:
+def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpoint) -> Player:
     trained, own = factory.config_of(loaded), factory.config_of(run)
     if trained.env.name != own.env.name:
         raise program.UserError(
@@ -142,7 +141,9 @@ def load_player(loaded: Checkpoint, env: Any, run: Checkpoint) -> Player:
 #
 # Raises:
 #     UserError: if nobody can be met there, or this player cannot play there.
-def find_player(name: str, run: Checkpoint, env_settings: settings.Env, env: Any) -> Player:
+def find_player(
+    name: str, run: checkpoint.Checkpoint, env_settings: settings.Env, env: Any
+) -> Player:
     if env.n_agents < 2:
         raise program.UserError(
             f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
@@ -161,7 +162,9 @@ class Arena:
     every agent's place, equally often, in up to `cfg.episodes` duels.
     """
 
-    def __init__(self, cfg, run: Checkpoint, env: settings.Env, geometry: Any, device: Any):
+    def __init__(
+        self, cfg, run: checkpoint.Checkpoint, env: settings.Env, geometry: Any, device: Any
+    ):
         self.cfg, self.run, env = cfg, run, factory.changed(env, **FOR_TWO)
         homes = factory.homes(env, geometry, cfg.split)
         where = dict(seed=cfg.seed, device=device)
@@ -206,7 +209,9 @@ class Arena:
     # and returns the path of the first.
     def rate(self) -> Path:
         folder, players = runs.folder_of(self.run.path), []
-        for path in checkpoints(folder / "snapshots") or checkpoints(folder / "checkpoints"):
+        for path in checkpoint.list_checkpoints(
+            folder / "snapshots"
+        ) or checkpoint.list_checkpoints(folder / "checkpoints"):
             player = find_player(str(path), self.run, None, self.sample)
             players.append(player._replace(name=f"{player.step:,} samples"))
         players += self.others

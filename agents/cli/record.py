@@ -61,7 +61,7 @@ def run(cfg: settings.Record) -> Path:
         opponent = evaluate.find_player(cfg.against, loaded, env_settings, env)
         console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
         seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
-        policy = duels.lineup(policy, opponent.policy, seat, env.n_agents)
+        policy = duels.duel_policy(policy, opponent.policy, seat, env.n_agents)
     # a video is the last thing that a run should fail for
     with program.errors(f"The video {path} could not be made: ", (Exception,)):
         film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)

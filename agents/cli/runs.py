@@ -20,7 +20,8 @@ from megastep.agents.cli import console, program
 from megastep.agents.cli.check import as_tree
 from megastep.agents.cli.program import UserError, shortened
 from megastep.agents.cli.settings import Env, Evaluate, Geometry, Train, label
-from megastep.agents.training import atomic_files, checkpoint, loggers
+from megastep.agents.training import checkpoint, json_lines
+from megastep.agents.training.atomic_files import write_atomically
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: One line for each start of a run: its folder.
@@ -185,11 +186,11 @@ def write_table(
     console.say(f"{title}\n{console.table(head, lines)}")
     with program.errors(f"{folder} cannot be written: "):
         folder.mkdir(exist_ok=True)
-        atomic_files.replace(
+        write_atomically(
             folder / f"{name[:200]}.md",
             f"{title}\n\n{console.table(head, lines, box.MARKDOWN)}\n".encode(),
         )
-        atomic_files.replace(folder / f"{name[:200]}.json", json.dumps(result, indent=2).encode())
+        write_atomically(folder / f"{name[:200]}.json", json.dumps(result, indent=2).encode())
     return folder / f"{name[:200]}.json"
 
 
@@ -203,7 +204,7 @@ def outcome(result: Path) -> dict[str, float | None]:
     if is_run := result.is_dir():
         files = sorted(result.glob("evaluations/*.json"))
         with contextlib.suppress(OSError):
-            rows = loggers.read(result / "metrics.jsonl")
+            rows = json_lines.read(result / "metrics.jsonl")
             returns = [
                 row["episode/return"] for row in rows if row.get("episode/return") is not None
             ]

@@ -31,7 +31,7 @@ from rich import box
 from megastep.agents.cli import console, factory, program, runs, signals
 from megastep.agents.cli.compose import Composer, key_of
 from megastep.agents.cli.program import ConfigErrors, UserError, shortened
-from megastep.agents.training import atomic_files
+from megastep.agents.training.atomic_files import write_atomically
 
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
 #: Columns of the table beside the job and the keys that vary.
@@ -178,7 +178,7 @@ class Job:
         with contextlib.ExitStack() as stack:
             with contextlib.suppress(OSError):  # no locks, or a full disk: the job is worth more
                 stack.enter_context(filelock.FileLock(path.with_suffix(".lock"), blocking=False))
-                atomic_files.replace(path, json.dumps(row).encode())
+                write_atomically(path, json.dumps(row).encode())
             try:
                 stack.enter_context(signals.handled(signals.interrupt))
                 gpu = stack.enter_context(one_gpu())
@@ -203,7 +203,7 @@ class Job:
             finally:
                 row["seconds"] = round(time.monotonic() - began, 1)
                 with contextlib.suppress(OSError):
-                    atomic_files.replace(path, json.dumps(row).encode())
+                    write_atomically(path, json.dumps(row).encode())
         if result and result.is_dir() and row["score"] is None:
             console.warn(f"job {number}: no episode finished, so it has no score; train longer")
         return row.get("score")
@@ -269,8 +269,8 @@ def report(folder: Path, rows: list[dict[str, Any]]) -> None:
     cells = [[_brief(row.get(name)) for name in head[:-1]] for row in rows]
     console.say(f"Sweep\n{console.table(head[:-1], cells)}")
     with console.warned(f"{folder} cannot be written: "):
-        atomic_files.replace(folder / "sweep.csv", text.getvalue().encode())
-        atomic_files.replace(
+        write_atomically(folder / "sweep.csv", text.getvalue().encode())
+        write_atomically(
             folder / "sweep.md", console.table(head[:-1], cells, box.MARKDOWN).encode()
         )
         console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")

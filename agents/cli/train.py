@@ -13,6 +13,7 @@ import yaml
 from megastep import engine
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.cli import (
+    check,
     command,
     compose,
     console,
@@ -24,8 +25,8 @@ from megastep.agents.cli import (
     settings,
     signals,
 )
-from megastep.agents.cli.check import as_tree
-from megastep.agents.training import atomic_files, budget, checkpoint, loggers, saver
+from megastep.agents.training import budget, checkpoint, curves, loggers, saver
+from megastep.agents.training.atomic_files import write_atomically
 from megastep.agents.training.trainer import Trainer
 
 HELP = """Trains a policy in an environment.
@@ -86,8 +87,8 @@ def make_trainer(
         factory.load_weights(policy, env, loaded)
     opponents = factory.make_opponents(cfg, env, sample, policy)
     for name in ("checkpoints", "snapshots") if cfg.resume else ():
-        checkpoint.rewind(folder / name, loaded.step)
-    config = {"train": as_tree(cfg), "spaces": factory.spaces_of(env)}
+        checkpoint.set_aside_after(folder / name, loaded.step)
+    config = {"train": check.as_tree(cfg), "spaces": factory.spaces_of(env)}
     wandb = vars(cfg.logger) | {"name": folder.name, "config": config["train"]}
     with factory.errors():
         improves = Trainer(
@@ -101,12 +102,12 @@ def make_trainer(
             ),
             saver.Saver(folder / "checkpoints", config, cfg.keep_checkpoints),
             budget.Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
-            report_every=cfg.log_every,
-            save_every=cfg.checkpoint_seconds,
-            on_report=lambda running: progress.show(*progress_of(running)),
+            log_every=cfg.log_every,
+            checkpoint_seconds=cfg.checkpoint_seconds,
+            on_log=lambda running: progress.show(*progress_of(running)),
             opponents=opponents,
-            snapshots=saver.Snapshots(
-                saver.Saver(folder / "snapshots", config, keep=10**9), cfg.snapshots
+            snapshot_saver=saver.SnapshotSaver(
+                saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9), cfg.snapshots
             ),
         )
         if cfg.resume:
@@ -119,11 +120,11 @@ def make_trainer(
 def progress_of(running: Trainer) -> tuple[float | None, list[str]]:
     words, left, latest = (
         [f"{console.number(running.samples)} samples"],
-        running.left,
-        running.latest,
+        running.fraction_left,
+        running.latest_stats,
     )
-    if running.rate is not None:
-        words.append(f"{console.number(running.rate)}/s")
+    if running.samples_per_second is not None:
+        words.append(f"{console.number(running.samples_per_second)}/s")
     if running.score is not None:
         words.append(f"return {running.score:.3g}")
         words += few_means(latest, running.episode_stats.metrics, running.episode_stats.groups)
@@ -160,10 +161,10 @@ def run(cfg: settings.Train) -> Path:
                 undo.callback(shutil.rmtree, folder, ignore_errors=True)
             running = make_trainer(cfg, folder, device, progress)
             with program.errors(runs.CANNOT.format(folder)):
-                atomic_files.replace(
+                write_atomically(
                     folder / "config.yaml",
                     yaml.safe_dump(
-                        as_tree(cfg), sort_keys=False, allow_unicode=True, encoding="utf-8"
+                        check.as_tree(cfg), sort_keys=False, allow_unicode=True, encoding="utf-8"
                     ),
                 )
             undo.pop_all()
@@ -171,22 +172,22 @@ def run(cfg: settings.Train) -> Path:
         console.say(f"Training on {device} in {folder}")
         resume = f"To continue: {runs.resume_command(folder)}"
         try:
-            with signals.handled() as numbers, progress, contextlib.closing(running.metrics):
+            with signals.handled() as numbers, progress, contextlib.closing(running.logger):
                 running.train(lambda: bool(numbers))
         except NonFiniteError as error:
             raise program.NonFinite(f"{error}. What was saved before is in {folder}") from error
         except (engine.EngineError, torch.OutOfMemoryError) as error:
-            saved = running.save_checkpoint.unsaved or "What was learnt last could not be saved"
+            saved = running.saver.error or "What was learnt last could not be saved"
             saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
             reason = str(error).partition("\n")[0].rstrip(".")
             raise program.UserError(f"{reason}. {saved}. {resume}") from error
         finally:
-            loggers.curves(folder)
+            curves.plot_curves(folder)
         if numbers:
             raise signals.Interrupted(
                 numbers[0], f"Stopped after {running.samples:,} samples. {resume}"
             )
-        nonfinite, unsaved = running.nonfinite_value, running.save_checkpoint.unsaved
+        nonfinite, unsaved = running.nonfinite_value, running.saver.error
         if unsaved:
             raise program.UserError(unsaved)
         del running  # its memory is the evaluation's now

@@ -1,14 +1,20 @@
-"""What lasts from step to step: the recurrent cores of policies, by name.
+"""Recurrent cores by name: lstm, gru, mingru and none.
 
-A core is a module `Core(width)`. `initial(B, device)` gives the state of B lanes at the start of an
-episode, an arrdict of (B, ...) float32. `core(x, reset, state)` runs over x (T, B, W) from a state,
-which it clears before each step where reset (T, B), and returns outputs (T, B, W) and the state
-after the last step. Axes: T time, B lanes, W width.
+A core is a module `Core(width)` with two methods:
+
+- `initial(B, device)` returns the hidden state of B lanes at the start of an episode, an arrdict of
+  (B, ...) float32 tensors.
+- `forward(x, reset, state)` unrolls over x (T, B, W) from a hidden state. It clears a lane's state
+  before each step where reset (T, B) is true, and returns outputs (T, B, W) and the state after the
+  last step.
+
+T time, B lanes, W width.
 """
 
 import torch
 from torch import nn
 
+from megastep import spaces
 from megastep.agents.imports import resolve
 from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.mingru import MinGRU
@@ -17,8 +23,8 @@ from megastep.dotdict import leaves
 
 
 class GRU(nn.Module):
-    """A gated recurrent unit (Cho et al. 2014), with the reset gate after the matrix product, as
-    PyTorch's own has it. Its state is arrdict(output (B, W)).
+    """A gated recurrent unit (Cho et al. 2014) with PyTorch's equations: the reset gate comes after
+    the matrix product. Its hidden state is arrdict(output (B, W)).
 
     Gates are laid out (..., 3 W): reset, update, candidate. Matrix products run in the compute
     dtype (autocast's), the rest in float32.
@@ -27,23 +33,25 @@ class GRU(nn.Module):
     def __init__(self, width: int):
         super().__init__()
         self.width = width
-        self.input, self.memory = nn.Linear(width, 3 * width), nn.Linear(width, 3 * width)
-        for layer in (self.input, self.memory):
+        self.input, self.recurrent = nn.Linear(width, 3 * width), nn.Linear(width, 3 * width)
+        for layer in (self.input, self.recurrent):
             nn.init.zeros_(layer.bias)
             for block in layer.weight.split(width):
                 nn.init.orthogonal_(block)
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """Returns the hidden state of B lanes at the start of an episode."""
         return arrdict(output=torch.zeros(n_lanes, self.width, device=device))
 
     def forward(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
     ) -> tuple[torch.Tensor, arrdict]:
+        """Unrolls over a sequence, as the head of this file says."""
         from_input, output, outputs = self.input(x), state["output"], []
         for t in range(len(x)):
             output = output.masked_fill(reset[t, :, None], 0.0)
             r_in, z_in, n_in = from_input[t].float().chunk(3, -1)
-            r, z, n = self.memory(output).float().chunk(3, -1)
+            r, z, n = self.recurrent(output).float().chunk(3, -1)
             candidate = (n_in + (r_in + r).sigmoid() * n).tanh()
             output = candidate.lerp(output, (z_in + z).sigmoid())
             outputs.append(output)
@@ -51,7 +59,7 @@ class GRU(nn.Module):
 
 
 class Feedforward(nn.Module):
-    """No memory: a hidden layer in the place of one. What is seen now decides alone."""
+    """A hidden layer in the place of a recurrent core: only the current observation counts."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -60,11 +68,13 @@ class Feedforward(nn.Module):
         nn.init.zeros_(self.hidden.bias)
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """Returns an empty hidden state."""
         return arrdict()
 
     def forward(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
     ) -> tuple[torch.Tensor, arrdict]:
+        """Applies the layer to every step. `reset` and `state` have no effect."""
         return self.hidden(x).relu(), state
 
 
@@ -72,30 +82,41 @@ CORES = {"lstm": LSTM, "gru": GRU, "mingru": MinGRU, "none": Feedforward}
 
 
 class Stack(nn.ModuleList):
-    """Cores one above the other, each added to what it was given (He et al. 2016), and together a
-    core: its outputs are the sum of theirs. Its state is that of each, by its number.
+    """Several cores with residual connections (He et al. 2016), which together are a core.
+
+    The input of each is x plus the outputs of those below. The output is the sum of all outputs.
+    The hidden state holds theirs under "0", "1", ...
     """
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
+        """Returns the hidden state of B lanes at the start of an episode."""
         return arrdict({str(i): core.initial(n_lanes, device) for i, core in enumerate(self)})
 
     def forward(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
     ) -> tuple[torch.Tensor, arrdict]:
+        """Unrolls over a sequence, as the head of this file says."""
         total, after = None, arrdict()
         for i, core in enumerate(self):
-            given = x if total is None else x + total
-            outputs, after[str(i)] = core(given, reset, state[str(i)])
+            core_input = x if total is None else x + total
+            outputs, after[str(i)] = core(core_input, reset, state[str(i)])
             total = outputs if total is None else total + outputs
         return total, after
 
 
 def make_core(name: str, width: int, layers: int = 1) -> nn.Module:
-    """The core called `name`: one of `CORES`, or an import path; or a `Stack` of `layers` of
-    them. ValueError that names the clause, if it is not as the head of this file says.
+    """Returns a recurrent core.
+
+    Args:
+        name: a name in `CORES`, or an import path.
+        width: W.
+        layers: number of cores; more than one make a `Stack`.
+
+    Raises:
+        ValueError: if there is no such core, or it breaks the contract at the head of this file.
     """
-    made = resolve(name, CORES)
-    cores = [made(width) for _ in range(layers)]
+    kind = resolve(name, CORES)
+    cores = [kind(width) for _ in range(layers)]
     if ":" in name:
         _check(name, cores[0], width)
     return cores[0] if layers == 1 else Stack(cores)
@@ -103,32 +124,33 @@ def make_core(name: str, width: int, layers: int = 1) -> nn.Module:
 
 @torch.no_grad()
 def _check(name, core, width, n_steps=3, n_lanes=2):
-    _require(name, hasattr(core, "initial"), "it has a method initial(B, device)")
+    """Runs a core on two inputs that differ only before a reset."""
+    _require(name, hasattr(core, "initial"), "it needs a method initial(B, device)")
     state = core.initial(n_lanes, "cpu")
-    _require(name, isinstance(state, arrdict), "a state is an arrdict of tensors")
-    _require(name, all(len(leaf) == n_lanes for leaf in leaves(state)), "it has a row per lane")
+    _require(name, isinstance(state, arrdict), "the hidden state must be an arrdict of tensors")
+    has_lanes = all(len(leaf) == n_lanes for leaf in leaves(state))
+    _require(name, has_lanes, "the hidden state must have a row per lane")
     generator = torch.Generator().manual_seed(1)
     x, other = torch.randn(2, n_steps, n_lanes, width, generator=generator)
     other[1:] = x[1:]
     reset = torch.zeros(n_steps, n_lanes, dtype=torch.bool)
     reset[1] = True
-    (outputs, after), (others, _) = core(x, reset, state), core(other, reset, state)
-    shape = tuple(outputs.shape)
+    (outputs, after), (other_outputs, _) = core(x, reset, state), core(other, reset, state)
+    shape, expected = tuple(outputs.shape), (n_steps, n_lanes, width)
     _require(
-        name,
-        shape == (n_steps, n_lanes, width),
-        f"outputs are (T, B, width), here {(n_steps, n_lanes, width)}, not {shape}",
+        name, shape == expected, f"outputs must be (T, B, width), here {expected}, not {shape}"
     )
-    _require(name, _shapes(after) == _shapes(state), "a state is like the one before it")
-    _require(name, torch.equal(outputs[1:], others[1:]), "what came before a reset is forgotten")
+    _require(
+        name, _shapes(after) == _shapes(state), "the hidden state must keep its keys and shapes"
+    )
+    is_cleared = torch.equal(outputs[1:], other_outputs[1:])
+    _require(name, is_cleared, "a reset must clear the hidden state")
 
 
-def _shapes(tree):
-    if isinstance(tree, dict):
-        return {key: _shapes(child) for key, child in tree.items()}
-    return tuple(tree.shape)
+def _shapes(state):
+    return {path: tuple(leaf.shape) for path, leaf in spaces.leaves(state).items()}
 
 
-def _require(name, kept, clause):
-    if not kept:
+def _require(name, condition, clause):
+    if not condition:
         raise ValueError(f"{name} breaks the contract of recurrent cores: {clause}")

@@ -1,26 +1,29 @@
-"""The critic: the expected return, from the actor's features and from what only the critic sees.
+"""The critic: predicts the return from the actor's features and from privileged observations.
 
-Axes: `...` any leading axes, such as (B,) lanes or (T, B) time and lanes.
+`...` any leading axes, such as (B,) lanes or (T, B) time and lanes.
 """
-
-from typing import Any
 
 import torch
 from torch import nn
 
 from megastep.agents.networks import heads
 from megastep.agents.networks.value_output import ValueOutput
+from megastep.types import Space, Tree
 
 
 class Critic(nn.Module):
-    """The expected return, (..., width) features -> (...,) float32, in units of reward.
+    """Predicts the return: features (..., width) -> (...,) float32, in units of reward.
 
-    Where `privileged_space` is given the critic is asymmetric (Pinto et al. 2018): it also takes
-    values of that space, encoded into `width` more features, and a hidden layer joins the two. The
-    actor sees neither, so that a policy acts without them.
+    With a `privileged_space` the critic is asymmetric (Pinto et al. 2018): it encodes the
+    privileged observation into `width` more features, and a hidden layer joins both. The actor
+    never sees them.
+
+    Args:
+        width: number of features.
+        privileged_space: space of what only the critic sees, or None.
     """
 
-    def __init__(self, width: int, privileged_space: Any = None):
+    def __init__(self, width: int, privileged_space: Space | None = None):
         super().__init__()
         self.is_asymmetric = privileged_space is not None
         if self.is_asymmetric:
@@ -30,8 +33,13 @@ class Critic(nn.Module):
             nn.init.zeros_(self.hidden.bias)
         self.output = ValueOutput(width)
 
-    def forward(self, features: torch.Tensor, privileged: Any = None) -> torch.Tensor:
-        """`privileged` is a value (..., *shape) of its space, or a dict of them."""
+    def forward(self, features: torch.Tensor, privileged: Tree | None = None) -> torch.Tensor:
+        """Returns the value.
+
+        Args:
+            features: (..., width).
+            privileged: (..., *shape) or a dict of them; unused by a plain critic.
+        """
         if self.is_asymmetric:
             joined = torch.cat([features, self.intake(privileged).to(features.dtype)], -1)
             features = self.hidden(joined).relu()

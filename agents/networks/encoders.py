@@ -1,11 +1,10 @@
-"""Encoders: what turns one leaf of an observation into features.
+"""Encoders: turn one leaf of an observation into features.
 
-Axes: `...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A the agents that one
-lane controls.
+`...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane
+controls. An image leaf is (..., A, C, H, W).
 """
 
 import math
-from typing import Any
 
 import torch
 from torch import nn
@@ -14,52 +13,69 @@ from torch.nn import functional as F
 from megastep import spaces
 from megastep.agents.imports import resolve
 from megastep.agents.networks.precision import compute_dtype
+from megastep.types import Space
 
 
 class Flat(nn.Module):
-    """A vector or an image as it is, unrolled: (..., *shape) -> (..., n_features)."""
+    """Flattens a vector or an image: (..., *shape) -> (..., n_features)."""
 
-    def __init__(self, space):
+    def __init__(self, space: Space):
         super().__init__()
-        self.axes = len(space.shape)
+        self.n_axes = len(space.shape)
         self.n_features = math.prod(space.shape)
 
-    def forward(self, obs):
-        return obs.flatten(-self.axes)
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        return obs.flatten(-self.n_axes)
 
 
 class OneHot(nn.Module):
-    """Integers as indicators: (..., A) -> (..., A n)."""
+    """One-hot encoding of integers: (..., A) -> (..., A n)."""
 
-    def __init__(self, space):
+    def __init__(self, space: spaces.MultiDiscrete):
         super().__init__()
         self.n_features = space.n_agents * space.n_actions
         self.register_buffer("values", torch.arange(space.n_actions), persistent=False)
 
-    def forward(self, obs):
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return (obs[..., None] == self.values).flatten(-2)
 
 
 class BandedConv1d(nn.Conv1d):
-    """A convolution of rows of one length, (N, C, W) -> (N, C', W').
+    """A convolution of rows of fixed length, (N, C, W) -> (N, C', W').
 
-    On a GPU, rows of at most `MAX_BANDED` columns are multiplied by a banded matrix, the weights of
-    all columns: many times the arithmetic, and several times sooner done, as tensor cores have it
-    to spare, and cuDNN's gradients for few channels are slow.
+    On a GPU, rows of at most `MAX_BANDED` columns are multiplied by a banded matrix that holds the
+    weights of every column. That is many times the arithmetic, but several times faster: tensor
+    cores have it to spare, and cuDNN's gradients are slow for few channels.
+
+    Args:
+        in_channels: C.
+        n_columns: W.
+        out_channels: C'.
+        kernel_size: columns of the kernel, K.
+        stride: columns between two outputs.
+        padding: columns of zeros at each end.
     """
 
     MAX_BANDED = 256
 
-    def __init__(self, channels, n_columns, out_channels, kernel_size, stride, padding):
-        super().__init__(channels, out_channels, kernel_size, stride=stride, padding=padding)
-        self.columns = (n_columns + 2 * padding - kernel_size) // stride + 1
-        column = torch.arange(n_columns) - stride * torch.arange(self.columns)[:, None] + padding
-        # (K, W', W): whether the weight of that place in the kernel joins the two columns
-        band = (column == torch.arange(kernel_size)[:, None, None]).float()
+    def __init__(
+        self,
+        in_channels: int,
+        n_columns: int,
+        out_channels: int,
+        kernel_size: int,
+        stride: int,
+        padding: int,
+    ):
+        super().__init__(in_channels, out_channels, kernel_size, stride=stride, padding=padding)
+        self.n_outputs = (n_columns + 2 * padding - kernel_size) // stride + 1
+        offset = torch.arange(n_columns) - stride * torch.arange(self.n_outputs)[:, None] + padding
+        # (K, W', W): 1 where kernel column k connects input column w to output column w'
+        band = (offset == torch.arange(kernel_size)[:, None, None]).float()
         self.register_buffer("band", band, persistent=False)
 
     def matrix(self) -> torch.Tensor:
-        """(C' W', C W) float32: the convolution of a flattened row, but for the bias."""
+        """Returns (C' W', C W) float32, the convolution of a flattened row without the bias."""
         with torch.autocast(self.weight.device.type, enabled=False):
             spread = self.weight.flatten(0, 1) @ self.band.flatten(1)
         spread = spread.view(*self.weight.shape[:2], *self.band.shape[1:])
@@ -71,27 +87,26 @@ class BandedConv1d(nn.Conv1d):
         return super().forward(rows)
 
     def as_product(self, rows: torch.Tensor) -> torch.Tensor:
-        """What `forward` gives, by the banded matrix."""
-        bias = self.bias[:, None].expand(-1, self.columns).flatten()
-        return F.linear(rows.flatten(1), self.matrix(), bias).unflatten(1, (-1, self.columns))
+        """Computes the convolution with the banded matrix."""
+        bias = self.bias[:, None].expand(-1, self.n_outputs).flatten()
+        return F.linear(rows.flatten(1), self.matrix(), bias).unflatten(1, (-1, self.n_outputs))
 
 
 class Conv(nn.Module):
-    """An image through two convolutions along its rows: (..., A, C, H, W) -> (..., n_features).
+    """Two convolutions along the rows of an image: (..., A, C, H, W) -> (..., n_features).
 
-    The image's rows count as channels, since images here are one pixel high or a few. Agents share
-    the weights.
+    The H rows count as channels, since images are one or a few pixels high. Agents share weights.
     """
 
-    def __init__(self, space, channels=32):
+    def __init__(self, space: spaces.MultiImage, channels: int = 32):
         super().__init__()
         shape = space.C * space.H, space.W
         self.first = BandedConv1d(*shape, channels, kernel_size=8, stride=4, padding=4)
-        shape = channels, self.first.columns
+        shape = channels, self.first.n_outputs
         self.second = BandedConv1d(*shape, channels, kernel_size=4, stride=2, padding=2)
-        self.n_features = space.n_agents * channels * self.second.columns
+        self.n_features = space.n_agents * channels * self.second.n_outputs
 
-    def forward(self, obs):
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
         lead = obs.shape[:-4]
         rows = obs.reshape(-1, obs.shape[-3] * obs.shape[-2], obs.shape[-1]).to(
             compute_dtype(self.first.weight)
@@ -99,44 +114,57 @@ class Conv(nn.Module):
         return F.relu(self.second(F.relu(self.first(rows)))).reshape(*lead, self.n_features)
 
 
-#: Encoders of images, by name. One is a module `Encoder(space)` with `n_features`, which takes
+#: Encoders of images by name. An encoder is a module `Encoder(space)` with `n_features` that maps
 #: images (..., A, C, H, W) to features (..., n_features).
 ENCODERS = {"linear": Flat, "conv": Conv}
 
 
-def encoder(name: str, space: spaces.MultiImage) -> nn.Module:
-    """The encoder of images called `name`: one of `ENCODERS`, or an import path. ValueError if its
-    features are not as it says.
+def make_image_encoder(name: str, space: spaces.MultiImage) -> nn.Module:
+    """Returns an encoder of images.
+
+    Args:
+        name: a name in `ENCODERS`, or an import path.
+        space: space of the images.
+
+    Raises:
+        ValueError: if there is no such encoder, or its features have the wrong shape.
     """
-    made = resolve(name, ENCODERS)(space)
+    encoder = resolve(name, ENCODERS)(space)
     if ":" in name:
-        _check_encoder(name, made, space)
-    return made
+        _check_encoder(name, encoder, space)
+    return encoder
 
 
 @torch.no_grad()
-def _check_encoder(name, made, space):
+def _check_encoder(name, encoder, space):
     for lead in (3,), (3, 2):
-        got = tuple(made(torch.zeros(*lead, *space.shape)).shape)
-        wanted = *lead, getattr(made, "n_features", "n_features")
-        if got != wanted:
+        shape = tuple(encoder(torch.zeros(*lead, *space.shape)).shape)
+        expected = *lead, getattr(encoder, "n_features", "n_features")
+        if shape != expected:
             raise ValueError(
-                f"{name} breaks the contract of encoders: images {(*lead, *space.shape)} give "
-                f"features {wanted}, not {got}"
+                f"{name} breaks the contract of encoders: images {(*lead, *space.shape)} must give "
+                f"features {expected}, not {shape}"
             )
 
 
-def encoder_of(space: Any, of_images: str, path: str) -> nn.Module:
-    """The encoder of a leaf of an observation space; `of_images` is that of images, by name, `path`
-    where the leaf is. ValueError if the space is of no known kind.
+def make_encoder(space: Space, image_encoder: str, path: str) -> nn.Module:
+    """Returns the encoder of one leaf of an observation space.
+
+    Args:
+        space: the leaf.
+        image_encoder: encoder of images, by name.
+        path: dotted path of the leaf, for the message.
+
+    Raises:
+        ValueError: if the space is of an unknown kind.
     """
     if isinstance(space, spaces.MultiImage):
-        return encoder(of_images, space)
+        return make_image_encoder(image_encoder, space)
     if isinstance(space, spaces.MultiVector):
         return Flat(space)
     if isinstance(space, spaces.MultiDiscrete):
         return OneHot(space)
     raise ValueError(
-        f"no intake is known for the observation space {path or 'itself'} = {space!r}; "
-        "there are MultiVector, MultiImage, MultiDiscrete and dicts of them"
+        f"no intake is known for the observation space {path or 'itself'} = {space!r}: use "
+        "MultiVector, MultiImage, MultiDiscrete or dicts of them"
     )

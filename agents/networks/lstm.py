@@ -1,13 +1,13 @@
-"""A long short-term memory (Hochreiter and Schmidhuber 1997) whose state is cleared inside a
-sequence where an episode starts.
+"""A long short-term memory (LSTM, Hochreiter and Schmidhuber 1997) whose hidden state is cleared
+inside a sequence where an episode starts.
 
-Axes: T time, B lanes, W width. Gates are laid out (..., 4 W): input, forget, candidate, output, as
-PyTorch's own are. On a GPU matrix products run in the compute dtype (autocast's), on a CPU in
-float32; the cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell would
-round small additions away.
+T time, B lanes, W width. Gates are laid out (..., 4 W): input, forget, candidate, output, as in
+PyTorch. Matrix products run in the compute dtype (autocast's) on a GPU and in float32 on a CPU. The
+cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell would round small
+additions away.
 
-What happens between two matrix products is written out here for the CPU; on a GPU it is a kernel of
-the same arguments (`megastep.agents.networks.kernels.lstm`).
+The part between two matrix products is written here for the CPU. On a GPU it is a kernel with the
+same arguments (`megastep.agents.networks.kernels.lstm`).
 """
 
 from types import SimpleNamespace
@@ -30,14 +30,14 @@ def _split(gates):
     return gates.view(len(gates), 4, -1).unbind(1)
 
 
-def _start(reset, last_output, last_cell, memory, cell):
+def _start(reset, last_output, last_cell, hidden, cell):
     reset = reset[:, None]
-    memory.copy_(last_output).masked_fill_(reset, 0.0)
+    hidden.copy_(last_output).masked_fill_(reset, 0.0)
     cell.copy_(last_cell).masked_fill_(reset, 0.0)
 
 
-def _forward(gates, cell, next_reset, output, next_memory, next_cell):
-    """Leaves the gates activated, for `_backward`; kernels activate them twice."""
+def _forward(gates, cell, next_reset, output, next_hidden, next_cell):
+    """Leaves the gates activated for `_backward`; the kernels activate them twice instead."""
     i, f, g, o = _split(gates)
     gates[:, : 2 * i.shape[1]].sigmoid_()
     g.tanh_()
@@ -46,17 +46,17 @@ def _forward(gates, cell, next_reset, output, next_memory, next_cell):
     torch.tanh(next_cell, out=output).mul_(o)
     if next_reset is not None:
         reset = next_reset[:, None]
-        next_memory.copy_(output).masked_fill_(reset, 0.0)
+        next_hidden.copy_(output).masked_fill_(reset, 0.0)
         next_cell.masked_fill_(reset, 0.0)
 
 
-def _backward(gates, cell, next_reset, d_output, d_next_memory, d_next_cell, d_gates, d_cell):
+def _backward(gates, cell, next_reset, d_output, d_next_hidden, d_next_cell, d_gates, d_cell):
     i, f, g, o = _split(gates)
     d_i, d_f, d_g, d_o = _split(d_gates)
     squashed = (f * cell).addcmul_(i, g).tanh_()
     if next_reset is not None:
         reset = next_reset[:, None]
-        d_output = d_output + d_next_memory.masked_fill(reset, 0.0)
+        d_output = d_output + d_next_hidden.masked_fill(reset, 0.0)
         d_next_cell = d_next_cell.masked_fill(reset, 0.0)
     d_after = _tanh_backward(d_output * o, squashed, grad_input=d_cell).add_(d_next_cell)
     _sigmoid_backward(d_after * g, i, grad_input=d_i)
@@ -66,65 +66,76 @@ def _backward(gates, cell, next_reset, d_output, d_next_memory, d_next_cell, d_g
     d_cell.mul_(f)
 
 
-_WRITTEN_OUT = SimpleNamespace(start=_start, forward=_forward, backward=_backward)
+_CPU_STEPS = SimpleNamespace(start=_start, forward=_forward, backward=_backward)
 
 
 def _steps(x):
-    return kernels if x.is_cuda else _WRITTEN_OUT
+    return kernels if x.is_cuda else _CPU_STEPS
 
 
 class _Sequence(torch.autograd.Function):
-    """The recurrence over time, with its gradient written out.
+    """The recurrence over time with an explicit gradient.
 
-    Autograd would add up the weights' gradients step by step; here each is one matrix product for
-    all of time.
+    Autograd would accumulate the weights' gradients step by step. Here each is one matrix product
+    over all steps.
     """
 
     @staticmethod
     def forward(ctx, x, input_weight, bias, weight, reset, output, cell):
-        """x (T, B, W), weights (4 W, W) and bias (4 W) in the compute dtype, reset (T, B) bool,
-        output and cell (B, W) float32. Returns outputs (T, B, W) in the compute dtype and the last
-        cell.
+        """Unrolls the recurrence.
+
+        Args:
+            x: (T, B, W) in the compute dtype.
+            input_weight: (4 W, W) in the compute dtype.
+            bias: (4 W,) in the compute dtype.
+            weight: (4 W, W) in the compute dtype, of the recurrent product.
+            reset: (T, B) bool.
+            output: (B, W) float32, last output before the sequence.
+            cell: (B, W) float32, last cell before the sequence.
+
+        Returns:
+            outputs (T, B, W) in the compute dtype, and the last cell (B, W).
         """
         steps, x, reset = _steps(x), x.contiguous(), reset.contiguous()
         gates = F.linear(x, input_weight, bias)
-        outputs, memories = torch.empty_like(x), torch.empty_like(x)
+        # hiddens[t] is the output of step t - 1 as step t sees it: 0 after a reset
+        outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
         output, cell = aligned(output), aligned(cell)
         cells = [torch.empty_like(cell)]
-        steps.start(reset[0], output, cell, memories[0], cells[0])
-        upcoming = [*zip(reset[1:], memories[1:], strict=True), (None, None)]
-        for t, (next_reset, next_memory) in enumerate(upcoming):
-            gates[t].addmm_(memories[t], weight.T)
+        steps.start(reset[0], output, cell, hiddens[0], cells[0])
+        next_steps = [*zip(reset[1:], hiddens[1:], strict=True), (None, None)]
+        for t, (next_reset, next_hidden) in enumerate(next_steps):
+            gates[t].addmm_(hiddens[t], weight.T)
             cells.append(torch.empty_like(cells[t]))
-            steps.forward(gates[t], cells[t], next_reset, outputs[t], next_memory, cells[t + 1])
-        ctx.save_for_backward(x, input_weight, weight, reset, gates, memories, *cells[:-1])
+            steps.forward(gates[t], cells[t], next_reset, outputs[t], next_hidden, cells[t + 1])
+        ctx.save_for_backward(x, input_weight, weight, reset, gates, hiddens, *cells[:-1])
         return outputs, cells[-1]
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_outputs, d_cell):
-        x, input_weight, weight, reset, gates, memories, *cells = ctx.saved_tensors
+        x, input_weight, weight, reset, gates, hiddens, *cells = ctx.saved_tensors
         steps = _steps(x)
         d_outputs, d_cell, d_gates = aligned(d_outputs), aligned(d_cell), torch.empty_like(gates)
-        next_reset = d_memory = d_output = None
+        next_reset = d_hidden = d_output = None
         for t in reversed(range(len(reset))):
             d_next_cell, d_cell = d_cell, torch.empty_like(d_cell)
             steps.backward(
                 *(gates[t], cells[t], next_reset),
-                *(d_outputs[t], d_memory, d_next_cell),
+                *(d_outputs[t], d_hidden, d_next_cell),
                 *(d_gates[t], d_cell),
             )
             if t or any(ctx.needs_input_grad[-2:]):
-                next_reset, d_memory = reset[t], d_gates[t] @ weight
+                next_reset, d_hidden = reset[t], d_gates[t] @ weight
         if any(ctx.needs_input_grad[-2:]):
-            d_output = d_memory.float().masked_fill_(reset[0, :, None], 0.0)
+            d_output = d_hidden.float().masked_fill_(reset[0, :, None], 0.0)
             d_cell.masked_fill_(reset[0, :, None], 0.0)
         flat = d_gates.flatten(0, 1)
         return (
             d_gates @ input_weight,
             flat.T @ x.flatten(0, 1),
             flat.sum(0),
-            flat.T @ memories.flatten(0, 1),
+            flat.T @ hiddens.flatten(0, 1),
             None,
             d_output,
             d_cell,
@@ -132,24 +143,22 @@ class _Sequence(torch.autograd.Function):
 
 
 class LSTM(nn.Module):
-    """An LSTM of `width` units. Between calls its state is arrdict(output, cell), each (B, W)
-    float32.
-    """
+    """An LSTM of `width` units. Its hidden state is arrdict(output, cell), each (B, W) float32."""
 
     def __init__(self, width: int):
         super().__init__()
         self.width = width
         self.input = nn.Linear(width, 4 * width)
-        self.memory = nn.Linear(width, 4 * width, bias=False)
+        self.recurrent = nn.Linear(width, 4 * width, bias=False)
         with torch.no_grad():
-            for block in (*self.input.weight.split(width), *self.memory.weight.split(width)):
+            for block in (*self.input.weight.split(width), *self.recurrent.weight.split(width)):
                 nn.init.orthogonal_(block)
-            # A forget gate that starts open, so that gradients reach back from the start
+            # Forget gates start open, so that gradients reach far back from the beginning
             # (Jozefowicz et al. 2015)
             self.input.bias.zero_()[width : 2 * width] = 1.0
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """The state of lanes at the start of an episode."""
+        """Returns the hidden state of B lanes at the start of an episode."""
         return arrdict(
             {key: torch.zeros(n_lanes, self.width, device=device) for key in ("output", "cell")}
         )
@@ -157,16 +166,24 @@ class LSTM(nn.Module):
     def forward(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
     ) -> tuple[torch.Tensor, arrdict]:
-        """Runs over x (T, B, W) from a state; a lane's state is cleared before each step where
-        reset (T, B).
+        """Unrolls over a sequence.
 
-        Returns the outputs (T, B, W), in the compute dtype on a GPU and float32 on a CPU, and the
-        state after the last step. ValueError if shapes or devices do not fit.
+        Args:
+            x: (T, B, W).
+            reset: (T, B) bool; clears a lane's hidden state before the step.
+            state: hidden state before the sequence.
+
+        Returns:
+            outputs (T, B, W), in the compute dtype on a GPU and float32 on a CPU, and the hidden
+            state after the sequence.
+
+        Raises:
+            ValueError: if shapes or devices do not fit.
         """
         check_shapes(x, reset, state, ("output", "cell"))
-        dtype = compute_dtype(self.memory.weight) if x.is_cuda else torch.float32
-        weights = self.input.weight, self.input.bias, self.memory.weight
-        # autocast would choose dtypes of its own inside
+        dtype = compute_dtype(self.recurrent.weight) if x.is_cuda else torch.float32
+        weights = self.input.weight, self.input.bias, self.recurrent.weight
+        # autocast would choose its own dtypes inside
         with torch.autocast(x.device.type, enabled=False):
             outputs, cell = _Sequence.apply(
                 x.to(dtype),
@@ -179,6 +196,6 @@ class LSTM(nn.Module):
     def step(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
     ) -> tuple[torch.Tensor, arrdict]:
-        """One step, x (B, W) and reset (B,): the outputs (B, W) and the state after it."""
+        """Takes one step: x (B, W), reset (B,) -> output (B, W), next hidden state."""
         outputs, state = self(x[None], reset[None], state)
         return outputs[0], state

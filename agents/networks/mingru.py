@@ -1,21 +1,20 @@
-"""A minimal gated recurrent unit (Feng et al. 2024, "Were RNNs all we needed?") whose state is
-cleared inside a sequence where an episode starts.
+"""A minimal gated recurrent unit (minGRU, Feng et al. 2024, "Were RNNs all we needed?") whose
+hidden state is cleared inside a sequence where an episode starts.
 
-    z_t = sigmoid(W_z x_t + b_z)             the update gate
-    c_t = W_c x_t + b_c                      the candidate
+    z_t = sigmoid(W_z x_t + b_z)             update gate
+    c_t = W_c x_t + b_c                      candidate
     h_t = (1 - z_t) h_{t-1} + z_t c_t        h_{t-1} = 0 at a reset
 
-Gate and candidate see the input alone, not h. So a sequence takes one matrix product, for all of
-its steps, and the rest is a linear recurrence: a scan, whose gradient is a scan from the end on.
-This is the paper's plain form. Its other one is in logarithms, with a candidate that is never
-negative, for a scan that divides by products of 1 - z; ours does not, and a reset, a factor of 0,
-has no logarithm.
+Gate and candidate depend on the input alone, not on h. So a sequence takes one matrix product for
+all its steps and then a linear recurrence, computed by a scan, whose gradient is a scan in reverse.
+This is the paper's plain form. The paper's log-space form needs candidates that are never negative,
+and a reset, a factor of 0, has no logarithm.
 
-Axes: T time, B lanes, W width. Gates are laid out (..., 2 W): update gate, before its sigmoid, and
-candidate. Matrix products run in the compute dtype (autocast's), the recurrence in float32: over
-hundreds of steps a bfloat16 state would round small additions away.
+T time, B lanes, W width. Gates are laid out (..., 2 W): update gate before its sigmoid, candidate.
+Matrix products run in the compute dtype (autocast's). The recurrence is float32: over hundreds of
+steps a bfloat16 state would round small additions away.
 
-The recurrence is written out here for the CPU; on a GPU it is a kernel of the same arguments
+The recurrence is written here for the CPU. On a GPU it is a kernel with the same arguments
 (`megastep.agents.networks.kernels.mingru`).
 """
 
@@ -27,7 +26,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep.agents.networks.kernels import mingru as kernels
 from megastep.agents.networks.kernels.program import aligned, check_shapes
-from megastep.agents.networks.scan import scan
+from megastep.agents.networks.scan import linear_scan
 from megastep.arrdict import arrdict
 
 
@@ -38,41 +37,50 @@ def _split(gates):
 
 def _forward(gates, reset, start, outputs, last):
     (z, candidate), reset = _split(gates), reset[..., None]
-    terms, kept = z * candidate, 1 - z
-    terms[0].addcmul_(kept[0], start.masked_fill(reset[0], 0.0))
-    states = scan(terms, kept, reset)
+    terms, factors = z * candidate, 1 - z
+    terms[0].addcmul_(factors[0], start.masked_fill(reset[0], 0.0))
+    states = linear_scan(terms, factors, reset)
     outputs.copy_(states)
     last.copy_(states[-1])
 
 
 def _backward(gates, reset, start, outputs, d_outputs, d_last, d_gates, d_start):
     (z, candidate), reset = _split(gates), reset[..., None]
-    kept, before = 1 - z, torch.cat([start[None], outputs[:-1]]).masked_fill(reset, 0.0)
+    factors, before = 1 - z, torch.cat([start[None], outputs[:-1]]).masked_fill(reset, 0.0)
     terms = torch.cat([d_outputs[:-1], (d_outputs[-1] + d_last)[None]])
-    # row t of both is that of the step after t; what stands in the last row counts for nothing
-    d = scan(terms, kept.roll(-1, 0), reset.roll(-1, 0), reverse=True)
+    # Row t needs the factor and reset of step t + 1. The last row is not used.
+    d = linear_scan(terms, factors.roll(-1, 0), reset.roll(-1, 0), reverse=True)
     d_update, d_candidate = d_gates.chunk(2, -1)
-    d_update.copy_(d * (candidate - before) * z * kept)
+    d_update.copy_(d * (candidate - before) * z * factors)
     d_candidate.copy_(d * z)
-    d_start.copy_((d[0] * kept[0]).masked_fill(reset[0], 0.0))
+    d_start.copy_((d[0] * factors[0]).masked_fill(reset[0], 0.0))
 
 
-_WRITTEN_OUT = SimpleNamespace(forward=_forward, backward=_backward)
+_CPU_RECURRENCE = SimpleNamespace(forward=_forward, backward=_backward)
 
 
 def _recurrence(gates):
-    return kernels if gates.is_cuda else _WRITTEN_OUT
+    return kernels if gates.is_cuda else _CPU_RECURRENCE
 
 
 class _Sequence(torch.autograd.Function):
-    """The recurrence over time, with its gradient written out. It saves what it is given and what
-    it gives, no more; where outputs are bfloat16, its gradient knows states to as many bits.
+    """The recurrence over time with an explicit gradient.
+
+    Saves only its inputs and outputs. If outputs are bfloat16, the gradient sees states rounded to
+    bfloat16.
     """
 
     @staticmethod
     def forward(ctx, gates, reset, start):
-        """gates (T, B, 2 W) in the compute dtype, reset (T, B) bool, start (B, W) float32. Returns
-        outputs (T, B, W) in the compute dtype and the last state (B, W) float32.
+        """Unrolls the recurrence.
+
+        Args:
+            gates: (T, B, 2 W) in the compute dtype.
+            reset: (T, B) bool.
+            start: (B, W) float32, state before the sequence.
+
+        Returns:
+            outputs (T, B, W) in the compute dtype, and the last state (B, W) float32.
         """
         gates, reset, start = aligned(gates), reset.contiguous(), aligned(start)
         outputs = gates.new_empty((*gates.shape[:2], start.shape[1]))
@@ -95,7 +103,7 @@ class _Sequence(torch.autograd.Function):
 
 
 class MinGRU(nn.Module):
-    """A minGRU of `width` units. Between calls its state is arrdict(output (B, W)) float32."""
+    """A minGRU of `width` units. Its hidden state is arrdict(output (B, W)) float32."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -103,24 +111,31 @@ class MinGRU(nn.Module):
         self.input = nn.Linear(width, 2 * width)
         for block in self.input.weight.split(width):
             nn.init.orthogonal_(block)
-        # Each unit starts with a time of its own over which it remembers, from 1 to 32 steps
-        # (Tallec and Ollivier 2018): with all at 1, a cue that counts after 12 steps is learnt late
+        # Units start with time constants from 1 to 32 steps (chrono initialisation, Tallec and
+        # Ollivier 2018). With 1 step for all, a cue needed 12 steps later is learned late.
         nn.init.zeros_(self.input.bias)
         with torch.no_grad():
             self.input.bias[:width] = -torch.linspace(1, 32, width).log()
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """The state of lanes at the start of an episode."""
+        """Returns the hidden state of B lanes at the start of an episode."""
         return arrdict(output=torch.zeros(n_lanes, self.width, device=device))
 
     def forward(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
     ) -> tuple[torch.Tensor, arrdict]:
-        """Runs over x (T, B, W) from a state; a lane's state is cleared before each step where
-        reset (T, B).
+        """Unrolls over a sequence.
 
-        Returns the outputs (T, B, W) in the compute dtype, and the state after the last step.
-        ValueError if shapes or devices do not fit.
+        Args:
+            x: (T, B, W).
+            reset: (T, B) bool; clears a lane's hidden state before the step.
+            state: hidden state before the sequence.
+
+        Returns:
+            outputs (T, B, W) in the compute dtype, and the hidden state after the sequence.
+
+        Raises:
+            ValueError: if shapes or devices do not fit.
         """
         check_shapes(x, reset, state, ("output",))
         outputs, last = _Sequence.apply(self.input(x), reset.bool(), state["output"].float())

@@ -1,11 +1,11 @@
-"""The actor-critic: an intake (the encoder of observations), a memory, an output to act, and a
-critic, which may see more than the actor.
+"""The policy: an intake of observations, a recurrent core, an output of actions, and a critic that
+may see more than the actor.
 
-Axes: T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, on the CPU in
-float32.
+T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, on a CPU in float32.
 """
 
 import copy
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import torch
@@ -14,16 +14,16 @@ from torch import nn
 
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.imports import resolve
-from megastep.agents.networks import cores as cores
-from megastep.agents.networks import encoders, heads
+from megastep.agents.networks import cores, encoders, heads
 from megastep.agents.networks.critic import Critic
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.settings import checked
+from megastep.types import Space, Tree
 
 
-def _known(table):
-    """The check of a name: a word of the table, or an import path."""
+def _name_in(table: Mapping[str, Any]) -> AfterValidator:
+    """Returns a validator of names: a name in the table, or an import path."""
 
     def check(name):
         resolve(name, table)
@@ -34,33 +34,46 @@ def _known(table):
 
 class Policy(nn.Module):
     """Acts on worlds: `decision, state = policy(world, state)`, starting from `policy.initial(B)`.
-    A world is what an environment's `step` returns, a decision what it takes.
 
-    `core` and `encoder` are names in `memory.CORES` and `encoders.ENCODERS`, or import paths
-    of others; `layers` is how many cores stand one above the other. `output` is "softmax", which
-    samples actions by their probabilities, or "duelling", which takes the one of most value.
-    `critic` is "asymmetric", which also sees a world's `privileged` of `privileged_space` where
-    there is such a space; "plain", which sees what the actor sees; or None, for a policy that only
-    acts, as one of action values always is. Nothing privileged reaches the actions; but
-    `prediction_error` can teach the memory what the critic knows.
+    A world is what an environment's `step` returns, a decision what it takes. Privileged
+    observations never reach the actions. They reach the critic, and `prediction_error` can teach
+    the core to infer them.
 
-    `seed` decides the first weights and, where no generator is given, the sampled actions. The
-    weights are in `state_dict()`, those that only training needs under "critic." and "prediction.";
-    where the random stream is, is in `random.state_dict()`, which a learner saves. ValueError if
-    the width or the layers are out of range, or a space is of no known kind.
+    Args:
+        obs_space: the environment's observation space.
+        action_space: the environment's action space.
+        privileged_space: space of what only the critic sees, or None.
+        width: units of the recurrent core and of all features.
+        core: a name in `cores.CORES`, or an import path.
+        layers: recurrent cores, stacked with residual connections.
+        encoder: encoder of images, a name in `encoders.ENCODERS`, or an import path.
+        output: "softmax" samples actions by their probabilities; "duelling" takes the action of the
+            highest value.
+        critic: "asymmetric" sees privileged observations, if there are any; "plain" sees what the
+            actor sees; None makes a policy that only acts, as every duelling one does.
+        bf16: on a GPU, runs matrix products in bfloat16.
+        seed: seed of the initial weights, and of the actions unless a generator is given.
+
+    Attributes:
+        generator: the `SeededGenerator` of the actions. A learner saves its state.
+
+    Weights used in training only are under "critic." and "prediction." in `state_dict()`.
+
+    Raises:
+        ValueError: if an argument is out of range, or a space is of an unknown kind.
     """
 
     @checked
     def __init__(
         self,
-        obs_space: Any,
-        action_space: Any,
-        privileged_space: Any = None,
+        obs_space: Space,
+        action_space: Space,
+        privileged_space: Space | None = None,
         *,
-        width: Annotated[int, Field(ge=1, le=8192)] = 128,
-        core: Annotated[str, _known(cores.CORES)] = "lstm",
+        width: Annotated[int, Field(ge=1, le=8192)] = 256,
+        core: Annotated[str, _name_in(cores.CORES)] = "lstm",
         layers: Annotated[int, Field(ge=1, le=8)] = 1,
-        encoder: Annotated[str, _known(encoders.ENCODERS)] = "linear",
+        encoder: Annotated[str, _name_in(encoders.ENCODERS)] = "linear",
         output: Literal["softmax", "duelling"] = "softmax",
         critic: Literal["asymmetric", "plain"] | None = "asymmetric",
         bf16: bool = True,
@@ -70,7 +83,7 @@ class Policy(nn.Module):
         critic = None if output == "duelling" else critic
         self.width, self.layers, self.bf16, self.output_kind = width, layers, bf16, output
         self.privileged_space = privileged_space if critic == "asymmetric" else None
-        self.random = SeededGenerator(seed)
+        self.generator = SeededGenerator(seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.intake = heads.intake(obs_space, width, encoder)
@@ -82,17 +95,18 @@ class Policy(nn.Module):
 
     @property
     def device(self) -> torch.device:
+        """Device of the weights."""
         return next(self.parameters()).device
 
     @property
     def activation_bytes(self) -> int:
-        """About how many bytes learning takes per step of one lane, beside the step itself: some 24
-        activations of 4 bytes per unit, and 8 for each layer above the first.
+        """About how many bytes of activations learning needs per step of one lane: some 24 float32
+        per unit, and 8 for each layer above the first.
         """
         return 4 * (24 + 8 * (self.layers - 1)) * self.width
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """The state of B lanes at the start of an episode: arrdict of (B, ...) float32."""
+        """Returns the hidden state of B lanes at the start of an episode: (B, ...) float32."""
         return self.core.initial(n_lanes, self.device if device is None else device)
 
     def forward(
@@ -102,16 +116,21 @@ class Policy(nn.Module):
         sample: bool = True,
         generator: torch.Generator | None = None,
     ) -> tuple[arrdict, arrdict]:
-        """One step for all lanes: (decision, state) from world.obs and world.reset, which clears a
-        lane's state.
+        """Acts for one step.
 
-        decision is arrdict(actions, logits, logprobs (B,), features (B, width)). Actions are
-        sampled with `generator`, by default the policy's own, or are the likeliest if not `sample`.
+        Args:
+            world: has `obs`, and `reset` (B,), which clears a lane's hidden state.
+            state: hidden state.
+            sample: samples actions; if false, takes the most likely or best ones.
+            generator: generator of the actions; None: the policy's own.
+
+        Returns:
+            arrdict(actions, logits, logprobs (B,), features (B, width)) and the next hidden state.
         """
         out = self.unroll(mapping(torch.unsqueeze)(world["obs"], 0), world["reset"][None], state)
         logits = mapping(torch.squeeze)(out["logits"], 0)
         if sample:
-            generator = self.random.on(self.device) if generator is None else generator
+            generator = self.generator.on(self.device) if generator is None else generator
             actions = self.output.sample(logits, generator)
         else:
             actions = self.output.greedy(logits)
@@ -123,57 +142,76 @@ class Policy(nn.Module):
         )
         return decision, out["state"]
 
-    def unroll(self, obs: Any, reset: torch.Tensor, state: arrdict) -> arrdict:
-        """Many steps for all lanes: obs (T, B, ...), reset (T, B) and the state before them. The
-        state is cleared inside the sequence where reset. Returns arrdict(logits (T, B, ...),
-        features (T, B, width) that they were made from, state after the last step).
+    def unroll(self, obs: Tree, reset: torch.Tensor, state: arrdict) -> arrdict:
+        """Runs over a sequence without acting.
+
+        Args:
+            obs: (T, B, ...) per leaf.
+            reset: (T, B) bool; clears a lane's hidden state before the step.
+            state: hidden state before the sequence.
+
+        Returns:
+            arrdict(logits (T, B, ...), features (T, B, width) that they were computed from, state
+            after the sequence).
         """
         with self.compute_dtype():
             encoded = self.intake(obs)
             outputs, state = self.core(encoded, reset, state)
-            # what needs no memory does not have to pass through it
-            features = encoded + outputs
+            features = encoded + outputs  # a residual connection around the recurrent core
             return arrdict(logits=self.output(features), features=features, state=state)
 
-    def value(self, features: torch.Tensor, privileged: Any = None) -> torch.Tensor:
-        """The return expected by the critic, (...,) float32, from features (..., width) and, if it
-        is asymmetric, from the world's `privileged`.
+    def value(self, features: torch.Tensor, privileged: Tree | None = None) -> torch.Tensor:
+        """Returns the critic's value (...,) float32.
+
+        Args:
+            features: (..., width), of `unroll`.
+            privileged: the world's privileged observations, for an asymmetric critic.
         """
         with self.compute_dtype():
             return self.critic(features, privileged)
 
-    def prediction_error(self, features: torch.Tensor, privileged: Any) -> torch.Tensor:
-        """(T, B): how badly the features of `unroll` tell what the critic sees, as a mean squared
-        error in standard deviations. An auxiliary loss that only shapes the memory (Mirowski et al.
-        2017; of privileged information: Lambrechts et al. 2024).
+    def prediction_error(self, features: torch.Tensor, privileged: Tree) -> torch.Tensor:
+        """Returns the error (T, B) of predicting the encoded privileged observations from features:
+        a mean squared error in standard deviations.
+
+        An auxiliary loss that trains the core and not the critic (Mirowski et al. 2017; with
+        privileged information: Lambrechts et al. 2024).
         """
         with torch.no_grad():
-            target = self.critic.intake.encoded(privileged)
+            target = self.critic.intake.encode(privileged)
         with self.compute_dtype():
             predicted = self.prediction(features)
         return (predicted - target).square().mean(-1)
 
     def compute_dtype(self) -> torch.autocast:
-        """The context in which matrix products are taken. Within one of them autocast casts a
-        weight once, however often it is used.
+        """Returns the autocast context of matrix products. Inside one context, autocast casts each
+        weight only once.
         """
         return torch.autocast(
             self.device.type, torch.bfloat16, enabled=self.bf16 and self.device.type == "cuda"
         )
 
     def actor(self) -> "Policy":
-        """A copy that only acts, with weights of its own that need no gradient."""
+        """Returns a copy that only acts, with its own weights, which need no gradient."""
         absent = {id(getattr(self, name, None)): None for name in ("critic", "prediction")}
-        actor = copy.deepcopy(self, {id(self.random): SeededGenerator(self.random.seed), **absent})
+        generator = SeededGenerator(self.generator.seed)
+        actor = copy.deepcopy(self, {id(self.generator): generator, **absent})
         actor.privileged_space = None
         return actor.requires_grad_(False)
 
     def update_stats(
-        self, obs: Any, privileged: Any = None, taken: torch.Tensor | bool = True
+        self,
+        obs: Tree,
+        privileged: Tree | None = None,
+        is_counted: torch.Tensor | bool = True,
     ) -> None:
-        """Takes what B lanes and their critic saw, or those `taken`, () or (B,) bool, into account
-        in how it is standardised from now on.
+        """Adds observations to the running statistics of the actor's and the critic's intake.
+
+        Args:
+            obs: (B, ...) per leaf.
+            privileged: (B, ...) per leaf, for an asymmetric critic.
+            is_counted: () or (B,) bool, lanes to count.
         """
-        self.intake.update_stats(obs, taken)
+        self.intake.update_stats(obs, is_counted)
         if self.privileged_space:
-            self.critic.intake.update_stats(privileged, taken)
+            self.critic.intake.update_stats(privileged, is_counted)

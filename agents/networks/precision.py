@@ -1,10 +1,10 @@
-"""The precision that layers compute in."""
+"""The dtype that layers compute in."""
 
 import torch
 
 
-def compute_dtype(weight):
-    """The dtype a matrix product with `weight` runs in: autocast's where that is on, else the
+def compute_dtype(weight: torch.Tensor) -> torch.dtype:
+    """Returns the dtype of a matrix product with `weight`: autocast's if it is on, else the
     weight's own.
     """
     device = weight.device.type

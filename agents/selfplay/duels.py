@@ -1,83 +1,105 @@
-"""Who wins between agents of one environment, and duels of two policies in many.
+"""Duels of two policies in an environment with several agents.
 
-Axes: E environments of A agents, B = E A lanes.
+Axes: N environments, A agents, B = N A lanes. A slot is the index of an agent in its environment.
 """
-
-from typing import Any
 
 import torch
 
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
-from megastep.agents.training.evaluation import CHECK
+from megastep.agents.training.evaluation import CHECK_EVERY
 from megastep.arrdict import arrdict
+from megastep.types import Env, Policy
 
-#: Steps after which a duel is a draw.
+#: A duel is a draw after this many steps.
 MAX_STEPS = 500
 
 
-def pairs(
-    terminal: torch.Tensor, returns: torch.Tensor, seat: torch.Tensor
+def score_pairs(
+    terminal: torch.Tensor, returns: torch.Tensor, slots: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """What a step decides between the agent at `seat` (E, 1) of each environment and each of its
-    others: `(won, decided)`, both (E,) float32, how many of those pairs it won, a draw being half,
-    and how many were decided.
+    """Scores one agent of each environment against each other agent, on a single step.
 
-    A pair is decided by a step that one of the two does not survive, its `terminal` (E, A): who
-    survives has won. If it is terminal for both, as a game is that ends for all, the higher of
-    their `returns` (E, A) has, the rewards since each one's episode began; equal ones are a draw.
+    A pair is decided when either agent's episode is terminal. If only one is, the other agent has
+    won. If both are, as in a game that ends for all, the higher return wins, and equal returns are
+    a draw.
+
+    Args:
+        terminal: (N, A) bool, of this step.
+        returns: (N, A), rewards since each agent's episode began.
+        slots: (N, 1) int64, the agent that is scored.
+
+    Returns:
+        Two (N,) float32: pairs won, with a draw as half, and pairs decided.
     """
-    mine, my_return = terminal.gather(1, seat), returns.gather(1, seat)
-    ahead = torch.where(
-        terminal == mine, my_return - returns, terminal.float() - mine.float()
+    own_terminal, own_return = terminal.gather(1, slots), returns.gather(1, slots)
+    sign = torch.where(
+        terminal == own_terminal, own_return - returns, terminal.float() - own_terminal.float()
     ).sign()
-    decided = (terminal | mine).scatter(1, seat, False)
-    won = torch.where(decided, (1 + ahead) / 2, 0.0).sum(1)
+    decided = (terminal | own_terminal).scatter(1, slots, False)
+    won = torch.where(decided, (1 + sign) / 2, 0.0).sum(1)
     return won, decided.float().sum(1)
 
 
-def seats(n_envs: int, n_agents: int, device: Any = None) -> torch.Tensor:
-    """(E, 1) int64: every agent's place in turn, each for as many environments, one after the
-    other.
+def rotating_slots(
+    n_envs: int, n_agents: int, device: torch.device | str | None = None
+) -> torch.Tensor:
+    """Returns one slot per environment, (N, 1) int64: slot 0 for the first N / A environments, and
+    so on.
     """
     return (torch.arange(n_envs, device=device) * n_agents // n_envs)[:, None]
 
 
-def lineup(policy: Any, opponent: Any, seat: torch.Tensor, n_agents: int) -> MixedPolicy:
-    """`policy` at its `seat` (E, 1) of each environment, `opponent` at all others."""
-    is_mine = torch.zeros(len(seat), n_agents, dtype=torch.bool, device=seat.device)
-    is_mine = is_mine.scatter(1, seat, True).flatten()
-    lanes = torch.arange(len(is_mine), device=seat.device)
-    return MixedPolicy([policy, opponent], [lanes[is_mine], lanes[~is_mine]])
+def duel_policy(
+    policy: Policy, opponent: Policy, slots: torch.Tensor, n_agents: int
+) -> MixedPolicy:
+    """Returns a policy that is `policy` in one slot per environment and `opponent` in the others.
+
+    Args:
+        slots: (N, 1) int64.
+    """
+    is_own = torch.zeros(len(slots), n_agents, dtype=torch.bool, device=slots.device)
+    is_own = is_own.scatter(1, slots, True).flatten()
+    lanes = torch.arange(len(is_own), device=slots.device)
+    return MixedPolicy([policy, opponent], [lanes[is_own], lanes[~is_own]])
 
 
 @torch.no_grad()
 def play(
-    env: Any,
-    policy: Any,
-    opponent: Any,
+    env: Env,
+    policy: Policy,
+    opponent: Policy,
     seed: int = 1,
     greedy: bool = False,
     max_steps: int = MAX_STEPS,
 ) -> arrdict:
-    """One duel in each environment, from its reset: arrdict of `score` (E,) float32, 1 where
-    `policy` won, 0 where it lost and 0.5 for a draw, `lengths` (E,) float32 steps, `seat` (E,)
-    int64, the agent that `policy` was, each in turn (`seats`), and `homes` (E,) int32, the layouts
-    that the environment shows after its reset, if it has any.
+    """Plays one duel per environment, from a reset.
 
-    A duel ends with the first step that is terminal for any of its agents: `pairs` says who won.
-    A step that truncates an episode, or `max_steps`, ends it as a draw. With more than two agents,
-    `opponent` is all others.
+    A duel ends at the first step that is terminal for any of its agents; `score_pairs` decides who
+    won. It is a draw if the episode is truncated or `max_steps` is reached first. With more than
+    two agents, `opponent` controls all the others, and the score is the mean over decided pairs.
+
+    Args:
+        seed: of the action sampling.
+        greedy: takes the most likely actions instead of sampling.
+
+    Returns:
+        An arrdict of
+
+        - score: (N,) float32, 1 if `policy` won, 0 if it lost, 0.5 for a draw
+        - lengths: (N,) float32, steps
+        - slots: (N,) int64, the agent that `policy` controlled, as in `rotating_slots`
+        - homes: (N,) int32, the layouts after the reset; only if `env.layout` exists
     """
     device, shape = torch.device(env.device), (env.n_envs, env.n_agents)
     generator = torch.Generator(device).manual_seed(seed)
-    seat = seats(*shape, device)
-    both = lineup(policy, opponent, seat, env.n_agents)
+    slots = rotating_slots(*shape, device)
+    both = duel_policy(policy, opponent, slots, env.n_agents)
     world, state = env.reset(), both.initial(env.n_envs * env.n_agents, device)
     homes = {} if getattr(env, "layout", None) is None else {"homes": env.layout.clone()}
     returns, lengths = torch.zeros(shape, device=device), torch.zeros(env.n_envs, device=device)
     score, is_over = torch.full_like(lengths, 0.5), torch.zeros_like(lengths, dtype=torch.bool)
     for step in range(max_steps):
-        if step % CHECK == 0 and bool(is_over.all()):
+        if step % CHECK_EVERY == 0 and bool(is_over.all()):
             break
         decision, state = both(world, state, sample=not greedy, generator=generator)
         world = env.step(decision)
@@ -86,8 +108,8 @@ def play(
         )
         returns += reward
         lengths += ~is_over
-        won, decided = pairs(terminal, returns, seat)
+        won, decided = score_pairs(terminal, returns, slots)
         score = torch.where((decided > 0) & ~is_over, won / decided, score)
         is_over |= (terminal | truncated).any(1)
     env.check()
-    return arrdict(score=score, lengths=lengths, seat=seat[:, 0], **homes)
+    return arrdict(score=score, lengths=lengths, slots=slots[:, 0], **homes)

@@ -1,36 +1,46 @@
-"""Several policies in one environment, each at lanes of its own.
+"""Several policies that act in one environment, each in lanes of its own.
 
-Axes: B lanes of an environment, L of them in a lineup.
+Axes: B lanes of the environment, M lanes of the mixed policy (M = B unless others act too).
 """
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any
 
 import torch
 
 from megastep.arrdict import arrdict, cat
 from megastep.dotdict import mapping
+from megastep.types import Policy, Tree, World
 
 
 class MixedPolicy:
-    """Policies, and the `lanes` that each plays, int64 (l,): together a policy like any other, for
-    an environment whose lanes they all are.
+    """A policy made of several policies, each with a fixed set of lanes.
 
-    `act` is for an environment that others play in, too: it is given what its own lanes see, in the
-    order of `lanes`, player by player. On a GPU each policy acts on a stream of its own, also
-    within a graph: small networks do not fill it, one after the other they would wait.
+    Call it like any policy if it has all lanes of the environment. Use `act` if other policies act
+    in the remaining lanes.
+
+    On a GPU each policy runs on a stream of its own, also inside a CUDA graph: one small network
+    does not fill the GPU.
+
+    Args:
+        policies: the policies.
+        lanes: the lanes of each policy, int64 (m,).
+
+    Attributes:
+        lanes: (M,) int64, the lanes of all policies, one policy after the other.
+        sizes: number of lanes of each policy.
     """
 
-    def __init__(self, policies: Sequence[Any], lanes: Sequence[torch.Tensor]):
-        self.policies, self.sizes = list(policies), [len(each) for each in lanes]
+    def __init__(self, policies: Sequence[Policy], lanes: Sequence[torch.Tensor]):
+        self.policies = list(policies)
+        self.sizes = [len(policy_lanes) for policy_lanes in lanes]
         self.lanes = torch.cat(list(lanes))
         self.order = self.lanes.argsort()
         is_cuda = self.lanes.is_cuda
         self.streams = [torch.cuda.Stream(self.lanes.device) for _ in policies[1:] if is_cuda]
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """The state of every policy, by its number."""
+        """Returns the initial hidden state of each policy, by its index as a string."""
         return arrdict(
             {
                 str(i): policy.initial(size, device)
@@ -40,39 +50,41 @@ class MixedPolicy:
 
     def __call__(
         self,
-        world: Mapping,
+        world: World,
         state: arrdict,
         sample: bool = True,
         generator: torch.Generator | None = None,
     ) -> tuple[arrdict, arrdict]:
-        """One step for all lanes of an environment: (arrdict(actions), state)."""
-        actions, state = self.act(self.seen(world), state, sample, generator)
+        """Acts in all lanes of an environment. Returns (arrdict(actions), next state)."""
+        actions, state = self.act(self.select_lanes(world), state, sample, generator)
         return arrdict(actions=_select(actions, self.order)), state
 
-    def seen(self, world: Mapping) -> arrdict:
-        """What policies see of a world, at the lineup's lanes."""
+    def select_lanes(self, world: World) -> arrdict:
+        """Returns a copy of `obs` and `reset` in the lanes of the policies, in their order."""
         return arrdict({key: _select(world[key], self.lanes) for key in ("obs", "reset")})
 
     def act(
         self,
-        seen: arrdict,
+        world: Mapping,
         state: arrdict,
         sample: bool = True,
         generator: torch.Generator | None = None,
-    ) -> tuple[Any, arrdict]:
-        """Actions (L, ...) for what the lineup's lanes see, and the state after them."""
+    ) -> tuple[Tree, arrdict]:
+        """Acts on the result of `select_lanes`. Returns actions (M, ...) and the next state."""
         main = torch.cuda.current_stream(self.lanes.device) if self.streams else None
         for stream in self.streams:
             stream.wait_stream(main)
-        actions, after, first = [], arrdict(), 0
+        actions, next_state, start = [], arrdict(), 0
         for i, (policy, size) in enumerate(zip(self.policies, self.sizes, strict=True)):
-            world, first = seen[first : first + size], first + size
+            policy_world, start = world[start : start + size], start + size
             with torch.cuda.stream(self.streams[i - 1]) if self.streams and i else nullcontext():
-                decision, after[str(i)] = policy(world, state[str(i)], sample, generator)
+                decision, next_state[str(i)] = policy(
+                    policy_world, state[str(i)], sample, generator
+                )
             actions.append(decision["actions"])
         for stream in self.streams:
             main.wait_stream(stream)
-        return cat(actions), after
+        return cat(actions), next_state
 
 
 def _select(tree, lanes):

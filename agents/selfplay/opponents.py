@@ -1,184 +1,215 @@
-"""Opponents: past selves and a scripted policy, in some of the environments of one that learns.
+"""Opponents: past snapshots of the policy, or a scripted bot, in some of the environments.
 
-Axes: E environments of A agents, B = E A lanes, O environments with opponents.
+Axes: N environments of A agents, B = N A lanes; M of the environments have opponents.
 """
 
 from typing import Annotated, Any
 
 import torch
-from pydantic import Field
+from pydantic import Field, SkipValidation
 
 from megastep.agents.generator import SeededGenerator
+from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay import duels
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.settings import checked
+from megastep.types import Env, World
+from megastep.types import Policy as AnyPolicy
 
-Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class Opponents:
-    """An environment in some of whose environments others play: there one lane learns, each
-    agent's place in turn, and all others are opponents. Their `learns` is False, and what a
-    decision says of them is ignored. In the first environments every lane learns, as it does
-    without opponents: the policy plays itself as it is now.
+    """Wraps a multi-agent environment so that past snapshots or a scripted bot play some agents.
 
-    env, policy  the environment, of two agents or more, and the policy that learns in it
-    scripted     another policy, which acts as policies do
-    past         the share of environments against past selves
-    bot          the share against the scripted policy
-    snapshots    how many past selves there are, in as many environments each; all begin as copies
-                 of the policy
-    every        updates after which the oldest one becomes a copy of the policy as it is then
+    In an environment with opponents, one agent learns and a single opponent controls all others.
+    The learning agent's slot rotates across environments. In the remaining environments, which come
+    first, the current policy controls every agent and learns from all of them.
 
-    Which lanes learn never changes, and weights are copied in place, so a graph stays valid. Beside
-    what `env` has there are `learners` (B,) bool, the lanes that learn, and `kinds`, by name: the
-    lanes (B,) bool of environments against "now", "past" and "bot". ValueError if the shares are
-    no shares, or leave a snapshot without an environment.
+    The lanes of opponents have `learns` False, and `step` ignores the actions given for them.
+
+    Args:
+        env: environment with at least two agents.
+        policy: the policy that learns. Snapshots are copies of its actor.
+        scripted: the bot, a policy; needed if `bot` > 0.
+        past: fraction of environments played against snapshots.
+        bot: fraction of environments played against `scripted`.
+        snapshots: number of snapshots. Each gets the same number of environments.
+        every: updates between two refreshes; each replaces the oldest snapshot.
+        seed: of the opponents' actions.
+
+    Attributes:
+        learners: (B,) bool, lanes whose transitions are used for learning. Never changes, so CUDA
+            graphs stay valid.
+        matchups: (B,) bool by name, the lanes of environments played against "now" (the current
+            policy), "past" and "bot". Names without environments are absent.
+        snapshots: the snapshots, as policies. Refreshed in place.
+
+    All other attributes are those of `env`.
+
+    Raises:
+        ValueError: the environment has one agent, `past + bot > 1`, or a snapshot or the bot would
+            get no environment.
     """
 
     @checked
     def __init__(
         self,
-        env: Any,
-        policy: Any,
-        scripted: Any = None,
+        env: SkipValidation[Env],
+        policy: SkipValidation[Policy],
+        scripted: SkipValidation[AnyPolicy] | None = None,
         *,
-        past: Share = 0.0,
-        bot: Share = 0.0,
+        past: Fraction = 0.0,
+        bot: Fraction = 0.0,
         snapshots: Annotated[int, Field(ge=1, le=10_000)] = 4,
         every: Annotated[int, Field(ge=1, le=10**9)] = 100,
         seed: int = 1,
     ):
         self.env, self.every, device = env, every, env.device
-        each, n_bot = shared(env, past, bot, snapshots)
-        # autocast keeps the cast of a weight only where it could need a gradient
-        n_actors = snapshots if past else 0
-        self.actors = [policy.actor().requires_grad_(True) for _ in range(n_actors)]
-        self.random = SeededGenerator(seed)
-        groups = [each for _ in self.actors] + [n_bot] * (n_bot > 0)  # environments, by opponent
-        self.n_past, self.n_opposed = each * len(self.actors), sum(groups)
+        n_per_snapshot, n_bot = count_environments(env, past, bot, snapshots)
+        n_snapshots = snapshots if past else 0
+        # autocast caches the cast of a weight only if the weight requires a gradient
+        self.snapshots = [policy.actor().requires_grad_(True) for _ in range(n_snapshots)]
+        self.generator = SeededGenerator(seed)
+        n_by_opponent = [n_per_snapshot] * n_snapshots + [n_bot] * (n_bot > 0)
+        self.n_past, self.n_opposed = n_per_snapshot * n_snapshots, sum(n_by_opponent)
 
-        self.seat = torch.cat([duels.seats(n, env.n_agents, device) for n in groups])
+        slots = [duels.rotating_slots(n, env.n_agents, device) for n in n_by_opponent]
+        self.slots = torch.cat(slots)  # (M, 1)
         learners = torch.ones(env.n_envs, env.n_agents, dtype=torch.bool, device=device)
-        learners[-self.n_opposed :] = torch.zeros_like(self.seat, dtype=torch.bool)
-        learners[-self.n_opposed :].scatter_(1, self.seat, True)
+        learners[-self.n_opposed :] = torch.zeros_like(self.slots, dtype=torch.bool)
+        learners[-self.n_opposed :].scatter_(1, self.slots, True)
         self.learners = learners.flatten()
-        opposing = (~self.learners).nonzero()[:, 0].split([n * (env.n_agents - 1) for n in groups])
-        self.lineup = MixedPolicy([*self.actors, scripted][: len(groups)], opposing)
-        self.kinds = self._kinds({"past": self.n_past, "bot": n_bot})
-        # pairs of a learner and an opponent that were won and decided since `take`, by environment
+        opponent_lanes = (~self.learners).nonzero()[:, 0]
+        n_lanes_by_opponent = [n * (env.n_agents - 1) for n in n_by_opponent]
+        opponents = [*self.snapshots, scripted][: len(n_by_opponent)]
+        self.mixed_policy = MixedPolicy(opponents, opponent_lanes.split(n_lanes_by_opponent))
+        self.matchups = self._matchups({"past": self.n_past, "bot": n_bot})
+        # (2, M): pairs of a learning agent and an opponent that were won and decided since `pop`
         self.pairs = torch.zeros(2, self.n_opposed, device=device)
         self.returns = torch.zeros(self.n_opposed, env.n_agents, device=device)
 
-    def _kinds(self, numbers):
-        """Which lanes are of environments against whom, {name: (B,) bool}, where there are any."""
-        numbers = {"now": self.env.n_envs - self.n_opposed, **numbers}
-        lanes = torch.tensor(list(numbers.values())) * self.env.n_agents
-        kind = torch.arange(len(numbers)).repeat_interleave(lanes).to(self.env.device)
-        return {name: kind == i for i, name in enumerate(numbers) if numbers[name]}
+    def _matchups(self, n_by_kind):
+        """Returns {name: (B,) bool} from the number of environments per kind of opponent."""
+        n_by_kind = {"now": self.env.n_envs - self.n_opposed, **n_by_kind}
+        n_lanes = torch.tensor(list(n_by_kind.values())) * self.env.n_agents
+        kind = torch.arange(len(n_by_kind)).repeat_interleave(n_lanes).to(self.env.device)
+        return {name: kind == i for i, name in enumerate(n_by_kind) if n_by_kind[name]}
 
-    def __getattr__(self, name):
-        if name == "env":  # of an object that is being copied
+    def __getattr__(self, name: str) -> Any:
+        if name == "env":  # not set yet while the object is being copied
             raise AttributeError(name)
         return getattr(self.env, name)
 
-    def reset(self) -> arrdict:
-        """Starts every episode anew. Returns a world."""
-        self.memory = self.lineup.initial(len(self.learners), self.env.device)
+    def reset(self) -> World:
+        """Starts every episode and returns the first world."""
+        self.hidden_state = self.mixed_policy.initial(len(self.learners), self.env.device)
         self.returns.zero_()
-        return self._shown(self.env.reset())
+        return self._observed(self.env.reset())
 
     @torch.no_grad()
-    def step(self, decision: arrdict) -> arrdict:
-        """One step by `decision.actions` (B, ...) of the lanes that learn, and by the opponents'
-        own of theirs. Returns a world.
-        """
-        generator = self.random.on(self.learners.device)
-        theirs, self.memory = self.lineup.act(self.seen, self.memory, generator=generator)
-        put = mapping(lambda all_of, own: all_of.index_copy(0, self.lineup.lanes, own.to(all_of)))
-        world = self.env.step(arrdict(actions=put(decision["actions"], theirs)))
-        self._count(world)
-        return self._shown(world)
+    def step(self, decision: arrdict) -> World:
+        """Steps the environment.
 
-    def _shown(self, world):
-        self.seen = self.lineup.seen(world)
+        Takes `decision.actions`, (B, ...), in the lanes that learn; the opponents act in theirs.
+        """
+        generator = self.generator.on(self.learners.device)
+        opponent_actions, self.hidden_state = self.mixed_policy.act(
+            self.opponent_world, self.hidden_state, generator=generator
+        )
+        lanes = self.mixed_policy.lanes
+        replace = mapping(lambda leaf, theirs: leaf.index_copy(0, lanes, theirs.to(leaf)))
+        actions = replace(decision["actions"], opponent_actions)
+        world = self.env.step(arrdict(actions=actions))
+        self._count_pairs(world)
+        return self._observed(world)
+
+    def _observed(self, world):
+        """Stores what the opponents see of a world. Returns the world with `learns`."""
+        self.opponent_world = self.mixed_policy.select_lanes(world)
         learns = self.learners if "learns" not in world else self.learners & world["learns"]
         return arrdict(world, learns=learns)
 
-    def _count(self, world):
-        """Adds up pairs that this step decided."""
+    def _count_pairs(self, world):
+        """Adds the pairs that this step decided to `pairs`."""
         reward, terminal, truncated = (
             world[key].view(-1, self.env.n_agents)[-self.n_opposed :]
             for key in ("reward", "terminal", "truncated")
         )
         self.returns += reward
-        self.pairs += torch.stack(duels.pairs(terminal, self.returns, self.seat))
+        self.pairs += torch.stack(duels.score_pairs(terminal, self.returns, self.slots))
         self.returns.masked_fill_(terminal | truncated, 0.0)
 
-    def refresh(self, policy: Any, updates: int) -> None:
-        """After each update: where it is time to, the oldest snapshot becomes what the policy is
-        now, and forgets what it remembered of its episodes.
-        """
-        if not self.actors or updates % self.every:
-            return
-        slot = (updates // self.every - 1) % len(self.actors)
-        actor, weights = self.actors[slot], policy.state_dict()
-        actor.load_state_dict({name: weights[name] for name in actor.state_dict()})
-        lanes, memory = self.lineup.sizes[slot], self.memory[str(slot)]
-        memory[:] = actor.initial(lanes, self.env.device)
+    def refresh_snapshots(self, policy: Policy, n_updates: int) -> None:
+        """Copies the policy into the oldest snapshot, every `every` updates. Called after each one.
 
-    def take(self) -> dict[str, float]:
-        """The share of pairs that were won against each kind of opponent since the last call, of
-        those that were decided. Synchronises.
+        Also clears that snapshot's hidden state.
         """
-        found = {}
-        for name, part in zip(("past", "bot"), self.pairs.double().tensor_split([self.n_past], 1)):
-            won, decided = part.sum(1).tolist()
+        if not self.snapshots or n_updates % self.every:
+            return
+        index = (n_updates // self.every - 1) % len(self.snapshots)
+        snapshot, weights = self.snapshots[index], policy.state_dict()
+        snapshot.load_state_dict({name: weights[name] for name in snapshot.state_dict()})
+        state = self.hidden_state[str(index)]
+        state[:] = snapshot.initial(self.mixed_policy.sizes[index], self.env.device)
+
+    def pop_win_rates(self) -> dict[str, float]:
+        """Returns the fraction of decided pairs that were won since the last call. Synchronises.
+
+        By metric name, for each kind of opponent that any pair was decided against.
+        """
+        win_rates = {}
+        by_kind = self.pairs.double().tensor_split([self.n_past], 1)
+        for name, pairs in zip(("past", "bot"), by_kind):
+            won, decided = pairs.sum(1).tolist()
             if decided:
-                found[f"episode/won/{name}"] = won / decided
+                win_rates[f"episode/won/{name}"] = won / decided
         self.pairs.zero_()
-        return found
+        return win_rates
 
     def state_dict(self) -> dict[str, Any]:
-        """The snapshots, and what was counted: dicts of tensors and numbers."""
+        """Returns the snapshots, the pairs counted and the generator's state."""
         return dict(
-            actors={str(i): actor.state_dict() for i, actor in enumerate(self.actors)},
+            snapshots={str(i): policy.state_dict() for i, policy in enumerate(self.snapshots)},
             pairs=self.pairs,
-            random=self.random.state_dict(),
+            generator=self.generator.state_dict(),
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from a `state_dict`. Episodes start anew."""
-        for i, actor in enumerate(self.actors):
-            actor.load_state_dict(state["actors"][str(i)])
+        """Restores a `state_dict`. Episodes start anew."""
+        for i, snapshot in enumerate(self.snapshots):
+            snapshot.load_state_dict(state["snapshots"][str(i)])
         self.pairs.copy_(state["pairs"])
-        self.random.load_state_dict(state["random"], self.learners.device)
+        self.generator.load_state_dict(state["generator"], self.learners.device)
 
 
-def shared(env: Any, past: float, bot: float, snapshots: int) -> tuple[int, int]:
-    """How many environments each snapshot and the scripted policy play in. ValueError if that
-    cannot be.
+def count_environments(env: Env, past: float, bot: float, snapshots: int) -> tuple[int, int]:
+    """Returns the number of environments per snapshot, and against the bot.
+
+    Raises:
+        ValueError: as for `Opponents`.
     """
     if env.n_agents < 2:
         raise ValueError(
-            f"opponents need an environment of two agents or more, and {type(env).__name__} has one"
+            f"opponents need an environment with at least two agents; {type(env).__name__} has one"
         )
     if past + bot > 1:
         raise ValueError(
-            f"opponents.past={past} and opponents.bot={bot} are shares of the environments, "
-            "together at most 1"
+            f"opponents.past={past} and opponents.bot={bot} are fractions of the environments, so "
+            "their sum must be at most 1"
         )
-    each, n_bot = round(past * env.n_envs) // snapshots, round(bot * env.n_envs)
-    if past and not each:
+    n_past, n_bot = round(past * env.n_envs), round(bot * env.n_envs)
+    if past and n_past < snapshots:
         raise ValueError(
-            f"opponents.past={past} of {env.n_envs:,} environments are "
-            f"{round(past * env.n_envs):,}, one for each of so many snapshots and not for "
-            f"{snapshots:,}: give opponents.snapshots or env.n_envs"
+            f"opponents.past={past} of {env.n_envs:,} environments is {n_past:,} environments, too "
+            f"few for opponents.snapshots={snapshots:,}: reduce opponents.snapshots or raise "
+            "env.n_envs"
         )
     if bot and not n_bot:
         raise ValueError(
-            f"opponents.bot={bot} of {env.n_envs:,} environments are none: give more env.n_envs"
+            f"opponents.bot={bot} of {env.n_envs:,} environments is none: raise opponents.bot or "
+            "env.n_envs"
         )
-    return each, n_bot
+    return n_past // snapshots, n_bot

@@ -1,43 +1,46 @@
-"""Ratings of players by what came of their duels: the Plackett-Luce model of Weng and Lin (JMLR 12,
-2011), by the package openskill.
+"""Ratings of players from the results of their duels.
 
-A rating is a mean, 25 for whoever has not played, and a standard deviation of what is not known
-about it; a player 5.9 above another wins 73 % of their duels, one 1 above 54 %.
+Uses the Plackett-Luce model of Weng and Lin (JMLR 12, 2011) from the package openskill. A rating is
+a mean, which starts at 25, and a standard deviation for its uncertainty. A player rated 5.9 higher
+wins 73 % of the duels, a player rated 1 higher 54 %.
 """
 
 import csv
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from megastep.agents.training import atomic_files
+from megastep.agents.training.atomic_files import write_atomically
 
-#: In how many orders the same duels are taken.
-ORDERS = 10
+#: Number of orders that ratings are averaged over.
+N_ORDERS = 10
+
+#: Scores of player i in duels with player j, by (i, j): 1 won, 0 lost, 0.5 a draw.
+Scores = Mapping[tuple[int, int], Sequence[float]]
 
 
-def rate(
-    n_players: int, scores: Mapping[tuple[int, int], Sequence[float]], seed: int = 1
-) -> list[tuple[float, float]]:
-    """(mean, standard deviation) of each player. `scores[i, j]` are those of player i in duels with
-    player j, 1 won, 0 lost, 0.5 a draw. The model takes them one by one, so ratings depend on their
-    order: these are means over `ORDERS` of them, drawn from `seed`.
+def rate(n_players: int, scores: Scores, seed: int = 1) -> list[tuple[float, float]]:
+    """Returns the rating (mean, standard deviation) of each player.
+
+    The model updates ratings duel by duel, so they depend on the order of the duels. The result is
+    the mean over `N_ORDERS` random orders.
     """
-    games = [(i, j, score) for (i, j), row in scores.items() for score in row]
-    random = np.random.default_rng(seed)
-    orders = [random.permutation(len(games)) for _ in range(ORDERS)]
-    rated = [_rate(n_players, [games[k] for k in order]) for order in orders]
-    return [(float(mean), float(sigma)) for mean, sigma in np.mean(rated, 0)]
+    duels = [(i, j, score) for (i, j), values in scores.items() for score in values]
+    generator = np.random.default_rng(seed)
+    orders = [generator.permutation(len(duels)) for _ in range(N_ORDERS)]
+    ratings = [_rate_in_order(n_players, [duels[k] for k in order]) for order in orders]
+    return [(float(mean), float(sigma)) for mean, sigma in np.mean(ratings, 0)]
 
 
-def _rate(n_players, games):
+def _rate_in_order(n_players, duels):
     from openskill.models import PlackettLuce
 
-    model = PlackettLuce(tau=0.0)  # players do not change between two duels
+    model = PlackettLuce(tau=0.0)  # the strength of a player does not drift between duels
     players = [model.rating() for _ in range(n_players)]
-    for i, j, score in games:
+    for i, j, score in duels:
         [players[i]], [players[j]] = model.rate(
             [[players[i]], [players[j]]], scores=[score, 1 - score]
         )
@@ -45,42 +48,43 @@ def _rate(n_players, games):
 
 
 def rows(
-    players: Sequence[tuple[str, int | None]],
-    scores: Mapping[tuple[int, int], Sequence[float]],
-    seed: int = 1,
-) -> list[dict]:
-    """A table's row for each player `(name, samples)`: its rating, the share of its duels that it
-    won, a draw being half, and their number.
+    players: Sequence[tuple[str, int | None]], scores: Scores, seed: int = 1
+) -> list[dict[str, Any]]:
+    """Returns a table row per player: rating, fraction of duels won (a draw is half), and duels.
+
+    Args:
+        players: (name, samples it was trained on, or None) of each player.
     """
-    found = []
-    for k, ((name, samples), (mean, sigma)) in enumerate(
-        zip(players, rate(len(players), scores, seed), strict=True)
-    ):
-        own = [x for (i, _), row in scores.items() if i == k for x in row]
-        own += [1 - x for (_, j), row in scores.items() if j == k for x in row]
-        found.append(
+    ratings = rate(len(players), scores, seed)
+    table = []
+    for k, ((name, samples), (mean, sigma)) in enumerate(zip(players, ratings, strict=True)):
+        results = [score for (i, _), values in scores.items() if i == k for score in values]
+        results += [1 - score for (_, j), values in scores.items() if j == k for score in values]
+        table.append(
             dict(
                 player=name,
                 samples=samples,
                 rating=mean,
                 sigma=sigma,
-                won=sum(own) / len(own),
-                duels=len(own),
+                won=sum(results) / len(results),
+                duels=len(results),
             )
         )
-    return found
+    return table
 
 
-def write(folder: Path, table: Sequence[dict], title: str) -> None:
-    """Writes `ratings.csv` and `ratings.svg` into a folder, each whole or not at all: ratings
-    against samples with two standard deviations, players without samples as lines.
+def write(folder: Path, table: Sequence[dict[str, Any]], title: str) -> None:
+    """Writes `ratings.csv` and `ratings.svg` into a folder, each atomically.
+
+    The plot shows rating against samples with two standard deviations. Players without samples are
+    horizontal lines.
     """
     text = io.StringIO()
     writer = csv.DictWriter(text, list(table[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(table)
-    atomic_files.replace(folder / "ratings.csv", text.getvalue().encode())
-    atomic_files.replace(folder / "ratings.svg", _plot(table, title))
+    write_atomically(folder / "ratings.csv", text.getvalue().encode())
+    write_atomically(folder / "ratings.svg", _plot(table, title))
 
 
 def _plot(table, title):
@@ -88,12 +92,13 @@ def _plot(table, title):
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
-    learnt = [row for row in table if row["samples"] is not None]
+    trained = [row for row in table if row["samples"] is not None]
+    untrained = [row for row in table if row["samples"] is None]
     samples, means, sigmas = (
-        np.array([row[key] for row in learnt], float) for key in ("samples", "rating", "sigma")
+        np.array([row[key] for row in trained], float) for key in ("samples", "rating", "sigma")
     )
     axes.errorbar(samples, means, 2 * sigmas, marker="o", capsize=3, label="the run")
-    for i, row in enumerate(each for each in table if each["samples"] is None):
+    for i, row in enumerate(untrained):
         axes.axhline(row["rating"], color=f"C{i + 1}", linestyle="--", label=row["player"])
     axes.set(title=title, xlabel="samples", ylabel="rating ± two standard deviations")
     axes.grid(alpha=0.3)

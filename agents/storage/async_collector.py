@@ -1,67 +1,78 @@
-"""Acting ahead of the learner, on weights that are an exact number of updates old.
+"""Collecting while the learner updates, with weights that are an exact number of updates old.
 
-    call n:    waits for rollout n, hands it over, and has rollout n + lag collected
-    rollout n: acted in with the weights after update n - 1 - lag, the first `lag` with the first
+    call n:    waits for rollout n, returns it, and starts collecting rollout n + lag
+    rollout n: acted with the weights after update n - 1 - lag, or with the first weights
 
-On a GPU a stream of its own collects while the learner updates on the current one. On a CPU the
-same happens in the same order, one after the other, with the same numbers.
+On a GPU a second stream collects while the learner updates on the current one. A CPU does the same
+work in the same order, one after the other, with the same numbers.
 """
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import cycle
-from typing import Any
 
 import torch
 
-from megastep.agents.storage.rollout import Collector, Rollout, initial_actor_state
+from megastep.agents.networks.policy import Policy
+from megastep.agents.storage.collector import Collector, initial_actor_state
+from megastep.agents.storage.rollout import Rollout
+from megastep.arrdict import arrdict
 from megastep.capture import Graph
+from megastep.types import Env
 
 
 class _Slot:
-    """Where every `lag`-th rollout is collected: the weights it is acted in with, its memory, its
-    graph, and the event of its end.
+    """One of the `lag` rollouts in progress, with the weights, the graph and the end event that
+    belong to it. The actor state is shared by all.
     """
 
-    def __init__(self, env, policy, rollout, actor_state):
-        # autocast keeps the cast of a weight only where it could need a gradient
+    def __init__(self, env: Env, policy: Policy, rollout: Rollout, actor_state: arrdict):
+        # autocast caches the cast of a weight only if the weight requires a gradient
         self.actor = policy.actor().requires_grad_(True)
-        self.actor.random = policy.random  # one random stream for all, which is saved with it
-        theirs = policy.state_dict()
-        self.own = self.actor.state_dict()
-        self.weights = [theirs[name] for name in self.own]
+        self.actor.generator = policy.generator  # shared by all actors and saved with the policy
+        policy_weights = policy.state_dict()
+        self.weights = self.actor.state_dict()
+        self.sources = [policy_weights[name] for name in self.weights]
         self.rollout = copy.deepcopy(rollout)
         self.collect = Collector(env, self.actor, self.rollout, actor_state)
         self.end = None
 
-    def take_weights(self):
-        torch._foreach_copy_(list(self.own.values()), self.weights)
+    def copy_weights(self):
+        torch._foreach_copy_(list(self.weights.values()), self.sources)
 
 
 class AsyncCollector:
-    """Collects rollouts of a policy ahead, `lag` of them, and returns one after the other as one
-    and the same `rollout`, which stores no values: they would be those of old weights.
+    """Collects `lag` rollouts in advance. Returns them one after the other, copied into `rollout`.
 
-    What ran ahead is lost when a run stops: one that goes on begins anew, with the weights of then.
-    ValueError if the environment has opponents in it, whose weights change as the learner learns.
+    Rollouts store no values, since those of old weights are of no use. A resumed run starts
+    collecting again with the weights it loaded; rollouts that were in progress are not saved.
+
+    Args:
+        env: environment without opponents.
+        policy: the policy that the learner updates.
+        rollout: what each call fills and returns.
+        lag: how many updates old the acting weights are.
+
+    Raises:
+        ValueError: if the environment has opponents, whose weights change with the updates.
     """
 
-    def __init__(self, env: Any, policy: Any, rollout: Rollout, lag: int):
+    def __init__(self, env: Env, policy: Policy, rollout: Rollout, lag: int):
         if rollout.learners is not None:
             raise ValueError(
-                f"acting {lag} updates ahead (lag) and opponents cannot be combined, as opponents "
-                "change with the updates: give lag=0, or no opponents"
+                f"lag={lag} does not work with opponents, whose weights change with the updates: "
+                "use lag=0 or no opponents"
             )
         self.rollout = rollout
         self.on_gpu = torch.device(env.device).type == "cuda"
         self.stream = torch.cuda.Stream(env.device) if self.on_gpu else None
         actor_state = initial_actor_state(env, policy, rollout)
         self.slots = [_Slot(env, policy, rollout, actor_state) for _ in range(lag)]
-        self._next: Iterator | None = None
+        self._next: Iterator[_Slot] | None = None
 
     @property
-    def graph(self) -> Any:
-        """The graph that collects, once there is one."""
+    def graph(self) -> Callable | None:
+        """The captured graph that collects, or None."""
         return self.slots[0].collect.graph
 
     def __call__(self) -> Rollout:
@@ -77,8 +88,8 @@ class AsyncCollector:
         return self.rollout
 
     def _launch(self, slot):
-        """Has a rollout collected with the weights of now."""
-        slot.take_weights()
+        """Starts collecting a rollout with the policy's current weights."""
+        slot.copy_weights()
         if not self.on_gpu:
             slot.collect()
             return
@@ -89,10 +100,10 @@ class AsyncCollector:
             slot.end = self.stream.record_event()
         if not isinstance(slot.collect.graph, Graph):
             # An environment may replace tensors in its first steps, which frees memory of the
-            # current stream: it must not be used again before those steps are done.
+            # current stream. Nothing may reuse that memory before these steps are done.
             current.wait_event(slot.end)
 
     def wait(self) -> None:
-        """Waits until nothing is being collected: the environment may be looked at, or go."""
+        """Blocks until nothing is being collected, so that others may use the environment."""
         if self.on_gpu:
             self.stream.synchronize()

@@ -1,52 +1,51 @@
-"""Minibatches of fresh sequences and replayed ones, side by side.
+"""Minibatches of fresh sequences followed by replayed ones.
 
-Axes: T time, M lanes of a minibatch, of which the first are fresh.
+T time, M lanes of a minibatch, fresh ones first.
 """
-
-from typing import Any
 
 import torch
 
-from megastep.agents.storage.replay import Replay
+from megastep.agents.networks.policy import Policy
+from megastep.agents.storage.replay import ReplayBuffer
 from megastep.agents.storage.rollout import Rollout
 from megastep.arrdict import arrdict, cat
 from megastep.dotdict import mapping
 
-# what has an axis of time
+# keys with a time axis
 _IN_TIME = (
     *("obs", "privileged", "starts", "learns"),
     *("actions", "logprobs", "reward", "terminal", "truncated"),
 )
 
 
-def fresh(rollout: Rollout, rows: torch.Tensor) -> arrdict:
-    """Whole sequences of some lanes, rows (M,), as `Rollout.sequences` gives them; and of each,
-    (M,), `weight` in the loss, 1, and `age`, 0.
+def from_rollout(rollout: Rollout, lanes: torch.Tensor) -> arrdict:
+    """Returns whole sequences of some lanes (M,), as `Rollout.sequences`, and per sequence
+    `weight` 1 and `age` 0, both (M,).
     """
-    batch = rollout.sequences(rows)
-    return arrdict(batch, weight=torch.ones_like(batch.reward[0]), age=torch.zeros_like(rows))
+    batch = rollout.sequences(lanes)
+    return arrdict(batch, weight=torch.ones_like(batch.reward[0]), age=torch.zeros_like(lanes))
 
 
-def with_replayed(
-    batch: arrdict, replay: Replay, policy: Any, n: int, generator: torch.Generator
+def add_replayed(
+    batch: arrdict, replay: ReplayBuffer, policy: Policy, n: int, generator: torch.Generator
 ) -> arrdict:
-    """A fresh batch and n sequences of a replay memory behind it, (T, M + n, ...). Their burn-in
-    has warmed up the policy's memory. None of them learns while there is nothing to draw.
+    """Returns a fresh batch followed by n replayed sequences, (T, M + n, ...).
 
-    `index` (n,) is what `Replay.set_priorities` takes.
+    Burn-in steps are removed after warming up the hidden state. While the buffer is not ready, the
+    replayed sequences have `learns` false. `index` (n,) is for `ReplayBuffer.set_priorities`.
     """
-    drawn = _warmed_up(replay.sample(n, generator), policy, replay.settings.burn_in)
-    drawn["learns"] = drawn.learns & replay.is_ready
-    joined = {key: cat([batch[key], drawn[key]], int(key in _IN_TIME)) for key in batch}
-    return arrdict(joined, index=drawn.index)
+    replayed = _burn_in(replay.sample(n, generator), policy, replay.settings.burn_in)
+    replayed["learns"] = replayed.learns & replay.is_ready
+    joined = {key: cat([batch[key], replayed[key]], int(key in _IN_TIME)) for key in batch}
+    return arrdict(joined, index=replayed.index)
 
 
 @torch.no_grad()
-def _warmed_up(batch, policy, burn_in):
-    """A batch less its first steps, with the state after them."""
-    if not burn_in:
+def _burn_in(batch, policy, n_steps):
+    """Returns a batch without its first steps, with the hidden state after them."""
+    if not n_steps:
         return batch
-    first, rest = mapping(lambda leaf: leaf[:burn_in]), mapping(lambda leaf: leaf[burn_in:])
+    first, rest = mapping(lambda leaf: leaf[:n_steps]), mapping(lambda leaf: leaf[n_steps:])
     state = policy.unroll(first(batch.obs), first(batch.starts), batch.state).state
     parts = {key: rest(part) if key in _IN_TIME else part for key, part in batch.items()}
     return arrdict(parts, state=state)

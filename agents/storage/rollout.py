@@ -1,72 +1,69 @@
-"""Rollouts: T steps of B lanes on the device, and how they are collected.
+"""Rollouts: T steps of B lanes on the device.
 
-Axes: T time, B lanes, M lanes of a minibatch. Row t of a rollout is the observation and the action
-of time t; `reward`, `reset`, `terminal` and `truncated` at row t are those of the world that
-followed, t+1. So row t is a valid transition unless its `reset` is set.
+T time, B lanes, M lanes of a minibatch. Row t of a rollout is the observation and the action of
+time t. `reward`, `reset`, `terminal` and `truncated` at row t come from the world that followed,
+t+1. So row t is a valid transition unless its `reset` is set.
 """
 
 import math
-from typing import Any
 
 import torch
 
 from megastep import spaces
+from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, clone
-from megastep.capture import capture
 from megastep.dotdict import leaves, mapping
+from megastep.types import Env, Space, Tree
 
-
-def _zeros(space, lead, device, dtype):
-    """Zeros for values of a tree of spaces, after `lead` axes: of the dtype that a space names,
-    int64 for its integers, else of `dtype`.
-    """
-    if isinstance(space, dict):
-        return arrdict({key: _zeros(child, lead, device, dtype) for key, child in space.items()})
-    if isinstance(space, spaces.MultiDiscrete):
-        dtype = torch.int64
-    dtype = getattr(space, "dtype", None) or dtype
-    return torch.zeros(*lead, *space.shape, dtype=dtype, device=device)
-
-
-def _floats(tree, name):
-    """The leaves of a tree that are not integers, by their paths below `name`."""
-    if isinstance(tree, dict):
-        parts = (_floats(child, f"{name}.{key}") for key, child in tree.items())
-        return {path: leaf for part in parts for path, leaf in part.items()}
-    return {name: tree} if tree.is_floating_point() else {}
+_SEQUENCES = "obs starts learns actions logprobs reward terminal truncated".split()
+_BYTES_OF_THE_REST = 64  # of a step: everything except observations
 
 
 class Rollout:
-    """T steps of B lanes, in memory that is allocated once and overwritten by every `collect`.
+    """T steps of B lanes. Memory is allocated once and overwritten by every `collect`.
 
-    obs        (T+1, B, ...), the last row is the observation that the next rollout starts from
-    privileged (T+1, B, ...) float32, what the critic alone sees, or None where there is no such
-               space
-    starts     (T+1, B) bool, whether that observation is its episode's first
-    learns     (T+1, B) bool, whether the learner learns from the lane then; all do unless worlds
-               say otherwise
-    actions    (T, B, ...) int64
-    logprobs   (T, B) of those actions, under the policy that chose them; 0 of one that gives none
-    values     (T+1, B), as the policy's critic estimated them then, or None if nobody needs them
-    reward     (T, B), and `terminal`, `truncated` (T, B) bool: of the world that followed
-    metrics    by name, (T, B) float32: of the world that followed, where an episode ended
-    state      the policy's state before row 0, leaves (B, ...)
+    Args:
+        n_steps: T.
+        n_lanes: B.
+        obs_space: space of the observations.
+        action_space: space of the actions.
+        state: the policy's hidden state of B lanes, such as `policy.initial(B)`; is copied.
+        device: device of all tensors.
+        privileged_space: space of what only the critic sees, or None.
+        obs_dtype: dtype of observations, except integers and spaces that name a dtype.
+        learners: bool per lane of the environment, true for the B lanes that are stored. For
+            environments with opponents; None stores every lane.
+        values: whether to store the critic's values.
 
-    Args: `state`, the policy's state of B lanes, such as `policy.initial(B)`, of which a copy is
-    made; `obs_dtype`, of all observations that are not integers and whose space names none;
-    `learners`, for an environment where opponents play too, which of its lanes are the B that are
-    stored, a bool each; `values`, whether there are any. ValueError if it has no row.
+    Attributes:
+        obs: (T+1, B, ...). The last row is the observation that the next rollout starts from.
+        privileged: (T+1, B, ...) float32, or None without a `privileged_space`.
+        starts: (T+1, B) bool, whether the observation is its episode's first.
+        learns: (T+1, B) bool, whether to learn from the lane at that time. True unless worlds
+            have `learns`.
+        actions: (T, B, ...) int64.
+        logprobs: (T, B), log-probabilities of the actions under the policy that took them; 0 for a
+            policy that gives none.
+        values: (T+1, B), the critic's values at the time of acting, or None.
+        reward: (T, B).
+        terminal: (T, B) bool.
+        truncated: (T, B) bool.
+        metrics: (T, B) float32 by name, read where an episode ends.
+        state: (B, ...), the policy's hidden state before row 0.
+
+    Raises:
+        ValueError: if there are no steps or no lanes.
     """
 
     def __init__(
         self,
         n_steps: int,
         n_lanes: int,
-        obs_space: Any,
-        action_space: Any,
+        obs_space: Space,
+        action_space: Space,
         state: arrdict,
         device: torch.device | str | None = None,
-        privileged_space: Any = None,
+        privileged_space: Space | None = None,
         obs_dtype: torch.dtype = torch.float16,
         learners: torch.Tensor | None = None,
         values: bool = True,
@@ -76,59 +73,32 @@ class Rollout:
                 f"a rollout needs at least one step and one lane, not {n_steps} and {n_lanes}"
             )
         self.n_steps, self.n_lanes, self.learners = n_steps, n_lanes, learners
-        self.stored = None if learners is None else learners.nonzero()[:, 0]
-        rows, more = (n_steps, n_lanes), (n_steps + 1, n_lanes)
-        self.obs = _zeros(obs_space, more, device, obs_dtype)
+        self.lane_indices = None if learners is None else learners.nonzero()[:, 0]
+        rows, rows_and_last = (n_steps, n_lanes), (n_steps + 1, n_lanes)
+        self.obs = _zeros(obs_space, rows_and_last, device, obs_dtype)
         self.privileged = None
         if privileged_space is not None:
-            self.privileged = _zeros(privileged_space, more, device, torch.float32)
+            self.privileged = _zeros(privileged_space, rows_and_last, device, torch.float32)
         self.actions = _zeros(action_space, rows, device, torch.int64)
-        self.starts = torch.zeros(more, dtype=torch.bool, device=device)
-        self.learns = torch.ones(more, dtype=torch.bool, device=device)
+        self.starts = torch.zeros(rows_and_last, dtype=torch.bool, device=device)
+        self.learns = torch.ones(rows_and_last, dtype=torch.bool, device=device)
         self.terminal = torch.zeros(rows, dtype=torch.bool, device=device)
         self.truncated = torch.zeros(rows, dtype=torch.bool, device=device)
-        self.values = torch.zeros(more, device=device) if values else None
+        self.values = torch.zeros(rows_and_last, device=device) if values else None
         self.logprobs = torch.zeros(rows, device=device)
         self.reward = torch.zeros(rows, device=device)
         self.metrics = arrdict()
         self.state = clone(state)
 
-    def make_room(self, world: arrdict) -> None:
-        """For the metrics of worlds like this one, before the first is stored."""
+    # ---- Writing ----
+
+    def allocate_metrics(self, world: arrdict) -> None:
+        """Allocates the metrics of worlds like this one. Call once, before the first step."""
         for name in world.get("metrics", {}):
             self.metrics[name] = torch.zeros_like(self.reward)
 
-    @property
-    def reset(self) -> torch.Tensor:
-        """(T, B) bool: whether row t's action was ignored because an episode started instead."""
-        return self.starts[1:]
-
-    def copy_(self, other: "Rollout") -> None:
-        """Takes over all that another one of the same kind holds."""
-        for own, its in zip(self._tensors(), other._tensors(), strict=True):
-            own.copy_(its)
-
-    def _tensors(self):
-        parts = [getattr(self, name) for name in (*_SEQUENCES, "privileged", "values")]
-        kept = {str(i): part for i, part in enumerate(parts) if part is not None}
-        return leaves({**kept, "metrics": self.metrics, "state": self.state})
-
-    def own(self, world: arrdict) -> arrdict:
-        """Of an environment's world, the lanes that are stored."""
-        return world if self.stored is None else _rows(world, self.stored)
-
-    def for_all(self, actions: Any) -> Any:
-        """Actions of the lanes that are stored as actions of all that the environment has, 0 for
-        those that act for themselves.
-        """
-        if self.stored is None:
-            return actions
-        n = len(self.learners)
-        put = mapping(lambda own: own.new_zeros(n, *own.shape[1:]).index_copy(0, self.stored, own))
-        return put(actions)
-
     def store_world(self, t: int, world: arrdict) -> arrdict:
-        """Stores the world at time t, and returns it as it was stored, for the policy to act on."""
+        """Stores the world at time t. Returns it as it was stored, for the policy to act on."""
         self.obs[t] = world["obs"]
         self.starts[t] = world["reset"]
         if "learns" in world:
@@ -138,37 +108,74 @@ class Rollout:
         return self.world(t)
 
     def store_decision(self, t: int, decision: arrdict) -> None:
-        """Stores the actions of time t, and their log-probabilities if the policy has any."""
+        """Stores the actions of time t, and their log-probabilities if the decision has any."""
         self.actions[t] = decision["actions"]
         if "logprobs" in decision:
             self.logprobs[t] = decision["logprobs"]
 
-    def store_outcome(self, t: int, world: arrdict) -> None:
-        """Stores what the world that followed time t says of the actions of that time."""
+    def store_transition(self, t: int, world: arrdict) -> None:
+        """Stores reward, end of episode and metrics of the world that followed time t."""
         self.reward[t] = world["reward"]
         self.terminal[t], self.truncated[t] = world["terminal"], world["truncated"]
         for name, rows in self.metrics.items():
             rows[t] = world["metrics"][name]
 
-    def world(self, t: int) -> arrdict:
-        """What a policy sees at time t: arrdict(obs, reset, and privileged if there is any)."""
-        seen = arrdict(obs=self.obs[t], reset=self.starts[t])
-        if self.privileged is not None:
-            seen["privileged"] = self.privileged[t]
-        return seen
+    def copy_(self, other: "Rollout") -> None:
+        """Copies every tensor of another rollout of the same shape."""
+        for target, source in zip(self._tensors(), other._tensors(), strict=True):
+            target.copy_(source)
 
-    def numbers(self) -> dict[str, torch.Tensor]:
-        """All that may stop being finite, by name, each (T, B) or (T+1, B, ...)."""
-        named = _floats(self.obs, "obs")
+    def _tensors(self):
+        parts = [getattr(self, name) for name in (*_SEQUENCES, "privileged", "values")]
+        parts = [part for part in parts if part is not None]
+        return [leaf for part in (*parts, self.metrics, self.state) for leaf in leaves(part)]
+
+    # ---- Lanes of the environment and lanes of the rollout ----
+
+    def select_lanes(self, world: arrdict) -> arrdict:
+        """Returns the stored lanes of an environment's world."""
+        return world if self.lane_indices is None else _select(world, self.lane_indices)
+
+    def scatter_actions(self, actions: Tree) -> Tree:
+        """Returns actions for every lane of the environment: 0 for lanes that are not stored."""
+        if self.lane_indices is None:
+            return actions
+        n_env_lanes = len(self.learners)
+
+        @mapping
+        def scatter(leaf):
+            zeros = leaf.new_zeros(n_env_lanes, *leaf.shape[1:])
+            return zeros.index_copy(0, self.lane_indices, leaf)
+
+        return scatter(actions)
+
+    # ---- Reading ----
+
+    @property
+    def reset(self) -> torch.Tensor:
+        """(T, B) bool, whether row t's action was ignored because an episode started instead."""
+        return self.starts[1:]
+
+    def world(self, t: int) -> arrdict:
+        """Returns what a policy sees at time t: arrdict(obs, reset), and privileged if stored."""
+        world = arrdict(obs=self.obs[t], reset=self.starts[t])
         if self.privileged is not None:
-            named |= _floats(self.privileged, "privileged")
-        named["reward"] = self.reward
+            world["privileged"] = self.privileged[t]
+        return world
+
+    def floats(self) -> dict[str, torch.Tensor]:
+        """Returns every tensor that may become non-finite, by name: (T, B) or (T+1, B, ...)."""
+        tensors = spaces.leaves(self.obs, "obs")
+        if self.privileged is not None:
+            tensors |= spaces.leaves(self.privileged, "privileged")
+        tensors = {name: leaf for name, leaf in tensors.items() if leaf.is_floating_point()}
+        tensors["reward"] = self.reward
         if self.values is not None:
-            named["value"] = self.values
-        return named | {"logprob": self.logprobs}
+            tensors["value"] = self.values
+        return tensors | {"logprob": self.logprobs}
 
     def transitions(self) -> dict[str, torch.Tensor]:
-        """The arguments of `returns.gae`, each (T, B), the last value (B,)."""
+        """Returns the arguments of `returns.gae`: (T, B) each, and the last value (B,)."""
         return dict(
             value=self.values[:-1],
             last_value=self.values[-1],
@@ -178,53 +185,29 @@ class Rollout:
             truncated=self.truncated,
         )
 
-    def sequences(self, rows: torch.Tensor) -> arrdict:
-        """Whole sequences of some lanes, rows (M,) int64, as a copy: arrdict of
+    def sequences(self, lanes: torch.Tensor) -> arrdict:
+        """Returns whole sequences of some lanes, as a copy.
 
-        obs, starts, learns, privileged if there is any   (T+1, M, ...)
-        actions, logprobs, reward, terminal, truncated    (T, M, ...)
-        state   the policy's before row 0, (M, ...)
+        Args:
+            lanes: (M,) int64.
+
+        Returns:
+            arrdict of obs, starts, learns and privileged (if stored), each (T+1, M, ...); actions,
+            logprobs, reward, terminal and truncated, each (T, M, ...); and state (M, ...), the
+            hidden state before row 0.
         """
-        select = mapping(lambda leaf: leaf.index_select(1, rows))
+        select = mapping(lambda leaf: leaf.index_select(1, lanes))
         batch = arrdict({name: select(getattr(self, name)) for name in _SEQUENCES})
         if self.privileged is not None:
             batch["privileged"] = select(self.privileged)
-        batch["state"] = _rows(self.state, rows)
+        batch["state"] = _select(self.state, lanes)
         return batch
 
 
-_SEQUENCES = "obs starts learns actions logprobs reward terminal truncated".split()
+def make_rollout(env: Env, policy: Policy, n_steps: int, values: bool = True) -> Rollout:
+    """Allocates a rollout of T steps for an environment and a policy.
 
-
-def without_last(tree: Any) -> Any:
-    """The first T of T+1 rows of a tree of tensors, those that were acted on; None is None."""
-    return None if tree is None else mapping(lambda leaf: leaf[:-1])(tree)
-
-
-def initial_actor_state(env: Any, policy: Any, rollout: Rollout) -> arrdict:
-    """Resets an environment, makes room in the rollout for the metrics of its worlds, and returns
-    the actor_state that `collect` begins with: arrdict(world, state), of the world what
-    `store_world` stores. It shares no memory with the environment.
-    """
-    first = rollout.own(env.reset())
-    rollout.make_room(first)
-    world = _stored(first).map(torch.clone)
-    return arrdict(world=world, state=policy.initial(len(world.reset)))
-
-
-def _rows(tree, rows):
-    return mapping(lambda leaf: leaf.index_select(0, rows))(tree)
-
-
-def _stored(world):
-    """Of a world, what `store_world` stores."""
-    keys = "obs", "reset", "learns", "privileged"
-    return arrdict({key: world[key] for key in keys if key in world})
-
-
-def make_rollout(env: Any, policy: Any, n_steps: int, values: bool = True) -> Rollout:
-    """Room for T steps of all lanes of an environment, or of those that learn where others are
-    `opponents.Opponents`.
+    It holds all lanes, or only those that learn if the environment has `learners` (opponents).
     """
     learners = getattr(env, "learners", None)
     n_lanes = env.n_envs * env.n_agents if learners is None else int(learners.sum())
@@ -241,79 +224,41 @@ def make_rollout(env: Any, policy: Any, n_steps: int, values: bool = True) -> Ro
     )
 
 
-def bytes_per_step(env: Any, policy: Any) -> int:
-    """About how many bytes a rollout takes per step of one lane: observations, what is privileged,
-    and 64 of the rest.
-    """
-    seen, privileged = (
-        sum(math.prod(space.shape) * _itemsize(space, size) for space in leaves(tree or {}))
-        for tree, size in ((env.obs_space, 2), (policy.privileged_space, 4))
-    )
-    return seen + privileged + 64
+def bytes_per_step(env: Env, policy: Policy) -> int:
+    """Returns about how many bytes a rollout takes per step and lane."""
+    obs = _bytes(env.obs_space, default_itemsize=2)
+    privileged = 0
+    if policy.privileged_space:
+        privileged = _bytes(policy.privileged_space, default_itemsize=4)
+    return obs + privileged + _BYTES_OF_THE_REST
 
 
-def _itemsize(space, otherwise):
-    """Bytes of one number of a space, `otherwise` where it names no dtype."""
-    dtype = getattr(space, "dtype", None)
-    return dtype.itemsize if dtype else otherwise
+def without_last(tree: Tree | None) -> Tree | None:
+    """Returns the first T of T+1 rows, those with actions, of a tree of tensors or of None."""
+    return None if tree is None else mapping(lambda leaf: leaf[:-1])(tree)
 
 
-@torch.no_grad()
-def collect(env: Any, policy: Any, rollout: Rollout, actor_state: arrdict) -> arrdict:
-    """Fills a rollout: T times act, env.step, store. Never synchronises, so it can be a CUDA graph.
-
-    The actor_state (of `initial_actor_state`, or of the `collect` before) is updated in place, and
-    returned.
-    """
-    world, state = actor_state["world"], actor_state["state"]
-    rollout.state[:] = state
-    features = []
-    with policy.compute_dtype():
-        for t in range(rollout.n_steps):
-            decision, state = policy(rollout.store_world(t, world), state)
-            rollout.store_decision(t, decision)
-            if rollout.values is not None:
-                features.append(decision["features"])
-            with torch.autocast(rollout.reward.device.type, enabled=False):
-                world = env.step(arrdict(actions=rollout.for_all(decision["actions"])))
-                world = rollout.own(world)
-            rollout.store_outcome(t, world)
-
-        last = rollout.store_world(rollout.n_steps, world)
-        if rollout.values is not None:
-            features.append(policy(last, state, sample=False)[0]["features"])
-            rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
-    # a memory that is not finite starts anew, or it would last until the lane's episode ends
-    state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
-    after = arrdict(world=_stored(world), state=state)
-    for target, source in zip(leaves(actor_state), leaves(after), strict=True):
-        target.copy_(source)
-    return actor_state
-
-
-class Collector:
-    """Fills a rollout, again and again, from an environment, which it resets once, unless it is
-    given the `actor_state` to go on from. Each call returns the rollout.
-
-    The first time is eager, so that libraries set themselves up; from the second time on a GPU
-    replays a CUDA graph, `graph`.
+def _zeros(space, lead, device, dtype):
+    """Returns zeros (*lead, ...) for a space: int64 for integers, else the dtype that the space
+    names, else `dtype`.
     """
 
-    def __init__(self, env: Any, policy: Any, rollout: Rollout, actor_state: arrdict | None = None):
-        self.rollout = rollout
-        if actor_state is None:
-            actor_state = initial_actor_state(env, policy, rollout)
-        self.parts = env, policy, rollout, actor_state
-        self.on_gpu = torch.device(env.device).type == "cuda"
-        self.n_collected = 0
-        self.graph = None
+    def zeros(leaf):
+        is_integer = isinstance(leaf, spaces.MultiDiscrete)
+        leaf_dtype = torch.int64 if is_integer else getattr(leaf, "dtype", None) or dtype
+        return torch.zeros(*lead, *leaf.shape, dtype=leaf_dtype, device=device)
 
-    def __call__(self) -> Rollout:
-        if self.on_gpu and self.n_collected == 1:
-            self.graph = capture(lambda: collect(*self.parts), (), self.parts)
-        self.n_collected += 1
-        if self.graph is None:
-            collect(*self.parts)
-        else:
-            self.graph()
-        return self.rollout
+    return spaces.map(zeros, space)
+
+
+def _bytes(space, default_itemsize):
+    """Returns the bytes of one value of a space, whose leaves may name a dtype."""
+    n_bytes = 0
+    for leaf in spaces.leaves(space).values():
+        dtype = getattr(leaf, "dtype", None)
+        n_bytes += math.prod(leaf.shape) * (dtype.itemsize if dtype else default_itemsize)
+    return n_bytes
+
+
+def _select(tree, lanes):
+    return mapping(lambda leaf: leaf.index_select(0, lanes))(tree)

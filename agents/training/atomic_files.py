@@ -1,20 +1,29 @@
-"""Files that are whole or as they were."""
+"""Writes that a crash cannot leave half done."""
 
 import os
 from pathlib import Path
 
 
-def replace(path: Path, data: bytes) -> None:
-    """Writes a file beside its place, forces it to the disk and renames it: whoever reads it, and
-    whenever the process is killed, sees the old content or the new. OSError if there is no room.
+def write_atomically(path: Path, data: bytes) -> None:
+    """Writes a file through a temporary one that is renamed into place.
+
+    A reader sees either the old or the new content, even if the process is killed.
+
+    Raises:
+        OSError: the disk is full or not writable. The old file is unchanged.
     """
-    copy = path.with_name(f"{path.name}.tmp")
+    temporary = path.with_name(f"{path.name}.tmp")
     try:
-        with open(copy, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(copy, path)
+        write_synced(temporary, data)
+        os.replace(temporary, path)
     except BaseException:
-        copy.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
+
+
+def write_synced(path: Path, data: bytes) -> None:
+    """Writes a file and flushes it to disk."""
+    with open(path, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())

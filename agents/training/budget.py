@@ -1,6 +1,6 @@
-"""When a run ends, how its learning rate falls, and the clock that both may follow.
+"""When a run ends, how its learning rate is annealed, and the clock for both.
 
-"Samples" are environment steps of all lanes together.
+A sample is one environment step of one lane.
 """
 
 import dataclasses
@@ -9,11 +9,13 @@ import time
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """A run ends after so many samples or so many seconds of training, whichever comes first; with
-    neither, never.
+    """Ends a run after a number of samples or seconds, whichever comes first.
 
-    `anneal` names what the learning rate falls to 0 over: "samples", "seconds" or "never". What
-    follows samples is the same in every run of a seed; what follows the clock is not.
+    Args:
+        samples: environment steps of all lanes together; None for no limit.
+        seconds: seconds of training; None for no limit.
+        anneal: "samples" or "seconds": the learning rate falls linearly to 0 over that limit.
+            "never": it is constant. Annealing over samples is reproducible, over seconds is not.
     """
 
     samples: int | None = None
@@ -22,37 +24,42 @@ class Budget:
 
     @property
     def is_limited(self) -> bool:
-        """Whether the run ends by itself."""
+        """True if either limit is set."""
         return self.samples is not None or self.seconds is not None
 
-    def left(self, samples: int, seconds: float) -> float:
-        """The fraction of the budget that is left; without one, all of it."""
-        return min(_left(samples, self.samples), _left(seconds, self.seconds))
+    def fraction_left(self, samples: int, seconds: float) -> float:
+        """Returns the fraction of the budget that is left: 1 if there is no limit, below 0 if it is
+        overspent.
+        """
+        return min(_fraction_left(samples, self.samples), _fraction_left(seconds, self.seconds))
 
     def lr_fraction(self, samples: int, seconds: float) -> float:
-        """What to multiply the learning rate by."""
+        """Returns the factor for the learning rate, from 1 to 0."""
         if self.anneal == "never":
             return 1.0
-        follows_samples = self.anneal == "samples"
-        return max(
-            0.0,
-            _left(samples, self.samples) if follows_samples else _left(seconds, self.seconds),
-        )
+        if self.anneal == "samples":
+            return max(0.0, _fraction_left(samples, self.samples))
+        return max(0.0, _fraction_left(seconds, self.seconds))
 
 
-def _left(spent, limit):
+def _fraction_left(spent, limit):
     return 1.0 if limit is None else 1 - spent / limit
 
 
 class Stopwatch:
-    """Seconds of training: those `before` a resume, and those since `start`."""
+    """Counts seconds of training.
+
+    Attributes:
+        seconds_before: seconds that the run had trained before it was resumed.
+        started: time of `start` on the monotonic clock, or None.
+    """
 
     def __init__(self):
-        self.before = 0.0
+        self.seconds_before = 0.0
         self.started = None
 
     def start(self) -> None:
-        """Called at the end of the first update, so that compiling does not count."""
+        """Starts counting. Called after the first update, so compilation does not count."""
         self.started = time.monotonic()
 
     @property
@@ -61,4 +68,6 @@ class Stopwatch:
 
     @property
     def seconds(self) -> float:
-        return self.before + (time.monotonic() - self.started if self.is_running else 0.0)
+        """Seconds of training so far, those before a resume included."""
+        since_start = time.monotonic() - self.started if self.is_running else 0.0
+        return self.seconds_before + since_start

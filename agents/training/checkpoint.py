@@ -1,17 +1,12 @@
-"""Checkpoints that are whole or absent, and say so when they are damaged.
+"""The checkpoints of a run: one folder `step_<N>` per checkpoint, N environment steps.
 
-A checkpoint is a folder `step_<N>` of state.pt (plain dicts of tensors and numbers), config.json
-and manifest.json (sizes and sha256 of the two, and a sha256 of its own). It is written beside its
-place, forced to the disk, renamed into it and read again; so a reader sees all of it or none. A
-second one of a step is `step_<N>-2`: none is replaced, the earlier one goes when the later stands.
+A checkpoint is written to a temporary folder, flushed to disk, renamed into place and verified. A
+reader sees a whole checkpoint or none, and damage is reported (:mod:`checkpoint_format`). No
+checkpoint is overwritten: a second one of the same step is `step_<N>-2`, and the first is deleted
+after the second is verified.
 """
 
-import dataclasses
-import hashlib
-import io
-import json
 import os
-import pickle
 import re
 import shutil
 import warnings
@@ -20,32 +15,24 @@ from typing import Any
 
 import torch
 
-#: Raised by one whenever what is written changes so that an older reader would misread it, or a
-#: newer one what is older.
-FORMAT = 4
-FILES = ("state.pt", "config.json")
+from megastep.agents.training import checkpoint_format
+from megastep.agents.training.checkpoint_format import (
+    Checkpoint,
+    CheckpointError,
+    DamagedCheckpoint,
+)
 
-
-class CheckpointError(RuntimeError):
-    """No checkpoint can be used; the message says which were tried, what is wrong with each and the
-    cure.
-    """
-
-
-class Damaged(CheckpointError):
-    """One checkpoint is not what its manifest says; an earlier one may be whole."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Checkpoint:
-    """A checkpoint as loaded: its folder, its step (environment steps so far), and what `save` was
-    given.
-    """
-
-    path: Path
-    step: int
-    state: dict[str, Any]
-    config: dict[str, Any]
+__all__ = [
+    "Checkpoint",
+    "CheckpointError",
+    "DamagedCheckpoint",
+    "delete_leftovers",
+    "list_checkpoints",
+    "load_latest",
+    "save",
+    "set_aside_after",
+    "step_of",
+]
 
 
 def save(
@@ -53,227 +40,141 @@ def save(
     step: int,
     state: dict[str, Any],
     config: dict[str, Any],
-    keep: int = 2,
+    keep_checkpoints: int = 2,
     score: float | None = None,
 ) -> Path:
-    """Writes the checkpoint of a step and deletes older ones: the last `keep` stay, and the one of
-    the highest `score`.
+    """Writes a checkpoint and deletes old ones. Returns its folder.
 
-    Raises OSError, with nothing changed, when the disk is full or not writable. Returns the
-    checkpoint's folder.
+    Args:
+        folder: the run's `checkpoints` folder.
+        step: environment steps so far, of all lanes.
+        state: dicts and lists of tensors and numbers.
+        config: the run's configuration, as JSON.
+        keep_checkpoints: the last so many steps are kept, and the one with the highest score.
+        score: the higher the better, such as the mean return; None if unknown.
+
+    Raises:
+        OSError: the disk is full or not writable. Nothing has changed.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    sweep(folder)
+    delete_leftovers(folder)
     temporary = folder / f"step_{step}.tmp-{os.getpid()}"
     try:
-        temporary.mkdir()
-        for name, data in _contents(step, state, config, score).items():
-            _write(temporary / name, data)
-        _sync(temporary)
-        last = max((n for s, n in map(_order, checkpoints(folder)) if s == step), default=0)
-        place = folder / (f"step_{step}-{last + 1}" if last else f"step_{step}")
-        os.replace(temporary, place)
-        _sync(folder)
+        checkpoint_format.write(temporary, step, state, config, score)
+        path = folder / _next_name(folder, step)
+        os.replace(temporary, path)
+        checkpoint_format.sync_folder(folder)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    _read(place)  # older ones go only once this one is known to be whole
-    rewind(folder, step)
-    _prune(folder, keep, step)
-    return place
+    checkpoint_format.read_files(path)  # verified before any old one is deleted
+    set_aside_after(folder, step)
+    _prune(folder, keep_checkpoints, step)
+    return path
 
 
 def load_latest(folder: Path | str, device: torch.device | str = "cpu") -> Checkpoint:
-    """The newest whole checkpoint of a `checkpoints` folder, or the checkpoint that `folder` is
-    itself.
+    """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`.
 
-    A damaged one is named in a warning and the one before it is used; with none left,
-    CheckpointError.
+    Warns about each damaged checkpoint that is skipped.
+
+    Raises:
+        CheckpointError: there is none, all are damaged, or another version of megastep wrote it.
     """
     folder = Path(folder)
     if (folder / "manifest.json").exists():
-        return _load(folder, device)
-    found, wrong = checkpoints(folder), []
-    for path in reversed(found):
+        return checkpoint_format.read(folder, device)
+    messages = []
+    for path in reversed(list_checkpoints(folder)):
         try:
-            checkpoint = _load(path, device)
-        except Damaged as error:
-            wrong.append(str(error))
+            checkpoint = checkpoint_format.read(path, device)
+        except DamagedCheckpoint as error:
+            messages.append(str(error))
             continue
-        for sentence in wrong:
-            warnings.warn(f"{sentence}; using {path.name} instead", stacklevel=2)
+        for message in messages:
+            warnings.warn(f"{message}; using {path.name} instead", stacklevel=2)
         return checkpoint
-    if wrong:
-        raise CheckpointError(f"Every checkpoint in {folder} is damaged: {'; '.join(wrong)}")
+    if messages:
+        raise CheckpointError(f"Every checkpoint in {folder} is damaged: {'; '.join(messages)}")
     raise CheckpointError(f"There is no checkpoint in {folder}; has the run saved one yet?")
 
 
-def rewind(folder: Path | str, step: int) -> None:
-    """Sets aside the checkpoints of later steps, as `step_<N>.aside`: a run that goes on from
-    `step` makes its own. `save` deletes them once it has come as far.
+def set_aside_after(folder: Path | str, step: int) -> None:
+    """Renames the checkpoints after `step` to `step_<N>.aside`, for a run that resumes from `step`.
+
+    `save` deletes each one when the run reaches its step again.
     """
-    for path in checkpoints(folder):  # the newest last: it counts until the others are aside
+    for path in list_checkpoints(folder):  # the newest last: it stays the latest until then
         if step_of(path) > step:
             aside = path.with_name(f"{path.name}.aside")
             _delete(aside)
             os.replace(path, aside)
 
 
-def checkpoints(folder: Path | str) -> list[Path]:
-    """The checkpoint folders in `folder`, oldest first; no unfinished ones, none set aside."""
-    found = Path(folder).glob("step_*")
-    return sorted((p for p in found if re.fullmatch(r"step_\d+(-\d+)?", p.name)), key=_order)
+def list_checkpoints(folder: Path | str) -> list[Path]:
+    """Returns the checkpoints in a folder, oldest first. Skips unfinished and set-aside ones."""
+    paths = Path(folder).glob("step_*")
+    names = re.compile(r"step_\d+(-\d+)?")
+    return sorted((path for path in paths if names.fullmatch(path.name)), key=_step_and_number)
 
 
 def step_of(path: Path) -> int:
-    """The environment steps before the checkpoint in this folder, by its name."""
-    return _order(path)[0]
+    """Returns the step in a checkpoint's folder name."""
+    return _step_and_number(path)[0]
 
 
-def _order(path: Path) -> tuple[int, int]:
-    """A checkpoint's step, and its number among those of that step."""
-    step, n = re.match(r"step_(\d+)(?:-(\d+))?", path.name).groups()
-    return int(step), int(n or 1)
-
-
-def sweep(folder: Path | str) -> None:
-    """Deletes what an interrupted `save` of a process that is gone left behind."""
+def delete_leftovers(folder: Path | str) -> None:
+    """Deletes temporary folders of processes that no longer run."""
     for path in Path(folder).glob("step_*.tmp-*"):
-        owner = path.name.rpartition("-")[2]
-        if not (owner.isdigit() and Path("/proc", owner).exists() and int(owner) != os.getpid()):
+        pid = path.name.rpartition("-")[2]
+        is_alive = pid.isdigit() and Path("/proc", pid).exists() and int(pid) != os.getpid()
+        if not is_alive:
             shutil.rmtree(path, ignore_errors=True)
 
 
-# ---- Writing ----
+def _step_and_number(path: Path) -> tuple[int, int]:
+    """Returns a checkpoint's step, and its number among the checkpoints of that step, from 1."""
+    step, number = re.match(r"step_(\d+)(?:-(\d+))?", path.name).groups()
+    return int(step), int(number or 1)
 
 
-def _contents(step: int, state: dict, config: dict, score: float | None) -> dict[str, bytes]:
-    """The files of a checkpoint, by name."""
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    contents = {"state.pt": buffer.getvalue(), "config.json": json.dumps(config, indent=2).encode()}
-    files = {
-        name: {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
-        for name, data in contents.items()
-    }
-    manifest = dict(format=FORMAT, step=step, score=score, torch=torch.__version__, files=files)
-    return {**contents, "manifest.json": _sealed(manifest)}
+def _next_name(folder: Path, step: int) -> str:
+    """Returns `step_<N>`, or `step_<N>-2` and so on if that step has checkpoints."""
+    pairs = map(_step_and_number, list_checkpoints(folder))
+    last = max((number for other_step, number in pairs if other_step == step), default=0)
+    return f"step_{step}-{last + 1}" if last else f"step_{step}"
 
 
-def _sealed(manifest: dict[str, Any]) -> bytes:
-    """The text of a manifest, with a digest of its own."""
-    digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
-    return json.dumps({**manifest, "sha256": digest}, indent=2).encode()
+def _prune(folder: Path, keep_checkpoints: int, step: int) -> None:
+    """Deletes old checkpoints, and set-aside ones up to `step`.
 
-
-def _write(path: Path, data: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _sync(folder: Path) -> None:
-    """Forces a folder's entries to the disk; where folders cannot be opened there is nothing to
-    force.
+    Keeps the last `keep_checkpoints` steps and the step with the best score. Of each step only the
+    last checkpoint is kept.
     """
-    try:
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _delete(path: Path) -> None:
-    """Deletes a checkpoint; killed meanwhile, it leaves no half of one under its name."""
-    leftover = path.with_name(f"{path.name}.tmp-{os.getpid()}")
-    try:
-        os.replace(path, leftover)
-    except OSError:  # it is not there, or has to stay
-        return
-    shutil.rmtree(leftover, ignore_errors=True)
-
-
-def _prune(folder: Path, keep: int, step: int) -> None:
-    """Deletes all but the last `keep` steps and the best one, of each step all but the last; and
-    what was set aside of steps up to `step`.
-    """
-    found = checkpoints(folder)
-    last = list({step_of(path): path for path in found}.values())
-    scores = {path: _score(path) for path in last}
-    scored = [path for path in last if scores[path] is not None]
-    stay = {*last[-keep:], max(scored, key=scores.get, default=None)}
+    checkpoints = list_checkpoints(folder)
+    last_of_each_step = list({step_of(path): path for path in checkpoints}.values())
+    scores = {path: _score(path) for path in last_of_each_step}
+    scored = [path for path in last_of_each_step if scores[path] is not None]
+    best = max(scored, key=scores.get, default=None)
+    kept = {*last_of_each_step[-keep_checkpoints:], best}
     aside = [path for path in folder.glob("step_*.aside") if step_of(path) <= step]
-    for path in [*(path for path in found if path not in stay), *aside]:
+    for path in [*(path for path in checkpoints if path not in kept), *aside]:
         _delete(path)
 
 
 def _score(path: Path) -> float | None:
     try:
-        return _manifest(path)["score"]
+        return checkpoint_format.read_manifest(path)["score"]
     except CheckpointError:
         return None
 
 
-# ---- Reading ----
-
-
-def _manifest(path: Path) -> dict[str, Any]:
-    """A checkpoint's manifest, which must be what `_sealed` writes to the last byte."""
+def _delete(path: Path) -> None:
+    """Deletes a checkpoint. If killed, leaves a temporary folder and no damaged checkpoint."""
+    leftover = path.with_name(f"{path.name}.tmp-{os.getpid()}")
     try:
-        data = (path / "manifest.json").read_bytes()
-        manifest = json.loads(data)
-        version = manifest["format"]
-        body = {key: value for key, value in manifest.items() if key != "sha256"}
-        whole = data == _sealed(body)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        version, whole = None, False
-    before_digests = version == 1 and "sha256" not in manifest
-    if not (whole or before_digests):
-        raise Damaged(
-            f"Checkpoint {path} is damaged: manifest.json cannot be read, or does not have the "
-            "sha256 it gives"
-        )
-    if version != FORMAT:
-        raise CheckpointError(
-            f"Checkpoint {path} has format {version} and this megastep reads format {FORMAT}; "
-            f"use the megastep that wrote it, with torch {manifest.get('torch')}"
-        )
-    return manifest
-
-
-def _read(path: Path) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """`{name: bytes}` of a checkpoint and its manifest, each file compared with its sha256."""
-    manifest, contents = _manifest(path), {}
-    for name in FILES:
-        try:
-            contents[name] = (path / name).read_bytes()
-        except OSError as error:
-            raise Damaged(
-                f"Checkpoint {path} is damaged: {name} cannot be read ({error.strerror})"
-            ) from None
-        if hashlib.sha256(contents[name]).hexdigest() != manifest["files"][name]["sha256"]:
-            raise Damaged(
-                f"Checkpoint {path} is damaged: {name} does not have the sha256 its manifest gives"
-            )
-    return contents, manifest
-
-
-def _load(path: Path, device: torch.device | str) -> Checkpoint:
-    contents, manifest = _read(path)
-    try:
-        state = torch.load(io.BytesIO(contents["state.pt"]), map_location=device, weights_only=True)
-    except pickle.UnpicklingError:
-        raise Damaged(
-            f"Checkpoint {path} is refused: state.pt holds more than tensors and numbers, "
-            "which could run code of its own"
-        ) from None
-    except (RuntimeError, EOFError, ValueError) as error:
-        raise Damaged(
-            f"Checkpoint {path} is damaged: state.pt cannot be read ({str(error).splitlines()[0]})"
-        ) from None
-    return Checkpoint(path, manifest["step"], state, json.loads(contents["config.json"]))
+        os.replace(path, leftover)
+    except OSError:  # it does not exist or cannot be moved
+        return
+    shutil.rmtree(leftover, ignore_errors=True)

@@ -1,23 +1,30 @@
-"""Statistics of whole episodes, summed lane by lane on the device.
+"""Statistics of finished episodes, accumulated on the device.
 
 Axes: T time, B lanes, G groups of lanes.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 
 from megastep.agents.algorithms.nonfinite import LIMIT
+from megastep.types import Env
 
 
 class EpisodeStats:
-    """Return, length and metrics of the episodes that end, each summed from its first step; only
-    `take` synchronises.
+    """Accumulates return, length and metrics of the episodes that end. Only `pop` synchronises.
 
-    Args: `metrics`, the names of those that worlds carry; `groups`, by name, which lanes (B,) bool
-    have means of their own as well.
+    Args:
+        n_lanes: B.
+        device: where the transitions are.
+        metrics: names of the metrics that worlds carry.
+        groups: group name -> (B,) bool. Each group's means are reported beside the overall ones.
+
+    Attributes:
+        returns, lengths: (B,) float64, of the episode that each lane is in.
+        sums: (4 + metrics, 1 + G) float64, over finished episodes: count, return, squared return,
+            length, and each metric; for all lanes and for each group.
     """
 
     def __init__(
@@ -28,13 +35,10 @@ class EpisodeStats:
         groups: Mapping[str, torch.Tensor] | None = None,
     ):
         self.metrics, self.groups = tuple(metrics), tuple(groups or ())
-        every = torch.ones(n_lanes, dtype=torch.bool, device=device)
-        self.members = torch.stack([every, *(groups or {}).values()], 1).double()  # (B, 1 + G)
-        # of the episodes that go on, (B,)
+        all_lanes = torch.ones(n_lanes, dtype=torch.bool, device=device)
+        self.members = torch.stack([all_lanes, *(groups or {}).values()], 1).double()  # (B, 1 + G)
         self.returns = torch.zeros(n_lanes, dtype=torch.float64, device=device)
         self.lengths = torch.zeros(n_lanes, dtype=torch.float64, device=device)
-        # of those that ended, in all lanes and in each group: their number, sums of returns, of
-        # squared returns, of lengths, of each metric
         shape = 4 + len(self.metrics), 1 + len(self.groups)
         self.sums = torch.zeros(shape, dtype=torch.float64, device=device)
 
@@ -46,83 +50,104 @@ class EpisodeStats:
         learns: torch.Tensor | bool = True,
         metrics: Mapping[str, torch.Tensor] | None = None,
     ) -> None:
-        """Takes T transitions of B lanes; `reward`, `reset`, `done` and `metrics` (T, B) are those
-        of the worlds that followed. EpisodeStats count where `learns` (T, B), in the world before their
-        end. A reward that is not finite, or beyond `finite.LIMIT`, counts as 0.
+        """Adds T transitions of B lanes.
+
+        Args:
+            reward: (T, B). NaN, infinity and values beyond `nonfinite.LIMIT` count as 0.
+            reset: (T, B) bool, true if the transition only started a new episode.
+            done: (T, B) bool, true if the episode ended.
+            learns: (T, B) bool. An episode counts if this was true when its last action was chosen.
+            metrics: name -> (T, B), read where `done`.
         """
         reward = torch.where(reward.abs() <= LIMIT, reward, 0.0)
-        # cumulative sums over all T rows, less the sum at the last end before each row
+        # cumulative sums over all T rows, less the sum at the last episode end before each row
         returns = self.returns + reward.double().cumsum(0)
         lengths = self.lengths + (~reset).double().cumsum(0)
         rows = torch.arange(len(reward), device=reward.device)[:, None]
-        last = torch.where(done, rows, -1).cummax(0).values
-        before = torch.cat([torch.full_like(last[:1], -1), last[:-1]])
-        finished, ended = _since(returns, before), done & learns
+        last_end = torch.where(done, rows, -1).cummax(0).values
+        previous_end = torch.cat([torch.full_like(last_end[:1], -1), last_end[:-1]])
+        episode_returns, counts = _sum_since(returns, previous_end), done & learns
         values = [
-            torch.ones_like(finished),
-            finished,
-            finished**2,
-            _since(lengths, before),
+            torch.ones_like(episode_returns),
+            episode_returns,
+            episode_returns**2,
+            _sum_since(lengths, previous_end),
             *(metrics[name].double() for name in self.metrics),
         ]
-        sums = torch.stack([torch.where(ended, each, 0.0).sum(0) for each in values])
+        sums = torch.stack([torch.where(counts, value, 0.0).sum(0) for value in values])
         self.sums += sums @ self.members
-        self.returns = _since(returns, last, slice(-1, None))[0]
-        self.lengths = _since(lengths, last, slice(-1, None))[0]
+        self.returns = _sum_since(returns, last_end, slice(-1, None))[0]
+        self.lengths = _sum_since(lengths, last_end, slice(-1, None))[0]
 
-    def take(self) -> dict[str, float]:
-        """Of the episodes that ended since the last call: how many, mean and standard deviation of
-        the return, means of length and metrics; means by group, too: `episode/return/leader`.
+    def pop(self) -> dict[str, float]:
+        """Returns statistics of the episodes that ended since the last call. Synchronises.
+
+        Holds `episode/count`, the means of return, length and metrics, the standard deviation of
+        the return, and each mean by group, such as `episode/return/leader`. Groups without a
+        finished episode are absent; without any finished episode, `episode/count` is all.
         """
-        totals, *groups = self.sums.T.tolist()
+        totals, *group_totals = self.sums.T.tolist()
         self.sums.zero_()
-        n, _, squares, *_ = totals
+        n, _, squared_returns, *_ = totals
         if not n:
             return {"episode/count": 0}
         means = self._means(totals)
-        found = {
+        variance = squared_returns / n - means["episode/return"] ** 2
+        stats = {
             "episode/count": int(n),
             **means,
-            "episode/return_std": math.sqrt(max(squares / n - means["episode/return"] ** 2, 0.0)),
+            "episode/return_std": math.sqrt(max(variance, 0.0)),
         }
-        for group, own in zip(self.groups, groups, strict=True):
-            found |= {f"{name}/{group}": mean for name, mean in self._means(own).items()}
-        return found
+        for group, totals in zip(self.groups, group_totals, strict=True):
+            stats |= {f"{name}/{group}": mean for name, mean in self._means(totals).items()}
+        return stats
 
     def _means(self, totals):
-        n, total, _, steps, *metrics = totals
+        n, returns, _, lengths, *metrics = totals
         if not n:
             return {}
-        named = {"return": total, "length": steps, **dict(zip(self.metrics, metrics, strict=True))}
-        return {f"episode/{name}": value / n for name, value in named.items()}
+        by_metric = dict(zip(self.metrics, metrics, strict=True))
+        by_name = {"return": returns, "length": lengths, **by_metric}
+        return {f"episode/{name}": total / n for name, total in by_name.items()}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """The sums over episodes that ended. EpisodeStats that go on are not saved, as environments are
-        not: a resumed run starts them anew.
+        """Returns the sums over finished episodes.
+
+        Unfinished episodes are not saved: a resumed run starts new episodes.
         """
         return {"sums": self.sums}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Sums of other metrics, of an environment that has changed since, are left out."""
+        """Restores a `state_dict`. Ignores one with other metrics or groups."""
         if state["sums"].shape == self.sums.shape:
             self.sums.copy_(state["sums"])
 
 
-def lane_groups(env: Any, chosen: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-    """Groups of an environment's lanes, by name, or of those `chosen`: its roles, several agents
-    may share one, and the `kinds` of opponents that they meet.
+def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    """Returns groups of an environment's lanes: one per role, and one per kind of opponent.
+
+    Args:
+        env: `env.roles` names the role of each agent slot; several slots may share a role.
+            `env.matchups` is that of `selfplay.opponents.Opponents`. Both are optional.
+        stored: (all lanes,) bool, the lanes to keep in each group, such as those that learn.
+
+    Returns:
+        Group name -> (B,) bool.
     """
     groups, roles = {}, getattr(env, "roles", None) or ()
     for role in dict.fromkeys(roles):
-        own = torch.tensor([name == role for name in roles], device=env.device)
-        groups[role] = own.repeat(env.n_envs)
-    groups |= getattr(env, "kinds", {})
-    return groups if chosen is None else {name: own[chosen] for name, own in groups.items()}
+        has_role = torch.tensor([name == role for name in roles], device=env.device)
+        groups[role] = has_role.repeat(env.n_envs)
+    groups |= getattr(env, "matchups", {})
+    return groups if stored is None else {name: lanes[stored] for name, lanes in groups.items()}
 
 
-def _since(totals, ends, rows=slice(None)):
-    """The cumulative sums (T, B) in some rows, less those in the row `ends` (T, B) of the last end,
-    -1 for none.
+def _sum_since(cumulative, ends, rows=slice(None)):
+    """Returns cumulative sums (T, B) at some rows, less those at the row of the last episode end.
+
+    Args:
+        ends: (T, B) int64, the row of that end, -1 if there was none.
     """
     ends = ends[rows]
-    return totals[rows] - torch.where(ends >= 0, totals.gather(0, ends.clamp(min=0)), 0.0)
+    at_end = torch.where(ends >= 0, cumulative.gather(0, ends.clamp(min=0)), 0.0)
+    return cumulative[rows] - at_end

@@ -1,6 +1,6 @@
-"""Files of JSON lines: one object per line, each with the environment steps before it, `samples`.
+"""Files of JSON lines: one object per line, with the environment steps so far as `samples`.
 
-Written so that a killed run loses no line, read so that a damaged line costs no other.
+A killed run loses no line, and a damaged line does not affect others.
 """
 
 import json
@@ -9,23 +9,23 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from megastep.agents.training import atomic_files
+from megastep.agents.training.atomic_files import write_atomically
 
 
 class JsonLines:
-    """A file that lines are appended to, each written at once."""
+    """A file that lines are appended to. Each line is flushed when it is written."""
 
     def __init__(self, path: Path | str):
         self.path = Path(path)
         self.file = open(self.path, "a", encoding="utf-8")
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
-        """Appends numbers and words; a number that is not finite becomes null: JSON has none."""
-        finite = {
+        """Appends a line of numbers and strings. Writes NaN and infinity as null."""
+        json_values = {
             key: value if isinstance(value, str) or math.isfinite(value) else None
             for key, value in values.items()
         }
-        self.file.write(json.dumps({"samples": step, **finite}) + "\n")
+        self.file.write(json.dumps({"samples": step, **json_values}) + "\n")
         self.file.flush()
 
     def close(self) -> None:
@@ -33,40 +33,46 @@ class JsonLines:
 
 
 def read(path: Path | str) -> list[dict[str, Any]]:
-    """The objects of a file. Damaged lines are named in a warning and skipped, without one if it is
-    the last, cut short by a crash.
+    """Returns the objects of a file.
+
+    Skips damaged lines with a warning, and a last line that a crash cut short without one.
     """
-    return [row for row, _ in _lines(Path(path))]
+    return [row for row, _ in _intact_lines(Path(path))]
 
 
-def rewind(path: Path | str, step: int) -> None:
-    """Drops the lines after `step` environment steps, which a resumed run writes again, and those
-    that are damaged. OSError, with the file as it was, if there is no room for a copy.
+def truncate_after(path: Path | str, step: int) -> None:
+    """Removes the lines after `step` environment steps, which a resumed run writes again.
+
+    Removes damaged lines too. Does nothing if there is no such file.
+
+    Raises:
+        OSError: there is no space for a copy. The file is unchanged.
     """
     path = Path(path)
     if not path.exists():
         return
-    kept = b"".join(line + b"\n" for row, line in _lines(path) if row["samples"] <= step)
-    if kept != path.read_bytes():
-        atomic_files.replace(path, kept)
+    lines = (line + b"\n" for row, line in _intact_lines(path) if row["samples"] <= step)
+    data = b"".join(lines)
+    if data != path.read_bytes():
+        write_atomically(path, data)
 
 
-def _lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:
-    """The lines that are whole, as objects and as they stand in the file."""
+def _intact_lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:
+    """Returns the intact lines, each as an object and as its bytes."""
     *lines, last = path.read_bytes().split(b"\n")
-    rows = [(_row(line), line) for line in [*lines, last]]
+    rows = [(_parsed(line), line) for line in [*lines, last]]
     damaged = [str(n) for n, (row, _) in enumerate(rows[:-1], 1) if row is None]
     if damaged:
         which = f"line {damaged[0]} is" if len(damaged) == 1 else f"lines {', '.join(damaged)} are"
-        skipped = "is skipped" if len(damaged) == 1 else "are skipped"
-        warnings.warn(f"{path}: {which} damaged and {skipped}", stacklevel=4)
+        warnings.warn(f"{path}: {which} damaged and skipped", stacklevel=4)
     return [(row, line) for row, line in rows if row is not None]
 
 
-def _row(line: bytes) -> dict[str, Any] | None:
+def _parsed(line: bytes) -> dict[str, Any] | None:
+    """Returns a line's object, or None if it is damaged."""
     try:
         row = json.loads(line)
     except ValueError:
         return None
-    whole = isinstance(row, dict) and isinstance(row.get("samples"), int)
-    return row if whole else None
+    is_intact = isinstance(row, dict) and isinstance(row.get("samples"), int)
+    return row if is_intact else None

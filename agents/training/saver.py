@@ -1,9 +1,11 @@
-"""Saving a run: a checkpoint now and then, and what to say when one cannot be written."""
+"""Saving a run: checkpoints at intervals, and snapshots of the weights spaced over the budget."""
+
+from __future__ import annotations
 
 import shutil
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch.utils._pytree import tree_leaves, tree_map_only
@@ -11,60 +13,84 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 from megastep.agents.algorithms.nonfinite import NonFiniteError, nonfinite_leaf
 from megastep.agents.training import checkpoint
 
+if TYPE_CHECKING:
+    from megastep.agents.training.trainer import Trainer
+
 
 class Saver:
-    """Writes the checkpoints of one run into a folder, with the `config` that it runs under.
+    """Writes the checkpoints of one run.
 
-    A disk that is full or not writable is a warning, the first time, and the next call tries again.
-    Until one succeeds, `unsaved` is the sentence that says why the last checkpoint is missing. A
-    state that is not finite is never written: NonFiniteError, and the checkpoints before it stay.
+    A full or read-only disk causes one warning; each later call tries again.
+
+    Args:
+        folder: where the checkpoints go.
+        config: the run's configuration, stored in each checkpoint.
+        keep_checkpoints: number of checkpoints kept, besides the one with the best score.
+
+    Attributes:
+        error: why the last checkpoint could not be written, as a sentence; None if it was.
     """
 
-    def __init__(self, folder: Path, config: dict[str, Any], keep: int = 2):
-        self.folder, self.config, self.keep = folder, config, keep
-        self.unsaved = None
+    def __init__(self, folder: Path, config: dict[str, Any], keep_checkpoints: int = 2):
+        self.folder, self.config, self.keep_checkpoints = folder, config, keep_checkpoints
+        self.error = None
 
     def __call__(self, step: int, state: dict[str, Any], score: float | None = None) -> bool:
-        """Saves `state`, dicts of tensors and numbers, after `step` samples; whether it could."""
-        # first of all to the CPU: a GPU may have no memory left
+        """Writes a checkpoint of `state` after `step` environment steps. Returns True if it could.
+
+        Args:
+            state: dicts and lists of tensors and numbers.
+            score: the higher the better, such as the mean return; None if unknown.
+
+        Raises:
+            NonFiniteError: the state holds a NaN or infinity. Earlier checkpoints are kept.
+        """
+        # copied to the CPU first: the GPU may have no memory left for the check
         state = tree_map_only(torch.Tensor, lambda leaf: leaf.detach().cpu(), state)
         if path := nonfinite_leaf(state):
             raise NonFiniteError(
-                f"The checkpoint at {step:,} samples was not saved, for {path} is not finite"
+                f"The checkpoint at {step:,} samples was not saved: {path} is not finite"
             )
         try:
-            checkpoint.save(self.folder, step, state, self.config, self.keep, score)
+            checkpoint.save(self.folder, step, state, self.config, self.keep_checkpoints, score)
         except OSError as error:
-            warned = self.unsaved is not None
-            self.unsaved = self._explain(step, state, error)
-            if not warned:
+            has_warned = self.error is not None
+            self.error = self._message(step, state, error)
+            if not has_warned:
                 warnings.warn(
-                    f"{self.unsaved}; training goes on and the next checkpoint tries again",
+                    f"{self.error}. Training goes on; the next checkpoint tries again",
                     stacklevel=2,
                 )
             return False
-        self.unsaved = None
+        self.error = None
         return True
 
-    def _explain(self, step, state, error):
-        needed = sum(getattr(leaf, "nbytes", 0) for leaf in tree_leaves(state))
-        free = shutil.disk_usage(self.folder.parent).free
+    def _message(self, step, state, error):
+        n_bytes = sum(getattr(leaf, "nbytes", 0) for leaf in tree_leaves(state))
+        free_bytes = shutil.disk_usage(self.folder.parent).free
         return (
             f"The checkpoint at {step:,} samples could not be saved ({error.strerror}): it needs "
-            f"about {needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free in {self.folder.parent}"
+            f"about {n_bytes / 1e6:.1f} MB, and {free_bytes / 1e6:.1f} MB are free in "
+            f"{self.folder.parent}"
         )
 
 
-class Snapshots:
-    """Keeps a run's weights at the ends of `n` equal parts of its budget, with a `Saver` of its
-    own: what `evaluate.py ratings=true` compares. A trainer calls it with itself.
+class SnapshotSaver:
+    """Saves the policy's weights at the end of each of `n` equal parts of the budget.
+
+    `evaluate.py ratings=true` compares these snapshots. :class:`Trainer` calls it with itself.
+
+    Args:
+        saver: writes the snapshots.
+        n: number of snapshots; 0 for none.
     """
 
-    def __init__(self, save: Saver, n: int):
-        self.save, self.n, self.n_past = save, n, None
+    def __init__(self, saver: Saver, n: int):
+        self.saver, self.n = saver, n
+        self.n_parts_done = None
 
-    def __call__(self, trainer: Any) -> None:
-        n_past = int((1 - trainer.left) * self.n + 1e-9)
-        if self.n_past is not None and n_past > self.n_past:
-            self.save(trainer.samples, {"policy": trainer.policy.state_dict()})
-        self.n_past = n_past
+    def __call__(self, trainer: Trainer) -> None:
+        n_parts_done = int((1 - trainer.fraction_left) * self.n + 1e-9)
+        if self.n_parts_done is not None and n_parts_done > self.n_parts_done:
+            self.saver(trainer.samples, {"policy": trainer.policy.state_dict()})
+        self.n_parts_done = n_parts_done

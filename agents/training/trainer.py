@@ -1,57 +1,89 @@
-"""The training loop: collect, update, report, save."""
+"""The training loop: collect, update, log, save."""
+
+from __future__ import annotations
 
 import contextlib
 import dataclasses
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import EpisodeStats, lane_groups
+from megastep.types import Env
 
-#: So many skipped updates in a row end a run.
+if TYPE_CHECKING:
+    from megastep.agents.networks.policy import Policy
+    from megastep.agents.types import Learner, Logger
+
+#: Training stops after this many skipped updates in a row.
 MAX_SKIPPED = 20
 
 
+class OpponentPool(Protocol):
+    """The part of `selfplay.opponents.Opponents` that a trainer uses."""
+
+    def refresh_snapshots(self, policy: Policy, n_updates: int) -> None: ...
+
+    def pop_win_rates(self) -> dict[str, float]: ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+
+
 class Trainer:
-    """Improves a policy in an environment until a budget is spent.
+    """Trains a policy in an environment until a budget is spent.
 
     Args:
-    env, policy  the environment, and who acts in it
-    learner      what improves the policy, as `megastep.agents.algorithms.learner` describes it
-    metrics      has `write(samples, metrics, perf)`: `megastep.agents.training.loggers.Loggers`
-    save         called with (samples, state, score); returns whether it could: a `Saver`
-    budget       when to end, and how the learning rate falls
-    report_every, save_every  updates between two reports, and seconds between two checkpoints
-    on_report    called with the trainer after each report, to show how far it is
-    opponents    the environment, where it is `opponents.Opponents`
-    snapshots    called with the trainer before the first update and after each: `saver.Snapshots`
+        env: the environment.
+        policy: the policy that the learner improves.
+        learner: such as `PPO`.
+        logger: such as `loggers.Loggers`.
+        saver: such as `saver.Saver`: called with (samples, state, score), returns True if the
+            checkpoint was written.
+        budget: when the run ends and how its learning rate falls.
+        log_every: updates between two reports.
+        checkpoint_seconds: seconds between two checkpoints.
+        on_log: called with the trainer after each report, for example to show progress.
+        opponents: `env`, if it is an `Opponents`.
+        snapshot_saver: such as `saver.SnapshotSaver`: called with the trainer before the first
+            update and after each.
+
+    Attributes:
+        samples, updates: environment steps of all lanes, and updates, so far.
+        clock: counts the seconds of training.
+        lr: the current learning rate.
+        score: the last mean return that was logged, or None.
+        samples_per_second: speed between the last two reports, or None.
+        latest_stats: name -> the last value of each episode statistic.
+        nonfinite_value: the first NaN or infinity of the run, or None.
     """
 
     def __init__(
         self,
-        env: Any,
-        policy: Any,
-        learner: Any,
-        metrics: Any,
-        save: Callable[[int, dict, float | None], bool],
+        env: Env,
+        policy: Policy,
+        learner: Learner,
+        logger: Logger,
+        saver: Callable[[int, dict[str, Any], float | None], bool],
         budget: Budget,
         *,
-        report_every: int = 1,
-        save_every: float = 30.0,
-        on_report: Callable[["Trainer"], None] = lambda trainer: None,
-        opponents: Any = None,
-        snapshots: Callable[["Trainer"], None] = lambda trainer: None,
+        log_every: int = 1,
+        checkpoint_seconds: float = 30.0,
+        on_log: Callable[[Trainer], None] = lambda trainer: None,
+        opponents: OpponentPool | None = None,
+        snapshot_saver: Callable[[Trainer], None] = lambda trainer: None,
     ):
         self.env, self.policy, self.learner = env, policy, learner
-        self.metrics, self.save_checkpoint, self.budget = metrics, save, budget
-        self.report_every, self.save_every, self.on_report = report_every, save_every, on_report
-        self.opponents, self.snapshots = opponents, snapshots
+        self.logger, self.saver, self.budget = logger, saver, budget
+        self.log_every, self.checkpoint_seconds = log_every, checkpoint_seconds
+        self.on_log, self.opponents, self.snapshot_saver = on_log, opponents, snapshot_saver
         self.collect = learner.collector(env)
-        self.rollout = self.collect.rollout  # what was collected last
+        self.rollout = self.collect.rollout
         self.episode_stats = EpisodeStats(
             self.rollout.n_lanes,
             env.device,
@@ -61,57 +93,61 @@ class Trainer:
         self.clock = Stopwatch()
         self.samples = self.updates = 0
         self.lr = learner.lr
-        self.score = self.rate = None  # the last reported return, and samples per second
-        self.latest = {}  # of episodes, by name, when the last ones ended
-        self.reported_at = 0, 0.0  # samples and seconds
-        self.saved_at = 0.0  # seconds
-        self.saved_updates = None  # updates that the last checkpoint holds
-        self.nonfinite_value = None  # the first one that was not finite
+        self.score = self.samples_per_second = None
+        self.latest_stats = {}
+        self.samples_at_log = 0
+        self.seconds_at_log = self.seconds_at_checkpoint = 0.0
+        self.updates_at_checkpoint = None
+        self.nonfinite_value = None
 
     @property
-    def left(self) -> float:
+    def fraction_left(self) -> float:
         """The fraction of the budget that is left."""
-        return self.budget.left(self.samples, self.clock.seconds)
+        return self.budget.fraction_left(self.samples, self.clock.seconds)
 
     @property
     def is_saved(self) -> bool:
-        """Whether a checkpoint holds all that was learnt."""
-        return self.saved_updates == self.updates
+        """True if the last checkpoint holds every update."""
+        return self.updates_at_checkpoint == self.updates
 
     def train(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Runs until the budget is spent or `stop()`. An error ends it too, once all that was
-        learnt is saved; so does NonFiniteError, of which only what came before it is saved.
+        """Trains until the budget is spent or `stop()` returns True, then saves a checkpoint.
+
+        Raises:
+            NonFiniteError: training diverged, or the environment returns only NaN or infinity. The
+                last good checkpoint is kept.
+            Exception: any other error, after a checkpoint was saved.
         """
         try:
-            self.snapshots(self)
-            while self.left > 0 and not stop():
+            self.snapshot_saver(self)
+            while self.fraction_left > 0 and not stop():
                 self.rollout = self.collect()
                 losses = self.update()
-                self.snapshots(self)
-                if self.updates % self.report_every == 0:
-                    self.report(losses)
-                is_due = self.clock.seconds - self.saved_at >= self.save_every
-                if is_due and self.check_numbers():
-                    self.save()
-            self.check_numbers()
+                self.snapshot_saver(self)
+                if self.updates % self.log_every == 0:
+                    self.log(losses)
+                seconds_since = self.clock.seconds - self.seconds_at_checkpoint
+                if seconds_since >= self.checkpoint_seconds and self.check_finite():
+                    self.save_checkpoint()
+            self.check_finite()
         except NonFiniteError:
             raise
         except Exception:
-            with contextlib.suppress(Exception):  # the first error is the one to tell
-                self.save()
+            with contextlib.suppress(Exception):  # the first error is the one to report
+                self.save_checkpoint()
             raise
         finally:
-            with contextlib.suppress(Exception):  # so it is here
-                self.wait()
-        self.save()
+            with contextlib.suppress(Exception):  # as above
+                self.wait_for_collector()
+        self.save_checkpoint()
 
-    def wait(self) -> None:
-        """Waits until nothing acts in the environment, where the learner's collector acts ahead."""
+    def wait_for_collector(self) -> None:
+        """Waits until an async collector has stopped stepping the environment."""
         if hasattr(self.collect, "wait"):
             self.collect.wait()
 
     def update(self) -> dict[str, torch.Tensor]:
-        """Learns from the rollout and counts it. Returns the learner's metrics."""
+        """Learns from the current rollout. Returns the learner's metrics, tensors of shape ()."""
         rollout = self.rollout
         if self.budget.anneal != "never":
             self.lr = self.learner.lr * self.budget.lr_fraction(self.samples, self.clock.seconds)
@@ -127,93 +163,99 @@ class Trainer:
         self.samples += rollout.n_steps * rollout.n_lanes
         self.updates += 1
         if self.opponents is not None:
-            self.opponents.refresh(self.policy, self.updates)
+            self.opponents.refresh_snapshots(self.policy, self.updates)
         if not self.clock.is_running:
             if torch.device(self.env.device).type == "cuda":
                 torch.cuda.synchronize(self.env.device)
             self.clock.start()
-            self.saved_at = self.clock.seconds
-            self.reported_at = self.samples, self.clock.seconds
+            self.seconds_at_checkpoint = self.clock.seconds
+            self.samples_at_log, self.seconds_at_log = self.samples, self.clock.seconds
         return losses
 
-    def report(self, losses: dict[str, torch.Tensor]) -> None:
-        """Writes the metrics since the last report. Synchronises; raises what the environment
-        flagged since then, if it has `check()`.
+    def log(self, losses: dict[str, torch.Tensor]) -> None:
+        """Writes the metrics since the last report. Synchronises.
+
+        Raises the errors that `env.check()` does, and NonFiniteError as `check_finite` does.
         """
-        self.wait()
+        self.wait_for_collector()
         if hasattr(self.env, "check"):
             self.env.check()
-        values = torch.stack(list(losses.values())).tolist()
-        episodes = self.episode_stats.take()
+        loss_values = torch.stack(list(losses.values())).tolist()
+        stats = self.episode_stats.pop()
         if self.opponents is not None:
-            episodes |= self.opponents.take()
-        self.latest.update(episodes)
-        found = {
-            **episodes,
-            **dict(zip(losses, values, strict=True)),
+            stats |= self.opponents.pop_win_rates()
+        self.latest_stats.update(stats)
+        metrics = {
+            **stats,
+            **dict(zip(losses, loss_values, strict=True)),
             "updates": self.updates,
             "lr": self.lr,
             "anneal": self.budget.anneal,
         }
-        (samples, seconds), now = self.reported_at, self.clock.seconds
-        self.reported_at = self.samples, now
-        perf = {"perf/seconds": now}
-        if self.samples > samples:  # the first update, which compiles, says nothing of the rate
-            self.rate = (self.samples - samples) / (now - seconds)
-            perf["perf/rate"] = self.rate
-        self.metrics.write(self.samples, found, perf)
-        self.score = found.get("episode/return", self.score)
-        self.on_report(self)
-        self.check_numbers()
+        seconds = self.clock.seconds
+        perf = {"perf/seconds": seconds}
+        if self.samples > self.samples_at_log:  # not for the first update, which compiles
+            n_samples = self.samples - self.samples_at_log
+            self.samples_per_second = n_samples / (seconds - self.seconds_at_log)
+            perf["perf/rate"] = self.samples_per_second
+        self.samples_at_log, self.seconds_at_log = self.samples, seconds
+        self.logger.write(self.samples, metrics, perf)
+        self.score = metrics.get("episode/return", self.score)
+        self.on_log(self)
+        self.check_finite()
 
-    def check_numbers(self) -> bool:
-        """Whether the last update was followed. Warns of the first number that could not be learnt
-        from; NonFiniteError if none of the last `MAX_SKIPPED` rollouts could. Synchronises.
+    def check_finite(self) -> bool:
+        """Returns True if the last update was applied, False if it was skipped. Synchronises.
+
+        Warns about the first NaN or infinity of the run.
+
+        Raises:
+            NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
         """
-        bad, n_skipped = self.learner.check.read(self.rollout.numbers())
-        if bad and self.rollout.learners is not None:
+        value, n_skipped = self.learner.check.read(self.rollout.floats())
+        if value and self.rollout.learners is not None:
             lanes = self.rollout.learners.nonzero()[:, 0]
-            bad = dataclasses.replace(bad, lane=int(lanes[bad.lane]))
-        if bad and self.nonfinite_value is None:
-            self.nonfinite_value = bad
-            warnings.warn(f"{bad}; its rollout was not learnt from", stacklevel=2)
+            value = dataclasses.replace(value, lane=int(lanes[value.lane]))
+        if value and self.nonfinite_value is None:
+            self.nonfinite_value = value
+            warnings.warn(f"{value}; its rollout was skipped", stacklevel=2)
         if n_skipped < MAX_SKIPPED:
             return n_skipped == 0
-        advice = f"the policy diverged, so try a learning rate smaller than {self.learner.lr:g}"
-        if bad and bad.is_from_env:
-            self.save()  # the policy is as good as it was before
-            advice = f"the environment gave it, so look at how it computes {bad.name}"
+        advice = f"The policy diverged: try a learning rate smaller than {self.learner.lr:g}"
+        if value and value.is_from_env:
+            self.save_checkpoint()  # the skipped updates left the policy unchanged
+            advice = f"It came from the environment: check how it computes {value.name}"
         raise NonFiniteError(
-            f"The last {n_skipped} updates were skipped, as their numbers were not finite or too "
-            f"large ({bad or 'gradients'}): {advice}"
+            f"The last {n_skipped} updates were skipped because of numbers that were not finite or "
+            f"too large ({value or 'gradients'}). {advice}"
         )
 
-    def save(self) -> None:
-        """Writes a checkpoint, unless the last one holds the same."""
-        self.saved_at = self.clock.seconds
-        if not self.is_saved and self.save_checkpoint(self.samples, self.state_dict(), self.score):
-            self.saved_updates = self.updates
+    def save_checkpoint(self) -> None:
+        """Writes a checkpoint, unless the last one holds every update."""
+        self.seconds_at_checkpoint = self.clock.seconds
+        if not self.is_saved and self.saver(self.samples, self.state_dict(), self.score):
+            self.updates_at_checkpoint = self.updates
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a run goes on from, as plain dicts of tensors and numbers."""
-        others = {} if self.opponents is None else {"opponents": self.opponents.state_dict()}
+        """Returns all that a resumed run needs, as plain dicts of tensors and numbers."""
+        opponents = {} if self.opponents is None else {"opponents": self.opponents.state_dict()}
         return dict(
-            **others,
+            **opponents,
             policy=self.policy.state_dict(),
             learner=self.learner.state_dict(),
-            episodes=self.episode_stats.state_dict(),
+            episode_stats=self.episode_stats.state_dict(),
             samples=self.samples,
             updates=self.updates,
             seconds=self.clock.seconds,
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from a `state_dict`. The environment starts new episodes."""
+        """Restores a `state_dict`. The environment starts new episodes."""
         self.policy.load_state_dict(state["policy"])
         self.learner.load_state_dict(state["learner"])
-        self.episode_stats.load_state_dict(state["episodes"])
+        self.episode_stats.load_state_dict(state["episode_stats"])
         if self.opponents is not None:
             self.opponents.load_state_dict(state["opponents"])
         self.samples, self.updates = state["samples"], state["updates"]
-        self.clock.before = state["seconds"]
-        self.saved_updates = self.updates
+        self.clock.seconds_before = state["seconds"]
+        self.updates_at_checkpoint = self.updates

@@ -1,31 +1,22 @@
-"""The engine: operations on many environments at once, on the CPU or the GPU, whichever their tensors
-are on.
+"""The engine: operations on many environments at once, on the device that their tensors are on.
 
 ``bake``, ``physics``, ``render``, ``observe``, ``unseen``, ``coverage``, ``spawn`` and ``uniform``
-check their arguments, allocate their outputs and launch one kernel each. None synchronises host and
-device. An argument that does not fit raises TypeError or ValueError and is named.
+check their arguments, allocate their outputs and launch one kernel each. None of them synchronises
+host and device. An argument that does not fit raises a TypeError or ValueError that names it.
 
-A game's step is an operation too; it lies beside its environment, such as
+A game's step is an operation too. It lies beside its environment, for example
 :func:`megastep.envs.deathmatch.step.deathmatch_step`.
 """
 
 from megastep.engine.agents import AGENT_RADIUS, AGENT_WIDTH, MAX_RES, Agents, check, check_flag
 from megastep.engine.devices import device, fit, set_threads, threads
-from megastep.engine.ops import (
-    BANDS,
-    SECTORS,
-    bake,
-    coverage,
-    observe,
-    physics,
-    render,
-    spawn,
-    uniform,
-    unseen,
-    update_agent_geometry,
-)
+from megastep.engine.lighting import bake
+from megastep.engine.movement import physics
 from megastep.engine.outputs import Observation, Physics, Render
+from megastep.engine.rendering import observe, render, update_agent_geometry
 from megastep.engine.scenery import Layouts, Scenery
+from megastep.engine.spawning import spawn, uniform
+from megastep.engine.texels import BANDS, SECTORS, coverage, unseen
 from megastep.kernels.build.compile import EngineError
 
 __all__ = [

@@ -1,6 +1,4 @@
-"""Agents: where they are, how they move, what their cameras are like, and what the device found
-wrong with them.
-"""
+"""Agents: poses, velocities, camera settings, and the errors that the device flagged."""
 
 import math
 from collections.abc import Sequence
@@ -10,6 +8,7 @@ import torch
 
 from megastep.engine import checks
 from megastep.kernels.build.compile import EngineError
+from megastep.kernels.build.launch import ENGINE
 from megastep.read_only import SetOnce
 
 __all__ = [
@@ -17,21 +16,32 @@ __all__ = [
     *("check", "check_flag", "check_on_cpu", "check_flag_on_cpu"),
 ]
 
-AGENT_WIDTH = 0.15
-AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # the disc about a square of that width
-MAX_RES = 1024
+AGENT_WIDTH = 0.15  # metres
+AGENT_RADIUS = AGENT_WIDTH / 2**0.5  # of the disc around a square of that width
+MAX_RES = ENGINE.constants["MAX_RES"]
 
 
 class Agents(SetOnce):
-    """A agents in each of N environments, their cameras alike.
+    """The agents of N environments, A each, all with the same cameras.
 
-    ``positions`` (N, A, 2) metres, ``angles`` (N, A) degrees, ``velocity`` (N, A, 2) metres per
-    second, ``angvelocity`` (N, A) degrees per second; an angle of 0 looks along +x. They may be
-    written in place or replaced. The settings are fixed: ``res`` rays per camera, ``fov`` degrees,
-    ``fps`` steps per second, ``radius`` metres, and ``cameras``, yaw offsets in degrees, of which
-    there is one straight ahead by default.
+    Args:
+        n_envs: number of environments N.
+        n_agents: agents per environment A.
+        res: rays per camera, 1 to 1024.
+        fov: field of view in degrees, above 0 and below 180.
+        fps: steps per second.
+        cameras: yaw offset of each camera in degrees. Default: one camera, straight ahead.
+        radius: metres.
 
-    ValueError unless 1 <= res <= 1024, 0 < fov < 180, fps > 0, radius > 0.
+    Attributes:
+        positions: (N, A, 2) metres. This and the next three may be written in place or replaced.
+        angles: (N, A) degrees; 0 looks along +x.
+        velocity: (N, A, 2) metres per second.
+        angvelocity: (N, A) degrees per second.
+        error_flag: (1,) int32, see :func:`check`.
+
+    Raises:
+        ValueError: naming the argument that is out of range.
     """
 
     _replaceable = ("positions", "angles", "velocity", "angvelocity")
@@ -70,43 +80,50 @@ class Agents(SetOnce):
         self.error_flag = torch.zeros(1, dtype=torch.int32, device=device)
 
 
-# By kind, as errors.h numbers them.
-_ERRORS = {
-    1: "An agent of environment {env} has a position, angle or velocity that is not a finite "
-    "number: look at what was last written to it.",
-    2: "An agent of environment {env} was given an action that is none of its action space: "
-    "actions count from 0.",
-    3: "Environment {env} shows a layout that the scenery does not have: ids in scenery.layout "
-    "count from 0 and stay below the number of layouts.",
-    4: "An agent of environment {env} has a goal or a spawn point that its layout does not have: "
-    "they count from 0 and stay below their number per layout.",
-}
-_KINDS = 8  # as errors.h has it
+_MESSAGES = dict(
+    NONFINITE="An agent of environment {env} has a non-finite position, angle or velocity: check "
+    "what was last written to them.",
+    BAD_ACTION="An agent of environment {env} was given an action outside of its action space: "
+    "actions are integers from 0.",
+    BAD_LAYOUT="Environment {env} shows a layout that the scenery does not have: entries of "
+    "scenery.layout must be from 0 to the number of layouts - 1.",
+    BAD_GOAL="An agent of environment {env} has a goal or a spawn point that its layout does not "
+    "have: indices must be from 0 to the number per layout - 1.",
+)
+_ERRORS = {ENGINE.constants[name]: message for name, message in _MESSAGES.items()}
 
 
 def check(agents: Agents) -> None:
-    """EngineError, which names an environment, if since the last check an agent's position, angle
-    or velocity was not a finite number, an action, a layout or a goal was none. Synchronises
-    with the device, so it is not for inside a step.
+    """Raises the error that the device flagged since the last check, if any.
+
+    Synchronises host and device, so do not call it inside a step.
+
+    Raises:
+        EngineError: naming an environment with a non-finite position, angle or velocity, or with an
+            action, layout or goal that does not exist.
     """
     check_flag(checks.instance("agents", agents, Agents).error_flag)
 
 
 def check_flag(error_flag: torch.Tensor) -> None:
-    """:func:`check` of a flag (1,) int32 that is no agents'."""
+    """Does what :func:`check` does, for an environment without :class:`Agents`.
+
+    Args:
+        error_flag: (1,) int32, cleared by this call.
+    """
     flag = int(error_flag)
     if flag:
         error_flag.zero_()
-        env, kind = divmod(flag, _KINDS)
+        env, kind = divmod(flag, ENGINE.constants["ERROR_KINDS"])
         raise EngineError(_ERRORS[kind].format(env=env))
 
 
 def check_on_cpu(agents: Agents) -> None:
-    """:func:`check` where it takes no synchronisation."""
+    """Does what :func:`check` does if the agents are on the CPU, where nothing synchronises."""
     check_flag_on_cpu(agents.error_flag)
 
 
 def check_flag_on_cpu(error_flag: torch.Tensor) -> None:
-    """:func:`check_flag` where it takes no synchronisation."""
+    """Does what :func:`check_flag` does if the flag is on the CPU, where nothing synchronises."""
     if error_flag.device.type == "cpu":
         check_flag(error_flag)

@@ -1,6 +1,4 @@
-"""Checks of arguments at the boundary: each raises an error that names the argument, what it must
-be and what was given.
-"""
+"""Checks of arguments. Their errors name the argument, what is allowed and what was given."""
 
 import math
 import numbers
@@ -27,114 +25,123 @@ __all__ = [
     "ragged",
 ]
 
-LIMIT = 1e9  # of what kernels calculate with: products of four still fit into float32
+LIMIT = 1e9  # of numbers that kernels compute with: a product of four still fits into float32
 
 
 def integer(name: str, value: Any, min: int, max: float = math.inf) -> int:
-    """``value`` as an int. ValueError unless it is an integer from ``min`` to ``max``."""
+    """Returns ``value`` as an int. ValueError unless it is an integer from ``min`` to ``max``."""
     try:
-        found = None if isinstance(value, bool) else operator.index(value)
+        number = None if isinstance(value, bool) else operator.index(value)
     except (TypeError, RuntimeError, ValueError):
-        found = None
-    if found is None or not min <= found <= max:
+        number = None
+    if number is None or not min <= number <= max:
         range_ = f"from {min} to {max}" if max < math.inf else f"of at least {min}"
-        raise ValueError(f"{name} must be an integer {range_}, but {_given(value)} was given")
-    return found
+        raise ValueError(f"{name} must be an integer {range_}, but {_described(value)} was given")
+    return number
 
 
 def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: str = "") -> float:
-    """``value`` as a float. ValueError unless it is a number between ``min`` and ``max``, both
-    excluded.
-    """
+    """Returns ``value`` as a float. ValueError unless ``min < value < max``."""
     plain = type(value) is float or type(value) is int
     real = plain or isinstance(value, numbers.Real) and not isinstance(value, bool)
     if not real or not min < value < max:
         kind = f"a number of {unit}" if unit else "a number"
         range_ = f"between {min:g} and {max:g}" if max < math.inf else f"above {min:g}"
         range_ = range_ if min > -math.inf else "that is finite"
-        raise ValueError(f"{name} must be {kind} {range_}{hint}, but {_given(value)} was given")
+        raise ValueError(f"{name} must be {kind} {range_}{hint}, but {_described(value)} was given")
     return float(value)
 
 
 def flag(name: str, value: Any) -> bool:
-    """``value``. TypeError unless it is True or False."""
+    """Returns ``value``. TypeError unless it is True or False."""
     if value is not True and value is not False:
-        raise TypeError(f"{name} must be True or False, but {_given(value)} was given")
+        raise TypeError(f"{name} must be True or False, but {_described(value)} was given")
     return value
 
 
 def instance(name: str, value: Any, kind: type) -> Any:
-    """``value``. TypeError unless it is a ``kind``."""
+    """Returns ``value``. TypeError unless it is a ``kind``."""
     if not isinstance(value, kind):
-        raise TypeError(f"{name} must be a {kind.__name__}, but {_given(value)} was given")
+        raise TypeError(f"{name} must be a {kind.__name__}, but {_described(value)} was given")
     return value
 
 
 def items(name: str, value: Any) -> list:
-    """``value`` as a list. TypeError or ValueError unless it holds something."""
+    """Returns ``value`` as a list. TypeError or ValueError unless it is a list and not empty."""
     if isinstance(value, (str, dict)) or not isinstance(value, Iterable):
-        raise TypeError(f"{name} must be a list, but {_given(value)} was given")
-    found = list(value)
-    if not found:
+        raise TypeError(f"{name} must be a list, but {_described(value)} was given")
+    values = list(value)
+    if not values:
         raise ValueError(f"{name} must hold at least one, but an empty list was given")
-    return found
+    return values
 
 
 def device(name: str, value: Any) -> torch.device:
-    """``value`` as a device. ValueError unless PyTorch knows it."""
+    """Returns ``value`` as a torch.device. ValueError unless PyTorch knows it."""
     try:
         return torch.device(value)
     except (RuntimeError, TypeError):
         raise ValueError(
-            f"{name} must be a device such as cpu or cuda, but {_given(value)} was given"
+            f"{name} must be a device such as cpu or cuda, but {_described(value)} was given"
         ) from None
 
 
 def floats(name: str, value: Any, shape: Sequence, device: Any) -> torch.Tensor:
-    """``value`` as a contiguous float32 tensor on ``device``. ValueError unless it is an array of
-    numbers of that shape, none as large as 1e9; a string in ``shape`` stands for any size.
+    """Returns ``value`` as a contiguous float32 tensor on ``device``.
+
+    Args:
+        shape: sizes; a string stands for any size.
+
+    Raises:
+        ValueError: unless it is an array of that shape whose numbers are below 1e9.
     """
     try:
-        found = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
-        found = found.clone() if isinstance(found, ReadOnlyTensor) else found
-        found = None if found.is_complex() else found.to(device=device, dtype=torch.float32)
+        tensor = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
+        tensor = tensor.clone() if isinstance(tensor, ReadOnlyTensor) else tensor
+        tensor = None if tensor.is_complex() else tensor.to(device=device, dtype=torch.float32)
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
-        found = None
-    if found is None or not _fits(found, shape):
+        tensor = None
+    if tensor is None or not _fits(tensor, shape):
         raise ValueError(
-            f"{name} must be an array of numbers of shape ({_sizes(shape)}), but {_given(value)} "
-            f"was given"
+            f"{name} must be an array of numbers of shape ({_sizes(shape)}), but "
+            f"{_described(value)} was given"
         )
-    if not bool((found.abs() < LIMIT).all()):
+    if not bool((tensor.abs() < LIMIT).all()):
         raise ValueError(
             f"{name} must hold numbers below {LIMIT:g}, but one is NaN, infinite or larger"
         )
-    return found.contiguous()
+    return tensor.contiguous()
 
 
 def integers(
     name: str, value: Any, size: int | str, min: int, max: int, device: Any
 ) -> torch.Tensor:
-    """A copy of ``value`` as an int64 tensor of shape (size,) on ``device``. ValueError unless all
-    are integers from ``min`` to ``max``; a string as ``size`` stands for any.
+    """Returns a copy of ``value`` as an int64 tensor of shape (size,) on ``device``.
+
+    Args:
+        size: a string stands for any size.
+
+    Raises:
+        ValueError: unless all are integers from ``min`` to ``max``.
     """
     try:
-        found = torch.as_tensor(value).detach().clone()
-        found = found.to(torch.int64) if not found.numel() else found
-        real = found.is_floating_point() or found.is_complex() or found.dtype == torch.bool
-        found = None if real else found.to(device=device, dtype=torch.int64)
+        tensor = torch.as_tensor(value).detach().clone()
+        tensor = tensor.to(torch.int64) if not tensor.numel() else tensor
+        real = tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool
+        tensor = None if real else tensor.to(device=device, dtype=torch.int64)
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
-        found = None
-    if found is None or not _fits(found, (size,)):
+        tensor = None
+    if tensor is None or not _fits(tensor, (size,)):
         raise ValueError(
-            f"{name} must be an array of integers of shape ({size},), but {_given(value)} was given"
+            f"{name} must be an array of integers of shape ({size},), but "
+            f"{_described(value)} was given"
         )
-    outside = found[(found < min) | (found > max)]
+    outside = tensor[(tensor < min) | (tensor > max)]
     if len(outside):
         raise ValueError(
             f"{name} must hold integers from {min} to {max}, but one is {int(outside[0])}"
         )
-    return found
+    return tensor
 
 
 def _fits(tensor, shape):
@@ -144,29 +151,35 @@ def _fits(tensor, shape):
 
 
 def ragged(name: str, value: Any, shape: Sequence, device: Any) -> RaggedTorch:
-    """``value`` as a Ragged of contiguous float32 tensors on ``device``. TypeError unless it is a
-    Ragged, ValueError unless its vals are as :func:`floats` wants them.
+    """Returns ``value`` as a Ragged of contiguous float32 tensors on ``device``.
+
+    Raises:
+        TypeError: unless it is a Ragged.
+        ValueError: unless its vals pass :func:`floats`.
     """
     if not isinstance(value, Ragged) and not hasattr(value, "torchify"):
-        raise TypeError(f"{name} must be a Ragged, but {_given(value)} was given")
+        raise TypeError(f"{name} must be a Ragged, but {_described(value)} was given")
     value = value.torchify()
     return Ragged(floats(f"{name}.vals", value.vals, shape, device), value.widths.to(device))
 
 
 def length(name: str, value: Any, axis: int = 0) -> int:
-    """The size of a tensor's ``axis``. TypeError or ValueError unless it has one."""
+    """Returns the size of a tensor's ``axis``. TypeError or ValueError unless it has that axis."""
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{name} must be a tensor, but {_given(value)} was given")
+        raise TypeError(f"{name} must be a tensor, but {_described(value)} was given")
     if not -value.ndim <= axis < value.ndim:
-        raise ValueError(f"{name} must have more axes than {_given(value)} has")
+        raise ValueError(f"{name} must have more axes than {_described(value)} has")
     return value.shape[axis]
 
 
 def address(
     name: str, value: Any, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
 ) -> int:
-    """A checked tensor's address; nothing is copied or waited for. TypeError or ValueError unless
-    it is a contiguous tensor of that shape and dtype on ``device``.
+    """Returns a tensor's address. Copies nothing and does not synchronise.
+
+    Raises:
+        TypeError: unless it is a tensor.
+        ValueError: unless it is contiguous, on ``device``, and of that shape and dtype.
     """
     if (
         not isinstance(value, torch.Tensor)
@@ -177,7 +190,7 @@ def address(
     ):
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
             f"{name} must be a contiguous {dtype} tensor of shape {tuple(shape)} on {device}, but "
-            f"{_given(value)} was given"
+            f"{_described(value)} was given"
         )
     return value.data_ptr()
 
@@ -186,8 +199,8 @@ def _sizes(shape):
     return ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
 
 
-def _given(value):
-    """What was given, in a few words."""
+def _described(value):
+    """Describes a value in a few words."""
     if isinstance(value, torch.Tensor):
         layout = "" if value.is_contiguous() else "non-contiguous "
         return f"a {layout}{value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"

@@ -1,6 +1,4 @@
-"""Devices by name, whether what is to be made fits into their memory, and how many threads of the
-CPU the engine takes.
-"""
+"""Devices by name, their free memory, and the number of CPU threads."""
 
 from typing import Any
 
@@ -14,8 +12,10 @@ _n_threads = None  # None: as many as PyTorch
 
 
 def device(name: str | torch.device = "auto") -> torch.device:
-    """The device called ``name``: auto (a GPU if there is one), cpu, cuda, cuda:1. EngineError if
-    it is not there.
+    """Returns a device by name: auto (a GPU if there is one, else the CPU), cpu, cuda or cuda:1.
+
+    Raises:
+        EngineError: if the device does not exist.
     """
     if name == "auto":
         return (
@@ -24,19 +24,19 @@ def device(name: str | torch.device = "auto") -> torch.device:
             else torch.device("cpu")
         )
     try:
-        chosen = torch.device(name)
+        requested = torch.device(name)
     except (RuntimeError, TypeError):
-        chosen = None
-    if chosen is None or chosen.type not in ("cpu", "cuda"):
+        requested = None
+    if requested is None or requested.type not in ("cpu", "cuda"):
         raise EngineError(f"device={name} is unknown: use auto, cpu, cuda, or cuda: and a number.")
-    if chosen.type == "cuda":
+    if requested.type == "cuda":
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        if (chosen.index or 0) >= count:
+        if (requested.index or 0) >= count:
             raise EngineError(
                 f"device={name} was given, but {_missing(count)}: use device=auto or device=cpu."
             )
-        return torch.device("cuda", chosen.index or 0)
-    return chosen
+        return torch.device("cuda", requested.index or 0)
+    return requested
 
 
 def _missing(count):
@@ -47,32 +47,32 @@ def _missing(count):
 
 
 def threads() -> int:
-    """How many threads an operation of the engine takes on the CPU: what :func:`set_threads` was
-    given, else as many as PyTorch's operations.
-    """
+    """Returns the number of CPU threads per operation. Default: as many as PyTorch uses."""
     return _n_threads or torch.get_num_threads()
 
 
 def set_threads(n: int | None) -> None:
-    """Gives the engine a number of threads of its own, or with None PyTorch's."""
+    """Sets the number of CPU threads per operation; None means as many as PyTorch uses."""
     global _n_threads
     _n_threads = n
 
 
-def fit(n_envs: int, bytes_each: float, device: Any, what: str = "environments") -> None:
-    """EngineError, with the number that fits, if ``n_envs`` things of ``bytes_each`` bytes are too
-    many for the memory that is free on ``device``.
+def fit(n: int, bytes_each: float, device: Any, what: str = "environments") -> None:
+    """Checks that ``n`` things of ``bytes_each`` bytes fit into the free memory of ``device``.
+
+    Raises:
+        EngineError: if they do not; it says how many fit.
     """
     free = free_memory(device)
-    if n_envs * bytes_each > 0.95 * free:
+    if n * bytes_each > 0.95 * free:
         raise EngineError(
-            f"{n_envs:,} {what} need {n_envs * bytes_each / 1e9:.1f} GB, but {free / 1e9:.1f} GB "
+            f"{n:,} {what} need {n * bytes_each / 1e9:.1f} GB, but {free / 1e9:.1f} GB "
             f"are free on {device}: at most {int(0.95 * free / bytes_each):,} fit."
         )
 
 
 def free_memory(device: Any) -> int:
-    """Bytes that can still be allocated on ``device``."""
+    """Returns the number of bytes that can still be allocated on ``device``."""
     device = torch.device(device)
     if device.type == "cuda":
         return (

@@ -1,4 +1,4 @@
-"""From tensors to what a launch is given: addresses, checked by name, without synchronisation."""
+"""The fields that many launches share: tensors' addresses, checked without synchronisation."""
 
 import operator
 
@@ -7,16 +7,18 @@ import torch
 from megastep.engine import checks, devices
 from megastep.engine.agents import Agents
 from megastep.engine.scenery import Scenery
-from megastep.kernels.build.launch import params
+from megastep.kernels.build.launch import ENGINE
 
-__all__ = ["error_flag", "lanes_of", "scenery_params", "seed_params", "state_params"]
+__all__ = ["error_flag_address", "lanes_of", "scenery_params", "seed_params", "state_params"]
 
 _address, _shape = torch.Tensor.data_ptr, operator.attrgetter("shape")
 
 
 class _Packed:
-    """The packed params of a scenery, of which tensors, and the memory for which they hold. It has
-    no ``__dict__``, as it is no state.
+    """The packed SceneryParams of a scenery, and the memory that they were packed for.
+
+    Has no ``__dict__``, so that :func:`~megastep.engine.state_tree.state_tree` does not look
+    inside.
     """
 
     __slots__ = ("tensors", "memory", "params")
@@ -38,8 +40,13 @@ class _Packed:
 
 
 def scenery_params(scenery: Scenery, radius: float) -> bytes:
-    """The params of a scenery. Its tensors cannot be replaced, so they are checked again only where
-    the memory or the shape of one has changed: ValueError, naming it, if it no longer fits.
+    """Returns the packed SceneryParams of a scenery.
+
+    Its tensors cannot be replaced, so they are checked only if the memory or the shape of one has
+    changed since the last call.
+
+    Raises:
+        ValueError: naming the tensor that no longer fits.
     """
     packed = vars(scenery).get("_packed")
     if packed is None:
@@ -64,10 +71,10 @@ def _pack(scenery, radius, n_threads):
         vals = getattr(layouts, name).vals
         if vals.data_ptr() != texels + column * vals.element_size() * bool(len(vals)):
             raise ValueError(
-                f"scenery.layouts.texels and the vals of scenery.layouts.{name} must share their "
-                f"memory, but one of them was given other memory"
+                f"scenery.layouts.texels and scenery.layouts.{name}.vals must share their memory: "
+                f"write into them in place instead of replacing one"
             )
-    return params.SceneryParams(
+    return ENGINE.params.SceneryParams(
         walls=address("scenery.layouts.lines.vals", layouts.lines.vals, layouts.n_walls, 2, 2),
         wall_starts=layouts.wall_starts.data_ptr(),
         texel_starts=layouts.texel_starts.data_ptr(),
@@ -101,29 +108,33 @@ _STATE = {"positions": (2,), "angles": (), "velocity": (2,), "angvelocity": ()}
 
 
 def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int]:
-    """The addresses of these tensors of the agents, by name. TypeError or ValueError, naming the
-    first, if they do not fit the scenery.
+    """Returns {name: address} of the agents' tensors ``names``.
+
+    Raises:
+        TypeError, ValueError: naming the first tensor that does not fit the scenery.
     """
-    lanes, on, given = (scenery.n_envs, scenery.n_agents), scenery.device, vars(agents)
+    lanes, device, tensors = (scenery.n_envs, scenery.n_agents), scenery.device, vars(agents)
     return {
-        name: checks.address(f"agents.{name}", given[name], lanes + _STATE[name], torch.float32, on)
+        name: checks.address(
+            f"agents.{name}", tensors[name], lanes + _STATE[name], torch.float32, device
+        )
         for name in names
     }
 
 
-def error_flag(scenery: Scenery, agents: Agents) -> int:
-    """The address of the flag that the device raises; see :func:`~megastep.engine.check`."""
+def error_flag_address(scenery: Scenery, agents: Agents) -> int:
+    """Returns the address of the flag that :func:`~megastep.engine.check` reads."""
     return checks.address("agents.error_flag", agents.error_flag, (1,), torch.int32, scenery.device)
 
 
 def lanes_of(scenery: Scenery, agents: Agents) -> tuple[int, int]:
-    """(N, A), after a look at the types."""
+    """Returns (N, A), after checking the types of both."""
     checks.instance("scenery", scenery, Scenery)
     checks.instance("agents", agents, Agents)
     return scenery.n_envs, scenery.n_agents
 
 
 def seed_params(seed: int) -> dict[str, int]:
-    """A seed's two words."""
+    """Returns a 64-bit seed as the two words of a generator's key."""
     seed = checks.integer("seed", seed, 0, 2**64 - 1)
     return dict(key0=seed & 0xFFFFFFFF, key1=seed >> 32)

@@ -1,8 +1,8 @@
-"""Scenery: what the engine renders and collides with.
+"""Scenery: what the engine renders and what agents collide with.
 
-Walls, their textures and baked light, and lights belong to a *layout*, a floor plan as the engine
-holds it; an environment shows a layout, so that a million environments share a few thousand homes.
-Each environment adds only its agents' lines and the light on them.
+A *layout* is a floor plan as the engine holds it: walls, their textures and baked light, and
+lights. Each environment shows one layout, so a million environments can share a few thousand homes.
+An environment itself holds only its agents' lines and the light on them.
 
 N environments, D layouts, A agents per environment, M lines of the agent model, K texels of one
 environment's agents, W walls and T texels of all layouts.
@@ -15,24 +15,34 @@ import torch
 
 from megastep.engine import checks, views
 from megastep.engine.views import JoinedRagged
+from megastep.kernels.build.launch import ENGINE
 from megastep.ragged import Ragged
 from megastep.read_only import ReadOnlyTensor, SetOnce
 
 __all__ = ["Layouts", "Scenery"]
 
-BOX = 32  # walls per bounding box, as the kernels have it: one for each lane of a warp
+BOX_WALLS = ENGINE.constants["BOX_WALLS"]  # walls per bounding box
 
 
 class Layouts(SetOnce):
-    """The static part of scenery, shared by the environments that show it.
-
-    Args: ``lines`` Ragged (W, 2, 2) metres, the walls by layout; ``textures`` Ragged (T, 3), one
-    subarray per wall, linear light in [0, 1]; ``lights`` Ragged (l, 3) by layout, x, y, intensity;
-    ``agent_textures`` (D, K, 3). TypeError or ValueError, naming the argument, if they do not fit.
+    """The static part of scenery: the floor plans that environments share.
 
     ``lines.vals``, ``textures.vals``, ``baked.vals``, ``lights.vals`` and ``agent_textures`` may be
-    written in place; call ``bake`` after moving walls or lights. ``texels`` (T, 4) is the memory
-    behind ``textures`` and ``baked``.
+    written in place. Call :func:`~megastep.engine.bake` after moving walls or lights.
+
+    Args:
+        lines: Ragged (W, 2, 2) metres, the walls of each layout.
+        textures: Ragged (T, 3), linear light in [0, 1], the texels of each wall.
+        lights: Ragged (l, 3), the lights of each layout: x, y, intensity.
+        agent_textures: (D, K, 3), the texels of an environment's agents.
+        device: where to put them.
+
+    Attributes:
+        baked: Ragged (T,), the light on each texel.
+        texels: (T, 4), the memory that ``textures`` and ``baked`` share.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
     """
 
     def __init__(
@@ -44,9 +54,7 @@ class Layouts(SetOnce):
         lights = checks.ragged("lights", lights, ("l", 3), device)
         self.n_layouts = len(lines)
         if not self.n_layouts:
-            raise ValueError(
-                "lines must have the walls of at least one layout, but none were given"
-            )
+            raise ValueError("lines must have at least one layout, but none was given")
         _same("textures", "one subarray per wall of lines", len(lines.vals), len(textures))
         _same("lights", "one subarray per layout of lines", self.n_layouts, len(lights))
         if len(textures) and int(textures.widths.min()) < 1:
@@ -63,7 +71,7 @@ class Layouts(SetOnce):
         self.wall_starts = _starts("wall_starts", lines.widths)
         self.light_starts = _starts("light_starts", lights.widths)
         self.texel_starts = _starts("texel_starts", textures.widths)
-        self.box_starts = _starts("box_starts", -(-lines.widths // BOX))
+        self.box_starts = _starts("box_starts", -(-lines.widths // BOX_WALLS))
         self.n_walls, self.n_texels, self.n_lights = (
             len(r.vals) for r in (lines, textures, lights)
         )
@@ -75,8 +83,8 @@ class Layouts(SetOnce):
 
     @property
     def boxes(self) -> torch.Tensor:
-        """(b, 4) min x, min y, max x, max y around every 32 walls of a layout, which let the GPU
-        skip what cannot be seen or met. Read-only.
+        """(b, 4) bounding boxes of every 32 walls of a layout: min x, min y, max x, max y.
+        Read-only.
         """
         return ReadOnlyTensor(
             self._boxes,
@@ -84,34 +92,43 @@ class Layouts(SetOnce):
         )
 
     def update_bounding_boxes(self) -> None:
-        """Fits ``boxes`` to where the walls are now, in place. ``bake`` does it too."""
+        """Refits ``boxes`` to the walls, in place. ``bake`` calls it."""
         layout = self.lines.inverse
         wall = torch.arange(len(layout), device=layout.device)
-        box = self.box_starts.long()[layout] + (wall - self.lines.starts[layout]) // BOX
+        box = self.box_starts.long()[layout] + (wall - self.lines.starts[layout]) // BOX_WALLS
         box, ends = box[:, None].expand(-1, 2), self.lines.vals
         self._boxes[:, :2].fill_(torch.inf).scatter_reduce_(0, box, ends.amin(1), "amin")
         self._boxes[:, 2:].fill_(-torch.inf).scatter_reduce_(0, box, ends.amax(1), "amax")
 
     @cached_property
     def max_texels(self) -> int:
-        """The most static texels that any layout has."""
+        """The largest number of static texels in any layout."""
         return int(self.texel_starts[self.wall_starts.long()].diff().max())
 
 
 class Scenery(SetOnce):
-    """N environments of A agents each.
+    """The scenery of N environments with A agents each.
 
-    ``Scenery(n_agents, lights, lines, textures, model)`` takes what every environment has of its
-    own: raggeds of ``lights`` (l, 3) and ``lines`` (L, 2, 2) by environment, each one's agents'
-    lines first, ``textures`` (T, 3) by line, and the agents' ``model`` (M, 2, 2) in metres about
-    their origin. The agents' texture widths must be the same in every environment.
-    :meth:`of_layouts` shares layouts between environments. TypeError or ValueError, naming the
-    argument, if they do not fit.
+    This constructor gives each environment a layout of its own; :meth:`of_layouts` shares layouts
+    between environments. :func:`megastep.scene.scenery` makes scenery from geometries.
 
-    ``layout`` (N,) int32, the layout each environment shows, may be written in place; so may what
-    :class:`Layouts` names. ``agent_lines`` (N, A M, 2, 2) and ``agent_light`` (N, K) are written by
-    every render. ``lines``, ``lights``, ``textures`` and ``baked`` show all this by environment,
-    and raise ValueError where somebody writes into them.
+    Args:
+        n_agents: agents per environment A.
+        lights: Ragged (l, 3), the lights of each environment: x, y, intensity.
+        lines: Ragged (L, 2, 2) metres, the lines of each environment, its agents' first.
+        textures: Ragged (T, 3), the texels of each line. An agent line must have the same number of
+            texels in every environment.
+        model: (M, 2, 2) metres, the lines of an agent about its origin.
+        device: where to put it. Default: the device of ``lines``.
+
+    Attributes:
+        layouts: :class:`Layouts`, the static part. May be written in place.
+        layout: (N,) int32, the layout that each environment shows. May be written in place.
+        agent_lines: (N, A M, 2, 2), written by every render.
+        agent_light: (N, K), written by every render.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
     """
 
     def __init__(
@@ -129,28 +146,28 @@ class Scenery(SetOnce):
         device = lines.device
         textures = checks.ragged("textures", textures, ("T", 3), device)
         model = checks.floats("model", model, ("M", 2, 2), device)
-        n, own = len(lines), n_agents * len(model)
+        n, n_own = len(lines), n_agents * len(model)
         _same("textures", "one subarray per line of lines", len(lines.vals), len(textures))
-        if not n or int(lines.widths.min()) < own:
+        if not n or int(lines.widths.min()) < n_own:
             fewest = int(lines.widths.min()) if n else 0
             raise ValueError(
-                f"lines must begin, in every environment, with the {own} lines of its {n_agents} "
-                f"agents, but one has {fewest} lines in all"
+                f"lines must start, in every environment, with the {n_own} lines of its {n_agents} "
+                f"agents, but one environment has only {fewest} lines"
             )
         within = torch.arange(len(lines.vals), device=device) - lines.starts[lines.inverse]
-        is_agent = within < own
-        agent_widths = textures.widths[is_agent].view(n, own)
+        is_agent = within < n_own
+        agent_widths = textures.widths[is_agent].view(n, n_own)
         if not bool((agent_widths == agent_widths[0]).all()):
             raise ValueError(
                 "textures of the agents' lines must have the same widths in every environment, but "
                 "they differ"
             )
-        of_agent = is_agent[textures.inverse]
+        texel_of_agent = is_agent[textures.inverse]
         layouts = Layouts(
-            Ragged(lines.vals[~is_agent], lines.widths - own),
-            Ragged(textures.vals[~of_agent], textures.widths[~is_agent]),
+            Ragged(lines.vals[~is_agent], lines.widths - n_own),
+            Ragged(textures.vals[~texel_of_agent], textures.widths[~is_agent]),
             lights,
-            textures.vals[of_agent].view(n, int(agent_widths[0].sum()), 3),
+            textures.vals[texel_of_agent].view(n, int(agent_widths[0].sum()), 3),
             device,
         )
         self._set(n_agents, layouts, model, agent_widths[0], torch.arange(n))
@@ -159,8 +176,14 @@ class Scenery(SetOnce):
     def of_layouts(
         cls, n_agents: int, layouts: Layouts, model: Any, model_widths: Any, layout: Any
     ) -> "Scenery":
-        """Environments that share layouts: ``layout`` (N,) integers, the one each shows;
-        ``model_widths`` (A M,) integers, the texels of each agent line.
+        """Returns scenery whose environments share layouts.
+
+        Args:
+            n_agents: agents per environment A.
+            layouts: the floor plans.
+            model: (M, 2, 2) metres, the lines of an agent about its origin.
+            model_widths: (A M,) integers, the number of texels of each agent line.
+            layout: (N,) integers, the layout that each environment shows.
         """
         checks.instance("layouts", layouts, Layouts)
         n_agents = checks.integer("n_agents", n_agents, 0)
@@ -176,7 +199,7 @@ class Scenery(SetOnce):
         layout = checks.integers("layout", layout, "N", 0, len(layouts) - 1, device)
         _same("model_widths", "widths that add up to agent_textures'", n_texels, int(widths.sum()))
         if not len(layout):
-            raise ValueError("layout must have at least one environment, but none was given")
+            raise ValueError("layout must have one entry per environment, but it is empty")
         self.n_envs, self.n_agents, self.n_agent_texels = len(layout), n_agents, n_texels
         self.layouts, self.device = layouts, device
         self.model = _fixed("model", model.clone())
@@ -188,48 +211,54 @@ class Scenery(SetOnce):
 
     @property
     def lines(self) -> JoinedRagged:
-        """Per environment, all its lines (l, 2, 2): the agents' first, as last rendered."""
+        """The lines (l, 2, 2) of each environment, agents' first, as last rendered. Read-only."""
         return views.lines(self)
 
     @property
     def lights(self) -> JoinedRagged:
-        """Per environment, its lights (l, 3)."""
+        """The lights (l, 3) of each environment. Read-only."""
         return views.lights(self)
 
     @property
     def textures(self) -> JoinedRagged:
-        """Per line of all environments, its texels (w, 3); line l of environment e is line
-        ``lines.starts[e] + l``.
+        """The texels (w, 3) of each line of all environments. Read-only.
+
+        Line l of environment e has the index ``lines.starts[e] + l``.
         """
         return views.textures(self)
 
     @property
     def baked(self) -> JoinedRagged:
-        """Per line of all environments, the light on its texels (w,)."""
+        """The light (w,) on each line of all environments, indexed as ``textures``. Read-only."""
         return views.baked(self)
 
     def env(self, e: int) -> tuple[torch.Tensor, tuple[torch.Tensor, ...], torch.Tensor]:
-        """Copies of environment ``e`` alone: (lines (l, 2, 2), a tuple of lit textures (w, 3) per
-        line, lights (l, 3)), the agents' first. Cheap however many environments there are.
+        """Returns copies of one environment's lines, lit textures and lights.
+
+        Takes the same time however many environments there are.
+
+        Returns:
+            (lines (l, 2, 2), one lit texture (w, 3) per line, lights (l, 3)), agents' lines first.
         """
         e = checks.integer("e", e, -self.n_envs, self.n_envs - 1)
         layouts, d = self.layouts, int(self.layout[e])
         lines = torch.cat([self.agent_lines[e], layouts.lines[d]])
         first, last = layouts.wall_starts[d : d + 2].tolist()
-        bounds, own = layouts.texel_starts[first : last + 1].tolist(), self.model_texels.tolist()
+        bounds = layouts.texel_starts[first : last + 1].tolist()
+        model_bounds = self.model_texels.tolist()
         agents = layouts.agent_textures[d] * self.agent_light[e, :, None]
         texels = layouts.texels[bounds[0] : bounds[-1]]
         walls = texels[:, :3] * texels[:, 3:]
         return (
             lines,
-            (*agents.split(_widths(own)), *walls.split(_widths(bounds))),
+            (*agents.split(_widths(model_bounds)), *walls.split(_widths(bounds))),
             layouts.lights[d].clone(),
         )
 
 
-def _same(name, what, wanted, given):
-    if wanted != given:
-        raise ValueError(f"{name} must have {what}, so {wanted}, but {given} were given")
+def _same(name, what, expected, actual):
+    if expected != actual:
+        raise ValueError(f"{name} must have {what}, so {expected}, but {actual} were given")
 
 
 def _widths(bounds):
@@ -238,7 +267,7 @@ def _widths(bounds):
 
 def _fixed(name, tensor):
     return ReadOnlyTensor(
-        tensor, f"{name} is read-only, because all else is laid out by it: make another Scenery"
+        tensor, f"{name} is read-only, because other tensors depend on it: make another Scenery"
     )
 
 
@@ -247,7 +276,7 @@ def _of_fixed_widths(name, vals, widths):
 
 
 def _starts(name, widths):
-    """(n + 1,) int32: where each subarray starts, and where the last ends."""
+    """(n + 1,) int32: the start of each subarray, and the end of the last one."""
     ends = widths.cumsum(0)
     if len(ends) and int(ends[-1]) >= 2**31:
         raise ValueError(

@@ -1,12 +1,12 @@
 """The state of an environment: every tensor and generator reachable from its attributes.
 
-:func:`state_tree` finds them by path, :func:`snapshot` copies them and :func:`restore` writes such
-a copy back in place. :mod:`~megastep.capture` does so around the recording of a CUDA graph. The
-checkpoints of a run do not hold it: they hold the learner, and a resumed run starts new episodes.
+:func:`state_tree` finds them by path, :func:`snapshot` copies them, and :func:`restore` writes such
+a copy back in place. :mod:`~megastep.capture` uses this while it records a CUDA graph. Checkpoints
+of a run do not hold an environment's state: a resumed run starts new episodes.
 """
 
 import ast
-import types
+import types as python_types
 from typing import Any
 
 import torch
@@ -19,11 +19,11 @@ State = dict[str, torch.Tensor]
 
 SCALARS = (bool, int, float, str, type(None))
 _LEAVES = (torch.Tensor, torch.Generator)
-_OPAQUE = (  # what has attributes, but no state of the environment in them
-    types.ModuleType,
-    types.FunctionType,
-    types.MethodType,
-    types.BuiltinFunctionType,
+_OPAQUE = (  # types whose attributes hold no state of an environment
+    python_types.ModuleType,
+    python_types.FunctionType,
+    python_types.MethodType,
+    python_types.BuiltinFunctionType,
     type,
     torch.dtype,
     torch.device,
@@ -31,7 +31,7 @@ _OPAQUE = (  # what has attributes, but no state of the environment in them
 
 
 def _children(node):
-    """(step of the path, child) of a node of the walk."""
+    """[(step of the path, child)] of a node."""
     if isinstance(node, dict):
         return [(f"[{key!r}]", child) for key, child in dict.items(node)]
     if isinstance(node, (list, tuple)):
@@ -45,26 +45,31 @@ def _children(node):
     return []
 
 
-def walk(root: Any, wanted: tuple[type, ...]) -> dict[str, tuple[Any, str, Any]]:
-    """{path: (parent, step, leaf)} of the leaves of types ``wanted`` below ``root``, each object
-    once. Paths read as attributes do, ``.core.agents.positions``; the step is their last part.
+def walk(root: Any, types: tuple[type, ...]) -> dict[str, tuple[Any, str, Any]]:
+    """Returns {path: (parent, step, leaf)} of the leaves below ``root`` that have one of these
+    python_types.
+
+    Paths read like attributes, ``.core.agents.positions``; ``step`` is a path's last part. An
+    object with children is visited once, by its first path.
     """
-    found, seen, stack = {}, set(), [("", None, "", root)]
+    leaves, visited, stack = {}, set(), [("", None, "", root)]
     while stack:
         path, parent, step, node = stack.pop()
-        if isinstance(node, wanted):
-            found[path] = (parent, step, node)
-        elif not isinstance(node, (*_OPAQUE, *SCALARS, *_LEAVES)) and id(node) not in seen:
-            seen.add(id(node))
+        if isinstance(node, types):
+            leaves[path] = (parent, step, node)
+        elif not isinstance(node, (*_OPAQUE, *SCALARS, *_LEAVES)) and id(node) not in visited:
+            visited.add(id(node))
             stack += [
                 (path + below, node, below, child) for below, child in reversed(_children(node))
             ]
-    return found
+    return leaves
 
 
 def rebind(parent: Any, step: str, leaf: Any) -> None:
-    """Makes ``leaf`` what a node's child at a ``step`` of :func:`walk` is. TypeError or
-    AttributeError if the node does not allow it.
+    """Replaces a node's child at a ``step`` of :func:`walk` by ``leaf``.
+
+    Raises:
+        TypeError, AttributeError: if the node does not allow it.
     """
     if isinstance(parent, tuple):
         raise TypeError("a tensor inside a tuple was replaced")
@@ -77,8 +82,9 @@ def rebind(parent: Any, step: str, leaf: Any) -> None:
 
 
 def state_tree(env: Any) -> dict[str, torch.Tensor | torch.Generator]:
-    """{path: tensor or generator} of everything in ``env`` that can change, so without its
-    read-only tensors.
+    """Returns {path: tensor or generator} of everything in ``env`` that can change.
+
+    Read-only tensors are left out.
     """
     return {
         path: leaf
@@ -88,7 +94,7 @@ def state_tree(env: Any) -> dict[str, torch.Tensor | torch.Generator]:
 
 
 def snapshot(env: Any) -> State:
-    """A copy of what :func:`state_tree` finds, for :func:`restore`."""
+    """Returns a copy of the state, for :func:`restore`."""
     return {
         path: leaf.detach().clone() if isinstance(leaf, torch.Tensor) else leaf.get_state()
         for path, leaf in state_tree(env).items()
@@ -97,8 +103,10 @@ def snapshot(env: Any) -> State:
 
 @torch.no_grad()
 def restore(env: Any, saved: State) -> None:
-    """Writes a :func:`snapshot` back, in place. ValueError, naming the first, if a leaf is missing
-    or differs in shape or dtype.
+    """Writes a :func:`snapshot` back, in place.
+
+    Raises:
+        ValueError: naming the first leaf that is missing or differs in shape or dtype.
     """
     tree = state_tree(env)
     missing = sorted(saved.keys() - tree.keys())

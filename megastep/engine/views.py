@@ -1,4 +1,4 @@
-"""Scenery as each environment sees it: read-only views that join its agents' part and its layout's.
+"""Scenery by environment: read-only views that join an environment's agents and its layout.
 
 N environments, A agents per environment, M lines of the agent model, K texels of one environment's
 agents, W walls of all layouts, L lines of all environments.
@@ -16,7 +16,7 @@ __all__ = ["JoinedRagged", "baked", "lights", "lines", "textures"]
 _SHARED = "which reaches every environment that shows the layout"
 LINES = (
     "scenery.lines is a read-only copy: write walls into scenery.layouts.lines, "
-    f"{_SHARED}, and call bake; agents' lines follow agents.positions when they are rendered"
+    f"{_SHARED}, and call bake; agents' lines follow agents.positions at each render"
 )
 LIGHTS = (
     "scenery.lights is a read-only copy: write into scenery.layouts.lights, "
@@ -28,27 +28,28 @@ TEXTURES = (
 )
 BAKED = (
     "scenery.baked is a read-only copy: write walls' light into scenery.layouts.baked, "
-    f"{_SHARED}; agents' light is calculated when they are rendered"
+    f"{_SHARED}; agents' light is computed at each render"
 )
 
 
 class JoinedRagged(RaggedTorch):
-    """A read-only Ragged whose subarrays join pieces of several tensors, made when looked at.
+    """A read-only Ragged whose subarrays join pieces of several tensors, computed when read.
 
-    Args: for each part its vals (V, ...) and where in them the pieces lie, ``starts`` (D,) and
-    ``widths`` (D,); the ``refusal`` to be raised where somebody writes into what was read.
+    Args:
+        refusal: message of the ValueError that a write raises.
+        parts: (vals (V, ...), starts (D,), widths (D,)) each: the tensor, and the pieces of it.
     """
 
     def __init__(self, refusal: str, *parts: tuple[torch.Tensor, torch.Tensor, torch.Tensor]):
-        self._sentence, self._parts = refusal, parts
+        self._message, self._parts = refusal, parts
         self.widths = self._guarded(sum(widths for _, _, widths in parts))
 
     def _guarded(self, tensor):
-        return ReadOnlyTensor(tensor, self._sentence)
+        return ReadOnlyTensor(tensor, self._message)
 
     @cached_property
     def vals(self) -> torch.Tensor:
-        """(V, ...) a copy of all subarrays, end to end."""
+        """(V, ...) a copy of all subarrays, concatenated."""
         vals, starts, widths = zip(*self._parts)
         lengths = torch.tensor([0, *map(len, vals)])
         starts = torch.stack([s + int(before) for s, before in zip(starts, lengths.cumsum(0))], 1)
@@ -66,8 +67,8 @@ class JoinedRagged(RaggedTorch):
 
     @cached_property
     def inverse(self) -> torch.Tensor:
-        each = torch.arange(len(self), device=self.device)
-        return self._guarded(torch.repeat_interleave(each, self.widths))
+        subarrays = torch.arange(len(self), device=self.device)
+        return self._guarded(torch.repeat_interleave(subarrays, self.widths))
 
     @property
     def device(self) -> torch.device:
@@ -75,22 +76,22 @@ class JoinedRagged(RaggedTorch):
 
     def __getitem__(self, index: int | slice) -> torch.Tensor | Ragged:
         if isinstance(index, slice):
-            chosen = range(len(self))[index]
-            pieces = [self[i] for i in chosen] or [self._parts[0][0][:0]]
+            indices = range(len(self))[index]
+            pieces = [self[i] for i in indices] or [self._parts[0][0][:0]]
             return Ragged(
-                self._guarded(torch.cat(pieces)), self._guarded(self.widths[list(chosen)])
+                self._guarded(torch.cat(pieces)), self._guarded(self.widths[list(indices)])
             )
         i = self._index(index)
         pieces = [vals[int(s[i]) : int(s[i]) + int(w[i])] for vals, s, w in self._parts]
         return self._guarded(torch.cat(pieces))
 
     def numpyify(self) -> RaggedNumpy:
-        """A copy on numpy arrays, to be written at will."""
+        """Returns a writable copy with numpy arrays."""
         return self.clone().numpyify()
 
 
 def _ranges(starts, widths):
-    """Indices of the ranges [start, start + width), end to end."""
+    """Indices of the ranges [start, start + width), concatenated."""
     offsets = widths.cumsum(0) - widths
     return torch.arange(int(widths.sum()), device=widths.device) + torch.repeat_interleave(
         starts - offsets, widths
@@ -98,7 +99,7 @@ def _ranges(starts, widths):
 
 
 def lines(scenery) -> JoinedRagged:
-    """Per environment, all its lines (l, 2, 2): the agents' first, as last rendered."""
+    """Returns the lines (l, 2, 2) of each environment: its agents' first, as last rendered."""
     layout, walls = scenery.layout.long(), scenery.layouts.lines
     n = scenery.agent_lines.shape[1]
     agents = torch.arange(scenery.n_envs, device=scenery.device) * n
@@ -110,30 +111,30 @@ def lines(scenery) -> JoinedRagged:
 
 
 def lights(scenery) -> JoinedRagged:
-    """Per environment, its lights (l, 3)."""
+    """Returns the lights (l, 3) of each environment."""
     layout, lights = scenery.layout.long(), scenery.layouts.lights
     return JoinedRagged(LIGHTS, (lights.vals, lights.starts[layout], lights.widths[layout]))
 
 
 def textures(scenery) -> JoinedRagged:
-    """Per line of all environments, its texels (w, 3)."""
+    """Returns the texels (w, 3) of each line of all environments."""
     agents = scenery.layouts.agent_textures
     starts = scenery.layout.long() * agents.shape[1]
     return _by_line(scenery, TEXTURES, agents.flatten(0, 1), starts, scenery.layouts.textures.vals)
 
 
 def baked(scenery) -> JoinedRagged:
-    """Per line of all environments, the light on its texels (w,)."""
+    """Returns the light (w,) on each line of all environments."""
     agents = scenery.agent_light
     starts = torch.arange(scenery.n_envs, device=scenery.device) * agents.shape[1]
     return _by_line(scenery, BAKED, agents.flatten(), starts, scenery.layouts.baked.vals)
 
 
 def _by_line(scenery, refusal, agents, agent_starts, texels):
-    """Texels by line: ``agents`` holds those of each environment from ``agent_starts`` (N,) on.
+    """Texels by line. ``agents`` holds those of environment e's agents from ``agent_starts[e]`` on.
 
-    A line is an agent's or a wall; its part of the other kind is the empty one that both tables
-    end in.
+    A line is an agent's or a wall. Its piece of the other tensor is empty: both tables end in an
+    empty entry for this purpose.
     """
     walls, wall_texels = scenery.layouts.lines, scenery.layouts.textures
     layout, bounds = scenery.layout.long(), scenery.model_texels.long()
@@ -147,11 +148,11 @@ def _by_line(scenery, refusal, agents, agent_starts, texels):
     )
     return JoinedRagged(
         refusal,
-        (agents, agent_starts[e] + bounds[agent_line], _ended(bounds.diff())[agent_line]),
-        (texels, _ended(wall_texels.starts)[wall], _ended(wall_texels.widths)[wall]),
+        (agents, agent_starts[e] + bounds[agent_line], _with_zero(bounds.diff())[agent_line]),
+        (texels, _with_zero(wall_texels.starts)[wall], _with_zero(wall_texels.widths)[wall]),
     )
 
 
-def _ended(table):
-    """A table with a zero at its end."""
+def _with_zero(table):
+    """A table with a zero appended."""
     return torch.cat([table, table.new_zeros(1)])

@@ -1,7 +1,4 @@
-"""Explorer: see as much of a home as you can.
-
-N environments of one agent, so N lanes.
-"""
+"""Explorer: see as much of a home as possible. N environments of one agent each, so B = N lanes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
@@ -11,31 +8,57 @@ from pydantic import Field
 
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
-from megastep.arrdict import arrdict, numpyify
+from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
+from megastep.envs.common import SceneryEnv
 from megastep.scene import scenery
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Explorer"]
 
 
-class Explorer:
-    """Reward for wall texels seen for the first time in an episode, / 64; what the first view shows
-    pays nothing.
+class Explorer(SceneryEnv):
+    """An agent explores a floor plan. New wall texels (5 cm each) that it sees are the reward.
 
-    Observation: RGB and depth of 64 pixels per camera, each the mean of 4 rays, and IMU, all fp16.
-    One camera looks ahead, 130 degrees wide. Seven actions, with momentum. Truncated when the
-    episode's length in steps reaches the number of texels seen, the first view's included, + 200.
-    Its metric is ``coverage``, the share seen of the texels that a look all round from some spawn
-    point can show.
+    Observation:
+        A dict of float16, W = ``res / subsample`` pixels (64) for each of C cameras (1).
 
-    Args: ``geometries`` to live in, generated homes by default; ``res`` rays and ``subsample`` rays
-    per pixel; ``fov`` degrees; ``cameras``, the yaw of each in degrees, 0 ahead and 90 left;
-    ``fps`` steps per second; ``patience`` steps; ``resample``: every episode in a home drawn anew,
-    instead of one home per environment for ever; ``privileged``: worlds also tell a critic how far
-    the episode is and where the texels are that can be seen from some spawn point and have not been
-    seen yet.
+        - ``rgb``: (B, 1, 3, C, W), linear light. A pixel is the mean of ``subsample`` rays.
+        - ``d``: (B, 1, 1, C, W), depth: 1 at the agent's edge, 0 at 10 m and beyond.
+        - ``imu``: (B, 1, 3), angular velocity / 360 deg/s, velocity forward and left / 10 m/s.
+
+    Actions:
+        (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
+        They accelerate the agent (:class:`~megastep.modules.MomentumMovement`).
+
+    Reward:
+        Number of texels seen for the first time this episode, divided by 64. The first observation
+        gives 0.
+
+    Episode end:
+        Truncated after ``patience`` + (texels seen) steps, so an agent that finds nothing new times
+        out. Texels of the first observation count. Never terminal.
+
+    Metrics:
+        ``coverage``: texels seen, divided by the texels that are visible from the spawn points.
+
+    Args:
+        n_envs: number of environments, N.
+        geometries: floor plans. Default: generated homes, at most 512.
+        seed: of textures, lights, spawns, and of the homes drawn by default.
+        device: where the tensors are. Default: a GPU if there is one.
+        res: rays per camera.
+        subsample: rays per pixel; divides ``res``.
+        fov: field of view of a camera, degrees.
+        cameras: yaw of each camera, degrees; 0 looks ahead, 90 left.
+        fps: steps per second of simulated time.
+        patience: an episode is truncated after this many steps plus the texels seen.
+        resample: if True, each episode takes place in a randomly drawn floor plan. Otherwise an
+            environment keeps its own.
+        privileged: if True, worlds have ``privileged`` for a critic: ``episode`` (B, 1, 4), steps
+            left and taken, texels seen and left; ``unseen`` (B, 1, 48), where around the agent the
+            visible texels lie that it has not seen yet.
     """
 
     n_agents = 1
@@ -93,11 +116,11 @@ class Explorer:
             )
 
     def reset(self) -> arrdict:
-        """Starts every episode anew. Returns a world."""
+        """Starts a new episode in every lane. Returns the first world."""
         return self._world(self.lifecycle.start_all())
 
     def step(self, decision: Mapping) -> arrdict:
-        """One step by ``decision.actions`` (B, 1). Returns a world."""
+        """Takes one step by ``decision["actions"]``, (B, 1). Returns a world."""
         self.movement(decision)
         return self._world(self.lifecycle.start_ended())
 
@@ -114,15 +137,18 @@ class Explorer:
         return world
 
     def _metrics(self, ends):
-        """``coverage`` (N,), of the episodes that end here."""
+        """``coverage`` (B,), of the episodes that end here."""
         ends = modules.to_agents(ends, self.n_agents)
-        shares = engine.coverage(self.core.scenery, self.core.agents, self.seen, self.visible, ends)
-        return arrdict(coverage=modules.to_lanes(shares))
+        coverage = engine.coverage(
+            self.core.scenery, self.core.agents, self.seen, self.visible, ends
+        )
+        return arrdict(coverage=modules.to_lanes(coverage))
 
     def _privileged(self):
-        """What only a critic sees, in units that make each number about 1: ``episode`` (N, 1, 4),
-        steps left and behind, texels seen and left; ``unseen`` (N, 1, 48), the root of how many are
-        left in each band and sector of ``engine.unseen``.
+        """Inputs of the critic, scaled to about 1.
+
+        ``episode`` (B, 1, 4): steps left and taken, texels seen and left. ``unseen`` (B, 1, 48):
+        square root of (unseen texels / 64) in each band and sector of ``engine.unseen``.
         """
         ages, limits = self.lifecycle.ages, self.lifecycle.limits
         counts = engine.unseen(self.core.scenery, self.core.agents, self.seen, self.visible)
@@ -130,39 +156,34 @@ class Explorer:
         columns = limits - ages, ages, self.n_seen, counts.sum((1, 2), dtype=torch.int32)
         return arrdict(
             episode=torch.stack(columns, -1)[:, None] / self.units,
-            # in double precision, as PyTorch's root of a float has other last bits on a CPU
+            # in double precision: the float square roots of CPU and GPU differ in the last bit
             unseen=(counts.double() / modules.TEXELS_PER_POINT).sqrt_().float(),
         )
 
     @property
     def n_seen(self) -> torch.Tensor:
-        """(N,) int32: texels seen in this episode."""
+        """(B,) int32: texels seen this episode."""
         return self.lifecycle.limits - self.patience
 
-    def _observation(self, **seen):
-        """The observation, and if ``seen`` is given how many texels were new (N,)."""
-        view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True, **seen)
+    def _observation(self, **bitmaps):
+        """Returns the observation and the number of newly seen texels, (B,) int32.
+
+        Without ``bitmaps`` (arguments ``seen`` and ``clear_mask`` of ``engine.observe``) the number
+        is None.
+        """
+        view = engine.observe(
+            self.core.scenery, self.core.agents, self.subsample, imu=True, **bitmaps
+        )
         per_camera = view.rgb.view(self.n_envs, 1, -1, 3, self.obs_space.rgb.W)
         obs = arrdict(
             rgb=per_camera.transpose(2, 3),
             d=view.depth.view(self.n_envs, *self.obs_space.d.shape),
             imu=view.imu,
         )
-        return obs, modules.to_lanes(view.newly_seen) if seen else None
-
-    def check(self) -> None:
-        """EngineError if the engine has flagged an error since the last check. Waits for the
-        device, so not for inside a step.
-        """
-        engine.check(self.core.agents)
-
-    @property
-    def layout(self) -> torch.Tensor:
-        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
-        return self.core.scenery.layout
+        return obs, modules.to_lanes(view.newly_seen) if bitmaps else None
 
     def state(self, e: int = 0) -> arrdict:
-        """What :meth:`plot_state` draws of environment ``e``."""
+        """Returns the tensors of environment ``e`` that :meth:`plot_state` draws."""
         return arrdict(
             core=self.core.state(e),
             obs=self._observation()[0][e],
@@ -172,9 +193,7 @@ class Explorer:
         )
 
     def _seen_texels(self, e):
-        """(T,) bool: which of the static texels of environment ``e`` have been seen in this
-        episode.
-        """
+        """(T,) bool: the wall texels of environment ``e`` that were seen this episode."""
         bits = (
             self.seen[e, 0, :, None] >> torch.arange(32, dtype=torch.int32, device=self.device) & 1
         )
@@ -184,8 +203,8 @@ class Explorer:
 
     @classmethod
     def plot_state(cls, state: arrdict) -> Any:
-        """A matplotlib figure of a numpyified :meth:`state`: the plan, bright where it has been
-        seen, and what the agent sees.
+        """Draws a numpyified :meth:`state`: the floor plan, bright where it was seen, above the
+        agent's images. Returns a matplotlib figure.
         """
         steps, n_texels = state.lifecycle.age[0], len(state.seen)
         title = f"step {steps}, {state.n_seen} of {n_texels} texels seen"
@@ -196,7 +215,3 @@ class Explorer:
         modules.RGB.plot_state(state.obs.rgb, strips[:1], yaws)
         modules.Depth.plot_state(state.obs.d, strips[1:], yaws)
         return figure
-
-    def display(self, e: int = 0) -> Any:
-        """Environment ``e`` as it is now, as a matplotlib figure."""
-        return self.plot_state(numpyify(self.state(e)))

@@ -1,7 +1,4 @@
-"""Minimal: an agent that moves and sees. Nothing is rewarded; episodes end at a random lifespan.
-
-N environments of one agent, so N lanes.
-"""
+"""Minimal: an agent that moves and sees. N environments of one agent each, so B = N lanes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
@@ -10,20 +7,44 @@ import torch
 from pydantic import Field
 
 from megastep import engine, modules, plotting, toys
-from megastep.arrdict import arrdict, numpyify
+from megastep.arrdict import arrdict
 from megastep.core import Core
+from megastep.envs.common import SceneryEnv
 from megastep.scene import scenery
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Minimal"]
 
 
-class Minimal:
-    """The environment to start others from: RGB of 64 pixels, seven actions, no reward, truncated
-    after a random 128 to 256 steps.
+class Minimal(SceneryEnv):
+    """An agent moves through a floor plan and is never rewarded: a template for other environments.
 
-    Args: ``geometries`` to live in, boxes by default; ``res`` rays; ``fov`` degrees; ``fps`` steps
-    per second; ``shortest`` and ``longest`` lifespan in steps.
+    Observation:
+        (B, 1, 3, 1, ``res``) float16: the RGB image of one camera, linear light.
+
+    Actions:
+        (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
+        They set the velocity for one step (:class:`~megastep.modules.SimpleMovement`).
+
+    Reward:
+        Always 0.
+
+    Episode end:
+        Truncated after a random number of steps from ``shortest`` to ``longest``. Never terminal.
+
+    Metrics:
+        None.
+
+    Args:
+        n_envs: number of environments, N.
+        geometries: floor plans. Default: a box of 5 m x 5 m.
+        seed: of textures, lights, spawns and lifespans.
+        device: where the tensors are. Default: a GPU if there is one.
+        res: rays of the camera, one per pixel.
+        fov: field of view, degrees.
+        fps: steps per second of simulated time.
+        shortest: minimum lifespan, steps.
+        longest: maximum lifespan, steps.
     """
 
     n_agents = 1
@@ -61,11 +82,11 @@ class Minimal:
         self._reward = torch.zeros(n_envs, device=self.device)
 
     def reset(self) -> arrdict:
-        """Starts every episode anew. Returns a world."""
+        """Starts a new episode in every lane. Returns the first world."""
         return self._world(self.lifecycle.start_all())
 
     def step(self, decision: Mapping) -> arrdict:
-        """One step by ``decision.actions`` (B, 1). Returns a world."""
+        """Takes one step by ``decision["actions"]``, (B, 1). Returns a world."""
         self.movement(decision)
         return self._world(self.lifecycle.start_ended())
 
@@ -77,32 +98,20 @@ class Minimal:
         view = engine.observe(self.core.scenery, self.core.agents, depth=False)
         return view.rgb.view(self.n_envs, *self.obs_space.shape)
 
-    def check(self) -> None:
-        """EngineError if the engine has flagged an error since the last check. Waits for the
-        device, so not for inside a step.
-        """
-        engine.check(self.core.agents)
-
-    @property
-    def layout(self) -> torch.Tensor:
-        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
-        return self.core.scenery.layout
-
     def state(self, e: int = 0) -> arrdict:
-        """What :meth:`plot_state` draws of environment ``e``."""
+        """Returns the tensors of environment ``e`` that :meth:`plot_state` draws."""
         return arrdict(
             core=self.core.state(e), rgb=self._rgb()[e], lifecycle=self.lifecycle.state(e)
         )
 
     @classmethod
     def plot_state(cls, state: arrdict) -> Any:
-        """A matplotlib figure of a numpyified :meth:`state`: the plan, and what the agent sees."""
-        life = state.lifecycle
-        figure, plan, strips = plotting.panels(1, title=f"step {life.age[0]} of {life.limit[0]}")
+        """Draws a numpyified :meth:`state`: the floor plan above the agent's image. Returns a
+        matplotlib figure.
+        """
+        lifecycle = state.lifecycle
+        title = f"step {lifecycle.age[0]} of {lifecycle.limit[0]}"
+        figure, plan, strips = plotting.panels(1, title=title)
         Core.plot_state(state.core, plan)
         modules.RGB.plot_state(state.rgb, strips)
         return figure
-
-    def display(self, e: int = 0) -> Any:
-        """Environment ``e`` as it is now, as a matplotlib figure."""
-        return self.plot_state(numpyify(self.state(e)))

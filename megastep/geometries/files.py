@@ -1,9 +1,8 @@
-"""Lists of geometries as one `.npz` file: arrays `<i>/walls`, `lights`, `masks`, `res`, `id` for i
-= 0, 1, ...
+"""Lists of geometries in an `.npz` file: arrays `<i>/walls`, `lights`, `masks`, `res` and `id` for
+i = 0, 1, ...
 
-A file may come from anyone, so nothing in it is believed: sizes are checked before anything is
-unpacked, nothing is written to disk, pickled objects are refused, and every error is a ValueError
-of one sentence naming file and geometry.
+Files may come from strangers. Sizes are checked before anything is unpacked, nothing is written to
+disk, pickled objects are refused, and every error is a ValueError that names file and geometry.
 """
 
 import functools
@@ -26,13 +25,14 @@ from megastep.dotdict import dotdict
 
 KEYS = ("walls", "lights", "masks", "res", "id")
 MAX_GEOMETRIES = 16_384
-# Bytes of the zip's table of contents: five entries for each of the most geometries.
+# Bytes of the zip's table of contents: five entries for each of MAX_GEOMETRIES.
 MAX_DIRECTORY = 8 << 20
-# Bytes of all arrays; twice that once masks are int16, so under 500 MB with Python itself.
+# Bytes of all arrays. Masks become int16, so a load takes less than 500 MB with Python itself.
 MAX_UNPACKED = 96 << 20
-MAX_ARRAY = 32 << 20  # bytes of one array: the most cells in the widest type
-MAX_HEADER = 1_024  # bytes of an array's own header, which is parsed as Python; numpy writes 118
+MAX_ARRAY = 32 << 20  # bytes of one array: the maximum of cells in the widest dtype
+MAX_HEADER = 1_024  # bytes of an array's header, which is parsed as Python; numpy writes 118
 
+# What zipfile and numpy raise for broken files. The last four come from parsing an array's header.
 UNREADABLE = (
     ValueError,
     EOFError,
@@ -44,64 +44,66 @@ UNREADABLE = (
     tokenize.TokenError,
     RecursionError,
     MemoryError,
-)  # these by way of an array's header
+)
 NAME = re.compile(r"(0|[1-9][0-9]{0,5})/([A-Za-z_][A-Za-z0-9_]{0,63})\.npy")
 
 
-def _opened(path):
-    """The zip file at `path`, its table of contents no larger than we are willing to read."""
+def _open(path):
+    """Opens a zip file. Raises ValueError if its table of contents exceeds MAX_DIRECTORY."""
     size = path.stat().st_size
     with path.open("rb") as file:
         file.seek(max(0, size - (22 + 65_535)))  # the end record and the longest comment after it
         tail = file.read()
     at = tail.rfind(b"PK\5\6")
     if at < 0 or len(tail) < at + 22:
-        raise ValueError("is not an .npz file, or it is cut short")
+        raise ValueError("is not an .npz file, or is cut short")
     (directory,) = struct.unpack_from("<I", tail, at + 12)
     if directory > MAX_DIRECTORY:
         raise ValueError(
-            f"lists more arrays than {MAX_GEOMETRIES:,} geometries have, which is the limit"
+            f"lists more arrays than {MAX_GEOMETRIES:,} geometries have, which are the limit"
         )
     return zipfile.ZipFile(path)
 
 
 def _contents(archive):
-    """{geometry index: {key: zip entry}} of an archive that holds the indices from 0 up and nothing
-    else.
+    """Returns {geometry index: {key: zip entry}}.
+
+    Raises ValueError unless the archive holds the indices from 0 up, nothing else, and respects the
+    limits at the head of this file.
     """
-    found = {}
+    contents = {}
     for entry in archive.infolist():
         match = NAME.fullmatch(entry.filename)
         if not match:
             raise ValueError(
-                f"holds {entry.filename[:80]!r}, and only '<number>/<name>.npy' is expected"
+                f"holds {entry.filename[:80]!r}, but only '<number>/<name>.npy' is allowed"
             )
-        if match[2] in found.setdefault(int(match[1]), {}):
+        if match[2] in contents.setdefault(int(match[1]), {}):
             raise ValueError(f"holds {entry.filename!r} twice")
-        found[int(match[1])][match[2]] = entry
-    if not found:
+        contents[int(match[1])][match[2]] = entry
+    if not contents:
         raise ValueError("holds no geometry")
-    if len(found) > MAX_GEOMETRIES:
-        raise ValueError(f"holds {len(found):,} geometries, and the limit is {MAX_GEOMETRIES:,}")
-    for entries in found.values():
-        for entry in entries.values():
-            if entry.file_size > MAX_ARRAY:
-                size = f"{entry.file_size:,} bytes"
-                raise ValueError(
-                    f"holds {entry.filename!r} of {size}, and the limit is {MAX_ARRAY:,}"
-                )
-    unpacked = sum(entry.file_size for entries in found.values() for entry in entries.values())
+    if len(contents) > MAX_GEOMETRIES:
+        raise ValueError(f"holds {len(contents):,} geometries, but the limit is {MAX_GEOMETRIES:,}")
+    entries = [entry for by_key in contents.values() for entry in by_key.values()]
+    for entry in entries:
+        if entry.file_size > MAX_ARRAY:
+            raise ValueError(
+                f"holds {entry.filename!r} of {entry.file_size:,} bytes, but the limit is "
+                f"{MAX_ARRAY:,}"
+            )
+    unpacked = sum(entry.file_size for entry in entries)
     if unpacked > MAX_UNPACKED:
-        raise ValueError(f"unpacks to {unpacked:,} bytes, and the limit is {MAX_UNPACKED:,}")
-    if sorted(found) != list(range(len(found))):
-        missing = min(set(range(len(found))) - set(found))
-        raise ValueError(f"numbers its geometries with a gap: {missing} is missing")
-    return found
+        raise ValueError(f"unpacks to {unpacked:,} bytes, but the limit is {MAX_UNPACKED:,}")
+    if sorted(contents) != list(range(len(contents))):
+        missing = min(set(range(len(contents))) - set(contents))
+        raise ValueError(f"must number its geometries from 0 up, but {missing} is missing")
+    return contents
 
 
-@functools.lru_cache(maxsize=1024)  # the arrays of a file have few different ones
-def _header(start):
-    """(shape, fortran order, dtype) from the first bytes of an array's file."""
+@functools.lru_cache(maxsize=1024)  # a file has few different headers
+def _read_header(start):
+    """Returns (shape, fortran order, dtype) from the first bytes of an array's file."""
     file = io.BytesIO(start)
     version = np.lib.format.read_magic(file)
     reader = {
@@ -109,87 +111,86 @@ def _header(start):
         (2, 0): np.lib.format.read_array_header_2_0,
     }.get(version)
     if reader is None:
-        raise ValueError(f"has an array format {version} that is not known")
+        raise ValueError(f"has an unknown array format, version {version}")
     return reader(file, max_header_size=MAX_HEADER)
 
 
-def _array(archive, entry):
-    """The array of one zip entry, refused when its header promises other than the entry holds."""
+def _read_array(archive, entry):
+    """Returns the array of a zip entry. Raises ValueError if its header contradicts its size."""
     if entry.flag_bits & 1:
         raise ValueError("is encrypted")
     content = archive.read(entry)
-    counts = slice(8, 12 if content[6:7] == b"\2" else 10)  # where the header's length stands
-    offset = counts.stop + int.from_bytes(content[counts], "little")
-    shape, fortran, dtype = _header(content[: min(offset, 1 << 16)])
+    length = slice(8, 12 if content[6:7] == b"\2" else 10)  # the bytes of the header's length
+    offset = length.stop + int.from_bytes(content[length], "little")
+    shape, fortran, dtype = _read_header(content[: min(offset, 1 << 16)])
     if dtype.hasobject:
         raise ValueError("is a pickled object, which is never loaded")
     if dtype.kind not in "fiub":
         raise ValueError(f"is of dtype {dtype}, which is not a number")
-    held = entry.file_size - offset
-    if prod(shape) * dtype.itemsize != held:
-        raise ValueError(f"claims shape {shape} of {dtype} but holds {held:,} bytes")
+    n_bytes = entry.file_size - offset
+    if prod(shape) * dtype.itemsize != n_bytes:
+        raise ValueError(f"claims shape {shape} of {dtype} but holds {n_bytes:,} bytes")
     values = np.frombuffer(content, dtype, offset=offset)
     return values.reshape(shape, order="F" if fortran else "C")
 
 
-def _geometry(archive, entries):
+def _read_geometry(archive, entries):
     g = dotdict()
     for key, entry in sorted(entries.items()):
         try:
-            g[key] = _array(archive, entry)
+            g[key] = _read_array(archive, entry)
         except UNREADABLE as error:
             raise ValueError(f"{key!r} cannot be read: {_clause(error)}") from error
-    return geometry.checked(g)
+    return geometry.validate_geometry(g)
 
 
 def _clause(error):
+    """The first line of an error's message, to be put into a sentence."""
     return str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
 
 
 def load(path: str | Path) -> list[dotdict]:
-    """The list of geometries in the `.npz` file at `path`; walls of no length are dropped.
+    """Returns the list of geometries in an `.npz` file. Walls of length 0 are dropped.
 
-    Raises ValueError, one sentence with the file, the geometry and what is allowed, for a file that
-    is missing, broken, too large or holds what `geometry.checked` refuses.
+    Raises:
+        ValueError: if the file is missing, broken or too large, or if `validate_geometry` refuses a
+            geometry. The message names the file and the geometry.
     """
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"There is no geometry file {str(path)!r}; give the path of an .npz file.")
-    where = ""
+        raise ValueError(f"There is no geometry file {str(path)!r}. Set path to an .npz file.")
+    place = ""
     try:
-        with _opened(path) as archive:
-            result = []
+        with _open(path) as archive:
+            geometries = []
             for index, entries in sorted(_contents(archive).items()):
-                where = f", geometry {index}"
-                result.append(_geometry(archive, entries))
-            return result
+                place = f", geometry {index}"
+                geometries.append(_read_geometry(archive, entries))
+            return geometries
     except UNREADABLE as error:
-        raise ValueError(f"Geometry file {str(path)!r}{where}: {_clause(error)}.") from error
+        raise ValueError(f"Geometry file {str(path)!r}{place}: {_clause(error)}.") from error
 
 
 def save(path: str | Path, geometries: Sequence[dict]) -> None:
-    """Writes a list of geometries to `path` as `.npz`, all or nothing; of further keys those that
-    are numbers.
+    """Writes a list of geometries to an `.npz` file, atomically. Further keys are written if they
+    are numbers or arrays of numbers.
 
-    Raises ValueError, naming the geometry, for what `load` would refuse.
+    Raises:
+        ValueError: if `load` would refuse a geometry. The message names it.
     """
     path, arrays = Path(path), {}
     if not 0 < len(geometries) <= MAX_GEOMETRIES:
         raise ValueError(
-            f"{len(geometries):,} geometries cannot be saved: take 1 to {MAX_GEOMETRIES:,}."
+            f"{len(geometries):,} geometries cannot be saved: give from 1 to {MAX_GEOMETRIES:,}."
         )
     for index, g in enumerate(geometries):
         try:
-            g = geometry.checked(g)
+            g = geometry.validate_geometry(g)
         except ValueError as error:
             raise ValueError(f"Geometry {index} cannot be saved: {error}.") from error
-        arrays.update(
-            {
-                f"{index}/{key}": np.asarray(value)
-                for key, value in g.items()
-                if key in KEYS or np.asarray(value).dtype.kind in "fiub"
-            }
-        )
+        for key, value in g.items():
+            if key in KEYS or np.asarray(value).dtype.kind in "fiub":
+                arrays[f"{index}/{key}"] = np.asarray(value)
     handle, partial = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -1,11 +1,13 @@
 """Mazes: square grids of cells, joined by openings as wide as the corridors.
 
-A perfect maze has one way between any two cells. It is a spanning tree of its grid, drawn by
-Wilson's algorithm ("Generating random spanning trees more quickly than the cover time", STOC 1996),
-so all perfect mazes of a size are equally likely. A braided one has dead ends opened, which makes
-loops. A seed gives the same bytes on every machine (see `homes.random_stream`).
+A perfect maze has exactly one path between any two cells: it is a spanning tree of the grid. Trees
+are drawn by Wilson's algorithm ("Generating random spanning trees more quickly than the cover
+time", STOC 1996), so all perfect mazes of a size are equally likely. A braided maze has some dead
+ends opened, which makes loops. A seed gives the same bytes on every machine
+(:mod:`~megastep.geometries.homes.portable_generator`).
 
-Lengths here are in millimetres; a cell is the number row * size + column, row 0 at the bottom.
+Lengths in this file are in millimetres. A cell is the number row * size + column, with row 0 at the
+bottom.
 """
 
 import functools
@@ -17,41 +19,41 @@ from megastep.dotdict import dotdict
 from megastep.geometries.homes.portable_generator import PortableGenerator
 from megastep.geometries.homes.walls import INDOORS, WALL, segments
 
-COUNT = 5_000  # mazes of each kind, those of seeds 0 to 4,999; as many as there are homes
-# Metres; an agent's disc and 5 cm on either side of it are 0.312 m wide, and where it spawns is a
-# strip between those.
+COUNT = 5_000  # mazes per kind, of seeds 0 to 4,999; as many as homes
+# Metres. An agent's disc with 5 cm on either side is 0.312 m wide; it needs a strip to spawn in.
 MIN_CORRIDOR = 0.32
-START = 1_000  # mm; about where a maze begins
-LIT = 3_000  # mm; walking so far, or two cells, from any cell there is a light
-# Of memory per metre of wall, that is 20 texels, while an environment is made of it: Explorer takes
-# 1,540 on a CPU.
+START = 1_000  # mm; about where the lower-left corner is
+LIT = 3_000  # mm; a light is at most this walk, or two cells, from any cell
+# Memory per metre of wall (20 texels) while an environment is made. Explorer takes 1,540 on a CPU.
 BYTES_PER_METRE = 2_000
 
 
-def checked(size: int, corridor: float, thickness: float) -> tuple[int, int]:
-    """Corridor and thickness, given in metres, in mm. ValueError if agents or geometries could not
-    be that small or large.
+def validate_lengths(size: int, corridor: float, thickness: float) -> tuple[int, int]:
+    """Returns (corridor, thickness) in mm, given in metres.
+
+    Raises:
+        ValueError: if the maze would be too small or too large, or a corridor too narrow.
     """
     if size < 2:
-        raise ValueError(f"size={size} cells are no maze: take 2 or more")
+        raise ValueError(f"size={size}: a maze needs at least 2 x 2 cells")
     if corridor < MIN_CORRIDOR:
         raise ValueError(
-            f"corridor={corridor:g} m is too narrow for an agent: take {MIN_CORRIDOR:g} or more"
+            f"corridor={corridor:g} m is too narrow for an agent: take at least {MIN_CORRIDOR:g}"
         )
     wide, thick = round(1000 * corridor), round(1000 * thickness)
     reach = (START + size * (wide + thick)) / 1000 + 1  # rounding to cells adds less than a metre
     if reach > geometry.MAX_EXTENT:
         raise ValueError(
-            f"a maze of {size} x {size} cells, {corridor:g} m wide between walls of {thickness:g} "
-            f"m, is too large: it reaches {reach:g} m, and {geometry.MAX_EXTENT:g} m is the limit"
+            f"a maze of size={size}, corridor={corridor:g}, thickness={thickness:g} is too large: "
+            f"it reaches {reach:g} m, but the limit is {geometry.MAX_EXTENT:g} m"
         )
     return wide, thick
 
 
 def bytes_each(size: int, corridor: float, thickness: float) -> float:
-    """How much memory a maze takes at most: its masks, its walls, and the scenery made of them."""
-    wider = thickness > corridor  # then an opening adds more wall than it takes
-    n_openings = 2 * size * (size - 1) if wider else size * size - 1
+    """Returns the maximum memory of a maze: its masks, walls, and the scenery made of them."""
+    openings_add_wall = thickness > corridor
+    n_openings = 2 * size * (size - 1) if openings_add_wall else size * size - 1
     metres = 4 * size * size * corridor + 2 * n_openings * (thickness - corridor)
     pixels = (size * ((corridor + thickness) / geometry.RES + 1) + 15) ** 2
     return BYTES_PER_METRE * metres + 2 * pixels
@@ -59,7 +61,7 @@ def bytes_each(size: int, corridor: float, thickness: float) -> float:
 
 @functools.lru_cache(maxsize=8)
 def _neighbours(size):
-    """The cells beside each cell, walls or not."""
+    """Returns the neighbours of each cell, whether or not a wall is between."""
     return [
         [
             row * size + column
@@ -71,24 +73,24 @@ def _neighbours(size):
     ]
 
 
-def passages(size: int, braid: float, stream: PortableGenerator) -> list[list[int]]:
-    """The cells that each cell opens to. Of the dead ends the share `braid` is opened, each to a
-    random neighbour.
+def passages(size: int, braid: float, generator: PortableGenerator) -> list[list[int]]:
+    """Returns the cells that each cell opens to. The fraction `braid` of the dead ends is opened,
+    each to a random neighbour.
     """
-    around = _neighbours(size)
-    opened = [[] for _ in around]
+    neighbours = _neighbours(size)
+    opened = [[] for _ in neighbours]
 
     def join(a, b):
         opened[a].append(b)
         opened[b].append(a)
 
-    in_tree = [False] * len(around)
-    in_tree[stream.below(len(around))] = True
-    for start in range(len(around)):
-        # A random walk to the tree. Its last exit from each cell leads there without loops.
+    in_tree = [False] * len(neighbours)
+    in_tree[generator.below(len(neighbours))] = True
+    for start in range(len(neighbours)):
+        # A random walk to the tree. The last exit from each cell gives the walk without loops.
         exits, cell = {}, start
         while not in_tree[cell]:
-            exits[cell] = around[cell][stream.below(len(around[cell]))]
+            exits[cell] = neighbours[cell][generator.below(len(neighbours[cell]))]
             cell = exits[cell]
         cell = start
         while not in_tree[cell]:
@@ -96,49 +98,51 @@ def passages(size: int, braid: float, stream: PortableGenerator) -> list[list[in
             join(cell, exits[cell])
             cell = exits[cell]
 
-    dead_ends = [cell for cell, others in enumerate(opened) if len(others) == 1]
+    dead_ends = [cell for cell, exits in enumerate(opened) if len(exits) == 1]
     for k in range(int(braid * len(dead_ends) + 0.5)):
-        at = k + stream.below(len(dead_ends) - k)
+        at = k + generator.below(len(dead_ends) - k)
         dead_ends[k], dead_ends[at] = dead_ends[at], dead_ends[k]
         cell = dead_ends[k]
-        if len(opened[cell]) == 1:  # or a neighbour has been opened to it
-            closed = [other for other in around[cell] if other not in opened[cell]]
-            join(cell, closed[stream.below(len(closed))])
+        if len(opened[cell]) == 1:  # False if a neighbour was opened to it before
+            closed = [beside for beside in neighbours[cell] if beside not in opened[cell]]
+            join(cell, closed[generator.below(len(closed))])
     return opened
 
 
 def lit_cells(opened: list[list[int]], reach: int) -> list[int]:
-    """Few cells from which every cell is at most `reach` steps away.
+    """Returns few cells such that every cell is at most `reach` steps from one of them.
 
-    Of the cells that no light reaches yet, the one furthest from cell 0 gets a light, `reach` steps
-    nearer to cell 0. In a perfect maze fewer lights would not do.
+    Repeats: take the cell furthest from cell 0 that no light reaches, and put a light `reach` steps
+    nearer to cell 0. In a perfect maze this gives the minimum number of lights.
     """
-    before, order = {0: 0}, [0]
+    parents, order = {0: 0}, [0]
     for cell in order:
-        for other in opened[cell]:
-            if other not in before:
-                before[other] = cell
-                order.append(other)
-    chosen, reached = [], set()
+        for neighbour in opened[cell]:
+            if neighbour not in parents:
+                parents[neighbour] = cell
+                order.append(neighbour)
+    lit, reached = [], set()
     for cell in reversed(order):
         if cell in reached:
             continue
         for _ in range(reach):
-            cell = before[cell]
-        chosen.append(cell)
+            cell = parents[cell]
+        lit.append(cell)
         ring = near = {cell}
         for _ in range(reach):
-            ring = {other for cell in ring for other in opened[cell]} - near
+            ring = {neighbour for cell in ring for neighbour in opened[cell]} - near
             near = near | ring
         reached |= near
-    return sorted(chosen)
+    return sorted(lit)
 
 
-def _painted(size, opened):
-    """(2 size + 1, 2 size + 1) states of walls and corridors, in turn, row 0 at the bottom."""
+def _paint(size, opened):
+    """Returns a grid of the states WALL and INDOORS, (2 size + 1, 2 size + 1), in which wall and
+    corridor lines alternate. Row 0 is at the bottom.
+    """
     grid = np.full((2 * size + 1, 2 * size + 1), WALL, np.int8)
     grid[1::2, 1::2] = INDOORS
-    pairs = [(a, b) for a, others in enumerate(opened) for b in others if a < b]
+    pairs = [(a, b) for a, exits in enumerate(opened) for b in exits if a < b]
     a, b = np.array(pairs).T
     grid[a // size + b // size + 1, a % size + b % size + 1] = INDOORS
     return grid
@@ -147,17 +151,23 @@ def _painted(size, opened):
 def generate(
     seed: int, size: int = 8, corridor: float = 1.0, thickness: float = 0.2, braid: float = 0.0
 ) -> dotdict:
-    """The maze of a seed, any integer: `size` x `size` cells, `corridor` metres wide between walls
-    `thickness` metres thick, both to a millimetre, with the share `braid` of its dead ends opened.
+    """Returns the maze of a seed: a geometry of one room.
 
-    A geometry of one room. Walls are the faces that can be seen from inside, each as long as it is
-    straight. A cell of the masks is at most 0.2 m wide, and one in each row and column of them lies
-    in the middle of each corridor, so that corridors of any width are connected there.
+    Walls are the faces that are visible from inside, each as long as it is straight. A cell of the
+    masks is at most 0.2 m wide. One row or column of cells runs along the middle of each corridor,
+    so the masks of corridors of any width are connected.
+
+    Args:
+        seed: any integer.
+        size: cells per side.
+        corridor: width in metres, rounded to a millimetre.
+        thickness: of the walls in metres, rounded to a millimetre.
+        braid: fraction of the dead ends that is opened.
     """
-    wide, thick = checked(size, corridor, thickness)
+    wide, thick = validate_lengths(size, corridor, thickness)
     pitch = wide + thick
     opened = passages(size, braid, PortableGenerator(seed))
-    grid = _painted(size, opened)
+    grid = _paint(size, opened)
     lines = np.cumsum([0] + [thick, wide] * size + [thick])
 
     per_cell = -(-pitch // round(1000 * geometry.RES))

@@ -1,5 +1,6 @@
-"""The sources of geometries, each a function `(n, split, seed, **options) -> list`; settings of a
-run are their arguments.
+"""The sources of geometries: functions `(n, split, seed, **options) -> list`.
+
+Their arguments are the settings of a run's `geometry`.
 """
 
 import functools
@@ -23,8 +24,8 @@ BENCH = Path(__file__).parent / "data" / "bench_homes.npz"
 
 
 def _split_range(count, split):
-    """The range of a database of `count` geometries that `split` holds; a single one is in every
-    split.
+    """Returns the indices of a split, as a range into a database of `count` geometries. A single
+    geometry is in every split.
     """
     training = count - max(1, round(count / 10)) if count > 1 else 1
     return {
@@ -34,50 +35,49 @@ def _split_range(count, split):
     }[split]
 
 
-def _selected(count, n, split, seed):
-    """n indices into a database of `count`: the split in an order drawn from `seed`, over and
-    over.
-    """
+def _draw_indices(count, n, split, seed):
+    """Returns n indices into a database of `count`: a random permutation of the split, repeated."""
     members = _split_range(count, split)
-    order = np.random.RandomState(seed % 2**32).permutation(
-        len(members)
-    )  # a stream numpy promises never to change
+    random = np.random.RandomState(seed % 2**32)  # numpy never changes what it draws
+    order = random.permutation(len(members))
     return [members[order[i % len(members)]] for i in range(n)]
 
 
 def box(n: Count = 1, split: str = "training", seed: Seed = 1, width: float = 5.0) -> list[dotdict]:
-    """One empty square room, `width` metres wide, n times."""
+    """Returns one empty square room, `width` metres wide, n times."""
     return [toys.box(width)] * n
 
 
 def column(
     n: Count = 1, split: str = "training", seed: Seed = 1, width: float = 5.0, pillar: float = 1.0
 ) -> list[dotdict]:
-    """One square room with a square column of `pillar` metres in its middle, n times."""
+    """Returns one square room with a pillar, `pillar` metres wide, in its middle, n times."""
     return [toys.column(width, pillar)] * n
 
 
 @functools.lru_cache(maxsize=2)
-def _loaded(path, changed):
+def _load(path, modified):
     return npz.load(path)
 
 
 def files(n: Count = 512, split: str = "training", seed: Seed = 1, *, path: str) -> list[dotdict]:
-    """From the `.npz` file at `path`; the last tenth of it is the test split."""
+    """Returns geometries from the `.npz` file at `path`. The last tenth of it is the test split."""
     path = Path(path)
-    database = _loaded(path, path.stat().st_mtime_ns if path.exists() else 0)
-    return [database[i] for i in _selected(len(database), n, split, seed)]
+    database = _load(path, path.stat().st_mtime_ns if path.exists() else 0)
+    return [database[i] for i in _draw_indices(len(database), n, split, seed)]
 
 
 def homes(
     n: Count = 512, split: str = "training", seed: Seed = 1, outer: bool = True
 ) -> list[dotdict]:
-    """From the 5,000 homes; without the outer face of their envelopes if not `outer`."""
-    return [database.home(index, outer) for index in _selected(database.COUNT, n, split, seed)]
+    """Returns homes from the 5,000 of the package. With `outer=False` they lack the outer faces of
+    outer walls, which cannot be seen from inside.
+    """
+    return [database.home(i, outer) for i in _draw_indices(database.COUNT, n, split, seed)]
 
 
 def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdict]:
-    """The 512 dense homes every benchmark runs on."""
+    """Returns homes from the 512 dense ones on which the benchmarks run."""
     return files(n, split, seed, path=BENCH)
 
 
@@ -91,15 +91,17 @@ def maze(
     thickness: Annotated[float, Field(ge=0.02, le=100)] = 0.2,
     braid: Annotated[float, Field(ge=0, le=1)] = 0.0,
 ) -> list[dotdict]:
-    """From 5,000 mazes of `size` x `size` cells, `corridor` metres wide between walls of
-    `thickness`, with the share `braid` of their dead ends opened.
-    """
-    from megastep.engine.devices import fit  # brings PyTorch, without which settings are read
+    """Returns mazes of `size` x `size` cells from 5,000 of them.
 
-    mazes.checked(size, corridor, thickness)
-    indices = _selected(mazes.COUNT, n, split, seed)
-    different = dict.fromkeys(indices)
+    Corridors are `corridor` metres wide between walls of `thickness` metres. The fraction `braid`
+    of the dead ends is opened.
+    """
+    from megastep.engine.devices import fit  # imports PyTorch, which reading settings must not
+
+    mazes.validate_lengths(size, corridor, thickness)
+    indices = _draw_indices(mazes.COUNT, n, split, seed)
+    unique = dict.fromkeys(indices)
     what = f"mazes of {size} x {size} cells"
-    fit(len(different), mazes.bytes_each(size, corridor, thickness), "cpu", what)
-    made = {i: mazes.generate(i, size, corridor, thickness, braid) for i in different}
-    return [made[i] for i in indices]
+    fit(len(unique), mazes.bytes_each(size, corridor, thickness), "cpu", what)
+    generated = {i: mazes.generate(i, size, corridor, thickness, braid) for i in unique}
+    return [generated[i] for i in indices]

@@ -1,4 +1,4 @@
-"""Geometries small enough to know by heart."""
+"""Toy geometries: a box, and a box with a pillar."""
 
 from numbers import Real
 
@@ -7,18 +7,18 @@ import numpy as np
 from megastep import geometry
 from megastep.dotdict import dotdict
 
-CORNER = 1.0  # metres; where the lower-left corner of every toy is
+CORNER = 1.0  # metres; x and y of the lower-left corner of every toy
 
 
 def _square(left, width):
-    """The corners, (4, 2) anticlockwise, of a square from (left, left) to (left + width, left +
-    width).
+    """Returns the corners, (4, 2) anticlockwise, of a square with its lower-left corner at
+    (left, left).
     """
     return left + width * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
 def _loop(corners):
-    """The walls (P, 2, 2) between successive corners (P, 2), the last and the first included."""
+    """Returns the walls (P, 2, 2) of a closed loop of corners (P, 2)."""
     return np.stack([corners, np.roll(corners, -1, 0)], 1)
 
 
@@ -33,31 +33,29 @@ def _toy(rings, lights):
     )
 
 
-def _checked_width(width, minimum):
-    if not isinstance(width, Real) or not minimum <= width <= geometry.MAX_EXTENT - CORNER:
-        raise ValueError(
-            f"width={width!r} m is not allowed: take {minimum:g} to "
-            f"{geometry.MAX_EXTENT - CORNER:g}"
-        )
+def _validate_width(width, minimum):
+    maximum = geometry.MAX_EXTENT - CORNER
+    if not isinstance(width, Real) or not minimum <= width <= maximum:
+        raise ValueError(f"width={width!r} must be from {minimum:g} to {maximum:g} m")
 
 
 def box(width: float = 5) -> dotdict:
-    """One square room `width` metres wide from (1, 1) and a light at its centre; by default walls
-    run from 1 to 6.
+    """Returns a square room, `width` metres wide, with a light in its centre.
+
+    Its lower-left corner is at (1, 1), so by default its walls run from 1 to 6.
     """
-    _checked_width(width, 1)
+    _validate_width(width, 1)
     return _toy([_square(CORNER, width)], [[CORNER + width / 2] * 2])
 
 
 def column(width: float = 5, pillar: float = 1) -> dotdict:
-    """A box with a square pillar of side `pillar` metres in its middle, and a light in two opposite
-    corners.
+    """Returns a box with a square pillar, `pillar` metres wide, in its middle, and a light in each
+    of two opposite corners.
     """
-    _checked_width(width, 2)
+    _validate_width(width, 2)
     if not isinstance(pillar, Real) or not 0 < pillar <= width - 1:
         raise ValueError(
-            f"pillar={pillar!r} m does not fit a box {width} m wide: take above 0 and up to "
-            f"{width - 1:g}"
+            f"pillar={pillar!r} must be above 0 and at most {width - 1:g} m in a box of {width} m"
         )
     rings = [_square(CORNER, width), _square(CORNER + (width - pillar) / 2, pillar)[::-1]]
     near = (width - pillar) / 4

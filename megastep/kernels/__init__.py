@@ -1,3 +1,5 @@
-"""The kernels: C++ and CUDA sources, and :mod:`~megastep.kernels.compile`, which builds them at
-first use.
+"""The engine's kernels in C++ and CUDA: one operation is a ``.h``, a ``.cpp`` and a ``.cu`` file.
+
+Headers in ``common/`` are for all programs. :mod:`~megastep.kernels.build` builds and launches
+them.
 """

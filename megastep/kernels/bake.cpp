@@ -1,5 +1,6 @@
-// A loop over static texels; see bake.cu.
+// A loop over static texels.
 #include "light_cpu.h"
+#include "params.h"
 
 KERNEL bake(const BakeParams& p) {
     const SceneryParams& s = p.scenery;

@@ -1,14 +1,15 @@
-// One thread per static texel: ambient light, and every light of its layout that no wall occludes.
+// One thread per static texel: ambient light plus every light of its layout that no wall occludes.
 #include "light.h"
+#include "params.h"
 
-DEVICE int is_hidden(const SceneryParams& s, int layout, const float* light, float dx, float dy) {
-    int hidden = 0;
-    for (int j = s.wall_starts[layout]; j < s.wall_starts[layout + 1] && !hidden; j++) {
+DEVICE int is_occluded(const SceneryParams& s, int layout, const float* light, float dx, float dy) {
+    int occluded = 0;
+    for (int j = s.wall_starts[layout]; j < s.wall_starts[layout + 1] && !occluded; j++) {
         float4 wall = ((const float4*)s.walls)[j];
         Occluder occluder = occluder_of(light[0], light[1], wall.x, wall.y, wall.z, wall.w);
-        hidden = occludes(occluder, dx, dy);
+        occluded = occludes(occluder, dx, dy);
     }
-    return hidden;
+    return occluded;
 }
 
 KERNEL bake(BakeParams p) {
@@ -23,7 +24,7 @@ KERNEL bake(BakeParams p) {
     for (int l = s.light_starts[layout]; l < s.light_starts[layout + 1]; l++) {
         const float* light = s.lights + 3 * l;
         float dx = x - light[0], dy = y - light[1];
-        if (!is_hidden(s, layout, light, dx, dy))
+        if (!is_occluded(s, layout, light, dx, dy))
             sum += irradiance(light[2], dx, dy);
     }
     s.texels[4 * (long long)texel + 3] = minf(sum, 1.f);

@@ -1,11 +1,11 @@
-// Which walls could hide a light from some part of an agent. Never says no wrongly: a wall is ruled
-// out only if it lies wholly on one side of the path from the light to the agent's centre, by more
-// than the agent's reach, or wholly behind the light, or wholly behind the agent.
+// Which walls could occlude a light from some part of an agent. Conservative: a wall is ruled out
+// only if it lies entirely to one side of the path from the light to the agent's centre, by more
+// than the agent's reach, or entirely behind the light, or entirely behind the agent.
 #pragma once
-#include "common.h"
+#include "common/math.h"
 
-// The path from a light at (x, y) by d to an agent, and how far along it and aside of it walls
-// matter, both times the path's length.
+// The path (dx, dy) from a light at (x, y) to an agent. Walls matter up to `along` in its direction
+// and up to `aside` to either side; both are distances times the path's length.
 struct Corridor {
     float x, y, dx, dy, along, aside;
 };
@@ -14,7 +14,7 @@ HD Corridor corridor_of(float light_x, float light_y, const Pose& agent, float r
     float dx = agent.x - light_x, dy = agent.y - light_y;
     float length2 = dx * dx + dy * dy;
     float wide = maxf(dx, -dx), tall = maxf(dy, -dy);
-    // At least the length, at most an eighth more; and a slack for rounding.
+    // The path's length, overestimated by up to an eighth, plus a slack for rounding.
     float aside = reach * (maxf(wide, tall) + 0.5f * minf(wide, tall)) + 1e-3f;
     return {light_x, light_y, dx, dy, length2 + aside, aside};
 }
@@ -28,7 +28,7 @@ HD int may_occlude(const Corridor& c, float ax, float ay, float bx, float by) {
              (maxf(along_a, along_b) < -c.aside) | (minf(along_a, along_b) > c.along));
 }
 
-// May any wall within the box?
+// Could any wall inside the box?
 HD int box_may_occlude(const Corridor& c, float min_x, float min_y, float max_x, float max_y) {
     float min_side = 1e9f, max_side = -1e9f;
     float min_along = 1e9f, max_along = -1e9f;

@@ -13,6 +13,6 @@ KERNEL coverage(const CoverageParams& p) {
             for (int i = 0; i < p.n_words; i++)
                 count_covered(seen[i], visible[i], n_seen, n_visible);
         }
-        p.coverage[agent] = share_of(n_seen, n_visible);
+        p.coverage[agent] = fraction_of(n_seen, n_visible);
     }
 }

@@ -1,11 +1,14 @@
-// What share of the texels that an agent could see it has seen.
+// Coverage: the fraction of the visible texels that an agent has seen.
 #pragma once
-#include "errors.h"
+#include "common/scenery.h"
+#include "params.h"
 
-// The 32 texels of a word: how many can be seen, and how many of those were.
+// Counts, of a word's 32 texels, the visible ones and those of them that were seen.
 HD void count_covered(unsigned int seen, unsigned int visible, int& n_seen, int& n_visible) {
     n_seen += COUNT_BITS(seen & visible);
     n_visible += COUNT_BITS(visible);
 }
 
-HD float share_of(int n_seen, int n_visible) { return (float)n_seen / (float)maxi(n_visible, 1); }
+HD float fraction_of(int n_seen, int n_visible) {
+    return (float)n_seen / (float)maxi(n_visible, 1);
+}

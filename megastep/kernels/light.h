@@ -1,18 +1,17 @@
-// How light falls: ambient light, and each light's where no wall of the layout occludes it.
+// Irradiance: ambient light, and the light of each lamp that no wall of the layout occludes.
 #pragma once
-#include "common.h"
-#include "params.h"
+#include "common/math.h"
 
 constexpr float AMBIENT = 0.1f;
 
-// Of a light of `intensity` at a distance of (dx, dy), never more than at 1 m.
+// The irradiance at (dx, dy) metres from a light; closer than 1 m it stays constant.
 HD float irradiance(float intensity, float dx, float dy) {
     return 2.f * intensity / maxf(dx * dx + dy * dy, 1.f);
 }
 
-// A wall as a light sees it: its direction v, and its start w from the light, both turned round if
-// need be so that `area` = w x v is not negative. An area of 0 is a wall seen end on, which hides
-// nothing.
+// A wall relative to a light: its direction v, and its start w from the light. Both are negated if
+// necessary so that `area` = w x v is not negative. A wall of area 0 points at the light and
+// occludes nothing.
 struct Occluder {
     float vx, vy, wx, wy, area;
 };
@@ -25,15 +24,15 @@ HD Occluder occluder_of(float light_x, float light_y, float ax, float ay, float 
     return {sign * vx, sign * vy, sign * wx, sign * wy, sign * area};
 }
 
-// Does the segment from the light along d meet the wall, short of its last thousandth, where the
-// lit texel's own wall lies? No division: both sides are multiplied by the determinant.
+// Does the segment from the light to a texel at d meet the wall? Its last thousandth, where the
+// texel's own wall lies, does not count. No division: both sides are multiplied by the determinant.
 HD int occludes(const Occluder& wall, float dx, float dy) {
     float determinant = cross(dx, dy, wall.vx, wall.vy);
     float u = cross(wall.wx, wall.wy, dx, dy);
     return (wall.area > 0.f) & (wall.area < 0.999f * determinant) & (u >= 0.f) & (u <= determinant);
 }
 
-// The centre of a line's texel k of `width`.
+// The centre of texel k of a line that has `width` texels.
 HD void texel_centre(const float* line, int k, int width, float& x, float& y) {
     float u = ((float)k + 0.5f) / (float)width;
     x = mix(line[0], line[2], u);

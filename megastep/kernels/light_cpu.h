@@ -1,20 +1,21 @@
-// The light at a point, on the CPU: walls are tried 64 at a time, in loops that compilers
+// The light at a point, on the CPU. Walls are tested 64 at a time, in loops that compilers
 // vectorise.
 #pragma once
+#include "common/scenery.h"
 #include "light.h"
 
-// Does any of n walls hide a light from a point that lies d from it?
-static int is_hidden(const float* walls, int n, const float* light, float dx, float dy) {
+// Does any of n walls occlude the light from a point at (dx, dy) from it?
+static int is_occluded(const float* walls, int n, const float* light, float dx, float dy) {
     for (int start = 0; start < n; start += 64) {
         int end = mini(start + 64, n);
-        int hidden = 0;
-#pragma omp simd reduction(| : hidden)
+        int occluded = 0;
+#pragma omp simd reduction(| : occluded)
         for (int j = start; j < end; j++) {
             const float* wall = walls + 4 * j;
-            hidden |= occludes(occluder_of(light[0], light[1], wall[0], wall[1], wall[2], wall[3]),
-                               dx, dy);
+            occluded |= occludes(
+                occluder_of(light[0], light[1], wall[0], wall[1], wall[2], wall[3]), dx, dy);
         }
-        if (hidden)
+        if (occluded)
             return 1;
     }
     return 0;
@@ -27,7 +28,7 @@ static float light_at(const SceneryParams& s, int layout, float x, float y) {
     for (int l = s.light_starts[layout]; l < s.light_starts[layout + 1]; l++) {
         const float* light = s.lights + 3 * l;
         float dx = x - light[0], dy = y - light[1];
-        if (!is_hidden(walls, n_walls, light, dx, dy))
+        if (!is_occluded(walls, n_walls, light, dx, dy))
             sum += irradiance(light[2], dx, dy);
     }
     return minf(sum, 1.f);

@@ -1,8 +1,8 @@
-// A loop over environments. For each agent, a vectorised loop finds the walls whose boxes its path
-// meets; only those are swept.
+// A loop over environments. For each agent, a vectorised loop finds the walls whose bounding boxes
+// the agent's path overlaps; only those are tested exactly.
 #include <vector>
 
-#include "movement.h"
+#include "physics.h"
 
 static float sweep_walls(const float* walls, int n, unsigned char* meets, float px, float py,
                          float dx, float dy, float rho) {
@@ -23,8 +23,7 @@ static float sweep_walls(const float* walls, int n, unsigned char* meets, float 
     return contact;
 }
 
-// Writes which fraction of agent i's step is free. Its environment's agents are those from `first`
-// on.
+// Writes the free fraction of agent i's step. `first` is the first agent of its environment.
 static void sweep(const PhysicsParams& p, int first, int i, const float* walls, int n,
                   unsigned char* meets) {
     float rho = p.scenery.radius * INFLATION;

@@ -1,11 +1,11 @@
-// One group of threads per environment: 8 where there are many environments, 32 where there are
-// few. For each agent in turn, the group tests the boxes around 32 walls each, then the walls in
-// the boxes that the agent's path meets, then the other agents; after that all agents move at once.
-#include "movement.h"
-#include "scenery.h"
+// One group of threads per environment: 8 threads if there are many environments, 32 if there are
+// few. For each agent in turn, the group tests the bounding boxes of 32 walls each, then the walls
+// in boxes that the agent's path overlaps, then the other agents. Finally all agents move at once.
+#include "common/scenery.h"
+#include "physics.h"
 
-// `size` neighbouring threads of a warp, of which this one is number `rank`; the group begins at
-// the warp's lane `first`, and `mask` has a bit for each of its warp lanes.
+// `size` neighbouring threads of a warp; this one is number `rank`. The group starts at warp lane
+// `first`, and `mask` has a bit for each of its warp lanes.
 struct ThreadGroup {
     int size, rank, first;
     unsigned int mask;
@@ -18,7 +18,7 @@ DEVICE ThreadGroup group_of(int size) {
     return {size, rank, first, mask};
 }
 
-// The earliest contact with a wall that this thread finds, of an agent at p that moves by d.
+// The earliest contact, among the walls that this thread tests, of an agent at p that moves by d.
 DEVICE float sweep_walls(const SceneryParams& s, const ThreadGroup& group, const Walls& walls,
                          float px, float py, float dx, float dy, float rho) {
     float contact = NO_CONTACT;
@@ -42,7 +42,7 @@ DEVICE float sweep_walls(const SceneryParams& s, const ThreadGroup& group, const
     return contact;
 }
 
-// Writes which fraction of agent a's step is free.
+// Writes the free fraction of agent a's step.
 DEVICE void sweep(const PhysicsParams& p, const ThreadGroup& group, int env, const Walls& walls,
                   float rho, int a) {
     int n_agents = p.scenery.n_agents;

@@ -1,10 +1,18 @@
 // Rasterising in one dimension. A line covers an interval of pixels, and along it inverse depth is
-// affine in the pixel's index. In a camera's frame x is depth, and y points left.
+// an affine function of the pixel's index. In a camera's frame x is depth and y points left.
 #pragma once
-#include "common.h"
+#include "common/math.h"
+#include "constants.h"
 #include "params.h"
 
-// RenderParams' fields of these names.
+// The nearest line at a pixel. On the GPU each warp keeps one per pixel in dynamic shared memory.
+struct alignas(8) NearestLine {
+    float inverse;  // inverse depth, per metre
+    int line;       // -1: none
+};
+static_assert(sizeof(NearestLine) == NEAREST_LINE_BYTES, "Python allocates shared memory for them");
+
+// The fields of RenderParams with these names.
 struct Screen {
     float edge, pitch, centre, scale, near, radius;
     int res;
@@ -22,22 +30,24 @@ HD void to_camera(const Pose& camera, float x, float y, float& depth, float& lef
     left = camera.cosine * dy - camera.sine * dx;
 }
 
-// Pixels [first, end); at pixel r inverse depth is base + gain r. Sixteen bytes, which move as one.
+// Pixels [first, end); at pixel r inverse depth is base + gain r. 16 bytes, moved in one
+// instruction.
 struct ALIGNED PixelSpan {
     int first, end;
     float base, gain;
 };
 
-// `near_clipped`: the line may come within the agent's radius, and there it is not seen.
+// `near_clipped`: parts of the line may be within the agent's radius, and these are invisible.
 struct Projection {
     PixelSpan span;
     int near_clipped;
 };
 
-// Lines that share a corner compute its pixel from the same bits, and intervals are half open: no
-// ray slips between them, and none sees both. What lies nearer than `near` in depth is within the
-// radius for every ray of the screen, so that cutting it off loses nothing. The ends come as four
-// floats, for GCC 12 does not vectorise a loop over lines that builds a struct.
+// Projects the line from (x0, y0) to (x1, y1) onto the screen. Lines that share a corner compute
+// its pixel from the same bits, and intervals are half open, so every ray near a corner hits
+// exactly one of them. The part closer than `near` in depth is cut off: for every ray it is within
+// the radius, hence invisible. The ends are four floats because GCC 12 does not vectorise a loop
+// that builds structs.
 HD Projection project(const Pose& camera, const Screen& screen, float x0, float y0, float x1,
                       float y1) {
     float ax, ay, bx, by;
@@ -46,7 +56,8 @@ HD Projection project(const Pose& camera, const Screen& screen, float x0, float 
     float vx = bx - ax, vy = by - ay;
     float area = cross(ax, ay, vx, vy);
     int behind_a = ax < screen.near, behind_b = bx < screen.near;
-    float cut = ay + (screen.near - ax) * RECIPROCAL(vx) * vy;  // y where it crosses the near plane
+    float cut =
+        ay + (screen.near - ax) * RECIPROCAL(vx) * vy;  // y where the line crosses the near plane
     float slope_a = (behind_a ? cut : ay) * RECIPROCAL(behind_a ? screen.near : ax);
     float slope_b = (behind_b ? cut : by) * RECIPROCAL(behind_b ? screen.near : bx);
     float pixel_a = screen.centre - screen.scale * slope_a;
@@ -54,25 +65,25 @@ HD Projection project(const Pose& camera, const Screen& screen, float x0, float 
     float res = (float)screen.res;
     int hidden = (behind_a & behind_b) | (area == 0.f);
     float k = RECIPROCAL(area);
-    Projection made;
-    made.span.first = (int)CEIL(clamp(minf(pixel_a, pixel_b), 0.f, res));
-    made.span.end = hidden ? 0 : (int)CEIL(clamp(maxf(pixel_a, pixel_b), 0.f, res));
-    made.span.base = (vy - screen.edge * vx) * k;
-    made.span.gain = screen.pitch * vx * k;
+    Projection projection;
+    projection.span.first = (int)CEIL(clamp(minf(pixel_a, pixel_b), 0.f, res));
+    projection.span.end = hidden ? 0 : (int)CEIL(clamp(maxf(pixel_a, pixel_b), 0.f, res));
+    projection.span.base = (vy - screen.edge * vx) * k;
+    projection.span.gain = screen.pitch * vx * k;
     float reach2 = screen.radius * screen.radius * (vx * vx + vy * vy);
-    made.near_clipped = area * area <= reach2 * 1.001f;
-    return made;
+    projection.near_clipped = area * area <= reach2 * 1.001f;
+    return projection;
 }
 
-// What a box of walls may cover: pixels [first, last], at inverse depths up to max_inverse.
-// distance2 is the box's squared distance from the camera, or -1 if it can cover no pixel.
+// Bounds on what the walls of a box cover: pixels [first, last], inverse depths up to max_inverse.
+// distance2 is the box's squared distance from the camera, or -1 if it covers no pixel.
 struct ScreenBounds {
     float distance2, max_inverse;
     int first, last;
 };
 
-// A box covers no pixel if all of it lies behind the camera or beyond one edge of the screen. The
-// slack is more than rounding can make of 200 m.
+// A box covers no pixel if it lies entirely behind the camera or beyond one edge of the screen. The
+// slack exceeds the rounding error at 200 m.
 HD ScreenBounds bounds_of(const Pose& camera, const Screen& screen, float half_width, float min_x,
                           float min_y, float max_x, float max_y) {
     float slack = 1e-3f * (1.f + half_width);
@@ -94,7 +105,7 @@ HD ScreenBounds bounds_of(const Pose& camera, const Screen& screen, float half_w
     ScreenBounds bounds = {dx * dx + dy * dy, 1e9f, 0, screen.res - 1};
     if (!(ahead & leftwards & rightwards))
         bounds.distance2 = -1.f;
-    if (min_depth > 0.01f) {  // wholly ahead: its corners bound what it covers
+    if (min_depth > 0.01f) {  // entirely ahead: its corners bound the pixels it covers
         float last = (float)(screen.res - 1);
         bounds.max_inverse = 1.01f * RECIPROCAL(min_depth - 1e-3f);
         bounds.first = (int)clamp(min_pixel - 1.f, 0.f, last);

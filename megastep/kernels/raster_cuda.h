@@ -1,16 +1,18 @@
-// A warp rasterises one camera's view: groups of 32 lines, a warp lane each, into shared memory.
-// Each warp lane projects its line; then the warp goes over the tiles of 32 pixels that the group
-// covers, and over each tile's lines, a pixel per warp lane, keeping the largest inverse depth and,
-// of equals, the first line.
+// A warp rasterises one camera's view into shared memory, 32 lines at a time. Each warp lane
+// projects one line of such a group. Then the warp visits each tile of 32 pixels that the group
+// covers: each warp lane takes one pixel and keeps, of the lines that cover it, the one with the
+// largest inverse depth, or the first of equals.
 #pragma once
+#include "constants.h"
 #include "raster.h"
 #include "shading.h"
 
 constexpr int TILE = WARP;  // pixels
+static_assert(MAX_RES == TILE * WARP, "warp lane k holds tile_min of tile k");
 
-// One camera's view in the making. Warp lane k knows tile_min, the smallest inverse depth in tile
-// k. `nearest` has whole tiles: pixels beyond the screen are infinitely near, so that they never
-// are the smallest.
+// One camera's view while it is rasterised. Warp lane k holds tile_min of tile k: the smallest
+// inverse depth among its pixels. `nearest` has whole tiles; pixels beyond the screen have infinite
+// inverse depth, so they are never the smallest.
 struct View {
     const Pose& camera;
     const Screen& screen;
@@ -30,16 +32,16 @@ DEVICE void clear(View& v) {
     v.tile_min = 0.f;
 }
 
-// The nearest of a group's lines at pixel r: its inverse depth, or 0, and its slot in the group.
-// `slots` are the lines that cover the tile; the near-clipped ones are not seen where they come
-// within the radius.
+// The nearest of a group's lines at pixel r: its inverse depth (0: none) and its slot in the group.
+// `slots` has a bit for each line that covers the tile. Near-clipped lines are invisible where they
+// are within the radius.
 DEVICE NearestLine nearest_of_group(const View& v, int r, unsigned int slots,
                                     unsigned int near_clipped) {
     float at = (float)r, max_inverse = 0.f;
     int slot = 0;
 #pragma unroll 1
     for (unsigned int left = slots & ~near_clipped; left;) {
-        int i = 31 - __clz(left);  // downwards, so that of equals the first line comes last
+        int i = 31 - __clz(left);  // last line first, so that the first of equals wins
         PixelSpan span = v.spans[i];
         float inverse = span.base + span.gain * at;
         if (r >= span.first && r < span.end && inverse >= max_inverse) {
@@ -63,21 +65,21 @@ DEVICE NearestLine nearest_of_group(const View& v, int r, unsigned int slots,
     return {max_inverse, slot};
 }
 
-// Rasterises 32 lines at once, one per warp lane, where `on`. `line` is the first warp lane's index
-// in its environment.
-DEVICE void raster_group(View& v, const Float4* own_line, int line, int on) {
-    Projection own = {{0, 0, 0.f, 0.f}, 0};
-    if (on) {
-        Float4 ends = LOAD(own_line);
-        own = project(v.camera, v.screen, ends.x, ends.y, ends.z, ends.w);
+// Rasterises 32 lines, one per warp lane, `ends` being this lane's. Lanes that are not `active`
+// have none. `line` is the index, in its environment, of the first warp lane's line.
+DEVICE void raster_group(View& v, const Float4* ends, int line, int active) {
+    Projection projection = {{0, 0, 0.f, 0.f}, 0};
+    if (active) {
+        Float4 e = LOAD(ends);
+        projection = project(v.camera, v.screen, e.x, e.y, e.z, e.w);
     }
-    PixelSpan span = own.span;
+    PixelSpan span = projection.span;
     int visible = span.first < span.end;
     int first_tile = visible ? span.first >> 5 : 32;
     int last_tile = visible ? (span.end - 1) >> 5 : -1;
     float max_inverse = maxf(span.base + span.gain * (float)span.first,
                              span.base + span.gain * (float)(span.end - 1));
-    unsigned int near_clipped = __ballot_sync(FULL_WARP, own.near_clipped);
+    unsigned int near_clipped = __ballot_sync(FULL_WARP, projection.near_clipped);
     __syncwarp();
     v.spans[v.warp_lane] = span;
     __syncwarp();
@@ -98,16 +100,16 @@ DEVICE void raster_group(View& v, const Float4* own_line, int line, int on) {
             nearest = group;
             v.nearest[r] = nearest;
         }
-        // Of floats that are not negative the bits are in the same order.
+        // Non-negative floats are ordered as their bits are.
         unsigned int min_bits = __reduce_min_sync(FULL_WARP, __float_as_uint(nearest.inverse));
         if (v.warp_lane == tile)
             v.tile_min = __uint_as_float(min_bits);
     }
 }
 
-// Walls come in groups of 32 with a box around each. Groups that cannot be seen are left out, and
-// the others come nearest first, so that those wholly behind what their tiles show already are
-// skipped.
+// Rasterises walls, in groups of 32 with a bounding box around each. Groups that are off-screen are
+// skipped. The others come nearest first, so that groups entirely behind what is already there can
+// be skipped too.
 DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scenery,
                          float half_width) {
     for (int start = 0; BOX_WALLS * start < scenery.n_walls; start += WARP) {
@@ -130,7 +132,7 @@ DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scen
             int covers = v.warp_lane >= (its_tiles & 0xffff) && v.warp_lane <= its_tiles >> 16;
             float tile_min = covers ? v.tile_min : INF_VALUE;
             if (__all_sync(FULL_WARP, tile_min > max_inverse))
-                continue;  // all of the box is behind what is already there
+                continue;  // the box is entirely behind what is already there
             int l = BOX_WALLS * (start + k);
             raster_group(v, (const Float4*)s.walls + (scenery.first_wall + l + v.warp_lane),
                          scenery.n_agent_lines + l, l + v.warp_lane < scenery.n_walls);
@@ -138,11 +140,11 @@ DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scen
     }
 }
 
-// The other agents' lines.
+// Rasterises the lines of all agents except agent a.
 DEVICE void raster_agents(View& v, const SceneryParams& s, const EnvScenery& scenery, int a) {
     for (int first = 0; first < scenery.n_agent_lines; first += WARP) {
         int l = first + v.warp_lane;
-        int on = l < scenery.n_agent_lines && l / s.n_model != a;
-        raster_group(v, (const Float4*)scenery.agent_lines + l, first, on);
+        int active = l < scenery.n_agent_lines && l / s.n_model != a;
+        raster_group(v, (const Float4*)scenery.agent_lines + l, first, active);
     }
 }

@@ -1,11 +1,12 @@
-// A loop over agents. Each line of a view in turn is compared with the nearest so far at the pixels
-// it covers; then rays are shaded, run by run of those that hit the same line.
+// A loop over agents. Each line of a view is compared with the nearest so far at the pixels it
+// covers. Then rays are shaded, in runs of neighbours that hit the same line.
 #include <vector>
 
-#include "errors.h"
-#include "sensors.h"
+#include "common/errors.h"
+#include "common/scenery.h"
+#include "render.h"
 
-// One thread's working memory: its lines' projections, and one view.
+// One thread's buffers: the projections of its lines, and one view.
 struct Scratch {
     std::vector<Projection> projections;
     std::vector<float> inverse;
@@ -13,7 +14,7 @@ struct Scratch {
     std::vector<RaySample> samples;
 };
 
-// A line that may come within the radius is not seen where it does.
+// Rasterises a near-clipped line, which is invisible where it is within the radius.
 static void raster_near(Projection line, const RenderParams& p, int index, Scratch& scratch) {
     for (int r = line.span.first; r < line.span.end; r++) {
         float inverse = line.span.base + line.span.gain * (float)r;
@@ -34,8 +35,8 @@ static void raster_span(PixelSpan span, int index, float* inverse, int* indices)
     }
 }
 
-// Rasterises n lines but for those from skip_first to skip_end, the agent's own. `offset` is the
-// first line's index in the environment.
+// Rasterises n lines except [skip_first, skip_end), the agent's own. `offset` is the index of the
+// first line in the environment.
 static void raster_lines(const Pose& camera, const Screen& screen, const RenderParams& p,
                          const float* lines, int n, int offset, int skip_first, int skip_end,
                          Scratch& scratch) {
@@ -104,7 +105,7 @@ static void write_pixels(const RenderParams& p, int view, const RaySample* sampl
     }
 }
 
-// The ray nearest to the middle one that shows another agent, of equals the first; or -1.
+// The ray closest to the central one that hits another agent, or the first of equals; -1: none.
 static int agent_ray_of(const std::vector<int>& index, int n_agent_lines) {
     int res = (int)index.size(), best = -1, least = res;
     for (int r = 0; r < res; r++) {

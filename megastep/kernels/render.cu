@@ -1,10 +1,12 @@
-// One warp per agent, its cameras one after the other: it rasterises what the camera sees, then
-// each warp lane shades its rays, and neighbours sum theirs into pixels.
-#include "errors.h"
+// One warp per agent, which handles the agent's cameras one after the other. The warp rasterises a
+// camera's view; then each warp lane shades its rays, and neighbouring lanes sum theirs into
+// pixels.
+#include "common/errors.h"
+#include "common/scenery.h"
 #include "raster_cuda.h"
-#include "sensors.h"
+#include "render.h"
 
-// The sum of a warp lane's ray and those of the next ones, `n` in all, in order.
+// The sum over `n` warp lanes, in order: this one and those after it.
 DEVICE RaySample sum_of(const RaySample& ray, int n) {
     RaySample sum = ray;
     for (int j = 1; j < n; j++) {
@@ -16,8 +18,8 @@ DEVICE RaySample sum_of(const RaySample& ray, int n) {
     return sum;
 }
 
-// The sum over four neighbouring warp lanes, by pairs. Each is left with one number of it: the
-// first with red, the next with blue, green, depth.
+// The sum over four neighbouring warp lanes, in pairs. Each lane returns one component: the first
+// red, the next ones blue, green and depth.
 DEVICE float quarter_of_sum(const RaySample& ray, int warp_lane) {
     int odd = warp_lane & 1, second = warp_lane & 2;
     float one = odd ? ray.blue : ray.red;
@@ -27,7 +29,7 @@ DEVICE float quarter_of_sum(const RaySample& ray, int warp_lane) {
     return (second ? two : one) + __shfl_xor_sync(FULL_WARP, second ? one : two, 2);
 }
 
-// Shades a camera's rays, a batch of warp lanes at a time, and sums them into pixels.
+// Shades a camera's rays, one batch of warp lanes at a time, and sums them into pixels.
 template <int full_res, int has_agents>
 DEVICE void shade(const RenderParams& p, const View& v, const EnvScenery& scenery, int view,
                   unsigned int* seen, int& newly_seen) {
@@ -39,9 +41,9 @@ DEVICE void shade(const RenderParams& p, const View& v, const EnvScenery& scener
     plane += (long long)(channel == 3 ? view : 3 * view + channel) * p.n_pixels;
 #pragma unroll 1
     for (int start = 0; start < res; start += batch) {
-        int r = start + warp_lane, on = r < res && warp_lane < batch;
+        int r = start + warp_lane, active = r < res && warp_lane < batch;
         RaySample sample = {0.f, 0.f, 0.f, 0.f};
-        if (on) {
+        if (active) {
             NearestLine nearest = v.nearest[r];
             long long ray = (long long)view * res + r;
             if (full_res)
@@ -57,17 +59,17 @@ DEVICE void shade(const RenderParams& p, const View& v, const EnvScenery& scener
         }
         if (subsample == 4) {
             float sum = quarter_of_sum(sample, warp_lane);
-            if (on && wanted)
+            if (active && wanted)
                 plane[r >> 2] = HALF_BITS(sum * p.inv_subsample);
         } else {
             RaySample sum = sum_of(sample, subsample);
-            if (on && warp_lane % subsample == 0)
+            if (active && warp_lane % subsample == 0)
                 write_pixel(p, view, r / subsample, sum);
         }
     }
 }
 
-// The ray nearest to the middle one that shows another agent, of equals the first; or -1.
+// The ray closest to the central one that hits another agent, or the first of equals; -1: none.
 DEVICE int agent_ray_of(const NearestLine* nearest, int res, int n_agent_lines, int warp_lane) {
     unsigned int best = ~0u;
     for (int r = warp_lane; r < res; r += WARP) {
@@ -123,7 +125,7 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         p.newly_seen[agent] = newly_seen;
 }
 
-// One form each for all outputs, for several agents and for one, which needs the fewest registers.
+// Three variants: all outputs, several agents, one agent. The last needs the fewest registers.
 KERNEL BOUNDS(24) render(RenderParams p) {
     extern __shared__ NearestLine shared[];
     __shared__ PixelSpan spans[BLOCK];
@@ -131,12 +133,12 @@ KERNEL BOUNDS(24) render(RenderParams p) {
     int agent = blockIdx.x * (BLOCK / WARP) + warp;
     if (agent >= p.scenery.n_envs * p.scenery.n_agents)
         return;
-    PixelSpan* own_spans = spans + WARP * warp;
+    PixelSpan* warp_spans = spans + WARP * warp;
     NearestLine* nearest = shared + whole_tiles(p.res) * warp;
     if (p.indices)
-        render_agent<1, 1>(p, agent, warp_lane, own_spans, nearest);
+        render_agent<1, 1>(p, agent, warp_lane, warp_spans, nearest);
     else if (p.scenery.n_agents > 1)
-        render_agent<0, 1>(p, agent, warp_lane, own_spans, nearest);
+        render_agent<0, 1>(p, agent, warp_lane, warp_spans, nearest);
     else
-        render_agent<0, 0>(p, agent, warp_lane, own_spans, nearest);
+        render_agent<0, 0>(p, agent, warp_lane, warp_spans, nearest);
 }

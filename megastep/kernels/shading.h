@@ -1,6 +1,6 @@
-// What a ray sees of the line it hits: where, at which angle, and in which colour.
+// Shading: where a ray hits a line, at which angle, and the colour there.
 #pragma once
-#include "common.h"
+#include "common/math.h"
 #include "params.h"
 #include "raster.h"
 
@@ -25,24 +25,24 @@ HD EnvScenery env_scenery(const SceneryParams& s, int env, int layout) {
             s.texel_starts[first]};
 }
 
-// A line that rays hit: its start and direction in the camera's frame, and its texels.
+// A line hit by rays: its start and direction in the camera's frame, and its texels.
 struct Surface {
     float ax, ay, vx, vy;
-    int first_texel, width, of_agent;
+    int first_texel, width, is_agent;
 };
 
-// Line l of an environment, the agents' first. `has_agents`: it may be an agent's.
+// Line l of an environment; agents' lines come first. If not `has_agents`, it is always a wall.
 template <int has_agents>
 HD Surface surface_of(const SceneryParams& s, const EnvScenery& scenery, const Pose& camera,
                       int l) {
-    int of_agent = has_agents && l < scenery.n_agent_lines;
-    int i = of_agent ? l : l + (scenery.first_wall - scenery.n_agent_lines);
-    Float4 line = LOAD((const Float4*)(of_agent ? scenery.agent_lines : s.walls) + i);
-    const int* starts = (of_agent ? s.model_texels : s.texel_starts) + i;
+    int is_agent = has_agents && l < scenery.n_agent_lines;
+    int i = is_agent ? l : l + (scenery.first_wall - scenery.n_agent_lines);
+    Float4 line = LOAD((const Float4*)(is_agent ? scenery.agent_lines : s.walls) + i);
+    const int* starts = (is_agent ? s.model_texels : s.texel_starts) + i;
     float ax, ay, bx, by;
     to_camera(camera, line.x, line.y, ax, ay);
     to_camera(camera, line.z, line.w, bx, by);
-    return {ax, ay, bx - ax, by - ay, starts[0], starts[1] - starts[0], of_agent};
+    return {ax, ay, bx - ax, by - ay, starts[0], starts[1] - starts[0], is_agent};
 }
 
 // `location`: fraction along the line. `facing`: squared sine between ray and line.
@@ -50,7 +50,8 @@ struct Hit {
     float location, facing;
 };
 
-// Of the ray along (1, y), `length` long at unit depth. One division serves both numbers.
+// Where the ray along (1, y), of `length` at unit depth, hits a line. One division serves both
+// fields.
 HD Hit hit_of(const Surface& line, float y, float length) {
     float across = line.vy - y * line.vx;
     float size = length * length * (line.vx * line.vx + line.vy * line.vy);
@@ -67,7 +68,7 @@ HD float cosine_of(const Surface& line, float y, float length) {
     return (line.vx + y * line.vy) / (length * size + 1e-6f);
 }
 
-// Linear filtering between texel centres, clamped at the line's ends.
+// Linear filtering between texel centres, clamped at the ends of the line.
 struct Filter {
     int left, right;
     float weight;
@@ -87,7 +88,7 @@ struct Colour {
     float red, green, blue;
 };
 
-// Between two texels of red, green, blue and light.
+// Interpolates two texels (red, green, blue, light) and applies the light.
 HD Colour blend(const Float4 left, const Float4 right, float weight, float facing) {
     float light = mix(left.w, right.w, weight) * facing;
     return {mix(left.x, right.x, weight) * light, mix(left.y, right.y, weight) * light,

@@ -4,5 +4,5 @@
 KERNEL spawn(SpawnParams p) {
     int env = blockIdx.x * blockDim.x + threadIdx.x;
     if (env < p.scenery.n_envs)
-        spawn_env<0>(p, Alone{0}, env);
+        spawn_env<0>(p, SingleThread{0}, env);
 }

@@ -1,22 +1,22 @@
-// Puts agents at random points of their environment's layout, out of the others' sight if so
-// wanted.
+// Respawns agents at random points of their environment's layout, optionally where no other agent
+// sees them.
 #pragma once
-#include "errors.h"
+#include "common/line_of_sight.h"
+#include "common/philox.h"
 #include "params.h"
-#include "philox.h"
-#include "sight.h"
 
-// Of agent a's own points, from number `first` on, the first that nobody who stands has in sight:
-// the others that do not respawn, and those that have. If there is none, the one furthest from
-// whoever stands nearest to it.
-template <class Crew>
-HD int hidden_point(const SpawnParams& p, const Crew& crew, int env, int a, int layout, int first) {
-    int n_agents = p.scenery.n_agents, n_own = p.n_points / n_agents, furthest = first;
-    const float* points = p.points + 2 * ((long long)layout * p.n_points + a * n_own);
+// The first of agent a's points, counted from `first`, that no placed agent can see. Placed are
+// agents that do not respawn and those that already have. If every point is visible, the one that
+// is furthest from its nearest placed agent.
+template <class Group>
+HD int hidden_point(const SpawnParams& p, const Group& group, int env, int a, int layout,
+                    int first) {
+    int n_agents = p.scenery.n_agents, n_per_agent = p.n_points / n_agents, furthest = first;
+    const float* points = p.points + 2 * ((long long)layout * p.n_points + a * n_per_agent);
     Walls walls = walls_of(p.scenery, layout);
     float furthest2 = -1.f;
-    for (int k = 0; k < n_own; k++) {
-        int point = (first + k) % n_own, seen = 0;
+    for (int k = 0; k < n_per_agent; k++) {
+        int point = (first + k) % n_per_agent, seen = 0;
         float x = points[2 * point], y = points[2 * point + 1], nearest2 = INF_VALUE;
         for (int b = 0; b < n_agents; b++) {
             int other = env * n_agents + b;
@@ -25,7 +25,7 @@ HD int hidden_point(const SpawnParams& p, const Crew& crew, int env, int a, int 
             float from_x = p.positions[2 * other], from_y = p.positions[2 * other + 1];
             float dx = x - from_x, dy = y - from_y;
             nearest2 = minf(nearest2, dx * dx + dy * dy);
-            seen = seen || in_sight(p.scenery, crew, walls, from_x, from_y, dx, dy);
+            seen = seen || is_visible(p.scenery, group, walls, from_x, from_y, dx, dy);
         }
         if (!seen)
             return point;
@@ -47,13 +47,13 @@ HD void place(const SpawnParams& p, int i, const float* at, float angle) {
     p.angvelocity[i] = 0.f;
 }
 
-// Each agent that respawns goes to a point of its own share of the layout's points, at rest,
-// looking anywhere; if `hidden`, out of the others' sight where it can. An environment all of whose
-// agents respawn may move to another layout first.
-template <int hidden, class Crew>
-HD void spawn_env(const SpawnParams& p, const Crew& crew, int env) {
+// Respawns the masked agents of an environment: at rest, with a random heading, at a random point
+// of the agent's own share of the layout's points; if `hidden`, at one that no other agent sees, if
+// there is one. An environment whose agents all respawn may move to another layout first.
+template <int hidden, class Group>
+HD void spawn_env(const SpawnParams& p, const Group& group, int env) {
     const SceneryParams& s = p.scenery;
-    int n_agents = s.n_agents, n_own = p.n_points / n_agents, all = 1, any = 0, layout = 0;
+    int n_agents = s.n_agents, n_per_agent = p.n_points / n_agents, all = 1, any = 0, layout = 0;
     for (int i = env * n_agents; i < (env + 1) * n_agents; i++) {
         all &= p.mask[i] != 0;
         any |= p.mask[i] != 0;
@@ -70,18 +70,18 @@ HD void spawn_env(const SpawnParams& p, const Crew& crew, int env) {
         Philox bits = philox((unsigned int)i, (unsigned int)p.counts[i], p.key0, p.key1);
         if (a == 0 && moves)
             layout = (int)(unit_float(bits.c) * (float)s.n_layouts);
-        int point = (int)(unit_float(bits.a) * (float)n_own);
+        int point = (int)(unit_float(bits.a) * (float)n_per_agent);
         if (hidden)
-            point = hidden_point(p, crew, env, a, layout, point);
-        sync(crew);  // until all have read what is written now
-        if (crew.rank == 0) {
-            if (p.chosen)
-                p.chosen[i] = a * n_own + point;
-            place(p, i, p.points + 2 * ((long long)layout * p.n_points + a * n_own + point),
+            point = hidden_point(p, group, env, a, layout, point);
+        sync(group);  // all threads have read what is written now
+        if (group.rank == 0) {
+            if (p.point_index)
+                p.point_index[i] = a * n_per_agent + point;
+            place(p, i, p.points + 2 * ((long long)layout * p.n_points + a * n_per_agent + point),
                   360.f * unit_float(bits.b) - 180.f);
         }
-        sync(crew);
+        sync(group);
     }
-    if (moves && crew.rank == 0)
+    if (moves && group.rank == 0)
         s.layout[env] = layout;
 }

@@ -4,5 +4,5 @@
 KERNEL spawn_hidden(const SpawnParams& p) {
 #pragma omp parallel for schedule(static) num_threads(p.scenery.n_threads)
     for (int env = 0; env < p.scenery.n_envs; env++)
-        spawn_env<1>(p, Alone{0}, env);
+        spawn_env<1>(p, SingleThread{0}, env);
 }

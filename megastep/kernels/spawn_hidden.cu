@@ -1,19 +1,19 @@
-// One warp per environment, whose warp lanes look at a wall each.
+// One warp per environment: each warp lane tests one wall at a time.
 #include "spawn.h"
 
-struct Warp {
+struct WholeWarp {
     static constexpr int SIZE = WARP;
     int rank;
 };
 
-DEVICE void sync(const Warp&) { __syncwarp(); }
+DEVICE void sync(const WholeWarp&) { __syncwarp(); }
 
-DEVICE unsigned int unite(const Warp&, unsigned int bits) {
+DEVICE unsigned int reduce_or(const WholeWarp&, unsigned int bits) {
     return __reduce_or_sync(FULL_WARP, bits);
 }
 
 KERNEL spawn_hidden(SpawnParams p) {
     int env = (blockIdx.x * blockDim.x + threadIdx.x) / WARP;
     if (env < p.scenery.n_envs)
-        spawn_env<1>(p, Warp{(int)threadIdx.x % WARP}, env);
+        spawn_env<1>(p, WholeWarp{(int)threadIdx.x % WARP}, env);
 }

@@ -1,7 +1,7 @@
-// Four uniform numbers per lane.
+// Four uniform random numbers per lane.
 #pragma once
+#include "common/philox.h"
 #include "params.h"
-#include "philox.h"
 
 HD void uniform_lane(const UniformParams& p, int lane) {
     if (!p.mask[lane])

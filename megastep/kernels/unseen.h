@@ -1,14 +1,15 @@
-// Where the texels are that an agent could see and has not seen yet: how many lie in each of 16
-// sectors about the way it looks, in each of three bands of distance.
+// Counts of the visible texels that an agent has not seen yet, in 16 sectors of bearing relative to
+// the agent's heading and 3 bands of distance.
 #pragma once
-#include "errors.h"
-#include "scenery.h"
+#include "common/scenery.h"
+#include "constants.h"
+#include "params.h"
 
-constexpr int BANDS = 3, SECTORS = 16, BINS = BANDS * SECTORS;
+constexpr int BINS = BANDS * SECTORS;
 constexpr float BAND_ENDS[] = {1.5f, 4.f};  // metres
 
-// Sector 0 lies straight ahead, 4 to the left, 8 behind. A bearing is compared with odd multiples
-// of 11.25 degrees by their tangents, which needs no arc tangent.
+// Sector 0 is straight ahead, 4 to the left, 8 behind. Bearings are compared with the tangents of
+// odd multiples of 11.25 degrees, which needs no arc tangent.
 HD int sector_of(float ahead, float left) {
     float along = ahead < 0.f ? -ahead : ahead, across = left < 0.f ? -left : left;
     int sector = (across > 0.19891237f * along) + (across > 0.66817864f * along) +
@@ -23,8 +24,8 @@ HD int band_of(float ahead, float left) {
     return (squared > BAND_ENDS[0] * BAND_ENDS[0]) + (squared > BAND_ENDS[1] * BAND_ENDS[1]);
 }
 
-// Adds the unseen texels of a wall of the layout whose texels start at `first_texel`. Those that
-// share a word of bits, at most 1.6 m of a wall, count where their middle lies.
+// Adds the unseen texels of a wall. `first_texel` is the first texel of the wall's layout. Texels
+// that share a word of bits, at most 1.6 m of a wall, are all counted at their midpoint.
 HD void count_wall(const UnseenParams& p, const Pose& pose, const unsigned int* seen,
                    const unsigned int* visible, int first_texel, int wall, int* bins) {
     int first = p.scenery.texel_starts[wall] - first_texel;
@@ -43,8 +44,8 @@ HD void count_wall(const UnseenParams& p, const Pose& pose, const unsigned int* 
     }
 }
 
-// Adds the unseen texels of the walls of an agent's layout that are this thread's: number `rank`
-// and each `n_threads` further.
+// Adds the unseen texels of every `n_threads`-th wall of an agent's layout, starting at wall
+// `rank`.
 HD void count_unseen(const UnseenParams& p, int agent, int rank, int n_threads, int* bins) {
     const SceneryParams& s = p.scenery;
     float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];

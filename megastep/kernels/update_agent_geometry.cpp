@@ -1,7 +1,6 @@
-// A loop over agents: carries their models to where they stand and, if told to, lights their
-// texels.
-#include "agent_geometry.h"
-#include "errors.h"
+// A loop over agents: moves their models to their poses and, if `lit`, lights their texels.
+#include "update_agent_geometry.h"
+#include "common/scenery.h"
 #include "light_cpu.h"
 
 static void light_agent(const UpdateAgentGeometryParams& p, int env, int a) {

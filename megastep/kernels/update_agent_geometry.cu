@@ -1,11 +1,10 @@
-// One warp per agent: carries its model to where it stands and, if told to, lights its texels, a
-// warp lane each. For every light, the warp first rules out boxes around 32 walls, and then walls,
-// that cannot hide the light from any part of the agent; only the others are tried against each
-// texel, until all texels are hidden.
-#include "agent_geometry.h"
+// One warp per agent: moves its model to its pose and, if `lit`, lights its texels, one per warp
+// lane. For each light, the warp rules out the bounding boxes of 32 walls each, and then the walls,
+// that cannot occlude the light from any part of the agent. The remaining walls are tested against
+// each texel until all texels are in shadow.
+#include "common/scenery.h"
 #include "corridor.h"
-#include "errors.h"
-#include "scenery.h"
+#include "update_agent_geometry.h"
 
 DEVICE float from_warp_lane(float x, int warp_lane) { return __shfl_sync(FULL_WARP, x, warp_lane); }
 
@@ -15,40 +14,40 @@ DEVICE Occluder from_warp_lane(const Occluder& wall, int warp_lane) {
             from_warp_lane(wall.area, warp_lane)};
 }
 
-// Does one of the 32 walls from `first` on hide the light from this warp lane's texel, which lies d
-// from it?
-DEVICE int hidden_by_box(const SceneryParams& s, const Corridor& corridor, int first, int end,
-                         int warp_lane, float dx, float dy) {
-    Occluder own = {0.f, 0.f, 0.f, 0.f, 0.f};
-    int may = 0, hidden = 0;
+// Does one of the 32 walls from `first` on occlude the light from this warp lane's texel? The texel
+// is at (dx, dy) from the light.
+DEVICE int occluded_by_box(const SceneryParams& s, const Corridor& corridor, int first, int end,
+                           int warp_lane, float dx, float dy) {
+    Occluder occluder = {0.f, 0.f, 0.f, 0.f, 0.f};
+    int maybe = 0, occluded = 0;
     if (first + warp_lane < end) {
         Float4 wall = LOAD((const Float4*)s.walls + (first + warp_lane));
-        own = occluder_of(corridor.x, corridor.y, wall.x, wall.y, wall.z, wall.w);
-        may = (own.area > 0.f) & may_occlude(corridor, wall.x, wall.y, wall.z, wall.w);
+        occluder = occluder_of(corridor.x, corridor.y, wall.x, wall.y, wall.z, wall.w);
+        maybe = (occluder.area > 0.f) & may_occlude(corridor, wall.x, wall.y, wall.z, wall.w);
     }
-    for (unsigned int walls = __ballot_sync(FULL_WARP, may); walls; walls &= walls - 1)
-        hidden |= occludes(from_warp_lane(own, __ffs(walls) - 1), dx, dy);
-    return hidden;
+    for (unsigned int walls = __ballot_sync(FULL_WARP, maybe); walls; walls &= walls - 1)
+        occluded |= occludes(from_warp_lane(occluder, __ffs(walls) - 1), dx, dy);
+    return occluded;
 }
 
-// Is the light hidden from this warp lane's texel, which lies d from it? `hidden` to begin with:
-// warp lanes without a texel.
-DEVICE int hidden_by_walls(const SceneryParams& s, const Corridor& corridor, const Walls& walls,
-                           int warp_lane, float dx, float dy, int hidden) {
+// Is the light occluded from this warp lane's texel at (dx, dy) from it? Warp lanes without a texel
+// pass `occluded` = 1.
+DEVICE int occluded_by_walls(const SceneryParams& s, const Corridor& corridor, const Walls& walls,
+                             int warp_lane, float dx, float dy, int occluded) {
     int n_boxes = walls.end_box - walls.first_box;
     for (int start = 0; start < n_boxes; start += WARP) {
-        int may = 0;
+        int maybe = 0;
         if (start + warp_lane < n_boxes) {
             Float4 box = LOAD((const Float4*)s.boxes + (walls.first_box + start + warp_lane));
-            may = box_may_occlude(corridor, box.x, box.y, box.z, box.w);
+            maybe = box_may_occlude(corridor, box.x, box.y, box.z, box.w);
         }
-        unsigned int boxes = __ballot_sync(FULL_WARP, may);
-        for (; boxes && !__all_sync(FULL_WARP, hidden); boxes &= boxes - 1) {
+        unsigned int boxes = __ballot_sync(FULL_WARP, maybe);
+        for (; boxes && !__all_sync(FULL_WARP, occluded); boxes &= boxes - 1) {
             int first = walls.first_wall + BOX_WALLS * (start + __ffs(boxes) - 1);
-            hidden |= hidden_by_box(s, corridor, first, walls.end_wall, warp_lane, dx, dy);
+            occluded |= occluded_by_box(s, corridor, first, walls.end_wall, warp_lane, dx, dy);
         }
     }
-    return hidden;
+    return occluded;
 }
 
 KERNEL BOUNDS(20) update_agent_geometry(UpdateAgentGeometryParams p) {
@@ -75,7 +74,7 @@ KERNEL BOUNDS(20) update_agent_geometry(UpdateAgentGeometryParams p) {
             const float* light = s.lights + 3 * l;
             float dx = x - light[0], dy = y - light[1];
             Corridor corridor = corridor_of(light[0], light[1], pose, s.reach);
-            if (!hidden_by_walls(s, corridor, walls, warp_lane, dx, dy, texel >= end))
+            if (!occluded_by_walls(s, corridor, walls, warp_lane, dx, dy, texel >= end))
                 sum += irradiance(light[2], dx, dy);
         }
         if (texel < end)

@@ -1,5 +1,6 @@
-"""What environments are made of: movement, sensors, spawning, goals, the lifecycle of episodes.
-Callables with a ``.space`` where there is one to declare.
+"""The parts of an environment: movement, sensors, spawning, episodes, lanes.
+
+They are callables. Sensors and movements have a ``.space``.
 """
 
 from megastep.modules.lanes import to_agents, to_lanes

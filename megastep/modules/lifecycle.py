@@ -1,21 +1,27 @@
-"""When episodes begin and end: the part of the contract that every environment shares.
+"""The lifecycle of episodes: when each lane begins and ends one.
 
-N environments, A agents, B = N A lanes.
+Axes: N environments, A agents, B = N A lanes.
 """
-
-from typing import Any
 
 import torch
 
 from megastep import engine
 from megastep.arrdict import arrdict
+from megastep.core import Core
 
-ENDLESS = 2**31 - 1  # steps; the longest an int32 age can tell
+ENDLESS = 2**31 - 1  # steps; the largest int32, which ages and limits are
 
 
 class CounterGenerator:
-    """Random numbers by lane: the k-th draw of a lane depends on the seed, the lane and k alone, so
-    it is the same on every device, captured or not.
+    """A counter-based random generator (Philox) with a counter per lane.
+
+    The k-th draw of a lane depends on the seed, the lane and k only. So it is the same on the CPU,
+    on a GPU and in a CUDA graph.
+
+    Args:
+        n_lanes: number of lanes, B.
+        seed: from 0 to 2**64 - 1.
+        device: where the numbers are drawn.
     """
 
     def __init__(self, n_lanes: int, seed: int, device: torch.device | str):
@@ -24,73 +30,87 @@ class CounterGenerator:
         self.values = torch.zeros((n_lanes, 4), device=device)
 
     def __call__(self, mask: torch.Tensor) -> torch.Tensor:
-        """Four uniform numbers in [0, 1) for each lane, (B, 4): new where ``mask`` (B,) bool,
-        elsewhere those drawn last.
+        """Draws four uniform numbers in [0, 1) for each lane where ``mask``, (B,) bool, is True.
+
+        Returns (B, 4) float32. The other lanes keep the numbers of their last draw.
         """
         return engine.uniform(self.counts, mask.reshape(-1), self.seed, self.values)
 
 
 class RandomLifespans:
-    """Lifespans of a random number of steps, from ``shortest`` to ``longest``: what a
-    :class:`Lifecycle` may take for its limit.
+    """Random time limits of episodes, for the argument ``limit`` of :class:`Lifecycle`.
+
+    Args:
+        core: the environment's core.
+        shortest: minimum lifespan, steps.
+        longest: maximum lifespan, steps.
+        seed: of the lifespans. Default: the core's.
     """
 
-    def __init__(self, core: Any, shortest: int = 128, longest: int = 256, seed: int | None = None):
+    def __init__(
+        self, core: Core, shortest: int = 128, longest: int = 256, seed: int | None = None
+    ):
         if not 0 < shortest <= longest:
             raise ValueError(
-                f"lifespans need 0 < shortest <= longest steps, but {shortest} and {longest} were "
-                f"given"
+                f"lifespans need 0 < shortest <= longest, but shortest={shortest} and "
+                f"longest={longest} were given"
             )
         self.shortest, self.longest = shortest, longest
-        seed = (core.seed if seed is None else seed) + (1 << 32)  # other draws than the spawns'
+        seed = (core.seed if seed is None else seed) + (1 << 32)  # differs from the spawns' seed
         self.random = CounterGenerator(core.n_envs * core.n_agents, seed, core.device)
 
     def draw(self, reset: torch.Tensor, limits: torch.Tensor) -> None:
-        """Writes lifespans into ``limits`` (B,) int32: new ones where ``reset`` (B,) bool."""
-        chance = self.random(reset)[:, 0]
-        limits.copy_(chance * (self.longest - self.shortest + 1)).add_(self.shortest)
+        """Writes new lifespans into ``limits``, (B,) int32, where ``reset``, (B,) bool, is True."""
+        uniform = self.random(reset)[:, 0]
+        limits.copy_(uniform * (self.longest - self.shortest + 1)).add_(self.shortest)
 
 
 class Lifecycle:
-    """Which lanes begin an episode, which end theirs, and why: `reset`, `terminal` and `truncated`
-    of a world.
+    """Keeps the age of every lane's episode and sets ``reset``, ``terminal`` and ``truncated``.
 
-    ``ages`` (B,) int32 are steps since the episode's first observation; an episode is truncated
-    when its age reaches the lane's of ``limits`` (B,) int32. ``ended`` (B,) bool: the last world
-    was its episode's last, so the next step begins another, whatever the decision says. A step that
-    begins an episode cannot end it.
+    An episode is truncated when its age reaches its limit. The step after an episode's end begins
+    the next one, whatever the decision says. A step that begins an episode cannot end it.
 
-    Args: ``limit``: a number of steps, a :class:`RandomLifespans`, or None: episodes end by the
-    environment's own rules, of which it may write some into ``limits``.
+    Args:
+        core: the environment's core.
+        limit: number of steps, or :class:`RandomLifespans`. None sets no limit; the environment may
+            write its own into ``limits``.
+
+    Attributes:
+        ages: (B,) int32, steps since the first observation of the episode.
+        limits: (B,) int32, age at which the episode is truncated.
+        ended: (B,) bool, True if the last world ended the episode.
     """
 
-    def __init__(self, core: Any, limit: int | RandomLifespans | None = None):
-        fixed = ENDLESS if limit is None else limit
+    def __init__(self, core: Core, limit: int | RandomLifespans | None = None):
+        n_steps = ENDLESS if limit is None else limit
         self.lifespans = limit if isinstance(limit, RandomLifespans) else None
-        if self.lifespans is None and not 1 <= fixed <= ENDLESS:
-            raise ValueError(f"an episode's limit must be at least one step, but {limit} was given")
-        lanes, device = core.n_envs * core.n_agents, core.device
+        if self.lifespans is None and not 1 <= n_steps <= ENDLESS:
+            raise ValueError(f"limit must be from 1 to {ENDLESS} steps, but {limit} was given")
+        n_lanes, device = core.n_envs * core.n_agents, core.device
         self.n_agents = core.n_agents
-        self.ages = torch.zeros(lanes, dtype=torch.int32, device=device)
+        self.ages = torch.zeros(n_lanes, dtype=torch.int32, device=device)
         self.limits = torch.zeros_like(self.ages)
         if self.lifespans is None:
-            self.limits.fill_(fixed)
-        self.ended = torch.zeros(lanes, dtype=torch.bool, device=device)
+            self.limits.fill_(n_steps)
+        self.ended = torch.zeros(n_lanes, dtype=torch.bool, device=device)
         self._never = torch.zeros_like(self.ended)
 
     def start_all(self) -> torch.Tensor:
-        """(B,) bool: every lane begins an episode."""
+        """Returns the ``reset`` mask, (B,) bool, of ``env.reset``: True in every lane."""
         return torch.ones_like(self.ended)
 
     def start_ended(self) -> torch.Tensor:
-        """(B,) bool: the lanes that begin an episode in this step, as their last one ended."""
+        """Returns the ``reset`` mask, (B,) bool, of a step: True where the last episode ended."""
         return self.ended.clone()
 
     def __call__(self, reset: torch.Tensor, terminal: torch.Tensor | None = None) -> arrdict:
-        """Counts one step: lanes of ``reset`` (B,) bool begin an episode, the others age.
+        """Counts one step. Returns the world's flags, arrdict(reset, terminal, truncated).
 
-        ``terminal`` (B,) bool: which episodes end here by the environment's own rule. Returns the
-        world's flags, arrdict(reset, terminal, truncated), each (B,) bool.
+        Args:
+            reset: (B,) bool, lanes that begin an episode in this step.
+            terminal: (B,) bool, lanes whose episode ends by the environment's own rule. Ignored
+                where ``reset`` is True; takes precedence over the time limit.
         """
         if self.lifespans is not None:
             self.lifespans.draw(reset, self.limits)
@@ -105,6 +125,6 @@ class Lifecycle:
         return arrdict(reset=reset, terminal=terminal, truncated=truncated)
 
     def state(self, e: int = 0) -> arrdict:
-        """Of environment ``e``'s agents, (A,) each: ``age`` and ``limit`` in steps."""
+        """Returns ``age`` and ``limit`` of the agents of environment ``e``: (A,) int32, steps."""
         lanes = slice(e * self.n_agents, (e + 1) * self.n_agents)
         return arrdict(age=self.ages[lanes].clone(), limit=self.limits[lanes].clone())

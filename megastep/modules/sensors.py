@@ -1,7 +1,7 @@
-"""Sensors: what agents see and feel, one call per observation. Each has a ``.space``, the ``state``
-of one environment, and a ``plot_state`` that draws a numpyified one.
+"""Sensors: RGB, depth and inertia. A call returns the observation of every agent.
 
-N environments, A agents, C cameras per agent, R rays per camera.
+Each has a ``space``, the ``state`` of one environment, and ``plot_state``, which draws a numpyified
+state. Axes: N environments, A agents, C cameras per agent, R rays per camera.
 """
 
 from typing import Any
@@ -10,38 +10,44 @@ import numpy as np
 import torch
 
 from megastep import engine, plotting, spaces
+from megastep.core import Core
 from megastep.modules.movement import to_local
 
 
-def render(core: Any) -> engine.Render:
-    """:func:`~megastep.engine.render` of a core."""
+def render(core: Core) -> engine.Render:
+    """Renders the agents of a core with :func:`megastep.engine.render`."""
     return engine.render(core.scenery, core.agents)
 
 
 def downsample(screen: torch.Tensor, subsample: int) -> torch.Tensor:
-    """(..., R) to (..., R / subsample, subsample): neighbouring rays grouped, ready for a mean or a
-    minimum over the last axis.
+    """Groups neighbouring rays: (..., R) to (..., R / subsample, subsample).
+
+    Take a mean or minimum over the last axis to get pixels.
+
+    Raises:
+        ValueError: if ``subsample`` does not divide R.
     """
-    if subsample < 1 or screen.shape[-1] % subsample:
-        raise ValueError(
-            f"subsample must divide the {screen.shape[-1]} rays of the screen, but {subsample} "
-            f"was given"
-        )
+    n_rays = screen.shape[-1]
+    if subsample < 1 or n_rays % subsample:
+        raise ValueError(f"subsample={subsample} does not divide the {n_rays} rays of the screen")
     return screen.reshape(*screen.shape[:-1], screen.shape[-1] // subsample, subsample)
 
 
 def _plot_strips(name, state, axes, yaws):
-    """Strips of images (A, channels, C, R), one per agent, with a row per camera."""
+    """Draws images (A, channels, C, R) as strips, one per agent, with a row per camera."""
     aspect = plotting.STRIP * np.shape(state)[-2]
     return plotting.plot_images({name: state}, aspect=aspect, axes=axes, yaws=yaws)
 
 
 class RGB:
-    """Colour: float32 (N, A, 3, 1, R / subsample) in linear light, the mean over ``subsample``
-    rays. Several cameras per agent give (N, A, 3, C, R / subsample).
+    """RGB images: float32 (N, A, 3, C, R / subsample) in linear light.
+
+    Args:
+        core: the environment's core.
+        subsample: rays per pixel; a pixel is their mean. Divides R.
     """
 
-    def __init__(self, core: Any, subsample: int = 1):
+    def __init__(self, core: Core, subsample: int = 1):
         self.core, self.subsample = core, subsample
         downsample(torch.empty(core.res), subsample)
         self.space = spaces.MultiImage(
@@ -49,30 +55,43 @@ class RGB:
         )
 
     def __call__(self, r: engine.Render | None = None) -> torch.Tensor:
-        """The observation of a render, by default of one made now."""
+        """Returns the observation of a render. Default: of the present state."""
         r = render(self.core) if r is None else r
         screen = r.screen.reshape(self.core.n_envs, self.core.n_agents, -1, self.core.res, 3)
         return downsample(screen.permute(0, 1, 4, 2, 3), self.subsample).mean(-1)
 
     def state(self, e: int = 0) -> torch.Tensor:
-        """What the agents of environment ``e`` see now, (A, 3, C, R / subsample)."""
+        """Returns the images of the agents of environment ``e``: (A, 3, C, R / subsample)."""
         return self()[e]
 
     @staticmethod
     def plot_state(state: np.ndarray, axes: Any = None, yaws: Any = None) -> np.ndarray:
-        """Draws a numpyified :meth:`state` as strips, one per agent, on as many ``axes`` or on a
-        new figure. A strip has a row for each camera, named by its angle if ``yaws`` (C,) are
-        given. Returns the axes.
+        """Draws a numpyified :meth:`state` as one strip per agent, with a row per camera.
+
+        Args:
+            state: (A, 3, C, R / subsample).
+            axes: matplotlib axes, one per agent. Default: those of a new figure.
+            yaws: (C,) degrees, shown as the names of the rows.
+
+        Returns:
+            The axes.
         """
         return _plot_strips("rgb", state, axes, yaws)
 
 
 class Depth:
-    """Depth: float32 (N, A, 1, C, R / subsample), the mean over ``subsample`` rays of 1 -
-    clamp((distance - radius) / max_depth, 0, 1); ``max_depth`` metres.
+    """Depth images: float32 (N, A, 1, C, R / subsample).
+
+    A ray's depth is 1 - clamp((distance - radius) / max_depth, 0, 1): 1 at the agent's edge, 0 at
+    ``max_depth`` and beyond.
+
+    Args:
+        core: the environment's core.
+        subsample: rays per pixel; a pixel is their mean. Divides R.
+        max_depth: metres.
     """
 
-    def __init__(self, core: Any, subsample: int = 1, max_depth: float = 10.0):
+    def __init__(self, core: Core, subsample: int = 1, max_depth: float = 10.0):
         self.core, self.subsample, self.max_depth = core, subsample, max_depth
         downsample(torch.empty(core.res), subsample)
         self.space = spaces.MultiImage(
@@ -80,46 +99,51 @@ class Depth:
         )
 
     def __call__(self, r: engine.Render | None = None) -> torch.Tensor:
-        """The observation of a render, by default of one made now."""
+        """Returns the observation of a render. Default: of the present state."""
         r = render(self.core) if r is None else r
         distances = r.distances.reshape(self.core.n_envs, self.core.n_agents, 1, -1, self.core.res)
         depth = 1 - ((distances - self.core.agents.radius) / self.max_depth).clamp(0, 1)
         return downsample(depth, self.subsample).mean(-1)
 
     def state(self, e: int = 0) -> torch.Tensor:
-        """What the agents of environment ``e`` see now, (A, 1, C, R / subsample)."""
+        """Returns the images of the agents of environment ``e``: (A, 1, C, R / subsample)."""
         return self()[e]
 
     @staticmethod
     def plot_state(state: np.ndarray, axes: Any = None, yaws: Any = None) -> np.ndarray:
-        """Draws a numpyified :meth:`state` as :meth:`RGB.plot_state` does, in grey; near is
-        bright. Returns the axes.
+        """Draws a numpyified :meth:`state` in grey, bright where near. Arguments and result are
+        those of :meth:`RGB.plot_state`.
         """
         return _plot_strips("depth", state, axes, yaws)
 
 
 class IMU:
-    """Inertia: float32 (N, A, 3), angular velocity / 360 and the agent's own velocity, ahead and
-    left, / 10.
+    """Inertia: float32 (N, A, 3), angular velocity / 360 deg/s and velocity / 10 m/s.
+
+    The velocity is in the agent's frame, forward and left.
+
+    Args:
+        core: the environment's core.
     """
 
-    def __init__(self, core: Any):
+    def __init__(self, core: Core):
         self.core = core
         self.space = spaces.MultiVector(core.n_agents, 3)
 
     def __call__(self) -> torch.Tensor:
+        """Returns the observation, (N, A, 3)."""
         agents = self.core.agents
         return torch.cat(
             [agents.angvelocity[..., None] / 360, to_local(agents.angles, agents.velocity) / 10], -1
         )
 
     def state(self, e: int = 0) -> torch.Tensor:
-        """What the agents of environment ``e`` feel now, (A, 3)."""
+        """Returns the observation of the agents of environment ``e``: (A, 3)."""
         return self()[e]
 
     @staticmethod
     def plot_state(state: np.ndarray, ax: Any = None) -> Any:
-        """Draws a numpyified :meth:`state` as three bars per agent, on ``ax`` or on a new figure.
-        Returns the axes.
+        """Draws a numpyified :meth:`state` as three bars per agent on ``ax``, by default on a new
+        figure. Returns the axes.
         """
         return plotting.plot_bars(("turn", "ahead", "left"), state, ax)

@@ -1,28 +1,29 @@
-"""Spawning: points where agents fit, found once per layout, and the module that puts agents there.
+"""Spawning: a search for points where agents fit, and a module that puts agents there.
 
-N environments, A agents, D layouts, P points, M walls.
+Axes: N environments, A agents, D layouts, P points, M walls.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from megastep import cache, engine
+from megastep.core import Core
+from megastep.dotdict import dotdict
 from megastep.geometry import centers, hashed
 from megastep.modules.lanes import to_agents
 
-CLEARANCE = 0.05  # metres from a spawned agent's collision disc to walls and to others spawned
-PREFIX = "spawn-points-"  # of their files in the cache
-MAX_FILES = 64  # of them, half a megabyte each for 512 layouts
-MIN_CACHED = 32  # layouts; the points of fewer are found in no time
-BATCHES = 20  # of candidates that are tried before a geometry is held to have no more room
+CLEARANCE = 0.05  # metres between a spawned agent's disc and walls, or other spawned agents
+PREFIX = "spawn-points-"  # of the files in the cache
+MAX_FILES = 64  # in the cache, half a megabyte each for 512 layouts
+MIN_CACHED = 32  # layouts; the search is quick for fewer
+BATCHES = 20  # of candidate points; then the search ends
 
 
 def distances(points, walls):
-    """(P,) float64 metres from points (P, 2) to the nearest of walls (M, 2, 2)."""
+    """Returns the metres, (P,) float64, from points (P, 2) to the nearest of walls (M, 2, 2)."""
     (ax, ay), (vx, vy) = walls[:, 0].T, (walls[:, 1] - walls[:, 0]).T
     dx, dy = points[:, :1] - ax, points[:, 1:] - ay
     along = (dx * vx + dy * vy) / np.maximum(vx * vx + vy * vy, 1e-12)
@@ -33,82 +34,97 @@ def distances(points, walls):
 
 
 def _candidates(g, n, random):
-    """Batches (n, 2) of points drawn evenly from the rooms of a geometry."""
+    """Yields batches (n, 2) of points, drawn uniformly from the rooms of a geometry."""
     i, j = (g.masks > 0).nonzero()
     if not len(i):
-        raise ValueError(f"geometry {g.id} has no room to spawn in: its masks need cells above 0")
+        raise ValueError(f"geometry {g.id} has no room to spawn in: no cell of masks is above 0")
     for _ in range(BATCHES):
         choice = random.integers(len(i), size=4 * n)
         cells = centers(np.stack([i[choice], j[choice]], 1), g.masks.shape, g.res)
         yield from np.split(cells + random.uniform(-0.5, 0.5, (4 * n, 2)) * g.res, 4)
 
 
-def _dealt(points, owners, found, n_agents, size, gap):
-    """``points`` (P, 2) and the agents they belong to, ``owners`` (P,), with those of ``found`` (F,
-    2) that fit: one for each agent in turn, none nearer than ``gap`` to another agent's.
+def _assign(points, owners, candidates, n_agents, size, gap):
+    """Gives candidate points (F, 2) to agents in turn, at most ``size`` each, none nearer than
+    ``gap`` to a point of another agent.
+
+    Returns ``points`` (P, 2) and ``owners`` (P,), the agent of each, with the new ones appended.
     """
     if n_agents == 1:
-        points = np.concatenate([points, found])[:size]
+        points = np.concatenate([points, candidates])[:size]
         return points, np.zeros(len(points), int)
-    points = np.concatenate([points, found])
-    owners = np.concatenate([owners, np.full(len(found), -1)])  # -1: of no agent
-    close = ((found[:, None] - points) ** 2).sum(-1) < gap**2
+    points = np.concatenate([points, candidates])
+    owners = np.concatenate([owners, np.full(len(candidates), -1)])  # -1: no agent
+    close = ((candidates[:, None] - points) ** 2).sum(-1) < gap**2
     counts = np.bincount(owners + 1, minlength=n_agents + 1)[1:].tolist()
-    for p, neighbours in enumerate(close, len(points) - len(found)):
-        near = set(owners[neighbours].tolist()) - {-1}
-        agent = min(near, default=counts.index(min(counts)))
-        if len(near) < 2 and counts[agent] == min(counts) < size:
+    for p, neighbours in enumerate(close, len(points) - len(candidates)):
+        near_agents = set(owners[neighbours].tolist()) - {-1}
+        agent = min(near_agents, default=counts.index(min(counts)))
+        if len(near_agents) < 2 and counts[agent] == min(counts) < size:
             owners[p] = agent
             counts[agent] += 1
     return points[owners >= 0], owners[owners >= 0]
 
 
 def spawn_points(
-    g: Any, n: int, n_agents: int, radius: float, random: np.random.Generator
+    g: dotdict, n: int, n_agents: int, radius: float, random: np.random.Generator
 ) -> np.ndarray:
-    """(n_agents * (n // n_agents), 2) float64 points in the rooms of a geometry, each agent's end
-    to end. A disc of ``radius`` about a point is 5 cm clear of every wall, and of the discs about
-    other agents' points. Where fewer fit, some come again. ValueError if there are none.
+    """Returns points in the rooms of a geometry, (n_agents * (n // n_agents), 2) float64, those of
+    agent 0 first.
+
+    A disc of ``radius`` metres around a point is 5 cm clear of every wall and of the discs around
+    other agents' points. If fewer points fit, some are repeated.
+
+    Raises:
+        ValueError: if an agent has no point.
     """
     size, points, owners = n // n_agents, np.empty((0, 2)), np.empty(0, int)
     from_wall, apart = radius + CLEARANCE, 2 * radius + CLEARANCE
     for batch in _candidates(g, n, random):
-        found = batch[distances(batch, g.walls) > from_wall]
-        points, owners = _dealt(points, owners, found, n_agents, size, apart)
+        clear = batch[distances(batch, g.walls) > from_wall]
+        points, owners = _assign(points, owners, clear, n_agents, size, apart)
         if len(points) == n_agents * size:
             return points[owners.argsort(kind="stable")]
     if not len(points):
         raise ValueError(
             f"geometry {g.id} has no point in a room that is {from_wall:.2f} m from every wall"
         )
-    shares = [points[owners == agent] for agent in range(n_agents)]
-    if not min(map(len, shares)):
+    per_agent = [points[owners == agent] for agent in range(n_agents)]
+    if not min(map(len, per_agent)):
         raise ValueError(
             f"geometry {g.id} has no room for {n_agents} agents at once, {apart:.2f} m apart"
         )
-    return np.concatenate([share[random.integers(len(share), size=size)] for share in shares])
+    return np.concatenate(
+        [of_agent[random.integers(len(of_agent), size=size)] for of_agent in per_agent]
+    )
 
 
 class RandomSpawns:
-    """Puts agents at random points in the rooms of their environment's layout, at rest, looking
-    anywhere.
+    """Puts agents at random points in the rooms of their layout, at rest, with a random heading.
 
-    ``points`` (D, A * (n_spawns // A), 2) float32 are found once, 5 cm clear of the walls; each
-    agent has some of its own, 5 cm clear of all other agents'. So agents that respawn together
-    never overlap; one that respawns alone may land on another that has walked there, and the
-    physics lets overlapping discs part. With ``resample`` an environment whose agents all respawn
-    moves to another layout first. With ``hidden`` an agent respawns out of sight of the others that
-    stand in its environment, or if it has no such point, as far from them as it can.
+    Each agent has spawn points of its own, 5 cm clear of the walls and of the other agents' points.
+    So agents that respawn together never overlap. An agent that respawns alone may land on another
+    that has walked there; physics lets overlapping discs part.
 
-    Args: ``geometries`` are those the scenery was made from; ``n_spawns`` points per layout;
-    ``points`` (D, A * n, 2) float32 to spawn at instead, each agent's end to end. ``chosen`` (N, A)
-    int32 are the numbers of the points where agents spawned last.
+    Args:
+        geometries: those that the scenery was made from.
+        core: the environment's core.
+        n_spawns: points per layout, shared out among the agents.
+        resample: move an environment to a random layout whenever all its agents respawn.
+        seed: of the points and spawns. Default: the core's.
+        hidden: respawn out of sight of the other agents in the environment. If no point is, take
+            the one furthest from them.
+        points: (D, A * n, 2) float32, points to use instead, those of agent 0 first.
+
+    Attributes:
+        points: (D, A * (n_spawns // A), 2) float32, those of agent 0 first.
+        chosen: (N, A) int32, index of the point where each agent last spawned.
     """
 
     def __init__(
         self,
-        geometries: Sequence[Any],
-        core: Any,
+        geometries: Sequence[dotdict],
+        core: Core,
         n_spawns: int = 128,
         resample: bool = False,
         seed: int | None = None,
@@ -117,15 +133,15 @@ class RandomSpawns:
     ):
         if n_spawns < core.n_agents:
             raise ValueError(
-                f"n_spawns must be at least one point for each of the {core.n_agents} agents, but "
-                f"{n_spawns} was given"
+                f"n_spawns={n_spawns} is less than one point for each of the {core.n_agents} agents"
             )
         self.core, self.resample, self.hidden = core, resample, hidden
         self.seed = core.seed if seed is None else seed
         if points is None:
             geometries = geometries[: len(core.scenery.layouts)]
-            given = n_spawns, core.n_agents, core.agents.radius, self.seed
-            points = _cached_points(geometries, *given)
+            points = _cached_points(
+                geometries, n_spawns, core.n_agents, core.agents.radius, self.seed
+            )
         self.points = torch.as_tensor(points, device=core.device)
         self.counts, self.chosen = (
             torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
@@ -133,7 +149,7 @@ class RandomSpawns:
         )
 
     def __call__(self, reset: torch.Tensor) -> None:
-        """Respawns the agents marked in ``reset``, (N, A) or (B,) bool."""
+        """Respawns the agents where ``reset``, (N, A) or (B,) bool, is True."""
         engine.spawn(
             self.core.scenery,
             self.core.agents,
@@ -148,7 +164,7 @@ class RandomSpawns:
 
 
 def _all_points(geometries, n_spawns, n_agents, radius, seed):
-    """(D, A * (n_spawns // A), 2) float32: the points of every layout."""
+    """Returns the points of every layout, (D, A * (n_spawns // A), 2) float32."""
     points = [
         spawn_points(
             g, n_spawns, n_agents, radius, np.random.Generator(np.random.Philox([seed, d]))
@@ -159,7 +175,7 @@ def _all_points(geometries, n_spawns, n_agents, radius, seed):
 
 
 def _cached_points(geometries, *arguments):
-    """:func:`_all_points`, from the cache if the same were found before."""
+    """Returns :func:`_all_points`, from the cache if it holds them."""
     if len(geometries) < MIN_CACHED:
         return _all_points(geometries, *arguments)
     key = hashed(geometries)

@@ -1,6 +1,6 @@
-"""Which of a layout's texels can be seen at all: the most that a view may show.
+"""The texels of each layout that can be seen from its spawn points.
 
-D layouts, P points, N environments.
+Axes: D layouts, P points.
 """
 
 import hashlib
@@ -12,50 +12,56 @@ import torch
 from megastep import cache, engine
 from megastep.engine import checks
 from megastep.engine.scenery import Scenery
-from megastep.kernels.build.compile import sources
+from megastep.kernels.build.launch import ENGINE
 
 __all__ = ["visible_texels"]
 
-CAMERAS = (0.0, 120.0, 240.0)  # degrees
+CAMERAS = (0.0, 120.0, 240.0)  # yaw of each, degrees
 FOV = 122.0  # degrees; neighbouring cameras overlap by two
 RES = 512  # rays per camera
-AWAY = 1e4  # metres
-PREFIX = "visible-texels-"  # of their files in the cache
-MAX_FILES = 32  # of them, half a kilobyte per layout
-MIN_CACHED = 32  # layouts; the texels of fewer are found in no time
+AWAY = 1e4  # metres; where unused agents stand
+PREFIX = "visible-texels-"  # of the files in the cache
+MAX_FILES = 32  # in the cache, half a kilobyte per layout
+MIN_CACHED = 32  # layouts; the computation is quick for fewer
 TEXELS_PER_POINT = 64  # newly seen texels that earn a reward of 1
 
 
 def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
-    """(D, n_words) int32, a bit for each static texel of each layout: whether it is seen by a look
-    all round from one of the layout's ``points`` (D, P, 2), as :func:`~megastep.engine.observe`
-    marks what is seen. ValueError if the scenery has no agent to look with.
+    """Returns a bitmap, (D, n_words) int32, of the wall texels that are visible from any of the
+    layout's points with cameras all round. Bits are set as :func:`megastep.engine.observe` does.
 
-    On the CPU, where two thousand homes take seconds, many layouts' are kept in the cache.
+    On the CPU two thousand homes take seconds, so bitmaps of many layouts are cached.
+
+    Args:
+        scenery: its agents' model is what looks; it needs at least one agent.
+        points: (D, P, 2) metres, points to look from.
+
+    Raises:
+        ValueError: if an argument does not fit.
     """
     checks.instance("scenery", scenery, Scenery)
     checks.integer("scenery.n_agents", scenery.n_agents, 1)
     layouts, device = scenery.layouts, scenery.device
     points = checks.floats("points", points, (len(layouts), "P", 2), device)
     if device.type != "cpu" or len(layouts) < MIN_CACHED:
-        return _looked(scenery, points)
+        return _visible_from(scenery, points)
     key = hashlib.sha256(Path(__file__).read_bytes() + repr(engine.AGENT_RADIUS).encode())
-    for name, text in sources(".h", ".cpp").items():
+    for name, text in ENGINE.sources(".h", ".cpp").items():
         key.update(f"{name}\0{text}\0".encode())
     for tensor in (layouts.lines.vals, layouts.wall_starts, layouts.texel_starts, points):
         key.update(repr((tensor.shape, tensor.dtype)).encode() + tensor.numpy().tobytes())
 
     def build():
         cache.prune(PREFIX, MAX_FILES - 1)
-        return _looked(scenery, points).numpy().tobytes()
+        return _visible_from(scenery, points).numpy().tobytes()
 
     body, _ = cache.fetch(f"{PREFIX}{key.hexdigest()[:20]}", build)
     return torch.from_numpy(np.frombuffer(body, np.int32).reshape(len(layouts), -1).copy())
 
 
-def _looked(scenery, points):
+def _visible_from(scenery, points):
     layouts, device = scenery.layouts, scenery.device
-    each_once = Scenery.of_layouts(
+    env_per_layout = Scenery.of_layouts(
         scenery.n_agents,
         layouts,
         scenery.model,
@@ -64,10 +70,10 @@ def _looked(scenery, points):
     )
     shape = len(layouts), scenery.n_agents
     agents = engine.Agents(*shape, res=RES, fov=FOV, cameras=CAMERAS, device=device)
-    agents.positions.fill_(AWAY)  # all agents but the first, which shall not hide anything
+    agents.positions.fill_(AWAY)  # agents beside the first must not hide anything
     seen = torch.zeros((*shape, -(-layouts.max_texels // 32)), dtype=torch.int32, device=device)
     for p in range(points.shape[1]):
         agents.positions[:, 0] = points[:, p]
-        engine.observe(each_once, agents, rgb=False, depth=False, seen=seen)
+        engine.observe(env_per_layout, agents, rgb=False, depth=False, seen=seen)
     engine.check(agents)
     return seen[:, 0].clone()

@@ -1,42 +1,40 @@
-"""What a step of Pong costs one environment, by how many are stepped at once: in plain Python, in
-NumPy, by the engine, and in the Atari emulator; all with pictures.
+"""Compares what a step of Pong with images costs per environment, over the number of environments.
 
-    python scripts/benchmarks/pong_chart.py measure       # on the CPU; writes docs/pong.jsonl
-    python scripts/benchmarks/pong_chart.py draw          # docs/pong.svg
+    python scripts/benchmarks/pong_chart.py measure       # on the CPU; writes docs/lab/pong.jsonl
+    python scripts/benchmarks/pong_chart.py draw          # docs/lab/pong.svg
 
-One thread of the CPU each; on a GPU, what `python scripts/benchmarks/benchmark.py pong` measured. Atari Pong
-is measured where ale-py is installed; it is under the GPL 2.0, so nothing here requires it: pip
-install ale-py. Its frame has other rules and 160 x 210 pixels.
+Compared are plain Python, NumPy, megastep and the Atari emulator on one CPU thread each, and
+megastep on a GPU, from the records of `python scripts/benchmarks/benchmark.py pong`. Atari Pong is
+measured if ale-py is installed (pip install ale-py). It is under the GPL 2.0, so nothing here
+requires it. It has other rules and frames of 160 x 210 pixels.
 """
 
 import argparse
+import itertools
 import json
 import os
 import re
 import sys
 import time
-from datetime import date
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # idle threads of PyTorch must not spin
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # this checkout comes first
 
+import figures
 import numpy as np
+import paths
+import records
 import torch
+from timing import N_CALLS, seconds_per_call
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "scripts" / "benchmarks")]
+from megastep import arrdict, envs
+from tests.helpers.pong_twins import NumpyPong, PythonPong
 
-from benchmark import commit, machine  # noqa: E402
-from benchmark_report import newest, read  # noqa: E402
-from timing import TURNS, timed  # noqa: E402
-
-from megastep import arrdict, envs  # noqa: E402
-from tests.helpers.pong_twins import NumpyPong, PythonPong  # noqa: E402
-
-RECORDS, CHART = ROOT / "docs" / "pong.jsonl", ROOT / "docs" / "pong.svg"
-BENCHMARKS = ROOT / "docs" / "benchmarks.jsonl"
-ON_GPU = r"pong, pictures, `env.step`, ([\d,]+) environments"
-STEPS = 300  # before it is timed, so that games are in all their phases
+GPU_MEASUREMENT = r"pong, pictures, `env.step`, ([\d,]+) environments"
+N_WARM_UP = 300  # steps before timing, so that games are in all phases
+MAX_WARM_UP_SECONDS = 1
 COLOURS = {
     "Atari emulator": "tab:red",
     "plain Python": "tab:orange",
@@ -44,50 +42,52 @@ COLOURS = {
     "megastep": "tab:green",
 }
 
+# ---- Implementations: each returns a function that steps n environments ----
 
-def plain_python(n):
-    games, random = [PythonPong(lane) for lane in range(n)], np.random.default_rng(1)
-    actions = random.integers(3, size=(TURNS, n)).tolist()
-    turn = turns()
+
+def plain_python(n: int) -> Callable[[], None]:
+    games, generator = [PythonPong(lane) for lane in range(n)], np.random.default_rng(1)
+    actions = itertools.cycle(generator.integers(3, size=(N_CALLS, n)).tolist())
     for game in games:
         game.reset()
 
     def step():
-        for game, action in zip(games, actions[next(turn)]):
+        for game, action in zip(games, next(actions)):
             game.step([action])
 
     return step
 
 
-def numpy(n):
-    games, turn = NumpyPong(n), turns()
-    actions = np.random.default_rng(1).integers(3, size=(TURNS, 1, n))
+def numpy(n: int) -> Callable[[], object]:
+    games = NumpyPong(n)
+    actions = itertools.cycle(np.random.default_rng(1).integers(3, size=(N_CALLS, 1, n)))
     games.reset()
-    return lambda: games.step(actions[next(turn)])
+    return lambda: games.step(next(actions))
 
 
-def megastep(n):
-    env, turn = envs.Pong(n, pixels=True, device="cpu"), turns()
-    actions = torch.randint(3, (TURNS, n, 1))
-    decisions = [arrdict.arrdict(actions=some) for some in actions]
+def megastep(n: int) -> Callable[[], object]:
+    env = envs.Pong(n, pixels=True, device="cpu")
+    actions = torch.randint(3, (N_CALLS, n, 1))
+    decisions = itertools.cycle([arrdict.arrdict(actions=row) for row in actions])
     env.reset()
-    return lambda: env.step(decisions[next(turn)])
+    return lambda: env.step(next(decisions))
 
 
-def atari(n):
-    """A frame of each of ``n`` emulators, in grey. ImportError where ale-py is not installed."""
+def atari(n: int) -> Callable[[], None]:
+    """Steps ``n`` emulators and reads their grey images. ImportError without ale-py."""
     from ale_py import ALEInterface, LoggerMode, roms
 
     ALEInterface.setLoggerMode(LoggerMode.Error)
     emulators = [ALEInterface() for _ in range(n)]
     for emulator in emulators:
         emulator.loadROM(roms.get_rom_path("pong"))
-    legal, turn = emulators[0].getMinimalActionSet(), turns()
-    actions = np.random.default_rng(1).integers(len(legal), size=(TURNS, n)).tolist()
+    legal = emulators[0].getMinimalActionSet()
+    indices = np.random.default_rng(1).integers(len(legal), size=(N_CALLS, n))
+    actions = itertools.cycle(indices.tolist())
     screens = np.empty((n, *emulators[0].getScreenDims()), np.uint8)
 
     def step():
-        for emulator, action, screen in zip(emulators, actions[next(turn)], screens):
+        for emulator, action, screen in zip(emulators, next(actions), screens):
             emulator.act(legal[action])
             emulator.getScreenGrayscale(screen)
             if emulator.game_over():
@@ -96,13 +96,8 @@ def atari(n):
     return step
 
 
-def turns():
-    while True:
-        yield from range(TURNS)
-
-
-#: What is measured, and how many environments at most.
-SUBJECTS = {
+#: Name: (implementation, largest number of environments).
+IMPLEMENTATIONS = {
     "Atari emulator": (atari, 30),
     "plain Python": (plain_python, 1000),
     "NumPy": (numpy, 100_000),
@@ -110,97 +105,89 @@ SUBJECTS = {
 }
 
 
-def sizes(most):
-    """1, 3, 10, 30 ... to ``most``, which is the last."""
-    found = [times * 10**power for power in range(7) for times in (1, 3)]
-    return [n for n in found if n < most] + [most]
+# ---- Measuring ----
 
 
-def measure(name):
-    """A record per number of environments: seconds per step and environment, the least of some
-    samples of 50 ms each, for whatever else the machine does only adds to them.
+def sizes(largest: int) -> list[int]:
+    """Returns 1, 3, 10, 30, ... up to ``largest``, which is always the last."""
+    candidates = [factor * 10**power for power in range(7) for factor in (1, 3)]
+    return [n for n in candidates if n < largest] + [largest]
+
+
+def measure(name: str) -> Iterator[dict]:
+    """Yields a record per number of environments: seconds per step and environment.
+
+    It is the minimum over samples of 50 ms, since other load on the machine only adds to them.
     """
-    (make, most), device = SUBJECTS[name], torch.device("cpu")
-    for n in sizes(most):
-        step = make(n)
-        start, steps = time.perf_counter(), 0
-        while steps < STEPS and time.perf_counter() - start < 1:
+    (implementation, largest), device = IMPLEMENTATIONS[name], torch.device("cpu")
+    for n in sizes(largest):
+        step = implementation(n)
+        end = time.perf_counter() + MAX_WARM_UP_SECONDS
+        for _ in range(N_WARM_UP):
             step()
-            steps += 1
-        yield dict(
-            name=name,
-            environments=n,
-            seconds=float(f"{min(timed(step, device)) / n:.4g}"),
-            **machine(device),
-            commit=commit(),
-            date=str(date.today()),
-        )
+            if time.perf_counter() > end:
+                break
+        seconds = float(f"{min(seconds_per_call(step, device)) / n:.4g}")
+        provenance = records.provenance(device, records.commit())
+        yield dict(name=name, environments=n, seconds=seconds) | provenance
 
 
-def store(path, record):
-    """Adds a record to the file of JSON lines, in the place of an older one of the same thing."""
-
-    def key(one):
-        return one["name"], one["environments"]
-
-    lines = path.read_text().splitlines() if path.exists() else []
-    records = {key(one): one for one in [*map(json.loads, lines), record]}
-    lines = [json.dumps(records[k]) for k in sorted(records)]
-    path.write_text("\n".join(lines) + "\n")
+def store(path: Path, record: dict) -> None:
+    """Adds a record to a file of JSON lines, or replaces the one of the same name and size."""
+    old_records = records.read(path) if path.exists() else []
+    newest = {(row["name"], row["environments"]): row for row in [*old_records, record]}
+    path.write_text("".join(json.dumps(newest[key]) + "\n" for key in sorted(newest)))
 
 
-def on_gpu(records):
-    """The same of the newest records of `benchmark.py pong`: (environments, seconds, GPU), ...."""
-    for record in newest(records):
-        match = re.fullmatch(ON_GPU, record["what"])
-        if match and not record["on"].startswith("CPU"):
+# ---- Drawing ----
+
+
+def gpu_points(rows: list[dict]) -> Iterator[tuple[int, float, str]]:
+    """Yields (environments, seconds per environment, GPU) from records of `benchmark.py pong`."""
+    for record in records.newest(rows):
+        match = re.fullmatch(GPU_MEASUREMENT, record["what"])
+        if match and not figures.is_cpu(record):
             yield int(match[1].replace(",", "")), 1e-6 / record["value"], record["on"]
 
 
-def draw(records, benchmarks, path):
-    """Seconds per step and environment against environments, both logarithmic."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    ax = Figure(figsize=(7.5, 4.8), layout="constrained").subplots()
-    lines = {name: [r for r in records if r["name"] == name] for name in COLOURS}
-    for name, own in lines.items():
-        if own:
-            n, seconds = zip(*sorted((r["environments"], r["seconds"]) for r in own))
-            style = dict(color=COLOURS[name], marker="o", markersize=4)
-            ax.plot(n, seconds, label=f"{name}, one CPU thread", **style)
-    if points := sorted(on_gpu(benchmarks)):
-        n, seconds, where = zip(*points)
+def draw(rows: list[dict], benchmark_rows: list[dict], path: Path) -> None:
+    """Plots seconds per step and environment over the number of environments, both logarithmic."""
+    ax = figures.subplots(7.5, 4.8)
+    for name, colour in COLOURS.items():
+        points = [(row["environments"], row["seconds"]) for row in rows if row["name"] == name]
+        if points:
+            style = dict(color=colour, marker="o", markersize=4)
+            ax.plot(*zip(*sorted(points)), label=f"{name}, one CPU thread", **style)
+    if points := sorted(gpu_points(benchmark_rows)):
+        n_envs, seconds, gpus = zip(*points)
         style = dict(color=COLOURS["megastep"], linestyle="--", marker="o", markersize=4)
-        ax.plot(n, seconds, label=f"megastep, one {where[0]}", **style)
+        ax.plot(n_envs, seconds, label=f"megastep, one {gpus[0]}", **style)
     ax.set(xscale="log", yscale="log", xlabel="environments")
     ax.set_ylabel("seconds per step and environment")
-    ax.grid(alpha=0.3)
-    ax.legend(fontsize=8)
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
-        ax.figure.savefig(path, metadata={"Date": None})
+    figures.finish(ax, path)
 
 
-def main(argv=None):
+def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("what", choices=("measure", "draw"))
-    parser.add_argument("--only", nargs="+", choices=SUBJECTS, default=[*SUBJECTS])
-    parser.add_argument("--records", type=Path, default=RECORDS)
-    parser.add_argument("--chart", type=Path, default=CHART)
-    options = parser.parse_args(argv)
-    if options.what == "draw":
-        draw(read(options.records), read(BENCHMARKS), options.chart)
+    parser.add_argument("--only", nargs="+", choices=IMPLEMENTATIONS, default=[*IMPLEMENTATIONS])
+    parser.add_argument("--records", type=Path, default=paths.PONG_RECORDS)
+    parser.add_argument("--chart", type=Path, default=paths.PONG_CHART)
+    arguments = parser.parse_args(argv)
+    if arguments.what == "draw":
+        draw(records.read(arguments.records), records.read(paths.RECORDS), arguments.chart)
         return
     torch.set_num_threads(1)
-    for name in options.only:
+    for name in arguments.only:
         try:
             for record in measure(name):
-                store(options.records, record)
-                print(f"{name}, {record['environments']:,}: {record['seconds'] * 1e9:,.1f} ns")
+                store(arguments.records, record)
+                nanoseconds = record["seconds"] * 1e9
+                print(f"{name}, {record['environments']:,}: {nanoseconds:,.1f} ns")
         except ImportError as error:
-            print(f"{name} is left out ({error}): pip install ale-py")
+            print(f"{name} is skipped ({error}): pip install ale-py")
 
 
 if __name__ == "__main__":

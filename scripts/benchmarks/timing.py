@@ -1,4 +1,4 @@
-"""How the benchmarks time a call: CUDA events on a GPU, the clock on the CPU; median and spread."""
+"""Times calls: with CUDA events on a GPU, with the clock on the CPU. Gives medians and spreads."""
 
 import itertools
 import statistics
@@ -9,60 +9,68 @@ import torch
 
 from megastep import capture
 
-REPEATS = 15  # samples per measurement
-SECONDS = 0.05  # per sample
-TURNS = 16  # operations in one CUDA graph
+N_SAMPLES = 15  # per measurement
+SAMPLE_SECONDS = 0.05
+N_CALLS = 16  # calls in one CUDA graph; also how many random actions are drawn beforehand
 SCALES = {"k": 1e3, "M": 1e6}
 
 
-def laps(work: Callable[[], object], device: torch.device, calls: int, n: int) -> list[float]:
-    """Seconds that each of ``n`` laps of ``calls`` calls takes."""
-    gpu = device.type == "cuda"
+def lap_seconds(
+    function: Callable[[], object], device: torch.device, n_calls: int, n_laps: int
+) -> list[float]:
+    """Returns the seconds of each of ``n_laps`` laps of ``n_calls`` calls."""
+    on_gpu = device.type == "cuda"
 
-    def mark():
-        if not gpu:
+    def timestamp():
+        if not on_gpu:
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)
         event.record()
         return event
 
-    marks = [mark()]
-    for _ in range(n):
-        for _ in range(calls):
-            work()
-        marks.append(mark())
-    if gpu:
+    timestamps = [timestamp()]
+    for _ in range(n_laps):
+        for _ in range(n_calls):
+            function()
+        timestamps.append(timestamp())
+    if on_gpu:
         torch.cuda.synchronize(device)
     return [
-        start.elapsed_time(end) / 1e3 if gpu else end - start
-        for start, end in itertools.pairwise(marks)
+        start.elapsed_time(end) / 1e3 if on_gpu else end - start
+        for start, end in itertools.pairwise(timestamps)
     ]
 
 
-def timed(work: Callable[[], object], device: torch.device, repeats: int | None = None):
-    """Seconds per call of ``work``, a list of samples."""
-    calls = max(1, round(SECONDS / min(laps(work, device, 1, 3))))
-    return [lap / calls for lap in laps(work, device, calls, repeats or REPEATS)]
+def seconds_per_call(
+    function: Callable[[], object], device: torch.device, n_samples: int | None = None
+) -> list[float]:
+    """Returns samples of the seconds that a call takes, each a mean over ``SAMPLE_SECONDS``."""
+    n_calls = max(1, round(SAMPLE_SECONDS / min(lap_seconds(function, device, 1, 3))))
+    laps = lap_seconds(function, device, n_calls, n_samples or N_SAMPLES)
+    return [seconds / n_calls for seconds in laps]
 
 
-def alone(function: Callable[[int], object], device: torch.device) -> list[float]:
-    """Seconds per call of ``function(i)``, i in turn from 0 to 15, by itself: on a GPU the sixteen
-    are one CUDA graph, so that none waits for Python.
+def graph_seconds_per_call(function: Callable[[int], object], device: torch.device) -> list[float]:
+    """Returns samples of the seconds that ``function(i)`` takes, for i from 0 to 15 in turn.
+
+    On a GPU the sixteen calls are one CUDA graph, so that Python's own time does not count.
     """
     if device.type != "cuda":
-        turn = itertools.cycle(range(TURNS))
-        return timed(lambda: function(next(turn)), device)
+        indices = itertools.cycle(range(N_CALLS))
+        return seconds_per_call(lambda: function(next(indices)), device)
 
-    def turns():
-        for i in range(TURNS):
+    def call_all():
+        for i in range(N_CALLS):
             function(i)
 
-    return [lap / TURNS for lap in timed(capture.capture(turns, (), ()), device)]
+    graph = capture.capture(call_all, (), ())
+    return [seconds / N_CALLS for seconds in seconds_per_call(graph, device)]
 
 
 def measurement(what: str, unit: str, samples: list[float]) -> dict:
-    """The median of ``samples``; of several also ``lower`` and ``upper``, their 10th and 90th
-    percentiles.
+    """Returns the median of ``samples`` as a measurement.
+
+    ``lower`` and ``upper`` are the 10th and 90th percentiles, None if there is one sample.
     """
     lower, *_, upper = (
         statistics.quantiles(samples, n=10, method="inclusive")
@@ -73,8 +81,9 @@ def measurement(what: str, unit: str, samples: list[float]) -> dict:
     return dict(what=what, value=value, unit=unit, lower=lower, upper=upper, n=len(samples))
 
 
-def rate(what: str, count: int, times: list[float], unit: str = "M/s") -> dict:
-    """The measurement of ``count`` things done in each of ``times`` seconds; ``unit`` begins with
-    its scale.
+def rate(what: str, count: int, seconds: list[float], unit: str = "M/s") -> dict:
+    """Returns the measurement of a rate: ``count`` items in each sample of ``seconds``.
+
+    The first letter of ``unit`` is its scale, k or M.
     """
-    return measurement(what, unit, [count / t / SCALES[unit[0]] for t in times])
+    return measurement(what, unit, [count / sample / SCALES[unit[0]] for sample in seconds])

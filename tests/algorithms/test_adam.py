@@ -1,4 +1,4 @@
-"""Our use of PyTorch's fused Adam, against PyTorch's own class."""
+"""Adam against torch.optim.Adam."""
 
 import pathlib
 import subprocess
@@ -20,61 +20,62 @@ def parameters(device="cpu"):
     ]
 
 
-def set_gradients(ours, *others, seed):
+def set_gradients(*parameter_lists, seed):
+    """Gives every list of parameters the same random gradients."""
     generator = torch.Generator().manual_seed(seed)
-    for each in zip(ours, *others):
-        grad = torch.randn(each[0].shape, generator=generator)
-        for p in each:
+    for parameters in zip(*parameter_lists):
+        grad = torch.randn(parameters[0].shape, generator=generator)
+        for p in parameters:
             p.grad = grad.to(p.device)
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
-def test_steps_are_those_of_torchs_own_class(device):
-    ours, theirs = parameters(device), parameters(device)
+def test_matches_torch_optim_adam(device):
+    params, torch_params = parameters(device), parameters(device)
     lr = torch.tensor(0.1, device=device)
-    adam = Adam(ours, lr, betas=(0.8, 0.99), eps=1e-4)
-    how = dict(betas=(0.8, 0.99), eps=1e-4, fused=True, capturable=device == "cuda")
-    own = torch.optim.Adam(theirs, lr=lr, **how)
+    adam = Adam(params, lr, betas=(0.8, 0.99), eps=1e-4)
+    options = dict(betas=(0.8, 0.99), eps=1e-4, fused=True, capturable=device == "cuda")
+    torch_adam = torch.optim.Adam(torch_params, lr=lr, **options)
     for seed in range(4):
         lr.fill_(0.1 / (seed + 1))
-        set_gradients(ours, theirs, seed=seed)
+        set_gradients(params, torch_params, seed=seed)
         adam.step(YES.to(device))
-        own.step()
-    assert all(map(torch.equal, ours, theirs))
+        torch_adam.step()
+    assert all(map(torch.equal, params, torch_params))
 
 
-def test_a_step_that_is_not_taken_changes_nothing():
-    left_out, without = parameters(), parameters()
-    first, second = (Adam(p, torch.tensor(0.1)) for p in (left_out, without))
-    for adam, takes in ((first, (YES, NO, YES)), (second, (YES, YES))):
+def test_skipped_step_changes_nothing():
+    skipping, plain = parameters(), parameters()
+    first, second = (Adam(p, torch.tensor(0.1)) for p in (skipping, plain))
+    for adam, steps in ((first, (YES, NO, YES)), (second, (YES, YES))):
         seeds = iter((0, 1))
-        for taken in takes:
-            set_gradients(adam.parameters, seed=next(seeds) if taken else 9)
-            if not taken:
+        for is_taken in steps:
+            set_gradients(adam.parameters, seed=next(seeds) if is_taken else 9)
+            if not is_taken:
                 adam.parameters[0].grad.fill_(torch.nan)
-            adam.step(taken)
-    assert all(map(torch.equal, left_out, without))
+            adam.step(is_taken)
+    assert all(map(torch.equal, skipping, plain))
     assert first.n_steps == second.n_steps == 2
     assert all(map(torch.equal, first.squares, second.squares))
 
 
-def test_a_saved_adam_goes_on():
-    ours, theirs = parameters(), parameters()
-    first = Adam(ours, torch.tensor(0.1))
-    set_gradients(ours, seed=0)
+def test_state_dict_resumes():
+    params, resumed = parameters(), parameters()
+    first = Adam(params, torch.tensor(0.1))
+    set_gradients(params, seed=0)
     first.step(YES)
-    second = Adam(theirs, torch.tensor(0.1))
+    second = Adam(resumed, torch.tensor(0.1))
     second.load_state_dict(first.state_dict())
-    for a, b in zip(theirs, ours):
-        a.data.copy_(b.data)
-    set_gradients(ours, theirs, seed=1)
+    for target, source in zip(resumed, params):
+        target.data.copy_(source.data)
+    set_gradients(params, resumed, seed=1)
     first.step(YES)
     second.step(YES)
-    assert all(map(torch.equal, ours, theirs))
+    assert all(map(torch.equal, params, resumed))
 
 
-def test_an_update_does_not_import_pytorchs_compiler():
-    # It takes more than a second, before the first update.
+def test_update_does_not_import_torch_dynamo():
+    # importing it would delay the first update by more than a second
     script = """
 import sys, torch
 from megastep.agents.networks.policy import Policy

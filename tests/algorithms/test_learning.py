@@ -1,5 +1,5 @@
-"""Learners learn: small environments, each of which only a learner with one particular ability can
-solve, in seconds.
+"""Learning tests: small environments, each solvable in seconds by a learner with one particular
+ability only.
 """
 
 import pytest
@@ -14,15 +14,15 @@ B = 64
 
 
 class Env:
-    """Lanes whose episodes are at step `age`; subclasses define what is observed and paid, and when
-    it ends.
+    """Base of the environments. `age` (B,) is the step of each lane's episode. Subclasses define
+    observations in `show`, and (reward, terminal, truncated) in `result`.
     """
 
-    n_shown, n_actions = 1, 4
+    obs_dim, n_actions = 1, 4
     n_envs, n_agents, device = B, 1, torch.device("cpu")
 
     def __init__(self, seed=0):
-        self.obs_space = spaces.MultiVector(1, self.n_shown)
+        self.obs_space = spaces.MultiVector(1, self.obs_dim)
         self.action_space = spaces.MultiDiscrete(1, self.n_actions)
         self.generator = torch.Generator().manual_seed(seed)
         self.age, self.over = torch.zeros(B, dtype=torch.int64), torch.zeros(B, dtype=torch.bool)
@@ -57,11 +57,11 @@ class Env:
         pass
 
     def show(self):
-        return torch.zeros(B, self.n_shown)
+        return torch.zeros(B, self.obs_dim)
 
 
 class Bandit(Env):
-    """One action per episode; action 2 pays 1, the others a tenth of their number."""
+    """One action per episode; action 2 has reward 1, the others less."""
 
     def result(self, action):
         over = torch.ones(B, dtype=torch.bool)
@@ -69,32 +69,32 @@ class Bandit(Env):
 
 
 class Corridor(Env):
-    """Seven cells in a row, from the first to the last, which pays 1; action 0 goes back, action 1
-    on. An episode is truncated after 40 steps.
+    """Seven cells in a row; the last one has reward 1. Action 0 goes back, action 1 forward. An
+    episode is truncated after 40 steps.
     """
 
-    n_shown = 7
+    obs_dim = 7
 
     def begin(self, which):
         cell = getattr(self, "cell", torch.zeros(B, dtype=torch.int64))
         self.cell = cell.masked_fill(which, 0)
 
     def show(self):
-        return torch.nn.functional.one_hot(self.cell, self.n_shown).float()
+        return torch.nn.functional.one_hot(self.cell, self.obs_dim).float()
 
     def result(self, action):
         way = (action == 1).long() - (action == 0).long()
-        self.cell = (self.cell + way).clamp(0, self.n_shown - 1)
-        there = self.cell == self.n_shown - 1
+        self.cell = (self.cell + way).clamp(0, self.obs_dim - 1)
+        there = self.cell == self.obs_dim - 1
         return there.float(), there, (self.age == 39) & ~there
 
 
 class Cue(Env):
-    """Shows one of four cues on an episode's first observation and then nothing; doing what it said
-    pays 1 at age 5.
+    """Shows one of four cues in an episode's first observation only. The action of the same number
+    has reward 1 at age 5.
     """
 
-    n_shown, lag = 4, 5
+    obs_dim, lag = 4, 5
 
     def begin(self, which):
         new = torch.randint(self.n_actions, (B,), generator=self.generator)
@@ -109,10 +109,8 @@ class Cue(Env):
 
 
 class Clock(Env):
-    """Shows nothing at all, ever. At age k the action PATTERN[k] pays 1, and an episode may be cut
-    after any step.
-
-    Only who starts counting anew with each episode can know k.
+    """Shows nothing. At age k the action PATTERN[k] has reward 1, and an episode may be truncated
+    after any step. Only a policy that counts from the start of each episode knows k.
     """
 
     PATTERN = torch.tensor([2, 0, 3, 1, 1])
@@ -124,8 +122,8 @@ class Clock(Env):
 
 
 class Wage(Env):
-    """Pays 1 for every step, whatever one does; an episode ends after each with probability 1/8, in
-    one way.
+    """Reward 1 in every step, whatever the action. An episode ends after each step with probability
+    1/8, always the same way.
     """
 
     def __init__(self, ends):
@@ -141,8 +139,8 @@ class Wage(Env):
 
 
 class Luck(Env):
-    """Pays the same at every step of an episode, whatever one does: how much is drawn as it begins,
-    and shown to nobody but a critic.
+    """A random reward that stays the same during an episode, whatever the action. Only the critic
+    sees it.
     """
 
     privileged_space = arrdict(luck=spaces.MultiVector(1, 1))
@@ -159,92 +157,93 @@ class Luck(Env):
         return arrdict(super()._world(*flags), privileged=dict(luck=self.luck.view(B, 1, 1)))
 
 
-def learn(env, n_updates, policy=None, name="ppo", **how):
-    """Trains a small policy and counts what happened in the last ten rollouts: (policy, rewards,
-    ends, valid steps, tenths of the returns' variance that the critic explained, if it has one).
+def learn(env, n_updates, policy=None, name="ppo", **settings):
+    """Trains a small policy. Returns it and four sums over the last ten rollouts: rewards, terminal
+    ends, valid steps, and the critic's explained variance.
     """
     kind = LEARNERS[name]
-    made, learner = kind.make(env, **how)
     if policy is None:
-        policy = made
+        policy, learner = kind.make(env, **settings)
     else:
-        learner = kind.made(policy, **{**kind.how, **how})
+        learner = kind.learner(policy, **{**kind.settings, **settings})
     collect, counts = learner.collector(env), torch.zeros(4)
     for i in range(n_updates):
         rollout = collect()
         explained = learner.update(rollout).get("loss/explained_variance", torch.tensor(0.0))
         if i >= n_updates - 10:
-            happened = rollout.reward.sum(), rollout.terminal.sum(), (~rollout.reset).sum()
-            counts += torch.stack([*happened, explained])
+            sums = rollout.reward.sum(), rollout.terminal.sum(), (~rollout.reset).sum()
+            counts += torch.stack([*sums, explained])
     return policy, *counts.tolist()
 
 
-class Forgetless(Policy):
-    """A policy whose memory leaks from one episode into the next."""
+class NeverResets(Policy):
+    """A policy whose hidden state leaks from one episode into the next."""
 
     def unroll(self, obs, reset, state):
         return super().unroll(obs, torch.zeros_like(reset), state)
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_the_arm_that_pays_is_found(name):
+def test_learns_bandit(name):
     _, rewards, ends, *_ = learn(Bandit(), 30, name=name)
     assert rewards / ends > 0.9
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_the_end_of_a_corridor_is_reached(name):
-    """The shortest way takes 6 steps; whoever walks at random gets there in a third of episodes.
-    R2D2 draws some actions by chance while it learns.
+def test_learns_corridor(name):
+    """The shortest way takes 6 steps. A random policy arrives in a third of the episodes. R2D2
+    takes some random actions while it learns.
     """
     _, rewards, _, valid, _ = learn(Corridor(), 30, name=name, gamma=0.95)
     assert valid / rewards < (8 if name == "r2d2" else 7)
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_a_cue_is_remembered(name):
-    """Guessing earns 1/4, and so does any policy without a memory."""
+def test_remembers_cue(name):
+    """A policy without a hidden state earns 1/4."""
     _, rewards, ends, *_ = learn(Cue(), 60, name=name, lr=3e-3)
     assert rewards / ends > 0.9
 
 
 @pytest.mark.parametrize(
-    "core, least, most", [("gru", 0.9, 1), ("mingru", 0.9, 1), ("none", 0.1, 0.4)]
+    "core, min_return, max_return", [("gru", 0.9, 1), ("mingru", 0.9, 1), ("none", 0.1, 0.4)]
 )
-def test_every_recurrent_core_remembers_a_cue(core, least, most):
+def test_recurrent_cores_remember_cue(core, min_return, max_return):
     env = Cue()
     policy = Policy(env.obs_space, env.action_space, width=32, core=core)
     _, rewards, ends, *_ = learn(env, 40, policy, lr=3e-3)
-    assert least < rewards / ends <= most
+    assert min_return < rewards / ends <= max_return
 
 
-def test_memory_starts_anew_with_every_episode():
-    how, env = dict(n_updates=60, lr=1e-2, entropy_coef=0.03), Clock()
-    _, rewards, _, valid, _ = learn(env, **how)
+def test_hidden_state_is_reset_with_episode():
+    env, settings = Clock(), dict(n_updates=60, lr=1e-2, entropy_coef=0.03)
+    _, rewards, _, valid, _ = learn(env, **settings)
     assert rewards / valid > 0.9
-    leaky = Forgetless(env.obs_space, env.action_space, width=32)
-    _, rewards, _, valid, _ = learn(env, policy=leaky, **how)
-    assert rewards / valid < 0.5  # nothing it sees tells it when an episode begins
+    leaky = NeverResets(env.obs_space, env.action_space, width=32)
+    _, rewards, _, valid, _ = learn(env, policy=leaky, **settings)
+    assert rewards / valid < 0.5  # no observation shows when an episode begins
 
 
 @pytest.mark.parametrize(
-    "ends, worth",
+    "ends, expected",
     [
-        ("truncated", 1 / (1 - 0.9)),  # a time limit takes nothing away: 1 + .9 + .81 + ...
-        ("terminal", 1 / (1 - 0.9 * 7 / 8)),
+        ("truncated", 1 / (1 - 0.9)),  # 1 + .9 + .81 + ...
+        ("terminal", 1 / (1 - 0.9 * 7 / 8)),  # 1 + .9 (7/8) + ...
     ],
-)  # a death does: 1 + .9 (7/8) + ...
-def test_a_time_limit_is_not_a_death(ends, worth):
+)
+def test_truncated_bootstraps_and_terminal_does_not(ends, expected):
     env = Wage(ends)
     policy, *_ = learn(env, n_updates=60, gamma=0.9, lambda_=0.8)
     obs, reset = torch.zeros(12, 1, 1, 1), torch.zeros(12, 1, dtype=torch.bool)
     value = policy.value(policy.unroll(obs, reset, policy.initial(1)).features)[:, 0]
-    torch.testing.assert_close(value, torch.full((12,), worth), rtol=0.1, atol=0)
+    torch.testing.assert_close(value, torch.full((12,), expected), rtol=0.1, atol=0)
 
 
-@pytest.mark.parametrize("critic, least, most", [("asymmetric", 0.95, 1), ("plain", -0.1, 0.1)])
-def test_what_only_the_critic_sees_explains_the_returns(critic, least, most):
+@pytest.mark.parametrize(
+    "critic, min_explained, max_explained", [("asymmetric", 0.95, 1), ("plain", -0.1, 0.1)]
+)
+def test_asymmetric_critic_explains_returns(critic, min_explained, max_explained):
     env = Luck()
     policy = Policy(env.obs_space, env.action_space, env.privileged_space, critic=critic, width=32)
-    *_, tenths = learn(env, 60, policy)
-    assert least < tenths / 10 <= most
+    *_, explained = learn(env, 60, policy)
+    assert min_explained < explained / 10 <= max_explained

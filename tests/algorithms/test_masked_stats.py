@@ -1,4 +1,4 @@
-"""Statistics over the valid, by hand."""
+"""Statistics over valid entries, against hand calculations."""
 
 import math
 
@@ -8,7 +8,7 @@ import torch
 from megastep.agents.algorithms import masked_stats
 
 
-def test_means_and_standard_deviations_are_over_the_valid():
+def test_mean_and_normalise_use_valid_only():
     x, valid = (
         torch.tensor([[1.0, 5.0], [torch.nan, 3.0]]),
         torch.tensor([[True, True], [False, True]]),
@@ -16,11 +16,11 @@ def test_means_and_standard_deviations_are_over_the_valid():
     assert masked_stats.masked_mean(x, valid).item() == 3
     std = math.sqrt(8 / 3)
     expected = torch.tensor([[-2 / std, 2 / std], [0.0, 0.0]])
-    torch.testing.assert_close(masked_stats.normalised(x, valid), expected)
+    torch.testing.assert_close(masked_stats.masked_normalise(x, valid), expected)
     assert masked_stats.masked_mean(x, torch.zeros_like(valid)).item() == 0
 
 
-def test_explained_variance_of_the_truth_is_one_and_of_a_constant_zero():
+def test_explained_variance():
     targets, valid = torch.tensor([[1.0, 2.0, 6.0]]), torch.tensor([[True, True, True]])
     assert masked_stats.explained_variance(targets + 4, targets, valid).item() == pytest.approx(1)
     assert masked_stats.explained_variance(
@@ -29,7 +29,7 @@ def test_explained_variance_of_the_truth_is_one_and_of_a_constant_zero():
     assert masked_stats.explained_variance(-targets, targets, valid).item() == pytest.approx(-3)
 
 
-def test_the_effective_sample_size_by_hand():
+def test_effective_sample_size():
     weights = torch.tensor([[2.0, 2.0, torch.nan], [2.0, 2.0, 0.0]])
     valid = ~weights.isnan()
     assert masked_stats.effective_sample_size(weights, valid).item() == pytest.approx(64 / (5 * 16))
@@ -38,6 +38,6 @@ def test_the_effective_sample_size_by_hand():
     assert masked_stats.effective_sample_size(alone, alone > 5).item() == 0
 
 
-def test_means_along_an_axis():
+def test_mean_along_axis():
     x, valid = torch.tensor([[1.0, 5.0], [3.0, torch.nan]]), torch.tensor([[True, False]] * 2)
     assert masked_stats.masked_mean(x, valid, 0).tolist() == [2, 0]

@@ -1,4 +1,4 @@
-"""Finding numbers that cannot be learnt from, in rollouts and in what is saved."""
+"""Detection of non-finite numbers in rollouts and in saved state."""
 
 from collections import OrderedDict
 
@@ -15,8 +15,8 @@ from megastep.agents.algorithms.nonfinite import (
 T, B = 4, 3
 
 
-def numbers():
-    """As a rollout has them: one row more of what is seen than of what follows."""
+def floats():
+    """Returns tensors like those of `Rollout.floats`."""
     return {
         "obs.rgb": torch.rand(T + 1, B, 1, 3, 1, 8).half(),
         "obs.imu": torch.rand(T + 1, B, 1, 3),
@@ -27,55 +27,56 @@ def numbers():
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1.01 * LIMIT, -1e30])
-@pytest.mark.parametrize("name", numbers())
-def test_a_bad_number_is_named_with_its_lane_and_step(name, value):
-    check, rollout = NonFiniteCheck("cpu"), numbers()
+@pytest.mark.parametrize("name", floats())
+def test_nonfinite_value_has_name_lane_and_step(name, value):
+    check, rollout = NonFiniteCheck("cpu"), floats()
     assert check(rollout)
-    rollout[name][2, 1] = value  # in float16, all of these are infinite or no number
+    rollout[name][2, 1] = value  # infinite or NaN in float16
     assert not check(rollout)
     bad, _ = check.read(rollout)
     # the third row of the second rollout
     assert (bad.name, bad.lane, bad.step) == (name, 1, T + 3)
-    assert not bad.size <= LIMIT and str(bad).startswith(f"{name} of lane 1 was ")
+    assert not bad.size <= LIMIT and name in str(bad)
 
 
-def test_one_pixel_is_enough():
-    check, rollout = NonFiniteCheck("cpu"), numbers()
+def test_single_nan_pixel_is_found():
+    check, rollout = NonFiniteCheck("cpu"), floats()
     rollout["obs.rgb"][4, 2, 0, 1, 0, 7] = torch.nan
     assert not check(rollout)
     assert check.read(rollout)[0].step == 5
 
 
-def test_the_largest_numbers_that_can_be_learnt_from_are_fine():
-    check, rollout = NonFiniteCheck("cpu"), numbers()
+def test_largest_allowed_numbers_pass():
+    check, rollout = NonFiniteCheck("cpu"), floats()
     rollout["reward"][0, 0], rollout["value"][0, 0] = 0.99 * LIMIT, -0.99 * LIMIT
     rollout["obs.rgb"][:] = 65504
     assert check(rollout) and check.read(rollout) == (None, 0)
 
 
-def test_the_first_is_remembered_until_it_is_read():
-    check, good, bad = NonFiniteCheck("cpu"), numbers(), numbers()
+def test_first_value_is_kept_until_read():
+    check, good, bad = NonFiniteCheck("cpu"), floats(), floats()
     bad["reward"][1, 2] = 1e13
     worse = {name: values * torch.nan for name, values in good.items()}
     for rollout in (good, bad, worse, good):
         check(rollout)
-    found, _ = check.read(good)
-    assert found == NonFiniteValue("reward", 2, T + 2, pytest.approx(1e13))
-    assert found.is_from_env and str(found) == f"reward of lane 2 was 1e+13 at step {T + 2}"
+    value, _ = check.read(good)
+    assert value == NonFiniteValue("reward", 2, T + 2, pytest.approx(1e13))
+    assert value.is_from_env
+    assert all(part in str(value) for part in ("reward", "lane 2", "1e+13", f"step {T + 2}"))
     assert check.read(good)[0] is None
     check(worse)
     assert check.read(good)[0].step == 4 * T + 1
 
 
-def test_updates_skipped_in_a_row_are_counted():
+def test_consecutive_skipped_updates_are_counted():
     check, counts = NonFiniteCheck("cpu"), []
     for is_skipped in (False, True, True, False, True):
         check.count(torch.tensor(is_skipped))
-        counts.append(check.read(numbers())[1])
+        counts.append(check.read(floats())[1])
     assert counts == [0, 1, 2, 0, 1]
 
 
-def test_what_is_not_finite_in_a_tree_is_named():
+def test_nonfinite_leaf_returns_path():
     tree = {"policy": OrderedDict([("a.b", torch.ones(2)), ("c", torch.ones(()))]), "n": [1, 0.5]}
     tree |= {"none": None, "word": "nan", "generator": torch.zeros(3, dtype=torch.uint8)}
     assert nonfinite_leaf(tree) is None
@@ -85,15 +86,15 @@ def test_what_is_not_finite_in_a_tree_is_named():
 
 
 @pytest.mark.cuda
-def test_looking_over_a_rollout_never_synchronises():
-    rollout = {name: values.cuda() for name, values in numbers().items()}
+def test_check_never_synchronises():
+    rollout = {name: values.cuda() for name, values in floats().items()}
     rollout["obs.imu"][3, 1] = torch.nan
     check = NonFiniteCheck(torch.device("cuda"))
     check(rollout)
     torch.cuda.set_sync_debug_mode("error")
     try:
-        is_fine = check(rollout)
-        check.count(~is_fine)
+        is_finite = check(rollout)
+        check.count(~is_finite)
     finally:
         torch.cuda.set_sync_debug_mode("default")
     bad, n_skipped = check.read(rollout)

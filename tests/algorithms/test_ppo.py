@@ -1,6 +1,4 @@
-"""PPO: what one update does, on made-up rollouts. That it learns is in
-test_learning.py.
-"""
+"""PPO's update on random rollouts. test_learning.py tests that PPO learns."""
 
 import io
 import math
@@ -9,19 +7,19 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.algorithms import ppo
+from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.rollout import Rollout
 from megastep.arrdict import arrdict
-from tests.helpers.made_up import MORE, MOVES, OBS, WIDTH, B, T, made_up, weights
+from tests.helpers.made_up import MOVES, OBS, PRIVILEGED, WIDTH, B, T, made_up, weights
 
 
-def test_the_first_pass_finds_the_policy_where_it_was():
+def test_first_pass_has_zero_kl():
     policy, rollout = made_up()
-    metrics = ppo.PPO(policy, n_minibatches=1).update(rollout)
+    metrics = PPO(policy, n_minibatches=1).update(rollout)
     assert metrics["loss/kl"].item() == pytest.approx(0, abs=1e-6)
     assert metrics["loss/clip_fraction"].item() == metrics["loss/skipped_steps"].item() == 0
-    # With ratios of 1 the policy's loss is the mean advantage, which normalising made 0
+    # with ratios of 1 the policy loss is the mean of normalised advantages
     assert metrics["loss/policy"].item() == pytest.approx(0, abs=1e-6)
     assert 0 < metrics["loss/entropy"].item() < math.log(3)
     assert set(metrics) == {
@@ -39,28 +37,27 @@ def test_the_first_pass_finds_the_policy_where_it_was():
     }
 
 
-def test_kl_and_clipping_by_hand():
-    # Acting found every action half as probable as the policy does now: ratio 2, so KL = 2 - 1 -
-    # log 2 in every row
+def test_kl_and_clip_fraction_match_hand_calculation():
+    # every action was half as likely when it was taken: ratio 2, so KL = 2 - 1 - log 2 in every row
     policy, rollout = made_up()
     rollout.logprobs -= math.log(2)
-    metrics = ppo.PPO(policy, n_minibatches=2, lr=1e-30).update(rollout)
+    metrics = PPO(policy, n_minibatches=2, lr=1e-30).update(rollout)
     assert metrics["loss/kl"].item() == pytest.approx(1 - math.log(2), abs=1e-5)
     assert metrics["loss/clip_fraction"].item() == 1
 
 
-def test_good_actions_become_likelier_and_bad_ones_rarer():
+def test_rewarded_action_becomes_likelier():
     policy, rollout = made_up()
     rollout.reward[:] = (rollout.actions[..., 0] == 2).float()
     before = policy.unroll(rollout.obs, rollout.starts, rollout.state).logits.exp().mean((0, 1, 2))
-    learner = ppo.PPO(policy, lr=3e-3, gamma=0.0)
+    learner = PPO(policy, lr=3e-3, gamma=0.0)
     for _ in range(5):
         learner.update(rollout)
     after = policy.unroll(rollout.obs, rollout.starts, rollout.state).logits.exp().mean((0, 1, 2))
     assert after[2] > before[2] + 0.05 and after[0] < before[0] and after[1] < before[1]
 
 
-def test_what_an_invalid_row_holds_teaches_nothing():
+def test_invalid_rows_are_ignored():
     results = []
     for corrupt in (False, True):
         policy, rollout = made_up()
@@ -69,7 +66,7 @@ def test_what_an_invalid_row_holds_teaches_nothing():
             assert len(ignored[0]) == 2
             rollout.reward[ignored], rollout.logprobs[ignored] = 1e3, -5.0
             rollout.actions[ignored] = (rollout.actions[ignored] + 1) % 3
-        learner = ppo.PPO(policy, n_epochs=2, n_minibatches=2)
+        learner = PPO(policy, n_epochs=2, n_minibatches=2)
         results.append((learner.update(rollout), weights(policy)))
     (clean_metrics, clean), (dirty_metrics, dirty) = results
     assert torch.equal(clean, dirty)
@@ -77,13 +74,13 @@ def test_what_an_invalid_row_holds_teaches_nothing():
 
 
 @pytest.mark.parametrize("n_minibatches", [2, B])
-def test_lanes_that_do_not_learn_change_no_bit_of_weights_or_statistics(n_minibatches):
-    """All of two lanes is replaced, by numbers whose ratios of probabilities overflow. One lane
-    learns at some times: its other rows count in no mean, though its memory passes through them.
+def test_lanes_that_do_not_learn_change_no_bit(n_minibatches):
+    """Replaces two lanes by numbers whose ratios overflow. A third lane learns at some times only:
+    its other rows count in no mean, but its hidden state passes through them.
     """
     results = []
     for changed in (False, True):
-        policy, rollout = made_up(privileged=MORE)
+        policy, rollout = made_up(privileged=PRIVILEGED)
         rollout.learns[:, [0, 4]] = False
         rollout.learns[2:4, 3] = False
         if changed:
@@ -95,7 +92,7 @@ def test_lanes_that_do_not_learn_change_no_bit_of_weights_or_statistics(n_miniba
             rollout.state.cell[[0, 4]] = 7.0
             rollout.logprobs[2:4, 3], rollout.values[2:4, 3] = -200.0, rollout.values[2:4, 3]
             rollout.actions[2:4, 3] = (rollout.actions[2:4, 3] + 1) % 3
-        learner = ppo.PPO(policy, n_epochs=2, n_minibatches=n_minibatches, lr=1e-2)
+        learner = PPO(policy, n_epochs=2, n_minibatches=n_minibatches, lr=1e-2)
         metrics = learner.update(rollout)
         results.append((metrics, policy.state_dict(), learner.optimizer.means))
     (clean_metrics, clean, means), (metrics, dirty, dirty_means) = results
@@ -104,10 +101,10 @@ def test_lanes_that_do_not_learn_change_no_bit_of_weights_or_statistics(n_miniba
     assert metrics == clean_metrics and metrics["loss/skipped_steps"].item() == 0
 
 
-def test_an_update_without_a_lane_that_learns_changes_nothing():
-    """Adam's means of earlier gradients would move the weights on."""
+def test_update_without_learning_lanes_changes_nothing():
+    """Without a skip, Adam's running means would still move the weights."""
     policy, rollout = made_up()
-    learner = ppo.PPO(policy, n_minibatches=2, lr=1e-2)
+    learner = PPO(policy, n_minibatches=2, lr=1e-2)
     learner.update(rollout)
     before = {name: value.clone() for name, value in policy.state_dict().items()}
     means = [mean.clone() for mean in learner.optimizer.means]
@@ -115,103 +112,106 @@ def test_an_update_without_a_lane_that_learns_changes_nothing():
     learner.update(rollout)
     assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
     assert all(map(torch.equal, learner.optimizer.means, means))
-    assert learner.check.read(rollout.numbers()) == (None, 0), "nor is it counted as skipped"
+    assert learner.check.read(rollout.floats()) == (None, 0), "not counted as skipped"
 
 
-def test_lanes_that_learn_do_change_the_weights():
+def test_lanes_that_learn_change_weights():
     ends = []
     for lane in (None, 0, 2):
         policy, rollout = made_up()
         rollout.learns[:, 0] = False
         if lane is not None:
             rollout.reward[:, lane] += torch.arange(T)
-        ppo.PPO(policy, n_minibatches=2, lr=1e-2).update(rollout)
+        PPO(policy, n_minibatches=2, lr=1e-2).update(rollout)
         ends.append(weights(policy))
     assert torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], ends[2])
 
 
-def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
+def test_nonfinite_gradient_is_skipped():
     policy, rollout = made_up()
-    rollout.logprobs[2, 3] = -200.0  # a ratio of e^200 in one lane of six, a minibatch of its own
+    rollout.logprobs[2, 3] = -200.0  # a ratio of e^200 in one of six minibatches
     before = weights(policy)
-    learner = ppo.PPO(policy, n_minibatches=B)
+    learner = PPO(policy, n_minibatches=B)
     metrics = learner.update(rollout)
     assert metrics["loss/skipped_steps"].item() == 1
     assert not torch.equal(weights(policy), before) and weights(policy).isfinite().all()
     assert all(value.isfinite() for value in metrics.values())
-    assert learner.check.read(rollout.numbers()) == (None, 0)  # the update was not skipped
+    assert learner.check.read(rollout.floats()) == (
+        None,
+        0,
+    )  # the update as a whole was not skipped
 
 
 @pytest.mark.parametrize("name", ["obs", "reward", "value", "logprob"])
 @pytest.mark.parametrize("value", [math.nan, 1e30])
-def test_a_bad_number_in_a_rollout_changes_no_bit_of_weights_or_statistics(name, value):
+def test_nonfinite_rollout_changes_no_bit(name, value):
     policy, rollout = made_up()
-    learner = ppo.PPO(policy, n_minibatches=B, n_epochs=2)
+    learner = PPO(policy, n_minibatches=B, n_epochs=2)
     learner.update(rollout)
     parts = policy.state_dict(), {"n": learner.optimizer.n_steps}
     lists = learner.optimizer.means, learner.optimizer.squares
     before = [{key: tensor.clone() for key, tensor in part.items()} for part in parts]
     before_lists = [[tensor.clone() for tensor in each] for each in lists]
-    rollout.numbers()[name][2, 3] = value
+    rollout.floats()[name][2, 3] = value
     metrics = learner.update(rollout)
     assert metrics["loss/skipped_steps"].item() == 2 * B
     for part, old in zip(parts, before, strict=True):
         assert all(torch.equal(part[key], old[key]) for key in old)
     for each, old in zip(lists, before_lists, strict=True):
         assert all(map(torch.equal, each, old))
-    bad, n_skipped = learner.check.read(rollout.numbers())
+    bad, n_skipped = learner.check.read(rollout.floats())
     assert (bad.name, bad.lane, bad.step, n_skipped) == (name, 3, T + 3, 1)
 
 
-def test_what_comes_after_a_stop_is_not_counted_as_skipped():
-    # The policy that acted is found 1 - log 2 = .31 nats away in the first minibatch of one lane,
-    # which stops the update; in the lanes that follow, gradients are not finite.
+def test_steps_after_target_kl_are_not_counted_as_skipped():
+    # The first minibatch has a KL divergence of 1 - log 2 = .31 nats, which stops the update. The
+    # gradients of the other minibatches are not finite.
     policy, rollout = made_up()
     rollout.logprobs -= math.log(2)
     next(policy.parameters()).register_hook(lambda grad: grad * math.nan)
-    stopped = ppo.PPO(policy, n_minibatches=B, target_kl=0.1)
+    stopped = PPO(policy, n_minibatches=B, target_kl=0.1)
     assert stopped.update(rollout)["loss/skipped_steps"].item() == 0
-    assert stopped.check.read(rollout.numbers()) == (None, 0)
-    going_on = ppo.PPO(policy, n_minibatches=B, target_kl=1.0)
-    assert going_on.update(rollout)["loss/skipped_steps"].item() == B
-    assert going_on.check.read(rollout.numbers()) == (None, 1)
+    assert stopped.check.read(rollout.floats()) == (None, 0)
+    continued = PPO(policy, n_minibatches=B, target_kl=1.0)
+    assert continued.update(rollout)["loss/skipped_steps"].item() == B
+    assert continued.check.read(rollout.floats()) == (None, 1)
 
 
-def test_an_update_stops_once_the_policy_has_gone_too_far():
+def test_target_kl_stops_update():
     ends = []
-    for how in (dict(n_epochs=1), dict(n_epochs=4, target_kl=1e-4), dict(n_epochs=4)):
+    for settings in (dict(n_epochs=1), dict(n_epochs=4, target_kl=1e-4), dict(n_epochs=4)):
         policy, rollout = made_up()
-        ppo.PPO(policy, lr=3e-2, n_minibatches=1, **how).update(rollout)
+        PPO(policy, lr=3e-2, n_minibatches=1, **settings).update(rollout)
         ends.append(weights(policy))
     once, stopped, four_times = ends
     assert torch.equal(stopped, once) and not torch.equal(four_times, once)
 
 
-def test_an_update_learns_how_observations_are_spread():
+def test_update_normalises_observations():
     policy, rollout = made_up()
     rollout.obs += 5
-    ppo.PPO(policy).update(rollout)
+    PPO(policy).update(rollout)
     norm, last = policy.intake.norms[0], rollout.obs[-1]
     torch.testing.assert_close(norm.mean, last.mean(0))
     torch.testing.assert_close(norm(last).std(0, correction=0), torch.ones(1, 4))
 
 
-def test_the_learning_rate_can_be_changed():
+def test_set_lr():
     policy, rollout = made_up()
-    learner, before = ppo.PPO(policy, lr=1e-2), weights(policy)
+    learner, before = PPO(policy, lr=1e-2), weights(policy)
     learner.set_lr(0.0)
     learner.update(rollout)
     assert torch.equal(weights(policy), before)
     learner.set_lr(1e-3)
     learner.update(rollout)
-    # Adam's first step that counts moves no weight by more than about lr, whatever the gradient
+    # Adam's first step moves no weight by more than about lr, whatever the gradient
     assert 0 < (weights(policy) - before).abs().max() < 4 * 4e-3
 
 
 @pytest.mark.parametrize("n_before", [0, 2])
-def test_a_saved_learner_goes_on_bit_by_bit(n_before):
+def test_state_dict_resumes_bit_for_bit(n_before):
     policy, rollout = made_up()
-    learner = ppo.PPO(policy, n_epochs=2, n_minibatches=3)
+    learner = PPO(policy, n_epochs=2, n_minibatches=3)
     for _ in range(n_before):
         learner.update(rollout)
     learner.set_lr(2e-3)
@@ -222,72 +222,71 @@ def test_a_saved_learner_goes_on_bit_by_bit(n_before):
     file.seek(0)
     saved = torch.load(file, weights_only=True)
     other = Policy(OBS, MOVES, width=WIDTH, seed=9)
-    resumed = ppo.PPO(other, n_epochs=2, n_minibatches=3, lr=0.5, seed=9)
+    resumed = PPO(other, n_epochs=2, n_minibatches=3, lr=0.5, seed=9)
     other.load_state_dict(saved["policy"])
     resumed.load_state_dict(saved["learner"])
     resumed.update(rollout)
     assert torch.equal(weights(other), weights(policy))
     assert torch.equal(
-        other.random.on(other.device).get_state(), policy.random.on(policy.device).get_state()
+        other.generator.on(other.device).get_state(), policy.generator.on(policy.device).get_state()
     )
     resumed.set_lr(0.0)  # still reaches the optimizer
     resumed.update(rollout)
     assert torch.equal(weights(other), weights(policy))
 
 
-def test_minibatches_need_lanes():
+def test_fewer_lanes_than_minibatches_raises():
     policy, rollout = made_up()
-    with pytest.raises(ValueError, match="6 lanes cannot be cut into 7 minibatches"):
-        ppo.PPO(policy, n_minibatches=7).update(rollout)
+    with pytest.raises(ValueError, match="6 lanes .* 7 minibatches.*n_minibatches"):
+        PPO(policy, n_minibatches=7).update(rollout)
 
 
-def test_nested_actions_learn_together():
+def test_nested_action_space():
     moves = arrdict(move=MOVES, fire=spaces.MultiDiscrete(1, 2))
     policy = Policy(OBS, moves, width=WIDTH)
     rollout = Rollout(T, B, OBS, moves, policy.initial(B))
     rollout.logprobs[:] = math.log(1 / 6)
     rollout.reward[:] = torch.randn(T, B)
     before = weights(policy)
-    metrics = ppo.PPO(policy).update(rollout)
+    metrics = PPO(policy).update(rollout)
     assert metrics["loss/entropy"].item() == pytest.approx(math.log(6), abs=1e-3)
     assert not torch.equal(weights(policy), before)
 
 
 @pytest.mark.cuda
-def test_a_captured_update_is_the_eager_one():
+def test_captured_update_matches_eager():
     ends = []
     for graph in (False, True):
         policy, rollout = made_up(device="cuda")
-        learner = ppo.PPO(policy, n_epochs=2, n_minibatches=3, lr=1e-3, graph=graph)
+        learner = PPO(policy, n_epochs=2, n_minibatches=3, lr=1e-3, graph=graph)
         for i in range(5):
             learner.set_lr(1e-3 / (i + 1))
             metrics = learner.update(rollout)
         ends.append((weights(policy), metrics["loss/value"]))
-    torch.testing.assert_close(
-        ends[1], ends[0], rtol=1e-3, atol=1e-4
-    )  # bf16 products, kernels chosen anew
+    # bfloat16 products; the captured graph may use other kernels
+    torch.testing.assert_close(ends[1], ends[0], rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.cuda
-def test_an_update_is_captured_on_the_gpu_of_its_policy_whichever_is_current():
+def test_capture_on_second_gpu():
     if torch.cuda.device_count() < 2:
-        pytest.skip("there is one GPU")
+        pytest.skip("needs two GPUs")
     ends = []
     for device in ("cuda:0", "cuda:1"):
         policy, rollout = made_up(device=device)
-        learner = ppo.PPO(policy, n_epochs=2, n_minibatches=3, lr=1e-3, graph=True)
+        learner = PPO(policy, n_epochs=2, n_minibatches=3, lr=1e-3, graph=True)
         with torch.cuda.device(0):
             for _ in range(5):
                 metrics = learner.update(rollout)
         ends.append((weights(policy).cpu(), metrics["loss/value"].cpu()))
     assert metrics["loss/value"].device == torch.device("cuda:1")
-    torch.testing.assert_close(ends[1], ends[0], rtol=1e-3, atol=1e-4)  # bf16 products
+    torch.testing.assert_close(ends[1], ends[0], rtol=1e-3, atol=1e-4)  # bfloat16 products
 
 
 @pytest.mark.cuda
-def test_a_captured_update_skips_a_rollout_that_is_not_finite():
+def test_captured_update_skips_nonfinite_rollout():
     policy, rollout = made_up(device="cuda")
-    learner = ppo.PPO(policy, n_minibatches=3, graph=True)
+    learner = PPO(policy, n_minibatches=3, graph=True)
     for _ in range(4):
         learner.update(rollout)
     before = weights(policy)
@@ -296,18 +295,18 @@ def test_a_captured_update_skips_a_rollout_that_is_not_finite():
     for _ in range(2):
         assert learner.update(rollout)["loss/skipped_steps"].item() == 3
     assert torch.equal(weights(policy), before)
-    bad, n_skipped = learner.check.read(rollout.numbers())
+    bad, n_skipped = learner.check.read(rollout.floats())
     assert (bad.name, bad.lane, bad.step, n_skipped) == ("reward", 3, 4 * T + 3, 2)
     rollout.reward[2, 3] = good
     learner.update(rollout)
     assert not torch.equal(weights(policy), before)
-    assert learner.check.read(rollout.numbers()) == (None, 0)
+    assert learner.check.read(rollout.floats()) == (None, 0)
 
 
 @pytest.mark.cuda
-def test_an_update_never_synchronises():
+def test_update_never_synchronises():
     policy, rollout = made_up(device="cuda")
-    learner = ppo.PPO(policy, n_epochs=2, n_minibatches=2, target_kl=0.01)
+    learner = PPO(policy, n_epochs=2, n_minibatches=2, target_kl=0.01)
     learner.update(rollout)
     torch.cuda.set_sync_debug_mode("error")
     try:

@@ -1,5 +1,5 @@
-"""Returns: against numbers worked out by hand, identities, and loops that share no code with
-agents/returns.py.
+"""Returns and advantages against hand calculations, identities, and loops that share no code with
+returns.py.
 """
 
 import pytest
@@ -7,13 +7,12 @@ import torch
 
 from megastep.agents.algorithms import returns
 
-F64_CLOSE = dict(
-    rtol=1e-10, atol=1e-10
-)  # two orders of summing the same few hundred float64 numbers
+# two orders of summing the same few hundred float64 numbers
+F64_CLOSE = dict(rtol=1e-10, atol=1e-10)
 
 
 def column(*values):
-    """One lane over time, (T, 1)."""
+    """Returns one lane over time, (T, 1)."""
     return torch.tensor(values, dtype=torch.float64)[:, None]
 
 
@@ -34,21 +33,21 @@ def lane(value, last_value, reward, reset=None, terminal=None, truncated=None):
 
 
 def episodes(T=37, B=64, seed=0):
-    """Random lanes as an autoresetting env makes them: an end is followed by a reset, some lanes
-    end twice in a row.
+    """Returns random transitions and log ratios like those of an environment: the step after an end
+    is a reset.
     """
-    g = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     reset, terminal, truncated = (torch.zeros(T, B, dtype=torch.bool) for _ in range(3))
-    ended = torch.rand(B, generator=g) < 0.3
+    ended = torch.rand(B, generator=generator) < 0.3
     for t in range(T):
         reset[t] = ended
-        end = ~reset[t] & (torch.rand(B, generator=g) < 0.25)
-        terminal[t] = end & (torch.rand(B, generator=g) < 0.5)
+        end = ~reset[t] & (torch.rand(B, generator=generator) < 0.25)
+        terminal[t] = end & (torch.rand(B, generator=generator) < 0.5)
         truncated[t] = end & ~terminal[t]
         ended = end
 
     def normal(*shape):
-        return torch.randn(*shape, generator=g, dtype=torch.float64)
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
     return dict(
         reward=torch.where(reset, 0.0, normal(T, B)),
@@ -60,7 +59,7 @@ def episodes(T=37, B=64, seed=0):
     ), normal(T, B)
 
 
-def test_gae_by_hand():
+def test_gae_matches_hand_calculation():
     # gamma = lambda = 1/2. Backwards: delta_2 = 4 + 8/2 - 2 = 6, delta_1 = 2 + 2/2 - 4 = -1,
     # delta_0 = 1 + 4/2 - 1 = 2. A_2 = 6, A_1 = -1 + 6/4 = 1/2, A_0 = 2 + 1/8.
     r = returns.gae(**lane(value=[1, 4, 2], last_value=8, reward=[1, 2, 4]), gamma=0.5, lambda_=0.5)
@@ -69,9 +68,8 @@ def test_gae_by_hand():
     assert r.valid.all()
 
 
-def test_a_terminal_end_drops_the_value_of_gae_and_a_truncated_one_does_not():
-    # The episode's last observation is that of row 1; row 2 is the transition to the next episode's
-    # first.
+def test_gae_bootstraps_from_truncated_not_terminal():
+    # the episode ends after row 1; row 2 is the reset
     case = dict(value=[1, 4, 100, 6], last_value=8, reward=[1, 2, 0, 3], reset=[0, 0, 1, 0])
     died = returns.gae(**lane(**case, terminal=[0, 1, 0, 0]), gamma=0.5, lambda_=0.5)
     # A_3 = 3 + 4 - 6 = 1, A_2 is masked, A_1 = 2 - 4 = -2, A_0 = 1 + 2 - 1 - 2/4 = 1.5
@@ -82,7 +80,7 @@ def test_a_terminal_end_drops_the_value_of_gae_and_a_truncated_one_does_not():
     assert died.valid[:, 0].tolist() == cut.valid[:, 0].tolist() == [True, True, False, True]
 
 
-def test_vtrace_by_hand():
+def test_vtrace_matches_hand_calculation():
     # gamma = 1, ratios 2, 1/2, 4: rho = c = 1, 1/2, 1.
     # delta_2 = 4 + 8 - 2 = 10, delta_1 = (2 + 2 - 4)/2 = 0, delta_0 = 1 + 4 - 1 = 4.
     # v - V: 10; 0 + 10/2 = 5; 4 + 5 = 9. So v = 10, 9, 12 and A = 1 + 9 - 1, (2 + 12 - 4)/2, 4 + 8
@@ -94,7 +92,7 @@ def test_vtrace_by_hand():
 
 
 @pytest.mark.parametrize("T", [1, 2, 3, 8, 13])
-def test_discounted_sum_is_the_recursion(T):
+def test_discounted_sum_matches_recursion(T):
     terms, discounts = torch.randn(2, T, 5, dtype=torch.float64)
     discounts[torch.rand(T, 5) < 0.3] = 0.0
     expected, tail = torch.empty_like(terms), torch.zeros(5, dtype=torch.float64)
@@ -103,7 +101,7 @@ def test_discounted_sum_is_the_recursion(T):
     torch.testing.assert_close(returns.discounted_sum(terms, discounts), expected, **F64_CLOSE)
 
 
-def test_lambda_one_is_the_n_step_return():
+def test_gae_with_lambda_one_is_n_step_return():
     case, _ = episodes()
     for name in ("reset", "terminal", "truncated"):
         case[name] = torch.zeros_like(case[name])
@@ -117,7 +115,7 @@ def test_lambda_one_is_the_n_step_return():
         torch.testing.assert_close(r.targets[t], n_step, **F64_CLOSE)
 
 
-def test_lambda_zero_is_the_one_step_error():
+def test_gae_with_lambda_zero_is_one_step_error():
     case, _ = episodes()
     r = returns.gae(**case, gamma=0.9, lambda_=0.0)
     following = torch.cat([case["value"][1:], case["last_value"][None]])
@@ -126,21 +124,21 @@ def test_lambda_zero_is_the_one_step_error():
 
 
 @pytest.mark.parametrize("lambda_", [0.0, 0.7, 1.0])
-def test_vtrace_on_its_own_policy_is_the_lambda_return(lambda_):
+def test_on_policy_vtrace_is_lambda_return(lambda_):
     case, _ = episodes()
     on_policy = returns.vtrace(torch.zeros_like(case["reward"]), **case, gamma=0.9, lambda_=lambda_)
     expected = returns.gae(**case, gamma=0.9, lambda_=lambda_)
     torch.testing.assert_close(on_policy.targets, expected.targets, **F64_CLOSE)
 
 
-def test_vtrace_never_taken_actions_teach_nothing():
+def test_vtrace_ignores_actions_of_probability_zero():
     case, _ = episodes()
     r = returns.vtrace(torch.full_like(case["reward"], -torch.inf), **case, gamma=0.9)
     assert torch.equal(r.targets, case["value"]) and not r.advantages.any()
 
 
 def split(case, b):
-    """Yields lane b's episodes as lists of row numbers, invalid rows left out."""
+    """Yields the valid rows of each of lane b's episodes, as lists."""
     rows = []
     for t in range(len(case["reward"])):
         if case["reset"][t, b]:
@@ -154,13 +152,13 @@ def split(case, b):
 
 
 def beyond(case, t, b):
-    """The value of the observation after row t."""
+    """Returns the value of the observation after row t: 0 if terminal."""
     last = t + 1 == len(case["reward"])
     value = case["last_value"][b] if last else case["value"][t + 1, b]
     return 0.0 if case["terminal"][t, b] else value.item()
 
 
-def test_gae_matches_a_slow_loop_over_episodes():
+def test_gae_matches_loop_over_episodes():
     case, _ = episodes(seed=1)
     gamma, lambda_ = 0.97, 0.9
     r = returns.gae(**case, gamma=gamma, lambda_=lambda_)
@@ -175,9 +173,9 @@ def test_gae_matches_a_slow_loop_over_episodes():
     torch.testing.assert_close(r.advantages, expected, **F64_CLOSE)
 
 
-def test_vtrace_matches_the_sums_and_products_of_the_paper():
-    """v_s = V_s + sum_{t >= s} gamma^{t-s} (prod_{i=s}^{t-1} c_i) rho_t (r_t + gamma V_{t+1} -
-    V_t), by episodes.
+def test_vtrace_matches_definition_in_paper():
+    """Section 4.1: v_s = V_s + sum_{t >= s} gamma^{t-s} (prod_{i=s}^{t-1} c_i) rho_t (r_t + gamma
+    V_{t+1} - V_t), by episodes.
     """
     case, log_ratio = episodes(seed=2)
     gamma, lambda_, rho_clip, c_clip = 0.97, 0.9, 1.3, 0.8
@@ -208,11 +206,11 @@ def test_vtrace_matches_the_sums_and_products_of_the_paper():
     torch.testing.assert_close(r.advantages, advantages, **F64_CLOSE)
 
 
-def test_what_an_invalid_row_holds_changes_nothing():
-    """The environment ignored that action; even a NaN there must not leak."""
+def test_invalid_rows_are_ignored():
+    """Not even a NaN in a row whose action was ignored may leak."""
     case, log_ratio = episodes(seed=3)
     corrupted = dict(case, reward=torch.where(case["reset"], torch.nan, case["reward"]))
-    clean, dirty = (returns.n_step(**c, gamma=0.9, n=3) for c in (case, corrupted))
+    clean, dirty = (returns.n_step_returns(**c, gamma=0.9, n=3) for c in (case, corrupted))
     assert torch.equal(clean, dirty)
     for f in (returns.gae, lambda **k: returns.vtrace(log_ratio, **k)):
         clean, dirty = (f(**c, gamma=0.9, lambda_=0.8) for c in (case, corrupted))
@@ -221,42 +219,41 @@ def test_what_an_invalid_row_holds_changes_nothing():
         )
 
 
-def test_n_step_returns_by_hand():
-    # gamma = 1/2. Three rows, then the last observation, worth 8: with two steps row 0 counts 1 +
-    # 2/2 + 2/4, row 1 counts 2 + 4/2 + 8/4, and row 2 has but one step, 4 + 8/2.
+def test_n_step_returns_match_hand_calculation():
+    # gamma = 1/2, n = 2: G_0 = 1 + 2/2 + 2/4, G_1 = 2 + 4/2 + 8/4; row 2 has one step only, 4 + 8/2
     case = lane(value=[1, 4, 2], last_value=8, reward=[1, 2, 4])
-    found = returns.n_step(**case, gamma=0.5, n=2)
-    assert found[:, 0].tolist() == [2.5, 6.0, 8.0]
-    assert returns.n_step(**case, gamma=0.5, n=1)[:, 0].tolist() == [3.0, 3.0, 8.0]
+    result = returns.n_step_returns(**case, gamma=0.5, n=2)
+    assert result[:, 0].tolist() == [2.5, 6.0, 8.0]
+    assert returns.n_step_returns(**case, gamma=0.5, n=1)[:, 0].tolist() == [3.0, 3.0, 8.0]
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 40])
-def test_n_step_returns_cross_no_end(n):
+def test_n_step_returns_stop_at_episode_end(n):
     case, _ = episodes()
-    found, gamma = returns.n_step(**case, gamma=0.9, n=n), 0.9
+    result, gamma = returns.n_step_returns(**case, gamma=0.9, n=n), 0.9
     for b in range(case["reward"].shape[1]):
         for rows in split(case, b):
             for i, t in enumerate(rows):
-                taken = rows[i : i + n]
-                total = sum(gamma**k * case["reward"][s, b] for k, s in enumerate(taken))
-                if not case["terminal"][taken[-1], b]:
-                    total = total + gamma ** len(taken) * beyond(case, taken[-1], b)
-                torch.testing.assert_close(found[t, b], total, **F64_CLOSE)
-    assert torch.equal(found[case["reset"]], case["value"][case["reset"]])
+                steps = rows[i : i + n]
+                total = sum(gamma**k * case["reward"][s, b] for k, s in enumerate(steps))
+                if not case["terminal"][steps[-1], b]:
+                    total = total + gamma ** len(steps) * beyond(case, steps[-1], b)
+                torch.testing.assert_close(result[t, b], total, **F64_CLOSE)
+    assert torch.equal(result[case["reset"]], case["value"][case["reset"]])
 
 
-def test_n_step_returns_over_all_rows_are_lambda_one():
+def test_n_step_returns_over_all_rows_match_gae_with_lambda_one():
     case, _ = episodes(seed=5)
     expected = returns.gae(**case, gamma=0.9, lambda_=1.0).targets
-    found = returns.n_step(**case, gamma=0.9, n=len(case["reward"]))
-    torch.testing.assert_close(found, expected, **F64_CLOSE)
+    result = returns.n_step_returns(**case, gamma=0.9, n=len(case["reward"]))
+    torch.testing.assert_close(result, expected, **F64_CLOSE)
 
 
-def test_rescaling_is_undone_also_in_single_precision():
-    assert returns.rescaled(torch.tensor(3.0)).item() == pytest.approx(1 + 3e-3)
+def test_inverse_rescale_in_float32():
+    assert returns.rescale(torch.tensor(3.0)).item() == pytest.approx(1 + 3e-3)
     x = torch.tensor([0.0, 1e-4, 1e-2, 1, 30, 1e4])
     x = torch.cat([-x, x])
-    there = returns.rescaled(x)
-    assert (there[6:].diff() > 0).all() and torch.equal(there[:6], -there[6:])
-    # a root of 1 + x is rounded to 1e-7, and what remains of it squared
-    torch.testing.assert_close(returns.unscaled(there), x, rtol=1e-6, atol=1e-6)
+    y = returns.rescale(x)
+    assert (y[6:].diff() > 0).all() and torch.equal(y[:6], -y[6:])
+    # sqrt(1 + x) is rounded to 1e-7, and the inverse squares it
+    torch.testing.assert_close(returns.inverse_rescale(y), x, rtol=1e-6, atol=1e-6)

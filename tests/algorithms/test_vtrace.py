@@ -1,5 +1,5 @@
-"""V-trace: what one update does, on made-up rollouts. That it learns is in test_learning.py, what
-it shares with other learners in test_learners.py.
+"""V-trace's update on random rollouts. test_learning.py tests that V-trace learns, test_learners.py
+what all learners have in common.
 """
 
 import math
@@ -9,11 +9,11 @@ import torch
 
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.replay import ReplaySettings
-from tests.helpers.made_up import MORE, MOVES, OBS, B, Numbers, made_up, weights
+from megastep.agents.storage.replay_settings import ReplaySettings
+from tests.helpers.made_up import MOVES, OBS, PRIVILEGED, B, Numbers, made_up, weights
 
 
-def test_the_first_pass_finds_the_policy_where_it_was():
+def test_first_pass_has_zero_kl():
     policy, rollout = made_up(values=False)
     metrics = VTrace(policy, n_minibatches=1).update(rollout)
     assert metrics["loss/kl"].item() == pytest.approx(0, abs=1e-6)
@@ -32,8 +32,8 @@ def test_the_first_pass_finds_the_policy_where_it_was():
 @pytest.mark.parametrize(
     "ratio, rho, clip_fraction", [(2.0, 1.0, 1.0), (0.5, 0.5, 0.0), (math.e**60, 1.0, 1.0)]
 )
-def test_ratios_by_hand(ratio, rho, clip_fraction):
-    """In every row the policy finds the action so many times as probable as it was."""
+def test_ratio_metrics_match_hand_calculation(ratio, rho, clip_fraction):
+    """In every row the policy finds the action `ratio` times as likely as it was."""
     policy, rollout = made_up(values=False)
     rollout.logprobs -= math.log(ratio)
     metrics = VTrace(policy, n_minibatches=2, lr=1e-30).update(rollout)
@@ -45,29 +45,30 @@ def test_ratios_by_hand(ratio, rho, clip_fraction):
     assert metrics["loss/skipped_steps"].item() == 0
 
 
-def test_the_effective_samples_falls_as_ratios_differ():
+def test_effective_samples_falls_as_ratios_differ():
     policy, rollout = made_up(values=False)
-    rollout.logprobs[:, ::2] += math.log(3)  # half of the lanes weigh a third
+    rollout.logprobs[:, ::2] += math.log(3)  # half of the lanes have ratio 1/3
     metrics = VTrace(policy, n_minibatches=1).update(rollout)
-    # 24 - 0 and 24 - 2 rows are valid, as lanes 1 and 4 have one reset each: 23 weigh 1/3, 23 1
+    # lanes 1 and 4 have one reset each: 23 valid rows have ratio 1/3, 23 have 1
     share = (1 / 3 + 1) ** 2 / (2 * (1 / 9 + 1))
     assert metrics["loss/effective_samples"].item() == pytest.approx(share, abs=1e-4)
 
 
-def test_advantages_are_measured_in_their_own_size_or_the_floor():
+def test_advantage_floor():
     def losses(floor):
         policy, rollout = made_up(values=False)
-        made = VTrace(policy, n_minibatches=1, lr=1e-30, advantage_floor=floor).update(rollout)
-        return made["loss/policy"].item(), made["loss/advantage"].item()
+        learner = VTrace(policy, n_minibatches=1, lr=1e-30, advantage_floor=floor)
+        metrics = learner.update(rollout)
+        return metrics["loss/policy"].item(), metrics["loss/advantage"].item()
 
-    own, size = losses(1e-6)
+    policy_loss, size = losses(1e-6)
     assert size > 0
-    assert losses(size / 2)[0] == pytest.approx(own, rel=1e-5)
-    for times in (2, 5):
-        assert losses(times * size)[0] == pytest.approx(own / times, rel=1e-5)
+    assert losses(size / 2)[0] == pytest.approx(policy_loss, rel=1e-5)
+    for factor in (2, 5):
+        assert losses(factor * size)[0] == pytest.approx(policy_loss / factor, rel=1e-5)
 
 
-def test_good_actions_become_likelier_and_bad_ones_rarer():
+def test_rewarded_action_becomes_likelier():
     policy, rollout = made_up(values=False)
     rollout.reward[:] = (rollout.actions[..., 0] == 2).float()
     before = policy.unroll(rollout.obs, rollout.starts, rollout.state).logits.exp().mean((0, 1, 2))
@@ -78,8 +79,8 @@ def test_good_actions_become_likelier_and_bad_ones_rarer():
     assert after[2] > before[2] + 0.05 and after[0] < before[0] and after[1] < before[1]
 
 
-def test_actions_that_the_policy_would_never_take_teach_the_policy_nothing():
-    """Their ratios are 0: the value keeps its own estimate, too."""
+def test_actions_of_probability_zero_are_ignored():
+    """Their ratios are 0, so the value keeps its estimate, too."""
     policy, rollout = made_up(values=False)
     rollout.logprobs += 200.0
     before = weights(policy)
@@ -89,24 +90,24 @@ def test_actions_that_the_policy_would_never_take_teach_the_policy_nothing():
 
 
 @pytest.mark.parametrize("ended, error", [(False, 0.0), (True, 1.0)])
-def test_values_are_told_what_follows_the_last_row(ended, error):
-    """Nothing is paid, every value is 1 and gamma is 1: what follows the last row is worth 1, so
-    all values are right, unless the episode ends there: then each is 1 too much.
+def test_bootstraps_from_last_row(ended, error):
+    """The reward is 0, every value is 1 and gamma is 1. So all values are right, unless the episode
+    ends after the last row: then each is 1 too large.
     """
     policy, rollout = made_up(values=False)
     rollout.reward.zero_(), rollout.terminal.zero_(), rollout.truncated.zero_()
     rollout.starts[1:] = False
     rollout.terminal[-1] = ended
     with torch.no_grad():
-        policy.critic.output.core.weight.zero_()
-        policy.critic.output.core.bias.fill_(1.0)
+        policy.critic.output.linear.weight.zero_()
+        policy.critic.output.linear.bias.fill_(1.0)
         logits = policy.unroll(rollout.obs, rollout.starts, rollout.state).logits[:-1]
         rollout.logprobs[:] = policy.output.logprob(logits, rollout.actions)
     metrics = VTrace(policy, n_minibatches=1, gamma=1.0, lambda_=1.0).update(rollout)
     assert metrics["loss/value"].item() == pytest.approx(error, abs=1e-5)
 
 
-def test_what_an_invalid_row_holds_teaches_nothing():
+def test_invalid_rows_are_ignored():
     results = []
     for corrupt in (False, True):
         policy, rollout = made_up(values=False)
@@ -122,13 +123,13 @@ def test_what_an_invalid_row_holds_teaches_nothing():
 
 
 @pytest.mark.parametrize("n_minibatches", [2, B])
-def test_lanes_that_do_not_learn_change_no_bit_of_weights_or_statistics(n_minibatches):
-    """One lane learns at some times: its traces pass through its other rows as if the policy had
+def test_lanes_that_do_not_learn_change_no_bit(n_minibatches):
+    """One lane learns at some times only: traces pass through its other rows as if the policy had
     acted there.
     """
     results = []
     for changed in (False, True):
-        policy, rollout = made_up(privileged=MORE, values=False)
+        policy, rollout = made_up(privileged=PRIVILEGED, values=False)
         rollout.learns[:, [0, 4]] = False
         rollout.learns[2:4, 3] = False
         if changed:
@@ -147,7 +148,7 @@ def test_lanes_that_do_not_learn_change_no_bit_of_weights_or_statistics(n_miniba
     assert metrics == clean_metrics and metrics["loss/auxiliary"] > 0
 
 
-def test_returns_set_the_scale_of_values_and_change_no_prediction():
+def test_popart_sets_scale_and_keeps_predictions():
     policy, rollout = made_up(values=False)
     rollout.reward += 100
     VTrace(policy, n_minibatches=1, gamma=0.0, lr=1e-30).update(rollout)
@@ -161,7 +162,7 @@ def test_returns_set_the_scale_of_values_and_change_no_prediction():
 
 
 def replaying(n_updates, env=None, **how):
-    """After so many updates in `Numbers`: the learner, with what collects for it, and metrics."""
+    """Returns a learner with a replay buffer after some updates, and its last metrics."""
     env = env or Numbers()
     policy = Policy(env.obs_space, env.action_space, width=8)
     settings = ReplaySettings(capacity=3 * 5 * B, **how.pop("replay", {}))
@@ -173,8 +174,8 @@ def replaying(n_updates, env=None, **how):
 
 
 @pytest.mark.parametrize("lag", [0, 2])
-def test_how_old_what_is_replayed_was_is_told(lag):
-    """Of three rollouts two can be drawn, 1 and 2 updates old, and as much as they acted late."""
+def test_staleness_metric(lag):
+    """Of three rollouts two can be drawn, 1 and 2 updates old; lag adds to that."""
     learner, metrics = replaying(12, lag=lag)
     assert 1 + lag < metrics["staleness"] < 2 + lag
     assert metrics["kl"] < metrics["replayed_kl"]
@@ -183,20 +184,18 @@ def test_how_old_what_is_replayed_was_is_told(lag):
     assert first["staleness"] == first["replayed_rho"] == first["replayed_effective_samples"] == 0
 
 
-def test_what_surprised_most_is_drawn_most():
+def test_priorities_follow_errors():
     learner, _ = replaying(12, replay=dict(alpha=1.0))
-    priorities = learner.replay.tree.priorities
-    drawn = priorities[priorities > 0]
-    assert len(drawn.unique()) > B, "each has its own"
+    priorities = learner.replay_buffer.tree.priorities
+    assert len(priorities[priorities > 0].unique()) > B
     uniform, _ = replaying(12)
-    drawn = uniform.replay.tree.priorities
-    assert set(drawn.tolist()) == {0.0, 1.0}
+    assert set(uniform.replay_buffer.tree.priorities.tolist()) == {0.0, 1.0}
 
 
-def test_sequences_count_in_the_loss_by_their_weights():
+def test_importance_weights_scale_losses():
     policy, rollout = made_up(values=False)
-    learner, rows = VTrace(policy), torch.arange(B)
-    batch = learner._batch(rollout, rows)
+    learner = VTrace(policy)
+    batch = learner._batch(rollout, torch.arange(B))
     _, ones, _ = learner._losses(batch, B)
     batch["weight"] = 2 * batch.weight
     _, twos, _ = learner._losses(batch, B)
@@ -205,7 +204,7 @@ def test_sequences_count_in_the_loss_by_their_weights():
     assert twos["entropy"] == ones["entropy"] and ones["policy"].abs() > 1e-3
 
 
-def test_a_rollout_with_a_bad_number_is_never_replayed():
+def test_nonfinite_rollout_is_never_replayed():
     learner, metrics = replaying(5, Numbers(bad_steps=(22,)), replay=dict(ratio=10.0))
     assert metrics["skipped_steps"] == 2
     for _ in range(4):
@@ -214,8 +213,8 @@ def test_a_rollout_with_a_bad_number_is_never_replayed():
     assert metrics["loss/staleness"] > 0
 
 
-def test_what_is_replayed_is_learnt_from():
-    """From fresh rollouts alone with a share of next to none, and as many replayed."""
+def test_replayed_sequences_change_weights():
+    """Compares a tiny replay ratio with a ratio of 1."""
     ends = []
     for ratio in (1e-6, 1.0):
         learner, metrics = replaying(6, replay=dict(ratio=ratio), lr=1e-2)
@@ -225,23 +224,23 @@ def test_what_is_replayed_is_learnt_from():
 
 
 @pytest.mark.parametrize(
-    "settings, told",
+    "settings, error",
     [
-        (dict(replay=ReplaySettings(ratio=2.0)), "those of buffer=replay"),
+        (dict(replay=ReplaySettings(ratio=2.0)), "buffer=replay"),
         (
             dict(buffer="replay", replay=ReplaySettings(length=40), n_steps=32),
             "leave replay.length",
         ),
         (dict(buffer="replay", replay=ReplaySettings(burn_in=9, length=9)), "shorter than"),
-        (dict(lag=3), "lag: 3 is out of range"),
+        (dict(lag=3), "lag: 3"),
     ],
 )
-def test_settings_that_do_not_fit_are_refused(settings, told):
-    with pytest.raises(ValueError, match=told):
+def test_bad_settings_raise(settings, error):
+    with pytest.raises(ValueError, match=error):
         VTrace(made_up()[0], **settings)
 
 
-def test_a_policy_without_a_critic_is_refused():
+def test_policy_without_critic_raises():
     policy = Policy(OBS, MOVES, critic=None)
-    with pytest.raises(ValueError, match="needs a policy with a critic"):
+    with pytest.raises(ValueError, match="critic"):
         VTrace(policy)

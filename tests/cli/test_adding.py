@@ -191,7 +191,8 @@ def test_a_learner(outside, capsys):
         from pydantic import Field
 
         from megastep.agents.algorithms.nonfinite import NonFiniteCheck
-        from megastep.agents.storage.rollout import Collector, Rollout
+        from megastep.agents.storage.collector import Collector
+        from megastep.agents.storage.rollout import Rollout
 
 
         class Reinforce:
@@ -216,7 +217,7 @@ def test_a_learner(outside, capsys):
                     group["lr"] = lr
 
             def update(self, rollout):
-                is_fine = self.check(rollout.numbers())
+                is_fine = self.check(rollout.floats())
                 out = self.policy.unroll(rollout.obs, rollout.starts, rollout.state)
                 logprobs = self.policy.output.logprob(out.logits[:-1], rollout.actions)
                 to_go = rollout.reward.flip(0).cumsum(0).flip(0)
@@ -228,10 +229,10 @@ def test_a_learner(outside, capsys):
                 return {"loss/policy": loss.detach()}
 
             def state_dict(self):
-                return dict(random=self.policy.random.state_dict())
+                return dict(generator=self.policy.generator.state_dict())
 
             def load_state_dict(self, state):
-                self.policy.random.load_state_dict(state["random"], self.policy.device)
+                self.policy.generator.load_state_dict(state["generator"], self.policy.device)
         '''
     add(outside, "learner", {"counter.py": COUNTER, "reinforce.py": learner})
     words = ["env=counter:Counter", *(w for w in SMALL if not w.startswith("learner."))]
@@ -419,14 +420,14 @@ def test_what_cannot_be_used_is_one_sentence(outside, capsys, words, sentence):
     "change, clause",
     [
         (("n_agents, fps = 1, 5.0", "n_agents = 1"), "it has no fps"),
-        (("reward=reward,", "reward=reward.double(),"), "rewards are float32"),
+        (("reward=reward,", "reward=reward.double(),"), "reward must be torch.float32"),
         (("torch.zeros_like(reset),", "self.age >= self.limit,"), "exclude each other"),
-        (("[:, None],", ","), "observation is as its space says"),
+        (("[:, None],", ","), "obs must be "),
         (
             ("reset=reset,", "reset=reset, metrics=dict(up=up[:1]),"),
-            "metric up has one float32",
+            "metrics.up must be torch.float32",
         ),
-        (("reset=reset,", ""), "a world has reset"),
+        (("reset=reset,", ""), "the world has no reset"),
     ],
 )
 def test_a_class_that_breaks_a_clause_of_the_contract_is_told_which(
@@ -442,17 +443,17 @@ def test_a_class_that_breaks_a_clause_of_the_contract_is_told_which(
 @pytest.mark.parametrize(
     "change, clause",
     [
-        (("masked_fill(reset[t, :, None], 0.0)", "clone()"), "what came before a reset is forgot"),
-        (("self.layer(total)", "self.layer(total)[:, :1]"), "outputs are (T, B, width)"),
-        (("arrdict(total=total)", "arrdict()"), "a state is like the one before it"),
-        (("def initial", "def start"), "it has a method initial(B, device)"),
+        (("masked_fill(reset[t, :, None], 0.0)", "clone()"), "reset must clear"),
+        (("self.layer(total)", "self.layer(total)[:, :1]"), "(T, B, width)"),
+        (("arrdict(total=total)", "arrdict()"), "keep its keys and shapes"),
+        (("def initial", "def start"), "initial(B, device)"),
     ],
 )
 def test_a_core_that_breaks_a_clause_is_told_which(outside, capsys, change, clause):
     assert change[0] in MEAN
     outside({"mean.py": MEAN.replace(*change)})
     told = refused(capsys, "env=minimal", *SMALL, "agent.core=mean:Mean")
-    assert f"mean:Mean breaks the contract of recurrent cores: {clause}" in told, told
+    assert "mean:Mean" in told and clause in told, told
 
 
 def test_an_encoder_that_breaks_its_word_is_told(outside, capsys):

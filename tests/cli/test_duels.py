@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from test_train import configured
 
-from megastep.agents.cli import evaluate, record, train
-from megastep.agents.cli import runs as run_folders
+from megastep.agents.cli import evaluate, record, runs, train
 from megastep.agents.selfplay import duels, ratings
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.training import checkpoint
 from megastep.agents.training.evaluation import interval
 from megastep.arrdict import arrdict
+from tests.cli.test_train import configured
 from tests.helpers.games import Always, Matrix
 
 # ---- Duels ----
@@ -30,7 +29,7 @@ def test_the_stronger_wins_from_every_place():
     played = duels.play(Matrix(64), Always(2), Always(0))
     assert (played.score == 1).all() and (played.lengths == 1).all()
     assert duels.play(Matrix(64), Always(0), Always(2)).score.sum() == 0
-    assert played.seat.tolist() == [0] * 32 + [1] * 32
+    assert played.slots.tolist() == [0] * 32 + [1] * 32
 
 
 @pytest.mark.parametrize("mortal", [False, True])
@@ -42,7 +41,7 @@ def test_the_share_won_is_what_an_independent_count_says(mortal):
     actions = torch.stack(env.played)  # (T, E, 2)
     first = (actions[:, :, 0] != actions[:, :, 1]).int().argmax(0)
     chosen = actions[first, torch.arange(2000)]
-    mine = chosen.gather(1, played.seat[:, None])[:, 0]
+    mine = chosen.gather(1, played.slots[:, None])[:, 0]
     assert torch.equal(played.score, (mine == chosen.amax(1)).float())
     assert torch.equal(played.lengths, first + 1.0)
     # on paper: me 2, 1, 0 with 4/6, 1/6, 1/6, the other the other way round
@@ -84,7 +83,7 @@ def test_whoever_dies_first_loses_and_the_others_are_one_opponent():
     assert (duels.play(env, Always(2), Always(1)).score == 1).all()
     assert (duels.play(env, Always(1), Always(2)).score == 0).all()
     played = duels.play(env, Always(2), Always(1))
-    assert played.seat.bincount().tolist() == [4, 4, 4, 4]
+    assert played.slots.bincount().tolist() == [4, 4, 4, 4]
 
 
 def test_homes_are_those_of_the_environment_and_intervals_are_over_them():
@@ -93,7 +92,7 @@ def test_homes_are_those_of_the_environment_and_intervals_are_over_them():
     played = duels.play(env, Always(2), Always(0))
     assert played.homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
     # each home was played in from both places
-    pairs = set(zip(played.homes.tolist(), played.seat.tolist(), strict=True))
+    pairs = set(zip(played.homes.tolist(), played.slots.tolist(), strict=True))
     assert len(pairs) == 8
     assert evaluate.summary(played)["homes"] == 4
     score = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0])
@@ -197,7 +196,7 @@ UPDATE = 16 * 16
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
+def trained(tmp_path_factory):
     """Two runs of self-play, the first with snapshots; and the folder that they are in."""
     base = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
@@ -212,9 +211,9 @@ def runs(tmp_path_factory):
 
 
 @pytest.fixture
-def here(runs, monkeypatch):
-    monkeypatch.chdir(runs)
-    return runs
+def here(trained, monkeypatch):
+    monkeypatch.chdir(trained)
+    return trained
 
 
 def test_snapshots_are_kept_along_the_budget_beside_the_checkpoints(here):
@@ -245,8 +244,8 @@ def test_duels_are_printed_and_written(here, capsys):
     assert "95 % interval" in text and "95 % interval" in capsys.readouterr().out
     row = result["rows"][0]
     expected = dict(score=row["won"], evaluated=row["won"], lower=row["lower"])
-    assert expected.items() <= run_folders.outcome(path).items()
-    assert run_folders.outcome(here / "a")["evaluated"] is None, "a duel's table has no return"
+    assert expected.items() <= runs.outcome(path).items()
+    assert runs.outcome(here / "a")["evaluated"] is None, "a duel's table has no return"
 
 
 def test_ratings_are_printed_written_and_drawn(here, capsys):
@@ -342,7 +341,7 @@ def test_a_duel_is_of_two_in_unseen_homes_each_from_both_places(tmp_path, monkey
     )
     ((env, found),) = played
     assert (env.n_envs, env.n_agents) == (28, 2)
-    counts = torch.stack([found.homes, found.seat.int()], 1).unique(dim=0, return_counts=True)[1]
+    counts = torch.stack([found.homes, found.slots.int()], 1).unique(dim=0, return_counts=True)[1]
     assert counts.tolist() == [2] * 14
     (path,) = (tmp_path / "run" / "evaluations").glob("*.json")
     assert json.loads(path.read_text())["rows"][0]["homes"] == 7

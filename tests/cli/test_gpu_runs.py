@@ -11,7 +11,7 @@ import torch
 from megastep import capture
 from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.training import checkpoint, loggers
+from megastep.agents.training import checkpoint, json_lines, loggers
 
 pytestmark = pytest.mark.cuda
 
@@ -31,7 +31,7 @@ STOPPED = 6 * UPDATE
 
 
 def rows(folder):
-    return loggers.read(folder / "metrics.jsonl")
+    return json_lines.read(folder / "metrics.jsonl")
 
 
 def weights(folder):
@@ -104,13 +104,13 @@ def test_what_a_graph_collects_after_a_resume_differs_from_rollout_to_rollout(st
     """Nothing that a captured call needs is left behind: not the memory, not the random stream."""
     collected = []
 
-    def store(self, losses, real=train.Trainer.report):
+    def store(self, losses, real=train.Trainer.log):
         real(self, losses)
         rollout = self.rollout
         collected.append((rollout.actions.clone(), rollout.state.cell.clone()))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train.Trainer, "report", store)
+        patch.setattr(train.Trainer, "log", store)
         step = checkpoint.load_latest(stopped / "checkpoints").step
         assert train.main([f"resume={stopped}", f"samples={step + 6 * UPDATE}"]) == 0
     assert is_captured(trainers[0])

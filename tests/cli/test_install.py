@@ -1,94 +1,188 @@
-"""What `pip install .` gives, as a stranger has it: a wheel in a fresh environment, used from an
-empty folder. Slow, for all that it needs is installed as well.
+"""The package as a user installs it: the wheel's contents, and a wheel installed in a fresh virtual
+environment beside the OpenAI Agents SDK. Tests that install are slow: they download PyTorch.
 """
 
 import os
-import pathlib
 import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
+from pathlib import Path
 
 import pytest
 import yaml
 
 from tests.helpers import tiny
 
-ROOT = pathlib.Path(__file__).parents[2]
-NAME = "megastep_flatland"
-#: Without a path to this checkout, which pip would take for an installed package.
+ROOT = Path(__file__).parents[2]
+DISTRIBUTION = "megastep_flatland"
+#: Without PYTHONPATH, through which pip and Python would find this checkout.
 ENVIRONMENT = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+#: Source folders with files that the wheel must contain, and where it has them.
+PACKAGE_DATA = {
+    "configs": ("megastep/agents/configs", {".yaml"}),
+    "agents": ("megastep/agents", {".py", ".h", ".cu", ".cpp"}),
+    "megastep": ("megastep", {".py", ".h", ".cu", ".cpp", ".npz", ".json", ".sha256"}),
+}
+
+
+def build_wheel(source, folder):
+    """Builds the wheel of a source folder with pip. Returns its path."""
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, source]
+    subprocess.run(list(map(str, command)), check=True, env=ENVIRONMENT, cwd=folder)
+    (wheel,) = folder.glob(f"{DISTRIBUTION}-*.whl")
+    return wheel
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("wheel")
-    others = shutil.ignore_patterns(".*", "runs", "sweeps", "build", "dist", "*.egg-info")
-    source = shutil.copytree(ROOT, folder / "source", symlinks=True, ignore=others)
-    pip = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(source)]
-    subprocess.run(pip, check=True, env=ENVIRONMENT)
-    (path,) = folder.glob(f"{NAME}-*.whl")
-    return path
+def source(tmp_path_factory):
+    """A copy of this checkout without what git ignores, for setuptools to write into."""
+    folder = tmp_path_factory.mktemp("source") / "megastep"
+    listing = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    try:
+        listed = subprocess.run(listing, cwd=ROOT, capture_output=True, text=True, check=True)
+        names = listed.stdout.splitlines()
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("needs a git checkout, to copy the files that belong to the project")
+    for name in names:
+        if os.path.lexists(ROOT / name):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name, follow_symlinks=False)
+    return folder
 
 
 @pytest.fixture(scope="module")
-def programs(wheel, tmp_path_factory):
-    """The folder of programs of an environment that has the wheel and what it needs alone."""
+def wheel(source, tmp_path_factory):
+    return build_wheel(source, tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def python(wheel, tmp_path_factory):
+    """The interpreter of a virtual environment with the wheel and openai-agents, nothing else."""
     folder = tmp_path_factory.mktemp("fresh")
     subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
-    pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "-q"]
-    for what in ("torch==2.13.0", str(wheel)):
-        constrained = [*pip, "-c", str(ROOT / "constraints.txt"), what]
-        subprocess.run(constrained, check=True, env=ENVIRONMENT)
-    return folder / "bin"
+    python = folder / "bin" / "python"
+    constraints = str(ROOT / "constraints.txt")
+    for requirements in (["torch==2.13.0"], [str(wheel), "openai-agents"]):
+        command = [str(python), "-m", "pip", "install", "-q", "-c", constraints, *requirements]
+        subprocess.run(command, check=True, env=ENVIRONMENT, cwd=folder)
+    return python
+
+
+def run(command, folder, returncode=0, **environment):
+    """Runs a command in a folder. Returns its stdout and stderr together."""
+    completed = subprocess.run(
+        list(map(str, command)),
+        cwd=folder,
+        text=True,
+        capture_output=True,
+        env=ENVIRONMENT | environment,
+    )
+    assert completed.returncode == returncode, completed.stderr
+    return completed.stdout + completed.stderr
+
+
+def names_in(wheel):
+    return set(zipfile.ZipFile(wheel).namelist())
+
+
+# ---- A checkout ----
+
+
+def test_import_agents_from_checkout_names_megastep_agents():
+    output = run([sys.executable, "-c", "import agents"], ROOT, returncode=1)
+    assert output.splitlines()[-1].startswith("ImportError: ")
+    assert "megastep.agents" in output.splitlines()[-1]
+
+
+def test_checkout_and_link_are_one_package():
+    """The link gives each module one name: no second copy of a class under `agents`."""
+    import megastep.agents
+
+    assert Path(megastep.agents.__file__).resolve() == ROOT / "agents" / "__init__.py"
+    assert not any(name.split(".")[0] == "agents" for name in sys.modules)
+
+
+# ---- The wheel ----
 
 
 @pytest.mark.slow
-def test_the_wheel_adds_two_import_names_with_configs_and_kernels_as_data(wheel):
-    names = zipfile.ZipFile(wheel).namelist()
-    assert {name.split("/")[0].split("-")[0] for name in names} == {"megastep", "agents", NAME}
-    for folder, pattern, place in (
-        ("configs", "*.yaml", "agents/configs"),
-        ("megastep/kernels", "*.[ch]*", "megastep/kernels"),
-        ("agents/kernels", "*.[ch]*", "agents/kernels"),
-    ):
-        files = {str(path.relative_to(ROOT / folder)) for path in (ROOT / folder).rglob(pattern)}
-        assert {f"{place}/{file}" for file in files} <= set(names)
+def test_wheel_has_one_import_name(wheel):
+    top_level = {name.split("/")[0] for name in names_in(wheel)}
+    assert {name for name in top_level if not name.endswith(".dist-info")} == {"megastep"}
 
 
 @pytest.mark.slow
-def test_the_installed_command_trains_evaluates_and_films_in_an_empty_folder(programs, tmp_path):
-    environment = ENVIRONMENT | {"MEGASTEP_CACHE": str(tmp_path / "cache")}
-    (tmp_path / "empty").mkdir()
+def test_wheel_contains_sources_kernels_configs_and_data(wheel, source):
+    for folder, (packaged, suffixes) in PACKAGE_DATA.items():
+        paths = [path for path in (source / folder).rglob("*") if path.suffix in suffixes]
+        expected = {f"{packaged}/{path.relative_to(source / folder)}" for path in paths}
+        assert expected and not expected - names_in(wheel)
 
-    def typed(*words, code=0):
-        done = subprocess.run(
-            [str(programs / words[0]), *words[1:]],
-            cwd=tmp_path / "empty",
-            text=True,
-            capture_output=True,
-            env=environment,
-        )
-        assert done.returncode == code, done.stderr
-        return done.stdout + done.stderr
 
-    assert "Traceback" not in typed("megastep", "train", *tiny.TINY, "samples=64", "folder=run")
-    assert "trained" in typed("megastep", "evaluate", "run=run", "episodes=4")
-    typed("megastep", "record", "run=latest", "steps=3")
-    assert (tmp_path / "empty/run/video.mp4").exists()
+@pytest.mark.slow
+def test_sdist_builds_the_same_wheel(wheel, source, tmp_path):
+    pytest.importorskip("setuptools")
+    code = f"import setuptools.build_meta as backend; backend.build_sdist({str(tmp_path)!r})"
+    run([sys.executable, "-c", code], source)
+    (sdist,) = tmp_path.glob(f"{DISTRIBUTION}-*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path / "unpacked", filter="data")
+    (unpacked,) = (tmp_path / "unpacked").iterdir()
+    assert not (unpacked / "tests").exists()
+    assert names_in(build_wheel(unpacked, tmp_path)) == names_in(wheel)
+
+
+# ---- A fresh virtual environment ----
+
+
+@pytest.mark.slow
+def test_installed_beside_openai_agents(python, tmp_path):
+    """`agents` is OpenAI's and `megastep.agents` is ours, in one process."""
+    code = """
+import agents
+import megastep.agents.algorithms.ppo
+import megastep.agents
+print(agents.Agent.__module__, agents.__file__, megastep.agents.__file__)
+"""
+    module, openai_file, our_file = run([python, "-c", code], tmp_path).split()
+    assert module.split(".")[0] == "agents"
+    assert Path(openai_file).parts[-2:] == ("agents", "__init__.py")
+    assert Path(our_file).parts[-3:] == ("megastep", "agents", "__init__.py")
+    files = run([python, "-m", "pip", "show", "-f", "openai-agents"], tmp_path)
+    assert "agents/agent.py" in files
+
+
+@pytest.mark.slow
+def test_installed_package_claims_no_other_import_name(python, tmp_path):
+    for name in ("train", "evaluate", "configs", "scripts", "tests", "hydra_plugins"):
+        output = run([python, "-c", f"import {name}"], tmp_path, returncode=1)
+        assert "ModuleNotFoundError" in output
+    packages = run([python, "-m", "pip", "list"], tmp_path)
+    assert not any(name in packages for name in ("wandb", "optuna", "pytest"))
+
+
+@pytest.mark.slow
+def test_installed_command_trains_evaluates_and_records(python, tmp_path):
+    folder = tmp_path / "empty"
+    folder.mkdir()
+
+    def megastep(*arguments, returncode=0):
+        command = [python.with_name("megastep"), *arguments]
+        return run(command, folder, returncode, MEGASTEP_CACHE=str(tmp_path / "cache"))
+
+    assert "Traceback" not in megastep("train", *tiny.TINY, "samples=64", "folder=run")
+    assert "trained" in megastep("evaluate", "run=run", "episodes=4")
+    megastep("record", "run=latest", "steps=3")
+    assert (folder / "run/video.mp4").exists()
     sweep = ["-m", "seed=1,2", "samples=64", "hydra.sweep.dir=mine"]
-    assert "sweep.md" in typed("megastep", "train", *tiny.TINY, *sweep)
-    told = typed("megastep", "train", "lr=1", code=2).splitlines()
-    assert told[0] == "megastep train: 1 error in the configuration"
-    assert told[1] == "  lr: no such key; did you mean learner.lr?"
-    tree = yaml.safe_load(typed("megastep", "train", "--cfg", "job", "env=pong"))
-    assert tree["env"]["name"] == "megastep.envs.pong:Pong"
-    told = typed("megastep", "train", "hydra/launcher=joblib", "-m", code=2)
-    assert "pip install 'megastep-flatland[sweep]'" in told
-    versions = typed("megastep", "--version")
-    assert re.match(r"megastep-flatland \d", versions)
-    for name in ("train", "evaluate", "configs", "hydra_plugins"):
-        assert "ModuleNotFoundError" in typed("python", "-c", f"import {name}", code=1)
-    installed = typed("python", "-m", "pip", "list")
-    assert "wandb" not in installed and "optuna" not in installed and "pytest" not in installed
+    assert "sweep.md" in megastep("train", *tiny.TINY, *sweep)
+    errors = megastep("train", "lr=1", returncode=2)
+    assert "lr" in errors and "learner.lr" in errors
+    config = yaml.safe_load(megastep("train", "--cfg", "job", "env=pong"))
+    assert config["env"]["name"] == "megastep.envs.pong:Pong"
+    error = megastep("train", "hydra/launcher=joblib", "-m", returncode=2)
+    assert "pip install 'megastep-flatland[sweep]'" in error
+    assert re.match(r"megastep-flatland \d", megastep("--version"))

@@ -89,7 +89,7 @@ def test_a_signal_while_filming_is_no_fault_of_the_video(
     script, number, code, trained, tmp_path, handlers, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(recording._Video, "add", lambda *_: os.kill(os.getpid(), number))
+    monkeypatch.setattr(recording.Mp4Writer, "add", lambda *_: os.kill(os.getpid(), number))
     if script == "record":
         assert record.main([f"run={trained}", "steps=9", "device=cpu"]) == code
     else:

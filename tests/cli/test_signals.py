@@ -15,8 +15,8 @@ import pytest
 
 from megastep import recording
 from megastep.agents.cli import factory, train
-from megastep.agents.storage.rollout import Collector
-from megastep.agents.training import checkpoint, evaluation, loggers
+from megastep.agents.storage.collector import Collector
+from megastep.agents.training import checkpoint, checkpoint_format, evaluation, loggers
 from tests.helpers import tiny
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -81,7 +81,9 @@ def reporting(monkeypatch, number):
 
 
 def saving(monkeypatch, number):
-    signalled(monkeypatch, checkpoint, "_write", number, call=4)  # in the second checkpoint
+    signalled(
+        monkeypatch, checkpoint_format, "write_synced", number, call=4
+    )  # in the second checkpoint
 
 
 @pytest.mark.parametrize("number", SIGNALS)
@@ -105,7 +107,7 @@ def evaluating(monkeypatch, number):
 
 
 def filming(monkeypatch, number):
-    signalled(monkeypatch, recording._Video, "add", number)
+    signalled(monkeypatch, recording.Mp4Writer, "add", number)
 
 
 # filming, which is slow, gets the others in test_record.py

@@ -219,7 +219,7 @@ def test_a_single_runs_folder_is_hydras_too(here, capsys):
 def test_runs_of_a_sweep_are_a_group_of_wandbs(here, monkeypatch):
     given = []
     monkeypatch.setattr(
-        loggers.Loggers, "_open", lambda self, sink, *_, **known: given.append(known)
+        loggers.Loggers, "_add_optional", lambda self, sink, *_, **known: given.append(known)
     )
     wandb = ["logger=wandb", "logger.mode=offline"]
     assert train.main([*SHORT, *wandb, "-m", "seed=1", "hydra.sweep.dir=mine"]) == 0

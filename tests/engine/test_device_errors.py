@@ -1,5 +1,5 @@
-"""Errors that only the device can see: ids out of range and values that are not finite. A kernel
-never reads out of bounds for them; it raises a flag, and ``engine.check`` names the environment.
+"""Errors that only the device can see: indices out of range and non-finite values. Kernels never
+read out of bounds; they set a flag, and ``engine.check`` names the environment.
 """
 
 import math
@@ -12,11 +12,11 @@ from megastep import core, engine, scene, toys
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
 
-LAST = 3  # of four environments, so that they end where memory does
+LAST = 3  # of four environments, so that the buffers end with it
 
 
 def boxes(device, n_agents=1):
-    """Four environments of two layouts, whose agents stand apart in the middle of their box."""
+    """Four environments with two layouts, whose agents stand apart in the middle of their box."""
     geometries = [toys.box(4), toys.box(6)]
     c = core.Core(scene.scenery(geometries, n_agents, n_envs=LAST + 1, device=device), res=32)
     c.agents.positions[:] = 2 + torch.arange(n_agents, device=device)[:, None] / 2
@@ -58,7 +58,7 @@ def coverage(c):
     return engine.coverage(c.scenery, c.agents, seen, visible, mask)
 
 
-def seek(c):
+def pointgoal(c):
     goals = GoalFields(
         points=2 * [np.ones((1, 2))],
         fields=2 * [np.arange(36, dtype=np.float16).reshape(1, 6, 6)],
@@ -70,19 +70,19 @@ def seek(c):
         device=c.device,
     )
     n, on = (LAST + 1) * c.n_agents, dict(device=c.device)
-    chosen, ages, draws = (torch.zeros(n, dtype=torch.int32, **on) for _ in range(3))
-    found = pointgoal_step(
+    goal_index, ages, n_draws = (torch.zeros(n, dtype=torch.int32, **on) for _ in range(3))
+    result = pointgoal_step(
         c.scenery,
         c.agents,
         goals,
-        chosen,
+        goal_index,
         torch.zeros((PROGRESS_ROWS, n), **on),
         ages,
         torch.zeros(n, dtype=torch.bool, **on),
-        draws,
+        n_draws,
         torch.zeros((LAST + 1, c.n_agents), dtype=torch.int32, **on),
     )
-    return found.reward.view(LAST + 1, -1)
+    return result.reward.view(LAST + 1, -1)
 
 
 def spawn(c):
@@ -97,37 +97,37 @@ def spawn(c):
 @pytest.mark.parametrize("layout", [2, -1, 2**31 - 1, -(2**31)])
 @pytest.mark.parametrize("n_agents", [1, 3])
 @pytest.mark.parametrize(
-    "operation", [physics, render, observe, geometry, unseen, coverage, seek, spawn]
+    "operation", [physics, render, observe, geometry, unseen, coverage, pointgoal, spawn]
 )
-def test_a_layout_that_is_none_is_named_and_others_go_on(operation, n_agents, layout, device):
+def test_bad_layout_is_named_and_other_environments_continue(operation, n_agents, layout, device):
     expected = operation(boxes(device, n_agents))
     c = boxes(device, n_agents)
     c.scenery.layout[LAST] = layout
-    found = expected  # of the CPU, which raises before it can return anything
+    result = expected  # for the CPU, which raises before it returns anything
     with pytest.raises(engine.EngineError, match=f"^Environment {LAST} .* layout"):
-        found = operation(c)
+        result = operation(c)
         engine.check(c.agents)
-    assert torch.equal(found[:LAST], expected[:LAST])
+    assert torch.equal(result[:LAST], expected[:LAST])
     c.scenery.layout[LAST] = 1
     operation(c)
     engine.check(c.agents)
 
 
-@pytest.mark.parametrize("operation", [physics, render, observe, unseen, seek])
+@pytest.mark.parametrize("operation", [physics, render, observe, unseen, pointgoal])
 @pytest.mark.parametrize("field", ["positions", "angles"])
-def test_a_place_that_is_not_finite_is_named_by_whatever_reads_it(operation, field, device):
+def test_nonfinite_pose_is_named_by_every_operation(operation, field, device):
     expected = operation(boxes(device, 2))
     c = boxes(device, 2)
     getattr(c.agents, field)[LAST, 1] = math.nan
-    found = expected
-    with pytest.raises(engine.EngineError, match=f"environment {LAST} .* not a finite number"):
-        found = operation(c)
+    result = expected
+    with pytest.raises(engine.EngineError, match=f"environment {LAST} .* non-finite"):
+        result = operation(c)
         engine.check(c.agents)
-    assert torch.equal(found[:LAST], expected[:LAST])
+    assert torch.equal(result[:LAST], expected[:LAST])
 
 
 @pytest.mark.parametrize("action", [7, -1, 2**40])
-def test_an_action_that_is_none_is_named(action, device):
+def test_bad_action_is_named(action, device):
     c = boxes(device, 2)
     moves = torch.zeros((7, 3), device=device)
     actions = torch.zeros((LAST + 1, 2), dtype=torch.int64, device=device)
@@ -139,10 +139,10 @@ def test_an_action_that_is_none_is_named(action, device):
 
 @pytest.mark.parametrize("field", ["positions", "angles", "velocity", "angvelocity"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_value_that_is_not_finite_is_named(value, field, device):
+def test_nonfinite_state_is_named(value, field, device):
     c = boxes(device, 2)
     getattr(c.agents, field)[1] = value
-    with pytest.raises(engine.EngineError, match="environment 1 .* not a finite number"):
+    with pytest.raises(engine.EngineError, match="environment 1 .* non-finite"):
         engine.physics(c.scenery, c.agents)
         engine.check(c.agents)
     engine.check(c.agents)

@@ -1,5 +1,5 @@
-"""The engine against the laws: the original's golden outputs, the brute-force twin on random
-environments, and the public pieces that `observe` fuses. Outputs are poisoned first.
+"""The engine against golden outputs of the original, against a brute-force twin in random
+environments, and `observe` against the operations that it fuses. Outputs are poisoned first.
 """
 
 import math
@@ -15,7 +15,7 @@ from tests.helpers.outputs import Poison, seen_of
 
 
 def core_of(envs, device, **settings):
-    """A Core of a test's environments."""
+    """A Core with these environments."""
     core = cuda.Core(cuda.Scenery(**envs.scenery_arguments(), device=device), **settings)
     for name in ("positions", "angles", "velocity", "angvelocity"):
         getattr(core.agents, name).copy_(getattr(envs, name))
@@ -24,9 +24,9 @@ def core_of(envs, device, **settings):
 
 @pytest.fixture
 def poison(monkeypatch):
-    found = Poison(torch.empty)
-    monkeypatch.setattr(torch, "empty", found.allocate)
-    return found
+    poison = Poison(torch.empty)
+    monkeypatch.setattr(torch, "empty", poison.allocate)
+    return poison
 
 
 def state_of(core, physics):
@@ -41,22 +41,22 @@ def state_of(core, physics):
 
 
 def baked_and_rendered(core, poison):
-    """A render's fields, after a bake; all that either must write was poisoned."""
+    """The fields of a render after a bake, with all outputs of both poisoned first."""
     baked = core.scenery.layouts.baked.vals
     baked.fill_(math.nan)
     cuda.bake(core.scenery)
-    assert not baked.isnan().any(), "light that bake did not write"
+    assert not baked.isnan().any(), "bake did not write all light"
     poison.scenery(core.scenery)
     r = cuda.render(core.scenery, core.agents)._asdict()
     poison.check(**r, lines=core.scenery.agent_lines, light=core.scenery.agent_light)
     return r
 
 
-# ---- Golden: what the original computed, within the tolerances its README gives ----
+# ---- Golden outputs of the original, with the tolerances of their README ----
 
 
 @pytest.mark.parametrize("case", random_scenery.CASES)
-def test_golden(case, device, poison):
+def test_matches_the_original(case, device, poison):
     envs, settings, _ = random_scenery.golden(case)
     core = core_of(envs, device, **settings)
     r = baked_and_rendered(core, poison)
@@ -68,7 +68,7 @@ def test_golden(case, device, poison):
     compare.check_golden(case, state_of(core, physics))
 
 
-# ---- The twin: random environments, all degenerate cases ----
+# ---- The twin: random environments with degenerate cases ----
 
 VIEWS = [
     dict(res=1, fov=130.0),
@@ -83,7 +83,7 @@ VIEWS = [
 @pytest.mark.parametrize("n_agents", [1, 4])
 @pytest.mark.parametrize("view", VIEWS, ids=str)
 @pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
-def test_twin_render(view, n_agents, degenerate, device, poison):
+def test_render_matches_twin(view, n_agents, degenerate, device, poison):
     for seed in range(2):
         envs = random_scenery.random_environments(
             seed,
@@ -101,7 +101,7 @@ def test_twin_render(view, n_agents, degenerate, device, poison):
 
 @pytest.mark.parametrize("n_agents", [1, 4])
 @pytest.mark.parametrize("name", [None, *random_scenery.DEGENERATE, "overlap"])
-def test_twin_physics(name, n_agents, device, poison):
+def test_physics_matches_twin(name, n_agents, device, poison):
     for seed in range(6):
         envs = random_scenery.random_environments(
             seed,
@@ -116,10 +116,11 @@ def test_twin_physics(name, n_agents, device, poison):
         compare.check_physics(state_of(core, physics), envs)
 
 
-def test_an_output_that_is_not_written_is_named(poison, monkeypatch):
-    """What the checks above would say of kernels that write nothing."""
+def test_unwritten_outputs_are_named(poison, monkeypatch):
+    """The checks above fail for kernels that write nothing."""
     core = core_of(random_scenery.random_environments(0), "cpu")
-    monkeypatch.setattr(engine, "launch", lambda *args, **kwargs: None)
+    for module in ("movement", "rendering"):
+        monkeypatch.setattr(f"megastep.engine.{module}.launch", lambda *args, **kwargs: None)
     outputs = [
         cuda.render(core.scenery, core.agents),
         cuda.physics(core.scenery, core.agents),
@@ -138,12 +139,12 @@ def test_an_output_that_is_not_written_is_named(poison, monkeypatch):
                 poison.check(**{name: tensor})
 
 
-# ---- The fused pass is the composition of the public pieces ----
+# ---- observe against the operations that it fuses ----
 
 
 @pytest.mark.parametrize("n_agents", [1, 3])
 @pytest.mark.parametrize("subsample", [1, 4])
-def test_observe_composes(n_agents, subsample, device, poison):
+def test_observe_matches_render_and_sensors(n_agents, subsample, device, poison):
     envs = random_scenery.random_environments(
         5, n_envs=8, n_agents=n_agents, degenerate=random_scenery.EVERYTHING, res=64
     )
@@ -153,7 +154,7 @@ def test_observe_composes(n_agents, subsample, device, poison):
     o = engine.observe(core.scenery, core.agents, subsample, imu=True, centre_line=True, seen=seen)
     poison.check(**o._asdict())
     r = cuda.render(core.scenery, core.agents)
-    # half a unit of fp16's last place, and the mean's rounding
+    # half a unit in fp16's last place, and the rounding of the mean
     assert torch.allclose(o.rgb.float(), RGB(core, subsample)(r)[:, :, :, 0], atol=6e-4), "rgb"
     assert torch.allclose(o.depth.float(), Depth(core, subsample)(r)[:, :, 0, 0], atol=6e-4), (
         "depth"
@@ -170,24 +171,24 @@ def test_observe_composes(n_agents, subsample, device, poison):
         o.newly_seen.cpu().long(),
     ), "newly_seen"
     again = engine.observe(core.scenery, core.agents, subsample, seen=seen)
-    assert not again.newly_seen.any(), "a texel is new only once"
+    assert not again.newly_seen.any(), "a texel is newly seen once"
     cleared = engine.observe(
         core.scenery, core.agents, subsample, seen=seen, clear_mask=core.agent_full(True)
     )
-    assert torch.equal(cleared.newly_seen, o.newly_seen), "a cleared mask starts anew"
+    assert torch.equal(cleared.newly_seen, o.newly_seen), "clear_mask clears"
 
 
 def bits_seen(core, r):
-    """What `seen` must hold after one view, from a full render, agent by agent."""
+    """The expected `seen` after one view, from a full render, agent by agent."""
     scenery, layouts = core.scenery, core.scenery.layouts
     out = torch.zeros((core.n_envs, core.n_agents, -(-layouts.max_texels // 32)), dtype=torch.int64)
-    own, starts = scenery.agent_lines.shape[1], layouts.texel_starts.tolist()
+    n_agent_lines, starts = scenery.agent_lines.shape[1], layouts.texel_starts.tolist()
     for e in range(core.n_envs):
         first = int(layouts.wall_starts[int(scenery.layout[e])])
         for a in range(core.n_agents):
             for line, location in zip(r.indices[e, a].tolist(), r.locations[e, a].tolist()):
-                if line >= own:
-                    wall = first + line - own
+                if line >= n_agent_lines:
+                    wall = first + line - n_agent_lines
                     width = starts[wall + 1] - starts[wall]
                     texel = (
                         starts[wall]

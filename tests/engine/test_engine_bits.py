@@ -1,4 +1,4 @@
-"""The CPU's numbers are the GPU's, and one thread's are those of many, on every bit."""
+"""CPU and GPU, and any number of CPU threads, agree on every bit."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from tests.helpers.outputs import seen_of
 
 
 def trajectory(device, n_agents, subsample=1, **settings):
-    """All tensors of a few steps in generated homes."""
+    """All outputs of a few steps in generated homes."""
     homes = sample("homes", 8)
     core = cuda.Core(scene.scenery(homes, n_agents, n_envs=24, device=device), **settings)
     spawn, seen = RandomSpawns(homes, core), seen_of(core)
@@ -62,9 +62,8 @@ SETTINGS = [
     dict(n_agents=1, res=64),
     dict(n_agents=4, res=128, fov=70.0),
     dict(n_agents=2, res=32, fov=90.0, cameras=[0, 120, 240]),
-    dict(
-        n_agents=1, res=256, subsample=4
-    ),  # the usual one; then batches that do not fill a warp, or lie across blocks
+    dict(n_agents=1, res=256, subsample=4),  # the most common one
+    # batches that do not fill a warp, or span blocks
     dict(n_agents=1, res=60, subsample=3),
     dict(n_agents=2, res=160, subsample=5),
     dict(n_agents=1, res=96, subsample=32),
@@ -80,13 +79,13 @@ def test_cpu_and_gpu_agree_on_every_bit(settings):
 
 @pytest.mark.cuda
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-def test_gpus_agree_on_every_bit_whichever_is_current():
+def test_gpus_agree_on_every_bit():
     here, there = trajectory("cuda:0", n_agents=2, res=64), trajectory("cuda:1", n_agents=2, res=64)
     assert torch.cuda.current_device() == 0 and not any(differing(here, there))
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_threads_do_not_matter(settings):
+def test_number_of_threads_changes_no_bit(settings):
     runs = []
     try:
         for n in (1, 2, 4):

@@ -1,4 +1,4 @@
-"""The engine's calls: facts to check on paper, bad input, and what a GPU must not wait for."""
+"""The engine's operations: facts to check by hand, bad arguments, no synchronisation."""
 
 import math
 
@@ -11,7 +11,7 @@ from megastep.geometries import sample
 from megastep.modules import RandomSpawns
 from tests.helpers.outputs import seen_of
 
-# ---- Facts to check on paper ----
+# ---- Facts to check by hand ----
 
 
 def box(device, **settings):
@@ -20,7 +20,7 @@ def box(device, **settings):
     return core
 
 
-def test_two_metres_from_a_wall_depth_reads_two_metres(device):
+def test_depth_two_metres_from_a_wall(device):
     core = box(device, res=63)
     core.agents.positions[:, :, 0] = 4.0
     r = cuda.render(core.scenery, core.agents)
@@ -29,7 +29,7 @@ def test_two_metres_from_a_wall_depth_reads_two_metres(device):
     assert abs(float(o.depth[0, 0, 31]) - (1 - (2 - engine.AGENT_RADIUS) / 10)) < 5e-4
 
 
-def test_depth_falls_to_0_at_max_depth_beyond_the_radius(device):
+def test_max_depth(device):
     core = box(device, res=63)
     core.agents.positions[:, :, 0] = 4.0
     for max_depth, expected in ((4.0, 1 - (2 - engine.AGENT_RADIUS) / 4), (1.5, 0.0)):
@@ -37,7 +37,7 @@ def test_depth_falls_to_0_at_max_depth_beyond_the_radius(device):
         assert abs(float(o.depth[0, 0, 31]) - expected) < 5e-4
 
 
-def test_the_tutorials_wall(device):
+def test_wall_of_the_tutorial(device):
     core = box(device)
     core.agents.velocity[:] = torch.tensor([1000.0, 0.0])
     p = cuda.physics(core.scenery, core.agents)
@@ -57,7 +57,7 @@ def test_no_agent_leaves_a_closed_box(speed, device):
     assert float(clearance) >= engine.AGENT_RADIUS, "cameras stay on their side of the wall"
 
 
-def test_two_cores_live_side_by_side(device):
+def test_two_cores_are_independent(device):
     narrow, wide = box(device, res=16, fov=30.0), box(device, res=64, fov=150.0, cameras=[0, 180])
     before = cuda.render(narrow.scenery, narrow.agents)
     assert cuda.render(wide.scenery, wide.agents).screen.shape == (2, 1, 2, 64, 3)
@@ -65,7 +65,7 @@ def test_two_cores_live_side_by_side(device):
     assert before.screen.shape == (2, 1, 16, 3) and torch.equal(before.screen, after.screen)
 
 
-def test_layouts_are_shared(device):
+def test_environments_share_layouts(device):
     scenery = scene.scenery([toys.box(), toys.column()], n_agents=1, n_envs=6, device=device)
     assert scenery.layout.tolist() == [0, 1, 0, 1, 0, 1] and len(scenery.layouts) == 2
     lines, textures, baked = scenery.lines, scenery.textures, scenery.baked
@@ -85,8 +85,8 @@ def test_layouts_are_shared(device):
     )
 
 
-def test_random_streams_are_philox(device):
-    """Against the published vector for key 0, counter 0 (Random123's kat_vectors)."""
+def test_uniform_matches_published_philox_vectors(device):
+    """Key 0 and counter 0, from Random123's kat_vectors."""
     counts = torch.zeros(1, dtype=torch.int32, device=device)
     out = engine.uniform(
         counts,
@@ -98,15 +98,15 @@ def test_random_streams_are_philox(device):
     assert out[0].tolist() == [(word >> 8) / 2**24 for word in words] and counts.tolist() == [1]
 
 
-def test_lanes_draw_where_they_are_masked(device):
+def test_uniform_draws_for_masked_lanes_only(device):
     counts = torch.tensor([5, 5, 5], dtype=torch.int32, device=device)
     mask = torch.tensor([True, False, True], device=device)
     out = engine.uniform(counts, mask, 3, torch.full((3, 4), -1.0, device=device))
     assert counts.tolist() == [6, 5, 6] and (out[1] == -1).all() and (out[::2] >= 0).all()
 
 
-def test_seeds_that_differ_in_either_word_draw_differently(device):
-    drawn = [
+def test_both_words_of_a_seed_matter(device):
+    draws = [
         engine.uniform(
             torch.zeros(1, dtype=torch.int32, device=device),
             torch.ones(1, dtype=torch.bool, device=device),
@@ -115,10 +115,10 @@ def test_seeds_that_differ_in_either_word_draw_differently(device):
         )
         for seed in (1, 2, 1 + (1 << 32))
     ]
-    assert len(torch.cat(drawn).unique(dim=0)) == 3
+    assert len(torch.cat(draws).unique(dim=0)) == 3
 
 
-def test_an_action_damps_the_velocities_and_adds_its_move_in_the_agents_frame(device):
+def test_actions_damp_and_add_their_move(device):
     core = box(device)
     core.agents.angles[:] = 90.0  # ahead is +y, left is -x
     core.agents.velocity[:] = torch.tensor([2.0, 0.0])
@@ -132,7 +132,7 @@ def test_an_action_damps_the_velocities_and_adds_its_move_in_the_agents_frame(de
     assert torch.allclose(core.agents.positions[:, 0].cpu(), 3 + expected / 10, atol=1e-6)
 
 
-def test_a_spawn_leaves_others_alone_and_layouts_too(device):
+def test_spawn_changes_masked_agents_only(device):
     scenery = scene.scenery([toys.box(), toys.column()], 1, 8, device=device)
     core = cuda.Core(scenery)
     points = torch.full((2, 4, 2), 2.5, device=device)
@@ -144,11 +144,11 @@ def test_a_spawn_leaves_others_alone_and_layouts_too(device):
     assert counts.flatten().tolist() == [0, 1] * 4 and scenery.layout.tolist() == [0, 1] * 4
     for _ in range(8):
         engine.spawn(scenery, core.agents, mask, points, counts, seed=1, resample=True)
-    assert scenery.layout[::2].tolist() == [0] * 4, "who does not respawn stays"
-    assert scenery.layout[1::2].unique().tolist() == [0, 1], "who does moves"
+    assert scenery.layout[::2].tolist() == [0] * 4, "environments without respawns stay"
+    assert scenery.layout[1::2].unique().tolist() == [0, 1], "the others move"
 
 
-def test_as_many_points_as_agents_are_enough(device):
+def test_spawn_with_one_point_per_agent(device):
     core = cuda.Core(scene.scenery([toys.box()], 2, 1, device=device))
     points = torch.tensor([[[2.0, 2.0], [4.0, 4.0]]], device=device)
     counts = torch.zeros((1, 2), dtype=torch.int32, device=device)
@@ -156,7 +156,7 @@ def test_as_many_points_as_agents_are_enough(device):
     assert sorted(core.agents.positions[0].tolist()) == [[2, 2], [4, 4]]
 
 
-# ---- Bad input ----
+# ---- Bad arguments ----
 
 
 @pytest.mark.parametrize(
@@ -164,28 +164,28 @@ def test_as_many_points_as_agents_are_enough(device):
     [dict(res=0), dict(res=1025), dict(fov=180.0), dict(fov=0.0), dict(fps=0.0), dict(cameras=[])],
     ids=str,
 )
-def test_bad_settings_are_refused(settings):
+def test_bad_settings(settings):
     with pytest.raises(ValueError, match="but"):
         box("cpu", **settings)
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, math.nan, math.inf])
-def test_a_disc_needs_a_radius(radius):
-    with pytest.raises(ValueError, match="radius must be a number of metres above 0"):
+def test_bad_radius(radius):
+    with pytest.raises(ValueError, match="radius .* above 0"):
         engine.Agents(1, 1, radius=radius)
 
 
 @pytest.mark.parametrize("max_depth", [0.0, -1.0, math.nan])
-def test_depth_needs_a_range(max_depth):
+def test_bad_max_depth(max_depth):
     core = box("cpu")
-    with pytest.raises(ValueError, match="max_depth must be a number of metres above 0"):
+    with pytest.raises(ValueError, match="max_depth .* above 0"):
         engine.observe(core.scenery, core.agents, max_depth=max_depth)
 
 
-def test_a_position_that_is_not_finite_is_named(device):
+def test_nonfinite_position_is_named(device):
     core = box(device)
     core.agents.positions[1, 0, 0] = math.nan
-    with pytest.raises(engine.EngineError, match="environment 1 .* not a finite number"):
+    with pytest.raises(engine.EngineError, match="environment 1 .* non-finite"):
         cuda.render(core.scenery, core.agents)
         engine.check(core.agents)
     core.agents.positions[:] = 3.0
@@ -194,7 +194,7 @@ def test_a_position_that_is_not_finite_is_named(device):
 
 
 @pytest.mark.parametrize(
-    "broken, found",
+    "broken, description",
     [
         (lambda good: good.double(), r"a torch.float64 tensor of shape \(2, 1, 2\)"),
         (lambda good: good[:1].clone(), r"a torch.float32 tensor of shape \(1, 1, 2\)"),
@@ -203,17 +203,19 @@ def test_a_position_that_is_not_finite_is_named(device):
     ],
     ids=["dtype", "shape", "not contiguous", "None"],
 )
-def test_wrong_tensors_are_named(broken, found):
+def test_wrong_tensors_are_named(broken, description):
     core = box("cpu")
     good = core.agents.positions
     core.agents.positions = broken(good)
-    with pytest.raises((TypeError, ValueError), match=f"agents.positions must be .*but {found}"):
+    with pytest.raises(
+        (TypeError, ValueError), match=f"agents.positions must be .*but {description}"
+    ):
         cuda.render(core.scenery, core.agents)
     core.agents.positions = good.clone()
     cuda.render(core.scenery, core.agents)
 
 
-def test_unknown_devices_are_refused():
+def test_unknown_devices():
     with pytest.raises(engine.EngineError, match="device=tpu is unknown"):
         engine.device("tpu")
     if not torch.cuda.is_available():
@@ -221,13 +223,13 @@ def test_unknown_devices_are_refused():
             engine.device("cuda")
 
 
-def test_too_many_environments_are_counted(monkeypatch):
+def test_too_many_environments_say_how_many_fit(monkeypatch):
     monkeypatch.setattr(devices, "free_memory", lambda device: 10**6)
     with pytest.raises(engine.EngineError, match="at most [0-9,]+ fit"):
         scene.scenery([toys.box()], n_agents=1, n_envs=10**6, device="cpu")
 
 
-# ---- What needs a GPU ----
+# ---- On a GPU ----
 
 
 def no_synchronisation(act):
@@ -268,17 +270,17 @@ def test_no_operation_synchronises():
 
 
 @pytest.mark.cuda
-def test_a_recorded_bake_follows_walls_and_lights_that_move():
-    recorded, eager = (
+def test_captured_bake_follows_moved_walls_and_lights():
+    captured, eager = (
         scene.scenery([toys.box(), toys.column()], 1, 4, device="cuda") for _ in range(2)
     )
-    graph = capture.Graph(lambda: engine.bake(recorded), (), (recorded,))
-    for scenery in (recorded, eager):
+    graph = capture.Graph(lambda: engine.bake(captured), (), (captured,))
+    for scenery in (captured, eager):
         scenery.layouts.lines.vals.add_(0.25)
         scenery.layouts.lights.vals[:, 2].mul_(0.5)
     graph()
     engine.bake(eager)
-    assert torch.equal(recorded.layouts.boxes, eager.layouts.boxes)
-    assert torch.equal(recorded.layouts.baked.vals, eager.layouts.baked.vals)
-    images = [cuda.render(s, cuda.Core(s).agents).screen for s in (recorded, eager)]
+    assert torch.equal(captured.layouts.boxes, eager.layouts.boxes)
+    assert torch.equal(captured.layouts.baked.vals, eager.layouts.baked.vals)
+    images = [cuda.render(s, cuda.Core(s).agents).screen for s in (captured, eager)]
     assert torch.equal(*images)

@@ -1,4 +1,4 @@
-"""Scenery: views by environment, what may be written and what refuses, layouts that are shared."""
+"""Scenery: views by environment, what is writable and what is read-only, shared layouts."""
 
 import copy
 
@@ -23,7 +23,7 @@ def shared():
 
 
 def image(scenery):
-    """What an agent in the middle of each environment sees."""
+    """The view of an agent in the middle of each environment."""
     c = core.Core(scenery)
     c.agents.positions[:] = torch.tensor([2.0, 3.0])
     return engine.render(scenery, c.agents).screen.clone()
@@ -38,19 +38,19 @@ def expected(scenery):
     for e, d in enumerate(scenery.layout.tolist()):
         out["lines"].append(torch.cat([scenery.agent_lines[e], layouts.lines[d]]))
         out["lights"].append(layouts.lights[d])
-        own = scenery.model_texels.diff().tolist()
-        out["textures"] += layouts.agent_textures[d].split(own)
-        out["baked"] += scenery.agent_light[e].split(own)
+        widths = scenery.model_texels.diff().tolist()
+        out["textures"] += layouts.agent_textures[d].split(widths)
+        out["baked"] += scenery.agent_light[e].split(widths)
         for wall in range(*layouts.wall_starts[d : d + 2].tolist()):
             out["textures"].append(layouts.textures[wall])
             out["baked"].append(layouts.baked[wall])
     return out
 
 
-def wallless(n_agents):
-    """Two environments of one layout that has no walls, and of another that has two."""
-    made = random_scenery.random_environments(3, n_envs=2, n_agents=n_agents)
-    arguments = made.scenery_arguments()
+def without_walls(n_agents):
+    """Environments of two layouts: one has no walls, the other two walls."""
+    other = random_scenery.random_environments(3, n_envs=2, n_agents=n_agents)
+    arguments = other.scenery_arguments()
     walls = Layouts(
         Ragged(torch.tensor([[[1.0, 1], [2, 1]], [[2, 1], [2, 2]]]), [0, 2]),
         Ragged(torch.rand(5, 3), [2, 3]),
@@ -68,12 +68,12 @@ def wallless(n_agents):
     [
         lambda: scene.scenery([toys.box(), toys.column()], 2, 6, device="cpu"),
         lambda: scene.scenery([toys.box()], 0, 3, device="cpu"),
-        lambda: wallless(1),
-        lambda: wallless(0),
+        lambda: without_walls(1),
+        lambda: without_walls(0),
     ],
     ids=["shared", "no agents", "no walls", "no agents nor walls"],
 )
-def test_views_join_the_agents_part_and_the_layouts(make, name):
+def test_views_join_agents_and_layouts(make, name):
     scenery = make()
     scenery.agent_light.copy_(torch.rand_like(scenery.agent_light))
     view, parts = getattr(scenery, name), expected(scenery)[name]
@@ -88,14 +88,14 @@ def test_views_join_the_agents_part_and_the_layouts(make, name):
     assert [piece.tolist() for piece in view[::-2]] == [part.tolist() for part in parts[::-2]]
 
 
-def test_a_view_is_of_the_moment_it_is_read(shared):
+def test_views_are_computed_when_read(shared):
     before = shared.lines[0]
     image(shared)
     assert not torch.equal(before, shared.lines[0])
 
 
 @pytest.mark.parametrize("index", [6, -7])
-def test_environments_out_of_range_are_named(shared, index):
+def test_environment_out_of_range(shared, index):
     with pytest.raises(IndexError, match=f"index {index} is out of range"):
         shared.lines[index]
     with pytest.raises(ValueError, match=f"e must be an integer from -6 to 5, but {index}"):
@@ -146,7 +146,7 @@ def statements():
 
 @pytest.mark.parametrize("name", VIEWS)
 @pytest.mark.parametrize("statement", statements())
-def test_writing_into_a_view_raises_with_the_cure(shared, name, statement):
+def test_writing_into_a_view_raises(shared, name, statement):
     with pytest.raises(ValueError, match=rf"scenery.{name} is a read-only|read-only"):
         statements()[statement](getattr(shared, name))
 
@@ -163,7 +163,7 @@ def test_replacing_a_view_or_its_vals_raises(shared, name):
 
 
 @pytest.mark.parametrize("name", VIEWS)
-def test_copies_of_a_view_are_written_at_will(shared, name):
+def test_copies_of_a_view_are_writable(shared, name):
     view = getattr(shared, name)
     before = view.vals.clone()
     view.clone().vals.zero_()
@@ -174,16 +174,16 @@ def test_copies_of_a_view_are_written_at_will(shared, name):
     assert torch.equal(getattr(shared, name).vals, before)
 
 
-def test_what_is_calculated_from_a_read_only_tensor_is_plain(shared):
+def test_results_from_read_only_tensors_are_plain(shared):
     vals = shared.textures.vals
-    for made in (vals + 1, vals.half(), torch.cat([vals, vals]), vals.sum(), vals.clone()):
-        assert type(made) is torch.Tensor
+    for other in (vals + 1, vals.half(), torch.cat([vals, vals]), vals.sum(), vals.clone()):
+        assert type(other) is torch.Tensor
     assert isinstance(vals[:1], ReadOnlyTensor) and isinstance(vals.detach(), ReadOnlyTensor)
     assert type(torch.zeros_like(vals).copy_(vals)) is torch.Tensor
     assert vals.shape == torch.Size(vals.shape) and type(vals.shape) is torch.Size
 
 
-def test_what_is_written_into_a_layout_reaches_every_environment_of_it(shared):
+def test_writes_to_a_layout_reach_all_its_environments(shared):
     before = image(shared)
     shared.layouts.textures.vals[: int(shared.layouts.texel_starts[4])] = 0  # the box's four walls
     after = image(shared)
@@ -192,7 +192,7 @@ def test_what_is_written_into_a_layout_reaches_every_environment_of_it(shared):
     assert torch.equal(after[0], after[2])
 
 
-def test_lights_and_walls_that_move_are_seen_after_baking(shared):
+def test_bake_after_moving_lights_and_walls(shared):
     before = image(shared)
     shared.layouts.lights.vals[:, 2] *= 0.25
     assert torch.equal(image(shared)[:, :, :, 0].isnan(), before[:, :, :, 0].isnan())
@@ -204,7 +204,7 @@ def test_lights_and_walls_that_move_are_seen_after_baking(shared):
     assert (image(shared) != darker).any()
 
 
-def test_memory_that_was_exchanged_is_read_where_it_is_now(shared):
+def test_exchanged_memory_is_read(shared):
     image(shared)
     lights = shared.layouts.lights.vals
     lights.data = lights * torch.tensor([1.0, 1.0, 0.0])
@@ -218,13 +218,13 @@ def test_bounding_boxes_are_updated_in_place(shared):
     assert before.tolist()[0] == [1, 1, 6, 6]
     layouts.lines.vals += 1
     engine.bake(shared)
-    assert layouts.boxes.data_ptr() == address, "a recorded graph reads where they always were"
+    assert layouts.boxes.data_ptr() == address, "a captured graph reads the old address"
     assert torch.equal(layouts.boxes, before + 1)
 
 
-def test_boxes_hold_32_walls_of_one_layout_each():
-    made = random_scenery.random_environments(1, n_envs=3, n_walls=70)
-    layouts = Scenery(**made.scenery_arguments()).layouts
+def test_boxes_hold_32_walls_of_one_layout():
+    other = random_scenery.random_environments(1, n_envs=3, n_walls=70)
+    layouts = Scenery(**other.scenery_arguments()).layouts
     starts = layouts.box_starts.tolist()
     for d in range(3):
         groups = layouts.lines[d].split(32)
@@ -234,7 +234,7 @@ def test_boxes_hold_32_walls_of_one_layout_each():
 
 
 @pytest.mark.parametrize("n_walls, n_boxes", [(0, 0), (1, 1), (31, 1), (32, 1), (33, 2), (64, 2)])
-def test_a_layout_has_as_many_boxes_as_its_walls_need(n_walls, n_boxes):
+def test_number_of_boxes(n_walls, n_boxes):
     walls = Ragged(torch.rand(n_walls, 2, 2), [n_walls])
     texels, lights = Ragged(torch.rand(n_walls, 3), [1] * n_walls), Ragged(torch.rand(0, 3), [0])
     layouts = Layouts(walls, texels, lights, torch.rand(1, 8, 3), "cpu")
@@ -245,19 +245,19 @@ TABLES = "wall_starts", "texel_starts", "light_starts", "box_starts", "boxes"
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_the_tables_of_layouts_are_read_only(shared, name):
+def test_tables_of_layouts_are_read_only(shared, name):
     with pytest.raises(ValueError, match=f"{name} (is|are) read-only"):
         getattr(shared.layouts, name)[0] = 10**6
 
 
 @pytest.mark.parametrize("name", ["lines", "textures", "baked", "lights"])
-def test_the_widths_of_layouts_are_read_only(shared, name):
+def test_widths_of_layouts_are_read_only(shared, name):
     with pytest.raises(ValueError, match=f"{name}.widths is read-only.*: make another Scenery"):
         getattr(shared.layouts, name).widths[0] = 10**6
 
 
 @pytest.mark.parametrize("name", ["model", "model_texels"])
-def test_the_model_is_read_only(shared, name):
+def test_model_is_read_only(shared, name):
     with pytest.raises(ValueError, match=f"{name} is read-only.*: make another Scenery"):
         getattr(shared, name)[0] = 7
 
@@ -266,7 +266,7 @@ def attributes(thing):
     return [name for name in vars(thing) if not name.startswith("_")]
 
 
-def test_what_scenery_and_layouts_hold_is_never_replaced(shared):
+def test_attributes_cannot_be_replaced(shared):
     for thing in (shared, shared.layouts, shared.layouts.lines):
         for name in attributes(thing):
             with pytest.raises(AttributeError, match=name):
@@ -278,14 +278,14 @@ def test_what_scenery_and_layouts_hold_is_never_replaced(shared):
     )
 
 
-def test_an_environment_moves_to_another_layout_in_place(shared):
+def test_environments_change_layout_in_place(shared):
     before = image(shared)
     shared.layout[:] = shared.layout.flip(0)
     after = image(shared)
     assert shared.layout.tolist() == [1, 0] * 3 and torch.equal(after, before.flip(0))
 
 
-def test_an_environment_alone_is_a_copy(shared):
+def test_env_returns_copies(shared):
     before = [view.clone() for view in (shared.layouts.lines.vals, shared.layouts.lights.vals)]
     lines, colours, lights = shared.env(1)
     for tensor in (lines, lights, *colours):
@@ -295,7 +295,7 @@ def test_an_environment_alone_is_a_copy(shared):
     assert torch.equal(shared.env(-1)[0], shared.env(5)[0])
 
 
-# ---- Parts that do not fit ----
+# ---- Bad parts ----
 
 
 def parts(**changes):
@@ -303,7 +303,7 @@ def parts(**changes):
     return random_scenery.random_environments(0, n_envs=2).scenery_arguments() | changes
 
 
-def test_agents_textures_must_have_the_same_widths_everywhere():
+def test_agents_texture_widths_must_be_equal():
     good = parts()
     widths = good["textures"].widths.clone()
     second = int(good["lines"].widths[0])
@@ -313,7 +313,7 @@ def test_agents_textures_must_have_the_same_widths_everywhere():
         Scenery(**parts(textures=Ragged(good["textures"].vals, widths)))
 
 
-def test_every_wall_needs_a_texel():
+def test_walls_need_a_texel():
     good = parts()
     widths = good["textures"].widths.clone()
     widths[-2:] += torch.tensor([widths[-1], -widths[-1]])
@@ -321,23 +321,23 @@ def test_every_wall_needs_a_texel():
         Scenery(**parts(textures=Ragged(good["textures"].vals, widths)))
 
 
-def test_every_environment_begins_with_its_agents_lines():
+def test_lines_must_start_with_the_agents():
     good = parts()
-    with pytest.raises(ValueError, match="lines must begin, .* with the 1600 lines of its 200"):
+    with pytest.raises(ValueError, match="lines .* 1600 lines of its 200"):
         Scenery(**parts(n_agents=200))
     assert Scenery(**good).n_agents == 1
 
 
-def test_parts_of_one_scenery_make_another():
+def test_scenery_from_the_parts_of_another():
     good = Scenery(**parts())
     views = {name: getattr(good, name) for name in ("lights", "lines", "textures")}
-    made = Scenery(1, **views, model=good.model)
+    other = Scenery(1, **views, model=good.model)
     for name in VIEWS:
-        assert torch.equal(getattr(made, name).vals, getattr(good, name).vals), name
-    made.layouts.lights.vals.zero_()
+        assert torch.equal(getattr(other, name).vals, getattr(good, name).vals), name
+    other.layouts.lights.vals.zero_()
     assert good.lights.vals.any(), "memory of its own"
 
 
-def test_tables_that_outgrow_32_bits_are_refused():
+def test_tables_beyond_32_bits_are_refused():
     with pytest.raises(ValueError, match="at most 2,147,483,647 .* but 2147483648 were given"):
         scenery_module._starts("texel_starts", torch.tensor([2**31 - 1, 1]))

@@ -1,5 +1,5 @@
-"""The twin against what the original engine computed and against sums on paper; whether comparing
-with it finds mistakes.
+"""The twin against outputs of the original engine and against hand calculation; comparing with it
+finds errors.
 """
 
 import math
@@ -31,14 +31,14 @@ def placed(w):
 
 
 def golden_light(w, baked):
-    """Golden light of static texels, and the law's of agents' texels."""
+    """Light of static texels from the golden data, and of agents' texels from the twin."""
     n_own = int(w["widths"][: len(w["positions"]) * len(w["model"])].sum())
     points = twin.texel_positions(placed(w), w["widths"])[:n_own]
     return torch.cat([twin.light_at(points, w["walls"], w["lights"]), baked[n_own:].double()])
 
 
 @pytest.mark.parametrize("case", random_scenery.CASES)
-def test_rays_of_the_original(case):
+def test_twin_rays_match_the_original(case):
     envs, settings, right = random_scenery.golden(case)
     seen = []
     for e, baked in enumerate(right["baked_vals"].split(envs.texels().tolist())):
@@ -56,7 +56,7 @@ def test_rays_of_the_original(case):
 
 
 @pytest.mark.parametrize("case", random_scenery.CASES)
-def test_light_of_the_original(case):
+def test_twin_light_matches_the_original(case):
     envs, _, right = random_scenery.golden(case)
     errors = []
     for e, baked in enumerate(right["baked_vals"].split(envs.texels().tolist())):
@@ -83,12 +83,12 @@ def golden_step(case):
 
 
 @pytest.mark.parametrize("case", random_scenery.CASES)
-def test_physics_of_the_original(case):
+def test_twin_physics_matches_the_original(case):
     compare.check_golden(case, golden_step(case)[0])
 
 
 def original_progress(walls, offsets, steps, position, step):
-    """How far the original lets a disc go, by its shortcuts: see the README beside the data."""
+    """The free fraction of a step by the original's shortcuts; see the README beside the data."""
     start, along = walls[:, 0] - position, walls[:, 1] - walls[:, 0]
     height = twin.cross(start, along).abs() / along.norm(dim=-1)
     crossing = twin.cross(start, along) / twin.cross(step, along)
@@ -107,7 +107,7 @@ def original_progress(walls, offsets, steps, position, step):
 
 
 @pytest.mark.parametrize("case", random_scenery.CASES)
-def test_the_original_misjudges_the_agents_that_we_excuse_and_no_others(case):
+def test_excused_agents_are_those_that_the_original_misjudges(case):
     ours, settings, right, ws = golden_step(case)
     off = ((ours["progress"] - right["progress"]).abs() > 2e-3).nonzero().tolist()
     assert {(case, *place) for place in off} == {
@@ -122,19 +122,19 @@ def test_the_original_misjudges_the_agents_that_we_excuse_and_no_others(case):
             assert abs(progress - right["progress"][e, a]) < 1e-4, (case, e, a)
 
 
-# Rays on paper
+# Rays by hand
 
 NO_LINES = torch.zeros((0, 2, 2), dtype=torch.float64)
 WALL_AT_3 = t([[3, -5], [3, 5]])
 
 
 def raycast(lines, position=(1.0, 0.0), angle=0.0, res=3, fov=90.0):
-    """What one camera at `position` sees of lines: fields of shape (R,)."""
+    """The hits of one camera at `position`: fields of shape (R,)."""
     hits = twin.raycast(lines, t(position), twin.rays(t(angle), [0.0], res, fov))
     return {k: v[0, 0] for k, v in hits.items()}
 
 
-def test_a_wall_two_metres_ahead_is_two_metres_away():
+def test_wall_two_metres_ahead():
     seen = raycast(WALL_AT_3)
     assert seen["indices"].tolist() == [0, 0, 0]
     assert seen["distances"][1] == 2
@@ -146,12 +146,12 @@ def test_a_wall_two_metres_ahead_is_two_metres_away():
     )
 
 
-def test_a_wall_behind_another_is_hidden_and_one_behind_the_camera_unseen():
+def test_hidden_walls():
     walls = torch.cat([WALL_AT_3 + t([1, 0]), WALL_AT_3, WALL_AT_3 - t([4, 0])])
     assert raycast(walls)["indices"].tolist() == [1, 1, 1]
 
 
-def test_a_miss_is_blank_and_black():
+def test_rays_without_a_hit():
     wall, light, white, one = t([[9, 9], [9, 10]]), t([5, 5, 1]), t([1, 1, 1]), torch.tensor([1])
     seen = twin.render(NO_LINES, wall, light, white, one, t([1, 1]), t(180), res=2, fov=60)
     assert (
@@ -162,7 +162,7 @@ def test_a_miss_is_blank_and_black():
     assert seen["locations"].isnan().all() and seen["dots"].isnan().all()
 
 
-def test_pixel_0_is_on_the_left_and_cameras_turn_counter_clockwise():
+def test_pixel_0_is_on_the_left():
     left = t([[2, 0.1], [2, 5]])
     assert raycast(left)["indices"].tolist() == [0, -1, -1]
     hits = twin.raycast(WALL_AT_3, t([1, 0]), twin.rays(t(-90), [0.0, 90.0], 1, 60))
@@ -170,13 +170,13 @@ def test_pixel_0_is_on_the_left_and_cameras_turn_counter_clockwise():
 
 
 @pytest.mark.parametrize("angle", [0, 30])
-def test_the_near_limit_is_a_circle(angle):
+def test_near_limit_is_a_circle(angle):
     closer, further = (t([[x, -5], [x, 5]]) for x in (0.9 * twin.RADIUS, 1.1 * twin.RADIUS))
     seen = raycast(torch.cat([closer, further]), (0, 0), angle, fov=1)
     assert seen["indices"].tolist() == 3 * [0 if math.cos(math.radians(angle)) < 0.9 else 1]
 
 
-def test_of_equal_lines_the_first_is_seen():
+def test_first_of_equal_lines_is_hit():
     assert raycast(torch.cat([WALL_AT_3 + t([1, 0]), WALL_AT_3, WALL_AT_3]))[
         "indices"
     ].tolist() == [
@@ -186,11 +186,11 @@ def test_of_equal_lines_the_first_is_seen():
     ]
 
 
-def test_lines_along_a_ray_and_lines_without_length_are_unseen():
+def test_degenerate_lines_are_invisible():
     assert raycast(t([[2, 0], [3, 0]], [[2, 0], [2, 0]]))["indices"].tolist() == [-1, -1, -1]
 
 
-def test_agents_see_each_other_but_not_themselves():
+def test_agents_see_others_but_not_themselves():
     lines = twin.agent_lines(random_scenery.OCTAGON.double(), t([1, 1], [3, 1]), t(0, 45))
     seen = twin.raycast(lines, t([1, 1], [3, 1]), twin.rays(t(0, 180), [0.0], 1, 60))
     assert seen["indices"].flatten().tolist() == [
@@ -202,7 +202,7 @@ def test_agents_see_each_other_but_not_themselves():
     )
 
 
-def test_texels_are_filtered_between_their_centres():
+def test_texels_are_filtered():
     values, width, start = t([9], [0], [1], [9]), torch.tensor(2), torch.tensor(1)
     for location, value in ((0, 0), (0.25, 0), (0.5, 0.5), (0.6, 0.7), (0.75, 1), (1, 1)):
         assert twin.filtered(values, width, start, t(location)).item() == pytest.approx(
@@ -210,7 +210,7 @@ def test_texels_are_filtered_between_their_centres():
         )
 
 
-def test_a_slanted_wall_is_darker():
+def test_slanted_walls_are_darker():
     hits = dict(
         indices=torch.tensor([0, 0, -1]), locations=t(0.5, 0.5, math.nan), dots=t(0, -0.5, math.nan)
     )
@@ -218,7 +218,7 @@ def test_a_slanted_wall_is_darker():
     assert screen.flatten().tolist() == pytest.approx([0.8, 0.4, 0.16, 0.6, 0.3, 0.12, 0, 0, 0])
 
 
-# Light on paper
+# Light by hand
 
 
 @pytest.mark.parametrize(
@@ -240,12 +240,12 @@ def test_light_at_the_origin(wall, light, level, why):
     )
 
 
-def test_texels_sit_at_the_middle_of_their_part():
+def test_texel_positions():
     points = twin.texel_positions(t([[0, 0], [4, 0]], [[1, 1], [1, 2]]), torch.tensor([2, 1]))
     assert points.tolist() == [[1, 0], [3, 0], [1, 1.5]]
 
 
-# Physics on paper
+# Physics by hand
 
 
 def move(walls, positions, velocity, fps=1.0, angles=None, angvelocity=None):
@@ -261,7 +261,7 @@ def move(walls, positions, velocity, fps=1.0, angles=None, angvelocity=None):
     )
 
 
-def test_a_disc_stops_a_hundredth_short_of_a_wall():
+def test_disc_stops_short_of_a_wall():
     after = move([[[6, 1], [6, 6]]], [[3, 3]], [[1000, 0]], fps=10)  # the example of the tutorial
     assert after["progress"].item() == pytest.approx(0.99 * (3 - REACH) / 100, abs=EXACT)
     assert after["positions"][0].tolist() == pytest.approx([5.8649, 3.0], abs=1e-4)
@@ -269,20 +269,20 @@ def test_a_disc_stops_a_hundredth_short_of_a_wall():
 
 
 @pytest.mark.parametrize("end", [[3, 0], [5, 0]], ids=["point", "wall met head-on"])
-def test_points_and_ends_of_walls_stop_a_disc(end):
+def test_disc_stops_at_points_and_ends_of_walls(end):
     assert move([[[3, 0], end]], [[0, 0]], [[4, 0]])["progress"].item() == pytest.approx(
         0.99 * (3 - REACH) / 4, abs=EXACT
     )
 
 
 @pytest.mark.parametrize("aside, free", [(1.001, True), (0.999, False)])
-def test_a_disc_passes_the_end_of_a_wall_beyond_its_reach_only(aside, free):
+def test_disc_passes_the_end_of_a_wall(aside, free):
     after = move([[[3, aside * REACH], [3, 4]]], [[0, 0]], [[4, 0]])
     assert (after["progress"].item() == 1) == free
     assert (after["velocity"][0].tolist() == [4, 0]) == free
 
 
-def test_a_wall_just_out_of_reach_of_the_step_does_not_count():
+def test_wall_just_out_of_reach():
     assert move([[[3, -1], [3, 1]]], [[0, 0]], [[2.999 - REACH, 0]])["progress"].item() == 1
     assert move([[[3, -1], [3, 1]]], [[0, 0]], [[3.001 - REACH, 0]])["progress"].item() < 0.99
 
@@ -290,17 +290,17 @@ def test_a_wall_just_out_of_reach_of_the_step_does_not_count():
 @pytest.mark.parametrize(
     "velocity, progress", [([1, 0], 0), ([-1, 0], 1), ([0, 1], 1), ([0, 0], 1)]
 )
-def test_overlapping_a_wall_a_disc_may_move_anywhere_but_in(velocity, progress):
+def test_overlapping_disc_moves_anywhere_but_in(velocity, progress):
     assert move([[[0.05, -9], [0.05, 9]]], [[0, 0]], [velocity])["progress"].item() == progress
 
 
-def test_two_discs_meet_halfway_and_a_third_is_free():
+def test_two_discs_meet_halfway():
     after = move([], [[0, 0], [4, 0], [0, 5]], [[4, 0], [-4, 0], [1, 0]])
     meeting = 0.99 * (4 - 2 * REACH) / 8
     assert after["progress"].tolist() == pytest.approx([meeting, meeting, 1], abs=EXACT)
 
 
-def test_a_disc_at_rest_shares_the_progress_of_one_that_runs_into_it():
+def test_disc_at_rest_shares_progress():
     after = move([], [[0, 0], [2, 0]], [[4, 0], [0, 0]], angvelocity=[0, 90])
     assert after["progress"].tolist() == pytest.approx(2 * [0.99 * (2 - 2 * REACH) / 4], abs=EXACT)
     assert after["angvelocity"].tolist() == [0, 0]
@@ -308,7 +308,7 @@ def test_a_disc_at_rest_shares_the_progress_of_one_that_runs_into_it():
 
 
 @pytest.mark.parametrize("velocity, progress", [([1, 0], 0), ([-1, 0], 1), ([0, 1], 1)])
-def test_overlapping_discs_part_but_do_not_approach(velocity, progress):
+def test_overlapping_discs(velocity, progress):
     assert move([], [[0, 0], [0.1, 0]], [velocity, [0, 0]])["progress"].tolist() == [
         progress,
         progress,
@@ -332,9 +332,7 @@ HARD = dict(
 
 
 def rounded(envs, res, fov, cameras=(0.0,)):
-    """Render, step and light of environments by the twin in float32: an engine that is right, but
-    rounds.
-    """
+    """Render, step and light by the twin in float32: an engine that is correct but rounds."""
     renders, steps, lights = [], [], []
     for e in range(envs.n_envs):
         w = envs.one(e, torch.float32)
@@ -356,7 +354,7 @@ def rounded(envs, res, fov, cameras=(0.0,)):
         (3, 1.0, dict(res=1, fov=20.0, cameras=(0.0, 120.0, 240.0))),
     ],
 )
-def test_rounding_is_no_mistake(seed, origin, camera):
+def test_rounding_errors_are_tolerated(seed, origin, camera):
     envs = random_scenery.random_environments(seed, **{**HARD, "origin": origin})
     render, step, light = rounded(envs, **camera)
     compare.check_render(render, envs, **camera)
@@ -365,7 +363,7 @@ def test_rounding_is_no_mistake(seed, origin, camera):
 
 
 def hidden(render):
-    """Every ray that hits names the line after the one it hits."""
+    """Every hit is attributed to the next line."""
     return dict(render, indices=render["indices"] + (render["indices"] >= 0).int())
 
 
@@ -383,7 +381,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_in_rendering_is_named(mistake):
+def test_errors_in_rendering_are_named(mistake):
     envs = random_scenery.random_environments(4, **HARD)
     render = rounded(envs, 48, 100.0)[0]
     with pytest.raises(
@@ -393,7 +391,7 @@ def test_a_mistake_in_rendering_is_named(mistake):
 
 
 @pytest.mark.parametrize("field", ["progress", "positions", "angles", "velocity", "angvelocity"])
-def test_a_mistake_in_physics_is_named(field):
+def test_errors_in_physics_are_named(field):
     envs = random_scenery.random_environments(5, **HARD)
     step = rounded(envs, 48, 100.0)[1]
     step[field][:, 1] -= 0.01
@@ -401,7 +399,7 @@ def test_a_mistake_in_physics_is_named(field):
         compare.check_physics(step, envs)
 
 
-def test_a_mistake_in_one_texel_is_named():
+def test_error_in_one_texel_is_named():
     envs = random_scenery.random_environments(6, **HARD)
     light = rounded(envs, 48, 100.0)[2]
     light[-7] += 0.01
@@ -409,14 +407,14 @@ def test_a_mistake_in_one_texel_is_named():
         compare.check_baked(light, envs)
 
 
-def test_golden_mistakes_are_named():
+def test_errors_against_golden_data_are_named():
     case = "home_4_near"
     step = golden_step(case)[0]
     with pytest.raises(AssertionError, match="home_4_near: progress: .* at most"):
         compare.check_golden(case, dict(step, progress=step["progress"] * 0.99))
 
 
-def test_random_environments_repeat_and_differ_by_seed():
+def test_random_environments_are_seeded():
     same, again, other = (random_scenery.random_environments(seed, **HARD) for seed in (7, 7, 8))
     assert torch.equal(same.lines, again.lines) and torch.equal(same.velocity, again.velocity)
     assert not torch.equal(same.angles, other.angles)
@@ -426,7 +424,7 @@ def test_random_environments_repeat_and_differ_by_seed():
     )
 
 
-def test_random_environments_hold_the_degenerate_cases_asked_for():
+def test_random_environments_have_degenerate_cases():
     envs = random_scenery.random_environments(9, **HARD)
     for e in range(envs.n_envs):
         w = envs.one(e)

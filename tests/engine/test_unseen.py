@@ -1,5 +1,5 @@
-"""What is left to see: which texels can be seen at all, where those lie that an agent has not seen,
-and what Explorer tells a critic of them.
+"""Texels that are left to see: visible texels, counts of unseen ones, and Explorer's privileged
+observation.
 """
 
 import pytest
@@ -11,31 +11,31 @@ from megastep.geometries import sample
 from tests.helpers import random_scenery, twin
 from tests.helpers.outputs import Poison, seen_of
 
-SLACK = 2e-5  # of 1 + d metres: places of float32 at 200 m, and rounded sines and tangents
+SLACK = 2e-5  # of 1 + d metres: float32's resolution at 200 m, and rounded sines and tangents
 AHEAD, LEFT, BEHIND, RIGHT = 0, 4, 8, 12  # sectors
 
 
 def packed(bits):
-    """Words (..., n_words) int32 of bits (..., 32 n_words) bool, the first in the lowest place."""
+    """Packs bits (..., 32 n_words) into words (..., n_words) int32, the first in the lowest bit."""
     values = torch.tensor([2**i for i in range(31)] + [-(2**31)])
     return (bits.unflatten(-1, (-1, 32)) * values).sum(-1).int()
 
 
 def unpacked(words):
-    """Bits (..., 32 n_words) bool of words (..., n_words) int32."""
+    """Unpacks words (..., n_words) int32 into bits (..., 32 n_words) bool."""
     return (words.cpu()[..., None] >> torch.arange(32, dtype=torch.int32) & 1).bool().flatten(-2)
 
 
 def n_texels(layouts):
-    """(D,) how many texels each layout has."""
+    """(D,): the number of texels of each layout."""
     return layouts.texel_starts[layouts.wall_starts.long()].diff()
 
 
-# ---- engine.unseen: facts to check on paper ----
+# ---- engine.unseen: facts to check by hand ----
 
 
 def square(device, n_envs=1):
-    """A room of 1.6 m about (1.8, 1.8), whose four walls have a word of 32 texels each."""
+    """A room of 1.6 m around (1.8, 1.8), whose four walls have one word of 32 texels each."""
     c = core.Core(scene.scenery([toys.box(1.6)], 1, n_envs, device=device))
     c.agents.positions[:] = 1.8
     return c
@@ -48,7 +48,7 @@ def counts_of(c, seen=None, visible=None):
     return engine.unseen(c.scenery, c.agents, seen, visible)
 
 
-def test_a_wall_a_side_is_a_count_ahead_left_behind_and_right(device):
+def test_one_wall_on_each_side(device):
     counts = counts_of(square(device))
     assert counts.shape == (1, 1, 3, 16) and counts.dtype == torch.int32
     near = counts[0, 0, 0].tolist()
@@ -59,9 +59,9 @@ def test_a_wall_a_side_is_a_count_ahead_left_behind_and_right(device):
 @pytest.mark.parametrize(
     "angle, sector", [(0, AHEAD), (90, RIGHT), (180, BEHIND), (-90, LEFT), (-60, 3), (45, 14)]
 )
-def test_a_wall_lies_where_it_is_seen_from_the_way_the_agent_looks(angle, sector, device):
-    """The wall to the east, the others having been seen. Of sectors of 22.5 degrees, 60 to the left
-    is nearest to the third's 67.5, and 45 to the right to the 14th's 315.
+def test_sectors_follow_the_heading(angle, sector, device):
+    """Only the eastern wall is unseen. Sectors are 22.5 degrees wide: 60 degrees to the left is
+    closest to sector 3 at 67.5, and 45 to the right to sector 14 at 315.
     """
     c = square(device)
     c.agents.angles[:] = angle
@@ -73,7 +73,7 @@ def test_a_wall_lies_where_it_is_seen_from_the_way_the_agent_looks(angle, sector
 
 
 @pytest.mark.parametrize("metres, band", [(0.7, 0), (1.49, 0), (1.51, 1), (3.99, 1), (4.01, 2)])
-def test_bands_end_at_a_metre_and_a_half_and_at_four(metres, band, device):
+def test_bands_end_at_1_5_and_4_metres(metres, band, device):
     c = square(device)
     c.agents.positions[..., 0] = 2.6 - metres
     east = (c.scenery.layouts.lines.vals[..., 0] > 2).all(-1).nonzero().item()
@@ -83,7 +83,7 @@ def test_bands_end_at_a_metre_and_a_half_and_at_four(metres, band, device):
     assert counts[0, 0, band, AHEAD] == counts.sum() == 32
 
 
-def test_only_what_is_visible_and_not_seen_counts(device):
+def test_only_visible_unseen_texels_count(device):
     c = square(device)
     seen, visible = seen_of(c), torch.zeros((1, 4), dtype=torch.int32, device=device)
     assert not counts_of(c, visible=visible).any()
@@ -97,8 +97,9 @@ def test_only_what_is_visible_and_not_seen_counts(device):
 
 
 def check_unseen(c, seen, visible):
-    """Every count is one the definition allows, and all the texels are there. Returns the share of
-    texels whose place is certain.
+    """Checks that every count is within the twin's bounds and that no texel is missing.
+
+    Returns the fraction of texels whose sector and band are certain.
     """
     counts = engine.unseen(c.scenery, c.agents, seen, visible).cpu().long()
     layouts, certain, total = c.scenery.layouts, 0, 0
@@ -110,11 +111,11 @@ def check_unseen(c, seen, visible):
         for a in range(c.n_agents):
             position, angle = c.agents.positions[e, a].cpu().double(), c.agents.angles[e, a].item()
             least, most = twin.unseen(walls, widths, left[e, a], position, angle, SLACK)
-            found = counts[e, a]
+            ours = counts[e, a]
             where = f"agent {a} of environment {e}"
-            assert bool(((found >= least) & (found <= most)).all()), f"{where}: {found}"
+            assert bool(((ours >= least) & (ours <= most)).all()), f"{where}: {ours}"
             total += (n := int(left[e, a, : int(widths.sum())].sum()))
-            assert int(found.sum()) == n, where
+            assert int(ours.sum()) == n, where
             certain += int(least.sum())
     return certain / max(total, 1)
 
@@ -122,16 +123,16 @@ def check_unseen(c, seen, visible):
 @pytest.mark.parametrize("n_agents", [1, 3])
 @pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
 @pytest.mark.parametrize("density", [0.02, 0.5, 1.0])
-def test_counts_are_the_twins(n_agents, degenerate, density, device, monkeypatch):
-    """Rooms whose walls begin anywhere in a word and, some of them, take hundreds; two of four
-    environments share a layout; visible has bits beyond a layout's texels.
+def test_counts_match_twin(n_agents, degenerate, density, device, monkeypatch):
+    """Walls begin anywhere in a word, and some take hundreds of words. Two of four environments
+    share a layout. `visible` has bits beyond a layout's texels.
     """
     poison = Poison(torch.empty)
     for seed in range(2):
-        made = random_scenery.random_environments(
+        scenery = random_scenery.random_environments(
             seed, n_agents=n_agents, degenerate=degenerate, origin=190.0 if seed else 1.0
         )
-        c = core_of(made, device)
+        c = core_of(scenery, device)
         c.scenery.layout.copy_(torch.tensor([1, 3, 0, 1]))
         n_words = -(-c.scenery.layouts.max_texels // 32) + seed
         random = torch.Generator().manual_seed(seed)
@@ -143,10 +144,12 @@ def test_counts_are_the_twins(n_agents, degenerate, density, device, monkeypatch
             patch.setattr(torch, "empty", poison.allocate)
             words = packed(is_seen).to(device), packed(is_visible).to(device)
             poison.check(counts=engine.unseen(c.scenery, c.agents, *words))
-        assert check_unseen(c, *words) > 0.95, "few lie so near to a border that either side may do"
+        assert check_unseen(c, *words) > 0.95, (
+            "few are so close to a border that both sides are allowed"
+        )
 
 
-def test_a_home_is_the_twins_too(device):
+def test_counts_match_twin_in_homes(device):
     homes = sample("homes", 3)
     c = core.Core(scene.scenery(homes, 2, 5, device=device), res=256)
     spawner, seen = modules.RandomSpawns(homes, c), seen_of(c)
@@ -157,7 +160,7 @@ def test_a_home_is_the_twins_too(device):
         assert check_unseen(c, seen, visible) > 0.95
 
 
-def test_seen_and_visible_must_have_a_bit_for_every_texel():
+def test_too_few_words():
     c = square("cpu")
     short = torch.zeros((1, 1, 3), dtype=torch.int32)
     with pytest.raises(ValueError, match="seen must have a bit .* at least 4 words, but it has 3"):
@@ -169,36 +172,41 @@ def test_seen_and_visible_must_have_a_bit_for_every_texel():
 # ---- visible_texels ----
 
 
-def test_in_a_box_all_is_visible_and_no_bit_is_set_beyond_it(device):
-    made = scene.scenery([toys.box(5), toys.box(2)], 1, device=device)
+def test_all_texels_of_a_box_are_visible(device):
+    scenery = scene.scenery([toys.box(5), toys.box(2)], 1, device=device)
     points = torch.tensor([[[3.5, 3.5]], [[2.0, 2.0]]])
-    bits = unpacked(modules.visible_texels(made, points))
+    bits = unpacked(modules.visible_texels(scenery, points))
     assert bits.shape == (2, 13 * 32)
     for row, n in zip(bits, (400, 160), strict=True):  # 5 cm a texel
         assert bool(row[:n].all()) and not row[n:].any()
 
 
-def test_behind_a_pillar_nothing_is_visible(device):
-    """From a point 1 m in front of the middle of a pillar's western side, that side can be seen and
-    no other; the wall behind it neither, but at its ends.
+def test_texels_behind_a_pillar_are_not_visible(device):
+    """From a point 1 m in front of a pillar's western side, only that side is visible, and of the
+    wall behind the pillar only the ends.
     """
-    made = scene.scenery([toys.column(5, 1)], 1, device=device)
-    bits = unpacked(modules.visible_texels(made, torch.tensor([[[2.0, 3.5]]])))[0]
-    layouts, shares = made.layouts, {}
+    scenery = scene.scenery([toys.column(5, 1)], 1, device=device)
+    bits = unpacked(modules.visible_texels(scenery, torch.tensor([[[2.0, 3.5]]])))[0]
+    layouts, fractions = scenery.layouts, {}
     for wall, line in enumerate(layouts.lines.vals.cpu()):
         first, end = layouts.texel_starts[wall : wall + 2].tolist()
-        shares[tuple(line.mean(0).tolist())] = float(bits[first:end].float().mean())
-    assert [shares[3.0, 3.5], shares[4.0, 3.5], shares[3.5, 3.0], shares[3.5, 4.0]] == [1, 0, 0, 0]
+        fractions[tuple(line.mean(0).tolist())] = float(bits[first:end].float().mean())
+    assert [fractions[3.0, 3.5], fractions[4.0, 3.5], fractions[3.5, 3.0], fractions[3.5, 4.0]] == [
+        1,
+        0,
+        0,
+        0,
+    ]
     # the shadow of 1 m at 1 m is 4 m wide at 4 m, of the wall's 5 m
-    assert shares[6.0, 3.5] == pytest.approx(0.2, abs=0.03)
+    assert fractions[6.0, 3.5] == pytest.approx(0.2, abs=0.03)
 
 
 @pytest.mark.parametrize("n_agents", [1, 3])
-def test_visible_is_the_union_of_what_is_observed_from_every_point(n_agents, device):
+def test_visible_texels_match_observe_at_every_point(n_agents, device):
     homes = [*sample("homes", 2), *sample("bench", 1), toys.column()]
-    made = scene.scenery(homes, n_agents, 6, device=device)
-    points = modules.RandomSpawns(homes, core.Core(made)).points[:, : 4 * n_agents]
-    visible = unpacked(modules.visible_texels(made, points))
+    scenery = scene.scenery(homes, n_agents, 6, device=device)
+    points = modules.RandomSpawns(homes, core.Core(scenery)).points[:, : 4 * n_agents]
+    visible = unpacked(modules.visible_texels(scenery, points))
     for d, home in enumerate(homes):
         alone = core.Core(
             scene.scenery([home], 1, device=device), res=512, fov=122.0, cameras=[0, 120, 240]
@@ -211,34 +219,34 @@ def test_visible_is_the_union_of_what_is_observed_from_every_point(n_agents, dev
             marked = unpacked(seen)[0, 0]
             expected[: len(marked)] |= marked
         assert torch.equal(visible[d], expected), f"layout {d}"
-        n = int(n_texels(made.layouts)[d])
+        n = int(n_texels(scenery.layouts)[d])
         assert 0.1 * n < int(visible[d].sum()) <= n and not visible[d, n:].any()
 
 
-def test_looking_for_what_is_visible_moves_nobody():
-    made = scene.scenery([toys.box(), toys.column()], 1, 4, device="cpu")
-    before = made.layout.clone(), made.agent_lines.clone()
-    modules.visible_texels(made, torch.full((2, 1, 2), 2.0))
-    assert torch.equal(made.layout, before[0]) and torch.equal(made.agent_lines, before[1])
+def test_visible_texels_changes_no_state():
+    scenery = scene.scenery([toys.box(), toys.column()], 1, 4, device="cpu")
+    before = scenery.layout.clone(), scenery.agent_lines.clone()
+    modules.visible_texels(scenery, torch.full((2, 1, 2), 2.0))
+    assert torch.equal(scenery.layout, before[0]) and torch.equal(scenery.agent_lines, before[1])
 
 
-def test_visible_needs_somebody_to_look():
-    made = scene.scenery([toys.box()], 0, 1, device="cpu")
+def test_visible_texels_needs_an_agent():
+    scenery = scene.scenery([toys.box()], 0, 1, device="cpu")
     with pytest.raises(ValueError, match="scenery.n_agents must be .*1"):
-        modules.visible_texels(made, torch.full((1, 1, 2), 2.0))
+        modules.visible_texels(scenery, torch.full((1, 1, 2), 2.0))
 
 
-# ---- What Explorer tells a critic ----
+# ---- Explorer's privileged observation ----
 
 
 def explorer(device="cpu", n_envs=6, **settings):
-    given = dict(patience=1, res=1, subsample=1, resample=True, privileged=True)
-    return envs.Explorer(n_envs, sample("bench", 4), device=device, **{**given, **settings})
+    defaults = dict(patience=1, res=1, subsample=1, resample=True, privileged=True)
+    return envs.Explorer(n_envs, sample("bench", 4), device=device, **{**defaults, **settings})
 
 
 @pytest.mark.parametrize("resample", [False, True])
-def test_a_critic_is_told_how_far_the_episode_is_and_what_is_left(resample, device):
-    """Everything by hand from the flags, the texels seen and those visible."""
+def test_explorers_privileged_observation_by_hand(resample, device):
+    """Computed from the flags, the texels seen and the visible texels."""
     env = explorer(device, resample=resample)
     worlds, age = contract.rollout(env, 0), torch.zeros(6)
     generator = torch.Generator().manual_seed(1)
@@ -251,9 +259,9 @@ def test_a_critic_is_told_how_far_the_episode_is_and_what_is_left(resample, devi
         age = torch.where(world.reset, 0, age + 1)
         seen, visible = unpacked(env.seen)[:, 0], unpacked(env.visible)[env.layout.cpu().long()]
         n_seen, n_left = seen.sum(-1), (visible & ~seen).sum(-1)
-        told = world.privileged.episode[:, 0] * torch.tensor([200.0, 1000.0, 1000.0, 1000.0])
+        episode = world.privileged.episode[:, 0] * torch.tensor([200.0, 1000.0, 1000.0, 1000.0])
         expected = torch.stack([1 + n_seen - age, age, n_seen, n_left], -1)
-        torch.testing.assert_close(told, expected.float(), rtol=1e-6, atol=0)
+        torch.testing.assert_close(episode, expected.float(), rtol=1e-6, atol=0)
         left = world.privileged.unseen.square() * 64
         counts = engine.unseen(env.core.scenery, env.core.agents, env.seen, env.visible)
         torch.testing.assert_close(left, counts.view(6, 1, 48).cpu().float(), rtol=1e-5, atol=0)
@@ -266,18 +274,18 @@ def test_a_critic_is_told_how_far_the_episode_is_and_what_is_left(resample, devi
     assert n_ends >= 6 and len(env.layout.unique()) > 1
 
 
-def test_what_a_critic_is_told_changes_nothing_else(device):
-    plain, told = (
+def test_privileged_changes_nothing_else(device):
+    plain, extended = (
         contract.rollout(explorer(device, privileged=privileged), 40)
         for privileged in (False, True)
     )
     assert all("privileged" not in world for world in plain)
     assert explorer(privileged=False).privileged_space is None
-    for a, b in zip(plain, told, strict=True):
+    for a, b in zip(plain, extended, strict=True):
         assert contract.same(a, arrdict.arrdict({k: v for k, v in b.items() if k != "privileged"}))
 
 
-def test_visible_is_what_can_be_seen_from_the_spawn_points():
+def test_explorers_visible_texels():
     env = explorer()
     expected = modules.visible_texels(env.core.scenery, env.spawner.points)
     assert torch.equal(env.visible, expected)

@@ -1,5 +1,5 @@
-"""No agent ever passes a wall, and none that was stopped is stuck: ten million agent-steps that try
-on a CPU, a hundred million on a GPU. `scripts/check_walls.py` makes a thousand million.
+"""No agent ever passes a wall or gets stuck: ten million agent steps that try to on a CPU, a
+hundred million on a GPU. `scripts/check_walls.py` makes a billion.
 """
 
 import math
@@ -17,23 +17,25 @@ from tests.helpers import random_scenery, wall_courses, wall_crossings, walls
 from tests.helpers.wall_courses import BODY, COURSES, RADIUS, make_course
 from tests.helpers.wall_crossings import crossed
 
-STEPS = 10**7  # agent-steps of all courses
+STEPS = 10**7  # agent steps on all courses together
 STEPS_PER_COURSE = -(-STEPS // len(COURSES))
-# the least fraction of steps that a wall or an agent stops, or the test is too easy; some 0.65 are
+# minimum fraction of steps that a wall or an agent stops, else the test is too easy; 0.65 is
+# typical
 STOPPED = 0.5
-ACUTE = dict(
-    wedges=10, slivers=8, spokes=4, zigzags=4, crossing=8, fragments=8
-)  # layouts with acute corners
+# minimum number of layouts in whose acute corners agents must get
+ACUTE = dict(wedges=10, slivers=8, spokes=4, zigzags=4, crossing=8, fragments=8)
 
 
 def alone(*ends, n_envs=1, fps=10.0):
-    """A Core of environments with one agent each and walls (W, 2, 2) alone."""
+    """A Core with one agent per environment, and walls (W, 2, 2) without a room."""
     g = dotdict(walls=np.float32(ends), lights=np.zeros((0, 2)))
     return core.Core(scene.scenery([g], 1, n_envs, device=torch.device("cpu")), res=1, fps=fps)
 
 
 def check(total, n_steps):
-    """Asserts that a run was long and hard enough, and that no agent passed, sank or stuck."""
+    """Asserts that a run was long and hard enough, and that no agent passed a wall, sank in or
+    stuck.
+    """
     assert total["steps"] >= n_steps and total["collisions"] >= STOPPED * total["steps"], total
     failures = {key: total[key] for key in ("crossings", "sunk", "stuck")}
     assert not any(failures.values()), f"{failures} in {total['steps']:,} steps: " + "; ".join(
@@ -41,11 +43,11 @@ def check(total, n_steps):
     )
 
 
-# ---- The law ----
+# ---- The tests ----
 
 
 @pytest.mark.parametrize("name", COURSES)
-def test_no_agent_passes_a_wall_and_none_is_stuck(name):
+def test_no_agent_passes_a_wall_or_gets_stuck(name):
     total = walls.run(name, STEPS_PER_COURSE, 2048)
     check(total, STEPS_PER_COURSE)
     assert total["tried"] > 10_000 and total["held"] < 0.1 * total["tried"]
@@ -64,7 +66,7 @@ def test_no_agent_passes_a_wall_on_a_gpu(name):
     )
 
 
-def test_the_courses_make_ten_million_steps_at_the_rates_and_accelerations_wanted():
+def test_courses_cover_rates_and_accelerations():
     fps, accel = zip(*walls.SETTINGS)
     assert STEPS_PER_COURSE * len(COURSES) >= 10**7
     assert (min(fps), max(fps), min(accel), max(accel)) == (1, 200, 1, 100)
@@ -73,23 +75,23 @@ def test_the_courses_make_ten_million_steps_at_the_rates_and_accelerations_wante
     assert momentum.moves.max(0).values[0] == walls.ACCEL and momentum.damping == walls.DECAY
 
 
-def test_a_disc_that_touches_a_slanted_wall_is_held():
+def test_disc_touching_a_slanted_wall_is_stopped():
     c = alone([(2.3560333251953125, 2.9257616996765137), (5.024743556976318, 0.9436310529708862)])
     c.agents.positions[:] = torch.tensor([3.7575743198394775, 2.0170488357543945])
     c.agents.velocity[:] = torch.tensor([-4.205398082733154, -9.07274055480957])
     assert engine.physics(c.scenery, c.agents).progress.item() < 1e-3
 
 
-def test_an_agent_that_all_but_touches_a_wall_does_not_slip_through_along_it():
+def test_agent_does_not_slip_through_along_a_wall():
     c = alone([(6, 1), (6, 6)], fps=1.0)
     c.agents.positions[:] = torch.tensor([5.999889850616455, 4.891547679901123])
     c.agents.velocity[:] = torch.tensor([0.004166539758443832, -40.0])
     assert engine.physics(c.scenery, c.agents).progress.item() == 0
 
 
-def test_a_disc_beside_a_wall_that_rounding_puts_at_its_end_is_held():
-    """Along the wall its centre lies within 1e-6 m of the end; it goes back along the wall, and
-    ever nearer.
+def test_disc_that_rounding_puts_at_a_walls_end_is_stopped():
+    """Along the wall, its centre is within 1e-6 m of the end. It moves back along the wall and
+    closer.
     """
     c = alone([(2.0, 10.595815658569336), (4.6668243408203125, 2.0)], fps=1.0)
     c.agents.positions[:] = torch.tensor([4.6665940284729, 1.999928593635559])
@@ -98,25 +100,23 @@ def test_a_disc_beside_a_wall_that_rounding_puts_at_its_end_is_held():
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_steps_smaller_than_float32_resolves_do_not_add_up_to_a_way_into_a_wall(side):
-    """Far from the origin a short step along a slanted wall is rounded to one along an axis."""
+def test_tiny_steps_do_not_sink_into_a_wall(side):
+    """Far from the origin, rounding makes a short step along a slanted wall one along an axis."""
     along = torch.tensor([math.cos(0.5), math.sin(0.5)])
     c = alone([(30, 30), (30 + 8 * along[0], 30 + 8 * along[1])], n_envs=64, fps=200.0)
     normal = side * torch.tensor([-along[1], along[0]])
     c.agents.positions[:] = 30 + 4 * along + 1.001 * BODY * normal
-    way = torch.linspace(1e-6, 2e-5, 32)[
-        :, None
-    ]  # metres per step; a unit in the last place is 1.9e-6 m there
-    velocity = 200 * torch.cat(
-        [way * (0.01 * normal + sign * along) for sign in (1, -1)]
-    )  # and very slightly away
+    # metres per step; float32 resolves 1.9e-6 m there
+    way = torch.linspace(1e-6, 2e-5, 32)[:, None]
+    # along the wall either way, and very slightly away from it
+    velocity = 200 * torch.cat([way * (0.01 * normal + sign * along) for sign in (1, -1)])
     for _ in range(2000):
         c.agents.velocity[:, 0] = velocity
         engine.physics(c.scenery, c.agents)
     assert ((c.agents.positions[:, 0] - 30) @ normal).min().item() > RADIUS
 
 
-# ---- Whether these tests can fail ----
+# ---- These tests can fail ----
 
 
 def without_walls(scenery, agents, *rest):
@@ -130,13 +130,13 @@ def without_motion(scenery, agents, *rest):
     return engine.Physics(torch.zeros_like(agents.angles))
 
 
-def test_agents_that_pass_walls_are_caught(monkeypatch):
+def test_finds_agents_that_pass_walls(monkeypatch):
     monkeypatch.setattr(engine, "physics", without_walls)
     total = walls.run("box", 20_000, 512)
     assert total["crossings"] > 0.05 * total["steps"] and "box at 1 fps" in total["descriptions"][0]
 
 
-def test_the_description_of_a_crossing_is_enough_to_repeat_it(monkeypatch):
+def test_crossings_can_be_repeated_from_their_description(monkeypatch):
     monkeypatch.setattr(engine, "physics", without_walls)
     course = make_course("wedges")
     walk = walls.Walk(
@@ -159,7 +159,7 @@ def test_the_description_of_a_crossing_is_enough_to_repeat_it(monkeypatch):
     assert all(f"{x!r}" in walk.describe_crossings()[0] for x in record.values())
 
 
-def test_agents_that_cannot_move_are_stuck(monkeypatch):
+def test_finds_agents_that_are_stuck(monkeypatch):
     monkeypatch.setattr(engine, "physics", without_motion)
     total = walls.run("box", 10_000, 256)
     assert (
@@ -169,7 +169,7 @@ def test_agents_that_cannot_move_are_stuck(monkeypatch):
 
 
 def brute(p, q, a, b):
-    """Whether closed segments meet, in fractions, by where each one's line cuts the other."""
+    """True if the closed segments pq and ab meet, computed in exact fractions."""
     p, q, a, b = ([Fraction(x) for x in point] for point in (p, q, a, b))
     d, e, g = ((y[0] - x[0], y[1] - x[1]) for x, y in ((p, q), (a, b), (p, a)))
     area = d[0] * e[1] - d[1] * e[0]
@@ -187,9 +187,9 @@ def brute(p, q, a, b):
 
 
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
-def test_paths_cross_as_fractions_say(dense):
-    """On a grid of four by four points they touch, lie in line and shrink to points; off it they
-    cross or do not.
+def test_crossings_match_exact_fractions(dense):
+    """On a grid of 4 x 4 points, segments touch, are collinear and shrink to points; others are
+    random.
     """
     random = random_scenery.CounterGenerator(0)
     grid = random.pick(range(4), 3000, 4, 2)
@@ -205,7 +205,7 @@ def test_paths_cross_as_fractions_say(dense):
     assert torch.equal(mine, right) and 500 < right.sum() < 4500
 
 
-def test_a_layout_of_few_walls_is_filled_up_with_what_no_path_meets():
+def test_padding_walls_are_never_crossed():
     course = make_course("remote")
     filling = course.walls.isnan().all((-1, -2))
     assert filling.any() and torch.equal(filling.sum(1), len(filling[0]) - course.counts)
@@ -217,7 +217,7 @@ def test_a_layout_of_few_walls_is_filled_up_with_what_no_path_meets():
         assert not crossed(everywhere[:, :, 0], everywhere[:, :, 1], nothing, dense).any()
 
 
-def test_chunks_do_not_matter(monkeypatch):
+def test_chunk_size_changes_nothing(monkeypatch):
     course, random = make_course("crossing"), torch.Generator().manual_seed(0)
     before, after = (
         1 + 8 * torch.rand((40, len(course.walls), 3, 2), generator=random) for _ in range(2)
@@ -229,7 +229,7 @@ def test_chunks_do_not_matter(monkeypatch):
     )
 
 
-def test_agents_are_placed_touching_overlapping_and_clear():
+def test_spots_touch_overlap_and_are_clear():
     for name in COURSES:
         course = make_course(name)
         for layout in range(len(course.walls)):
@@ -259,7 +259,7 @@ def test_agents_are_placed_touching_overlapping_and_clear():
     ],
     ids=["slit", "wide slit", "wedge", "corner", "cell"],
 )
-def test_geometry_holds_a_disc_in_a_slit_and_a_cell_but_not_in_a_corner(shape, position, held):
+def test_held_by_geometry(shape, position, held):
     if shape.shape[0] == 2 and held:
         position = wall_courses.turned([position], 20.0)[0]
     at = torch.tensor(position, dtype=torch.float64)

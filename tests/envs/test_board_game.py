@@ -1,5 +1,6 @@
-"""A world without walls, homes or engine: a board of bytes, from a file outside the repository. It
-is trained, evaluated and filmed like any other.
+"""A board game in bytes, without floor plans or engine, from a file outside the repository.
+
+It is trained, evaluated and recorded like any other environment.
 """
 
 import json
@@ -19,7 +20,7 @@ from megastep import arrdict, spaces
 
 
 class Board:
-    """One of three squares is lit, as bright as a byte can be; naming it pays 1. Six turns."""
+    """One of three squares is lit. Choosing it gives a reward of 1. An episode has six turns."""
 
     n_agents, fps = 1, 4
     obs_space = spaces.MultiImage(1, 1, 1, 3, dtype=torch.uint8)
@@ -80,36 +81,36 @@ def folder(tmp_path, monkeypatch):
     sys.modules.pop("board", None)
 
 
-def test_a_board_game_is_learnt_evaluated_and_filmed(folder, capsys):
+def test_a_board_game_is_trained_evaluated_and_recorded(folder, capsys):
     assert train.main([*WORDS, "folder=run"]) == 0
     rows = [json.loads(line) for line in (folder / "run/metrics.jsonl").read_text().splitlines()]
-    told = [row for row in rows if row["episode/count"]]
-    assert all(row["episode/right"] == pytest.approx(row["episode/return"] / 6) for row in told)
-    assert told[-1]["episode/right"] > 0.9 > told[0]["episode/right"], "a third by chance"
+    ended = [row for row in rows if row["episode/count"]]
+    assert all(row["episode/right"] == pytest.approx(row["episode/return"] / 6) for row in ended)
+    assert ended[-1]["episode/right"] > 0.9 > ended[0]["episode/right"], "1/3 by chance"
     config = checkpoint.load_latest(folder / "run/checkpoints").config
     assert config["spaces"]["obs"].endswith("W=3, dtype=torch.uint8)")
 
     assert evaluate.main(["run=run", "episodes=30", "device=cpu"]) == 0
-    table = json.loads(
-        (folder / f"run/evaluations/board-test-{rows[-1]['samples']}.json").read_text()
-    )
+    path = folder / f"run/evaluations/board-test-{rows[-1]['samples']}.json"
+    table = json.loads(path.read_text())
     assert table["title"].startswith("board, after ") and table["rows"][0]["homes"] is None
     trained, random = (row["metrics"]["right"] for row in table["rows"])
     assert trained["lower"] > 0.8 > 0.5 > random["upper"] > random["mean"] > random["lower"] > 0.1
-    said = capsys.readouterr().out
-    assert "right" in said and "homes of" not in said
+    output = capsys.readouterr().out
+    assert "right" in output and "homes of" not in output
 
     pytest.importorskip("av")
     assert record.main(["run=run", "steps=4", "file=board.mp4", "device=cpu"]) == 0
     assert (folder / "board.mp4").stat().st_size > 500
 
 
-def test_bytes_are_stored_as_bytes_and_standardised(folder):
+def test_uint8_observations_are_stored_as_uint8_and_normalised(folder):
     import board
 
     from megastep.agents.algorithms.ppo import PPO
     from megastep.agents.networks.policy import Policy
-    from megastep.agents.storage.rollout import Collector, Rollout
+    from megastep.agents.storage.collector import Collector
+    from megastep.agents.storage.rollout import Rollout
 
     env = board.Board(6)
     policy = Policy(env.obs_space, env.action_space, width=8)
@@ -118,13 +119,12 @@ def test_bytes_are_stored_as_bytes_and_standardised(folder):
     Collector(env, policy, rollout)()
     assert rollout.obs.dtype == torch.uint8 and rollout.obs.amax(-1).eq(255).all()
     learner.update(rollout)
-    norm, seen = policy.intake.norms[0], rollout.obs[-1].float()
-    assert norm.mean.item() == pytest.approx(85) and norm.scale.item() == pytest.approx(
-        seen.std(correction=0).item()
-    )
+    norm, std = policy.intake.norms[0], rollout.obs[-1].float().std(correction=0)
+    assert norm.mean.item() == pytest.approx(85)
+    assert norm.scale.item() == pytest.approx(std.item())
 
 
-def test_a_byte_is_half_the_memory_of_a_half(folder):
+def test_bytes_per_env_follow_the_dtype_of_the_space(folder):
     import board
 
     from megastep import spaces
@@ -138,5 +138,6 @@ def test_a_byte_is_half_the_memory_of_a_half(folder):
     for dtype in (torch.uint8, None, torch.float32):
         env.obs_space = spaces.MultiImage(1, 1, 1, 3, dtype=dtype)
         sizes.append(learner.bytes_per_env(env))
-    each = 16 * 3 * 1.5  # rows, numbers, the rollout and a minibatch of half of it
-    assert (sizes[1] - sizes[0], sizes[2] - sizes[0]) == (each, 3 * each)
+    # 16 rows of 3 numbers, in the rollout and in a minibatch of half of it
+    n_numbers = 16 * 3 * 1.5
+    assert (sizes[1] - sizes[0], sizes[2] - sizes[0]) == (n_numbers, 3 * n_numbers)

@@ -1,5 +1,5 @@
-"""The scripted fighter: what it does in front of others and of walls, on what it acts, and what it
-is worth.
+"""The scripted bot of Deathmatch: what it does near agents and walls, and that it beats random
+actions.
 """
 
 import pytest
@@ -14,7 +14,7 @@ AHEAD = (2.0, 3.5, 0.0)
 
 
 def ring(device, *poses, **settings):
-    """A deathmatch in a box from 1 to 6 with agents at (x, y, degrees), and what they see there."""
+    """A Deathmatch in a box from 1 to 6 with agents at (x, y, degrees), and the first world."""
     env = envs.Deathmatch(1, [toys.box()], n_agents=len(poses), device=device, **settings)
     env.reset()
     poses = torch.tensor(poses, device=env.device)
@@ -31,19 +31,19 @@ def first_actions(device, *poses):
 
 
 @pytest.mark.parametrize("other, action", [((4.0, 4.3), LEFT), ((4.0, 2.7), RIGHT)])
-def test_it_turns_to_who_is_in_view(other, action, device):
+def test_turns_to_an_agent_in_view(other, action, device):
     assert first_actions(device, AHEAD, (*other, 0.0))[0] == action
 
 
 @pytest.mark.parametrize("metres, action", [(3.5, FORWARD), (2.0, NOTHING)])
-def test_it_approaches_who_is_in_the_middle_and_far(metres, action, device):
+def test_approaches_a_distant_agent(metres, action, device):
     assert first_actions(device, AHEAD, (2.0 + metres, 3.5, 0.0))[0] == action
 
 
 @pytest.mark.parametrize("bearing", [25, -25, 8, 0])
-def test_it_holds_a_target_in_the_middle(bearing, device):
-    """Two metres away, where an agent is four degrees wide and a turn comes to fourteen: in more
-    than half of 60 steps, those of turning there included.
+def test_keeps_a_target_at_the_centre(bearing, device):
+    """At two metres an agent is four degrees wide, and a turn takes fourteen. It must hit in more
+    than half of 60 steps, which include the first turn.
     """
     target = (4.0, 3.5, 0.0)
     env, world = ring(device, (2.0, 3.5, -bearing), target, damage=0)
@@ -57,8 +57,8 @@ def test_it_holds_a_target_in_the_middle(bearing, device):
     assert hits > 30
 
 
-def test_it_looks_round_then_walks_and_turns_where_a_wall_comes_near(device):
-    """Both look away from each other: the first at a wall a metre off, the second down the room."""
+def test_looks_round_then_walks_and_avoids_walls(device):
+    """The first looks at a wall one metre away, the second down the room; none sees the other."""
     env, world = ring(device, (1.9, 3.5, 180.0), (2.4, 3.5, 0.0))
     bot = Bot()
     state = bot.initial(2, env.device)
@@ -70,8 +70,8 @@ def test_it_looks_round_then_walks_and_turns_where_a_wall_comes_near(device):
     assert walking.actions.flatten().tolist() == [LEFT, FORWARD]
 
 
-def test_who_is_stopped_turns_to_the_wider_side(device):
-    """A push that did not move it: towards the east wall's far end, which is on its right."""
+def test_turns_to_the_wider_side_when_stopped(device):
+    """It was pushed but did not move. The wider side is to the right."""
     env, world = ring(device, (3.0, 5.0, 0.0), (2.0, 2.0, 180.0))
     bot = Bot()
     state = bot.initial(2, env.device)
@@ -81,7 +81,7 @@ def test_who_is_stopped_turns_to_the_wider_side(device):
     assert decision.actions[0] == RIGHT and state.around[0] > 5 and not state.pushed[0]
 
 
-def test_an_episode_begins_without_a_memory(device):
+def test_reset_clears_the_state(device):
     env, world = ring(device, AHEAD, (2.5, 3.5, 0.0))
     bot = Bot()
     state = bot.initial(2, env.device)
@@ -92,7 +92,7 @@ def test_an_episode_begins_without_a_memory(device):
     assert not state.around.any()
 
 
-def test_it_acts_on_observations_alone_and_lane_by_lane():
+def test_acts_on_observations_alone_and_lane_by_lane():
     env = envs.Deathmatch(8, sample("homes", 8), device="cpu", limit=30)
     bot, world = Bot(), env.reset()
     state, halves = bot.initial(32), [bot.initial(16), bot.initial(16)]
@@ -100,18 +100,18 @@ def test_it_acts_on_observations_alone_and_lane_by_lane():
         decision, state = bot(world, state)
         for i, part in enumerate((slice(0, 16), slice(16, 32))):
             seen = arrdict.arrdict(obs=world.obs[part], reset=world.reset[part])
-            own, halves[i] = bot(seen, halves[i], sample=False)
-            assert torch.equal(own.actions, decision.actions[part])
+            decision_of_half, halves[i] = bot(seen, halves[i], sample=False)
+            assert torch.equal(decision_of_half.actions, decision.actions[part])
         world = env.step(decision)
 
 
-def test_another_world_is_refused():
+def test_other_observations_are_refused():
     env = envs.Pong(2, device="cpu")
-    with pytest.raises(ValueError, match="observations of rgb, d and imu, as deathmatch's are"):
+    with pytest.raises(ValueError, match="rgb, d and imu"):
         Bot()(env.reset(), Bot().initial(2))
 
 
-def test_it_beats_random_actions_in_a_room():
+def test_beats_random_actions():
     """First deaths of 32 duels; the bot is the first agent in half of them."""
     env = envs.Deathmatch(32, [toys.box()], n_agents=2, device="cpu")
     players = Bot(), RandomActions(env.action_space)
@@ -133,7 +133,7 @@ def test_it_beats_random_actions_in_a_room():
 
 
 @pytest.mark.cuda
-def test_it_never_synchronises_and_can_be_captured():
+def test_never_synchronises_and_can_be_captured():
     env = envs.Deathmatch(8, [toys.box()], device="cuda")
     bot, world = Bot(), env.reset()
     state = bot.initial(32, "cuda")

@@ -1,4 +1,4 @@
-"""Deathmatch: against its twins on every bit, and what its rules say."""
+"""Deathmatch: against its twin on every bit, and its rules by hand."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from megastep.agents.cli import evaluate, record, train
 from megastep.engine.outputs import Observation
 from megastep.envs.deathmatch.step import deathmatch_step
 from megastep.geometries import sample
-from tests.helpers.deathmatch_twins import in_sight, shots, spawned, told
+from tests.helpers.deathmatch_twins import hits_of, is_visible, privileged, respawned
 
 RADIUS = engine.AGENT_RADIUS
 METRICS = "kills", "deaths", "damage", "accuracy"
@@ -22,7 +22,7 @@ RULES = {
         damage=0.31,
         recovery=0.01,
         drain=0.003,
-        spoils=0.05,
+        health_per_hit=0.05,
         limit=7,
         hit_reward=0.3,
         wound_cost=0.7,
@@ -36,7 +36,7 @@ ALL = dict(
     damage=0.1,
     recovery=0.0,
     drain=0.0,
-    spoils=0.0,
+    health_per_hit=0.0,
     limit=1000,
     hit_reward=1.0,
     wound_cost=1.0,
@@ -53,12 +53,12 @@ NOTHING = Observation(*len(Observation._fields) * [None])
 
 
 def fight(device, n_envs, n_agents, steps=30, **rules):
-    """Steps of random views, of which half show an agent: tuples of what was given, what came of
-    it, and positions and angles.
+    """Yields steps with random views, half of which show an agent: (inputs, outputs, positions,
+    angles).
     """
     random = np.random.default_rng(n_agents)
-    made = scene.scenery([toys.box()], n_agents, n_envs, device=device)
-    c, n, lanes = core.Core(made, res=512, fov=70), n_envs * n_agents, (n_envs, n_agents)
+    scenery = scene.scenery([toys.box()], n_agents, n_envs, device=device)
+    c, n, lanes = core.Core(scenery, res=512, fov=70), n_envs * n_agents, (n_envs, n_agents)
     state = dict(
         health=torch.ones(n, device=device),
         tally=torch.zeros((3, n), device=device),
@@ -75,62 +75,62 @@ def fight(device, n_envs, n_agents, steps=30, **rules):
             centre_line=torch.from_numpy(line).to(device),
             agent_ray=torch.from_numpy(ray).to(device),
         )
-        given = dict(line=line, ray=ray, **{k: v.cpu().numpy().copy() for k, v in state.items()})
-        out = deathmatch_step(made, c.agents, view, **state, **rules, told=True)._asdict()
-        came = {k: v.cpu().numpy().copy() for k, v in (out | state).items()}
-        came |= dict(zip(METRICS, came["metrics"], strict=True))
-        yield given, came, c.agents.positions.cpu().numpy(), c.agents.angles.cpu().numpy()
+        inputs = dict(line=line, ray=ray, **{k: v.cpu().numpy().copy() for k, v in state.items()})
+        out = deathmatch_step(scenery, c.agents, view, **state, **rules, privileged=True)._asdict()
+        outputs = {k: v.cpu().numpy().copy() for k, v in (out | state).items()}
+        outputs |= dict(zip(METRICS, outputs["metrics"], strict=True))
+        yield inputs, outputs, c.agents.positions.cpu().numpy(), c.agents.angles.cpu().numpy()
 
 
 @pytest.mark.parametrize("n_agents", [2, 3, 16])
 @pytest.mark.parametrize("rules", RULES.values(), ids=RULES)
-def test_shots_are_the_twins_on_every_bit(rules, n_agents, device):
+def test_step_matches_twin_on_every_bit(rules, n_agents, device):
     dead = 0
-    for given, came, positions, angles in fight(device, 5, n_agents, **rules):
+    for inputs, outputs, positions, angles in fight(device, 5, n_agents, **rules):
         for e in range(5):
             lanes = slice(e * n_agents, (e + 1) * n_agents)
-            own = {k: v[..., lanes] for k, v in given.items() if k not in ("line", "ray")}
-            expected = shots(
-                given["line"][e], given["ray"][e], **own, n_model=8, res=512, rules=ALL | rules
+            state = {k: v[..., lanes] for k, v in inputs.items() if k not in ("line", "ray")}
+            expected = hits_of(
+                inputs["line"][e], inputs["ray"][e], **state, n_model=8, res=512, rules=ALL | rules
             )
             for name, values in expected.items():
-                ours = came[name][..., lanes] if name == "tally" else came[name][lanes]
+                ours = outputs[name][..., lanes] if name == "tally" else outputs[name][lanes]
                 ours = ours.T if name == "tally" else ours.reshape(values.shape)
                 assert (ours == values).all(), f"{name}: {ours} is not {values}"
-            close = told(expected["health"], positions[e], angles[e])
-            np.testing.assert_allclose(came["told"][lanes, 0], close, rtol=0, atol=2e-6)
+            close = privileged(expected["health"], positions[e], angles[e])
+            np.testing.assert_allclose(outputs["privileged"][lanes, 0], close, rtol=0, atol=2e-6)
             dead += int(expected["terminal"].sum())
     assert dead > 5
 
 
-def test_what_shoot_is_not_asked_for_it_leaves_out():
-    made = scene.scenery([toys.box()], 2, 1, device="cpu")
-    agents = core.Core(made).agents
+def test_optional_outputs_are_left_out():
+    scenery = scene.scenery([toys.box()], 2, 1, device="cpu")
+    agents = core.Core(scenery).agents
     state = torch.ones(2), torch.zeros((3, 2)), torch.zeros(2, dtype=torch.int32)
-    view = engine.observe(made, agents, centre_line=True)
-    out = deathmatch_step(made, agents, view, *state, torch.zeros(2, dtype=torch.bool))
-    assert out.told is None and view.agent_ray is None
+    view = engine.observe(scenery, agents, centre_line=True)
+    out = deathmatch_step(scenery, agents, view, *state, torch.zeros(2, dtype=torch.bool))
+    assert out.privileged is None and view.agent_ray is None
     with pytest.raises(TypeError, match=r"view.agent_ray"):
         deathmatch_step(
-            made, agents, view, *state, torch.zeros(2, dtype=torch.bool), aim_reward=1.0
+            scenery, agents, view, *state, torch.zeros(2, dtype=torch.bool), aim_reward=1.0
         )
 
 
-@pytest.mark.parametrize("n_agents, cameras, told", [(1, [0], "not 1"), (17, [0], "not 17")])
-def test_shoot_takes_two_to_sixteen_agents(n_agents, cameras, told):
-    made = scene.scenery([toys.box()], n_agents, 1, device="cpu")
-    agents, n = core.Core(made).agents, n_agents
-    view = engine.observe(made, agents, centre_line=True)
+@pytest.mark.parametrize("n_agents, message", [(1, "2 to 16 .* not 1"), (17, "2 to 16 .* not 17")])
+def test_step_takes_two_to_sixteen_agents(n_agents, message):
+    scenery = scene.scenery([toys.box()], n_agents, 1, device="cpu")
+    agents, n = core.Core(scenery).agents, n_agents
+    view = engine.observe(scenery, agents, centre_line=True)
     state = torch.ones(n), torch.zeros((3, n)), torch.zeros(n, dtype=torch.int32)
-    with pytest.raises(ValueError, match=f"^shoot takes 2 to 16 agents per environment, {told}$"):
-        deathmatch_step(made, agents, view, *state, torch.zeros(n, dtype=torch.bool))
+    with pytest.raises(ValueError, match=message):
+        deathmatch_step(scenery, agents, view, *state, torch.zeros(n, dtype=torch.bool))
 
 
 # ---- engine.observe's agent_ray ----
 
 
 @pytest.mark.parametrize("n_agents, res", [(1, 64), (4, 512), (4, 63), (3, 1)])
-def test_the_agent_ray_is_the_nearest_to_the_middle_that_shows_an_agent(n_agents, res, device):
+def test_agent_ray_is_the_closest_to_the_centre(n_agents, res, device):
     homes = [toys.box(2), toys.column(3)]
     c = core.Core(scene.scenery(homes, n_agents, 40, device=device), res=res, fov=70)
     modules.RandomSpawns(homes, c)(c.agent_full(True))
@@ -138,12 +138,12 @@ def test_the_agent_ray_is_the_nearest_to_the_middle_that_shows_an_agent(n_agents
     shown = engine.render(c.scenery, c.agents).indices
     is_agent = ((shown >= 0) & (shown < 8 * n_agents)).view(-1, res).tolist()
     for row, ray in zip(is_agent, rays.flatten().tolist(), strict=True):
-        found = [r for r in range(res) if row[r]]
-        assert ray == min(found, key=lambda r: (abs(r - res // 2), r), default=-1)
+        hits = [r for r in range(res) if row[r]]
+        assert ray == min(hits, key=lambda r: (abs(r - res // 2), r), default=-1)
     assert n_agents == 1 or (rays >= 0).any()
 
 
-def test_of_two_as_near_to_the_middle_the_agent_ray_is_the_left(device):
+def test_agent_ray_prefers_the_left_of_equals(device):
     c = core.Core(scene.scenery([toys.box()], 3, 1, device=device), res=63, fov=70)
     c.agents.positions[0] = torch.tensor([(2.0, 3.5), (4.0, 3.0), (4.0, 4.0)])
     ray = engine.observe(c.scenery, c.agents, agent_ray=True).agent_ray[0, 0]
@@ -151,12 +151,12 @@ def test_of_two_as_near_to_the_middle_the_agent_ray_is_the_left(device):
     assert ray < 31 and shown[ray] // 8 == 2 and shown[62 - ray] // 8 == 1
 
 
-# ---- Spawning out of sight ----
+# ---- Hidden spawns ----
 
 
 @pytest.mark.parametrize("n_agents", [2, 4, 16])
 @pytest.mark.parametrize("source", ["bench", "homes", "box", "column"])
-def test_agents_respawn_where_the_twin_says(source, n_agents, device):
+def test_hidden_spawns_match_twin(source, n_agents, device):
     homes = sample(source, 4)
     c = core.Core(scene.scenery(homes, n_agents, 6, device=device))
     spawner, random = modules.RandomSpawns(homes, c, hidden=True, seed=3), np.random.default_rng(1)
@@ -168,13 +168,13 @@ def test_agents_respawn_where_the_twin_says(source, n_agents, device):
         for e, d in enumerate(c.scenery.layout.tolist()):
             walls = c.scenery.layouts.lines[d].cpu().numpy()
             drawn = dict(draws=draws[e], first_lane=e * n_agents, seed=3, radius=RADIUS)
-            expected = spawned(walls, points[d], before[e], mask[e], **drawn)
+            expected = respawned(walls, points[d], before[e], mask[e], **drawn)
             ours = c.agents.positions[e].cpu().numpy()
             assert (ours == expected.astype(np.float32)).all(), f"environment {e}, step {step}"
 
 
 def views_of(c, who):
-    """(N, A, A) bool: whether an agent, looking all round, sees another's lines."""
+    """(N, A, len(who)) bool: agents that, looking all round, see the lines of the agents `who`."""
     around = core.Core(c.scenery, res=1024, fov=122, cameras=[0, 120, 240])
     around.agents.positions.copy_(c.agents.positions)
     shown = engine.render(around.scenery, around.agents).indices.flatten(2)
@@ -182,9 +182,9 @@ def views_of(c, who):
 
 
 @pytest.mark.parametrize("source", ["bench", "homes"])
-def test_who_respawns_in_a_home_is_seen_by_nobody(source, device):
-    """However the others turn; but where all of an agent's points are in sight of somebody. Without
-    `hidden` many are seen.
+def test_hidden_spawns_are_seen_by_nobody(source, device):
+    """Whichever way the others look, except where all of an agent's points are visible. Without
+    `hidden`, many are seen.
     """
     homes = sample(source, 16)
     c = core.Core(scene.scenery(homes, 3, 64, device=device))
@@ -204,42 +204,42 @@ def test_who_respawns_in_a_home_is_seen_by_nobody(source, device):
 
 
 def has_hidden_point(c, spawner, e, a):
-    """Whether one of agent a's points is out of sight of all others of its environment."""
+    """True if one of agent a's points is out of sight of all other agents in environment e."""
     d = int(c.scenery.layout[e])
     walls = c.scenery.layouts.lines[d].cpu().numpy().astype(float)
-    own = spawner.points[d].view(c.n_agents, -1, 2)[a].cpu().numpy().astype(float)
+    points = spawner.points[d].view(c.n_agents, -1, 2)[a].cpu().numpy().astype(float)
     eyes = np.delete(c.agents.positions[e].cpu().numpy().astype(float), a, 0)
-    return any(not any(in_sight(walls, eye, at, RADIUS) for eye in eyes) for at in own)
+    return any(not any(is_visible(walls, eye, at, RADIUS) for eye in eyes) for at in points)
 
 
-def test_in_an_empty_room_who_respawns_is_furthest_from_whoever_is_nearest(device):
+def test_hidden_spawn_in_an_empty_room_is_the_furthest(device):
     c = core.Core(scene.scenery([toys.box()], 3, 20, device=device))
     spawner = modules.RandomSpawns([toys.box()], c, hidden=True)
     spawner(c.agent_full(True))
     mask = c.agent_full(False)
     mask[:, 1] = True
     spawner(mask)
-    own = spawner.points[0].view(3, -1, 2)[1]
+    points = spawner.points[0].view(3, -1, 2)[1]
     others = c.agents.positions[:, [0, 2]]
-    gaps = (own[None, :, None] - others[:, None]).norm(dim=-1).amin(-1)
-    chosen = (c.agents.positions[:, 1, None] - others).norm(dim=-1).amin(-1)
-    torch.testing.assert_close(chosen, gaps.amax(-1))
+    gaps = (points[None, :, None] - others[:, None]).norm(dim=-1).amin(-1)
+    distances = (c.agents.positions[:, 1, None] - others).norm(dim=-1).amin(-1)
+    torch.testing.assert_close(distances, gaps.amax(-1))
 
 
-def test_hidden_spawns_draw_as_often_as_others(device):
-    """Once each; an agent alone in its home goes where it would have gone anyway."""
-    found = []
+def test_hidden_spawns_draw_once(device):
+    """An agent alone in its home spawns where it would have spawned anyway."""
+    runs = []
     for hidden in (False, True):
         homes = sample("bench", 4)
         c = core.Core(scene.scenery(homes, 1, 8, device=device))
         spawner = modules.RandomSpawns(homes, c, hidden=hidden, resample=True)
         for _ in range(3):
             spawner(c.agent_full(True))
-        found.append([c.agents.positions, c.agents.angles, spawner.counts, c.scenery.layout])
-    assert contract.same(dict(enumerate(found[0])), dict(enumerate(found[1])))
+        runs.append([c.agents.positions, c.agents.angles, spawner.counts, c.scenery.layout])
+    assert contract.same(dict(enumerate(runs[0])), dict(enumerate(runs[1])))
 
 
-# ---- The rules, on paper ----
+# ---- The rules, by hand ----
 
 
 class Ring:
@@ -259,9 +259,9 @@ class Ring:
         agents.angvelocity.zero_()
 
     def step(self, n=1, *actions):
-        given = torch.tensor(actions or (0,) * self.env.n_agents, device=self.env.device)
+        actions = torch.tensor(actions or (0,) * self.env.n_agents, device=self.env.device)
         for _ in range(n):
-            world = self.env.step(arrdict.arrdict(actions=given[:, None]))
+            world = self.env.step(arrdict.arrdict(actions=actions[:, None]))
         return world
 
     @property
@@ -269,35 +269,37 @@ class Ring:
         return self.env.health.tolist()
 
 
-# One looks at the other, two metres ahead of it, who looks away.
+# The first agent looks at the second, which is two metres ahead and looks away.
 AMBUSH = (2.0, 3.5, 0.0), (4.0, 3.5, 0.0)
 
 
-def test_who_stands_in_the_middle_of_a_view_is_hit_each_step(device):
+def test_agent_at_the_centre_of_a_view_is_hit_each_step(device):
     ring = Ring(device, *AMBUSH)
     for step in range(1, 4):
         world = ring.step()
         assert world.reward.tolist() == [1, -1]
         assert ring.health == pytest.approx([1, 1 - 0.1 * step])
-        told = world.obs.health[:, 0].tolist()
-        assert told[0] == [1, 1, 0] and told[1] == pytest.approx([1 - 0.1 * step, 0, 1], abs=1e-3)
+        health_obs = world.obs.health[:, 0].tolist()
+        assert health_obs[0] == [1, 1, 0] and health_obs[1] == pytest.approx(
+            [1 - 0.1 * step, 0, 1], abs=1e-3
+        )
 
 
-def test_a_wall_between_them_saves_the_other(device):
+def test_walls_block_hits(device):
     west, east = (2.0, 3.5, 0.0), (5.0, 3.5, 0.0)
     for geometry, reward in ((toys.box(), [1, -1]), (toys.column(), [0, 0])):
         assert Ring(device, west, east, geometry=geometry).step().reward.tolist() == reward
 
 
 @pytest.mark.parametrize("degrees, hits", [(1.9, True), (2.6, False), (-1.9, True), (-2.6, False)])
-def test_the_middle_of_the_view_is_a_single_ray(degrees, hits, device):
-    """Side on, an agent is 0.15 m wide; two metres away its half is seen under 2.15 degrees."""
+def test_the_centre_of_the_view_is_one_ray(degrees, hits, device):
+    """Seen from the side, an agent is 0.15 m wide: at two metres, half of it spans 2.15 degrees."""
     (x, y, _), other = AMBUSH
     world = Ring(device, (x, y, degrees), other).step()
     assert world.reward.tolist() == ([1, -1] if hits else [0, 0])
 
 
-def test_ten_hits_kill_and_the_next_step_begins_another_life(device):
+def test_ten_hits_kill_and_the_next_step_respawns(device):
     ring = Ring(device, *AMBUSH)
     world = ring.step(9)
     assert not world.terminal.any() and ring.health[1] == pytest.approx(0.1)
@@ -312,15 +314,15 @@ def test_ten_hits_kill_and_the_next_step_begins_another_life(device):
     assert ring.env.core.agents.positions[0, 0].tolist() == [2, 3.5], "the other stays"
 
 
-def test_the_killers_metrics_are_told_where_its_own_episode_ends(device):
+def test_kills_are_reported_where_the_killers_episode_ends(device):
     world = Ring(device, *AMBUSH, limit=20).step(20)
     assert world.truncated.tolist() == [True, False]
     kills, deaths, damage, accuracy = (float(world.metrics[name][0]) for name in METRICS)
     assert kills >= 1 and deaths == 0 and damage >= 1 - 1e-6 and accuracy >= 0.5
 
 
-def test_a_kill_is_shared_among_those_who_hit_last(device):
-    """Two look at the one between, which has health for four hits: it dies at the second step."""
+def test_kill_reward_is_shared(device):
+    """Two agents look at the one between them, which has health for four hits: two steps."""
     settings = dict(damage=0.25, hit_reward=0, wound_cost=0, kill_reward=8, death_cost=3)
     ring = Ring(device, (3.5, 5.5, -90), (3.5, 3.5, 0), (3.5, 1.5, 90), **settings)
     assert not ring.step().reward.any()
@@ -329,14 +331,14 @@ def test_a_kill_is_shared_among_those_who_hit_last(device):
     assert ring.env.tally[:, [0, 2]].T.tolist() == 2 * [[0.5, 0.5, 2]]
 
 
-def test_who_is_killed_still_hits_in_that_step(device):
+def test_a_dying_agent_still_hits(device):
     ring = Ring(device, (2, 3.5, 0), (4, 3.5, 180), damage=1, kill_reward=2, death_cost=5)
     world = ring.step()
     assert world.terminal.all() and world.reward.tolist() == 2 * [1 - 1 + 2 - 5]
 
 
-def test_a_first_observation_neither_scores_nor_is_wounded(device):
-    """The first to die respawns into the other's view, which is then turned at it by hand."""
+def test_first_observation_neither_hits_nor_is_hit(device):
+    """A killed agent respawns, by hand, into the view of its killer."""
     ring = Ring(device, *AMBUSH, damage=1)
     assert not ring.first.reward.any() and ring.first.reset.all()
     assert ring.step().terminal.tolist() == [False, True]
@@ -350,13 +352,13 @@ def test_a_first_observation_neither_scores_nor_is_wounded(device):
     assert torch.equal(counts, ring.env.spawner.counts)
 
 
-def test_damage_beyond_what_is_left_counts_as_what_is_left(device):
+def test_damage_is_capped_by_health(device):
     ring = Ring(device, *AMBUSH, damage=0.7)
     ring.step(2)
     assert ring.env.tally[1].tolist() == pytest.approx([1, 0])
 
 
-def test_health_drains_and_recovers_by_the_second(device):
+def test_drain_and_recovery_are_per_second(device):
     away = (2.0, 2.0, 180.0), (5.0, 5.0, 0.0)
     ring = Ring(device, *away, drain=0.5)
     ring.step()
@@ -374,17 +376,15 @@ def test_health_drains_and_recovers_by_the_second(device):
     assert ring.health == [1, 1], "and never more than all"
 
 
-def test_spoils_heal_whoever_hits(device):
-    ring = Ring(device, *AMBUSH, spoils=0.05, drain=1.0)
+def test_health_per_hit(device):
+    ring = Ring(device, *AMBUSH, health_per_hit=0.05, drain=1.0)
     ring.step(3)
     assert ring.health == pytest.approx([1 - 3 * 0.1 + 3 * 0.05, 1 - 3 * 0.1 - 3 * 0.1])
 
 
 @pytest.mark.parametrize("ahead, left", [(2, 0.5), (2, -0.5), (3, 1.5), (1, 0)])
-def test_aim_falls_from_the_middle_of_the_view_to_its_edge(ahead, left, device):
-    """The part of the other that is nearest to the middle: it is 0.15 m wide, whichever side it
-    shows along the axes.
-    """
+def test_aim_reward_falls_from_centre_to_edge(ahead, left, device):
+    """Aim is measured to the part of the other agent that is closest to the centre."""
     ring = Ring(
         device, (2, 3.5, 0), (2 + ahead, 3.5 + left, 0), aim_reward=1, hit_reward=0, wound_cost=0
     )
@@ -395,31 +395,35 @@ def test_aim_falls_from_the_middle_of_the_view_to_its_edge(ahead, left, device):
     assert float(world.reward[0]) == pytest.approx(expected, abs=slack) and world.reward[1] == 0
 
 
-def test_nobody_in_view_is_no_aim(device):
+def test_aim_reward_needs_an_agent_in_view(device):
     ring = Ring(device, (2, 2, 180), (5, 5, 0), aim_reward=1)
     assert ring.step().reward.tolist() == [0, 0]
 
 
-def test_what_is_seen_for_the_first_time_is_paid(device):
-    """In as many lanes as there are agents, each for itself: the bits that a step adds."""
-    prices = dict(hit_reward=0, wound_cost=0, search_reward=64 / 4)
-    env = envs.Deathmatch(3, sample("homes", 3), n_agents=2, device=device, limit=9, **prices)
+def test_search_reward_counts_newly_seen_texels(device):
+    """In each lane, the reward is the number of bits that a step adds to `seen`."""
+    rewards = dict(hit_reward=0, wound_cost=0, search_reward=64 / 4)
+    env = envs.Deathmatch(3, sample("homes", 3), n_agents=2, device=device, limit=9, **rewards)
 
     def count():
         return np.unpackbits(env.seen.cpu().numpy().view(np.uint8).reshape(6, -1), axis=1).sum(1)
 
     env.reset()
-    generator, bits, n_paid, n_reset = torch.Generator().manual_seed(1), count(), 0, 0
+    generator, bits, n_rewarded, n_reset = torch.Generator().manual_seed(1), count(), 0, 0
     for _ in range(30):
         decision = arrdict.arrdict(actions=contract.random_actions(env, generator))
         world, now = env.step(decision), count()
         reset = world.reset.cpu().numpy()
         assert world.reward.tolist() == np.where(reset, 0, (now - bits) / 4).tolist()
-        bits, n_paid, n_reset = now, n_paid + (world.reward > 0).sum(), n_reset + reset.sum()
-    assert n_paid > 60 and n_reset > 12
+        bits, n_rewarded, n_reset = (
+            now,
+            n_rewarded + (world.reward > 0).sum(),
+            n_reset + reset.sum(),
+        )
+    assert n_rewarded > 60 and n_reset > 12
 
 
-def test_lanes_are_truncated_each_in_its_time(device):
+def test_lanes_are_truncated_independently(device):
     ring = Ring(device, (2, 2, 180), (5, 5, 0), limit=6)
     ring.env.ages[1] = 2
     for step in range(1, 8):
@@ -429,9 +433,9 @@ def test_lanes_are_truncated_each_in_its_time(device):
         ring.place((2, 2, 180), (5, 5, 0))
 
 
-def test_a_body_takes_no_action_of_its_own(device):
-    """In the step that begins another life, the last one's action moves nobody: the body stands
-    4 cm ahead, and who walks into it is stopped.
+def test_an_ended_agent_takes_no_action(device):
+    """In the step in which an agent respawns, its action is ignored: it still stands 4 cm ahead of
+    the other agent, which is stopped by it.
     """
     ring = Ring(device, (2, 3.5, 0), (2.25, 3.5, 0), damage=1)
     ring.step()
@@ -442,26 +446,26 @@ def test_a_body_takes_no_action_of_its_own(device):
     assert 2.03 < float(agents.positions[0, 0, 0]) < 2.04
 
 
-def test_a_death_respawns_out_of_sight_in_the_world_that_is_shown(device):
-    """In homes, over many lives: nobody who lives sees a newcomer, wherever they look."""
+def test_deaths_respawn_out_of_sight(device):
+    """In homes, over many episodes: no agent sees a newly respawned one, whichever way it looks."""
     homes = sample("bench", 8)
     env = envs.Deathmatch(32, homes, n_agents=3, device=device, limit=5)
     env.reset()
-    random, born = torch.Generator().manual_seed(1), 0
+    random, n_respawns = torch.Generator().manual_seed(1), 0
     for _ in range(40):
         world = env.step(arrdict.arrdict(actions=contract.random_actions(env, random)))
         new = modules.to_agents(world.reset, 3)
         env.ages.copy_(torch.where(world.reset, torch.arange(96, device=env.device) % 5, env.ages))
-        seen = views_of(env.core, range(3))  # (N, who looks, whom)
+        seen = views_of(env.core, range(3))  # (N, observer, observed)
         seen &= ~new[:, :, None]
         if new.all(1).any():
             seen[new.all(1)] = False
         assert not (seen & new[:, None]).any()
-        born += int(new.sum())
-    assert born > 100
+        n_respawns += int(new.sum())
+    assert n_respawns > 100
 
 
-def test_privileged_is_everyones_health_and_place(device):
+def test_privileged_observation_by_hand(device):
     ring = Ring(device, (2, 3.5, 0), (4, 4.5, 90), privileged=True)
     ring.env.health.copy_(torch.tensor([0.75, 0.5]))
     world = ring.step()
@@ -471,7 +475,7 @@ def test_privileged_is_everyones_health_and_place(device):
     assert second == pytest.approx([0.5, 0.75, -0.1, 0.2, 0, -1], abs=1e-6)
 
 
-def test_what_a_critic_is_told_changes_nothing_else(device):
+def test_privileged_changes_nothing_else(device):
     plain, more = (
         contract.rollout(
             envs.Deathmatch(4, sample("bench", 2), device=device, limit=9, privileged=privileged),
@@ -483,12 +487,12 @@ def test_what_a_critic_is_told_changes_nothing_else(device):
         assert contract.same(a, arrdict.arrdict({k: v for k, v in b.items() if k != "privileged"}))
 
 
-# ---- What is seen ----
+# ---- Images ----
 
 
-def test_a_pixel_tells_an_agent_from_a_wall(device):
-    """The weakest channel has at most 0.12 of an agent's light and more of a wall's, in any light;
-    pixels here are rays, for a mean over both lies between.
+def test_agents_and_walls_differ_in_colour(device):
+    """The weakest channel has at most 0.12 of an agent's light, and more of a wall's, in any light.
+    Pixels are single rays here, since the mean over an agent and a wall lies in between.
     """
     homes = sample("homes", 16)
     env = envs.Deathmatch(64, homes, n_agents=16, device=device, res=256, subsample=1)
@@ -507,7 +511,7 @@ def test_sixteen_agents_have_sixteen_colours():
 
 
 @pytest.mark.parametrize("n_agents", [2, 16])
-def test_every_agents_view_and_health_are_drawn(n_agents):
+def test_display_draws_every_agent(n_agents):
     env = envs.Deathmatch(2, [toys.box()], n_agents=n_agents, device="cpu")
     env.reset()
     env.health[n_agents:] = torch.linspace(0, 1, n_agents)
@@ -519,40 +523,39 @@ def test_every_agents_view_and_health_are_drawn(n_agents):
     assert plotting.rasterise(figure).std() > 5
 
 
-# ---- Settings that do not fit ----
+# ---- Bad settings ----
 
 
 @pytest.mark.parametrize("n_agents", [0, 1, 17, 200])
-def test_a_number_of_agents_out_of_range_is_told(n_agents):
-    told = rf"^n_agents: {n_agents} is out of range: allowed is from 2 to 16$"
-    with pytest.raises(ValueError, match=told):
+def test_n_agents_out_of_range(n_agents):
+    with pytest.raises(ValueError, match=rf"n_agents: {n_agents} .*2 to 16"):
         envs.Deathmatch(1, [toys.box()], n_agents=n_agents, device="cpu")
 
 
 @pytest.mark.parametrize(
-    "words, told",
+    "words, message",
     [
-        (["env.n_agents=0"], "env.n_agents: 0 is out of range: allowed is from 2 to 16"),
-        (["env.n_agents=200"], "env.n_agents: 200 is out of range: allowed is from 2 to 16"),
-        (["env.damage=2"], "env.damage: 2 is out of range: allowed is from 0 to 1"),
-        (["env.agents=4"], "did you mean env.n_agents?"),
+        (["env.n_agents=0"], "env.n_agents: 0 "),
+        (["env.n_agents=200"], "env.n_agents: 200 "),
+        (["env.damage=2"], "env.damage: 2 "),
+        (["env.agents=4"], "env.n_agents"),
     ],
 )
-def test_settings_that_do_not_fit_end_with_a_sentence(words, told, tmp_path, monkeypatch, capsys):
+def test_bad_settings_exit_with_a_message(words, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert train.main(["env=deathmatch", "samples=100", "device=cpu", *words]) == 2
-    said = capsys.readouterr().err
-    assert told in said and "Traceback" not in said and not list(tmp_path.iterdir())
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error and not list(tmp_path.iterdir())
 
 
-def test_more_agents_than_a_home_has_room_for_end_with_a_sentence(tmp_path, monkeypatch, capsys):
-    """A room of a metre."""
+def test_too_many_agents_for_a_home(tmp_path, monkeypatch, capsys):
+    """A room of one metre."""
     monkeypatch.chdir(tmp_path)
     np.savez("small.npz", **{f"0/{k}": v for k, v in toys.box(1).items()})
     words = ["env=deathmatch", "env.n_agents=16", "geometry=files", "geometry.path=small.npz"]
     assert train.main([*words, "samples=100", "device=cpu"]) == 2
-    said = capsys.readouterr().err
-    assert "has no room for 16 agents at once, 0.26 m apart" in said and "Traceback" not in said
+    error = capsys.readouterr().err
+    assert "16 agents" in error and "Traceback" not in error
 
 
 # ---- Devices ----
@@ -561,7 +564,7 @@ def test_more_agents_than_a_home_has_room_for_end_with_a_sentence(tmp_path, monk
 @pytest.mark.cuda
 @pytest.mark.parametrize("n_agents", [2, 4, 16])
 def test_cpu_and_gpu_agree_on_every_bit(n_agents):
-    settings = dict(limit=15, damage=0.3, recovery=0.1, drain=0.05, spoils=0.02)
+    settings = dict(limit=15, damage=0.3, recovery=0.1, drain=0.05, health_per_hit=0.02)
     settings |= dict(aim_reward=0.1, search_reward=0.3)
     runs = [
         arrdict.stack(
@@ -583,7 +586,7 @@ def test_cpu_and_gpu_agree_on_every_bit(n_agents):
     assert contract.same(*runs)
 
 
-def test_threads_do_not_matter():
+def test_number_of_threads_changes_no_bit():
     runs = []
     try:
         for n in (1, 3):
@@ -599,12 +602,12 @@ def test_threads_do_not_matter():
 
 
 def rows_of(run):
-    """A run's only table."""
+    """The rows of a run's only evaluation."""
     (table,) = Path(run).glob("evaluations/*.json")
     return json.loads(table.read_text())["rows"]
 
 
-def test_a_run_is_trained_in_self_play_evaluated_and_filmed(tmp_path, monkeypatch):
+def test_train_evaluate_and_record_in_self_play(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small = ["env.n_envs=4", "env.n_agents=3", "env.limit=20", "learner.n_minibatches=2"]
     small += ["agent.width=8", "env.res=64", "geometry=column", "samples=1000", "folder=run"]
@@ -617,8 +620,8 @@ def test_a_run_is_trained_in_self_play_evaluated_and_filmed(tmp_path, monkeypatc
 
 
 @pytest.mark.slow
-def test_the_recipe_learns_to_hit_more_often_than_random_actions(tmp_path, monkeypatch):
-    """In a quarter of its samples, five times as much as it takes to see it."""
+def test_recipe_learns_to_hit(tmp_path, monkeypatch):
+    """With a quarter of its samples, five times as many as it needs to show."""
     monkeypatch.chdir(tmp_path)
     words = ["experiment=deathmatch", "preset=cpu", "geometry=box", "samples=250_000"]
     assert train.main([*words, "finish.record=false", "device=cpu", "folder=run"]) == 0

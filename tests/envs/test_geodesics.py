@@ -1,5 +1,5 @@
-"""Shortest ways against paths that are found otherwise: by hand, and by a visibility graph of exact
-distances between segments, which shares nothing with the module.
+"""Shortest paths against an oracle: by hand, and by a visibility graph with exact distances between
+segments, which shares no code with the module.
 """
 
 import heapq
@@ -19,17 +19,17 @@ from megastep.modules.spawning import distances
 RADIUS = engine.AGENT_RADIUS
 
 
-def found_in(g, n_spawns=24, n_goals=4, seed=1):
+def geodesics_of(g, n_spawns=24, n_goals=4, seed=1):
     return geodesics(g, n_spawns, n_goals, RADIUS, np.random.Generator(np.random.Philox(seed)))
 
 
-def read(found, points):
-    """(P, G) a field between the centres of cells, by a loop."""
-    out = np.full((len(points), len(found.fields)), np.nan)
-    for p, (x, y) in enumerate((points.astype(float) - found.origin) / CELL):
+def read(result, points):
+    """(P, G): the fields interpolated at points, by a loop."""
+    out = np.full((len(points), len(result.fields)), np.nan)
+    for p, (x, y) in enumerate((points.astype(float) - result.origin) / CELL):
         i, j = int(y), int(x)
         up, right = y - i, x - j
-        corners = found.fields[:, i : i + 2, j : j + 2].astype(float)
+        corners = result.fields[:, i : i + 2, j : j + 2].astype(float)
         weights = np.outer([1 - up, up], [1 - right, right])
         known = np.isfinite(corners)
         out[p] = np.where(known, corners, 0).reshape(len(corners), -1) @ weights.ravel()
@@ -41,9 +41,7 @@ def read(found, points):
 
 
 def gap(p, q, walls):
-    """Metres between the segment p-q and the nearest of walls (M, 2, 2): 0 if they cross, else the
-    nearest end of one to the other.
-    """
+    """Metres between the segment p-q and the nearest of walls (M, 2, 2); 0 if they cross."""
     ends = np.concatenate([distances(np.stack([p, q]), walls)])
     way = np.stack([p, q])[None]
     nearest = min(ends.min(), distances(walls.reshape(-1, 2), way).min())
@@ -57,8 +55,9 @@ def gap(p, q, walls):
 
 
 def shortest(walls, starts, goals, radius, n_around=16):
-    """(S, G) lengths of the shortest polylines that stay `radius` from all walls: Dijkstra's
-    algorithm over starts, goals and the corners of polygons drawn around the ends of walls.
+    """Returns the lengths (S, G) of the shortest polylines that stay `radius` away from all walls.
+
+    Dijkstra's algorithm over starts, goals and the corners of polygons around the ends of walls.
     """
     walls = walls.astype(float)
     around = 2 * math.pi * (np.arange(n_around) + 0.5) / n_around
@@ -105,27 +104,27 @@ def shortest(walls, starts, goals, radius, n_around=16):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source, n", [("homes", 8), ("bench", 2), ("maze", 2)])
-def test_lengths_and_fields_are_those_of_an_independent_search_in_a_dozen_plans(source, n):
-    """The oracle's polygons lie outside of the arcs that an agent walks, by 2 % of an arc; ours
-    inside, by a few millimetres.
+def test_match_a_visibility_graph_in_many_homes(source, n):
+    """The oracle's polygons lie outside of the arcs that an agent walks, by 2 % of an arc; the
+    module's lie inside, by a few millimetres.
     """
     for g in sample(source, n, split="test"):
         check_against_oracle(g)
 
 
-def test_lengths_and_fields_are_those_of_an_independent_search_in_a_home():
+def test_match_a_visibility_graph_in_a_home():
     check_against_oracle(sample("homes", 1, split="test")[0])
 
 
 def check_against_oracle(g):
-    found = found_in(g)
-    starts = found.spawns[:3]
-    oracle = shortest(g.walls, starts, found.goals, RADIUS)
-    lengths = found.lengths[:3]
+    result = geodesics_of(g)
+    starts = result.spawns[:3]
+    oracle = shortest(g.walls, starts, result.goals, RADIUS)
+    lengths = result.lengths[:3]
     where = f"geometry {g.id}: {lengths} {oracle}"
     assert np.isfinite(oracle).all() and (lengths <= 1.003 * oracle + 2e-3).all(), where
     assert (lengths >= 0.985 * oracle - 2e-2).all(), where
-    fields = read(found, starts)
+    fields = read(result, starts)
     assert (fields >= 0.995 * oracle - 0.05).all(), where  # of cells, so not shorter
     assert (fields <= 1.1 * oracle + 0.25).all(), where
 
@@ -144,56 +143,54 @@ def room(*walls, width=6.0, height=4.0, id=7):
     )
 
 
-def test_where_nothing_is_in_the_way_the_shortest_way_is_straight():
-    found = found_in(toys.box(5))
-    straight = np.hypot(*np.moveaxis(found.spawns[:, None] - found.goals, -1, 0))
-    np.testing.assert_allclose(found.lengths, straight, rtol=1e-5)
-    assert (distances(found.goals.astype(float), toys.box(5).walls) > RADIUS + 0.05).all()
+def test_path_in_an_empty_room_is_straight():
+    result = geodesics_of(toys.box(5))
+    straight = np.hypot(*np.moveaxis(result.spawns[:, None] - result.goals, -1, 0))
+    np.testing.assert_allclose(result.lengths, straight, rtol=1e-5)
+    assert (distances(result.goals.astype(float), toys.box(5).walls) > RADIUS + 0.05).all()
 
 
-def test_around_the_end_of_a_wall_the_way_is_two_tangents_and_an_arc():
-    """A wall from the middle of the southern side two metres into a room of 6 x 4 m."""
+def test_path_around_a_wall_is_two_tangents_and_an_arc():
+    """A wall from the middle of the southern side reaches two metres into a room of 6 x 4 m."""
     g = room(((3, 0), (3, 2)))
-    found, end, n = found_in(g, 60, 40), np.array([4.0, 3.0]), 0
+    result, end, n = geodesics_of(g, 60, 40), np.array([4.0, 3.0]), 0
     for s, t in itertools.product(range(60), range(40)):
-        a, b = found.spawns[s] - end, found.goals[t] - end
+        a, b = result.spawns[s] - end, result.goals[t] - end
         if a[0] * b[0] > 0 or max(a[1], b[1]) > -0.3:
             continue  # on one side, or high enough to see each other
         reach = [np.sqrt(p @ p - RADIUS**2) for p in (a, b)]
         turn = math.acos(a @ b / np.hypot(*a) / np.hypot(*b))
         upward = 2 * math.pi - turn  # round the end, not through the wall
         arc = upward - sum(math.acos(RADIUS / np.hypot(*p)) for p in (a, b))
-        assert found.lengths[s, t] == pytest.approx(sum(reach) + RADIUS * arc, abs=1e-2)
+        assert result.lengths[s, t] == pytest.approx(sum(reach) + RADIUS * arc, abs=1e-2)
         n += 1
     assert n > 100
 
 
-def test_a_gap_is_a_way_for_whom_it_is_wide_enough():
-    """A wall across with a gap at the north: the disc is 0.212 m wide."""
+def test_paths_take_gaps_wider_than_the_agent():
+    """A wall across the room with a gap at its northern end. The disc is 0.212 m wide."""
     across = {gap: room(((3, 0), (3, 4 - gap))) for gap in (0.15, 0.19, 0.45)}
     for gap_, open_ in ((0.15, False), (0.19, False), (0.45, True)):
-        found = found_in(across[gap_], 100, 16)
-        sides = {bool(x > 4) for x in np.concatenate([found.spawns, found.goals])[:, 0]}
+        result = geodesics_of(across[gap_], 100, 16)
+        sides = {bool(x > 4) for x in np.concatenate([result.spawns, result.goals])[:, 0]}
         assert len(sides) == (2 if open_ else 1), gap_
-        assert np.isfinite(found.lengths).all()
+        assert np.isfinite(result.lengths).all()
 
 
-def test_goals_lie_in_the_largest_part_that_is_connected():
-    found = found_in(room(((2, 0), (2, 4))), 50, 16)
-    assert (found.spawns[:, 0] > 3).all() and (found.goals[:, 0] > 3).all()
+def test_goals_are_in_the_largest_connected_part():
+    result = geodesics_of(room(((2, 0), (2, 4))), 50, 16)
+    assert (result.spawns[:, 0] > 3).all() and (result.goals[:, 0] > 3).all()
 
 
 def test_fields_keep_the_agents_radius_from_walls():
-    """No cell nearer to a wall is passed: those have a neighbour's distance and a cell more, or
-    none.
-    """
+    """Cells closer to a wall hold a neighbour's distance plus one cell, or infinity."""
     g = sample("homes", 1)[0]
-    found = found_in(g)
-    _, height, width = found.fields.shape
+    result = geodesics_of(g)
+    _, height, width = result.fields.shape
     rows, columns = np.mgrid[:height, :width].reshape(2, -1)
-    centres = found.origin + CELL * np.stack([columns, rows], 1)
+    centres = result.origin + CELL * np.stack([columns, rows], 1)
     near = (distances(centres, g.walls.astype(float)) < RADIUS - 1e-6).reshape(height, width)
-    fields = found.fields.astype(float)
+    fields = result.fields.astype(float)
     lowest = np.pad(fields, ((0, 0), (1, 1), (1, 1)), constant_values=np.inf)
     around = np.minimum.reduce(
         [lowest[:, 2:, 1:-1], lowest[:, :-2, 1:-1], lowest[:, 1:-1, 2:], lowest[:, 1:-1, :-2]]
@@ -203,13 +200,13 @@ def test_fields_keep_the_agents_radius_from_walls():
     assert (fields[known] >= around[known] + CELL - 0.02).all(), "in half precision"
 
 
-def test_the_same_draws_give_the_same_and_others_differ():
+def test_seeds_repeat_and_differ():
     g = sample("homes", 1)[0]
-    a, b, c = found_in(g), found_in(g), found_in(g, seed=2)
+    a, b, c = geodesics_of(g), geodesics_of(g), geodesics_of(g, seed=2)
     assert all((x == y).all() for x, y in zip(a, b)) and not (a.goals == c.goals).all()
 
 
-def test_every_move_of_a_way_passes_free_cells():
+def test_moves_pass_free_cells_only():
     free = np.ones((5, 7), bool)
     free[2, 3] = False
     numbers, starts, ends, metres = module._graph(free)

@@ -1,4 +1,4 @@
-"""The code of docs/new-environment.md, run in order, and what its text promises of it."""
+"""docs/new-environment.md: its code runs in order and behaves as the text says."""
 
 import importlib.util
 import re
@@ -15,18 +15,18 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "new-environment.md"
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory):
-    """What the page's code defines, run in a folder of its own; without PyAV it is not filmed."""
-    found = {"__name__": "__main__", "folder": tmp_path_factory.mktemp("page")}
+    """The variables of the page's code, run in an empty folder. Recording needs PyAV."""
+    variables = {"__name__": "__main__", "folder": tmp_path_factory.mktemp("page")}
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(found["folder"])
+        patch.chdir(variables["folder"])
         for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S):
             if "record.film" not in block or importlib.util.find_spec("av"):
-                exec(compile(block, str(PAGE), "exec"), found)
-    return found
+                exec(compile(block, str(PAGE), "exec"), variables)
+    return variables
 
 
-def test_its_commands_train_evaluate_and_film(tmp_path, monkeypatch, capsys):
-    """The first part's, in an empty folder; the second part has a test file of its own."""
+def test_commands_train_evaluate_and_record(tmp_path, monkeypatch, capsys):
+    """The commands of the first part, in an empty folder. test_two_agents.py has the second's."""
     pytest.importorskip("av")
     text = PAGE.read_text().split("## Two agents")[0]
     assert "This is `rover.py`" in text
@@ -37,20 +37,17 @@ def test_its_commands_train_evaluate_and_film(tmp_path, monkeypatch, capsys):
     assert (run / "video.mp4").stat().st_size > 1000
 
 
-def test_the_page_trains(names):
-    assert (
-        all(bool(value.isfinite()) for value in names["losses"].values())
-        and names["rollout"].reward.any()
-    )
+def test_python_code_trains(names):
+    assert all(bool(value.isfinite()) for value in names["losses"].values())
+    assert names["rollout"].reward.any()
 
 
-def test_rover_pays_metres_and_ends_at_walls(names):
+def test_rover_is_rewarded_for_metres_and_ends_at_walls(names):
     env = names["Rover"](n_envs=64, device="cpu", limit=50)
     worlds = contract.rollout(env, 150)
-    assert any(bool(w.terminal.any()) for w in worlds) and any(
-        bool(w.truncated.any()) for w in worlds
-    )
-    assert max(float(w.reward.max()) for w in worlds) < 0.5, "at most 4 m/s, a tenth of a second"
+    assert any(bool(world.terminal.any()) for world in worlds)
+    assert any(bool(world.truncated.any()) for world in worlds)
+    assert max(float(world.reward.max()) for world in worlds) < 0.5, "at most 4 m/s for 0.1 s"
 
 
 def test_rover_is_displayed(names):
@@ -59,7 +56,7 @@ def test_rover_is_displayed(names):
     assert plotting.rasterise(env.display(1)).std() > 5
 
 
-def test_rover_is_filmed_at_its_own_rate(names):
+def test_video_has_the_fps_of_rover(names):
     av = pytest.importorskip("av")
     with av.open(str(names["folder"] / "rover.mp4")) as container:
         video = container.streams.video[0]
@@ -68,7 +65,7 @@ def test_rover_is_filmed_at_its_own_rate(names):
 
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_rover_is_captured(names):
+def test_rover_runs_as_a_cuda_graph(names):
     runs = []
     for wrap in (lambda env: env, capture.Captured):
         env = wrap(names["Rover"](n_envs=16, device="cuda", limit=10))

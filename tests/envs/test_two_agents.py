@@ -1,4 +1,4 @@
-"""The second half of docs/new-environment.md: its code, and its commands as they are typed."""
+"""docs/new-environment.md, part "Two agents": its code and its commands."""
 
 import json
 import re
@@ -25,7 +25,7 @@ def section():
 
 @pytest.fixture
 def convoy(section, tmp_path, monkeypatch):
-    """The page's class, from a file in the current folder."""
+    """The page's class, imported from a file in the current folder."""
     (code,) = re.findall(r"```python\n(.*?)```", section, re.S)
     (tmp_path / "convoy.py").write_text(code)
     monkeypatch.chdir(tmp_path)
@@ -37,28 +37,28 @@ def convoy(section, tmp_path, monkeypatch):
     del sys.modules["convoy"]
 
 
-def test_the_commands_train_evaluate_and_record(section, convoy, tmp_path, capsys):
+def test_commands_train_evaluate_and_record(section, convoy, tmp_path, capsys):
     pytest.importorskip("av")
     commands = re.findall(r"^python (\S+\.py) (.*)$", section, re.M)
     assert [script for script, _ in commands] == list(MAINS)
     for script, words in commands:
         assert MAINS[script](shlex.split(words)) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     (run,) = (path for path in (tmp_path / "runs").iterdir() if path.is_dir())
     last = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
     for name in ("return", "together"):
-        own = [last[f"episode/{name}/{role}"] for role in ("leader", "follower")]
-        assert last[f"episode/{name}"] == pytest.approx(sum(own) / 2)
+        by_role = [last[f"episode/{name}/{role}"] for role in ("leader", "follower")]
+        assert last[f"episode/{name}"] == pytest.approx(sum(by_role) / 2)
     (table,) = (run / "evaluations").glob("*.json")
     rows = json.loads(table.read_text())["rows"]
     assert [row.get("role") for row in rows] == 2 * [None, "leader", "follower"]
     assert rows[1]["metrics"]["together"] == rows[2]["metrics"]["together"]
-    assert "trained: follower" in said and "together" in said
+    assert "trained: follower" in output and "together" in output
     assert (run / "video.mp4").stat().st_size > 1000
 
 
 @pytest.mark.parametrize("scripted", [False, True])
-def test_a_convoy_pays_the_leader_metres_and_the_follower_nearness(convoy, scripted):
+def test_convoy_rewards_the_leader_for_metres_and_the_follower_for_closeness(convoy, scripted):
     env = convoy(16, device="cpu", limit=20, scripted=scripted)
     worlds = contract.rollout(env, 60)
     leader, follower = torch.stack([w.reward for w in worlds[:21]]).unflatten(1, (16, 2)).sum(0).T
@@ -66,13 +66,13 @@ def test_a_convoy_pays_the_leader_metres_and_the_follower_nearness(convoy, scrip
     assert last.truncated.all() and last.learns.tolist() == 16 * [not scripted, True]
     torch.testing.assert_close(last.metrics.together[::2], follower / 0.1 / 20)
     assert last.metrics.together.max() > last.metrics.together.min()
-    assert leader.min() > 0 and leader.max() < 20 * 0.4, "at most 4 m/s, a tenth of a second"
+    assert leader.min() > 0 and leader.max() < 20 * 0.4, "at most 4 m/s for 0.1 s"
     assert plotting.rasterise(env.plot_state(arrdict.numpyify(env.state(1)))).std() > 5
 
 
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_a_convoy_is_captured(convoy):
+def test_convoy_runs_as_a_cuda_graph(convoy):
     runs = []
     for wrap in (lambda env: env, capture.Captured):
         env = wrap(convoy(16, device="cuda", limit=10, scripted=True))
@@ -80,29 +80,29 @@ def test_a_convoy_is_captured(convoy):
     assert isinstance(env._step, capture.Graph) and contract.same(*runs)
 
 
-def test_what_a_scripted_leader_meets_changes_no_bit_of_the_weights(convoy, monkeypatch):
-    """Its rewards and what it sees are replaced; it neither learns nor is counted."""
-    as_it_is = convoy._world
+def test_rewards_and_observations_of_a_scripted_leader_do_not_change_the_weights(
+    convoy, monkeypatch
+):
+    original = convoy._world
 
     def altered(self, reset, driven):
-        world, leads = as_it_is(self, reset, driven), self.role == 0
+        world, leads = original(self, reset, driven), self.role == 0
         world["reward"] = torch.where(leads & ~reset, -7.0, world.reward)
         world.obs.rgb[leads], world.obs.imu[leads] = 0.3, 2.0
         return world
 
     weights = []
-    for name, method in {"as-it-is": as_it_is, "altered": altered}.items():
+    for name, method in {"original": original, "altered": altered}.items():
         monkeypatch.setattr(convoy, "_world", method)
         words = ["env=convoy:Convoy", "env.scripted=true", "env.limit=20", "geometry=box"]
         words += ["env.n_envs=8", "samples=1000", "device=cpu", f"folder={name}", *SMALL]
         assert train.main(words) == 0
         weights.append(checkpoint.load_latest(Path(name) / "checkpoints").state["policy"])
         rows = [json.loads(line) for line in Path(name, "metrics.jsonl").read_text().splitlines()]
-        told = [row for row in rows if row["episode/count"]]
-        assert told and all(
-            row["episode/return"] == row["episode/return/follower"] >= 0 for row in told
-        )
-        assert not any("episode/return/leader" in row for row in told)
+        rows = [row for row in rows if row["episode/count"]]
+        assert rows
+        assert all(row["episode/return"] == row["episode/return/follower"] >= 0 for row in rows)
+        assert not any("episode/return/leader" in row for row in rows)
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
 
 
@@ -114,23 +114,20 @@ ALTERED = """
         world.metrics["together"] = world.metrics.together{}
         return world
 """
-METRIC = "metric together has one float32 per lane, (8,), on the environment's device, not torch."
+METRIC = "metrics.together must be torch.float32 (8,) on cpu, not torch."
 FAULTS = {
     "column": (ALTERED.format("[:, None]"), METRIC + "float32 (8, 1)"),
     "integers": (ALTERED.format(".int()"), METRIC + "int32 (8,)"),
-    "roles": (
-        "    roles = ('leader',)",
-        "roles has one name per agent of an environment, 2 in all, not ('leader',)",
-    ),
+    "roles": ("    roles = ('leader',)", "one name per agent, 2 in all, not ('leader',)"),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_metric_or_roles_that_do_not_fit_are_one_sentence(convoy, fault, tmp_path, capsys):
+def test_a_wrong_metric_or_role_is_one_line(convoy, fault, tmp_path, capsys):
     body, clause = FAULTS[fault]
     code = f"import convoy\n\n\nclass Wrong(convoy.Convoy):\n{body}\n"
     (tmp_path / f"wrong_{fault}.py").write_text(code)
     assert train.main([f"env=wrong_{fault}:Wrong", "geometry=box", *SMALL, "device=cpu"]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and f"Wrong breaks the contract: {clause}" in said
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "Wrong breaks the contract: " in line and clause in line
     assert not list(tmp_path.glob("runs/*/"))

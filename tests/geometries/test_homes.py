@@ -1,4 +1,4 @@
-"""Homes: the generator's parts, what homes are like, and the database of ready ones."""
+"""Homes: the parts of their generator, statistics of homes, and the database of the package."""
 
 import hashlib
 import math
@@ -20,6 +20,7 @@ from megastep.geometries.homes import (
     portable_generator,
     regions,
 )
+from megastep.geometries.homes.portable_generator import PortableGenerator
 from scripts import check_homes, make_homes, show_homes
 
 matplotlib.use("Agg")
@@ -29,61 +30,52 @@ L_SHAPE = [(0, 0, 400, 600), (400, 0, 700, 250)]  # centimetres
 
 
 @pytest.fixture(scope="module")
-def made():
-    """Sixty homes fresh from the portable_generator."""
+def generated():
+    """Sixty generated homes."""
     return [homes.generate(seed) for seed in range(60)]
 
 
 @pytest.fixture(scope="module")
-def ready():
-    """All the homes that come with the package."""
+def packaged():
+    """All homes of the package."""
     return [database.home(index) for index in range(database.COUNT)]
 
 
-def test_random_numbers_are_those_of_splitmix64():
-    # The first outputs of the published generator from state 0, which is `mixed` of multiples of
-    # its increment.
-    outputs = [
-        portable_generator.mixed(k * portable_generator.GOLDEN & portable_generator.MASK)
-        for k in (1, 2, 3)
-    ]
+def test_numbers_equal_published_splitmix64():
+    # the first outputs of the published generator from state 0
+    states = [k * portable_generator.GOLDEN & portable_generator.MASK for k in (1, 2, 3)]
+    outputs = [portable_generator.mixed(state) for state in states]
     assert outputs == [0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F]
 
 
-def test_random_numbers_differ_between_seeds_and_not_between_runs():
-    assert portable_generator.PortableGenerator(5).bits() == 0x4000795F8E33B2A8
-    assert (
-        len({portable_generator.PortableGenerator(seed).bits() for seed in range(-100, 1000)})
-        == 1100
-    )
+def test_numbers_depend_on_the_seed_only():
+    assert PortableGenerator(5).bits() == 0x4000795F8E33B2A8
+    assert len({PortableGenerator(seed).bits() for seed in range(-100, 1000)}) == 1100
 
 
-def test_exp_is_the_exponential():
+def test_exp():
     for x in np.linspace(-19, 19, 77):
         assert portable_generator.exp(float(x)) == pytest.approx(math.exp(x), rel=1e-11)
 
 
-def test_random_numbers_have_the_moments_they_claim():
-    stream, n = portable_generator.PortableGenerator(1), 20_000
-    uniform, normal = (
-        np.array([draw() for _ in range(n)]) for draw in (stream.uniform, stream.normal)
-    )
+def test_distributions_have_the_right_moments():
+    generator, n = PortableGenerator(1), 20_000
+    uniform = np.array([generator.uniform() for _ in range(n)])
+    normal = np.array([generator.normal() for _ in range(n)])
     error = 4 / np.sqrt(n)  # four standard errors
     assert abs(uniform.mean() - 0.5) < error * 12**-0.5 and 0 <= uniform.min() and uniform.max() < 1
     assert abs(normal.mean()) < error and abs(normal.var() - 1) < error * 2**0.5
-    picks = np.bincount([stream.pick([1, 0, 3]) for _ in range(n)], minlength=3) / n
+    picks = np.bincount([generator.pick([1, 0, 3]) for _ in range(n)], minlength=3) / n
     assert picks[1] == 0 and abs(picks[2] - 0.75) < error * 0.433
-    assert {stream.between(2, 4) for _ in range(100)} == {2, 3, 4}
+    assert {generator.between(2, 4) for _ in range(100)} == {2, 3, 4}
 
 
-def test_regions_of_an_l():
+def test_regions_of_an_l_shape():
     assert regions.area(L_SHAPE) == 400 * 600 + 300 * 250
     assert regions.bounds(L_SHAPE) == (0, 0, 700, 600)
     assert regions.narrowest(L_SHAPE) == 250
     assert regions.widest(L_SHAPE) == (0, 0, 400, 600)
-    assert regions.corners(L_SHAPE, 0) == {
-        400: 1
-    }  # beyond x = 400 there is less: outdoors is above the line
+    assert regions.corners(L_SHAPE, 0) == {400: 1}, "outdoors is beyond x = 400"
     assert regions.corners(L_SHAPE, 1) == {250: 1}
     lower, upper = regions.cut(L_SHAPE, 1, 300)
     assert lower == [(0, 0, 400, 300), (400, 0, 700, 250)] and upper == [(0, 300, 400, 600)]
@@ -97,18 +89,18 @@ def test_regions_of_an_l():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_partition_covers_its_footprint_once(seed):
-    stream = portable_generator.PortableGenerator(seed)
+    generator = PortableGenerator(seed)
     for _ in range(60):
-        rooms = plan.programme(7, stream)
-        footprint = plan.footprint(sum(size for _, size in rooms), stream)
+        rooms = plan.programme(7, generator)
+        footprint = plan.footprint(sum(size for _, size in rooms), generator)
         try:
-            laid, _ = partition.partition(footprint, rooms, stream)
+            placed, _ = partition.partition(footprint, rooms, generator)
             break
         except partition.Failure:
             pass
-    assert sorted(room.kind for room in laid) == sorted(kind for kind, _ in rooms)
-    assert sum(regions.area(room.region) for room in laid) == regions.area(footprint)
-    pieces = [r for room in laid for r in room.region]
+    assert sorted(room.kind for room in placed) == sorted(kind for kind, _ in rooms)
+    assert sum(regions.area(room.region) for room in placed) == regions.area(footprint)
+    pieces = [r for room in placed for r in room.region]
     for i, a in enumerate(pieces):
         assert any(
             f[0] <= a[0] and f[1] <= a[1] and f[2] >= a[2] and f[3] >= a[3] for f in footprint
@@ -117,7 +109,7 @@ def test_a_partition_covers_its_footprint_once(seed):
             assert min(a[2], b[2]) <= max(a[0], b[0]) or min(a[3], b[3]) <= max(a[1], b[1])
 
 
-def test_contacts_are_the_walls_between_rooms():
+def test_contacts():
     rooms = [
         partition.Room("living", [(0, 0, 400, 600)]),
         partition.Room("bath", [(400, 0, 700, 250)]),
@@ -130,42 +122,41 @@ def test_contacts_are_the_walls_between_rooms():
     ]
 
 
-def test_a_home_depends_on_its_seed_alone():
-    alone = homes.generate(7)
+def test_a_home_is_determined_by_its_seed():
+    first = homes.generate(7)
     homes.generate(3)
-    again = homes.generate(7)
-    assert alone.keys() == again.keys() and all(
-        np.array_equal(alone[key], again[key]) for key in alone
-    )
+    second = homes.generate(7)
+    assert first.keys() == second.keys()
+    assert all(np.array_equal(first[key], second[key]) for key in first)
 
 
-def test_homes_are_the_same_bytes_on_any_machine(made):
+def test_bytes_of_homes_are_unchanged(generated):
     digest = hashlib.sha256()
-    for g in made:
+    for g in generated:
         for values, dtype in (g.walls, "<f4"), (g.lights, "<f4"), (g.masks, "<i2"):
             digest.update(values.astype(dtype).tobytes())
     assert digest.hexdigest() == "e5d40bf46ffaf368ed89de69fd7c6b18c8665457b7d8df80dcca074e81a5a926"
 
 
-def test_the_ready_homes_are_the_generated_ones(made):
-    for g in [*made[::6], homes.generate(4999)]:
+def test_packaged_homes_equal_generated_ones(generated):
+    for g in [*generated[::6], homes.generate(4999)]:
         stored = database.home(g.id)
         for key, value in stored.items():
             assert np.array_equal(value, g[key]), (g.id, key)
             assert getattr(value, "dtype", None) == getattr(g[key], "dtype", None)
 
 
-def test_every_fresh_home_passes_the_checks(made):
-    assert [(g.id, error) for g in made for error in check_homes.errors(g)] == []
+def test_generated_homes_pass_the_checks(generated):
+    assert [(g.id, error) for g in generated for error in check_homes.errors(g)] == []
 
 
-def test_ready_homes_pass_the_checks(ready):
-    assert [(g.id, error) for g in ready[::50] for error in check_homes.errors(g)] == []
+def test_packaged_homes_pass_the_checks(packaged):
+    assert [(g.id, error) for g in packaged[::50] for error in check_homes.errors(g)] == []
 
 
 @pytest.mark.slow
-def test_all_ready_homes_pass_the_checks(ready):
-    assert [(g.id, error) for g in ready for error in check_homes.errors(g)] == []
+def test_all_packaged_homes_pass_the_checks(packaged):
+    assert [(g.id, error) for g in packaged for error in check_homes.errors(g)] == []
 
 
 def open_envelope(g):
@@ -174,15 +165,15 @@ def open_envelope(g):
     g.masks[:i, j] = 0
 
 
-def shut(g, width):
-    """Narrows everything to `width` in the middle of a 3 m wide, 6 m long room."""
+def bottleneck(width):
+    """Walls that leave a gap of `width` in the middle of `room()`."""
     return np.array(
         [[[1.0, 4.0], [2.5 - width / 2, 4.0]], [[2.5 + width / 2, 4.0], [4.0, 4.0]]], np.float32
     )
 
 
 def room(walls=None):
-    """A plain room, 3 m by 6 m, as a home with two rooms that its walls may part."""
+    """A home of 3 m x 6 m with two rooms, which further walls may separate."""
     corners = np.array([[1, 1], [4, 1], [4, 7], [1, 7]], np.float32)
     outline = np.stack([corners, np.roll(corners, -1, 0)], 1)
     lines = outline if walls is None else np.concatenate([outline, walls])
@@ -197,12 +188,12 @@ def room(walls=None):
     )
 
 
-def test_the_checks_know_a_passage_from_a_wall():
-    assert check_homes.errors(room()) == [] and check_homes.errors(room(shut(room(), 0.6))) == []
-    assert check_homes.errors(room(shut(room(), 0.4))) == [
-        "a disc as wide as the least gap cannot reach every room"
-    ]
-    assert check_homes.errors(room(shut(room(), 0.1)))[0] == "an agent cannot reach every room"
+def test_checks_find_narrow_passages():
+    assert check_homes.errors(room()) == check_homes.errors(room(bottleneck(0.6))) == []
+    (error,) = check_homes.errors(room(bottleneck(0.4)))
+    assert "narrowest gap" in error and "every room" in error
+    first, *_ = check_homes.errors(room(bottleneck(0.1)))
+    assert "agent" in first and "every room" in first
 
 
 @pytest.mark.parametrize(
@@ -231,22 +222,20 @@ def test_the_checks_know_a_passage_from_a_wall():
         ("a light is in a wall", lambda g: g.lights.__setitem__((0, 0), 1.04)),
     ],
 )
-def test_the_checks_see(error, change):
+def test_checks_find(error, change):
     g = room()
     change(g)
-    assert any(error in found for found in check_homes.errors(g)), check_homes.errors(g)
+    assert any(error in message for message in check_homes.errors(g)), check_homes.errors(g)
 
 
-def test_components_are_those_of_a_flood_fill():
+def test_components_equal_a_flood_fill():
     free = np.random.default_rng(0).random((40, 50)) < 0.6
     labels, count = check_homes.components(free)
     flooded = np.where(free, np.arange(1, free.size + 1).reshape(free.shape), 0)
     for _ in range(free.size):
         far = np.pad(flooded, 1)
-        spread = (
-            np.max([flooded, far[:-2, 1:-1], far[2:, 1:-1], far[1:-1, :-2], far[1:-1, 2:]], 0)
-            * free
-        )
+        shifted = far[:-2, 1:-1], far[2:, 1:-1], far[1:-1, :-2], far[1:-1, 2:]
+        spread = np.max([flooded, *shifted], 0) * free
         if (spread == flooded).all():
             break
         flooded = spread
@@ -255,109 +244,99 @@ def test_components_are_those_of_a_flood_fill():
     assert ((labels > 0) == free).all()
 
 
-def test_rooms_are_where_the_generator_says(made):
-    for g in made:
+def test_masks_agree_with_rooms_and_areas(generated):
+    for g in generated:
         assert g.masks.max() == len(g.rooms) == len(g.lights) == len(g.areas)
         assert set(plan.CORE[: len(g.rooms)]) <= set(g.rooms)
         cells = np.bincount(g.masks[g.masks > 0])[1:] * g.res**2
-        assert (
-            cells <= np.array(g.areas) + 0.05 * np.sqrt(g.areas) * 4
-        ).all()  # walls take cells that are partly floor
+        # walls take cells that are partly floor
+        assert (cells <= np.array(g.areas) + 0.05 * np.sqrt(g.areas) * 4).all()
         assert all(0.6 <= width <= 0.95 for width in g.doors)
 
 
-def test_no_outer_face_without_the_rest_changing(made):
-    for g in made[:5]:
+def test_leaving_out_the_outer_face_changes_nothing_else(generated):
+    for g in generated[:5]:
         inner, stored = homes.generate(g.id, outer=False), database.home(g.id, outer=False)
         whole = database.home(g.id)
         assert len(inner.walls) == len(g.walls) - g.n_outer == len(stored.walls)
         for other in inner, stored:
-            assert (other.walls == whole.walls[: -g.n_outer]).all() and (
-                other.masks == whole.masks
-            ).all()
+            assert (other.walls == whole.walls[: -g.n_outer]).all()
+            assert (other.masks == whole.masks).all()
             assert other.n_outer == 0 and (other.lights == whole.lights).all()
 
 
-def test_some_corners_are_slanted(ready):
-    slanted = [g for g in ready if (g.walls[:, 0] != g.walls[:, 1]).all(-1).any()]
-    assert 0.05 < len(slanted) / len(ready) < 0.12
+def test_some_corners_are_slanted(packaged):
+    slanted = [g for g in packaged if (g.walls[:, 0] != g.walls[:, 1]).all(-1).any()]
+    assert 0.05 < len(slanted) / len(packaged) < 0.12
     lines = slanted[0].walls
     spans = np.abs(lines[:, 1] - lines[:, 0])
     diagonal = spans[(spans > 0).all(-1)]
     assert len(diagonal) == 2 and np.allclose(diagonal[:, 0], diagonal[:, 1])
     a, b = lines[(spans > 0).all(-1)]
     normal = (b[1] - b[0])[::-1] * [1, -1] / np.linalg.norm(b[1] - b[0])
-    assert (
-        abs(abs((a[0] - b[0]) @ normal) - np.array([0.20, 0.24, 0.30])).min() < 0.011
-    )  # the envelope's thickness, to 1 cm
+    thickness = abs((a[0] - b[0]) @ normal)
+    assert abs(thickness - np.array([0.20, 0.24, 0.30])).min() < 0.011, "to 1 cm"
 
 
-def test_ready_homes_are_like_real_ones(ready):
-    lengths = [np.linalg.norm(g.walls[:, 1] - g.walls[:, 0], axis=-1).sum() for g in ready]
+def test_statistics_of_packaged_homes(packaged):
+    lengths = [np.linalg.norm(g.walls[:, 1] - g.walls[:, 0], axis=-1).sum() for g in packaged]
     values = {
-        "walls": [len(g.walls) for g in ready],
+        "walls": [len(g.walls) for g in packaged],
         "wall length, m": lengths,
-        "long side, m": [np.ptp(g.walls, axis=(0, 1)).max() for g in ready],
-        "rooms": [g.masks.max() for g in ready],
+        "long side, m": [np.ptp(g.walls, axis=(0, 1)).max() for g in packaged],
+        "rooms": [g.masks.max() for g in packaged],
     }
     bands = [band for band in make_homes.BANDS if band[0] in values]
     assert len(bands) == 7
     assert make_homes.outside(values, bands) == []
 
 
-def test_fresh_homes_are_like_real_ones(made):
-    medians = [
-        band for band in make_homes.BANDS if band[1] == 50
-    ]  # sixty homes have no 95 % quantile to speak of
-    assert make_homes.outside(make_homes.statistics(made), medians) == []
+def test_statistics_of_generated_homes(generated):
+    medians = [band for band in make_homes.BANDS if band[1] == 50]  # 60 homes are few for a 95 %
+    assert make_homes.outside(make_homes.statistics(generated), medians) == []
 
 
 @pytest.mark.slow
-def test_a_thousand_homes_are_like_real_ones_and_quickly_made():
+def test_statistics_of_a_thousand_homes_generated_in_seconds():
     start = time.process_time()
-    made = [homes.generate(seed) for seed in range(10_000, 11_000)]
-    assert time.process_time() - start < 20  # seconds: 20 ms a home on one core
-    assert make_homes.outside(make_homes.statistics(made), make_homes.BANDS) == []
+    plans = [homes.generate(seed) for seed in range(10_000, 11_000)]
+    assert time.process_time() - start < 20  # seconds: 20 ms per home on one core
+    assert make_homes.outside(make_homes.statistics(plans), make_homes.BANDS) == []
 
 
-def test_the_bands_are_there_to_be_missed(made):
-    small = make_homes.statistics([g for g in made if len(g.rooms) < 6])
-    assert any(
-        missed.startswith("rooms: the 50 % quantile")
-        for missed in make_homes.outside(small, make_homes.BANDS)
-    )
+def test_statistics_outside_their_bands_are_named(generated):
+    small = make_homes.statistics([g for g in generated if len(g.rooms) < 6])
+    messages = make_homes.outside(small, make_homes.BANDS)
+    assert any(message.startswith("rooms: the 50 %") for message in messages)
 
 
-def test_no_two_homes_are_the_same(ready):
-    assert len({make_homes.fingerprint(g) for g in ready[:1000] + ready[4500:]}) == 1500
+def test_no_two_homes_are_equal(packaged):
+    assert len({make_homes.fingerprint(g) for g in packaged[:1000] + packaged[4500:]}) == 1500
 
 
 @pytest.mark.slow
-def test_training_and_test_share_no_home(ready):
-    assert len({make_homes.fingerprint(g) for g in ready}) == 5000
+def test_training_and_test_share_no_home(packaged):
+    assert len({make_homes.fingerprint(g) for g in packaged}) == 5000
 
 
-def test_a_turned_home_has_the_same_fingerprint(made):
-    g, other = made[0], made[1]
-    turned = dotdict(
-        g, walls=g.walls[::-1, ::-1, ::-1] * np.float32([-1, 1]) + np.float32([20.05, 3.1])
-    )
-    assert (
-        make_homes.fingerprint(turned) == make_homes.fingerprint(g) != make_homes.fingerprint(other)
-    )
-    assert (
-        make_homes.similarity([g, turned, other])[:2].min() > 0.8
-    )  # cells are 30 cm and it moved by 5
+def test_a_turned_home_has_the_same_fingerprint(generated):
+    g, other = generated[:2]
+    walls = g.walls[::-1, ::-1, ::-1] * np.float32([-1, 1]) + np.float32([20.05, 3.1])
+    turned = dotdict(g, walls=walls)
+    assert make_homes.fingerprint(turned) == make_homes.fingerprint(g)
+    assert make_homes.fingerprint(turned) != make_homes.fingerprint(other)
+    nearest = make_homes.similarity([g, turned, other])
+    assert nearest[:2].min() > 0.8, "not 1: it moved by 5 cm, cells are 30 cm"
 
 
-def test_few_homes_are_nearly_the_same(ready):
-    nearest = make_homes.similarity(ready[:400])
+def test_few_homes_are_nearly_equal(packaged):
+    nearest = make_homes.similarity(packaged[:400])
     assert np.median(nearest) <= 0.60 and (nearest > 0.9).mean() <= 0.005
 
 
 @pytest.mark.slow
-def test_few_of_a_thousand_homes_are_nearly_the_same(ready):
-    nearest = make_homes.similarity(ready[4000:])
+def test_few_of_a_thousand_homes_are_nearly_equal(packaged):
+    nearest = make_homes.similarity(packaged[4000:])
     assert np.median(nearest) <= 0.60 and (nearest > 0.9).mean() <= 0.005
 
 
@@ -370,32 +349,30 @@ def test_a_damaged_database_is_named(tmp_path):
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     database._arrays.cache_clear()
-    with pytest.raises(ValueError, match="homes.npz' are damaged .*; install megastep again"):
+    with pytest.raises(ValueError, match="homes.npz' are damaged .*install megastep again"):
         database.home(4, path=path)
     path.with_suffix(".sha256").unlink()
     with pytest.raises(ValueError, match="homes.npz' cannot be read"):
         database.home(5, path=path)
 
 
-def test_a_written_database_reads_back(tmp_path, made):
-    path = tmp_path / "homes.npz"
-    digest = make_homes.write(made[:3], path)
+def test_a_written_database_can_be_read(tmp_path, generated):
+    path, plans = tmp_path / "homes.npz", generated[:3]
+    digest = make_homes.write(plans, path)
     assert path.with_suffix(".sha256").read_text() == f"{digest}  homes.npz\n"
-    assert (
-        hashlib.sha256(path.read_bytes()).hexdigest() == digest == make_homes.write(made[:3], path)
-    )
-    for index, g in enumerate(made[:3]):
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == digest
+    assert make_homes.write(plans, path) == digest, "equal homes give equal bytes"
+    for index, g in enumerate(plans):
         stored = database.home(index, path=path)
         assert all(np.array_equal(stored[key], g[key]) for key in stored)
 
 
-def test_make_homes_prints_what_homes_are_like(monkeypatch, capsys):
+def test_make_homes_prints_statistics(monkeypatch, capsys):
     monkeypatch.setattr(make_homes, "BANDS", [("rooms", 50, 7, 10)])
     make_homes.main(["--count", "20", "--dry"])
-    printed = capsys.readouterr().out
-    assert (
-        "20 homes" in printed and "20 different plans" in printed and "all checks passed" in printed
-    )
+    output = capsys.readouterr().out
+    assert "20 homes" in output and "20 different plans" in output
+    assert "all checks passed" in output
 
 
 def test_show_homes_draws_every_home():

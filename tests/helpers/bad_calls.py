@@ -1,11 +1,12 @@
-"""Calls of the engine's and the scenery's public functions with one argument or buffer wrong each:
-dtype, shape, layout in memory, device, None, other types, numbers out of range, buffers that were
-replaced or resized. Run as a script it makes them all, so that a crash of the interpreter can be
-told by the last line printed:
+"""Calls of public engine functions with one wrong argument or buffer each: dtype, shape, memory
+layout, device, None, other types, numbers out of range, buffers that were replaced or resized.
 
-    python tests/bad_calls.py cpu
+Run as a script, it makes them all and prints each first, so a crash of the interpreter shows its
+call:
 
-Axes: N environments, A agents, D layouts.
+    python tests/helpers/bad_calls.py cpu
+
+N environments, A agents, D layouts.
 """
 
 import json
@@ -18,7 +19,7 @@ import torch
 
 from megastep import core, cuda, engine, modules, scene, toys
 from megastep.engine.scenery import Layouts, Scenery
-from megastep.envs.deathmatch.step import deathmatch_step
+from megastep.envs.deathmatch.step import TALLY_ROWS, deathmatch_step
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
 from megastep.envs.pong.step import GAME_FIELDS, PIXELS, pong_step
@@ -29,7 +30,7 @@ N, A, D = 3, 2, 2
 
 
 def fixture(device):
-    """Small environments in which every call below succeeds as it is."""
+    """Small environments in which every call below succeeds with its right arguments."""
     scenery = scene.scenery([toys.box(), toys.column()], A, N, device=device)
     c = core.Core(scenery, res=16, cameras=[0, 180])
     c.agents.positions[:] = torch.tensor([[2.0, 3.0], [3.0, 2.0]])
@@ -62,19 +63,19 @@ def fixture(device):
             device=scenery.device,
         ),
         numbers=torch.zeros(N * A, dtype=torch.int32, device=device),
-        journey=torch.zeros((PROGRESS_ROWS, N * A), device=device),
+        progress=torch.zeros((PROGRESS_ROWS, N * A), device=device),
         free=torch.ones((N, A), device=device),
         pixels=torch.zeros((N, 1, 1, *PIXELS), dtype=torch.uint8, device=device),
-        one_eyed=(one_eyed := core.Core(scenery, res=16)).agents,
-        view=engine.observe(scenery, one_eyed.agents, centre_line=True, agent_ray=True),
+        one_camera=(one_camera := core.Core(scenery, res=16)).agents,
+        view=engine.observe(scenery, one_camera.agents, centre_line=True, agent_ray=True),
         health=torch.ones(N * A, device=device),
-        tally=torch.zeros((3, N * A), device=device),
+        tally=torch.zeros((TALLY_ROWS, N * A), device=device),
         ages=torch.zeros(N * A, dtype=torch.int32, device=device),
         ended=torch.zeros(N * A, dtype=torch.bool, device=device),
     )
 
 
-# ---- Wrong values, by what is right: (label, value) ----
+# ---- Wrong values, (label, value) each, for a right value ----
 
 
 def not_tensors(good):
@@ -82,7 +83,7 @@ def not_tensors(good):
 
 
 def wrong_tensors(good):
-    """What is not a contiguous tensor of that dtype and shape on that device."""
+    """Tensors that are not contiguous, or differ in dtype, shape or device."""
     for dtype in (
         torch.float64,
         torch.float16,
@@ -118,7 +119,7 @@ def optional_tensors(good):
 
 
 def arrays(good):
-    """What is not an array of finite numbers of that shape; any dtype of real numbers is right."""
+    """Values that are not an array of finite real numbers of that shape. Any real dtype is fine."""
     yield from [("None", None), ("a string", "text"), ("a number", 3.5), ("words", ["a", "b"])]
     yield "an axis more", good[None]
     yield "an axis less", good[0]
@@ -185,7 +186,7 @@ def ids(good):
     yield from [("none", good[:0]), ("huge", good.long() + 2**40)]
 
 
-# ---- The calls: function, its right arguments, and what is wrong for each ----
+# ---- The calls: function, right arguments, and the wrong values of each ----
 
 OPERANDS = dict(scenery=objects, agents=objects)
 
@@ -234,7 +235,7 @@ def operations(f):
             counts=f.counts,
             seed=1,
             resample=True,
-            chosen=f.counts,
+            point_index=f.counts,
         ),
         dict(
             OPERANDS,
@@ -244,7 +245,7 @@ def operations(f):
             seed=lambda good: [*integers(0)(good)][:6],
             resample=flags,
             hidden=flags,
-            chosen=optional_tensors,
+            point_index=optional_tensors,
         ),
     )
     yield (
@@ -252,31 +253,31 @@ def operations(f):
         dict(
             both,
             goals=f.goals,
-            chosen=f.numbers,
-            journey=f.journey,
+            goal_index=f.numbers,
+            progress=f.progress,
             ages=f.ages,
             ended=f.ended,
-            draws=f.numbers,
-            spawned=f.counts,
+            n_draws=f.numbers,
+            spawn_index=f.counts,
             free=f.free,
             seed=1,
         ),
         dict(
             OPERANDS,
             goals=objects,
-            chosen=tensors,
-            journey=tensors,
+            goal_index=tensors,
+            progress=tensors,
             ages=tensors,
             ended=tensors,
-            draws=tensors,
-            spawned=tensors,
+            n_draws=tensors,
+            spawn_index=tensors,
             free=optional_tensors,
             seed=lambda good: [*integers(0)(good)][:6],
             reach=numbers(),
             bonus=numbers(),
             cost=numbers(),
             limit=lambda good: integers(1, 2**31 - 1)(1),
-            told=flags,
+            privileged=flags,
         ),
     )
     yield (
@@ -302,18 +303,18 @@ def operations(f):
     yield (
         deathmatch_step,
         dict(
-            scenery=f.scenery, agents=f.one_eyed, view=f.view, health=f.health, tally=f.tally,
-            ages=f.ages, ended=f.ended, limit=9, aim_reward=1.0, told=True,
+            scenery=f.scenery, agents=f.one_camera, view=f.view, health=f.health, tally=f.tally,
+            ages=f.ages, ended=f.ended, limit=9, aim_reward=1.0, privileged=True,
         ),
         dict(
             OPERANDS,
             view=views,
             **dict.fromkeys(("health", "tally", "ages", "ended"), tensors),
-            **dict.fromkeys(("damage", "recovery", "drain", "spoils"), numbers(-0.1)),
+            **dict.fromkeys(("damage", "recovery", "drain", "health_per_hit"), numbers(-0.1)),
             **dict.fromkeys(("hit_reward", "wound_cost", "kill_reward", "death_cost"), numbers()),
             aim_reward=numbers(),
             limit=lambda good: integers(1, 2**31 - 1)(1),
-            told=flags,
+            privileged=flags,
         ),
     )  # fmt: skip
     yield (
@@ -437,7 +438,7 @@ BUFFERS = {
 
 
 def replacements(device):
-    """(label, name, act): an attribute is set to something wrong, and a call follows."""
+    """(label, name, act): sets an attribute to a wrong value and makes a call."""
     f = fixture(device)
     for name in STATE:
         for label, value in tensors(getattr(f.agents, name)):
@@ -468,9 +469,7 @@ def _set(owner, name, value, call):
 
 
 def resizings(device):
-    """(label, name, act): after a good call a buffer's own memory is exchanged, and a call
-    follows.
-    """
+    """(label, name, act): exchanges a buffer's memory between two calls."""
 
     def between_calls(change):
         return lambda f: (CALLS["render"](f), change(f), CALLS["render"](f))
@@ -536,7 +535,7 @@ def others(device):
 
 
 def wrong_arguments(device):
-    """(label, name, act) of every call with every argument wrong in every way."""
+    """(label, name, act) of every call with every wrong value of every argument."""
     for table in (operations, constructors):
         for i, (function, right, wrong) in enumerate(table(fixture(device))):
             title = function.__qualname__
@@ -560,11 +559,13 @@ def cases(device):
 
 
 def verdict(name, act, f):
-    """What is wrong with how a call ended, or None: it must name its argument (or the mask, which
-    must be as long as counts) and change nothing; where there is no name, it must succeed.
+    """Returns what is wrong with a call's outcome, or None.
+
+    The call must raise an error that names the argument `name`, and leave the agents unchanged.
+    Without a name, it must succeed. `uniform` compares counts and mask and may name either.
     """
     before = [getattr(f.agents, state).clone() for state in STATE]
-    held = [getattr(f.agents, state) for state in STATE]
+    tensors_before = [getattr(f.agents, state) for state in STATE]
     try:
         act(f)
     except ALLOWED as error:
@@ -572,7 +573,7 @@ def verdict(name, act, f):
             return f"refused: {error}"
         if name not in str(error) and not (name == "counts" and "mask" in str(error)):
             return f"{type(error).__name__} does not name {name}: {error}"
-        if not all(map(torch.equal, before, held)):
+        if not all(map(torch.equal, before, tensors_before)):
             return "refused, but the agents have changed"
         return None
     except Exception as error:
@@ -584,10 +585,10 @@ def main(device):
     torch.set_num_threads(1)
     for label, name, act in cases(device):
         print(json.dumps(dict(call=label)), flush=True)
-        found = verdict(name, act, fixture(device))
+        problem = verdict(name, act, fixture(device))
         if device != "cpu":
             torch.cuda.synchronize()
-        print(json.dumps(dict(call=label, wrong=found)), flush=True)
+        print(json.dumps(dict(call=label, wrong=problem)), flush=True)
 
 
 if __name__ == "__main__":

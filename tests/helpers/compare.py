@@ -1,10 +1,10 @@
-"""Compares what an engine computed with the twin, field by field, and names the place that differs
+"""Compares an engine's outputs with the twin, field by field, and names the element that differs
 most.
 
-The engine works in float32, so a ray that passes a wall's end by a micrometre may fairly miss it,
-and a disc that grazes one may fairly slip by. Nothing is excused by counting, though: an answer is
-right if it follows from the laws for inputs within SLACK of the given ones, and every answer must
-be. Golden data is judged by its own tolerances.
+The engine computes in float32, so a ray may miss a wall that it hits by a micrometre, and a disc
+may slip past a wall that it grazes. Such cases are not excused by counting them: an output is
+correct if the twin gives it for inputs within SLACK of the actual ones, and every output must be.
+Golden data has its own tolerances.
 """
 
 import math
@@ -13,30 +13,28 @@ import torch
 
 from tests.helpers import random_scenery, twin
 
-COORDINATE_SLACK = (
-    3e-7  # of the largest coordinate: two roundings of float32 when an agent's lines are placed
-)
-ANGLE_SLACK = (
-    1e-6  # radians: sine, cosine and degrees-to-radians in float32, and a pixel's direction
-)
-TIE = 1e-4  # of the distance: walls this close to each other may be taken for one another
-# of 1 + d: some twenty roundings beyond those SLACK speaks of; the law for golden data is 1e-4
+# of the largest coordinate: two float32 roundings when an agent's lines are placed
+COORDINATE_SLACK = 3e-7
+# radians: sine, cosine and degrees-to-radians in float32, and a pixel's direction
+ANGLE_SLACK = 1e-6
+TIE = 1e-4  # of the distance: walls this close to each other may be confused
+# of 1 + d: some twenty roundings beyond those in SLACK; golden data has 1e-4
 DISTANCE = 2e-5
 FRACTION = 2e-5  # the same for locations, dots and progress
-SCREEN = 1e-3  # colours are at most 1; half of what golden data allows
+SCREEN = 1e-3  # colours are at most 1; golden data has twice as much
 LIGHT = 1e-4
 ANGLE = 1e-4  # degrees: three roundings of an angle of 360
 FASTER = 1e-6  # of a step's length, in metres
 
 
 class Report:
-    """Collects each field's worst error in units of its tolerance, and where it was."""
+    """Collects each field's worst error, in units of its tolerance, and its place."""
 
     def __init__(self):
         self.worst = {}
 
     def add(self, field, env, error, tolerance, ours, right, axes):
-        """Notes tensors of one shape whose axes are named; a NaN error is infinitely wrong."""
+        """Adds errors: tensors of one shape with named axes. A NaN error counts as infinite."""
         ratio = (error / tolerance).nan_to_num(nan=math.inf, posinf=math.inf)
         if ratio.numel() and float(ratio.max()) > self.worst.get(field, (-1,))[0]:
             place = [int(i) for i in torch.unravel_index(ratio.argmax(), ratio.shape)]
@@ -59,7 +57,7 @@ class Report:
         )
 
     def check(self):
-        """Raises if a field exceeds its tolerance; returns {field: worst error in units of
+        """Raises AssertionError if a field exceeds its tolerance. Returns {field: worst error /
         tolerance}.
         """
         bad = [
@@ -77,11 +75,11 @@ def double(tree):
 
 
 def meetings(lines, positions, directions, radius):
-    """How rays (A, C, R, 2) from positions (A, 2) meet lines (L, 2, 2) whose ends may be off by
-    SLACK.
+    """Intersects rays (A, C, R, 2) from positions (A, 2) with lines (L, 2, 2) whose ends may be off
+    by SLACK.
 
-    Six (A, C, R, L): certain and possible meetings, their distance and location, and the
-    uncertainty (blur, smear) of these two.
+    Returns six tensors (A, C, R, L): certain hits, possible hits, distance, location, and the
+    uncertainty of these two (blur, smear).
     """
     rays = (directions / directions.norm(dim=-1, keepdim=True))[..., None, :]
     a, b = ((end - positions[:, None])[:, None, None] for end in lines.unbind(1))
@@ -106,8 +104,8 @@ def meetings(lines, positions, directions, radius):
 
 
 def check_hits(report, env, ours, lines, positions, directions, radius):
-    """Indices (A, C, R) must be some that the laws allow; locations, dots, distances those of the
-    lines they name.
+    """Checks that indices (A, C, R) are possible hits, and locations, dots, distances those of
+    these lines.
     """
     certain, possible, distance, location, blur, smear = meetings(
         lines, positions, directions, radius
@@ -156,7 +154,7 @@ def check_render(ours, envs, *, res=64, fov=130.0, cameras=(0.0,), radius=twin.R
     """Checks indices, locations, dots, distances (N, A[, C], R) and screen (N, A[, C], R, 3) of
     `ours`.
 
-    The screen is checked by shading our own hits, so that it is judged on its own. Returns the
+    The expected screen is shaded from our own hits, so that it is checked on its own. Returns the
     worst ratios by field.
     """
     report, ours = Report(), double(ours)
@@ -190,7 +188,7 @@ def check_render(ours, envs, *, res=64, fov=130.0, cameras=(0.0,), radius=twin.R
 
 
 def light_bracket(w, lines):
-    """The least and the most light (T,) that the texels of an environment's lines may have."""
+    """Bounds (T,), (T,) on the light of the texels of an environment's lines."""
     points = twin.texel_positions(lines, w["widths"])
     slack = (
         1e-6
@@ -203,8 +201,8 @@ def light_bracket(w, lines):
 
 
 def check_baked(baked, envs, static_only=True):
-    """Checks the light (T,) of all environments' texels, or of their static ones only; returns the
-    worst ratio.
+    """Checks the light (T,) of all environments' texels, or of static ones only. Returns the worst
+    ratio.
     """
     report, each = Report(), double(dict(baked=baked))["baked"].split(envs.texels().tolist())
     n_lines = envs.n_agents * len(envs.model)
@@ -218,8 +216,8 @@ def check_baked(baked, envs, static_only=True):
 
 
 def check_physics(ours, envs, *, fps=10.0, radius=twin.RADIUS):
-    """Checks progress, positions, angles, velocity, angvelocity (N, A, ...) after a step that began
-    as `envs` says.
+    """Checks progress, positions, angles, velocity, angvelocity (N, A, ...) after a step from
+    `envs`.
     """
     report, ours = Report(), double(ours)
     for e in range(envs.n_envs):
@@ -259,35 +257,22 @@ def check_physics(ours, envs, *, fps=10.0, radius=twin.RADIUS):
 
 # Golden data
 
-# Agents that the original's collision test misjudges by more than golden tolerance;
-# `original_progress` in test_twin.py follows its shortcuts, and gets them all. (case, env, agent):
-# why.
+# Agents that the original's collision test misjudges by more than the golden tolerance;
+# `original_progress` in test_twin.py reproduces all of them. (case, env, agent): why.
 MISJUDGED = {
-    (
-        "home_1_fast",
-        11,
-        0,
-    ): "it backs off from the infinite line of the wall it crosses, here before the wall begins",
-    (
-        "home_4_near",
-        1,
-        1,
-    ): "close to the line of a wall that it reaches late, it is held as if it touched it now",
-    (
-        "home_4_near",
-        1,
-        3,
-    ): "crossing no wall and ending at none, it sinks a tenth of its radius into one midway",
+    ("home_1_fast", 11, 0): "backs off from a wall's infinite line, here before the wall begins",
+    ("home_4_near", 1, 1): "is stopped at once near the line of a wall that it reaches late",
+    ("home_4_near", 1, 3): "sinks into a wall midway, by a tenth of its radius",
 }
 
 
 def golden_errors(case, ours):
-    """{name: (figure, the most it may be)}: shares of values out of tolerance, or mean errors where
-    the name says so.
+    """Returns {name: (figure, maximum)}: fractions of values out of tolerance, or mean errors where
+    named so.
 
-    `ours` holds some of these: `lines` (L, 2, 2) after render, `baked` (T,), the fields of a render
-    (N, A, R[, 3]), and of a step of physics `progress` with the `positions`, `angles`, `velocity`,
-    `angvelocity` after it.
+    `ours` holds some of: `lines` (L, 2, 2) after render; `baked` (T,); the fields of a render (N,
+    A, R[, 3]); `progress` of physics with the `positions`, `angles`, `velocity`, `angvelocity`
+    after it.
     """
     envs, settings, right = random_scenery.golden(case)
     right = {
@@ -348,7 +333,9 @@ def golden_errors(case, ours):
 
 
 def check_golden(case, ours):
-    """Raises, naming the errors, if `ours` misses a golden tolerance; returns the errors."""
+    """Raises AssertionError, naming the errors, if `ours` misses a golden tolerance. Returns all
+    errors.
+    """
     errors = golden_errors(case, ours)
     bad = [
         f"{name}: {figure:.4g}, at most {most:g}"

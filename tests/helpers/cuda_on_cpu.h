@@ -1,7 +1,9 @@
-// What a CUDA kernel of independent threads needs in order to be compiled for a CPU and run one
-// thread after another.
+// Lets a CUDA kernel of independent threads compile for a CPU, where its threads run one after
+// another.
 #include <cmath>
 #include <cstring>
+
+#include "common/constants.h"
 
 #define __device__
 #define __global__

@@ -1,5 +1,5 @@
-"""Deathmatch twice more: who is hit, what it costs and pays, and who is in whose sight, in plain
-Python and NumPy. Slow, obvious, and nothing shared with the kernels.
+"""A twin of Deathmatch in plain Python and NumPy: hits, health, rewards, hidden spawns. Slow and
+obvious, and shares no code with the kernels.
 
 N environments, A agents, M lines of the agent model, W walls.
 """
@@ -8,31 +8,31 @@ import numpy as np
 
 from tests.helpers.pong_twins import philox
 
-ONE, SPENT = np.float32(1), np.float32(1e-4)
+ONE, MIN_HEALTH = np.float32(1), np.float32(1e-4)
 F = np.float32
 
 
-def shots(line, ray, health, tally, ages, ended, *, n_model, res, rules):
-    """A step of one environment: ``line``, ``ray``, ``health``, ``ages``, ``ended`` (A,), ``tally``
-    (3, A), kills, damage, hits. Returns what the engine writes, by name, and the new state.
+def hits_of(line, ray, health, tally, ages, ended, *, n_model, res, rules):
+    """Steps one environment. ``line``, ``ray``, ``health``, ``ages``, ``ended`` are (A,); ``tally``
+    is (3, A): kills, damage, hits. Returns {name: values} of the outputs and the new state.
     """
     n, rules = len(line), {name: F(value) for name, value in rules.items()}
-    hits = {}  # shooter: target
+    hits = {}  # attacker: target
     for a in range(n):
         target = int(line[a]) // n_model if 0 <= line[a] < n * n_model else None
         if target is not None and not ended[a] and not ended[target]:
             hits[a] = target
-    by = {a: [shooter for shooter, target in hits.items() if target == a] for a in range(n)}
+    by = {a: [attacker for attacker, target in hits.items() if target == a] for a in range(n)}
     left, lost, dies = {}, {}, {}
     for a in range(n):
         before = ONE if ended[a] else health[a]
         wounds = F(len(by[a])) * rules["damage"]
         left[a] = ONE if ended[a] else before - wounds - rules["drain"]
-        lost[a], dies[a] = min(wounds, before), bool(left[a] <= SPENT)
+        lost[a], dies[a] = min(wounds, before), bool(left[a] <= MIN_HEALTH)
     rows = []
     for a in range(n):
-        begins, target = bool(ended[a]), hits.get(a)
-        gain = rules["spoils"] if a in hits else F(0)
+        starts, target = bool(ended[a]), hits.get(a)
+        gain = rules["health_per_hit"] if a in hits else F(0)
         gain = gain if by[a] else gain + rules["recovery"]
         hit, wounds, kill, damage = F(a in hits), F(len(by[a])), F(0), F(0)
         if target is not None:
@@ -48,21 +48,21 @@ def shots(line, ray, health, tally, ages, ended, *, n_model, res, rules):
             - rules["death_cost"] * F(dies[a])
             + rules["aim_reward"] * aim
         )
-        age = 0 if begins else int(ages[a]) + 1
-        ends = not begins and (dies[a] or age >= rules["limit"])
-        sums = [F(0) if begins else tally[k, a] + x for k, x in enumerate((kill, damage, hit))]
+        age = 0 if starts else int(ages[a]) + 1
+        ends = not starts and (dies[a] or age >= rules["limit"])
+        sums = [F(0) if starts else tally[k, a] + x for k, x in enumerate((kill, damage, hit))]
         after = F(0) if dies[a] else min(left[a] + gain, ONE)
         rows.append(
             dict(
-                reward=F(0) if begins else reward,
-                reset=begins,
+                reward=F(0) if starts else reward,
+                reset=starts,
                 terminal=ends and dies[a],
                 truncated=ends and not dies[a],
                 kills=sums[0] if ends else F(0),
                 deaths=F(ends and dies[a]),
                 damage=sums[1] if ends else F(0),
                 accuracy=sums[2] / F(age) if ends else F(0),
-                vitals=np.array([after, hit, wounds], np.float16),
+                health_obs=np.array([after, hit, wounds], np.float16),
                 health=after,
                 tally=np.array(sums),
                 ages=age,
@@ -72,9 +72,10 @@ def shots(line, ray, health, tally, ages, ended, *, n_model, res, rules):
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
-def told(health, positions, angles):
-    """What critics are told of one environment, (A, 1 + 5 (A - 1)) float64: own health, and of each
-    other, the next one first, health, place ahead and left / 10 m, cosine and sine of its heading.
+def privileged(health, positions, angles):
+    """Returns the privileged observation of one environment, (A, 1 + 5 (A - 1)) float64: own
+    health; then, for each other agent from the next one on, health, position ahead and left / 10 m,
+    cosine and sine of its relative heading.
     """
     rows, n = [], len(health)
     for a in range(n):
@@ -89,11 +90,11 @@ def told(health, positions, angles):
     return np.array(rows)
 
 
-# ---- Spawning out of sight ----
+# ---- Hidden spawns ----
 
 
-def meets(walls, start, end):
-    """(W,) bool: which walls (W, 2, 2) a line of sight meets, by solving for where they cross."""
+def cuts(walls, start, end):
+    """(W,) bool: walls (W, 2, 2) that cut a line of sight, by solving for the crossings."""
     along, step = walls[:, 1] - walls[:, 0], end - start
     area = step[0] * along[:, 1] - step[1] * along[:, 0]
     away = walls[:, 0] - start
@@ -103,29 +104,32 @@ def meets(walls, start, end):
     return (on_sight >= 0) & (on_sight <= 1) & (on_wall >= 0) & (on_wall <= 1) & (area != 0)
 
 
-def in_sight(walls, eye, place, radius):
-    """Whether somebody at ``eye`` (2,) sees the middle or either side of a disc at ``place``."""
+def is_visible(walls, eye, place, radius):
+    """Returns if an agent at ``eye`` (2,) sees the centre or either side of a disc at ``place``."""
     away = place - eye
     side = radius * np.array([-away[1], away[0]]) / max(np.linalg.norm(away), radius)
-    return any(not meets(walls, eye, place + k * side).any() for k in (-1, 0, 1))
+    return any(not cuts(walls, eye, place + k * side).any() for k in (-1, 0, 1))
 
 
-def spawned(walls, points, positions, mask, draws, first_lane, seed, radius):
-    """Where the agents of one environment stand, (A, 2), once those of ``mask`` (A,) have respawned
-    among the points (A, P, 2) of each; ``draws`` (A,) are their numbers drawn before.
+def respawned(walls, points, positions, mask, draws, first_lane, seed, radius):
+    """Returns the agents' positions (A, 2) after those of ``mask`` (A,) have respawned.
+
+    ``points`` are (A, P, 2), ``draws`` (A,) the numbers drawn before.
     """
     walls, positions = walls.astype(float), positions.astype(float).copy()
-    stands = [not gone for gone in mask]
+    placed = [not respawns for respawns in mask]
     for a in np.nonzero(mask)[0]:
         word = philox(first_lane + int(a), int(draws[a]), seed)[0]
         first = int((word >> 8) / 2**24 * len(points[a]))
-        own = np.roll(points[a].astype(float), -first, axis=0)
-        others = [positions[b] for b in range(len(mask)) if stands[b] and b != a]
-        hidden = [not any(in_sight(walls, eye, at, radius) for eye in others) for at in own]
+        candidates = np.roll(points[a].astype(float), -first, axis=0)
+        others = [positions[b] for b in range(len(mask)) if placed[b] and b != a]
+        hidden = [
+            not any(is_visible(walls, eye, at, radius) for eye in others) for at in candidates
+        ]
         if any(hidden):
-            positions[a] = own[hidden.index(True)]
+            positions[a] = candidates[hidden.index(True)]
         else:
-            gaps = [min(np.linalg.norm(at - eye) for eye in others) for at in own]
-            positions[a] = own[int(np.argmax(gaps))]
-        stands[a] = True
+            gaps = [min(np.linalg.norm(at - eye) for eye in others) for at in candidates]
+            positions[a] = candidates[int(np.argmax(gaps))]
+        placed[a] = True
     return positions

@@ -1,4 +1,4 @@
-"""Toy environments of two agents and more, and policies for them that need no learning."""
+"""A toy game for two or more agents, and fixed policies that play it."""
 
 import torch
 
@@ -7,12 +7,18 @@ from megastep.arrdict import arrdict
 
 
 class Matrix:
-    """Agents choose one of three numbers, every step is an episode: terminal for all, unless the
-    numbers are equal. Whoever's is higher is paid 1, whoever's is lower -1; agents are shown their
-    place, and who else plays is not to be seen.
+    """Agents choose one of three numbers. The highest gets reward 1, the lowest -1.
 
-    `mortal`: terminal for those alone that chose less than the highest. `geometries` are homes that
-    nobody sees.
+    A step ends the episode of every agent, unless all numbers are equal. Agents observe their slot,
+    and nothing of the others.
+
+    Args:
+        mortal: a step ends only the episodes of agents below the highest number.
+        limit: steps after which an episode is truncated.
+        geometries: homes, for `layout`; they change nothing else.
+
+    Attributes:
+        played: the actions of each step, (n_envs, n_agents).
     """
 
     fps = 1.0
@@ -37,26 +43,26 @@ class Matrix:
         actions, new = decision.actions.view(self.n_envs, self.n_agents), self.over
         self.played.append(actions.clone())
         best, worst = actions.amax(1, keepdim=True), actions.amin(1, keepdim=True)
-        paid = ((actions == best).float() - (actions == worst).float()).flatten()
+        reward = ((actions == best).float() - (actions == worst).float()).flatten()
         uneven = (best > worst).expand_as(actions)
-        ended = (uneven & (actions < best) if self.mortal else uneven).flatten() & ~new
+        terminal = (uneven & (actions < best) if self.mortal else uneven).flatten() & ~new
         self.age = torch.where(new, 0, self.age + 1)
-        cut = (self.age == self.limit) & ~ended
-        self.over = ended | cut
-        return self._world(self.scored(paid.masked_fill(new, 0.0)), ended, cut, new)
+        truncated = (self.age == self.limit) & ~terminal
+        self.over = terminal | truncated
+        return self._world(self.scored(reward.masked_fill(new, 0.0)), terminal, truncated, new)
 
     def scored(self, reward):
         return reward
 
     def _world(self, reward, terminal, truncated, reset):
-        place = torch.eye(6)[: self.n_agents].repeat(self.n_envs, 1)[:, None]
+        slot = torch.eye(6)[: self.n_agents].repeat(self.n_envs, 1)[:, None]
         return arrdict(
-            obs=place,
+            obs=slot,
             reward=reward,
             reset=reset,
             terminal=terminal,
             truncated=truncated,
-            metrics=arrdict(paid=reward.clone()),
+            metrics=arrdict(points=reward.clone()),
         )
 
     def check(self):
@@ -64,8 +70,8 @@ class Matrix:
 
 
 class Always:
-    """Chooses the same number for ever, or with `chance` another, evenly. Its memory counts steps
-    since a reset.
+    """Chooses `action`, or with probability `chance` a random number. Its hidden state counts the
+    steps since a reset.
     """
 
     def __init__(self, action=2, chance=0.0, n_actions=3):
@@ -84,9 +90,11 @@ class Always:
 
 
 class High(Always):
-    """The highest number: what `bot_class=tests.helpers.games:High` makes."""
+    """Always chooses the highest number. Needs no arguments, so it can be a `bot_class`."""
 
 
 class Middle(Always):
+    """Always chooses the middle number."""
+
     def __init__(self):
         super().__init__(1)

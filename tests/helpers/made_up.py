@@ -1,4 +1,4 @@
-"""Random worlds, rollouts of them, and what is compared after learning from these."""
+"""A random environment, random rollouts, and the weights to compare after learning from them."""
 
 import torch
 
@@ -9,14 +9,16 @@ from megastep.arrdict import arrdict
 
 T, B, WIDTH = 8, 6, 16
 OBS, MOVES = spaces.MultiVector(1, 4), spaces.MultiDiscrete(1, 3)
-MORE = spaces.MultiVector(1, 2)  # what a critic may see beside
+PRIVILEGED = spaces.MultiVector(1, 2)
 
 
 class Numbers:
-    """Shows random numbers; action 1 pays the first of them. An episode is truncated after 7 steps.
-    What is seen does not depend on what is done, so one action that differs changes little.
+    """Random observations; action 1 is rewarded with their first number. Episodes are truncated
+    after 7 steps. Observations do not depend on actions, so one different action changes little.
 
-    Args: `bad_steps`, those that pay lane 3 nan; the first is 1.
+    Args:
+        device: device of the environment.
+        bad_steps: steps, from 1, in which lane 3 gets a reward of NaN.
     """
 
     obs_space, action_space = spaces.MultiVector(1, 3), spaces.MultiDiscrete(1, 3)
@@ -50,15 +52,13 @@ class Numbers:
 
 
 def made_up(seed=0, device="cpu", privileged=None, values=True):
-    """A policy and a rollout of random worlds, acted in by that policy. Lanes 1 and 4 have resets
-    in the middle.
-    """
+    """Returns a policy and a random rollout with its actions. Lanes 1 and 4 have a reset each."""
     policy = Policy(OBS, MOVES, privileged, width=WIDTH, seed=seed).to(device)
     with torch.no_grad():
         # a policy far from uniform, so that gradients differ by action
-        policy.output.core.weight.mul_(100)
+        policy.output.linear.weight.mul_(100)
     state = policy.initial(B)
-    rollout = Rollout(*(T, B, OBS, MOVES, state, device, privileged, torch.float32), values=values)
+    rollout = Rollout(T, B, OBS, MOVES, state, device, privileged, torch.float32, values=values)
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape):
@@ -74,13 +74,15 @@ def made_up(seed=0, device="cpu", privileged=None, values=True):
         out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
         if values:
             rollout.values[:] = policy.value(out.features, rollout.privileged)
-        rollout.actions[:] = policy.output.sample(out.logits[:-1], policy.random.on(policy.device))
+        rollout.actions[:] = policy.output.sample(
+            out.logits[:-1], policy.generator.on(policy.device)
+        )
         rollout.logprobs[:] = policy.output.logprob(out.logits[:-1], rollout.actions)
     return policy, rollout
 
 
 def weights(policy):
-    """All but the value's own layer, which `update_stats` changes with no prediction."""
+    """Returns all weights, except the value's linear layer, which PopArt rescales."""
     return torch.cat(
         [
             p.detach().flatten()

@@ -1,8 +1,8 @@
-"""Memory that kernels write: poisoned, so that what they leave out is found."""
+"""Poisons the memory that kernels write, to find elements that they leave out."""
 
 import torch
 
-# Bits that no kernel writes: NaNs that are not its own, and an integer that is no index or count.
+# Bits that no kernel writes: unusual NaNs, and an integer that is no index or count.
 POISON = {torch.float32: 0x7FC0DEAD, torch.float16: 0x7EAD, torch.int32: -0x21524111}
 
 
@@ -11,22 +11,20 @@ def bits(tensor):
 
 
 class Poison:
-    """Fills memory that the engine is to write with bits of its own, and finds what is left of
-    them.
-    """
+    """Fills outputs with special bits before a call, and finds those that are left afterwards."""
 
     def __init__(self, empty):
         self.empty = empty
 
     def allocate(self, *args, **kwargs):
-        """Stands in for torch.empty."""
-        made = self.empty(*args, **kwargs)
-        if made.dtype in POISON:
-            bits(made).fill_(POISON[made.dtype])
-        return made
+        """Replaces torch.empty."""
+        tensor = self.empty(*args, **kwargs)
+        if tensor.dtype in POISON:
+            bits(tensor).fill_(POISON[tensor.dtype])
+        return tensor
 
     def scenery(self, scenery):
-        """Poisons what render writes into a scenery."""
+        """Poisons the tensors of a scenery that render writes."""
         for tensor in (scenery.agent_lines, scenery.agent_light):
             bits(tensor).fill_(POISON[tensor.dtype])
 
@@ -42,6 +40,6 @@ class Poison:
 
 
 def seen_of(core):
-    """Room for the texels that each agent has seen."""
+    """Returns zeros (N, A, n_words) for the texels that each agent has seen."""
     n_words = -(-core.scenery.layouts.max_texels // 32)
     return torch.zeros((core.n_envs, core.n_agents, n_words), dtype=torch.int32, device=core.device)

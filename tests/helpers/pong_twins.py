@@ -1,7 +1,7 @@
-"""Pong twice more: one game in plain Python, and many at once in NumPy. The engine's kernel is
-compared with both, on every bit, and the chart of `scripts/benchmarks/pong_chart.py` shows what each costs.
+"""Twins of Pong: one game in plain Python, and many games in NumPy. The kernel is compared with
+both on every bit, and `scripts/benchmarks/pong_chart.py` compares their speed.
 
-Places and speeds are integers, 256 to a cell. N games, S sides that act, B = N S lanes.
+Positions and speeds are integers, 256 per cell. N games, S sides that act, B = N S lanes.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ WORD = 0xFFFFFFFF
 
 
 def philox(lane, draw, seed):
-    """Philox 4x32-10 of a lane's draw: four words of 32 bits."""
+    """Returns Philox 4x32-10 of a lane's draw: four words of 32 bits."""
     words, keys = [lane, draw, 0, 0], [seed & WORD, seed >> 32]
     for _ in range(10):
         first, second = 0xD2511F53 * words[0], 0xCD9E8D57 * words[2]
@@ -50,7 +50,7 @@ class PythonPong:
         self.velocity = [CELL if to_right else -CELL, ((slope >> 16) * (CELL + 1) >> 16) - 128]
 
     def step(self, actions):
-        """A world after the actions of all sides."""
+        """Takes one step with the actions of all sides. Returns a world."""
         if self.over:
             return self.reset()
         moves = [(0, -CELL, CELL)[action] for action in actions]
@@ -89,9 +89,9 @@ class PythonPong:
 
     def world(self, reset, winner, won):
         played = sum(self.scores)
-        seen = self.picture if self.pixels else self.features
+        observe = self.image if self.pixels else self.features
         return dict(
-            obs=[seen(side) for side in range(self.sides)],
+            obs=[observe(side) for side in range(self.sides)],
             reward=[
                 0.0 if winner is None else 1.0 if winner == side else -1.0
                 for side in range(self.sides)
@@ -105,8 +105,8 @@ class PythonPong:
             ],
         )
 
-    def picture(self, side):
-        """The pixels, row by row."""
+    def image(self, side):
+        """Returns the pixels, row by row."""
         pixels = bytearray(ROWS * COLUMNS)
         for paddle, column in ((side, 0), (1 - side, COLUMNS - 1)):
             top = self.paddles[paddle] // CELL
@@ -118,8 +118,8 @@ class PythonPong:
         return pixels
 
     def features(self, side):
-        """Own paddle, other paddle, ball across and down, its speeds across and down, and how far
-        it is below the middle of each paddle.
+        """Returns own paddle, other paddle, ball x and y, its velocity x and y, and how far it is
+        below the centre of each paddle.
         """
         (x, y), (across, down) = self.ball, self.velocity
         middles = [self.paddles[paddle] + 511.5 for paddle in (side, 1 - side)]
@@ -136,8 +136,8 @@ class PythonPong:
 
 
 class NumpyPong:
-    """N games at once. Without `self_play`, a tracker plays the right side. Pictures are one
-    buffer, which every step writes anew.
+    """N games at once. Without `self_play`, a tracker plays the right side. All steps write to the
+    same buffer of images.
     """
 
     def __init__(self, n, seed=1, points=1, limit=1000, self_play=False, tracker=128, pixels=True):
@@ -149,14 +149,14 @@ class NumpyPong:
         )
         self.age, self.draws = np.zeros((2, n), np.int64)
         self.over = np.ones(n, bool)
-        self.pictures = np.zeros((n, self.sides, ROWS, COLUMNS), np.uint8) if pixels else None
+        self.images = np.zeros((n, self.sides, ROWS, COLUMNS), np.uint8) if pixels else None
 
     def reset(self):
         self.over[:] = True
         return self.step(np.zeros((self.sides, self.n), np.int64))
 
     def serve(self, which):
-        """In the games numbered `which`."""
+        """Serves in the games `which`."""
         counters = [which.astype(np.uint64), self.draws[which].astype(np.uint64)]
         words = [*counters, np.zeros_like(counters[0]), np.zeros_like(counters[0])]
         mask, half, keys = np.uint64(WORD), np.uint64(32), [self.seed & WORD, self.seed >> 32]
@@ -173,7 +173,7 @@ class NumpyPong:
         self.draws[which] += 1
 
     def step(self, actions):
-        """A world after actions (S, N)."""
+        """Takes one step with actions (S, N). Returns a world."""
         reset, room = self.over.copy(), (ROWS - PADDLE_ROWS) * CELL
         moves = np.zeros((2, self.n), np.int64)
         moves[: self.sides] = np.array([0, -CELL, CELL])[actions]
@@ -211,7 +211,7 @@ class NumpyPong:
         return self.world(reset, winner, won)
 
     def world(self, reset, winner, won):
-        """Of (N,) flags; rewards and shares are (N, S), observations (N, S, ...)."""
+        """Returns a world: flags (N,), rewards and points won (N, S), observations (N, S, ...)."""
         sides = range(self.sides)
         reward = [np.where(winner < 0, 0.0, np.where(winner == s, 1.0, -1.0)) for s in sides]
         played = self.scores.sum(0).astype(np.float32)
@@ -220,7 +220,7 @@ class NumpyPong:
             for s in sides
         ]
         return dict(
-            obs=self._features() if self.pictures is None else self._pictures(),
+            obs=self._features() if self.images is None else self._images(),
             reward=np.stack(reward, -1).astype(np.float32),
             reset=reset,
             terminal=won,
@@ -228,18 +228,18 @@ class NumpyPong:
             points_won=np.where(self.over[:, None], np.stack(shares, -1), 0.0).astype(np.float32),
         )
 
-    def _pictures(self):
-        self.pictures[:] = 0
+    def _images(self):
+        self.images[:] = 0
         games = self.rows[:, None]
         for side in range(self.sides):
-            pixels = self.pictures[:, side]
+            pixels = self.images[:, side]
             for paddle, column in ((side, 0), (1 - side, COLUMNS - 1)):
                 rows = self.paddles[paddle][:, None] // CELL + np.arange(PADDLE_ROWS)
                 pixels[games, rows, column] = 170
             for (x, y), grey in ((self.last, 85), (self.ball, 255)):
                 column = COLUMNS - 1 - x // CELL if side else x // CELL
                 pixels[self.rows, y // CELL, column] = grey
-        return self.pictures
+        return self.images
 
     def _features(self):
         (x, y), (across, down), seen = self.ball, self.velocity, []

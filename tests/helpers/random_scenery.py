@@ -1,5 +1,5 @@
-"""Small environments for the engine's tests: random ones with degenerate cases on demand, and those
-of the golden data.
+"""Small environments for the engine's tests: random ones, optionally with degenerate cases, and
+those of the golden data.
 
 Axes: N environments, A agents, M model lines, L lines of all environments (the agents' first in
 each), K lights, T texels.
@@ -25,12 +25,10 @@ OCTAGON = torch.stack([CORNERS, CORNERS.roll(-1, 0)], 1)  # the original's model
 
 @dataclass(frozen=True)
 class Environments:
-    """N environments in the form `Scenery(n_agents, lights, lines, textures, model)` takes, and
-    their agents. All float32.
-    """
+    """The parts of a `Scenery` of N environments, and their agents. All float32."""
 
     model: torch.Tensor  # (M, 2, 2)
-    lines: torch.Tensor  # (L, 2, 2), the agents' own still about the origin
+    lines: torch.Tensor  # (L, 2, 2), agents' lines about the origin
     line_widths: torch.Tensor  # (N,)
     lights: torch.Tensor  # (K, 3): x, y, intensity
     light_widths: torch.Tensor  # (N,)
@@ -66,13 +64,12 @@ class Environments:
         )
 
     def texels(self):
-        """How many texels each environment has, (N,)."""
+        """(N,): the number of texels of each environment."""
         return torch.stack([w.sum() for w in self.texture_widths.split(self.line_widths.tolist())])
 
     def one(self, e, dtype=torch.float64):
-        """Environment e alone: dict of model, walls (all lines but the agents'), lights, textures,
-        widths (of the
-        lines' textures), positions, angles, velocity, angvelocity.
+        """Returns environment e as a dict: model, walls (all lines except agents'), lights,
+        textures, widths (texels per line), positions, angles, velocity, angvelocity.
         """
         mine = lambda vals, widths: vals.split(widths.tolist())[e]  # noqa: E731
         state = {
@@ -91,15 +88,13 @@ class Environments:
 
 
 def unplaced(model, n_agents, walls):
-    """The lines of environments with these walls before a render has moved the agents' lines to
-    where the agents are.
-    """
+    """The lines of environments with these walls, with agents' lines still about the origin."""
     return torch.cat([torch.cat([*n_agents * [model], w]) for w in walls])
 
 
 def golden(case):
-    """A golden case: its Environments, its settings (res, fov, fps), and what the original
-    computed, named as in the README beside the data.
+    """Returns a golden case: Environments, settings (res, fov, fps), and the original's outputs,
+    named as in the README beside the data.
     """
     with np.load(GOLDEN) as arrays:
         g = {k.split("/")[1]: torch.as_tensor(arrays[k]) for k in arrays if k.split("/")[0] == case}
@@ -160,9 +155,7 @@ def nudged(x, ulps):
 
 
 def parallel(random, walls, agents, directions):
-    """Walls that lie exactly along a ray: ahead of the agent, behind it, and one that it stands
-    on.
-    """
+    """Walls exactly along a ray: ahead of the agent, behind it, and one through it."""
     p, ray = agents[0], directions[0, 0, random.pick(range(directions.shape[2]), 3).long()]
     return torch.stack(
         [p + near * r + torch.stack([0 * r, r]) for near, r in zip((1, -2, -0.5), ray)]
@@ -170,7 +163,7 @@ def parallel(random, walls, agents, directions):
 
 
 def zero_length(random, walls, agents, directions):
-    """Points: in the way of an agent, just beside it, and anywhere."""
+    """Points: in an agent's path, just beside it, and anywhere."""
     at = torch.stack(
         [
             agents[0] + 0.5 * random.direction(),
@@ -182,24 +175,21 @@ def zero_length(random, walls, agents, directions):
 
 
 def duplicates(random, walls, agents, directions):
-    """Walls that are there already, to the bit and the other way round."""
+    """Exact copies of other walls, and reversed copies."""
     return torch.cat([walls[-4:], walls[-6:-4].flip(1)])
 
 
 def touching(random, walls, agents, directions):
-    """Axis-parallel walls at the distance of contact from the first agent: on it, and a few ulps to
-    either side.
-    """
+    """Axis-parallel walls at the contact distance from the first agent, to a few ulps."""
     p, reach = agents[0], twin.INFLATION * twin.RADIUS
-    made = []
+    contacts = []
     for side, axis, ulps in ((1, 0, 0), (-1, 0, 1), (1, 1, -1), (-1, 1, 3)):
         wall = torch.stack([p, p])
         wall[:, axis] = nudged(p[axis] + side * reach, ulps)
         wall[:, 1 - axis] += torch.tensor([-0.4, 0.7], dtype=p.dtype)
-        made.append(wall)
-    return torch.stack(made)[
-        torch.randperm(4, generator=random.generator)[:2]
-    ]  # between all four it could not move
+        contacts.append(wall)
+    # two of the four: between all of them, the agent could not move
+    return torch.stack(contacts)[torch.randperm(4, generator=random.generator)[:2]]
 
 
 def pixel_ends(random, walls, agents, directions):
@@ -209,7 +199,7 @@ def pixel_ends(random, walls, agents, directions):
 
 
 def tiny(random, walls, agents, directions):
-    """Walls of 0.01 to 10 mm close to the agents."""
+    """Walls of 0.01 to 10 mm, close to the agents."""
     centres = agents[random.pick(range(len(agents)), 6).long()] + random.direction(
         6
     ) * random.uniform(0.15, 1, 6, 1)
@@ -217,7 +207,7 @@ def tiny(random, walls, agents, directions):
 
 
 def long(random, walls, agents, directions):
-    """Walls of 100 to 400 m: past an agent at arm's length, and anywhere."""
+    """Walls of 100 to 400 m: one close to an agent, one anywhere."""
     along = random.direction(2) * random.uniform(100, 200, 2, 1)
     aside = torch.stack([-along[:, 1], along[:, 0]], -1) / along.norm(dim=-1, keepdim=True)
     middle = torch.stack([agents[0] + 0.3 * aside[0], walls.mean((0, 1)) + 2 * aside[1]])
@@ -263,12 +253,15 @@ def random_environments(
     fov=130.0,
     max_lights=5,
 ):
-    """N random environments: rooms of `size` metres from (origin, origin) on, with walls and the
-    `degenerate` cases named.
+    """Returns N random environments: rooms of `size` metres with their corner at (origin, origin),
+    and walls.
 
-    The names are those of EVERYTHING; `res` and `fov` are the camera whose rays 'parallel' and
-    'pixel_ends' aim at. Environments differ in their number of lines and lights. An origin of 190
-    puts coordinates at 200 m.
+    Environments differ in their number of lines and lights.
+
+    Args:
+        degenerate: names from EVERYTHING, degenerate cases to add.
+        res, fov: the camera whose rays the cases 'parallel' and 'pixel_ends' use.
+        origin: 190 puts coordinates at 200 m, where float32 is coarse.
     """
     random, lines, lights, agents, angles = CounterGenerator(seed), [], [], [], []
     for _ in range(n_envs):

@@ -1,38 +1,43 @@
-"""What tests of recurrent cores with kernels of their own share."""
+"""Shared by the tests of recurrent cores that have kernels."""
 
 import torch
 
 
-def assert_close(names, found, expected, slack):
-    """Arrays agree, each element to a share of its array's greatest magnitude."""
-    for name, ours, theirs in zip(names, found, expected, strict=True):
+def assert_close(names, results, expected, slack):
+    """Compares tensors with a tolerance of `slack` times their largest magnitude."""
+    for name, tensor, expected_tensor in zip(names, results, expected, strict=True):
         torch.testing.assert_close(
-            *(ours, theirs),
+            *(tensor, expected_tensor),
             rtol=0,
-            atol=slack * theirs.abs().max().item(),
+            atol=slack * expected_tensor.abs().max().item(),
             msg=lambda text, name=name: f"{name}: {text}",
         )
 
 
 def check_captured(core, last, step, slack, bf16, n_steps=9, n_lanes=64):
-    """On a GPU a captured graph of a core's unrolling, gradients included, gives what unrolling and
-    stepping do, with inputs, resets and a state that were changed after the capture.
+    """Checks on a GPU that a captured unroll and its gradients match an eager unroll and steps.
 
-    `last` is the leaf of the state that the loss depends on; `step` takes x (B, W), reset (B,) and
-    a state, and returns the output and the next state.
+    Inputs, resets and hidden state change after the capture.
+
+    Args:
+        core: the recurrent core.
+        last: leaf of the hidden state that the loss depends on.
+        step: takes x (B, W), reset (B,) and a hidden state; returns the output and the next state.
+        slack: tolerance, as for `assert_close`.
+        bf16: whether to use autocast.
     """
     torch.manual_seed(0)
     core = core.cuda()
     x = torch.randn(n_steps, n_lanes, core.width, device="cuda", requires_grad=True)
     reset = torch.rand(n_steps, n_lanes, device="cuda") < 0.3
     state = core.initial(n_lanes, "cuda")
-    wanted = [x, *core.parameters()]
+    inputs = [x, *core.parameters()]
 
     def unroll():
         with torch.autocast("cuda", torch.bfloat16, enabled=bf16):
             outputs, after = core(x, reset, state)
         loss = outputs.float().square().sum() + after[last].sum()
-        return [outputs, after[last], *torch.autograd.grad(loss, wanted)]
+        return [outputs, after[last], *torch.autograd.grad(loss, inputs)]
 
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())

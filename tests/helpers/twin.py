@@ -1,9 +1,9 @@
-"""The engine's laws by brute force: every ray against every line, every texel and light, every disc
+"""The engine's twin by brute force: every ray against every line, every texel and light, every disc
 and obstacle.
 
 Plain PyTorch, one environment at a time, in the dtype and on the device of its arguments (the tests
-use float64). It shares nothing with the kernels and is meant to be read beside the original
-megastep's Concepts page, not to be fast.
+use float64). It shares no code with the kernels. It is not fast; read it beside the Concepts page
+of the original megastep.
 
 Axes: A agents, C cameras, R pixels, L lines (the agents' first), W walls (static lines), K lights,
 P points, T texels. Units: metres, degrees, seconds. A line is its two ends, (2, 2). A light is (x,
@@ -14,15 +14,12 @@ import math
 
 import torch
 
-RADIUS = 0.15 / math.sqrt(
-    2
-)  # m, the disc around a square agent 0.15 m wide: its body, and how close its camera sees
-INFLATION = (
-    1.001  # collisions happen this much further out, so that a stopped agent does not yet touch
-)
-SHORTFALL = 0.99  # the part of the way to a contact that is travelled
-AMBIENT = 0.1  # light where no light reaches
-SHADOW_LIMIT = 0.999  # a line further along the way from light to texel is the texel's own line
+# m, the disc around a square agent 0.15 m wide: its body, and the near limit of its camera
+RADIUS = 0.15 / math.sqrt(2)
+INFLATION = 1.001  # of the radius in collisions, so that a stopped agent does not touch
+SHORTFALL = 0.99  # fraction of the path to a contact that is travelled
+AMBIENT = 0.1  # light without any lamp
+SHADOW_LIMIT = 0.999  # a line further along the path from light to texel is the texel's own line
 DOT_GUARD = 1e-6  # m, keeps the dot of a very short line finite
 
 
@@ -50,14 +47,12 @@ def wrapped(degrees):
 
 
 def agent_lines(model, positions, angles):
-    """The model (M, 2, 2) put where the agents are: (A*M, 2, 2), agent by agent."""
+    """The model (M, 2, 2) at the agents' poses: (A M, 2, 2), agent by agent."""
     return (turn(model[None], angles[:, None, None]) + positions[:, None, None]).flatten(0, 1)
 
 
 def texel_positions(lines, widths):
-    """Centres (T, 2) of the texels: texel k of a line of w texels sits at the fraction (k +
-    1/2)/w.
-    """
+    """Centres (T, 2) of the texels. Texel k of w is at the fraction (k + 1/2) / w of its line."""
     centres = [
         ((torch.arange(int(w), device=lines.device) + 0.5) / int(w)).to(lines) for w in widths
     ]
@@ -67,8 +62,8 @@ def texel_positions(lines, widths):
 
 
 def light_at(points, walls, lights, slack=0.0, chunk=2**20):
-    """Light (P,) in [0.1, 1] at points (P, 2): ambient, and 2 I/max(d^2, 1) from each light that no
-    wall occludes.
+    """Light (P,) in [0.1, 1] at points (P, 2): ambient, plus 2 I / max(d^2, 1) of each light that
+    no wall occludes.
     """
     levels = []
     for some in points.split(max(chunk // max(len(walls), 1), 1)):
@@ -83,12 +78,11 @@ def light_at(points, walls, lights, slack=0.0, chunk=2**20):
 
 
 def occluded(ways, walls, slack=0.0):
-    """Whether a wall crosses the way (P, 2) from a light at 0 to a point, short of 0.999 of it: (P,
-    W).
+    """(P, W): walls that cross the path (P, 2) from a light at 0 to a point, before 0.999 of it.
 
-    A wall crosses if its ends are on different sides. `slack` (metres): walls this near to crossing
-    count too; if it is negative, only those that cross with so much to spare. The two bracket the
-    truth for slightly different inputs.
+    A wall crosses if its ends are on different sides. With `slack` metres, walls this close to
+    crossing count too; with negative slack, only those that cross with this margin. Both together
+    bracket the truth for slightly different inputs.
     """
     along, area = walls[:, 1] - walls[:, 0], cross(ways[:, None], walls[:, 1] - walls[:, 0])
     reach = ways.norm(dim=-1, keepdim=True).clamp(min=1e-9)
@@ -110,9 +104,7 @@ def bake(walls, lights, points):
 
 
 def rays(angles, cameras, res, fov):
-    """What the pixels look along, (A, C, R, 2): one unit ahead of the camera; pixel 0 is the
-    leftmost.
-    """
+    """Ray directions (A, C, R, 2), one unit ahead of the camera. Pixel 0 is the leftmost."""
     pixel = torch.arange(res, dtype=angles.dtype, device=angles.device)
     sideways = math.tan(math.radians(fov) / 2) * (res - 2 * pixel - 1) / res
     yaws = angles[:, None] + torch.as_tensor(cameras, dtype=angles.dtype, device=angles.device)
@@ -123,10 +115,10 @@ def raycast(lines, positions, directions, radius=RADIUS):
     """The nearest line beyond the radius along each ray: indices, locations, dots, distances, each
     (A, C, R).
 
-    A line is met at the ray parameter s = cross(a, v)/cross(ray, v), v the line and a its start
-    seen from the agent. Distances are metres; of two lines at the same one, the lower index is
-    seen; parallel or zero-length lines are not. An agent does not see itself because its lines lie
-    within its radius.
+    A ray meets a line at s = cross(a, v) / cross(ray, v), where v is the line and a its start
+    relative to the agent. Distances are in metres. Of lines at the same distance, the lowest index
+    is hit; parallel and zero-length lines never are. Agents do not see themselves, as their own
+    lines are within the radius.
     """
     along, ray = lines[:, 1] - lines[:, 0], directions[..., None, :]
     start = (lines[:, 0] - positions[:, None])[:, None, None]
@@ -152,8 +144,8 @@ def raycast(lines, positions, directions, radius=RADIUS):
 
 
 def filtered(values, width, start, location):
-    """Clamped linear filtering: values (T, D) between the texel centres of lines of `width` texels
-    from `start` on.
+    """Interpolates values (T, D) linearly between texel centres, clamped at the ends of the line,
+    which has `width` texels from `start` on.
     """
     place = torch.minimum((location * width - 0.5).clamp(min=0), (width - 1).to(location))
     left = place.floor().long()
@@ -163,8 +155,8 @@ def filtered(values, width, start, location):
 
 
 def shade(hits, textures, widths, light):
-    """Colours (A, C, R, 3) of hits: filtered texture (T, 3) x filtered light (T,) x (1 - dot^2); a
-    miss is black.
+    """Colours (A, C, R, 3) of hits: filtered texture (T, 3) x filtered light (T,) x (1 - dot^2).
+    Misses are black.
     """
     hit, line = hits["indices"] >= 0, hits["indices"].clamp(min=0).long()
     width, start = widths.long()[line], (widths.cumsum(0) - widths).long()[line]
@@ -189,8 +181,8 @@ def render(
     cameras=(0.0,),
     radius=RADIUS,
 ):
-    """All that `cuda.render` says of one environment, the placed `lines` (L, 2, 2) and the `light`
-    (T,) of every texel.
+    """Returns the fields of `cuda.render` for one environment, its `lines` (L, 2, 2) and the
+    `light` (T,) of every texel.
     """
     lines = torch.cat([agent_lines(model, positions, angles), walls])
     light = light_at(texel_positions(lines, widths), walls, lights)
@@ -202,27 +194,25 @@ def render(
 
 
 def contact(offset, step, radius, slack=0.0):
-    """The fraction (...) of `step` at which a centre at `offset` (..., 2) comes within `radius` of
-    0; inf if never.
-
-    If it is within already: at once if it approaches 0, never if it does not.
+    """The fraction (...) of `step` at which a point at `offset` (..., 2) comes within `radius` of
+    0; inf if never. If it is within the radius already: 0 if it approaches, else inf.
     """
     speed, inward = step.square().sum(-1), -(offset * step).sum(-1)
     outside = offset.square().sum(-1) - radius**2
     root = inward.square() - speed * outside
     enters = (outside > 0) & (inward > 0) & (root >= 0)
     later = outside / torch.where(enters, inward + root.clamp(min=0).sqrt(), 1)
-    at_once = (outside <= 0) & (inward > -slack * speed.sqrt())
-    return torch.where(at_once, 0, torch.where(enters, later, math.inf))
+    immediate = (outside <= 0) & (inward > -slack * speed.sqrt())
+    return torch.where(immediate, 0, torch.where(enters, later, math.inf))
 
 
 def wall_contact(start, end, step, radius, slack=0.0):
-    """The fraction (A, W) of steps (A, 1, 2) at which a disc at 0 meets walls with ends (A, W, 2);
-    inf if never.
+    """The fraction (A, W) of steps (A, 1, 2) at which a disc at 0 touches walls with ends (A, W,
+    2); inf if never.
 
-    A wall's flank is met where the distance to its infinite line falls to the radius between the
-    ends; its ends are met as points. An overlapped wall stops the disc if the wall's nearest point
-    is being approached.
+    The disc touches a wall's flank where the distance to its infinite line falls to the radius,
+    between the ends; the ends are points. A wall that overlaps the disc stops it if the disc
+    approaches the wall's nearest point.
     """
     along = end - start
     length = along.norm(dim=-1)
@@ -240,12 +230,10 @@ def wall_contact(start, end, step, radius, slack=0.0):
 
 
 def physics(walls, positions, angles, velocity, angvelocity, *, fps=10.0, radius=RADIUS, slack=0.0):
-    """One step of one environment: dict of progress (A,), and positions, angles, velocity,
-    angvelocity after it.
+    """Steps one environment. Returns progress (A,), and positions, angles, velocity, angvelocity.
 
-    Progress is the part of the step that was travelled. `slack` (metres) makes discs that much
-    larger and more easily stopped: with +slack and -slack the true progress of slightly different
-    inputs is bracketed.
+    Progress is the fraction of the step that was travelled. `slack` metres make discs larger and
+    more easily stopped: +slack and -slack bracket the true progress of slightly different inputs.
     """
     step = velocity / fps
     reach = INFLATION * radius + slack
@@ -268,19 +256,19 @@ def physics(walls, positions, angles, velocity, angvelocity, *, fps=10.0, radius
     )
 
 
-# What is left to see
+# Unseen texels
 
-BANDS = 1.5, 4.0  # m, where the first and the second of three end
-SECTOR = 22.5  # degrees; the first of 16 is centred on the way the agent looks
+BANDS = 1.5, 4.0  # m, the ends of the first two of three
+SECTOR = 22.5  # degrees; the first of 16 is centred on the agent's heading
 
 
 def unseen(walls, widths, left, position, angle, slack):
-    """How many texels lie in each band and sector: (least, most), each (3, 16).
+    """Bounds on the number of texels in each band and sector: (least, most), each (3, 16).
 
-    `left` (T,) bool are the texels to count, of which each wall (W, 2, 2) has so many as `widths`
-    says. 32 successive texels share a word; those of a wall that share one lie where the middle of
-    all the wall's texels in that word is. Where that may be off by `slack` (metres, and as a
-    fraction of the distance), any of the places it may be counts.
+    `left` (T,) bool are the texels to count, wall by wall; `widths` are their numbers per wall (W,
+    2, 2). 32 successive texels share a word. Texels of one wall that share a word are counted at
+    the midpoint of all the wall's texels in that word. `slack` (metres, and as a fraction of the
+    distance) is its possible error: every bin within reach of it counts towards the upper bound.
     """
     least = torch.zeros(3, 16, dtype=torch.int64)
     most, first = least.clone(), 0
@@ -301,11 +289,11 @@ def unseen(walls, widths, left, position, angle, slack):
 
 
 def _bins(offset, angle, slack):
-    """The set of (band, sector) that a place so far from an agent may be in."""
-    (x, y), found = offset.tolist(), set()
+    """The set of (band, sector) that a point at `offset` from an agent may be in."""
+    (x, y), bins = offset.tolist(), set()
     reach = slack * (1 + math.hypot(x, y))
     for dx, dy in ((0, 0), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)):
         there = x + reach * dx, y + reach * dy
         bearing = math.degrees(math.atan2(there[1], there[0])) - angle
-        found.add((sum(math.hypot(*there) > end for end in BANDS), round(bearing / SECTOR) % 16))
-    return found
+        bins.add((sum(math.hypot(*there) > end for end in BANDS), round(bearing / SECTOR) % 16))
+    return bins

@@ -1,7 +1,7 @@
-"""Courses: layouts that make it hard to stay on one's side of a wall, and where agents are placed.
+"""Courses: layouts in which it is hard to stay on one side of a wall, and spots to place agents at.
 
-Axes: D layouts, W walls of the largest one; a smaller one is filled up with NaN, which meets
-nothing. P places. Metres, degrees.
+D layouts, W walls of the largest one; others are padded with NaN, which no path crosses. P spots.
+Metres, degrees.
 """
 
 import math
@@ -15,8 +15,8 @@ from megastep.geometries import sample
 from tests.helpers import random_scenery
 
 RADIUS = 0.15 / math.sqrt(2)  # m, an agent's
-BODY = 1.001 * RADIUS  # m, at which it is stopped
-# m, no agent is placed nearer to a wall: 6 units in the last place of float32 at 200 m
+BODY = 1.001 * RADIUS  # m, at which an agent is stopped
+# m, minimum distance from a wall to place an agent: 6 units in the last place of float32 at 200 m
 MIN_GAP = 1e-4
 
 
@@ -24,7 +24,7 @@ MIN_GAP = 1e-4
 
 
 def turned(walls, degrees):
-    """Walls turned counter-clockwise about the origin."""
+    """Walls rotated counter-clockwise about the origin."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.asarray(walls, float) @ np.array([[c, s], [-s, c]])
 
@@ -36,9 +36,7 @@ def path(corners):
 
 
 def enclosed(walls, corner=1.0):
-    """The walls, in a room that leaves a metre on all sides and whose lower-left corner is at
-    (corner, corner).
-    """
+    """The walls in a room with a margin of 1 m and its lower-left corner at (corner, corner)."""
     walls = np.asarray(walls, float)
     walls = walls - walls.min((0, 1)) + corner + 1
     width, height = walls.max((0, 1)) - corner + 1
@@ -60,7 +58,7 @@ def sliver(degrees, turn, arm=9.0):
 
 
 def spokes(n, turn, arm=3.0):
-    """Walls from one point in n directions: as many corners of 360 / n degrees."""
+    """Walls from one point in n directions: n corners of 360 / n degrees."""
     return np.concatenate([turned([[(0, 0), (arm, 0)]], turn + 360 * k / n) for k in range(n)])
 
 
@@ -85,9 +83,7 @@ def crossing(random, n=9, size=6.0):
 
 
 def fragments(seed):
-    """A room of free-standing walls with all that degenerates: of no length, double, tiny, of 400
-    m.
-    """
+    """A room with free-standing degenerate walls: of length 0, duplicate, tiny, of 400 m."""
     cases = "parallel", "zero_length", "duplicates", "touching", "pixel_ends", "tiny", "long"
     return (
         random_scenery.random_environments(seed, 1, n_walls=6, size=5.0, degenerate=cases)
@@ -109,7 +105,7 @@ def homes(source, n):
     return [enclosed(g.walls) for g in sample(source, n)]
 
 
-COURSES = {  # name: (layouts from a random stream, agents per environment)
+COURSES = {  # name: (function of a random generator that returns layouts, agents per environment)
     "box": (lambda random: [g.walls for g in sample("box", 1)], 1),
     "column": (lambda random: [g.walls for g in sample("column", 1)], 4),
     "wedges": (
@@ -164,12 +160,14 @@ def clearances(points, walls):
 
 
 def places(walls, n, random):
-    """Where agents are placed: (n, 2) float32 points within the bounds of walls (W, 2, 2), no
-    nearer than MIN_GAP to any. Four in ten lie anywhere; the rest at a wall's flank or end:
-    touching it to a few units in the last place, overlapping it, or with the centre next to it.
+    """Returns spots (n, 2) float32 within the bounds of walls (W, 2, 2), at least MIN_GAP from
+    each.
+
+    Four in ten are anywhere. The others are at a wall's flank or end: touching it to a few units in
+    the last place, overlapping it, or with the centre next to it.
     """
-    found, lower, upper = torch.zeros((0, 2)), walls.amin((0, 1)), walls.amax((0, 1))
-    while len(found) < n:
+    spots, lower, upper = torch.zeros((0, 2)), walls.amin((0, 1)), walls.amax((0, 1))
+    while len(spots) < n:
         a, b = walls[random.pick(range(len(walls)), n).long()].unbind(1)
         u, aside = random.uniform(-0.5, 1.5, n, 1).clamp(0, 1), random.direction(n)
         normal = torch.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], -1)
@@ -186,27 +184,27 @@ def places(walls, n, random):
         anywhere = random.uniform(0, 1, n, 2) * (upper - lower) + lower
         points = torch.where(random.uniform(0, 1, n, 1) < 0.4, anywhere, near).float()
         inside = ((points > lower) & (points < upper)).all(-1)
-        found = torch.cat(
-            [found, points[inside & (clearances(points.double(), walls).amin(1) > MIN_GAP)]]
+        spots = torch.cat(
+            [spots, points[inside & (clearances(points.double(), walls).amin(1) > MIN_GAP)]]
         )
-    return found[:n]
+    return spots[:n]
 
 
 @dataclass(frozen=True)
 class Course:
-    """A course's layouts and where agents are placed in them."""
+    """A course's layouts, and the spots where agents are placed."""
 
     name: str
     n_agents: int
     geometries: list
     walls: torch.Tensor  # (D, W, 2, 2) float32
-    counts: torch.Tensor  # (D,) how many walls each layout has
-    spots: torch.Tensor  # (D, P, 2) float32: where agents are placed
-    clear: torch.Tensor  # (D, P) bool: where they then overlap no wall
+    counts: torch.Tensor  # (D,) number of walls of each layout
+    spots: torch.Tensor  # (D, P, 2) float32
+    clear: torch.Tensor  # (D, P) bool: spots where an agent overlaps no wall
 
 
 def make_course(name, seed=0, device="cpu", n_spots=512):
-    """The course called `name`."""
+    """Returns the course called `name`."""
     make, n_agents = COURSES[name]
     random = random_scenery.CounterGenerator(seed)
     layouts = [torch.as_tensor(np.float32(walls)) for walls in make(random)]

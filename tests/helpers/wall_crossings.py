@@ -1,4 +1,4 @@
-"""Whether paths cross walls, and how near walls are, in float64 and without the kernels.
+"""Which paths cross walls, and how close walls are, in float64 and without the kernels.
 
 Axes: B copies of each of D layouts, A agents per environment, W walls of the largest layout.
 """
@@ -9,10 +9,10 @@ import torch
 
 from tests.helpers.wall_courses import RADIUS
 
-TOUCH = 1.01 * RADIUS  # m, nearer than which an agent counts as touching
-# cosine between the directions to two touched walls: they meet at less than 83 degrees
+TOUCH = 1.01 * RADIUS  # m: closer agents count as touching
+# maximum cosine between the directions to two touched walls that meet at less than 83 degrees
 CORNER_COSINE = -0.125
-# agents times walls checked at once: within a core's cache; 128 MB per float64
+# agents times walls checked at once: on a CPU they fit into a core's cache, on a GPU into 128 MB
 MAX_PAIRS = dict(cpu=1 << 16, cuda=1 << 24)
 
 
@@ -21,8 +21,8 @@ def cross(ax, ay, bx, by):
 
 
 def boxes_meet(p, q, a, b):
-    """Whether the bounding boxes of segments pq and ab meet, touching included. Exact in any
-    floating type.
+    """True where the bounding boxes of segments pq and ab overlap or touch. Exact in any float
+    dtype.
     """
     meet = None
     for i in (0, 1):
@@ -34,20 +34,20 @@ def boxes_meet(p, q, a, b):
 
 
 def straddles(p, q, a, b):
-    """Whether p and q do not both lie strictly on one side of the line through a and b. Float64."""
+    """True unless p and q lie strictly on one side of the line through a and b. For float64."""
     ex, ey = b[0] - a[0], b[1] - a[1]
     one, other = cross(ex, ey, p[0] - a[0], p[1] - a[1]), cross(ex, ey, q[0] - a[0], q[1] - a[1])
     return (torch.minimum(one, other) <= 0) & (torch.maximum(one, other) >= 0)
 
 
 def crossed(before, after, walls, dense=None):
-    """Whether the straight paths from before to after (B, D, A, 2) touch any of walls (D, W, 2, 2):
-    bool (B, D, A).
+    """Returns (B, D, A) bool: straight paths from before to after (B, D, A, 2) that touch one of
+    walls (D, W, 2, 2).
 
-    Closed segments meet if their boxes do and each straddles the other's line (true of points and
-    of collinear ones too). Boxes are compared in the given type, which is exact, sides in float64.
-    The CPU tries only the pairs whose boxes meet, a GPU all of them (`dense`), because their
-    number would take a synchronisation.
+    Closed segments meet if their bounding boxes do and each straddles the other's line, also if
+    they are points or collinear. Boxes are compared in the given dtype, which is exact, sides in
+    float64. The CPU tests only the pairs whose boxes meet; a GPU tests all (`dense`), since their
+    number would need a synchronisation.
     """
     dense = before.device.type == "cuda" if dense is None else dense
     rows, check = rows_of(before, walls), _crossed_dense if dense else _crossed_sparse
@@ -55,7 +55,7 @@ def crossed(before, after, walls, dense=None):
 
 
 def rows_of(points, walls):
-    """How many of the copies of points (B, D, A, 2) to check at once."""
+    """The number of copies, of points (B, D, A, 2), to check at once."""
     return max(
         MAX_PAIRS[points.device.type] // (walls.shape[0] * walls.shape[1] * points.shape[2]), 1
     )
@@ -84,12 +84,12 @@ def _crossed_sparse(p, q, walls):
 
 
 def surroundings(points, walls):
-    """The nearest wall of each agent at points (B, D, A, 2), how far it is, and whether the agent
-    touches two walls that meet at less than 83 degrees, having them on opposite sides: all (B, D,
-    A).
+    """Returns, for agents at points (B, D, A, 2), all (B, D, A): the nearest wall, its distance,
+    and if the agent is in an acute corner: between two touched walls that meet at less than 83
+    degrees.
     """
-    some = (_surroundings(p, walls) for p in points.split(rows_of(points, walls)))
-    return tuple(map(torch.cat, zip(*some)))
+    chunks = (_surroundings(p, walls) for p in points.split(rows_of(points, walls)))
+    return tuple(map(torch.cat, zip(*chunks)))
 
 
 def _surroundings(points, walls):

@@ -1,8 +1,9 @@
-"""Agents that try to pass walls and, when stopped, to leave, on the courses of wall_courses.py.
-What comes of it is checked by wall_crossings.py, which shares nothing with the kernels.
+"""Agents that try to pass walls and, when stopped, to get away, on the courses of wall_courses.py.
 
-Axes: B copies of each of D layouts (environment e shows layout e % D, as in `scene.scenery`), A
-agents per environment, W walls of the largest layout. Metres, degrees, seconds.
+wall_crossings.py checks the outcome and shares no code with the kernels.
+
+B copies of each of D layouts (environment e shows layout e % D, as in `scene.scenery`), A agents
+per environment, W walls of the largest layout. Metres, degrees, seconds.
 """
 
 import math
@@ -14,12 +15,12 @@ from megastep.modules import MomentumMovement
 from tests.helpers.wall_courses import BODY, RADIUS, make_course
 from tests.helpers.wall_crossings import crossed, surroundings
 
-PHASE, MIN_PHASES = 16, 2  # steps in which agents keep their goals; and the fewest such phases
+PHASE = 16  # steps in which agents keep their targets
+MIN_PHASES = 2
 ACCEL, DECAY = 5.0, 0.125  # MomentumMovement's defaults: m/s^2, and a fraction per step
-TRY = 0.01  # m: the distance tried from where an agent was stopped
-LEAVES = 0.001  # m: the least that counts as leaving
-# m, deeper than which a wall is within the radius, and no rounding: of the 1e-4 between RADIUS and
-# BODY
+TRY = 0.01  # m: distance that a stopped agent tries to get away
+LEAVES = 0.001  # m: minimum distance that counts as getting away
+# m: a wall this deep within the radius is no rounding error; RADIUS and BODY differ by 1e-4
 SUNK = 1e-5
 SETTINGS = [
     (1, 1),
@@ -51,18 +52,18 @@ RECORDED = (
 
 
 class Walk:
-    """Agents on one course, at one rate and acceleration, that seek walls and corners in phases of
-    16 steps.
+    """Agents on one course, at one rate and acceleration, that run into walls and corners in phases
+    of 16 steps.
 
-    Before each phase a quarter of them is placed anew. In a phase an agent heads for an end of a
-    wall, for a point of one, along one, or anywhere, at up to the speed that MomentumMovement would
-    give it in the end. If `acting` it does so by MomentumMovement's actions, else its velocity is
-    written.
+    Before each phase a quarter of them is placed anew. During a phase an agent heads for an end of
+    a wall, for a point on one, along one, or anywhere, at up to MomentumMovement's terminal speed.
+    If `acting`, it takes MomentumMovement's actions; else its velocity is set.
 
-    ``counts`` (4,) int64 are of steps, collisions, crossings, and agents that overlapped no wall
-    when placed but are nearer than their radius to one when a phase ends. ``cornered`` (D,) counts
-    those that then are in an acute corner. ``records`` (B, D, A, 9) describe each agent's first
-    crossing.
+    Attributes:
+        counts: (4,) int64: steps, collisions, crossings, and agents that overlapped no wall when
+            placed but have one within their radius when a phase ends (sunk).
+        cornered: (D,) agents that are in an acute corner when a phase ends.
+        records: (B, D, A, 9), each agent's first crossing.
     """
 
     def __init__(self, course, scenery, fps, accel, acting, seed):
@@ -98,13 +99,13 @@ class Walk:
         return self.core.agents.positions.view(*self.shape, 2)
 
     def count_places(self):
-        """Counts where agents have got to."""
+        """Counts agents that sank into walls or are in corners."""
         _, least, cornered = surroundings(self.positions, self.course.walls)
         self.counts[3] += (self.clear & (least < RADIUS - SUNK)).sum()
         self.cornered += cornered.sum((0, 2))
 
     def respawn(self, fraction):
-        """Places that fraction of the agents anew, at rest."""
+        """Places this fraction of the agents anew, at rest."""
         agents, again = self.core.agents, self.random() < fraction
         spot = self.pick(self.course.spots.shape[1])
         flat, wide = again.view(agents.angles.shape), again[..., None]
@@ -119,7 +120,7 @@ class Walk:
         agents.angvelocity.masked_fill_(flat, 0)
 
     def aim(self):
-        """Gives each agent a wall, and a goal there, for a phase."""
+        """Gives each agent a wall, and a target on it, for a phase."""
         nearest = surroundings(self.positions, self.course.walls)[0]
         some = (self.random() * self.course.counts[:, None]).long()
         wall = torch.where(self.random() < 0.5, nearest, some)
@@ -128,32 +129,31 @@ class Walk:
         foot = (
             ((self.positions - a) * along).sum(-1) / along.square().sum(-1).clamp(min=1e-12)
         ).clamp(0, 1)
-        kind = self.pick(4)  # to an end, to the foot, to anywhere on it, to anywhere on it
+        kind = self.pick(4)  # 0: an end, 1: the closest point, else: anywhere on the wall
         u = torch.where(
             kind == 0, (self.random() < 0.5).float(), torch.where(kind == 1, foot, self.random())
         )
-        self.goal = a + u[..., None] * along
+        self.target = a + u[..., None] * along
         sign, slant = (
             2 * self.pick(2)[..., None] - 1,
             self.slants[self.pick(len(self.slants))][..., None],
         )
         self.grazing = sign * along + slant * torch.stack([-along[..., 1], along[..., 0]], -1)
-        self.mode = self.pick(8)[
-            ..., None
-        ]  # 0: anywhere, 1 and 2: along the wall, else: to the goal
+        # 0: anywhere, 1 and 2: along the wall, else: to the target
+        self.mode = self.pick(8)[..., None]
         self.speeds = (
             self.speed * torch.where(self.random() < 0.5, 1, 10 ** (-4 * self.random()))[..., None]
         )
 
     def headings(self):
-        """Where each agent wants to go, (B, D, A, 2) of length 1 or, being there, 0."""
-        way = torch.where(self.mode == 0, self.random(2) - 0.5, self.goal - self.positions)
+        """Returns each agent's desired direction (B, D, A, 2), of length 1, or 0 at its target."""
+        way = torch.where(self.mode == 0, self.random(2) - 0.5, self.target - self.positions)
         way = torch.where((self.mode == 1) | (self.mode == 2), self.grazing, way)
         return way / way.norm(dim=-1, keepdim=True).clamp(min=1e-30)
 
     def actions(self, headings):
-        """For each agent the action of the first five that takes it furthest along its way; one in
-        ten any.
+        """Returns, of the first five actions, the one that moves each agent furthest along its
+        heading; a random action for one agent in ten.
         """
         radians = torch.deg2rad(self.core.agents.angles.view(self.shape))
         c, s = radians.cos(), radians.sin()
@@ -199,24 +199,24 @@ class Walk:
         self.count_places()
 
     def stopped(self, most):
-        """The (b, d, a) of at most that many agents that the last step stopped, at random.
-        Synchronises with the device.
+        """Returns (b, d, a) of at most that many random agents that the last step stopped.
+        Synchronises.
         """
         b, d, a = (self.progress < 1).nonzero(as_tuple=True)
         some = torch.randperm(len(b), generator=self.generator, device=b.device)[:most]
         return b[some], d[some], a[some]
 
     def describe_crossings(self, most=3):
-        """Sentences on the first few crossings, from which each can be made again; the walls are
-        those of `make_course(name, seed // 1000)`.
+        """Describes the first few crossings, so that each can be repeated on the walls of
+        `make_course(name, seed // 1000)`.
         """
-        told = []
+        descriptions = []
         for b, d, a in (~self.records[..., 0].isnan()).nonzero()[:most].tolist():
             note = ", ".join(
                 f"{name} {x!r}" for name, x in zip(RECORDED, self.records[b, d, a].tolist())
             )
-            told.append(f"{self}: copy {b} of layout {d}, agent {a}: {note}")
-        return told
+            descriptions.append(f"{self}: copy {b} of layout {d}, agent {a}: {note}")
+        return descriptions
 
     def __str__(self):
         how = "acting" if self.acting else "driven"
@@ -230,15 +230,15 @@ class Walk:
 
 
 def directions(n, device):
-    """(n, 2) unit vectors, those along the axes exactly so."""
+    """(n, 2) unit vectors; those along the axes are exact."""
     turn = 2 * math.pi * torch.arange(n, dtype=torch.float64) / n
-    found = torch.stack([turn.cos(), turn.sin()], -1)
-    return torch.where(found.abs() < 1e-12, 0, found).float().to(device)
+    vectors = torch.stack([turn.cos(), turn.sin()], -1)
+    return torch.where(vectors.abs() < 1e-12, 0, vectors).float().to(device)
 
 
 def attempts(scenery, fps, positions, layout, agent, headings):
-    """How far (K, n) agent k of each environment (K, A, 2) gets by a step of 1 cm in each direction
-    of headings (K, n, 2) while the others rest; 0 if physics says that no progress was made.
+    """Returns how far (K, n) one agent of each environment (K, A, 2) gets by a step of 1 cm in each
+    direction of headings (K, n, 2) while the others rest; 0 if physics reports no progress.
     """
     k, n, _ = headings.shape
     copies = engine.Scenery.of_layouts(
@@ -250,18 +250,17 @@ def attempts(scenery, fps, positions, layout, agent, headings):
     )
     agents = engine.Agents(k * n, scenery.n_agents, res=1, fps=fps, device=scenery.device)
     agents.positions.copy_(positions.repeat_interleave(n, 0))
-    each, who = torch.arange(k * n, device=scenery.device), agent.repeat_interleave(n)
-    agents.velocity[each, who] = headings.reshape(-1, 2) * TRY * fps
+    copy, who = torch.arange(k * n, device=scenery.device), agent.repeat_interleave(n)
+    agents.velocity[copy, who] = headings.reshape(-1, 2) * TRY * fps
     start = agents.positions.clone()
     progress = engine.physics(copies, agents).progress
-    way = (agents.positions - start)[each, who].norm(dim=-1)
-    return torch.where(progress[each, who] > 0, way, 0).view(k, n)
+    way = (agents.positions - start)[copy, who].norm(dim=-1)
+    return torch.where(progress[copy, who] > 0, way, 0).view(k, n)
 
 
 def held_by_geometry(position, others, walls):
-    """Whether all that an agent overlaps or all but touches leaves it no direction, within half a
-    degree, that does not bring it nearer to something: then a disc cannot leave. position (2,),
-    others (A - 1, 2), walls (W, 2, 2).
+    """True if every direction, to half a degree, brings a disc closer to something that it overlaps
+    or nearly touches: then it cannot get away. position (2,), others (A - 1, 2), walls (W, 2, 2).
     """
     offset, along = position - walls[:, 0], walls[:, 1] - walls[:, 0]
     u = ((offset * along).sum(-1) / along.square().sum(-1).clamp(min=1e-30)).clamp(0, 1)
@@ -273,9 +272,9 @@ def held_by_geometry(position, others, walls):
 
 
 def stuck(walk, most):
-    """Tries to leave with at most that many agents that were stopped: 32 directions and the way
-    straight back, and 720 if these fail. Returns (how many were tried, how many of them geometry
-    holds, sentences on the others that stay).
+    """Lets at most that many stopped agents try to get away: in 32 directions and straight back,
+    and in 720 if these fail. Returns (number tried, number held by geometry, descriptions of the
+    stuck ones).
     """
     scenery, device = walk.core.scenery, walk.core.device
     b, d, a = walk.stopped(most)
@@ -287,38 +286,41 @@ def stuck(walk, most):
     )
     far = attempts(scenery, walk.fps, positions, d, a, headings).amax(1)
     rest, fine = (far < LEAVES).nonzero()[:, 0], directions(720, device)
-    for some in rest.split(256) if len(rest) else ():
-        all_ways = fine.expand(len(some), -1, -1)
-        far[some] = attempts(scenery, walk.fps, positions[some], d[some], a[some], all_ways).amax(1)
-    n_held, told = 0, []
+    for part in rest.split(256) if len(rest) else ():
+        all_ways = fine.expand(len(part), -1, -1)
+        far[part] = attempts(scenery, walk.fps, positions[part], d[part], a[part], all_ways).amax(1)
+    n_held, descriptions = 0, []
     for k in rest[far[rest] < LEAVES].tolist():
-        places_of_all, own = (
-            positions[k].double(),
-            torch.arange(walk.course.n_agents, device=device) == a[k],
-        )
+        everyone = positions[k].double()
+        is_self = torch.arange(walk.course.n_agents, device=device) == a[k]
         walls = walk.course.walls[d[k], : int(walk.course.counts[d[k]])].double()
         excusable = walk.course.n_agents > 1 or not walk.clear[b[k], d[k], a[k]]
-        if excusable and held_by_geometry(places_of_all[own][0], places_of_all[~own], walls):
+        if excusable and held_by_geometry(everyone[is_self][0], everyone[~is_self], walls):
             n_held += 1
         else:
-            told.append(
+            descriptions.append(
                 f"{walk}: copy {b[k]} of layout {d[k]}, agent {a[k]}, step {walk.age}: stuck in an "
                 f"environment whose agents are at {positions[k].tolist()!r}"
             )
-    return len(b), n_held, told
+    return len(b), n_held, descriptions
 
 
 # ---- Runs ----
 
 
 def run(name, n_steps, n_agents, device="cpu", seed=0, tries=1 << 30, report=None):
-    """Walks a course for at least n_steps agent-steps in all, with up to n_agents at once, at each
-    of the SETTINGS in turn, driven and acting. After each phase up to `tries` of those that were
-    stopped try to leave.
+    """Walks a course with each of the SETTINGS, driven and acting.
 
-    Returns a dict: the COUNTED; `tried`, `held` and `stuck`; `cornered` (D,), a list; and
-    `descriptions` of the first crossings and of the stuck. ``report(total)`` is called after each
-    walk.
+    Args:
+        name: of the course.
+        n_steps: minimum number of agent steps in all.
+        n_agents: maximum number of agents at once.
+        tries: number of stopped agents that try to get away after each phase.
+        report: called with the result so far after each walk.
+
+    Returns:
+        A dict: the COUNTED; `tried`, `held`, `stuck`; `cornered`, a list (D,); `descriptions` of
+        the first crossings and of stuck agents.
     """
     course = make_course(name, seed, device)
     modes = [(*setting, acting) for setting in SETTINGS for acting in (False, True)]
@@ -336,12 +338,10 @@ def run(name, n_steps, n_agents, device="cpu", seed=0, tries=1 << 30, report=Non
         for _ in range(math.ceil((n_steps - total["steps"]) / ((len(modes) - i) * per_phase))):
             walk.phase()
             if tries:
-                tried, held, told = stuck(walk, tries)
+                tried, held, descriptions = stuck(walk, tries)
                 total["tried"], total["held"] = total["tried"] + tried, total["held"] + held
-                total["stuck"], total["descriptions"] = (
-                    total["stuck"] + len(told),
-                    total["descriptions"] + told[:3],
-                )
+                total["stuck"] += len(descriptions)
+                total["descriptions"] += descriptions[:3]
         engine.check(walk.core.agents)
         for key, value in zip(COUNTED, walk.counts.tolist()):
             total[key] += value

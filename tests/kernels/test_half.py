@@ -1,6 +1,4 @@
-"""Rounding to half precision on the CPU, which the kernels do with integers of their own, against
-PyTorch's.
-"""
+"""Rounding to fp16 on the CPU, which the kernels do with integers, against PyTorch."""
 
 import ctypes
 import subprocess
@@ -12,9 +10,9 @@ import torch
 from megastep import core, engine, scene, toys
 from megastep.kernels.build import compile
 
-CANONICAL_NAN = 0x7FFF  # what a GPU's conversion gives for every NaN
+CANONICAL_NAN = 0x7FFF  # a GPU converts every NaN to this one
 SOURCE = """
-#include "backend_cpu.h"
+#include "common/backend_cpu.h"
 extern "C" void halves(const float* values, unsigned short* out, int n) {
     for (int i = 0; i < n; i++)
         out[i] = HALF_BITS(values[i]);
@@ -25,11 +23,11 @@ NANS = [0x7F800001, 0x7F801FFF, 0x7F802000, 0x7FA00000, 0x7FC00000, 0x7FFFFFFF]
 
 @pytest.fixture(scope="module")
 def halves(tmp_path_factory):
-    """The kernels' conversion: floats to the bits of halves."""
+    """The kernels' conversion from floats to the bits of fp16 numbers."""
     folder = tmp_path_factory.mktemp("half")
     (folder / "half.cpp").write_text(SOURCE)
-    compiler, _ = compile._compiler()
-    flags = [*compile.CPU_FLAGS, f"-I{compile.HERE}"]
+    compiler, _ = compile.compiler()
+    flags = [*compile.CPU_FLAGS, f"-I{compile.KERNELS}"]
     subprocess.run(
         [compiler, *flags, str(folder / "half.cpp"), "-o", str(folder / "half.so")], check=True
     )
@@ -43,7 +41,8 @@ def halves(tmp_path_factory):
     return convert
 
 
-def test_every_half_its_neighbours_and_the_ties_between_are_rounded_as_pytorch_does(halves):
+def test_rounds_as_pytorch_does(halves):
+    """Every fp16 number, its float neighbours, and the ties in between."""
     exact = np.arange(0x7C01, dtype=np.uint16).view(np.float16).astype(np.float32)  # 0 to infinity
     exact[-1] = 65536  # the half beyond the largest, whose tie with it rounds to infinity
     ties = (exact[1:] + exact[:-1]) / 2
@@ -57,14 +56,14 @@ def test_every_half_its_neighbours_and_the_ties_between_are_rounded_as_pytorch_d
     assert len(values) > 370_000
 
 
-def test_a_nan_stays_a_nan(halves):
+def test_nan_stays_nan(halves):
     bits = np.array([nan | sign for nan in NANS for sign in (0, 0x80000000)], np.uint32)
     assert (halves(bits.view(np.float32)) == CANONICAL_NAN).all()
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 @pytest.mark.parametrize("nan", NANS)
-def test_a_nan_velocity_is_felt_as_a_nan_of_the_same_bits_on_every_device(nan, device):
+def test_nan_in_the_imu_has_the_same_bits_on_every_device(nan, device):
     if device == "cuda" and not torch.cuda.is_available():
         pytest.skip("needs a GPU")
     c = core.Core(scene.scenery([toys.box()], device=device))

@@ -1,5 +1,5 @@
-"""The cache of built kernels: used again, damaged, raced, full, shared, planted, interrupted. Each
-fault is injected for real.
+"""The cache of built kernels: reused, damaged, raced, full, shared, planted, interrupted. Faults
+are real.
 """
 
 import contextlib
@@ -17,8 +17,9 @@ from test_compile import ROOT, STEP, run
 
 from megastep import cache
 from megastep.kernels.build import compile
+from megastep.kernels.build.launch import ENGINE
 
-UNUSED = "the kernel cache is not used"
+UNUSED = "the cache is not used"
 BODY = b"what was built " * 10_000
 PLANTED = """
 #include <fcntl.h>
@@ -26,12 +27,12 @@ PLANTED = """
 #include <unistd.h>
 __attribute__((constructor)) static void planted() { close(creat(getenv("MARKER"), 0600)); }
 """
-root = pytest.mark.skipif(os.geteuid() != 0, reason="needs leave to give files away")
+root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """The file that a first use of the kernels leaves in its cache, and what that use printed."""
+    """The file that a first use of the kernels puts in the cache, and that use's output."""
     folder = tmp_path_factory.mktemp("cache")
     status, out, err = run(STEP, folder)
     assert status == 0 and UNUSED not in err, err
@@ -41,7 +42,7 @@ def built(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def quick(built, tmp_path_factory):
-    """A compiler, as CXX names it, that gives what was built before, a second after it began."""
+    """A path for CXX: a compiler that takes one second and returns the library built before."""
     path = tmp_path_factory.mktemp("compiler") / "c++"
     path.write_text(
         f'#!/bin/sh\n[ "$1" = --version ] && exec echo quick\ntouch "$MARKER"\nsleep 1\n'
@@ -53,7 +54,7 @@ def quick(built, tmp_path_factory):
 
 @pytest.fixture
 def fetch(monkeypatch):
-    """``cache.fetch`` of a file in a folder: its body, its path, and how often it was built."""
+    """``cache.fetch`` of a file in a folder, which returns (body, path, number of builds)."""
 
     def fetch(folder):
         monkeypatch.setenv("MEGASTEP_CACHE", str(folder))
@@ -66,27 +67,27 @@ def fetch(monkeypatch):
 
 @contextlib.contextmanager
 def mounted(folder, options):
-    """A small file system on the folder; skips where one may not be mounted."""
+    """Mounts a small file system on the folder. Skips the test if that is not permitted."""
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", options + ",mode=0700", "tmpfs", str(folder)]
     if sys.platform != "linux" or os.geteuid() or subprocess.run(command).returncode:
-        pytest.skip("needs leave to mount")
+        pytest.skip("needs permission to mount")
     try:
         yield folder
     finally:
         subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
-# ---- Used again, damaged, raced ----
+# ---- Reused, damaged, raced ----
 
 
-def test_the_library_is_cached_and_used_again(built):
+def test_library_is_cached(built):
     path, out = built
     before = path.stat().st_mtime_ns
     assert run(STEP, path.parent)[:2] == (0, out) and path.stat().st_mtime_ns == before
 
 
-def test_a_new_folder_is_for_its_owner_alone(fetch, tmp_path):
+def test_new_folder_is_private(fetch, tmp_path):
     before = os.umask(0)
     try:
         body, path, builds = fetch(tmp_path / "new")
@@ -98,7 +99,7 @@ def test_a_new_folder_is_for_its_owner_alone(fetch, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "garbage", "missing"])
-def test_a_damaged_file_is_built_again(fetch, damage, tmp_path):
+def test_damaged_file_is_built_again(fetch, damage, tmp_path):
     _, path, _ = fetch(tmp_path)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
@@ -108,12 +109,12 @@ def test_a_damaged_file_is_built_again(fetch, damage, tmp_path):
         assert fetch(tmp_path) == (BODY, path, 1)
     else:
         path.write_bytes(damaged[damage])
-        with pytest.warns(UserWarning, match="is damaged or not this user's own: it is made again"):
+        with pytest.warns(UserWarning, match="is damaged"):
             assert fetch(tmp_path) == (BODY, path, 1)
     assert fetch(tmp_path) == (BODY, path, 0)
 
 
-def test_two_processes_may_build_at_once(built, quick, tmp_path):
+def test_two_processes_build_at_once(built, quick, tmp_path):
     env = {**os.environ, "MEGASTEP_CACHE": str(tmp_path), "CXX": quick}
     command = [sys.executable, "-c", STEP]
     both = [
@@ -127,21 +128,21 @@ def test_two_processes_may_build_at_once(built, quick, tmp_path):
 # ---- Folders that cannot be used ----
 
 
-def test_a_folder_that_cannot_be_made_is_done_without(fetch, tmp_path):
+def test_folder_that_cannot_be_made(fetch, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.warns(UserWarning, match=f"{UNUSED}.*cannot be used"):
         assert fetch(tmp_path / "file" / "cache") == (BODY, None, 1)
     assert (tmp_path / "file").read_text() == "in the way"
 
 
-def test_a_full_folder_is_done_without(fetch, tmp_path):
+def test_full_folder(fetch, tmp_path):
     with mounted(tmp_path / "full", "size=16k") as folder:
         with pytest.warns(UserWarning, match=f"{UNUSED}.*No space left"):
             assert fetch(folder) == (BODY, None, 1)
         assert not list(folder.iterdir()), "no half-written file is left"
 
 
-def test_a_write_that_fails_leaves_nothing(fetch, tmp_path, monkeypatch):
+def test_failed_write_leaves_nothing(fetch, tmp_path, monkeypatch):
     def full(*args):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -151,7 +152,7 @@ def test_a_write_that_fails_leaves_nothing(fetch, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_libraries_may_not_be_loaded_from_is_done_without(built, quick, tmp_path):
+def test_noexec_folder(built, quick, tmp_path):
     with mounted(tmp_path / "noexec", "size=4m,noexec") as folder:
         status, out, err = run(STEP, folder, CXX=quick)
         assert (status, out) == (0, built[1]), err
@@ -159,29 +160,29 @@ def test_a_folder_that_libraries_may_not_be_loaded_from_is_done_without(built, q
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o702])
-def test_a_folder_that_others_may_write_is_done_without(fetch, mode, tmp_path):
+def test_folder_writable_by_others(fetch, mode, tmp_path):
     _, path, _ = fetch(tmp_path)
     tmp_path.chmod(mode)
-    with pytest.warns(UserWarning, match=f"{UNUSED}.*other users may write.*chmod 700"):
+    with pytest.warns(UserWarning, match=f"{UNUSED}.*other users can write.*chmod 700"):
         assert fetch(tmp_path) == (BODY, None, 1)
 
 
-def test_a_folder_that_others_may_replace_is_done_without(fetch, tmp_path):
+def test_folder_replaceable_by_others(fetch, tmp_path):
     tmp_path.chmod(0o777)
-    with pytest.warns(UserWarning, match=f"{UNUSED}.*other users may replace"):
+    with pytest.warns(UserWarning, match=f"{UNUSED}.*other users can replace"):
         assert fetch(tmp_path / "own") == (BODY, None, 1)
     tmp_path.chmod(0o1777)  # sticky, as /tmp is: only owners may rename
     assert fetch(tmp_path / "own")[1:] == (tmp_path / "own" / "name", 1)
 
 
 @root
-def test_a_folder_of_another_user_is_done_without(fetch, tmp_path):
+def test_folder_of_another_user(fetch, tmp_path):
     os.chown(tmp_path, 12345, 12345)
-    with pytest.warns(UserWarning, match=f"{UNUSED}.*other users may write"):
+    with pytest.warns(UserWarning, match=f"{UNUSED}.*other users can write"):
         assert fetch(tmp_path) == (BODY, None, 1)
 
 
-def test_nowhere_to_load_from_is_one_sentence_with_the_cure(tmp_path, monkeypatch):
+def test_no_folder_to_load_from(tmp_path, monkeypatch):
     def refuse(path):
         raise OSError(f"{path}: failed to map segment from shared object")
 
@@ -194,13 +195,13 @@ def test_nowhere_to_load_from_is_one_sentence_with_the_cure(tmp_path, monkeypatc
     assert "\n" not in str(error.value)
 
 
-def test_no_room_to_build_is_one_sentence_with_the_cure(monkeypatch):
+def test_no_room_to_build(monkeypatch):
     def full(*args, **kwargs):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(compile.tempfile, "mkdtemp", full)
     with pytest.raises(compile.EngineError, match="No space left on device.*set TMPDIR") as error:
-        compile._build_cpu(compile._compiler()[0])
+        compile._build_cpu(ENGINE, compile.compiler()[0])
     assert "\n" not in str(error.value)
 
 
@@ -208,7 +209,7 @@ def test_no_room_to_build_is_one_sentence_with_the_cure(monkeypatch):
 
 
 @pytest.mark.parametrize("how", ["a group may write it", "all may write it"])
-def test_a_file_that_others_may_write_is_built_again(fetch, how, tmp_path):
+def test_file_writable_by_others_is_built_again(fetch, how, tmp_path):
     _, path, _ = fetch(tmp_path)
     path.chmod(0o620 if how == "a group may write it" else 0o602)
     assert fetch(tmp_path) == (BODY, path, 1)
@@ -216,22 +217,22 @@ def test_a_file_that_others_may_write_is_built_again(fetch, how, tmp_path):
 
 
 @root
-def test_a_file_of_another_user_is_built_again(fetch, tmp_path):
+def test_file_of_another_user_is_built_again(fetch, tmp_path):
     _, path, _ = fetch(tmp_path)
     os.chown(path, 12345, 12345)
     assert fetch(tmp_path) == (BODY, path, 1)
     assert path.stat().st_uid == 0
 
 
-def test_a_planted_library_is_never_loaded(built, tmp_path, monkeypatch):
-    """One that another user left in a folder of all, under the right name and intact by its digest,
-    and that leaves a mark when it is loaded.
+def test_planted_library_is_never_loaded(built, tmp_path, monkeypatch):
+    """Another user left it in a shared folder, with the right name and digest. It leaves a mark if
+    loaded.
     """
     folder, mark, source = tmp_path / "folder", tmp_path / "mark", tmp_path / "planted.c"
     folder.mkdir()
     source.write_text(PLANTED)
     library = tmp_path / "planted.so"
-    compiler, _ = compile._compiler()
+    compiler, _ = compile.compiler()
     command = [compiler, "-x", "c", "-shared", "-fPIC", str(source), "-o", str(library)]
     subprocess.run(command, check=True)
     body = library.read_bytes()
@@ -243,15 +244,15 @@ def test_a_planted_library_is_never_loaded(built, tmp_path, monkeypatch):
     assert err.count(UNUSED) == 1 and not mark.exists()
     monkeypatch.setenv("MARKER", str(mark))
     ctypes.CDLL(str(path))
-    assert mark.exists(), "it would have left its mark"
+    assert mark.exists(), "it leaves its mark if loaded"
 
 
 # ---- Signals ----
 
 
 def interrupted(folder, compiler, code):
-    """What a program does that a terminal's Ctrl-C reaches, with all its children, while it builds:
-    (exit status, stdout, stderr).
+    """Sends Ctrl-C to a program and its children while it builds. Returns (exit status, stdout,
+    stderr).
     """
     mark = folder / "mark"
     process = subprocess.Popen(
@@ -276,14 +277,14 @@ def interrupted(folder, compiler, code):
     return process.returncode, out.strip(), err
 
 
-def test_ctrl_c_while_building_is_the_programs_to_handle(built, quick, tmp_path):
+def test_ctrl_c_while_building_reaches_the_programs_handler(built, quick, tmp_path):
     handled = "import signal; signal.signal(signal.SIGINT, lambda *args: print('noted'))"
     status, out, err = interrupted(tmp_path, quick, handled + STEP)
     assert (status, out.split()) == (0, ["noted", built[1]]), err
 
 
-def test_ctrl_c_while_building_ends_a_program_that_does_not_handle_it(quick, tmp_path):
-    # Python's own handler, for in the background of a shell signals are ignored.
+def test_ctrl_c_while_building_ends_a_program_without_handler(quick, tmp_path):
+    # Python's own handler, since signals are ignored in the background of a shell.
     usual = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     status, out, err = interrupted(tmp_path, quick, usual + STEP)
     assert status == -signal.SIGINT and "KeyboardInterrupt" in err and "EngineError" not in err
@@ -293,10 +294,10 @@ def test_ctrl_c_while_building_ends_a_program_that_does_not_handle_it(quick, tmp
 @pytest.mark.parametrize(
     "stop", ["kill -TERM $$", 'echo "c++: Killed signal terminated program cc1plus" >&2; exit 1']
 )
-def test_a_compiler_that_a_signal_stopped_is_not_called_missing(stop, tmp_path):
+def test_compiler_stopped_by_a_signal(stop, tmp_path):
     stopped = tmp_path / "c++"
     stopped.write_text(f"#!/bin/sh\n{stop}\n")
     stopped.chmod(0o755)
     with pytest.raises(compile.EngineError, match=r"stopped by a signal \((SIGTERM|Killed)\)") as e:
-        compile._build_cpu(str(stopped))
+        compile._build_cpu(ENGINE, str(stopped))
     assert "install" not in str(e.value) and "\n" not in str(e.value)

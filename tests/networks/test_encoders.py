@@ -1,4 +1,4 @@
-"""Convolutions as products with banded matrices; what encoders are for is in test_heads.py."""
+"""Convolutions as banded matrices. test_heads.py tests encoders as part of intakes."""
 
 import pytest
 import torch
@@ -8,28 +8,28 @@ from megastep.agents.networks import encoders
 
 
 @pytest.mark.parametrize("shape", [(3, 128), (1, 64), (6, 37), (1, 5)])
-def test_a_convolution_is_a_product_with_a_banded_matrix(shape):
+def test_banded_matrix_matches_convolution(shape):
     channels, n_columns = shape
     conv = encoders.Conv(spaces.MultiImage(1, channels, 1, n_columns))
     rows = torch.rand(6, channels, n_columns, generator=torch.Generator().manual_seed(1))
     for layer in conv.first, conv.second:
-        wanted, found = layer(rows), layer.as_product(rows)
-        torch.testing.assert_close(found, wanted)
-        weights = torch.rand(wanted.shape, generator=torch.Generator().manual_seed(2))
+        expected, product = layer(rows), layer.as_product(rows)
+        torch.testing.assert_close(product, expected)
+        weights = torch.rand(expected.shape, generator=torch.Generator().manual_seed(2))
         parameters = layer.weight, layer.bias
         torch.testing.assert_close(
-            torch.autograd.grad((found * weights).sum(), parameters),
-            torch.autograd.grad((wanted * weights).sum(), parameters),
+            torch.autograd.grad((product * weights).sum(), parameters),
+            torch.autograd.grad((expected * weights).sum(), parameters),
             rtol=1e-4,
             atol=1e-4,
         )
-        rows = wanted.detach()
+        rows = expected.detach()
 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("n_columns", [128, 2 * encoders.BandedConv1d.MAX_BANDED])
-def test_gpu_and_cpu_convolve_alike(n_columns):
+def test_gpu_matches_cpu(n_columns):
     conv = encoders.Conv(spaces.MultiImage(1, 3, 1, n_columns))
     image = torch.rand(7, 1, 3, 1, n_columns, generator=torch.Generator().manual_seed(1))
-    wanted = conv(image)
-    torch.testing.assert_close(conv.cuda()(image.cuda()).cpu(), wanted, rtol=1e-3, atol=1e-3)
+    expected = conv(image)
+    torch.testing.assert_close(conv.cuda()(image.cuda()).cpu(), expected, rtol=1e-3, atol=1e-3)

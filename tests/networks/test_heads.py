@@ -1,4 +1,4 @@
-"""Heads: networks made from spaces, and the distributions over actions they stand for."""
+"""Intakes and outputs made from spaces, and distributions of actions."""
 
 import math
 
@@ -20,8 +20,8 @@ MOVES = arrdict(movement=spaces.MultiDiscrete(2, 7), fire=spaces.MultiDiscrete(2
 WIDTH = 24
 
 
-def sample_of(space, *lead, seed=0, dtype=torch.float32):
-    """Something that an environment with this space might show."""
+def random_obs(space, *lead, seed=0, dtype=torch.float32):
+    """Returns a random observation of a space."""
     generator = torch.Generator().manual_seed(seed)
 
     def leaf(child):
@@ -37,17 +37,17 @@ def sample_of(space, *lead, seed=0, dtype=torch.float32):
     "space", [IMAGE, VECTOR, spaces.MultiDiscrete(2, 4), TREE, spaces.MultiImage(1, 3, 4, 1)]
 )
 @pytest.mark.parametrize("lead", [(), (6,), (3, 6)])
-def test_an_intake_gives_width_numbers_whatever_it_is_shown(space, encoder, lead):
+def test_intake_shape(space, encoder, lead):
     intake = heads.intake(space, WIDTH, encoder)
-    out = intake(sample_of(space, *lead))
+    out = intake(random_obs(space, *lead))
     assert out.shape == (*lead, WIDTH) and out.dtype == torch.float32 and out.isfinite().all()
 
 
 @pytest.mark.parametrize("encoder", encoders.ENCODERS)
-def test_every_pixel_and_every_leaf_matters(encoder):
+def test_every_pixel_and_leaf_has_a_gradient(encoder):
     torch.manual_seed(0)
     intake = heads.intake(TREE, 512, encoder)
-    obs = sample_of(TREE, 1)
+    obs = random_obs(TREE, 1)
     for leaf in (obs.eyes.rgb, obs.eyes.d, obs.imu):
         leaf.requires_grad_()
     intake(obs).sum().backward()
@@ -57,46 +57,44 @@ def test_every_pixel_and_every_leaf_matters(encoder):
     assert not torch.equal(intake(other), intake(obs))
 
 
-def test_the_order_of_keys_does_not_matter():
+def test_order_of_keys_does_not_matter():
     intake = heads.intake(TREE, WIDTH)
-    obs = sample_of(TREE, 6)
+    obs = random_obs(TREE, 6)
     backwards = arrdict({key: obs[key] for key in reversed(obs)})
     assert torch.equal(intake(backwards), intake(obs))
 
 
-def test_half_precision_images_meet_single_precision_weights():
+def test_float16_observations():
     intake = heads.intake(TREE, WIDTH)
-    half = sample_of(TREE, 6, dtype=torch.float16)
+    half = random_obs(TREE, 6, dtype=torch.float16)
     single = half.map(lambda leaf: leaf.float() if leaf.is_floating_point() else leaf)
     assert torch.equal(intake(half), intake(single))
 
 
-def test_autocast_decides_the_dtype_of_the_products_but_not_of_the_logits():
+def test_autocast_changes_features_not_logits():
     intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
     with torch.autocast("cpu", torch.bfloat16):
-        x = intake(sample_of(TREE, 6, dtype=torch.float16))
+        x = intake(random_obs(TREE, 6, dtype=torch.float16))
         assert x.dtype == torch.bfloat16
         assert output(x).movement.dtype == torch.float32
 
 
-def test_leaves_weigh_the_same_at_the_start():
-    # An image of 3 x 64 numbers and a vector of 3, all 1: each leaf's part of the sum has variance
-    # 2/2
+def test_leaves_have_equal_initial_weight():
+    # an image of 3 x 64 numbers and a vector of 3, all 1: each leaf's part of the sum has variance
+    # 1
     torch.manual_seed(0)
     intake = heads.intake(
         arrdict(rgb=spaces.MultiImage(1, 3, 1, 64), imu=spaces.MultiVector(1, 3)), 4096
     )
-    of_rgb, of_imu, padding = intake.project.weight.split([192, 3, 5], dim=1)
+    rgb, imu, padding = intake.project.weight.split([192, 3, 5], dim=1)
     assert not padding.any()
-    for part in (of_rgb, of_imu):
-        assert part.sum(1).var().item() == pytest.approx(
-            1, abs=0.1
-        )  # 4096 samples: 4.5 standard errors
+    for block in (rgb, imu):  # 4096 samples: 4.5 standard errors
+        assert block.sum(1).var().item() == pytest.approx(1, abs=0.1)
 
 
-def test_logits_are_log_probabilities_that_an_env_can_be_given():
+def test_shapes_of_logits_and_actions():
     intake, output = heads.intake(TREE, WIDTH), heads.output(MOVES, WIDTH)
-    logits = nn.Sequential(intake, output)(sample_of(TREE, 6))
+    logits = nn.Sequential(intake, output)(random_obs(TREE, 6))
     assert logits.movement.shape == (6, 2, 7) and logits.fire.shape == (6, 2, 2)
     torch.testing.assert_close(logits.movement.exp().sum(-1), torch.ones(6, 2))
     actions = output.sample(logits)
@@ -106,20 +104,20 @@ def test_logits_are_log_probabilities_that_an_env_can_be_given():
     assert output.logprob(logits, actions).shape == output.entropy(logits).shape == (6,)
 
 
-def test_a_bare_space_gives_bare_actions():
+def test_bare_action_space():
     output = heads.output(spaces.MultiDiscrete(1, 7), WIDTH)
     logits = output(torch.randn(3, 5, WIDTH))
     assert logits.shape == (3, 5, 1, 7) and output.sample(logits).shape == (3, 5, 1)
 
 
-def test_logprob_and_entropy_by_hand():
+def test_logprob_and_entropy_match_hand_calculation():
     output = heads.output(MOVES, WIDTH)
     even = arrdict(
         movement=torch.full((1, 2, 7), 1 / 7).log(),
         fire=torch.tensor([[[0.25, 0.75], [0.5, 0.5]]]).log(),
     )
     actions = arrdict(movement=torch.tensor([[6, 0]]), fire=torch.tensor([[1, 0]]))
-    # two agents move evenly among 7, one fires with 3/4, the other with 1/2
+    # two agents move uniformly among 7; one fires with probability 3/4, the other with 1/2
     assert output.logprob(even, actions).item() == pytest.approx(
         2 * math.log(1 / 7) + math.log(0.75) + math.log(0.5)
     )
@@ -128,14 +126,14 @@ def test_logprob_and_entropy_by_hand():
     assert output.greedy(even).fire.tolist() == [[1, 0]]
 
 
-def test_the_first_policy_is_close_to_uniform():
+def test_initial_policy_is_almost_uniform():
     output = heads.output(spaces.MultiDiscrete(1, 7), WIDTH)
     assert output.entropy(output(torch.randn(100, WIDTH))).min().item() == pytest.approx(
         math.log(7), abs=0.01
     )
 
 
-def test_actions_are_sampled_as_often_as_they_are_probable():
+def test_sample_frequencies_match_probabilities():
     probabilities = torch.tensor([0.5, 0.3, 0.15, 0.05])
     output, n = heads.output(spaces.MultiDiscrete(1, 4), WIDTH), 100_000
     logits = probabilities.log().expand(n, 1, 4)
@@ -146,13 +144,13 @@ def test_actions_are_sampled_as_often_as_they_are_probable():
     assert ((sampled - probabilities).abs() < 4 * error).all()
 
 
-def test_what_is_impossible_is_never_sampled():
+def test_probability_zero_is_never_sampled():
     output = heads.output(spaces.MultiDiscrete(1, 3), WIDTH)
     logits = torch.tensor([0.0, 1.0, 0.0]).log().expand(100_000, 1, 3)
     assert (output.sample(logits, torch.Generator().manual_seed(0)) == 1).all()
 
 
-def test_a_generator_decides_all_samples():
+def test_generator_determines_samples():
     output = heads.output(MOVES, WIDTH)
     logits = output(torch.randn(50, WIDTH))
     torch.manual_seed(0)
@@ -162,7 +160,7 @@ def test_a_generator_decides_all_samples():
     assert torch.equal(before, torch.get_rng_state())
 
 
-def test_action_values_are_a_value_and_advantages_over_their_mean():
+def test_duelling_is_value_plus_centred_advantages():
     output = heads.output(spaces.MultiDiscrete(2, 3), WIDTH, "duelling")
     x = torch.randn(5, WIDTH)
     hidden = output.hidden(x).relu()
@@ -173,7 +171,7 @@ def test_action_values_are_a_value_and_advantages_over_their_mean():
     torch.testing.assert_close(q.diff(dim=-1), advantage.diff(dim=-1))
 
 
-def test_the_value_of_a_joint_action_is_the_sum_over_its_parts():
+def test_joint_action_value_is_sum():
     output = heads.output(MOVES, WIDTH, "duelling")
     logits = output(torch.randn(4, 6, WIDTH))
     actions = output.greedy(logits)
@@ -184,7 +182,7 @@ def test_the_value_of_a_joint_action_is_the_sum_over_its_parts():
     torch.testing.assert_close(output.action_value(logits, other), best - loss)
 
 
-def test_of_action_values_the_best_is_taken_and_now_and_then_any():
+def test_duelling_sample_is_epsilon_greedy():
     n = 100_000
     output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
     logits = torch.tensor([0.1, 0.9, 0.3, -2.0]).expand(n, 1, 4)
@@ -201,18 +199,18 @@ def test_of_action_values_the_best_is_taken_and_now_and_then_any():
     torch.testing.assert_close(shares, likely, rtol=0, atol=0.0025)
 
 
-def test_action_values_are_in_single_precision_where_products_are_not():
+def test_action_values_are_float32_under_autocast():
     output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
     with torch.no_grad():
         output.value.bias += 300.0
         with torch.autocast("cpu", torch.bfloat16):
-            found = output(torch.randn(50, WIDTH))
-    assert found.dtype == torch.float32
-    # about 300 neighbours are 2 apart in bfloat16
-    assert 0.01 < found.std() < 1 and len(found.mean(-1).unique()) > 40
+            values = output(torch.randn(50, WIDTH))
+    assert values.dtype == torch.float32
+    # near 300, bfloat16 numbers are 2 apart
+    assert 0.01 < values.std() < 1 and len(values.mean(-1).unique()) > 40
 
 
-def test_features_of_zero_leave_action_values_something_to_learn_from():
+def test_zero_features_have_a_gradient():
     output = heads.output(spaces.MultiDiscrete(1, 4), WIDTH, "duelling")
     x = torch.zeros(1, WIDTH, requires_grad=True)
     output(x)[0, 0, 1].backward()
@@ -220,25 +218,25 @@ def test_features_of_zero_leave_action_values_something_to_learn_from():
 
 
 @pytest.mark.parametrize(
-    "make, words",
+    "make, error",
     [
         (lambda: heads.intake("images", WIDTH), "observation space itself = 'images'"),
         (lambda: heads.intake(arrdict(imu=VECTOR, x=3), WIDTH), "observation space x = 3"),
         (lambda: heads.intake(arrdict(nothing=spaces.MultiEmpty()), WIDTH), "nothing in it"),
         (
             lambda: heads.intake(IMAGE, WIDTH, "resnet"),
-            "'resnet' is unknown; there are conv, linear, module:Class",
+            "'resnet'.*conv, linear, module:Class",
         ),
-        (lambda: heads.output(VECTOR, WIDTH), "there are MultiDiscrete and dicts of it"),
-        (lambda: heads.output(arrdict(), WIDTH), "there are MultiDiscrete and dicts of it"),
+        (lambda: heads.output(VECTOR, WIDTH), "MultiDiscrete or dicts of it"),
+        (lambda: heads.output(arrdict(), WIDTH), "MultiDiscrete or dicts of it"),
     ],
 )
-def test_a_space_that_no_head_is_known_for_is_refused(make, words):
-    with pytest.raises(ValueError, match=words):
+def test_unknown_spaces_raise(make, error):
+    with pytest.raises(ValueError, match=error):
         make()
 
 
-def test_images_are_standardised_by_channel_and_vectors_by_number():
+def test_normalises_images_per_channel_and_vectors_per_number():
     space = arrdict(rgb=spaces.MultiImage(1, 2, 1, 3), imu=spaces.MultiVector(1, 2))
     intake = heads.intake(space, WIDTH)
     rgb = (
@@ -248,25 +246,25 @@ def test_images_are_standardised_by_channel_and_vectors_by_number():
     )
     imu = torch.tensor([[5.0, 0.0], [7.0, 0.0], [5.0, 0.0], [7.0, 0.0]])[:, None]
     intake.update_stats(arrdict(rgb=rgb.half(), imu=imu.half()))
-    of_rgb, of_imu = intake.norms
+    rgb_norm, imu_norm = intake.norms
     torch.testing.assert_close(
-        of_rgb(rgb)[0, 0, 0, 0], torch.tensor([-(1.5**0.5), 0.0, 1.5**0.5])
+        rgb_norm(rgb)[0, 0, 0, 0], torch.tensor([-(1.5**0.5), 0.0, 1.5**0.5])
     )  # std sqrt 2/3
     torch.testing.assert_close(
-        of_rgb(rgb)[0, 0, 1, 0], torch.tensor([-(0.5**0.5), -(0.5**0.5), 2**0.5])
+        rgb_norm(rgb)[0, 0, 1, 0], torch.tensor([-(0.5**0.5), -(0.5**0.5), 2**0.5])
     )
-    torch.testing.assert_close(of_imu(imu)[:, 0, 0], torch.tensor([-1.0, 1.0, -1.0, 1.0]))
-    assert not of_imu(imu)[..., 1].any()  # what never varies divides by no zero
+    torch.testing.assert_close(imu_norm(imu)[:, 0, 0], torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    assert not imu_norm(imu)[..., 1].any()  # a constant divides by min_scale, not by 0
 
-    # A second call weighs a half: mean (6 + 10) / 2, mean square (37 + 100) / 2
+    # the second call has weight 1/2: mean (6 + 10) / 2, mean square (37 + 100) / 2
     intake.update_stats(arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
-    assert of_imu.mean[0, 0].item() == 8 and of_imu.scale[0, 0].item() == pytest.approx(
+    assert imu_norm.mean[0, 0].item() == 8 and imu_norm.scale[0, 0].item() == pytest.approx(
         (137 / 2 - 64) ** 0.5
     )
 
 
-def test_what_was_learned_about_observations_is_saved_with_the_weights():
-    intake, other, obs = heads.intake(TREE, WIDTH), heads.intake(TREE, WIDTH), sample_of(TREE, 6)
+def test_statistics_are_saved_with_weights():
+    intake, other, obs = heads.intake(TREE, WIDTH), heads.intake(TREE, WIDTH), random_obs(TREE, 6)
     intake.update_stats(obs)
     other.load_state_dict(intake.state_dict())
     assert torch.equal(other(obs), intake(obs))

@@ -1,7 +1,6 @@
-"""The LSTM against PyTorch's own, and its resets against sequences cut by hand.
+"""The LSTM against torch.nn.LSTMCell, and its kernels against the CPU implementation.
 
-The GPU's kernels are compared with what is written out for the CPU: on a GPU, and compiled for a
-CPU through `cuda_on_cpu.h`, which runs the same source.
+Kernels run on a GPU, and compiled for the CPU from the same source (`cuda_on_cpu.h`).
 """
 
 import pytest
@@ -20,7 +19,7 @@ CLOSE = dict(rtol=1e-5, atol=1e-5)  # float32 sums of 16 products, nine steps de
 
 
 def case(seed=0, p_reset=0.3):
-    """An LSTM, inputs (T, B, W), resets (T, B), and a state that is not zero."""
+    """Returns an LSTM, inputs (T, B, W), resets (T, B) and a nonzero hidden state."""
     torch.manual_seed(seed)
     lstm = LSTM(W)
     with torch.no_grad():
@@ -30,18 +29,19 @@ def case(seed=0, p_reset=0.3):
     return lstm, x, torch.rand(T, B) < p_reset, state
 
 
-def torchs_own(lstm):
+def torch_cell(lstm):
+    """Returns PyTorch's cell with the same weights."""
     cell = nn.LSTMCell(W, W)
     with torch.no_grad():
         cell.weight_ih.copy_(lstm.input.weight)
-        cell.weight_hh.copy_(lstm.memory.weight)
+        cell.weight_hh.copy_(lstm.recurrent.weight)
         cell.bias_ih.copy_(lstm.input.bias)
         cell.bias_hh.zero_()
     return cell
 
 
 def by_hand(cell, x, reset, state):
-    """One lane and one step at a time, starting from zeros where an episode starts."""
+    """Runs lane by lane and step by step, from zeros where an episode starts."""
     outputs, cells = [], []
     for b in range(x.shape[1]):
         h, c = state.output[b], state.cell[b]
@@ -55,9 +55,9 @@ def by_hand(cell, x, reset, state):
 
 
 @pytest.mark.parametrize("p_reset", [0.0, 0.3, 1.0])
-def test_outputs_and_gradients_are_those_of_torchs_own_cell(p_reset):
+def test_outputs_and_gradients_match_torch(p_reset):
     lstm, x, reset, state = case(p_reset=p_reset)
-    cell = torchs_own(lstm)
+    cell = torch_cell(lstm)
     outputs, after = lstm(x, reset, state)
     expected, expected_cell = by_hand(cell, x, reset, state)
     torch.testing.assert_close(outputs, expected, **CLOSE)
@@ -65,25 +65,27 @@ def test_outputs_and_gradients_are_those_of_torchs_own_cell(p_reset):
     torch.testing.assert_close(after.cell, expected_cell, **CLOSE)
 
     weights = torch.randn(T, B, W), torch.randn(B, W)
-    of = (x, state.output, state.cell)
-    ours = torch.autograd.grad(
+    inputs = (x, state.output, state.cell)
+    grads = torch.autograd.grad(
         (outputs * weights[0]).sum() + (after.cell * weights[1]).sum(),
-        (*of, lstm.input.weight, lstm.memory.weight, lstm.input.bias),
+        (*inputs, lstm.input.weight, lstm.recurrent.weight, lstm.input.bias),
     )
-    theirs = torch.autograd.grad(
+    expected_grads = torch.autograd.grad(
         (expected * weights[0]).sum() + (expected_cell * weights[1]).sum(),
-        (*of, cell.weight_ih, cell.weight_hh, cell.bias_ih),
+        (*inputs, cell.weight_ih, cell.weight_hh, cell.bias_ih),
         materialize_grads=True,
     )
-    for name, a, b in zip(
-        ("x", "output", "cell", "input", "memory", "bias"), ours, theirs, strict=True
-    ):
+    names = "x", "output", "cell", "input", "recurrent", "bias"
+    for name, grad, expected_grad in zip(names, grads, expected_grads, strict=True):
         torch.testing.assert_close(
-            a, b, rtol=1e-4, atol=1e-4, msg=lambda text, name=name: f"d {name}: {text}"
+            *(grad, expected_grad),
+            rtol=1e-4,
+            atol=1e-4,
+            msg=lambda text, name=name: f"d {name}: {text}",
         )
 
 
-def test_steps_and_a_sequence_agree():
+def test_sequence_matches_steps():
     lstm, x, reset, state = case()
     outputs, after = lstm(x, reset, state)
     for t in range(T):
@@ -92,7 +94,7 @@ def test_steps_and_a_sequence_agree():
     torch.testing.assert_close(state.cell, after.cell, **CLOSE)
 
 
-def test_a_sequence_may_be_cut_anywhere():
+def test_sequence_can_be_split():
     lstm, x, reset, state = case()
     whole, _ = lstm(x, reset, state)
     first, between = lstm(x[:4], reset[:4], state)
@@ -100,7 +102,7 @@ def test_a_sequence_may_be_cut_anywhere():
     torch.testing.assert_close(torch.cat([first, second]), whole, **CLOSE)
 
 
-def test_nothing_before_a_reset_is_remembered_not_even_a_nan():
+def test_reset_clears_even_nan():
     lstm, x, _, state = case()
     reset = torch.zeros(T, B, dtype=torch.bool)
     reset[4] = True
@@ -112,7 +114,7 @@ def test_nothing_before_a_reset_is_remembered_not_even_a_nan():
     assert not d_x[:4].any() and d_x[4:].all()
 
 
-def test_without_a_reset_the_first_input_reaches_the_last_output():
+def test_first_input_reaches_last_output_without_reset():
     lstm, x, _, state = case()
     (d_x,) = torch.autograd.grad(
         lstm(x, torch.zeros(T, B, dtype=torch.bool), state)[0][-1].sum(), x
@@ -126,9 +128,9 @@ def test_lanes_do_not_mix():
     assert d_x[-1, 2].all() and not d_x[:, [0, 1, 3, 4]].any()
 
 
-def test_forget_gates_start_open_and_no_other_gate():
-    # Jozefowicz et al. 2015: a bias of 1; in the order of torch.nn.LSTM, forget is the second of
-    # four. With no input and no output yet, a cell then retains sigmoid(1) of itself per step.
+def test_forget_gates_start_open():
+    # Jozefowicz et al. 2015: a bias of 1. Forget is the second gate, as in torch.nn.LSTM. Without
+    # input and output, a cell then keeps sigmoid(1) of its value per step.
     lstm = LSTM(W)
     biases = lstm.input.bias.detach().split(W)
     assert [bias.unique().tolist() for bias in biases] == [[0.0], [1.0], [0.0], [0.0]]
@@ -138,7 +140,7 @@ def test_forget_gates_start_open_and_no_other_gate():
     torch.testing.assert_close(after.cell, torch.full((B, W), retained), **CLOSE)
 
 
-def test_a_state_or_reset_of_another_shape_is_named():
+def test_wrong_shapes_raise():
     lstm, x, reset, state = case()
     with pytest.raises(
         ValueError, match=r"reset is \(9, 4\) on cpu, but x asks for \(9, 5\) on cpu"
@@ -150,7 +152,7 @@ def test_a_state_or_reset_of_another_shape_is_named():
         lstm(x, reset, arrdict(state, cell=state.cell[:1]))
 
 
-def test_a_gradient_may_be_asked_for_twice():
+def test_gradient_can_be_computed_twice():
     lstm, x, reset, state = case()
     loss = lstm(x, reset, state)[0].square().sum()
     first, second = (torch.autograd.grad(loss, x, retain_graph=True)[0] for _ in range(2))
@@ -162,7 +164,7 @@ def test_a_gradient_may_be_asked_for_twice():
 
 @pytest.fixture(params=["compiled", pytest.param("cuda", marks=pytest.mark.cuda)])
 def where(request, monkeypatch):
-    """The device of the kernels: a GPU, or the CPU with the kernels compiled for it."""
+    """Device of the kernels: a GPU, or the CPU with kernels compiled for it."""
     if request.param == "cuda":
         return "cuda"
     monkeypatch.setattr(program, "launch", request.getfixturevalue("launch_on_cpu"))
@@ -171,7 +173,7 @@ def where(request, monkeypatch):
 
 
 def sequence(device, dtype, x, reset, state, weights, d_outputs, d_cell):
-    """Outputs, last cell and all gradients of the bare recurrence, on the CPU in float32."""
+    """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU."""
     to = [leaf.detach().to(device, dtype).requires_grad_() for leaf in (x, *weights)]
     states = [leaf.detach().to(device).requires_grad_() for leaf in state]
     outputs, cell = lstm_module._Sequence.apply(*to, reset.to(device), *states)
@@ -183,8 +185,8 @@ def sequence(device, dtype, x, reset, state, weights, d_outputs, d_cell):
 
 
 NAMES = ("outputs", "cell", "d x", "d input weight", "d bias", "d weight", "d output", "d cell")
-# Per dtype, the share of an array's greatest magnitude by which an element may be off: approximate
-# exponentials and TF32 products; numbers of 8 bits, over nine steps.
+# Tolerance as a fraction of a tensor's largest magnitude. float32: approximate exponentials and
+# TF32 products. bfloat16: 8 bits, over nine steps.
 SLACK = {torch.float32: 2e-3, torch.bfloat16: 6e-2}
 
 
@@ -192,11 +194,10 @@ SLACK = {torch.float32: 2e-3, torch.bfloat16: 6e-2}
 @pytest.mark.parametrize(
     "n_steps, n_lanes, width", [(9, 5, 16), (9, 5, 7), (1, 3, 16), (9, 1, 1), (3, 40, 256)]
 )
-def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lanes, width):
+def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width):
     torch.manual_seed(0)
-    given = dict(
-        # Rounded beforehand, so that all begin with the same numbers, and of another layout in
-        # memory than the kernels'.
+    inputs = dict(
+        # rounded to bfloat16, so that both start with the same numbers; not contiguous
         x=torch.randn(width, n_steps, n_lanes).permute(1, 2, 0).bfloat16().float(),
         reset=(torch.rand(n_lanes, n_steps) < 0.3).T,
         state=[torch.randn(width, n_lanes).T for _ in range(2)],
@@ -207,28 +208,28 @@ def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lan
         d_outputs=torch.randn(width, n_steps, n_lanes).permute(1, 2, 0).bfloat16().float(),
         d_cell=torch.randn(width, n_lanes).T,
     )
-    found = sequence(where, dtype, **given)
+    results = sequence(where, dtype, **inputs)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lstm_module, "_steps", lambda x: lstm_module._WRITTEN_OUT)
-        expected = sequence("cpu", torch.float32, **given)
-    assert_close(NAMES, found, expected, SLACK[dtype])
+        patch.setattr(lstm_module, "_steps", lambda x: lstm_module._CPU_STEPS)
+        expected = sequence("cpu", torch.float32, **inputs)
+    assert_close(NAMES, results, expected, SLACK[dtype])
 
 
 @pytest.mark.parametrize("offset", [0, 1])
 @pytest.mark.parametrize("shape", [(4, 8), (8, 4)])
-def test_kernels_read_words_of_16_bytes(offset, shape):
+def test_aligned_is_contiguous_in_16_byte_words(offset, shape):
     tensor = torch.arange(40.0)[offset : offset + 32].view(shape)
-    for given in (tensor, tensor.T):
-        found = program.aligned(given)
-        assert torch.equal(found, given)
-        assert found.is_contiguous() and not found.data_ptr() % 16
+    for source in (tensor, tensor.T):
+        aligned = program.aligned(source)
+        assert torch.equal(aligned, source)
+        assert aligned.is_contiguous() and not aligned.data_ptr() % 16
 
 
 @pytest.mark.parametrize("dtype", SLACK, ids=str)
 @pytest.mark.parametrize("width", [16, 7])
-def test_the_kernels_forget_even_a_nan(where, dtype, width):
+def test_kernels_clear_even_nan_at_reset(where, dtype, width):
     torch.manual_seed(0)
-    given = dict(
+    inputs = dict(
         x=torch.randn(T, B, width),
         reset=torch.zeros(T, B, dtype=torch.bool),
         state=[torch.randn(B, width) for _ in range(2)],
@@ -236,29 +237,30 @@ def test_the_kernels_forget_even_a_nan(where, dtype, width):
         d_outputs=torch.randn(T, B, width),
         d_cell=torch.randn(B, width),
     )
-    given["weights"].insert(1, torch.randn(4 * width))
-    given["reset"][[0, 4]] = True
-    clean = sequence(where, dtype, **given)
-    given["x"][:4] = torch.nan
-    after_nan = sequence(where, dtype, **given)
+    inputs["weights"].insert(1, torch.randn(4 * width))
+    inputs["reset"][[0, 4]] = True
+    clean = sequence(where, dtype, **inputs)
+    inputs["x"][:4] = torch.nan
+    after_nan = sequence(where, dtype, **inputs)
     assert torch.equal(after_nan[0][4:], clean[0][4:]) and after_nan[0][:4].isnan().all()
     assert torch.equal(after_nan[1], clean[1])  # the cell
     assert torch.equal(after_nan[2][4:], clean[2][4:])  # d x
-    given["x"][:4] = 0.0
-    given["state"] = [torch.full((B, width), torch.nan) for _ in range(2)]
-    found = sequence(where, dtype, **given)
-    assert torch.equal(found[0][4:], clean[0][4:]) and all(leaf.isfinite().all() for leaf in found)
-    assert not found[-2].any() and not found[-1].any()  # d output, d cell: cleared at once
-    # nor does a gradient that is not a number come back through a reset
-    given["state"] = [torch.zeros(B, width) for _ in range(2)]
-    given["d_outputs"][4:] = torch.nan
-    d_x = sequence(where, dtype, **given)[2]
+    inputs["x"][:4] = 0.0
+    inputs["state"] = [torch.full((B, width), torch.nan) for _ in range(2)]
+    results = sequence(where, dtype, **inputs)
+    assert torch.equal(results[0][4:], clean[0][4:])
+    assert all(leaf.isfinite().all() for leaf in results)
+    assert not results[-2].any() and not results[-1].any()  # d output, d cell: cut by the reset
+    # a NaN gradient does not pass a reset, either
+    inputs["state"] = [torch.zeros(B, width) for _ in range(2)]
+    inputs["d_outputs"][4:] = torch.nan
+    d_x = sequence(where, dtype, **inputs)[2]
     assert d_x[:4].isfinite().all() and d_x[4:].isnan().all()
 
 
 @pytest.mark.parametrize("width", [4, 3])
-def test_gates_saturate_and_a_nan_stays_one(where, width):
-    """By hand: all gates of a lane before their activation are one number."""
+def test_gates_saturate_and_nan_propagates(where, width):
+    """All gates of a lane have the same value before their activation."""
     inf, nan = torch.inf, torch.nan
     values = torch.tensor([-inf, -1e30, -100.0, -20.0, 0.0, 20.0, 100.0, 1e30, inf, nan])
     gates = values[:, None].expand(-1, 4 * width).contiguous().to(where)
@@ -267,9 +269,9 @@ def test_gates_saturate_and_a_nan_stays_one(where, width):
     kernels.forward(gates, cell, None, output, None, after)
     sigmoid, squashed = values.double().sigmoid(), values.double().tanh()
     cells = sigmoid * 0.5 + sigmoid * squashed
-    for found, expected in ((after, cells), (output, sigmoid * cells.tanh())):
+    for result, expected in ((after, cells), (output, sigmoid * cells.tanh())):
         torch.testing.assert_close(
-            found.cpu().double(),
+            result.cpu().double(),
             expected[:, None].expand(-1, width),
             rtol=0,
             atol=1e-6,
@@ -277,22 +279,22 @@ def test_gates_saturate_and_a_nan_stays_one(where, width):
         )
 
 
-def test_rounding_to_bfloat16_is_pytorchs(where):
-    """Through `start`, which rounds and no more: ties, infinities, the greatest float and NaN."""
+def test_kernels_round_to_bfloat16_like_torch(where):
+    """Uses `start`, which only rounds: ties, infinities, the largest float and NaN."""
     inf, nan = torch.inf, torch.nan
     values = torch.tensor([0.0, -0.0, 1 + 2**-8, 1 + 3 * 2**-8, -1 - 2**-8, 3.3e38, inf, -inf, nan])
     bits = torch.tensor([0x3F80_7FFF, 0x3F80_8001, 0x7F7F_FFFF, 0x7FFF_FFFF], dtype=torch.int32)
     values = torch.cat([values, bits.view(torch.float32), torch.randn(1011)]).view(-1, 4).to(where)
     reset = torch.zeros(len(values), dtype=torch.bool, device=where)
-    memory, cell = torch.empty_like(values, dtype=torch.bfloat16), torch.empty_like(values)
-    kernels.start(reset, values, values, memory, cell)
-    torch.testing.assert_close(memory, values.bfloat16(), rtol=0, atol=0, equal_nan=True)
+    hidden, cell = torch.empty_like(values, dtype=torch.bfloat16), torch.empty_like(values)
+    kernels.start(reset, values, values, hidden, cell)
+    torch.testing.assert_close(hidden, values.bfloat16(), rtol=0, atol=0, equal_nan=True)
     torch.testing.assert_close(cell, values, rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("bf16", [False, True])
-def test_on_a_gpu_a_captured_graph_unrolls_as_steps_do(bf16):
+def test_captured_unroll_matches_steps(bf16):
     lstm = LSTM(256)
     slack = SLACK[torch.bfloat16 if bf16 else torch.float32]
     check_captured(lstm, "cell", lstm.step, slack, bf16)

@@ -1,7 +1,6 @@
-"""The minGRU against its equations step by step, and its resets against sequences cut by hand.
+"""The minGRU against its equations step by step, and its kernels against the CPU implementation.
 
-The GPU's kernels are compared with what is written out for the CPU: on a GPU, and compiled for a
-CPU through `cuda_on_cpu.h`, which runs the same source.
+Kernels run on a GPU, and compiled for the CPU from the same source (`cuda_on_cpu.h`).
 """
 
 import pytest
@@ -20,14 +19,14 @@ CLOSE = dict(rtol=1e-5, atol=1e-5)  # float32 sums of nine terms in another orde
 
 
 def case(n_steps=T, p_reset=0.3):
-    """Gates (T, B, 2 W), resets (T, B) and a state that is not zero."""
+    """Returns gates (T, B, 2 W), resets (T, B) and a nonzero state."""
     torch.manual_seed(0)
     gates = torch.randn(n_steps, B, 2 * W, requires_grad=True)
     return gates, torch.rand(n_steps, B) < p_reset, torch.randn(B, W, requires_grad=True)
 
 
 def by_hand(gates, reset, start):
-    """One lane and one step at a time, starting from zeros where an episode starts."""
+    """Runs lane by lane and step by step, from zeros where an episode starts."""
     lanes, lasts = [], []
     for b in range(gates.shape[1]):
         h, states = start[b], []
@@ -43,27 +42,23 @@ def by_hand(gates, reset, start):
 
 
 @pytest.mark.parametrize("n_steps, p_reset", [(1, 0.3), (9, 0.0), (9, 0.3), (9, 1.0), (32, 0.1)])
-def test_outputs_and_gradients_are_those_of_the_equations(n_steps, p_reset):
+def test_outputs_and_gradients_match_equations(n_steps, p_reset):
     gates, reset, start = case(n_steps, p_reset)
-    found, expected = (
-        mingru_module._Sequence.apply(gates, reset, start),
-        by_hand(gates, reset, start),
-    )
+    results = mingru_module._Sequence.apply(gates, reset, start)
+    expected = by_hand(gates, reset, start)
     weights = torch.randn(n_steps, B, W), torch.randn(B, W)
-    ours, theirs = (
-        torch.autograd.grad(results, (gates, start), weights, materialize_grads=True)
-        for results in (found, expected)
+    grads, expected_grads = (
+        torch.autograd.grad(tensors, (gates, start), weights, materialize_grads=True)
+        for tensors in (results, expected)
     )
-    for name, a, b in zip(
-        ("outputs", "last", "d gates", "d start"),
-        (*found, *ours),
-        (*expected, *theirs),
-        strict=True,
-    ):
-        torch.testing.assert_close(a, b, **CLOSE, msg=lambda text, name=name: f"{name}: {text}")
+    tensors, expected_tensors = (*results, *grads), (*expected, *expected_grads)
+    for name, tensor, expected_tensor in zip(NAMES, tensors, expected_tensors, strict=True):
+        torch.testing.assert_close(
+            *(tensor, expected_tensor), **CLOSE, msg=lambda text, name=name: f"{name}: {text}"
+        )
 
 
-def test_half_open_gates_halve_the_way_to_the_candidate():
+def test_half_open_gates_match_hand_calculation():
     core = MinGRU(2)
     with torch.no_grad():
         core.input.weight.zero_()
@@ -75,8 +70,8 @@ def test_half_open_gates_halve_the_way_to_the_candidate():
     assert torch.equal(state.output, outputs[-1])
 
 
-def test_units_start_with_times_from_1_to_32_steps():
-    # sigmoid(-log(tau)) = 1 / (1 + tau): of a unit's state tau / (1 + tau) is left after a step
+def test_initial_time_constants():
+    # sigmoid(-log(tau)) = 1 / (1 + tau): a unit keeps tau / (1 + tau) of its state per step
     core = MinGRU(W)
     x, reset = torch.zeros(1, B, W), torch.zeros(1, B, dtype=torch.bool)
     outputs, _ = core(x, reset, arrdict(output=torch.ones(B, W)))
@@ -84,8 +79,8 @@ def test_units_start_with_times_from_1_to_32_steps():
     torch.testing.assert_close(outputs[0], (taus / (1 + taus)).expand(B, W), **CLOSE)
 
 
-def test_a_sequence_saves_four_numbers_per_unit_and_step_for_its_gradient():
-    """Its input, two gates and the output: none of the scan's passes."""
+def test_saved_for_backward_is_four_numbers_per_unit():
+    """The input, two gates and the output, but nothing of the scan's passes."""
     core, saved = MinGRU(W), {}
 
     def pack(tensor):
@@ -95,11 +90,11 @@ def test_a_sequence_saves_four_numbers_per_unit_and_step_for_its_gradient():
     x, reset, state = torch.randn(32, B, W), torch.zeros(32, B, dtype=torch.bool), core.initial(B)
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
         core(x, reset, state)
-    beside = reset.numel() + B * W + core.input.weight.numel()
-    assert 4 * x.numel() <= sum(saved.values()) <= 4 * x.numel() + beside
+    overhead = reset.numel() + B * W + core.input.weight.numel()
+    assert 4 * x.numel() <= sum(saved.values()) <= 4 * x.numel() + overhead
 
 
-def test_a_state_or_reset_of_another_shape_is_named():
+def test_wrong_shapes_raise():
     core, x, reset = MinGRU(W), torch.randn(T, B, W), torch.zeros(T, B, dtype=torch.bool)
     state = core.initial(B)
     with pytest.raises(
@@ -114,7 +109,7 @@ def test_a_state_or_reset_of_another_shape_is_named():
         core(x[:0], reset[:0], state)
 
 
-def test_a_gradient_may_be_asked_for_twice():
+def test_gradient_can_be_computed_twice():
     gates, reset, start = case()
     loss = mingru_module._Sequence.apply(gates, reset, start)[0].square().sum()
     first, second = (torch.autograd.grad(loss, gates, retain_graph=True)[0] for _ in range(2))
@@ -126,7 +121,7 @@ def test_a_gradient_may_be_asked_for_twice():
 
 @pytest.fixture(params=["compiled", pytest.param("cuda", marks=pytest.mark.cuda)])
 def where(request, monkeypatch):
-    """The device of the kernels: a GPU, or the CPU with the kernels compiled for it."""
+    """Device of the kernels: a GPU, or the CPU with kernels compiled for it."""
     if request.param == "cuda":
         return "cuda"
     monkeypatch.setattr(program, "launch", request.getfixturevalue("launch_on_cpu"))
@@ -135,7 +130,7 @@ def where(request, monkeypatch):
 
 
 def sequence(device, dtype, gates, reset, start, d_outputs, d_last):
-    """Outputs, last state and gradients of the bare recurrence, on the CPU in float32."""
+    """Returns outputs, last state and gradients of the recurrence, as float32 on the CPU."""
     gates = gates.to(device, dtype).requires_grad_()
     start = start.to(device).requires_grad_()
     outputs, last = mingru_module._Sequence.apply(gates, reset.to(device), start)
@@ -147,8 +142,8 @@ def sequence(device, dtype, gates, reset, start, d_outputs, d_last):
 
 
 NAMES = ("outputs", "last", "d gates", "d start")
-# Per dtype, the share of an array's greatest magnitude by which an element may be off: approximate
-# exponentials; numbers of 8 bits.
+# Tolerance as a fraction of a tensor's largest magnitude. float32: approximate exponentials.
+# bfloat16: 8 bits.
 SLACK = {torch.float32: 1e-5, torch.bfloat16: 1e-2}
 
 
@@ -156,57 +151,55 @@ SLACK = {torch.float32: 1e-5, torch.bfloat16: 1e-2}
 @pytest.mark.parametrize(
     "n_steps, n_lanes, width", [(9, 5, 16), (9, 5, 7), (1, 3, 16), (9, 1, 1), (3, 40, 256)]
 )
-def test_the_kernels_agree_with_what_is_written_out(where, dtype, n_steps, n_lanes, width):
+def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width):
     torch.manual_seed(0)
 
     def rounded(*shape):
-        """So that both begin with the same numbers; of another layout in memory than the
-        kernels'.
-        """
+        """Returns numbers rounded to bfloat16, so that both start with the same; not contiguous."""
         return torch.randn(*reversed(shape)).movedim((0, 1, 2), (2, 1, 0)).bfloat16().float()
 
-    given = dict(
+    inputs = dict(
         gates=rounded(n_steps, n_lanes, 2 * width),
         reset=(torch.rand(n_lanes, n_steps) < 0.3).T,
         start=torch.randn(width, n_lanes).T,
         d_outputs=rounded(n_steps, n_lanes, width),
         d_last=torch.randn(width, n_lanes).T,
     )
-    found = sequence(where, dtype, **given)
+    results = sequence(where, dtype, **inputs)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mingru_module, "_recurrence", lambda gates: mingru_module._WRITTEN_OUT)
-        expected = sequence("cpu", torch.float32, **given)
-    assert_close(NAMES, found, expected, SLACK[dtype])
+        patch.setattr(mingru_module, "_recurrence", lambda gates: mingru_module._CPU_RECURRENCE)
+        expected = sequence("cpu", torch.float32, **inputs)
+    assert_close(NAMES, results, expected, SLACK[dtype])
 
 
 @pytest.mark.parametrize("dtype", SLACK, ids=str)
 @pytest.mark.parametrize("width", [16, 7])
-def test_the_kernels_forget_even_a_nan(where, dtype, width):
+def test_kernels_clear_even_nan_at_reset(where, dtype, width):
     torch.manual_seed(0)
-    given = dict(
+    inputs = dict(
         gates=torch.randn(T, B, 2 * width),
         reset=torch.zeros(T, B, dtype=torch.bool),
         start=torch.randn(B, width),
         d_outputs=torch.randn(T, B, width),
         d_last=torch.randn(B, width),
     )
-    given["reset"][[0, 4]] = True
-    clean = sequence(where, dtype, **given)
-    broken = dict(given, gates=given["gates"].clone(), start=torch.full((B, width), torch.nan))
+    inputs["reset"][[0, 4]] = True
+    clean = sequence(where, dtype, **inputs)
+    broken = dict(inputs, gates=inputs["gates"].clone(), start=torch.full((B, width), torch.nan))
     broken["gates"][:4] = torch.nan
     outputs, last, d_gates, d_start = sequence(where, dtype, **broken)
     assert torch.equal(outputs[4:], clean[0][4:]) and outputs[:4].isnan().all()
     assert torch.equal(last, clean[1]) and torch.equal(d_gates[4:], clean[2][4:])
-    assert not d_start.any()  # cleared at once
-    # nor does a gradient that is not a number come back through a reset
-    given["d_outputs"][4:] = torch.nan
-    d_gates = sequence(where, dtype, **given)[2]
+    assert not d_start.any()  # cut by the reset
+    # a NaN gradient does not pass a reset, either
+    inputs["d_outputs"][4:] = torch.nan
+    d_gates = sequence(where, dtype, **inputs)[2]
     assert torch.equal(d_gates[:4], clean[2][:4]) and d_gates[4:].isnan().all()
 
 
 @pytest.mark.parametrize("width", [4, 3])
-def test_gates_saturate_and_a_nan_stays_one(where, width):
-    """By hand: all update gates of a lane before their activation are one number."""
+def test_gates_saturate_and_nan_propagates(where, width):
+    """All update gates of a lane have the same value before their activation."""
     inf, nan = torch.inf, torch.nan
     values = torch.tensor([-inf, -1e30, -100.0, -20.0, 0.0, 20.0, 100.0, 1e30, inf, nan])
     gates = torch.full((1, len(values), 2 * width), 3.0)
@@ -216,24 +209,24 @@ def test_gates_saturate_and_a_nan_stays_one(where, width):
     outputs, last = torch.full_like(gates[..., :width], 7.0).contiguous(), torch.empty_like(start)
     kernels.forward(gates, reset, start, outputs, last)
     expected = (5.0 - 2.0 * values.double().sigmoid()).float()[:, None].expand(-1, width)
-    for found in (outputs[0], last):
-        torch.testing.assert_close(found.cpu(), expected, rtol=0, atol=2e-6, equal_nan=True)
+    for result in (outputs[0], last):
+        torch.testing.assert_close(result.cpu(), expected, rtol=0, atol=2e-6, equal_nan=True)
 
 
-def test_kernels_refuse_other_dtypes(where):
+def test_unsupported_dtype_raises(where):
     gates, reset, start = (tensor.to(where) for tensor in case())
-    with pytest.raises(EngineError, match="float32 or bfloat16, not in torch.float16: choose one"):
+    with pytest.raises(EngineError, match="float32 or bfloat16.*float16"):
         mingru_module._Sequence.apply(gates.half(), reset, start)
 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("bf16", [False, True])
-def test_on_a_gpu_a_captured_graph_unrolls_as_steps_do(bf16):
+def test_captured_unroll_matches_steps(bf16):
     core = MinGRU(256)
 
     def step(x, reset, state):
         outputs, state = core(x[None], reset[None], state)
         return outputs[0], state
 
-    slack = 2e-2 if bf16 else 2e-3  # bfloat16's rounding, and TF32's, of products of 256 numbers
+    slack = 2e-2 if bf16 else 2e-3  # rounding of bfloat16 and of TF32 in sums of 256 products
     check_captured(core, "output", step, slack, bf16)

@@ -1,4 +1,4 @@
-"""docs/networks.md: its classes, and its commands as they are typed."""
+"""The classes and commands of docs/networks.md."""
 
 import json
 import pathlib
@@ -22,9 +22,9 @@ def folder(tmp_path_factory):
     return place
 
 
-def test_its_commands_train_and_evaluate(folder, monkeypatch):
-    typed = pages.type_all(PAGE.read_text(), folder, monkeypatch)
-    assert typed == 2 * ["train.py", "evaluate.py"]
+def test_commands_of_page_train_and_evaluate(folder, monkeypatch):
+    scripts = pages.type_all(PAGE.read_text(), folder, monkeypatch)
+    assert scripts == 2 * ["train.py", "evaluate.py"]
     runs = sorted(path for path in (folder / "runs").iterdir() if path.is_dir())
     agents = [config(run)["agent"] for run in runs]
     assert [agent["core"] for agent in agents] == ["cores:Trace", "lstm"]
@@ -36,12 +36,12 @@ def config(run):
     return json.loads((checkpoint / "config.json").read_text())["train"]
 
 
-def test_its_core_is_a_decaying_mean(folder, monkeypatch):
+def test_core_of_page_is_decaying_mean(folder, monkeypatch):
     with pages.inside(folder, monkeypatch):
         core = cores.make_core("cores:Trace", 2)
     with torch.no_grad():
         core.input.weight.copy_(torch.eye(2)), core.input.bias.zero_()
-        core.rate.zero_()  # keeps half
+        core.rate.zero_()  # keeps one half
     x = torch.tensor([1.0, 0.0, 0.0, 8.0]).view(4, 1, 1).expand(4, 1, 2)
     reset = torch.tensor([True, False, True, False])[:, None]
     outputs, state = core(x, reset, core.initial(1))

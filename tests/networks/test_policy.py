@@ -1,4 +1,4 @@
-"""The policy: acting step by step is an unroll over the sequence, and a seed decides all of it."""
+"""The policy: steps match an unroll over the sequence, and a seed determines everything."""
 
 import io
 
@@ -23,22 +23,22 @@ def worlds(obs_space=OBS, dtype=torch.float16, seed=0):
     return arrdict(obs=obs, reset=torch.rand(T, B, generator=generator) < 0.3)
 
 
-def play(policy, world, **how):
+def act(policy, world, **options):
+    """Acts step by step. Returns the decisions and the last hidden state."""
     state, decisions = policy.initial(B), []
     for t in range(T):
-        decision, state = policy(world[t], state, **how)
+        decision, state = policy(world[t], state, **options)
         decisions.append(decision)
     return stack(decisions), state
 
 
 @pytest.mark.parametrize("encoder", ["linear", "conv"])
-def test_acting_step_by_step_gives_what_an_unroll_gives(encoder):
+def test_steps_match_unroll(encoder):
     policy, world = Policy(OBS, MOVES, width=32, encoder=encoder), worlds()
-    decisions, state = play(policy, world)
+    decisions, state = act(policy, world)
     unrolled = policy.unroll(world.obs, world.reset, policy.initial(B))
-    close = dict(
-        rtol=1e-5, atol=1e-5
-    )  # the same float32 products over T rows at once and one at a time
+    # the same float32 products over T rows at once and over one row at a time
+    close = dict(rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(decisions.logits.movement, unrolled.logits.movement, **close)
     torch.testing.assert_close(decisions.features, unrolled.features, **close)
     torch.testing.assert_close(state.cell, unrolled.state.cell, **close)
@@ -48,45 +48,46 @@ def test_acting_step_by_step_gives_what_an_unroll_gives(encoder):
 
 @pytest.mark.parametrize("layers", [1, 3])
 @pytest.mark.parametrize("core", CORES)
-def test_every_core_acts_as_it_unrolls(core, layers):
+def test_steps_match_unroll_for_every_core(core, layers):
     policy, world = Policy(OBS, MOVES, width=16, core=core, layers=layers), worlds()
-    decisions, state = play(policy, world)
+    decisions, state = act(policy, world)
     unrolled = policy.unroll(world.obs, world.reset, policy.initial(B))
     close = dict(rtol=1e-5, atol=1e-5)  # as above
     torch.testing.assert_close(decisions.features, unrolled.features, **close)
-    for found, expected in zip(leaves(state), leaves(unrolled.state), strict=True):
-        torch.testing.assert_close(found, expected, **close)
+    for leaf, expected in zip(leaves(state), leaves(unrolled.state), strict=True):
+        torch.testing.assert_close(leaf, expected, **close)
 
 
-def test_activations_are_reckoned_with_by_layer():
-    # 24 numbers of 4 bytes per unit, 8 for each further layer
+def test_activation_bytes_count_layers():
+    # 24 float32 per unit, 8 for each further layer
     sizes = [Policy(OBS, MOVES, width=32, layers=n).activation_bytes for n in (1, 2, 4)]
     assert sizes == [32 * 4 * 24, 32 * 4 * 32, 32 * 4 * 48]
 
 
 @pytest.mark.parametrize("core", CORES)
-def test_a_further_layer_saves_no_more_for_its_gradient_than_is_reckoned_with(core):
-    def saved_by(policy):
+def test_activation_bytes_bound_saved_tensors(core):
+    def saved_bytes(policy):
+        """Returns the bytes saved for the gradient per step and lane."""
         weights, sizes = {p.data_ptr() for p in policy.parameters()}, {}
 
         def pack(tensor):
             if tensor.data_ptr() not in weights:
                 sizes[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
-            held.append(tensor)
+            saved.append(tensor)
             return tensor
 
-        held, world = [], worlds()
+        saved, world = [], worlds()
         with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
             policy.unroll(world.obs, world.reset, policy.initial(B))
         return sum(sizes.values()) / (T * B)
 
     policies = [Policy(OBS, MOVES, width=32, core=core, layers=n) for n in (1, 2)]
-    more = saved_by(policies[1]) - saved_by(policies[0])
-    reckoned = policies[1].activation_bytes - policies[0].activation_bytes
-    assert reckoned / 8 <= more <= 1.1 * reckoned  # beside them stand the state and its resets
+    n_saved = saved_bytes(policies[1]) - saved_bytes(policies[0])
+    estimate = policies[1].activation_bytes - policies[0].activation_bytes
+    assert estimate / 8 <= n_saved <= 1.1 * estimate  # resets and the hidden state come on top
 
 
-def test_a_decision_has_the_shapes_of_the_contract():
+def test_shapes_of_decision():
     policy = Policy(OBS, MOVES, width=32)
     decision, state = policy(worlds()[0], policy.initial(B))
     assert decision.actions.movement.shape == (B, 1) and decision.logits.fire.shape == (B, 1, 2)
@@ -95,17 +96,17 @@ def test_a_decision_has_the_shapes_of_the_contract():
     assert state.cell.shape == (B, 32)
 
 
-def test_bare_spaces_work_too():
+def test_bare_spaces():
     policy = Policy(spaces.MultiVector(1, 4), spaces.MultiDiscrete(1, 3), width=8)
     world = arrdict(obs=torch.randn(B, 1, 4), reset=torch.ones(B, dtype=torch.bool))
     decision, _ = policy(world, policy.initial(B), sample=False)
     assert torch.equal(decision.actions, decision.logits.argmax(-1))
 
 
-def test_a_seed_decides_weights_and_actions_and_leaves_torchs_own_generator_alone():
+def test_seed_determines_weights_and_actions():
     before = torch.get_rng_state()
     first, second, other = (
-        play(Policy(OBS, MOVES, width=32, seed=seed), worlds())[0] for seed in (1, 1, 2)
+        act(Policy(OBS, MOVES, width=32, seed=seed), worlds())[0] for seed in (1, 1, 2)
     )
     assert torch.equal(before, torch.get_rng_state())
     assert torch.equal(first.actions.movement, second.actions.movement)
@@ -114,15 +115,15 @@ def test_a_seed_decides_weights_and_actions_and_leaves_torchs_own_generator_alon
     assert not torch.equal(first.actions.movement, other.actions.movement)
 
 
-def test_a_generator_of_ones_own_decides_the_actions():
+def test_own_generator_determines_actions():
     policy, world = Policy(OBS, MOVES, width=32), worlds()
     first, second = (
-        play(policy, world, generator=torch.Generator().manual_seed(5))[0].actions for _ in range(2)
+        act(policy, world, generator=torch.Generator().manual_seed(5))[0].actions for _ in range(2)
     )
     assert torch.equal(first.movement, second.movement) and torch.equal(first.fire, second.fire)
 
 
-def test_weights_load_from_plain_tensors():
+def test_weights_load_with_weights_only():
     policy, twin = Policy(OBS, MOVES, width=32, seed=1), Policy(OBS, MOVES, width=32, seed=2)
     policy.critic.output.update_stats(torch.tensor([1.0, 9.0]), torch.tensor([True, True]))
     file = io.BytesIO()
@@ -130,47 +131,45 @@ def test_weights_load_from_plain_tensors():
     file.seek(0)
     twin.load_state_dict(torch.load(file, weights_only=True))
     world = worlds()
-    ours, theirs = (p.unroll(world.obs, world.reset, p.initial(B)) for p in (policy, twin))
-    assert torch.equal(policy.value(ours.features), twin.value(theirs.features)) and torch.equal(
-        ours.logits.fire, theirs.logits.fire
-    )
+    outputs, expected = (p.unroll(world.obs, world.reset, p.initial(B)) for p in (policy, twin))
+    assert torch.equal(policy.value(outputs.features), twin.value(expected.features))
+    assert torch.equal(outputs.logits.fire, expected.logits.fire)
 
 
-def test_a_width_of_zero_is_refused():
-    with pytest.raises(ValueError, match="width: 0 is out of range"):
+def test_zero_width_raises():
+    with pytest.raises(ValueError, match="width: 0"):
         Policy(OBS, MOVES, width=0)
 
 
-def test_a_random_stream_goes_on_where_it_was_saved():
-    stream, cpu = SeededGenerator(3), torch.device("cpu")
-    untouched = stream.state_dict()
-    start = torch.rand(4, generator=stream.on(cpu))
-    saved = stream.state_dict()
-    rest = torch.rand(4, generator=stream.on(cpu))
+def test_generator_resumes():
+    generator, cpu = SeededGenerator(3), torch.device("cpu")
+    unused = generator.state_dict()
+    start = torch.rand(4, generator=generator.on(cpu))
+    saved = generator.state_dict()
+    rest = torch.rand(4, generator=generator.on(cpu))
     other = SeededGenerator(8)
     other.load_state_dict(saved, cpu)
     assert torch.equal(torch.rand(4, generator=other.on(cpu)), rest)
-    other.load_state_dict(untouched, cpu)
+    other.load_state_dict(unused, cpu)
     assert torch.equal(torch.rand(4, generator=other.on(cpu)), start)
-    other.load_state_dict(
-        {**saved, "device": "cuda"}, cpu
-    )  # a GPU's state means nothing here: from the seed again
+    # a GPU's state means nothing on a CPU: starts again from the seed
+    other.load_state_dict({**saved, "device": "cuda"}, cpu)
     assert torch.equal(torch.rand(4, generator=other.on(cpu)), start)
 
 
 @pytest.mark.cuda
-def test_a_random_stream_on_a_gpu_goes_on_from_a_state_that_was_loaded_onto_the_gpu():
+def test_gpu_generator_resumes_from_state_on_gpu():
     device = torch.device("cuda", torch.cuda.current_device())
-    stream, other = SeededGenerator(3), SeededGenerator(8)
-    torch.rand(4, device=device, generator=stream.on(device))
-    saved = {**stream.state_dict(), "generator": stream.state_dict()["generator"].to(device)}
+    generator, other = SeededGenerator(3), SeededGenerator(8)
+    torch.rand(4, device=device, generator=generator.on(device))
+    saved = {**generator.state_dict(), "generator": generator.state_dict()["generator"].to(device)}
     other.load_state_dict(saved, device)
-    expected = torch.rand(4, device=device, generator=stream.on(device))
+    expected = torch.rand(4, device=device, generator=generator.on(device))
     assert torch.equal(torch.rand(4, device=device, generator=other.on(device)), expected)
 
 
 @pytest.mark.cuda
-def test_on_a_gpu_acting_never_synchronises_and_stays_close_to_single_precision():
+def test_gpu_never_synchronises_and_bf16_is_close():
     world, results = worlds().cuda(), []
     for bf16 in (False, True):
         policy = Policy(OBS, MOVES, width=64, bf16=bf16).cuda()
@@ -182,6 +181,5 @@ def test_on_a_gpu_acting_never_synchronises_and_stays_close_to_single_precision(
             results.append(policy.unroll(world.obs, world.reset, state).logits.movement)
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    torch.testing.assert_close(
-        *results, rtol=0, atol=5e-3
-    )  # logits of a first policy differ by some .01, bf16 by 1 %
+    # logits of an untrained policy differ by some .01, bfloat16 by 1 %
+    torch.testing.assert_close(*results, rtol=0, atol=5e-3)

@@ -1,4 +1,4 @@
-"""The output that predicts returns: its statistics move, its predictions do not."""
+"""PopArt: updating the statistics of returns keeps the predictions."""
 
 import math
 
@@ -7,51 +7,50 @@ import torch
 
 from megastep.agents.networks.value_output import ValueOutput
 
-WIDTH, EVERY = 24, torch.ones(64, dtype=torch.bool)
+WIDTH, VALID = 24, torch.ones(64, dtype=torch.bool)
 
 
-def test_updating_the_statistics_of_a_value_changes_no_prediction():
+def test_update_stats_keeps_predictions():
     value, x = ValueOutput(WIDTH), torch.randn(200, WIDTH)
     before = value(x)
     for offset in (0.0, 300.0, 310.0):
-        value.update_stats(torch.randn(64) * 20 + offset, EVERY)
+        value.update_stats(torch.randn(64) * 20 + offset, VALID)
         assert value.mean.item() != 0 and value.scale.item() != 1
-        torch.testing.assert_close(
-            value(x), before, rtol=1e-4, atol=1e-4
-        )  # float32 at a mean of 300
+        # float32 at a mean of 300
+        torch.testing.assert_close(value(x), before, rtol=1e-4, atol=1e-4)
 
 
-def test_a_value_learns_the_mean_and_standard_deviation_of_what_is_valid():
+def test_statistics_of_valid_returns():
     value = ValueOutput(WIDTH)
     value.update_stats(torch.tensor([1.0, 5.0, torch.nan]), torch.tensor([True, True, False]))
     assert value.mean.item() == pytest.approx(3) and value.scale.item() == pytest.approx(2)
-    value.update_stats(torch.full((64,), 9.0), EVERY)
-    # The second of two calls weighs a half: mean 6, mean square (13 + 81) / 2 = 47, standard
-    # deviation sqrt(47 - 36)
+    value.update_stats(torch.full((64,), 9.0), VALID)
+    # the second call has weight 1/2: mean 6, mean square (13 + 81) / 2 = 47, standard deviation
+    # sqrt(47 - 36)
     assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
-    value.update_stats(torch.full((64,), 7.0), ~EVERY)
+    value.update_stats(torch.full((64,), 7.0), ~VALID)
     assert value.mean.item() == pytest.approx(6) and value.scale.item() == pytest.approx(11**0.5)
 
 
-def test_returns_that_never_vary_do_not_divide_by_zero():
+def test_constant_returns_do_not_divide_by_zero():
     value = ValueOutput(WIDTH)
     for _ in range(5):
-        value.update_stats(torch.zeros(64), EVERY)
+        value.update_stats(torch.zeros(64), VALID)
     assert (
         value.scale.item() == pytest.approx(1e-3) and value(torch.randn(8, WIDTH)).isfinite().all()
     )
 
 
-def test_its_numbers_are_single_precision_whatever_the_products_are():
+def test_values_are_float32_under_autocast():
     with torch.autocast("cpu", torch.bfloat16):
         assert ValueOutput(WIDTH)(torch.randn(3, WIDTH)).dtype == torch.float32
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
-def test_returns_that_are_not_finite_change_nothing(bad):
+def test_nonfinite_returns_change_nothing(bad):
     value = ValueOutput(WIDTH)
-    value.update_stats(torch.randn(64) * 3 + 1, EVERY)
+    value.update_stats(torch.randn(64) * 3 + 1, VALID)
     before = {name: tensor.clone() for name, tensor in value.state_dict().items()}
-    # 1e30 is finite, and its square is not
+    # 1e30 is finite, its square is not
     value.update_stats(torch.tensor([1.0, 2.0, bad]), torch.tensor([True, True, True]))
     assert all(torch.equal(value.state_dict()[name], before[name]) for name in before)

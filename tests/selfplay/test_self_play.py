@@ -1,25 +1,30 @@
-"""Training against opponents as the command line does it."""
+"""Training against opponents from the command line."""
 
 import re
 
 import pytest
 import torch
-from test_duels import PONG, UPDATE
-from test_train import configured
 
 from megastep import capture
 from megastep.agents.cli import evaluate, train
-from megastep.agents.training import checkpoint, loggers
+from megastep.agents.training import checkpoint, json_lines
 from megastep.engine import devices
 from megastep.envs.pong.step import CELL
+from tests.cli.test_duels import PONG, UPDATE
+from tests.cli.test_train import configured
 from tests.helpers import pages
 from tests.helpers.games import Always
 from tests.helpers.tiny import settings
 
-SHARES = ["opponents.past=0.5", "opponents.bot=0.25", "opponents.snapshots=2", "opponents.every=2"]
-OPPOSED = [*PONG, *SHARES, "opponents.bot_class=tests.helpers.games:High", "env.limit=5"]
-#: Samples of an update: two environments of two lanes that learn, six of one.
-SMALLER = 10 * 16
+FRACTIONS = [
+    "opponents.past=0.5",
+    "opponents.bot=0.25",
+    "opponents.snapshots=2",
+    "opponents.every=2",
+]
+OPPOSED = [*PONG, *FRACTIONS, "opponents.bot_class=tests.helpers.games:High", "env.limit=5"]
+#: Samples of an update: two environments with two learning lanes, six with one.
+OPPOSED_UPDATE = 10 * 16
 
 
 @pytest.fixture
@@ -28,19 +33,19 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def actors(folder):
-    return checkpoint.load_latest(folder / "checkpoints").state["opponents"]["actors"]
+def saved_snapshots(folder):
+    return checkpoint.load_latest(folder / "checkpoints").state["opponents"]["snapshots"]
 
 
 def same(a, b):
     return all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_every_command_of_the_page_composes_and_its_policy_plays(here, monkeypatch):
+def test_commands_and_code_of_the_page_work(here, monkeypatch):
     text = (pages.ROOT / "docs" / "self-play.md").read_text()
-    typed = pages.commands(text)
-    assert {script for script, _ in typed} == set(pages.MAINS)
-    for script, words in typed:
+    commands = pages.commands(text)
+    assert {script for script, _ in commands} == set(pages.MAINS)
+    for script, words in commands:
         if script == "evaluate.py":
             words = [re.sub("^against=(.*)", r"against=[\1]", word) for word in words]
         settings(*words, script=script.removesuffix(".py"))
@@ -56,145 +61,149 @@ def test_every_command_of_the_page_composes_and_its_policy_plays(here, monkeypat
     assert tracker > random + 5
 
 
-def test_a_run_against_opponents_tells_how_it_does_against_each(here):
-    folder = train.run(configured(f"samples={6 * SMALLER}", tiny=OPPOSED))
-    rows = loggers.read(folder / "metrics.jsonl")
-    assert [row["samples"] for row in rows] == [SMALLER * (i + 1) for i in range(6)]
+def test_metrics_by_kind_of_opponent(here):
+    folder = train.run(configured(f"samples={6 * OPPOSED_UPDATE}", tiny=OPPOSED))
+    rows = json_lines.read(folder / "metrics.jsonl")
+    assert [row["samples"] for row in rows] == [OPPOSED_UPDATE * (i + 1) for i in range(6)]
     assert {f"episode/return/{name}" for name in ("left", "right", "now", "past", "bot")} <= set(
         rows[0]
     )
     assert evaluate.main([f"run={folder}", "against=bot", "episodes=4", "device=cpu"]) == 0
     (path,) = folder.glob("evaluations/*.md")
-    assert "tests.helpers.games:High" in path.read_text(), "bot is the one that the run has met"
+    assert "tests.helpers.games:High" in path.read_text(), "bot is the run's own"
 
 
-class Told(Always):
-    """Is told of the environment what it asks for."""
+class Configured(Always):
+    """Takes settings of the environment as arguments."""
 
     def __init__(self, points, limit=7, other=3):
         super().__init__()
         assert (points, limit, other) == (2, 5, 3)
 
 
-def test_a_scripted_policy_is_given_the_settings_that_it_takes(here):
-    words = [f"samples={SMALLER}", "env.points=2", "opponents.bot_class=test_self_play:Told"]
+def test_bot_gets_the_settings_its_constructor_takes(here):
+    words = [
+        f"samples={OPPOSED_UPDATE}",
+        "env.points=2",
+        "opponents.bot_class=test_self_play:Configured",
+    ]
     folder = train.run(configured(*words, tiny=OPPOSED))
     assert evaluate.main([f"run={folder}", "against=bot", "episodes=2", "device=cpu"]) == 0
 
 
-def test_without_opponents_a_run_is_as_it_was(here):
-    """No share: nothing in the checkpoint, in the metrics, and every lane is a sample."""
+def test_run_without_opponents_has_none_of_their_state_or_metrics(here):
     folder = train.run(configured(f"samples={2 * UPDATE}", tiny=[*PONG, "env.limit=5"]))
-    rows = loggers.read(folder / "metrics.jsonl")
+    rows = json_lines.read(folder / "metrics.jsonl")
     assert rows[-1]["samples"] == 2 * UPDATE and "episode/return/left" in rows[-1]
-    ours = ("/now", "/past", "/bot")
-    assert not any(name.endswith(ours) or name.startswith("episode/won") for name in rows[-1])
+    matchups = "/now", "/past", "/bot"
+    assert not any(name.endswith(matchups) or name.startswith("episode/won") for name in rows[-1])
     assert "opponents" not in checkpoint.load_latest(folder / "checkpoints").state
 
 
-def test_a_resumed_run_has_the_pool_it_had(here):
-    folder = train.run(configured(f"samples={2 * SMALLER}", tiny=OPPOSED))
-    saved = actors(folder)
-    assert not same(saved["0"], saved["1"]), "the first was renewed after two updates"
-    train.run(configured(f"resume={folder}", f"samples={3 * SMALLER}", tiny=[]))
-    after = actors(folder)
+def test_resumed_run_has_the_same_snapshots(here):
+    folder = train.run(configured(f"samples={2 * OPPOSED_UPDATE}", tiny=OPPOSED))
+    saved = saved_snapshots(folder)
+    assert not same(saved["0"], saved["1"]), "the first was refreshed after two updates"
+    train.run(configured(f"resume={folder}", f"samples={3 * OPPOSED_UPDATE}", tiny=[]))
+    after = saved_snapshots(folder)
     assert all(same(after[name], saved[name]) for name in saved)
-    train.run(configured(f"resume={folder}", f"samples={4 * SMALLER}", tiny=[]))
-    later = actors(folder)
+    train.run(configured(f"resume={folder}", f"samples={4 * OPPOSED_UPDATE}", tiny=[]))
+    later = saved_snapshots(folder)
     assert same(later["0"], saved["0"]) and not same(later["1"], saved["1"])
 
 
-def test_a_run_from_the_weights_of_another_begins_with_them_as_past_selves(here):
+def test_init_weights_are_the_first_snapshots(here):
     first = train.run(configured(f"samples={UPDATE}", tiny=PONG))
-    second = train.run(configured(f"init={first}", f"samples={SMALLER}", tiny=OPPOSED))
+    second = train.run(configured(f"init={first}", f"samples={OPPOSED_UPDATE}", tiny=OPPOSED))
     weights = checkpoint.load_latest(first / "checkpoints").state["policy"]
-    assert all(same(actor, weights) for actor in actors(second).values())
+    assert all(same(snapshot, weights) for snapshot in saved_snapshots(second).values())
 
 
-def test_snapshots_can_be_started_from_but_not_gone_on_from(here, capsys):
+def test_snapshot_works_with_init_and_not_with_resume(here, capsys):
     folder = train.run(configured(f"samples={2 * UPDATE}", "snapshots=1", tiny=PONG))
     snapshot = folder / "snapshots" / f"step_{2 * UPDATE}"
     train.run(configured(f"init={snapshot}", f"samples={UPDATE}", tiny=PONG))
     assert train.main([f"resume={snapshot}", "samples=1e6"]) == 2
-    assert "is a snapshot, the weights alone; init=" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "is a snapshot" in error and "init=" in error
 
 
-def test_snapshots_of_a_run_that_goes_on_are_spaced_over_its_new_budget(here):
-    """Half of seven updates is over when the second part begins, after four."""
+def test_snapshots_of_a_resumed_run_are_spaced_over_its_new_budget(here):
+    """At the resume after four updates, half of the new budget of seven is spent."""
     folder = train.run(configured(f"samples={4 * UPDATE}", "snapshots=2", tiny=PONG))
     train.run(configured(f"resume={folder}", f"samples={7 * UPDATE}", tiny=[]))
     names = {path.name for path in (folder / "snapshots").iterdir()}
     assert names == {f"step_{n * UPDATE}" for n in (2, 4, 7)}
 
 
-class Elsewhere(Always):
-    """Made for an environment that shows something else."""
+class NeedsRgb(Always):
+    """Needs an observation that Pong does not have."""
 
     def __call__(self, world, state, sample=True, generator=None):
         return super().__call__(world, state, world["obs"]["rgb"])
 
 
 @pytest.mark.parametrize(
-    "words, sentence",
+    "words, message",
     [
-        (["env.self_play=false"], "two agents or more, and Pong has one"),
-        (["opponents.past=0.9"], "opponents.past=0.9 and opponents.bot=0.25 are shares"),
-        (["opponents.snapshots=5"], "one for each of so many snapshots and not for 5"),
-        (["opponents.snapshots=0"], "opponents.snapshots: 0 is out of range"),
-        (["opponents.bot_class=tests.helpers.games:Hihg"], "did you mean High?"),
-        (["opponents.bot_class=test_self_play:Elsewhere"], "Elsewhere cannot play in Pong"),
-        (["samples=null", "snapshots=8"], "snapshots: they are spaced over the budget"),
+        (["env.self_play=false"], "at least two agents; Pong has one"),
+        (["opponents.past=0.9"], "opponents.past=0.9 and opponents.bot=0.25"),
+        (["opponents.snapshots=5"], "opponents.snapshots=5"),
+        (["opponents.snapshots=0"], "opponents.snapshots: 0"),
+        (["opponents.bot_class=tests.helpers.games:Hihg"], "High"),
+        (["opponents.bot_class=test_self_play:NeedsRgb"], "test_self_play:NeedsRgb"),
+        (["samples=null", "snapshots=8"], "snapshots: "),
     ],
 )
-def test_what_cannot_be_is_one_sentence_and_leaves_nothing(here, capsys, words, sentence):
+def test_bad_settings_are_named_and_leave_no_folder(here, capsys, words, message):
     assert train.main([*OPPOSED, "samples=100", *words]) == 2
-    assert sentence in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not list(here.glob("runs/*/"))
 
 
-def test_a_pool_larger_than_the_memory_says_how_many_fit(here, capsys, monkeypatch):
-    folder = train.run(configured(f"samples={SMALLER}", tiny=OPPOSED))
-    each = sum(weight.nbytes for weight in actors(folder)["0"].values())
-    monkeypatch.setattr(devices, "free_memory", lambda device: 3.3 * each)
+def test_snapshots_that_do_not_fit_say_how_many_would(here, capsys, monkeypatch):
+    folder = train.run(configured(f"samples={OPPOSED_UPDATE}", tiny=OPPOSED))
+    n_bytes = sum(weight.nbytes for weight in saved_snapshots(folder)["0"].values())
+    monkeypatch.setattr(devices, "free_memory", lambda device: 3.3 * n_bytes)
     assert train.main([*OPPOSED, "samples=100", "opponents.snapshots=4"]) == 2
     error = capsys.readouterr().err
-    assert "4 snapshots need" in error and "are free on cpu: at most 3 fit" in error
+    assert "4 snapshots" in error and "at most 3 fit" in error
 
 
-def test_snapshots_act_as_they_are_and_on_a_gpu_in_graphs(here, monkeypatch, device):
-    """On a GPU from the second rollout on, each on a stream of its own."""
-    made, real = [], train.make_trainer
+def test_snapshots_act_with_their_current_weights(here, monkeypatch, device):
+    """On a GPU in CUDA graphs from the second rollout on, each on a stream of its own."""
+    trainers, real = [], train.make_trainer
 
-    def make_trainer(*arguments):
-        made.append(real(*arguments))
-        return made[-1]
+    def make_trainer(*args):
+        trainers.append(real(*args))
+        return trainers[-1]
 
     monkeypatch.setattr(train, "make_trainer", make_trainer)
     tiny = [word for word in OPPOSED if not word.startswith(("device", "agent.core", "env."))]
     tiny += ["env.self_play=true", "env.n_envs=64", f"device={device}"]
-    folder = train.run(configured(f"samples={12 * 8 * SMALLER}", tiny=tiny))
-    ((trainer, _),) = made
+    folder = train.run(configured(f"samples={12 * 8 * OPPOSED_UPDATE}", tiny=tiny))
+    (trainer,) = trainers
     if device == "cuda":
         assert isinstance(trainer.collect.graph, capture.Graph) and trainer.learner.cuda_graph.graph
     assert trainer.nonfinite_value is None and trainer.updates == 12
-    rows = loggers.read(folder / "metrics.jsonl")
+    rows = json_lines.read(folder / "metrics.jsonl")
     for name in ("return/past", "return/bot", "won/past", "won/bot"):
         assert any(f"episode/{name}" in row for row in rows)
     played = []
     for _ in range(2):
         trainer.rollout = trainer.collect()
-        played.append((trainer.rollout.actions.clone(), trainer.env.memory["0"].cell.clone()))
-    assert not torch.equal(played[0][0], played[1][0]), "the random stream goes on"
-    assert not torch.equal(played[0][1], played[1][1]), "snapshots remember"
-    # now one snapshot that only moves up and one that only moves down, written in place
-    for up, actor in zip((50.0, -50.0), trainer.opponents.actors, strict=True):
-        actor.output.core.weight.data.zero_()
-        actor.output.core.bias.data.copy_(torch.tensor([-90.0, up, -up]))
+        played.append((trainer.rollout.actions.clone(), trainer.env.hidden_state["0"].cell.clone()))
+    assert not torch.equal(played[0][0], played[1][0]), "the generator advances"
+    assert not torch.equal(played[0][1], played[1][1]), "the hidden state advances"
+    # change the weights in place: the first snapshot only moves up, the second only down
+    for up, snapshot in zip((50.0, -50.0), trainer.opponents.snapshots, strict=True):
+        snapshot.output.linear.weight.data.zero_()
+        snapshot.output.linear.bias.data.copy_(torch.tensor([-90.0, up, -up]))
     for _ in range(4):
         trainer.collect()
     tops = trainer.env.env.games[6:8].T  # of the left and the right paddle
-    theirs = ~trainer.env.learners.view(-1, 2)
+    is_opponent = ~trainer.env.learners.view(-1, 2)
     for first, is_up in ((16, True), (32, False)):
-        found = tops[first : first + 16][theirs[first : first + 16]]
+        opponent_tops = tops[first : first + 16][is_opponent[first : first + 16]]
         middle = 13 * CELL
-        assert ((found < middle) == is_up).float().mean() > 0.8
+        assert ((opponent_tops < middle) == is_up).float().mean() > 0.8

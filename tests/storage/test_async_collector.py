@@ -1,5 +1,5 @@
-"""Acting ahead: the weights that act are an exact number of updates old, and the numbers are those
-of a loop by hand.
+"""The async collector: acting weights are an exact number of updates old, and the numbers match a
+loop that stores old weights.
 """
 
 import copy
@@ -10,50 +10,53 @@ import torch
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.async_collector import AsyncCollector
-from megastep.agents.storage.rollout import Collector, make_rollout
+from megastep.agents.storage.collector import Collector
+from megastep.agents.storage.rollout import make_rollout
 from tests.helpers.made_up import B, Numbers
 
 T = 5
-HOW = dict(n_steps=T, n_minibatches=2, lr=1e-2)
+SETTINGS = dict(n_steps=T, n_minibatches=2, lr=1e-2, gamma=0.99, advantage_floor=0.3)
 
 
 def policy_of(env):
     return Policy(env.obs_space, env.action_space, width=8, bf16=False).to(env.device)
 
 
-def recorded(rollout):
+def acted(rollout):
+    """Returns copies of observations, actions and log-probabilities."""
     return [rollout.obs.clone(), rollout.actions.clone(), rollout.logprobs.clone()]
 
 
 def by_hand(lag, n_updates, device="cpu"):
-    """Keeps old weights in a list. Returns the policy, and what was acted in each rollout."""
+    """Runs a loop that stores old weights in a list. Returns the policy and `acted` per rollout."""
     env = Numbers(device)
-    policy, seen, old = policy_of(env), [], []
-    learner, actor = VTrace(policy, **HOW), policy_of(env)
-    actor.random = policy.random
+    policy, rollouts, weights = policy_of(env), [], []
+    learner, actor = VTrace(policy, **SETTINGS), policy_of(env)
+    actor.generator = policy.generator
     collect = Collector(env, actor, make_rollout(env, policy, T, values=False))
     for n in range(n_updates):
-        old.append(copy.deepcopy(policy.state_dict()))
-        actor.load_state_dict(old[max(n - lag, 0)])
+        weights.append(copy.deepcopy(policy.state_dict()))
+        actor.load_state_dict(weights[max(n - lag, 0)])
         rollout = collect()
-        seen.append(recorded(rollout))
+        rollouts.append(acted(rollout))
         learner.update(rollout)
-    return policy, seen
+    return policy, rollouts
 
 
-def ahead(lag, n_updates, device="cpu", graph=False):
+def train(lag, n_updates, device="cpu", graph=False):
+    """Trains with a lag. Returns the policy, `acted` per rollout, and the collector."""
     env = Numbers(device)
-    policy, seen = policy_of(env), []
-    learner = VTrace(policy, lag=lag, graph=graph, **HOW)
+    policy, rollouts = policy_of(env), []
+    learner = VTrace(policy, lag=lag, graph=graph, **SETTINGS)
     collect = learner.collector(env)
     for _ in range(n_updates):
         rollout = collect()
         assert rollout is collect.rollout
-        seen.append(recorded(rollout))
+        rollouts.append(acted(rollout))
         learner.update(rollout)
     if lag:
         collect.wait()
-    return policy, seen, collect
+    return policy, rollouts, collect
 
 
 def flat(policy):
@@ -61,30 +64,30 @@ def flat(policy):
 
 
 @pytest.mark.parametrize("lag", [0, 1, 2])
-def test_it_is_the_loop_by_hand_that_keeps_old_weights(lag):
-    """Statistics of observations are among the weights that are old."""
-    (expected, acted), (policy, seen, _) = by_hand(lag, 6), ahead(lag, 6)
-    for rollout, hand in zip(seen, acted, strict=True):
-        assert all(map(torch.equal, rollout, hand))
+def test_matches_loop_with_stored_weights(lag):
+    """Running statistics of observations are as old as the weights."""
+    (expected, expected_rollouts), (policy, rollouts, _) = by_hand(lag, 6), train(lag, 6)
+    for rollout, expected_rollout in zip(rollouts, expected_rollouts, strict=True):
+        assert all(map(torch.equal, rollout, expected_rollout))
     assert torch.equal(flat(policy), flat(expected))
 
 
-def test_each_lag_is_another_loop():
-    first, second, third = (ahead(lag, 6)[0] for lag in (0, 1, 2))
+def test_lags_differ():
+    first, second, third = (train(lag, 6)[0] for lag in (0, 1, 2))
     assert not torch.equal(flat(first), flat(second))
     assert not torch.equal(flat(second), flat(third))
 
 
-def test_the_first_rollouts_are_acted_in_with_the_first_weights():
-    _, seen, _ = ahead(2, 5)
+def test_first_rollouts_use_initial_weights():
+    _, rollouts, _ = train(2, 5)
     env = Numbers()
     policy = policy_of(env)
     collect = Collector(env, policy, make_rollout(env, policy, T, values=False))
-    same = [all(map(torch.equal, rollout, recorded(collect()))) for rollout in seen]
-    assert same == [True, True, True, False, False]
+    is_same = [all(map(torch.equal, rollout, acted(collect()))) for rollout in rollouts]
+    assert is_same == [True, True, True, False, False]
 
 
-def test_all_that_a_rollout_holds_is_handed_over():
+def test_every_tensor_is_copied():
     env = Numbers()
     policy = policy_of(env)
     collect = AsyncCollector(env, policy, make_rollout(env, policy, T, values=False), 1)
@@ -97,13 +100,13 @@ def test_all_that_a_rollout_holds_is_handed_over():
     assert not state.any() and collect().state.cell.any()
 
 
-def test_who_goes_on_acts_with_the_weights_of_then():
-    """A trainer makes its collector first and loads weights later."""
+def test_weights_loaded_after_construction_are_used():
+    """A resumed trainer makes its collector first and loads weights later."""
     env, other = Numbers(), policy_of(Numbers())
     policy = policy_of(env)
-    collect = VTrace(policy, lag=2, **HOW).collector(env)
+    collect = VTrace(policy, lag=2, **SETTINGS).collector(env)
     with torch.no_grad():
-        other.output.core.weight.mul_(100)
+        other.output.linear.weight.mul_(100)
     policy.load_state_dict(other.state_dict())
     rollout = collect()
     logits = other.unroll(rollout.obs, rollout.starts, rollout.state).logits[:-1]
@@ -111,49 +114,50 @@ def test_who_goes_on_acts_with_the_weights_of_then():
     torch.testing.assert_close(rollout.logprobs, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_opponents_are_refused():
+def test_opponents_raise():
     env = Numbers()
     env.learners = torch.ones(B, dtype=torch.bool)
-    with pytest.raises(ValueError, match="lag=0, or no opponents"):
-        VTrace(policy_of(env), lag=1, **HOW).collector(env)
+    with pytest.raises(ValueError, match="lag=0 or no opponents"):
+        VTrace(policy_of(env), lag=1, **SETTINGS).collector(env)
 
 
-def test_memory_is_needed_for_each_rollout_ahead():
+def test_bytes_per_env_counts_rollouts_in_progress():
     env = Numbers()
-    need = [VTrace(policy_of(env), lag=lag, **HOW).bytes_per_env(env) for lag in (0, 1, 2)]
-    assert need[2] - need[1] == need[1] - need[0] > 0
+    n_bytes = [VTrace(policy_of(env), lag=lag, **SETTINGS).bytes_per_env(env) for lag in (0, 1, 2)]
+    assert n_bytes[2] - n_bytes[1] == n_bytes[1] - n_bytes[0] > 0
 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("lag", [1, 2])
-def test_on_a_gpu_it_is_the_loop_by_hand(lag):
-    (expected, acted), (policy, seen, collect) = (
+def test_gpu_matches_loop_with_stored_weights(lag):
+    (expected, expected_rollouts), (policy, rollouts, collect) = (
         by_hand(lag, 8, "cuda"),
-        ahead(lag, 8, "cuda", graph=True),
+        train(lag, 8, "cuda", graph=True),
     )
     assert collect.graph is not None
-    for rollout, hand in zip(seen, acted, strict=True):
-        assert torch.equal(rollout[0], hand[0]), "what is seen does not depend on what is done"
-    # kernels are chosen anew where a graph is captured; an update moves weights by some 1e-2
+    for rollout, expected_rollout in zip(rollouts, expected_rollouts, strict=True):
+        assert torch.equal(rollout[0], expected_rollout[0]), "observations ignore actions"
+    # a captured graph may use other kernels; an update moves weights by some 1e-2
     torch.testing.assert_close(flat(policy), flat(expected), rtol=1e-3, atol=1e-3)
-    other = ahead(lag - 1, 8, "cuda")[0]
+    other = train(lag - 1, 8, "cuda")[0]
     assert (flat(policy) - flat(other)).abs().max() > 1e-2
 
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("lag", [1, 2])
-def test_on_a_gpu_the_same_seed_gives_the_same_numbers(lag):
-    (first, acted, _), (second, again, _) = (ahead(lag, 12, "cuda", graph=True) for _ in range(2))
-    for one, other in zip(acted, again, strict=True):
-        assert all(map(torch.equal, one, other))
-    assert torch.equal(flat(first), flat(second))
+def test_gpu_is_deterministic(lag):
+    runs = [train(lag, 12, "cuda", graph=True) for _ in range(2)]
+    (policy, rollouts, _), (other_policy, other_rollouts, _) = runs
+    for rollout, other in zip(rollouts, other_rollouts, strict=True):
+        assert all(map(torch.equal, rollout, other))
+    assert torch.equal(flat(policy), flat(other_policy))
 
 
 @pytest.mark.cuda
-def test_collecting_and_learning_never_synchronise():
+def test_collect_and_update_never_synchronise():
     env = Numbers("cuda")
     policy = policy_of(env)
-    learner = VTrace(policy, lag=1, graph=True, **HOW)
+    learner = VTrace(policy, lag=1, graph=True, **SETTINGS)
     collect = learner.collector(env)
     for _ in range(5):
         learner.update(collect())

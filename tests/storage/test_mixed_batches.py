@@ -1,4 +1,4 @@
-"""Fresh and replayed sequences side by side: every number tells its lane and its time."""
+"""Minibatches of fresh and replayed sequences. Every number encodes its lane and time."""
 
 import pytest
 import torch
@@ -6,18 +6,20 @@ import torch
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage import mixed_batches
-from megastep.agents.storage.replay import Replay, ReplaySettings
+from megastep.agents.storage.replay import ReplayBuffer
+from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout
 
 T, B = 4, 3
-OBS, MOVES, MORE = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 60), spaces.MultiVector(1, 1)
-ROWS = torch.tensor([2, 0])
+OBS, MOVES = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 60)
+PRIVILEGED = spaces.MultiVector(1, 1)
+LANES = torch.tensor([2, 0])
 
 
 def rollouts(policy, n):
-    """Rollouts one after the other: at time t of lane b every number is 10 t + b."""
+    """Yields consecutive rollouts in which every number is 10 t + b at time t of lane b."""
     for i in range(n):
-        rollout = Rollout(T, B, OBS, MOVES, policy.initial(B), privileged_space=MORE)
+        rollout = Rollout(T, B, OBS, MOVES, policy.initial(B), privileged_space=PRIVILEGED)
         times = torch.arange(i * T, (i + 1) * T + 1)
         label = 10 * times[:, None] + torch.arange(B)
         rollout.obs[:] = label[..., None, None]
@@ -29,25 +31,25 @@ def rollouts(policy, n):
 
 
 def batch_of(n_rollouts, n=5, burn_in=0, **settings):
-    policy = Policy(OBS, MOVES, MORE, width=8)
+    policy = Policy(OBS, MOVES, PRIVILEGED, width=8)
     settings = ReplaySettings(capacity=4 * T * B, burn_in=burn_in, **settings)
     for i, rollout in enumerate(rollouts(policy, n_rollouts)):
         if i == 0:
-            replay = Replay(rollout, OBS, MOVES, settings)
+            replay = ReplayBuffer(rollout, OBS, MOVES, settings)
         replay.add(rollout)
     generator = torch.Generator().manual_seed(1)
-    batch = mixed_batches.fresh(rollout, ROWS)
-    return policy, replay, rollout, mixed_batches.with_replayed(batch, replay, policy, n, generator)
+    batch = mixed_batches.from_rollout(rollout, LANES)
+    return policy, replay, rollout, mixed_batches.add_replayed(batch, replay, policy, n, generator)
 
 
 @pytest.mark.parametrize("burn_in", [0, 2])
-def test_rows_are_joined_time_by_time(burn_in):
+def test_fresh_and_replayed_rows_line_up(burn_in):
     _, _, rollout, batch = batch_of(4, burn_in=burn_in)
     label = batch.obs[..., 0, 0]
     assert label.shape == (T + 1, 2 + 5)
-    assert torch.equal(label[:, :2], rollout.obs[:, ROWS, 0, 0])
+    assert torch.equal(label[:, :2], rollout.obs[:, LANES, 0, 0])
     assert torch.equal(label[1:] - label[:-1], torch.full((T, 7), 10.0, dtype=label.dtype))
-    # a sequence begins with a rollout, and what is learnt from it after the burn-in
+    # a sequence starts where a rollout starts, and its batch after the burn-in
     assert ((label[0] // 10) % T == torch.tensor([0, 0, *[burn_in % T] * 5])).all()
     assert torch.equal(batch.privileged[..., 0, 0], label.float())
     assert torch.equal(batch.actions[..., 0], label[:-1].long())
@@ -61,18 +63,18 @@ def test_rows_are_joined_time_by_time(burn_in):
         )
 
 
-def test_a_burn_in_ends_with_the_state_that_an_unroll_gives():
+def test_burn_in_warms_up_hidden_state():
     policy, _, _, batch = batch_of(4, burn_in=2)
     for i in range(2, 7):
-        first = batch.obs[0, i, 0, 0] - 20  # two steps earlier the rollout began
+        first = batch.obs[0, i, 0, 0] - 20  # the rollout started two steps earlier
         obs = torch.stack([first, first + 10]).half().view(2, 1, 1, 1).expand(2, 1, 1, 2)
         state = policy.initial(1).map(lambda leaf, x=first: torch.full_like(leaf, float(x) / 100))
         after = policy.unroll(obs, torch.zeros(2, 1, dtype=torch.bool), state).state
-        # the stored state is in half precision
+        # the hidden state is stored as float16
         torch.testing.assert_close(batch.state.cell[i], after.cell[0], rtol=1e-2, atol=1e-3)
 
 
-def test_nothing_replayed_learns_while_there_is_nothing_to_draw():
+def test_replayed_do_not_learn_until_ready():
     *_, batch = batch_of(1)
     assert batch.learns[:, :2].all() and not batch.learns[:, 2:].any()
     *_, batch = batch_of(3, start=4 * T * B)

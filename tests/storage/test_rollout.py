@@ -1,5 +1,5 @@
-"""Rollouts: an environment of numbers that tell their lane, time and key, followed through collect
-and sequences.
+"""Rollouts and the collectors that fill them. Every number of the environment encodes its lane,
+time and key.
 """
 
 import pytest
@@ -8,13 +8,8 @@ import torch
 from megastep import spaces
 from megastep.agents.algorithms.returns import gae
 from megastep.agents.networks.policy import Policy
-from megastep.agents.storage.rollout import (
-    Collector,
-    Rollout,
-    collect,
-    initial_actor_state,
-    without_last,
-)
+from megastep.agents.storage.collector import Collector, collect, initial_actor_state
+from megastep.agents.storage.rollout import Rollout, without_last
 from megastep.arrdict import arrdict
 from megastep.capture import state_tree
 from megastep.dotdict import leaves
@@ -22,9 +17,9 @@ from megastep.dotdict import leaves
 B, T = 6, 5
 
 
-class Telltale:
-    """Every number is 100 * lane + time, plus a tenth for each key; lane b ends at times divisible
-    by b + 2.
+class LabelledEnv:
+    """Every number is 100 * lane + time plus a fraction per key. Episodes of lane b end at times
+    divisible by b + 2.
     """
 
     obs_space = arrdict(
@@ -59,9 +54,8 @@ class Telltale:
             self.obs = arrdict(
                 eye=torch.zeros(B, 1, 1, 1, 2), rest=arrdict(imu=torch.zeros(B, 1, 3))
             )
-        self.obs.eye[:] = label.view(
-            B, 1, 1, 1, 1
-        )  # in the same memory every time, as an engine would
+        # the same memory every time, like the engine
+        self.obs.eye[:] = label.view(B, 1, 1, 1, 1)
         self.obs.rest.imu[:] = label.view(B, 1, 1) + 0.5
         odd = torch.arange(B) % 2 == 1
         return arrdict(
@@ -74,11 +68,12 @@ class Telltale:
 
 
 def collected(n_rollouts=1, dtype=torch.float32, env=None, values=True):
-    env = env or Telltale()
+    """Collects some rollouts. Returns env, policy, the last rollout and the actor state."""
+    env = env or LabelledEnv()
     policy = Policy(env.obs_space, env.action_space, width=16)
     state = policy.initial(B)
-    spaces_of = env.obs_space, env.action_space
-    rollout = Rollout(T, B, *spaces_of, state, obs_dtype=dtype, values=values)
+    env_spaces = env.obs_space, env.action_space
+    rollout = Rollout(T, B, *env_spaces, state, obs_dtype=dtype, values=values)
     actor_state = initial_actor_state(env, policy, rollout)
     for _ in range(n_rollouts):
         actor_state = collect(env, policy, rollout, actor_state)
@@ -86,7 +81,7 @@ def collected(n_rollouts=1, dtype=torch.float32, env=None, values=True):
 
 
 @pytest.mark.parametrize("n_rollouts", [1, 3])
-def test_rows_hold_what_was_seen_and_what_followed(n_rollouts):
+def test_rows_line_up_with_env(n_rollouts):
     env, _, rollout, _ = collected(n_rollouts)
     first = (n_rollouts - 1) * T
     for row in range(T + 1):
@@ -107,7 +102,7 @@ def test_rows_hold_what_was_seen_and_what_followed(n_rollouts):
         assert torch.equal(rollout.actions.fire[row], env.actions[time].fire)
 
 
-def test_a_rollout_begins_where_the_one_before_ended():
+def test_rollout_starts_where_previous_ended():
     env, policy, rollout, actor_state = collected()
     last, state = rollout.obs.eye[-1].clone(), actor_state.state.map(torch.clone)
     collect(env, policy, rollout, actor_state)
@@ -115,19 +110,19 @@ def test_a_rollout_begins_where_the_one_before_ended():
     assert torch.equal(rollout.state.cell, state.cell) and state.cell.any()
 
 
-def test_an_actor_state_stays_in_its_own_memory():
+def test_actor_state_is_updated_in_place():
     env, policy, rollout, actor_state = collected()
-    places = [leaf.data_ptr() for leaf in leaves(actor_state)]
+    addresses = [leaf.data_ptr() for leaf in leaves(actor_state)]
     again = collect(env, policy, rollout, actor_state)
-    assert [leaf.data_ptr() for leaf in leaves(again)] == places
+    assert [leaf.data_ptr() for leaf in leaves(again)] == addresses
     assert actor_state.world.obs.eye.data_ptr() != env.obs.eye.data_ptr()
     assert torch.equal(actor_state.world.obs.eye[:, 0, 0, 0, 0], env.label(2 * T))
 
 
-def test_probabilities_and_values_are_those_of_an_unroll_over_what_was_written():
+def test_logprobs_and_values_match_unroll():
     _, policy, rollout, actor_state = collected(n_rollouts=2, dtype=torch.float16)
     out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
-    close = dict(rtol=1e-4, atol=1e-4)  # products of numbers up to 500 in another order
+    close = dict(rtol=1e-4, atol=1e-4)  # sums of numbers up to 500 in another order
     torch.testing.assert_close(rollout.values, policy.value(out.features), **close)
     logprobs = policy.output.logprob(out.logits[:-1], rollout.actions)
     torch.testing.assert_close(rollout.logprobs, logprobs, **close)
@@ -135,8 +130,8 @@ def test_probabilities_and_values_are_those_of_an_unroll_over_what_was_written()
     torch.testing.assert_close(rollout.values[-1:], policy.value(last.features), **close)
 
 
-class Faulty(Telltale):
-    """Lane 4, whose episode lasts from time 7 to time 12, sees no number at time 9."""
+class NaNEnv(LabelledEnv):
+    """Lane 4, whose episode lasts from time 7 to time 12, observes NaN at time 9."""
 
     def _world(self, reset):
         world = super()._world(reset)
@@ -145,8 +140,8 @@ class Faulty(Telltale):
         return world
 
 
-def test_a_memory_that_is_not_finite_starts_anew_with_the_next_rollout():
-    env, policy, rollout, actor_state = collected(n_rollouts=2, env=Faulty())
+def test_nonfinite_hidden_state_is_cleared():
+    env, policy, rollout, actor_state = collected(n_rollouts=2, env=NaNEnv())
     assert rollout.values[4:, 4].isnan().all() and rollout.values[:4].isfinite().all()
     assert rollout.values[:, :4].isfinite().all()
     collect(env, policy, rollout, actor_state)
@@ -154,23 +149,23 @@ def test_a_memory_that_is_not_finite_starts_anew_with_the_next_rollout():
     assert rollout.values.isfinite().all() and rollout.logprobs.isfinite().all()
 
 
-def test_a_collector_begins_each_rollout_where_the_one_before_ended():
-    env = Telltale()
+def test_collector_continues_between_rollouts():
+    env = LabelledEnv()
     policy = Policy(env.obs_space, env.action_space, width=16)
     rollout = Rollout(T, B, env.obs_space, env.action_space, policy.initial(B))
     collector = Collector(env, policy, rollout)
-    places = [leaf.data_ptr() for leaf in leaves(rollout.state)]
+    addresses = [leaf.data_ptr() for leaf in leaves(rollout.state)]
     for _ in range(3):
         collector()
     _, _, expected, _ = collected(n_rollouts=3, dtype=torch.float16)
     assert torch.equal(rollout.values, expected.values) and collector.graph is None
     assert torch.equal(rollout.state.cell, expected.state.cell)
-    assert [leaf.data_ptr() for leaf in leaves(rollout.state)] == places
+    assert [leaf.data_ptr() for leaf in leaves(rollout.state)] == addresses
 
 
-def test_collecting_allocates_nothing_that_stays():
-    """A graph writes where its capture wrote, so all must be there before."""
-    env = Telltale()
+def test_collect_reuses_the_rollouts_tensors():
+    """A CUDA graph writes to the memory of its capture, so tensors must not be replaced."""
+    env = LabelledEnv()
     policy = Policy(env.obs_space, env.action_space, width=16)
     rollout = Rollout(T, B, env.obs_space, env.action_space, policy.initial(B))
     before = state_tree(rollout)
@@ -181,8 +176,8 @@ def test_collecting_allocates_nothing_that_stays():
 
 
 @pytest.mark.parametrize("values", [True, False])
-def test_sequences_join_the_rows_of_their_lanes(values):
-    env = Talkative()
+def test_sequences_select_lanes(values):
+    env = MetricsEnv()
     _, _, rollout, _ = collected(n_rollouts=2, env=env, values=values)
     rollout.logprobs[:] = torch.arange(T)[:, None] + 100.0 * torch.arange(B)
     rollout.state.cell[:] = torch.arange(B)[:, None].float()
@@ -202,62 +197,62 @@ def test_sequences_join_the_rows_of_their_lanes(values):
     assert torch.equal(acted.eye, batch.obs.eye[:T]) and without_last(None) is None
 
 
-def test_a_policy_without_a_critic_acts_as_one_whose_values_are_not_stored():
-    """Nor does it have to tell log-probabilities, as a policy of action values has none."""
+def test_policy_without_critic_or_logprobs():
+    """A decision does not need log-probabilities, either."""
 
-    class Silent(Policy):
+    class NoLogprobs(Policy):
         def forward(self, *arguments):
             decision, state = super().forward(*arguments)
             return arrdict(actions=decision.actions), state
 
     stored = []
-    for kind, critic in (Policy, "plain"), (Silent, None):
-        env = Telltale()
+    for kind, critic in (Policy, "plain"), (NoLogprobs, None):
+        env = LabelledEnv()
         policy = kind(env.obs_space, env.action_space, width=16, critic=critic)
         state = policy.initial(B)
         rollout = Rollout(T, B, env.obs_space, env.action_space, state, values=False)
         collect(env, policy, rollout, initial_actor_state(env, policy, rollout))
-        assert rollout.values is None and "value" not in rollout.numbers()
+        assert rollout.values is None and "value" not in rollout.floats()
         stored.append(rollout)
     assert torch.equal(stored[0].actions.move, stored[1].actions.move)
     assert stored[0].logprobs.all() and not stored[1].logprobs.any()
 
 
-def test_transitions_are_what_returns_are_computed_from():
+def test_transitions_fit_gae():
     env, _, rollout, _ = collected(n_rollouts=2)
     estimates = gae(**rollout.transitions(), gamma=0.0, lambda_=1.0)
     assert torch.equal(estimates.valid, ~rollout.reset)
-    # With gamma 0 an advantage is the reward that followed less the value before
+    # with gamma 0 the advantage is the reward minus the value
     expected = (rollout.reward - rollout.values[:-1]) * ~rollout.reset
     assert torch.equal(estimates.advantages, expected)
 
 
-def test_the_same_seed_collects_the_same():
+def test_same_seed_collects_the_same():
     (_, _, first, _), (_, _, second, _) = collected(2), collected(2)
     assert torch.equal(first.actions.move, second.actions.move) and torch.equal(
         first.values, second.values
     )
 
 
-def test_images_are_stored_in_half_precision_and_integers_as_integers():
+def test_default_dtypes():
     space = arrdict(rgb=spaces.MultiImage(1, 3, 1, 4), team=spaces.MultiDiscrete(1, 5000))
     rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
     assert rollout.obs.rgb.dtype == torch.float16 and rollout.obs.team.dtype == torch.int64
     assert rollout.actions.shape == (T, B, 1)
 
 
-def test_what_a_space_names_its_dtype_is_stored_as_such():
+def test_dtypes_named_by_spaces():
     space = arrdict(
         sky=spaces.MultiImage(1, 3, 1, 4, dtype=torch.uint8),
         gauge=spaces.MultiVector(1, 2, dtype=torch.float32),
     )
     rollout = Rollout(T, B, space, spaces.MultiDiscrete(1, 7), arrdict())
     assert rollout.obs.sky.dtype == torch.uint8 and rollout.obs.gauge.dtype == torch.float32
-    assert rollout.numbers().keys() == {"obs.gauge", "reward", "value", "logprob"}
+    assert rollout.floats().keys() == {"obs.gauge", "reward", "value", "logprob"}
 
 
-class Talkative(Telltale):
-    """Lane b learns at times divisible by b + 1. Two metrics tell lane and time, and a half."""
+class MetricsEnv(LabelledEnv):
+    """Lane b learns at times divisible by b + 1. Two metrics encode lane and time."""
 
     def _world(self, reset):
         world, label = super()._world(reset), self.label(self.time)
@@ -269,8 +264,8 @@ class Talkative(Telltale):
 
 
 @pytest.mark.parametrize("n_rollouts", [1, 3])
-def test_rows_hold_who_learnt_then_and_the_metrics_that_followed(n_rollouts):
-    env, _, rollout, _ = collected(n_rollouts, env=Talkative())
+def test_learns_and_metrics_line_up_with_env(n_rollouts):
+    env, _, rollout, _ = collected(n_rollouts, env=MetricsEnv())
     first = (n_rollouts - 1) * T
     for row in range(T + 1):
         assert torch.equal(rollout.learns[row], env.learns(first + row))
@@ -279,11 +274,11 @@ def test_rows_hold_who_learnt_then_and_the_metrics_that_followed(n_rollouts):
         assert torch.equal(rollout.metrics.falls[row], env.label(first + row + 1) + 0.5)
 
 
-def test_all_lanes_learn_unless_a_world_says_otherwise():
+def test_all_lanes_learn_by_default():
     _, _, rollout, _ = collected()
     assert rollout.learns.all() and not rollout.metrics
 
 
-def test_a_rollout_of_nothing_is_refused():
+def test_empty_rollout_raises():
     with pytest.raises(ValueError, match="not 0 and 6"):
-        Rollout(0, B, Telltale.obs_space, Telltale.action_space, arrdict())
+        Rollout(0, B, LabelledEnv.obs_space, LabelledEnv.action_space, arrdict())

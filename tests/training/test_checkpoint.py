@@ -1,8 +1,9 @@
-"""Checkpoints: whole or absent, and damage is named. The damage here is done for real, to files on
-the disk and to processes that write them.
+"""Checkpoints are whole or absent, and damage is reported. Files are really damaged, and processes
+really killed.
 """
 
 import errno
+import hashlib
 import itertools
 import json
 import os
@@ -15,7 +16,7 @@ import sys
 import pytest
 import torch
 
-from megastep.agents.training import checkpoint
+from megastep.agents.training import checkpoint, checkpoint_format
 from megastep.agents.training.checkpoint import CheckpointError
 from tests.helpers import faults
 
@@ -24,6 +25,7 @@ ROOT = pathlib.Path(__file__).parents[2]
 
 
 def state(n):
+    """A state whose tensor and numbers tell which save it is from."""
     return {
         "weights": {"w": torch.full((1000,), float(n))},
         "samples": n,
@@ -37,41 +39,41 @@ def state(n):
 def folder(tmp_path):
     """Three checkpoints, of steps 10, 20 and 30."""
     for n in (10, 20, 30):
-        checkpoint.save(tmp_path, n, state(n), CONFIG, keep=3)
+        checkpoint.save(tmp_path, n, state(n), CONFIG, keep_checkpoints=3)
     return tmp_path
 
 
 def names(folder):
-    return [path.name for path in checkpoint.checkpoints(folder)]
+    return [path.name for path in checkpoint.list_checkpoints(folder)]
 
 
-def test_what_was_saved_is_loaded(folder):
+def test_load_returns_what_was_saved(folder):
     loaded = checkpoint.load_latest(folder)
     assert loaded.step == 30 and loaded.config == CONFIG and loaded.path == folder / "step_30"
     assert torch.equal(loaded.state.pop("weights")["w"], torch.full((1000,), 30.0))
     assert loaded.state == {"samples": 30, "rate": 0.5, "none": None, "list": [1, 2]}
 
 
-def test_one_checkpoint_can_be_chosen(folder):
+def test_load_one_checkpoint_by_path(folder):
     assert checkpoint.load_latest(folder / "step_10").step == 10
 
 
-def test_steps_are_ordered_as_numbers(tmp_path):
+def test_checkpoints_are_sorted_by_number(tmp_path):
     for n in (9, 20, 100):
-        checkpoint.save(tmp_path, n, state(n), CONFIG, keep=9)
+        checkpoint.save(tmp_path, n, state(n), CONFIG, keep_checkpoints=9)
     assert names(tmp_path) == ["step_9", "step_20", "step_100"]
 
 
 @pytest.mark.parametrize("fraction", [0, 0.1, 0.5, 0.99])
 @pytest.mark.parametrize("file", ["state.pt", "config.json", "manifest.json"])
-def test_a_truncated_file_is_named_and_the_checkpoint_before_is_used(folder, file, fraction):
+def test_truncated_file_is_named_and_the_previous_checkpoint_used(folder, file, fraction):
     path = folder / "step_30" / file
     os.truncate(path, int(fraction * path.stat().st_size))
     with pytest.warns(UserWarning, match=f"step_30 is damaged: {file}.*using step_20"):
         assert checkpoint.load_latest(folder).step == 20
 
 
-def test_a_lost_file_is_named(folder):
+def test_missing_file_is_named(folder):
     (folder / "step_30" / "state.pt").unlink()
     with pytest.warns(UserWarning, match="state.pt cannot be read"):
         assert checkpoint.load_latest(folder).step == 20
@@ -80,43 +82,43 @@ def test_a_lost_file_is_named(folder):
 @pytest.mark.parametrize(
     "file, every", [("manifest.json", 3), ("config.json", 1), ("state.pt", 29)]
 )
-def test_a_flipped_bit_is_found_and_the_file_is_named(folder, file, every):
+def test_every_flipped_bit_is_detected(folder, file, every):
     path = folder / "step_30" / file
-    whole = path.read_bytes()
-    for bit in range(0, 8 * len(whole), every):
-        data = bytearray(whole)
+    intact = path.read_bytes()
+    for bit in range(0, 8 * len(intact), every):
+        data = bytearray(intact)
         data[bit // 8] ^= 1 << bit % 8
         path.write_bytes(data)
-        with pytest.raises(checkpoint.Damaged, match=f"step_30 is damaged: {file}"):
+        with pytest.raises(checkpoint.DamagedCheckpoint, match=f"step_30 is damaged: {file}"):
             checkpoint.load_latest(folder / "step_30")
     with pytest.warns(UserWarning, match=f"step_30 is damaged: {file}.*using step_20"):
         assert checkpoint.load_latest(folder).step == 20
-    path.write_bytes(whole)
+    path.write_bytes(intact)
     assert checkpoint.load_latest(folder).step == 30
 
 
-def test_the_newest_whole_one_is_used_however_many_are_damaged(folder):
+def test_newest_intact_checkpoint_is_used_when_several_are_damaged(folder):
     for n in (20, 30):
         os.truncate(folder / f"step_{n}" / "state.pt", 100)
-    with pytest.warns(UserWarning) as caught:
+    with pytest.warns(UserWarning) as warnings:
         assert checkpoint.load_latest(folder).step == 10
-    assert len(caught) == 2
+    assert len(warnings) == 2
 
 
-def test_nothing_starts_from_scratch_when_all_are_damaged(folder):
+def test_error_if_every_checkpoint_is_damaged(folder):
     for n in (10, 20, 30):
         os.truncate(folder / f"step_{n}" / "state.pt", 100)
     with pytest.raises(CheckpointError, match="Every checkpoint.*step_30.*step_20.*step_10"):
         checkpoint.load_latest(folder)
 
 
-def test_a_chosen_one_that_is_damaged_is_not_replaced(folder):
+def test_damaged_checkpoint_by_path_is_an_error(folder):
     os.truncate(folder / "step_30" / "state.pt", 100)
     with pytest.raises(CheckpointError, match="step_30"):
         checkpoint.load_latest(folder / "step_30")
 
 
-def test_an_empty_folder_is_told(tmp_path):
+def test_error_if_there_is_no_checkpoint(tmp_path):
     with pytest.raises(CheckpointError, match="no checkpoint"):
         checkpoint.load_latest(tmp_path)
 
@@ -135,11 +137,11 @@ class Payload:
 @pytest.mark.parametrize(
     "write", [torch.save, lambda value, file: pickle.dump(value, open(file, "wb"))]
 )
-def test_code_in_a_checkpoint_is_refused_and_not_run(folder, tmp_path, write):
+def test_code_in_a_checkpoint_is_refused_and_does_not_run(folder, tmp_path, write):
     mark, path = tmp_path / "ran", folder / "step_30" / "state.pt"
     write({"weights": Payload(mark)}, path)
     manifest = json.loads((path.parent / "manifest.json").read_text())
-    digest = checkpoint.hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
     manifest["files"]["state.pt"]["sha256"] = digest
     seal(path.parent, manifest)
     with pytest.warns(UserWarning, match="step_30 is refused"):
@@ -148,95 +150,116 @@ def test_code_in_a_checkpoint_is_refused_and_not_run(folder, tmp_path, write):
 
 
 def seal(path, manifest):
-    """Writes a manifest with the digest that makes it believable."""
+    """Writes a manifest with a valid digest."""
     manifest.pop("sha256")
-    (path / "manifest.json").write_bytes(checkpoint._sealed(manifest))
+    (path / "manifest.json").write_bytes(checkpoint_format.sealed(manifest))
 
 
-@pytest.mark.parametrize("version", [0, 1, 7])
-def test_another_format_is_named_and_neither_read_nor_passed_over(folder, version):
-    manifest = json.loads((folder / "step_30" / "manifest.json").read_text())
-    seal(folder / "step_30", {**manifest, "format": version})
-    with pytest.raises(
-        CheckpointError,
-        match=f"step_30 has format {version}.*format 4.*use the megastep that wrote it",
-    ):
+def with_format(path, version):
+    manifest = json.loads((path / "manifest.json").read_text())
+    seal(path, {**manifest, "format": version})
+
+
+@pytest.mark.parametrize("version, commit", [(4, "e9908db"), (1, "e17fabe")])
+def test_earlier_format_names_the_commit_that_reads_it(folder, version, commit):
+    with_format(folder / "step_30", version)
+    with pytest.raises(CheckpointError, match=rf"step_30 .*\(format {version}\).*{commit}"):
         checkpoint.load_latest(folder)
 
 
-def test_a_checkpoint_from_before_manifests_had_a_digest_is_named_by_its_format(folder):
+@pytest.mark.parametrize("version", [0, checkpoint_format.FORMAT + 1, "5"])
+def test_unknown_format_is_refused_and_not_skipped(folder, version):
+    with_format(folder / "step_30", version)
+    with pytest.raises(CheckpointError, match=f"step_30 has format {version}.*Update megastep"):
+        checkpoint.load_latest(folder)
+
+
+def test_every_earlier_format_has_a_reader():
+    assert list(checkpoint_format.READERS) == list(range(1, checkpoint_format.FORMAT))
+
+
+def test_format_1_without_a_digest_is_an_earlier_format_and_not_damage(folder):
     path = folder / "step_30" / "manifest.json"
     manifest = json.loads(path.read_text())
     del manifest["sha256"]
     path.write_text(json.dumps({**manifest, "format": 1}, indent=2))
-    with pytest.raises(CheckpointError, match="step_30 has format 1"):
+    with pytest.raises(CheckpointError, match=r"step_30 .*\(format 1\)"):
         checkpoint.load_latest(folder)
 
 
-def test_the_last_ones_and_the_best_stay(tmp_path):
+def test_last_checkpoints_and_the_best_are_kept(tmp_path):
     for n, score in ((1, 5.0), (2, 9.0), (3, None), (4, 1.0), (5, 2.0)):
-        checkpoint.save(tmp_path, n, state(n), CONFIG, keep=2, score=score)
+        checkpoint.save(tmp_path, n, state(n), CONFIG, keep_checkpoints=2, score=score)
     assert names(tmp_path) == ["step_2", "step_4", "step_5"]
 
 
-def test_nothing_is_deleted_before_the_new_one_is_known_to_be_whole(folder, monkeypatch):
+def test_old_checkpoints_are_kept_until_the_new_one_is_verified(folder, monkeypatch):
     def write(path, data):
         path.write_bytes(data[: len(data) // 2])
 
-    monkeypatch.setattr(checkpoint, "_write", write)
+    monkeypatch.setattr(checkpoint_format, "write_synced", write)
     with pytest.raises(CheckpointError, match="step_40"):
-        checkpoint.save(folder, 40, state(40), CONFIG, keep=2)
+        checkpoint.save(folder, 40, state(40), CONFIG, keep_checkpoints=2)
     assert names(folder) == ["step_10", "step_20", "step_30", "step_40"]
 
 
-def test_the_same_step_can_be_saved_again_and_again(folder):
+def test_same_step_can_be_saved_repeatedly(folder):
     for n in (31, 32, 33):
-        checkpoint.save(folder, 30, state(n), CONFIG, keep=3)
+        checkpoint.save(folder, 30, state(n), CONFIG, keep_checkpoints=3)
         assert checkpoint.load_latest(folder).state["samples"] == n
-        assert [checkpoint.step_of(path) for path in checkpoint.checkpoints(folder)] == [10, 20, 30]
+        assert [checkpoint.step_of(path) for path in checkpoint.list_checkpoints(folder)] == [
+            10,
+            20,
+            30,
+        ]
     assert len(list(folder.iterdir())) == 3
 
 
-def test_a_damaged_second_one_of_a_step_is_replaced_by_nothing_newer(folder):
-    checkpoint.save(folder, 30, state(31), CONFIG, keep=3)
-    os.truncate(checkpoint.checkpoints(folder)[-1] / "state.pt", 10)
+def test_damaged_second_checkpoint_of_a_step_falls_back(folder):
+    checkpoint.save(folder, 30, state(31), CONFIG, keep_checkpoints=3)
+    os.truncate(checkpoint.list_checkpoints(folder)[-1] / "state.pt", 10)
     with pytest.warns(UserWarning, match="is damaged"):
         assert checkpoint.load_latest(folder).step == 20
 
 
 class Killed(BaseException):
-    """Stands for kill -9: from here on nothing happens to any file."""
+    """Stands for kill -9: no file changes after it."""
 
 
 @pytest.mark.parametrize("step", [30, 31, 15])
 @pytest.mark.parametrize("n_old", [1, 3])
-def test_killed_between_any_two_changes_of_files_a_whole_checkpoint_is_left(tmp_path, step, n_old):
-    changes = [(os, "replace"), (os, "mkdir"), (shutil, "rmtree"), (checkpoint, "_write")]
+def test_kill_between_any_two_file_operations_leaves_an_intact_checkpoint(tmp_path, step, n_old):
+    operations = [
+        (os, "replace"),
+        (os, "mkdir"),
+        (shutil, "rmtree"),
+        (checkpoint_format, "write_synced"),
+    ]
     for n in itertools.count():
         folder = tmp_path / str(n)
         for old in (10, 20, 30)[-n_old:]:
-            checkpoint.save(folder, old, state(old), CONFIG, keep=3)
-        done = itertools.count()
+            checkpoint.save(folder, old, state(old), CONFIG, keep_checkpoints=3)
+        n_done = itertools.count()
 
-        def until_killed(real, n=n, done=done):
-            def change(*arguments, **options):
-                if next(done) >= n:
+        def until_killed(real, n=n, n_done=n_done):
+            def operation(*args, **kwargs):
+                if next(n_done) >= n:
                     raise Killed
-                return real(*arguments, **options)
+                return real(*args, **kwargs)
 
-            return change
+            return operation
 
         with pytest.MonkeyPatch.context() as patch:
-            for place, name in changes:
-                patch.setattr(place, name, until_killed(getattr(place, name)))
+            for module, name in operations:
+                patch.setattr(module, name, until_killed(getattr(module, name)))
             try:
-                checkpoint.save(folder, step, state(99), CONFIG, keep=2)
+                checkpoint.save(folder, step, state(99), CONFIG, keep_checkpoints=2)
                 break
             except Killed:
                 pass
         loaded = checkpoint.load_latest(folder)
         assert loaded.state["samples"] in (99, 30), n
-        checkpoint.save(folder, step + 1, state(100), CONFIG, keep=2)
+        checkpoint.save(folder, step + 1, state(100), CONFIG, keep_checkpoints=2)
         assert checkpoint.load_latest(folder).state["samples"] == 100
         assert not list(folder.glob("*.tmp-*"))
     assert n >= 5 and checkpoint.load_latest(folder).state["samples"] == 99
@@ -245,7 +268,7 @@ def test_killed_between_any_two_changes_of_files_a_whole_checkpoint_is_left(tmp_
 SAVES_UNTIL_KILLED = """
 import os, random, signal, sys, time
 import torch
-from megastep.agents.training import checkpoint
+from megastep.agents.training import checkpoint, checkpoint_format
 
 folder, kills, again = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "again"
 checkpoint.save(folder, 1, {"n": 1, "w": torch.zeros(50_000)}, {})
@@ -260,9 +283,9 @@ for kill in range(kills):
     time.sleep(random.uniform(0, 0.08))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    found = checkpoint.load_latest(folder).state["n"]
-    assert found >= newest, (found, newest)
-    newest = found
+    loaded = checkpoint.load_latest(folder).state["n"]
+    assert loaded >= newest, (loaded, newest)
+    newest = loaded
 checkpoint.save(folder, newest + 1, {"n": newest + 1}, {})
 print(newest, *sorted(os.listdir(folder)))
 """
@@ -271,72 +294,72 @@ print(newest, *sorted(os.listdir(folder)))
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("steps", ["again", "new"])
 @pytest.mark.parametrize("kills", [10, pytest.param(60, marks=pytest.mark.slow)])
-def test_kill_9_at_random_leaves_the_newest_whole_checkpoint(tmp_path, kills, steps):
-    done = subprocess.run(
+def test_kill_9_at_random_leaves_the_newest_checkpoint_intact(tmp_path, kills, steps):
+    process = subprocess.run(
         [sys.executable, "-W", "error", "-c", SAVES_UNTIL_KILLED, tmp_path, str(kills), steps],
         cwd=ROOT,
         text=True,
         timeout=120,
         stdout=subprocess.PIPE,
     )
-    assert done.returncode == 0
-    newest, *left = done.stdout.split()
-    assert int(newest) > kills // 10, "some processes lived long enough to save, on busy cores too"
-    assert len(left) == 2 and not any("tmp" in name for name in left), left
+    assert process.returncode == 0
+    newest, *files = process.stdout.split()
+    assert int(newest) > kills // 10, "too few processes lived long enough to save"
+    assert len(files) == 2 and not any("tmp" in name for name in files), files
 
 
-# ---- Going on from an earlier checkpoint ----
+# ---- Resuming from an earlier checkpoint ----
 
 
-def test_past_damaged_ones_the_new_checkpoint_stays_and_is_the_newest(folder):
+def test_checkpoint_saved_before_damaged_later_ones_is_the_latest(folder):
     for n in (20, 30):
         os.truncate(folder / f"step_{n}" / "state.pt", 100)
-    checkpoint.save(folder, 12, state(12), CONFIG, keep=2)
+    checkpoint.save(folder, 12, state(12), CONFIG, keep_checkpoints=2)
     assert checkpoint.load_latest(folder).step == 12
-    checkpoint.save(folder, 14, state(14), CONFIG, keep=2)
+    checkpoint.save(folder, 14, state(14), CONFIG, keep_checkpoints=2)
     assert checkpoint.load_latest(folder).step == 14
     assert names(folder) == ["step_12", "step_14"]
 
 
-def test_after_going_back_later_checkpoints_are_set_aside_at_once(folder):
-    checkpoint.rewind(folder, 30)
+def test_later_checkpoints_are_set_aside(folder):
+    checkpoint.set_aside_after(folder, 30)
     assert checkpoint.load_latest(folder).step == 30
-    checkpoint.rewind(folder, 29)
+    checkpoint.set_aside_after(folder, 29)
     assert checkpoint.load_latest(folder).step == 20
-    checkpoint.rewind(folder, 10)
+    checkpoint.set_aside_after(folder, 10)
     assert checkpoint.load_latest(folder).step == 10 and names(folder) == ["step_10"]
-    assert checkpoint.load_latest(folder / "step_30.aside").step == 30, "none is lost by going back"
+    assert checkpoint.load_latest(folder / "step_30.aside").step == 30
 
 
-def test_what_was_set_aside_goes_once_the_run_has_come_as_far(folder):
-    checkpoint.rewind(folder, 10)
-    checkpoint.save(folder, 25, state(25), CONFIG, keep=3)
-    left = sorted(path.name for path in folder.iterdir())
-    assert left == ["step_10", "step_25", "step_30.aside"]
-    checkpoint.rewind(folder, 10)
-    checkpoint.save(folder, 30, state(30), CONFIG, keep=3)
+def test_set_aside_checkpoint_is_deleted_when_its_step_is_reached(folder):
+    checkpoint.set_aside_after(folder, 10)
+    checkpoint.save(folder, 25, state(25), CONFIG, keep_checkpoints=3)
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["step_10", "step_25", "step_30.aside"]
+    checkpoint.set_aside_after(folder, 10)
+    checkpoint.save(folder, 30, state(30), CONFIG, keep_checkpoints=3)
     assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_30"]
 
 
-def test_going_back_twice_sets_the_same_step_aside_twice(folder):
-    checkpoint.rewind(folder, 20)
-    checkpoint.save(folder, 30, state(31), CONFIG, keep=3)
-    checkpoint.rewind(folder, 20)
+def test_same_step_can_be_set_aside_twice(folder):
+    checkpoint.set_aside_after(folder, 20)
+    checkpoint.save(folder, 30, state(31), CONFIG, keep_checkpoints=3)
+    checkpoint.set_aside_after(folder, 20)
     assert names(folder) == ["step_10", "step_20"]
 
 
-def test_a_full_disk_leaves_what_was_there(folder, monkeypatch):
+def test_full_disk_leaves_existing_checkpoints(folder, monkeypatch):
     def write(path, data):
         path.write_bytes(data[:10])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(checkpoint, "_write", write)
+    monkeypatch.setattr(checkpoint_format, "write_synced", write)
     with pytest.raises(OSError, match="No space left"):
         checkpoint.save(folder, 40, state(40), CONFIG)
     assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_20", "step_30"]
 
 
-def test_a_file_that_may_not_grow_leaves_what_was_there_and_the_next_save_works(folder):
+def test_save_works_again_after_a_full_disk(folder):
     big = {"w": torch.zeros(100_000)}
     with faults.full_disk(20_000), pytest.raises(OSError, match="File too large"):
         checkpoint.save(folder, 40, big, CONFIG)
@@ -345,15 +368,15 @@ def test_a_file_that_may_not_grow_leaves_what_was_there_and_the_next_save_works(
     assert checkpoint.load_latest(folder).step == 40
 
 
-def test_what_a_killed_process_left_is_ignored_and_swept(folder):
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    left = folder / f"step_40.tmp-{gone.pid}"
-    own = folder / f"step_45.tmp-{os.getpid()}"  # a process of this number, before this one
-    writing = folder / f"step_50.tmp-{os.getppid()}"  # a process that lives
-    for path in (left, own, writing):
+def test_leftovers_of_killed_processes_are_ignored_and_deleted(folder):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    from_dead = folder / f"step_40.tmp-{dead.pid}"
+    from_own_pid = folder / f"step_45.tmp-{os.getpid()}"  # an earlier process with this pid
+    from_living = folder / f"step_50.tmp-{os.getppid()}"
+    for path in (from_dead, from_own_pid, from_living):
         path.mkdir()
         (path / "state.pt").write_bytes(b"half")
     assert checkpoint.load_latest(folder).step == 30
     checkpoint.save(folder, 60, state(60), CONFIG)
-    assert not left.exists() and not own.exists() and writing.exists()
+    assert not from_dead.exists() and not from_own_pid.exists() and from_living.exists()

@@ -1,4 +1,4 @@
-"""Episode statistics, against a slow count."""
+"""Episode statistics, compared with a slow count."""
 
 from types import SimpleNamespace
 
@@ -8,9 +8,9 @@ import torch
 from megastep.agents.training.episode_stats import EpisodeStats, lane_groups
 
 
-def counted(reward, reset, done, partial):
-    """Return and length of each episode that ends, one lane and one step at a time; `partial`
-    holds those that go on, by lane.
+def slow_episodes(reward, reset, done, partial):
+    """Returns (return, length) of each finished episode. Updates `partial`, the return and length
+    so far of each lane's current episode.
     """
     finished = []
     for t in range(len(reward)):
@@ -31,36 +31,36 @@ def test_two_steps_and_an_end_are_an_episode_of_length_two():
         torch.tensor([[False], [True], [False], [False]]),
     )
     episodes.add(torch.tensor([[1.0], [2.0], [0.0], [5.0]]), reset, done)
-    assert episodes.take() == {
+    assert episodes.pop() == {
         "episode/count": 1,
         "episode/return": 3.0,
         "episode/length": 2.0,
         "episode/return_std": 0.0,
     }
     assert episodes.returns.tolist() == [5.0] and episodes.lengths.tolist() == [1.0]
-    assert episodes.take() == {"episode/count": 0}
+    assert episodes.pop() == {"episode/count": 0}
 
 
-def test_episodes_run_across_rollouts_as_if_there_were_one():
+def test_episodes_across_rollouts_match_slow_count():
     torch.manual_seed(1)
     n_lanes, episodes, finished = 5, EpisodeStats(5, "cpu"), []
     partial = {lane: (0.0, 0) for lane in range(n_lanes)}
-    before = torch.zeros(n_lanes, dtype=torch.bool)
+    ended = torch.zeros(n_lanes, dtype=torch.bool)
     for _ in range(6):
         done = torch.rand(7, n_lanes) < 0.2
-        reset = torch.cat([before[None], done[:-1]])
-        done &= ~reset  # a lane on its first observation has not ended
-        reset = torch.cat([before[None], done[:-1]])
-        before = done[-1]
+        reset = torch.cat([ended[None], done[:-1]])
+        done &= ~reset  # an episode cannot end on its first observation
+        reset = torch.cat([ended[None], done[:-1]])
+        ended = done[-1]
         reward = torch.rand(7, n_lanes) * ~reset
         episodes.add(reward, reset, done)
-        finished += counted(reward, reset, done, partial)
-    found = episodes.take()
+        finished += slow_episodes(reward, reset, done, partial)
+    stats = episodes.pop()
     returns = torch.tensor([total for total, _ in finished])
-    assert found["episode/count"] == len(finished) > 20
-    assert found["episode/return"] == pytest.approx(float(returns.mean()), rel=1e-6)
-    assert found["episode/return_std"] == pytest.approx(float(returns.std(correction=0)), rel=1e-5)
-    assert found["episode/length"] == pytest.approx(
+    assert stats["episode/count"] == len(finished) > 20
+    assert stats["episode/return"] == pytest.approx(float(returns.mean()), rel=1e-6)
+    assert stats["episode/return_std"] == pytest.approx(float(returns.std(correction=0)), rel=1e-5)
+    assert stats["episode/length"] == pytest.approx(
         sum(length for _, length in finished) / len(finished)
     )
     assert episodes.returns.tolist() == pytest.approx(
@@ -69,28 +69,28 @@ def test_episodes_run_across_rollouts_as_if_there_were_one():
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e30])
-def test_a_reward_that_is_not_finite_counts_as_nothing(bad):
+def test_nonfinite_reward_counts_as_zero(bad):
     episodes, none = EpisodeStats(2, "cpu"), torch.zeros(3, 2, dtype=torch.bool)
     episodes.add(torch.tensor([[1.0, 1.0], [bad, 2.0], [3.0, 3.0]]), none, none)
     done = torch.tensor([[True, True]])
     episodes.add(torch.full((1, 2), 4.0), none[:1], done)
-    found = episodes.take()
-    assert (found["episode/count"], found["episode/return"]) == (2, (8 + 10) / 2)
-    assert not episodes.returns.any() and found["episode/length"] == 4
+    stats = episodes.pop()
+    assert (stats["episode/count"], stats["episode/return"]) == (2, (8 + 10) / 2)
+    assert not episodes.returns.any() and stats["episode/length"] == 4
 
 
-def test_metrics_are_read_where_episodes_end_and_split_by_role():
-    """Two environments of three agents; the two followers share a role."""
+def test_metrics_are_read_at_episode_ends_and_split_by_role():
+    """Two environments of three agents, one leader and two followers."""
     env = SimpleNamespace(n_envs=2, device="cpu", roles=("leader", "follower", "follower"))
     episodes = EpisodeStats(6, "cpu", ["laps", "falls"], lane_groups(env))
     done = torch.zeros(2, 6, dtype=torch.bool)
     done[0, 0] = done[1, 3] = done[1, 4] = done[1, 5] = True
     reward = torch.tensor([[1.0, 0, 0, 2, 3, 4], [0, 0, 0, 5, 6, 7]])
-    laps = torch.where(done, 10.0 * reward, torch.nan)  # elsewhere a metric may be anything
+    laps = torch.where(done, 10.0 * reward, torch.nan)  # metrics are read only on the last step
     metrics = dict(laps=laps, falls=torch.ones(2, 6))
     episodes.add(reward, torch.zeros_like(done), done, metrics=metrics)
-    found = episodes.take()
-    assert found == {
+    stats = episodes.pop()
+    assert stats == {
         "episode/count": 4,
         "episode/return": (1 + 7 + 9 + 11) / 4,
         "episode/length": 7 / 4,
@@ -106,19 +106,19 @@ def test_metrics_are_read_where_episodes_end_and_split_by_role():
         "episode/laps/follower": 65,
         "episode/falls/follower": 1,
     }
-    assert list(found)[:6] == [
+    assert list(stats)[:6] == [
         f"episode/{name}" for name in ("count", "return", "length", "laps", "falls", "return_std")
     ]
     done[:] = False
     done[1, 0] = True
     episodes.add(reward, torch.zeros_like(done), done, metrics=metrics)
-    found = episodes.take()
-    assert found["episode/return/leader"] == 1 and "episode/return/follower" not in found
+    stats = episodes.pop()
+    assert stats["episode/return/leader"] == 1 and "episode/return/follower" not in stats
 
 
-def test_lanes_are_in_groups_by_role_and_by_whom_they_meet():
+def test_lane_groups_by_role_and_matchup():
     past = torch.tensor([False, False, True, True])
-    env = SimpleNamespace(n_envs=2, device="cpu", roles=("left", "right"), kinds={"past": past})
+    env = SimpleNamespace(n_envs=2, device="cpu", roles=("left", "right"), matchups={"past": past})
     groups = lane_groups(env, torch.tensor([True, True, False, True]))
     assert {name: lanes.tolist() for name, lanes in groups.items()} == {
         "left": [True, False, False],
@@ -128,24 +128,24 @@ def test_lanes_are_in_groups_by_role_and_by_whom_they_meet():
     assert lane_groups(SimpleNamespace(roles=None)) == {}
 
 
-def test_an_episode_counts_where_its_lane_learns():
+def test_only_episodes_of_learning_lanes_count():
     episodes = EpisodeStats(2, "cpu", ["laps"])
     done, none = torch.ones(1, 2, dtype=torch.bool), torch.zeros(1, 2, dtype=torch.bool)
     learns = torch.tensor([[True, False]])
     for reward in (1.0, 5.0):
         rewards = torch.tensor([[reward, torch.nan]])
         episodes.add(rewards, none, done, learns, dict(laps=rewards))
-    assert episodes.take() == {
+    assert episodes.pop() == {
         "episode/count": 2,
         "episode/return": 3,
         "episode/length": 1,
         "episode/laps": 3,
         "episode/return_std": 2,
     }
-    assert not episodes.returns.any(), "the lane that does not learn begins anew as well"
+    assert not episodes.returns.any(), "the lane that does not learn is cleared too"
 
 
-def test_sums_are_restored_unless_they_are_of_other_metrics():
+def test_sums_are_restored_only_for_the_same_metrics():
     done, none = torch.ones(1, 2, dtype=torch.bool), torch.zeros(1, 2, dtype=torch.bool)
     first, same, other = (
         EpisodeStats(2, "cpu", ["a"]),
@@ -155,4 +155,4 @@ def test_sums_are_restored_unless_they_are_of_other_metrics():
     first.add(torch.ones(1, 2), none, done, metrics=dict(a=torch.ones(1, 2)))
     for episodes in (same, other):
         episodes.load_state_dict(first.state_dict())
-    assert same.take() == first.take() and other.take() == {"episode/count": 0}
+    assert same.pop() == first.pop() and other.pop() == {"episode/count": 0}

@@ -1,5 +1,5 @@
-"""The training loop, around an environment of a few lines: what it counts, and what becomes of it
-when numbers, memory or disks fail.
+"""The training loop: what it counts, logs and saves, and what it does on NaN, out of memory and
+other errors.
 """
 
 import pytest
@@ -20,9 +20,10 @@ B, T, UPDATE = 6, 4, 24  # lanes, steps of a rollout, samples of an update
 
 
 class Numbers:
-    """Shows two random numbers; an episode is truncated after 7 steps and pays 1 at each.
+    """Observes two random numbers. Each step gives reward 1; episodes are truncated after 7 steps.
 
-    Args: `faults`, {(tensor, step, lane): value}, where the first step after `reset` is 1.
+    Args:
+        faults: {(tensor, step, lane): value}; the first step after `reset` is 1.
     """
 
     obs_space, action_space = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 3)
@@ -30,7 +31,7 @@ class Numbers:
 
     def __init__(self, faults=()):
         self.faults, self.generator = dict(faults), torch.Generator().manual_seed(1)
-        self.steps, self.checked = 0, 0
+        self.steps, self.n_checks = 0, 0
         self.age = torch.zeros(B, dtype=torch.int64)
 
     def reset(self):
@@ -52,19 +53,19 @@ class Numbers:
         return arrdict(world)
 
     def check(self):
-        self.checked += 1
+        self.n_checks += 1
 
 
 class Rows(list):
-    """Metrics as a list."""
+    """A logger that keeps metrics in a list."""
 
     def write(self, samples, metrics, perf):
         self.append({"samples": samples, **metrics})
 
 
 class Pairs(Numbers):
-    """The same lanes as three environments of a leader and a follower; its metric is how many steps
-    each lane's number has seen, and a follower's episodes end a step later.
+    """The same lanes as three environments of a leader and a follower. The follower's episodes end
+    one step later. The metric `age` is ten times the length.
     """
 
     n_envs, n_agents, roles = B // 2, 2, ("leader", "follower")
@@ -80,13 +81,13 @@ class Pairs(Numbers):
         return arrdict(world, truncated=ends, learns=torch.arange(B) < 4, metrics=arrdict(age=age))
 
 
-def made(folder, faults=(), samples=None, every=1, lr=1e-3, env=None, **options):
+def make_trainer(folder, faults=(), samples=None, every=1, lr=1e-3, env=None, **options):
     """A trainer in `Numbers` that saves into a folder."""
     env = env or Numbers(faults)
     policy = Policy(env.obs_space, env.action_space, width=8)
     learner = PPO(policy, n_steps=T, n_minibatches=2, lr=lr)
     saver, budget = Saver(folder, {}), Budget(samples)
-    return Trainer(env, policy, learner, Rows(), saver, budget, report_every=every, **options)
+    return Trainer(env, policy, learner, Rows(), saver, budget, log_every=every, **options)
 
 
 def always(name, lane, value, n=1000):
@@ -101,41 +102,41 @@ def same(a, b):
     return all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_a_trainer_collects_updates_reports_and_saves(tmp_path):
-    run = made(tmp_path, samples=5 * UPDATE, every=2)
+def test_trainer_collects_updates_logs_and_saves(tmp_path):
+    run = make_trainer(tmp_path, samples=5 * UPDATE, every=2)
     run.train()
-    assert [row["samples"] for row in run.metrics] == [2 * UPDATE, 4 * UPDATE]
-    assert [row["updates"] for row in run.metrics] == [2, 4]
-    assert run.env.steps == 5 * T and run.env.checked == 2
+    assert [row["samples"] for row in run.logger] == [2 * UPDATE, 4 * UPDATE]
+    assert [row["updates"] for row in run.logger] == [2, 4]
+    assert run.env.steps == 5 * T and run.env.n_checks == 2
     assert checkpoint.load_latest(tmp_path).step == 5 * UPDATE
     # episodes of 7 steps and one for the reset: the first ends in step 7, the second in step 15
-    assert [row["episode/count"] for row in run.metrics] == [B, B]
-    assert [row["episode/return"] for row in run.metrics] == [7, 7]
-    assert run.score == 7 and run.left == 0
+    assert [row["episode/count"] for row in run.logger] == [B, B]
+    assert [row["episode/return"] for row in run.logger] == [7, 7]
+    assert run.score == 7 and run.fraction_left == 0
 
 
-def test_metrics_are_reported_by_name_and_role_from_lanes_that_learn(tmp_path):
-    run = made(tmp_path, samples=2 * UPDATE, every=2, env=Pairs())
+def test_metrics_are_logged_by_name_and_role_for_lanes_that_learn(tmp_path):
+    run = make_trainer(tmp_path, samples=2 * UPDATE, every=2, env=Pairs())
     run.train()
-    (row,) = run.metrics
+    (row,) = run.logger
     assert row["episode/count"] == 4 and row["episode/age"] == 75 and run.score == 7.5
     assert (row["episode/age/leader"], row["episode/age/follower"]) == (70, 80)
     assert (row["episode/return/leader"], row["episode/return/follower"]) == (7, 8)
-    assert run.latest["episode/age"] == 75
+    assert run.latest_stats["episode/age"] == 75
 
 
-def test_all_that_a_trainer_has_it_has_from_the_start(tmp_path):
-    run = made(tmp_path, samples=3 * UPDATE)
-    attributes, methods = set(vars(run)), run.collect
+def test_training_adds_no_attributes(tmp_path):
+    run = make_trainer(tmp_path, samples=3 * UPDATE)
+    attributes, collect = set(vars(run)), run.collect
     run.train()
-    assert set(vars(run)) == attributes and run.collect is methods
+    assert set(vars(run)) == attributes and run.collect is collect
 
 
-def test_nobody_acts_ahead_while_the_environment_is_looked_at_or_when_a_run_has_ended(tmp_path):
-    run, order = made(tmp_path, samples=3 * UPDATE, every=2), []
+def test_async_collector_is_waited_for_before_checks_and_at_the_end(tmp_path):
+    run, order = make_trainer(tmp_path, samples=3 * UPDATE, every=2), []
     collect = run.collect
 
-    class Ahead:
+    class AsyncCollector:
         rollout = collect.rollout
 
         def __call__(self):
@@ -145,22 +146,22 @@ def test_nobody_acts_ahead_while_the_environment_is_looked_at_or_when_a_run_has_
         def wait(self):
             order.append("wait")
 
-    run.collect = Ahead()
+    run.collect = AsyncCollector()
     run.env.check = lambda: order.append("check")
     run.train()
     assert order == ["collect", "collect", "wait", "check", "collect", "wait"]
 
 
-def test_a_trainer_stops_when_it_is_told_to(tmp_path):
-    run = made(tmp_path)
+def test_trainer_stops_on_request(tmp_path):
+    run = make_trainer(tmp_path)
     run.train(lambda: run.updates == 2)
     assert run.samples == checkpoint.load_latest(tmp_path).step == 2 * UPDATE
 
 
-def test_what_was_saved_goes_on_and_is_not_saved_again(tmp_path):
-    first = made(tmp_path, samples=2 * UPDATE)
+def test_resumed_trainer_continues_and_does_not_save_again(tmp_path):
+    first = make_trainer(tmp_path, samples=2 * UPDATE)
     first.train()
-    second = made(tmp_path / "second", samples=2 * UPDATE, lr=0.5)
+    second = make_trainer(tmp_path / "second", samples=2 * UPDATE, lr=0.5)
     second.load_state_dict(checkpoint.load_latest(tmp_path).state)
     assert same(copied(second.policy), copied(first.policy))
     assert (second.samples, second.updates) == (2 * UPDATE, 2)
@@ -169,10 +170,12 @@ def test_what_was_saved_goes_on_and_is_not_saved_again(tmp_path):
     assert second.env.steps == 0 and not (tmp_path / "second").exists()
 
 
-def test_the_budget_that_is_nearer_its_end_counts():
+def test_budget_ends_at_the_nearer_limit():
     budget = Budget(samples=100, seconds=10.0)
-    assert budget.left(50, 2.0) == 0.5 and budget.left(20, 9.0) == pytest.approx(0.1)
-    assert Budget().left(10**9, 1e9) == 1 and not Budget().is_limited
+    assert budget.fraction_left(50, 2.0) == 0.5 and budget.fraction_left(20, 9.0) == pytest.approx(
+        0.1
+    )
+    assert Budget().fraction_left(10**9, 1e9) == 1 and not Budget().is_limited
     assert budget.lr_fraction(50, 9.0) == 1
     assert Budget(100, 10.0, "samples").lr_fraction(50, 9.0) == 0.5
     assert Budget(100, 10.0, "seconds").lr_fraction(50, 9.0) == pytest.approx(0.1)
@@ -181,9 +184,9 @@ def test_the_budget_that_is_nearer_its_end_counts():
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e30])
 @pytest.mark.parametrize("name", ["reward", "obs"])
-def test_one_bad_number_is_named_costs_its_rollouts_and_changes_nothing_else(tmp_path, name, value):
+def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_path, name, value):
     step, lane = 6, 3  # in the second rollout
-    run = made(tmp_path, {(name, step, lane): value}, samples=8 * UPDATE)
+    run = make_trainer(tmp_path, {(name, step, lane): value}, samples=8 * UPDATE)
     run.collect()
     run.update()
     before = copied(run.policy), [m.clone() for m in run.learner.optimizer.means]
@@ -193,62 +196,60 @@ def test_one_bad_number_is_named_costs_its_rollouts_and_changes_nothing_else(tmp
     assert all(map(torch.equal, run.learner.optimizer.means, before[1]))
     with pytest.warns(UserWarning, match=rf"{name} of lane 3 was (nan|inf|1e\+30) at step"):
         run.train()
-    # an observation is seen in the step that follows the one that gave it
+    # an observation is stored with the step that acts on it
     assert (run.nonfinite_value.name, run.nonfinite_value.lane) == (name, lane)
     assert run.nonfinite_value.step == step + (name == "obs") and run.nonfinite_value.is_from_env
     assert not same(copied(run.policy), before[0])
-    skipped = [row["loss/skipped_steps"] for row in run.metrics]
+    skipped = [row["loss/skipped_steps"] for row in run.logger]
     assert skipped == [0] * 6  # of the third and later updates
     assert nonfinite.nonfinite_leaf(checkpoint.load_latest(tmp_path).state) is None
-    returns = [row["episode/return"] for row in run.metrics if row["episode/count"]]
+    returns = [row["episode/return"] for row in run.logger if row["episode/count"]]
     assert all(0 < r <= 7 for r in returns)
 
 
-def test_a_bad_number_is_named_though_no_report_follows(tmp_path):
-    run = made(tmp_path, {("reward", 6, 3): torch.nan}, samples=8 * UPDATE, every=100)
+def test_nonfinite_number_is_named_without_a_later_report(tmp_path):
+    run = make_trainer(tmp_path, {("reward", 6, 3): torch.nan}, samples=8 * UPDATE, every=100)
     with pytest.warns(UserWarning, match="reward of lane 3 was nan at step 6"):
         run.train()
     assert run.nonfinite_value.step == 6
 
 
 @pytest.mark.parametrize("every", [1, 7])
-def test_an_environment_that_gives_no_more_good_numbers_ends_the_run(tmp_path, every):
-    run = made(tmp_path, always("reward", 2, float("nan")), every=every)
+def test_environment_of_only_nan_ends_the_run(tmp_path, every):
+    run = make_trainer(tmp_path, always("reward", 2, float("nan")), every=every)
     before = copied(run.policy)
     with pytest.warns(UserWarning, match="lane 2"), pytest.raises(NonFiniteError) as error:
         run.train()
     assert "reward of lane 2 was nan" in str(error.value)
-    assert "the environment gave it" in str(error.value)
-    first_report = -(-trainer.MAX_SKIPPED // every) * every
-    assert run.updates == first_report
+    assert "environment" in str(error.value)
+    next_report = -(-trainer.MAX_SKIPPED // every) * every
+    assert run.updates == next_report
     assert same(copied(run.policy), before)
     assert same(checkpoint.load_latest(tmp_path).state["policy"], before)
 
 
-def test_gradients_that_are_never_finite_end_the_run_with_advice(tmp_path):
-    run = made(tmp_path, lr=0.25)
+def test_nonfinite_gradients_end_the_run_with_advice(tmp_path):
+    run = make_trainer(tmp_path, lr=0.25)
     next(run.policy.parameters()).register_hook(lambda grad: grad * torch.nan)
     with pytest.raises(NonFiniteError, match=r"\(gradients\).*learning rate smaller than 0.25"):
         run.train()
     assert run.updates == trainer.MAX_SKIPPED
-    assert [row["loss/skipped_steps"] for row in run.metrics] == [2] * trainer.MAX_SKIPPED
+    assert [row["loss/skipped_steps"] for row in run.logger] == [2] * trainer.MAX_SKIPPED
     assert nonfinite.nonfinite_leaf(run.state_dict()) is None
 
 
-def test_a_gradient_that_is_finite_again_starts_the_count_anew(tmp_path):
-    run = made(tmp_path, samples=50 * UPDATE)
-    bad = lambda: run.updates % 25 < trainer.MAX_SKIPPED - 1  # noqa: E731
-    next(run.policy.parameters()).register_hook(lambda grad: grad * torch.nan if bad() else grad)
+def test_finite_gradient_restarts_the_count_of_skipped_updates(tmp_path):
+    run = make_trainer(tmp_path, samples=50 * UPDATE)
+    is_bad = lambda: run.updates % 25 < trainer.MAX_SKIPPED - 1  # noqa: E731
+    next(run.policy.parameters()).register_hook(lambda grad: grad * torch.nan if is_bad() else grad)
     run.train()
     assert run.updates == 50
 
 
 @pytest.mark.parametrize("lr", [10.0, 1e3])
 @pytest.mark.filterwarnings("ignore:value of lane")
-def test_a_policy_that_diverged_ends_the_run_with_advice_and_leaves_the_checkpoint_before(
-    tmp_path, lr
-):
-    run = made(tmp_path, lr=lr, save_every=0.0)
+def test_divergence_ends_the_run_and_keeps_the_last_good_checkpoint(tmp_path, lr):
+    run = make_trainer(tmp_path, lr=lr, checkpoint_seconds=0.0)
     with pytest.raises(NonFiniteError, match=f"learning rate smaller than {lr:g}"):
         run.train()
     assert run.updates < 200
@@ -258,7 +259,7 @@ def test_a_policy_that_diverged_ends_the_run_with_advice_and_leaves_the_checkpoi
 
 
 @pytest.mark.parametrize(
-    "path, spoil",
+    "path, corrupt",
     [
         ("policy.critic.output.scale", lambda run: run.policy.critic.output.scale.fill_(torch.nan)),
         (
@@ -271,26 +272,26 @@ def test_a_policy_that_diverged_ends_the_run_with_advice_and_leaves_the_checkpoi
         ),
     ],
 )
-def test_a_state_that_is_not_finite_is_never_saved(tmp_path, path, spoil):
-    run = made(tmp_path)
+def test_nonfinite_state_is_never_saved(tmp_path, path, corrupt):
+    run = make_trainer(tmp_path)
     run.train(lambda: run.updates == 1)
-    spoil(run)
+    corrupt(run)
     run.updates += 1
-    with pytest.raises(NonFiniteError, match=f"was not saved, for {path} is not finite"):
-        run.save()
-    assert [path.name for path in checkpoint.checkpoints(tmp_path)] == [f"step_{UPDATE}"]
+    with pytest.raises(NonFiniteError, match=f"{path} is not finite"):
+        run.save_checkpoint()
+    assert [path.name for path in checkpoint.list_checkpoints(tmp_path)] == [f"step_{UPDATE}"]
 
 
 @pytest.mark.parametrize("method", ["collect", "learner.update"])
-def test_memory_that_runs_out_ends_the_run_with_all_that_was_learnt(tmp_path, monkeypatch, method):
-    run = made(tmp_path)
+def test_out_of_memory_ends_the_run_with_a_checkpoint(tmp_path, monkeypatch, method):
+    run = make_trainer(tmp_path)
     owner, name = (run, method) if "." not in method else (run.learner, "update")
     real = getattr(owner, name)
 
-    def fails_later(*arguments):
+    def fails_later(*args):
         if run.updates == 3:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
-        return real(*arguments)
+        return real(*args)
 
     monkeypatch.setattr(owner, name, fails_later)
     with pytest.raises(torch.OutOfMemoryError):
@@ -298,17 +299,15 @@ def test_memory_that_runs_out_ends_the_run_with_all_that_was_learnt(tmp_path, mo
     assert checkpoint.load_latest(tmp_path).step == 3 * UPDATE
 
 
-def test_the_error_that_ended_a_run_is_the_one_told_though_nothing_can_be_saved(
-    tmp_path, monkeypatch
-):
-    def fails(sentence):
-        def method(*arguments):
-            raise RuntimeError(sentence)
+def test_first_error_is_raised_if_saving_fails_too(tmp_path, monkeypatch):
+    def fails(message):
+        def method(*args):
+            raise RuntimeError(message)
 
         return method
 
-    run = made(tmp_path)
-    monkeypatch.setattr(run, "collect", fails("a device that is lost"))
-    monkeypatch.setattr(run, "save_checkpoint", fails("it cannot be read"))
+    run = make_trainer(tmp_path)
+    monkeypatch.setattr(run, "collect", fails("the device is lost"))
+    monkeypatch.setattr(run, "saver", fails("the state cannot be read"))
     with pytest.raises(RuntimeError, match="lost"):
         run.train()

@@ -1,3 +1,1 @@
-"""The recurrent cores' kernels for the GPU (:mod:`~megastep.agents.networks.kernels.program`), and what launches
-them, a module per core.
-"""
+"""The recurrent cores' kernels for the GPU, and a module per core that launches them."""

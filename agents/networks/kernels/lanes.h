@@ -1,11 +1,13 @@
-// What the kernels of recurrent cores share: one thread per lane and n_units neighbouring units.
+// How the kernels of recurrent cores are divided among threads: one thread per lane and n_units
+// neighbouring units.
 #pragma once
+#include "common/constants.h"
 #include "number.h"
 
 #define KERNEL extern "C" __global__ void __launch_bounds__(BLOCK)
 
-// A thread's lane and where its units are in an array (B, W) and in the first gate of one
-// (B, gates W).
+// A thread's lane, and the offsets of its units in an array (B, W) and in the first gate of an
+// array (B, gates W).
 struct Place {
     int lane;
     long long unit, gate;
@@ -27,7 +29,7 @@ DEVICE void clear(float (&values)[N]) {
         values[n] = 0.f;
 }
 
-// An operation on numbers of type T, for a thread with units of its own.
+// Runs an operation on numbers of type T, for the lane and units of this thread.
 template <class Operation, class T, class Params>
 DEVICE void run(const Params& p) {
     Place place;

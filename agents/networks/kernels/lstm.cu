@@ -1,15 +1,16 @@
-// What the LSTM does to a step between two matrix products, in float32. One thread per lane and
+// The LSTM's element-wise work between two matrix products, in float32. One thread per lane and
 // n_units neighbouring units.
 //
-// The gates stay as the product left them, and the backward step activates them once more: in
-// bfloat16 a gate of 0.99 is known to 0.002, so its slope, which holds 1 - 0.99, would be lost.
+// Gates are stored before activation, and the backward step activates them again. Stored after it,
+// in bfloat16, a gate of 0.99 would have an error of 0.002 and its slope, 0.99 (1 - 0.99), would be
+// lost.
 #include "lanes.h"
 #include "params.h"
 
-// The activated gates of N units, the cell before and after the step, and the latter squashed.
+// The activated gates of N units, the cell before and after the step, and tanh of the latter.
 template <int N>
 struct LstmStep {
-    float input[N], forget[N], candidate[N], output[N], before[N], after[N], squashed[N];
+    float input[N], forget[N], candidate[N], output[N], before[N], after[N], tanh_after[N];
 };
 
 template <class T, int N, class Params>
@@ -25,7 +26,7 @@ DEVICE void activate(LstmStep<N>& s, const Params& p, const Place& place) {
         s.candidate[n] = tanh_of(s.candidate[n]);
         s.output[n] = sigmoid(s.output[n]);
         s.after[n] = s.forget[n] * s.before[n] + s.input[n] * s.candidate[n];
-        s.squashed[n] = tanh_of(s.after[n]);
+        s.tanh_after[n] = tanh_of(s.after[n]);
     }
 }
 
@@ -34,14 +35,14 @@ struct LstmStart {
 
     template <class T, int N>
     DEVICE void run(const LstmStartParams& p, const Place& place) {
-        float memory[N], cell[N];
-        read<float>(memory, p.last_output, place.unit);
+        float hidden[N], cell[N];
+        read<float>(hidden, p.last_output, place.unit);
         read<float>(cell, p.last_cell, place.unit);
         if (p.reset[place.lane]) {
-            clear(memory);
+            clear(hidden);
             clear(cell);
         }
-        write<T>(p.memory, place.unit, memory);
+        write<T>(p.hidden, place.unit, hidden);
         write<float>(p.cell, place.unit, cell);
     }
 };
@@ -51,19 +52,19 @@ struct LstmForward {
 
     template <class T, int N>
     DEVICE void run(const LstmForwardParams& p, const Place& place) {
-        bool forgotten = p.next_reset && p.next_reset[place.lane];
+        bool next_resets = p.next_reset && p.next_reset[place.lane];
         LstmStep<N> s;
         activate<T>(s, p, place);
         float output[N];
         for (int n = 0; n < N; n++)
-            output[n] = s.output[n] * s.squashed[n];
+            output[n] = s.output[n] * s.tanh_after[n];
         write<T>(p.output, place.unit, output);
-        if (forgotten) {
+        if (next_resets) {
             clear(output);
             clear(s.after);
         }
-        if (p.next_memory)
-            write<T>(p.next_memory, place.unit, output);
+        if (p.next_hidden)
+            write<T>(p.next_hidden, place.unit, output);
         write<float>(p.next_cell, place.unit, s.after);
     }
 };
@@ -73,29 +74,29 @@ struct LstmBackward {
 
     template <class T, int N>
     DEVICE void run(const LstmBackwardParams& p, const Place& place) {
-        float d_output[N], d_memory[N], d_after[N];
+        float d_output[N], d_hidden[N], d_after[N];
         read<T>(d_output, p.d_output, place.unit);
         read<float>(d_after, p.d_next_cell, place.unit);
-        clear(d_memory);
-        bool forgotten = false;
-        if (p.d_next_memory) {  // whether forgotten or not: no load waits for another
-            read<T>(d_memory, p.d_next_memory, place.unit);
-            forgotten = p.next_reset[place.lane];
+        clear(d_hidden);
+        bool next_resets = false;
+        if (p.d_next_hidden) {  // even if the next step resets: no load waits for another
+            read<T>(d_hidden, p.d_next_hidden, place.unit);
+            next_resets = p.next_reset[place.lane];
         }
         LstmStep<N> s;
         activate<T>(s, p, place);
-        if (forgotten) {
-            clear(d_memory);
+        if (next_resets) {
+            clear(d_hidden);
             clear(d_after);
         }
         for (int n = 0; n < N; n++) {
             float i = s.input[n], f = s.forget[n], g = s.candidate[n], o = s.output[n];
-            float d_h = d_output[n] + d_memory[n];
-            float d_cell = d_after[n] + d_h * o * (1.f - s.squashed[n] * s.squashed[n]);
+            float d_h = d_output[n] + d_hidden[n];
+            float d_cell = d_after[n] + d_h * o * (1.f - s.tanh_after[n] * s.tanh_after[n]);
             s.input[n] = d_cell * g * i * (1.f - i);
             s.forget[n] = d_cell * s.before[n] * f * (1.f - f);
             s.candidate[n] = d_cell * i * (1.f - g * g);
-            s.output[n] = d_h * s.squashed[n] * o * (1.f - o);
+            s.output[n] = d_h * s.tanh_after[n] * o * (1.f - o);
             d_after[n] = d_cell * f;
         }
         write<T>(p.d_gates, place.gate, s.input);

@@ -1,34 +1,47 @@
-"""The LSTM on a GPU between its matrix products: a kernel before the first step, one per step, and
-one per step back.
+"""The LSTM on a GPU between its matrix products: one kernel before the first step, one per step,
+and one per backward step.
 
-Axes: B lanes, W units. All tensors are contiguous, and where W is a multiple of 4 they begin at a
-multiple of four elements. Gates, outputs, memories and their gradients are in the compute dtype,
-cells in float32, resets bool. Each function writes to the tensors given last.
+B lanes, W units. All tensors are contiguous; if W is a multiple of 4, they start at a multiple of
+four elements. Gates are before activation. Gates, outputs, hidden states and their gradients are in
+the compute dtype, cells are float32, resets are bool. Each function writes to its last arguments.
 """
 
 from megastep.agents.networks.kernels.program import run
 
 
-def start(reset, last_output, last_cell, memory, cell):
-    """What the first step remembers, (B, W): the last output and cell, or zero where `reset` (B).
-    `last_output` is float32.
+def start(reset, last_output, last_cell, hidden, cell):
+    """Computes the first step's input state: the last output and cell, zeroed where `reset`.
+
+    Args:
+        reset: (B,) bool, of the first step.
+        last_output: (B, W) float32.
+        last_cell: (B, W) float32.
+        hidden: (B, W), written.
+        cell: (B, W), written.
     """
     run(
         "lstm_start",
-        memory.dtype,
+        hidden.dtype,
         cell,
         reset=reset,
         last_output=last_output,
         last_cell=last_cell,
-        memory=memory,
+        hidden=hidden,
         cell=cell,
     )
 
 
-def forward(gates, cell, next_reset, output, next_memory, next_cell):
-    """From the gates before their activation (B, 4 W) and the cell (B, W) to the output, and to the
-    output and the cell as the next step remembers them: zero where `next_reset` (B). If there is no
-    next step, `next_reset` and `next_memory` are None.
+def forward(gates, cell, next_reset, output, next_hidden, next_cell):
+    """Computes a step's output, and the input state of the next step.
+
+    Args:
+        gates: (B, 4 W).
+        cell: (B, W).
+        next_reset: (B,) bool, where the next step's input state is zeroed; None without a next
+            step.
+        output: (B, W), written.
+        next_hidden: (B, W), written; None without a next step.
+        next_cell: (B, W), written.
     """
     run(
         "lstm_forward",
@@ -38,13 +51,13 @@ def forward(gates, cell, next_reset, output, next_memory, next_cell):
         cell=cell,
         next_reset=next_reset,
         output=output,
-        next_memory=next_memory,
+        next_hidden=next_hidden,
         next_cell=next_cell,
     )
 
 
-def backward(gates, cell, next_reset, d_output, d_next_memory, d_next_cell, d_gates, d_cell):
-    """The gradients of `forward` in its gates and its cell, from those in what it gave."""
+def backward(gates, cell, next_reset, d_output, d_next_hidden, d_next_cell, d_gates, d_cell):
+    """Computes the gradients of `forward`'s gates and cell from those of its outputs."""
     run(
         "lstm_backward",
         gates.dtype,
@@ -53,7 +66,7 @@ def backward(gates, cell, next_reset, d_output, d_next_memory, d_next_cell, d_ga
         cell=cell,
         next_reset=next_reset,
         d_output=d_output,
-        d_next_memory=d_next_memory,
+        d_next_hidden=d_next_hidden,
         d_next_cell=d_next_cell,
         d_gates=d_gates,
         d_cell=d_cell,

@@ -1,18 +1,16 @@
-"""The minGRU on a GPU after its matrix product: a kernel for all steps, and one for all steps back.
+"""The minGRU on a GPU after its matrix product: one kernel for all steps, one for all steps back.
 
-Axes: T time, B lanes, W units. All tensors are contiguous, and where W is a multiple of 4 they
-begin at a multiple of four elements. Gates (T, B, 2 W), outputs (T, B, W) and their gradients are
-in the compute dtype, states (B, W) in float32, resets (T, B) bool. Each function writes to the
-tensors given last.
+T steps, B lanes, W units. All tensors are contiguous; if W is a multiple of 4, they start at a
+multiple of four elements. Gates (T, B, 2 W), before activation, outputs (T, B, W) and their
+gradients are in the compute dtype, states (B, W) are float32, resets (T, B) are bool. Each function
+writes to its last arguments.
 """
 
 from megastep.agents.networks.kernels.program import run
 
 
 def forward(gates, reset, start, outputs, last):
-    """From the gates before their activation and the state before the first step to the outputs and
-    the state after the last.
-    """
+    """Computes the outputs and the last state from the gates and the first state."""
     run(
         "mingru_forward",
         gates.dtype,
@@ -27,7 +25,7 @@ def forward(gates, reset, start, outputs, last):
 
 
 def backward(gates, reset, start, outputs, d_outputs, d_last, d_gates, d_start):
-    """The gradients of `forward` in its gates and its first state, from those in what it gave."""
+    """Computes the gradients of `forward`'s gates and first state from those of its outputs."""
     run(
         "mingru_backward",
         gates.dtype,

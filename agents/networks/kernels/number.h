@@ -1,9 +1,9 @@
-// Numbers of either dtype, several at once, and the gates' activations.
+// Reading and writing float32 and bfloat16 numbers, several at once, and the gates' activations.
 #pragma once
 
 #define DEVICE static __device__ __forceinline__
 
-// The upper half of a float. Without its header, NVRTC needs no include folder.
+// The upper half of a float. Not cuda_bf16.h, so NVRTC needs no include folder.
 struct Bfloat16 {
     unsigned short bits;
 };
@@ -14,7 +14,7 @@ DEVICE float to_float(Bfloat16 x) { return __uint_as_float((unsigned int)x.bits 
 
 DEVICE void assign(float& target, float x) { target = x; }
 
-// Rounds to the nearest, ties to even. A NaN stays one: rounded up, it might end as an infinity.
+// Rounds to nearest, ties to even. NaN is kept apart: rounding up could turn it into infinity.
 DEVICE void assign(Bfloat16& target, float x) {
     unsigned int bits = __float_as_uint(x);
     bool is_nan = (bits & 0x7fffffffu) > 0x7f800000u;
@@ -22,7 +22,7 @@ DEVICE void assign(Bfloat16& target, float x) {
     target.bits = (unsigned short)((is_nan ? bits | 0x400000u : rounded) >> 16);
 }
 
-// The word of so many bytes that one instruction moves.
+// The type of a word of BYTES bytes, which one instruction moves.
 template <int BYTES>
 struct Word;
 template <>
@@ -42,7 +42,7 @@ struct Word<16> {
     typedef uint4 Type;
 };
 
-// N neighbours in one word: left to itself, the compiler moves some of them singly.
+// N neighbours in one word. Without it, the compiler moves some of them one by one.
 template <class T, int N>
 union Pack {
     typename Word<N * sizeof(T)>::Type word;
@@ -65,8 +65,8 @@ DEVICE void write(void* base, long long index, const float (&values)[N]) {
     ((Pack<T, N>*)((T*)base + index))->word = pack.word;
 }
 
-// Where x is large either way, the exponential is 0 or infinite and the quotient 0 or 1. NaN stays.
+// For large |x| the exponential is 0 or infinite and the quotient 1 or 0. NaN stays NaN.
 DEVICE float sigmoid(float x) { return __fdividef(1.f, 1.f + __expf(-x)); }
 
-// Within 3e-7, from -1 to 1.
+// Absolute error below 3e-7.
 DEVICE float tanh_of(float x) { return 1.f - 2.f * sigmoid(-2.f * x); }

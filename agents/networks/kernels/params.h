@@ -1,21 +1,21 @@
-// What each launch is given, by value; Python reads these structs, one field per line.
+// The parameters of each launch, passed by value; see megastep/kernels/params.h.
 //
-// T steps, B lanes, W units. "compute" stands for the dtype of matrix products, float or bfloat16.
+// T steps, B lanes, W units. "compute" is the dtype of matrix products, float32 or bfloat16.
 #pragma once
 
-// The LSTM. A null pointer: there is no next step. Gates are those before their activation: input,
-// forget, candidate, output. The memory is the output, and the cell, as the step sees them: zero
-// where a reset has cleared them.
+// The LSTM. Gates are before activation, in the order input, forget, candidate, output. `hidden`
+// and `cell` are a step's input state: the last step's output and cell, zeroed where a reset clears
+// them. A null pointer means that there is no next step.
 
 struct LstmStartParams {
     const unsigned char* reset;  // (B) at the first step
     const float* last_output;    // (B, W)
     const float* last_cell;      // (B, W)
-    void* memory;                // (B, W) compute
+    void* hidden;                // (B, W) compute
     float* cell;                 // (B, W)
     int n_lanes;
     int width;
-    int n_units;  // of one thread
+    int n_units;  // units per thread
 };
 
 struct LstmForwardParams {
@@ -23,11 +23,11 @@ struct LstmForwardParams {
     const float* cell;                // (B, W)
     const unsigned char* next_reset;  // (B)
     void* output;                     // (B, W) compute
-    void* next_memory;                // (B, W) compute
+    void* next_hidden;                // (B, W) compute
     float* next_cell;                 // (B, W)
     int n_lanes;
     int width;
-    int n_units;  // of one thread
+    int n_units;  // units per thread
 };
 
 struct LstmBackwardParams {
@@ -35,17 +35,17 @@ struct LstmBackwardParams {
     const float* cell;                // (B, W)
     const unsigned char* next_reset;  // (B)
     const void* d_output;             // (B, W) compute
-    const void* d_next_memory;        // (B, W) compute
+    const void* d_next_hidden;        // (B, W) compute
     const float* d_next_cell;         // (B, W)
     void* d_gates;                    // (B, 4 W) compute
     float* d_cell;                    // (B, W)
     int n_lanes;
     int width;
-    int n_units;  // of one thread
+    int n_units;  // units per thread
 };
 
-// The minGRU. Gates are the update gate before its activation, and the candidate. The start is the
-// state before the first step, the last that after the last.
+// The minGRU. Gates are the update gate before activation, and the candidate. `start` is the state
+// before the first step, `last` the state after the last.
 
 struct MingruForwardParams {
     const void* gates;           // (T, B, 2 W) compute
@@ -56,7 +56,7 @@ struct MingruForwardParams {
     int n_steps;
     int n_lanes;
     int width;
-    int n_units;  // of one thread
+    int n_units;  // units per thread
 };
 
 struct MingruBackwardParams {
@@ -71,5 +71,5 @@ struct MingruBackwardParams {
     int n_steps;
     int n_lanes;
     int width;
-    int n_units;  // of one thread
+    int n_units;  // units per thread
 };

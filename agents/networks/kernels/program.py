@@ -1,34 +1,31 @@
-"""The learner's kernels for the GPU as one program, what they ask of tensors, and their launch."""
+"""The recurrent cores' kernels for the GPU as one program, and their launch."""
 
 from pathlib import Path
 
 import torch
 
 from megastep.arrdict import arrdict
-from megastep.kernels.build.compile import BLOCK, EngineError, Program
-from megastep.kernels.build.launch import builders, fields_of, launch
+from megastep.kernels.build.compile import EngineError
+from megastep.kernels.build.launch import launch
+from megastep.kernels.build.program import Program
 
-HERE = Path(__file__).parent
 DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
-# By operation, the struct of params.h that it is given.
-STRUCTS = {
-    "lstm_start": "LstmStartParams",
-    "lstm_forward": "LstmForwardParams",
-    "lstm_backward": "LstmBackwardParams",
-    "mingru_forward": "MingruForwardParams",
-    "mingru_backward": "MingruBackwardParams",
-}
-# Fused multiply-adds and numbers below 1e-38 flushed to zero: no bits have to agree here.
-FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info", f"-DBLOCK={BLOCK}")
-CORES = Program(
-    HERE, tuple(f"{name}_{dtype}" for name in STRUCTS for dtype in DTYPES.values()), FLAGS
-)
-params = builders(fields_of(HERE))
+# Unlike in the engine, no bits have to agree: fused multiply-adds, and subnormals flushed to zero.
+CUDA_FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info")
+CORES = Program(Path(__file__).parent, CUDA_FLAGS)
 
 
-def run(operation: str, dtype: torch.dtype, state: torch.Tensor, **given) -> None:
-    """Launches an operation that computes in `dtype`, for all lanes and units of a state (B, W).
-    The rest is what its struct holds: tensors for pointers, None for a null one, and numbers.
+def run(operation: str, dtype: torch.dtype, state: torch.Tensor, **fields) -> None:
+    """Launches an operation for all lanes and units of a state.
+
+    Args:
+        operation: its name without the dtype, such as `lstm_start`.
+        dtype: in which it computes.
+        state: (B, W).
+        fields: the other fields of its struct. A tensor stands for its address, None for null.
+
+    Raises:
+        EngineError: if there is no kernel for `dtype`.
     """
     if dtype not in DTYPES:
         raise EngineError(
@@ -37,25 +34,21 @@ def run(operation: str, dtype: torch.dtype, state: torch.Tensor, **given) -> Non
         )
     n_lanes, width = state.shape
     n_units = 1 if width % 4 else 4
-    fields = {name: _field(value) for name, value in given.items()}
-    build = getattr(params, STRUCTS[operation])
-    launch(
-        f"{operation}_{DTYPES[dtype]}",
-        build(**fields, n_lanes=n_lanes, width=width, n_units=n_units),
-        state.device,
-        n_lanes * width // n_units,
-        program=CORES,
-    )
+    kernel = f"{operation}_{DTYPES[dtype]}"
+    pack = getattr(CORES.params, CORES.cuda_operations[kernel])
+    values = {name: _value(field) for name, field in fields.items()}
+    packed = pack(**values, n_lanes=n_lanes, width=width, n_units=n_units)
+    launch(CORES, kernel, packed, state.device, n_lanes * width // n_units)
 
 
-def _field(value):
-    if isinstance(value, torch.Tensor):
-        return value.data_ptr()
-    return 0 if value is None else value
+def _value(field):
+    if isinstance(field, torch.Tensor):
+        return field.data_ptr()
+    return 0 if field is None else field
 
 
 def aligned(tensor: torch.Tensor) -> torch.Tensor:
-    """The tensor as kernels read it: contiguous, from a multiple of 16 bytes on."""
+    """Returns the tensor, or a copy, contiguous and starting at a multiple of 16 bytes."""
     if tensor.data_ptr() % 16:
         return tensor.clone(memory_format=torch.contiguous_format)
     return tensor.contiguous()
@@ -64,16 +57,24 @@ def aligned(tensor: torch.Tensor) -> torch.Tensor:
 def check_shapes(
     x: torch.Tensor, reset: torch.Tensor, state: arrdict, leaves: tuple[str, ...]
 ) -> None:
-    """ValueError unless `reset` and the leaves of a state fit x (T, B, W), T at least 1: kernels
-    would read past the end of what is too small, or in another device's memory.
+    """Checks the inputs of a recurrent core, since kernels would read out of bounds.
+
+    Args:
+        x: (T, B, W), T at least 1.
+        reset: (T, B), on the device of `x`.
+        state: whose `leaves` are (B, W), on the device of `x`.
+        leaves: names of the leaves to check.
+
+    Raises:
+        ValueError: naming the tensor that does not fit `x`.
     """
     if not len(x):
         raise ValueError(f"x is {tuple(x.shape)}, but a sequence has at least one step")
     expected = {"reset": (reset, x.shape[:2])}
     expected |= {f"state.{name}": (state[name], x.shape[1:]) for name in leaves}
-    for name, (given, shape) in expected.items():
-        if given.shape != shape or given.device != x.device:
+    for name, (tensor, shape) in expected.items():
+        if tensor.shape != shape or tensor.device != x.device:
             raise ValueError(
-                f"{name} is {tuple(given.shape)} on {given.device}, but x asks for {tuple(shape)} "
-                f"on {x.device}"
+                f"{name} is {tuple(tensor.shape)} on {tensor.device}, but x asks for "
+                f"{tuple(shape)} on {x.device}"
             )

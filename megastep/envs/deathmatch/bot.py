@@ -1,4 +1,4 @@
-"""Scripted policies, which act on observations as any other does. B lanes, R pixels."""
+"""A scripted policy for Deathmatch that acts on observations alone. B lanes, R pixels."""
 
 from collections.abc import Mapping
 
@@ -6,36 +6,40 @@ import torch
 
 from megastep.arrdict import arrdict
 
-#: Actions of agents that walk about.
+#: Actions with momentum.
 NOTHING, FORWARD, LEFT, RIGHT = 0, 3, 5, 6
-TURN = 18.0  # degrees per second that an action adds
-KEPT = 0.875  # of a velocity, from step to step
+TURN = 18.0  # degrees per second added by an action
+RETAINED = 0.875  # fraction of a velocity left after a step
 STEP = 0.1  # seconds
-SATURATED = 0.12  # share of a pixel's light in its weakest channel: agents have less, walls more
-DARK = 0.01  # light below which a pixel tells nothing
-LOOK = 25  # steps to turn to where somebody was last seen: all round
-AROUND = 10  # steps to turn away from what stopped a walk
-SLOW = 0.05  # tens of metres per second at which it approaches
-MIDDLE = 8  # pixels either way that a walk needs clear
-CLOSE, NEAR = 0.7, 0.9  # depth of somebody three metres away, near enough; of a wall at one metre
+SATURATED = 0.12  # fraction of a pixel's light in its weakest channel: agents have less, walls more
+DARK = 0.01  # darker pixels are ignored
+LOOK = 25  # steps it turns after it lost an agent: all round
+AROUND = 10  # steps it turns away from what stopped it
+SLOW = 0.05  # maximum speed at which it approaches, in tens of metres per second
+MIDDLE = 8  # pixels left and right of the centre that must be free to walk
+CLOSE = 0.7  # depth at 3 m, near enough to an agent
+NEAR = 0.9  # depth at 1 m, too near to a wall
 
 
 class Bot:
-    """Fights in deathmatch: turns until another agent is in the middle of its view, holds it there,
-    and approaches. Who sees nobody walks about, and turns where a wall comes near.
+    """Plays Deathmatch: turns until another agent is at the centre of its view, keeps it there and
+    approaches. If it sees no agent, it walks about and turns away from walls.
 
-    It acts on a world's `obs` (`rgb`, `d`, `imu`) and `reset` alone, tells agents from walls by
-    their saturated colours, and has no weights. `fov` degrees, of its camera; it expects ten steps
-    per second.
+    It uses a world's `obs` (`rgb`, `d`, `imu`) and `reset` only, recognises agents by their
+    saturated colours, and has no weights. It expects ten steps per second.
+
+    Args:
+        fov: the camera's field of view in degrees.
     """
 
     def __init__(self, fov: float = 70.0):
         self.fov = fov
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
-        """The state of B lanes, (B,) each: `lost`, steps since anybody was in view; `side`, which
-        way to turn, 1 left or -1 right; `around`, steps still to turn away from a wall; `pushed`,
-        whether the last action was a push ahead.
+        """Returns the initial state, (B,) each.
+
+        `lost`: steps since an agent was in view. `side`: direction to turn, 1 left or -1 right.
+        `around`: steps left to turn away from a wall. `pushed`: the last action was forward.
         """
         zeros = torch.zeros(n_lanes, dtype=torch.int64, device=device)
         return arrdict(
@@ -49,12 +53,22 @@ class Bot:
         sample: bool = True,
         generator: torch.Generator | None = None,
     ) -> tuple[arrdict, arrdict]:
-        """One step for all lanes: (arrdict(actions (B, 1) int64), state). Nothing is drawn, so
-        `sample` and `generator` change nothing. ValueError for worlds of another kind.
+        """Chooses actions for all lanes.
+
+        Args:
+            world: of Deathmatch.
+            state: of the last step, or :meth:`initial`.
+            sample, generator: ignored; the bot is deterministic.
+
+        Returns:
+            (arrdict(actions (B, 1) int64), new state).
+
+        Raises:
+            ValueError: if the observations are not Deathmatch's.
         """
         obs = world["obs"]
         if not isinstance(obs, Mapping) or not {"rgb", "d", "imu"} <= obs.keys():
-            raise ValueError("it acts on observations of rgb, d and imu, as deathmatch's are")
+            raise ValueError("the bot needs observations rgb, d and imu, as Deathmatch has them")
         rgb, depth = obs["rgb"][:, 0, :, 0].float(), obs["d"][:, 0, 0, 0].float()
         spin, ahead = 360 * obs["imu"][:, 0, 0].float(), obs["imu"][:, 0, 1]
         is_seen, pixel = self._nearest_agent(rgb)
@@ -69,14 +83,14 @@ class Bot:
         clear = depth[:, half - MIDDLE : half + MIDDLE].amax(1) < NEAR
         walks = clear & (around == 0) & (lost > LOOK)
         searches = torch.where(walks, FORWARD, torch.where(side > 0, LEFT, RIGHT))
-        comes = (depth.gather(1, pixel[:, None])[:, 0] < CLOSE) & (ahead < SLOW)
-        fights = self._fight(target, spin, comes)
+        approaches = (depth.gather(1, pixel[:, None])[:, 0] < CLOSE) & (ahead < SLOW)
+        fights = self._fight(target, spin, approaches)
         actions = torch.where(is_seen, fights, searches)
         state = arrdict(lost=lost, side=side, around=around, pushed=actions == FORWARD)
         return arrdict(actions=actions[:, None]), state
 
     def _nearest_agent(self, rgb):
-        """Whether an agent is in view (B,), and its pixel nearest to the middle (B,)."""
+        """Returns if an agent is in view (B,), and the agent's pixel closest to the centre (B,)."""
         light = rgb.sum(1)
         is_agent = (rgb.amin(1) < SATURATED * light) & (light > DARK)
         n = rgb.shape[2]
@@ -84,20 +98,20 @@ class Bot:
         return is_agent.any(1), torch.where(is_agent, off, float(n)).argmin(1)
 
     def _bearing(self, pixel, n_pixels):
-        """Degrees to the left of the middle at which pixels (B,) look."""
+        """Returns the bearing of pixels (B,) in degrees, positive to the left."""
         slope = (n_pixels - 1 - 2 * pixel) / n_pixels
         half = torch.deg2rad(torch.full_like(slope, self.fov / 2)).tan()
         return torch.rad2deg((slope * half).atan())
 
     def _turn(self, target, spin, seconds):
-        """Left, right or nothing (B,), whichever brings a bearing nearest to the middle by then."""
+        """Returns the turn (B,) that brings a bearing closest to 0 after so many seconds."""
         pushes = torch.arange(-1, 2, device=spin.device) * TURN  # right, nothing, left
-        off = target[:, None] - seconds * (KEPT * spin[:, None] + pushes)
+        off = target[:, None] - seconds * (RETAINED * spin[:, None] + pushes)
         best = off.abs().argmin(1)
         return torch.where(best == 0, RIGHT, torch.where(best == 2, LEFT, NOTHING))
 
-    def _fight(self, target, spin, comes):
-        """Turns to a target, and where that takes no turn, comes nearer, where it `comes`."""
+    def _fight(self, target, spin, approaches):
+        """Turns to a target; walks forward where no turn is needed and it `approaches`."""
         soon, later = (self._turn(target, spin, seconds) for seconds in (STEP, 3 * STEP))
         action = torch.where(target.abs() > 3, later, soon)
-        return torch.where((action == NOTHING) & comes, FORWARD, action)
+        return torch.where((action == NOTHING) & approaches, FORWARD, action)

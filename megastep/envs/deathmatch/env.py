@@ -1,6 +1,6 @@
-"""Deathmatch: agents in one home hit whoever stands in the middle of their view.
+"""Deathmatch: agents in one home hit whoever is at the centre of their view.
 
-N environments of A agents, each a lane, so B = N A.
+N environments of A agents. Each agent is a lane: B = N A.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,46 +11,72 @@ from pydantic import Field
 
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
-from megastep.arrdict import arrdict, numpyify
+from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
-from megastep.envs.deathmatch.step import MAX_AGENTS, deathmatch_step
+from megastep.envs.common import SceneryEnv
+from megastep.envs.deathmatch.step import (
+    MAX_AGENTS,
+    TALLY_ROWS,
+    deathmatch_step,
+    privileged_size,
+)
 from megastep.scene import scenery
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Deathmatch"]
 
 METRICS = "kills", "deaths", "damage", "accuracy"
-MIN_SPAWNS = 128  # points per layout, as many as other environments have
-SPAWNS = 16  # points per agent at least, to find one out of sight
+MIN_SPAWNS = 128  # spawn points per layout, as in other environments
+SPAWNS_PER_AGENT = 16  # at least, so that one is likely hidden from the other agents
 
-Share = Annotated[float, Field(ge=0, le=1)]
-Price = Annotated[float, Field(ge=-1000, le=1000)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Reward = Annotated[float, Field(ge=-1000, le=1000)]
 
 
-class Deathmatch:
-    """A reward of 1 for each step with another agent in the middle of the view, a hit, and -1 for
-    each hit by another, a wound.
+class Deathmatch(SceneryEnv):
+    """Agents in one home hit each other by looking at each other.
 
-    Observation: RGB and depth of 128 pixels over 70 degrees, each the mean of 4 rays; IMU; and
-    ``health``, three numbers: health from 1 to 0, whether the last step hit somebody, how many hit
-    the agent. All are fp16. Agents have saturated colours of their own and a red front; walls are
-    paler. Seven actions, with momentum; there is no trigger.
+    In each step, an agent hits whoever is at the centre of its view; there is no trigger. A hit
+    costs the target health. An agent on its first observation neither hits nor is hit. Agents whose
+    episode ended respawn in the next step, out of the other agents' sight if possible.
 
-    Terminal at death, when no health is left; the agent respawns at the next step, out of the
-    others' sight where it can. Truncated after ``limit`` steps. On its first observation an agent
-    neither hits nor is hit. Metrics: ``kills``, shared among those who hit last, ``deaths``,
-    ``damage``, health taken from others, and ``accuracy``, the share of steps that hit.
+    Observation, all fp16: ``rgb`` (1, 3, 1, 128) and ``d`` (1, 1, 1, 128), 128 pixels over 70
+    degrees, each the mean of 4 rays; ``imu`` (1, 3); ``health`` (1, 3): own health from 0 to 1,
+    whether the last step hit another agent, how many agents hit this one. Agents have saturated
+    colours and a red front; walls are paler.
 
-    Args: ``geometries`` to live in, generated homes by default; ``n_agents`` per home. Of health,
-    1 in all, ``damage`` is what a hit takes, ``spoils`` what it gives whoever scored it,
-    ``recovery`` what a second without a wound gives back, ``drain`` what any second takes. A reward
-    adds up ``hit_reward`` per hit, ``-wound_cost`` per wound, ``kill_reward`` per kill,
-    ``-death_cost`` at death, ``aim_reward`` for another agent in the middle of the view, which
-    falls to 0 at its edge, and ``search_reward`` per 64 texels of the walls that the agent sees for
-    the first time in its episode, as Explorer pays. ``res`` rays and ``subsample`` rays per pixel;
-    ``fov`` degrees; ``fps`` steps per second; ``privileged``: worlds also tell a critic everyone's
-    health and place.
+    Actions: seven, with momentum; see :class:`~megastep.modules.MomentumMovement`.
+
+    Reward: the sum of the rewards and costs below; by default hits - wounds.
+
+    Episode end: an agent's episode is terminal at health 0 and truncated after ``limit`` steps.
+
+    Metrics: ``kills``, shared among the agents that hit the target in its last step; ``deaths``;
+    ``damage``, health taken from others; ``accuracy``, the fraction of steps with a hit.
+
+    Args:
+        n_envs: number of environments.
+        geometries: homes to live in. Default: generated homes.
+        n_agents: agents per environment.
+        seed: of textures, spawns and generated homes.
+        device: default: a GPU if there is one.
+        damage: health that a hit costs its target.
+        recovery: health regained per second without a wound.
+        drain: health lost per second.
+        health_per_hit: health gained by an agent that hits.
+        limit: steps after which an episode is truncated.
+        hit_reward: per hit.
+        wound_cost: per hit received.
+        kill_reward: per kill.
+        death_cost: per death.
+        aim_reward: per step with another agent at the centre of the view, falling to 0 at the edge.
+        search_reward: per 64 wall texels seen for the first time in the episode, as in Explorer.
+        res: rays of an agent's camera.
+        subsample: rays per pixel.
+        fov: field of view in degrees.
+        fps: steps per second.
+        privileged: worlds hold ``privileged`` for a critic: every agent's health and pose.
     """
 
     @checked
@@ -62,17 +88,17 @@ class Deathmatch:
         n_agents: Annotated[int, Field(ge=2, le=MAX_AGENTS)] = 4,
         seed: int = 1,
         device: torch.device | str | None = None,
-        damage: Share = 0.1,
-        recovery: Share = 0.0,
-        drain: Share = 0.0,
-        spoils: Share = 0.0,
+        damage: Fraction = 0.1,
+        recovery: Fraction = 0.0,
+        drain: Fraction = 0.0,
+        health_per_hit: Fraction = 0.0,
         limit: Annotated[int, Field(ge=1, le=10**6)] = 500,
-        hit_reward: Price = 1.0,
-        wound_cost: Price = 1.0,
-        kill_reward: Price = 0.0,
-        death_cost: Price = 0.0,
-        aim_reward: Price = 0.0,
-        search_reward: Price = 0.0,
+        hit_reward: Reward = 1.0,
+        wound_cost: Reward = 1.0,
+        kill_reward: Reward = 0.0,
+        death_cost: Reward = 0.0,
+        aim_reward: Reward = 0.0,
+        search_reward: Reward = 0.0,
         res: Annotated[int, Field(ge=1, le=1024)] = 512,
         subsample: Annotated[int, Field(ge=1, le=32)] = 4,
         fov: Annotated[float, Field(gt=0, lt=180)] = 70.0,
@@ -82,15 +108,15 @@ class Deathmatch:
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
         geometries = geometries[:n_envs]
-        made = scenery(geometries, n_agents, n_envs=n_envs, seed=seed, device=device)
-        self.core = Core(made, res, fov, fps, seed=seed)
+        homes = scenery(geometries, n_agents, n_envs=n_envs, seed=seed, device=device)
+        self.core = Core(homes, res, fov, fps, seed=seed)
         self.n_envs, self.n_agents = n_envs, n_agents
         self.device, self.fps, self.subsample = self.core.device, self.core.fps, subsample
         self.spawner = modules.RandomSpawns(
-            geometries, self.core, max(MIN_SPAWNS, SPAWNS * n_agents), hidden=True
+            geometries, self.core, max(MIN_SPAWNS, SPAWNS_PER_AGENT * n_agents), hidden=True
         )
         self.movement = modules.MomentumMovement(self.core)
-        pixels, told = res // subsample, 1 + 5 * (n_agents - 1)
+        pixels, n_privileged = res // subsample, privileged_size(n_agents)
         self.obs_space = dotdict(
             rgb=spaces.MultiImage(1, 3, 1, pixels),
             d=spaces.MultiImage(1, 1, 1, pixels),
@@ -98,12 +124,12 @@ class Deathmatch:
             health=spaces.MultiVector(1, 3),
         )
         self.action_space = spaces.MultiDiscrete(1, len(modules.MOVES))
-        self.privileged_space = spaces.MultiVector(1, told) if privileged else None
+        self.privileged_space = spaces.MultiVector(1, n_privileged) if privileged else None
         self.rules = dict(
             damage=damage,
             recovery=recovery / fps,
             drain=drain / fps,
-            spoils=spoils,
+            health_per_hit=health_per_hit,
             limit=limit,
             hit_reward=hit_reward,
             wound_cost=wound_cost,
@@ -111,35 +137,35 @@ class Deathmatch:
             death_cost=death_cost,
             aim_reward=aim_reward,
         )
-        words = -(-made.layouts.max_texels // 32) if search_reward else 0
-        each = 8 * pixels + 4 * told * privileged + 4 * words + 128
-        engine.fit(n_envs, n_agents * each, self.device)
+        words = -(-homes.layouts.max_texels // 32) if search_reward else 0
+        bytes_per_lane = 8 * pixels + 4 * n_privileged * privileged + 4 * words + 128
+        engine.fit(n_envs, n_agents * bytes_per_lane, self.device)
         self.search_reward, self.seen = search_reward, None
         if search_reward:
             on = dict(dtype=torch.int32, device=self.device)
             self.seen = torch.zeros((n_envs, n_agents, words), **on)
         n_lanes, on = n_envs * n_agents, dict(device=self.device)
         self.health = torch.ones(n_lanes, **on)
-        self.tally = torch.zeros((3, n_lanes), **on)
+        self.tally = torch.zeros((TALLY_ROWS, n_lanes), **on)
         self.ages = torch.zeros(n_lanes, dtype=torch.int32, **on)
         self.ended = torch.zeros(n_lanes, dtype=torch.bool, **on)
 
     def reset(self) -> arrdict:
-        """Starts every episode anew. Returns a world."""
+        """Starts a new episode for every agent. Returns a world."""
         self.ended.fill_(True)
         return self._world()
 
     def step(self, decision: Mapping) -> arrdict:
-        """One step by ``decision.actions`` (B, 1). Returns a world."""
+        """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
         actions = decision["actions"].masked_fill(self.ended[:, None], 0)
         self.movement(dict(actions=actions))
         return self._world()
 
     def _world(self):
-        """Respawns who ended an episode, looks, and shoots."""
+        """Respawns agents whose episode has ended, renders, and lets the agents hit each other."""
         self.spawner(self.ended)
-        view = self._view(**self._search())
-        shots = deathmatch_step(
+        view = self._view(**self._search_arguments())
+        step = deathmatch_step(
             self.core.scenery,
             self.core.agents,
             view,
@@ -147,27 +173,27 @@ class Deathmatch:
             self.tally,
             self.ages,
             self.ended,
-            told=self.privileged_space is not None,
+            privileged=self.privileged_space is not None,
             **self.rules,
         )
-        reward = shots.reward
+        reward = step.reward
         if self.seen is not None:
-            found = view.newly_seen.flatten() * (self.search_reward / modules.TEXELS_PER_POINT)
-            reward = reward + found.masked_fill_(shots.reset, 0.0)
+            search = view.newly_seen.flatten() * (self.search_reward / modules.TEXELS_PER_POINT)
+            reward = reward + search.masked_fill_(step.reset, 0.0)
         world = arrdict(
-            obs=arrdict(self._shown(view), health=shots.vitals),
+            obs=arrdict(self._images(view), health=step.health_obs),
             reward=reward,
-            reset=shots.reset,
-            terminal=shots.terminal,
-            truncated=shots.truncated,
-            metrics=arrdict(zip(METRICS, shots.metrics.unbind())),
+            reset=step.reset,
+            terminal=step.terminal,
+            truncated=step.truncated,
+            metrics=arrdict(zip(METRICS, step.metrics.unbind())),
         )
-        if shots.told is not None:
-            world["privileged"] = shots.told
+        if step.privileged is not None:
+            world["privileged"] = step.privileged
         return world
 
-    def _search(self):
-        """What counts the texels that are seen for the first time, if they are paid for."""
+    def _search_arguments(self):
+        """The arguments of observe that count newly seen texels, if search_reward is not 0."""
         if self.seen is None:
             return {}
         starts = self.ended.view(self.n_envs, self.n_agents)
@@ -184,8 +210,8 @@ class Deathmatch:
             **search,
         )
 
-    def _shown(self, view):
-        """What of a view each lane is shown, (B, 1, ...)."""
+    def _images(self, view):
+        """The images and the IMU of a view, by lane: (B, 1, ...)."""
         lanes = self.n_envs * self.n_agents
         return arrdict(
             rgb=view.rgb.view(lanes, *self.obs_space.rgb.shape),
@@ -193,30 +219,21 @@ class Deathmatch:
             imu=view.imu.view(lanes, 1, 3),
         )
 
-    def check(self) -> None:
-        """EngineError if the engine has flagged an error since the last check. Waits for the
-        device, so not for inside a step.
-        """
-        engine.check(self.core.agents)
-
-    @property
-    def layout(self) -> torch.Tensor:
-        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
-        return self.core.scenery.layout
-
     def state(self, e: int = 0) -> arrdict:
-        """What :meth:`plot_state` draws of environment ``e``, (A, ...) each; ``target`` is the
-        agent in the middle of another's view, or -1, and ``kills`` those of the episodes under way.
+        """Returns environment ``e`` for :meth:`plot_state`, (A, ...) each.
+
+        ``target`` is the agent at the centre of each agent's view, or -1. ``kills`` counts the
+        current episode's.
         """
         lanes = slice(e * self.n_agents, (e + 1) * self.n_agents)
         view, n_model = self._view(), len(self.core.scenery.model)
         line = view.centre_line[e]
         is_agent = (line >= 0) & (line < self.n_agents * n_model)
-        shown = self._shown(view)
+        images = self._images(view)
         return arrdict(
             core=self.core.state(e),
-            rgb=shown.rgb[lanes, 0],
-            d=shown.d[lanes, 0],
+            rgb=images.rgb[lanes, 0],
+            d=images.d[lanes, 0],
             health=self.health[lanes].clone(),
             kills=self.tally[0, lanes].clone(),
             age=self.ages[lanes].clone(),
@@ -225,8 +242,8 @@ class Deathmatch:
 
     @classmethod
     def plot_state(cls, state: arrdict) -> Any:
-        """A matplotlib figure of a numpyified :meth:`state`: the plan, with a line to whoever is in
-        the middle of a view, and beside it each agent's health and what it sees.
+        """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan, with a line from
+        each agent to its target, and each agent's health, RGB and depth.
         """
         title = f"step {state.age.max()}, {state.kills.sum():.3g} kills"
         figure, plan, rows = plotting.panels_beside(len(state.health), 2, title=title)
@@ -237,14 +254,10 @@ class Deathmatch:
         for agent, (colour, depth) in enumerate(rows):
             modules.RGB.plot_state(state.rgb[agent : agent + 1], [colour])
             modules.Depth.plot_state(state.d[agent : agent + 1], [depth])
-            told = f"{agent}: health {state.health[agent]:.2f}, step {state.age[agent]}"
-            colour.set_title(told, fontsize="small", loc="left", pad=7)
+            title = f"{agent}: health {state.health[agent]:.2f}, step {state.age[agent]}"
+            colour.set_title(title, fontsize="small", loc="left", pad=7)
             depth.set_title("", loc="left")
             for strip in (colour, depth):
                 strip.set(xlabel="", xticks=[], box_aspect=None)
             plotting.plot_level(colour, state.health[agent])
         return figure
-
-    def display(self, e: int = 0) -> Any:
-        """Environment ``e`` as it is now, as a matplotlib figure."""
-        return self.plot_state(numpyify(self.state(e)))

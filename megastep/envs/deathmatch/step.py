@@ -1,6 +1,7 @@
-"""One step of Deathmatch, as one operation of the device. N environments, A agents each, B lanes."""
+"""One step of Deathmatch as one operation. N environments, A agents each, B = N A lanes."""
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -11,23 +12,34 @@ from megastep.engine.devices import threads
 from megastep.engine.launch_params import lanes_of, state_params
 from megastep.engine.outputs import Observation
 from megastep.engine.scenery import Scenery
-from megastep.kernels.build.launch import launch, params
+from megastep.kernels.build.launch import launch
+from megastep.kernels.build.program import Program
 
-__all__ = ["MAX_AGENTS", "DeathmatchStep", "deathmatch_step"]
+__all__ = [
+    *("MAX_AGENTS", "PROGRAM", "TALLY_ROWS"),
+    *("DeathmatchStep", "deathmatch_step", "privileged_size"),
+]
 
-MAX_AGENTS = 16  # agents per environment
+PROGRAM = Program(Path(__file__).parent / "kernels")
+MAX_AGENTS = PROGRAM.constants["MAX_AGENTS"]  # per environment
+TALLY_ROWS = PROGRAM.constants["TALLY_ROWS"]
 
 
 class DeathmatchStep(NamedTuple):
-    """A step of agents that hit whoever stands in the middle of their view, one value per lane."""
+    """The outcome of a step, one row per lane."""
 
     reward: torch.Tensor  # (B,)
-    reset: torch.Tensor  # (B,) bool, as the next two
-    terminal: torch.Tensor
-    truncated: torch.Tensor
-    metrics: torch.Tensor  # (4, B): where an episode ends, kills, deaths, damage, accuracy; else 0
-    vitals: torch.Tensor  # (B, 1, 3) fp16: health, whether it hit somebody, how many hit it
-    told: torch.Tensor | None  # (B, 1, 1 + 5 (A - 1)): what a critic is told; None if not wanted
+    reset: torch.Tensor  # (B,) bool
+    terminal: torch.Tensor  # (B,) bool
+    truncated: torch.Tensor  # (B,) bool
+    metrics: torch.Tensor  # (4, B): kills, deaths, damage, accuracy where an episode ends; else 0
+    health_obs: torch.Tensor  # (B, 1, 3) fp16: health, whether it hit, how many hit it
+    privileged: torch.Tensor | None  # (B, 1, privileged_size(A)) for a critic; None if not wanted
+
+
+def privileged_size(n_agents: int) -> int:
+    """Returns how many numbers a critic sees: own health, and five of each other agent."""
+    return 1 + PROGRAM.constants["PRIVILEGED_PER_OPPONENT"] * (n_agents - 1)
 
 
 def deathmatch_step(
@@ -42,68 +54,86 @@ def deathmatch_step(
     damage: float = 0.1,
     recovery: float = 0.0,
     drain: float = 0.0,
-    spoils: float = 0.0,
+    health_per_hit: float = 0.0,
     limit: int = 1000,
     hit_reward: float = 1.0,
     wound_cost: float = 1.0,
     kill_reward: float = 0.0,
     death_cost: float = 0.0,
     aim_reward: float = 0.0,
-    told: bool = False,
+    privileged: bool = False,
 ) -> DeathmatchStep:
-    """Each agent hits whoever stands in the middle of its view; see
-    :class:`~megastep.envs.Deathmatch`. Those that begin an episode neither hit nor are hit.
+    """Lets each agent hit whoever is at the centre of its view; see
+    :class:`~megastep.envs.Deathmatch`. An agent that starts an episode neither hits nor is hit.
 
-    Args: ``view``, as of :func:`observe` by one camera per agent, with ``centre_line`` and, for
-    aim_reward, ``agent_ray``; in place, ``health`` (B,) float32, 1 where whole, ``tally`` (3, B)
-    float32, kills, damage and hits of an episode so far, ``ages`` (B,) int32, ``ended`` (B,) bool,
-    lanes that begin an episode in this step, and then those that end theirs. Of health, 1 in all,
-    ``damage`` is what a hit takes, ``spoils`` what it gives whoever scored it, ``recovery`` what a
-    step without a wound gives back, ``drain`` what any step takes; ``limit`` steps per episode;
-    rewards and costs per hit, per wound, per kill (shared among those who hit last), per death, and
-    for an agent in the middle of the view, falling to 0 at its edge; ``told``: what a critic is
-    told is wanted, too.
+    Args:
+        view: from :func:`~megastep.engine.observe` with one camera per agent and ``centre_line``;
+            with ``agent_ray`` too if ``aim_reward`` is not 0.
+        health: (B,) float32, from 0 to 1, updated in place.
+        tally: (3, B) float32, kills, damage and hits of the episode so far, updated in place.
+        ages: (B,) int32, steps since the first observation, updated in place.
+        ended: (B,) bool, updated in place. In: lanes that start an episode in this step. Out: lanes
+            whose episode ends in this step.
+        damage: health that a hit costs its target.
+        recovery: health regained in a step without a wound.
+        drain: health lost in every step.
+        health_per_hit: health gained by an agent that hits.
+        limit: steps after which an episode is truncated.
+        hit_reward: per hit.
+        wound_cost: per hit received.
+        kill_reward: per kill, shared among the agents that hit the target in that step.
+        death_cost: per death.
+        aim_reward: for another agent at the centre of the view, falling to 0 at the edge.
+        privileged: compute the privileged observation.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
     """
     n, a = lanes = lanes_of(scenery, agents)
-    on, n_lanes = scenery.device, n * a
+    device, n_lanes = scenery.device, n * a
     if not 2 <= a <= MAX_AGENTS:
-        raise ValueError(f"shoot takes 2 to {MAX_AGENTS} agents per environment, not {a}")
+        raise ValueError(f"deathmatch_step takes 2 to {MAX_AGENTS} agents per environment, not {a}")
     if agents.n_cameras > 1:
-        raise ValueError(f"shoot takes one camera per agent, not {agents.n_cameras}")
+        raise ValueError(f"deathmatch_step takes one camera per agent, not {agents.n_cameras}")
     checks.instance("view", view, Observation)
-    rules = dict(damage=damage, recovery=recovery, drain=drain, spoils=spoils)
-    prices = dict(hit_reward=hit_reward, wound_cost=wound_cost, kill_reward=kill_reward)
-    prices |= dict(death_cost=death_cost, aim_reward=aim_reward)
-    for name, value in {**rules, **prices}.items():
+    health_rules = dict(
+        damage=damage, recovery=recovery, drain=drain, health_per_hit=health_per_hit
+    )
+    rewards = dict(hit_reward=hit_reward, wound_cost=wound_cost, kill_reward=kill_reward)
+    rewards |= dict(death_cost=death_cost, aim_reward=aim_reward)
+    for name, value in {**health_rules, **rewards}.items():
         checks.number(name, value, -math.inf, math.inf)
-    for name, value in rules.items():
+    for name, value in health_rules.items():
         if value < 0:
             raise ValueError(f"{name} must be at least 0, not {value:g}")
     agent_ray, poses = 0, dict(positions=0, angles=0)
     if aim_reward:
-        agent_ray = checks.address("view.agent_ray", view.agent_ray, lanes, torch.int32, on)
-    if checks.flag("told", told):
+        agent_ray = checks.address("view.agent_ray", view.agent_ray, lanes, torch.int32, device)
+    if checks.flag("privileged", privileged):
         poses = state_params(scenery, agents, "positions", "angles")
-    flags = [torch.empty(n_lanes, dtype=torch.bool, device=on) for _ in range(3)]
-    half, n_told = torch.float16, 1 + 5 * (a - 1)
+    flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
     out = DeathmatchStep(
-        torch.empty(n_lanes, device=on),
+        torch.empty(n_lanes, device=device),
         *flags,
-        metrics=torch.empty((4, n_lanes), device=on),
-        vitals=torch.empty((n_lanes, 1, 3), dtype=half, device=on),
-        told=torch.empty((n_lanes, 1, n_told), device=on) if told else None,
+        metrics=torch.empty((4, n_lanes), device=device),
+        health_obs=torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=device),
+        privileged=(
+            torch.empty((n_lanes, 1, privileged_size(a)), device=device) if privileged else None
+        ),
     )
-    packed = params.ShootParams(
-        centre_line=checks.address("view.centre_line", view.centre_line, lanes, torch.int32, on),
+    packed = PROGRAM.params.DeathmatchStepParams(
+        centre_line=checks.address(
+            "view.centre_line", view.centre_line, lanes, torch.int32, device
+        ),
         agent_ray=agent_ray,
         **poses,
-        health=checks.address("health", health, (n_lanes,), torch.float32, on),
-        tally=checks.address("tally", tally, (3, n_lanes), torch.float32, on),
-        ages=checks.address("ages", ages, (n_lanes,), torch.int32, on),
-        ended=checks.address("ended", ended, (n_lanes,), torch.bool, on),
+        health=checks.address("health", health, (n_lanes,), torch.float32, device),
+        tally=checks.address("tally", tally, (TALLY_ROWS, n_lanes), torch.float32, device),
+        ages=checks.address("ages", ages, (n_lanes,), torch.int32, device),
+        ended=checks.address("ended", ended, (n_lanes,), torch.bool, device),
         **{k: 0 if v is None else v.data_ptr() for k, v in out._asdict().items()},
-        **rules,
-        **prices,
+        **health_rules,
+        **rewards,
         limit=checks.integer("limit", limit, 1, 2**31 - 1),
         res=agents.res,
         n_envs=n,
@@ -111,5 +141,5 @@ def deathmatch_step(
         n_model=len(scenery.model),
         n_threads=threads(),
     )
-    launch("shoot", packed, on, threads=n)
+    launch(PROGRAM, "deathmatch_step", packed, device, threads=n)
     return out

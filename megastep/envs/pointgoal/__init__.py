@@ -1,4 +1,4 @@
-"""PointGoal: the environment, its step as one operation, and shortest paths to goals."""
+"""PointGoal: the environment, its step as one operation (with its kernel), and shortest paths."""
 
 from megastep.envs.pointgoal.env import PointGoal
 

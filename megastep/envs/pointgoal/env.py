@@ -1,6 +1,6 @@
-"""PointGoal: go to a point that is given by distance and bearing.
+"""PointGoal: navigate to a point given by its distance and bearing.
 
-N environments of one agent, so N lanes.
+N environments of one agent, so B = N lanes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,40 +11,58 @@ from pydantic import Field
 
 from megastep import engine, modules, plotting, spaces
 from megastep import geometries as sources
-from megastep.arrdict import arrdict, numpyify
+from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
+from megastep.envs.common import SceneryEnv
 from megastep.envs.pointgoal.goals import goal_fields
-from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
+from megastep.envs.pointgoal.step import N_PRIVILEGED, PROGRESS_ROWS, pointgoal_step
 from megastep.scene import scenery
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["PointGoal"]
 
 METRICS = "success", "spl", "soft_spl", "collisions"
-REACH = 0.2  # metres from the goal: there
+REACH = 0.2  # metres from the goal that count as success
 
 
-class PointGoal:
-    """Reward for every metre by which the shortest way to the goal becomes shorter, and ``bonus``
-    within 0.2 m of it, which ends the episode; each step costs ``cost``.
+class PointGoal(SceneryEnv):
+    """Point-goal navigation: walk to a point given by its distance and bearing.
 
-    Observation: RGB and depth of 64 pixels, each the mean of 4 rays over 130 degrees, IMU, and the
-    goal in the agent's frame: distance straight to it in tens of metres, cosine and sine of its
-    bearing. All fp16. Seven actions, with momentum. Terminal at success, truncated after ``limit``
-    steps.
+    Observation, all fp16: ``rgb`` and ``d``, 64 pixels over 130 degrees, each the mean of 4 rays;
+    ``imu`` (1, 3); ``goal`` (1, 3), in the agent's frame: straight-line distance in tens of metres,
+    cosine and sine of the bearing.
+
+    Actions: seven, with momentum; see :class:`~megastep.modules.MomentumMovement`.
+
+    Reward: metres by which the shortest path to the goal became shorter, minus ``cost``, plus
+    ``bonus`` at success.
+
+    Episode end: terminal within 0.2 m of the goal (success), truncated after ``limit`` steps.
 
     Metrics: ``success``; ``spl``, success weighted by path length (Anderson et al. 2018): 0 without
-    success, else the length of the shortest way over that of the agent's, or over itself if that is
-    longer; ``soft_spl``, the same with the share of the way that was made in place of success
-    (Datta et al. 2020); ``collisions``, steps that a wall cut short.
+    success, else the length of the shortest path divided by the length walked, at most 1;
+    ``soft_spl``, the same with the fraction of the distance covered in place of success (Datta et
+    al. 2020); ``collisions``, steps that a wall cut short.
 
-    Args: ``geometries`` to live in, generated homes by default; ``nearest`` and ``furthest`` metres
-    that the shortest way to a goal may be; ``limit`` steps; ``bonus`` and ``cost``; ``res`` rays
-    and ``subsample`` rays per pixel; ``fov`` degrees; ``fps`` steps per second; ``resample``: every
-    episode in a home drawn anew, instead of one home per environment for ever; ``privileged``:
-    worlds also tell a critic how far the goal is by the shortest way, how that distance falls ahead
-    and to the left, and the share of the steps that is left.
+    Args:
+        n_envs: number of environments.
+        geometries: homes to live in. Default: generated homes.
+        seed: of textures, spawns, goals and generated homes.
+        device: default: a GPU if there is one.
+        nearest: minimum length of the shortest path to a goal, in metres.
+        furthest: maximum length of the shortest path to a goal, in metres.
+        limit: steps after which an episode is truncated.
+        bonus: reward for success.
+        cost: subtracted from the reward of every step.
+        res: rays of the camera.
+        subsample: rays per pixel.
+        fov: field of view in degrees.
+        fps: steps per second.
+        resample: draw a new home for every episode. Default: each environment keeps its home.
+        privileged: worlds hold ``privileged.way`` (1, 4) for a critic: tens of metres to go by the
+            shortest path, the slope of that distance ahead and to the left, and the fraction of the
+            steps that is left.
     """
 
     n_agents = 1
@@ -80,7 +98,7 @@ class PointGoal:
             seed=seed,
         )
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
-        self.subsample, self.seed = subsample, seed + (2 << 32)  # other draws than the spawns'
+        self.subsample, self.seed = subsample, seed + (2 << 32)  # not the spawns' seed
         self.rules = dict(bonus=bonus, cost=cost, limit=limit, reach=REACH)
         self.goals = goal_fields(geometries, self.core, nearest, furthest)
         self.spawner = modules.RandomSpawns(
@@ -94,55 +112,57 @@ class PointGoal:
             goal=spaces.MultiVector(1, 3),
         )
         self.action_space = self.movement.space
-        self.privileged_space = dotdict(way=spaces.MultiVector(1, 4)) if privileged else None
-        self.chosen, self.ages, self.draws = (
+        self.privileged_space = (
+            dotdict(way=spaces.MultiVector(1, N_PRIVILEGED)) if privileged else None
+        )
+        self.goal_index, self.ages, self.n_draws = (
             torch.zeros(n_envs, dtype=torch.int32, device=self.device) for _ in range(3)
         )
         self.ended = torch.zeros(n_envs, dtype=torch.bool, device=self.device)
-        self.journey = torch.zeros((PROGRESS_ROWS, n_envs), device=self.device)
+        self.progress = torch.zeros((PROGRESS_ROWS, n_envs), device=self.device)
 
     def reset(self) -> arrdict:
-        """Starts every episode anew. Returns a world."""
+        """Starts a new episode in every environment. Returns a world."""
         self.ended.fill_(True)
         return self._world()
 
     def step(self, decision: Mapping) -> arrdict:
-        """One step by ``decision.actions`` (B, 1). Returns a world."""
+        """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
         return self._world(self.movement(decision).progress)
 
     def _world(self, free=None):
-        """Respawns who ended an episode, looks, and judges where the agents have got to."""
+        """Respawns agents whose episode has ended, renders, and computes rewards and flags."""
         self.spawner(self.ended)
         obs = self._view()
-        sought = pointgoal_step(
+        step = pointgoal_step(
             self.core.scenery,
             self.core.agents,
             self.goals,
-            self.chosen,
-            self.journey,
+            self.goal_index,
+            self.progress,
             self.ages,
             self.ended,
-            self.draws,
+            self.n_draws,
             self.spawner.chosen,
             free,
             seed=self.seed,
-            told=self.privileged_space is not None,
+            privileged=self.privileged_space is not None,
             **self.rules,
         )
         world = arrdict(
-            obs=arrdict(obs, goal=sought.bearing),
-            reward=sought.reward,
-            reset=sought.reset,
-            terminal=sought.terminal,
-            truncated=sought.truncated,
-            metrics=arrdict(zip(METRICS, sought.metrics.unbind())),
+            obs=arrdict(obs, goal=step.goal_obs),
+            reward=step.reward,
+            reset=step.reset,
+            terminal=step.terminal,
+            truncated=step.truncated,
+            metrics=arrdict(zip(METRICS, step.metrics.unbind())),
         )
-        if sought.told is not None:
-            world["privileged"] = arrdict(way=sought.told)
+        if step.privileged is not None:
+            world["privileged"] = arrdict(way=step.privileged)
         return world
 
     def _view(self):
-        """The observation but for the goal."""
+        """The observation without the goal."""
         view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True)
         return arrdict(
             rgb=view.rgb.view(self.n_envs, *self.obs_space.rgb.shape),
@@ -150,21 +170,10 @@ class PointGoal:
             imu=view.imu,
         )
 
-    def check(self) -> None:
-        """EngineError if the engine has flagged an error since the last check. Waits for the
-        device, so not for inside a step.
-        """
-        engine.check(self.core.agents)
-
-    @property
-    def layout(self) -> torch.Tensor:
-        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
-        return self.core.scenery.layout
-
     def state(self, e: int = 0) -> arrdict:
-        """What :meth:`plot_state` draws of environment ``e``."""
-        layout, goal = self.layout[e].long(), self.chosen[e].long()
-        _, _, distance, _, shortest, walked, _ = self.journey[:, e].clone()
+        """Returns environment ``e`` for :meth:`plot_state`."""
+        layout, goal = self.layout[e].long(), self.goal_index[e].long()
+        _, _, distance, _, shortest, walked, _ = self.progress[:, e].clone()
         return arrdict(
             self._view().map(lambda leaf: leaf[e]),
             core=self.core.state(e),
@@ -177,8 +186,8 @@ class PointGoal:
 
     @classmethod
     def plot_state(cls, state: arrdict) -> Any:
-        """A matplotlib figure of a numpyified :meth:`state`: the plan with the goal, and what the
-        agent sees.
+        """Draws a numpyified :meth:`state` as a matplotlib figure: the floor plan with the goal,
+        and the agent's RGB and depth.
         """
         title = (
             f"step {state.age}, {state.distance:.1f} m to go, {state.walked:.1f} m walked, "
@@ -192,7 +201,3 @@ class PointGoal:
         modules.RGB.plot_state(state.rgb, strips[:1], yaws)
         modules.Depth.plot_state(state.d, strips[1:], yaws)
         return figure
-
-    def display(self, e: int = 0) -> Any:
-        """Environment ``e`` as it is now, as a matplotlib figure."""
-        return self.plot_state(numpyify(self.state(e)))

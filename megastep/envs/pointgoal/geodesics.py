@@ -1,10 +1,13 @@
-"""Shortest paths of an agent between walls: goals, a field of distances to each, and how long the
-ways to them from spawn points are.
+"""Shortest paths of an agent's disc between walls, to random goals from anywhere.
 
-A field is Dijkstra's algorithm on square cells joined to 16 neighbours each: a few per cent too
-long, and steady, so progress is counted on it. The length of a way is that of the shortest
-polyline along which the agent's disc touches no wall, from a visibility graph (Lozano-Perez and
-Wesley 1979) of goals, spawn points and points about the ends of walls.
+Distances are computed in two ways:
+
+* A *field* holds the distance to a goal from every cell of a grid, by Dijkstra's algorithm on 16
+  neighbours per cell. It is a few per cent too long, but continuous, so progress is measured on it.
+* The *length* of the shortest path from a spawn point to a goal is exact to millimetres: that of
+    the
+  shortest polyline along which the disc touches no wall, from a visibility graph (Lozano-Perez and
+  Wesley 1979) of goals, spawn points and points around the ends of walls.
 
 M walls, H x W cells, G goals, S spawn points, P points, K pairs of points.
 """
@@ -16,17 +19,17 @@ import numpy as np
 from megastep.modules.spawning import distances, spawn_points
 
 CELL = 0.1  # metres, of fields
-FINE = 2  # times finer are the cells of which the clearance is known
-FAR = 0.5  # metres; no clearance above it is told apart
-RINGS = 3  # of cells beside walls that take over a neighbour's distance, to interpolate from
-ARC = 8  # points about the end of a wall
-STEP = 0.05  # metres between the points of a way that are looked at
-# Metres that a way may come nearer to a wall than the agent does: what an interpolated clearance
-# may be short of the true one, and the chord of an arc lies inside of it.
+FINE = 2  # cells of the clearance are this many times smaller
+FAR = 0.5  # metres; the clearance is clipped here
+RINGS = 3  # rings of cells inside walls that get a neighbour's distance, for interpolation
+ARC = 8  # points around the end of a wall
+STEP = 0.05  # metres between the points of a path that are tested
+# Metres by which a path may be closer to a wall than an agent: the error of interpolated
+# clearances, and the distance of an arc's chord from the arc.
 TOLERANCE = 0.015
-SPARE = 4  # times as many points are drawn as are needed, as some may lie in rooms without a door
-# Half of the moves between neighbours, as ways go both ways: rows up and columns right, and the
-# cells that a move passes.
+SPARE = 4  # times as many points are drawn as needed, as some may be in rooms without a door
+# Half of the moves between neighbours (the others are their reverses): rows up, columns right, and
+# the cells that a move passes.
 MOVES = {
     (0, 1): [],
     (1, 0): [],
@@ -40,18 +43,18 @@ MOVES = {
 
 
 class Geodesics(NamedTuple):
-    """Of one geometry, in metres."""
+    """Goals, spawn points and shortest paths of one geometry, in metres."""
 
     origin: np.ndarray  # (2,) float32: the centre of the first cell
-    fields: np.ndarray  # (G, H, W) float16: distances to the goals, row 0 at the bottom, or inf
-    spawns: np.ndarray  # (S, 2) float32; each has a way to each goal
+    fields: np.ndarray  # (G, H, W) float16: distance to each goal or inf; row 0 at the bottom
+    spawns: np.ndarray  # (S, 2) float32; every goal can be reached from each
     goals: np.ndarray  # (G, 2) float32
-    lengths: np.ndarray  # (S, G) float32: of the shortest ways
+    lengths: np.ndarray  # (S, G) float32: of the shortest paths
 
 
 class _Grid:
-    """Square cells (H, W), and the clearance of `FINE` times finer ones: metres from their centres
-    to the nearest wall, at most `FAR`.
+    """A grid of square cells (H, W), and the clearance on a grid `FINE` times finer: metres from a
+    cell's centre to the nearest wall, at most `FAR`.
     """
 
     def __init__(self, walls):
@@ -60,10 +63,10 @@ class _Grid:
         width, height = np.ceil((high - low) / CELL).astype(int) + 2
         self.clearance = np.full((FINE * height, FINE * width), FAR)
         for start, end in walls:
-            self._take(start, end)
+            self._add(start, end)
 
-    def _take(self, start, end):
-        """Takes a wall into account, where it is near."""
+    def _add(self, start, end):
+        """Lowers the clearance near a wall."""
         side = CELL / FINE
         low, high = np.minimum(start, end) - FAR, np.maximum(start, end) + FAR
         column, row = np.floor((low - self.origin) / side).astype(int).clip(0)
@@ -78,11 +81,13 @@ class _Grid:
         np.minimum(near, np.sqrt(dx * dx + dy * dy), out=near)
 
     def free(self, radius):
-        """(H, W) bool: the cells whose centre has room for a disc."""
+        """(H, W) bool: cells at whose centre a disc fits."""
         return self.clearance[::FINE, ::FINE] >= radius
 
     def read(self, values, points):
-        """(..., P) what `values` (..., H, W) of cells, or of finer ones, are at points (P, 2)."""
+        """(..., P): interpolates `values` (..., H, W), of this grid or the finer one, at points (P,
+        2).
+        """
         height, width = values.shape[-2:]
         side = CELL * len(self.clearance) / (FINE * height)
         at = (points - self.origin) / side
@@ -92,37 +97,37 @@ class _Grid:
         x, y = x - column, y - row
         index = row * width + column
         flat = values.reshape(*values.shape[:-2], -1)
-        found = 0.0
+        total = 0.0
         for offset, weight in (
             (0, (1 - x) * (1 - y)),
             (1, x * (1 - y)),
             (width, (1 - x) * y),
             (width + 1, x * y),
         ):
-            found = found + np.where(weight > 0, flat[..., index + offset], 0.0) * weight
-        return found
+            total = total + np.where(weight > 0, flat[..., index + offset], 0.0) * weight
+        return total
 
     def sees(self, starts, ends, least):
-        """(K,) whether all of the way straight from a start to an end, (K, 2) each, is at least
+        """(K,) bool: the straight paths from starts to ends, (K, 2) each, that keep at least
         `least` metres from all walls.
         """
         across = ends - starts
         n_steps = np.ceil(np.sqrt((across**2).sum(1)) / STEP).astype(int) + 1
         clear = np.ones(len(starts), bool)
-        for rough in (1, 3, 7, None):  # most that are not clear are soon found out
+        for n_points in (1, 3, 7, None):  # a few points rule out most paths that are not clear
             left = clear.nonzero()[0]
-            counts = n_steps[left] if rough is None else np.full(len(left), rough)
-            way = np.repeat(left, counts)
-            step = np.arange(len(way)) - np.repeat(np.cumsum(counts) - counts, counts)
+            counts = n_steps[left] if n_points is None else np.full(len(left), n_points)
+            path = np.repeat(left, counts)
+            step = np.arange(len(path)) - np.repeat(np.cumsum(counts) - counts, counts)
             part = (step + 1) / (np.repeat(counts, counts) + 1)
-            places = starts[way] + part[:, None] * across[way]
-            clear[way[self.read(self.clearance, places) < least]] = False
+            places = starts[path] + part[:, None] * across[path]
+            clear[path[self.read(self.clearance, places) < least]] = False
         return clear
 
 
 def _graph(free):
-    """The number of each `free` cell (H, W), else -1, and the moves between them: from, to, (E,)
-    each, and metres (E,).
+    """Returns the numbers of the `free` cells (H, W), -1 elsewhere, and the moves between them:
+    from, to and metres, (E,) each.
     """
     height, width = free.shape
     numbers = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
@@ -143,7 +148,7 @@ def _graph(free):
 
 
 def _entries(grid, numbers, points):
-    """Moves from points (P, 2) to the free cells about them: point, cell, metres, (E,) each."""
+    """Moves from points (P, 2) to the free cells around them: point, cell, metres, (E,) each."""
     nearest = np.rint((points - grid.origin) / CELL).astype(int)
     offsets = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 2)
     cells = (nearest[:, None] + offsets).reshape(-1, 2)
@@ -152,8 +157,8 @@ def _entries(grid, numbers, points):
     point, cells = np.repeat(np.arange(len(points)), 9)[inside], cells[inside]
     number = numbers[cells[:, 1], cells[:, 0]]
     metres = np.sqrt(((grid.origin + CELL * cells - points[point]) ** 2).sum(1))
-    chosen = (number >= 0) & (metres <= 1.5 * CELL)
-    return point[chosen], number[chosen], metres[chosen]
+    usable = (number >= 0) & (metres <= 1.5 * CELL)
+    return point[usable], number[usable], metres[usable]
 
 
 def _sparse(n, *moves):
@@ -164,7 +169,7 @@ def _sparse(n, *moves):
 
 
 def _filled(fields, passable):
-    """Fields (G, H, W) whose cells beside walls hold a neighbour's distance and a cell more."""
+    """Fields (G, H, W) whose cells inside walls hold a neighbour's distance plus one cell."""
     for _ in range(RINGS):
         padded = np.pad(fields, ((0, 0), (1, 1), (1, 1)), constant_values=np.inf)
         around = np.minimum(
@@ -176,8 +181,8 @@ def _filled(fields, passable):
 
 
 def _corners(walls, radius):
-    """(C, 2) places where a shortest way may bend, touching the ends of walls, and (C, 2) the
-    directions to them from those ends.
+    """Returns the points (C, 2) where a shortest path may bend, on arcs around the ends of walls,
+    and the directions (C, 2) to them from those ends.
     """
     ends = np.unique(walls.reshape(-1, 2), axis=0)
     angles = 2 * np.pi * np.arange(ARC) / ARC
@@ -186,7 +191,7 @@ def _corners(walls, radius):
     touching = distances(points, walls) > radius - 1e-4
     points, away = points[touching], away[touching]
     aside = STEP * np.stack([-away[:, 1], away[:, 0]], 1)
-    # beside a straight wall a step to either side is as near to it as before: nothing bends there
+    # Beside a straight wall, a step to either side keeps the distance: no path bends there.
     further = np.sqrt(radius**2 + STEP**2) - 1e-3
     bends = (distances(points + aside, walls) > further) | (
         distances(points - aside, walls) > further
@@ -195,31 +200,34 @@ def _corners(walls, radius):
 
 
 def _pairs(points, away, n_goals, n_ends, to_goals):
-    """(K,), (K,) numbers of points (P, 2), of which two and two may be neighbours on a shortest
-    way: goals, then from `n_goals` spawns, then from `n_ends` corners, with `away` (P, 2) the
-    directions from the walls they touch, 0 elsewhere. `to_goals` (G, P) are distances.
+    """Returns the pairs of points (P, 2) that may be neighbours on a shortest path, (K,) indices
+    each.
 
-    Left out are those that cannot see each other, as their distances to a goal differ by more than
-    the way between them, and those where a way would not bend round the end of the wall.
+    Points are goals, then spawns from `n_goals` on, then corners from `n_ends` on. `away` (P, 2)
+    are the directions from the walls that corners touch, 0 for others. `to_goals` (G, P) are
+    distances.
+
+    Left out are pairs whose distances to a goal differ by more than the distance between them, as
+    they cannot see each other, and pairs where the path would not bend around the end of the wall.
     """
     tangent = np.sin(np.pi / ARC) + 0.05
-    found = []
+    pairs = []
     for i in range(n_ends, len(points)):
         across = points[:i] - points[i]
         straight = np.sqrt((across**2).sum(1))
         bent = np.maximum(np.abs(across @ away[i]), np.abs((across * away[:i]).sum(1)))
-        others = (bent <= tangent * straight).nonzero()[0]
-        apart = np.abs(to_goals[:, others] - to_goals[:, i, None]).max(0)
-        others = others[apart <= 1.03 * straight[others] + 2 * CELL]
-        found.append(np.stack([np.full(len(others), i), others], 1))
+        partners = (bent <= tangent * straight).nonzero()[0]
+        apart = np.abs(to_goals[:, partners] - to_goals[:, i, None]).max(0)
+        partners = partners[apart <= 1.03 * straight[partners] + 2 * CELL]
+        pairs.append(np.stack([np.full(len(partners), i), partners], 1))
     direct = np.indices((n_goals, n_ends - n_goals)).reshape(2, -1).T + (0, n_goals)
-    starts, ends = np.concatenate([direct, *found]).T
+    starts, ends = np.concatenate([direct, *pairs]).T
     return starts, ends
 
 
 def _lengths(grid, goals, spawns, corners, away, fields, radius):
-    """(S, G) lengths of the shortest ways from spawns (S, 2) to goals (G, 2), bending at corners
-    (C, 2). `fields` (G, H, W) are distances to the goals.
+    """Returns the lengths (S, G) of the shortest paths from spawns (S, 2) to goals (G, 2) that bend
+    at corners (C, 2). `fields` (G, H, W) are distances to the goals.
     """
     from scipy.sparse.csgraph import dijkstra
 
@@ -233,15 +241,25 @@ def _lengths(grid, goals, spawns, corners, away, fields, radius):
     starts, ends = starts[clear], ends[clear]
     metres = np.sqrt(((points[ends] - points[starts]) ** 2).sum(1))
     graph = _sparse(len(points), (starts, ends, metres))
-    found = dijkstra(graph, directed=False, indices=np.arange(n_goals))[:, n_goals:n_ends].T
-    return np.where(np.isfinite(found), found, to_goals[:, n_goals:n_ends].T)
+    lengths = dijkstra(graph, directed=False, indices=np.arange(n_goals))[:, n_goals:n_ends].T
+    return np.where(np.isfinite(lengths), lengths, to_goals[:, n_goals:n_ends].T)
 
 
 def geodesics(
     g: Any, n_spawns: int, n_goals: int, radius: float, random: np.random.Generator
 ) -> Geodesics:
-    """The goals and spawn points of a geometry, drawn from its largest part that is connected, and
-    the ways between them. ValueError, naming the geometry, if it has no room for an agent.
+    """Draws goals and spawn points from the largest connected part of a geometry, and computes the
+    shortest paths between them.
+
+    Args:
+        g: the geometry.
+        n_spawns: number of spawn points S.
+        n_goals: number of goals G.
+        radius: of the agents, in metres.
+        random: generator of the points.
+
+    Raises:
+        ValueError: naming the geometry, if it has no room for an agent.
     """
     from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -256,7 +274,7 @@ def geodesics(
     of_point[entries[0]] = parts[entries[1]]
     if (of_point < 0).all():
         raise ValueError(
-            f"geometry {g.id} has no room for an agent to walk in: no gap is "
+            f"geometry {g.id} has no room for an agent to walk in: it needs gaps at least "
             f"{2 * radius + CELL:.2f} m wide"
         )
     largest = np.bincount(of_point[of_point >= 0]).argmax()
@@ -267,10 +285,10 @@ def geodesics(
 
     starts, ends, metres = _entries(grid, numbers, goals)
     graph = _sparse(n_cells + n_goals, moves, (starts + n_cells, ends, metres))
-    found = dijkstra(graph, directed=False, indices=n_cells + np.arange(n_goals))
+    distance = dijkstra(graph, directed=False, indices=n_cells + np.arange(n_goals))
     free = numbers >= 0
     fields = np.full((n_goals, *free.shape), np.inf)
-    fields[:, free] = found[:, :n_cells]
+    fields[:, free] = distance[:, :n_cells]
     reached = np.isfinite(fields[0])
     fields = _filled(fields, free)
     lengths = _lengths(grid, goals, spawns, *_corners(walls, radius), fields, radius)

@@ -1,4 +1,4 @@
-"""Goals of layouts: how far it is to each by the shortest way, from anywhere.
+"""Goals of layouts, and the length of the shortest path to each goal from anywhere.
 
 D layouts, G goals and S spawn points per layout, H x W cells.
 """
@@ -14,17 +14,27 @@ __all__ = ["GoalFields"]
 
 
 class GoalFields:
-    """What :func:`~megastep.engine.seek` reads. It never changes.
+    """The goals of a scenery's layouts, as :func:`~megastep.envs.pointgoal.step.pointgoal_step`
+    reads them. Immutable.
 
-    ``points`` (D, G, 2) float32 and ``spawns`` (D, S, 2) float32 are places in metres.
+    Args:
+        points: D arrays (G, 2) metres, the goals.
+        fields: D arrays (G, H, W) float16 of at least 2 x 2 square cells, row 0 at the bottom:
+            metres to each goal from the centre of a cell by the shortest path, infinite if there is
+            none. Layouts may share an array.
+        origins: D arrays (2,) metres, the centre of the first cell.
+        spawns: D arrays (S, 2) metres, the spawn points.
+        lengths: D arrays (S, G) metres, of the shortest paths from spawn points to goals.
+        allowed: D arrays (S, G) bool, the goals that may be drawn; at least one per spawn point.
+        cell: side of a cell in metres.
+        device: where to put the tensors.
 
-    Args, a list of D arrays each, in metres: ``points`` (G, 2), the goals; ``fields`` (G, H, W)
-    float16, at least 2 x 2 square cells, row 0 at the bottom: how far it is to each goal from the
-    centre of a cell, infinite where nothing leads there; ``origins`` (2,), the centre of the first
-    cell; ``spawns`` (S, 2); ``lengths`` (S, G) of the shortest ways between the two; ``allowed``
-    (S, G) bool: the goals that an agent may be sent to, at least one from each spawn point.
-    ``cell`` is the side of a cell. Layouts may share arrays. ValueError if they do not fit each
-    other.
+    Attributes:
+        points: (D, G, 2) float32.
+        spawns: (D, S, 2) float32.
+
+    Raises:
+        ValueError: naming the argument that does not fit the others.
     """
 
     __slots__ = (
@@ -47,15 +57,15 @@ class GoalFields:
         self.n_layouts, self.n_goals = len(checks.items("fields", fields)), len(fields[0])
         self.n_spawns = s = len(checks.items("spawns", spawns)[0])
         g = self.n_goals
-        given = dict(
+        per_layout = dict(
             points=points, origins=origins, spawns=spawns, lengths=lengths, allowed=allowed
         )
         shapes = dict(points=(g, 2), origins=(2,), spawns=(s, 2), lengths=(s, g), allowed=(s, g))
         for name, shape in shapes.items():
-            each = given[name]
-            if len(each) != self.n_layouts or any(np.shape(one) != shape for one in each):
+            actual_shapes = {np.shape(array) for array in per_layout[name]}
+            if len(per_layout[name]) != self.n_layouts or actual_shapes != {shape}:
                 raise ValueError(
-                    f"{name} must be an array {shape} for each of the {self.n_layouts} layouts"
+                    f"{name} must have one array {shape} for each of the {self.n_layouts} layouts"
                 )
         for field in fields:
             fits = np.ndim(field) == 3 and field.dtype == np.float16 and len(field) == g
@@ -64,15 +74,15 @@ class GoalFields:
                     f"fields must be float16 ({g}, H, W) of at least 2 x 2 cells, but one is "
                     f"{getattr(field, 'dtype', type(field).__name__)} {np.shape(field)}"
                 )
-        counts = np.stack([one.sum(1) for one in allowed]).astype(np.int32)
+        counts = np.stack([mask.sum(1) for mask in allowed]).astype(np.int32)
         if not counts.all():
             raise ValueError("allowed must have at least one goal for each spawn point")
-        different = {id(field): field for field in fields}
-        ends = np.cumsum([field.size for field in different.values()])
-        starts = {key: end - field.size for (key, field), end in zip(different.items(), ends)}
+        distinct = {id(field): field for field in fields}
+        ends = np.cumsum([field.size for field in distinct.values()])
+        starts = {key: end - field.size for (key, field), end in zip(distinct.items(), ends)}
         arrays = dict(
             points=np.stack(points).astype(np.float32),
-            fields=np.concatenate([field.reshape(-1) for field in different.values()]),
+            fields=np.concatenate([field.reshape(-1) for field in distinct.values()]),
             starts=np.array([starts[id(field)] for field in fields], np.int64),
             shapes=np.array([field.shape[1:] for field in fields], np.int32),
             origins=np.stack(origins).astype(np.float32),
@@ -84,5 +94,5 @@ class GoalFields:
         self._tensors, self.points = tensors, tensors["points"]
         self.spawns = torch.from_numpy(np.stack(spawns).astype(np.float32)).to(device)
         self.device = self.points.device
-        #: Where the tensors lie, by the names of the kernel's params.
+        #: {field of PointgoalStepParams: address}.
         self.addresses = {name: tensor.data_ptr() for name, tensor in tensors.items()}

@@ -1,46 +1,54 @@
-"""One step of PointGoal, as one operation of the device. N environments, A agents each, B lanes."""
+"""One step of PointGoal as one operation. N environments, A agents each, B = N A lanes."""
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
 from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
-from megastep.engine.launch_params import error_flag as error_flag_of
-from megastep.engine.launch_params import lanes_of, scenery_params, seed_params, state_params
+from megastep.engine.launch_params import (
+    error_flag_address,
+    lanes_of,
+    scenery_params,
+    seed_params,
+    state_params,
+)
 from megastep.engine.scenery import Scenery
 from megastep.envs.pointgoal.goal_fields import GoalFields
-from megastep.kernels.build.launch import launch, params
+from megastep.kernels.build.launch import launch
+from megastep.kernels.build.program import Program
 
-__all__ = ["PROGRESS_ROWS", "PointGoalStep", "pointgoal_step"]
+__all__ = ["N_PRIVILEGED", "PROGRAM", "PROGRESS_ROWS", "PointGoalStep", "pointgoal_step"]
 
-PROGRESS_ROWS = 7  # numbers that are kept of an agent that seeks a goal
-TOLD = 4  # numbers that its critic is told
+PROGRAM = Program(Path(__file__).parent / "kernels")
+PROGRESS_ROWS = PROGRAM.constants["PROGRESS_ROWS"]  # numbers that describe an episode so far
+N_PRIVILEGED = PROGRAM.constants["N_PRIVILEGED"]  # numbers that a critic sees
 
 
 class PointGoalStep(NamedTuple):
-    """A step of agents that seek a goal, one value per lane."""
+    """The outcome of a step, one row per lane."""
 
     reward: torch.Tensor  # (B,)
-    reset: torch.Tensor  # (B,) bool, as the next two
-    terminal: torch.Tensor
-    truncated: torch.Tensor
-    metrics: torch.Tensor  # (4, B): where an episode ends, success, SPL, soft SPL, collisions
-    bearing: torch.Tensor  # (B, 1, 3) fp16: metres / 10 straight, cosine and sine of the bearing
-    told: torch.Tensor | None  # (B, 1, 4): what a critic is told; None if not wanted
+    reset: torch.Tensor  # (B,) bool
+    terminal: torch.Tensor  # (B,) bool
+    truncated: torch.Tensor  # (B,) bool
+    metrics: torch.Tensor  # (4, B): success, SPL, soft SPL, collisions where an episode ends
+    goal_obs: torch.Tensor  # (B, 1, 3) fp16: distance / 10 m, cosine and sine of the bearing
+    privileged: torch.Tensor | None  # (B, 1, 4) for a critic; None if not wanted
 
 
 def pointgoal_step(
     scenery: Scenery,
     agents: Agents,
     goals: GoalFields,
-    chosen: torch.Tensor,
-    journey: torch.Tensor,
+    goal_index: torch.Tensor,
+    progress: torch.Tensor,
     ages: torch.Tensor,
     ended: torch.Tensor,
-    draws: torch.Tensor,
-    spawned: torch.Tensor,
+    n_draws: torch.Tensor,
+    spawn_index: torch.Tensor,
     free: torch.Tensor | None = None,
     *,
     seed: int = 1,
@@ -48,51 +56,71 @@ def pointgoal_step(
     bonus: float = 5.0,
     cost: float = 0.02,
     limit: int = 500,
-    told: bool = False,
+    privileged: bool = False,
 ) -> PointGoalStep:
-    """Each agent is told where its goal lies, paid for what the shortest way there has become
-    shorter, and done within ``reach`` metres; see :class:`~megastep.envs.PointGoal`. Those that
-    begin an episode draw a goal, once from their random stream.
+    """Rewards each agent for getting closer to its goal by the shortest path, and observes the
+    goal. An agent that starts an episode draws a goal. See :class:`~megastep.envs.PointGoal`.
 
-    Args: in place, ``chosen`` (B,) int32, the goals' numbers, ``journey`` (7, B) float32, of which
-    rows 2 to 6 are metres to go by the shortest way, the same at the start, the length of the
-    shortest way from there, metres walked, and collisions; ``ages`` (B,) int32, ``ended`` (B,)
-    bool, lanes that begin an episode in this step, and then those that end theirs, ``draws`` (B,)
-    int32, goals drawn so far; ``spawned`` (N, A) int32, the spawn points of those that begin one;
-    ``free`` (N, A) float32, the progress of :func:`physics`, None if no step was taken; ``bonus``
-    for being there, ``cost`` of a step, ``limit`` steps per episode; ``told``: what a critic is
-    told is wanted, too.
+    Args:
+        goals: of the scenery's layouts.
+        goal_index: (B,) int32, each agent's goal among its layout's, updated in place.
+        progress: (7, B) float32, updated in place. Rows: x and y one step ago; metres to go by the
+            shortest path, now and at the start; length of the shortest path from the start; metres
+            walked; collisions.
+        ages: (B,) int32, steps since the first observation, updated in place.
+        ended: (B,) bool, updated in place. In: lanes that start an episode in this step. Out: lanes
+            whose episode ends in this step.
+        n_draws: (B,) int32, goals drawn so far, the generator's counter, updated in place.
+        spawn_index: (N, A) int32, the spawn points of lanes that start an episode.
+        free: (N, A) float32, ``progress`` of :func:`~megastep.engine.physics`, or None if no step
+            was taken.
+        seed: the generator's key.
+        reach: metres; an agent this close to its goal succeeds.
+        bonus: reward for success.
+        cost: subtracted from the reward of every step.
+        limit: steps after which an episode is truncated.
+        privileged: compute the privileged observation: tens of metres to go, the slope of that
+            distance ahead and to the left, and the fraction of the steps that is left.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+        EngineError: on the CPU, if a position is NaN or an index is out of range.
     """
     n, a = lanes = lanes_of(scenery, agents)
-    on, n_lanes = scenery.device, n * a
+    device, n_lanes = scenery.device, n * a
     checks.instance("goals", goals, GoalFields)
-    if goals.n_layouts != len(scenery.layouts) or goals.device != on:
+    if goals.n_layouts != len(scenery.layouts) or goals.device != device:
         raise ValueError(
-            f"goals must be of the scenery's {len(scenery.layouts)} layouts and on {on}, but those "
-            f"of {goals.n_layouts} on {goals.device} were given"
+            f"goals must be for the {len(scenery.layouts)} layouts of the scenery, on {device}, "
+            f"but they are for {goals.n_layouts} on {goals.device}"
         )
     for name, value in dict(reach=reach, bonus=bonus, cost=cost).items():
         checks.number(name, value, -math.inf, math.inf)
-    flags = [torch.empty(n_lanes, dtype=torch.bool, device=on) for _ in range(3)]
+    flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
+    privileged_out = None
+    if checks.flag("privileged", privileged):
+        privileged_out = torch.empty((n_lanes, 1, N_PRIVILEGED), device=device)
     out = PointGoalStep(
-        torch.empty(n_lanes, device=on),
+        torch.empty(n_lanes, device=device),
         *flags,
-        metrics=torch.empty((4, n_lanes), device=on),
-        bearing=torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=on),
-        told=torch.empty((n_lanes, 1, TOLD), device=on) if checks.flag("told", told) else None,
+        metrics=torch.empty((4, n_lanes), device=device),
+        goal_obs=torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=device),
+        privileged=privileged_out,
     )
-    packed = params.SeekParams(
+    packed = PROGRAM.params.PointgoalStepParams(
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
-        free=0 if free is None else checks.address("free", free, lanes, torch.float32, on),
-        spawned=checks.address("spawned", spawned, lanes, torch.int32, on),
+        free=0 if free is None else checks.address("free", free, lanes, torch.float32, device),
+        spawn_index=checks.address("spawn_index", spawn_index, lanes, torch.int32, device),
         **goals.addresses,
-        draws=checks.address("draws", draws, (n_lanes,), torch.int32, on),
-        goals=checks.address("chosen", chosen, (n_lanes,), torch.int32, on),
-        journey=checks.address("journey", journey, (PROGRESS_ROWS, n_lanes), torch.float32, on),
-        ages=checks.address("ages", ages, (n_lanes,), torch.int32, on),
-        ended=checks.address("ended", ended, (n_lanes,), torch.bool, on),
-        error_flag=error_flag_of(scenery, agents),
+        n_draws=checks.address("n_draws", n_draws, (n_lanes,), torch.int32, device),
+        goal_index=checks.address("goal_index", goal_index, (n_lanes,), torch.int32, device),
+        progress=checks.address(
+            "progress", progress, (PROGRESS_ROWS, n_lanes), torch.float32, device
+        ),
+        ages=checks.address("ages", ages, (n_lanes,), torch.int32, device),
+        ended=checks.address("ended", ended, (n_lanes,), torch.bool, device),
+        error_flag=error_flag_address(scenery, agents),
         **{k: 0 if v is None else v.data_ptr() for k, v in out._asdict().items()},
         **seed_params(seed),
         per_cell=1 / goals.cell,
@@ -103,6 +131,6 @@ def pointgoal_step(
         n_goals=goals.n_goals,
         n_spawns=goals.n_spawns,
     )
-    launch("seek", packed, on, threads=n_lanes)
+    launch(PROGRAM, "pointgoal_step", packed, device, threads=n_lanes)
     check_on_cpu(agents)
     return out

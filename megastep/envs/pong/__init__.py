@@ -1,4 +1,4 @@
-"""Pong: the environment, and its step as one operation."""
+"""Pong: the environment, and its step as one operation (with its kernel)."""
 
 from megastep.envs.pong.env import Pong
 

@@ -1,7 +1,7 @@
 """Pong: two paddles return a ball, on a court of 40 x 30 cells.
 
-N environments of one lane, the left side, or with self-play of two, so B = N or 2 N lanes. No
-geometry: the whole step is the engine's :func:`~megastep.engine.pong`.
+N environments. B lanes: N, the left paddles, or 2 N with self-play. There is no geometry; a step is
+one operation, :func:`~megastep.envs.pong.step.pong_step`.
 """
 
 from collections.abc import Mapping
@@ -13,35 +13,52 @@ from pydantic import Field
 
 from megastep import engine, spaces
 from megastep.arrdict import arrdict, numpyify
-from megastep.envs.pong.step import CELL, FEATURES, GAME_FIELDS, PIXELS, pong_step
+from megastep.envs.common import DisplayedEnv
+from megastep.envs.pong.step import CELL, FEATURES, GAME_FIELDS, PIXELS, PROGRAM, pong_step
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Pong"]
 
 ROWS, COLUMNS = PIXELS
-PADDLE = 4  # cells that a paddle is high
-TEXT = {0: " ", 85: ".", 170: "|", 255: "o"}  # by the grey of a pixel
+PADDLE_ROWS, TRAIL_GREY, PADDLE_GREY, BALL_GREY = (
+    PROGRAM.constants[name] for name in ("PADDLE_ROWS", "TRAIL_GREY", "PADDLE_GREY", "BALL_GREY")
+)
+TEXT = {0: " ", TRAIL_GREY: ".", PADDLE_GREY: "|", BALL_GREY: "o"}  # character of each grey
 
 
-class Pong:
-    """A reward of 1 for a point won, -1 for a point lost.
+class Pong(DisplayedEnv):
+    """Two-player Pong against a scripted tracker or in self-play.
 
-    The ball flies a cell per step across the court, and up to a cell up or down: the further from
-    its middle a paddle of 4 cells hits it, the steeper. Three actions: 0 nothing, 1 a cell up, 2 a
-    cell down. A ball that a paddle misses is a point for the other side; it is served from the
-    middle, at random. The right side is a tracker, whose paddle follows the ball at
-    ``tracker_speed`` cells per step; or with ``self_play`` a lane too, which is shown and moves as
-    if it were the left.
+    The ball moves one cell per step across the court and up to one cell up or down, more steeply
+    the further from its centre a paddle of 4 cells hits it. If a paddle misses the ball, the other
+    side wins a point, and the ball is served from the centre in a random direction. The right
+    paddle is a tracker that follows the ball or, with ``self_play``, a lane that observes the game
+    mirrored.
 
-    Observation: eight features in fp16: own paddle, the other, the ball across and down, each from
-    -1 to 1; its speed across and down in cells per step; how far it is below the middle of own
-    paddle and of the other, 1 at the edge and no more than 2. Or with ``pixels`` a picture of 30 x
-    40 uint8: the ball 255, the paddles 170, where the ball was a step ago 85. Pictures are one
-    buffer, which every step writes anew.
+    Observation: (1, 8) fp16 features: y of the own paddle, y of the other paddle, x and y of the
+    ball, all in [-1, 1]; the ball's velocity in x and y, in cells per step; how far the ball is
+    below the centre of the own and of the other paddle, 1 at the paddle's edge, clamped to [-2, 2].
+    With ``pixels``: (1, 1, 30, 40) uint8, the ball 255, paddles 170, the ball's last position 85.
+    All steps write to the same buffer of images.
 
-    Terminal when a side has ``points`` points: one, or say 21 for a game. Truncated after ``limit``
-    steps per such point. Its metric is ``points_won``, the share of the points played, 0.5 where
-    none was.
+    Actions: 0 nothing, 1 up, 2 down; a paddle moves one cell per step.
+
+    Reward: 1 for a point won, -1 for a point lost.
+
+    Episode end: terminal once a side has ``points`` points; truncated after ``limit * points``
+        steps.
+
+    Metrics: ``points_won``, the fraction of the episode's points won; 0.5 if there were none.
+
+    Args:
+        n_envs: number of environments.
+        seed: of the serves.
+        device: default: a GPU if there is one.
+        points: points that end an episode; 21 for a whole game.
+        limit: steps per point after which an episode is truncated.
+        self_play: control both paddles.
+        tracker_speed: cells per step of the tracker.
+        pixels: observe pixels instead of features.
     """
 
     fps = 30.0
@@ -79,15 +96,15 @@ class Pong:
             self.pixels = torch.zeros(shape, dtype=torch.uint8, **on)
 
     def reset(self) -> arrdict:
-        """Starts every episode anew. Returns a world."""
+        """Starts a new episode in every environment. Returns a world."""
         return self._world(self.no_actions, restart=True)
 
     def step(self, decision: Mapping) -> arrdict:
-        """One step by ``decision.actions`` (B, 1). Returns a world."""
+        """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
         return self._world(decision["actions"])
 
     def _world(self, actions, restart=False):
-        played = pong_step(
+        step = pong_step(
             self.games,
             actions,
             self.error_flag,
@@ -99,12 +116,12 @@ class Pong:
             pixels=self.pixels,
         )
         return arrdict(
-            obs=played.features if self.pixels is None else self.pixels,
-            reward=played.reward,
-            reset=played.reset,
-            terminal=played.terminal,
-            truncated=played.truncated,
-            metrics=arrdict(points_won=played.points_won),
+            obs=step.features if self.pixels is None else self.pixels,
+            reward=step.reward,
+            reset=step.reset,
+            terminal=step.terminal,
+            truncated=step.truncated,
+            metrics=arrdict(points_won=step.points_won),
         )
 
     def check(self) -> None:
@@ -114,9 +131,10 @@ class Pong:
         engine.check_flag(self.error_flag)
 
     def state(self, e: int = 0) -> arrdict:
-        """What :meth:`plot_state` draws of environment ``e``: ``ball`` and ``last_ball`` (2,), x
-        and y, and ``paddles`` (2,), the tops of the left and the right, in cells from the court's
-        top left; ``scores`` (2,) and the game's ``age`` in steps.
+        """Returns environment ``e`` for :meth:`plot_state`.
+
+        ``ball`` and ``last_ball`` (2,) are x and y, ``paddles`` (2,) the tops of the left and the
+        right paddle, all in cells from the court's top left. ``scores`` (2,); ``age`` in steps.
         """
         game = self.games[:, e].clone()
         places = game / CELL
@@ -129,37 +147,33 @@ class Pong:
         )
 
     @staticmethod
-    def picture(state: arrdict) -> np.ndarray:
-        """(30, 40) uint8: the pixels that the left side sees in a numpyified :meth:`state`."""
+    def image(state: arrdict) -> np.ndarray:
+        """Returns the left side's pixels (30, 40) uint8 in a numpyified :meth:`state`."""
         pixels = np.zeros((ROWS, COLUMNS), np.uint8)
         for top, column in zip(state.paddles.astype(int), (0, -1), strict=True):
-            pixels[top : top + PADDLE, column] = 170
-        for (x, y), grey in ((state.last_ball, 85), (state.ball, 255)):
+            pixels[top : top + PADDLE_ROWS, column] = PADDLE_GREY
+        for (x, y), grey in ((state.last_ball, TRAIL_GREY), (state.ball, BALL_GREY)):
             pixels[int(y), int(x)] = grey
         return pixels
 
     def text(self, e: int = 0) -> str:
-        """Environment ``e`` as it is now, for a terminal: the score above 30 lines of the court."""
+        """Draws environment ``e`` as text: the score above 30 lines of the court."""
         state = numpyify(self.state(e))
-        lines = ["".join(TEXT[grey] for grey in row) for row in self.picture(state).tolist()]
+        lines = ["".join(TEXT[grey] for grey in row) for row in self.image(state).tolist()]
         left, right = state.scores
         score, edge = f"{left} : {right}".center(COLUMNS).rstrip(), COLUMNS * "-"
         return "\n".join([score, edge, *(line.rstrip() for line in lines), edge])
 
     @classmethod
     def plot_state(cls, state: arrdict) -> Any:
-        """A matplotlib figure of a numpyified :meth:`state`: the court and the score."""
+        """Draws the court and the score of a numpyified :meth:`state` as a matplotlib figure."""
         from matplotlib.figure import Figure
 
         left, right = state.scores
         figure = Figure(figsize=(6, 4.8), dpi=100, layout="constrained")
         court = figure.subplots()
         court.set_title(f"step {state.age}, {left} : {right}")
-        court.imshow(cls.picture(state), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+        court.imshow(cls.image(state), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
         court.set_xticks([])
         court.set_yticks([])
         return figure
-
-    def display(self, e: int = 0) -> Any:
-        """Environment ``e`` as it is now, as a matplotlib figure."""
-        return self.plot_state(numpyify(self.state(e)))

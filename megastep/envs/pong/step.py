@@ -1,6 +1,7 @@
-"""One step of Pong, as one operation of the device. N games, B lanes."""
+"""One step of Pong as one operation. N games, B lanes."""
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -9,25 +10,27 @@ from megastep.engine import checks
 from megastep.engine.agents import check_flag_on_cpu
 from megastep.engine.devices import threads
 from megastep.engine.launch_params import seed_params
-from megastep.kernels.build.launch import launch, params
+from megastep.kernels.build.launch import launch
+from megastep.kernels.build.program import Program
 
-__all__ = ["CELL", "FEATURES", "GAME_FIELDS", "PIXELS", "PongStep", "pong_step"]
+__all__ = ["CELL", "FEATURES", "GAME_FIELDS", "PIXELS", "PROGRAM", "PongStep", "pong_step"]
 
-GAME_FIELDS = 13  # of a game of Pong
-FEATURES = 8  # that a side is told of it
-PIXELS = 30, 40  # of its picture
-CELL = 256  # parts of a pixel that its places and speeds are counted in
+PROGRAM = Program(Path(__file__).parent / "kernels")
+CELL = PROGRAM.constants["CELL"]  # units of position per cell; a cell is one pixel
+FEATURES = PROGRAM.constants["N_FEATURES"]  # of an observation
+GAME_FIELDS = PROGRAM.constants["GAME_FIELDS"]  # of a game's state
+PIXELS = PROGRAM.constants["ROWS"], PROGRAM.constants["COLUMNS"]
 
 
 class PongStep(NamedTuple):
-    """A step of a game of Pong, one value per lane."""
+    """The outcome of a step, one row per lane."""
 
-    reward: torch.Tensor  # (B,): 1 for a point won, -1 for one lost
-    reset: torch.Tensor  # (B,) bool, as the next two
-    terminal: torch.Tensor
-    truncated: torch.Tensor
-    points_won: torch.Tensor  # (B,): where a game ends, the share of its points; 0 elsewhere
-    features: torch.Tensor | None  # (B, 1, 8) fp16; None where pixels were wanted
+    reward: torch.Tensor  # (B,): 1 for a point won, -1 for a point lost
+    reset: torch.Tensor  # (B,) bool
+    terminal: torch.Tensor  # (B,) bool
+    truncated: torch.Tensor  # (B,) bool
+    points_won: torch.Tensor  # (B,): where a game ends, the fraction of its points won; else 0
+    features: torch.Tensor | None  # (B, 1, 8) fp16; None if pixels are written instead
 
 
 def pong_step(
@@ -42,37 +45,47 @@ def pong_step(
     tracker_speed: float = 0.5,
     pixels: torch.Tensor | None = None,
 ) -> PongStep:
-    """One step of N games of Pong, or, where the last step ended one, the start of another; see
-    :class:`~megastep.envs.Pong`. Each serve draws once from the environment's random stream.
+    """Plays one step of N games of Pong. A game that ended in the last step starts anew instead.
 
-    Args: ``games`` (13, N) int32, updated in place, zeros before the first ``restart``, which
-    starts all; ``actions`` (B, 1) int64, of one lane per game, or two, the left paddle first: 0
-    nothing, 1 up, 2 down; ``error_flag`` (1,) int32, see :func:`check_flag`; ``points`` that win a
-    game; ``limit`` steps that truncate it; ``tracker_speed`` cells per step of the right paddle
-    where it is no lane; ``pixels`` (B, 1, 1, 30, 40) uint8, written instead of features.
+    Args:
+        games: (13, N) int32, the state, updated in place. Zeros before the first ``restart``.
+        actions: (B, 1) int64, 0 nothing, 1 up, 2 down. B = N: the left paddle of each game; B = 2
+            N: the left and the right paddle.
+        error_flag: (1,) int32, see :func:`~megastep.engine.check_flag`.
+        seed: the generator's key; each serve draws once.
+        restart: start all games anew.
+        points: points that win a game.
+        limit: steps after which a game is truncated.
+        tracker_speed: cells per step of the right paddle if it is not a lane.
+        pixels: (B, 1, 1, 30, 40) uint8, written instead of features.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+        EngineError: on the CPU, if an action is out of range.
     """
-    n, on = checks.length("games", games, axis=1), games.device
-    lanes = checks.length("actions", actions)
-    if lanes not in (n, 2 * n) or actions.device != on:
+    n, device = checks.length("games", games, axis=1), games.device
+    n_lanes = checks.length("actions", actions)
+    if n_lanes not in (n, 2 * n) or actions.device != device:
         raise ValueError(
-            f"actions must be of one lane or two for each of the {n} games on {on}, but those of "
-            f"{lanes} lanes on {actions.device} were given"
+            f"actions must have one or two lanes for each of the {n} games, on {device}, but "
+            f"{n_lanes} lanes on {actions.device} were given"
         )
-    flags = [torch.empty(lanes, dtype=torch.bool, device=on) for _ in range(3)]
-    reward, points_won = (torch.empty(lanes, device=on) for _ in range(2))
+    flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
+    reward, points_won = (torch.empty(n_lanes, device=device) for _ in range(2))
     features, pixels_at = None, 0
     if pixels is None:
-        features = torch.empty((lanes, 1, FEATURES), dtype=torch.float16, device=on)
+        features = torch.empty((n_lanes, 1, FEATURES), dtype=torch.float16, device=device)
     else:
-        pixels_at = checks.address("pixels", pixels, (lanes, 1, 1, *PIXELS), torch.uint8, on)
+        shape = n_lanes, 1, 1, *PIXELS
+        pixels_at = checks.address("pixels", pixels, shape, torch.uint8, device)
         if pixels_at % 8:
-            raise ValueError("pixels must begin at a multiple of 8 bytes, as a whole tensor does")
+            raise ValueError("pixels must start at a multiple of 8 bytes, as a whole tensor does")
     speed = checks.number("tracker_speed", tracker_speed, -math.inf, PIXELS[1], "cells per step")
     if speed < 0:
         raise ValueError(f"tracker_speed must be at least 0 cells per step, not {speed:g}")
-    packed = params.PongParams(
-        games=checks.address("games", games, (GAME_FIELDS, n), torch.int32, on),
-        actions=checks.address("actions", actions, (lanes, 1), torch.int64, on),
+    packed = PROGRAM.params.PongStepParams(
+        games=checks.address("games", games, (GAME_FIELDS, n), torch.int32, device),
+        actions=checks.address("actions", actions, (n_lanes, 1), torch.int64, device),
         reward=reward.data_ptr(),
         reset=flags[0].data_ptr(),
         terminal=flags[1].data_ptr(),
@@ -80,16 +93,16 @@ def pong_step(
         points_won=points_won.data_ptr(),
         features=0 if features is None else features.data_ptr(),
         pixels=pixels_at,
-        error_flag=checks.address("error_flag", error_flag, (1,), torch.int32, on),
+        error_flag=checks.address("error_flag", error_flag, (1,), torch.int32, device),
         **seed_params(seed),
         n_envs=n,
-        n_sides=lanes // n,
+        n_sides=n_lanes // n,
         restart=int(checks.flag("restart", restart)),
         points=checks.integer("points", points, 1, 2**31 - 1),
         limit=checks.integer("limit", limit, 1, 2**31 - 1),
         tracker_speed=round(CELL * speed),
         n_threads=threads(),
     )
-    launch("pong", packed, on, threads=n)
+    launch(PROGRAM, "pong_step", packed, device, threads=n)
     check_flag_on_cpu(error_flag)
     return PongStep(reward, *flags, points_won, features)

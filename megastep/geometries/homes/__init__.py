@@ -1,8 +1,9 @@
 """Homes: floor plans like those of real flats and houses.
 
-`generate(seed)` makes the home of a seed, the same on every machine (see `random_stream`): a number
-of rooms, what they are, an outline, a partition, doors and openings, walls. `database` holds 5,000
-ready ones, those of seeds 0 to 4,999.
+`generate(seed)` generates a home in steps: the number and kinds of rooms, the outline, a partition
+into rooms, doors and openings, walls. A seed gives the same home on every machine
+(`portable_generator`). `database` holds the 5,000 homes of seeds 0 to 4,999, which come with the
+package.
 """
 
 import numpy as np
@@ -12,67 +13,72 @@ from megastep.dotdict import dotdict
 from megastep.geometries.homes import openings, partition, plan, walls
 from megastep.geometries.homes.portable_generator import PortableGenerator
 
-ATTEMPTS = 60  # plans tried before a home is given one room less
-# The best of three plans is taken; with more than ten rooms, which are expensive, the first.
+ATTEMPTS = 60  # plans tried before a home gets one room less
+# The best of three plans is taken. With more than ten rooms plans are expensive: take the first.
 ENOUGH, FEW = 3, 10
-THIN, THICK = (10, 11, 12, 14), (20, 24, 30)  # cm; the thickness of inner walls and of the envelope
-SLANTED = 0.08  # of the homes have a corner cut off at 45 degrees
+THIN, THICK = (10, 11, 12, 14), (20, 24, 30)  # cm; thickness of inner walls and of the envelope
+SLANTED = 0.08  # fraction of homes with a corner cut off at 45 degrees
 START = 100  # cm; the minimum coordinate of a home
 
 
-def _attempt(count, stream):
-    """A plan of `count` rooms as [(cost, footprint, rooms, contacts, depth, gaps)], or [] if it
-    does not work out.
+def _attempt(count, generator):
+    """Tries to plan `count` rooms. Returns [(cost, footprint, rooms, contacts, depth, gaps)], or []
+    if it fails.
     """
-    rooms = plan.programme(count, stream)
-    footprint = plan.footprint(sum(size for _, size in rooms), stream)
+    rooms = plan.programme(count, generator)
+    footprint = plan.footprint(sum(size for _, size in rooms), generator)
     try:
-        rooms, sides = partition.partition(footprint, rooms, stream)
+        rooms, sides = partition.partition(footprint, rooms, generator)
     except partition.Failure:
         return []
-    depth = walls.depths(sides, THIN[stream.below(len(THIN))])
+    depth = walls.depths(sides, THIN[generator.below(len(THIN))])
     meetings = openings.contacts(rooms)
     spans = {contact: openings.clear(contact, meetings, depth) for contact in meetings}
-    found = openings.connections(rooms, spans, stream)
-    if not found:
+    result = openings.connections(rooms, spans, generator)
+    if not result:
         return []
-    cost, chosen = found
+    cost, connections = result
     gaps = [
-        openings.opening(c, spans[c], (rooms[c.a].kind, rooms[c.b].kind), stream) for c in chosen
+        openings.opening(c, spans[c], (rooms[c.a].kind, rooms[c.b].kind), generator)
+        for c in connections
     ]
     return [(cost, footprint, rooms, meetings, depth, gaps)]
 
 
-def _best_plan(stream):
-    """The best of a few plans: (cost, footprint, rooms, contacts, depth, gaps).
+def _best_plan(generator):
+    """Returns the best of a few plans: (cost, footprint, rooms, contacts, depth, gaps).
 
-    The number of rooms is drawn once, before any plan is rejected: small homes work out more
-    often, so drawing it anew each time would make the homes small.
+    The number of rooms is drawn once. Plans of few rooms succeed more often, so drawing it again
+    after each failure would make homes too small.
     """
-    count = plan.room_count(stream)
+    count = plan.room_count(generator)
     while True:
-        found = []
+        plans = []
         for _ in range(ATTEMPTS):
-            found += _attempt(count, stream)
-            if len(found) >= (ENOUGH if count <= FEW else 1):
+            plans += _attempt(count, generator)
+            if len(plans) >= (ENOUGH if count <= FEW else 1):
                 break
-        if found:
-            return min(found, key=lambda found: found[0])
+        if plans:
+            return min(plans, key=lambda plan: plan[0])
         count -= 1
 
 
 def generate(seed: int, outer: bool = True) -> dotdict:
-    """The home of a seed, any integer; if not `outer`, less its envelope's outer face, which cannot
-    be seen from indoors.
+    """Returns the home of a seed.
 
-    A geometry with further keys: `rooms`, the kind of each room in the order of the masks' numbers;
-    `areas`, their clear areas in m2; `doors` and `openings`, the widths in metres of the gaps with
-    and without a door; `n_outer`, how many of the walls, the last ones, are the envelope's outer
-    face.
+    Args:
+        seed: any integer.
+        outer: if False, leave out the envelope's outer face, which cannot be seen from indoors.
+
+    Returns:
+        A geometry with further keys: `rooms`, the kind of each room in the order of the masks'
+        numbers; `areas`, their clear areas in m2; `doors` and `openings`, the widths in metres of
+        the gaps with and without a door; `n_outer`, the number of walls, the last ones, that are
+        the envelope's outer face.
     """
-    stream = PortableGenerator(seed)
-    _, footprint, rooms, meetings, depth, gaps = _best_plan(stream)
-    thickness = THICK[stream.below(len(THICK))]
+    generator = PortableGenerator(seed)
+    _, footprint, rooms, meetings, depth, gaps = _best_plan(generator)
+    thickness = THICK[generator.below(len(THICK))]
     grid = walls.paint(
         footprint, walls.solids(meetings, depth), [walls.gap(g, depth) for g in gaps], thickness
     )
@@ -82,8 +88,8 @@ def generate(seed: int, outer: bool = True) -> dotdict:
         [[(x0, y0), (x1, y0), (x1, y1), (x0, y1)] for x0, y0, x1, y1 in room.region]
         for room in rooms
     ]
-    if stream.chance(SLANTED):
-        inside, outside, triangle = walls.slanted(inside, outside, *grid, thickness, stream)
+    if generator.chance(SLANTED):
+        inside, outside, triangle = walls.slanted(inside, outside, *grid, thickness, generator)
         for room, ring in zip(rooms, rings):
             ring += [triangle] if walls.holds(room.region, triangle) else []
 

@@ -1,9 +1,8 @@
-"""The 5,000 homes that come with the package: `data/homes.npz` and its sha256, written by
-`scripts/make_homes.py`.
+"""The 5,000 homes that come with the package: `data/homes.npz` and its sha256.
 
-The arrays of all homes lie end to end, coordinates in centimetres as int16: `walls` (M, 2,
-2), `lights` (K, 2) and `masks` (cells,) int8; `widths` (homes, 5) has each home's number of walls,
-of those in the outer face, of lights, and its masks' height and width.
+`scripts/make_homes.py` writes them. The arrays of all homes lie end to end: `walls` (M, 2, 2) and
+`lights` (K, 2), int16 centimetres, and `masks` (cells,) int8. `widths` (homes, 5) has, per home,
+the number of walls, of walls in the outer face, of lights, and the height and width of the masks.
 """
 
 import functools
@@ -23,8 +22,9 @@ REMEDY = "install megastep again, or run scripts/make_homes.py"
 
 @functools.lru_cache(maxsize=1)
 def _arrays(path):
-    """A database's arrays and where each home's begin; ValueError unless its sha256 is the one
-    beside it.
+    """Returns the arrays of a database and the index at which each home's begin.
+
+    Raises ValueError unless the file's sha256 is the one in the file beside it.
     """
     try:
         content = path.read_bytes()
@@ -34,9 +34,7 @@ def _arrays(path):
             f"The homes in {str(path)!r} cannot be read ({error}); {REMEDY}."
         ) from error
     if hashlib.sha256(content).hexdigest() != expected:
-        raise ValueError(
-            f"The homes in {str(path)!r} are damaged (their sha256 is another); {REMEDY}."
-        )
+        raise ValueError(f"The homes in {str(path)!r} are damaged (wrong sha256); {REMEDY}.")
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     widths = arrays["widths"]
@@ -46,7 +44,7 @@ def _arrays(path):
 
 @functools.lru_cache(maxsize=COUNT)
 def home(index: int, outer: bool = True, path: Path = PATH) -> dotdict:
-    """The home of seed `index` as a geometry with `n_outer`; `outer` as for `generate`."""
+    """Returns the home of seed `index`, a geometry with `n_outer`. `outer` is as in `generate`."""
     arrays, starts = _arrays(path)
     _, n_outer, _, height, width = arrays["widths"][index]
     walls, lights, cells = (

@@ -1,4 +1,4 @@
-"""Where rooms meet, and which of those walls have a door or an opening. Integer centimetres."""
+"""Contacts between rooms, and their doors and openings. Lengths are integer centimetres."""
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
@@ -6,15 +6,15 @@ from typing import Any, NamedTuple
 
 from megastep.geometries.homes.portable_generator import PortableGenerator
 
-# How often a door has each width.
+# Probability of each width of a door.
 DOORS = {60: 0.06, 65: 0.12, 70: 0.16, 75: 0.18, 80: 0.24, 85: 0.14, 90: 0.10}
 SMALL = ("bath", "closet", "lobby", "storage")  # rooms with doors of at most 80 cm
 MAX_SMALL = 80
 STUB = 5  # cm of wall beside a door in a corner
-IN_CORNER = 0.70  # of the doors; the others stand anywhere
-MIN_CONTACT = 95  # cm of clear wall a door needs
-LOOPS = 0.45  # of the cheap contacts that the tree of doors leaves out become doors too
-# How often a connection has no door.
+IN_CORNER = 0.70  # fraction of doors in a corner; the others are anywhere
+MIN_CONTACT = 95  # cm of clear wall that a door needs
+LOOPS = 0.45  # fraction of cheap contacts outside the tree that become doors too
+# Probability that a connection has no door.
 OPEN = {
     frozenset(pair): share
     for pair, share in {
@@ -30,12 +30,11 @@ OPEN = {
         ("bedroom", "room"): 0.2,
     }.items()
 }
-FULL = 0.45  # of the connections without a door take the whole wall between the rooms
-OPENING = (100, 240)  # cm; the others
-REACH = 25  # cm; walls that come this near to the end of another narrow what can be opened there
+FULL = 0.45  # fraction of connections without a door that take the whole wall
+OPENING = (100, 240)  # cm; width of the others
+REACH = 25  # cm; a wall this close to the end of another leaves less of it to open
 
-# What a connection costs in the spanning tree: cheap ones become doors. Pairs before single kinds
-# before the default.
+# Cost of a connection in the spanning tree: cheap ones become doors.
 COSTS = {
     frozenset(pair): cost
     for pair, cost in {
@@ -58,9 +57,7 @@ CHEAP = 0.8  # the maximum cost of a loop
 
 
 class Contact(NamedTuple):
-    """A straight piece of wall between rooms a and b, on the line `at` of `axis`, from low to high
-    along it.
-    """
+    """A straight wall between rooms a and b, from low to high on the line `at` of `axis`."""
 
     axis: int
     at: int
@@ -71,7 +68,7 @@ class Contact(NamedTuple):
 
 
 class Opening(NamedTuple):
-    """A gap in the wall of a contact from low to high; it has a door or not."""
+    """A gap in the wall of a contact, from low to high, with or without a door."""
 
     contact: Contact
     low: int
@@ -80,7 +77,7 @@ class Opening(NamedTuple):
 
 
 def contacts(rooms: Sequence[Any]) -> list[Contact]:
-    """Every Contact between two of the rooms, collinear pieces merged."""
+    """Returns every Contact between two of the rooms. Collinear pieces are merged."""
     pieces = []
     for (i, room), (j, other) in combinations(enumerate(rooms), 2):
         for r in room.region:
@@ -100,7 +97,7 @@ def contacts(rooms: Sequence[Any]) -> list[Contact]:
 
 
 def clear(contact: Contact, others: Iterable[Contact], depth: Callable) -> tuple[int, int]:
-    """The part (low, high) of a contact that no other wall meets; `depth` as from
+    """Returns the part (low, high) of a contact that no other wall meets. `depth` is a result of
     `walls.depths`.
     """
     low, high = contact.low, contact.high
@@ -115,7 +112,7 @@ def clear(contact: Contact, others: Iterable[Contact], depth: Callable) -> tuple
 
 
 def _cost(a, b):
-    """The cost of a connection between rooms of kinds a and b."""
+    """Returns the cost of a connection between rooms of kinds a and b."""
     pair = frozenset((a, b))
     return COSTS.get(
         pair, COST_ENTRY if "entry" in pair else COST_LIVING if "living" in pair else COST
@@ -123,12 +120,12 @@ def _cost(a, b):
 
 
 def connections(
-    rooms: Sequence[Any], spans: dict[Contact, tuple[int, int]], stream: PortableGenerator
+    rooms: Sequence[Any], spans: dict[Contact, tuple[int, int]], generator: PortableGenerator
 ) -> tuple[float, list[Contact]] | None:
-    """The contacts to open: a cheapest tree over the rooms and some loops.
+    """Chooses the contacts to open: a cheapest spanning tree of the rooms, and some loops.
 
     `spans` has the clear (low, high) of every contact. Returns (mean cost of the tree, [contact]),
-    or None when no tree reaches every room.
+    or None if no tree reaches every room.
     """
     longest = {}
     for contact, (low, high) in spans.items():
@@ -136,43 +133,46 @@ def connections(
         if high - low >= MIN_CONTACT and high - low > longest.get(pair, (0, None))[0]:
             longest[pair] = high - low, contact
     edges = sorted(
-        (_cost(rooms[a].kind, rooms[b].kind) + stream.uniform(0, 0.15), contact)
+        (_cost(rooms[a].kind, rooms[b].kind) + generator.uniform(0, 0.15), contact)
         for (a, b), (_, contact) in longest.items()
     )
     parts = list(range(len(rooms)))
-    chosen, rest, total = [], [], 0.0
+    tree, cheap, total = [], [], 0.0
     for cost, contact in edges:
         a, b = parts[contact.a], parts[contact.b]
         if a == b:
-            rest += [contact] if cost < CHEAP else []
+            cheap += [contact] if cost < CHEAP else []
             continue
         parts = [b if part == a else part for part in parts]
-        chosen.append(contact)
+        tree.append(contact)
         total += cost
     if len(set(parts)) > 1:
         return None
-    return total / (len(rooms) - 1), chosen + [contact for contact in rest if stream.chance(LOOPS)]
+    loops = [contact for contact in cheap if generator.chance(LOOPS)]
+    return total / (len(rooms) - 1), tree + loops
 
 
 def opening(
-    contact: Contact, span: tuple[int, int], kinds: tuple[str, str], stream: PortableGenerator
+    contact: Contact, span: tuple[int, int], kinds: tuple[str, str], generator: PortableGenerator
 ) -> Opening:
-    """The Opening made in a contact between rooms of two kinds, somewhere within the clear span
-    (low, high).
+    """Returns a random Opening within the clear span (low, high) of a contact between rooms of two
+    kinds.
     """
     low, high = span
-    open_plan = stream.chance(OPEN.get(frozenset(kinds), 0.0))
+    open_plan = generator.chance(OPEN.get(frozenset(kinds), 0.0))
     if open_plan:
-        if stream.chance(FULL):
+        if generator.chance(FULL):
             return Opening(contact, low, high, False)
-        width = stream.between(OPENING[0] // 5, OPENING[1] // 5) * 5
+        width = generator.between(OPENING[0] // 5, OPENING[1] // 5) * 5
     else:
         widths = list(DOORS)
         if any(kind in SMALL for kind in kinds):
             widths = [width for width in widths if width <= MAX_SMALL]
-        width = widths[stream.pick([DOORS[width] for width in widths])]
+        width = widths[generator.pick([DOORS[width] for width in widths])]
     spare = high - low - width - 2 * STUB
     if spare < 0:
         return Opening(contact, low, high, False)
-    offset = stream.below(2) * spare if stream.chance(IN_CORNER) else stream.between(0, spare)
+    offset = (
+        generator.below(2) * spare if generator.chance(IN_CORNER) else generator.between(0, spare)
+    )
     return Opening(contact, low + STUB + offset, low + STUB + offset + width, not open_plan)

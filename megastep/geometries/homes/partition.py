@@ -1,5 +1,5 @@
-"""Cuts a footprint into rooms: recursive guillotine cuts, and corridors between two rows of
-rooms.
+"""Partition of a footprint into rooms, by recursive guillotine cuts and by corridors between two
+rows of rooms.
 """
 
 from collections.abc import Sequence
@@ -11,18 +11,18 @@ from megastep.geometries.homes.plan import ALLOWANCE, KINDS
 from megastep.geometries.homes.portable_generator import PortableGenerator, exp
 
 PORTAL = 120  # cm; the minimum neck between the parts of a region that is still to be cut
-MIN_FILL = 0.55  # of a room's bounding box
+MIN_FILL = 0.55  # fraction of its bounding box that a room fills at least
 MIN_JOG = 35  # cm; shorter steps in a room's outline are refused
 SNAP = 45  # cm within which a cut moves to a corner of the outline
-TEMPERATURE = 0.35  # of the choice among cuts by their worst aspect
-BRANCHES = 4  # cuts tried at one place before giving it up
-STEPS = 40  # cuts tried before a whole partition is given up
+TEMPERATURE = 0.35  # of the random choice among cuts by their worst aspect
+BRANCHES = 4  # cuts tried for one region
+STEPS = 40  # cuts tried for a whole partition
 CORRIDOR = (110, 150)  # cm of clear width
-MAX_CORRIDOR = 850  # cm
-CORRIDORS = 8.0  # how much likelier a corridor is drawn than a simple cut of its aspect
+MAX_CORRIDOR = 850  # cm of length
+CORRIDORS = 8.0  # relative probability of a corridor against a simple cut of its aspect
 
-# Rooms close in this order tend to be neighbours: dry rooms at the ends, entry and wet rooms in
-# between.
+# Rooms that are close in this order tend to be neighbours: dry rooms at the ends, entry and wet
+# rooms in between.
 ORDER = {
     "living": 0.0,
     "kitchen": 1.0,
@@ -38,70 +38,73 @@ ORDER = {
 
 
 class Room(NamedTuple):
+    """A room of a kind and its region."""
+
     kind: str
     region: list
 
 
 class Cut(NamedTuple):
-    """Parts of a region and the rooms that go there, the lines between, and the worst aspect among
-    the parts.
-    """
+    """A cut of a region into parts, each for some of the rooms."""
 
     parts: list  # of (region, rooms)
     lines: list  # of (axis, at, side), side as in `regions.corners` or 0
-    aspect: float
-    favour: float = 1.0  # how much likelier it is drawn than another of its aspect
+    aspect: float  # the worst of the parts
+    favour: float = 1.0  # relative probability among cuts of equal aspect
 
 
 class Failure(Exception):
-    """No partition was found in the steps allowed."""
+    """No partition was found in STEPS cuts."""
 
 
 def partition(
-    region: regions.Region, rooms: Sequence[tuple[str, int]], stream: PortableGenerator
+    region: regions.Region, rooms: Sequence[tuple[str, int]], generator: PortableGenerator
 ) -> tuple[list[Room], dict]:
-    """Rooms, a list of (kind, area), laid out in a region.
+    """Lays out rooms, a list of (kind, area in cm2), in a region.
 
-    Returns ([Room], {(axis, at): side}), the second the side of each cut's line on which its wall
-    is to stand. Raises Failure.
+    Returns:
+        ([Room], {(axis, at): side}): the rooms, and for the line of each cut the side of it on
+        which the wall stands.
+
+    Raises:
+        Failure: if no partition is found.
     """
-    keyed = [(ORDER[kind] + stream.normal(0.0, 0.8), i) for i, (kind, _) in enumerate(rooms)]
+    keyed = [(ORDER[kind] + generator.normal(0.0, 0.8), i) for i, (kind, _) in enumerate(rooms)]
     ordered = [rooms[i] for _, i in sorted(keyed)]
-    steps = [STEPS]
-    found = _divided(region, ordered, stream, steps)
-    if found is None:
+    result = _divide(region, ordered, generator, steps_left=[STEPS])
+    if result is None:
         raise Failure
-    return found
+    return result
 
 
-def _divided(region, rooms, stream, steps):
-    """As `partition`, for rooms in their order; None when it fails. `steps` counts down over the
-    whole recursion.
+def _divide(region, rooms, generator, steps_left):
+    """Returns the result of `partition` for rooms in this order, or None if it fails. `steps_left`
+    counts down over the whole recursion.
     """
     if len(rooms) == 1:
         return [Room(rooms[0][0], region)], {}
-    cuts = _cuts(region, rooms, stream)
+    cuts = _cuts(region, rooms, generator)
     for _ in range(min(BRANCHES, len(cuts))):
-        steps[0] -= 1
-        if steps[0] < 0:
+        steps_left[0] -= 1
+        if steps_left[0] < 0:
             return None
         cut = cuts.pop(
-            stream.pick([c.favour * exp(-min(c.aspect, 5.0) / TEMPERATURE) for c in cuts])
+            generator.pick([c.favour * exp(-min(c.aspect, 5.0) / TEMPERATURE) for c in cuts])
         )
         placed, sides = [], {(axis, at): side for axis, at, side in cut.lines}
-        for part, inside in cut.parts:
-            found = _divided(part, inside, stream, steps)
-            if found is None:
+        for part, rooms_inside in cut.parts:
+            result = _divide(part, rooms_inside, generator, steps_left)
+            if result is None:
                 break
-            placed += found[0]
-            sides.update(found[1])
+            placed += result[0]
+            sides.update(result[1])
         else:
             return placed, sides
     return None
 
 
-def _cuts(region, rooms, stream):
-    """All the cuts of a region in two that suit its rooms, and those with a corridor."""
+def _cuts(region, rooms, generator):
+    """Returns all cuts of a region in two that suit its rooms, and cuts with a corridor."""
     widths = [KINDS[kind].width + ALLOWANCE for kind, _ in rooms]
     firsts, lasts = list(accumulate(widths, max)), list(accumulate(widths[::-1], max))[::-1]
     size, total = regions.area(region), sum(size for _, size in rooms)
@@ -109,7 +112,7 @@ def _cuts(region, rooms, stream):
     for axis in (0, 1):
         inner, slices = regions.corners(region, axis), regions.bands(region, axis)
         low, high = slices[0][0], slices[-1][1]
-        flipped = stream.chance(0.5)
+        flipped = generator.chance(0.5)
         below = 0
         for k in range(1, len(rooms)):
             below += rooms[k - 1][1]
@@ -124,22 +127,22 @@ def _cuts(region, rooms, stream):
                 lower, upper = (upper, lower) if flipped else (lower, upper)
                 pairs = [(lower, rooms[:k]), (upper, rooms[k:])]
                 cuts.append(_suitable_cut(pairs, [(axis, at, side)]))
-        cuts.append(_corridor(region, rooms, axis, slices, stream))
+        cuts.append(_corridor(region, rooms, axis, slices, generator))
     return [cut for cut in cuts if cut]
 
 
-def _corridor(region, rooms, axis, slices, stream):
-    """A cut of a region into two rows of rooms with the entry as a corridor between them, or
+def _corridor(region, rooms, axis, slices, generator):
+    """Returns a cut of a region into two rows of rooms with the entry as a corridor between, or
     None.
     """
     entries = [room for room in rooms if room[0] == "entry"]
-    others = [room for room in rooms if room[0] != "entry"]
-    if not entries or len(others) < 4:
+    in_rows = [room for room in rooms if room[0] != "entry"]
+    if not entries or len(in_rows) < 4:
         return None
     low, high = slices[0][0], slices[-1][1]
-    width = stream.between(*CORRIDOR) // regions.LATTICE * regions.LATTICE + ALLOWANCE // 2 * 2
-    k = stream.between(2, len(others) - 2)
-    below, total = (sum(size for _, size in part) for part in (others[:k], others))
+    width = generator.between(*CORRIDOR) // regions.LATTICE * regions.LATTICE + ALLOWANCE // 2 * 2
+    k = generator.between(2, len(in_rows) - 2)
+    below, total = (sum(size for _, size in part) for part in (in_rows[:k], in_rows))
     at = (
         regions.position(slices, regions.area(region) * below // total)
         - width // 2 // regions.LATTICE * regions.LATTICE
@@ -151,13 +154,13 @@ def _corridor(region, rooms, axis, slices, stream):
     if len(strip) > 1 or strip[0][3 - axis] - strip[0][1 - axis] > MAX_CORRIDOR:
         return None
     cut = _suitable_cut(
-        [(lower, others[:k]), (upper, others[k:])], [(axis, at, 0), (axis, at + width, 0)]
+        [(lower, in_rows[:k]), (upper, in_rows[k:])], [(axis, at, 0), (axis, at + width, 0)]
     )
     return cut and cut._replace(parts=[*cut.parts, (strip, entries)], favour=CORRIDORS)
 
 
 def _suitable_cut(pairs, lines):
-    """The Cut of these (region, rooms), or None when a part does not suit its rooms."""
+    """Returns the Cut of these (region, rooms), or None if a part does not suit its rooms."""
     worst = 1.0
     for part, rooms in pairs:
         aspect = _leaf_aspect(part, rooms[0][0]) if len(rooms) == 1 else _aspect(part, rooms)
@@ -168,8 +171,8 @@ def _suitable_cut(pairs, lines):
 
 
 def _aspect(region, rooms):
-    """Long side by short side of a region for several rooms, or None when it is too narrow for one
-    of them.
+    """Returns long side / short side of a region for several rooms, or None if it is too narrow for
+    one of them.
     """
     if not region or not regions.connected(region, PORTAL):
         return None
@@ -181,7 +184,7 @@ def _aspect(region, rooms):
 
 
 def _leaf_aspect(region, kind):
-    """Long side by short side of a room of this kind, or None when it cannot be one."""
+    """Returns long side / short side of a region for one room, or None if it does not suit it."""
     if not region or len(region) > 2 or not regions.connected(region, 90):
         return None
     x0, y0, x1, y1 = regions.bounds(region)

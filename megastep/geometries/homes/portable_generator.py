@@ -1,10 +1,10 @@
-"""Random numbers that are the same on every machine.
+"""A random generator that gives equal bits on every machine and Python version.
 
 The k-th number of a seed is a hash of (seed, k): SplitMix64 (Steele, Lea and Flood, "Fast
-splittable pseudorandom number generators", OOPSLA 2014), on Python integers. What is made of them
-uses only +, -, *, / on Python floats, each of which IEEE 754 rounds in one way; exponentials come
-from `exp` below and not from the C library, whose last bit differs between systems, and nothing
-calls `sum` on floats, which Python 3.12 taught to round otherwise.
+splittable pseudorandom number generators", OOPSLA 2014) on Python integers. Floats are computed
+with +, -, * and / only, which IEEE 754 defines to the last bit. `exp` below replaces the C
+library's, whose last bit differs between systems. `sum` of floats is avoided, since Python 3.12
+changed its rounding.
 """
 
 from collections.abc import Iterable
@@ -14,9 +14,7 @@ GOLDEN = 0x9E3779B97F4A7C15
 
 
 def exp(x: float) -> float:
-    """e^x for |x| < 20 from multiplications alone: a Taylor series at x/1024, squared ten times;
-    good to 1e-12.
-    """
+    """Returns e^x for |x| < 20, to 1e-12: a Taylor series at x / 1024, squared ten times."""
     x, term, total = x / 1024, 1.0, 1.0
     for k in range(1, 7):
         term = term * x / k
@@ -27,42 +25,42 @@ def exp(x: float) -> float:
 
 
 def mixed(value: int) -> int:
-    """A 64-bit hash of a 64-bit integer."""
+    """Returns a 64-bit hash of a 64-bit integer."""
     value = ((value ^ (value >> 30)) * 0xBF58476D1CE4E5B9) & MASK
     value = ((value ^ (value >> 27)) * 0x94D049BB133111EB) & MASK
     return value ^ (value >> 31)
 
 
 class PortableGenerator:
-    """The random numbers of one seed, any integer."""
+    """A counter-based random generator (SplitMix64) of one seed, any integer."""
 
     def __init__(self, seed: int):
         self._key = mixed((seed * GOLDEN + 1) & MASK)
         self._count = 0
 
     def bits(self) -> int:
-        """An integer of 64 random bits."""
+        """Returns an integer of 64 random bits."""
         self._count += 1
         return mixed((self._key + self._count * GOLDEN) & MASK)
 
     def below(self, n: int) -> int:
-        """An integer in 0..n-1."""
+        """Returns an integer from 0 to n - 1."""
         return self.bits() * n >> 64
 
     def between(self, low: int, high: int) -> int:
-        """An integer in low..high, both included."""
+        """Returns an integer from low to high, both included."""
         return low + self.below(high - low + 1)
 
     def uniform(self, low: float = 0.0, high: float = 1.0) -> float:
-        """A float in low..high."""
+        """Returns a float from low to high."""
         return low + (high - low) * ((self.bits() >> 11) / 2**53)
 
     def chance(self, probability: float) -> bool:
-        """True with this probability."""
+        """Returns True with this probability."""
         return self.uniform() < probability
 
     def normal(self, mean: float = 0.0, std: float = 1.0) -> float:
-        """Nearly normal: the sum of twelve 16-bit uniforms, whose variance is one."""
+        """Returns a nearly normal number: the sum of twelve 16-bit uniforms has variance 1."""
         total = 0
         for _ in range(3):
             word = self.bits()
@@ -70,14 +68,14 @@ class PortableGenerator:
         return mean + std * (total / 65_536 - 6)
 
     def lognormal(self, median: float, sigma: float) -> float:
-        """median * e^(sigma z), z nearly normal."""
+        """Returns median * e^(sigma z), where z is nearly normal."""
         return median * exp(sigma * self.normal())
 
     def pick(self, weights: Iterable[float]) -> int:
-        """The index of one of `weights`, with probability in proportion to it."""
+        """Returns the index of one of `weights`, with probability proportional to it."""
         total, sums = 0.0, []
         for weight in weights:
             total += weight
             sums.append(total)
-        at = self.uniform() * total
-        return next((index for index, below in enumerate(sums) if at < below), len(sums) - 1)
+        point = self.uniform() * total
+        return next((index for index, end in enumerate(sums) if point < end), len(sums) - 1)

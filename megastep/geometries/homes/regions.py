@@ -1,28 +1,27 @@
-"""Rectilinear regions: lists of disjoint rectangles (x0, y0, x1, y1) in integer centimetres, side
-by side.
+"""Rectilinear regions: lists of disjoint rectangles (x0, y0, x1, y1), integer centimetres.
 
-`footprint` makes them so that no two of their rectangles are stacked, and cuts keep it so: each
-rectangle is as tall as the region is there. Axis 0 is x, axis 1 is y.
+The rectangles of a region lie side by side: each is as tall as the region is there. `footprint`
+makes such regions, and cuts preserve this. Axis 0 is x, axis 1 is y.
 """
 
 Region = list[tuple[int, int, int, int]]
 
-LATTICE = 5  # centimetres; where cuts may be
+LATTICE = 5  # centimetres; cuts are at multiples
 
 
 def area(region: Region) -> int:
-    """In cm2."""
+    """Returns the area in cm2."""
     return sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in region)
 
 
 def bounds(region: Region) -> tuple[int, int, int, int]:
-    """The bounding box (x0, y0, x1, y1)."""
+    """Returns the bounding box (x0, y0, x1, y1)."""
     x0, y0, x1, y1 = zip(*region)
     return min(x0), min(y0), max(x1), max(y1)
 
 
 def cut(region: Region, axis: int, at: int) -> tuple[Region, Region]:
-    """The parts of a region below and above a line."""
+    """Returns the parts of a region below and above a line."""
     lower, upper = [], []
     for rectangle in region:
         if rectangle[axis + 2] <= at:
@@ -37,7 +36,7 @@ def cut(region: Region, axis: int, at: int) -> tuple[Region, Region]:
 
 
 def bands(region: Region, axis: int) -> list[tuple[int, int, int]]:
-    """The region in slices across an axis, between all of its lines: a list of (low, high, length
+    """Cuts the region across an axis at all its lines. Returns a list of (low, high, length
     across).
     """
     if len(region) == 1:
@@ -56,18 +55,18 @@ def bands(region: Region, axis: int) -> list[tuple[int, int, int]]:
     ]
 
 
-def position(slices: list[tuple[int, int, int]], wanted: int) -> int:
-    """The lattice line nearest to having `wanted` cm2 of a region's `bands` below it."""
+def position(slices: list[tuple[int, int, int]], area_below: int) -> int:
+    """Returns the lattice line that has nearly `area_below` cm2 of a region's `bands` below it."""
     for low, high, length in slices:
-        if wanted <= (high - low) * length:
+        if area_below <= (high - low) * length:
             break
-        wanted -= (high - low) * length
-    return (low + wanted // max(length, 1) + LATTICE // 2) // LATTICE * LATTICE
+        area_below -= (high - low) * length
+    return (low + area_below // max(length, 1) + LATTICE // 2) // LATTICE * LATTICE
 
 
 def corners(region: Region, axis: int) -> dict[int, int]:
-    """{line: side} for the lines through the region's inner corners; what is outside is on side
-    -1 (below) or +1.
+    """Returns {line: side} of the lines through the region's inner corners. The outside is on side
+    -1 (below) or +1 (above).
     """
     if len(region) == 1:
         return {}
@@ -86,7 +85,7 @@ def corners(region: Region, axis: int) -> dict[int, int]:
 
 
 def connected(region: Region, portal: int) -> bool:
-    """Whether all of a region can be reached through contacts of at least `portal` cm."""
+    """Returns True if contacts of at least `portal` cm connect the whole region."""
     if len(region) == 1:
         return True
     reached, rest = [region[0]], list(region[1:])
@@ -102,7 +101,7 @@ def connected(region: Region, portal: int) -> bool:
 
 
 def narrowest(region: Region) -> int:
-    """The shortest line along x or y, in cm, from boundary to boundary of a region."""
+    """Returns the length in cm of the shortest line along x or y across a region."""
     shortest = min(y1 - y0 for _, y0, _, y1 in region)
     levels = sorted({y for r in region for y in (r[1], r[3])})
     for low, high in zip(levels, levels[1:]):
@@ -118,7 +117,7 @@ def narrowest(region: Region) -> int:
 
 
 def widest(region: Region) -> tuple[int, int, int, int]:
-    """The rectangle in a region that has the longest short side (the larger one when two do)."""
+    """Returns the rectangle in a region with the longest short side; of equal ones, the largest."""
     best = max(region, key=_breadth)
     ordered = sorted(region)
     for i, (x0, y0, x1, y1) in enumerate(ordered):

@@ -1,7 +1,6 @@
-"""Solid walls of a partition with openings, the segments that bound them, and lights. Whole
-centimetres.
+"""The walls of a home as solids, the segments that bound them, and lights. Integer centimetres.
 
-Everything is painted on a grid whose lines are the coordinates that occur: a cell is wholly
+Everything is painted on a grid with a line at each coordinate that occurs, so a cell is wholly
 outdoors, wall or indoors.
 """
 
@@ -16,14 +15,14 @@ from megastep.geometries.homes.portable_generator import PortableGenerator
 Grid = tuple[np.ndarray, np.ndarray, np.ndarray]  # xs, ys, cells
 
 OUTDOORS, WALL, INDOORS = 0, 1, 2
-# cm, along x or y, between a light and any wall: then its cell of the masks touches none
+# cm along x or y between a light and any wall, so that no wall touches its cell of the masks
 CLEAR = 21
-SHORTEST, LONGEST = 60, 150  # cm; what a slanted corner takes off either side
+SHORTEST, LONGEST = 60, 150  # cm that a slanted corner takes off either side
 
 
 def depths(sides: dict, thickness: int) -> Callable:
-    """A function from a contact to how far its wall reaches (before, after) its line; `sides` as
-    from `partition`.
+    """Returns a function from a contact to (before, after), the cm that its wall reaches on either
+    side of its line. `sides` is a result of `partition`.
     """
     around = {
         0: (thickness // 2, thickness - thickness // 2),
@@ -34,15 +33,13 @@ def depths(sides: dict, thickness: int) -> Callable:
 
 
 def _rectangle(axis, across, along):
-    """A rectangle from its extent along `axis` and its extent along the other one."""
+    """Returns a rectangle from its extents along `axis` and along the other axis."""
     (a, b), (c, d) = across, along
     return (a, c, b, d) if axis == 0 else (c, a, d, b)
 
 
 def solids(meetings: Sequence[Contact], depth: Callable) -> regions.Region:
-    """The rectangle of the wall on every contact, long enough to fill the corners it makes with
-    others.
-    """
+    """Returns the rectangle of each contact's wall, long enough to fill the corners with others."""
     rectangles = []
     for contact in meetings:
         low, high = contact.low, contact.high
@@ -61,7 +58,7 @@ def solids(meetings: Sequence[Contact], depth: Callable) -> regions.Region:
 
 
 def gap(opening: Opening, depth: Callable) -> tuple[int, int, int, int]:
-    """The rectangle an opening takes out of its wall."""
+    """Returns the rectangle that an opening takes out of its wall."""
     before, after = depth(opening.contact)
     at = opening.contact.at
     return _rectangle(opening.contact.axis, (at - before, at + after), (opening.low, opening.high))
@@ -70,11 +67,11 @@ def gap(opening: Opening, depth: Callable) -> tuple[int, int, int, int]:
 def paint(
     floor: regions.Region, walls: regions.Region, gaps: regions.Region, envelope: int
 ) -> Grid:
-    """The grid of a home from rectangles of floor, inner walls and gaps, the envelope so many cm
-    thick.
+    """Paints the grid of a home from rectangles of floor, inner walls and gaps, with an envelope of
+    so many cm.
 
-    Returns the lines' coordinates xs and ys, and the cells' states (len(ys) - 1, len(xs) - 1), row
-    0 at the bottom.
+    Returns the coordinates of the lines, xs and ys, and the states of the cells,
+    (len(ys) - 1, len(xs) - 1) with row 0 at the bottom.
     """
     layers = [
         ((x0 - envelope, y0 - envelope, x1 + envelope, y1 + envelope), WALL)
@@ -93,10 +90,10 @@ def paint(
 
 
 def _faces(lines, along, cells, beside):
-    """Segments where a wall has `beside` on one side, across rows: (n, 2, 2) of (along, line); the
-    longest possible.
+    """Returns the longest segments between rows with a wall on one side and the state `beside` on
+    the other: (n, 2, 2) of (along, line).
 
-    A face with the wall above it and one with the wall below it are never joined.
+    A face with the wall above it is never joined to one with the wall below it.
     """
     padded = np.pad(cells, ((1, 1), (0, 0)))
     low, high = padded[:-1], padded[1:]
@@ -111,8 +108,8 @@ def _faces(lines, along, cells, beside):
 
 
 def segments(xs: np.ndarray, ys: np.ndarray, cells: np.ndarray, beside: int) -> np.ndarray:
-    """All the segments (n, 2, 2) of (x, y) between walls and cells in the state `beside`, joined
-    where collinear.
+    """Returns all segments (n, 2, 2) of (x, y) between walls and cells in the state `beside`.
+    Collinear ones are joined.
     """
     level = _faces(ys, xs, cells, beside)
     upright = _faces(xs, ys, cells.T, beside)[..., ::-1]
@@ -120,24 +117,22 @@ def segments(xs: np.ndarray, ys: np.ndarray, cells: np.ndarray, beside: int) -> 
 
 
 def areas(grid: Grid, parts: Sequence[regions.Region]) -> list[float]:
-    """The indoor area in m2 of each of some regions of a painted grid."""
+    """Returns the indoor area in m2 of each region, `parts`, of a painted grid."""
     xs, ys, cells = grid
     indoors = np.outer(np.diff(ys), np.diff(xs)) * (cells == INDOORS)
-    found = []
+    square_metres = []
     for part in parts:
         boxes = [(np.searchsorted(ys, r[1::2]), np.searchsorted(xs, r[::2])) for r in part]
-        found.append(
-            sum(int(indoors[slice(*rows), slice(*columns)].sum()) for rows, columns in boxes)
-            / 10_000
-        )
-    return found
+        total = sum(int(indoors[slice(*rows), slice(*columns)].sum()) for rows, columns in boxes)
+        square_metres.append(total / 10_000)
+    return square_metres
 
 
 def light(region: regions.Region, inside: np.ndarray) -> tuple[int, int]:
-    """Where the light of a room is: at its centroid if that is clear of walls, else amid its widest
-    rectangle.
+    """Returns the place of a room's light: its centroid if that is clear of walls, else the centre
+    of its widest rectangle.
 
-    `inside` are the segments (n, 2, 2) indoors, all of them along an axis.
+    `inside` has the segments (n, 2, 2) indoors, all along an axis.
     """
     total = 2 * regions.area(region)
     x = sum((x1 - x0) * (y1 - y0) * (x0 + x1) for x0, y0, x1, y1 in region) // total
@@ -156,13 +151,14 @@ def slanted(
     ys: np.ndarray,
     cells: np.ndarray,
     thickness: int,
-    stream: PortableGenerator,
+    generator: PortableGenerator,
 ) -> tuple[np.ndarray, np.ndarray, list]:
-    """A home with one outer corner cut off at 45 degrees: the new segments inside and outside, and
-    the triangle lost.
+    """Cuts off one outer corner of a home at 45 degrees. Returns the new segments inside and
+    outside, and the triangle that was cut off.
 
-    Both faces of the envelope are cut, so that it stays `thickness` thick to a centimetre. The
-    triangle's first corner is the corner it was; it is empty when the walls there are too short.
+    Both faces of the envelope are cut, so it stays `thickness` thick to a centimetre. The first
+    corner of the triangle is the old corner. The triangle is empty, and nothing is cut, if the
+    walls there are too short.
     """
     outdoors = np.pad(cells == OUTDOORS, 1, constant_values=True)
     around = (
@@ -173,7 +169,7 @@ def slanted(
         + tuple(int(outdoors[i + k, j + l]) for k in (0, 1) for l in (0, 1))
         for i, j in zip(*np.nonzero(around == 3))
     ]
-    x, y, *quadrants = corners[stream.below(len(corners))]
+    x, y, *quadrants = corners[generator.below(len(corners))]
     k, l = divmod(quadrants.index(0), 2)  # the quadrant that is wall
     right, up = 2 * l - 1, 2 * k - 1
     inner = x + right * thickness, y + up * thickness
@@ -190,13 +186,13 @@ def slanted(
 
 
 def _reach(lines, corner):
-    """How far the segments that end in a corner run from it, along x and along y."""
+    """Returns the lengths along x and y of the segments that end in a corner."""
     return np.abs(lines[(lines == corner).all(-1).any(-1)] - corner).max((0, 1))
 
 
 def _chamfered(lines, corner, dx, dy):
-    """Segments with the two that end in a corner cut back by (dx, dy), and a new one between their
-    new ends.
+    """Cuts back the two segments that end in a corner by (dx, dy), and adds one between their new
+    ends.
     """
     x, y = corner
     lines = lines.copy()
@@ -208,7 +204,7 @@ def _chamfered(lines, corner, dx, dy):
 
 
 def holds(region: regions.Region, triangle: list) -> bool:
-    """Whether a corner of one of a region's rectangles is the triangle's first."""
+    """Returns True if the triangle's first corner is a corner of one of the region's rectangles."""
     return bool(triangle) and any(
         triangle[0] in ((x0, y0), (x1, y0), (x1, y1), (x0, y1)) for x0, y0, x1, y1 in region
     )

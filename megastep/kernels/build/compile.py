@@ -1,8 +1,8 @@
-"""Builds the kernels at first use, and loads them.
+"""Builds a program for the CPU or a GPU at first use, and loads it.
 
-The CPU library comes from the system's C++ compiler, the GPU's cubin from NVRTC, which PyTorch's
-CUDA wheels bring along: no nvcc. Either is cached under a hash of sources, flags, compiler and
-processor.
+The CPU library comes from the system's C++ compiler. The GPU's cubin comes from NVRTC, which is
+part of PyTorch's CUDA wheels, so nvcc is not needed. Both are cached under a hash of sources,
+flags, compiler and processor.
 """
 
 import ctypes
@@ -15,16 +15,17 @@ import shutil
 import signal
 import subprocess
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from megastep import cache
+from megastep.kernels.build.program import KERNELS, Program
 
-HERE = Path(__file__).parents[1]
-#: Each is a kernel of this name in two files, one for the GPU and one for the CPU.
-OPERATIONS = tuple(sorted(path.stem for path in HERE.glob("*.cu")))
+__all__ = ["EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"]
+
 CPU_FLAGS = (
     "-std=c++17",
     "-O3",
@@ -37,35 +38,12 @@ CPU_FLAGS = (
     "-shared",
     "-fPIC",
 )
-BLOCK = 64  # threads per block, for the launcher and for the kernels
-CUDA_FLAGS = (
-    "--std=c++17",
-    "--fmad=false",
-    "--prec-div=true",
-    "--prec-sqrt=true",
-    "--ftz=false",
-    "--generate-line-info",
-    f"-DBLOCK={BLOCK}",
-)
-
-
-@dataclass(frozen=True, eq=False)
-class Program:
-    """Kernels for the GPU that are built together: every ``.cu`` and ``.h`` of a folder, which
-    define the operations. Flags are NVRTC's, without the architecture.
-    """
-
-    folder: Path
-    operations: tuple[str, ...]
-    flags: tuple[str, ...]
-
-
-ENGINE = Program(HERE, OPERATIONS, CUDA_FLAGS)
 
 
 class EngineError(RuntimeError):
-    """The machine cannot do this: no compiler, no GPU, no memory, a position that is not a number.
-    The message is one sentence with the cure.
+    """The machine cannot do this: no compiler, no GPU, no memory, a NaN position.
+
+    The message is one sentence and names the cure.
     """
 
 
@@ -73,48 +51,59 @@ def _key(*parts):
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
 
 
-def sources(*suffixes: str, folder: Path = HERE) -> dict[str, str]:
-    """The text of each file of the folder with such a suffix, by name."""
-    return {
-        path.name: path.read_text() for path in sorted(folder.iterdir()) if path.suffix in suffixes
-    }
-
-
 # ---- The CPU ----
 
 
-def _compiler():
-    """The C++ compiler's command, and its version as text."""
-    chosen = os.environ.get("CXX")
-    for command in [chosen] if chosen else ["c++", "g++", "clang++"]:
-        found = shutil.which(command)
-        if found:
-            return found, _run([found, "--version"]).stdout
-    what = f"CXX={chosen} is not a program" if chosen else "none of c++, g++ and clang++ is there"
+@functools.cache
+def cpu(program: Program) -> dict[str, Callable[[bytes], None]]:
+    """Returns a program's operations for the CPU: {name: function of its packed struct}."""
+    if not program.cpu_operations:
+        return {}
+    command, version = compiler()
+    files = program.sources(".h", ".cpp")
+    key = _key(*files, *files.values(), *CPU_FLAGS, command, version, _processor())
+    name = f"cpu-{key}.so"
+    library = _load(name, *cache.fetch(name, lambda: _build_cpu(program, command)))
+    functions = {operation: getattr(library, operation) for operation in program.cpu_operations}
+    for function in functions.values():
+        function.argtypes, function.restype = [ctypes.c_char_p], None
+    return functions
+
+
+def compiler() -> tuple[str, str]:
+    """Returns the C++ compiler's path, and its version as text. ``CXX`` overrides the default."""
+    override = os.environ.get("CXX")
+    for command in [override] if override else ["c++", "g++", "clang++"]:
+        path = shutil.which(command)
+        if path:
+            return path, _run([path, "--version"]).stdout
+    problem = f"CXX={override} is not a program" if override else "c++, g++ and clang++ are missing"
     raise EngineError(
-        f"The CPU engine needs a C++ compiler and {what}: install one (Debian: apt install g++) "
-        f"or set CXX to yours."
+        f"The CPU engine needs a C++ compiler, and {problem}: install one (Debian: apt install "
+        f"g++) or set CXX to yours."
     )
 
 
 def _run(command, **env):
-    """Runs a compiler, apart from the terminal: what Ctrl-C does is for Python's handlers to say.
+    """Runs a compiler in a session of its own, so that Ctrl-C reaches Python's handlers only.
+
     EngineError if a signal stopped it.
     """
-    done = subprocess.run(
+    process = subprocess.run(
         command, capture_output=True, text=True, start_new_session=True, env={**os.environ, **env}
     )
-    by_driver = re.search(r"(\w+) signal terminated program", done.stderr)  # as g++ puts it
-    if done.returncode < 0 or by_driver:
-        name = by_driver[1] if by_driver else signal.Signals(-done.returncode).name
+    by_driver = re.search(r"(\w+) signal terminated program", process.stderr)  # g++'s words
+    if process.returncode < 0 or by_driver:
+        name = by_driver[1] if by_driver else signal.Signals(-process.returncode).name
         raise EngineError(
-            f"{command[0]} was stopped by a signal ({name}) before the CPU engine was built: start "
-            f"again; if no one stopped it, free some memory first."
+            f"{command[0]} was stopped by a signal ({name}) while it built the CPU kernels: start "
+            f"again, and if nobody stopped it, free some memory first."
         )
-    return done
+    return process
 
 
 def _processor():
+    """The CPU's features, which -march=native depends on."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(
@@ -124,28 +113,31 @@ def _processor():
         return platform.machine() + platform.processor()
 
 
-def _build_cpu(compiler):
-    files = [str(path) for path in sorted(HERE.glob("*.cpp"))]
+def _build_cpu(program, command):
+    """Returns a library of all ``.cpp`` files."""
+    files = [str(program.folder / name) for name in program.sources(".cpp")]
     try:
         with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
-            out = Path(folder) / "engine.so"
-            done = _run([compiler, *CPU_FLAGS, *files, "-o", str(out)], TMPDIR=folder)
-            if not done.returncode:
+            out = Path(folder) / "kernels.so"
+            process = _run(
+                [command, *CPU_FLAGS, f"-I{KERNELS}", *files, "-o", str(out)], TMPDIR=folder
+            )
+            if not process.returncode:
                 return out.read_bytes()
     except OSError as error:
         raise EngineError(
-            f"The CPU engine could not be built in {tempfile.gettempdir()} ({error.strerror}): "
+            f"The CPU kernels could not be built in {tempfile.gettempdir()} ({error.strerror}): "
             f"make room there, or set TMPDIR to a folder that has some."
         ) from None
     raise EngineError(
-        f"{compiler} could not build the CPU engine; it needs a C++17 compiler with OpenMP "
-        f"(Debian: apt install g++) and room in {tempfile.gettempdir()}. It said: "
-        f"{' '.join(done.stderr.split())[:500]}"
+        f"{command} could not build the CPU kernels in {program.folder}; it needs C++17, OpenMP "
+        f"(Debian: apt install g++) and room in {tempfile.gettempdir()}. Its output: "
+        f"{' '.join(process.stderr.split())[:500]}"
     )
 
 
 def _load(name, body, path):
-    """The library ``body``, from its cached file or else from a private one that is gone again."""
+    """Loads a library from its cached file or, without a cache, from a temporary copy."""
     if path is not None:
         try:
             return ctypes.CDLL(str(path))
@@ -158,30 +150,48 @@ def _load(name, body, path):
             return ctypes.CDLL(str(copy))
     except OSError as error:
         raise EngineError(
-            f"The CPU engine was built, but cannot be loaded from {tempfile.gettempdir()} "
-            f"({error}): set MEGASTEP_CACHE to a folder of your own, with room, whose mount is not "
-            f"noexec."
+            f"The CPU kernels were built, but cannot be loaded from {tempfile.gettempdir()} "
+            f"({error}): set MEGASTEP_CACHE to a private folder with free space on a mount that is "
+            f"not noexec."
         ) from None
-
-
-@functools.cache
-def cpu():
-    """The CPU backend: operation name -> function of its packed params."""
-    compiler, version = _compiler()
-    parts = (*sources(".h", ".cpp").values(), *CPU_FLAGS, compiler, version, _processor())
-    name = f"cpu-{_key(*parts)}.so"
-    library = _load(name, *cache.fetch(name, lambda: _build_cpu(compiler)))
-    functions = {operation: getattr(library, operation) for operation in OPERATIONS}
-    for function in functions.values():
-        function.argtypes, function.restype = [ctypes.c_char_p], None
-    return functions
 
 
 # ---- The GPU ----
 
 
 @functools.cache
-def bindings():
+def cuda(program: Program, index: int) -> dict[str, Any]:
+    """Returns a program's operations on GPU ``index``: {name: CUfunction}."""
+    if not program.cuda_operations:
+        return {}
+    driver, nvrtc = bindings()
+    major, minor = torch.cuda.get_device_capability(index)
+    files = program.sources(".h", ".cu")
+    flags = (*program.cuda_flags, f"--gpu-architecture=sm_{major}{minor}")
+    try:
+        version = check_status(nvrtc.nvrtcVersion(), "NVRTC")
+    except (RuntimeError, OSError) as error:
+        raise EngineError(
+            f"Kernels on a GPU need NVRTC, which comes with PyTorch's CUDA wheels, and it could "
+            f"not be loaded ({error}): reinstall torch."
+        ) from None
+    cubin, _ = cache.fetch(
+        f"cuda-{_key(*files, *files.values(), *flags, str(version))}.cubin",
+        lambda: _build_cuda(files, flags),
+    )
+    loading = "Loading the GPU's kernels"
+    with torch.cuda.device(index):
+        torch.cuda.current_stream().synchronize()  # makes the device's primary context current
+        module = check_status(driver.cuModuleLoadData(cubin), loading)
+        return {
+            operation: check_status(driver.cuModuleGetFunction(module, operation.encode()), loading)
+            for operation in program.cuda_operations
+        }
+
+
+@functools.cache
+def bindings() -> tuple[Any, Any]:
+    """Returns the modules ``driver`` and ``nvrtc`` of cuda.bindings."""
     try:
         from cuda.bindings import driver, nvrtc
     except ImportError:
@@ -192,69 +202,46 @@ def bindings():
     return driver, nvrtc
 
 
-def checked(result, what):
-    """What a call of cuda.bindings returned beside its status, or an EngineError."""
+def check_status(result: tuple, action: str) -> Any:
+    """Returns what a call of cuda.bindings gave beside its status.
+
+    Raises:
+        EngineError: if the status is an error. ``action`` names what failed.
+    """
     status, *values = result
     if int(status):
         raise EngineError(
-            f"{what} failed with {getattr(status, 'name', status)}; is the NVIDIA driver as new "
-            f"as PyTorch's "
-            f"CUDA {torch.version.cuda}?"
+            f"{action} failed with {getattr(status, 'name', status)}: check that the NVIDIA driver "
+            f"supports CUDA {torch.version.cuda}, which this PyTorch is built for."
         )
     return values[0] if len(values) == 1 else values
 
 
 def _build_cuda(files, flags):
-    """A cubin of all kernels. NVRTC gets every file under its own name, so that its errors, ncu and
-    compute-sanitizer name the file and line: physics.cu:23.
+    """Returns a cubin of all ``.cu`` files.
+
+    NVRTC gets every file under its own name, so its errors, ncu and compute-sanitizer name file and
+    line: physics.cu:23.
     """
     _, nvrtc = bindings()
-    headers = [text.encode() for text in files.values()], [name.encode() for name in files]
-    program = checked(
-        nvrtc.nvrtcCreateProgram(program_of(files).encode(), b"kernels.cu", len(files), *headers),
+    names, texts = [name.encode() for name in files], [text.encode() for text in files.values()]
+    program = check_status(
+        nvrtc.nvrtcCreateProgram(joined(files).encode(), b"kernels.cu", len(files), texts, names),
         "NVRTC",
     )
     (status,) = nvrtc.nvrtcCompileProgram(program, len(flags), [flag.encode() for flag in flags])
     if int(status):
-        log = bytearray(checked(nvrtc.nvrtcGetProgramLogSize(program), "NVRTC"))
+        log = bytearray(check_status(nvrtc.nvrtcGetProgramLogSize(program), "NVRTC"))
         nvrtc.nvrtcGetProgramLog(program, log)
         raise EngineError(
             f"NVRTC could not build the GPU's kernels: {bytes(log).decode(errors='replace')[:2000]}"
         )
-    cubin = bytearray(checked(nvrtc.nvrtcGetCUBINSize(program), "NVRTC"))
-    checked(nvrtc.nvrtcGetCUBIN(program, cubin), "NVRTC")
+    cubin = bytearray(check_status(nvrtc.nvrtcGetCUBINSize(program), "NVRTC"))
+    check_status(nvrtc.nvrtcGetCUBIN(program, cubin), "NVRTC")
     nvrtc.nvrtcDestroyProgram(program)
     return bytes(cubin)
 
 
-def program_of(files: dict[str, str]) -> str:
-    """The program of all ``.cu`` files: it includes each."""
+def joined(files: dict[str, str]) -> str:
+    """Returns a source that includes every ``.cu`` file."""
     return "".join(f'#include "{name}"\n' for name in files if name.endswith(".cu"))
-
-
-@functools.cache
-def cuda(index, program):
-    """A program on GPU ``index``: operation name -> CUfunction."""
-    driver, nvrtc = bindings()
-    major, minor = torch.cuda.get_device_capability(index)
-    files = sources(".h", ".cu", folder=program.folder)
-    flags = (*program.flags, f"--gpu-architecture=sm_{major}{minor}")
-    try:
-        version = checked(nvrtc.nvrtcVersion(), "NVRTC")
-    except (RuntimeError, OSError) as error:
-        raise EngineError(
-            f"Kernels on a GPU need NVRTC, which comes with PyTorch's CUDA wheels, and it could "
-            f"not be loaded ({error}): reinstall torch."
-        ) from None
-    cubin, _ = cache.fetch(
-        f"cuda-{_key(*files.values(), *flags, str(version))}.cubin",
-        lambda: _build_cuda(files, flags),
-    )
-    loading = "Loading the GPU's kernels"
-    with torch.cuda.device(index):
-        torch.cuda.current_stream().synchronize()  # makes the device's primary context current
-        module = checked(driver.cuModuleLoadData(cubin), loading)
-        return {
-            operation: checked(driver.cuModuleGetFunction(module, operation.encode()), loading)
-            for operation in program.operations
-        }

@@ -1,0 +1,98 @@
+"""The intake: turns an observation into a vector.
+
+`...` any leading axes, such as (B,) lanes or (T, B) time and lanes.
+"""
+
+import math
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from megastep import spaces
+from megastep.agents.networks.encoders import make_encoder
+from megastep.agents.networks.precision import compute_dtype
+from megastep.agents.networks.running_norm import RunningNorm
+from megastep.types import Space, Tree
+
+
+class ConcatIntake(nn.Module):
+    """Normalises and encodes every leaf of an observation, concatenates the features, and projects
+    them to (..., width) with a ReLU.
+
+    Initially every leaf has the same weight, however many numbers it has: weights have variance
+    2 / (leaves x features of the leaf), which preserves the size of the inputs (He et al. 2015).
+
+    Args:
+        space: observation space, a leaf or nested dicts.
+        width: number of output features.
+        encoder: encoder of images, a name in `encoders.ENCODERS` or an import path.
+
+    Attributes:
+        n_features: features of all leaves together, before the projection.
+
+    Raises:
+        ValueError: if a space is of an unknown kind, or nothing is observed.
+    """
+
+    def __init__(self, space: Space, width: int, encoder: str = "linear"):
+        super().__init__()
+        leaves = {
+            path: leaf
+            for path, leaf in spaces.leaves(space).items()
+            if not isinstance(leaf, spaces.MultiEmpty)
+        }
+        if not leaves:
+            raise ValueError(f"the observation space {space!r} has nothing in it to encode")
+        self.paths = list(leaves)
+        self.encoders = nn.ModuleList(
+            make_encoder(leaf, encoder, path) for path, leaf in leaves.items()
+        )
+        self.norms = nn.ModuleList(
+            nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else RunningNorm(leaf)
+            for leaf in leaves.values()
+        )
+        sizes = [encoder.n_features for encoder in self.encoders]
+        self.n_features = sum(sizes)
+        # GPUs multiply matrices whose columns are a multiple of 8 several times faster
+        self.n_padding = -self.n_features % 8
+        self.project = nn.Linear(self.n_features + self.n_padding, width)
+        with torch.no_grad():
+            self.project.bias.zero_()
+            blocks = self.project.weight.split([*sizes, self.n_padding], dim=1)
+            blocks[-1].zero_()
+            for block, size in zip(blocks, sizes):
+                block.normal_(std=math.sqrt(2 / (len(sizes) * size)))
+
+    def forward(self, obs: Tree) -> torch.Tensor:
+        features = self._encode_leaves(obs)
+        if self.n_padding:
+            features.append(features[0].new_zeros((*features[0].shape[:-1], self.n_padding)))
+        return F.relu(self.project(torch.cat(features, dim=-1)))
+
+    def encode(self, obs: Tree) -> torch.Tensor:
+        """Returns all leaves, normalised, encoded and concatenated: (..., n_features)."""
+        return torch.cat(self._encode_leaves(obs), dim=-1)
+
+    def _encode_leaves(self, obs):
+        dtype = compute_dtype(self.project.weight)
+        leaves = self._leaves(obs)
+        return [
+            encoder(norm(leaf)).to(dtype)
+            for leaf, norm, encoder in zip(leaves, self.norms, self.encoders, strict=True)
+        ]
+
+    def update_stats(self, obs: Tree, is_counted: torch.Tensor | bool = True) -> None:
+        """Adds observations to the running statistics of the normalisation.
+
+        Args:
+            obs: (B, ...) per leaf.
+            is_counted: () or (B,) bool, lanes to count.
+        """
+        for leaf, norm in zip(self._leaves(obs), self.norms, strict=True):
+            if isinstance(norm, RunningNorm):
+                norm.update_stats(leaf, is_counted)
+
+    def _leaves(self, obs):
+        values = spaces.leaves(obs)
+        return [values[path] for path in self.paths]

@@ -1,0 +1,180 @@
+"""Outputs: turn a vector into actions, by probabilities or by action values.
+
+`...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane
+controls, n choices of each.
+"""
+
+import math
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from megastep import spaces
+from megastep.agents.networks.precision import compute_dtype
+from megastep.arrdict import arrdict
+from megastep.types import Tree
+
+# below the smallest exponential sample in float32, and far from underflow
+_TINY = 1e-20
+
+
+class MultiDiscreteOutput(nn.Module):
+    """One categorical choice out of n per agent.
+
+    Logits are log-probabilities (..., A, n), actions (..., A) int64. `logprob` and `entropy` (...,)
+    belong to the lane's joint action: they are summed over its agents.
+
+    Args:
+        space: action space.
+        width: number of features.
+    """
+
+    def __init__(self, space: spaces.MultiDiscrete, width: int):
+        super().__init__()
+        self.shape = (space.n_agents, space.n_actions)
+        self.linear = nn.Linear(width, math.prod(self.shape))
+        # A hundredth of the usual gain, so that the first policy is almost uniform (Andrychowicz et
+        # al. 2021)
+        nn.init.orthogonal_(self.linear.weight, gain=0.01)
+        nn.init.zeros_(self.linear.bias)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        scores = self.linear(x.to(compute_dtype(self.linear.weight))).float()
+        return scores.unflatten(-1, self.shape).log_softmax(-1)
+
+    def sample(
+        self, logits: torch.Tensor, generator: torch.Generator | None = None
+    ) -> torch.Tensor:
+        """Samples actions by the Gumbel-max trick."""
+        noise = torch.empty_like(logits).exponential_(generator=generator).clamp_(min=_TINY).log_()
+        return (logits - noise).argmax(-1)
+
+    def greedy(self, logits: torch.Tensor) -> torch.Tensor:
+        """Returns the most likely actions."""
+        return logits.argmax(-1)
+
+    def logprob(self, logits: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Returns the log-probability (...,) of actions."""
+        return _gather(logits, actions)
+
+    def entropy(self, logits: torch.Tensor) -> torch.Tensor:
+        """Returns the entropy (...,) in nats."""
+        return -(logits.exp() * logits).sum((-1, -2))
+
+
+class DuellingOutput(nn.Module):
+    """Action values (..., A, n) of a duelling network (Wang et al. 2016): the lane's value plus
+    advantages minus their mean, each behind a hidden layer, in whatever scale a learner fits.
+
+    The action values take the place of `logits`. `sample` is epsilon-greedy: a policy that is
+    always greedy can stand before a wall forever. `action_value` (...,) belongs to the lane's joint
+    action, the sum over its agents (VDN, Sunehag et al. 2018).
+
+    Args:
+        space: action space.
+        width: number of features.
+    """
+
+    epsilon = 0.05
+
+    def __init__(self, space: spaces.MultiDiscrete, width: int):
+        super().__init__()
+        self.shape = (space.n_agents, space.n_actions)
+        self.hidden = nn.Linear(width, 2 * width)
+        self.value = nn.Linear(width, space.n_agents)
+        self.advantage = nn.Linear(width, math.prod(self.shape))
+        # The bias keeps its random initialisation: with zeros, features of 0 would put every ReLU
+        # exactly at its kink.
+        nn.init.orthogonal_(self.hidden.weight, gain=2**0.5)
+        for layer in self.value, self.advantage:
+            nn.init.orthogonal_(layer.weight, gain=0.1)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        hidden = F.relu(self.hidden(x.to(compute_dtype(self.hidden.weight))))
+        # bfloat16 would round large values by more than actions differ
+        with torch.autocast(x.device.type, enabled=False):
+            value, advantage = hidden.float().chunk(2, -1)
+            value = self.value(value)[..., None]
+            advantage = self.advantage(advantage).unflatten(-1, self.shape)
+        return value + advantage - advantage.mean(-1, keepdim=True)
+
+    def sample(
+        self,
+        logits: torch.Tensor,
+        generator: torch.Generator | None = None,
+        epsilon: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Returns the best actions, or random ones with probability epsilon (...,) per lane."""
+        epsilon = self.epsilon if epsilon is None else epsilon[..., None]
+        best = self.greedy(logits)
+        options = dict(generator=generator, device=logits.device)
+        random = torch.randint(logits.shape[-1], best.shape, **options)
+        is_random = torch.rand(best.shape, **options) < epsilon
+        return torch.where(is_random, random, best)
+
+    def greedy(self, logits: torch.Tensor) -> torch.Tensor:
+        """Returns the best actions."""
+        return logits.argmax(-1)
+
+    def logprob(self, logits: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Returns the log-probability (...,) of actions under `sample` with the default epsilon."""
+        n, is_best = logits.shape[-1], actions == self.greedy(logits)
+        return ((1 - self.epsilon) * is_best + self.epsilon / n).log().sum(-1)
+
+    def action_value(self, logits: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Returns the value (...,) of actions."""
+        return _gather(logits, actions)
+
+
+class DictOutput(nn.Module):
+    """Independent outputs by key. Logits and actions are arrdicts with the same keys; `logprob`,
+    `entropy` and `action_value` (...,) are summed over the keys.
+
+    Args:
+        outputs: an output per key of the action space.
+    """
+
+    def __init__(self, outputs: dict[str, nn.Module]):
+        super().__init__()
+        self.outputs = nn.ModuleDict(outputs)
+
+    def forward(self, x: torch.Tensor) -> arrdict:
+        return arrdict({key: output(x) for key, output in self.outputs.items()})
+
+    def sample(
+        self, logits: Tree, generator: torch.Generator | None = None, **options: torch.Tensor
+    ) -> arrdict:
+        """Samples actions, key by key."""
+        return self._map("sample", logits, generator=generator, **options)
+
+    def greedy(self, logits: Tree) -> arrdict:
+        """Returns the most likely or best actions."""
+        return self._map("greedy", logits)
+
+    def logprob(self, logits: Tree, actions: Tree) -> torch.Tensor:
+        """Returns the log-probability (...,) of actions."""
+        return sum(self._map("logprob", logits, actions).values())
+
+    def entropy(self, logits: Tree) -> torch.Tensor:
+        """Returns the entropy (...,) in nats."""
+        return sum(self._map("entropy", logits).values())
+
+    def action_value(self, logits: Tree, actions: Tree) -> torch.Tensor:
+        """Returns the value (...,) of actions."""
+        return sum(self._map("action_value", logits, actions).values())
+
+    def _map(self, method, *trees, **options):
+        """Calls a method of each output with its part of the trees."""
+        return arrdict(
+            {
+                key: getattr(output, method)(*(tree[key] for tree in trees), **options)
+                for key, output in self.outputs.items()
+            }
+        )
+
+
+def _gather(values, actions):
+    """Returns the entries (..., A, n) of the actions (..., A), summed over agents."""
+    return values.gather(-1, actions.long()[..., None]).squeeze(-1).sum(-1)

@@ -1,0 +1,105 @@
+"""Collectors: a policy acts in an environment and fills rollouts.
+
+T time, B lanes.
+"""
+
+import torch
+
+from megastep.agents.storage.rollout import Rollout
+from megastep.agents.types import Actor
+from megastep.arrdict import arrdict
+from megastep.capture import capture
+from megastep.dotdict import leaves
+from megastep.types import Env
+
+_STORED = "obs", "reset", "learns", "privileged"  # what `Rollout.store_world` reads
+
+
+def initial_actor_state(env: Env, policy: Actor, rollout: Rollout) -> arrdict:
+    """Resets an environment and allocates the rollout's metrics.
+
+    Returns the actor state for `collect`: arrdict(world, state), the current world as far as
+    rollouts store it and the hidden state. It shares no memory with the environment.
+    """
+    first = rollout.select_lanes(env.reset())
+    rollout.allocate_metrics(first)
+    world = _stored(first).map(torch.clone)
+    return arrdict(world=world, state=policy.initial(len(world.reset)))
+
+
+@torch.no_grad()
+def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> arrdict:
+    """Fills a rollout: T times act, step, store. Never synchronises, so it can be captured.
+
+    Args:
+        actor_state: of `initial_actor_state` or of the previous `collect`; updated in place.
+
+    Returns:
+        the actor state.
+    """
+    world, state = actor_state["world"], actor_state["state"]
+    rollout.state[:] = state
+    features = []
+    with policy.compute_dtype():
+        for t in range(rollout.n_steps):
+            decision, state = policy(rollout.store_world(t, world), state)
+            rollout.store_decision(t, decision)
+            if rollout.values is not None:
+                features.append(decision["features"])
+            with torch.autocast(rollout.reward.device.type, enabled=False):
+                world = env.step(arrdict(actions=rollout.scatter_actions(decision["actions"])))
+                world = rollout.select_lanes(world)
+            rollout.store_transition(t, world)
+
+        last = rollout.store_world(rollout.n_steps, world)
+        if rollout.values is not None:
+            features.append(policy(last, state, sample=False)[0]["features"])
+            rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
+    # Clear a non-finite hidden state, which would otherwise last until the lane's episode ends.
+    state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))
+    after = arrdict(world=_stored(world), state=state)
+    for target, source in zip(leaves(actor_state), leaves(after), strict=True):
+        target.copy_(source)
+    return actor_state
+
+
+class Collector:
+    """Fills the same rollout again and again. Each call collects T steps and returns the rollout.
+
+    The first call is eager, so that libraries can initialise themselves. From the second call on, a
+    GPU replays a CUDA graph.
+
+    Args:
+        env: environment, which is reset once, here.
+        policy: who acts.
+        rollout: the rollout to fill.
+        actor_state: where to continue instead of resetting the environment.
+
+    Attributes:
+        graph: the captured graph, or None.
+    """
+
+    def __init__(
+        self, env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict | None = None
+    ):
+        self.rollout = rollout
+        if actor_state is None:
+            actor_state = initial_actor_state(env, policy, rollout)
+        self.parts = env, policy, rollout, actor_state
+        self.on_gpu = torch.device(env.device).type == "cuda"
+        self.n_collected = 0
+        self.graph = None
+
+    def __call__(self) -> Rollout:
+        if self.on_gpu and self.n_collected == 1:
+            self.graph = capture(lambda: collect(*self.parts), (), self.parts)
+        self.n_collected += 1
+        if self.graph is None:
+            collect(*self.parts)
+        else:
+            self.graph()
+        return self.rollout
+
+
+def _stored(world):
+    return arrdict({key: world[key] for key in _STORED if key in world})

@@ -1,0 +1,76 @@
+"""Physics: moving agents, with collisions.
+
+N environments, A agents per environment.
+"""
+
+import math
+
+import torch
+
+from megastep.engine import checks
+from megastep.engine.agents import Agents, check_on_cpu
+from megastep.engine.launch_params import (
+    error_flag_address,
+    lanes_of,
+    scenery_params,
+    state_params,
+)
+from megastep.engine.outputs import Physics
+from megastep.engine.scenery import Scenery
+from megastep.kernels.build.launch import ENGINE, WARP, launch
+
+__all__ = ["physics"]
+
+MANY_ENVS = 32_768  # enough to fill a GPU with a quarter of a warp each
+
+
+def physics(
+    scenery: Scenery,
+    agents: Agents,
+    actions: torch.Tensor | None = None,
+    moves: torch.Tensor | None = None,
+    damping: float = 1.0,
+) -> Physics:
+    """Moves the agents by their velocities for 1 / fps seconds, in place.
+
+    An agent stops just before the first wall or agent that it touches, and its velocities become 0.
+
+    Args:
+        actions: (N, A) int64. If given, velocities are first multiplied by ``1 - damping``, and row
+            ``action`` of ``moves`` is added. If None, ``moves`` must be None too.
+        moves: (n_moves, 3) m/s ahead, m/s left, deg/s, added by each action.
+        damping: fraction of the velocities lost per step.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+        EngineError: on the CPU, if a position is NaN or an action is out of range. On a GPU,
+            :func:`~megastep.engine.check` raises it later.
+    """
+    n, a = lanes = lanes_of(scenery, agents)
+    checks.number("damping", damping, -math.inf, math.inf)
+    device = scenery.device
+    if actions is None and moves is None:
+        n_moves = actions_at = moves_at = 0
+    else:
+        actions_at = checks.address("actions", actions, lanes, torch.int64, device)
+        n_moves = checks.length("moves", moves)
+        if not n_moves:
+            raise ValueError("moves must have one row per action, but it has none")
+        moves_at = checks.address("moves", moves, (n_moves, 3), torch.float32, device)
+    progress = torch.empty(lanes, device=device)
+    threads_per_env = 8 if n > MANY_ENVS else WARP
+    packed = ENGINE.params.PhysicsParams(
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+        progress=progress.data_ptr(),
+        error_flag=error_flag_address(scenery, agents),
+        actions=actions_at,
+        moves=moves_at,
+        n_moves=n_moves,
+        retained=1 - damping,
+        seconds=1 / agents.fps,
+        threads_per_env=threads_per_env,
+    )
+    launch(ENGINE, "physics", packed, device, threads=threads_per_env * n)
+    check_on_cpu(agents)
+    return Physics(progress)

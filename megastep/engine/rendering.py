@@ -1,0 +1,178 @@
+"""Rendering: what cameras see, at full resolution or as observations for training.
+
+N environments, A agents per environment, C cameras per agent (the axis is dropped if there is one),
+R rays per camera, P = R / subsample pixels.
+"""
+
+import math
+
+import torch
+
+from megastep.engine import checks
+from megastep.engine.agents import Agents, check_on_cpu
+from megastep.engine.launch_params import (
+    error_flag_address,
+    lanes_of,
+    scenery_params,
+    state_params,
+)
+from megastep.engine.outputs import Observation, Render
+from megastep.engine.scenery import Scenery
+from megastep.engine.texels import texel_bits
+from megastep.kernels.build.launch import ENGINE, WARP, launch
+
+__all__ = ["observe", "render", "update_agent_geometry"]
+
+MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
+NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
+
+# RenderParams' optional outputs and what only they need. 0 is null: not wanted.
+_OPTIONAL = dict.fromkeys(
+    (
+        *("indices", "locations", "dots", "distances", "screen"),
+        *("rgb", "depth", "centre_line", "agent_ray", "velocity", "angvelocity", "imu"),
+        *("seen", "clear_mask", "newly_seen", "n_words"),
+    ),
+    0,
+)
+
+
+def update_agent_geometry(scenery: Scenery, agents: Agents, lit: bool = True) -> None:
+    """Moves the agents' lines to their current poses, and computes the light on them if ``lit``."""
+    n, a = lanes_of(scenery, agents)
+    packed = ENGINE.params.UpdateAgentGeometryParams(
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles"),
+        error_flag=error_flag_address(scenery, agents),
+        lit=int(checks.flag("lit", lit)),
+    )
+    launch(ENGINE, "update_agent_geometry", packed, scenery.device, threads=WARP * n * a)
+    check_on_cpu(agents)
+
+
+def render(scenery: Scenery, agents: Agents) -> Render:
+    """Renders every camera at full resolution, for people and tests.
+
+    Also updates the agents' lines in ``scenery``. Training uses :func:`observe`, which is faster.
+    """
+    update_agent_geometry(scenery, agents)
+    device, shape = scenery.device, (*_per_camera(lanes_of(scenery, agents), agents), agents.res)
+    out = Render(
+        indices=torch.empty(shape, dtype=torch.int32, device=device),
+        locations=torch.empty(shape, device=device),
+        dots=torch.empty(shape, device=device),
+        distances=torch.empty(shape, device=device),
+        screen=torch.empty((*shape, 3), device=device),
+    )
+    _render(scenery, agents, **out._asdict())
+    return out
+
+
+def observe(
+    scenery: Scenery,
+    agents: Agents,
+    subsample: int = 1,
+    rgb: bool = True,
+    depth: bool = True,
+    imu: bool = False,
+    centre_line: bool = False,
+    agent_ray: bool = False,
+    seen: torch.Tensor | None = None,
+    clear_mask: torch.Tensor | None = None,
+    max_depth: float = 10.0,
+) -> Observation:
+    """Renders what training needs, in one pass and without full-resolution tensors.
+
+    Equals :func:`render` followed by the sensors of :mod:`~megastep.modules`. With one agent per
+    environment, ``scenery.lines`` is not updated.
+
+    Args:
+        subsample: rays per pixel, a divisor of ``agents.res``; at most 32.
+        rgb, depth, imu, centre_line, agent_ray: which fields of :class:`Observation` to compute.
+        seen: (N, A, n_words) int32, one bit per static texel of the environment's layout. Texels in
+            view are marked in place and counted in ``newly_seen``.
+        clear_mask: (N, A) bool, agents whose ``seen`` is cleared first.
+        max_depth: metres beyond the agent's radius at which depth reads 0.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    n, a = lanes = lanes_of(scenery, agents)
+    device = scenery.device
+    if agents.res % checks.integer("subsample", subsample, 1, MAX_SUBSAMPLE):
+        raise ValueError(
+            f"subsample must divide the {agents.res} rays of a camera, but {subsample} was given"
+        )
+    checks.number("max_depth", max_depth, 0, math.inf, "metres")
+    wanted = dict(rgb=rgb, depth=depth, imu=imu, centre_line=centre_line, agent_ray=agent_ray)
+    for name, value in wanted.items():
+        checks.flag(name, value)
+    seen_fields = {}
+    if seen is not None or clear_mask is not None:
+        seen_fields = _seen_fields(scenery, seen, clear_mask)
+    if a > 1:
+        update_agent_geometry(scenery, agents, lit=rgb)
+    shape, pixels = _per_camera(lanes, agents), agents.res // subsample
+    half, int32 = torch.float16, torch.int32
+    out = Observation(
+        rgb=torch.empty((*shape, 3, pixels), dtype=half, device=device) if rgb else None,
+        depth=torch.empty((*shape, pixels), dtype=half, device=device) if depth else None,
+        centre_line=torch.empty(shape, dtype=int32, device=device) if centre_line else None,
+        agent_ray=torch.empty(shape, dtype=int32, device=device) if agent_ray else None,
+        imu=torch.empty((n, a, 3), dtype=half, device=device) if imu else None,
+        newly_seen=torch.empty(lanes, dtype=int32, device=device) if seen_fields else None,
+    )
+    moving = state_params(scenery, agents, "velocity", "angvelocity") if imu else {}
+    _render(scenery, agents, subsample, max_depth, **moving, **seen_fields, **out._asdict())
+    return out
+
+
+def _per_camera(lanes, agents):
+    return lanes if agents.n_cameras == 1 else (*lanes, agents.n_cameras)
+
+
+def _seen_fields(scenery, seen, clear_mask):
+    """RenderParams' fields about the texels seen."""
+    lanes, mask = (scenery.n_envs, scenery.n_agents), 0
+    if seen is None:
+        raise ValueError("clear_mask clears seen, but seen was not given")
+    if clear_mask is not None:
+        mask = checks.address("clear_mask", clear_mask, lanes, torch.bool, scenery.device)
+    address, n_words = texel_bits(scenery, "seen", seen, lanes)
+    return dict(seen=address, clear_mask=mask, n_words=n_words)
+
+
+def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
+    res, device = agents.res, scenery.device
+    half_width = math.tan(math.radians(agents.fov / 2))
+    fields = {
+        name: value.data_ptr() if isinstance(value, torch.Tensor) else value
+        for name, value in outputs.items()
+        if value is not None
+    }
+    packed = ENGINE.params.RenderParams(
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles"),
+        yaws=checks.address("agents.yaws", agents.yaws, (agents.n_cameras,), torch.float32, device),
+        ray_lengths=checks.address(
+            "agents.ray_lengths", agents.ray_lengths, (res,), torch.float32, device
+        ),
+        error_flag=error_flag_address(scenery, agents),
+        n_cameras=agents.n_cameras,
+        res=res,
+        half_width=half_width,
+        edge=half_width * (res - 1) / res,
+        pitch=2 * half_width / res,
+        centre=res / 2 - 0.5,
+        scale=res / (2 * half_width),
+        near=0.99 * agents.radius * math.cos(math.radians(agents.fov / 2)),
+        subsample=subsample,
+        n_pixels=res // subsample,
+        inv_subsample=1 / subsample,
+        inv_max_depth=1 / max_depth,
+        **{**_OPTIONAL, **fields},
+    )
+    shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)
+    threads = WARP * scenery.n_envs * scenery.n_agents
+    launch(ENGINE, "render", packed, device, threads, shared)
+    check_on_cpu(agents)

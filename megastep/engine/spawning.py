@@ -1,0 +1,104 @@
+"""Random numbers and spawning, from a counter-based generator: Philox 4x32-10.
+
+N environments, A agents per environment, D layouts, B lanes.
+"""
+
+import torch
+
+from megastep.engine import checks
+from megastep.engine.agents import Agents, check_on_cpu
+from megastep.engine.devices import threads
+from megastep.engine.launch_params import (
+    error_flag_address,
+    lanes_of,
+    scenery_params,
+    seed_params,
+    state_params,
+)
+from megastep.engine.scenery import Scenery
+from megastep.kernels.build.launch import ENGINE, WARP, launch
+
+__all__ = ["spawn", "uniform"]
+
+
+def spawn(
+    scenery: Scenery,
+    agents: Agents,
+    mask: torch.Tensor,
+    points: torch.Tensor,
+    counts: torch.Tensor,
+    seed: int,
+    resample: bool = False,
+    hidden: bool = False,
+    point_index: torch.Tensor | None = None,
+) -> None:
+    """Puts agents at random points of their environment's layout, at rest, with random headings.
+
+    Args:
+        mask: (N, A) bool, agents to respawn.
+        points: (D, n, 2) metres. Each agent of an environment has its own n / A of them.
+        counts: (N, A) int32, numbers drawn so far. Each respawned agent's is advanced by one.
+        seed: the generator's key.
+        resample: if all agents of an environment respawn, move it to a random layout first.
+        hidden: choose a point where no other agent of the environment sees the new one, except
+            through gaps narrower than an agent's radius. If there is none, take the point furthest
+            from its nearest agent. Agents respawn one after the other and avoid those before them.
+        point_index: (N, A) int32, receives the index of each respawned agent's point.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    lanes, device, n_layouts = lanes_of(scenery, agents), scenery.device, len(scenery.layouts)
+    n_points = checks.length("points", points, axis=1)
+    if n_points < scenery.n_agents:
+        raise ValueError(
+            f"points must have at least one per agent in each layout, so {scenery.n_agents}, but "
+            f"{n_points} were given"
+        )
+    point_index_at = 0
+    if point_index is not None:
+        point_index_at = checks.address("point_index", point_index, lanes, torch.int32, device)
+    packed = ENGINE.params.SpawnParams(
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
+        mask=checks.address("mask", mask, lanes, torch.bool, device),
+        points=checks.address("points", points, (n_layouts, n_points, 2), torch.float32, device),
+        counts=checks.address("counts", counts, lanes, torch.int32, device),
+        point_index=point_index_at,
+        error_flag=error_flag_address(scenery, agents),
+        **seed_params(seed),
+        n_points=n_points,
+        resample=int(checks.flag("resample", resample)),
+    )
+    if checks.flag("hidden", hidden):
+        launch(ENGINE, "spawn_hidden", packed, device, threads=WARP * scenery.n_envs)
+    else:
+        launch(ENGINE, "spawn", packed, device, threads=scenery.n_envs)
+    check_on_cpu(agents)
+
+
+def uniform(counts: torch.Tensor, mask: torch.Tensor, seed: int, out: torch.Tensor) -> torch.Tensor:
+    """Draws four uniform numbers in [0, 1) for each masked lane.
+
+    Args:
+        counts: (B,) int32, numbers drawn so far: with the lane, the generator's counter. Advanced
+            by one where ``mask``.
+        mask: (B,) bool, lanes that draw.
+        seed: the generator's key.
+        out: (B, 4) float32, written where ``mask``.
+
+    Returns:
+        ``out``.
+    """
+    n, device = checks.length("counts", counts), counts.device
+    packed = ENGINE.params.UniformParams(
+        counts=checks.address("counts", counts, (n,), torch.int32, device),
+        mask=checks.address("mask", mask, (n,), torch.bool, device),
+        out=checks.address("out", out, (n, 4), torch.float32, device),
+        **seed_params(seed),
+        n_lanes=n,
+        n_threads=threads(),
+    )
+    launch(ENGINE, "uniform", packed, device, threads=n)
+    counts.add_(mask)
+    return out

@@ -1,0 +1,41 @@
+"""Members that the environments share."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from megastep import engine
+from megastep.arrdict import arrdict, numpyify
+from megastep.core import Core
+
+__all__ = ["DisplayedEnv", "SceneryEnv"]
+
+
+class DisplayedEnv:
+    """An environment that is drawn by its own ``state(e)`` and ``plot_state(state)``."""
+
+    plot_state: Callable[..., Any]
+    state: Callable[..., arrdict]
+
+    def display(self, e: int = 0) -> Any:
+        """Draws environment ``e`` as it is now. Returns a matplotlib figure."""
+        return self.plot_state(numpyify(self.state(e)))
+
+
+class SceneryEnv(DisplayedEnv):
+    """An environment built around a :class:`~megastep.core.Core`, its attribute ``core``."""
+
+    core: Core
+
+    def check(self) -> None:
+        """Raises EngineError if the engine flagged an error on the device since the last check.
+
+        Synchronises host and device, so do not call it from ``step``.
+        """
+        engine.check(self.core.agents)
+
+    @property
+    def layout(self) -> torch.Tensor:
+        """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
+        return self.core.scenery.layout

@@ -1,0 +1,37 @@
+// The parameters of each launch, passed by value; see megastep/kernels/params.h.
+//
+// N environments, A agents per environment, M lines of the agent model.
+#pragma once
+
+struct DeathmatchStepParams {
+    const int* centre_line;  // (N, A) line at the centre of each view, as Render.indices
+    const int* agent_ray;    // (N, A) ray closest to the centre that hits an agent, or -1
+    const float* positions;  // (N, A, 2) for privileged
+    const float* angles;     // (N, A) for privileged
+    float* health;           // (N, A) in and out, as the next three: from 0 to 1
+    float* tally;            // (TALLY_ROWS, N, A) of the episode so far: kills, damage, hits
+    int* ages;               // (N, A) steps since the first observation
+    unsigned char* ended;    // (N, A) in: starts an episode in this step; out: ends it in this step
+    float* reward;           // (N, A) out, as the next six
+    unsigned char* reset;    // (N, A)
+    unsigned char* terminal;   // (N, A)
+    unsigned char* truncated;  // (N, A)
+    float* metrics;  // (4, N, A) kills, deaths, damage, accuracy where an episode ends; else 0
+    unsigned short* health_obs;  // (N, A, 3) fp16: health, whether it hit, how many hit it
+    float* privileged;     // (N, A, 1 + PRIVILEGED_PER_OPPONENT (A - 1)) for a critic; null: none
+    float damage;          // health that a hit costs its target
+    float recovery;        // health regained in a step without a wound
+    float drain;           // health lost in every step
+    float health_per_hit;  // health gained by an agent that hits
+    float hit_reward;
+    float wound_cost;
+    float kill_reward;
+    float death_cost;
+    float aim_reward;  // for an agent at the centre of the view, falling to 0 at the edge
+    int limit;         // steps per episode
+    int res;           // rays per view
+    int n_envs;        // N
+    int n_agents;      // A
+    int n_model;       // M
+    int n_threads;     // CPU threads
+};

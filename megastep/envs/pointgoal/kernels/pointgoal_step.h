@@ -1,0 +1,142 @@
+// One step of PointGoal. Computes an agent's distance and bearing to its goal, rewards, and where
+// episodes start and end. An agent that starts an episode draws a goal first.
+#pragma once
+#include "common/errors.h"
+#include "common/philox.h"
+#include "common/scenery.h"
+#include "constants.h"
+#include "params.h"
+
+// Metres to a goal by the shortest path, at the centres of square cells.
+struct Field {
+    const unsigned short* cells;  // fp16
+    int height, width;
+    float x, y;  // the centre of the first cell
+};
+
+// A field's value at a point, and its gradient per metre.
+struct Reading {
+    float distance, gradient_x, gradient_y;
+};
+
+// Interpolates a field between the centres of four cells. A cell from which the goal cannot be
+// reached holds infinity and is left out. If all four do, the distance is infinite.
+HD Reading read_field(const Field& f, float per_cell, float x, float y) {
+    float u = (x - f.x) * per_cell, v = (y - f.y) * per_cell;
+    int column = (int)clamp(u, 0.f, (float)(f.width - 2));
+    int row = (int)clamp(v, 0.f, (float)(f.height - 2));
+    float right = clamp(u - (float)column, 0.f, 1.f), up = clamp(v - (float)row, 0.f, 1.f);
+    float weight[4] = {(1.f - right) * (1.f - up), right * (1.f - up), (1.f - right) * up,
+                       right * up};
+    float value[4], total = 0.f, weighted = 0.f, sum = 0.f;
+    int n_known = 0;
+    for (int i = 0; i < 4; i++) {
+        value[i] = HALF_VALUE(f.cells[(long long)(row + i / 2) * f.width + column + i % 2]);
+        if (is_finite(value[i])) {
+            weighted += weight[i] * value[i];
+            total += weight[i];
+            sum += value[i];
+            n_known++;
+        }
+    }
+    if (!n_known)
+        return {INF_VALUE, 0.f, 0.f};
+    float distance = total > 0.f ? weighted / total : sum / (float)n_known;
+    for (int i = 0; i < 4; i++)
+        value[i] = is_finite(value[i]) ? value[i] : distance;
+    return {distance, mix(value[1] - value[0], value[3] - value[2], up) * per_cell,
+            mix(value[2] - value[0], value[3] - value[1], right) * per_cell};
+}
+
+// `index` if it is in [0, n), else 0 and an error flag.
+HD int checked_index(int index, int n, int* error_flag, int env) {
+    if ((unsigned int)index < (unsigned int)n)
+        return index;
+    flag_error(error_flag, env, BAD_GOAL);
+    return 0;
+}
+
+// Draws a goal within range of the spawn point. Returns the length of the shortest path to it.
+HD float draw_goal(const PointgoalStepParams& p, int agent, int env, int layout) {
+    Philox bits = philox((unsigned int)agent, (unsigned int)p.n_draws[agent]++, p.key0, p.key1);
+    int spawn = checked_index(p.spawn_index[agent], p.n_spawns, p.error_flag, env);
+    long long row = (long long)layout * p.n_spawns + spawn;
+    int column = (int)(unit_float(bits.a) * (float)p.n_in_range[row]);
+    int goal = p.in_range[row * p.n_goals + column];
+    p.goal_index[agent] = goal;
+    return p.lengths[row * p.n_goals + goal];
+}
+
+HD float ratio(float part, float whole) { return part / maxf(whole, 1e-3f); }
+
+// Writes the metrics of an episode that ends, else zeros: success, success weighted by path length
+// (SPL, Anderson et al. 2018), the same with the fraction of the distance covered in place of
+// success (soft SPL, Datta et al. 2020), collisions.
+HD void write_metrics(const PointgoalStepParams& p, int agent, int n, int ends, int success) {
+    const float* progress = p.progress + agent;
+    long long rows = n;
+    float shortest = progress[SHORTEST * rows];
+    float efficiency = ratio(shortest, maxf(shortest, progress[WALKED * rows]));
+    float covered =
+        clamp(1.f - ratio(progress[DISTANCE * rows], progress[START_DISTANCE * rows]), 0.f, 1.f);
+    p.metrics[agent] = ends && success ? 1.f : 0.f;
+    p.metrics[rows + agent] = ends && success ? efficiency : 0.f;
+    p.metrics[2 * rows + agent] = ends ? (success ? 1.f : covered) * efficiency : 0.f;
+    p.metrics[3 * rows + agent] = ends ? progress[COLLISIONS * rows] : 0.f;
+}
+
+// One step of one agent.
+HD void pointgoal_agent(const PointgoalStepParams& p, int agent) {
+    const SceneryParams& s = p.scenery;
+    int env = agent / s.n_agents, layout = layout_of(s, env, p.error_flag);
+    int n = s.n_envs * s.n_agents, reset = p.ended[agent];
+    long long rows = n;
+    float* progress = p.progress + agent;
+    float x = p.positions[2 * agent], y = p.positions[2 * agent + 1];
+    flag_nonfinite(p.error_flag, env, x, y, p.angles[agent]);
+    Pose pose = pose_at(x, y, p.angles[agent]);
+    if (reset)
+        progress[SHORTEST * rows] = draw_goal(p, agent, env, layout);
+
+    int goal = checked_index(p.goal_index[agent], p.n_goals, p.error_flag, env);
+    const float* goal_at = p.points + 2 * ((long long)layout * p.n_goals + goal);
+    float dx = goal_at[0] - x, dy = goal_at[1] - y, straight = SQRT(dx * dx + dy * dy);
+    float ahead = pose.cosine * dx + pose.sine * dy, left = pose.cosine * dy - pose.sine * dx;
+    unsigned short* goal_obs = p.goal_obs + 3 * (long long)agent;
+    goal_obs[0] = HALF_BITS(straight * 0.1f);
+    goal_obs[1] = HALF_BITS(straight > 0.f ? ahead / straight : 1.f);
+    goal_obs[2] = HALF_BITS(straight > 0.f ? left / straight : 0.f);
+
+    int height = p.shapes[2 * layout], width = p.shapes[2 * layout + 1];
+    Field field = {p.fields + p.starts[layout] + (long long)goal * height * width, height, width,
+                   p.origins[2 * layout], p.origins[2 * layout + 1]};
+    Reading reading = read_field(field, p.per_cell, x, y);
+    float before = progress[DISTANCE * rows];
+    float distance = is_finite(reading.distance) ? reading.distance : before;
+    float moved_x = x - progress[PREVIOUS_X * rows], moved_y = y - progress[PREVIOUS_Y * rows];
+    float moved = SQRT(moved_x * moved_x + moved_y * moved_y);
+    float hit = p.free && p.free[agent] < 1.f ? 1.f : 0.f;
+    progress[PREVIOUS_X * rows] = x;
+    progress[PREVIOUS_Y * rows] = y;
+    progress[DISTANCE * rows] = distance;
+    progress[START_DISTANCE * rows] = reset ? distance : progress[START_DISTANCE * rows];
+    progress[WALKED * rows] = reset ? 0.f : progress[WALKED * rows] + moved;
+    progress[COLLISIONS * rows] = reset ? 0.f : progress[COLLISIONS * rows] + hit;
+
+    int age = reset ? 0 : p.ages[agent] + 1, success = straight <= p.reach;
+    int ends = !reset && (success || age >= p.limit);
+    p.reward[agent] = reset ? 0.f : before - distance + (success ? p.bonus : 0.f) - p.cost;
+    p.reset[agent] = (unsigned char)reset;
+    p.terminal[agent] = (unsigned char)(ends && success);
+    p.truncated[agent] = (unsigned char)(ends && !success);
+    p.ended[agent] = (unsigned char)ends;
+    p.ages[agent] = age;
+    write_metrics(p, agent, n, ends, success);
+    if (p.privileged) {
+        float* privileged = p.privileged + N_PRIVILEGED * (long long)agent;
+        privileged[0] = distance * 0.1f;
+        privileged[1] = -(pose.cosine * reading.gradient_x + pose.sine * reading.gradient_y);
+        privileged[2] = -(pose.cosine * reading.gradient_y - pose.sine * reading.gradient_x);
+        privileged[3] = (float)(p.limit - age) / (float)p.limit;
+    }
+}

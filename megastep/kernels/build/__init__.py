@@ -1,0 +1,5 @@
+"""Builds folders of C++ and CUDA kernels at first use, and launches them.
+
+A folder is a :class:`~megastep.kernels.build.program.Program`;
+:func:`~megastep.kernels.build.launch.launch` runs one of its operations.
+"""

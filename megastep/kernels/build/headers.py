@@ -1,0 +1,99 @@
+"""Reads a program's headers, so that structs, constants and operations are declared in one place.
+
+Three kinds of declarations are recognised:
+
+* structs whose names end in ``Params``, one field per line: ``const float* positions;``
+* constants in files called ``constants.h``, one per line: ``constexpr int MAX_RES = 1024;``
+* operations: ``KERNEL render(RenderParams p)``
+"""
+
+import re
+import struct
+from collections.abc import Callable, Mapping
+
+__all__ = ["constants", "operations", "packer", "struct_fields"]
+
+FORMATS = {"int": "i", "float": "f", "unsigned int": "I"}  # characters of the module struct
+CONSTANT = re.compile(r"constexpr (int|float) (\w+) = (-?\d[\d.e-]*)f?;")
+OPERATION = re.compile(r"^KERNEL\s+(?:BOUNDS\(\d+\)\s+)?(\w+)\((?:const\s+)?(\w+)", re.M)
+STRUCT = re.compile(r"^struct (\w+Params) \{(.*?)^\};", re.M | re.S)
+FIELD = re.compile(r"([\w ]+?)\s*(\*?)\s+(\w+)")
+
+Fields = list[tuple[str, str]]  # (name, format of the module struct)
+
+
+def struct_fields(sources: Mapping[str, str]) -> dict[str, Fields]:
+    """Returns the fields of every struct ``...Params`` in the headers ``sources`` {name: text}.
+
+    A struct that is a field of another must be declared before it.
+
+    Raises:
+        ValueError: if a field has a type that cannot be packed.
+    """
+    structs, formats = {}, dict(FORMATS)
+    for header, text in sources.items():
+        for name, body in STRUCT.findall(_without_comments(text)):
+            structs[name] = [_field(line, formats, header) for line in body.split(";")[:-1]]
+            formats[name] = f"0P{packer(structs[name]).size}s"
+    return structs
+
+
+def _field(line, formats, header):
+    match = FIELD.fullmatch(line.strip())
+    kind = match and match[1].replace("const", "").strip()
+    if not match or not (match[2] or kind in formats):
+        raise ValueError(
+            f"{header}: cannot pack the field '{' '.join(line.split())}'. A field is a pointer, "
+            f"an int, an unsigned int, a float or a struct ...Params declared above."
+        )
+    return match[3], "P" if match[2] else formats[kind]
+
+
+def packer(fields: Fields) -> struct.Struct:
+    """Returns the packer of a struct, with the memory layout that a C++ compiler gives it."""
+    # "0P" at the end pads to a pointer's alignment, as a compiler does if the struct holds one.
+    end = "0P" if any(kind[-1] in "Ps" for _, kind in fields) else ""
+    return struct.Struct("".join(kind for _, kind in fields) + end)
+
+
+def builder(name: str, fields: Fields) -> Callable[..., bytes]:
+    """Returns a function ``name`` of keyword arguments, one per field, that packs the struct.
+
+    All fields must be given: Python itself names one that is missing or misspelt.
+    """
+    names = ", ".join(field for field, _ in fields)
+    function = eval(f"lambda *, {names}: pack({names})", {"pack": packer(fields).pack})
+    function.__name__ = function.__qualname__ = name
+    return function
+
+
+def constants(sources: Mapping[str, str]) -> dict[str, int | float]:
+    """Returns the constants of all files called ``constants.h``.
+
+    Raises:
+        ValueError: if one is not a plain number, or two have the same name.
+    """
+    numbers = {}
+    for header, text in sources.items():
+        if header.rpartition("/")[2] != "constants.h":
+            continue
+        for line in _without_comments(text).splitlines():
+            if not line.startswith("constexpr"):
+                continue
+            match = CONSTANT.fullmatch(line.strip())
+            if not match or match[2] in numbers:
+                raise ValueError(
+                    f"{header}: cannot read '{line.strip()}'. Write one constant per line, under a "
+                    f"name of its own, as a plain int or float: constexpr int MAX_RES = 1024;"
+                )
+            numbers[match[2]] = {"int": int, "float": float}[match[1]](match[3])
+    return numbers
+
+
+def operations(sources: Mapping[str, str]) -> dict[str, str]:
+    """Returns {operation: name of its struct} for the KERNELs that these sources define."""
+    return dict(pair for text in sources.values() for pair in OPERATION.findall(text))
+
+
+def _without_comments(text):
+    return re.sub(r"//.*", "", text)

@@ -1,0 +1,74 @@
+"""A folder of kernels as a program for the CPU and the GPU."""
+
+from functools import cached_property
+from pathlib import Path
+from types import SimpleNamespace
+
+from megastep.kernels.build import headers
+
+__all__ = ["CUDA_FLAGS", "KERNELS", "Program"]
+
+#: The folder of the engine's kernels. Its headers in ``common/`` are for all programs.
+KERNELS = Path(__file__).parents[1]
+#: NVRTC's flags, without the architecture. No fused multiply-adds and IEEE division, so that the
+#: GPU computes the same bits as the CPU.
+CUDA_FLAGS = (
+    "--std=c++17",
+    "--fmad=false",
+    "--prec-div=true",
+    "--prec-sqrt=true",
+    "--ftz=false",
+    "--generate-line-info",
+)
+
+
+class Program:
+    """The kernels in one folder, which are built together when one is first launched.
+
+    The folder holds one ``.cpp`` file per operation for the CPU, one ``.cu`` file for the GPU, or
+    both; headers; ``params.h``, which declares the struct of each launch; and ``constants.h`` if
+    the kernels share constants with Python. Sources include the folder's headers by name and the
+    common ones as ``"common/errors.h"``. What is recognised in headers:
+    :mod:`~megastep.kernels.build.headers`.
+
+    Args:
+        folder: where the sources are.
+        cuda_flags: NVRTC's flags, without the architecture.
+
+    Attributes:
+        params: a function for each struct; ``params.RenderParams(res=64, ...)`` packs one. All
+            fields are required keyword arguments. A pointer is a tensor's address, or 0 for null.
+        constants: {name: number} from ``constants.h``, the folder's and the common one.
+        sizes: {struct: bytes}.
+        cpu_operations: {operation: struct} of the ``.cpp`` files.
+        cuda_operations: {operation: struct} of the ``.cu`` files.
+    """
+
+    def __init__(self, folder: Path | str, cuda_flags: tuple[str, ...] = CUDA_FLAGS):
+        self.folder, self.cuda_flags = Path(folder), cuda_flags
+        structs = headers.struct_fields(self.sources(".h"))
+        self.params = SimpleNamespace(
+            **{name: headers.builder(name, fields) for name, fields in structs.items()}
+        )
+        self.sizes = {name: headers.packer(fields).size for name, fields in structs.items()}
+        self.constants = headers.constants(self.sources(".h"))
+
+    def __repr__(self):
+        return f"Program({str(self.folder)!r})"
+
+    @cached_property
+    def cpu_operations(self) -> dict[str, str]:
+        return headers.operations(self.sources(".cpp"))
+
+    @cached_property
+    def cuda_operations(self) -> dict[str, str]:
+        return headers.operations(self.sources(".cu"))
+
+    def sources(self, *suffixes: str) -> dict[str, str]:
+        """Returns the text of the files with these suffixes, by the name that includes them.
+
+        The common headers come first, as ``common/...``; then the folder's own files.
+        """
+        files = {f"common/{path.name}": path for path in sorted((KERNELS / "common").iterdir())}
+        files |= {path.name: path for path in sorted(self.folder.iterdir())}
+        return {name: path.read_text() for name, path in files.items() if path.suffix in suffixes}

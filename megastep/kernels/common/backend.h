@@ -1,0 +1,19 @@
+// Macros that are spelt differently on the CPU and on the GPU:
+//   KERNEL         declares an operation that Python can launch
+//   HD             declares a function for both
+//   ALIGNED, LOAD  16-byte records, and reading one in one instruction
+//   OR_BITS, ADD   update a word that other threads may update too
+//   COUNT_BITS     number of bits set
+//   HALF_BITS, HALF_VALUE          between float and fp16
+//   NAN_VALUE, INF_VALUE
+//   SQRT, CEIL, FLOOR, RINT        of a float, correctly rounded
+//   RECIPROCAL     correctly rounded if argument and result are normal floats, else undefined
+//
+// CPU and GPU agree on every bit. That takes no fused multiply-add (a compiler flag on either
+// side), IEEE division and square root, and our own sine and cosine.
+#pragma once
+#ifdef __CUDACC__
+#include "common/backend_cuda.h"
+#else
+#include "common/backend_cpu.h"
+#endif

@@ -1,0 +1,54 @@
+// The macros of backend.h on the GPU.
+#pragma once
+#include "common/constants.h"
+
+#define HD static __device__ __forceinline__
+#define DEVICE static __device__ __forceinline__
+#define KERNEL extern "C" __global__ void
+// Blocks that a multiprocessor should hold at once. With 64 threads each, 24 blocks leave a thread
+// 40 of its 65,536 registers, and 20 leave it 48.
+#define BOUNDS(n_blocks) __launch_bounds__(BLOCK, n_blocks)
+#define ALIGNED __align__(16)
+#define SQRT(x) sqrtf(x)
+#define CEIL(x) ceilf(x)
+#define FLOOR(x) floorf(x)
+#define RINT(x) rintf(x)
+#define RECIPROCAL(x) reciprocal(x)
+#define LOAD(address) load(address)
+#define OR_BITS(word, bits) atomicOr(word, bits)
+#define ADD(word, number) atomicAdd(word, number)
+#define COUNT_BITS(word) __popc(word)
+#define HALF_BITS(x) half_bits(x)
+#define HALF_VALUE(bits) half_value(bits)
+#define NAN_VALUE __int_as_float(0x7fc00000)
+#define INF_VALUE __int_as_float(0x7f800000)
+
+constexpr unsigned int FULL_WARP = ~0u;
+
+// The hardware's approximation and one Newton step with fused multiply-adds. IEEE division does the
+// same, then handles overflow and subnormals.
+DEVICE float reciprocal(float x) {
+    float r;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(x));
+    return __fmaf_rn(r, __fmaf_rn(-x, r, 1.f), r);
+}
+
+// Reads 16 bytes at once from memory that no thread writes during the launch.
+template <class T>
+DEVICE T load(const T* address) {
+    float4 bits = __ldg((const float4*)address);
+    return *(T*)&bits;
+}
+
+// fp16 without cuda_fp16.h: NVRTC then needs no include folder.
+DEVICE unsigned short half_bits(float x) {
+    unsigned short bits;
+    asm("cvt.rn.f16.f32 %0, %1;" : "=h"(bits) : "f"(x));
+    return bits;
+}
+
+DEVICE float half_value(unsigned short bits) {
+    float x;
+    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(bits));
+    return x;
+}

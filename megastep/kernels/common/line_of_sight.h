@@ -1,0 +1,48 @@
+// Can one agent see another? Three lines of sight are tested: to the other's centre and to both
+// sides of its disc. The other is hidden if walls cut all three. A gap between walls narrower than
+// an agent's radius, which falls between two lines, may be missed.
+#pragma once
+#include "common/math.h"
+#include "common/scenery.h"
+
+// Does the wall ab cut the line from (x, y) to (x + dx, y + dy)? A wall's ends count, so that no
+// line passes between two walls that share a corner. Needs no division.
+HD int cuts(float ax, float ay, float bx, float by, float x, float y, float dx, float dy) {
+    float vx = bx - ax, vy = by - ay, px = x - ax, py = y - ay;
+    float side_a = cross(dx, dy, ax - x, ay - y), side_b = cross(dx, dy, bx - x, by - y);
+    float near_side = cross(vx, vy, px, py), far_side = cross(vx, vy, px + dx, py + dy);
+    return (minf(side_a, side_b) <= 0.f) & (maxf(side_a, side_b) >= 0.f) &
+           (minf(near_side, far_side) <= 0.f) & (maxf(near_side, far_side) >= 0.f) &
+           (cross(dx, dy, vx, vy) != 0.f);
+}
+
+// The threads that work on one environment together. This group is a single thread: always on the
+// CPU, and on the GPU where each environment has one thread. Thread `rank` is one of SIZE.
+struct SingleThread {
+    static constexpr int SIZE = 1;
+    int rank;
+};
+
+HD void sync(const SingleThread&) {}
+
+HD unsigned int reduce_or(const SingleThread&, unsigned int bits) { return bits; }
+
+// Is a disc of the agents' radius at (x + dx, y + dy) visible from (x, y)? The threads of `group`
+// share the walls.
+template <class Group>
+HD int is_visible(const SceneryParams& s, const Group& group, const Walls& walls, float x, float y,
+                  float dx, float dy) {
+    float wide = s.radius / maxf(SQRT(dx * dx + dy * dy), s.radius);
+    float side_x = -wide * dy, side_y = wide * dx;
+    unsigned int cut = 0;
+    for (int i = walls.first_wall + group.rank; i < walls.end_wall && cut != 7; i += Group::SIZE) {
+        Float4 wall = LOAD((const Float4*)s.walls + i);
+        for (int line = 0; line < 3; line++) {
+            float aside = (float)(line - 1);
+            cut |= (unsigned int)cuts(wall.x, wall.y, wall.z, wall.w, x, y, dx + aside * side_x,
+                                      dy + aside * side_y)
+                   << line;
+        }
+    }
+    return reduce_or(group, cut) != 7;
+}

@@ -1,0 +1,24 @@
+// Philox 4x32-10 (Salmon et al. 2011), a random generator without state. The key is the seed and
+// the counter is (lane, draw), so a lane's k-th draw is the same on every device and in any order.
+#pragma once
+#include "common/backend.h"
+
+struct Philox {
+    unsigned int a, b, c, d;
+};
+
+HD Philox philox(unsigned int lane, unsigned int draw, unsigned int key0, unsigned int key1) {
+    Philox x = {lane, draw, 0u, 0u};
+    for (int round = 0; round < 10; round++) {
+        unsigned long long p = 0xD2511F53ull * x.a;
+        unsigned long long q = 0xCD9E8D57ull * x.c;
+        x = {(unsigned int)(q >> 32) ^ x.b ^ key0, (unsigned int)q,
+             (unsigned int)(p >> 32) ^ x.d ^ key1, (unsigned int)p};
+        key0 += 0x9E3779B9u;
+        key1 += 0xBB67AE85u;
+    }
+    return x;
+}
+
+// A number in [0, 1) from the upper 24 bits, which a float holds exactly.
+HD float unit_float(unsigned int bits) { return (float)(bits >> 8) * (1.f / 16777216.f); }

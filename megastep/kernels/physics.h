@@ -1,0 +1,57 @@
+// How agents move: a step ends early where the agent's disc, swept along it, touches a wall or
+// another agent's disc.
+#pragma once
+#include "common/collision.h"
+#include "common/errors.h"
+#include "params.h"
+
+constexpr float INFLATION = 1.001f;  // of the radius: a stopped camera stays on its side of a wall
+constexpr float SHORTENING = 0.99f;  // of the free part of a step
+
+// The fraction of the step d after which an agent at p touches agent k, which moves too.
+HD float sweep_agent(const PhysicsParams& p, int k, float px, float py, float dx, float dy,
+                     float rho) {
+    float kx = p.positions[2 * k], ky = p.positions[2 * k + 1];
+    float other_dx = displacement(kx, p.velocity[2 * k], p.seconds);
+    float other_dy = displacement(ky, p.velocity[2 * k + 1], p.seconds);
+    return sweep_point(px - kx, py - ky, dx - other_dx, dy - other_dy, 2.f * rho);
+}
+
+HD float progress_of(float contact) {
+    return contact <= 1.f ? clamp(SHORTENING * contact, 0.f, 1.f) : 1.f;
+}
+
+// Applies agent a's action: damps its velocities and adds the action's, rotated to the agent's
+// heading.
+HD void apply_action(const PhysicsParams& p, int env, int a) {
+    int i = env * p.scenery.n_agents + a;
+    long long action = p.actions[i];
+    if (action < 0 || action >= p.n_moves) {
+        flag_error(p.error_flag, env, BAD_ACTION);
+        action = 0;
+    }
+    const float* move = p.moves + 3 * action;
+    float s, c;
+    sincos_degrees(p.angles[i], s, c);
+    float* velocity = p.velocity + 2 * i;
+    velocity[0] = p.retained * velocity[0] + (c * move[0] - s * move[1]);
+    velocity[1] = p.retained * velocity[1] + (s * move[0] + c * move[1]);
+    p.angvelocity[i] = p.retained * p.angvelocity[i] + move[2];
+}
+
+// Moves agent a by the free part of its step. An agent that hit something stops.
+HD void advance(const PhysicsParams& p, int env, int a) {
+    int i = env * p.scenery.n_agents + a;
+    float progress = p.progress[i];
+    float* position = p.positions + 2 * i;
+    float* velocity = p.velocity + 2 * i;
+    position[0] += progress * displacement(position[0], velocity[0], p.seconds);
+    position[1] += progress * displacement(position[1], velocity[1], p.seconds);
+    p.angles[i] = wrap_degrees(p.angles[i] + progress * (p.angvelocity[i] * p.seconds));
+    flag_nonfinite(p.error_flag, env, position[0], position[1], p.angles[i]);
+    if (progress < 1.f) {
+        velocity[0] = 0.f;
+        velocity[1] = 0.f;
+        p.angvelocity[i] = 0.f;
+    }
+}

@@ -1,0 +1,117 @@
+"""Plots of what agents observe: images, and named numbers as bars."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from megastep.colour import gamma_encode
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def plot_images(
+    images: Mapping[str, ArrayLike],
+    transpose: bool = False,
+    aspect: float | None = None,
+    axes: Sequence[Axes] | np.ndarray | None = None,
+    yaws: ArrayLike | None = None,
+) -> np.ndarray:
+    """Draws images side by side, one row of panels per name. Returns the axes, (names, images).
+
+    Args:
+        images: name -> (..., C, H, W), as policies see them. One channel is shown in grey, 0 to 1.
+            Three channels are linear light, and are gamma encoded here. All axes before the last
+            three count the images of that name.
+        transpose: the arrays are (..., H, W, C) instead, like ``Render.screen``.
+        aspect: height of a panel over its width; by default pixels are square.
+        axes: one per image, row by row.
+        yaws: degrees, the camera of each row of pixels, to label it with.
+
+    Raises:
+        ValueError: there are no images, or one has another shape.
+    """
+    stacks = {name: _stack(name, image, transpose) for name, image in images.items()}
+    shape = len(stacks), max(map(len, stacks.values()), default=0)
+    if not all(shape):
+        raise ValueError(
+            "plot_images was given no images; it needs a dict of arrays with at least one each"
+        )
+    if axes is None:
+        from matplotlib import pyplot
+
+        axes = pyplot.subplots(
+            *shape, squeeze=False, layout="constrained", figsize=(6 * shape[1], 1.5 * shape[0])
+        )[1]
+    axes = np.asarray(axes, dtype=object).reshape(shape)
+    for row, (name, stack) in zip(axes, stacks.items(), strict=True):
+        for i, ax in enumerate(row):
+            if i < len(stack):
+                _plot_image(ax, stack[i], name if len(stack) == 1 else f"{name} {i}", aspect, yaws)
+            else:
+                ax.set_axis_off()
+    return axes
+
+
+def _stack(name, image, transpose):
+    """Returns (n, H, W, C) floats in [0, 1], ready to show."""
+    image, shape = np.asarray(image, np.float32), np.shape(image)
+    if image.ndim >= 3 and not transpose:
+        image = np.moveaxis(image, -3, -1)
+    if image.ndim < 3 or image.shape[-1] not in (1, 3):
+        layout = "(..., H, W, C)" if transpose else "(..., C, H, W)"
+        raise ValueError(
+            f"image '{name}' must have shape {layout} with 1 or 3 channels C if transpose="
+            f"{bool(transpose)}, but its shape is {shape}"
+        )
+    image = np.clip(np.nan_to_num(image), 0, 1).reshape(-1, *image.shape[-3:])
+    return gamma_encode(image) if image.shape[-1] == 3 else image
+
+
+def _plot_image(ax, image, title, aspect, yaws):
+    options = dict(cmap="gray", vmin=0, vmax=1) if image.shape[-1] == 1 else {}
+    ax.imshow(
+        image.squeeze(-1) if image.shape[-1] == 1 else image,
+        interpolation="nearest",
+        aspect="equal" if aspect is None else "auto",
+        **options,
+    )
+    ax.set_box_aspect(aspect)
+    ax.set_title(title, fontsize="small", loc="left", pad=2)
+    ax.set_xlabel("pixel, from left to right", fontsize="x-small", labelpad=1)
+    ax.tick_params(labelsize="x-small")
+    ax.set_yticks([])
+    if yaws is not None and len(yaws) > 1:
+        ax.set_yticks(range(len(yaws)), [f"{yaw:g}°" for yaw in yaws])
+        for label, colour in zip(ax.get_yticklabels(), camera_colours(len(yaws)), strict=True):
+            label.set_color(colour)
+
+
+def camera_colours(n_cameras: int) -> list[str]:
+    """Returns a colour per camera, for its view on the plan and its row of pixels: white if there
+    is only one.
+    """
+    return ["w"] if n_cameras == 1 else [f"C{camera}" for camera in range(n_cameras)]
+
+
+def plot_bars(names: Sequence[str], values: ArrayLike, ax: Axes | None = None) -> Axes:
+    """Draws numbers in [-1, 1] as bars, one group per name. Returns the axes.
+
+    Args:
+        values: (A, len(names)), or one agent's.
+    """
+    if ax is None:
+        from matplotlib import pyplot
+
+        ax = pyplot.subplots(figsize=(3, 1.5), layout="constrained")[1]
+    values = np.asarray(values, np.float32).reshape(-1, len(names))
+    width = 0.8 / len(values)
+    for a, row in enumerate(values):
+        ax.bar(np.arange(len(names)) + width * (a - (len(values) - 1) / 2), row, width)
+    ax.set_xticks(np.arange(len(names)), names, fontsize="x-small")
+    ax.set_ylim(-1, 1)
+    return ax

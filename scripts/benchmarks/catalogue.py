@@ -1,0 +1,34 @@
+"""The benchmarks by name, in the order of the table.
+
+Each is a function of a device that yields measurements. Its docstring is printed above the table.
+"""
+
+from collections.abc import Callable, Iterator
+
+from engine_operations import agents, cpu, kernels, observe
+from env_steps import deathmatch, memory, pong, step
+from nsight_counters import counters
+from replay_buffer import replay
+from startup_times import compile_kernels, first_step, startup
+from training_benchmarks import ablation, duels, learners, train, worlds
+
+BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
+    "step": step,
+    "kernels": kernels,
+    "counters": counters,
+    "observe": observe,
+    "agents": agents,
+    "deathmatch": deathmatch,
+    "memory": memory,
+    "replay": replay,
+    "pong": pong,
+    "compile": compile_kernels,
+    "first": first_step,
+    "startup": startup,
+    "cpu": cpu,
+    "train": train,
+    "worlds": worlds,
+    "duels": duels,
+    "ablation": ablation,
+    "learners": learners,
+}

@@ -1,0 +1,210 @@
+"""Draws the figures of docs/lab from the records of benchmark.py.
+
+The same records give the same SVG, byte for byte.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from records import newest
+from training_benchmarks import COMPARED, LEARNERS, curve_metric
+
+#: Environments and frames per second of the original megastep's Explorer, on one H200.
+ORIGINAL_MEGASTEP = 16_384, 0.86e6
+#: Explorer's mean return in test homes for seeing all that is visible from 128 points.
+NEARLY_ALL_SEEN = 59.1
+ENV_COLOURS = {"explorer": "tab:blue", "minimal": "tab:orange", "pointgoal": "tab:purple"}
+BUDGET_COLOURS = "tab:green", "tab:blue", "tab:red"
+
+
+def subplots(width, height, *grid, **options):
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained").subplots(*grid, **options)
+
+
+def save(figure, path):
+    import matplotlib
+
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "megastep"}):
+        figure.savefig(path, metadata={"Date": None})
+
+
+def finish(ax, path, ticks=None, legend="best"):
+    """Adds ticks, a grid and a legend to a figure's only axes, and saves it."""
+    if ticks:
+        ax.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
+        ax.minorticks_off()
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8, loc=legend)
+    save(ax.figure, path)
+
+
+def metric_name(metric: str) -> str:
+    return "SPL" if metric == "spl" else metric.replace("_", " ")
+
+
+def is_cpu(record: dict) -> bool:
+    return record["on"].startswith("CPU")
+
+
+# ---- Steps ----
+
+
+def plot_frames_per_second(records: list[dict], path: Path) -> None:
+    """Plots frames per second over the number of environments, both logarithmic."""
+    series = {}
+    for record in newest(records):
+        match = re.fullmatch(
+            r"(\w+), `env.step`, ([\d,]+) environments(, as trained)?", record["what"]
+        )
+        if record["benchmark"] == "step" and match:
+            bounds = [record[key] or record["value"] for key in ("value", "lower", "upper")]
+            point = int(match[2].replace(",", "")), *(1e6 * bound for bound in bounds)
+            series.setdefault((match[1], match[3] or "", record["on"]), []).append(point)
+    ax = subplots(7.5, 4.8)
+    for (env, as_trained, machine), points in series.items():
+        n_envs, value, lower, upper = zip(*sorted(points))
+        dashes = "--" if machine.startswith("CPU") else ":" if as_trained else "-"
+        style = dict(color=ENV_COLOURS.get(env), linestyle=dashes)
+        label = f"{env}{as_trained}, {machine}"
+        ax.plot(n_envs, value, marker="o", markersize=4, label=label, **style)
+        ax.fill_between(n_envs, lower, upper, color=style["color"], alpha=0.2, linewidth=0)
+    label = "Explorer of the original megastep, one H200"
+    ax.plot(*ORIGINAL_MEGASTEP, "kx", label=label, linestyle="none")
+    ax.set(xscale="log", yscale="log", xlabel="environments", ylabel="frames per second")
+    finish(ax, path, ticks=[2**k for k in range(10, 21, 2)])
+
+
+# ---- Training ----
+
+
+def learning_curves(records: list[dict]) -> dict[int, dict]:
+    """Returns the newest learning curves of `train` on a GPU by budget in seconds.
+
+    Each is a dict of `seconds` (P,); `mean`, `lower` and `upper` (P,) of the seeds' returns during
+    training; and `evaluated`, a return per seed. P points.
+    """
+    records_by_budget = {}
+    for record in newest(records):
+        match = re.match(r"training, (\d+) s, seed (\d+), (.*)", record["what"])
+        if match and not is_cpu(record):
+            by_measurement = records_by_budget.setdefault(int(match[1]), {})
+            by_measurement.setdefault(match[3], []).append(record)
+    curves_by_budget = {}
+    for budget, by_measurement in sorted(records_by_budget.items()):
+        curves = [np.array(record["curve"]) for record in by_measurement["median rate"]]
+        start, end = max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves)
+        seconds = np.geomspace(start, end, 50)
+        returns = np.stack([np.interp(seconds, curve[:, 0], curve[:, 2]) for curve in curves])
+        curves_by_budget[budget] = dict(
+            seconds=seconds,
+            mean=returns.mean(0),
+            lower=returns.min(0),
+            upper=returns.max(0),
+            evaluated=[record["value"] for record in by_measurement["return in unseen homes"]],
+        )
+    return curves_by_budget
+
+
+def plot_training(records: list[dict], path: Path) -> None:
+    """Plots Explorer's return over seconds of training, a colour per budget."""
+    ax = subplots(7.5, 4.8)
+    for (budget, run), colour in zip(learning_curves(records).items(), BUDGET_COLOURS):
+        n_seeds, seconds = len(run["evaluated"]), run["seconds"]
+        label = f"{budget} s, {n_seeds} seeds, mean and range in training"
+        ax.plot(seconds, run["mean"], color=colour, label=label)
+        ax.fill_between(seconds, run["lower"], run["upper"], color=colour, alpha=0.2, linewidth=0)
+        ax.plot([budget] * n_seeds, run["evaluated"], "o", color=colour, markersize=5)
+    label = "evaluated in unseen homes, one point per seed"
+    ax.plot([], [], "o", color="grey", markersize=5, label=label)
+    style = dict(color="grey", linewidth=1, linestyle="--")
+    ax.axhline(NEARLY_ALL_SEEN, label="nearly everything there is to see", **style)
+    ax.set(xscale="log", xlabel="seconds of training", ylabel="return", ylim=(0, None))
+    finish(ax, path, ticks=[1, 10, 60, 240], legend="lower right")
+
+
+def plot_recipes(records: list[dict], path: Path) -> None:
+    """Plots each environment's metric over seconds of training, from `worlds`."""
+    curves = {
+        record["what"].removesuffix(", median rate"): record["curve"]
+        for record in newest(records)
+        if record["benchmark"] == "worlds" and "curve" in record
+    }
+    # in self-play each side wins half of the points
+    curves = {title: curve for title, curve in curves.items() if "self-play" not in title}
+    if not curves:
+        return
+    ax = subplots(7.5, 4.2)
+    for title, curve in curves.items():
+        seconds, _, values = zip(*curve)
+        ax.plot(seconds, values, label=f"{title}: {metric_name(curve_metric(title))}")
+    ax.set(xscale="log", xlabel="seconds of training", ylabel="metric in training", ylim=(0, 1))
+    finish(ax, path, ticks=[1, 3, 10, 30, 60], legend="lower right")
+
+
+def plot_learners(records: list[dict], path: Path) -> None:
+    """Plots each environment's metric over samples and over seconds, from `learners`.
+
+    A row of plots per environment and machine, a colour per learner, a line per seed. Only the runs
+    with the longest budget are drawn.
+    """
+    runs = {}
+    for record in newest(records):
+        if record["benchmark"] == "learners" and "curve" in record:
+            env, learner = record["what"].rsplit(", ", 3)[0].split(", ", 1)
+            runs.setdefault((env, record["on"].split(",")[0]), []).append((learner, record))
+    if not runs:
+        return
+    grid = subplots(9, 2.9 * len(runs), len(runs), 2, squeeze=False, sharey="row")
+    learners = list(LEARNERS)
+    places = sorted(runs, key=lambda place: (place[1] == "CPU", list(COMPARED).index(place[0])))
+    for (env, machine), (by_samples, by_seconds) in zip(places, grid):
+        place_runs = sorted(runs[env, machine], key=lambda run: learners.index(run[0]))
+        longest = max(record["curve"][-1][0] for _, record in place_runs)
+        for learner, record in place_runs:
+            seconds, samples, values = zip(*record["curve"])
+            if seconds[-1] < 0.75 * longest:
+                continue
+            style = dict(color=f"C{learners.index(learner)}", linewidth=1.2)
+            label = learner if ", seed 1," in record["what"] else None
+            by_samples.plot([n / 1e6 for n in samples], values, **style)
+            by_seconds.plot(seconds, values, label=label, **style)
+        metric = metric_name(COMPARED[env][1])
+        by_samples.set(xlabel="million samples", ylabel=f"{metric} in training")
+        by_samples.set(xscale="log", ylim=(0, None))
+        by_seconds.set(xlabel="seconds of training")
+        for ax in (by_samples, by_seconds):
+            ax.set(title=f"{env}, {machine}")
+            ax.grid(alpha=0.3)
+    grid[0, 1].legend(fontsize=8)
+    save(grid[0, 0].figure, path)
+
+
+def plot_ratings(records: list[dict], path: Path) -> None:
+    """Plots the ratings of each run's snapshots, and of the scripted bot, over samples."""
+    ratings_by_seed = {}
+    for record in newest(records):
+        match = re.fullmatch(r"deathmatch, .*, seed (\d+), rating of (.*)", record["what"])
+        if match:
+            rating = match[2], record["value"], record["upper"]
+            ratings_by_seed.setdefault(match[1], []).append(rating)
+    if not ratings_by_seed:
+        return
+    ax = subplots(7.5, 4.2)
+    for i, (seed, ratings) in enumerate(ratings_by_seed.items()):
+        snapshots = [
+            (float(player.split()[0].replace(",", "")) / 1e6, value, upper - value)
+            for player, value, upper in ratings
+            if player.endswith(" samples")
+        ]
+        samples, values, spreads = zip(*sorted(snapshots))
+        style = dict(color=f"C{i}", marker="o", markersize=4, capsize=3)
+        ax.errorbar(samples, values, spreads, label=f"seed {seed}", **style)
+        for player, value, _ in ratings:
+            if player == "Bot":
+                label = "the scripted bot, in each run's ratings" if i == 0 else None
+                ax.axhline(value, color=f"C{i}", linestyle="--", linewidth=1, label=label)
+    ax.set(xlabel="million samples", ylabel="rating ± two standard deviations")
+    finish(ax, path, legend="upper left")

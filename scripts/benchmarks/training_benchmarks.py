@@ -1,0 +1,197 @@
+"""Benchmarks that train: `train`, `worlds`, `duels`, `ablation`, `learners`.
+
+The titles of what is trained are part of the records' names, which join old and new measurements.
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import torch
+from training_runs import (
+    evaluate,
+    learning_curve,
+    metric_mean,
+    newest_evaluation,
+    rating,
+    ratings,
+    share_of_duels_won,
+    trained,
+    training_rate,
+)
+
+BUDGETS = 10, 60, 240  # seconds of training
+SEEDS = 1, 2, 3
+NO_FINISH = "finish.evaluate=false", "finish.record=false"
+EXPLORER = "geometry=bench", "finish.evaluate=true"  # overrides of `train`
+
+# ---- worlds: a recipe per environment ----
+
+PLACES = {
+    "homes": "geometry=homes",
+    "mazes": "geometry=maze geometry.braid=0.3",
+    "a box": "geometry=box",
+}
+AGENTS = {"Explorer": "env=explorer", "PointGoal": "experiment=pointgoal"}
+#: Title: (overrides of training, {place: overrides of its evaluation}).
+RECIPES = {
+    "Pong from features": ("experiment=pong", {"": ""}),
+    "Pong from pictures": ("experiment=pong_pixels", {"": ""}),
+    "Pong, self-play": (
+        "experiment=pong env.self_play=true seconds=25",
+        {"court of the tracker": "env=pong"},
+    ),
+    **{
+        f"{name}, trained in {place}": (
+            f"{overrides} {PLACES[place]} geometry.n=2000 seconds=60",
+            PLACES,
+        )
+        for name, overrides in AGENTS.items()
+        for place in ("homes", "mazes")
+    },
+}
+#: The metric that learning curves show.
+METRICS = {"Pong": "points_won", "Explorer": "coverage", "PointGoal": "spl"}
+
+# ---- duels and ablation: Deathmatch ----
+
+DEATHMATCH = "experiment=deathmatch", "seconds=null", *NO_FINISH
+#: Title: overrides of the recipe.
+ABLATIONS = {
+    "the recipe": "",
+    "hits less wounds alone": "env.aim_reward=0 env.search_reward=0",
+    "aim not paid": "env.aim_reward=0",
+    "searching not paid": "env.search_reward=0",
+    "wounds at half the cost": "env.wound_cost=0.5",
+    "self-play against now alone": "opponents.past=0 opponents.bot=0",
+    "past selves, no bot": "opponents.past=0.8 opponents.bot=0",
+    "a drain of 0.01 per second": "env.drain=0.01",
+    "fov 130": "env.fov=130",
+}
+N_SNAPSHOTS = 5  # rated per run
+N_DUELS = 1024  # of two policies; a quarter of that for each pair that is rated
+
+# ---- learners: a comparison ----
+
+ASYNC = "V-trace, an update behind"  # compared in Explorer only, with one seed
+#: Title: overrides.
+LEARNERS = {
+    "PPO": "learner=ppo",
+    "V-trace": "learner=vtrace",
+    ASYNC: "learner=vtrace learner.lag=1",
+    "V-trace with replay": (
+        "learner=vtrace learner.buffer=replay learner.replay.capacity={capacity}"
+    ),
+    "R2D2": "learner=r2d2",
+}
+REPLAY_CAPACITY = {"cuda": 8_000_000, "cpu": 100_000}  # observations, of V-trace with replay
+#: Environment: (overrides, metric that is compared, seconds of training).
+COMPARED = {
+    "Explorer": ("env=explorer geometry=bench", "return", 25),
+    "Pong": ("env=pong agent.core=none learner.gamma=0.99", "points_won", 12),
+    "PointGoal": ("env=pointgoal geometry=homes geometry.n=2000 learner.gamma=0.99", "spl", 30),
+}
+
+
+def curve_metric(title: str) -> str:
+    """Returns the metric that the learning curve of a recipe in RECIPES shows."""
+    return METRICS[title.split(",")[0].split()[0]]
+
+
+def train(
+    device: torch.device, seeds: Sequence[int] = SEEDS, budgets: Sequence[int] = BUDGETS
+) -> Iterator[dict]:
+    """Training of Explorer in the benchmark's homes for 10, 60 and 240 seconds after compilation,
+    three seeds each, and an evaluation in unseen homes.
+    """
+    for budget, seed in itertools.product(budgets, seeds):
+        what = f"training, {budget} s, seed {seed}"
+        with trained(device, (*EXPLORER, f"seconds={budget}", f"seed={seed}")) as (run,):
+            rows, curve = newest_evaluation(run), learning_curve(run)
+        for agent, row in zip(("return", "return of random actions"), rows):
+            yield metric_mean(f"{what}, {agent} in unseen homes", row, "return")
+        if len(curve) > 1:
+            yield training_rate(what, curve)
+
+
+def worlds(device: torch.device) -> Iterator[dict]:
+    """Each environment's recipe, one seed: metrics of first episodes in unseen places, of the
+    trained agent and of random actions.
+    """
+    for title, (recipe, places) in RECIPES.items():
+        with trained(device, (*recipe.split(), *NO_FINISH)) as (run,):
+            curve = learning_curve(run, curve_metric(title))
+            seconds, samples, _ = curve[-1]
+            yield training_rate(title, curve)
+            for place, overrides in places.items():
+                what = f"{title}, {seconds:.0f} s, {samples / 1e6:.0f} M samples"
+                what += f", in {place}" if place else ""
+                for row in evaluate(run, device, *overrides.split()):
+                    for metric in ("return", *row["metrics"]):
+                        yield metric_mean(f"{what}: {metric}, {row['agent']}", row, metric)
+
+
+def duels(
+    device: torch.device, seeds: Sequence[int] = SEEDS, samples: int = 600_000_000
+) -> Iterator[dict]:
+    """Deathmatch's recipe, all seeds side by side on one device: the share of duels that each wins
+    in unseen homes, a draw being half, and ratings of its snapshots and of the scripted bot.
+    """
+    runs = [
+        (*DEATHMATCH, f"samples={samples}", f"seed={seed}", f"snapshots={N_SNAPSHOTS}")
+        for seed in seeds
+    ]
+    with trained(device, *runs) as folders:
+        for seed, run in zip(seeds, folders):
+            what = f"deathmatch, {samples / 1e6:.0f} M samples, seed {seed}"
+            yield training_rate(what, learning_curve(run, "accuracy"))
+            yield from duels_of(what, run, device)
+            for row in ratings(run, device, N_DUELS // 4):
+                yield rating(what, row)
+
+
+def duels_of(what: str, run: Path, device: torch.device) -> Iterator[dict]:
+    """Measures a run's duels against the scripted bot and against random actions."""
+    for row in evaluate(run, device, "against=[bot,random]", f"episodes={N_DUELS}"):
+        yield share_of_duels_won(what, row)
+
+
+def ablation(device: torch.device, samples: int = 60_000_000) -> Iterator[dict]:
+    """Deathmatch's recipe with one change each, all side by side on one device, one seed: the share
+    of duels that each wins in unseen homes, a draw being half.
+    """
+    runs = [
+        (*DEATHMATCH, f"samples={samples}", *overrides.split()) for overrides in ABLATIONS.values()
+    ]
+    with trained(device, *runs) as folders:
+        for title, run in zip(ABLATIONS, folders):
+            yield from duels_of(f"deathmatch, {samples / 1e6:.0f} M samples, {title}", run, device)
+
+
+def learners(
+    device: torch.device,
+    seeds: Sequence[int] = SEEDS,
+    budgets: Sequence[int] | None = None,
+    envs: Sequence[str] = tuple(COMPARED),
+) -> Iterator[dict]:
+    """A comparison of learners that train for equally long, one at a time, with learning curves and
+    an evaluation in unseen homes. Three seeds in Explorer; one in the other environments, and one
+    for acting an update behind.
+    """
+    for env in envs:
+        env_overrides, metric, default_budget = COMPARED[env]
+        env_seeds = seeds if env == "Explorer" else seeds[:1]
+        for seed, budget in itertools.product(env_seeds, budgets or [default_budget]):
+            for title, overrides in LEARNERS.items():
+                if title == ASYNC and (env != "Explorer" or seed != seeds[0]):
+                    continue
+                what = f"{env}, {title}, {budget} s, seed {seed}"
+                overrides = overrides.format(capacity=REPLAY_CAPACITY[device.type])
+                words = f"log_every=10 {env_overrides} {overrides} seconds={budget} seed={seed}"
+                with trained(device, (*words.split(), *NO_FINISH)) as (run,):
+                    curve = learning_curve(run, metric)
+                    row = evaluate(run, device)[0]
+                if len(curve) > 1:
+                    yield training_rate(what, curve)
+                place = "in unseen homes" if row["homes"] else "in first episodes"
+                yield metric_mean(f"{what}: {metric} {place}", row, metric)

@@ -1,0 +1,95 @@
+"""Runs with either critic: train, resume, evaluate, record and init."""
+
+import pytest
+import torch
+
+from megastep import envs
+from megastep.agents.cli import evaluate, record, train
+from megastep.agents.cli.program import ConfigErrors, UserError
+from megastep.agents.training import checkpoint
+from tests.cli.test_train import configured
+
+EXPLORER = [
+    "env=explorer",
+    "geometry=box",
+    "preset=cpu",
+    "env.n_envs=4",
+    "env.res=8",
+    "env.patience=3",
+    "learner.n_steps=8",
+    "learner.n_minibatches=2",
+    "agent.width=8",
+    "device=cpu",
+    "log_every=1",
+]
+UPDATE = 4 * 8  # samples
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def trained(*overrides):
+    return train.run(configured(*overrides, tiny=EXPLORER))
+
+
+def weights(run):
+    return checkpoint.load_latest(run / "checkpoints").state["policy"]
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("critic", ["asymmetric", "plain"])
+def test_train_resume_evaluate_record_and_init(critic, monkeypatch):
+    run = trained(f"samples={2 * UPDATE}", f"agent.critic={critic}")
+    has_intake = "critic.intake.project.weight" in weights(run)
+    assert has_intake == ("prediction.weight" in weights(run)) == (critic == "asymmetric")
+    again = configured(f"resume={run}", f"samples={3 * UPDATE}", tiny=[])
+    assert again.agent.critic == critic and train.run(again) == run
+    assert checkpoint.load_latest(run / "checkpoints").step == 3 * UPDATE
+    second = trained("samples=1", "learner.lr=1e-12", f"init={run}", f"agent.critic={critic}")
+    first = "intake.project.weight"
+    torch.testing.assert_close(weights(second)[first], weights(run)[first], rtol=0, atol=1e-6)
+
+    # evaluating and recording compute no privileged observations
+    monkeypatch.setattr(envs.Explorer, "_privileged", None)
+    assert evaluate.main([f"run={run}", "episodes=3", "baseline=false", "device=cpu"]) == 0
+    pytest.importorskip("av")
+    assert record.main([f"run={run}", "steps=1", "device=cpu"]) == 0
+
+
+@pytest.mark.usefixtures("folder")
+def test_plain_critic_does_not_compute_privileged(monkeypatch):
+    monkeypatch.setattr(envs.Explorer, "_privileged", None)
+    trained("samples=1", "agent.critic=plain")
+    with pytest.raises(TypeError):
+        trained("samples=1", "agent.critic=asymmetric")
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("saved, chosen", [("asymmetric", "plain"), ("plain", "asymmetric")])
+def test_init_refuses_other_kind_of_critic(saved, chosen):
+    run = trained("samples=1", f"agent.critic={saved}")
+    with pytest.raises(UserError, match=f"critic.*{saved}.*{chosen}.*critic={saved}"):
+        trained("samples=1", f"init={run}", f"agent.critic={chosen}")
+
+
+@pytest.mark.usefixtures("folder")
+def test_init_allows_any_critic_without_privileged_space():
+    shape = "env=minimal", "env.n_envs=4", "env.res=8"
+    minimal = [word for word in EXPLORER if not word.startswith("env")] + [*shape, "samples=1"]
+    run = train.run(configured("agent.critic=asymmetric", tiny=minimal))
+    train.run(configured(f"init={run}", "agent.critic=plain", tiny=minimal))
+
+
+@pytest.mark.parametrize(
+    "word, error",
+    [
+        ("agent.critic=foo", "agent.critic: .*foo.* asymmetric"),
+        ("env.privileged=true", "env.privileged: no such key"),
+        ("learner.auxiliary_coef=-1", "learner.auxiliary_coef: .*-1.* out of range"),
+    ],
+)
+def test_bad_critic_settings(word, error):
+    with pytest.raises(ConfigErrors, match=error):
+        configured(word, tiny=EXPLORER)

@@ -1,0 +1,96 @@
+"""Structs and constants that Python reads from headers, against what a compiler reads."""
+
+import ctypes
+import re
+import subprocess
+
+import pytest
+
+from megastep.agents.networks.kernels.program import CORES
+from megastep.envs.deathmatch.step import PROGRAM as DEATHMATCH
+from megastep.envs.pointgoal.step import PROGRAM as POINTGOAL
+from megastep.envs.pong.step import PROGRAM as PONG
+from megastep.kernels.build import compile, headers
+from megastep.kernels.build.launch import ENGINE
+
+PROGRAMS = dict(engine=ENGINE, cores=CORES, pong=PONG, deathmatch=DEATHMATCH, pointgoal=POINTGOAL)
+programs = pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS)
+
+
+def compiled(folder, program, code):
+    """A library of `code`, which sees the program's headers."""
+    source, library = folder / "checks.cpp", folder / "checks.so"
+    source.write_text(code)
+    command = [compile.compiler()[0], "-std=c++17", "-shared", "-fPIC"]
+    command += [f"-I{program.folder}", f"-I{compile.KERNELS}", str(source), "-o", str(library)]
+    subprocess.run(command, check=True)
+    return ctypes.CDLL(str(library))
+
+
+@programs
+def test_packed_structs_have_the_compilers_layout(program, tmp_path):
+    """A compiler reads every field of every packed struct with the value that was packed."""
+    structs = headers.struct_fields(program.sources(".h"))
+    assert structs.keys() == vars(program.params).keys()
+    packed, code = {}, '#include "common/scenery.h"\n#include "params.h"\n'
+    for name, fields in structs.items():
+        values = {field: position + 1 for position, (field, _) in enumerate(fields)}
+        values |= {field: bytes(int(kind[2:-1])) for field, kind in fields if kind[-1] == "s"}
+        packed[name] = getattr(program.params, name)(**values)
+        tests = [f"(long long)p->{f} == {values[f]}" for f, kind in fields if kind[-1] != "s"]
+        code += (
+            f'extern "C" int check_{name}(const {name}* p, int size) '
+            f"{{ return size == sizeof({name}) && {' && '.join(tests)}; }}\n"
+        )
+    checks = compiled(tmp_path, program, code)
+    for name, data in packed.items():
+        assert len(data) == program.sizes[name]
+        assert getattr(checks, f"check_{name}")(data, len(data)), name
+
+
+@programs
+def test_constants_have_the_compilers_values(program, tmp_path):
+    own = '#include "constants.h"\n' if (program.folder / "constants.h").exists() else ""
+    code = '#include "common/constants.h"\n' + own
+    for name in program.constants:
+        code += f'extern "C" double read_{name}() {{ return {name}; }}\n'
+    library = compiled(tmp_path, program, code)
+    assert {"BLOCK", "WARP"} <= program.constants.keys()
+    for name, number in program.constants.items():
+        read = getattr(library, f"read_{name}")
+        read.restype = ctypes.c_double
+        assert read() == pytest.approx(number, rel=1e-7, abs=0), name
+
+
+def test_float_constants_are_read():
+    text = "constexpr float SHARE = 0.25f;  // a comment\nconstexpr int LEAST = -3;\n"
+    assert headers.constants({"constants.h": text}) == dict(SHARE=0.25, LEAST=-3)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["constexpr int N = 2 * 3;", "constexpr int A = 1, B = 2;", "constexpr int TWICE = 2;"],
+)
+def test_a_constant_that_cannot_be_read_is_named(line):
+    text = f"constexpr int TWICE = 1;\n{line}\n"
+    with pytest.raises(ValueError, match="constants.h: .*constexpr int"):
+        headers.constants({"common/constants.h": text})
+
+
+@pytest.mark.parametrize("field", ["double x;", "float x, y;", "OtherParams other;", "int x[3];"])
+def test_a_field_that_cannot_be_packed_is_named(field):
+    with pytest.raises(ValueError, match="params.h: .*" + re.escape(field[:-1])):
+        headers.struct_fields({"params.h": f"struct AParams {{\n    int a;\n    {field}\n}};\n"})
+
+
+def test_fields_are_required_keyword_arguments():
+    fields = dict(counts=0, mask=0, out=0, key0=1, key1=2, n_lanes=0, n_threads=1)
+    pack = ENGINE.params.UniformParams
+    pack(**fields)
+    with pytest.raises(TypeError, match=r"UniformParams\(\) got an unexpected .* 'n_lane'"):
+        pack(**fields, n_lane=3)
+    del fields["key1"]
+    with pytest.raises(TypeError, match=r"UniformParams\(\) missing 1 required .* 'key1'"):
+        pack(**fields)
+    with pytest.raises(TypeError):
+        pack(0, 0, 0, 1, 2, 0, 1)
