@@ -9,14 +9,15 @@ from tests.helpers import pages
 
 def test_example_of_page_runs(tmp_path, monkeypatch, device):
     text = (pages.ROOT / "docs" / "kernels.md").read_text()
+    (tmp_path / "kernels").mkdir()
     for name, body in re.findall(r"```cpp\n// (\S+)\n(.*?)```", text, re.S):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(body)
-    (code,) = pages.code(text)
-    monkeypatch.chdir(tmp_path)
-    names = {}
-    exec(compile(code, "docs/kernels.md", "exec"), names)
+    module, use = pages.code(text)
+    (tmp_path / "battery.py").write_text(module)
     expected = torch.tensor([1.0, 0.99, 0.98, 0.0])
+    names = {}
+    with pages.inside(tmp_path, monkeypatch):
+        exec(compile(use, "docs/kernels.md", "exec"), names)
     torch.testing.assert_close(names["charge"], expected)
 
     charge = torch.ones(4, device=device)
