@@ -161,7 +161,7 @@ class Finish:
 class Train(Common):
     env: Env
     geometry: Geometry
-    agent: Agent
+    agent: Agent = Agent()
     learner: Learner
     opponents: Opposition = Opposition()
     logger: Logger
