@@ -60,8 +60,8 @@ class R2D2(GradientLearner):
 
     Each gradient step draws sequences from the replay buffer and warms up the hidden state from the
     stored one. Then it moves the values of the actions taken towards n-step returns, which
-    bootstrap from the value that a target network gives the online network's best action (double
-    Q-learning, van Hasselt et al. 2016). Values are learned after `returns.rescale`.
+    bootstrap from the target network's value of the online network's best action (double
+    Q-learning, van Hasselt et al. 2016). Networks predict values transformed by `returns.rescale`.
 
     Args:
         policy: a policy with `output="duelling"`.
