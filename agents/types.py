@@ -31,8 +31,8 @@ class Actor(Policy, Protocol):
 
 
 class Rollout(Protocol):
-    """T steps of B lanes. Row t of a (T, B) tensor belongs to the action of time t and holds what
-    the world that followed said.
+    """T steps of B lanes. Row t of a (T, B) tensor is the outcome of the action taken at time t, as
+    reported by the next world.
     """
 
     n_steps: int  # T
@@ -43,7 +43,7 @@ class Rollout(Protocol):
     truncated: torch.Tensor  # (T, B) bool
     metrics: Mapping[str, torch.Tensor]  # (T, B) each, read where an episode ends
     learns: torch.Tensor  # (T+1, B) bool: transitions to learn from
-    learners: torch.Tensor | None  # bool per lane of the environment: the B stored; None: all
+    learners: torch.Tensor | None  # bool per lane of the environment: True if stored; None: all
 
     def floats(self) -> dict[str, torch.Tensor]:
         """Returns the float tensors by name, (T, B, ...) or (T+1, B, ...), for `learner.check`."""

@@ -26,15 +26,15 @@ class CaptureError(RuntimeError):
 
 
 class _StateBefore:
-    """The tensors and Python scalars below some objects before a function is called."""
+    """The tensors and Python scalars reachable from some objects, before a function is called."""
 
     def __init__(self, roots):
         self.roots = dict(enumerate(roots))
         self.tensors, self.scalars = walk(self.roots, torch.Tensor), walk(self.roots, SCALARS)
 
     def keep_in_place(self):
-        """Call this after the function. Copies each tensor that replaced another into the old
-        one, and puts the old one back.
+        """Copies each tensor that replaced another into the old one, and puts the old one back.
+        Called after the function.
 
         A tensor that replaced None, or a new attribute, stays: the function writes there from now
         on. Raises CaptureError for any other change that a graph cannot repeat.
@@ -92,7 +92,7 @@ def _copy_back(path, parent, step, old, new):
 
 
 def _readable(path):
-    """A path for messages, without the number of its root."""
+    """Returns a path for messages, without the number of its root."""
     return path.partition("]")[2].lstrip(".")
 
 
@@ -202,7 +202,9 @@ def capture(function: Callable, args: tuple, roots: tuple, warmup: int = 3) -> C
 
 
 def _line(error):
-    """The line outside PyTorch and this file that raised an error, as the end of a sentence."""
+    """Returns the line outside PyTorch and this file that raised an error, as the end of a
+    sentence.
+    """
     if isinstance(error, CaptureError):
         return ""
     frames = traceback.extract_tb(error.__traceback__)

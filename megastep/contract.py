@@ -117,7 +117,7 @@ def check_world(env: Env, world: World, last: World | None = None) -> None:
 
 
 def _check_tensor(env, path, values, shape, dtypes, kind=None):
-    """`values` is a tensor of this shape, of one of the dtypes, on the environment's device."""
+    """Requires a tensor of this shape, of one of the dtypes, on the environment's device."""
     described = repr(values)
     if isinstance(values, torch.Tensor):
         described = f"{values.dtype} {tuple(values.shape)} on {values.device.type}"
@@ -178,7 +178,7 @@ def _check_privileged(env, world):
 
 
 def _check_episodes(env, world, last):
-    """Rewards are finite, and episodes begin and end as they should."""
+    """Requires finite rewards, and flags that agree with those of the last step."""
     reward, (reset, terminal, truncated) = world["reward"], (world[key] for key in FLAGS)
     _require(env, bool(reward.isfinite().all()), "reward must be finite")
     both, ended = terminal & truncated, terminal | truncated

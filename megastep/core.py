@@ -28,7 +28,9 @@ class Core:
         seed: default seed of the modules built on this core.
 
     Attributes:
-        scenery, agents, n_envs, n_agents, device, res, fov, fps, seed: all public.
+        agents: the :class:`~megastep.engine.Agents`.
+        n_envs, n_agents, device: those of the scenery.
+        scenery, res, fov, fps, seed: the arguments.
     """
 
     def __init__(

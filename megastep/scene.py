@@ -80,7 +80,7 @@ def agent_model(width: float = engine.AGENT_WIDTH) -> np.ndarray:
 
 def _agent_textures(n_agents, model):
     """Returns the texels of an environment's agents, (K, 3), and the number of texels per line,
-    (A M,). Each agent has a colour of its own and a red front.
+    (A M,). Agents have different colours (16, then they repeat) and a red front.
     """
     widths = texel_widths(model)
     bodies, front = _linear(AGENT_PALETTE), _linear([FRONT])[0]

@@ -7,8 +7,8 @@ import torch
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.types import Rollout
 
-# Eager updates, which count like any other, before one is captured: libraries initialise themselves
-# in the first.
+# Updates that run eagerly before the capture, since libraries initialise themselves in the first.
+# They train the policy like any other update.
 _N_WARM_UPS = 2
 
 Metrics = dict[str, torch.Tensor]
@@ -43,8 +43,8 @@ class CudaGraphUpdate:
         self.restart()
 
     def restart(self) -> None:
-        """Discards the graph, which is then warmed up and captured again. Call it after generators
-        were replaced.
+        """Discards the graph. The next updates warm up and capture again. Call it after replacing
+        generators.
         """
         self.graph: torch.cuda.CUDAGraph | None = None
         self._rollout = self._metrics = None

@@ -10,7 +10,7 @@ from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 
 
 class GradientSteps:
-    """Adam's steps on some parameters, which non-finite numbers never reach.
+    """Takes Adam steps on some parameters. Skips steps with non-finite numbers.
 
         is_finite = steps.begin(rollout.floats())
         for batch in minibatches:
@@ -71,7 +71,8 @@ class GradientSteps:
         Args:
             loss: () tensor.
             metrics: tensors () by name, which `end` averages over the steps taken.
-            has_valid: () bool, whether the minibatch has a valid transition. No step without one.
+            has_valid: () bool, whether the minibatch has a valid transition. Without one, the step
+                is not taken.
             is_enabled: () bool. A step that is not enabled is neither taken nor counted as skipped.
 
         Returns:

@@ -12,17 +12,17 @@ needs the attributes of `megastep.agents.types.Learner`, and is used like this:
 Rules:
 
 - `collect()` returns a `megastep.agents.types.Rollout`; `storage.rollout.Rollout` is one. The
-  collector owns it, may return the same object every time, and has it as `collect.rollout` already
-  before the first call.
+  collector owns the rollout and may return the same object every time. `collect.rollout` exists
+  before the first call, too.
 - `collect()` and `update()` do not synchronise host and device.
-- `update()` passes `rollout.floats()` to `learner.check` before it learns, and learns nothing from
-  a rollout that is not finite. The trainer reads the check and stops after many skipped updates.
-- Only transitions with `rollout.learns` and without `rollout.reset` count in a loss. If an
-  environment has an attribute `learners` (there are opponents), only those lanes need to be stored.
+- `update()` passes `rollout.floats()` to `learner.check` before it learns, and skips a rollout with
+  non-finite numbers. The trainer reads the check and stops after many skipped updates in a row.
+- Only transitions with `rollout.learns` and without `rollout.reset` count in a loss. An environment
+  with opponents has an attribute `learners`, a bool per lane; only those lanes need to be stored.
 - A collector that acts in the background may return an older rollout. It has a method `wait()`,
-  which blocks until nobody acts in the environment.
-- If the constructor takes `seed` or `graph`, it is given the run's seed, and whether to capture
-  updates as a CUDA graph.
+  which blocks until nothing acts in the environment.
+- The constructor's arguments `seed` and `graph` are optional. `seed` receives the run's seed;
+  `graph` is true if updates should be captured as a CUDA graph.
 - A replay buffer belongs to the learner or to its collector. The learner then has a method
   `replay_size(env)`, which returns (observations, bytes per observation) before the buffer exists.
 
@@ -94,7 +94,7 @@ class GradientLearner:
     Attributes:
         steps: the `GradientSteps` of the policy's parameters.
         check: finds non-finite numbers in rollouts and counts skipped updates.
-        generator: the `SeededGenerator` of everything that an update draws.
+        generator: the `SeededGenerator` of all random numbers in an update.
     """
 
     def __init__(self, policy: Policy, lr: float, max_grad_norm: float, graph: bool, seed: int):
@@ -138,12 +138,12 @@ class GradientLearner:
         Raises:
             ValueError: if the state belongs to another class of learner.
         """
-        present = type(self).__name__
-        saved = state.get("learner", present)
-        if saved != present:
+        name = type(self).__name__
+        saved_name = state.get("learner", name)
+        if saved_name != name:
             raise ValueError(
-                f"the state of a {saved} learner cannot be loaded by {present}: use {saved}, or "
-                "start from the policy's weights alone (init=RUN)"
+                f"the state of a {saved_name} learner cannot be loaded by {name}: use "
+                f"{saved_name}, or start from the policy's weights alone (init=RUN)"
             )
         self.steps.load_state_dict(state)
         self.generator.load_state_dict(state["generator"], self.device)

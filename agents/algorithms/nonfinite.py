@@ -1,4 +1,4 @@
-"""Detection of NaN, infinity and overflow: found on the device, named on the host.
+"""Detection of NaN, infinity and overflow on the device, and their description on the host.
 
 T time, B lanes.
 """
@@ -10,7 +10,7 @@ import torch
 from torch.utils._pytree import tree_leaves_with_path
 
 #: The largest magnitude allowed in a rollout. Squares of returns made of such rewards, summed over
-#: millions of steps, still fit into float32 (3e38). An overflowing float16 is inf, so larger.
+#: millions of steps, still fit into float32 (3e38). A float16 that overflowed is inf, so larger.
 LIMIT = 1e12
 
 
@@ -99,7 +99,8 @@ def _sizes(values):
     if values.dim() > 2:
         values = values.flatten(2)
         if torch.finfo(values.dtype).max < LIMIT:
-            # too large a number is inf already and stays inf in a sum, which is five times faster
+            # any number beyond LIMIT is inf in this dtype, and stays inf or becomes NaN in a sum,
+            # which is five times faster than a maximum
             values = values.sum(-1, dtype=torch.float32)
         else:
             values = torch.maximum(values.amax(-1), -values.amin(-1))

@@ -50,7 +50,7 @@ class PPO(GradientLearner):
         target_kl: ends an update early, once the KL divergence of a minibatch from the acting
             policy exceeds this many nats. None: never.
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
-        seed: seed of the order of minibatches.
+        seed: seed of the minibatch order.
 
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
     statistic. `check` names the number and counts the updates skipped in a row.

@@ -23,7 +23,7 @@ from megastep.dotdict import mapping
 from megastep.settings import MAX_ENVS, checked
 from megastep.types import Env
 
-#: R2D2's replay settings. A configuration that gives some of them takes the others from here.
+#: R2D2's default replay settings. A configuration that sets some of them keeps the others.
 REPLAY = ReplaySettings(capacity=8_000_000, burn_in=32, ratio=4.0, alpha=0.9)
 
 
@@ -60,24 +60,24 @@ class R2D2(GradientLearner):
 
     Each gradient step draws sequences from the replay buffer and warms up the hidden state from the
     stored one. Then it moves the values of the actions taken towards n-step returns, which
-    bootstrap from the value that a target network gives the online network's best action (double
-    Q-learning, van Hasselt et al. 2016). Values are learned after `returns.rescale`.
+    bootstrap from the target network's value of the online network's best action (double
+    Q-learning, van Hasselt et al. 2016). Networks predict values transformed by `returns.rescale`.
 
     Args:
         policy: a policy with `output="duelling"`.
         n_steps: steps of a rollout, T.
         lr: Adam's step size.
         gamma: discount per step.
-        return_steps: rewards that a return sums before it bootstraps.
+        return_steps: n of the n-step returns, the rewards summed before bootstrapping.
         target_period: gradient steps between two copies of the weights to the target network.
         epsilon: probability of a random action in lane 0.
         epsilon_spread: lane i of B uses epsilon ** (1 + epsilon_spread i / (B - 1)).
         eta: weight of the largest error in a sequence's priority; the mean error has 1 - eta.
         max_grad_norm: longer gradients are scaled down to this norm.
-        gradient_steps: gradient steps per rollout; together they draw replay.ratio B sequences.
+        gradient_steps: gradient steps per rollout. Together they draw `replay.ratio` x B sequences.
         replay: settings of the replay buffer.
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
-        seed: seed of replay.
+        seed: seed of replay sampling.
 
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
     statistic, and is never drawn. `state_dict` does not include the replay buffer: a resumed run
@@ -111,7 +111,7 @@ class R2D2(GradientLearner):
         self.epsilon, self.epsilon_spread = epsilon, epsilon_spread
         self.gradient_steps, self.replay_settings = gradient_steps, replay
         self.length = replay.sequence_steps(n_steps)
-        self.replay_buffer: ReplayBuffer | None = None  # `collector` knows its lanes and makes it
+        self.replay_buffer: ReplayBuffer | None = None  # allocated by `collector`
         self.target = policy.actor()
         weights = policy.state_dict()
         self._target_copies = [
@@ -149,7 +149,9 @@ class R2D2(GradientLearner):
         return env.n_agents * (rollout + minibatch)
 
     def replay_size(self, env: Env) -> tuple[int, float]:
-        """Returns the observations that the replay buffer will hold, and the bytes of each."""
+        """Returns the number of observations that the replay buffer will hold, and the bytes per
+        observation.
+        """
         settings = self.replay_settings
         n_bytes = bytes_per_observation(env, self.policy, self.n_steps, settings, logprobs=False)
         return settings.capacity, n_bytes
@@ -165,14 +167,14 @@ class R2D2(GradientLearner):
             store_if(self.n_taken % self.target_period == 0, self._target_copies)
             batch = self.replay_buffer.sample(n_sequences, generator)
             loss, metrics, priorities, valid = self._losses(batch)
-            # A non-finite rollout counts as skipped, even if it is the reason why nothing is ready.
+            # A non-finite rollout counts as skipped even while the replay buffer is not ready.
             self.n_taken += self.steps.take(loss, metrics, valid.any(), is_ready | ~is_finite)
             self.replay_buffer.set_priorities(batch.index, priorities)
         last = rollout.world(-1)
         self.policy.update_stats(last.obs, is_counted=is_finite & rollout.learns[-1])
         priorities = self.replay_buffer.tree.priorities
         n_available = self.replay_buffer.n_available.clamp(min=1)
-        # the means of no steps at all are NaN, until the replay buffer is ready
+        # until the replay buffer is ready, no step is taken and the means are NaN
         return {
             **{name: mean.nan_to_num(0.0) for name, mean in self.steps.end().items()},
             "priority_max": priorities.amax().float(),

@@ -1,6 +1,6 @@
 """V-trace actor-critic (IMPALA, Espeholt et al. 2018) for recurrent policies.
 
-Learns off-policy: from actions of a policy that is some updates old or, with a replay buffer, many.
+Off-policy: the acting policy may be a few updates old or, with a replay buffer, many.
 
 T time, B lanes, M lanes of a minibatch. A minibatch holds whole sequences of some lanes, then
 replayed sequences if there is a replay buffer. Means are over valid steps: those that the
@@ -45,8 +45,8 @@ class VTrace(GradientLearner):
 
     Each minibatch is evaluated anew by the current policy, and V-trace corrects with truncated
     importance ratios. Advantages are divided by their root mean square, but by no less than
-    `advantage_floor`: unlike PPO, nothing clips large steps, so advantages stay small where all
-    actions are about as good.
+    `advantage_floor`: unlike in PPO, nothing clips large steps, so advantages must stay small where
+    all actions are about equally good.
 
     Args:
         policy: a policy with a critic.
@@ -54,8 +54,8 @@ class VTrace(GradientLearner):
         lr: Adam's step size.
         gamma: discount per step.
         lambda_: decay of the traces.
-        rho_clip: truncation of the ratios in the policy's gradient and the value's error. At 1, an
-            action that became likelier counts as if it had been as likely then.
+        rho_clip: truncation of the ratios in the policy's gradient and the value's error. At 1,
+            actions that became more likely have weight 1.
         c_clip: truncation of the ratios in the traces.
         advantage_floor: smallest divisor of advantages, in standard deviations of the return. Use
             about 0.3 for small batches.
@@ -71,7 +71,7 @@ class VTrace(GradientLearner):
             to each minibatch.
         replay: settings of the replay buffer.
         graph: on a GPU, captures updates as a CUDA graph. Always pass the same rollout then.
-        seed: seed of the order of minibatches and of replay.
+        seed: seed of the minibatch order and of replay sampling.
 
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
     statistic. `check` names the number and counts the updates skipped in a row.
@@ -121,13 +121,14 @@ class VTrace(GradientLearner):
         self.value_coef, self.auxiliary_coef = value_coef, auxiliary_coef
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
         self.replay_settings = replay if buffer == "replay" else None
-        self.replay_buffer: ReplayBuffer | None = None  # `collector` knows its lanes and makes it
+        self.replay_buffer: ReplayBuffer | None = None  # allocated by `collector`
 
     def collector(self, env: Env) -> Collector | AsyncCollector:
         """Returns a collector of rollouts of `n_steps` steps, and allocates the replay buffer.
 
         Raises:
-            ValueError: if the replay buffer is too small, or with a lag if there are opponents.
+            ValueError: if the replay buffer is too small, or the environment has opponents and
+                `lag` > 0.
         """
         rollout = make_rollout(env, self.policy, self.n_steps, values=False)
         if self.replay_settings:
@@ -149,7 +150,9 @@ class VTrace(GradientLearner):
         return env.n_agents * (self.n_steps + 1) * per_step
 
     def replay_size(self, env: Env) -> tuple[int, float]:
-        """Returns the observations that the replay buffer will hold, and the bytes of each."""
+        """Returns the number of observations that the replay buffer will hold, and the bytes per
+        observation; zeros without a replay buffer.
+        """
         settings = self.replay_settings
         if settings is None:
             return 0, 0.0

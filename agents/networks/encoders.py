@@ -44,8 +44,8 @@ class BandedConv1d(nn.Conv1d):
     """A convolution of rows of fixed length, (N, C, W) -> (N, C', W').
 
     On a GPU, rows of at most `MAX_BANDED` columns are multiplied by a banded matrix that holds the
-    weights of every column. That is many times the arithmetic, but several times faster: tensor
-    cores have it to spare, and cuDNN's gradients are slow for few channels.
+    weights of every column. That takes many times the arithmetic, but on tensor cores it is several
+    times faster than cuDNN, whose gradients are slow for few channels.
 
     Args:
         in_channels: C.

@@ -1,4 +1,4 @@
-"""Network layers made from spaces: an *intake* turns observations into a vector, an *output* turns
+"""Network layers built from spaces: an *intake* turns observations into a vector, an *output* turns
 a vector into actions.
 
     intake = heads.intake(env.obs_space, width)     # (..., A, C, H, W), (..., A, D) -> (..., width)

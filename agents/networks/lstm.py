@@ -37,7 +37,7 @@ def _start(reset, last_output, last_cell, hidden, cell):
 
 
 def _forward(gates, cell, next_reset, output, next_hidden, next_cell):
-    """Leaves the gates activated for `_backward`; the kernels activate them twice instead."""
+    """Leaves the gates activated for `_backward`; the kernels recompute the activations instead."""
     i, f, g, o = _split(gates)
     gates[:, : 2 * i.shape[1]].sigmoid_()
     g.tanh_()

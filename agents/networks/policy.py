@@ -35,9 +35,9 @@ def _name_in(table: Mapping[str, Any]) -> AfterValidator:
 class Policy(nn.Module):
     """Acts on worlds: `decision, state = policy(world, state)`, starting from `policy.initial(B)`.
 
-    A world is what an environment's `step` returns, a decision what it takes. Privileged
-    observations never reach the actions. They reach the critic, and `prediction_error` can teach
-    the core to infer them.
+    A world is the dict that an environment's `step` returns, a decision the dict that it takes.
+    Privileged observations never influence the actions directly: only the critic sees them, and
+    `prediction_error` can teach the core to infer them.
 
     Args:
         obs_space: the environment's observation space.
@@ -50,7 +50,7 @@ class Policy(nn.Module):
         output: "softmax" samples actions by their probabilities; "duelling" takes the action of the
             highest value.
         critic: "asymmetric" sees privileged observations, if there are any; "plain" sees what the
-            actor sees; None makes a policy that only acts, as every duelling one does.
+            actor sees; None: no critic. A duelling policy never has one.
         bf16: on a GPU, runs matrix products in bfloat16.
         seed: seed of the initial weights, and of the actions unless a generator is given.
 
@@ -122,7 +122,7 @@ class Policy(nn.Module):
             world: has `obs`, and `reset` (B,), which clears a lane's hidden state.
             state: hidden state.
             sample: samples actions; if false, takes the most likely or best ones.
-            generator: generator of the actions; None: the policy's own.
+            generator: generator of the actions. Default: the policy's.
 
         Returns:
             arrdict(actions, logits, logprobs (B,), features (B, width)) and the next hidden state.

@@ -1,4 +1,4 @@
-"""Running means and standard deviations, which non-finite numbers never enter.
+"""Normalisation by running means and standard deviations. Ignores non-finite numbers.
 
 B lanes; `...` any further axes.
 """
@@ -21,7 +21,7 @@ class RunningNorm(nn.Module):
 
     Args:
         space: leaf space of an image or a vector.
-        min_scale: smallest divisor, so that what hardly varies is not blown up.
+        min_scale: smallest divisor, so that nearly constant inputs are not amplified.
     """
 
     def __init__(self, space: Space, min_scale: float = 1e-2):
@@ -66,8 +66,8 @@ def mix_moments(
     variance: torch.Tensor,
     rate: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns mean and scale of a mixture: the norm's moments with weight 1 - rate, and the given
-    mean and variance with weight rate.
+    """Returns mean and scale of a mixture: the norm's moments with weight 1 - rate, `mean` and
+    `variance` with weight rate.
     """
     old_variance = norm.scale.square()
     spread = rate * (1 - rate) * (mean - norm.mean).square()

@@ -1,4 +1,4 @@
-"""The output that predicts returns, in a scale that follows them (PopArt).
+"""The critic's output layer, which predicts returns normalised by running statistics (PopArt).
 
 `...` any leading axes, such as (B,) lanes or (T, B) time and lanes.
 """

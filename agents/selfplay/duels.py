@@ -31,11 +31,11 @@ def score_pairs(
     Returns:
         Two (N,) float32: pairs won, with a draw as half, and pairs decided.
     """
-    own_terminal, own_return = terminal.gather(1, slots), returns.gather(1, slots)
+    slot_terminal, slot_return = terminal.gather(1, slots), returns.gather(1, slots)
     sign = torch.where(
-        terminal == own_terminal, own_return - returns, terminal.float() - own_terminal.float()
+        terminal == slot_terminal, slot_return - returns, terminal.float() - slot_terminal.float()
     ).sign()
-    decided = (terminal | own_terminal).scatter(1, slots, False)
+    decided = (terminal | slot_terminal).scatter(1, slots, False)
     won = torch.where(decided, (1 + sign) / 2, 0.0).sum(1)
     return won, decided.float().sum(1)
 
@@ -57,10 +57,10 @@ def duel_policy(
     Args:
         slots: (N, 1) int64.
     """
-    is_own = torch.zeros(len(slots), n_agents, dtype=torch.bool, device=slots.device)
-    is_own = is_own.scatter(1, slots, True).flatten()
-    lanes = torch.arange(len(is_own), device=slots.device)
-    return MixedPolicy([policy, opponent], [lanes[is_own], lanes[~is_own]])
+    in_slot = torch.zeros(len(slots), n_agents, dtype=torch.bool, device=slots.device)
+    in_slot = in_slot.scatter(1, slots, True).flatten()
+    lanes = torch.arange(len(in_slot), device=slots.device)
+    return MixedPolicy([policy, opponent], [lanes[in_slot], lanes[~in_slot]])
 
 
 @torch.no_grad()

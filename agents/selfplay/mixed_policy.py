@@ -1,4 +1,4 @@
-"""Several policies that act in one environment, each in lanes of its own.
+"""Several policies that act in one environment, each in a fixed set of lanes.
 
 Axes: B lanes of the environment, M lanes of the mixed policy (M = B unless others act too).
 """
@@ -19,8 +19,8 @@ class MixedPolicy:
     Call it like any policy if it has all lanes of the environment. Use `act` if other policies act
     in the remaining lanes.
 
-    On a GPU each policy runs on a stream of its own, also inside a CUDA graph: one small network
-    does not fill the GPU.
+    On a GPU each policy runs on a separate CUDA stream, also inside a CUDA graph, because one small
+    network does not fill the GPU.
 
     Args:
         policies: the policies.

@@ -28,7 +28,7 @@ class Opponents:
     The learning agent's slot rotates across environments. In the remaining environments, which come
     first, the current policy controls every agent and learns from all of them.
 
-    The lanes of opponents have `learns` False, and `step` ignores the actions given for them.
+    Opponents' lanes have `learns` False, and `step` ignores the decision's actions in them.
 
     Args:
         env: environment with at least two agents.
@@ -113,7 +113,7 @@ class Opponents:
     def step(self, decision: arrdict) -> World:
         """Steps the environment.
 
-        Takes `decision.actions`, (B, ...), in the lanes that learn; the opponents act in theirs.
+        Uses `decision.actions`, (B, ...), in the lanes that learn; the opponents act in the others.
         """
         generator = self.generator.on(self.learners.device)
         opponent_actions, self.hidden_state = self.mixed_policy.act(
@@ -158,7 +158,7 @@ class Opponents:
     def pop_win_rates(self) -> dict[str, float]:
         """Returns the fraction of decided pairs that were won since the last call. Synchronises.
 
-        By metric name, for each kind of opponent that any pair was decided against.
+        Keys are metric names. A kind of opponent without a decided pair is absent.
         """
         win_rates = {}
         by_kind = self.pairs.double().tensor_split([self.n_past], 1)

@@ -18,8 +18,8 @@ _STORED = "obs", "reset", "learns", "privileged"  # what `Rollout.store_world` r
 def initial_actor_state(env: Env, policy: Actor, rollout: Rollout) -> arrdict:
     """Resets an environment and allocates the rollout's metrics.
 
-    Returns the actor state for `collect`: arrdict(world, state), the current world as far as
-    rollouts store it and the hidden state. It shares no memory with the environment.
+    Returns the actor state for `collect`: arrdict(world, state), a copy of the parts of the current
+    world that rollouts store, and the hidden state.
     """
     first = rollout.select_lanes(env.reset())
     rollout.allocate_metrics(first)
@@ -70,10 +70,10 @@ class Collector:
     GPU replays a CUDA graph.
 
     Args:
-        env: environment, which is reset once, here.
-        policy: who acts.
+        env: environment. It is reset here, once, unless there is an `actor_state`.
+        policy: the acting policy.
         rollout: the rollout to fill.
-        actor_state: where to continue instead of resetting the environment.
+        actor_state: actor state to continue from; None resets the environment.
 
     Attributes:
         graph: the captured graph, or None.

@@ -23,9 +23,9 @@ from megastep.types import Env, Space
 
 #: Bool tensors of a row, stored as one bit each.
 _FLAGS = "starts", "learns", "terminal", "truncated"
-#: What a sequence has L + 1 rows of, instead of L.
+#: Tensors of which a sequence has L + 1 rows instead of L.
 _WITH_LAST = "obs", "privileged", "starts", "learns"
-#: Keeps sequences with no error drawable.
+#: Smallest priority before the exponent, so that sequences without error can still be drawn.
 _MIN_PRIORITY = 1e-6
 
 
@@ -151,12 +151,12 @@ class ReplayBuffer:
 
         Returns:
             an arrdict like that of `Rollout.sequences`, with leaves (L+1, M, ...) or (L, M, ...),
-            and of each sequence, (M,):
+            and per sequence, (M,):
 
             index: int64, for `set_priorities`
-            probability: float64, of being drawn, in each of n equal parts of the total priority
+            probability: float64, its priority divided by the sum of all priorities
             weight: float32 importance weight for the loss, at most 1 (Schaul et al. 2016, sec. 3.4)
-            age: int64, number of rollouts added after the one that it starts in
+            age: int64, number of rollouts added since the one that it starts in
         """
         index = self.tree.sample(n, generator)
         probability = self.tree.probability(index)
@@ -182,8 +182,8 @@ class ReplayBuffer:
     def set_priorities(self, index: torch.Tensor, values: torch.Tensor) -> None:
         """Sets the priorities of sequences of the last sample to values (M,) to the power alpha.
 
-        Non-finite values change nothing. Does nothing with alpha 0, or until `is_ready`, because
-        what was drawn until then was not learned from.
+        Non-finite values change nothing. Does nothing if alpha is 0, or until `is_ready`, because
+        nothing is learned from earlier samples.
         """
         if self.settings.alpha == 0:
             return

@@ -1,4 +1,4 @@
-"""Columns of the replay buffer: one tensor each, possibly stored in a smaller dtype than used."""
+"""Columns of the replay buffer: one tensor each, stored in a smaller dtype where possible."""
 
 import torch
 
@@ -13,7 +13,7 @@ class Column:
         n_rows: R.
         shape: shape of a row.
         dtype: dtype that `read` returns.
-        stored: dtype in memory; None: `dtype`.
+        stored: dtype of the storage; None: `dtype`.
         device: device of the rows.
     """
 
@@ -34,15 +34,15 @@ class Column:
         self.rows.index_copy_(0, index, values)
 
     def read(self, index: torch.Tensor) -> torch.Tensor:
-        """Returns single lanes of rows (R, B, ...): index (...) counts R B lanes."""
+        """Returns entries (..., *) of rows (R, B, *). Entry r B + b is lane b of row r."""
         rows = self.rows.flatten(0, 1).index_select(0, index.flatten())
         return cast(rows, self.dtype).unflatten(0, index.shape)
 
 
 def stored_dtype(space: Space, images: str) -> torch.dtype | None:
-    """Returns the dtype in which values of a leaf space are stored; None: their own.
+    """Returns the dtype in which values of a leaf space are stored; None if it does not change.
 
-    Integers take the fewest bytes that hold them.
+    Integers are stored in the smallest dtype that holds them.
     """
     if isinstance(space, spaces.MultiDiscrete):
         dtypes = torch.uint8, torch.int16, torch.int32

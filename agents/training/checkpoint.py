@@ -50,8 +50,8 @@ def save(
         step: environment steps so far, of all lanes.
         state: dicts and lists of tensors and numbers.
         config: the run's configuration, as JSON.
-        keep_checkpoints: the last so many steps are kept, and the one with the highest score.
-        score: the higher the better, such as the mean return; None if unknown.
+        keep_checkpoints: number of latest steps kept, besides the one with the highest score.
+        score: for example the mean return, higher is better; None if unknown.
 
     Raises:
         OSError: the disk is full or not writable. Nothing has changed.

@@ -60,7 +60,7 @@ class EpisodeStats:
             metrics: name -> (T, B), read where `done`.
         """
         reward = torch.where(reward.abs() <= LIMIT, reward, 0.0)
-        # cumulative sums over all T rows, less the sum at the last episode end before each row
+        # cumulative sums over all T rows, minus the sum at the last episode end before each row
         returns = self.returns + reward.double().cumsum(0)
         lengths = self.lengths + (~reset).double().cumsum(0)
         rows = torch.arange(len(reward), device=reward.device)[:, None]
@@ -143,7 +143,7 @@ def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch
 
 
 def _sum_since(cumulative, ends, rows=slice(None)):
-    """Returns cumulative sums (T, B) at some rows, less those at the row of the last episode end.
+    """Returns cumulative sums (T, B) at some rows, minus those at the row of the last episode end.
 
     Args:
         ends: (T, B) int64, the row of that end, -1 if there was none.

@@ -14,7 +14,7 @@ from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.types import Env, Policy, Space
 
-#: Steps between two checks whether all episodes have ended. A check empties the GPU's queue, which
+#: Steps between two checks of whether all episodes have ended. A check waits for the GPU, which
 #: costs more than a few superfluous steps.
 CHECK_EVERY = 64
 
@@ -54,7 +54,7 @@ def first_episodes(
     Args:
         seed: of the action sampling.
         greedy: takes the most likely actions instead of sampling.
-        max_steps: stops after so many steps; unfinished episodes have `done` False.
+        max_steps: maximum number of steps; unfinished episodes have `done` False.
 
     Returns:
         An arrdict on the environment's device:

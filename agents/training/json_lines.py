@@ -35,7 +35,7 @@ class JsonLines:
 def read(path: Path | str) -> list[dict[str, Any]]:
     """Returns the objects of a file.
 
-    Skips damaged lines with a warning, and a last line that a crash cut short without one.
+    Skips damaged lines with a warning. Skips a last line that a crash cut short silently.
     """
     return [row for row, _ in _intact_lines(Path(path))]
 

@@ -28,7 +28,7 @@ class Saver:
         keep_checkpoints: number of checkpoints kept, besides the one with the best score.
 
     Attributes:
-        error: why the last checkpoint could not be written, as a sentence; None if it was.
+        error: why the last checkpoint could not be written, as a sentence; None if it was written.
     """
 
     def __init__(self, folder: Path, config: dict[str, Any], keep_checkpoints: int = 2):
@@ -40,7 +40,7 @@ class Saver:
 
         Args:
             state: dicts and lists of tensors and numbers.
-            score: the higher the better, such as the mean return; None if unknown.
+            score: for example the mean return, higher is better; None if unknown.
 
         Raises:
             NonFiniteError: the state holds a NaN or infinity. Earlier checkpoints are kept.

@@ -4,7 +4,7 @@
 check their arguments, allocate their outputs and launch one kernel each. None of them synchronises
 host and device. An argument that does not fit raises a TypeError or ValueError that names it.
 
-A game's step is an operation too. It lies beside its environment, for example
+The step of a game is an operation too, in the environment's package, for example
 :func:`megastep.envs.deathmatch.step.deathmatch_step`.
 """
 

@@ -15,17 +15,17 @@ _address, _shape = torch.Tensor.data_ptr, operator.attrgetter("shape")
 
 
 class _Packed:
-    """The packed SceneryParams of a scenery, and the memory that they were packed for.
+    """The packed SceneryParams of a scenery, and the addresses and sizes they were packed from.
 
     Has no ``__dict__``, so that :func:`~megastep.engine.state_tree.state_tree` does not look
     inside.
     """
 
-    __slots__ = ("tensors", "memory", "params")
+    __slots__ = ("tensors", "inputs", "params")
 
     def __init__(self, scenery):
         layouts = scenery.layouts
-        self.memory = self.params = None
+        self.inputs = self.params = None
         self.tensors = (
             layouts.lines.vals,
             layouts.lights.vals,
@@ -42,7 +42,7 @@ class _Packed:
 def scenery_params(scenery: Scenery, radius: float) -> bytes:
     """Returns the packed SceneryParams of a scenery.
 
-    Its tensors cannot be replaced, so they are checked only if the memory or the shape of one has
+    Its tensors cannot be replaced, so they are checked only if the address or shape of one has
     changed since the last call.
 
     Raises:
@@ -52,10 +52,10 @@ def scenery_params(scenery: Scenery, radius: float) -> bytes:
     if packed is None:
         packed = vars(scenery)["_packed"] = _Packed(scenery)
     n_threads = devices.threads()
-    memory = [*map(_address, packed.tensors), *map(_shape, packed.tensors), radius, n_threads]
-    if packed.memory != memory:
+    inputs = [*map(_address, packed.tensors), *map(_shape, packed.tensors), radius, n_threads]
+    if packed.inputs != inputs:
         packed.params = _pack(scenery, radius, n_threads)
-        packed.memory = memory
+        packed.inputs = inputs
     return packed.params
 
 

@@ -26,7 +26,7 @@ __all__ = ["observe", "render", "update_agent_geometry"]
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
 
-# RenderParams' optional outputs and what only they need. 0 is null: not wanted.
+# RenderParams' optional outputs, and the inputs that only these need. 0 is null: not wanted.
 _OPTIONAL = dict.fromkeys(
     (
         *("indices", "locations", "dots", "distances", "screen"),
@@ -132,7 +132,7 @@ def _per_camera(lanes, agents):
 
 
 def _seen_fields(scenery, seen, clear_mask):
-    """RenderParams' fields about the texels seen."""
+    """Returns the fields of RenderParams about the texels seen."""
     lanes, mask = (scenery.n_envs, scenery.n_agents), 0
     if seen is None:
         raise ValueError("clear_mask clears seen, but seen was not given")

@@ -109,7 +109,7 @@ class Layouts(SetOnce):
 class Scenery(SetOnce):
     """The scenery of N environments with A agents each.
 
-    This constructor gives each environment a layout of its own; :meth:`of_layouts` shares layouts
+    This constructor gives every environment a separate layout; :meth:`of_layouts` shares layouts
     between environments. :func:`megastep.scene.scenery` makes scenery from geometries.
 
     Args:
@@ -146,28 +146,28 @@ class Scenery(SetOnce):
         device = lines.device
         textures = checks.ragged("textures", textures, ("T", 3), device)
         model = checks.floats("model", model, ("M", 2, 2), device)
-        n, n_own = len(lines), n_agents * len(model)
+        n, n_agent_lines = len(lines), n_agents * len(model)
         _same("textures", "one subarray per line of lines", len(lines.vals), len(textures))
-        if not n or int(lines.widths.min()) < n_own:
+        if not n or int(lines.widths.min()) < n_agent_lines:
             fewest = int(lines.widths.min()) if n else 0
             raise ValueError(
-                f"lines must start, in every environment, with the {n_own} lines of its {n_agents} "
-                f"agents, but one environment has only {fewest} lines"
+                f"lines must start, in every environment, with the {n_agent_lines} lines of its "
+                f"{n_agents} agents, but one environment has only {fewest} lines"
             )
         within = torch.arange(len(lines.vals), device=device) - lines.starts[lines.inverse]
-        is_agent = within < n_own
-        agent_widths = textures.widths[is_agent].view(n, n_own)
+        is_agent = within < n_agent_lines
+        agent_widths = textures.widths[is_agent].view(n, n_agent_lines)
         if not bool((agent_widths == agent_widths[0]).all()):
             raise ValueError(
                 "textures of the agents' lines must have the same widths in every environment, but "
                 "they differ"
             )
-        texel_of_agent = is_agent[textures.inverse]
+        is_agent_texel = is_agent[textures.inverse]
         layouts = Layouts(
-            Ragged(lines.vals[~is_agent], lines.widths - n_own),
-            Ragged(textures.vals[~texel_of_agent], textures.widths[~is_agent]),
+            Ragged(lines.vals[~is_agent], lines.widths - n_agent_lines),
+            Ragged(textures.vals[~is_agent_texel], textures.widths[~is_agent]),
             lights,
-            textures.vals[texel_of_agent].view(n, int(agent_widths[0].sum()), 3),
+            textures.vals[is_agent_texel].view(n, int(agent_widths[0].sum()), 3),
             device,
         )
         self._set(n_agents, layouts, model, agent_widths[0], torch.arange(n))
@@ -276,7 +276,7 @@ def _of_fixed_widths(name, vals, widths):
 
 
 def _starts(name, widths):
-    """(n + 1,) int32: the start of each subarray, and the end of the last one."""
+    """Returns (n + 1,) int32, the start of each subarray and the end of the last one."""
     ends = widths.cumsum(0)
     if len(ends) and int(ends[-1]) >= 2**31:
         raise ValueError(

@@ -1,4 +1,5 @@
-"""Random numbers and spawning, from a counter-based generator: Philox 4x32-10.
+"""Spawning agents at random points, and uniform random numbers by lane. Both use the counter-based
+generator Philox 4x32-10.
 
 N environments, A agents per environment, D layouts, B lanes.
 """
@@ -36,12 +37,12 @@ def spawn(
 
     Args:
         mask: (N, A) bool, agents to respawn.
-        points: (D, n, 2) metres. Each agent of an environment has its own n / A of them.
+        points: (D, n, 2) metres. Each agent has n / A points of a layout, agent 0 the first ones.
         counts: (N, A) int32, numbers drawn so far. Each respawned agent's is advanced by one.
         seed: the generator's key.
         resample: if all agents of an environment respawn, move it to a random layout first.
-        hidden: choose a point where no other agent of the environment sees the new one, except
-            through gaps narrower than an agent's radius. If there is none, take the point furthest
+        hidden: choose a point that no other agent of the environment sees, except through gaps
+            narrower than an agent's radius. If there is none, choose the point that is furthest
             from its nearest agent. Agents respawn one after the other and avoid those before them.
         point_index: (N, A) int32, receives the index of each respawned agent's point.
 

@@ -31,7 +31,7 @@ _OPAQUE = (  # types whose attributes hold no state of an environment
 
 
 def _children(node):
-    """[(step of the path, child)] of a node."""
+    """Returns [(step of the path, child)] of a node."""
     if isinstance(node, dict):
         return [(f"[{key!r}]", child) for key, child in dict.items(node)]
     if isinstance(node, (list, tuple)):
@@ -46,8 +46,8 @@ def _children(node):
 
 
 def walk(root: Any, types: tuple[type, ...]) -> dict[str, tuple[Any, str, Any]]:
-    """Returns {path: (parent, step, leaf)} of the leaves below ``root`` that have one of these
-    python_types.
+    """Returns {path: (parent, step, leaf)} of the leaves reachable from ``root`` that are of one of
+    these types.
 
     Paths read like attributes, ``.core.agents.positions``; ``step`` is a path's last part. An
     object with children is visited once, by its first path.

@@ -1,4 +1,4 @@
-"""Texels that agents have seen, against those that are visible at all.
+"""Counts of the texels that agents have seen, and of the visible ones they have not.
 
 N environments, A agents per environment, D layouts. A tensor of texels has one bit per static texel
 of a layout, in ``n_words`` words of 32.

@@ -91,7 +91,7 @@ class JoinedRagged(RaggedTorch):
 
 
 def _ranges(starts, widths):
-    """Indices of the ranges [start, start + width), concatenated."""
+    """Returns the indices of the ranges [start, start + width), concatenated."""
     offsets = widths.cumsum(0) - widths
     return torch.arange(int(widths.sum()), device=widths.device) + torch.repeat_interleave(
         starts - offsets, widths
@@ -131,7 +131,7 @@ def baked(scenery) -> JoinedRagged:
 
 
 def _by_line(scenery, refusal, agents, agent_starts, texels):
-    """Texels by line. ``agents`` holds those of environment e's agents from ``agent_starts[e]`` on.
+    """Returns texels by line. In ``agents``, those of environment e start at ``agent_starts[e]``.
 
     A line is an agent's or a wall. Its piece of the other tensor is empty: both tables end in an
     empty entry for this purpose.
@@ -154,5 +154,5 @@ def _by_line(scenery, refusal, agents, agent_starts, texels):
 
 
 def _with_zero(table):
-    """A table with a zero appended."""
+    """Returns a table with a zero appended."""
     return torch.cat([table, table.new_zeros(1)])

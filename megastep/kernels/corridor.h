@@ -28,7 +28,7 @@ HD int may_occlude(const Corridor& c, float ax, float ay, float bx, float by) {
              (maxf(along_a, along_b) < -c.aside) | (minf(along_a, along_b) > c.along));
 }
 
-// Could any wall inside the box?
+// The same for the walls in a bounding box: 0 only if none of them can occlude the light.
 HD int box_may_occlude(const Corridor& c, float min_x, float min_y, float max_x, float max_y) {
     float min_side = 1e9f, max_side = -1e9f;
     float min_along = 1e9f, max_along = -1e9f;

@@ -24,8 +24,9 @@ HD Occluder occluder_of(float light_x, float light_y, float ax, float ay, float 
     return {sign * vx, sign * vy, sign * wx, sign * wy, sign * area};
 }
 
-// Does the segment from the light to a texel at d meet the wall? Its last thousandth, where the
-// texel's own wall lies, does not count. No division: both sides are multiplied by the determinant.
+// Returns 1 if the wall cuts the segment from the light to a texel at d. The segment's last
+// thousandth does not count, since the wall of the texel itself lies there. Needs no division: both
+// sides are multiplied by the determinant.
 HD int occludes(const Occluder& wall, float dx, float dy) {
     float determinant = cross(dx, dy, wall.vx, wall.vy);
     float u = cross(wall.wx, wall.wy, dx, dy);

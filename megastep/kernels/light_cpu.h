@@ -4,7 +4,7 @@
 #include "common/scenery.h"
 #include "light.h"
 
-// Does any of n walls occlude the light from a point at (dx, dy) from it?
+// Returns 1 if any of n walls occludes the light from a point at (dx, dy) from it.
 static int is_occluded(const float* walls, int n, const float* light, float dx, float dy) {
     for (int start = 0; start < n; start += 64) {
         int end = mini(start + 64, n);

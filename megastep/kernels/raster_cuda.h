@@ -108,8 +108,8 @@ DEVICE void raster_group(View& v, const Float4* ends, int line, int active) {
 }
 
 // Rasterises walls, in groups of 32 with a bounding box around each. Groups that are off-screen are
-// skipped. The others come nearest first, so that groups entirely behind what is already there can
-// be skipped too.
+// skipped. The others come nearest first, so that groups entirely behind earlier ones can be skipped
+// too.
 DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scenery,
                          float half_width) {
     for (int start = 0; BOX_WALLS * start < scenery.n_walls; start += WARP) {
@@ -127,12 +127,12 @@ DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scen
             int k = __ffs(__ballot_sync(FULL_WARP, key == min_key)) - 1;
             if (v.warp_lane == k)
                 key = ~0u;
-            int its_tiles = __shfl_sync(FULL_WARP, tiles, k);
+            int box_tiles = __shfl_sync(FULL_WARP, tiles, k);
             float max_inverse = __shfl_sync(FULL_WARP, bounds.max_inverse, k);
-            int covers = v.warp_lane >= (its_tiles & 0xffff) && v.warp_lane <= its_tiles >> 16;
+            int covers = v.warp_lane >= (box_tiles & 0xffff) && v.warp_lane <= box_tiles >> 16;
             float tile_min = covers ? v.tile_min : INF_VALUE;
             if (__all_sync(FULL_WARP, tile_min > max_inverse))
-                continue;  // the box is entirely behind what is already there
+                continue;  // the box is entirely behind earlier ones
             int l = BOX_WALLS * (start + k);
             raster_group(v, (const Float4*)s.walls + (scenery.first_wall + l + v.warp_lane),
                          scenery.n_agent_lines + l, l + v.warp_lane < scenery.n_walls);

@@ -14,8 +14,8 @@ DEVICE Occluder from_warp_lane(const Occluder& wall, int warp_lane) {
             from_warp_lane(wall.area, warp_lane)};
 }
 
-// Does one of the 32 walls from `first` on occlude the light from this warp lane's texel? The texel
-// is at (dx, dy) from the light.
+// Returns 1 if one of the 32 walls from `first` on occludes the light from this warp lane's texel,
+// which is at (dx, dy) from the light.
 DEVICE int occluded_by_box(const SceneryParams& s, const Corridor& corridor, int first, int end,
                            int warp_lane, float dx, float dy) {
     Occluder occluder = {0.f, 0.f, 0.f, 0.f, 0.f};
@@ -30,8 +30,8 @@ DEVICE int occluded_by_box(const SceneryParams& s, const Corridor& corridor, int
     return occluded;
 }
 
-// Is the light occluded from this warp lane's texel at (dx, dy) from it? Warp lanes without a texel
-// pass `occluded` = 1.
+// Returns 1 if any wall occludes the light from this warp lane's texel, at (dx, dy) from the light.
+// Warp lanes without a texel pass `occluded` = 1.
 DEVICE int occluded_by_walls(const SceneryParams& s, const Corridor& corridor, const Walls& walls,
                              int warp_lane, float dx, float dy, int occluded) {
     int n_boxes = walls.end_box - walls.first_box;

@@ -40,7 +40,7 @@ def _plot_strips(name, state, axes, yaws):
 
 
 class RGB:
-    """RGB images: float32 (N, A, 3, C, R / subsample) in linear light.
+    """RGB images, float32 (N, A, 3, C, R / subsample), in linear light.
 
     Args:
         core: the environment's core.
@@ -55,7 +55,7 @@ class RGB:
         )
 
     def __call__(self, r: engine.Render | None = None) -> torch.Tensor:
-        """Returns the observation of a render. Default: of the present state."""
+        """Returns the observation of a render. Default: of the current state."""
         r = render(self.core) if r is None else r
         screen = r.screen.reshape(self.core.n_envs, self.core.n_agents, -1, self.core.res, 3)
         return downsample(screen.permute(0, 1, 4, 2, 3), self.subsample).mean(-1)
@@ -99,7 +99,7 @@ class Depth:
         )
 
     def __call__(self, r: engine.Render | None = None) -> torch.Tensor:
-        """Returns the observation of a render. Default: of the present state."""
+        """Returns the observation of a render. Default: of the current state."""
         r = render(self.core) if r is None else r
         distances = r.distances.reshape(self.core.n_envs, self.core.n_agents, 1, -1, self.core.res)
         depth = 1 - ((distances - self.core.agents.radius) / self.max_depth).clamp(0, 1)

@@ -33,7 +33,7 @@ def visible_texels(scenery: Scenery, points: torch.Tensor) -> torch.Tensor:
     On the CPU two thousand homes take seconds, so bitmaps of many layouts are cached.
 
     Args:
-        scenery: its agents' model is what looks; it needs at least one agent.
+        scenery: scenery with at least one agent per environment, which looks around.
         points: (D, P, 2) metres, points to look from.
 
     Raises:

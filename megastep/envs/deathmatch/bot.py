@@ -90,7 +90,9 @@ class Bot:
         return arrdict(actions=actions[:, None]), state
 
     def _nearest_agent(self, rgb):
-        """Returns if an agent is in view (B,), and the agent's pixel closest to the centre (B,)."""
+        """Returns (B,) bool, true if an agent is in view, and (B,) the agent's pixel closest to the
+        centre.
+        """
         light = rgb.sum(1)
         is_agent = (rgb.amin(1) < SATURATED * light) & (light > DARK)
         n = rgb.shape[2]
@@ -104,14 +106,16 @@ class Bot:
         return torch.rad2deg((slope * half).atan())
 
     def _turn(self, target, spin, seconds):
-        """Returns the turn (B,) that brings a bearing closest to 0 after so many seconds."""
+        """Returns the turn (B,) that brings a bearing closest to 0 after `seconds`."""
         pushes = torch.arange(-1, 2, device=spin.device) * TURN  # right, nothing, left
         off = target[:, None] - seconds * (RETAINED * spin[:, None] + pushes)
         best = off.abs().argmin(1)
         return torch.where(best == 0, RIGHT, torch.where(best == 2, LEFT, NOTHING))
 
     def _fight(self, target, spin, approaches):
-        """Turns to a target; walks forward where no turn is needed and it `approaches`."""
+        """Returns actions that turn to a target, or walk forward where no turn is needed and
+        `approaches` is true.
+        """
         soon, later = (self._turn(target, spin, seconds) for seconds in (STEP, 3 * STEP))
         action = torch.where(target.abs() > 3, later, soon)
         return torch.where((action == NOTHING) & approaches, FORWARD, action)

@@ -42,9 +42,9 @@ class Deathmatch(SceneryEnv):
     episode ended respawn in the next step, out of the other agents' sight if possible.
 
     Observation, all fp16: ``rgb`` (1, 3, 1, 128) and ``d`` (1, 1, 1, 128), 128 pixels over 70
-    degrees, each the mean of 4 rays; ``imu`` (1, 3); ``health`` (1, 3): own health from 0 to 1,
-    whether the last step hit another agent, how many agents hit this one. Agents have saturated
-    colours and a red front; walls are paler.
+    degrees, each the mean of 4 rays; ``imu`` (1, 3); ``health`` (1, 3): the agent's health from 0
+    to 1, whether it hit another agent in the last step, how many agents hit it. Agents have
+    saturated colours and a red front; walls are paler.
 
     Actions: seven, with momentum; see :class:`~megastep.modules.MomentumMovement`.
 
@@ -57,7 +57,7 @@ class Deathmatch(SceneryEnv):
 
     Args:
         n_envs: number of environments.
-        geometries: homes to live in. Default: generated homes.
+        geometries: floor plans. Default: generated homes.
         n_agents: agents per environment.
         seed: of textures, spawns and generated homes.
         device: default: a GPU if there is one.

@@ -38,7 +38,9 @@ class DeathmatchStep(NamedTuple):
 
 
 def privileged_size(n_agents: int) -> int:
-    """Returns how many numbers a critic sees: own health, and five of each other agent."""
+    """Returns the size of the privileged observation: the agent's health, and five numbers per
+    other agent.
+    """
     return 1 + PROGRAM.constants["PRIVILEGED_PER_OPPONENT"] * (n_agents - 1)
 
 

@@ -47,7 +47,7 @@ class PointGoal(SceneryEnv):
 
     Args:
         n_envs: number of environments.
-        geometries: homes to live in. Default: generated homes.
+        geometries: floor plans. Default: generated homes.
         seed: of textures, spawns, goals and generated homes.
         device: default: a GPU if there is one.
         nearest: minimum length of the shortest path to a goal, in metres.
@@ -162,7 +162,7 @@ class PointGoal(SceneryEnv):
         return world
 
     def _view(self):
-        """The observation without the goal."""
+        """Returns the observation without the goal."""
         view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True)
         return arrdict(
             rgb=view.rgb.view(self.n_envs, *self.obs_space.rgb.shape),

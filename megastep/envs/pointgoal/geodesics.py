@@ -4,10 +4,9 @@ Distances are computed in two ways:
 
 * A *field* holds the distance to a goal from every cell of a grid, by Dijkstra's algorithm on 16
   neighbours per cell. It is a few per cent too long, but continuous, so progress is measured on it.
-* The *length* of the shortest path from a spawn point to a goal is exact to millimetres: that of
-    the
-  shortest polyline along which the disc touches no wall, from a visibility graph (Lozano-Perez and
-  Wesley 1979) of goals, spawn points and points around the ends of walls.
+* The *length* of the shortest path from a spawn point to a goal is exact to millimetres. It is the
+  length of the shortest polyline along which the disc touches no wall, from a visibility graph
+  (Lozano-Perez and Wesley 1979) of goals, spawn points and points around the ends of walls.
 
 M walls, H x W cells, G goals, S spawn points, P points, K pairs of points.
 """
@@ -19,7 +18,7 @@ import numpy as np
 from megastep.modules.spawning import distances, spawn_points
 
 CELL = 0.1  # metres, of fields
-FINE = 2  # cells of the clearance are this many times smaller
+FINE = 2  # the clearance has cells this many times smaller
 FAR = 0.5  # metres; the clearance is clipped here
 RINGS = 3  # rings of cells inside walls that get a neighbour's distance, for interpolation
 ARC = 8  # points around the end of a wall
@@ -81,12 +80,12 @@ class _Grid:
         np.minimum(near, np.sqrt(dx * dx + dy * dy), out=near)
 
     def free(self, radius):
-        """(H, W) bool: cells at whose centre a disc fits."""
+        """Returns (H, W) bool, the cells at whose centre a disc fits."""
         return self.clearance[::FINE, ::FINE] >= radius
 
     def read(self, values, points):
-        """(..., P): interpolates `values` (..., H, W), of this grid or the finer one, at points (P,
-        2).
+        """Returns `values` (..., H, W), of this grid or the finer one, interpolated at points
+        (P, 2): (..., P).
         """
         height, width = values.shape[-2:]
         side = CELL * len(self.clearance) / (FINE * height)
@@ -108,20 +107,20 @@ class _Grid:
         return total
 
     def sees(self, starts, ends, least):
-        """(K,) bool: the straight paths from starts to ends, (K, 2) each, that keep at least
-        `least` metres from all walls.
+        """Returns (K,) bool, the straight paths from starts to ends, (K, 2) each, that stay at
+        least `least` metres from all walls.
         """
         across = ends - starts
         n_steps = np.ceil(np.sqrt((across**2).sum(1)) / STEP).astype(int) + 1
         clear = np.ones(len(starts), bool)
         for n_points in (1, 3, 7, None):  # a few points rule out most paths that are not clear
-            left = clear.nonzero()[0]
-            counts = n_steps[left] if n_points is None else np.full(len(left), n_points)
-            path = np.repeat(left, counts)
+            remaining = clear.nonzero()[0]
+            counts = n_steps[remaining] if n_points is None else np.full(len(remaining), n_points)
+            path = np.repeat(remaining, counts)
             step = np.arange(len(path)) - np.repeat(np.cumsum(counts) - counts, counts)
-            part = (step + 1) / (np.repeat(counts, counts) + 1)
-            places = starts[path] + part[:, None] * across[path]
-            clear[path[self.read(self.clearance, places) < least]] = False
+            fraction = (step + 1) / (np.repeat(counts, counts) + 1)
+            points = starts[path] + fraction[:, None] * across[path]
+            clear[path[self.read(self.clearance, points) < least]] = False
         return clear
 
 
@@ -148,7 +147,7 @@ def _graph(free):
 
 
 def _entries(grid, numbers, points):
-    """Moves from points (P, 2) to the free cells around them: point, cell, metres, (E,) each."""
+    """Returns the moves from points (P, 2) to free cells around them: point, cell, metres, (E,)."""
     nearest = np.rint((points - grid.origin) / CELL).astype(int)
     offsets = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 2)
     cells = (nearest[:, None] + offsets).reshape(-1, 2)
@@ -169,7 +168,7 @@ def _sparse(n, *moves):
 
 
 def _filled(fields, passable):
-    """Fields (G, H, W) whose cells inside walls hold a neighbour's distance plus one cell."""
+    """Fills the cells inside walls of fields (G, H, W): a neighbour's distance plus one cell."""
     for _ in range(RINGS):
         padded = np.pad(fields, ((0, 0), (1, 1), (1, 1)), constant_values=np.inf)
         around = np.minimum(
@@ -188,8 +187,8 @@ def _corners(walls, radius):
     angles = 2 * np.pi * np.arange(ARC) / ARC
     away = np.tile(np.stack([np.cos(angles), np.sin(angles)], 1), (len(ends), 1))
     points = np.repeat(ends, ARC, axis=0) + radius * away
-    touching = distances(points, walls) > radius - 1e-4
-    points, away = points[touching], away[touching]
+    fits = distances(points, walls) > radius - 1e-4
+    points, away = points[fits], away[fits]
     aside = STEP * np.stack([-away[:, 1], away[:, 0]], 1)
     # Beside a straight wall, a step to either side keeps the distance: no path bends there.
     further = np.sqrt(radius**2 + STEP**2) - 1e-3
@@ -270,15 +269,15 @@ def geodesics(
     points = spawn_points(g, SPARE * (n_spawns + n_goals), 1, radius, random)
     entries = _entries(grid, numbers, points)
     _, parts = connected_components(_sparse(n_cells, moves), directed=False)
-    of_point = np.full(len(points), -1)
-    of_point[entries[0]] = parts[entries[1]]
-    if (of_point < 0).all():
+    part_of_point = np.full(len(points), -1)
+    part_of_point[entries[0]] = parts[entries[1]]
+    if (part_of_point < 0).all():
         raise ValueError(
             f"geometry {g.id} has no room for an agent to walk in: it needs gaps at least "
             f"{2 * radius + CELL:.2f} m wide"
         )
-    largest = np.bincount(of_point[of_point >= 0]).argmax()
-    points = points[of_point == largest]
+    largest = np.bincount(part_of_point[part_of_point >= 0]).argmax()
+    points = points[part_of_point == largest]
     goals = np.resize(points[:n_goals], (n_goals, 2))
     spawns = points[n_goals:] if len(points) > n_goals else points
     spawns = np.resize(spawns, (n_spawns, 2))

@@ -69,8 +69,8 @@ def goal_fields(
 
 
 def _in_range(layout, g, nearest, furthest):
-    """Returns spawn points (S, 2) with a goal in range, lengths (S, G), and which are in range (S,
-    G).
+    """Returns spawn points (S, 2) with a goal in range, the lengths (S, G) of their shortest paths,
+    and (S, G) bool, true where a length is in range.
     """
     allowed = (layout.lengths >= nearest) & (layout.lengths <= furthest)
     indices = allowed.any(1).nonzero()[0]

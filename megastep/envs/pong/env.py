@@ -35,9 +35,10 @@ class Pong(DisplayedEnv):
     paddle is a tracker that follows the ball or, with ``self_play``, a lane that observes the game
     mirrored.
 
-    Observation: (1, 8) fp16 features: y of the own paddle, y of the other paddle, x and y of the
+    Observation: (1, 8) fp16 features: y of the lane's paddle, y of the opponent's, x and y of the
     ball, all in [-1, 1]; the ball's velocity in x and y, in cells per step; how far the ball is
-    below the centre of the own and of the other paddle, 1 at the paddle's edge, clamped to [-2, 2].
+    below the centre of the lane's paddle and of the opponent's, 1 at the paddle's edge, clamped to
+    [-2, 2].
     With ``pixels``: (1, 1, 30, 40) uint8, the ball 255, paddles 170, the ball's last position 85.
     All steps write to the same buffer of images.
 
@@ -56,8 +57,8 @@ class Pong(DisplayedEnv):
         device: default: a GPU if there is one.
         points: points that end an episode; 21 for a whole game.
         limit: steps per point after which an episode is truncated.
-        self_play: control both paddles.
-        tracker_speed: cells per step of the tracker.
+        self_play: makes both paddles lanes; otherwise the right one is a scripted tracker.
+        tracker_speed: maximum speed of the tracker, in cells per step.
         pixels: observe pixels instead of features.
     """
 
@@ -125,8 +126,9 @@ class Pong(DisplayedEnv):
         )
 
     def check(self) -> None:
-        """EngineError if the engine has flagged an error since the last check. Waits for the
-        device, so not for inside a step.
+        """Raises EngineError if the engine flagged an error on the device since the last check.
+
+        Synchronises host and device, so do not call it from ``step``.
         """
         engine.check_flag(self.error_flag)
 
@@ -137,11 +139,11 @@ class Pong(DisplayedEnv):
         right paddle, all in cells from the court's top left. ``scores`` (2,); ``age`` in steps.
         """
         game = self.games[:, e].clone()
-        places = game / CELL
+        cells = game / CELL
         return arrdict(
-            ball=places[:2],
-            last_ball=places[4:6],
-            paddles=places[6:8],
+            ball=cells[:2],
+            last_ball=cells[4:6],
+            paddles=cells[6:8],
             scores=game[8:10],
             age=game[10],
         )

@@ -56,7 +56,7 @@ def pong_step(
         restart: start all games anew.
         points: points that win a game.
         limit: steps after which a game is truncated.
-        tracker_speed: cells per step of the right paddle if it is not a lane.
+        tracker_speed: maximum speed, in cells per step, of the right paddle if it is not a lane.
         pixels: (B, 1, 1, 30, 40) uint8, written instead of features.
 
     Raises:

@@ -41,9 +41,8 @@ CPU_FLAGS = (
 
 
 class EngineError(RuntimeError):
-    """The machine cannot do this: no compiler, no GPU, no memory, a NaN position.
-
-    The message is one sentence and names the cure.
+    """The engine cannot go on, for example without a compiler, GPU or enough memory, or with a NaN
+    position. The message is one sentence and names the cure.
     """
 
 
@@ -85,9 +84,10 @@ def compiler() -> tuple[str, str]:
 
 
 def _run(command, **env):
-    """Runs a compiler in a session of its own, so that Ctrl-C reaches Python's handlers only.
+    """Runs a compiler in a new session, so that Ctrl-C reaches Python's handlers only.
 
-    EngineError if a signal stopped it.
+    Raises:
+        EngineError: if a signal stopped it.
     """
     process = subprocess.run(
         command, capture_output=True, text=True, start_new_session=True, env={**os.environ, **env}
@@ -103,7 +103,7 @@ def _run(command, **env):
 
 
 def _processor():
-    """The CPU's features, which -march=native depends on."""
+    """Returns the CPU's features, which -march=native depends on."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(
@@ -203,7 +203,7 @@ def bindings() -> tuple[Any, Any]:
 
 
 def check_status(result: tuple, action: str) -> Any:
-    """Returns what a call of cuda.bindings gave beside its status.
+    """Returns the results of a call of cuda.bindings, without its status.
 
     Raises:
         EngineError: if the status is an error. ``action`` names what failed.

@@ -83,8 +83,8 @@ def constants(sources: Mapping[str, str]) -> dict[str, int | float]:
             match = CONSTANT.fullmatch(line.strip())
             if not match or match[2] in numbers:
                 raise ValueError(
-                    f"{header}: cannot read '{line.strip()}'. Write one constant per line, under a "
-                    f"name of its own, as a plain int or float: constexpr int MAX_RES = 1024;"
+                    f"{header}: cannot read '{line.strip()}'. Write one constant per line, with a "
+                    f"unique name, as a plain int or float: constexpr int MAX_RES = 1024;"
                 )
             numbers[match[2]] = {"int": int, "float": float}[match[1]](match[3])
     return numbers

@@ -28,8 +28,8 @@ class Program:
     The folder holds one ``.cpp`` file per operation for the CPU, one ``.cu`` file for the GPU, or
     both; headers; ``params.h``, which declares the struct of each launch; and ``constants.h`` if
     the kernels share constants with Python. Sources include the folder's headers by name and the
-    common ones as ``"common/errors.h"``. What is recognised in headers:
-    :mod:`~megastep.kernels.build.headers`.
+    common ones as ``"common/errors.h"``. :mod:`~megastep.kernels.build.headers` lists the
+    declarations that are read from headers.
 
     Args:
         folder: where the sources are.

@@ -27,8 +27,8 @@ HD float sweep_point(float gx, float gy, float dx, float dy, float rho) {
     return outside / (approach + SQRT(discriminant));
 }
 
-// Do the bounding boxes of a swept disc and of a segment overlap? A cheap test that rules out
-// nearly all walls.
+// Returns 1 if the bounding boxes of a swept disc and of a segment overlap. A cheap test that rules
+// out nearly all walls.
 HD int boxes_meet(float px, float py, float dx, float dy, float ax, float ay, float bx, float by,
                   float rho) {
     return (minf(ax, bx) <= maxf(px, px + dx) + rho) & (maxf(ax, bx) >= minf(px, px + dx) - rho) &

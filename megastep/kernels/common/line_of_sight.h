@@ -1,12 +1,12 @@
-// Can one agent see another? Three lines of sight are tested: to the other's centre and to both
+// Tests if one agent can see another, along three lines of sight: to the other's centre and to both
 // sides of its disc. The other is hidden if walls cut all three. A gap between walls narrower than
 // an agent's radius, which falls between two lines, may be missed.
 #pragma once
 #include "common/math.h"
 #include "common/scenery.h"
 
-// Does the wall ab cut the line from (x, y) to (x + dx, y + dy)? A wall's ends count, so that no
-// line passes between two walls that share a corner. Needs no division.
+// Returns 1 if the wall ab cuts the line from (x, y) to (x + dx, y + dy). A wall's ends count, so
+// that no line passes between two walls that share a corner. Needs no division.
 HD int cuts(float ax, float ay, float bx, float by, float x, float y, float dx, float dy) {
     float vx = bx - ax, vy = by - ay, px = x - ax, py = y - ay;
     float side_a = cross(dx, dy, ax - x, ay - y), side_b = cross(dx, dy, bx - x, by - y);
@@ -27,8 +27,8 @@ HD void sync(const SingleThread&) {}
 
 HD unsigned int reduce_or(const SingleThread&, unsigned int bits) { return bits; }
 
-// Is a disc of the agents' radius at (x + dx, y + dy) visible from (x, y)? The threads of `group`
-// share the walls.
+// Returns 1 if a disc of the agents' radius at (x + dx, y + dy) is visible from (x, y). The threads
+// of `group` divide the walls among them.
 template <class Group>
 HD int is_visible(const SceneryParams& s, const Group& group, const Walls& walls, float x, float y,
                   float dx, float dy) {

@@ -108,18 +108,18 @@ HD void finish_step(const DeathmatchStepParams& p, int first, int a, const Hits&
 HD void write_privileged(const DeathmatchStepParams& p, int first, int a) {
     int n = p.n_agents, i = first + a;
     float* out = p.privileged + (1 + PRIVILEGED_PER_OPPONENT * (n - 1)) * (long long)i;
-    Pose own = pose_at(p.positions[2 * i], p.positions[2 * i + 1], p.angles[i]);
+    Pose pose = pose_at(p.positions[2 * i], p.positions[2 * i + 1], p.angles[i]);
     *out++ = p.health[i];
     for (int k = 1; k < n; k++) {
         int j = first + (a + k) % n;
-        float dx = p.positions[2 * j] - own.x, dy = p.positions[2 * j + 1] - own.y;
+        float dx = p.positions[2 * j] - pose.x, dy = p.positions[2 * j + 1] - pose.y;
         float sine, cosine;
         sincos_degrees(p.angles[j], sine, cosine);
         *out++ = p.health[j];
-        *out++ = (own.cosine * dx + own.sine * dy) * 0.1f;
-        *out++ = (own.cosine * dy - own.sine * dx) * 0.1f;
-        *out++ = own.cosine * cosine + own.sine * sine;
-        *out++ = own.cosine * sine - own.sine * cosine;
+        *out++ = (pose.cosine * dx + pose.sine * dy) * 0.1f;
+        *out++ = (pose.cosine * dy - pose.sine * dx) * 0.1f;
+        *out++ = pose.cosine * cosine + pose.sine * sine;
+        *out++ = pose.cosine * sine - pose.sine * cosine;
     }
 }
 

@@ -123,9 +123,9 @@ HD float offset(const Game& g, int side) {
     return (float)between(doubled, -2 * PADDLE, 2 * PADDLE) * (1.f / PADDLE);
 }
 
-// Features: positions in [-1, 1] of the side's own paddle, the other paddle and the ball (x, y);
-// the ball's velocity (x, y) in cells per step; the ball's offset from the own and from the other
-// paddle.
+// Features: positions in [-1, 1] of the side's paddle, the other paddle and the ball (x, y); the
+// ball's velocity (x, y) in cells per step; the ball's offset from the side's paddle and from the
+// other.
 HD void write_features(const PongStepParams& p, const Game& g, int lane, int side) {
     const float across = 2.f / WIDTH, down = 2.f / HEIGHT, paddle = 2.f / MAX_TOP,
                 cell = 1.f / CELL;
