@@ -1,4 +1,4 @@
-"""Settings: what an argument allows is said in its annotation, and enforced wherever it is from."""
+"""Settings: annotations are enforced, in the command line and in Python."""
 
 import dataclasses
 import inspect
@@ -18,8 +18,8 @@ from megastep.settings import checked, settings_of
 NAN = float("nan")
 
 
-def told(kind, **values):
-    """What is said of values that are not allowed, by key."""
+def messages(kind, **values):
+    """Returns {key: sentence} for values that are not allowed."""
     with pytest.raises(ConfigErrors) as error:
         check(kind, values)
     return dict(error.value.errors)
@@ -38,7 +38,7 @@ def told(kind, **values):
     ],
 )
 @pytest.mark.parametrize("optional", [False, True])
-def test_a_value_outside_is_told_what_is_allowed(bounds, inside, outside, allowed, optional):
+def test_out_of_range(bounds, inside, outside, allowed, optional):
     hint = Annotated[float, Field(**bounds)] if bounds else float
 
     def f(x: hint | None if optional else hint): ...
@@ -46,7 +46,7 @@ def test_a_value_outside_is_told_what_is_allowed(bounds, inside, outside, allowe
     kind = settings_of(f)
     assert [check(kind, {"x": value}).x for value in inside] == list(inside)
     for value in outside:
-        assert told(kind, x=value) == {"x": f"{value} is out of range: allowed is {allowed}"}
+        assert messages(kind, x=value) == {"x": f"{value} is out of range: allowed is {allowed}"}
 
 
 def rover(
@@ -66,10 +66,10 @@ def rover(
 ): ...
 
 
-def test_arguments_are_settings_with_types_and_defaults():
+def test_settings_of_signature():
     kind = settings_of(rover, ("seed",), name=str)
-    made = check(kind, {"name": "r", "must": "x", "sizes": [5], "limit": 7, "n_envs": 1e3})
-    assert dataclasses.astuple(made) == (
+    settings = check(kind, {"name": "r", "must": "x", "sizes": [5], "limit": 7, "n_envs": 1e3})
+    assert dataclasses.astuple(settings) == (
         "r",
         1000,
         7.0,
@@ -82,10 +82,10 @@ def test_arguments_are_settings_with_types_and_defaults():
         2,
         "x",
     )
-    assert check(kind, as_tree(made)) == made and as_tree(made)["sizes"] == [5]
+    assert check(kind, as_tree(settings)) == settings and as_tree(settings)["sizes"] == [5]
     assert as_tree(check(kind, {"name": "r", "must": "x", "plan": "a/b"}))["plan"] == "a/b"
     with pytest.raises(dataclasses.FrozenInstanceError):
-        made.limit = 3
+        settings.limit = 3
 
 
 @pytest.mark.parametrize(
@@ -108,14 +108,14 @@ def test_arguments_are_settings_with_types_and_defaults():
         ("seed", 2, "no such key; did you mean speed?"),
     ],
 )
-def test_a_value_of_another_kind_is_told_what_was_expected(key, value, sentence):
+def test_wrong_type(key, value, sentence):
     kind = settings_of(rover, ("seed",))
-    assert told(kind, **{"must": "x", key: value}) == {key: sentence}
+    assert messages(kind, **{"must": "x", key: value}) == {key: sentence}
 
 
-def test_all_that_is_wrong_is_told_at_once():
+def test_all_errors_at_once():
     kind = settings_of(rover, ("seed",))
-    assert set(told(kind, n_envs=0, limit=-1, far=3, zzz=1)) == {
+    assert set(messages(kind, n_envs=0, limit=-1, far=3, zzz=1)) == {
         "n_envs",
         "limit",
         "far",
@@ -124,7 +124,7 @@ def test_all_that_is_wrong_is_told_at_once():
     }
 
 
-def test_arguments_that_cannot_be_read_are_refused():
+def test_unreadable_annotations():
     def unknown(x: "Nowhere"): ...  # noqa: F821
 
     def taken(name: str): ...
@@ -135,7 +135,7 @@ def test_arguments_that_cannot_be_read_are_refused():
         settings_of(taken, name=str)
 
 
-def test_a_checked_function_refuses_by_name_and_keeps_its_signature():
+def test_checked():
     @checked
     def f(a: Annotated[int, Field(ge=1, le=3)], b=2, *, c: Annotated[float, Field(le=1)] = 0):
         """Adds up."""
@@ -155,7 +155,7 @@ def test_a_checked_function_refuses_by_name_and_keeps_its_signature():
 
 
 @pytest.mark.parametrize("name", envs.ENVS)
-def test_an_environment_refuses_what_is_out_of_the_bounds_of_its_arguments(name):
+def test_environment_bounds(name):
     outside = {"n_envs": (0, 2**26 + 1), "res": (0, 1025), "fov": (0, 180), "fps": (0.5, 1001)}
     outside |= {"points": (0, 1001), "limit": (0, 10**6 + 1), "tracker_speed": (-0.1, 40)}
     taken = inspect.signature(envs.ENVS[name]).parameters

@@ -1,6 +1,7 @@
-"""What a stranger adds from outside the repository, through the real command line: each thing with
-as few files as the table below says, of which one is its test; and what is said of what cannot be
-used.
+"""Extending megastep from outside the repository, through the command line.
+
+`FILES` limits how many files each kind of extension takes. Also tests the errors for classes that
+cannot be used.
 """
 
 import importlib.util
@@ -35,7 +36,7 @@ from megastep import arrdict, spaces
 
 
 class Counter:
-    """A board of one number: action 1 counts up, which pays 1. Truncated after `limit` steps."""
+    """A counter: action 1 counts up and gives reward 1. Truncated after `limit` steps."""
 
     n_agents, fps = 1, 5.0
     action_space = spaces.MultiDiscrete(1, 2)
@@ -92,7 +93,7 @@ class Counter:
 
 @pytest.fixture
 def outside(tmp_path, monkeypatch):
-    """Writes files into a folder of their own, the current one; gives the number written."""
+    """Changes to an empty folder. Returns a function that writes files there and counts them."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(ROOT), *sys.path])
     before = set(sys.modules)
@@ -112,24 +113,24 @@ def outside(tmp_path, monkeypatch):
 
 
 def add(outside, what, files):
-    """Writes what is added; its test is this one."""
+    """Writes the files of an extension, whose test is this file."""
     assert outside(files) + 1 <= FILES[what]
 
 
 def saved():
-    """The checkpoint of the latest run."""
+    """Returns the checkpoint of the latest run."""
     return checkpoint.load_latest(train.runs.find("latest") / "checkpoints")
 
 
 def leftovers():
-    """Run folders."""
+    """Returns the run folders."""
     return [path for path in pathlib.Path("runs").glob("*") if path.is_dir()]
 
 
 # ---- One test per row of the table ----
 
 
-def test_an_environment(outside, capsys):
+def test_custom_environment(outside, capsys):
     add(outside, "environment", {"board/__init__.py": "", "board/counter.py": COUNTER})
     name = "board.counter:Counter"
     assert train.main([f"env={name}", *RUN, "env.limit=9", "env.sizes=[3]"]) == 0
@@ -151,8 +152,8 @@ def test_an_environment(outside, capsys):
     assert train.main([*sizes, *RUN]) == 0 and capsys.readouterr().out.count("done") >= 2
 
 
-def test_an_environment_as_a_file_of_a_group(outside, monkeypatch, tmp_path):
-    """As ours are: configs/env/counter.yaml holds the import path and what differs."""
+def test_custom_environment_with_a_config_file(outside, monkeypatch, tmp_path):
+    """configs/env/counter.yaml holds the import path and differences from the defaults."""
     from megastep.agents.cli import check
 
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
@@ -163,7 +164,7 @@ def test_an_environment_as_a_file_of_a_group(outside, monkeypatch, tmp_path):
     assert saved().config["train"]["env"]["limit"] == 4
 
 
-def test_a_geometry_source(outside):
+def test_custom_geometry(outside):
     source = """
         from megastep import toys
 
@@ -182,8 +183,8 @@ def test_a_geometry_source(outside):
     assert json.loads(table.read_text())["rows"][0]["homes"] == 3
 
 
-def test_a_learner(outside, capsys):
-    """REINFORCE without a baseline, with storage and an estimate of its own."""
+def test_custom_learner(outside, capsys):
+    """REINFORCE without a baseline, with its own storage and estimate of memory."""
     learner = '''
         from typing import Annotated
 
@@ -236,8 +237,8 @@ def test_a_learner(outside, capsys):
         '''
     add(outside, "learner", {"counter.py": COUNTER, "reinforce.py": learner})
     words = ["env=counter:Counter", *(w for w in SMALL if not w.startswith("learner."))]
-    chosen = ["learner=reinforce:Reinforce", "learner.length=4", "learner.anneal=never"]
-    assert train.main([*words, *chosen, "samples=48", "log_every=1"]) == 0
+    learner_words = ["learner=reinforce:Reinforce", "learner.length=4", "learner.anneal=never"]
+    assert train.main([*words, *learner_words, "samples=48", "log_every=1"]) == 0
     config = saved().config["train"]["learner"]
     assert config == {
         "name": "reinforce:Reinforce",
@@ -250,7 +251,7 @@ def test_a_learner(outside, capsys):
     assert train.main(["resume=latest", "samples=64"]) == 0
     assert evaluate.main(["run=latest", "episodes=4"]) == 0
     capsys.readouterr()
-    many = [*words, *chosen, "env.n_envs=100", "folder=many", "learner.length=1000000000"]
+    many = [*words, *learner_words, "env.n_envs=100", "folder=many", "learner.length=1000000000"]
     assert train.main(many) == 2  # 100 times 1e12 bytes, by its own estimate
     assert "100 environments" in capsys.readouterr().err and not pathlib.Path("many").exists()
 
@@ -263,7 +264,7 @@ MEAN = '''
 
 
     class Mean(nn.Module):
-        """The sum of all that was seen in the episode, through a layer."""
+        """A layer on the sum of the inputs since the last reset."""
 
         def __init__(self, width):
             super().__init__()
@@ -281,7 +282,7 @@ MEAN = '''
     '''
 
 
-def test_a_recurrent_core(outside):
+def test_custom_recurrent_core(outside):
     add(outside, "core", {"mean.py": MEAN})
     words = ["env=minimal", "env.res=8", *SMALL, "samples=64", "agent.core=mean:Mean"]
     assert train.main(words) == 0
@@ -291,7 +292,7 @@ def test_a_recurrent_core(outside):
     assert train.main(["resume=latest", "samples=96"]) == 0
 
 
-def test_an_encoder(outside):
+def test_custom_encoder(outside):
     encoder = '''
         from torch import nn
 
@@ -313,8 +314,8 @@ def test_an_encoder(outside):
     assert evaluate.main(["run=latest", "episodes=4"]) == 0
 
 
-def test_a_kernel(tmp_path):
-    """In a copy of the simulator: four files of kernels/ and a function of engine/ops.py."""
+def test_custom_kernel(tmp_path):
+    """Adds to a copy of the simulator: four files of kernels/ and a function of engine/ops.py."""
     shutil.copytree(ROOT / "megastep", tmp_path / "megastep")
     kernels, engine = tmp_path / "megastep/kernels", tmp_path / "megastep/engine/ops.py"
     params = "struct TwiceParams {\n    const float* x;\n    float* out;\n    int n;\n};\n"
@@ -351,11 +352,11 @@ def test_a_kernel(tmp_path):
     assert done.stdout == "[0.0, 2.0, 4.0]\n", done.stderr
 
 
-# ---- What cannot be used ----
+# ---- Classes that cannot be used ----
 
 
 def refused(capsys, *words, main=train.main):
-    """The sentence of a command that is refused; it leaves no run folder."""
+    """Returns the error of a command, which must leave no run folder."""
     capsys.readouterr()
     assert main([*words]) == 2
     assert not leftovers()
@@ -389,7 +390,7 @@ def refused(capsys, *words, main=train.main):
         (["agent.encoder=counter:nothing"], "agent.encoder: counter:nothing cannot be imported"),
     ],
 )
-def test_what_cannot_be_used_is_one_sentence(outside, capsys, words, sentence):
+def test_unusable_class_error(outside, capsys, words, sentence):
     more = """
 
         class Bare:
@@ -412,8 +413,8 @@ def test_what_cannot_be_used_is_one_sentence(outside, capsys, words, sentence):
             "needs.py": "import nothing_of_this_name\n",
         }
     )
-    told = refused(capsys, *(word for word in SMALL if not word.startswith("learner.")), *words)
-    assert sentence in told, told
+    error = refused(capsys, *(word for word in SMALL if not word.startswith("learner.")), *words)
+    assert sentence in error, error
 
 
 @pytest.mark.parametrize(
@@ -430,14 +431,12 @@ def test_what_cannot_be_used_is_one_sentence(outside, capsys, words, sentence):
         (("reset=reset,", ""), "the world has no reset"),
     ],
 )
-def test_a_class_that_breaks_a_clause_of_the_contract_is_told_which(
-    outside, capsys, change, clause
-):
+def test_environment_contract_error_names_the_clause(outside, capsys, change, clause):
     assert change[0] in COUNTER
     outside({"counter.py": COUNTER.replace(*change)})
-    told = refused(capsys, "env=counter:Counter", *SMALL)
-    assert "Counter breaks the contract: " in told and clause in told, told
-    assert "counter:Counter" in told and len(told.splitlines()) == 1
+    error = refused(capsys, "env=counter:Counter", *SMALL)
+    assert "Counter breaks the contract: " in error and clause in error, error
+    assert "counter:Counter" in error and len(error.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
@@ -449,21 +448,21 @@ def test_a_class_that_breaks_a_clause_of_the_contract_is_told_which(
         (("def initial", "def start"), "initial(B, device)"),
     ],
 )
-def test_a_core_that_breaks_a_clause_is_told_which(outside, capsys, change, clause):
+def test_core_contract_error_names_the_clause(outside, capsys, change, clause):
     assert change[0] in MEAN
     outside({"mean.py": MEAN.replace(*change)})
-    told = refused(capsys, "env=minimal", *SMALL, "agent.core=mean:Mean")
-    assert "mean:Mean" in told and clause in told, told
+    error = refused(capsys, "env=minimal", *SMALL, "agent.core=mean:Mean")
+    assert "mean:Mean" in error and clause in error, error
 
 
-def test_an_encoder_that_breaks_its_word_is_told(outside, capsys):
+def test_encoder_contract_error(outside, capsys):
     text = "from torch import nn\n\n\nclass Half(nn.Flatten):\n    n_features = 3\n\n"
     outside({"half.py": text + "    def __init__(self, space):\n        super().__init__(-4)\n"})
-    told = refused(capsys, "env=minimal", "env.res=8", *SMALL, "agent.encoder=half:Half")
-    assert "half:Half breaks the contract of encoders" in told and "(3, 3), not (3, 24)" in told
+    error = refused(capsys, "env=minimal", "env.res=8", *SMALL, "agent.encoder=half:Half")
+    assert "half:Half breaks the contract of encoders" in error and "(3, 3), not (3, 24)" in error
 
 
-def test_a_checkpoint_whose_class_is_gone_says_so(outside, capsys):
+def test_missing_class_of_a_checkpoint(outside, capsys):
     outside({"counter.py": COUNTER})
     assert train.main(["env=counter:Counter", *RUN]) == 0
     os.remove("counter.py")
@@ -481,10 +480,10 @@ def test_a_checkpoint_whose_class_is_gone_says_so(outside, capsys):
     assert saved().step == 64
 
 
-# ---- A run from another's weights; random actions ----
+# ---- init, and recording without a run ----
 
 
-def test_a_run_from_anothers_weights_takes_its_environment_and_agent_unless_given(outside):
+def test_init_takes_environment_and_agent_unless_typed(outside):
     outside({"counter.py": COUNTER})
     own = ["env=counter:Counter", "env.limit=7", "agent.core=gru", "agent.critic=plain"]
     assert train.main([*RUN, *own, "folder=first"]) == 0
@@ -503,7 +502,7 @@ def test_a_run_from_anothers_weights_takes_its_environment_and_agent_unless_give
     assert checkpoint.load_latest("third/checkpoints").config["train"]["env"]["limit"] == 6
 
 
-def test_random_actions_are_filmed_without_a_run(outside, capsys):
+def test_record_random_actions_without_a_run(outside, capsys):
     pytest.importorskip("av")
     words = ["env=minimal", "env.res=8", "steps=2", "device=cpu"]
     assert record.main([*words, "geometry=box", "file=box.mp4"]) == 0

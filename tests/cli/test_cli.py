@@ -1,6 +1,4 @@
-"""The scripts in processes of their own: exit codes, signals, closed pipes. Few tests, as a process
-costs seconds.
-"""
+"""The scripts in their own processes: exit codes, signals, closed pipes."""
 
 import json
 import os
@@ -33,13 +31,13 @@ def start(script, *arguments, cwd, **environment):
 
 
 def finished(script, *arguments, cwd, **environment):
-    """(exit code, stdout, stderr)"""
+    """Runs a script. Returns (exit code, stdout, stderr)."""
     process = start(script, *arguments, cwd=cwd, **environment)
     out, err = process.communicate(timeout=120)
     return process.returncode, out, err
 
 
-def test_a_typo_is_exit_code_2_and_leaves_nothing(tmp_path):
+def test_typo_exits_with_2_and_leaves_nothing(tmp_path):
     code, out, err = finished("train", "env=explorr", "learner.lrr=1", "env.n_envs=0", cwd=tmp_path)
     assert code == 2 and out == ""
     assert err.splitlines() == [
@@ -51,7 +49,7 @@ def test_a_typo_is_exit_code_2_and_leaves_nothing(tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-def test_a_gpu_that_is_not_there_and_a_compiler_that_is_not_there_are_one_sentence(tmp_path):
+def test_missing_gpu_and_missing_compiler(tmp_path):
     code, _, err = finished("train", *TINY, "device=cuda", cwd=tmp_path, CUDA_VISIBLE_DEVICES="")
     assert code == 2 and "device=cpu" in err and len(err.splitlines()) == 1
     code, _, err = finished(
@@ -66,7 +64,7 @@ def test_a_gpu_that_is_not_there_and_a_compiler_that_is_not_there_are_one_senten
     assert not any(tmp_path.glob("runs/*"))
 
 
-def test_a_run_keeps_others_out_of_its_folder_and_saves_when_its_terminal_is_closed(tmp_path):
+def test_run_folder_lock_and_closed_terminal(tmp_path):
     process = start("train", *TINY, "folder=run", cwd=tmp_path)
     metrics, deadline = tmp_path / "run" / "metrics.jsonl", time.monotonic() + 60
     while not metrics.exists() or not metrics.stat().st_size:
@@ -95,7 +93,7 @@ def test_a_run_keeps_others_out_of_its_folder_and_saves_when_its_terminal_is_clo
         "{command} <&- | head -1 >/dev/full",
     ],
 )
-def test_a_run_that_cannot_print_goes_on_and_says_nothing(tmp_path, redirected):
+def test_run_continues_without_output(tmp_path, redirected):
     overrides = [*TINY, "samples=64", "folder=run", "finish.evaluate=true", "finish.episodes=4"]
     command = f"{{ {sys.executable} {ROOT / 'train.py'} {' '.join(overrides)}; echo $? >code; }}"
     subprocess.run(
@@ -111,7 +109,7 @@ def test_a_run_that_cannot_print_goes_on_and_says_nothing(tmp_path, redirected):
     assert checkpoint.load_latest(tmp_path / "run" / "checkpoints").step == 64
 
 
-def test_where_only_ascii_can_be_shown_tables_and_names_are_ascii(tmp_path):
+def test_ascii_output(tmp_path):
     overrides = [*TINY, "samples=1", 'folder="ü"', "finish.evaluate=true", "finish.episodes=4"]
     code, out, err = finished(
         "train", *overrides, cwd=tmp_path, PYTHONIOENCODING="ascii", TERM="dumb", COLUMNS="20"

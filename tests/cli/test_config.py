@@ -1,6 +1,4 @@
-"""The configuration: what composes, what is refused, and in which words. Nothing here starts a
-run.
-"""
+"""Composing and checking configurations. No test starts a run."""
 
 import copy
 import dataclasses
@@ -31,7 +29,7 @@ def errors(*overrides, script="train"):
 MORE = {"geometry=files": ["geometry.path=plans.npz"]}
 
 
-def test_every_member_of_every_group_composes():
+def test_every_group_member_composes():
     groups = Composer(train.SCRIPT).groups()
     assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "preset", "experiment"}
     assert set(groups["env"]) == set(envs.ENVS)
@@ -41,12 +39,12 @@ def test_every_member_of_every_group_composes():
 
 
 def leaves(tree, prefix=""):
-    """{dotted key: value}"""
-    found = {}
+    """Returns {dotted key: value} of nested dicts."""
+    pairs = {}
     for key, value in tree.items():
         nested = leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {}
-        found |= nested or {prefix + key: value}
-    return found
+        pairs |= nested or {prefix + key: value}
+    return pairs
 
 
 #: Groups whose files are part of another.
@@ -54,7 +52,7 @@ PACKAGES = {"recipe": "learner"}
 
 
 def values(file, script):
-    """What a file of configs/ says, by dotted key; `defaults` are choices, no values."""
+    """Returns {dotted key: value} of a file of configs/, without its defaults list."""
     text = (CONFIGS / f"{file}.yaml").read_text()
     tree = yaml.safe_load(text) or {}
     tree.pop("defaults", None)
@@ -66,39 +64,41 @@ def values(file, script):
 
 
 def compositions():
-    """For each member of each group: the files that it is composed of, `[(file, {key: value})]`,
-    those that win last.
+    """Yields for each member of each group the files it is composed of, [(file, {key: value})], in
+    order of precedence.
     """
     for name, script in SCRIPTS.items():
         composer = Composer(script)
         groups = composer.groups()
         for choice in [[]] + [[f"{group}={m}"] for group in groups for m in groups[group]]:
-            chosen = composer.composed(*choice).hydra.runtime.choices
-            files = [f"{g}/{chosen[g]}" for g in groups if chosen[g] is not None]
+            choices = composer.composed(*choice).hydra.runtime.choices
+            files = [f"{g}/{choices[g]}" for g in groups if choices[g] is not None]
             last = [f for f in files if f.startswith("preset/")]
             if last and "cpu" in last[0]:
-                last.append(f"preset/learner/cpu_{chosen['learner']}")
-            if (CONFIGS / f"preset/agent/{chosen.get('learner')}.yaml").exists():
-                last.append(f"preset/agent/{chosen['learner']}")
+                last.append(f"preset/learner/cpu_{choices['learner']}")
+            if (CONFIGS / f"preset/agent/{choices.get('learner')}.yaml").exists():
+                last.append(f"preset/agent/{choices['learner']}")
             last += [f for f in files if f.startswith("experiment/")]
-            for_recipe = f"preset/experiment/{chosen.get('preset')}_{chosen.get('experiment')}"
-            by_learner = f"preset/recipe/{chosen.get('learner')}_{chosen.get('experiment')}"
-            for file in (for_recipe, by_learner):
+            by_preset = f"preset/experiment/{choices.get('preset')}_{choices.get('experiment')}"
+            by_learner = f"preset/recipe/{choices.get('learner')}_{choices.get('experiment')}"
+            for file in (by_preset, by_learner):
                 last += [file] if (CONFIGS / f"{file}.yaml").exists() else []
             order = [f for f in files if f not in last] + [name] + last
             yield [(file, values(file, name)) for file in order]
 
 
-def test_every_value_of_every_file_is_in_force_somewhere_and_none_is_said_twice(monkeypatch):
+def test_no_config_value_is_unused_or_repeated(monkeypatch):
     written, in_force, twice = set(), set(), set()
     for gpu in (False, True):
         monkeypatch.setattr("torch.cuda.is_available", lambda gpu=gpu: gpu)
         for files in compositions():
             last = {}
-            for file, said in files:
-                written |= {(file, key) for key in said}
-                twice |= {(file, key) for key in said if key in last and last[key][1] == said[key]}
-                last |= {key: (file, value) for key, value in said.items()}
+            for file, pairs in files:
+                written |= {(file, key) for key in pairs}
+                twice |= {
+                    (file, key) for key in pairs if key in last and last[key][1] == pairs[key]
+                }
+                last |= {key: (file, value) for key, value in pairs.items()}
             in_force |= {(file, key) for key, (file, _) in last.items()}
     assert written == in_force and not twice, (written - in_force, twice)
     names = {str(path.relative_to(CONFIGS))[:-5] for path in CONFIGS.rglob("*.yaml")}
@@ -110,27 +110,27 @@ def test_settings_are_frozen():
         compose().seed = 2
 
 
-def test_what_is_written_can_be_read_again():
+def test_settings_round_trip():
     cfg = compose("env=minimal", "samples=1e6")
     assert check(Train, as_tree(cfg)) == cfg
 
 
 @pytest.mark.parametrize("group", ["env", "geometry", "learner", "agent"])
-def test_a_file_says_what_differs_from_the_defaults_of_the_constructor(group):
+def test_config_files_hold_no_constructor_defaults(group):
     for path in (CONFIGS / group).glob("*.yaml"):
         dotted = values(f"{group}/{path.stem}", "train")
-        said = {key.split(".")[1]: value for key, value in dotted.items() if "." in key}
-        kind = kind_of(group, said["name"]) if group in IMPORTED else Agent
+        pairs = {key.split(".")[1]: value for key, value in dotted.items() if "." in key}
+        kind = kind_of(group, pairs["name"]) if group in IMPORTED else Agent
         defaults = {field.name: field.default for field in dataclasses.fields(kind)}
-        assert not [key for key in said if said[key] == defaults[key]], path
+        assert not [key for key in pairs if pairs[key] == defaults[key]], path
 
 
-def test_every_key_of_a_logger_is_an_argument_of_what_it_makes():
+def test_logger_keys_are_constructor_arguments():
     keys = {field.name for field in dataclasses.fields(WandbLogger)}
     assert keys - {"name"} <= set(inspect.signature(Wandb).parameters)
 
 
-def test_the_preset_follows_the_device(monkeypatch):
+def test_preset_auto_follows_device(monkeypatch):
     cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
     assert compose("device=cpu") == dataclasses.replace(cpu, device="cpu")
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
@@ -141,8 +141,8 @@ def test_the_preset_follows_the_device(monkeypatch):
     assert compose("env.n_envs=7", "learner.n_minibatches=1").env.n_envs == 7
 
 
-def test_what_a_cpu_and_a_gpu_train_with():
-    """The recipes behind the measurements in README: changed together with them only."""
+def test_cpu_and_gpu_recipes():
+    """The recipes of the published measurements: change both together."""
     same = dict(
         name="megastep.agents.algorithms.ppo:PPO",
         n_steps=32,
@@ -161,7 +161,7 @@ def test_what_a_cpu_and_a_gpu_train_with():
     assert compose("experiment=quickstart").seconds == 160
 
 
-def test_a_recipe_differs_on_a_cpu_and_on_a_gpu():
+def test_experiment_differs_by_preset():
     cpu, gpu = (compose("experiment=pong", f"preset={preset}") for preset in ("cpu", "gpu"))
     assert (cpu.seconds, gpu.seconds) == (240, 12) and cpu.env.n_envs == 256
     assert (cpu.agent.core, cpu.learner.n_epochs) == ("none", 2)
@@ -172,7 +172,7 @@ def test_a_recipe_differs_on_a_cpu_and_on_a_gpu():
     assert (cpu.samples, gpu.samples, cpu.seconds, gpu.seconds) == (600_000, None, None, 480)
 
 
-def test_a_typo_names_the_nearest_key():
+def test_typo_hints_nearest_key():
     assert "learner.lr?" in errors("learner.lrr=1")["learner.lrr"]
     assert "learner.lr?" in errors("lr=1")["lr"]
     assert "env.n_envs?" in errors("n_envs=8")["n_envs"]
@@ -180,14 +180,14 @@ def test_a_typo_names_the_nearest_key():
     assert "geometry?" in errors("geometri=box")["geometri"]
 
 
-def test_a_key_of_another_member_names_that_member():
+def test_key_of_another_member():
     assert errors("logger.mode=offline")["logger.mode"] == "no such key here; logger=wandb has it"
-    found = errors("env=minimal", "env.patience=3", "geometry=box", "geometry.outer=false")
-    assert found["env.patience"] == "no such key here; env=explorer has it"
-    assert found["geometry.outer"] == "no such key here; geometry=homes has it"
+    messages = errors("env=minimal", "env.patience=3", "geometry=box", "geometry.outer=false")
+    assert messages["env.patience"] == "no such key here; env=explorer has it"
+    assert messages["geometry.outer"] == "no such key here; geometry=homes has it"
 
 
-def test_an_unknown_member_names_the_nearest_one():
+def test_unknown_member_hints_nearest():
     assert "explorer?" in errors("env=explorr")["env"]
     assert "homes?" in errors("geometry=home")["geometry"]
     assert "quickstart?" in errors("experiment=quickstrt")["experiment"]
@@ -197,10 +197,10 @@ def test_an_unknown_member_names_the_nearest_one():
 
 
 def test_all_errors_are_listed_at_once():
-    found = errors(
+    messages = errors(
         "env=explorr", "learner.lrr=1", "learner.lr=-1", "learner.gamma=nan", "seed=x", "device=gpu"
     )
-    assert set(found) == {"env", "learner.lrr", "learner.lr", "learner.gamma", "seed", "device"}
+    assert set(messages) == {"env", "learner.lrr", "learner.lr", "learner.gamma", "seed", "device"}
 
 
 @pytest.fixture(scope="module")
@@ -257,7 +257,7 @@ NAN, INFINITY = float("nan"), float("inf")
         ("learner.typo", 1),
     ],
 )
-def test_values_out_of_range_are_named_with_their_key(tree, key, value):
+def test_out_of_range_values(tree, key, value):
     *groups, last = key.split(".")
     changed = copy.deepcopy(tree)
     target = changed
@@ -269,40 +269,40 @@ def test_values_out_of_range_are_named_with_their_key(tree, key, value):
     assert [path for path, _ in error.value.errors] == [key]
 
 
-def test_a_missing_key_is_named(tree):
+def test_missing_key(tree):
     with pytest.raises(ConfigErrors, match="seed: is missing"):
         check(Train, {key: value for key, value in tree.items() if key != "seed"})
 
 
-def test_a_range_is_told():
+def test_out_of_range_error_names_the_range():
     assert errors("env.res=1025")["env.res"] == "1025 is out of range: allowed is from 1 to 1,024"
     assert (
         errors("env.fov=180")["env.fov"] == "180 is out of range: allowed is above 0 and below 180"
     )
 
 
-def test_a_list_may_be_too_short():
+def test_list_too_short():
     assert compose("env.cameras=[0,120,240]").env.cameras == [0, 120, 240]
-    found = errors("env.cameras=[]")["env.cameras"]
-    assert found == "a list of 0 is out of range: allowed is at least 1"
+    messages = errors("env.cameras=[]")["env.cameras"]
+    assert messages == "a list of 0 is out of range: allowed is at least 1"
 
 
-def test_settings_that_contradict_each_other_are_named():
+def test_contradicting_settings():
     assert "2" in errors("env.n_envs=2")["learner.n_minibatches"]
     assert errors("geometry=files") == {"geometry.path": "is missing"}
     assert "resume" in errors("resume=a", "init=b")["init"]
 
 
-def test_infinity_is_refused_as_it_is_typed():
-    found = errors("seconds=inf", "samples=.inf", "learner.lr=inf", "checkpoint_seconds=inf")
-    assert set(found) == {"seconds", "samples", "learner.lr", "checkpoint_seconds"}
-    assert found["seconds"] == "inf is out of range: allowed is more than 0"
+def test_infinity_is_refused():
+    messages = errors("seconds=inf", "samples=.inf", "learner.lr=inf", "checkpoint_seconds=inf")
+    assert set(messages) == {"seconds", "samples", "learner.lr", "checkpoint_seconds"}
+    assert messages["seconds"] == "inf is out of range: allowed is more than 0"
 
 
-def test_a_minibatch_can_be_one_environment_and_no_less():
+def test_minibatch_needs_an_environment():
     assert compose("env.n_envs=8", "learner.n_minibatches=8").learner.n_minibatches == 8
-    found = errors("env.n_envs=8", "learner.n_minibatches=9")
-    assert set(found) == {"learner.n_minibatches"} and "9" in found["learner.n_minibatches"]
+    messages = errors("env.n_envs=8", "learner.n_minibatches=9")
+    assert set(messages) == {"learner.n_minibatches"} and "9" in messages["learner.n_minibatches"]
 
 
 @pytest.mark.parametrize(
@@ -333,7 +333,7 @@ def test_a_minibatch_can_be_one_environment_and_no_less():
         ("env@x=minimal", "configuration", "+env@x=minimal"),
         ("+env@x=minimal", "x", "no such key"),
         ("nope@x=y", "nope@x", "no such key"),
-        ("seed=${nothere}", "seed", "Interpolation key 'nothere' not found"),
+        ("seed=${nothere}", "seed", "Interpolation key 'nothere' not messages"),
         ("hydra=3", "hydra", "3 is unknown"),
         ("hydra.swep.dir=x", "hydra.swep.dir", "no such key; did you mean hydra.sweep.dir?"),
         ("hydra.job.chdir=maybe", "hydra.job.chdir", "Value 'maybe' is not a valid bool"),
@@ -341,25 +341,25 @@ def test_a_minibatch_can_be_one_environment_and_no_less():
         ("hydra/lancher=basic", "hydra/lancher", "did you mean hydra/launcher?"),
     ],
 )
-def test_what_cannot_be_meant_is_one_sentence_at_its_key(override, key, sentence):
-    ((told, text),) = errors(override).items()
-    assert told == key and sentence in text and "\n" not in text
+def test_bad_overrides(override, key, sentence):
+    ((error_key, text),) = errors(override).items()
+    assert error_key == key and sentence in text and "\n" not in text
 
 
-def test_a_launcher_that_is_not_installed_names_what_to_install(monkeypatch):
+def test_launcher_not_installed(monkeypatch):
     composer = Composer(train.SCRIPT)
     composer.members = lambda group: ["basic"]
     _, errors = composer.config(composer.parse(["hydra/launcher=joblib"]))
     assert "pip install 'megastep-flatland[sweep]'" in dict(errors)["hydra/launcher"]
 
 
-def test_plus_signs_set_what_there_is():
+def test_plus_signs():
     expected = compose("seed=3", "env=minimal", "env.n_envs=9", "experiment=quickstart")
     assert compose("+seed=3", "env=minimal", "++env.n_envs=9", "experiment=quickstart") == expected
     assert compose("experiment=null", "~env.resample") == compose("env.resample=false")
 
 
-def test_a_value_with_an_equals_sign_needs_no_quotes():
+def test_value_with_equals_sign():
     assert compose("folder=sweeps/1/0_seed=1").folder == "sweeps/1/0_seed=1"
     cfg = compose("run=x", "against=[a/0_seed=1,bot]", script="evaluate")
     assert cfg.against == ("a/0_seed=1", "bot")
@@ -368,16 +368,18 @@ def test_a_value_with_an_equals_sign_needs_no_quotes():
     assert runs == ["a/0_seed=1", "a/1_seed=2"]
 
 
-def test_values_of_environment_variables_are_not_written(monkeypatch, capsys):
+def test_environment_variables_are_refused(monkeypatch, capsys):
     monkeypatch.setenv("SECRET", "hush")
-    found = errors("logger=wandb", "logger.project=${oc.env:SECRET}", "folder=x/${oc.env:SECRET}")
-    assert set(found) == {"logger.project", "folder"} and "hush" not in str(found)
+    messages = errors(
+        "logger=wandb", "logger.project=${oc.env:SECRET}", "folder=x/${oc.env:SECRET}"
+    )
+    assert set(messages) == {"logger.project", "folder"} and "hush" not in str(messages)
     assert train.main(["--cfg", "hydra", "hydra.sweep.dir=${oc.env:SECRET}/x"]) == 0
     shown = capsys.readouterr().out
     assert "dir: ${oc.env:SECRET}/x" in shown and "hush" not in shown
 
 
-def test_a_group_of_keys_is_no_single_value():
+def test_value_for_a_group_of_keys():
     assert "finish" in errors("finish=1")
     assert compose("finish={steps:3}").finish == dataclasses.replace(compose().finish, steps=3)
 
@@ -391,7 +393,7 @@ def jobs(*words):
     return sweeps.jobs_of(Composer(train.SCRIPT), [*words])[0]
 
 
-def test_a_sweep_is_every_combination():
+def test_grid_jobs():
     words = ["env=minimal,explorer", "seed=choice(1,2)", "keep_checkpoints=3"]
     assert jobs(*words) == [
         [f"env={env}", f"seed={seed}", "keep_checkpoints=3"]
@@ -400,12 +402,12 @@ def test_a_sweep_is_every_combination():
     ]
 
 
-def test_a_sweep_is_checked_before_its_first_job():
+def test_grid_is_checked_before_the_first_job():
     with pytest.raises(ConfigErrors, match="learner.lr"):
         jobs("learner.lr=1e-3,-1")
 
 
-def test_a_search_is_checked_at_its_first_values_and_at_every_other_alone():
+def test_search_is_checked_at_bounds():
     optuna = "hydra/sweeper=optuna"
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
     base = compose().learner.lr
@@ -427,12 +429,12 @@ def test_a_search_is_checked_at_its_first_values_and_at_every_other_alone():
 
 
 @pytest.mark.parametrize("word", ["env=glob(zz*)", "seed=range(3,3)"])
-def test_a_sweep_over_nothing_is_refused(word):
+def test_empty_sweep(word):
     with pytest.raises(ConfigErrors, match="has no value"):
         jobs(word)
 
 
-def test_a_glob_stands_for_members():
+def test_glob_sweep():
     assert jobs("geometry=glob(b*)") == [["geometry=bench"], ["geometry=box"]]
 
 
@@ -442,7 +444,7 @@ def test_help_lists_groups_and_members(capsys):
     assert "explorer, minimal" in text and "quickstart" in text and "--multirun" in text
 
 
-def test_the_composed_configuration_is_printed(capsys):
+def test_cfg_prints_composed_config(capsys):
     def printed(*words):
         assert train.main([*words]) == 0
         return capsys.readouterr().out

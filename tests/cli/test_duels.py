@@ -1,6 +1,4 @@
-"""Duels, ratings and films of two policies: players whose chances are known, and the scripts on
-runs of Pong.
-"""
+"""Duels and ratings: of players with known chances, and of runs of Pong by the scripts."""
 
 import csv
 import json
@@ -25,7 +23,7 @@ from tests.helpers.games import Always, Matrix
 # ---- Duels ----
 
 
-def test_the_stronger_wins_from_every_place():
+def test_stronger_player_wins_from_every_slot():
     played = duels.play(Matrix(64), Always(2), Always(0))
     assert (played.score == 1).all() and (played.lengths == 1).all()
     assert duels.play(Matrix(64), Always(0), Always(2)).score.sum() == 0
@@ -33,18 +31,18 @@ def test_the_stronger_wins_from_every_place():
 
 
 @pytest.mark.parametrize("mortal", [False, True])
-def test_the_share_won_is_what_an_independent_count_says(mortal):
-    """The higher of two numbers, of which one is 2 for sure or by a third of a half."""
+def test_win_share_matches_independent_count(mortal):
+    """Each player chooses its own number with probability 1/2, else any of three."""
     env = Matrix(2000, mortal=mortal)
     played = duels.play(env, Always(2, chance=0.5), Always(0, chance=0.5))
-    # the first step whose numbers differ decides: counted from what was played
+    # the first step with different numbers decides
     actions = torch.stack(env.played)  # (T, E, 2)
     first = (actions[:, :, 0] != actions[:, :, 1]).int().argmax(0)
-    chosen = actions[first, torch.arange(2000)]
-    mine = chosen.gather(1, played.slots[:, None])[:, 0]
-    assert torch.equal(played.score, (mine == chosen.amax(1)).float())
+    decisive = actions[first, torch.arange(2000)]
+    mine = decisive.gather(1, played.slots[:, None])[:, 0]
+    assert torch.equal(played.score, (mine == decisive.amax(1)).float())
     assert torch.equal(played.lengths, first + 1.0)
-    # on paper: me 2, 1, 0 with 4/6, 1/6, 1/6, the other the other way round
+    # by hand: the probabilities of 0, 1 and 2, for either player
     me, other = np.array([1, 1, 4]) / 6, np.array([4, 1, 1]) / 6
     win, lose = (
         sum(a[i] * b[j] for i in range(3) for j in range(i)) for a, b in ((me, other), (other, me))
@@ -55,7 +53,7 @@ def test_the_share_won_is_what_an_independent_count_says(mortal):
     assert row["won"] == mean and row["wins"] + row["losses"] == row["duels"] == 2000
 
 
-def test_a_duel_that_nothing_ends_is_a_draw():
+def test_unfinished_duel_is_a_draw():
     played = duels.play(Matrix(4), Always(1), Always(1), max_steps=70)
     assert (played.score == 0.5).all() and (played.lengths == 70).all()
     row = evaluate.summary(played)
@@ -64,9 +62,9 @@ def test_a_duel_that_nothing_ends_is_a_draw():
     assert (cut.score == 0.5).all() and (cut.lengths == 3).all()
 
 
-def test_only_the_first_duel_of_an_environment_counts():
+def test_only_first_duel_counts():
     class Turning(Always):
-        """Wins at first, and then loses again and again."""
+        """Wins the first duel and loses all others."""
 
         def __call__(self, world, state, *rest):
             decision, state = super().__call__(world, state, *rest)
@@ -77,8 +75,8 @@ def test_only_the_first_duel_of_an_environment_counts():
     assert (played.score == 1).all() and (played.lengths == 1).all()
 
 
-def test_whoever_dies_first_loses_and_the_others_are_one_opponent():
-    """Four agents: who chose less than the highest number dies."""
+def test_first_death_loses():
+    """Four agents; those below the highest number die."""
     env = Matrix(16, 4, mortal=True)
     assert (duels.play(env, Always(2), Always(1)).score == 1).all()
     assert (duels.play(env, Always(1), Always(2)).score == 0).all()
@@ -86,12 +84,12 @@ def test_whoever_dies_first_loses_and_the_others_are_one_opponent():
     assert played.slots.bincount().tolist() == [4, 4, 4, 4]
 
 
-def test_homes_are_those_of_the_environment_and_intervals_are_over_them():
+def test_intervals_are_over_homes():
     env = Matrix(8)
     env.layout = torch.arange(4, dtype=torch.int32).repeat(2)
     played = duels.play(env, Always(2), Always(0))
     assert played.homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
-    # each home was played in from both places
+    # each home was played in from both slots
     pairs = set(zip(played.homes.tolist(), played.slots.tolist(), strict=True))
     assert len(pairs) == 8
     assert evaluate.summary(played)["homes"] == 4
@@ -100,18 +98,18 @@ def test_homes_are_those_of_the_environment_and_intervals_are_over_them():
     assert (row["won"], row["lower"], row["upper"]) == interval(score.numpy(), played.homes.numpy())
 
 
-def test_a_duel_is_reproducible_and_a_seed_changes_it():
+def test_duels_are_reproducible():
     def scores(seed):
         return duels.play(Matrix(64), Always(2, 0.9), Always(0, 0.9), seed).score.tolist()
 
     assert scores(1) == scores(1) != scores(2)
 
 
-# ---- Lineups ----
+# ---- Mixed policies ----
 
 
 class Echo:
-    """Does what it is shown, and remembers what it was shown first."""
+    """Acts as it observes; its hidden state is the first observation."""
 
     def initial(self, n_lanes, device=None):
         return arrdict(first=torch.zeros(n_lanes, 1))
@@ -122,7 +120,7 @@ class Echo:
 
 
 @pytest.mark.parametrize("split", [[[0, 1, 2, 3], [4, 5]], [[5, 0, 3], [4], [1, 2]]])
-def test_each_policy_acts_at_its_lanes_and_remembers_them(split):
+def test_mixed_policy_lanes_and_hidden_states(split):
     players = [Echo() for _ in split]
     for i, player in enumerate(players):
         player.more = 100 * i
@@ -134,13 +132,13 @@ def test_each_policy_acts_at_its_lanes_and_remembers_them(split):
         obs = 10 * torch.arange(6.0)[:, None] + step
         world = arrdict(obs=obs, reset=torch.full((6,), reset), privileged=None)
         decision, state = lineup(world, state)
-        told = dict(zip(order, expected, strict=True))
-        assert decision.actions[:, 0].tolist() == [told[lane] + step for lane in range(6)]
+        action_of = dict(zip(order, expected, strict=True))
+        assert decision.actions[:, 0].tolist() == [action_of[lane] + step for lane in range(6)]
     for i, lanes in enumerate(split):
         assert state[str(i)].first[:, 0].tolist() == [10 * lane for lane in lanes]
 
 
-def test_actions_may_be_trees():
+def test_mixed_policy_with_action_trees():
     class Both:
         def initial(self, n_lanes, device=None):
             return arrdict()
@@ -158,7 +156,7 @@ def test_actions_may_be_trees():
 # ---- Ratings ----
 
 
-def test_ratings_are_in_the_order_of_strength_and_as_far_apart_as_the_model_says():
+def test_ratings_match_the_model():
     """Each wins 73 % against the next, e to 1: by the model that is 25 / 6 times 2**.5 apart."""
     random = np.random.default_rng(1)
     strength, gap = [2, 0, 1, 3], 25 / 6 * 2**0.5
@@ -169,12 +167,11 @@ def test_ratings_are_in_the_order_of_strength_and_as_far_apart_as_the_model_says
     }
     means = [mean for mean, _ in ratings.rate(4, scores)]
     assert sorted(range(4), key=means.__getitem__) == [1, 2, 0, 3]
-    found = np.sort(means)
-    assert np.diff(found) == pytest.approx([gap] * 3, abs=1)  # a standard deviation
+    assert np.diff(np.sort(means)) == pytest.approx([gap] * 3, abs=1)  # a standard deviation
     assert ratings.rate(4, scores) == ratings.rate(4, scores) != ratings.rate(4, scores, seed=2)
 
 
-def test_draws_leave_equals_equal_and_shares_are_counted_from_both_sides():
+def test_ratings_of_draws():
     table = ratings.rows(
         [("a", 10), ("b", 20), ("c", None)], {(0, 1): [0.5] * 50, (1, 2): [1, 0.5]}
     )
@@ -197,7 +194,7 @@ UPDATE = 16 * 16
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Two runs of self-play, the first with snapshots; and the folder that they are in."""
+    """A folder with runs a and b in self-play (a with snapshots), pixels and minimal."""
     base = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(base)
@@ -216,7 +213,7 @@ def here(trained, monkeypatch):
     return trained
 
 
-def test_snapshots_are_kept_along_the_budget_beside_the_checkpoints(here):
+def test_snapshots_are_spread_over_the_budget(here):
     names = {path.name for path in (here / "a" / "snapshots").iterdir()}
     assert names == {f"step_{2 * UPDATE}", f"step_{4 * UPDATE}"}
     assert not (here / "b" / "snapshots").exists()
@@ -226,7 +223,7 @@ def test_snapshots_are_kept_along_the_budget_beside_the_checkpoints(here):
     assert all(torch.equal(weights[name], last["policy"][name]) for name in weights)
 
 
-def test_duels_are_printed_and_written(here, capsys):
+def test_evaluate_against(here, capsys):
     names = f"a/snapshots/step_{2 * UPDATE},b,random,tests.helpers.games:High"
     assert evaluate.main(["run=a", f"against={names}", "episodes=20", "device=cpu"]) == 0
     (path,) = (here / "a" / "evaluations").glob("duels-*.json")
@@ -248,7 +245,7 @@ def test_duels_are_printed_and_written(here, capsys):
     assert runs.outcome(here / "a")["evaluated"] is None, "a duel's table has no return"
 
 
-def test_ratings_are_printed_written_and_drawn(here, capsys):
+def test_evaluate_ratings(here, capsys):
     assert (
         evaluate.main(["run=a", "ratings=true", "against=random", "episodes=8", "device=cpu"]) == 0
     )
@@ -265,7 +262,7 @@ def test_ratings_are_printed_written_and_drawn(here, capsys):
     xml.etree.ElementTree.parse(here / "a" / "ratings.svg")
 
 
-def test_one_agent_is_filmed_against_another(here, capsys, monkeypatch):
+def test_record_against(here, capsys, monkeypatch):
     drawn = []
 
     def film(env, policy, place, steps, *rest):
@@ -299,7 +296,7 @@ def test_one_agent_is_filmed_against_another(here, capsys, monkeypatch):
         ("nowhere", "nowhere does not exist"),
     ],
 )
-def test_who_cannot_play_is_one_sentence(here, capsys, name, sentence, script):
+def test_opponent_errors(here, capsys, name, sentence, script):
     assert script.main(["run=a", f"against={name}", "device=cpu"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(sentence, line)
@@ -310,20 +307,20 @@ class Elsewhere(Always):
         super().__init__(3)
 
 
-def test_one_agent_alone_has_no_duels(here, capsys):
+def test_duel_needs_two_agents(here, capsys):
     assert evaluate.main(["run=a", "env=pong", "against=b", "device=cpu"]) == 2
     assert "at least two agents, and Pong has one" in capsys.readouterr().err
     assert record.main(["run=null", "env=pong", "against=b"]) == 2
     assert "against: needs run=" in capsys.readouterr().err
 
 
-def test_a_run_with_one_checkpoint_has_nobody_to_be_compared_with(here, capsys):
+def test_ratings_need_two_checkpoints(here, capsys):
     assert evaluate.main(["run=b", "ratings=true", "device=cpu"]) == 2
     assert "train with snapshots=8" in capsys.readouterr().err
 
 
-def test_a_duel_is_of_two_in_unseen_homes_each_from_both_places(tmp_path, monkeypatch):
-    """Three agents learn; two duel. Seven homes and 40 duels: twice each home from each place."""
+def test_duel_homes_and_slots(tmp_path, monkeypatch):
+    """Three agents learn, two duel. Of 40 duels, each of 7 homes gets two from each slot."""
     monkeypatch.chdir(tmp_path)
     words = ["env=tests.helpers.games:Matrix", "env.n_agents=3", "env.n_envs=4", "geometry=homes"]
     options = ["geometry.n=7", "samples=1", "folder=run", *PONG[4:]]
@@ -339,9 +336,9 @@ def test_a_duel_is_of_two_in_unseen_homes_each_from_both_places(tmp_path, monkey
         evaluate.main(["run=run", "against=tests.helpers.games:High", "episodes=40", "device=cpu"])
         == 0
     )
-    ((env, found),) = played
+    ((env, result),) = played
     assert (env.n_envs, env.n_agents) == (28, 2)
-    counts = torch.stack([found.homes, found.slots.int()], 1).unique(dim=0, return_counts=True)[1]
+    counts = torch.stack([result.homes, result.slots.int()], 1).unique(dim=0, return_counts=True)[1]
     assert counts.tolist() == [2] * 14
     (path,) = (tmp_path / "run" / "evaluations").glob("*.json")
     assert json.loads(path.read_text())["rows"][0]["homes"] == 7
@@ -351,6 +348,6 @@ def test_a_duel_is_of_two_in_unseen_homes_each_from_both_places(tmp_path, monkey
     "word, names",
     [("a,b,bot", ["a", "b", "bot"]), ("[a,b]", ["a", "b"]), ("a", ["a"]), ("null", None)],
 )
-def test_a_list_of_opponents_is_no_sweep(capsys, word, names):
+def test_against_takes_a_list(capsys, word, names):
     assert evaluate.main(["run=x", f"against={word}", "--cfg", "job"]) == 0
     assert yaml.safe_load(capsys.readouterr().out)["against"] == names

@@ -1,4 +1,4 @@
-"""What the scripts begin with."""
+"""The start of the scripts: the GPU wakes up while Python imports."""
 
 import subprocess
 import sys
@@ -21,11 +21,11 @@ from megastep.agents.cli import entry
         (["--cfg", "job"], False),
     ],
 )
-def test_the_first_gpu_wakes_up_unless_another_device_is_named(words, wanted):
+def test_wants_first_gpu(words, wanted):
     assert entry.wants_first_gpu(words) == wanted
 
 
-def test_without_a_driver_nothing_happens(monkeypatch):
+def test_cuda_context_without_driver(monkeypatch):
     def absent(name):
         raise OSError(f"{name}: cannot open shared object file")
 
@@ -34,7 +34,7 @@ def test_without_a_driver_nothing_happens(monkeypatch):
 
 
 @pytest.mark.cuda
-def test_pytorch_works_in_the_context_that_was_created():
+def test_pytorch_uses_the_created_context():
     code = """
 from megastep.agents.cli.entry import create_cuda_context
 create_cuda_context()

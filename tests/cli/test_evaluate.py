@@ -1,6 +1,4 @@
-"""Evaluation: first episodes counted where returns are known, intervals checked on paper, and the
-script.
-"""
+"""Evaluation: first episodes with known returns, intervals checked by hand, and the script."""
 
 import dataclasses
 import itertools
@@ -24,7 +22,7 @@ TINY = [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=1"]
 
 
 class Counting:
-    """Lane b lives b + 1 steps, again and again; a step pays 1 in the first life and 100 later."""
+    """Episodes of lane b last b + 1 steps; the reward is 1 in the first and 100 in later ones."""
 
     n_agents, device = 1, torch.device("cpu")
     action_space = spaces.MultiDiscrete(1, 7)
@@ -54,14 +52,14 @@ class Counting:
 
 
 @pytest.mark.parametrize("mortal", [False, True])
-def test_only_the_first_episode_of_a_lane_counts(mortal):
+def test_only_first_episodes_count(mortal):
     env = Counting(100, mortal)
     episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
     assert episodes.returns.tolist() == episodes.lengths.tolist() == list(range(1, 101))
     assert bool(episodes.done.all())
 
 
-def test_an_episode_that_does_not_end_is_reported_as_it_stands():
+def test_unfinished_episodes():
     env = Counting(100, False)
     episodes = evaluation.first_episodes(
         env, evaluation.RandomActions(env.action_space), max_steps=64
@@ -72,8 +70,10 @@ def test_an_episode_that_does_not_end_is_reported_as_it_stands():
 
 
 class Teams(Counting):
-    """Environments of a leader and two followers, of whom the second follower does not learn. Its
-    metric is how old a lane is, and 1000 in a second life; anything where no episode ends.
+    """Environments with a leader and two followers; the second follower does not learn.
+
+    The metric at an episode's end is its length, plus 1000 from the second life on; elsewhere it is
+    meaningless.
     """
 
     n_agents, roles = 3, ("leader", "follower", "follower")
@@ -82,12 +82,12 @@ class Teams(Counting):
         self.n_lanes = 3 * self.n_envs
         env = Counting(self.n_lanes, False)
         self.env, world = env, env.reset()
-        return self.told(world)
+        return self.with_metrics(world)
 
     def step(self, decision):
-        return self.told(self.env.step(decision))
+        return self.with_metrics(self.env.step(decision))
 
-    def told(self, world):
+    def with_metrics(self, world):
         ended = world.terminal | world.truncated
         learns = torch.arange(self.n_lanes) % 3 < 2
         life = 1000 * (self.env.lives - 1)
@@ -95,22 +95,22 @@ class Teams(Counting):
         return arrdict(world, learns=learns, metrics=metrics)
 
 
-def test_metrics_and_returns_are_split_by_role_among_lanes_that_learn():
+def test_summaries_by_role():
     env = Teams(20, False)
     episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
     ages = torch.arange(1, 61)
     assert episodes.metrics.age.tolist() == ages.tolist()
     every, leader, follower = evaluation.summaries(episodes, env.roles)
-    for row, chosen in ((every, ages[ages % 3 > 0]), (leader, ages[::3]), (follower, ages[1::3])):
-        mean = pytest.approx(chosen.float().mean())
+    for row, lengths in ((every, ages[ages % 3 > 0]), (leader, ages[::3]), (follower, ages[1::3])):
+        mean = pytest.approx(lengths.float().mean())
         assert row["return"] == row["length"] == row["metrics"]["age"]["mean"] == mean
         assert row["metrics"]["age"]["lower"] == row["lower"] < row["return"] < row["upper"]
-        assert row["lanes"] == len(chosen)
+        assert row["lanes"] == len(lengths)
     assert (leader["role"], follower["role"]) == ("leader", "follower") and "role" not in every
 
 
-def test_the_agents_of_one_environment_are_one_draw():
-    """Two agents that always earn the same: half as many draws as there are episodes."""
+def test_agents_of_one_environment_are_one_sample():
+    """Two agents with equal returns: half as many samples as episodes."""
     alike = torch.arange(100.0).repeat_interleave(2)
     episodes = arrdict(
         returns=alike,
@@ -128,7 +128,7 @@ def test_the_agents_of_one_environment_are_one_draw():
     assert evaluation.summaries(in_one_home)[0]["lower"] == row["lower"]
 
 
-def test_a_metric_is_the_mean_over_episodes_that_ended():
+def test_metrics_average_over_finished_episodes():
     env = Teams(20, False)
     random = evaluation.RandomActions(env.action_space)
     (row,) = evaluation.summaries(evaluation.first_episodes(env, random, max_steps=10))
@@ -142,7 +142,7 @@ def test_a_metric_is_the_mean_over_episodes_that_ended():
     assert shown["age"] == shown["age: 95 % interval"] == "none"
 
 
-def test_metrics_stand_beside_the_return_of_a_table():
+def test_table_row_with_metrics():
     env = Teams(20, False)
     episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
     rows = [{"agent": "trained", **row} for row in evaluation.summaries(episodes, env.roles)]
@@ -159,7 +159,7 @@ def test_metrics_stand_beside_the_return_of_a_table():
     }
 
 
-def test_random_actions_are_spread_evenly_over_every_action():
+def test_random_actions_are_uniform():
     space = {"move": spaces.MultiDiscrete(2, 7), "fire": spaces.MultiDiscrete(1, 2)}
     policy = evaluation.RandomActions(arrdict(space))
     decision, _ = policy(
@@ -171,13 +171,13 @@ def test_random_actions_are_spread_evenly_over_every_action():
 
 
 def lanes_of_homes(sizes, random):
-    """Returns of ``sizes[h]`` lanes in each home h, and the lanes' homes."""
+    """Returns (returns of ``sizes[h]`` lanes in each home h, homes of the lanes)."""
     homes = np.repeat(np.arange(len(sizes)), sizes)
     return random.normal(np.arange(len(sizes))[homes], 1.0), homes
 
 
 class Moving:
-    """An Explorer that writes down in which home each lane's first episode ends."""
+    """An Explorer that records the home in which each lane's first episode ends."""
 
     def __init__(self, *args, **settings):
         self.env = envs.Explorer(*args, res=1, subsample=1, patience=1, **settings)
@@ -194,7 +194,7 @@ class Moving:
 
 
 @pytest.mark.parametrize("resample", [False, True])
-def test_a_lane_is_labelled_with_the_home_its_first_episode_is_played_in(resample):
+def test_homes_of_first_episodes(resample):
     env = Moving(10, sample("bench", 4), device="cpu", resample=resample)
     episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
     assert bool(episodes.done.all())
@@ -218,7 +218,7 @@ def test_agents_of_one_environment_share_its_home():
     assert episodes.homes.tolist() == [7, 7, 8, 8, 7, 7]
 
 
-def test_the_mean_is_exact_and_the_interval_holds_it():
+def test_interval_of_normal_samples():
     values = np.random.default_rng(1).normal(5, 2, 400)
     mean, lower, upper = evaluation.interval(values, np.arange(400))
     assert mean == pytest.approx(values.mean())
@@ -229,7 +229,7 @@ def test_the_mean_is_exact_and_the_interval_holds_it():
     )
 
 
-def test_lanes_of_one_home_count_as_one_draw():
+def test_lanes_of_one_home_are_one_sample():
     homes = np.random.default_rng(1).normal(0, 1, 50)
     alone = evaluation.interval(homes, np.arange(50))
     again = evaluation.interval(np.repeat(homes, 20), np.repeat(np.arange(50), 20))
@@ -237,12 +237,12 @@ def test_lanes_of_one_home_count_as_one_draw():
 
 
 @pytest.mark.parametrize("groups", [None, np.zeros(400)])
-def test_without_homes_or_in_one_alone_lanes_are_drawn(groups):
+def test_interval_without_homes(groups):
     mean, lower, upper = evaluation.interval([0.0, 1.0] * 200, groups)
     assert mean == 0.5 and upper - lower == pytest.approx(4 * 0.5 / 20, rel=0.15)
 
 
-def test_an_environment_without_homes_has_an_interval_over_episodes():
+def test_interval_over_episodes():
     env = Counting(400, False)
     episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
     (row,) = evaluation.summaries(episodes)
@@ -251,7 +251,7 @@ def test_an_environment_without_homes_has_an_interval_over_episodes():
     assert row["upper"] - row["lower"] == pytest.approx(2 * 1.96 * error, rel=0.1)
 
 
-def test_a_home_with_more_lanes_weighs_more():
+def test_interval_weighs_homes_by_lanes():
     """One lane that earned 0 in one home, three that earned 4 in another. Of the resamples of two
     homes half hold both: (0 + 3 * 4) / 4 = 3, not the mean of the homes' means, 2.
     """
@@ -260,14 +260,14 @@ def test_a_home_with_more_lanes_weighs_more():
 
 
 @pytest.mark.parametrize("sizes", [(1, 5, 2), (3, 3, 3), (1, 1, 7, 2)])
-def test_the_interval_is_that_of_an_evaluator_that_tries_every_resample(sizes):
+def test_interval_matches_exhaustive_bootstrap(sizes):
     values, homes = lanes_of_homes(sizes, np.random.default_rng(3))
     tries = []
-    for chosen in itertools.product(range(len(sizes)), repeat=len(sizes)):
-        drawn = [value for home in chosen for value in values[homes == home]]
+    for resample in itertools.product(range(len(sizes)), repeat=len(sizes)):
+        drawn = [value for home in resample for value in values[homes == home]]
         tries.append(sum(drawn) / len(drawn))
-    found = evaluation.interval(values, homes, level=0.8, n_resamples=200_000)
-    assert found == pytest.approx((values.mean(), *np.quantile(tries, [0.1, 0.9])), abs=0.02)
+    interval = evaluation.interval(values, homes, level=0.8, n_resamples=200_000)
+    assert interval == pytest.approx((values.mean(), *np.quantile(tries, [0.1, 0.9])), abs=0.02)
 
 
 def configured(**changes):
@@ -277,14 +277,14 @@ def configured(**changes):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A run folder, and the folder it was trained from."""
+    """The folder of a run."""
     with pytest.MonkeyPatch.context() as patch:
         base = tmp_path_factory.mktemp("trained")
         patch.chdir(base)
         return base / train.run(settings(*TINY))
 
 
-def test_the_table_is_printed_and_written(trained, capsys):
+def test_evaluate_prints_and_writes_a_table(trained, capsys):
     written = evaluate.run(configured(run=str(trained)))
     assert written == trained / "evaluations" / "box-test-32.json"
     result = json.loads(written.read_text())
@@ -307,7 +307,7 @@ def test_the_table_is_printed_and_written(trained, capsys):
     assert row.items() <= runs.outcome(trained).items()
 
 
-def test_it_is_reproducible_and_each_has_a_file_of_its_own(trained):
+def test_evaluate_is_reproducible(trained):
     shutil.rmtree(trained / "evaluations", ignore_errors=True)  # of other tests
 
     def lengths(**changes):
@@ -336,7 +336,7 @@ def test_it_is_reproducible_and_each_has_a_file_of_its_own(trained):
     }
 
 
-def test_a_file_of_homes_is_named_in_title_and_file_name(trained, tmp_path):
+def test_evaluate_in_homes_from_a_file(trained, tmp_path):
     files.save(tmp_path / "plans.npz", sample("homes", 3))
     words = ["run=x", "geometry=files", f"geometry.path={tmp_path / 'plans.npz'}"]
     plans = settings(*words, script="evaluate").geometry
@@ -348,8 +348,8 @@ def test_a_file_of_homes_is_named_in_title_and_file_name(trained, tmp_path):
     assert "in all homes of files-plans" in result["title"] and result["rows"][0]["homes"] == 3
 
 
-def test_a_lane_stays_in_one_home_whatever_the_training_did(tmp_path, monkeypatch):
-    """Ten lanes in four homes: three, three, two and two, each at home where its label says."""
+def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):
+    """Ten lanes in four homes: three, three, two and two."""
     monkeypatch.chdir(tmp_path)
     shape = ["env.n_envs=4", "env.patience=1", "env.res=4", "env.subsample=1", "agent.width=8"]
     learner = ["learner.n_steps=8", "learner.n_minibatches=2", "device=cpu", "samples=1"]
@@ -368,7 +368,7 @@ def test_a_lane_stays_in_one_home_whatever_the_training_did(tmp_path, monkeypatc
     assert torch.equal(seen["env"].core.scenery.layout, seen["episodes"].homes)
 
 
-def test_a_table_that_cannot_be_written_is_one_sentence(trained, monkeypatch, tmp_path):
+def test_unwritable_table(trained, monkeypatch, tmp_path):
     copy = shutil.copytree(trained, tmp_path / "copy")
     shutil.rmtree(copy / "evaluations", ignore_errors=True)
     (copy / "evaluations").write_text("")
@@ -376,7 +376,7 @@ def test_a_table_that_cannot_be_written_is_one_sentence(trained, monkeypatch, tm
         evaluate.run(configured(run=str(copy), baseline=False))
 
 
-def test_a_checkpoint_of_another_environment_is_refused_with_both_shapes(trained, tmp_path):
+def test_evaluate_refuses_another_environment(trained, tmp_path):
     from megastep.agents.training import checkpoint
 
     loaded = checkpoint.load_latest(trained / "checkpoints")
@@ -386,7 +386,7 @@ def test_a_checkpoint_of_another_environment_is_refused_with_both_shapes(trained
         evaluate.run(configured(run=str(tmp_path)))
 
 
-def test_a_folder_that_is_no_run_is_refused(tmp_path, capsys):
+def test_evaluate_without_a_run(tmp_path, capsys):
     assert evaluate.main([f"run={tmp_path}"]) == 2
     assert "is no run" in capsys.readouterr().err
     assert evaluate.main([]) == 2

@@ -39,9 +39,7 @@ def weights(folder):
 
 
 def train_until_interrupted(folder, *words):
-    """A run in a folder that Ctrl-C stops after six updates: two warm up a graph, the third
-    captures it.
-    """
+    """Trains until Ctrl-C after six updates: two warm up a CUDA graph, the third captures it."""
     write = loggers.Loggers.write
 
     def interrupting(self, step, *values):
@@ -63,45 +61,45 @@ def stopped(tmp_path_factory):
 
 @pytest.fixture
 def trainers(monkeypatch):
-    """The trainers that are made during a test."""
-    made, real = [], train.make_trainer
+    """The trainers trainers_made during a test."""
+    trainers_made, real = [], train.make_trainer
 
     def make_trainer(*arguments):
-        made.append(real(*arguments))
-        return made[-1]
+        trainers_made.append(real(*arguments))
+        return trainers_made[-1]
 
     monkeypatch.setattr(train, "make_trainer", make_trainer)
-    return made
+    return trainers_made
 
 
 def is_captured(trainer):
-    """Whether collecting and updating replay graphs."""
+    """Returns True if collecting and updating replay CUDA graphs."""
     return isinstance(trainer.collect.graph, capture.Graph) and trainer.learner.cuda_graph.graph
 
 
-def test_an_interrupted_run_is_saved(stopped):
+def test_interrupted_run_is_saved(stopped):
     assert [row["samples"] for row in rows(stopped)] == [(i + 1) * UPDATE for i in range(6)]
     loaded = checkpoint.load_latest(stopped / "checkpoints")
     assert loaded.step == STOPPED and nonfinite_leaf(loaded.state) is None
 
 
-def test_a_resumed_run_goes_on_in_graphs(stopped, trainers):
+def test_resumed_run_uses_cuda_graphs(stopped, trainers):
     before = weights(stopped)
     assert train.main([f"resume={stopped}", f"samples={2 * STOPPED}"]) == 0
     (trainer,) = trainers
     assert is_captured(trainer) and trainer.policy.device.type == "cuda"
     assert (trainer.samples, trainer.updates) == (2 * STOPPED, 12)
-    found = rows(stopped)
-    assert [row["updates"] for row in found] == list(range(1, 13))
-    assert all(row["loss/skipped_steps"] == 0 and row["loss/value"] >= 0 for row in found)
+    reports = rows(stopped)
+    assert [row["updates"] for row in reports] == list(range(1, 13))
+    assert all(row["loss/skipped_steps"] == 0 and row["loss/value"] >= 0 for row in reports)
     after = weights(stopped)
     assert any(not torch.equal(after[name], before[name]) for name in after)
     assert trainer.nonfinite_value is None and trainer.env.core.agents.positions.isfinite().all()
     assert checkpoint.load_latest(stopped / "checkpoints").step == 2 * STOPPED
 
 
-def test_what_a_graph_collects_after_a_resume_differs_from_rollout_to_rollout(stopped, trainers):
-    """Nothing that a captured call needs is left behind: not the memory, not the random stream."""
+def test_rollouts_differ_after_resume(stopped, trainers):
+    """A captured call advances the hidden state and the generator."""
     collected = []
 
     def store(self, losses, real=train.Trainer.log):
@@ -119,10 +117,10 @@ def test_what_a_graph_collects_after_a_resume_differs_from_rollout_to_rollout(st
         assert not torch.equal(actions, next_actions) and not torch.equal(cells, next_cells)
 
 
-def test_a_run_starts_from_the_weights_of_another(stopped, trainers, monkeypatch, tmp_path):
+def test_init(stopped, trainers, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    given = [*TINY, f"init={stopped}", f"samples={4 * UPDATE}", "learner.lr=1e-12", "folder=second"]
-    assert train.main(given) == 0
+    words = [*TINY, f"init={stopped}", f"samples={4 * UPDATE}", "learner.lr=1e-12", "folder=second"]
+    assert train.main(words) == 0
     ours, theirs = weights(tmp_path / "second"), weights(stopped)
     name = "intake.project.weight"
     torch.testing.assert_close(ours[name], theirs[name], rtol=0, atol=1e-6)
@@ -130,28 +128,26 @@ def test_a_run_starts_from_the_weights_of_another(stopped, trainers, monkeypatch
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_a_run_goes_on_on_another_device_and_back(stopped, device):
+def test_resume_on_another_device(stopped, device):
     step = checkpoint.load_latest(stopped / "checkpoints").step
-    given = [f"resume={stopped}", f"device={device}", f"samples={step + 4 * UPDATE}"]
-    assert train.main(given) == 0
+    words = [f"resume={stopped}", f"device={device}", f"samples={step + 4 * UPDATE}"]
+    assert train.main(words) == 0
     assert checkpoint.load_latest(stopped / "checkpoints").step == step + 4 * UPDATE
 
 
-def test_a_trained_agent_is_evaluated(stopped):
+def test_evaluate(stopped):
     assert evaluate.main([f"run={stopped}", "episodes=16", "device=cuda"]) == 0
     assert list(stopped.glob("evaluations/*.json"))
 
 
-def test_a_trained_agent_is_filmed(stopped):
+def test_record(stopped):
     pytest.importorskip("av")
     assert record.main([f"run={stopped}", "steps=3", "device=cuda"]) == 0
     assert (stopped / "video.mp4").stat().st_size > 1000
 
 
-def test_a_number_that_is_not_finite_is_named_in_a_captured_run(
-    monkeypatch, tmp_path, capsys, trainers
-):
-    # A fault that a graph holds: the reward of lane 5 is no number at every step.
+def test_non_finite_reward_in_a_cuda_graph(monkeypatch, tmp_path, capsys, trainers):
+    # captured in the graph: the reward of lane 5 is NaN at every step
     from megastep import envs
 
     real = envs.Explorer.step
@@ -173,7 +169,7 @@ def test_a_number_that_is_not_finite_is_named_in_a_captured_run(
 @pytest.mark.parametrize(
     "core, layers", [("gru", 1), ("mingru", 1), ("none", 1), ("lstm", 2), ("mingru", 2)]
 )
-def test_every_core_acts_and_learns_in_graphs(core, layers, trainers, monkeypatch, tmp_path):
+def test_every_core_in_cuda_graphs(core, layers, trainers, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     words = f"agent.core={core}", f"agent.layers={layers}", f"samples={6 * UPDATE}"
     assert train.main([*TINY, *words]) == 0
@@ -191,15 +187,13 @@ REPLAY = "learner.replay.capacity=4096"
         ["learner=r2d2", REPLAY, "learner.replay.burn_in=4"],
     ],
 )
-def test_every_learner_is_interrupted_goes_on_and_is_evaluated(
-    words, trainers, monkeypatch, tmp_path
-):
+def test_every_learner_resumes(words, trainers, monkeypatch, tmp_path):
     train_until_interrupted(tmp_path, *words)
     assert is_captured(trainers[0])
     monkeypatch.chdir(tmp_path)
     assert train.main(["resume=run", f"samples={2 * STOPPED}"]) == 0
     assert is_captured(trainers[1]) and trainers[1].nonfinite_value is None
-    found = rows(tmp_path / "run")
-    assert [row["updates"] for row in found] == list(range(1, 13))
-    assert all(row["loss/skipped_steps"] == 0 for row in found)
+    reports = rows(tmp_path / "run")
+    assert [row["updates"] for row in reports] == list(range(1, 13))
+    assert all(row["loss/skipped_steps"] == 0 for row in reports)
     assert evaluate.main(["run=run", "episodes=16", "device=cuda"]) == 0

@@ -24,7 +24,7 @@ def trained(tmp_path_factory):
         return base / train.run(settings(*TINY))
 
 
-def test_a_video_has_a_frame_for_every_step(trained):
+def test_video_has_a_frame_per_step(trained):
     import av
 
     assert record.main([f"run={trained}", "steps=3", "device=cpu"]) == 0
@@ -35,7 +35,7 @@ def test_a_video_has_a_frame_for_every_step(trained):
     assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
 
 
-def test_an_image_is_the_last_frame_and_needs_no_encoder(trained, tmp_path, monkeypatch):
+def test_png_is_the_last_frame(trained, tmp_path, monkeypatch):
     import av
 
     video, still = tmp_path / "a.mp4", tmp_path / "folder" / "a.png"
@@ -51,7 +51,7 @@ def test_an_image_is_the_last_frame_and_needs_no_encoder(trained, tmp_path, monk
     assert drawn.std() > 10 and errors.mean() < 3, "compression loses as much"
 
 
-def test_a_video_of_several_cameras_shows_each(tmp_path):
+def test_several_cameras(tmp_path):
     options = ["env=explorer", "geometry=box", "env.cameras=[0,120,240]", "device=cpu", "steps=1"]
     heights = []
     for cameras in options[2], "env.cameras=[0]":
@@ -64,19 +64,19 @@ def test_a_video_of_several_cameras_shows_each(tmp_path):
     )
 
 
-def test_a_place_that_cannot_be_written_is_one_sentence(trained, capsys):
+def test_unwritable_video(trained, capsys):
     assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=/proc/video.mp4"]) == 2
     assert "/proc/video.mp4 could not be made" in capsys.readouterr().err
 
 
-def test_another_kind_of_file_is_one_sentence(trained, capsys):
+def test_unknown_file_type(trained, capsys):
     assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=video.gif"]) == 2
     assert "video.gif could not be made: videos are mp4 files" in capsys.readouterr().err
 
 
 @pytest.fixture
 def handlers():
-    """Puts the handlers of signals back."""
+    """Restores the signal handlers."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     yield
     for number, handler in before.items():
@@ -85,7 +85,7 @@ def handlers():
 
 @pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 @pytest.mark.parametrize("script", ["record", "train"])
-def test_a_signal_while_filming_is_no_fault_of_the_video(
+def test_signal_while_filming(
     script, number, code, trained, tmp_path, handlers, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
@@ -102,7 +102,7 @@ def failing(*_, **__):
     raise RuntimeError("Frame 0 could not be drawn: by chance")
 
 
-def test_training_survives_a_video_that_fails(trained, tmp_path, monkeypatch, capsys):
+def test_training_survives_a_failed_video(trained, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(recording.ParallelEncoder, "__call__", failing)
     assert train.main([*TINY, "finish.record=true"]) == 0
@@ -110,9 +110,7 @@ def test_training_survives_a_video_that_fails(trained, tmp_path, monkeypatch, ca
     assert not list(tmp_path.glob("runs/*/*.mp4"))
 
 
-def test_without_the_encoder_training_goes_on_and_the_package_is_named(
-    tmp_path, monkeypatch, capsys
-):
+def test_training_without_the_encoder(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     faults.not_installed(monkeypatch, "av")
     assert train.main([*TINY, "finish.record=true"]) == 0
@@ -120,6 +118,6 @@ def test_without_the_encoder_training_goes_on_and_the_package_is_named(
     assert len(list(tmp_path.glob("runs/*/curves.png"))) == 1
 
 
-def test_keys_of_a_geometry_need_a_geometry(capsys):
+def test_geometry_keys_need_a_geometry(capsys):
     assert record.main(["env=minimal", "geometry.n=4"]) == 2
     assert re.search("geometry: .*give geometry=", capsys.readouterr().err)

@@ -1,4 +1,4 @@
-"""Run folders: made once each, however many programs start at a time; found by name; locked."""
+"""Run folders: new ones, existing ones by name, and their locks."""
 
 import errno
 import fcntl
@@ -27,38 +27,38 @@ def here(tmp_path, monkeypatch):
 
 
 def run(name):
-    """A run folder with a checkpoint folder, as one that has trained."""
+    """Makes a run folder with a folder of checkpoints and records its start."""
     path = pathlib.Path(name)
     (path / "checkpoints").mkdir(parents=True)
     runs.record_start(path)
     return path
 
 
-def test_a_taken_name_gets_a_number():
-    made = [runs.make(pathlib.Path("runs/a")) for _ in range(3)]
-    assert [str(path) for path in made] == ["runs/a", "runs/a-2", "runs/a-3"]
+def test_make_numbers_taken_names():
+    folders = [runs.make(pathlib.Path("runs/a")) for _ in range(3)]
+    assert [str(path) for path in folders] == ["runs/a", "runs/a-2", "runs/a-3"]
 
 
-def test_programs_that_start_in_the_same_second_get_folders_of_their_own():
+def test_make_from_many_threads():
     for round in range(20):
-        made, start = [], threading.Barrier(8)
+        folders, start = [], threading.Barrier(8)
 
-        def launch(name=f"runs/{round}", made=made, start=start):
+        def launch(name=f"runs/{round}", folders=folders, start=start):
             start.wait()
-            made.append(runs.make(pathlib.Path(name)))
+            folders.append(runs.make(pathlib.Path(name)))
 
         threads = [threading.Thread(target=launch) for _ in range(8)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-        assert len(set(made)) == 8 and all(path.is_dir() for path in made)
+        assert len(set(folders)) == 8 and all(path.is_dir() for path in folders)
 
 
 @pytest.mark.parametrize(
     "name", ["runs/2026-1-1_a-b", "r n ü", 'a"b', "a\\b", "it's", "[x,y]={$HOME}"]
 )
-def test_the_command_that_is_told_can_be_typed(name):
+def test_resume_command_is_quoted(name):
     typed = subprocess.run(
         ["bash", "-c", f"printf '%s\\n' {runs.resume_command(pathlib.Path(name))}"],
         text=True,
@@ -74,7 +74,7 @@ def test_the_command_that_is_told_can_be_typed(name):
 # ---- latest ----
 
 
-def test_the_latest_run_is_the_one_started_last_whatever_is_written_later():
+def test_latest_is_started_last():
     first, second = run("runs/b"), run("runs/a")
     assert runs.find("latest") == second
     (first / "checkpoints" / "step_1").mkdir()
@@ -84,13 +84,13 @@ def test_the_latest_run_is_the_one_started_last_whatever_is_written_later():
     assert runs.find("latest") == first
 
 
-def test_the_latest_run_may_be_a_sweeps_or_in_any_folder():
+def test_latest_in_any_folder():
     for name in ("runs/a", "sweeps/2026-01-01/0_seed=1", "else where/ü"):
         path = run(name)
         assert runs.find("latest") == path
 
 
-def test_neither_clocks_nor_copies_nor_deletion_change_which_run_is_the_latest():
+def test_latest_after_copies_and_deletions():
     first, second, third = run("runs/2026-03-01-a"), run("runs/2026-01-01-b"), run("runs/c")
     for path in (first, second, third):
         os.utime(path / "checkpoints", (0, 0))
@@ -102,7 +102,7 @@ def test_neither_clocks_nor_copies_nor_deletion_change_which_run_is_the_latest()
     assert runs.find("latest") == first
 
 
-def test_runs_whose_start_is_not_known_are_ordered_by_their_names():
+def test_latest_without_records():
     for name in ("2026-01-02", "2026-01-01"):
         pathlib.Path("runs", name, "checkpoints").mkdir(parents=True)
     assert str(runs.find("latest")) == "runs/2026-01-02"
@@ -110,7 +110,7 @@ def test_runs_whose_start_is_not_known_are_ordered_by_their_names():
     assert runs.find("latest") == known
 
 
-def test_a_start_that_cannot_be_noted_is_one_warning(capsys):
+def test_unwritable_start_record_warns(capsys):
     pathlib.Path("runs").write_text("a file")
     runs.record_start(pathlib.Path("elsewhere"))
     assert capsys.readouterr().err.startswith("warning: runs/started.txt cannot be written")
@@ -119,7 +119,7 @@ def test_a_start_that_cannot_be_noted_is_one_warning(capsys):
 # ---- The lock ----
 
 
-def test_a_folder_in_use_is_refused_with_the_process_that_has_it(here):
+def test_lock_names_the_process(here):
     with locked(here):
         assert (here / "lock").read_text() == str(os.getpid())
         with pytest.raises(
@@ -142,7 +142,7 @@ with locked(pathlib.Path(sys.argv[1])):
 """
 
 
-def test_the_lock_of_a_killed_process_is_no_obstacle(here):
+def test_lock_of_a_killed_process(here):
     holder = subprocess.Popen(
         [sys.executable, "-c", HOLDS, here], cwd=ROOT, text=True, stdout=subprocess.PIPE
     )
@@ -156,13 +156,13 @@ def test_the_lock_of_a_killed_process_is_no_obstacle(here):
         assert (here / "lock").read_text() == str(os.getpid())
 
 
-def test_a_lock_left_with_the_number_of_another_living_process_is_no_obstacle(here):
+def test_stale_lock_with_a_live_pid(here):
     (here / "lock").write_text(str(os.getppid()))
     with locked(here):
         assert (here / "lock").read_text() == str(os.getpid())
 
 
-def test_a_lock_file_that_its_owner_deletes_meanwhile_is_made_anew(here, monkeypatch):
+def test_lock_file_deleted_while_locking(here, monkeypatch):
     real, calls = fcntl.flock, []
 
     def flock(file, how):
@@ -177,7 +177,7 @@ def test_a_lock_file_that_its_owner_deletes_meanwhile_is_made_anew(here, monkeyp
     assert len(calls) >= 2
 
 
-def test_on_a_file_system_without_locks_a_run_is_warned(here, monkeypatch, capsys):
+def test_file_system_without_locks(here, monkeypatch, capsys):
     def flock(file, how):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
@@ -186,7 +186,7 @@ def test_on_a_file_system_without_locks_a_run_is_warned(here, monkeypatch, capsy
         assert "file system without locks" in capsys.readouterr().err
 
 
-def test_only_one_of_many_has_the_lock_at_a_time(here):
+def test_lock_excludes_threads(here):
     inside, most, refused = [], [], []
 
     def work():

@@ -1,6 +1,4 @@
-"""Signals at every moment of a run: the exit code is 128 + the number, what was learnt is saved,
-and nothing is mistaken for another error.
-"""
+"""Signals at every moment of a run: the exit code is 128 + the number, and nothing is lost."""
 
 import json
 import os
@@ -28,7 +26,7 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """A folder of its own, and signals as a shell leaves them."""
+    """Changes to an empty folder, with default signal handlers."""
     monkeypatch.chdir(tmp_path)
     before = {number: signal.signal(number, signal.SIG_DFL) for number in SIGNALS}
     yield tmp_path
@@ -65,7 +63,7 @@ def setting_up(monkeypatch, number):
 
 @pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize("moment", [composing, setting_up])
-def test_before_anything_is_learnt_nothing_is_left(here, monkeypatch, capsys, moment, number):
+def test_signal_before_training(here, monkeypatch, capsys, moment, number):
     moment(monkeypatch, number)
     assert train.main([*TINY, "seconds=60", "folder=run"]) == 128 + number
     assert capsys.readouterr().err == f"train.py: stopped by {number.name}\n"
@@ -88,15 +86,15 @@ def saving(monkeypatch, number):
 
 @pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize("moment", [collecting, reporting, saving])
-def test_while_training_the_step_is_finished_and_saved(here, monkeypatch, capsys, moment, number):
+def test_signal_while_training(here, monkeypatch, capsys, moment, number):
     moment(monkeypatch, number)
     assert (
         train.main([*TINY, "seconds=60", "folder=run", "checkpoint_seconds=1e-9"]) == 128 + number
     )
-    told = (
+    expected = (
         f"train.py: Stopped after {2 * UPDATE} samples. To continue: python train.py resume=run\n"
     )
-    assert capsys.readouterr().err == told
+    assert capsys.readouterr().err == expected
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == 2 * UPDATE
     assert not list((here / "run" / "checkpoints").glob("*tmp*"))
     assert not (here / "run" / "lock").exists()
@@ -114,7 +112,7 @@ def filming(monkeypatch, number):
 @pytest.mark.parametrize(
     "moment, number", [*((evaluating, number) for number in SIGNALS), (filming, signal.SIGHUP)]
 )
-def test_after_training_the_checkpoint_stands(here, monkeypatch, capsys, moment, number):
+def test_signal_after_training(here, monkeypatch, capsys, moment, number):
     moment(monkeypatch, number)
     assert train.main([*TINY, f"samples={UPDATE}", "folder=run", *WHOLE]) == 128 + number
     assert capsys.readouterr().err == f"train.py: stopped by {number.name}\n"
@@ -122,7 +120,7 @@ def test_after_training_the_checkpoint_stands(here, monkeypatch, capsys, moment,
     assert not list((here / "run").glob("*.mp4")) and not list((here / "run").glob(".*"))
 
 
-def test_a_sweep_stops_as_a_whole_and_shows_what_was_done(here, monkeypatch, capsys):
+def test_signal_stops_a_sweep(here, monkeypatch, capsys):
     signalled(monkeypatch, Collector, "__call__", signal.SIGTERM, call=2)
     assert train.main([*TINY, "-m", f"samples={UPDATE}", "seed=1,2,3"]) == 143
     table = capsys.readouterr().out.split("Sweep", 1)[1]
@@ -131,21 +129,21 @@ def test_a_sweep_stops_as_a_whole_and_shows_what_was_done(here, monkeypatch, cap
     assert len((folder / "sweep.csv").read_text().splitlines()) == 3  # the third never began
 
 
-def test_a_signal_sent_twice_at_once_is_one(here, monkeypatch):
-    """As coreutils' timeout does, and as a shell and the system do when a terminal is closed."""
+def test_double_signal_counts_once(here, monkeypatch):
+    """coreutils' timeout sends two, and so do a shell and the system when a terminal is closed."""
     signalled(monkeypatch, Collector, "__call__", signal.SIGTERM, signal.SIGTERM)
     assert train.main([*TINY, "seconds=60", "folder=run"]) == 143
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == 2 * UPDATE
 
 
-def test_under_nohup_a_closed_terminal_does_not_stop_a_run(here, monkeypatch):
+def test_nohup(here, monkeypatch):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signalled(monkeypatch, Collector, "__call__", signal.SIGHUP)
     assert train.main([*TINY, f"samples={4 * UPDATE}", "folder=run"]) == 0
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == 4 * UPDATE
 
 
-# ---- In processes of their own ----
+# ---- In their own processes ----
 
 STUCK = """
 import os, signal, sys, time
@@ -162,7 +160,7 @@ sys.exit(train.main(sys.argv[1:]))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_second_signal_ends_a_run_that_is_stuck_at_once(here, number):
+def test_second_signal_quits(here, number):
     process = subprocess.Popen(
         [sys.executable, "-c", STUCK, *TINY, "seconds=60", "folder=run"],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -190,14 +188,14 @@ def launched(*arguments, script="train", **environment):
 
 
 def is_caught(process, number):
-    """Whether a process has a handler for a signal."""
+    """Returns True if a process handles a signal."""
     status = pathlib.Path(f"/proc/{process.pid}/status").read_text()
     (mask,) = (line.split()[1] for line in status.splitlines() if line.startswith("SigCgt"))
     return bool(int(mask, 16) >> number - 1 & 1)
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_while_python_imports_a_signal_is_one_line(here, number):
+def test_signal_during_imports(here, number):
     process = launched(*TINY, "seconds=60")
     while not is_caught(process, signal.SIGTERM) or not is_caught(process, number):
         assert process.poll() is None
@@ -209,7 +207,7 @@ def test_while_python_imports_a_signal_is_one_line(here, number):
     assert not any(here.iterdir())
 
 
-def test_ctrl_c_while_compiling_is_no_missing_compiler(here):
+def test_ctrl_c_while_compiling(here):
     """A terminal's Ctrl-C reaches the compiler as well, which then fails."""
     compiler = here / "compiler"
     lines = ["#!/bin/sh", '[ "$1" = --version ] && exit', "kill -INT $PPID", "exit 1"]
@@ -222,8 +220,8 @@ def test_ctrl_c_while_compiling_is_no_missing_compiler(here):
     assert not (here / "run").exists()
 
 
-def test_a_terminal_that_is_closed_while_filming_ends_every_process_with_one_line(here):
-    """Its signal reaches them all: this one, its workers, and what watches over these."""
+def test_closed_terminal_while_filming(here):
+    """The signal reaches this process, its workers and their resource tracker."""
     filming = ["finish.record=true", "finish.steps=5000"]
     process = launched(*TINY, f"samples={UPDATE}", "folder=run", *filming)
     children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children")
@@ -236,7 +234,7 @@ def test_a_terminal_that_is_closed_while_filming_ends_every_process_with_one_lin
 
 
 def at_any_moment(here, seed):
-    """One run that gets a signal at a random time, and what has to hold whenever that is."""
+    """Sends a signal to a run at a random time, and checks what always holds."""
     draw = random.Random(seed)
     number, folder = draw.choice(SIGNALS), here / str(seed)
     process = launched(
@@ -271,5 +269,5 @@ def at_any_moment(here, seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(100))
-def test_at_whichever_moment_a_signal_comes_nothing_is_lost(here, seed):
+def test_signal_at_a_random_moment(here, seed):
     at_any_moment(here, seed)

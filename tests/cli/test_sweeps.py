@@ -38,7 +38,7 @@ from megastep import arrdict, spaces
 
 
 class Payer:
-    """Episodes of four steps, each of which pays `pay`; may fail as it is made."""
+    """Episodes of four steps with reward `pay` each; the constructor fails for some moods."""
 
     n_agents, fps = 1, 5.0
     action_space, obs_space = spaces.MultiDiscrete(1, 2), spaces.MultiVector(1, 2)
@@ -84,7 +84,7 @@ SHORT = [*SMALL, f"samples={2 * UPDATE}"]
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """An empty folder with the environment; what Hydra changes in the process is put back."""
+    """Changes to an empty folder with the environment; restores what Hydra changes."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
@@ -99,7 +99,7 @@ def here(tmp_path, monkeypatch):
 
 
 def rows(folder):
-    """The lines of a sweep's table, for machines."""
+    """Returns the rows of sweep.csv."""
     with open(pathlib.Path(folder) / "sweep.csv") as file:
         return list(csv.DictReader(file))
 
@@ -115,7 +115,7 @@ def start(*words, **environment):
 
 
 def finished(*words):
-    """(exit code, stdout, stderr)"""
+    """Runs train.py. Returns (exit code, stdout, stderr)."""
     process = start(*words)
     out, err = process.communicate(timeout=120)
     return process.returncode, out, err
@@ -124,16 +124,16 @@ def finished(*words):
 # ---- Hydra's own launcher and sweeper ----
 
 
-def test_a_sweep_leaves_a_folder_per_job_and_a_table(here, capsys):
+def test_sweep_folders_and_table(here, capsys):
     words = [*SHORT, "-m", "seed=1,2", "env.pay=0.5,3", "finish.evaluate=true", "finish.episodes=4"]
     assert train.main([*words, "hydra.sweep.dir=mine"]) == 0
-    found = rows("mine")
+    table = rows("mine")
     names = ["0_env.pay=0.5_seed=1", "1_env.pay=3_seed=1", "2_env.pay=0.5_seed=2"]
-    assert [pathlib.Path(row["folder"]).name for row in found[:3]] == names
+    assert [pathlib.Path(row["folder"]).name for row in table[:3]] == names
     assert all((here / "mine" / name / "checkpoints").is_dir() for name in names)
-    told = [(row["job"], row["seed"], row["env.pay"], row["state"]) for row in found]
-    assert told[1:3] == [("1", "1", "3", "done"), ("2", "2", "0.5", "done")]
-    for row in found:  # four steps of a known reward
+    states = [(row["job"], row["seed"], row["env.pay"], row["state"]) for row in table]
+    assert states[1:3] == [("1", "1", "3", "done"), ("2", "2", "0.5", "done")]
+    for row in table:  # four steps of a known reward
         numbers = [float(row[key]) for key in ("score", "evaluated", "lower", "upper")]
         assert numbers == 4 * [4 * float(row["env.pay"])]
     lines = (here / "mine" / "sweep.md").read_text().splitlines()
@@ -146,7 +146,7 @@ def test_a_sweep_leaves_a_folder_per_job_and_a_table(here, capsys):
 
 
 @pytest.mark.parametrize("more", [[], ["hydra.sweeper.max_batch_size=1"]])
-def test_a_sweep_goes_past_failed_jobs_marks_them_and_exits_with_1(here, capsys, more):
+def test_failed_jobs(here, capsys, more):
     words = [*SHORT, "-m", "env.mood=cross,fine,cross", "hydra.sweep.dir=mine", *more]
     assert train.main(words) == 1
     assert [row["state"] for row in rows("mine")] == [
@@ -159,8 +159,8 @@ def test_a_sweep_goes_past_failed_jobs_marks_them_and_exits_with_1(here, capsys,
     assert not (here / "mine/0_env.mood=cross/checkpoints").exists()
 
 
-def test_a_sweep_that_is_wrong_leaves_nothing(here, capsys):
-    for words, told in (
+def test_invalid_sweep_leaves_nothing(here, capsys):
+    for words, message in (
         (["seed=1,2", "learner.lr=1e-3,-1"], "learner.lr: -1 is out of range"),
         (["seed=1,2", "folder=x"], "hydra.sweep.dir="),
         (["hydra.launcher.n_job=3"], "hydra.launcher.n_job: no such key"),
@@ -168,12 +168,12 @@ def test_a_sweep_that_is_wrong_leaves_nothing(here, capsys):
         (["hydra.sweeper.max_batch_size=0"], "The sweep cannot start: "),
     ):
         assert train.main([*SHORT, "-m", *words]) == 2
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err
         left = {path.name for path in here.rglob("*")} - {"payer.py", "__pycache__"}
         assert not {name for name in left if not name.startswith("payer.")}, words
 
 
-def test_sweeps_of_one_second_have_folders_of_their_own(here, monkeypatch):
+def test_sweeps_in_the_same_second(here, monkeypatch):
     monkeypatch.setattr(train, "run", lambda cfg: None)
     monkeypatch.setattr(
         "hydra.core.utils.datetime", type("Clock", (), {"now": staticmethod(lambda: NOON)})
@@ -190,7 +190,7 @@ class NOON:
         return "noon"
 
 
-def test_a_folder_that_holds_a_run_is_no_jobs_again(here):
+def test_job_refuses_a_used_folder(here):
     words = [*SHORT, "-m", "seed=1", "hydra.sweep.dir=mine"]
     assert train.main(words) == 0
     before = (here / "mine/0_default/metrics.jsonl").read_bytes()
@@ -200,7 +200,7 @@ def test_a_folder_that_holds_a_run_is_no_jobs_again(here):
     assert (here / "mine/0_default/metrics.jsonl").read_bytes() == before
 
 
-def test_in_a_folder_of_its_own_a_job_finds_what_paths_meant_at_the_start(here):
+def test_paths_with_hydra_job_chdir(here):
     assert train.main([*SHORT, "folder=first", "hydra.job.chdir=true"]) == 0
     assert os.getcwd() == str(here) and (here / "first/checkpoints").is_dir()
     words = [*SHORT, "-m", "init=first", "seed=1,2", "hydra.job.chdir=true", "hydra.sweep.dir=mine"]
@@ -209,29 +209,35 @@ def test_in_a_folder_of_its_own_a_job_finds_what_paths_meant_at_the_start(here):
     assert runs.find("latest") == pathlib.Path("mine/1_seed=2")
 
 
-def test_a_single_runs_folder_is_hydras_too(here, capsys):
+def test_hydra_run_dir_is_the_folder(here, capsys):
     assert train.main([*SHORT, "hydra.run.dir=mine/first"]) == 0
     assert (here / "mine/first/checkpoints").is_dir()
     assert evaluate.main(["run=mine/first", "episodes=4", "hydra.run.dir=x"]) == 2
     assert "folder: no such key" in capsys.readouterr().err
 
 
-def test_runs_of_a_sweep_are_a_group_of_wandbs(here, monkeypatch):
-    given = []
+def test_wandb_group_of_a_sweep(here, monkeypatch):
+    loggers_added = []
     monkeypatch.setattr(
-        loggers.Loggers, "_add_optional", lambda self, sink, *_, **known: given.append(known)
+        loggers.Loggers,
+        "_add_optional",
+        lambda self, sink, *_, **options: loggers_added.append(options),
     )
     wandb = ["logger=wandb", "logger.mode=offline"]
     assert train.main([*SHORT, *wandb, "-m", "seed=1", "hydra.sweep.dir=mine"]) == 0
     assert train.main([*SHORT, *wandb, "-m", "seed=1", "hydra.sweep.dir=x", "logger.group=g"]) == 0
     assert train.main([*SHORT, *wandb, "folder=alone"]) == 0
-    assert [known["group"] for known in given if "group" in known] == ["mine", "g", None]
+    assert [options["group"] for options in loggers_added if "group" in options] == [
+        "mine",
+        "g",
+        None,
+    ]
 
 
 # ---- Other launchers and sweepers ----
 
 
-def test_joblib_runs_two_jobs_at_a_time(here):
+def test_joblib(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
     code, out, err = finished(*SHORT, "-m", "env.pay=1,2", *words)
@@ -242,7 +248,7 @@ def test_joblib_runs_two_jobs_at_a_time(here):
     assert "job 0: Training on cpu in mine/0_env.pay=1" in out
 
 
-def test_a_signal_has_jobs_in_other_processes_save(here):
+def test_signal_saves_jobs_in_other_processes(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
     process, deadline = start(*SMALL, "seconds=100", "-m", "seed=1,2,3", *words), time.time() + 60
@@ -256,19 +262,19 @@ def test_a_signal_has_jobs_in_other_processes_save(here):
     assert len(list(here.glob("mine/*/checkpoints/step_*"))) == 2
 
 
-def test_optuna_looks_for_high_returns_and_goes_past_a_failed_trial(here):
+def test_optuna_maximises_and_skips_failed_trials(here):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
     words = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=4", "hydra.sweeper.n_jobs=1"]
     words += ["hydra.sweeper.storage=sqlite:///study.db", "hydra.sweeper.study_name=pay"]
     words += ["hydra.sweeper.sampler.seed=1", "env.pay=interval(0.5,8.0)", "env.mood=fine,cross"]
     code = train.main([*SHORT, "-m", *words, "hydra.sweep.dir=mine"])
-    found = rows("mine")
-    assert len(found) == 4 and (here / "study.db").exists()
-    assert code == (1 if any(row["state"] != "done" for row in found) else 0)
-    scores = [float(row["score"]) for row in found if row["score"]]
+    table = rows("mine")
+    assert len(table) == 4 and (here / "study.db").exists()
+    assert code == (1 if any(row["state"] != "done" for row in table) else 0)
+    scores = [float(row["score"]) for row in table if row["score"]]
     assert scores and all(
         float(row["score"]) == pytest.approx(4 * float(row["env.pay"]), rel=1e-5)
-        for row in found
+        for row in table
         if row["score"]
     )
     best = yaml.safe_load((here / "mine/optimization_results.yaml").read_text())
@@ -276,7 +282,7 @@ def test_optuna_looks_for_high_returns_and_goes_past_a_failed_trial(here):
     assert set(best["best_params"]) == {"env.pay", "env.mood"}
 
 
-def test_submitit_runs_a_job(here):
+def test_submitit(here):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     code, _, err = finished(
         *SHORT, "-m", "env.pay=2", "hydra/launcher=submitit_local", "hydra.sweep.dir=mine"
@@ -287,7 +293,7 @@ def test_submitit_runs_a_job(here):
     assert list((here / "mine/.submitit").rglob("*_log.out"))
 
 
-def test_a_job_whose_process_is_killed_is_marked(here):
+def test_killed_job(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
     code, _, err = finished(*SHORT, "-m", "env.mood=dead", *words)
@@ -298,7 +304,7 @@ def test_a_job_whose_process_is_killed_is_marked(here):
 # ---- Where jobs run ----
 
 
-def test_the_preset_is_chosen_where_the_job_runs(here, monkeypatch):
+def test_preset_is_chosen_where_the_job_runs(here, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     job = sweeps.Job(Composer(train.SCRIPT), here)
     job = cloudpickle.loads(cloudpickle.dumps(job))
@@ -307,7 +313,7 @@ def test_the_preset_is_chosen_where_the_job_runs(here, monkeypatch):
         assert Composer(*job.source).settings(words).env.n_envs == n_envs
 
 
-def test_jobs_of_one_machine_take_the_gpu_with_the_fewest_jobs(here, monkeypatch):
+def test_jobs_share_gpus(here, monkeypatch):
     current = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
@@ -325,7 +331,7 @@ def test_jobs_of_one_machine_take_the_gpu_with_the_fewest_jobs(here, monkeypatch
         assert gpu is None
 
 
-def test_errors_can_be_sent_between_processes():
+def test_errors_can_be_pickled():
     errors = pickle.loads(pickle.dumps(ConfigErrors([("seed", "is missing")])))
     assert errors.errors == [("seed", "is missing")] and "seed: is missing" in str(errors)
     stop = pickle.loads(pickle.dumps(Interrupted(15, "saved")))
@@ -335,7 +341,7 @@ def test_errors_can_be_sent_between_processes():
 # ---- Names and scores ----
 
 
-def test_a_job_is_named_by_what_varies_in_characters_that_are_left_alone():
+def test_job_folder_names():
     def name(text):
         return OmegaConf.create({"x": "${file_name:${y}}", "y": text}).x
 
@@ -344,7 +350,7 @@ def test_a_job_is_named_by_what_varies_in_characters_that_are_left_alone():
     assert len(name("folder=" + 1000 * "ü").encode()) <= 200
 
 
-def test_the_score_of_a_run_is_the_mean_of_its_last_reports(here):
+def test_score_is_the_mean_of_the_last_reports(here):
     lines = [{"samples": n, "episode/return": float(n)} for n in range(1, 13)]
     lines.insert(5, {"samples": 5, "loss/value": 1.0})
     (here / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -353,10 +359,10 @@ def test_the_score_of_a_run_is_the_mean_of_its_last_reports(here):
     assert runs.outcome(here / "empty")["score"] is None
 
 
-# ---- A folder of one's own; shells ----
+# ---- --config-dir; completion ----
 
 
-def test_a_folder_of_ones_own_adds_groups_members_and_files(here, capsys):
+def test_config_dir_and_config_name(here, capsys):
     files = {
         "env/mine.yaml": "name: payer:Payer\npay: 7\n",
         "size/small.yaml": "# @package _global_\nagent:\n  width: 8\n",
@@ -380,7 +386,7 @@ def test_a_folder_of_ones_own_adds_groups_members_and_files(here, capsys):
     words = ["--config-dir", "conf", *SHORT[1:], "-m", "env=mine", "+size=small", "seed=1"]
     assert train.main([*words, "hydra.sweep.dir=mine"]) == 0
     assert float(rows("mine")[0]["score"]) == 28
-    for words, told in (
+    for words, message in (
         (["-cd", "conf", "env=mien"], "did you mean mine?"),
         (["-cd", "conf", "size=small"], "+size=small"),
         (["-cd", "conf", "+siz=small"], "siz: no such key; did you mean size?"),
@@ -388,7 +394,7 @@ def test_a_folder_of_ones_own_adds_groups_members_and_files(here, capsys):
         (["-cn", "nowhere"], "nowhere: is in none of the folders"),
     ):
         assert train.main(words) == 2
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -403,12 +409,12 @@ def test_a_folder_of_ones_own_adds_groups_members_and_files(here, capsys):
         ("env=explorr learner.la", ""),
     ],
 )
-def test_a_shell_completes_words(monkeypatch, capsys, line, expected):
+def test_shell_completion(monkeypatch, capsys, line, expected):
     monkeypatch.setenv("COMP_LINE", f"python train.py {line}")
     assert train.main(["-sc", "query=bash"]) == 0
     assert capsys.readouterr().out.strip() == expected
 
 
-def test_a_run_that_is_not_in_a_sweep_has_no_group():
+def test_wandb_group_without_a_sweep():
     settings = Composer(train.SCRIPT).settings(["logger=wandb"])
     assert dataclasses.asdict(settings.logger)["group"] is None

@@ -1,6 +1,4 @@
-"""Training, in this process: the configuration is composed as the command line does it, the
-environments are four boxes.
-"""
+"""Training in this process, with settings composed as by the command line, in four boxes."""
 
 import contextlib
 import itertools
@@ -45,7 +43,7 @@ def here(tmp_path, monkeypatch):
 
 
 def only_run(here):
-    """The one run folder there is."""
+    """Returns the only run folder."""
     (folder,) = (path for path in (here / "runs").iterdir() if path.is_dir())
     return folder
 
@@ -58,7 +56,7 @@ def same(a, b):
     return all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_a_run_leaves_what_it_promises(here):
+def test_files_of_a_run(here):
     folder = train.run(configured(f"samples={3 * UPDATE}"))
     assert folder.parent.name == "runs" and "minimal-box-1" in folder.name
     assert {path.name for path in folder.iterdir()} == {
@@ -85,7 +83,7 @@ def test_a_run_leaves_what_it_promises(here):
     assert loaded.config["spaces"]["obs"].startswith("MultiImage")
 
 
-def test_a_seed_determines_a_run_and_another_changes_it(here):
+def test_seeds(here):
     folders = [train.run(configured("samples=100", f"seed={seed}")) for seed in (1, 1, 2)]
     one, again, other = [(folder / "metrics.jsonl").read_bytes() for folder in folders]
     assert one == again != other
@@ -94,14 +92,14 @@ def test_a_seed_determines_a_run_and_another_changes_it(here):
     )
 
 
-def test_seconds_stop_a_run_and_a_report_comes_every_so_many_updates(here):
+def test_seconds_and_log_every(here):
     folder = train.run(configured("seconds=0.5", "log_every=2"))
     updates = [row["updates"] for row in json_lines.read(folder / "metrics.jsonl")]
     assert updates == list(range(2, len(updates) * 2 + 1, 2))
     assert 0.5 <= checkpoint.load_latest(folder / "checkpoints").state["seconds"] < 5
 
 
-def test_a_run_goes_on_under_its_own_configuration(here):
+def test_resume_keeps_the_configuration(here):
     folder = train.run(configured(f"samples={2 * UPDATE}", "learner.lr=0.123"))
     cfg = configured(f"resume={folder}", f"samples={4 * UPDATE}", tiny=[])
     assert cfg.learner.lr == 0.123 and cfg.env.n_envs == 4
@@ -112,7 +110,7 @@ def test_a_run_goes_on_under_its_own_configuration(here):
     assert yaml.safe_load((folder / "config.yaml").read_text())["samples"] == 4 * UPDATE
 
 
-def test_episodes_start_anew_when_a_run_goes_on(here):
+def test_resume_restarts_episodes(here):
     # every episode lasts 9 steps, and 8 are left over from the first rollout
     folder = train.run(configured(f"samples={UPDATE}", "env.shortest=9", "env.longest=9"))
     train.run(configured(f"resume={folder}", f"samples={5 * UPDATE}", tiny=[]))
@@ -120,7 +118,7 @@ def test_episodes_start_anew_when_a_run_goes_on(here):
     assert [row["episode/length"] for row in rows if row["episode/count"]] == [9, 9, 9]
 
 
-def test_episodes_that_ended_before_a_run_was_stopped_are_reported_when_it_goes_on(here):
+def test_resume_reports_earlier_episodes(here):
     lengths = "env.shortest=7", "env.longest=7"
     folder = train.run(configured(f"samples={UPDATE}", "log_every=2", *lengths))
     train.run(configured(f"resume={folder}", f"samples={2 * UPDATE}", tiny=[]))
@@ -129,14 +127,14 @@ def test_episodes_that_ended_before_a_run_was_stopped_are_reported_when_it_goes_
 
 
 def clock_jumps(monkeypatch, seconds):
-    """From its 12th reading on, in the first updates of a run, the clock shows so much more."""
+    """Makes the clock jump ahead by `seconds` at its 12th reading, early in a run."""
     readings = itertools.count()
     monkeypatch.setattr(
         time, "monotonic", lambda: 1e-3 * (n := next(readings)) + seconds * (n >= 12)
     )
 
 
-def test_the_learning_rate_falls_over_samples_where_both_budgets_are_given(here, monkeypatch):
+def test_anneal_over_samples(here, monkeypatch):
     clock_jumps(monkeypatch, 900)  # most of the seconds are gone before most of the samples are
     lr, n = 0.01, 4
     folder = train.run(configured(f"samples={n * UPDATE}", "seconds=1000", f"learner.lr={lr}"))
@@ -147,7 +145,7 @@ def test_the_learning_rate_falls_over_samples_where_both_budgets_are_given(here,
     assert written["learner"]["anneal"] == "samples"
 
 
-def test_a_seed_determines_the_file_whatever_the_clock_shows(here, monkeypatch):
+def test_metrics_do_not_depend_on_the_clock(here, monkeypatch):
     files = []
     for seconds in (0, 900):
         clock_jumps(monkeypatch, seconds)
@@ -156,7 +154,7 @@ def test_a_seed_determines_the_file_whatever_the_clock_shows(here, monkeypatch):
     assert files[0] == files[1]
 
 
-def test_the_learning_rate_falls_over_seconds_where_they_are_the_only_budget(here):
+def test_anneal_over_seconds(here):
     folder = train.run(configured("seconds=0.3"))
     rows = json_lines.read(folder / "metrics.jsonl")
     assert rows[0]["lr"] > rows[-1]["lr"] and {row["anneal"] for row in rows} == {"seconds"}
@@ -164,12 +162,12 @@ def test_the_learning_rate_falls_over_seconds_where_they_are_the_only_budget(her
     assert written["learner"]["anneal"] == "seconds"
 
 
-def test_a_learning_rate_cannot_fall_over_a_budget_that_is_not_given(here):
+def test_anneal_needs_its_budget(here):
     with pytest.raises(ConfigErrors, match="learner.anneal: .*samples="):
         configured("seconds=1", "learner.anneal=samples")
 
 
-def test_what_is_learnt_cannot_change_when_a_run_goes_on(here):
+def test_resume_refuses_changed_settings(here):
     folder = train.run(configured("samples=1"))
     with pytest.raises(ConfigErrors) as error:
         configured(f"resume={folder}", "learner.lr=1", "env=explorer", "finish.episodes=3", tiny=[])
@@ -177,7 +175,7 @@ def test_what_is_learnt_cannot_change_when_a_run_goes_on(here):
     assert "init=RUN" in str(error.value)
 
 
-def test_a_damaged_checkpoint_is_named_and_the_run_goes_on_from_the_one_before(here):
+def test_resume_skips_a_damaged_checkpoint(here):
     folder = train.run(configured(f"samples={2 * UPDATE}", "checkpoint_seconds=1e-9"))
     os.truncate(folder / "checkpoints" / f"step_{2 * UPDATE}" / "state.pt", 50)
     with pytest.warns(
@@ -191,7 +189,7 @@ def test_a_damaged_checkpoint_is_named_and_the_run_goes_on_from_the_one_before(h
     assert checkpoint.load_latest(folder / "checkpoints").step == 2 * UPDATE
 
 
-def test_going_back_to_an_earlier_checkpoint_leaves_no_hole_in_the_metrics(here):
+def test_resume_from_an_earlier_checkpoint(here):
     folder = train.run(
         configured(f"samples={4 * UPDATE}", "checkpoint_seconds=1e-9", "keep_checkpoints=9")
     )
@@ -206,7 +204,7 @@ def test_going_back_to_an_earlier_checkpoint_leaves_no_hole_in_the_metrics(here)
     assert checkpoint.load_latest(folder / "checkpoints").step == 5 * UPDATE
 
 
-def test_a_run_that_goes_back_and_is_lost_before_it_saves_goes_on_from_there(here, monkeypatch):
+def test_killed_after_resuming_an_earlier_checkpoint(here, monkeypatch):
     folder = train.run(
         configured(f"samples={3 * UPDATE}", "checkpoint_seconds=1e-9", "keep_checkpoints=9")
     )
@@ -218,7 +216,7 @@ def test_a_run_that_goes_back_and_is_lost_before_it_saves_goes_on_from_there(her
     assert checkpoint.load_latest(folder / "checkpoints").step == UPDATE
 
 
-def test_a_new_run_can_start_from_the_weights_of_another(here):
+def test_init(here):
     first = train.run(configured("samples=1"))
     second = train.run(configured("samples=1", "learner.lr=1e-12", f"init={first}", "seed=2"))
     name = next(name for name in weights(first) if "weight" in name)
@@ -226,7 +224,7 @@ def test_a_new_run_can_start_from_the_weights_of_another(here):
     assert checkpoint.load_latest(second / "checkpoints").step == UPDATE  # it counts from zero
 
 
-def test_weights_of_another_environment_are_refused_with_both_shapes(here):
+def test_init_refuses_other_shapes(here):
     first = train.run(configured("samples=1"))
     with pytest.raises(UserError, match=r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)"):
         train.run(configured("samples=1", f"init={first}", "env.res=16"))
@@ -235,7 +233,7 @@ def test_weights_of_another_environment_are_refused_with_both_shapes(here):
     assert only_run(here) == here / first  # the refused runs left nothing behind
 
 
-def test_a_run_of_several_layers_is_saved_evaluated_and_resumed(here):
+def test_several_layers(here):
     run = train.run(configured("agent.core=mingru", "agent.layers=2", "samples=1"))
     assert {"core.0.input.weight", "core.1.input.weight"} <= set(weights(run))
     assert evaluate.main([f"run={run}", "episodes=4"]) == 0
@@ -246,13 +244,13 @@ def test_a_run_of_several_layers_is_saved_evaluated_and_resumed(here):
             train.run(configured(f"init={run}", "samples=1", f"agent.layers={layers}"))
 
 
-def test_a_layer_too_many_is_refused(here):
+def test_init_refuses_fewer_layers(here):
     run = train.run(configured("agent.core=mingru", "agent.layers=3", "samples=1"))
     with pytest.raises(UserError, match=r"core.2.input.weight was \(16, 8\) and is absent"):
         train.run(configured(f"init={run}", "samples=1", "agent.layers=2"))
 
 
-def test_a_run_that_a_signal_stopped_goes_on(here, monkeypatch, capsys):
+def test_resume_after_a_signal(here, monkeypatch, capsys):
     real = loggers.Loggers.write
 
     def write(self, step, *values):
@@ -269,11 +267,11 @@ def test_a_run_that_a_signal_stopped_goes_on(here, monkeypatch, capsys):
     assert checkpoint.load_latest(here / "r n ü" / "checkpoints").step == 3 * UPDATE
 
 
-def test_a_budget_that_is_spent_is_told_and_nothing_changes(here, capsys):
+def test_resume_refuses_a_spent_budget(here, capsys):
     folder = train.run(configured(f"samples={2 * UPDATE}", "seconds=600"))
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     capsys.readouterr()
-    for more, told in (
+    for more, message in (
         ([], "samples: .* 64 of 64; .*samples="),
         (["samples=40"], "samples: .* 64 of 40; .*samples="),
         (
@@ -282,12 +280,12 @@ def test_a_budget_that_is_spent_is_told_and_nothing_changes(here, capsys):
         ),
     ):
         assert train.main([f"resume={folder}", *more]) == 2
-        assert re.search(told, capsys.readouterr().err)
+        assert re.search(message, capsys.readouterr().err)
     assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     assert train.main([f"resume={folder}", f"samples={3 * UPDATE}"]) == 0
 
 
-def test_the_latest_run_is_the_one_trained_last_not_evaluated_last(here):
+def test_latest_is_trained_last(here):
     first = train.run(configured("samples=1"))
     second = train.run(configured("samples=1", "seed=2"))
     assert evaluate.main([f"run={first}", "episodes=2", "device=cpu"]) == 0
@@ -296,7 +294,7 @@ def test_the_latest_run_is_the_one_trained_last_not_evaluated_last(here):
     assert train.run(configured("resume=latest", f"samples={3 * UPDATE}", tiny=[])) == first
 
 
-def test_a_second_training_in_one_folder_is_refused_and_harms_nothing(here, capsys):
+def test_second_training_in_one_folder(here, capsys):
     folder = train.run(configured("samples=1"))
     (here / "new").mkdir()
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
@@ -309,9 +307,7 @@ def test_a_second_training_in_one_folder_is_refused_and_harms_nothing(here, caps
     assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
-def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_environment(
-    here, monkeypatch, capsys
-):
+def test_non_finite_position(here, monkeypatch, capsys):
     real = train.Trainer.log
 
     def report(self, losses):
@@ -326,9 +322,7 @@ def test_a_position_that_is_not_a_number_is_one_sentence_that_names_the_environm
 
 
 def inject(monkeypatch, name, step, value, lane=2):
-    """In the environment's `step`-th step and, if it is given as a range, in others, a lane's
-    number is another.
-    """
+    """Replaces a number of one lane in the given steps of the environment."""
     real, steps = envs.Minimal.step, itertools.count(1)
     faulty = step if isinstance(step, range) else [step]
 
@@ -343,9 +337,7 @@ def inject(monkeypatch, name, step, value, lane=2):
 
 @pytest.mark.parametrize("value", [float("nan"), 1e30])
 @pytest.mark.parametrize("name", ["reward", "obs"])
-def test_a_number_that_is_not_finite_is_named_and_the_exit_code_says_so(
-    here, monkeypatch, capsys, name, value
-):
+def test_non_finite_world_exits_with_1(here, monkeypatch, capsys, name, value):
     inject(monkeypatch, name, step=13, value=value)
     assert train.main([*TINY, f"samples={8 * UPDATE}", "folder=run"]) == 1
     warning, sentence = capsys.readouterr().err.splitlines()
@@ -357,7 +349,7 @@ def test_a_number_that_is_not_finite_is_named_and_the_exit_code_says_so(
     assert loaded.step == 8 * UPDATE and nonfinite_leaf(loaded.state) is None
 
 
-def test_numbers_that_are_never_finite_end_a_run_with_one_sentence(here, monkeypatch, capsys):
+def test_repeated_non_finite_updates_stop(here, monkeypatch, capsys):
     inject(monkeypatch, "reward", step=range(17, 10**6), value=float("nan"))
     assert train.main([*TINY, "seconds=60", "folder=run", "log_every=8"]) == 1
     _, sentence = capsys.readouterr().err.splitlines()
@@ -369,7 +361,7 @@ def test_numbers_that_are_never_finite_end_a_run_with_one_sentence(here, monkeyp
     assert train.main(["resume=run", f"samples={26 * UPDATE}"]) == 0
 
 
-def test_a_learning_rate_that_is_too_large_ends_a_run_with_advice(here, capsys):
+def test_divergence_stops_with_advice(here, capsys):
     assert (
         train.main([*TINY, "learner.lr=1e3", "seconds=60", "checkpoint_seconds=1e-9", "folder=run"])
         == 1
@@ -380,7 +372,7 @@ def test_a_learning_rate_that_is_too_large_ends_a_run_with_advice(here, capsys):
     assert nonfinite_leaf(checkpoint.load_latest(here / "run" / "checkpoints").state) is None
 
 
-def test_memory_that_runs_out_is_one_sentence_and_the_run_can_go_on(here, monkeypatch, capsys):
+def test_out_of_memory_while_training(here, monkeypatch, capsys):
     real = ppo.PPO.update
 
     def update(self, rollout):
@@ -399,7 +391,7 @@ def test_memory_that_runs_out_is_one_sentence_and_the_run_can_go_on(here, monkey
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == 3 * UPDATE
 
 
-def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, monkeypatch):
+def test_full_disk_warns_once(here, monkeypatch):
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
@@ -413,9 +405,7 @@ def test_a_full_disk_is_one_warning_the_run_goes_on_and_the_end_says_so(here, mo
     assert len(json_lines.read(only_run(here) / "metrics.jsonl")) == 3
 
 
-def test_on_a_disk_that_fills_up_training_goes_on_and_the_last_checkpoint_stays(
-    here, monkeypatch, capsys
-):
+def test_disk_that_fills_up(here, monkeypatch, capsys):
     real, full = train.Trainer.log, contextlib.ExitStack()
 
     def report(self, losses):
@@ -435,7 +425,7 @@ def test_on_a_disk_that_fills_up_training_goes_on_and_the_last_checkpoint_stays(
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == 5 * UPDATE
 
 
-def test_a_disk_that_is_free_again_gets_the_checkpoint(here, monkeypatch):
+def test_disk_with_space_again(here, monkeypatch):
     real, calls = checkpoint.save, []
 
     def save(*arguments):
@@ -450,17 +440,17 @@ def test_a_disk_that_is_free_again_gets_the_checkpoint(here, monkeypatch):
     assert checkpoint.load_latest(folder / "checkpoints").step == 3 * UPDATE
 
 
-def test_an_environment_that_cannot_be_made_leaves_no_folder(here, tmp_path):
+def test_bad_geometry_leaves_no_folder(here, tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"no archive")
     assert train.main([*TINY, "geometry=files", "geometry.path=bad.npz"]) == 2
     assert train.main([*TINY, "geometry=files", "geometry.path=absent.npz"]) == 2
     assert not any((here / "runs").iterdir())
 
 
-def test_settings_of_an_environment_that_contradict_each_other_are_one_sentence(here, capsys):
+def test_contradicting_environment_settings(here, capsys):
     explorer = [word for word in TINY if "est=" not in word] + ["env=explorer", "env.subsample=3"]
     elsewhere = [word for word in TINY if "est=" not in word] + ["env=pointgoal"]
-    for words, told in (
+    for words, message in (
         ([*elsewhere, "env.nearest=40", "env.furthest=50"], "geometry 0 has no goal from 40 to 50"),
         ([*elsewhere, "env.nearest=5", "env.furthest=2"], "nearest < furthest metres, but 5 and 2"),
         ([*TINY, "env.shortest=10"], "shortest=10 and longest=9"),
@@ -468,23 +458,21 @@ def test_settings_of_an_environment_that_contradict_each_other_are_one_sentence(
     ):
         assert train.main(words) == 2
         (sentence,) = capsys.readouterr().err.splitlines()
-        assert told in sentence and not any((here / "runs").iterdir())
+        assert message in sentence and not any((here / "runs").iterdir())
 
 
-def test_too_many_environments_are_refused_with_the_number_that_fits(here, capsys):
+def test_too_many_environments(here, capsys):
     assert train.main([*TINY, f"env.n_envs={MAX_ENVS}", "learner.n_steps=4096"]) == 2
-    told = re.search(
+    message = re.search(
         "67,108,864 environments need .* free on cpu: at most ([0-9,]+) fit",
         capsys.readouterr().err,
     )
-    assert 10 < int(told[1].replace(",", "")) < MAX_ENVS
+    assert 10 < int(message[1].replace(",", "")) < MAX_ENVS
     assert not any((here / "runs").iterdir())
 
 
 @pytest.mark.parametrize("folder", ["file", "file/below", "/proc/run", "full"])
-def test_a_folder_that_cannot_be_used_is_one_sentence_before_anything_is_made(
-    here, monkeypatch, capsys, folder
-):
+def test_unusable_run_folder(here, monkeypatch, capsys, folder):
     (here / "file").write_text("")
     (here / "full").mkdir()
     (here / "full" / "mine.txt").write_text("")
@@ -495,14 +483,14 @@ def test_a_folder_that_cannot_be_used_is_one_sentence_before_anything_is_made(
     assert (here / "full" / "mine.txt").exists()
 
 
-def test_an_unknown_run_names_the_nearest(here, capsys):
+def test_unknown_run_hints_nearest(here, capsys):
     folder = train.run(configured("samples=1", "folder=runs/first"))
     assert train.main(["resume=runs/frist"]) == 2
     assert f"did you mean {folder}?" in capsys.readouterr().err
     assert train.main(["resume=file"]) == 2
 
 
-def test_the_end_of_a_run_can_hold_a_table_and_a_video(here, capsys):
+def test_finish(here, capsys):
     folder = train.run(
         configured(
             "samples=1",
@@ -519,12 +507,12 @@ def test_the_end_of_a_run_can_hold_a_table_and_a_video(here, capsys):
     assert "random" in capsys.readouterr().out
 
 
-def test_interrupted_carries_the_signal():
+def test_interrupted_has_the_signal():
     assert Interrupted(signal.SIGTERM, "x").args[0] == 15
 
 
 @pytest.mark.slow
-def test_a_long_run_leaks_neither_memory_nor_files(here, monkeypatch):
+def test_long_run_leaks_nothing(here, monkeypatch):
     real, seen = train.Trainer.log, {}
 
     def report(self, losses):
@@ -538,7 +526,7 @@ def test_a_long_run_leaks_neither_memory_nor_files(here, monkeypatch):
     assert late - early < 4 and files_late == files, seen  # megabytes in 1,500 updates
 
 
-def test_few_metrics_and_roles_are_shown_beside_the_return():
+def test_progress_metrics():
     latest = {
         "episode/return/leader": 12.345,
         "episode/return/follower": 2.0,
@@ -551,7 +539,7 @@ def test_few_metrics_and_roles_are_shown_beside_the_return():
     assert train.few_means(latest, ["coverage", *"abcd"], ()) == []
 
 
-def test_on_a_cpu_the_engine_takes_all_threads_and_a_small_network_one():
+def test_cpu_threads():
     before = torch.get_num_threads()
     try:
         for width, expected in ((64, 1), (256, 2), (4096, 3)):

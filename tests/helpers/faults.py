@@ -1,4 +1,4 @@
-"""Faults that tests inject for real: disks that are full, packages that are not installed."""
+"""Faults that tests inject: full disks, missing packages."""
 
 import contextlib
 import resource
@@ -7,9 +7,7 @@ import sys
 
 @contextlib.contextmanager
 def full_disk(n_bytes=0):
-    """No file of this process may grow beyond `n_bytes`: writing raises OSError, as on a disk that
-    is full.
-    """
+    """Writing a file beyond `n_bytes` raises OSError, as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
     try:
@@ -19,8 +17,8 @@ def full_disk(n_bytes=0):
 
 
 def not_installed(monkeypatch, *modules):
-    """Importing any of `modules` fails, as it does where their package is absent. What is imported
-    already stays whole: only its name is hidden.
+    """Makes importing `modules` fail, as if their package were absent. Modules that are already
+    imported keep working.
     """
     for name in modules:
         monkeypatch.setitem(sys.modules, name, None)

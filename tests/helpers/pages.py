@@ -1,4 +1,4 @@
-"""Pages of docs/ as a reader follows them: files written into a folder, commands typed there."""
+"""Follows pages of docs/: writes their files into a folder and runs their commands."""
 
 import contextlib
 import re
@@ -13,18 +13,18 @@ MAINS = {"train.py": train.main, "evaluate.py": evaluate.main, "record.py": reco
 
 
 def code(text):
-    """The Python blocks of a page or a part of it."""
+    """Returns the Python blocks of a page."""
     return re.findall(r"```python\n(.*?)```", text, re.S)
 
 
 def commands(text):
-    """Its commands, `(script, words)` each, in order."""
+    """Returns the commands of a page, (script, words) each, in order."""
     return [(s, shlex.split(words)) for s, words in re.findall(r"^python (\S+) (.*)$", text, re.M)]
 
 
 @contextlib.contextmanager
 def inside(folder, patch):
-    """A folder as the current one; what is imported from it is forgotten afterwards."""
+    """Changes to a folder; forgets the modules imported from it afterwards."""
     patch.chdir(folder)
     patch.syspath_prepend(folder)
     yield
@@ -34,7 +34,7 @@ def inside(folder, patch):
 
 
 def type_all(text, folder, patch):
-    """Types the commands of a page in a folder; they must succeed. Returns the scripts typed."""
+    """Runs the commands of a page in a folder; they must succeed. Returns the scripts."""
     with inside(folder, patch):
         for script, words in commands(text):
             assert MAINS[script](words) == 0, (script, words)
