@@ -52,8 +52,8 @@ def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:
         raise ConfigErrors(errors.items()) from None
 
 
-# the inverse of `check`
 def as_tree(chosen: Any) -> Tree:
+    """The inverse of `check`."""
     return TypeAdapter(type(chosen)).dump_python(chosen, mode="json")
 
 

@@ -118,8 +118,8 @@ def _run(script: compose.Script, argv: list[str]) -> int:
     return 0
 
 
-# has Hydra show or complete a configuration that has every key there is
 def _show(composer: compose.Composer, tree: Any, arguments: list[str]) -> None:
+    """Has Hydra show or complete a configuration that has every key there is."""
     node = {"defaults": [composer.name, "_self_"], **tree}
     compose.STORE.store(name="every-key", node=node)
     with factory.errors():

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import hydra
 import torch
+import yaml
 from hydra.core import config_store, global_hydra, plugins
 from hydra.core.override_parser import overrides_parser, types
 from hydra.errors import HydraException, MissingConfigException
@@ -54,8 +55,9 @@ class Script(NamedTuple):
     prepare: Callable[[check.Tree, list[str]], check.Tree] = lambda tree, typed: tree
 
 
-# has Hydra find files and groups in the folder given by --config-dir, beside ours
 class FolderOfUser(SearchPathPlugin):
+    """Has Hydra find files and groups in the folder given by --config-dir, beside ours."""
+
     path: str | None = None
 
     def manipulate_search_path(self, search_path):
@@ -89,17 +91,18 @@ class Composer:
             functools.cache, (self.loader.get_group_options, self._composed)
         )
 
-    # Returns {group: members} of the groups to choose from.
     def groups(self) -> dict[str, list[str]]:
+        """Returns {group: members} of the groups to choose from."""
         names = {group for group in self.composed().hydra.runtime.choices if "/" not in group}
         names |= {*self.loader.list_groups("")} if self.folder else set()
         return {
             name: self.members(name) for name in sorted(names - {"hydra"}) if self.members(name)
         }
 
-    # Returns words as Hydra's grammar reads them. Raises ConfigErrors with all unreadable
-    # ones.
     def parse(self, words: Iterable[str]) -> list[types.Override]:
+        """Returns words as Hydra's grammar reads them. Raises ConfigErrors with all unreadable
+        ones.
+        """
         overrides, errors, parser = [], [], overrides_parser.OverridesParser.create(self.loader)
         for word in words:
             key, _, value = word.partition("=")
@@ -125,9 +128,10 @@ class Composer:
     def settings(self, words: Iterable[str]) -> Any:
         return self.compose(words)[0]
 
-    # Returns checked settings, and the configuration they are from, Hydra's part included.
-    # Raises ConfigErrors with everything that is wrong.
     def compose(self, words: Iterable[str]) -> tuple[Any, DictConfig]:
+        """Returns checked settings, and the configuration they are from, Hydra's part included.
+        Raises ConfigErrors with everything that is wrong.
+        """
         overrides = self.parse(words)
         config, errors = self.config(overrides)
         cure = "is an environment variable, and would be written to config.yaml; type its value"
@@ -145,8 +149,8 @@ class Composer:
             raise ConfigErrors(errors + secret)
         return chosen, config
 
-    # Returns (the configuration, the errors of words that are not in it).
     def config(self, overrides: list[types.Override]) -> tuple[DictConfig, list[tuple[str, str]]]:
+        """Returns (the configuration, the errors of words that are not in it)."""
         groups, keys, errors = [], {}, []
         for override in overrides:
             key, group, value = key_of(override), override.key_or_group, override.value()
@@ -168,7 +172,7 @@ class Composer:
         try:
             device = keys["device"].value() if "device" in keys else None
             config = copy.deepcopy(self.composed(*groups, device=device))
-        except (HydraException, OmegaConfBaseException) as error:
+        except (HydraException, OmegaConfBaseException, yaml.YAMLError) as error:
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
             text = "is in none of the folders searched; --config-dir adds one" if absent else error
             text = program.shortened(text, 400)
@@ -198,8 +202,8 @@ class Composer:
         OmegaConf.set_struct(config, False)
         return config
 
-    # Calls Hydra's own main with these arguments. Its errors are raised; it sets sys.argv.
     def call_hydra(self, arguments: list[str], task: Callable | None = None) -> None:
+        """Calls Hydra's own main with these arguments. Its errors are raised; it sets sys.argv."""
         os.environ["HYDRA_FULL_ERROR"], sys.argv[1:] = "1", arguments
         global_hydra.GlobalHydra.instance().clear()
         hydra.main(config_path=self.main, config_name=self.name, version_base="1.3")(
@@ -207,13 +211,13 @@ class Composer:
         )()
 
 
-# the key or group@package of a word, without the sign before it
 def key_of(override: types.Override) -> str:
+    """The key or group@package of a word, without the sign before it."""
     return override.get_key_element().lstrip("+~")
 
 
-# nested dicts of all but Hydra's part, without groups that nothing is in
 def own(config: DictConfig, resolve: bool = False) -> check.Tree:
+    """Nested dicts of all but Hydra's part, without groups that nothing is in."""
     tree = plain(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"]), resolve)
     return {key: value for key, value in tree.items() if value != {}}
 
@@ -222,8 +226,8 @@ def plain(config: DictConfig, resolve: bool = False) -> check.Tree:
     return OmegaConf.to_container(config, resolve=resolve)
 
 
-# [(dotted key, value)] of nested dicts
 def leaves(tree: check.Tree, prefix: str = "") -> list[tuple[str, Any]]:
+    """[(dotted key, value)] of nested dicts."""
     if not isinstance(tree, dict):
         return [(prefix[1:], tree)]
     return [leaf for key, below in tree.items() for leaf in leaves(below, f"{prefix}.{key}")]

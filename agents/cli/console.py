@@ -49,9 +49,10 @@ class TolerantStream:
                 os.dup2(null.fileno(), self._stream.fileno())
 
 
-# Makes stdout and stderr tolerant of errors and encodings, and opens those that are closed, so
-# that no file takes their number.
 def open_streams() -> None:
+    """Makes stdout and stderr tolerant of errors and encodings, and opens those that are closed, so
+    that no file takes their number.
+    """
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     os.close(number)
@@ -65,22 +66,22 @@ def say(text: str, file: TextIO | None = None) -> None:
     print(textwrap.indent(text, prefix, bool), file=file or sys.stdout, flush=True)
 
 
-# one line on stderr; can stand in for `warnings.showwarning`
 def warn(sentence: object, *_: Any, **__: Any) -> None:
+    """One line on stderr; can stand in for `warnings.showwarning`."""
     say(f"warning: {sentence}", sys.stderr)
 
 
-# Turns an OSError or a UserError into a warning that begins with `prefix`.
 @contextlib.contextmanager
 def warned(prefix: str = "") -> Iterator[None]:
+    """Turns an OSError or a UserError into a warning that begins with `prefix`."""
     try:
         yield
     except (OSError, program.UserError) as error:
         warn(f"{prefix}{error}")
 
 
-# Prints why a thread ended, in one line if the disk is full, as TensorBoard's may find it.
 def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
+    """Prints why a thread ended, in one line if the disk is full, as TensorBoard's may find it."""
     if isinstance(failure.exc_value, OSError):
         warn(f"{failure.thread.name} stopped: {failure.exc_value}")
     else:
@@ -91,9 +92,10 @@ def is_unicode() -> bool:
     return (sys.stdout.encoding or "").lower().startswith("utf")
 
 
-# Returns a table as text, by default in characters that stdout can show. In Markdown with
-# `style=box.MARKDOWN`.
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], style: box.Box | None = None) -> str:
+    """Returns a table as text, by default in characters that stdout can show. In Markdown with
+    `style=box.MARKDOWN`.
+    """
     grid, text = (
         Table(*head, box=style or (box.HEAVY_HEAD if is_unicode() else box.ASCII)),
         StringIO(),
@@ -118,8 +120,8 @@ class Progress(progress.Progress):
         )
         self.bar = self.add_task("starting", total=1)
 
-    # Shows words on one line; `fraction` of the work is done, None if it has no end.
     def show(self, fraction: float | None, words: Sequence[str]) -> None:
+        """Shows words on one line; `fraction` of the work is done, None if it has no end."""
         text, total = (" · " if is_unicode() else "  ").join(words), None if fraction is None else 1
         self.update(self.bar, completed=fraction or 0, total=total, description=text)
         if self.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
@@ -127,16 +129,16 @@ class Progress(progress.Progress):
             say(text)
 
 
-# a count in three digits: 1.23M
 def number(value: float) -> str:
+    """A count in three digits: 1.23M."""
     for limit, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if value >= limit:
             return f"{value / limit:.3g}{unit}"
     return f"{value:.0f}"
 
 
-# a time in its two largest units: 5 s, 2 min 5 s, 1 h 2 min
 def duration(seconds: float) -> str:
+    """A time in its two largest units: 5 s, 2 min 5 s, 1 h 2 min."""
     minutes, seconds = divmod(max(0, round(seconds)), 60)
     if minutes < 60:
         return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"

@@ -33,8 +33,8 @@ WITHOUT_GPU = (
 )
 
 
-# Runs the installed command, `megastep`. Returns the exit code.
 def main() -> int:
+    """Runs the installed command, `megastep`. Returns the exit code."""
     words, line = sys.argv[1:] or ["--help"], os.environ.get("COMP_LINE", "")
     if words[0] in ("-sc", "--shell-completion"):
         script = "".join(line.split()[1:2])  # which is completed here, its options elsewhere
@@ -64,8 +64,8 @@ def main() -> int:
     return 0
 
 
-# Runs a script of this package by its name. Returns the exit code.
 def run_script(name: str) -> int:
+    """Runs a script of this package by its name. Returns the exit code."""
     signals.exit_on_signals(name)
     if wants_first_gpu(sys.argv[1:]):
         # the interpreter waits for this thread: a process must not end within the driver
@@ -77,17 +77,18 @@ def run_script(name: str) -> int:
     return importlib.import_module(f"megastep.agents.cli.{name}").main()
 
 
-# Returns whether a command line may use the first GPU in this process.
 def wants_first_gpu(words: list[str]) -> bool:
+    """Returns whether a command line may use the first GPU in this process."""
     devices = {word.partition("=")[2] for word in words if word.startswith("device=")}
     is_elsewhere = any(word.startswith(WITHOUT_GPU) for word in words)
     return devices <= {"auto", "cuda", "cuda:0"} and not is_elsewhere
 
 
-# Creates the primary context of the first GPU, if there is one; PyTorch finds it there later.
-#
-# It takes half a second in the driver, which passes beside Python's imports.
 def create_cuda_context() -> None:
+    """Creates the primary context of the first GPU, if there is one; PyTorch finds it there later.
+
+    It takes half a second in the driver, which passes beside Python's imports.
+    """
     device, context = ctypes.c_int(), ctypes.c_void_p()
     with contextlib.suppress(OSError):  # no driver
         driver = ctypes.CDLL("libcuda.so.1")

@@ -116,11 +116,12 @@ class Player(NamedTuple):
 FOR_TWO = {"n_agents": 2, "resample": False}
 
 
-# Returns the player of a checkpoint, to meet the agent of `run` in `env`.
-#
-# Raises:
-#     UserError: if one was trained in another environment.
 def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpoint) -> Player:
+    """Returns the player of a checkpoint, to meet the agent of `run` in `env`.
+
+    Raises:
+        UserError: if one was trained in another environment.
+    """
     trained, own = factory.config_of(loaded), factory.config_of(run)
     if trained.env.name != own.env.name:
         raise program.UserError(
@@ -133,17 +134,18 @@ def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpo
     )
 
 
-# Returns who is to meet the agent of `run` in `env`.
-#
-# Args:
-#     name: a run's folder or checkpoint; an import path, `random`, or `bot`, the scripted policy
-#         of the run, none of which needs weights.
-#
-# Raises:
-#     UserError: if nobody can be met there, or this player cannot play there.
 def find_player(
     name: str, run: checkpoint.Checkpoint, env_settings: settings.Env, env: Any
 ) -> Player:
+    """Returns who is to meet the agent of `run` in `env`.
+
+    Args:
+        name: a run's folder or checkpoint; an import path, `random`, or `bot`, the scripted policy
+            of the run, none of which needs weights.
+
+    Raises:
+        UserError: if nobody can be met there, or this player cannot play there.
+    """
     if env.n_agents < 2:
         raise program.UserError(
             f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
@@ -184,9 +186,10 @@ class Arena:
                 self.env, player.policy, opponent.policy, self.cfg.seed, self.cfg.greedy
             )
 
-    # Plays the run's agent against each of `cfg.against`. Prints and writes a table, and
-    # returns the path of its .json.
     def duel(self) -> Path:
+        """Plays the run's agent against each of `cfg.against`. Prints and writes a table, and
+        returns the path of its .json.
+        """
         rows = [{"against": p.name, **summary(self.play(self.agent, p))} for p in self.others]
         return runs.write_table(
             self.cfg,
@@ -204,10 +207,11 @@ class Arena:
             [{key: form.format_map(row) for key, form in DUELS.items()} for row in rows],
         )
 
-    # Rates the run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels
-    # of each with each. Prints a table, writes ratings.csv and ratings.svg into the run's folder,
-    # and returns the path of the first.
     def rate(self) -> Path:
+        """Rates the run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels
+        of each with each. Prints a table, writes ratings.csv and ratings.svg into the run's
+        folder, and returns the path of the first.
+        """
         folder, players = runs.folder_of(self.run.path), []
         for path in checkpoint.list_checkpoints(
             folder / "snapshots"
@@ -238,9 +242,10 @@ class Arena:
         return folder / "ratings.csv"
 
 
-# Returns a table's row for what `duels.play` returned: the share won, a draw counting half,
-# with its 95 % interval over homes, or over duels where there are none.
 def summary(played: dict) -> dict:
+    """Returns a table's row for what `duels.play` returned: the share won, a draw counting half,
+    with its 95 % interval over homes, or over duels where there are none.
+    """
     score, *homes = (played[k].cpu().numpy() for k in ("score", "homes") if k in played)
     mean, lower, upper = evaluation.interval(score, *homes)
     return {

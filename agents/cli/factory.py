@@ -39,9 +39,10 @@ KINDS = (
 errors = functools.partial(program.errors, kinds=KINDS)
 
 
-# Calls the class or function called `name`, by default the one that settings name, with those
-# of the settings and arguments that it takes.
 def construct(settings: Any, name: str | None = None, **arguments: Any) -> Any:
+    """Calls the class or function called `name`, by default the one that settings name, with those
+    of the settings and arguments that it takes.
+    """
     with errors():
         constructor = import_object(name or settings.name)
         taken = inspect.signature(constructor).parameters
@@ -62,18 +63,19 @@ def make_device(name: str) -> torch.device:
     return device
 
 
-# Returns the different geometries of a split, in order; none if `env` takes no geometries.
 def homes(env: Env, geometry: Geometry, split: str, max_homes: int | None = None) -> list[dict]:
+    """Returns the different geometries of a split, in order; none if `env` takes no geometries."""
     if "geometries" not in inspect.signature(import_object(env.name)).parameters:
         return []
     return [*{id(home): home for home in construct(geometry, split=split)}.values()][:max_homes]
 
 
-# Returns a small environment of the same kind, which tells spaces and sizes.
-#
-# Raises:
-#     UserError: naming the clause of the contract that a class of the user's breaks.
 def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:
+    """Returns a small environment of the same kind, which tells spaces and sizes.
+
+    Raises:
+        UserError: naming the clause of the contract that a class of the user's breaks.
+    """
     is_ours = env.name.startswith("megastep.")
     n_envs = 1 if is_ours else min(SAMPLE, env.n_envs)
     sample = construct(changed(env, n_envs=n_envs), geometries=geometries[:1], **arguments)
@@ -83,12 +85,13 @@ def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:
     return sample
 
 
-# Raises UserError with the number that fits, if there are too many environments, or too many
-# observations in a replay buffer, for the memory.
-#
-# The `sample` gives an upper bound of what an environment takes, as it counts what environments
-# share. Only if that does not fit, more of them are made.
 def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **arguments: Any) -> None:
+    """Raises UserError with the number that fits, if there are too many environments, or too many
+    observations in a replay buffer, for the memory.
+
+    The `sample` gives an upper bound of what an environment takes, as it counts what environments
+    share. Only if that does not fit, more of them are made.
+    """
     n_bytes, total = learner.bytes_per_env(sample), _nbytes(sample)
     with errors():
         if hasattr(learner, "replay_size"):
@@ -103,8 +106,8 @@ def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **argume
             engine.fit(env.n_envs, n_bytes, sample.device)
 
 
-# Returns a policy on the environment's device; without a `critic` it can only act.
 def make_policy(agent: Agent, env: Any, seed: int = 1, critic: str | None = None) -> Policy:
+    """Returns a policy on the environment's device; without a `critic` it can only act."""
     if torch.device(env.device).type == "cpu":
         share_threads(agent.width)
     with errors():
@@ -112,9 +115,10 @@ def make_policy(agent: Agent, env: Any, seed: int = 1, critic: str | None = None
         return Policy(*spaces, seed=seed, **vars(agent) | {"critic": critic}).to(env.device)
 
 
-# Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer: in smaller
-# layers, threads lose more by waiting for each other than they gain.
 def share_threads(width: int) -> None:
+    """Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer: in smaller
+    layers, threads lose more by waiting for each other than they gain.
+    """
     n_threads = engine.threads()
     engine.set_threads(n_threads)
     torch.set_num_threads(max(1, min(n_threads, width // 128)))
@@ -127,13 +131,14 @@ def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
     return learner
 
 
-# Returns the environment with opponents in it, None if there are to be none.
-#
-# `sample` is a small environment, in which a scripted opponent is tried.
-#
-# Raises:
-#     UserError: if the opponent cannot play there; with the number of snapshots that fits.
 def make_opponents(cfg: Train, env: Any, sample: Any, policy: Policy) -> Opponents | None:
+    """Returns the environment with opponents in it, None if there are to be none.
+
+    `sample` is a small environment, in which a scripted opponent is tried.
+
+    Raises:
+        UserError: if the opponent cannot play there; with the number of snapshots that fits.
+    """
     shares = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
     if not (cfg.opponents.past or cfg.opponents.bot):
         return None
@@ -146,11 +151,12 @@ def make_opponents(cfg: Train, env: Any, sample: Any, policy: Policy) -> Opponen
         return Opponents(env, policy, bot, seed=cfg.seed, **shares)
 
 
-# Returns a policy that needs no weights: `random`, or a class by import path.
-#
-# The class is given the environment's settings that it takes, such as `fov`, and takes one step
-# in `env`. Raises UserError if it cannot play there.
 def make_bot(name: str, settings: Env, env: Any) -> Any:
+    """Returns a policy that needs no weights: `random`, or a class by import path.
+
+    The class is given the environment's settings that it takes, such as `fov`, and takes one step
+    in `env`. Raises UserError if it cannot play there.
+    """
     if name == "random":
         return evaluation.RandomActions(env.action_space)
     n_lanes, where = env.n_envs * env.n_agents, type(env).__name__
@@ -168,29 +174,30 @@ def make_bot(name: str, settings: Env, env: Any) -> Any:
     return bot
 
 
-# Returns the checkpoint of a run found with `runs.find`. Warns of damaged ones it skips.
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> checkpoint.Checkpoint:
+    """Returns the checkpoint of a run found with `runs.find`. Warns of damaged ones it skips."""
     with errors():
         return checkpoint.load_latest(runs.checkpoints_of(path), device)
 
 
-# Returns the settings that a checkpoint was trained with. UserError if they cannot be used.
 def config_of(loaded: checkpoint.Checkpoint) -> Train:
+    """Returns the settings that a checkpoint was trained with. UserError if they cannot be used."""
     with program.errors(f"{loaded.path} cannot be used: ", (program.ConfigErrors,)):
         return check.check(Train, loaded.config["train"])
 
 
-# Returns the spaces of an environment as text: {'obs.rgb': 'MultiImage(...)', ...}.
 def spaces_of(env: Any) -> dict[str, str]:
+    """Returns the spaces of an environment as text: {'obs.rgb': 'MultiImage(...)', ...}."""
     tree = {"obs": env.obs_space, "actions": env.action_space}
     return {name: repr(space) for name, space in spaces.leaves(tree).items()}
 
 
-# Returns a policy made for `env` with a checkpoint's weights, the critic's too if it has one.
-#
-# Raises:
-#     UserError: naming what differs, if they do not fit.
 def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Policy:
+    """Returns a policy made for `env` with a checkpoint's weights, the critic's too if it has one.
+
+    Raises:
+        UserError: naming what differs, if they do not fit.
+    """
     saved, present = loaded.config["spaces"], spaces_of(env)
     if differing := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]:
         changes = [f"{k} was {saved.get(k)} and is {present.get(k)}" for k in differing]

@@ -12,8 +12,8 @@ DISTRIBUTION = "megastep-flatland"
 ROOT = Path(__file__).resolve().parents[2]
 
 
-# `megastep train`, or `train.py` after `python`
 def name(script: str, python: str = "") -> str:
+    """`megastep train`, or `train.py` after `python`."""
     is_installed = os.path.basename(sys.argv[0]) == "megastep" or not (ROOT / "train.py").exists()
     return f"megastep {script}" if is_installed else f"{python}{script}.py"
 
@@ -32,8 +32,9 @@ class UserError(Exception):
     code = 2
 
 
-# training stopped on numbers that are not finite, or went on without them
 class NonFinite(UserError):
+    """Training stopped on numbers that are not finite, or went on without them."""
+
     code = 1
 
 
@@ -49,11 +50,11 @@ class ConfigErrors(UserError):
         return "\n  ".join([head, *(f"{key}: {shortened(text, 400)}" for key, text in self.errors)])
 
 
-# Turns errors of these kinds into a UserError that begins with `prefix`.
 @contextlib.contextmanager
 def errors(
     prefix: str = "", kinds: tuple[type[BaseException], ...] = (OSError, ValueError)
 ) -> Iterator[None]:
+    """Turns errors of these kinds into a UserError that begins with `prefix`."""
     try:
         yield
     except kinds as error:

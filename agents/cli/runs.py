@@ -34,8 +34,8 @@ CANNOT = "{} cannot be written; choose another with folder=: "
 # ---- New folders ----
 
 
-# Makes a new folder and returns it; a taken name gets -2, -3, ...
 def make(path: Path) -> Path:
+    """Makes a new folder and returns it; a taken name gets -2, -3, ..."""
     with program.errors(CANNOT.format(shortened(path))):
         path.parent.mkdir(parents=True, exist_ok=True)
         for number in itertools.count(1):
@@ -45,9 +45,10 @@ def make(path: Path) -> Path:
                 return folder
 
 
-# Returns the folder of a new run: `cfg.folder`, which must be new or empty, or one named after
-# the time and the settings.
 def new(cfg: Train) -> Path:
+    """Returns the folder of a new run: `cfg.folder`, which must be new or empty, or one named after
+    the time and the settings.
+    """
     if cfg.folder is None:
         name = f"{label(cfg.env.name)}-{label(cfg.geometry.name)}-{cfg.seed}"
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{name}")
@@ -64,15 +65,16 @@ def new(cfg: Train) -> Path:
     return folder
 
 
-# Keeps other processes from training in a run folder.
-#
-# The system holds the lock for as long as this process lives, so none is ever stale: neither
-# after kill -9, nor when another process gets the number in the file.
-#
-# Raises:
-#     UserError: naming the process that trains there, or that the folder cannot be written.
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
+    """Keeps other processes from training in a run folder.
+
+    The system holds the lock for as long as this process lives, so none is ever stale: neither
+    after kill -9, nor when another process gets the number in the file.
+
+    Raises:
+        UserError: naming the process that trains there, or that the folder cannot be written.
+    """
     # its last owner may just be deleting it
     lock = filelock.FileLock(path := folder / "lock", timeout=0.2)
     try:
@@ -95,9 +97,10 @@ def locked(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-# Notes that training starts in a folder now. `latest` follows these notes, since folders'
-# times change with whatever is written there, and clocks are moved.
 def record_start(folder: Path) -> None:
+    """Notes that training starts in a folder now. `latest` follows these notes, since folders'
+    times change with whatever is written there, and clocks are moved.
+    """
     with console.warned(f"{STARTED} cannot be written, so `latest` will not find {folder}: "):
         RUNS.mkdir(exist_ok=True)
         with open(STARTED, "ab") as file:
@@ -107,9 +110,10 @@ def record_start(folder: Path) -> None:
 # ---- Existing folders ----
 
 
-# Returns the runs here, and those elsewhere that were started here; the one started or resumed
-# last comes last.
 def known() -> list[Path]:
+    """Returns the runs here, and those elsewhere that were started here; the one started or resumed
+    last comes last.
+    """
     lines = STARTED.read_bytes().split(b"\n") if STARTED.exists() else []
     order = {Path(os.fsdecode(line)): n for n, line in enumerate(lines) if line}
     folders = {*RUNS.glob("*"), *SWEEPS.glob("*/*"), *order}
@@ -117,11 +121,12 @@ def known() -> list[Path]:
     return sorted(folders, key=lambda path: (order.get(path, -1), str(path)))
 
 
-# Returns an existing run's folder, or one of its checkpoints, from a path or `latest`.
-#
-# Raises:
-#     UserError: naming the nearest run.
 def find(name: str) -> Path:
+    """Returns an existing run's folder, or one of its checkpoints, from a path or `latest`.
+
+    Raises:
+        UserError: naming the nearest run.
+    """
     path, folders = Path(name), known()
     if name == "latest" and folders:
         return folders[-1]
@@ -142,29 +147,27 @@ def resume_command(folder: Path) -> str:
     return f"{program.name('train', 'python ')} {shlex.quote(f'resume={name}')}"
 
 
-# a checkpoint, or the folder of a run's checkpoints
 def checkpoints_of(path: Path) -> Path:
+    """A checkpoint, or the folder of a run's checkpoints."""
     return path if (path / "manifest.json").exists() else path / "checkpoints"
 
 
-# the folder of the run that a path belongs to
 def folder_of(path: Path) -> Path:
+    """The folder of the run that a path belongs to."""
     return path.parent.parent if checkpoints_of(path) == path else path
 
 
 # ---- Results ----
 
 
-# Returns where a run is evaluated, for titles, and the source of homes, for file names.
 def place(env: Env, geometry: Geometry, homes: list, split: str) -> tuple[str, str]:
+    """Returns where a run is evaluated, for titles, and the source of homes, for file names."""
     stem = Path(getattr(geometry, "path", None) or "").stem
     source = "-".join(filter(None, [label(geometry.name), stem])) if homes else label(env.name)
     place = f" in {'all' if split == 'all' else f'the {split}'} homes of {source}" if homes else ""
     return label(env.name) + place, source
 
 
-# Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
-# and `rows` for programs, .json. Returns the latter's path.
 def write_table(
     cfg: Evaluate,
     loaded: checkpoint.Checkpoint,
@@ -173,6 +176,9 @@ def write_table(
     rows: list,
     cells: list[dict],
 ) -> Path:
+    """Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
+    and `rows` for programs, .json. Returns the latter's path.
+    """
     names = [name for name in (*names, "greedy" * cfg.greedy) if name]
     folder, name = folder_of(loaded.path) / "evaluations", re.sub(r"[^\w.-]", "-", "-".join(names))
     head, lines = [*cells[0]], [[*row.values()] for row in cells]
@@ -194,12 +200,13 @@ def write_table(
     return folder / f"{name[:200]}.json"
 
 
-# Returns what a job achieved, from what it returned.
-#
-# score: for a sweeper: a training run's mean return over its last 10 reports, an evaluation's
-#     return, the share of duels won against the first opponent.
-# evaluated, lower, upper: the evaluated one of these with its interval; of a run its return.
 def outcome(result: Path) -> dict[str, float | None]:
+    """Returns what a job achieved, from what it returned.
+
+    score: for a sweeper: a training run's mean return over its last 10 reports, an evaluation's
+        return, the share of duels won against the first opponent.
+    evaluated, lower, upper: the evaluated one of these with its interval; of a run its return.
+    """
     files, returns = [result], []
     if is_run := result.is_dir():
         files = sorted(result.glob("evaluations/*.json"))

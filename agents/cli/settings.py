@@ -34,15 +34,17 @@ Split = Literal["training", "test", "all"]
 # ---- Groups ----
 
 
-# TensorBoard and JSON lines, which are always written
 @frozen
 class LocalLogger:
+    """TensorBoard and JSON lines, which are always written."""
+
     name: str
 
 
-# Weights & Biases as well
 @frozen
 class WandbLogger:
+    """Weights & Biases as well."""
+
     name: str
     project: str
     mode: Literal["online", "offline"]
@@ -78,12 +80,13 @@ IMPORTED = {
 GROUPS = (*IMPORTED, "logger")
 
 
-# Returns the dataclass of the settings of a group's member, by the member's `name`.
-#
-# Raises:
-#     ValueError: if nothing can be imported under this name, or it takes other arguments.
 @functools.cache
 def kind_of(group: str, name: str) -> type:
+    """Returns the dataclass of the settings of a group's member, by the member's `name`.
+
+    Raises:
+        ValueError: if nothing can be imported under this name, or it takes other arguments.
+    """
     if group == "logger":
         if name not in LOGGERS:
             raise ValueError(f"{name!r} is unknown; {closest(name, LOGGERS)}")
@@ -100,8 +103,9 @@ def kind_of(group: str, name: str) -> type:
         raise ValueError(f"{name} cannot be used: {error}") from error
 
 
-# Returns the type of a field that holds the settings of a group's member.
 def _group(group: str) -> Any:
+    """Returns the type of a field that holds the settings of a group's member."""
+
     def settings(value):
         if dataclasses.is_dataclass(value):
             return value
@@ -114,8 +118,8 @@ def _group(group: str) -> Any:
     return Annotated[Any, BeforeValidator(settings)]
 
 
-# `explorer` for megastep.envs.explorer:Explorer
 def label(name: str) -> str:
+    """`explorer` for megastep.envs.explorer:Explorer."""
     return name.rpartition(":")[2].rpartition(".")[2].lower()
 
 
@@ -131,9 +135,10 @@ Opposition = settings_of(
 # ---- Scripts ----
 
 
-# settings of every script
 @frozen
 class Common:
+    """Settings of every script."""
+
     seed: Annotated[int, Field(ge=0, lt=2**63)]
     device: Annotated[str, AfterValidator(_device)]
 
@@ -148,9 +153,10 @@ class Common:
         return self
 
 
-# what follows training
 @frozen
 class Finish:
+    """What follows training."""
+
     evaluate: bool
     episodes: Count
     record: bool
@@ -198,9 +204,10 @@ class Train(Common):
         }
 
 
-# settings of what plays with a trained agent
 @frozen
 class Played(Common):
+    """Settings of what plays with a trained agent."""
+
     env: Env | None = None
     geometry: Geometry | None = None
     split: Split

@@ -35,9 +35,11 @@ def interrupt(number: int) -> NoReturn:
     raise Interrupted(number, f"stopped by {signal.Signals(number).name}")
 
 
-# From here on a signal ends the program at once, with one line: for imports and the
-# interpreter's end, which have nothing to save.
 def exit_on_signals(script: str) -> None:
+    """From here on a signal ends the program at once, with one line: for imports and the
+    interpreter's end, which have nothing to save.
+    """
+
     def exit_at_once(number, frame):
         _write(sys.__stderr__, f"{program.name(script)}: stopped by {signal.Signals(number).name}")
         os._exit(128 + number)
@@ -45,12 +47,13 @@ def exit_on_signals(script: str) -> None:
     _install(exit_at_once)
 
 
-# Calls `on_first(number)` at the first signal; another Ctrl-C or SIGTERM ends the program.
-#
-# Ending harms nothing: checkpoints are renamed into place when whole. Yields a list that gets the
-# number of the first signal.
 @contextlib.contextmanager
 def handled(on_first: Callable[[int], None] = announce) -> Iterator[list[int]]:
+    """Calls `on_first(number)` at the first signal; another Ctrl-C or SIGTERM ends the program.
+
+    Ending harms nothing: checkpoints are renamed into place when whole. Yields a list that gets the
+    number of the first signal.
+    """
     numbers, ends_after = [], time.monotonic()
 
     def handle(number, frame):
@@ -70,9 +73,10 @@ def handled(on_first: Callable[[int], None] = announce) -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-# Has another process stop in good order, once, though a terminal's Ctrl-C may have reached it
-# as well: a second SIGHUP never ends a program.
 def stop(process: int) -> None:
+    """Has another process stop in good order, once, though a terminal's Ctrl-C may have reached it
+    as well: a second SIGHUP never ends a program.
+    """
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     with contextlib.suppress(ProcessLookupError):
         os.kill(process, signal.SIGTERM if ignored else signal.SIGHUP)

@@ -51,15 +51,16 @@ OmegaConf.register_new_resolver(
 # ---- Before the first job ----
 
 
-# Returns (the words of each job that is known beforehand, all of them checked; the
-# configuration of the first).
-#
-# Of a grid these are all jobs; of a search, the first of all values, and each other value and
-# bound alone.
-#
-# Raises:
-#     ConfigErrors: with all that is wrong in the first wrong job.
 def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], Any]:
+    """Returns (the words of each job that is known beforehand, all of them checked; the
+    configuration of the first).
+
+    Of a grid these are all jobs; of a search, the first of all values, and each other value and
+    bound alone.
+
+    Raises:
+        ConfigErrors: with all that is wrong in the first wrong job.
+    """
     values = {key_of(override): _values(override) for override in composer.parse(words)}
     config = composer.compose([options[0] for options in values.values() if options[0]])[1].hydra
     params = composer.parse(f"{k}={v}" for k, v in (config.sweeper.get("params") or {}).items())
@@ -77,8 +78,8 @@ def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], Any]
     return jobs, config
 
 
-# the words that a word of a sweep may become; None where a search leaves it out
 def _values(override: Override) -> list[str | None]:
+    """The words that a word of a sweep may become; None where a search leaves it out."""
     key, sweep = override.get_key_element(), override.value()
     if override.is_interval_sweep():
         # a point inside that is no integer, even if the bounds are 1.0 and 4.0
@@ -92,9 +93,10 @@ def _values(override: Override) -> list[str | None]:
     raise ConfigErrors([(key, f"{override.input_line!r} has no value")])
 
 
-# Checks all jobs, then hands the sweep over to Hydra, past jobs that fail. Returns the exit
-# code.
 def sweep(composer: Composer, words: list[str]) -> int:
+    """Checks all jobs, then hands the sweep over to Hydra, past jobs that fail. Returns the exit
+    code.
+    """
     overrides = {key_of(override): override for override in composer.parse(words)}
     if "folder" in overrides:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])
@@ -154,9 +156,10 @@ class Job:
         self.records = folder.absolute() / ".jobs" / uuid.uuid4().hex[:8]
         self.records.mkdir(parents=True)
 
-    # Returns the job's score, None if it failed: a sweeper is to go on. Raises Interrupted
-    # alone.
     def __call__(self, config: Any) -> float | None:
+        """Returns the job's score, None if it failed: a sweeper is to go on. Raises Interrupted
+        alone.
+        """
         hydra, began, result = HydraConfig.get(), time.monotonic(), None
         words, number = [*hydra.overrides.task], hydra.job.num
         os.chdir(self.start)  # where paths are relative to, whatever hydra.job.chdir says
@@ -208,8 +211,8 @@ class Job:
             console.warn(f"job {number}: no episode finished, so it has no score; train longer")
         return row.get("score")
 
-    # Returns what the jobs of this sweep recorded, in order.
     def rows(self) -> list[dict[str, Any]]:
+        """Returns what the jobs of this sweep recorded, in order."""
         rows = []
         for path in self.records.glob("*.json"):
             state = RUNNING
@@ -222,8 +225,8 @@ class Job:
             rows.append(row | {"state": state} if row["state"] == RUNNING else row)
         return sorted(rows, key=lambda row: row["number"])
 
-    # Has jobs in other processes save and end, then raises Interrupted.
     def interrupt(self, number: int) -> NoReturn:
+        """Has jobs in other processes save and end, then raises Interrupted."""
         deadline = time.monotonic() + 30  # seconds, for jobs to save
         for process in self.running():
             signals.stop(process)
@@ -237,13 +240,14 @@ class Job:
         return [pid for pid in pids if pid != os.getpid()]
 
 
-# Makes a GPU with the fewest jobs on it PyTorch's current one, which device=auto means.
-#
-# Yields its index, None where there is no choice. Jobs know of each other by locks on temporary
-# files, one for each place on each GPU of this machine; the system drops them when a process
-# ends.
 @contextlib.contextmanager
 def one_gpu() -> Iterator[int | None]:
+    """Makes a GPU with the fewest jobs on it PyTorch's current one, which device=auto means.
+
+    Yields its index, None where there is no choice. Jobs know of each other by locks on temporary
+    files, one for each place on each GPU of this machine; the system drops them when a process
+    ends.
+    """
     n_gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     with contextlib.ExitStack() as stack:
         for place in itertools.count() if n_gpus > 1 else ():
@@ -259,9 +263,10 @@ def one_gpu() -> Iterator[int | None]:
 # ---- The table ----
 
 
-# Prints the table of a sweep and writes it into its folder: sweep.md as it is printed, and
-# sweep.csv with all digits.
 def report(folder: Path, rows: list[dict[str, Any]]) -> None:
+    """Prints the table of a sweep and writes it into its folder: sweep.md as it is printed, and
+    sweep.csv with all digits.
+    """
     head, text = ["job", *dict.fromkeys(k for row in rows for k in row["varied"])], io.StringIO()
     head += COLUMNS
     rows = [{**row, **row["varied"], "job": row["number"]} for row in rows]

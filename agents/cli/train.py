@@ -115,9 +115,10 @@ def make_trainer(
     return improves
 
 
-# Returns the fraction of the budget that is spent, None without one, and the few numbers that
-# people watch.
 def progress_of(running: Trainer) -> tuple[float | None, list[str]]:
+    """Returns the fraction of the budget that is spent, None without one, and the few numbers that
+    people watch.
+    """
     words, left, latest = (
         [f"{console.number(running.samples)} samples"],
         running.fraction_left,
@@ -135,17 +136,18 @@ def progress_of(running: Trainer) -> tuple[float | None, list[str]]:
     return 1 - left if running.budget.is_limited else None, words
 
 
-# the returns of groups of lanes, and metrics, if they are few enough for one line
 def few_means(latest: dict[str, float], metrics: Sequence[str], groups: Sequence[str]) -> list[str]:
+    """The returns of groups of lanes, and metrics, if they are few enough for one line."""
     names = {group: f"episode/return/{group}" for group in groups}
     names |= {name: f"episode/{name}" for name in metrics}
     shown = [f"{name} {latest[key]:.3g}" for name, key in names.items() if key in latest]
     return shown if len(names) <= 4 else []
 
 
-# Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
-# limited, else by never.
 def annealed(cfg: settings.Train) -> settings.Train:
+    """Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
+    limited, else by never.
+    """
     limits = [name for name in ("samples", "seconds") if getattr(cfg, name) is not None]
     anneal = [*limits, "never"][0] if cfg.learner.anneal == "auto" else cfg.learner.anneal
     return factory.changed(cfg, learner=factory.changed(cfg.learner, anneal=anneal))
@@ -202,12 +204,13 @@ def run(cfg: settings.Train) -> Path:
     return folder
 
 
-# Returns the tree of a run that resumes another or starts from its weights; any other is
-# returned as it is.
-#
-# A run that is resumed keeps its own settings, except for typed keys. A run that starts from the
-# weights of another has its environment and agent, except for typed keys and groups.
 def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
+    """Returns the tree of a run that resumes another or starts from its weights; any other is
+    returned as it is.
+
+    A run that is resumed keeps its own settings, except for typed keys. A run that starts from the
+    weights of another has its environment and agent, except for typed keys and groups.
+    """
     resume, init = tree.get("resume"), tree.get("init")
     if not isinstance(resume or init, str) or (resume and init):
         return tree
