@@ -95,9 +95,9 @@ class Composer:
         """Returns {group: members} of the groups to choose from."""
         names = {group for group in self.composed().hydra.runtime.choices if "/" not in group}
         names |= {*self.loader.list_groups("")} if self.folder else set()
-        return {
-            name: self.members(name) for name in sorted(names - {"hydra"}) if self.members(name)
-        }
+        # import paths that were given in this process are members too
+        files = {name: [m for m in self.members(name) if ":" not in m] for name in sorted(names)}
+        return {name: members for name, members in files.items() if members and name != "hydra"}
 
     def parse(self, words: Iterable[str]) -> list[types.Override]:
         """Returns words as Hydra's grammar reads them. Raises ConfigErrors with all unreadable

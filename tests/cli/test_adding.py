@@ -9,7 +9,6 @@ import json
 import os
 import pathlib
 import shutil
-import subprocess
 import sys
 import textwrap
 
@@ -22,7 +21,7 @@ from tests.helpers import tiny
 
 ROOT = pathlib.Path(__file__).parents[2]
 #: The most files that adding one takes, its test among them.
-FILES = {"environment": 3, "geometry": 3, "learner": 3, "core": 2, "encoder": 2, "kernel": 6}
+FILES = {"environment": 3, "geometry": 3, "learner": 3, "core": 2, "encoder": 2}
 SMALL = [word for word in tiny.TINY if not word.startswith(("env=", "env.res"))]
 RUN = [*SMALL, "samples=64", "log_every=1"]
 
@@ -312,44 +311,6 @@ def test_custom_encoder(outside):
     assert train.main(words) == 0
     assert saved().state["policy"]["intake.project.weight"].shape[0] == 8
     assert evaluate.main(["run=latest", "episodes=4"]) == 0
-
-
-def test_custom_kernel(tmp_path):
-    """Adds to a copy of the simulator: four files of kernels/ and a function of engine/ops.py."""
-    shutil.copytree(ROOT / "megastep", tmp_path / "megastep")
-    kernels, engine = tmp_path / "megastep/kernels", tmp_path / "megastep/engine/ops.py"
-    params = "struct TwiceParams {\n    const float* x;\n    float* out;\n    int n;\n};\n"
-    added = {
-        kernels / "params.h": (kernels / "params.h").read_text() + params,
-        kernels / "twice.h": '#pragma once\n#include "common.h"\n#include "params.h"\n'
-        "HD void twice_one(const TwiceParams& p, int i) {\n    p.out[i] = 2.f * p.x[i];\n}\n",
-        kernels / "twice.cpp": '#include "twice.h"\nKERNEL twice(const TwiceParams& p) {\n'
-        "    for (int i = 0; i < p.n; i++)\n        twice_one(p, i);\n}\n",
-        kernels / "twice.cu": '#include "twice.h"\nKERNEL twice(TwiceParams p) {\n'
-        "    int i = blockIdx.x * blockDim.x + threadIdx.x;\n    if (i < p.n)\n"
-        "        twice_one(p, i);\n}\n",
-        engine: engine.read_text()
-        + textwrap.dedent("""
-
-            def twice(x):
-                out, n = torch.empty_like(x), len(x)
-                packed = params.TwiceParams(x=x.data_ptr(), out=out.data_ptr(), n=n)
-                launch("twice", packed, x.device, threads=n)
-                return out
-            """),
-    }
-    assert len(added) + 1 <= FILES["kernel"]
-    for path, text in added.items():
-        path.write_text(text)
-    code = (
-        "import torch; from megastep.engine import ops; print(ops.twice(torch.arange(3.)).tolist())"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "CUDA_VISIBLE_DEVICES": ""}
-    environment["MEGASTEP_CACHE"] = str(tmp_path / "cache")
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment
-    )
-    assert done.stdout == "[0.0, 2.0, 4.0]\n", done.stderr
 
 
 # ---- Classes that cannot be used ----
