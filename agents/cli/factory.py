@@ -101,9 +101,11 @@ def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **argume
         try:
             engine.fit(env.n_envs, total + n_bytes, sample.device)
         except engine.EngineError:
-            probe = construct(changed(env, n_envs=PROBE), geometries=geometries[:1], **arguments)
-            n_bytes += (_nbytes(probe) - total) / (PROBE - sample.n_envs)
-            engine.fit(env.n_envs, n_bytes, sample.device)
+            if env.n_envs > PROBE:  # fewer tell for themselves whether they fit
+                probe = changed(env, n_envs=PROBE)
+                probe = construct(probe, geometries=geometries[:1], **arguments)
+                n_bytes += (_nbytes(probe) - total) / (PROBE - sample.n_envs)
+                engine.fit(env.n_envs, n_bytes, sample.device)
 
 
 def make_policy(agent: Agent, env: Any, seed: int = 1, critic: str | None = None) -> Policy:

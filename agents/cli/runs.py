@@ -81,9 +81,11 @@ def locked(folder: Path) -> Iterator[None]:
         lock.acquire()
         path.write_text(str(os.getpid()))
     except filelock.Timeout:
+        with program.errors(f"The run folder {folder} is in use, or was just now: "):
+            pid = path.read_text()  # its last owner may just be deleting it
         raise UserError(
-            f"The run folder {folder} is in use by process {path.read_text()}; wait for it, or end "
-            f"it: kill {path.read_text()}"
+            f"The run folder {folder} is in use by process {pid}; wait for it, or stop it: "
+            f"kill {pid}"
         ) from None
     except OSError as error:
         with program.errors(CANNOT.format(folder)):

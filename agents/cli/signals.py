@@ -77,9 +77,9 @@ def stop(process: int) -> None:
     """Has another process stop in good order, once, though a terminal's Ctrl-C may have reached it
     as well: a second SIGHUP never ends a program.
     """
-    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     with contextlib.suppress(ProcessLookupError):
-        os.kill(process, signal.SIGTERM if ignored else signal.SIGHUP)
+        os.kill(process, signal.SIGTERM if is_ignored else signal.SIGHUP)
 
 
 def _install(handler: Callable) -> dict[int, object]:

@@ -110,7 +110,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
     options = SEARCH if config.runtime.choices["hydra/sweeper"] == "optuna" else {}
     options = options | {
         "hydra.job.name": composer.script.name,
-        "hydra.sweep.dir": folder,
+        "hydra.sweep.dir": json.dumps(str(folder), ensure_ascii=False),
         "hydra.job.config.override_dirname.exclude_keys": json.dumps(
             [key for key, override in overrides.items() if not override.is_sweep_override()]
         ),

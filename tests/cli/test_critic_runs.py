@@ -70,7 +70,7 @@ def test_plain_critic_does_not_compute_privileged(monkeypatch):
 @pytest.mark.parametrize("saved, chosen", [("asymmetric", "plain"), ("plain", "asymmetric")])
 def test_init_refuses_other_kind_of_critic(saved, chosen):
     run = trained("samples=1", f"agent.critic={saved}")
-    with pytest.raises(UserError, match=f"critic.*{saved}.*{chosen}.*critic={saved}"):
+    with pytest.raises(UserError, match=f"agent.critic={saved}.*critic"):
         trained("samples=1", f"init={run}", f"agent.critic={chosen}")
 
 
