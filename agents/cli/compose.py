@@ -142,7 +142,7 @@ class Composer:
             groups = [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
             chosen = check.check(self.script.kind, tree, groups + self.loader.list_groups(""))
         except OmegaConfBaseException as error:
-            errors.append((error.full_key or "configuration", program.shortened(error, 400)))
+            errors.append((error.full_key or "configuration", str(error).partition("\n")[0]))
         except ConfigErrors as error:
             errors += error.errors
         if errors + secret:
@@ -189,7 +189,7 @@ class Composer:
                 hint = check.closest_key(key, dict(leaves({"hydra": plain(config.hydra)})))
                 errors.append((key, f"no such key; {hint}"))
             except OmegaConfBaseException as error:
-                errors.append((key, program.shortened(error, 400)))
+                errors.append((key, str(error).partition("\n")[0]))
         return config, errors
 
     def _composed(self, *groups: str, device: str | None = None) -> DictConfig:

@@ -333,7 +333,7 @@ def test_minibatch_needs_an_environment():
         ("env@x=minimal", "configuration", "+env@x=minimal"),
         ("+env@x=minimal", "x", "no such key"),
         ("nope@x=y", "nope@x", "no such key"),
-        ("seed=${nothere}", "seed", "Interpolation key 'nothere' not messages"),
+        ("seed=${nothere}", "seed", "Interpolation key 'nothere' not found"),
         ("hydra=3", "hydra", "3 is unknown"),
         ("hydra.swep.dir=x", "hydra.swep.dir", "no such key; did you mean hydra.sweep.dir?"),
         ("hydra.job.chdir=maybe", "hydra.job.chdir", "Value 'maybe' is not a valid bool"),
