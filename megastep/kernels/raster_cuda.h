@@ -108,8 +108,8 @@ DEVICE void raster_group(View& v, const Float4* ends, int line, int active) {
 }
 
 // Rasterises walls, in groups of 32 with a bounding box around each. Groups that are off-screen are
-// skipped. The others come nearest first, so that groups entirely behind earlier ones can be skipped
-// too.
+// skipped. The others come nearest first, so that groups entirely behind earlier ones can be
+// skipped too.
 DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scenery,
                          float half_width) {
     for (int start = 0; BOX_WALLS * start < scenery.n_walls; start += WARP) {
