@@ -30,7 +30,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from megastep import workers
 from megastep.arrdict import clone, numpyify
 from megastep.types import Tree
 from megastep.video import Mp4Writer, as_image
@@ -41,6 +40,15 @@ if TYPE_CHECKING:
 __all__ = ["ParallelEncoder", "draw"]
 
 MAX_WORKERS = 8  # about 80 figures per second; each imports torch, about half a gigabyte of memory
+#: Environment variables of a worker process: one thread, no screen, and no GPU, because even an
+#: idle CUDA context takes half a gigabyte.
+WORKER_ENV = {
+    "MPLBACKEND": "Agg",
+    "CUDA_VISIBLE_DEVICES": "",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
 
 
 class ParallelEncoder:
@@ -173,7 +181,7 @@ class ParallelEncoder:
             import loky
 
             self._n_workers = self._n_workers or min(loky.cpu_count(), MAX_WORKERS)
-            self._pool = loky.ProcessPoolExecutor(self._n_workers, env=workers.WORKER_ENV)
+            self._pool = loky.ProcessPoolExecutor(self._n_workers, env=WORKER_ENV)
         return self._pool
 
     def _add(self, image: np.ndarray | Future) -> None:

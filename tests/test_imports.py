@@ -16,7 +16,7 @@ SCRIPTS = ("train", "evaluate", "record")
 
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
-    ("cache", "colour", "dotdict", "read_only", "settings", "types", "video", "workers"),
+    ("cache", "colour", "dotdict", "read_only", "settings", "types", "video"),
     ("arrdict", "geometry", "kernels", "plotting", "ragged"),
     ("engine", "recording", "spaces"),
     ("capture", "contract", "geometries", "scene"),
@@ -71,11 +71,10 @@ OUTSIDE_USERS = {
     "cuda": ("megastep/kernels/build/compile.py",),
     "hydra": ("agents/cli/*.py",),
     "hydra_plugins": ("agents/cli/*.py",),
-    "loky": ("megastep/recording.py", "megastep/workers.py"),
+    "loky": ("megastep/recording.py",),
     "omegaconf": ("agents/cli/*.py",),
     "openskill": ("agents/selfplay/ratings.py",),
-    "rich": ("agents/cli/*.py", "megastep/workers.py"),
-    "scipy": ("megastep/envs/pointgoal/geodesics.py",),
+    "rich": ("agents/cli/*.py", "megastep/envs/pointgoal/goals.py"),
     "tensorboard": ("agents/training/loggers.py",),
     "wandb": ("agents/training/loggers.py",),
 }
@@ -332,7 +331,7 @@ PLANTED = [
     (outside_packages_stay_with_their_users, "megastep.agents.algorithms.ppo", "hydra.core"),
     (outside_packages_stay_with_their_users, "megastep.agents.cli.train", "wandb"),
     (outside_packages_stay_with_their_users, "megastep.core", "loky"),
-    (outside_packages_stay_with_their_users, "megastep.envs.pointgoal.goals", "scipy.sparse"),
+    (outside_packages_stay_with_their_users, "megastep.core", "rich.progress"),
     (agents_is_imported_as_megastep_agents, "megastep.agents.cli.train", "agents.cli"),
     (agents_is_imported_as_megastep_agents, "train", "agents"),
 ]

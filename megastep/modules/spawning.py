@@ -33,7 +33,7 @@ def distances(points, walls):
     return np.sqrt((dx * dx + dy * dy).min(1))
 
 
-def _candidates(g, n, random):
+def candidates(g, n, random):
     """Yields batches (n, 2) of points, drawn uniformly from the rooms of a geometry."""
     i, j = (g.masks > 0).nonzero()
     if not len(i):
@@ -80,7 +80,7 @@ def spawn_points(
     """
     size, points, owners = n // n_agents, np.empty((0, 2)), np.empty(0, int)
     from_wall, apart = radius + CLEARANCE, 2 * radius + CLEARANCE
-    for batch in _candidates(g, n, random):
+    for batch in candidates(g, n, random):
         clear = batch[distances(batch, g.walls) > from_wall]
         points, owners = _assign(points, owners, clear, n_agents, size, apart)
         if len(points) == n_agents * size:

@@ -9,9 +9,9 @@ import pytest
 import torch
 from test_geodesics import room
 
-from megastep import core, engine, modules, scene, toys, workers
-from megastep.envs.pointgoal import geodesics as ways
+from megastep import core, engine, modules, scene, toys
 from megastep.envs.pointgoal import goals as module
+from megastep.envs.pointgoal.geodesics import geodesics
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
@@ -234,12 +234,7 @@ def test_drawn_goals_are_in_range(n_agents, device):
     c = core.Core(scene.scenery(homes, n_agents, n, device=device), res=8)
     goals = goal_fields(homes, c, nearest=2.0, furthest=4.0)
     spawner = modules.RandomSpawns(homes, c, resample=True, points=goals.spawns)
-    truth = [
-        ways.geodesics(
-            g, 128, 16, c.agents.radius, np.random.Generator(np.random.Philox([c.seed, d]))
-        )
-        for d, g in enumerate(homes)
-    ]
+    truth = geodesics_of(homes, c.seed)
     drawn = set()
     spawner(c.agent_full(True))
     _, state = step(c, goals, torch.zeros_like(spawner.chosen), spawner.chosen)
@@ -272,22 +267,24 @@ def test_no_goal_in_range(range_, words):
 # ---- The cache ----
 
 
+def geodesics_of(homes, seed=1):
+    generators = [np.random.Generator(np.random.Philox([seed, d])) for d in range(len(homes))]
+    return list(geodesics(homes, 128, 16, engine.AGENT_RADIUS, generators))
+
+
 def all_of(geometries, seed=1):
     return module.all_geodesics(geometries, engine.AGENT_RADIUS, seed)
 
 
 def test_geodesics_are_cached_without_loss(folder, monkeypatch):
     homes = sample("homes", 2)
-    out, calls = all_of(homes), []
-    monkeypatch.setattr(module, "geodesics", lambda *parts: calls.append(1))
+    out = all_of(homes)
+    monkeypatch.setattr(module, "geodesics", lambda *parts: None)
     again = all_of(homes)
-    assert not calls and len(list(folder.glob("geodesics-*"))) == 1
-    for d, (a, b) in enumerate(zip(out, again)):
-        random = np.random.Generator(np.random.Philox([1, d]))
-        truth = ways.geodesics(homes[d], 128, 16, engine.AGENT_RADIUS, random)
+    assert len(list(folder.glob("geodesics-*"))) == 1
+    for a, b, truth in zip(out, again, geodesics_of(homes), strict=True):
         for x, y, z in zip(a, b, truth, strict=True):
             assert x.dtype == z.dtype and (x == z).all() and (y == z).all()
-    monkeypatch.undo()
 
 
 def test_equal_geometries_share_geodesics(folder):
@@ -324,18 +321,16 @@ def test_cached_files_are_limited_in_size(folder, monkeypatch):
     assert len(list(folder.glob("geodesics-*"))) == 2
 
 
-def test_worker_processes_compute_the_same(folder, monkeypatch, capfd):
-    boxes_ = [room(width=2 + 0.01 * i, height=1.5, id=i) for i in range(workers.MIN_PARALLEL)]
-    out = all_of(boxes_)
+def test_many_layouts_show_progress(folder, capfd):
+    all_of([toys.box(2 + 0.01 * i) for i in range(module.MIN_PROGRESS)])
     assert "48 layouts" in capfd.readouterr().err
-    monkeypatch.setattr(workers, "MIN_PARALLEL", 1000)
-    monkeypatch.setenv("MEGASTEP_CACHE", str(folder / "other"))
-    alone = all_of(boxes_)
-    assert all((x == y).all() for a, b in zip(out, alone) for x, y in zip(a, b))
 
 
-def test_an_error_in_a_worker_names_the_geometry(folder):
-    boxes_ = [room(width=2 + 0.01 * i, height=1.5, id=i) for i in range(workers.MIN_PARALLEL)]
-    boxes_[40]["masks"] = boxes_[40].masks * 0
-    with pytest.raises(ValueError, match="geometry 40 has no room to spawn in"):
+def test_errors_name_the_geometry():
+    boxes_ = [room(width=2 + 0.01 * i, height=1.5, id=i) for i in range(20)]
+    boxes_[18]["masks"] = boxes_[18].masks * 0
+    with pytest.raises(ValueError, match="geometry 18 has no room to spawn in"):
+        all_of(boxes_)
+    boxes_[18] = room(((0.0, 0.1), (2.0, 0.1)), width=2, height=0.2, id=18)
+    with pytest.raises(ValueError, match="geometry 18 has no point in a room"):
         all_of(boxes_)

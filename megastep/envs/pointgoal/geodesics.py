@@ -1,304 +1,368 @@
-"""Shortest paths of an agent's disc between walls, to random goals from anywhere.
+"""Shortest paths of an agent's disc between walls, to random goals from anywhere in a home.
 
-Distances are computed in two ways:
+Paths are shortest in a visibility graph (Lozano-Perez and Wesley 1979) between corners of polygons
+around the ends of walls; `kernels/shortest_paths.h` computes it, with the same bits on CPU and GPU.
+Every passage that is 5 mm wider than an agent is found, and no length is more than a body can walk.
+A *field* holds the lengths to one goal from the centres of a grid's cells.
 
-* A *field* holds the distance to a goal from every cell of a grid, by Dijkstra's algorithm on 16
-  neighbours per cell. It is a few per cent too long, but continuous, so progress is measured on it.
-* The *length* of the shortest path from a spawn point to a goal is exact to millimetres. It is the
-  length of the shortest polyline along which the disc touches no wall, from a visibility graph
-  (Lozano-Perez and Wesley 1979) of goals, spawn points and points around the ends of walls.
-
-M walls, H x W cells, G goals, S spawn points, P points, K pairs of points.
+D homes, W walls of all homes, V corners of all homes, S spawn points and G goals per home, P
+points, H x W cells.
 """
 
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
-from megastep.modules.spawning import distances, spawn_points
+from megastep.engine.devices import threads
+from megastep.envs.pointgoal.program import PROGRAM
+from megastep.kernels.build.launch import BLOCK, launch
+from megastep.modules.spawning import CLEARANCE, candidates
+
+__all__ = ["CELL", "Geodesics", "geodesics"]
 
 CELL = 0.1  # metres, of fields
-FINE = 2  # the clearance has cells this many times smaller
-FAR = 0.5  # metres; the clearance is clipped here
-RINGS = 3  # rings of cells inside walls that get a neighbour's distance, for interpolation
-ARC = 8  # points around the end of a wall
-STEP = 0.05  # metres between the points of a path that are tested
-# Metres by which a path may be closer to a wall than an agent: the error of interpolated
-# clearances, and the distance of an arc's chord from the arc.
-TOLERANCE = 0.015
-SPARE = 4  # times as many points are drawn as needed, as some may be in rooms without a door
-# Half of the moves between neighbours (the others are their reverses): rows up, columns right, and
-# the cells that a move passes.
-MOVES = {
-    (0, 1): [],
-    (1, 0): [],
-    (1, 1): [(0, 1), (1, 0)],
-    (1, -1): [(0, -1), (1, 0)],
-    (1, 2): [(0, 1), (1, 1)],
-    (1, -2): [(0, -1), (1, -1)],
-    (2, 1): [(1, 0), (1, 1)],
-    (2, -1): [(1, 0), (1, -1)],
-}
+SPARE = 2  # times as many points are drawn as needed, as some may be in rooms without a door
+SIDES = 16  # of the polygon around the end of a wall
+INFLATION = 1.001  # of the radius, as in physics
+SLACK = 5e-5  # metres between a path and the clearance that is tested, for rounding
+MAX_GOALS, GROUP = PROGRAM.constants["MAX_GOALS"], PROGRAM.constants["GROUP"]
+GROUP_SIDE = 1.5  # metres: walls with their middles in one square are neighbours
+STEP = 5e-3  # metres from a corner where it is tested if a path can turn there
+TURN = 0.026  # radians of that turn
+HOMES_AT_ONCE = {"cpu": 16, "cuda": 512}  # on a CPU, signals are handled in between
+
+_NO_LINKS = dict(targets=0, metres=0)
 
 
 class Geodesics(NamedTuple):
     """Goals, spawn points and shortest paths of one geometry, in metres."""
 
     origin: np.ndarray  # (2,) float32: the centre of the first cell
-    fields: np.ndarray  # (G, H, W) float16: distance to each goal or inf; row 0 at the bottom
+    fields: np.ndarray  # (G, H, W) float16: length to each goal or inf; row 0 at the bottom
     spawns: np.ndarray  # (S, 2) float32; every goal can be reached from each
     goals: np.ndarray  # (G, 2) float32
     lengths: np.ndarray  # (S, G) float32: of the shortest paths
 
 
-class _Grid:
-    """A grid of square cells (H, W), and the clearance on a grid `FINE` times finer: metres from a
-    cell's centre to the nearest wall, at most `FAR`.
-    """
-
-    def __init__(self, walls):
-        low, high = walls.min((0, 1)), walls.max((0, 1))
-        self.origin = low.astype(np.float32).astype(np.float64)
-        width, height = np.ceil((high - low) / CELL).astype(int) + 2
-        self.clearance = np.full((FINE * height, FINE * width), FAR)
-        for start, end in walls:
-            self._add(start, end)
-
-    def _add(self, start, end):
-        """Lowers the clearance near a wall."""
-        side = CELL / FINE
-        low, high = np.minimum(start, end) - FAR, np.maximum(start, end) + FAR
-        column, row = np.floor((low - self.origin) / side).astype(int).clip(0)
-        last_column, last_row = np.ceil((high - self.origin) / side).astype(int)
-        near = self.clearance[row : last_row + 1, column : last_column + 1]
-        y, x = np.ogrid[row : row + near.shape[0], column : column + near.shape[1]]
-        dx = self.origin[0] + side * x - start[0]
-        dy = self.origin[1] + side * y - start[1]
-        vx, vy = end - start
-        along = ((dx * vx + dy * vy) / max(vx * vx + vy * vy, 1e-12)).clip(0, 1)
-        dx, dy = dx - along * vx, dy - along * vy
-        np.minimum(near, np.sqrt(dx * dx + dy * dy), out=near)
-
-    def free(self, radius):
-        """Returns (H, W) bool, the cells at whose centre a disc fits."""
-        return self.clearance[::FINE, ::FINE] >= radius
-
-    def read(self, values, points):
-        """Returns `values` (..., H, W), of this grid or the finer one, interpolated at points
-        (P, 2): (..., P).
-        """
-        height, width = values.shape[-2:]
-        side = CELL * len(self.clearance) / (FINE * height)
-        at = (points - self.origin) / side
-        x = at[:, 0].clip(0, width - 1.001)
-        y = at[:, 1].clip(0, height - 1.001)
-        column, row = x.astype(int), y.astype(int)
-        x, y = x - column, y - row
-        index = row * width + column
-        flat = values.reshape(*values.shape[:-2], -1)
-        total = 0.0
-        for offset, weight in (
-            (0, (1 - x) * (1 - y)),
-            (1, x * (1 - y)),
-            (width, (1 - x) * y),
-            (width + 1, x * y),
-        ):
-            total = total + np.where(weight > 0, flat[..., index + offset], 0.0) * weight
-        return total
-
-    def sees(self, starts, ends, least):
-        """Returns (K,) bool, the straight paths from starts to ends, (K, 2) each, that stay at
-        least `least` metres from all walls.
-        """
-        across = ends - starts
-        n_steps = np.ceil(np.sqrt((across**2).sum(1)) / STEP).astype(int) + 1
-        clear = np.ones(len(starts), bool)
-        for n_points in (1, 3, 7, None):  # a few points rule out most paths that are not clear
-            remaining = clear.nonzero()[0]
-            counts = n_steps[remaining] if n_points is None else np.full(len(remaining), n_points)
-            path = np.repeat(remaining, counts)
-            step = np.arange(len(path)) - np.repeat(np.cumsum(counts) - counts, counts)
-            fraction = (step + 1) / (np.repeat(counts, counts) + 1)
-            points = starts[path] + fraction[:, None] * across[path]
-            clear[path[self.read(self.clearance, points) < least]] = False
-        return clear
-
-
-def _graph(free):
-    """Returns the numbers of the `free` cells (H, W), -1 elsewhere, and the moves between them:
-    from, to and metres, (E,) each.
-    """
-    height, width = free.shape
-    numbers = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1)
-    padded = np.pad(free, 2)
-
-    def at(i, j):
-        return padded[2 + i : 2 + i + height, 2 + j : 2 + j + width]
-
-    moves = []
-    for (i, j), passed in MOVES.items():
-        open_ = free & at(i, j)
-        for cell in passed:
-            open_ &= at(*cell)
-        rows, columns = open_.nonzero()
-        to = numbers[rows + i, columns + j]
-        moves.append((numbers[rows, columns], to, np.full(len(to), CELL * np.hypot(i, j))))
-    return numbers, *map(np.concatenate, zip(*moves))
-
-
-def _entries(grid, numbers, points):
-    """Returns the moves from points (P, 2) to free cells around them: point, cell, metres, (E,)."""
-    nearest = np.rint((points - grid.origin) / CELL).astype(int)
-    offsets = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 2)
-    cells = (nearest[:, None] + offsets).reshape(-1, 2)
-    height, width = numbers.shape
-    inside = ((cells >= 0) & (cells < (width, height))).all(1)
-    point, cells = np.repeat(np.arange(len(points)), 9)[inside], cells[inside]
-    number = numbers[cells[:, 1], cells[:, 0]]
-    metres = np.sqrt(((grid.origin + CELL * cells - points[point]) ** 2).sum(1))
-    usable = (number >= 0) & (metres <= 1.5 * CELL)
-    return point[usable], number[usable], metres[usable]
-
-
-def _sparse(n, *moves):
-    from scipy.sparse import csr_array
-
-    starts, ends, metres = map(np.concatenate, zip(*moves))
-    return csr_array((metres, (starts, ends)), shape=(n, n))
-
-
-def _filled(fields, passable):
-    """Fills the cells inside walls of fields (G, H, W): a neighbour's distance plus one cell."""
-    for _ in range(RINGS):
-        padded = np.pad(fields, ((0, 0), (1, 1), (1, 1)), constant_values=np.inf)
-        around = np.minimum(
-            np.minimum(padded[:, 2:, 1:-1], padded[:, :-2, 1:-1]),
-            np.minimum(padded[:, 1:-1, 2:], padded[:, 1:-1, :-2]),
-        )
-        fields = np.where(np.isinf(fields) & ~passable, around + CELL, fields)
-    return fields
-
-
-def _corners(walls, radius):
-    """Returns the points (C, 2) where a shortest path may bend, on arcs around the ends of walls,
-    and the directions (C, 2) to them from those ends.
-    """
-    ends = np.unique(walls.reshape(-1, 2), axis=0)
-    angles = 2 * np.pi * np.arange(ARC) / ARC
-    away = np.tile(np.stack([np.cos(angles), np.sin(angles)], 1), (len(ends), 1))
-    points = np.repeat(ends, ARC, axis=0) + radius * away
-    fits = distances(points, walls) > radius - 1e-4
-    points, away = points[fits], away[fits]
-    aside = STEP * np.stack([-away[:, 1], away[:, 0]], 1)
-    # Beside a straight wall, a step to either side keeps the distance: no path bends there.
-    further = np.sqrt(radius**2 + STEP**2) - 1e-3
-    bends = (distances(points + aside, walls) > further) | (
-        distances(points - aside, walls) > further
-    )
-    return points[bends], away[bends]
-
-
-def _pairs(points, away, n_goals, n_ends, to_goals):
-    """Returns the pairs of points (P, 2) that may be neighbours on a shortest path, (K,) indices
-    each.
-
-    Points are goals, then spawns from `n_goals` on, then corners from `n_ends` on. `away` (P, 2)
-    are the directions from the walls that corners touch, 0 for others. `to_goals` (G, P) are
-    distances.
-
-    Left out are pairs whose distances to a goal differ by more than the distance between them, as
-    they cannot see each other, and pairs where the path would not bend around the end of the wall.
-    """
-    tangent = np.sin(np.pi / ARC) + 0.05
-    pairs = []
-    for i in range(n_ends, len(points)):
-        across = points[:i] - points[i]
-        straight = np.sqrt((across**2).sum(1))
-        bent = np.maximum(np.abs(across @ away[i]), np.abs((across * away[:i]).sum(1)))
-        partners = (bent <= tangent * straight).nonzero()[0]
-        apart = np.abs(to_goals[:, partners] - to_goals[:, i, None]).max(0)
-        partners = partners[apart <= 1.03 * straight[partners] + 2 * CELL]
-        pairs.append(np.stack([np.full(len(partners), i), partners], 1))
-    direct = np.indices((n_goals, n_ends - n_goals)).reshape(2, -1).T + (0, n_goals)
-    starts, ends = np.concatenate([direct, *pairs]).T
-    return starts, ends
-
-
-def _lengths(grid, goals, spawns, corners, away, fields, radius):
-    """Returns the lengths (S, G) of the shortest paths from spawns (S, 2) to goals (G, 2) that bend
-    at corners (C, 2). `fields` (G, H, W) are distances to the goals.
-    """
-    from scipy.sparse.csgraph import dijkstra
-
-    reached = np.isfinite(grid.read(fields, corners)).all(0)
-    points = np.concatenate([goals, spawns, corners[reached]])
-    n_goals, n_ends = len(goals), len(goals) + len(spawns)
-    away = np.concatenate([np.zeros((n_ends, 2)), away[reached]])
-    to_goals = grid.read(fields, points)
-    starts, ends = _pairs(points, away, n_goals, n_ends, to_goals)
-    clear = grid.sees(points[starts], points[ends], radius - TOLERANCE)
-    starts, ends = starts[clear], ends[clear]
-    metres = np.sqrt(((points[ends] - points[starts]) ** 2).sum(1))
-    graph = _sparse(len(points), (starts, ends, metres))
-    lengths = dijkstra(graph, directed=False, indices=np.arange(n_goals))[:, n_goals:n_ends].T
-    return np.where(np.isfinite(lengths), lengths, to_goals[:, n_goals:n_ends].T)
-
-
 def geodesics(
-    g: Any, n_spawns: int, n_goals: int, radius: float, random: np.random.Generator
-) -> Geodesics:
-    """Draws goals and spawn points from the largest connected part of a geometry, and computes the
-    shortest paths between them.
+    geometries: Sequence[Any],
+    n_spawns: int,
+    n_goals: int,
+    radius: float,
+    generators: Sequence[np.random.Generator],
+    device: torch.device | str = "cpu",
+) -> Iterator[Geodesics]:
+    """Draws goals and spawn points from the largest connected part of each geometry, and computes
+    the shortest paths between them.
 
     Args:
-        g: the geometry.
+        geometries: the homes.
         n_spawns: number of spawn points S.
         n_goals: number of goals G.
         radius: of the agents, in metres.
-        random: generator of the points.
+        generators: of the points, one per geometry.
+        device: where to compute. The results do not depend on it.
+
+    Yields:
+        The geodesics of each geometry, in order.
 
     Raises:
         ValueError: naming the geometry, if it has no room for an agent.
     """
-    from scipy.sparse.csgraph import connected_components, dijkstra
+    device = torch.device(device)
+    step = HOMES_AT_ONCE[device.type]
+    for first in range(0, len(geometries), step):
+        chunk = slice(first, first + step)
+        homes = _Homes(geometries[chunk], radius, device)
+        points = _points(homes, SPARE * (n_spawns + n_goals), generators[chunk])
+        goals, spawns = _largest_part(homes, points, n_goals, n_spawns)
+        lengths = homes.lengths(goals, spawns).cpu().numpy()
+        cells, counts, order = homes.cells()
+        fields = homes.lengths(goals, cells, counts, order).half().cpu().numpy()
+        fields = np.split(fields, np.cumsum(n_goals * counts)[:-1])
+        for d, origin in enumerate(homes.origins):
+            yield Geodesics(
+                origin=origin,
+                fields=fields[d].reshape(n_goals, *homes.shapes[d]),
+                spawns=spawns[d] + origin,
+                goals=goals[d] + origin,
+                lengths=lengths[d].T,
+            )
 
-    walls = g.walls.astype(np.float64)
-    grid = _Grid(walls)
-    numbers, *moves = _graph(grid.free(radius))
-    n_cells = int(numbers.max()) + 1
-    points = spawn_points(g, SPARE * (n_spawns + n_goals), 1, radius, random)
-    entries = _entries(grid, numbers, points)
-    _, parts = connected_components(_sparse(n_cells, moves), directed=False)
-    part_of_point = np.full(len(points), -1)
-    part_of_point[entries[0]] = parts[entries[1]]
-    if (part_of_point < 0).all():
-        raise ValueError(
-            f"geometry {g.id} has no room for an agent to walk in: it needs gaps at least "
-            f"{2 * radius + CELL:.2f} m wide"
+
+class _Homes:
+    """The walls of homes, and the corners where paths may bend, on a device.
+
+    Args:
+        geometries: D of them.
+        radius: of the agents, in metres.
+        device: where to compute.
+
+    Attributes:
+        origins: (D, 2) float32. All points are relative to these.
+    """
+
+    def __init__(self, geometries, radius, device):
+        self.geometries, self.device, self.radius = geometries, device, radius
+        n_walls = np.array([len(g.walls) for g in geometries])
+        firsts, home = self._starts(n_walls)[:-1], np.repeat(np.arange(len(n_walls)), n_walls)
+        walls = np.concatenate([g.walls for g in geometries]).astype(np.float64)
+        low = np.minimum.reduceat(walls.min(1), firsts)
+        high = np.maximum.reduceat(walls.max(1), firsts)
+        self.origins = low.astype(np.float32)
+        self.shapes = np.ceil((high - low) / CELL).astype(int)[:, ::-1] + 2  # (D, 2) rows, columns
+        walls -= self.origins[home, None]
+        self._group(walls, home, n_walls)
+        self._set_corners(np.zeros((6, 0)), np.zeros(0, int))
+        self._set_corners(*self._find_corners(walls, home))
+        self.links = self._link()
+
+    def _group(self, walls, home, n_walls):
+        """Sets walls (W, 2, 2), neighbours together, in groups with bounding boxes."""
+        cells = (walls.mean(1) / GROUP_SIDE).astype(int)
+        walls = walls[np.lexsort((cells[:, 0], cells[:, 1], home))].astype(np.float32)
+        n_groups = -(-n_walls // GROUP)
+        # the last group of a home is filled up with its last wall
+        index = np.arange(GROUP * n_groups.sum()) - np.repeat(
+            GROUP * self._starts(n_groups)[:-1], GROUP * n_groups
         )
-    largest = np.bincount(part_of_point[part_of_point >= 0]).argmax()
-    points = points[part_of_point == largest]
-    goals = np.resize(points[:n_goals], (n_goals, 2))
-    spawns = points[n_goals:] if len(points) > n_goals else points
-    spawns = np.resize(spawns, (n_spawns, 2))
+        index = np.minimum(index, np.repeat(n_walls - 1, GROUP * n_groups))
+        walls = walls[index + np.repeat(self._starts(n_walls)[:-1], GROUP * n_groups)]
+        grouped = walls.reshape(-1, 2 * GROUP, 2)
+        boxes = np.concatenate([grouped.min(1), grouped.max(1)], 1)
+        self.n_groups = len(boxes)
+        self.tensors = dict(
+            walls=self._tensor(walls.reshape(-1, 4).T, np.float32),
+            boxes=self._tensor(boxes.T, np.float32),
+            group_starts=self._tensor(self._starts(n_groups), np.int32),
+        )
 
-    starts, ends, metres = _entries(grid, numbers, goals)
-    graph = _sparse(n_cells + n_goals, moves, (starts + n_cells, ends, metres))
-    distance = dijkstra(graph, directed=False, indices=n_cells + np.arange(n_goals))
-    free = numbers >= 0
-    fields = np.full((n_goals, *free.shape), np.inf)
-    fields[:, free] = distance[:, :n_cells]
-    reached = np.isfinite(fields[0])
-    fields = _filled(fields, free)
-    lengths = _lengths(grid, goals, spawns, *_corners(walls, radius), fields, radius)
+    def _starts(self, counts):
+        return np.concatenate([[0], np.cumsum(counts)])
 
-    rows, columns = (reached.any(axis).nonzero()[0] for axis in (1, 0))
-    row, column = max(rows[0] - RINGS, 0), max(columns[0] - RINGS, 0)
-    fields = fields[:, row : rows[-1] + RINGS + 1, column : columns[-1] + RINGS + 1]
-    return Geodesics(
-        origin=(grid.origin + CELL * np.array([column, row])).astype(np.float32),
-        fields=fields.astype(np.float16),
-        spawns=spawns.astype(np.float32),
-        goals=goals.astype(np.float32),
-        lengths=lengths.astype(np.float32),
-    )
+    def _tensor(self, array, dtype):
+        return torch.from_numpy(np.ascontiguousarray(array, dtype)).to(self.device)
+
+    def _params(self):
+        inradius = INFLATION * self.radius + 2 * SLACK
+        circumradius = inradius / np.cos(np.pi / SIDES)
+        return PROGRAM.params.HomesParams(
+            **{name: tensor.data_ptr() for name, tensor in self.tensors.items()},
+            n_groups=self.n_groups,
+            n_corners=self.n_corners,
+            n_homes=len(self.geometries),
+            n_threads=threads(),
+            clearance=inradius - SLACK,
+            rebate=(circumradius - inradius) * 2 * np.pi / SIDES,
+        )
+
+    def _launch(self, operation, params, n_threads, **values):
+        """Launches an operation. Values that are tensors are passed by address."""
+        packed = {
+            name: value.data_ptr() if isinstance(value, torch.Tensor) else value
+            for name, value in values.items()
+        }
+        struct = getattr(PROGRAM.params, params)(homes=self._params(), **packed)
+        launch(PROGRAM, operation, struct, self.device, threads=n_threads)
+
+    # ---- The visibility graph ----
+
+    def _set_corners(self, columns, home):
+        """Sets corners: columns (6, V) as in HomesParams, and the home of each, ascending."""
+        self.n_corners = len(home)
+        starts = np.searchsorted(home, np.arange(len(self.geometries) + 1))
+        self.tensors["corners"] = self._tensor(columns, np.float32)
+        self.tensors["corner_starts"] = self._tensor(starts, np.int32)
+        self.corner_homes = self._tensor(home, np.int32)
+
+    def _find_corners(self, walls, home):
+        """Returns the corners where a disc fits and a path may turn around the end of a wall:
+        columns (6, V), home (V,).
+        """
+        ends, owner = walls.reshape(-1, 2), np.repeat(home, 2)
+        order = np.lexsort((*ends.T, owner))
+        ends, owner = ends[order], owner[order]
+        is_new = np.ones(len(ends), bool)
+        is_new[1:] = (ends[1:] != ends[:-1]).any(1) | (owner[1:] != owner[:-1])
+        ends, owner = ends[is_new], owner[is_new]
+
+        inradius = INFLATION * self.radius + 2 * SLACK
+        side = 2 * np.pi / SIDES
+        angles = side * (np.arange(SIDES) + 0.5)
+        normals, next_normals = _directions(angles - side / 2), _directions(angles + side / 2)
+        corners = ends[:, None] + inradius / np.cos(side / 2) * _directions(angles)
+        # along the side before a corner and the one behind it, turned a little to the wall's end
+        ahead = _directions(angles - side / 2 + np.pi / 2 + TURN)
+        back = _directions(angles + side / 2 - np.pi / 2 - TURN)
+        owner = np.repeat(owner, SIDES)
+        fits = np.ones(len(owner), bool)
+        for step in (0.0, STEP * ahead, STEP * back):
+            indices = fits.nonzero()[0]
+            points = (corners + step).reshape(-1, 2)[indices]
+            fits[indices] = self.clearances(points, owner[indices]) >= inradius - SLACK
+        sides = np.broadcast_to(np.concatenate([normals, next_normals], 1), (len(ends), SIDES, 4))
+        columns = np.concatenate([corners, sides], 2).reshape(-1, 6)
+        return columns[fits].T, owner[fits]
+
+    def clearances(self, points, home):
+        """Returns the metres (P,) float32 from points (P, 2) to the nearest wall of their home."""
+        out = torch.empty(len(points), device=self.device)
+        self._launch(
+            "clearances",
+            "ClearancesParams",
+            len(points),
+            points=self._tensor(points, np.float32),
+            home_index=self._tensor(home, np.int32),
+            clearances=out,
+            n_points=len(points),
+        )
+        return out.cpu().numpy()
+
+    def _link(self):
+        """Returns the links between corners that see each other: starts (V + 1,) int32, targets
+        int32, metres float32.
+        """
+        v, device = self.n_corners, self.device
+        counts, tangent = torch.empty((2, v), dtype=torch.int32, device=device)
+        always = dict(corner_homes=self.corner_homes, tangent=tangent)
+        self._launch(
+            "corner_links", "CornerLinksParams", v, **always, starts=0, counts=counts, **_NO_LINKS
+        )
+        ends = counts.cumsum(0, dtype=torch.int32)
+        n_links = int(ends[-1]) if v else 0
+        links = dict(
+            starts=torch.cat([torch.zeros_like(ends[:1]), ends]),
+            targets=torch.empty(n_links, dtype=torch.int32, device=device),
+            metres=torch.empty(n_links, device=device),
+        )
+        self._launch("corner_links", "CornerLinksParams", v, **always, counts=0, **links)
+        return links
+
+    # ---- Shortest paths ----
+
+    def cells(self):
+        """Returns the centres of all cells (P, 2) float32, the number of cells in each home (D,),
+        and an order (P,) of the cells in which those of a square of 8 x 8 come together.
+        """
+        counts = self.shapes.prod(1)
+        home = np.repeat(np.arange(len(counts)), counts)
+        number = np.arange(len(home)) - np.repeat(self._starts(counts)[:-1], counts)
+        rows, columns = np.divmod(number, self.shapes[home, 1])
+        order = np.lexsort((columns, rows, columns // 8, rows // 8, home))
+        return CELL * np.stack([columns, rows], 1).astype(np.float32), counts, order
+
+    def lengths(self, goals, points, counts=None, order=None):
+        """Returns the lengths of the shortest paths to goals (D, G, 2).
+
+        Args:
+            points: (D, K, 2), or all homes' points (P, 2).
+            counts: (D,), number of points in each home, if these are (P, 2).
+            order: (P,) the points' numbers, home by home, neighbours together: it is faster so.
+
+        Returns:
+            (D, G, K) float32, or (P * G,): for each home G rows, one after the other. Infinite
+            where there is no path.
+        """
+        if counts is None:
+            d, k = points.shape[:2]
+            flat = self.lengths(goals, points.reshape(-1, 2), np.full(d, k))
+            return flat.view(d, -1, k)
+        n_goals = goals.shape[1]
+        if n_goals > MAX_GOALS:
+            parts = np.array_split(goals, -(-n_goals // MAX_GOALS), axis=1)
+            by_home = [
+                self.lengths(part, points, counts, order).split((part.shape[1] * counts).tolist())
+                for part in parts
+            ]
+            return torch.cat([rows[d] for d in range(len(counts)) for rows in by_home])
+        goals = self._tensor(goals, np.float32)
+        distances = torch.empty((self.n_corners, MAX_GOALS), device=self.device)
+        self._launch(
+            "corner_distances",
+            "CornerDistancesParams",
+            BLOCK * len(counts),
+            goals=goals,
+            distances=distances,
+            n_goals=n_goals,
+            **self.links,
+        )
+        out = torch.empty(len(points) * n_goals, device=self.device)
+        n_scratch = 10 * self.n_corners if self.device.type == "cpu" else 0
+        self._launch(
+            "path_lengths",
+            "PathLengthsParams",
+            len(points),
+            goals=goals,
+            distances=distances,
+            points=self._tensor(points, np.float32),
+            point_starts=self._tensor(self._starts(counts), np.int32),
+            home_index=self._tensor(np.repeat(np.arange(len(counts)), counts), np.int32),
+            lengths=out,
+            order=self._tensor(np.arange(len(points)) if order is None else order, np.int32),
+            scratch=torch.empty(n_scratch, dtype=torch.int32),
+            n_points=len(points),
+            n_goals=n_goals,
+        )
+        return out
+
+
+def _directions(angles):
+    return np.stack([np.cos(angles), np.sin(angles)], 1)
+
+
+# ---- Goals and spawn points ----
+
+
+def _points(homes, n, generators):
+    """Returns random points (D, n, 2) float32 in the rooms of homes, 5 cm clear of the walls. If
+    fewer fit, they are repeated.
+    """
+    found = [np.empty((0, 2), np.float32)] * len(generators)
+    streams = [candidates(*each) for each in zip(homes.geometries, itertools.repeat(n), generators)]
+    lacking = range(len(found))
+    while len(lacking):
+        batches = {d: batch for d in lacking if (batch := next(streams[d], None)) is not None}
+        if not batches:
+            break
+        drawn = np.stack([batch - homes.origins[d] for d, batch in batches.items()])
+        drawn = drawn.astype(np.float32)
+        home = np.repeat([*batches], n)
+        fits = homes.clearances(drawn.reshape(-1, 2), home) > homes.radius + CLEARANCE
+        for d, points, fitting in zip(batches, drawn, fits.reshape(-1, n)):
+            found[d] = np.concatenate([found[d], points[fitting]])[:n]
+        lacking = [d for d in batches if len(found[d]) < n]
+    for d, points in enumerate(found):
+        if not len(points):
+            raise ValueError(
+                f"geometry {homes.geometries[d].id} has no point in a room that is "
+                f"{homes.radius + CLEARANCE:.2f} m from every wall"
+            )
+    return np.stack([np.resize(points, (n, 2)) for points in found])
+
+
+def _largest_part(homes, points, n_goals, n_spawns):
+    """Returns goals (D, n_goals, 2) and spawn points (D, n_spawns, 2): the first of points (D, K,
+    2) in the connected part of each home that holds most of them.
+    """
+    n_homes, n_points = points.shape[:2]
+    homes_range = np.arange(n_homes)[:, None]
+    largest = np.zeros((n_homes, n_points), bool)
+    unknown = np.ones((n_homes, n_points), bool)  # points in parts that were not measured yet
+    while (unknown.sum(1) > largest.sum(1)).any():
+        probes = np.argsort(~unknown, 1, kind="stable")[:, :MAX_GOALS]
+        lengths = homes.lengths(points[homes_range, probes], points)
+        parts = lengths.isfinite().cpu().numpy()  # (D, probes, K)
+        parts &= unknown[homes_range, probes][:, :, None]
+        best = parts[homes_range[:, 0], parts.sum(2).argmax(1)]
+        larger = best.sum(1) > largest.sum(1)
+        largest[larger] = best[larger]
+        unknown &= ~parts.any(1)
+    order = np.argsort(~largest, 1, kind="stable")
+    counts = largest.sum(1)[:, None]
+    goals = order[homes_range, np.arange(n_goals) % np.minimum(counts, n_goals)]
+    n_left = np.where(counts > n_goals, counts - n_goals, counts)
+    spawns = np.where(counts > n_goals, n_goals, 0) + np.arange(n_spawns) % n_left
+    return points[homes_range, goals], points[homes_range, order[homes_range, spawns]]

@@ -4,26 +4,27 @@ D layouts, S spawn points and G goals per layout.
 """
 
 import io
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from megastep import cache, engine
 from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.geometry import hashed
 from megastep.modules import spawning
-from megastep.workers import parallel_map
 
 PREFIX = "geodesics-"  # of the cached files
 MAX_FILES, MAX_BYTES = 64, 10**9  # of all cached files together
+MIN_PROGRESS = 48  # layouts; fewer take less than a second or two
 #: Sources that the results depend on: a change invalidates the cache.
 SOURCES = (
     Path(__file__),
     Path(__file__).with_name("geodesics.py"),
+    *sorted(Path(__file__).with_name("kernels").iterdir()),
     Path(spawning.__file__),
 )
 N_GOALS = 16  # per layout
@@ -56,7 +57,7 @@ def goal_fields(
         )
     seed, device = core.seed if seed is None else seed, core.device
     geometries = geometries[: len(core.scenery.layouts)]
-    layouts = all_geodesics(geometries, core.agents.radius, seed)
+    layouts = all_geodesics(geometries, core.agents.radius, seed, device)
     mean_bytes = np.mean([layout.fields.nbytes for layout in layouts])
     engine.fit(len(layouts), mean_bytes, device, "layouts")
     spawns, lengths, allowed = zip(
@@ -87,56 +88,70 @@ def _in_range(layout, g, nearest, furthest):
 # ---- The cache ----
 
 
-def _packed(item):
-    """Returns a geometry's geodesics as bytes.
+def all_geodesics(
+    geometries: Sequence[Any], radius: float, seed: int, device: torch.device | str = "cpu"
+) -> list[Geodesics]:
+    """Returns the geodesics of each geometry.
 
-    Fields are stored as differences between neighbours, which compress well.
-    """
-    g, radius, seed, d = item
-    random = np.random.Generator(np.random.Philox([seed, d]))
-    result = geodesics(g, N_SPAWNS, N_GOALS, radius, random)
-    differences = np.diff(result.fields.view(np.uint16), axis=2, prepend=np.uint16(0))
-    file = io.BytesIO()
-    np.savez(file, **result._replace(fields=differences)._asdict())
-    return zlib.compress(file.getvalue(), 1)
-
-
-def _unpacked(body):
-    with np.load(io.BytesIO(zlib.decompress(body))) as arrays:
-        packed = Geodesics(**arrays)
-    cells = np.cumsum(packed.fields, axis=2, dtype=np.uint16)
-    return packed._replace(fields=cells.view(np.float16))
-
-
-def all_geodesics(geometries: Sequence[Any], radius: float, seed: int) -> list[Geodesics]:
-    """Returns the geodesics of each geometry, from the cache if possible.
-
-    Otherwise all CPU cores compute them, with a progress bar if that takes long.
+    A GPU computes them in less time than a file takes to read. A CPU takes some seconds for 512
+    homes: it shows a progress bar and caches them.
 
     Args:
         geometries: floor plans. The same object may occur several times.
         radius: of the agents, in metres.
         seed: of goals and spawn points.
+        device: where to compute. The results do not depend on it.
     """
     distinct = list({id(g): g for g in geometries}.values())
-    key = hashed(distinct)
+    generators = [np.random.Generator(np.random.Philox([seed, d])) for d in range(len(distinct))]
+    found = geodesics(distinct, N_SPAWNS, N_GOALS, radius, generators, device)
+    if torch.device(device).type == "cpu":
+        found = _cached(found, distinct, radius, seed)
+    by_id = dict(zip(map(id, distinct), found, strict=True))
+    return [by_id[id(g)] for g in geometries]
+
+
+def _cached(found, geometries, radius, seed):
+    """Returns the list of what the iterator `found` yields, from the cache if it holds it."""
+    key = hashed(geometries)
     for path in SOURCES:
         key.update(path.read_bytes())
     key.update(repr((np.__version__, radius, seed)).encode())
 
     def build():
-        items = [(g, radius, seed, d) for d, g in enumerate(distinct)]
-        packed = parallel_map(
-            _packed, items, f"Computing the shortest paths in {len(items):,} layouts"
-        )
-        sizes = np.array([len(items), *map(len, packed)], np.int64)
-        cache.prune(PREFIX, MAX_FILES - 1, MAX_BYTES - sum(sizes[1:].tolist()))
-        return b"".join([sizes.tobytes(), *packed])
+        layouts = list(_with_progress(found, len(geometries)))
+        file = io.BytesIO()
+        shapes = np.array([layout.fields.shape for layout in layouts])
+        fields = np.concatenate([layout.fields.ravel() for layout in layouts])
+        rest = {
+            name: np.stack([getattr(layout, name) for layout in layouts])
+            for name in ("origin", "spawns", "goals", "lengths")
+        }
+        np.savez(file, shapes=shapes, fields=fields, **rest)
+        cache.prune(PREFIX, MAX_FILES - 1, MAX_BYTES - file.tell())
+        return file.getbuffer()
 
     body, _ = cache.fetch(f"{PREFIX}{key.hexdigest()[:20]}", build)
-    n = int(np.frombuffer(body, np.int64, 1)[0])
-    ends = 8 * (n + 1) + np.frombuffer(body, np.int64, n + 1)[1:].cumsum()
-    starts = [8 * (n + 1), *ends[:-1]]
-    results = [_unpacked(body[start:end]) for start, end in zip(starts, ends, strict=True)]
-    numbers = {id(g): number for number, g in enumerate(distinct)}
-    return [results[numbers[id(g)]] for g in geometries]
+    with np.load(io.BytesIO(body)) as arrays:
+        parts = dict(arrays)
+    shapes = parts.pop("shapes")
+    ends = shapes.prod(1).cumsum()[:-1]
+    fields = [
+        field.reshape(shape)
+        for field, shape in zip(np.split(parts.pop("fields"), ends), shapes, strict=True)
+    ]
+    return [
+        Geodesics(fields=field, **dict(zip(parts, rest)))
+        for field, *rest in zip(fields, *parts.values(), strict=True)
+    ]
+
+
+def _with_progress(items, total):
+    """Returns an iterator over `items` that shows a progress bar on stderr, if they are many."""
+    if total < MIN_PROGRESS:
+        return items
+    from rich.console import Console
+    from rich.progress import track
+
+    description = f"Computing the shortest paths in {total:,} layouts"
+    return track(items, description, total, console=Console(stderr=True))

@@ -1,7 +1,6 @@
 """One step of PointGoal as one operation. N environments, A agents each, B = N A lanes."""
 
 import math
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -17,12 +16,11 @@ from megastep.engine.launch_params import (
 )
 from megastep.engine.scenery import Scenery
 from megastep.envs.pointgoal.goal_fields import GoalFields
+from megastep.envs.pointgoal.program import PROGRAM
 from megastep.kernels.build.launch import launch
-from megastep.kernels.build.program import Program
 
-__all__ = ["N_PRIVILEGED", "PROGRAM", "PROGRESS_ROWS", "PointGoalStep", "pointgoal_step"]
+__all__ = ["N_PRIVILEGED", "PROGRESS_ROWS", "PointGoalStep", "pointgoal_step"]
 
-PROGRAM = Program(Path(__file__).parent / "kernels")
 PROGRESS_ROWS = PROGRAM.constants["PROGRESS_ROWS"]  # numbers that describe an episode so far
 N_PRIVILEGED = PROGRAM.constants["N_PRIVILEGED"]  # numbers that a critic sees
 

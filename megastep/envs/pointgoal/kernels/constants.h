@@ -12,3 +12,6 @@ constexpr int COLLISIONS = 6;      // since the start
 constexpr int PROGRESS_ROWS = 7;
 
 constexpr int N_PRIVILEGED = 4;  // numbers that a critic sees
+
+constexpr int GROUP = 8;       // walls that share a bounding box in searches for shortest paths
+constexpr int MAX_GOALS = 16;  // per home, in one search

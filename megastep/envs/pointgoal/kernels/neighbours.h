@@ -1,0 +1,67 @@
+// A search for the corners that matter to a group of neighbouring points, on the CPU.
+#pragma once
+#include "shortest_paths.h"
+
+constexpr int N_NEIGHBOURS = 32;  // points in a group
+constexpr float MAX_BOX = 1.5f;   // metres: it does not pay to look for walls that hide more
+
+// A rectangle, as four points.
+struct Box {
+    Point at[4];
+};
+
+HD Box box_around(const Point* points, int n) {
+    float low_x = INF_VALUE, low_y = INF_VALUE, high_x = -INF_VALUE, high_y = -INF_VALUE;
+    for (int i = 0; i < n; i++) {
+        low_x = minf(low_x, points[i].x);
+        low_y = minf(low_y, points[i].y);
+        high_x = maxf(high_x, points[i].x);
+        high_y = maxf(high_y, points[i].y);
+    }
+    return {{{low_x, low_y}, {low_x, high_y}, {high_x, low_y}, {high_x, high_y}}};
+}
+
+// Returns 1 if one wall of a group blocks the lines from p to all corners of a box. It then blocks
+// the line to every point in the box, because the shadow of a convex body is convex.
+HD int group_hides(const HomeWalls& walls, int group, Point p, const Box& box, float least2) {
+    Line lines[4];
+    for (int k = 0; k < 4; k++)
+        lines[k] = line_between(p, box.at[k], least2);
+    int hidden = 0;
+    for (int i = GROUP * group; i < GROUP * group + GROUP; i++)
+        hidden |= blocks(walls, i, lines[0]) & blocks(walls, i, lines[1]) &
+                  blocks(walls, i, lines[2]) & blocks(walls, i, lines[3]);
+    return hidden;
+}
+
+// Returns 1 if one wall hides a whole box from p. `hint` holds the group that did so for a box
+// nearby. Such a wall also blocks the line to the middle of the box.
+HD int is_hidden(const HomeWalls& walls, Point p, const Box& box, float least2, int& hint) {
+    if (hint >= 0 && group_hides(walls, hint, p, box, least2))
+        return 1;
+    Point middle = {0.5f * (box.at[0].x + box.at[3].x), 0.5f * (box.at[0].y + box.at[3].y)};
+    Line line = line_between(p, middle, least2);
+    Bounds bounds = bounds_of(p, middle, SQRT(least2));
+    for (int k = 0; k < walls.n_groups; k++)
+        if (overlaps(walls, k, bounds) && group_blocks(walls, k, line) &&
+            group_hides(walls, k, p, box, least2)) {
+            hint = k;
+            return 1;
+        }
+    return 0;
+}
+
+// Returns 1 if no line from the box to a corner is a tangent of its polygon: if the box lies beyond
+// both sides that meet there, or behind both.
+HD int is_off_tangents(const Corners& corners, int corner, const Box& box) {
+    int beyond = 1, behind = 1;
+    for (int k = 0; k < 4; k++) {
+        float dx = box.at[k].x - corners.x[corner], dy = box.at[k].y - corners.y[corner];
+        float a = dx * corners.normal_x[corner] + dy * corners.normal_y[corner];
+        float b = dx * corners.next_x[corner] + dy * corners.next_y[corner];
+        float slack = maxf(TANGENT_SLACK * (maxf(dx, -dx) + maxf(dy, -dy)), POLYGON_SLACK);
+        beyond &= (a > slack) & (b > slack);
+        behind &= (a < -slack) & (b < -slack);
+    }
+    return beyond | behind;
+}
