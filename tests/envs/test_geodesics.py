@@ -233,8 +233,8 @@ def test_goals_are_in_the_largest_connected_part():
 
 
 def test_fields_do_not_leak_through_walls():
-    """A thin wall across the room, open at one end: on its two sides distances differ by metres, and
-    a body that touches it reads those of its own side.
+    """A thin wall across the room, open at one end: distances on its two sides differ by metres,
+    and a body that touches it reads those of its own side.
     """
     g = room(((1.03, 2.04), (6, 2.04)))
     result = geodesics_of(g, 60, 16)

@@ -331,6 +331,7 @@ def test_errors_name_the_geometry():
     boxes_[18]["masks"] = boxes_[18].masks * 0
     with pytest.raises(ValueError, match="geometry 18 has no room to spawn in"):
         all_of(boxes_)
-    boxes_[18] = room(((0.0, 0.1), (2.0, 0.1)), width=2, height=0.2, id=18)
+    boxes_[18] = room(*[((x, 0), (x, 4)) for x in np.arange(0.2, 2, 0.2)], width=2, id=18)
+    boxes_[18]["masks"] = np.abs(boxes_[18].masks)
     with pytest.raises(ValueError, match="geometry 18 has no point in a room"):
         all_of(boxes_)

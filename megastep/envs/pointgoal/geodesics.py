@@ -80,17 +80,9 @@ def geodesics(
         points = _points(homes, SPARE * (n_spawns + n_goals), generators[chunk])
         goals, spawns = _largest_part(homes, points, n_goals, n_spawns)
         lengths = homes.lengths(goals, spawns).cpu().numpy()
-        cells, counts, order = homes.cells()
-        fields = homes.lengths(goals, cells, counts, order).half().cpu().numpy()
-        fields = np.split(fields, np.cumsum(n_goals * counts)[:-1])
+        fields = homes.fields(goals)
         for d, origin in enumerate(homes.origins):
-            yield Geodesics(
-                origin=origin,
-                fields=fields[d].reshape(n_goals, *homes.shapes[d]),
-                spawns=spawns[d] + origin,
-                goals=goals[d] + origin,
-                lengths=lengths[d].T,
-            )
+            yield Geodesics(origin, fields[d], spawns[d] + origin, goals[d] + origin, lengths[d].T)
 
 
 class _Homes:
@@ -116,8 +108,12 @@ class _Homes:
         self.shapes = np.ceil((high - low) / CELL).astype(int)[:, ::-1] + 2  # (D, 2) rows, columns
         walls -= self.origins[home, None]
         self._group(walls, home, n_walls)
-        self._set_corners(np.zeros((6, 0)), np.zeros(0, int))
-        self._set_corners(*self._find_corners(walls, home))
+        self.tensors["corners"], self.corner_homes = torch.empty((6, 0)), torch.empty(0)
+        self.tensors["corner_starts"] = torch.empty(0)
+        self.tensors["corners"], self.corner_homes = self._find_corners(walls, home)
+        homes = torch.arange(len(n_walls) + 1, dtype=torch.int32, device=device)
+        starts = torch.searchsorted(self.corner_homes, homes)
+        self.tensors["corner_starts"] = starts.int()
         self.links = self._link()
 
     def _group(self, walls, home, n_walls):
@@ -135,15 +131,16 @@ class _Homes:
         boxes = np.concatenate([grouped.min(1), grouped.max(1)], 1)
         self.n_groups = len(boxes)
         self.tensors = dict(
-            walls=self._tensor(walls.reshape(-1, 4).T, np.float32),
-            boxes=self._tensor(boxes.T, np.float32),
-            group_starts=self._tensor(self._starts(n_groups), np.int32),
+            walls=self.tensor(walls.reshape(-1, 4).T, np.float32),
+            boxes=self.tensor(boxes.T, np.float32),
+            group_starts=self.tensor(self._starts(n_groups), np.int32),
         )
 
     def _starts(self, counts):
         return np.concatenate([[0], np.cumsum(counts)])
 
-    def _tensor(self, array, dtype):
+    def tensor(self, array, dtype):
+        """Returns an array on the device."""
         return torch.from_numpy(np.ascontiguousarray(array, dtype)).to(self.device)
 
     def _params(self):
@@ -152,7 +149,7 @@ class _Homes:
         return PROGRAM.params.HomesParams(
             **{name: tensor.data_ptr() for name, tensor in self.tensors.items()},
             n_groups=self.n_groups,
-            n_corners=self.n_corners,
+            n_corners=len(self.corner_homes),
             n_homes=len(self.geometries),
             n_threads=threads(),
             clearance=inradius - SLACK,
@@ -170,17 +167,9 @@ class _Homes:
 
     # ---- The visibility graph ----
 
-    def _set_corners(self, columns, home):
-        """Sets corners: columns (6, V) as in HomesParams, and the home of each, ascending."""
-        self.n_corners = len(home)
-        starts = np.searchsorted(home, np.arange(len(self.geometries) + 1))
-        self.tensors["corners"] = self._tensor(columns, np.float32)
-        self.tensors["corner_starts"] = self._tensor(starts, np.int32)
-        self.corner_homes = self._tensor(home, np.int32)
-
     def _find_corners(self, walls, home):
         """Returns the corners where a disc fits and a path may turn around the end of a wall:
-        columns (6, V), home (V,).
+        columns (6, V) as in HomesParams, and the home of each, (V,) int32, ascending.
         """
         ends, owner = walls.reshape(-1, 2), np.repeat(home, 2)
         order = np.lexsort((*ends.T, owner))
@@ -189,43 +178,44 @@ class _Homes:
         is_new[1:] = (ends[1:] != ends[:-1]).any(1) | (owner[1:] != owner[:-1])
         ends, owner = ends[is_new], owner[is_new]
 
-        inradius = INFLATION * self.radius + 2 * SLACK
-        side = 2 * np.pi / SIDES
+        inradius, side = INFLATION * self.radius + 2 * SLACK, 2 * np.pi / SIDES
         angles = side * (np.arange(SIDES) + 0.5)
-        normals, next_normals = _directions(angles - side / 2), _directions(angles + side / 2)
-        corners = ends[:, None] + inradius / np.cos(side / 2) * _directions(angles)
         # along the side before a corner and the one behind it, turned a little to the wall's end
         ahead = _directions(angles - side / 2 + np.pi / 2 + TURN)
         back = _directions(angles + side / 2 - np.pi / 2 - TURN)
-        owner = np.repeat(owner, SIDES)
-        fits = np.ones(len(owner), bool)
+        ends, owner = self.tensor(ends, np.float64), self.tensor(owner, np.int32)
+        corner, fits = inradius / np.cos(side / 2) * _directions(angles), None
         for step in (0.0, STEP * ahead, STEP * back):
-            indices = fits.nonzero()[0]
-            points = (corners + step).reshape(-1, 2)[indices]
-            fits[indices] = self.clearances(points, owner[indices]) >= inradius - SLACK
-        sides = np.broadcast_to(np.concatenate([normals, next_normals], 1), (len(ends), SIDES, 4))
-        columns = np.concatenate([corners, sides], 2).reshape(-1, 6)
-        return columns[fits].T, owner[fits]
+            points = (ends[:, None] + self.tensor(corner + step, np.float64)).view(-1, 2)
+            candidates = torch.arange(len(points), device=self.device) if fits is None else fits
+            clearances = self.clearances(points[candidates], owner[candidates // SIDES])
+            fits = candidates[clearances >= inradius - SLACK]
+        sides = [_directions(angles - side / 2), _directions(angles + side / 2)]
+        sides = self.tensor(np.concatenate(sides, 1), np.float32)[fits % SIDES]
+        corners = (ends[:, None] + self.tensor(corner, np.float64)).view(-1, 2)[fits]
+        return torch.cat([corners.float(), sides], 1).T.contiguous(), owner[fits // SIDES]
 
     def clearances(self, points, home):
-        """Returns the metres (P,) float32 from points (P, 2) to the nearest wall of their home."""
-        out = torch.empty(len(points), device=self.device)
+        """Returns the metres (P,) float32 from points (P, 2) to the nearest wall of their home, by
+        its number (P,) int32.
+        """
+        clearances = torch.empty(len(points), device=self.device)
         self._launch(
             "clearances",
             "ClearancesParams",
             len(points),
-            points=self._tensor(points, np.float32),
-            home_index=self._tensor(home, np.int32),
-            clearances=out,
+            points=points.float().contiguous(),
+            home_index=home,
+            clearances=clearances,
             n_points=len(points),
         )
-        return out.cpu().numpy()
+        return clearances
 
     def _link(self):
         """Returns the links between corners that see each other: starts (V + 1,) int32, targets
         int32, metres float32.
         """
-        v, device = self.n_corners, self.device
+        v, device = len(self.corner_homes), self.device
         counts, tangent = torch.empty((2, v), dtype=torch.int32, device=device)
         always = dict(corner_homes=self.corner_homes, tangent=tangent)
         self._launch(
@@ -243,43 +233,41 @@ class _Homes:
 
     # ---- Shortest paths ----
 
-    def cells(self):
-        """Returns the centres of all cells (P, 2) float32, the number of cells in each home (D,),
-        and an order (P,) of the cells in which those of a square of 8 x 8 come together.
+    def lengths(self, goals, points):
+        """Returns the lengths of the shortest paths from points (D, K, 2) to goals (D, G, 2), as
+        (D, G, K) float32. Infinite where there is no path.
         """
-        counts = self.shapes.prod(1)
-        home = np.repeat(np.arange(len(counts)), counts)
-        number = np.arange(len(home)) - np.repeat(self._starts(counts)[:-1], counts)
-        rows, columns = np.divmod(number, self.shapes[home, 1])
-        order = np.lexsort((columns, rows, columns // 8, rows // 8, home))
-        return CELL * np.stack([columns, rows], 1).astype(np.float32), counts, order
+        counts = np.full(points.shape[0], points.shape[1])
+        lengths = self._all_lengths(goals, counts, self.tensor(points, np.float32))
+        return lengths.view(len(points), -1, points.shape[1])
 
-    def lengths(self, goals, points, counts=None, order=None):
-        """Returns the lengths of the shortest paths to goals (D, G, 2).
+    def fields(self, goals):
+        """Returns the lengths of the shortest paths from all cells to goals (D, G, 2), as float16
+        (G, H, W) of each home.
+        """
+        shapes = [(goals.shape[1], *shape) for shape in self.shapes.tolist()]
+        lengths = self._all_lengths(goals, self.shapes.prod(1)).half().cpu().numpy()
+        ends = np.prod(shapes, 1).cumsum()[:-1]
+        return [field.reshape(s) for field, s in zip(np.split(lengths, ends), shapes)]
+
+    def _all_lengths(self, goals, counts, points=None):
+        """Returns lengths (P * G,): for each home G rows, one after the other.
 
         Args:
-            points: (D, K, 2), or all homes' points (P, 2).
-            counts: (D,), number of points in each home, if these are (P, 2).
-            order: (P,) the points' numbers, home by home, neighbours together: it is faster so.
-
-        Returns:
-            (D, G, K) float32, or (P * G,): for each home G rows, one after the other. Infinite
-            where there is no path.
+            goals: (D, G, 2).
+            counts: (D,), number of points in each home.
+            points: (P, 2); by default the centres of all cells.
         """
-        if counts is None:
-            d, k = points.shape[:2]
-            flat = self.lengths(goals, points.reshape(-1, 2), np.full(d, k))
-            return flat.view(d, -1, k)
         n_goals = goals.shape[1]
         if n_goals > MAX_GOALS:
             parts = np.array_split(goals, -(-n_goals // MAX_GOALS), axis=1)
             by_home = [
-                self.lengths(part, points, counts, order).split((part.shape[1] * counts).tolist())
+                self._all_lengths(part, counts, points).split((part.shape[1] * counts).tolist())
                 for part in parts
             ]
             return torch.cat([rows[d] for d in range(len(counts)) for rows in by_home])
-        goals = self._tensor(goals, np.float32)
-        distances = torch.empty((self.n_corners, MAX_GOALS), device=self.device)
+        goals = self.tensor(goals, np.float32)
+        distances = torch.empty((len(self.corner_homes), MAX_GOALS), device=self.device)
         self._launch(
             "corner_distances",
             "CornerDistancesParams",
@@ -289,24 +277,25 @@ class _Homes:
             n_goals=n_goals,
             **self.links,
         )
-        out = torch.empty(len(points) * n_goals, device=self.device)
-        n_scratch = 10 * self.n_corners if self.device.type == "cpu" else 0
+        n_points = int(counts.sum())
+        lengths = torch.empty(n_points * n_goals, device=self.device)
+        n_scratch = 11 * len(self.corner_homes) if self.device.type == "cpu" else 0
         self._launch(
             "path_lengths",
             "PathLengthsParams",
-            len(points),
+            n_points,
             goals=goals,
             distances=distances,
-            points=self._tensor(points, np.float32),
-            point_starts=self._tensor(self._starts(counts), np.int32),
-            home_index=self._tensor(np.repeat(np.arange(len(counts)), counts), np.int32),
-            lengths=out,
-            order=self._tensor(np.arange(len(points)) if order is None else order, np.int32),
+            points=0 if points is None else points,
+            widths=self.tensor(self.shapes[:, 1], np.int32),
+            point_starts=self.tensor(self._starts(counts), np.int32),
+            lengths=lengths,
             scratch=torch.empty(n_scratch, dtype=torch.int32),
-            n_points=len(points),
+            cell=CELL,
+            n_points=n_points,
             n_goals=n_goals,
         )
-        return out
+        return lengths
 
 
 def _directions(angles):
@@ -329,9 +318,10 @@ def _points(homes, n, generators):
             break
         drawn = np.stack([batch - homes.origins[d] for d, batch in batches.items()])
         drawn = drawn.astype(np.float32)
-        home = np.repeat([*batches], n)
-        fits = homes.clearances(drawn.reshape(-1, 2), home) > homes.radius + CLEARANCE
-        for d, points, fitting in zip(batches, drawn, fits.reshape(-1, n)):
+        home = homes.tensor(np.repeat([*batches], n), np.int32)
+        clearances = homes.clearances(homes.tensor(drawn.reshape(-1, 2), np.float32), home)
+        fits = (clearances > homes.radius + CLEARANCE).cpu().numpy().reshape(-1, n)
+        for d, points, fitting in zip(batches, drawn, fits):
             found[d] = np.concatenate([found[d], points[fitting]])[:n]
         lacking = [d for d in batches if len(found[d]) < n]
     for d, points in enumerate(found):

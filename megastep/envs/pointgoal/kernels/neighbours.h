@@ -2,8 +2,8 @@
 #pragma once
 #include "shortest_paths.h"
 
-constexpr int N_NEIGHBOURS = 32;  // points in a group
-constexpr float MAX_BOX = 1.5f;   // metres: it does not pay to look for walls that hide more
+constexpr int ROWS = 4, COLUMNS = 8;  // of cells in a group
+constexpr float MAX_BOX = 1.5f;       // metres: it does not pay to look for walls that hide more
 
 // A rectangle, as four points.
 struct Box {
@@ -21,33 +21,33 @@ HD Box box_around(const Point* points, int n) {
     return {{{low_x, low_y}, {low_x, high_y}, {high_x, low_y}, {high_x, high_y}}};
 }
 
-// Returns 1 if one wall of a group blocks the lines from p to all corners of a box. It then blocks
-// the line to every point in the box, because the shadow of a convex body is convex.
-HD int group_hides(const HomeWalls& walls, int group, Point p, const Box& box, float least2) {
-    Line lines[4];
-    for (int k = 0; k < 4; k++)
-        lines[k] = line_between(p, box.at[k], least2);
-    int hidden = 0;
-    for (int i = GROUP * group; i < GROUP * group + GROUP; i++)
-        hidden |= blocks(walls, i, lines[0]) & blocks(walls, i, lines[1]) &
-                  blocks(walls, i, lines[2]) & blocks(walls, i, lines[3]);
-    return hidden;
+// Returns 1 if wall i blocks the lines from p to all corners of a box. It then blocks the line to
+// every point in the box, because the shadow of a convex body is convex.
+HD int hides(const HomeWalls& walls, int i, const Line* to_corners) {
+    return blocks(walls, i, to_corners[0]) & blocks(walls, i, to_corners[1]) &
+           blocks(walls, i, to_corners[2]) & blocks(walls, i, to_corners[3]);
 }
 
-// Returns 1 if one wall hides a whole box from p. `hint` holds the group that did so for a box
+// Returns 1 if one wall hides a whole box from p. `hint` holds the wall that did so for a box
 // nearby. Such a wall also blocks the line to the middle of the box.
 HD int is_hidden(const HomeWalls& walls, Point p, const Box& box, float least2, int& hint) {
-    if (hint >= 0 && group_hides(walls, hint, p, box, least2))
+    Line to_corners[4];
+    for (int k = 0; k < 4; k++)
+        to_corners[k] = line_between(p, box.at[k], least2);
+    if (hint >= 0 && hides(walls, hint, to_corners))
         return 1;
     Point middle = {0.5f * (box.at[0].x + box.at[3].x), 0.5f * (box.at[0].y + box.at[3].y)};
     Line line = line_between(p, middle, least2);
     Bounds bounds = bounds_of(p, middle, SQRT(least2));
-    for (int k = 0; k < walls.n_groups; k++)
-        if (overlaps(walls, k, bounds) && group_blocks(walls, k, line) &&
-            group_hides(walls, k, p, box, least2)) {
-            hint = k;
-            return 1;
-        }
+    for (int k = 0; k < walls.n_groups; k++) {
+        if (!overlaps(walls, k, bounds) || !group_blocks(walls, k, line))
+            continue;
+        for (int i = GROUP * k; i < GROUP * k + GROUP; i++)
+            if (hides(walls, i, to_corners)) {
+                hint = i;
+                return 1;
+            }
+    }
     return 0;
 }
 

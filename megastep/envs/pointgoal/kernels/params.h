@@ -90,12 +90,12 @@ struct PathLengthsParams {
     HomesParams homes;
     const float* goals;       // (D, G, 2)
     const float* distances;   // (V, MAX_GOALS)
-    const float* points;      // (P, 2), those of one home after the other
+    const float* points;      // (P, 2), those of one home after the other; null: cells of grids
+    const int* widths;        // (D) columns of each home's grid, or 1
     const int* point_starts;  // (D + 1) first point of each home
-    const int* home_index;    // (P)
     float* lengths;           // out: per home (G, points of the home): metres to each goal
-    const int* order;         // (P) points in an order in which neighbours come together
-    int* scratch;             // (10, V) on the CPU
+    int* scratch;             // (11, V) on the CPU
+    float cell;               // metres between neighbouring cells
     int n_points;             // P
     int n_goals;              // G
 };

@@ -1,108 +1,136 @@
 // A loop over homes, and in each over groups of neighbouring points. Their paths have much in
-// common: corners that none of them sees are left out for all, the corners that the last point's
-// paths took are tried first, and of each line the walls that blocked it last.
+// common: corners and goals that none of them sees are left out for all, the corners that the last
+// point's paths took are tried first, and of each line the walls that blocked it last.
 #include "neighbours.h"
 
-// Copies of those corners of a home that matter to a group of points, in the scratch memory.
-struct Nearby {
+// The search in one home. Arrays begin with the home's first corner.
+struct Search {
+    const PathLengthsParams& p;
+    int home, first, n_corners;
+    HomeWalls walls;
+    Corners corners;
+    float least2;
+    int *hints, *box_hints;  // per corner: the walls that hid the last point and the last group
+    int goal_hints[MAX_GOALS], box_goal_hints[MAX_GOALS];
+    int last[MAX_GOALS];  // the corners that the last point's paths took
+    // copies of the corners that matter to a group of points
     float* rows[6];
-    int *index, *tangent;
-    int n;
+    int *nearby, *tangent;
+    int n_nearby;
     int goals[MAX_GOALS], n_goals;
-};
+    int* leads;  // per corner: 1 if some goal can be reached from there
 
-static void find_nearby(const PathLengthsParams& p, int home, const HomeWalls& walls,
-                        const Box& box, int* hints, int* goal_hints, Nearby& nearby) {
-    Corners corners = corners_of(p.homes);
-    int first = p.homes.corner_starts[home], end = p.homes.corner_starts[home + 1];
-    float least2 = p.homes.clearance * p.homes.clearance;
-    int* off = nearby.tangent;  // no longer needed by the group before
-    int is_small = maxf(box.at[3].x - box.at[0].x, box.at[3].y - box.at[0].y) < MAX_BOX;
-#pragma omp simd
-    for (int corner = first; corner < end; corner++)
-        off[corner - first] = is_off_tangents(corners, corner, box);
-    nearby.n = 0;
-    for (int corner = first; corner < end; corner++) {
-        if (off[corner - first] ||
-            (is_small && is_hidden(walls, corner_at(corners, corner), box, least2, hints[corner])))
-            continue;
+    Search(const PathLengthsParams& p, int home)
+        : p(p),
+          home(home),
+          first(p.homes.corner_starts[home]),
+          n_corners(p.homes.corner_starts[home + 1] - first),
+          walls(walls_of(p.homes, home)),
+          corners(corners_of(p.homes)),
+          least2(p.homes.clearance * p.homes.clearance) {
+        int* scratch = p.scratch + first;
+        long long n = p.homes.n_corners;
+        hints = scratch;
+        box_hints = scratch + n;
         for (int row = 0; row < 6; row++)
-            nearby.rows[row][nearby.n] = corners.x[(long long)row * p.homes.n_corners + corner];
-        nearby.index[nearby.n++] = corner;
+            rows[row] = (float*)(scratch + (2 + row) * n);
+        nearby = scratch + 8 * n;
+        tangent = scratch + 9 * n;
+        leads = scratch + 10 * n;
+        for (int i = 0; i < n_corners; i++) {
+            hints[i] = box_hints[i] = -1;
+            leads[i] = 0;
+            for (int goal = 0; goal < p.n_goals; goal++)
+                leads[i] |= is_finite(p.distances[(long long)MAX_GOALS * (first + i) + goal]);
+        }
+        for (int goal = 0; goal < MAX_GOALS; goal++)
+            goal_hints[goal] = box_goal_hints[goal] = last[goal] = -1;
     }
-    nearby.n_goals = 0;
-    for (int goal = 0; goal < p.n_goals; goal++)
-        if (!is_small || !is_hidden(walls, point_at(p.goals, (long long)home * p.n_goals + goal),
-                                    box, least2, goal_hints[goal]))
-            nearby.goals[nearby.n_goals++] = goal;
-}
 
-static void find_tangents(const Nearby& nearby, Point q) {
-    float* const* r = nearby.rows;
-    Corners corners = {r[0], r[1], r[2], r[3], r[4], r[5]};
-    int* tangent = nearby.tangent;
-    int n = nearby.n;
+    // Finds the corners and goals that some point in the box may see.
+    void find_nearby(const Box& box) {
+        int is_small = maxf(box.at[3].x - box.at[0].x, box.at[3].y - box.at[0].y) < MAX_BOX;
+        int* off = tangent;  // no longer needed by the group before
 #pragma omp simd
-    for (int i = 0; i < n; i++)
-        tangent[i] = is_tangent(corners, i, q);
-}
+        for (int i = 0; i < n_corners; i++)
+            off[i] = is_off_tangents(corners, first + i, box) | !leads[i];
+        n_nearby = n_goals = 0;
+        for (int i = 0; i < n_corners; i++) {
+            if (off[i] || (is_small && is_hidden(walls, corner_at(corners, first + i), box, least2,
+                                                 box_hints[i])))
+                continue;
+            for (int row = 0; row < 6; row++)
+                rows[row][n_nearby] = corners.x[(long long)row * p.homes.n_corners + first + i];
+            nearby[n_nearby++] = first + i;
+        }
+        for (int goal = 0; goal < p.n_goals; goal++)
+            if (!is_small ||
+                !is_hidden(walls, goal_at(p, home, goal), box, least2, box_goal_hints[goal]))
+                goals[n_goals++] = goal;
+    }
 
-static void home_lengths(const PathLengthsParams& p, int home) {
-    const HomesParams& homes = p.homes;
-    HomeWalls walls = walls_of(homes, home);
-    int first_corner = homes.corner_starts[home], end_corner = homes.corner_starts[home + 1];
-    long long n = homes.n_corners;
-    int *hints = p.scratch, *box_hints = p.scratch + n;
-    for (int corner = first_corner; corner < end_corner; corner++)
-        hints[corner] = box_hints[corner] = -1;
-    int goal_hints[MAX_GOALS], box_goal_hints[MAX_GOALS], last[MAX_GOALS];
-    for (int goal = 0; goal < MAX_GOALS; goal++)
-        goal_hints[goal] = box_goal_hints[goal] = last[goal] = -1;
-    Nearby nearby;
-    int* scratch = p.scratch + first_corner;
-    for (int row = 0; row < 6; row++)
-        nearby.rows[row] = (float*)(scratch + (2 + row) * n);
-    nearby.index = scratch + 8 * n;
-    nearby.tangent = scratch + 9 * n;
+    void try_nearby(int corner, Paths& paths) {
+        try_corner(p, walls, corner, paths, hints + corner - first);
+    }
 
-    int end = p.point_starts[home + 1];
-    for (int first = p.point_starts[home]; first < end; first += N_NEIGHBOURS) {
-        int fits[N_NEIGHBOURS], n_points = mini(N_NEIGHBOURS, end - first), n_fitting = 0;
-        Point from[N_NEIGHBOURS], fitting[N_NEIGHBOURS];
-        for (int k = 0; k < n_points; k++) {
-            from[k] = point_at(p.points, p.order[first + k]);
-            fits[k] = reachable_point(homes, walls, from[k]);
+    void find_paths(Paths& paths) {
+        clear_paths(paths);
+        for (int i = 0; i < n_goals; i++)
+            try_straight(p, home, walls, goals[i], paths, goal_hints + goals[i]);
+        for (int goal = 0; goal < p.n_goals; goal++)
+            if (last[goal] >= 0 && (!goal || last[goal] != last[goal - 1]) &&
+                is_tangent(corners, last[goal], paths.from))
+                try_nearby(last[goal], paths);
+        Corners copies = {rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]};
+        Point from = paths.from;
+        int n = n_nearby, *is_one = tangent;
+#pragma omp simd
+        for (int i = 0; i < n; i++)
+            is_one[i] = is_tangent(copies, i, from);
+        for (int i = 0; i < n; i++)
+            if (is_one[i])
+                try_nearby(nearby[i], paths);
+        for (int goal = 0; goal < MAX_GOALS; goal++)
+            last[goal] = paths.corner[goal];
+    }
+
+    // Writes the lengths of n points.
+    void group_lengths(const int* points, int n) {
+        int fits[ROWS * COLUMNS], n_fitting = 0;
+        Point from[ROWS * COLUMNS], fitting[ROWS * COLUMNS];
+        for (int k = 0; k < n; k++) {
+            from[k] = nth_point(p, home, points[k]);
+            fits[k] = reachable_point(p.homes, walls, from[k]);
             if (fits[k])
                 fitting[n_fitting++] = from[k];
         }
         if (n_fitting)
-            find_nearby(p, home, walls, box_around(fitting, n_fitting), box_hints, box_goal_hints,
-                        nearby);
-        for (int k = 0; k < n_points; k++) {
-            int i = p.order[first + k];
+            find_nearby(box_around(fitting, n_fitting));
+        for (int k = 0; k < n; k++) {
             Paths paths;
-            paths.at = point_at(p.points, i);
+            paths.at = nth_point(p, home, points[k]);
             paths.from = from[k];
-            if (fits[k]) {
-                clear_paths(paths);
-                for (int j = 0; j < nearby.n_goals; j++)
-                    try_straight(p, home, walls, nearby.goals[j], paths,
-                                 goal_hints + nearby.goals[j]);
-                Corners corners = corners_of(homes);
-                for (int goal = 0; goal < p.n_goals; goal++)
-                    if (last[goal] >= 0 && (!goal || last[goal] != last[goal - 1]) &&
-                        is_tangent(corners, last[goal], paths.from))
-                        try_corner(p, walls, last[goal], paths, hints + last[goal]);
-                find_tangents(nearby, paths.from);
-                for (int j = 0; j < nearby.n; j++)
-                    if (nearby.tangent[j])
-                        try_corner(p, walls, nearby.index[j], paths, hints + nearby.index[j]);
-                for (int goal = 0; goal < MAX_GOALS; goal++)
-                    last[goal] = paths.corner[goal];
-            }
-            write_lengths(p, home, i, paths, fits[k]);
+            if (fits[k])
+                find_paths(paths);
+            write_lengths(p, home, points[k], paths, fits[k]);
         }
     }
+};
+
+static void home_lengths(const PathLengthsParams& p, int home) {
+    Search search(p, home);
+    // rectangles of cells; of points that form no grid, as many in a row
+    int first = p.point_starts[home], n = p.point_starts[home + 1] - first;
+    int width = p.points ? n : p.widths[home];
+    int rows = p.points ? 1 : ROWS, columns = ROWS * COLUMNS / rows;
+    for (int row = 0; row * width < n; row += rows)
+        for (int column = 0; column < width; column += columns) {
+            int points[ROWS * COLUMNS], n_points = 0;
+            for (int r = row; r < row + rows && r * width < n; r++)
+                for (int c = column; c < mini(column + columns, width); c++)
+                    points[n_points++] = first + r * width + c;
+            search.group_lengths(points, n_points);
+        }
 }
 
 KERNEL path_lengths(const PathLengthsParams& p) {

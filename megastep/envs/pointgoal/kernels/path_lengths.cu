@@ -2,14 +2,14 @@
 #include "shortest_paths.h"
 
 KERNEL path_lengths(PathLengthsParams p) {
-    int thread = blockIdx.x * blockDim.x + threadIdx.x;
-    if (thread >= p.n_points)
+    int i = blockIdx.x * blockDim.x + threadIdx.x;
+    if (i >= p.n_points)
         return;
-    int i = p.order[thread], home = p.home_index[i];
+    int home = home_of(p, i);
     HomeWalls walls = walls_of(p.homes, home);
     Corners corners = corners_of(p.homes);
     Paths paths;
-    paths.at = paths.from = point_at(p.points, i);
+    paths.at = paths.from = nth_point(p, home, i);
     int fits = reachable_point(p.homes, walls, paths.from);
     if (fits) {
         clear_paths(paths);

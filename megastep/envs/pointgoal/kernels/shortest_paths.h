@@ -207,6 +207,27 @@ HD float straight_to_goal(const CornerDistancesParams& p, int home, int corner, 
 
 // ---- Points ----
 
+// The home of point i.
+HD int home_of(const PathLengthsParams& p, int i) {
+    int low = 0, high = p.homes.n_homes;
+    while (high - low > 1) {
+        int middle = (low + high) / 2;
+        if (p.point_starts[middle] <= i)
+            low = middle;
+        else
+            high = middle;
+    }
+    return low;
+}
+
+// Point i, of a home: one that is given, or the centre of a cell, row by row.
+HD Point nth_point(const PathLengthsParams& p, int home, int i) {
+    if (p.points)
+        return point_at(p.points, i);
+    int number = i - p.point_starts[home], row = number / p.widths[home];
+    return {p.cell * (float)(number - row * p.widths[home]), p.cell * (float)row};
+}
+
 // Moves a point that is too close to walls away from them, to where a disc fits. Returns 0 if there
 // is no such place nearby.
 //
@@ -234,6 +255,10 @@ HD int reachable_point(const HomesParams& p, const HomeWalls& walls, Point& q) {
     return nearest >= least2 && is_clear(walls, from, q, 0.f, nullptr);
 }
 
+HD Point goal_at(const PathLengthsParams& p, int home, int goal) {
+    return point_at(p.goals, (long long)home * p.n_goals + goal);
+}
+
 // The shortest paths from a point to the goals of its home, as far as they are known.
 struct Paths {
     Point at, from;             // the point, and the nearest one where a disc fits
@@ -252,7 +277,7 @@ HD void clear_paths(Paths& paths) {
 // Goes from the point to a goal in a straight line, if that is possible.
 HD void try_straight(const PathLengthsParams& p, int home, const HomeWalls& walls, int goal,
                      Paths& paths, int* hint) {
-    Point end = point_at(p.goals, (long long)home * p.n_goals + goal);
+    Point end = goal_at(p, home, goal);
     if (is_clear(walls, paths.from, end, p.homes.clearance * p.homes.clearance, hint)) {
         paths.shortest[goal] = distance_between(paths.from, end);
         paths.length[goal] = distance_between(paths.at, end);
