@@ -9,7 +9,7 @@ import pytest
 import torch
 from test_geodesics import room
 
-from megastep import core, engine, modules, scene, toys
+from megastep import core, engine, geometry, modules, scene, toys
 from megastep.envs.pointgoal import goals as module
 from megastep.envs.pointgoal.geodesics import geodesics
 from megastep.envs.pointgoal.goal_fields import GoalFields
@@ -332,6 +332,8 @@ def test_errors_name_the_geometry():
     with pytest.raises(ValueError, match="geometry 18 has no room to spawn in"):
         all_of(boxes_)
     boxes_[18] = room(*[((x, 0), (x, 4)) for x in np.arange(0.2, 2, 0.2)], width=2, id=18)
-    boxes_[18]["masks"] = np.abs(boxes_[18].masks)
+    (i, j), masks = geometry.indices((2.0, 3.0), boxes_[18].masks.shape), boxes_[18].masks * 0
+    masks[i, j] = 1
+    boxes_[18]["masks"] = masks
     with pytest.raises(ValueError, match="geometry 18 has no point in a room"):
         all_of(boxes_)

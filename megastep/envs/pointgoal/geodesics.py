@@ -24,11 +24,13 @@ from megastep.modules.spawning import CLEARANCE, candidates
 __all__ = ["CELL", "Geodesics", "geodesics"]
 
 CELL = 0.1  # metres, of fields
-SPARE = 2  # times as many points are drawn as needed, as some may be in rooms without a door
+SPARE = 1.5  # times as many points are drawn as needed, as some may be in rooms without a door
 SIDES = 16  # of the polygon around the end of a wall
 INFLATION = 1.001  # of the radius, as in physics
 SLACK = 5e-5  # metres between a path and the clearance that is tested, for rounding
-MAX_GOALS, GROUP = PROGRAM.constants["MAX_GOALS"], PROGRAM.constants["GROUP"]
+MAX_GOALS, GROUP, N_SCRATCH = (
+    PROGRAM.constants[name] for name in ("MAX_GOALS", "GROUP", "N_SCRATCH")
+)
 GROUP_SIDE = 1.5  # metres: walls with their middles in one square are neighbours
 STEP = 5e-3  # metres from a corner where it is tested if a path can turn there
 TURN = 0.026  # radians of that turn
@@ -77,7 +79,7 @@ def geodesics(
     for first in range(0, len(geometries), step):
         chunk = slice(first, first + step)
         homes = _Homes(geometries[chunk], radius, device)
-        points = _points(homes, SPARE * (n_spawns + n_goals), generators[chunk])
+        points = _points(homes, int(SPARE * (n_spawns + n_goals)), generators[chunk])
         goals, spawns = _largest_part(homes, points, n_goals, n_spawns)
         lengths = homes.lengths(goals, spawns).cpu().numpy()
         fields = homes.fields(goals)
@@ -132,7 +134,8 @@ class _Homes:
         self.n_groups = len(boxes)
         self.tensors = dict(
             walls=self.tensor(walls.reshape(-1, 4).T, np.float32),
-            boxes=self.tensor(boxes.T, np.float32),
+            # groups are looked at GROUP at once, so some beyond the last one are read
+            boxes=self.tensor(np.append(boxes.T, np.zeros(GROUP)), np.float32),
             group_starts=self.tensor(self._starts(n_groups), np.int32),
         )
 
@@ -188,16 +191,16 @@ class _Homes:
         for step in (0.0, STEP * ahead, STEP * back):
             points = (ends[:, None] + self.tensor(corner + step, np.float64)).view(-1, 2)
             candidates = torch.arange(len(points), device=self.device) if fits is None else fits
-            clearances = self.clearances(points[candidates], owner[candidates // SIDES])
+            clearances = self.clearances(points[candidates], owner[candidates // SIDES], inradius)
             fits = candidates[clearances >= inradius - SLACK]
         sides = [_directions(angles - side / 2), _directions(angles + side / 2)]
         sides = self.tensor(np.concatenate(sides, 1), np.float32)[fits % SIDES]
         corners = (ends[:, None] + self.tensor(corner, np.float64)).view(-1, 2)[fits]
         return torch.cat([corners.float(), sides], 1).T.contiguous(), owner[fits // SIDES]
 
-    def clearances(self, points, home):
+    def clearances(self, points, home, most):
         """Returns the metres (P,) float32 from points (P, 2) to the nearest wall of their home, by
-        its number (P,) int32.
+        its number (P,) int32; at most `most`.
         """
         clearances = torch.empty(len(points), device=self.device)
         self._launch(
@@ -207,6 +210,7 @@ class _Homes:
             points=points.float().contiguous(),
             home_index=home,
             clearances=clearances,
+            most=most,
             n_points=len(points),
         )
         return clearances
@@ -279,7 +283,7 @@ class _Homes:
         )
         n_points = int(counts.sum())
         lengths = torch.empty(n_points * n_goals, device=self.device)
-        n_scratch = 11 * len(self.corner_homes) if self.device.type == "cpu" else 0
+        n_scratch = N_SCRATCH * len(self.corner_homes) if self.device.type == "cpu" else 0
         self._launch(
             "path_lengths",
             "PathLengthsParams",
@@ -319,7 +323,7 @@ def _points(homes, n, generators):
         drawn = np.stack([batch - homes.origins[d] for d, batch in batches.items()])
         drawn = drawn.astype(np.float32)
         home = homes.tensor(np.repeat([*batches], n), np.int32)
-        clearances = homes.clearances(homes.tensor(drawn.reshape(-1, 2), np.float32), home)
+        clearances = homes.clearances(homes.tensor(drawn.reshape(-1, 2), np.float32), home, 1.0)
         fits = (clearances > homes.radius + CLEARANCE).cpu().numpy().reshape(-1, n)
         for d, points, fitting in zip(batches, drawn, fits):
             found[d] = np.concatenate([found[d], points[fitting]])[:n]

@@ -2,7 +2,7 @@
 #pragma once
 #include "shortest_paths.h"
 
-constexpr int ROWS = 4, COLUMNS = 8;  // of cells in a group
+constexpr int ROWS = 8, COLUMNS = 8;  // of cells in a group
 constexpr float MAX_BOX = 1.5f;       // metres: it does not pay to look for walls that hide more
 
 // A rectangle, as four points.
@@ -38,17 +38,16 @@ HD int is_hidden(const HomeWalls& walls, Point p, const Box& box, float least2, 
         return 1;
     Point middle = {0.5f * (box.at[0].x + box.at[3].x), 0.5f * (box.at[0].y + box.at[3].y)};
     Line line = line_between(p, middle, least2);
-    Bounds bounds = bounds_of(p, middle, SQRT(least2));
-    for (int k = 0; k < walls.n_groups; k++) {
-        if (!overlaps(walls, k, bounds) || !group_blocks(walls, k, line))
-            continue;
+    return any_group(walls, bounds_of(p, middle, SQRT(least2)), [&](int k) {
+        if (!group_blocks(walls, k, line))
+            return 0;
+        int hidden = 0;
         for (int i = GROUP * k; i < GROUP * k + GROUP; i++)
-            if (hides(walls, i, to_corners)) {
-                hint = i;
-                return 1;
-            }
-    }
-    return 0;
+            hidden |= hides(walls, i, to_corners);
+        for (int i = GROUP * k; hidden && i < GROUP * k + GROUP; i++)
+            hint = hides(walls, i, to_corners) ? i : hint;
+        return hidden;
+    });
 }
 
 // Returns 1 if no line from the box to a corner is a tangent of its polygon: if the box lies beyond

@@ -63,6 +63,7 @@ struct ClearancesParams {
     const float* points;    // (P, 2)
     const int* home_index;  // (P) the home that each point is in
     float* clearances;      // (P) out: metres to the nearest wall
+    float most;             // metres: no clearance is more
     int n_points;
 };
 
@@ -94,7 +95,7 @@ struct PathLengthsParams {
     const int* widths;        // (D) columns of each home's grid, or 1
     const int* point_starts;  // (D + 1) first point of each home
     float* lengths;           // out: per home (G, points of the home): metres to each goal
-    int* scratch;             // (11, V) on the CPU
+    int* scratch;             // (N_SCRATCH, V) on the CPU
     float cell;               // metres between neighbouring cells
     int n_points;             // P
     int n_goals;              // G

@@ -11,14 +11,13 @@ struct Search {
     Corners corners;
     float least2;
     int *hints, *box_hints;  // per corner: the walls that hid the last point and the last group
+    int* leads;              // per corner: 1 if some goal can be reached from there
     int goal_hints[MAX_GOALS], box_goal_hints[MAX_GOALS];
     int last[MAX_GOALS];  // the corners that the last point's paths took
-    // copies of the corners that matter to a group of points
-    float* rows[6];
-    int *nearby, *tangent;
-    int n_nearby;
+    // of the corners that matter to a group of points: copies, the walls of their hints, numbers
+    float *rows[6], *hint_walls[4];
+    int *nearby, n_nearby, *is_open;
     int goals[MAX_GOALS], n_goals;
-    int* leads;  // per corner: 1 if some goal can be reached from there
 
     Search(const PathLengthsParams& p, int home)
         : p(p),
@@ -28,15 +27,18 @@ struct Search {
           walls(walls_of(p.homes, home)),
           corners(corners_of(p.homes)),
           least2(p.homes.clearance * p.homes.clearance) {
-        int* scratch = p.scratch + first;
-        long long n = p.homes.n_corners;
-        hints = scratch;
-        box_hints = scratch + n;
+        int* scratch[N_SCRATCH];
+        for (int row = 0; row < N_SCRATCH; row++)
+            scratch[row] = p.scratch + first + (long long)row * p.homes.n_corners;
+        hints = scratch[0];
+        box_hints = scratch[1];
+        leads = scratch[2];
+        nearby = scratch[3];
+        is_open = scratch[4];
         for (int row = 0; row < 6; row++)
-            rows[row] = (float*)(scratch + (2 + row) * n);
-        nearby = scratch + 8 * n;
-        tangent = scratch + 9 * n;
-        leads = scratch + 10 * n;
+            rows[row] = (float*)scratch[5 + row];
+        for (int row = 0; row < 4; row++)
+            hint_walls[row] = (float*)scratch[11 + row];
         for (int i = 0; i < n_corners; i++) {
             hints[i] = box_hints[i] = -1;
             leads[i] = 0;
@@ -47,10 +49,18 @@ struct Search {
             goal_hints[goal] = box_goal_hints[goal] = last[goal] = -1;
     }
 
+    // Copies the wall that hid corner nearby[i]; if none did, one that is far away.
+    void copy_hint(int i) {
+        int hint = hints[nearby[i] - first];
+        const float* from[4] = {walls.ax, walls.ay, walls.bx, walls.by};
+        for (int row = 0; row < 4; row++)
+            hint_walls[row][i] = hint < 0 ? 1e9f : from[row][hint];
+    }
+
     // Finds the corners and goals that some point in the box may see.
     void find_nearby(const Box& box) {
         int is_small = maxf(box.at[3].x - box.at[0].x, box.at[3].y - box.at[0].y) < MAX_BOX;
-        int* off = tangent;  // no longer needed by the group before
+        int* off = is_open;  // no longer needed by the group before
 #pragma omp simd
         for (int i = 0; i < n_corners; i++)
             off[i] = is_off_tangents(corners, first + i, box) | !leads[i];
@@ -61,7 +71,8 @@ struct Search {
                 continue;
             for (int row = 0; row < 6; row++)
                 rows[row][n_nearby] = corners.x[(long long)row * p.homes.n_corners + first + i];
-            nearby[n_nearby++] = first + i;
+            nearby[n_nearby] = first + i;
+            copy_hint(n_nearby++);
         }
         for (int goal = 0; goal < p.n_goals; goal++)
             if (!is_small ||
@@ -69,7 +80,7 @@ struct Search {
                 goals[n_goals++] = goal;
     }
 
-    void try_nearby(int corner, Paths& paths) {
+    void try_hinted(int corner, Paths& paths) {
         try_corner(p, walls, corner, paths, hints + corner - first);
     }
 
@@ -80,16 +91,26 @@ struct Search {
         for (int goal = 0; goal < p.n_goals; goal++)
             if (last[goal] >= 0 && (!goal || last[goal] != last[goal - 1]) &&
                 is_tangent(corners, last[goal], paths.from))
-                try_nearby(last[goal], paths);
+                try_hinted(last[goal], paths);
         Corners copies = {rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]};
+        const float *ax = hint_walls[0], *ay = hint_walls[1], *bx = hint_walls[2],
+                    *by = hint_walls[3];
         Point from = paths.from;
-        int n = n_nearby, *is_one = tangent;
+        int n = n_nearby, *open = is_open;
+        float least = least2;
 #pragma omp simd
-        for (int i = 0; i < n; i++)
-            is_one[i] = is_tangent(copies, i, from);
-        for (int i = 0; i < n; i++)
-            if (is_one[i])
-                try_nearby(nearby[i], paths);
+        for (int i = 0; i < n; i++) {
+            Line line = line_between(from, corner_at(copies, i), least);
+            open[i] = is_tangent(copies, i, from) & !wall_blocks(ax[i], ay[i], bx[i], by[i], line);
+        }
+        for (int i = 0; i < n; i++) {
+            if (!open[i])
+                continue;
+            int hint = hints[nearby[i] - first];
+            try_hinted(nearby[i], paths);
+            if (hints[nearby[i] - first] != hint)
+                copy_hint(i);
+        }
         for (int goal = 0; goal < MAX_GOALS; goal++)
             last[goal] = paths.corner[goal];
     }

@@ -56,20 +56,50 @@ HD float squared_distance(const HomeWalls& walls, int i, Point q, float& x, floa
     return x * x + y * y;
 }
 
+struct Bounds {
+    float low_x, low_y, high_x, high_y;
+};
+
+HD Bounds bounds_of(Point p, Point q, float margin) {
+    return {minf(p.x, q.x) - margin, minf(p.y, q.y) - margin, maxf(p.x, q.x) + margin,
+            maxf(p.y, q.y) + margin};
+}
+
+// Calls visit(group) for each group of walls whose bounding box overlaps `bounds`, until one call
+// returns 1. Returns that, or 0.
+template <class Visit>
+HD int any_group(const HomeWalls& walls, const Bounds& bounds, Visit visit) {
+    for (int first = 0; first < walls.n_groups; first += GROUP) {
+        unsigned int overlapping = 0;
+#pragma omp simd reduction(| : overlapping)
+        for (int k = 0; k < GROUP; k++) {
+            int overlaps = (walls.low_x[first + k] <= bounds.high_x) &
+                           (walls.high_x[first + k] >= bounds.low_x) &
+                           (walls.low_y[first + k] <= bounds.high_y) &
+                           (walls.high_y[first + k] >= bounds.low_y);
+            overlapping |= (unsigned int)overlaps << k;
+        }
+        int n_left = walls.n_groups - first;
+        if (n_left < GROUP)
+            overlapping &= (1u << n_left) - 1u;
+        for (; overlapping; overlapping &= overlapping - 1u)
+            if (visit(first + COUNT_BITS((overlapping & (0u - overlapping)) - 1u)))
+                return 1;
+    }
+    return 0;
+}
+
 // Metres, squared, from q to the nearest wall, at most `most`. `group` is that wall's.
 HD float squared_clearance(const HomeWalls& walls, Point q, float most, int& group) {
     float nearest = most;
-    for (int k = 0; k < walls.n_groups; k++) {
-        float dx = maxf(maxf(walls.low_x[k] - q.x, q.x - walls.high_x[k]), 0.f);
-        float dy = maxf(maxf(walls.low_y[k] - q.y, q.y - walls.high_y[k]), 0.f);
-        if (dx * dx + dy * dy >= nearest)
-            continue;
+    any_group(walls, bounds_of(q, q, SQRT(most)), [&](int k) {
         float least = INF_VALUE, x, y;
         for (int i = 0; i < GROUP; i++)
             least = minf(least, squared_distance(walls, GROUP * k + i, q, x, y));
         group = least < nearest ? k : group;
         nearest = minf(nearest, least);
-    }
+        return 0;
+    });
     return nearest;
 }
 
@@ -85,12 +115,11 @@ HD Line line_between(Point p, Point q, float least2) {
     return {p, dx, dy, length2 > 0.f ? 1.f / length2 : 0.f, least2};
 }
 
-// Returns 1 if wall i crosses the line or comes too near to it. The ends of the line are not
+// Returns 1 if the wall ab crosses the line or comes too near to it. The ends of the line are not
 // tested: they are clear already.
-HD int blocks(const HomeWalls& walls, int i, const Line& line) {
+HD int wall_blocks(float ax, float ay, float bx, float by, const Line& line) {
     float dx = line.dx, dy = line.dy;
-    float rx = walls.ax[i] - line.p.x, ry = walls.ay[i] - line.p.y;
-    float sx = walls.bx[i] - line.p.x, sy = walls.by[i] - line.p.y;
+    float rx = ax - line.p.x, ry = ay - line.p.y, sx = bx - line.p.x, sy = by - line.p.y;
     float t = clamp((rx * dx + ry * dy) * line.inverse, 0.f, 1.f);
     float u = clamp((sx * dx + sy * dy) * line.inverse, 0.f, 1.f);
     float ex = rx - t * dx, ey = ry - t * dy, fx = sx - u * dx, fy = sy - u * dy;
@@ -101,26 +130,15 @@ HD int blocks(const HomeWalls& walls, int i, const Line& line) {
            ((side_a * side_b < 0.f) & (near_side * far_side < 0.f));
 }
 
+HD int blocks(const HomeWalls& walls, int i, const Line& line) {
+    return wall_blocks(walls.ax[i], walls.ay[i], walls.bx[i], walls.by[i], line);
+}
+
 HD int group_blocks(const HomeWalls& walls, int group, const Line& line) {
     int blocked = 0;
     for (int i = GROUP * group; i < GROUP * group + GROUP; i++)
         blocked |= blocks(walls, i, line);
     return blocked;
-}
-
-struct Bounds {
-    float low_x, low_y, high_x, high_y;
-};
-
-HD Bounds bounds_of(Point p, Point q, float margin) {
-    return {minf(p.x, q.x) - margin, minf(p.y, q.y) - margin, maxf(p.x, q.x) + margin,
-            maxf(p.y, q.y) + margin};
-}
-
-// Returns 1 if the bounding box of a group overlaps `bounds`.
-HD int overlaps(const HomeWalls& walls, int group, const Bounds& bounds) {
-    return (walls.low_x[group] <= bounds.high_x) & (walls.high_x[group] >= bounds.low_x) &
-           (walls.low_y[group] <= bounds.high_y) & (walls.high_y[group] >= bounds.low_y);
 }
 
 // Returns 1 if the straight line between two points keeps sqrt(least2) metres from all walls. If
@@ -129,14 +147,12 @@ HD int is_clear(const HomeWalls& walls, Point p, Point q, float least2, int* hin
     Line line = line_between(p, q, least2);
     if (hint && *hint >= 0 && blocks(walls, *hint, line))
         return 0;
-    Bounds bounds = bounds_of(p, q, SQRT(least2));
-    for (int k = 0; k < walls.n_groups; k++)
-        if (overlaps(walls, k, bounds) && group_blocks(walls, k, line)) {
-            for (int i = GROUP * k; hint && i < GROUP * k + GROUP; i++)
-                *hint = blocks(walls, i, line) ? i : *hint;
-            return 0;
-        }
-    return 1;
+    return !any_group(walls, bounds_of(p, q, SQRT(least2)), [&](int k) {
+        int blocked = group_blocks(walls, k, line);
+        for (int i = GROUP * k; hint && blocked && i < GROUP * k + GROUP; i++)
+            *hint = blocks(walls, i, line) ? i : *hint;
+        return blocked;
+    });
 }
 
 // ---- Corners ----
@@ -323,9 +339,9 @@ HD void write_lengths(const PathLengthsParams& p, int home, int i, const Paths& 
             lengths[(long long)goal * n_points] = fits ? paths.length[goal] : INF_VALUE;
 }
 
-// Metres from point i to the nearest wall.
+// Metres from point i to the nearest wall, at most `most`.
 HD float nearest_wall(const ClearancesParams& p, int i) {
     int group = 0;
     HomeWalls walls = walls_of(p.homes, p.home_index[i]);
-    return SQRT(squared_clearance(walls, point_at(p.points, i), INF_VALUE, group));
+    return SQRT(squared_clearance(walls, point_at(p.points, i), p.most * p.most, group));
 }
