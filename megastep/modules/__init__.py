@@ -4,7 +4,7 @@ They are callables. Sensors and movements have a ``.space``.
 """
 
 from megastep.modules.lanes import to_agents, to_lanes
-from megastep.modules.lifecycle import CounterGenerator, Lifecycle, RandomLifespans
+from megastep.modules.lifecycle import CounterGenerator, Lifecycle, RandomLifespans, random_ages
 from megastep.modules.movement import (
     MOVES,
     TURNS,
@@ -31,6 +31,7 @@ __all__ = [
     "CounterGenerator",
     "SimpleMovement",
     "downsample",
+    "random_ages",
     "render",
     "spawn_points",
     "to_agents",
