@@ -9,6 +9,7 @@ import re
 import shlex
 import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -24,6 +25,7 @@ from megastep.agents.cli.runs import locked
 from megastep.agents.cli.settings import Train
 from megastep.agents.cli.signals import Interrupted
 from megastep.agents.training import checkpoint, json_lines, loggers
+from megastep.agents.training.budget import Budget
 from megastep.settings import MAX_ENVS
 from tests.helpers import faults, tiny
 from tests.helpers.tiny import settings
@@ -545,6 +547,20 @@ def test_progress_metrics():
     assert shown == ["leader 12.3", "follower 2", "coverage 0.837"]
     assert train.few_means({}, ["coverage"], ()) == []
     assert train.few_means(latest, ["coverage", *"abcd"], ()) == []
+
+
+def test_progress_says_how_many_episodes_a_return_is_of():
+    running = SimpleNamespace(
+        samples=2_000_000,
+        samples_per_second=1e6,
+        fraction_left=1.0,
+        latest_stats={"episode/return": 26.34, "episode/window": 1312, "episode/won/past": 0.6},
+        episode_stats=SimpleNamespace(metrics=(), groups=()),
+        budget=Budget(),
+    )
+    fraction, words = train.progress_of(running)
+    assert fraction is None
+    assert words == ["2M samples", "1M/s", "return 26.3 of 1.31k episodes", "won vs past 60 %"]
 
 
 def test_cpu_threads():

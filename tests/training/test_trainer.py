@@ -248,8 +248,9 @@ def test_async_collector_is_waited_for_before_checks_and_at_the_end(tmp_path):
 
 
 def test_trainer_stops_on_request(tmp_path):
-    run = make_trainer(tmp_path)
+    run = make_trainer(tmp_path, every=5)
     run.train(lambda: run.updates == 2)
+    assert [row["updates"] for row in run.logger] == [2], "what was not reported yet is reported"
     assert run.samples == checkpoint.load_latest(tmp_path).step == 2 * UPDATE
 
 
