@@ -1,6 +1,22 @@
 """Random number generators that objects own, move between devices, and save."""
 
+import hashlib
+
 import torch
+
+
+def stream_seed(seed: int, name: str) -> int:
+    """Returns the seed of one of a run's random streams, from 0 to 2**63 - 1.
+
+    Streams of different names, or of different seeds, are independent: the seed is the beginning of
+    a SHA-256.
+
+    Args:
+        seed: the run's seed.
+        name: what draws from the stream, such as "policy".
+    """
+    digest = hashlib.sha256(f"{seed} {name}".encode()).digest()
+    return int.from_bytes(digest[:8], "little") >> 1
 
 
 class SeededGenerator:

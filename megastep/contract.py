@@ -28,7 +28,7 @@ FLOATS = torch.float16, torch.float32  # of an observation whose space names no 
 INTEGERS = tuple(
     getattr(torch, f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)
 )
-RESERVED = "count", "return", "length", "return_std"  # reported of every episode
+RESERVED = "count", "window", "return", "length", "return_std"  # reported of every episode
 ATTRIBUTES = {
     "n_envs": "the number of environments, N",
     "n_agents": "the number of lanes per environment, A",

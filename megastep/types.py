@@ -50,6 +50,9 @@ class Env(Protocol):
             of an evaluation are over layouts.
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
         privileged_space: space of ``world.privileged``.
+        desync(): gives every lane a random age, as if its episode had been going on for some steps.
+            Training calls it after ``reset``, so that lanes do not end their episodes in the same
+            steps.
         state(e), plot_state(state): draw environment ``e``, for videos.
     """
 

@@ -95,6 +95,8 @@ class GradientSteps:
     def end(self) -> dict[str, torch.Tensor]:
         """Ends the update. Returns the means of the metrics over the steps taken, and
         `skipped_steps`, the number of steps skipped because they were not finite.
+
+        Without a step, the means are NaN: a trainer leaves them out of its report.
         """
         *sums, n_taken, n_skipped = sum(self._rows).unbind()
         self.check.count((n_taken == 0) & (n_skipped > 0))

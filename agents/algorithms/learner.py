@@ -21,8 +21,9 @@ Rules:
   with opponents has an attribute `learners`, a bool per lane; only those lanes need to be stored.
 - A collector that acts in the background may return an older rollout. It has a method `wait()`,
   which blocks until nothing acts in the environment.
-- The constructor's arguments `seed` and `graph` are optional. `seed` receives the run's seed;
-  `graph` is true if updates should be captured as a CUDA graph.
+- The constructor's arguments `seed` and `graph` are optional. `seed` receives the run's seed, which
+  `generator.stream_seed(seed, name)` turns into that of a random stream of its own; `graph` is true
+  if updates should be captured as a CUDA graph.
 - A replay buffer belongs to the learner or to its collector. The learner then has a method
   `replay_size(env)`, which returns (observations, bytes per observation) before the buffer exists.
 
@@ -38,7 +39,7 @@ from pydantic import Field
 
 from megastep.agents.algorithms.cuda_graph import CudaGraphUpdate
 from megastep.agents.algorithms.gradient_steps import GradientSteps
-from megastep.agents.generator import SeededGenerator
+from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.rollout import Rollout
 
@@ -101,7 +102,7 @@ class GradientLearner:
         self.policy, self.device, self.lr = policy, policy.device, lr
         self.steps = GradientSteps(policy.parameters(), lr, max_grad_norm, self.device)
         self.check, self.optimizer = self.steps.check, self.steps.optimizer
-        self.generator = SeededGenerator(seed)
+        self.generator = SeededGenerator(stream_seed(seed, "learner"))
         self.cuda_graph = CudaGraphUpdate(self._update, self.device, graph, (self.generator,))
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:

@@ -174,9 +174,8 @@ class R2D2(GradientLearner):
         self.policy.update_stats(last.obs, is_counted=is_finite & rollout.learns[-1])
         priorities = self.replay_buffer.tree.priorities
         n_available = self.replay_buffer.n_available.clamp(min=1)
-        # until the replay buffer is ready, no step is taken and the means are NaN
         return {
-            **{name: mean.nan_to_num(0.0) for name, mean in self.steps.end().items()},
+            **self.steps.end(),  # NaN until the replay buffer is ready, as no step is taken
             "priority_max": priorities.amax().float(),
             "priority_mean": (priorities.sum() / n_available).float(),
         }

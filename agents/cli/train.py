@@ -25,7 +25,7 @@ from megastep.agents.cli import (
     settings,
     signals,
 )
-from megastep.agents.training import budget, checkpoint, curves, loggers, saver
+from megastep.agents.training import budget, checkpoint, curves, loggers, provenance, saver
 from megastep.agents.training.atomic_files import write_atomically
 from megastep.agents.training.trainer import Trainer
 
@@ -59,6 +59,7 @@ RESUMABLE = (
     "log_every",
     "checkpoint_seconds",
     "keep_checkpoints",
+    "desync",
     "snapshots",
     "logger",
     "finish",
@@ -104,6 +105,7 @@ def make_trainer(
             budget.Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
             log_every=cfg.log_every,
             checkpoint_seconds=cfg.checkpoint_seconds,
+            desync=cfg.desync,
             on_log=lambda running: progress.show(*progress_of(running)),
             opponents=opponents,
             snapshot_saver=saver.SnapshotSaver(
@@ -126,8 +128,9 @@ def progress_of(running: Trainer) -> tuple[float | None, list[str]]:
     )
     if running.samples_per_second is not None:
         words.append(f"{console.number(running.samples_per_second)}/s")
-    if running.score is not None:
-        words.append(f"return {running.score:.3g}")
+    if "episode/return" in latest:
+        n_episodes = console.number(latest["episode/window"])
+        words.append(f"return {latest['episode/return']:.3g} of {n_episodes} episodes")
         words += few_means(latest, running.episode_stats.metrics, running.episode_stats.groups)
         won = [(k.partition("episode/won/")[2], share) for k, share in latest.items()]
         words += [f"won vs {opponent} {100 * share:.0f} %" for opponent, share in won if opponent]
@@ -171,6 +174,7 @@ def run(cfg: settings.Train) -> Path:
                 )
             undo.pop_all()
         runs.record_start(folder)
+        provenance.record(folder, running.samples, device, program.version(), program.ROOT)
         console.say(f"Training on {device} in {folder}")
         resume = f"To continue: {runs.resume_command(folder)}"
         try:

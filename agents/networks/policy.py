@@ -12,7 +12,7 @@ import torch
 from pydantic import AfterValidator, Field
 from torch import nn
 
-from megastep.agents.generator import SeededGenerator
+from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.imports import resolve
 from megastep.agents.networks import cores, encoders, heads
 from megastep.agents.networks.critic import Critic
@@ -83,7 +83,7 @@ class Policy(nn.Module):
         critic = None if output == "duelling" else critic
         self.width, self.layers, self.bf16, self.output_kind = width, layers, bf16, output
         self.privileged_space = privileged_space if critic == "asymmetric" else None
-        self.generator = SeededGenerator(seed)
+        self.generator = SeededGenerator(stream_seed(seed, "policy"))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.intake = heads.intake(obs_space, width, encoder)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, SkipValidation
 
-from megastep.agents.generator import SeededGenerator
+from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay import duels
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
@@ -72,7 +72,7 @@ class Opponents:
         n_snapshots = snapshots if past else 0
         # autocast caches the cast of a weight only if the weight requires a gradient
         self.snapshots = [policy.actor().requires_grad_(True) for _ in range(n_snapshots)]
-        self.generator = SeededGenerator(seed)
+        self.generator = SeededGenerator(stream_seed(seed, "opponents"))
         n_by_opponent = [n_per_snapshot] * n_snapshots + [n_bot] * (n_bot > 0)
         self.n_past, self.n_opposed = n_per_snapshot * n_snapshots, sum(n_by_opponent)
 

@@ -1,6 +1,6 @@
 """The checkpoints of a run: one folder `step_<N>` per checkpoint, N environment steps.
 
-A checkpoint is written to a temporary folder, flushed to disk, renamed into place and verified. A
+A checkpoint is written to a temporary folder, flushed to disk, verified and renamed into place. A
 reader sees a whole checkpoint or none, and damage is reported (:mod:`checkpoint_format`). No
 checkpoint is overwritten: a second one of the same step is `step_<N>-2`, and the first is deleted
 after the second is verified.
@@ -55,6 +55,7 @@ def save(
 
     Raises:
         OSError: the disk is full or not writable. Nothing has changed.
+        DamagedCheckpoint: the disk returns other bytes than were written. Nothing has changed.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -62,13 +63,13 @@ def save(
     temporary = folder / f"step_{step}.tmp-{os.getpid()}"
     try:
         checkpoint_format.write(temporary, step, state, config, score)
+        checkpoint_format.read_files(temporary)  # verified before any old one is deleted
         path = folder / _next_name(folder, step)
         os.replace(temporary, path)
         checkpoint_format.sync_folder(folder)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    checkpoint_format.read_files(path)  # verified before any old one is deleted
     set_aside_after(folder, step)
     _prune(folder, keep_checkpoints, step)
     return path
@@ -128,9 +129,19 @@ def delete_leftovers(folder: Path | str) -> None:
     """Deletes temporary folders of processes that no longer run."""
     for path in Path(folder).glob("step_*.tmp-*"):
         pid = path.name.rpartition("-")[2]
-        is_alive = pid.isdigit() and Path("/proc", pid).exists() and int(pid) != os.getpid()
-        if not is_alive:
+        if not (pid.isdigit() and int(pid) != os.getpid() and _is_alive(int(pid))):
             shutil.rmtree(path, ignore_errors=True)
+
+
+def _is_alive(pid: int) -> bool:
+    """Returns whether a process exists."""
+    try:
+        os.kill(pid, 0)  # sends nothing; not all systems have /proc
+    except PermissionError:  # it is another user's
+        return True
+    except (ProcessLookupError, OverflowError):
+        return False
+    return True
 
 
 def _step_and_number(path: Path) -> tuple[int, int]:

@@ -4,12 +4,17 @@ Axes: T time, B lanes, G groups of lanes.
 """
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 
 from megastep.agents.algorithms.nonfinite import LIMIT
 from megastep.types import Env
+
+#: Means are over at least this many episodes, once so many have ended.
+MIN_EPISODES = 100
 
 
 class EpisodeStats:
@@ -20,11 +25,17 @@ class EpisodeStats:
         device: where the transitions are.
         metrics: names of the metrics that worlds carry.
         groups: group name -> (B,) bool. Each group's means are reported beside the overall ones.
+        skip_first: leaves out each lane's first episode, for lanes that started in the middle of
+            one (`desync`).
 
     Attributes:
         returns, lengths: (B,) float64, of the episode that each lane is in.
-        sums: (4 + metrics, 1 + G) float64, over finished episodes: count, return, squared return,
-            length, and each metric; for all lanes and for each group.
+        is_whole: (B,) bool, whether that episode is to be counted.
+        sums: (4 + metrics, 1 + G) float64, over the episodes that ended since the last `pop`:
+            count, return, squared return, length, and each metric; for all lanes and for each
+            group.
+        windows: for all lanes and for each group, the sums of the last reports, on the host. The
+            oldest report is dropped once the others hold `MIN_EPISODES`.
     """
 
     def __init__(
@@ -33,14 +44,17 @@ class EpisodeStats:
         device: torch.device | str,
         metrics: Sequence[str] = (),
         groups: Mapping[str, torch.Tensor] | None = None,
+        skip_first: bool = False,
     ):
         self.metrics, self.groups = tuple(metrics), tuple(groups or ())
         all_lanes = torch.ones(n_lanes, dtype=torch.bool, device=device)
         self.members = torch.stack([all_lanes, *(groups or {}).values()], 1).double()  # (B, 1 + G)
         self.returns = torch.zeros(n_lanes, dtype=torch.float64, device=device)
         self.lengths = torch.zeros(n_lanes, dtype=torch.float64, device=device)
+        self.is_whole = torch.full((n_lanes,), not skip_first, device=device)
         shape = 4 + len(self.metrics), 1 + len(self.groups)
         self.sums = torch.zeros(shape, dtype=torch.float64, device=device)
+        self.windows = [deque() for _ in range(1 + len(self.groups))]
 
     def add(
         self,
@@ -57,70 +71,83 @@ class EpisodeStats:
             reset: (T, B) bool, true if the transition only started a new episode.
             done: (T, B) bool, true if the episode ended.
             learns: (T, B) bool. An episode counts if this was true when its last action was chosen.
-            metrics: name -> (T, B), read where `done`.
+            metrics: name -> (T, B), read where `done`. Numbers that are not finite or beyond the
+                limit count as 0, too.
         """
-        reward = torch.where(reward.abs() <= LIMIT, reward, 0.0)
+        reward = _without_nonfinite(reward)
         # cumulative sums over all T rows, minus the sum at the last episode end before each row
         returns = self.returns + reward.double().cumsum(0)
         lengths = self.lengths + (~reset).double().cumsum(0)
         rows = torch.arange(len(reward), device=reward.device)[:, None]
         last_end = torch.where(done, rows, -1).cummax(0).values
         previous_end = torch.cat([torch.full_like(last_end[:1], -1), last_end[:-1]])
-        episode_returns, counts = _sum_since(returns, previous_end), done & learns
+        episode_returns = _sum_since(returns, previous_end)
+        counts = done & learns & (self.is_whole | (previous_end >= 0))
         values = [
             torch.ones_like(episode_returns),
             episode_returns,
             episode_returns**2,
             _sum_since(lengths, previous_end),
-            *(metrics[name].double() for name in self.metrics),
+            *(_without_nonfinite(metrics[name]).double() for name in self.metrics),
         ]
         sums = torch.stack([torch.where(counts, value, 0.0).sum(0) for value in values])
         self.sums += sums @ self.members
         self.returns = _sum_since(returns, last_end, slice(-1, None))[0]
         self.lengths = _sum_since(lengths, last_end, slice(-1, None))[0]
+        self.is_whole |= done.any(0)
 
     def pop(self) -> dict[str, float]:
-        """Returns statistics of the episodes that ended since the last call. Synchronises.
+        """Returns statistics for a report. Synchronises.
 
-        Holds `episode/count`, the means of return, length and metrics, the standard deviation of
-        the return, and each mean by group, such as `episode/return/leader`. Groups without a
-        finished episode are absent; without any finished episode, `episode/count` is all.
+        Means are over the episodes that ended since the last call and, if those are fewer than
+        `MIN_EPISODES`, those of earlier calls, a call at a time. A dict of
+
+        - `episode/count`: episodes that ended since the last call
+        - `episode/window`: episodes that the means are over; absent, like the means, if it is 0
+        - `episode/return`, `episode/length` and `episode/NAME` for each metric: the means
+        - `episode/return_std`: standard deviation of the return
+        - all but the last for each group, such as `episode/return/leader`
         """
-        totals, *group_totals = self.sums.T.tolist()
+        reports = self.sums.T.tolist()
         self.sums.zero_()
-        n, _, squared_returns, *_ = totals
-        if not n:
-            return {"episode/count": 0}
-        means = self._means(totals)
-        variance = squared_returns / n - means["episode/return"] ** 2
-        stats = {
-            "episode/count": int(n),
-            **means,
-            "episode/return_std": math.sqrt(max(variance, 0.0)),
-        }
-        for group, totals in zip(self.groups, group_totals, strict=True):
-            stats |= {f"{name}/{group}": mean for name, mean in self._means(totals).items()}
+        totals = [
+            _add_report(window, report)
+            for window, report in zip(self.windows, reports, strict=True)
+        ]
+        stats = self._means(reports[0], totals[0])
+        n, _, squared_returns, *_ = totals[0]
+        if n:
+            variance = squared_returns / n - stats["episode/return"] ** 2
+            stats["episode/return_std"] = math.sqrt(max(variance, 0.0))
+        for group, report, total in zip(self.groups, reports[1:], totals[1:], strict=True):
+            by_name = self._means(report, total)
+            stats |= {f"{name}/{group}": value for name, value in by_name.items()}
         return stats
 
-    def _means(self, totals):
+    def _means(self, report, totals):
+        """Returns counts and means by name from the sums of a report and those of a window."""
         n, returns, _, lengths, *metrics = totals
-        if not n:
-            return {}
-        by_metric = dict(zip(self.metrics, metrics, strict=True))
-        by_name = {"return": returns, "length": lengths, **by_metric}
-        return {f"episode/{name}": total / n for name, total in by_name.items()}
+        stats = {"episode/count": int(report[0])}
+        if n:
+            by_metric = dict(zip(self.metrics, metrics, strict=True))
+            by_name = {"return": returns, "length": lengths, **by_metric}
+            stats["episode/window"] = int(n)
+            stats |= {f"episode/{name}": total / n for name, total in by_name.items()}
+        return stats
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Returns the sums over finished episodes.
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the sums over finished episodes, since the last report and of earlier ones.
 
         Unfinished episodes are not saved: a resumed run starts new episodes.
         """
-        return {"sums": self.sums}
+        windows = [torch.tensor(window, dtype=torch.float64) for window in self.windows]
+        return {"sums": self.sums, "windows": windows}
 
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores a `state_dict`. Ignores one with other metrics or groups."""
-        if state["sums"].shape == self.sums.shape:
+        if state["sums"].shape == self.sums.shape and "windows" in state:
             self.sums.copy_(state["sums"])
+            self.windows = [deque(window.tolist()) for window in state["windows"]]
 
 
 def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
@@ -151,3 +178,19 @@ def _sum_since(cumulative, ends, rows=slice(None)):
     ends = ends[rows]
     at_end = torch.where(ends >= 0, cumulative.gather(0, ends.clamp(min=0)), 0.0)
     return cumulative[rows] - at_end
+
+
+def _add_report(window, report):
+    """Adds the sums of a report to a window, in place. Returns the sums over the window."""
+    if report[0]:
+        window.append(report)
+    counts = [report[0] for report in window]
+    while counts and sum(counts) - counts[0] >= MIN_EPISODES:
+        window.popleft()
+        del counts[0]
+    return [math.fsum(column) for column in zip(*window, strict=True)] or [0.0] * len(report)
+
+
+def _without_nonfinite(values):
+    """Returns numbers with 0 in place of NaN, infinity and those beyond `nonfinite.LIMIT`."""
+    return torch.where(values.abs() <= LIMIT, values, 0.0)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 class Saver:
     """Writes the checkpoints of one run.
 
-    A full or read-only disk causes one warning; each later call tries again.
+    A full, read-only or faulty disk causes one warning; each later call tries again.
 
     Args:
         folder: where the checkpoints go.
@@ -53,7 +53,7 @@ class Saver:
             )
         try:
             checkpoint.save(self.folder, step, state, self.config, self.keep_checkpoints, score)
-        except OSError as error:
+        except (OSError, checkpoint.DamagedCheckpoint) as error:
             has_warned = self.error is not None
             self.error = self._message(step, state, error)
             if not has_warned:
@@ -66,13 +66,17 @@ class Saver:
         return True
 
     def _message(self, step, state, error):
+        reason = getattr(error, "strerror", None) or str(error)
         n_bytes = sum(getattr(leaf, "nbytes", 0) for leaf in tree_leaves(state))
-        free_bytes = shutil.disk_usage(self.folder.parent).free
-        return (
-            f"The checkpoint at {step:,} samples could not be saved ({error.strerror}): it needs "
-            f"about {n_bytes / 1e6:.1f} MB, and {free_bytes / 1e6:.1f} MB are free in "
-            f"{self.folder.parent}"
+        sentence = (
+            f"The checkpoint at {step:,} samples could not be saved ({reason}): it needs about "
+            f"{n_bytes / 1e6:.1f} MB"
         )
+        try:
+            free_bytes = shutil.disk_usage(self.folder.parent).free
+        except OSError:
+            return f"{sentence} in {self.folder.parent}, which cannot be read"
+        return f"{sentence}, and {free_bytes / 1e6:.1f} MB are free in {self.folder.parent}"
 
 
 class SnapshotSaver:

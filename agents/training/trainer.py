@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
@@ -12,7 +13,8 @@ import torch
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.training.budget import Budget, Stopwatch
-from megastep.agents.training.episode_stats import EpisodeStats, lane_groups
+from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
+from megastep.agents.training.performance import PhaseTimer, device_memory
 from megastep.types import Env
 
 if TYPE_CHECKING:
@@ -48,6 +50,9 @@ class Trainer:
         budget: when the run ends and how its learning rate falls.
         log_every: updates between two reports.
         checkpoint_seconds: seconds between two checkpoints.
+        desync: starts the first episodes at random ages, so that not all lanes end theirs at the
+            same time, if the environment has a method `desync()`. Statistics leave these episodes
+            out.
         on_log: called with the trainer after each report, for example to show progress.
         opponents: `env`, if it is an `Opponents`.
         snapshot_saver: such as `saver.SnapshotSaver`: called with the trainer before the first
@@ -57,7 +62,8 @@ class Trainer:
         samples, updates: environment steps of all lanes, and updates, so far.
         clock: counts the seconds of training.
         lr: the current learning rate.
-        score: the last mean return that was logged, or None.
+        score: the last mean return that was logged, or None before `MIN_EPISODES` have ended: that
+            of few episodes is luck, and would mark the first checkpoint as the best.
         samples_per_second: speed between the last two reports, or None.
         latest_stats: name -> the last value of each episode statistic.
         nonfinite_value: the first NaN or infinity of the run, or None.
@@ -74,6 +80,7 @@ class Trainer:
         *,
         log_every: int = 1,
         checkpoint_seconds: float = 30.0,
+        desync: bool = False,
         on_log: Callable[[Trainer], None] = lambda trainer: None,
         opponents: OpponentPool | None = None,
         snapshot_saver: Callable[[Trainer], None] = lambda trainer: None,
@@ -84,18 +91,22 @@ class Trainer:
         self.on_log, self.opponents, self.snapshot_saver = on_log, opponents, snapshot_saver
         self.collect = learner.collector(env)
         self.rollout = self.collect.rollout
+        desync = desync and hasattr(env, "desync")
+        if desync:
+            env.desync()  # the collector has reset the environment, and has not stepped it yet
         self.episode_stats = EpisodeStats(
             self.rollout.n_lanes,
             env.device,
             tuple(self.rollout.metrics),
             lane_groups(env, self.rollout.learners),
+            skip_first=desync,
         )
-        self.clock = Stopwatch()
+        self.clock, self.timer = Stopwatch(), PhaseTimer(env.device)
         self.samples = self.updates = 0
         self.lr = learner.lr
         self.score = self.samples_per_second = None
         self.latest_stats = {}
-        self.samples_at_log = 0
+        self.samples_at_log = self.updates_at_log = 0
         self.seconds_at_log = self.seconds_at_checkpoint = 0.0
         self.updates_at_checkpoint = None
         self.nonfinite_value = None
@@ -121,14 +132,19 @@ class Trainer:
         try:
             self.snapshot_saver(self)
             while self.fraction_left > 0 and not stop():
+                self.timer.start("collect")
                 self.rollout = self.collect()
+                self.timer.start("update")
                 losses = self.update()
+                self.timer.start("rest")
                 self.snapshot_saver(self)
                 if self.updates % self.log_every == 0:
                     self.log(losses)
                 seconds_since = self.clock.seconds - self.seconds_at_checkpoint
                 if seconds_since >= self.checkpoint_seconds and self.check_finite():
                     self.save_checkpoint()
+            if self.updates > self.updates_at_log:
+                self.log(losses)
             self.check_finite()
         except NonFiniteError:
             raise
@@ -170,24 +186,27 @@ class Trainer:
             self.clock.start()
             self.seconds_at_checkpoint = self.clock.seconds
             self.samples_at_log, self.seconds_at_log = self.samples, self.clock.seconds
+            self.timer.pop()
         return losses
 
     def log(self, losses: dict[str, torch.Tensor]) -> None:
         """Writes the metrics since the last report. Synchronises.
+
+        A loss that is NaN has no value, as no gradient step was taken; it is left out.
 
         Raises the errors that `env.check()` does, and NonFiniteError as `check_finite` does.
         """
         self.wait_for_collector()
         if hasattr(self.env, "check"):
             self.env.check()
-        loss_values = torch.stack(list(losses.values())).tolist()
+        loss_values = zip(losses, torch.stack(list(losses.values())).tolist(), strict=True)
         stats = self.episode_stats.pop()
         if self.opponents is not None:
             stats |= self.opponents.pop_win_rates()
         self.latest_stats.update(stats)
         metrics = {
             **stats,
-            **dict(zip(losses, loss_values, strict=True)),
+            **{name: value for name, value in loss_values if not math.isnan(value)},
             "updates": self.updates,
             "lr": self.lr,
             "anneal": self.budget.anneal,
@@ -198,9 +217,13 @@ class Trainer:
             n_samples = self.samples - self.samples_at_log
             self.samples_per_second = n_samples / (seconds - self.seconds_at_log)
             perf["perf/rate"] = self.samples_per_second
+            perf |= {f"perf/{phase}": time for phase, time in self.timer.pop().items()}
+        perf |= {f"perf/memory_{name}": n for name, n in device_memory(self.env.device).items()}
         self.samples_at_log, self.seconds_at_log = self.samples, seconds
+        self.updates_at_log = self.updates
         self.logger.write(self.samples, metrics, perf)
-        self.score = metrics.get("episode/return", self.score)
+        if stats.get("episode/window", 0) >= MIN_EPISODES:
+            self.score = stats["episode/return"]
         self.on_log(self)
         self.check_finite()
 
@@ -258,4 +281,4 @@ class Trainer:
             self.opponents.load_state_dict(state["opponents"])
         self.samples, self.updates = state["samples"], state["updates"]
         self.clock.seconds_before = state["seconds"]
-        self.updates_at_checkpoint = self.updates
+        self.updates_at_checkpoint = self.updates_at_log = self.updates

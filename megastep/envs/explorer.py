@@ -59,6 +59,7 @@ class Explorer(SceneryEnv):
         privileged: if True, worlds have ``privileged`` for a critic: ``episode`` (B, 1, 4), steps
             left and taken, texels seen and left; ``unseen`` (B, 1, 48), where around the agent the
             visible texels lie that it has not seen yet.
+        metrics: if False, worlds have no ``metrics``, which saves a kernel launch per step.
     """
 
     n_agents = 1
@@ -79,6 +80,7 @@ class Explorer(SceneryEnv):
         patience: Annotated[int, Field(ge=1, le=10**6)] = 200,
         resample: bool = False,
         privileged: bool = False,
+        metrics: bool = True,
     ):
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
@@ -92,7 +94,7 @@ class Explorer(SceneryEnv):
             seed,
         )
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
-        self.subsample, self.patience = subsample, patience
+        self.subsample, self.patience, self.has_metrics = subsample, patience, metrics
         self.spawner = modules.RandomSpawns(geometries, self.core, resample=resample)
         self.movement = modules.MomentumMovement(self.core)
         self.lifecycle = modules.Lifecycle(self.core)
@@ -107,7 +109,8 @@ class Explorer(SceneryEnv):
         pixels = self.obs_space.d.H * self.obs_space.d.W
         engine.fit(n_envs, 4 * words + 8 * pixels + 64, self.device)
         self.seen = torch.zeros((n_envs, 1, words), dtype=torch.int32, device=self.device)
-        self.visible = modules.visible_texels(self.core.scenery, self.spawner.points)
+        if metrics or privileged:
+            self.visible = modules.visible_texels(self.core.scenery, self.spawner.points)
         if privileged:
             self.units = torch.tensor([200.0, 1000.0, 1000.0, 1000.0], device=self.device)
             self.privileged_space = dotdict(
@@ -118,6 +121,10 @@ class Explorer(SceneryEnv):
     def reset(self) -> arrdict:
         """Starts a new episode in every lane. Returns the first world."""
         return self._world(self.lifecycle.start_all())
+
+    def desync(self) -> None:
+        """Gives every lane a random age, from the seed, so that episodes do not end together."""
+        self.lifecycle.desync()
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``, (B, 1). Returns a world."""
@@ -131,7 +138,9 @@ class Explorer(SceneryEnv):
         self.lifecycle.limits.masked_fill_(reset, self.patience).add_(newly_seen)
         reward = (newly_seen / modules.TEXELS_PER_POINT).masked_fill_(reset, 0.0)
         flags = self.lifecycle(reset)
-        world = arrdict(obs=obs, reward=reward, metrics=self._metrics(flags.truncated), **flags)
+        world = arrdict(obs=obs, reward=reward, **flags)
+        if self.has_metrics:
+            world["metrics"] = self._metrics(flags.truncated)
         if self.privileged_space is not None:
             world["privileged"] = self._privileged()
         return world

@@ -85,6 +85,10 @@ class Minimal(SceneryEnv):
         """Starts a new episode in every lane. Returns the first world."""
         return self._world(self.lifecycle.start_all())
 
+    def desync(self) -> None:
+        """Gives every lane a random age, from the seed, so that episodes do not end together."""
+        self.lifecycle.desync()
+
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``, (B, 1). Returns a world."""
         self.movement(decision)

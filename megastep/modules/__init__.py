@@ -4,7 +4,13 @@ They are callables. Sensors and movements have a ``.space``.
 """
 
 from megastep.modules.lanes import to_agents, to_lanes
-from megastep.modules.lifecycle import CounterGenerator, Lifecycle, RandomLifespans
+from megastep.modules.lifecycle import (
+    ENDLESS,
+    CounterGenerator,
+    Lifecycle,
+    RandomLifespans,
+    random_ages,
+)
 from megastep.modules.movement import (
     MOVES,
     TURNS,
@@ -18,6 +24,7 @@ from megastep.modules.spawning import RandomSpawns, spawn_points
 from megastep.modules.visibility import TEXELS_PER_POINT, visible_texels
 
 __all__ = [
+    "ENDLESS",
     "IMU",
     "MOVES",
     "RGB",
@@ -31,6 +38,7 @@ __all__ = [
     "CounterGenerator",
     "SimpleMovement",
     "downsample",
+    "random_ages",
     "render",
     "spawn_points",
     "to_agents",

@@ -37,6 +37,22 @@ class CounterGenerator:
         return engine.uniform(self.counts, mask.reshape(-1), self.seed, self.values)
 
 
+def random_ages(limits: torch.Tensor, seed: int) -> torch.Tensor:
+    """Draws ages at which lanes could be in the middle of an episode.
+
+    Args:
+        limits: (B,) int32, age at which each lane's episode is truncated.
+        seed: of the draws, from 0 to 2**63 - 1.
+
+    Returns:
+        (B,) int32, uniform in [0, limit); 0 where the limit is ``ENDLESS``.
+    """
+    generator = CounterGenerator(len(limits), seed + (3 << 32), limits.device)  # not the spawns'
+    uniform = generator(torch.ones_like(limits, dtype=torch.bool))[:, 0]
+    ages = (uniform.double() * limits).int()  # in double precision it stays below the limit
+    return ages.masked_fill_(limits == ENDLESS, 0)
+
+
 class RandomLifespans:
     """Random time limits of episodes, for the argument ``limit`` of :class:`Lifecycle`.
 
@@ -88,7 +104,7 @@ class Lifecycle:
         if self.lifespans is None and not 1 <= n_steps <= ENDLESS:
             raise ValueError(f"limit must be from 1 to {ENDLESS} steps, but {limit} was given")
         n_lanes, device = core.n_envs * core.n_agents, core.device
-        self.n_agents = core.n_agents
+        self.n_agents, self.seed = core.n_agents, core.seed
         self.ages = torch.zeros(n_lanes, dtype=torch.int32, device=device)
         self.limits = torch.zeros_like(self.ages)
         if self.lifespans is None:
@@ -103,6 +119,14 @@ class Lifecycle:
     def start_ended(self) -> torch.Tensor:
         """Returns the ``reset`` mask, (B,) bool, of a step: True where the last episode ended."""
         return self.ended.clone()
+
+    def desync(self) -> None:
+        """Gives every lane a random age below its limit, for the ``desync`` of an environment.
+
+        Call it after ``env.reset``. Without it, lanes with equal limits begin and end their
+        episodes in the same steps.
+        """
+        self.ages.copy_(random_ages(self.limits, self.seed))
 
     def __call__(self, reset: torch.Tensor, terminal: torch.Tensor | None = None) -> arrdict:
         """Counts one step. Returns the world's flags, arrdict(reset, terminal, truncated).

@@ -15,18 +15,21 @@ N_ENVS = {
 }
 N_ENVS_AS_TRAINED = {"cuda": (1024, 4096, 16_384), "cpu": (1024,)}
 N_ARENAS = {"cuda": (1024, 8192, 65_536), "cpu": (1024,)}  # homes of four agents each
-#: Explorer's settings in training: a new home per episode, a privileged observation.
-AS_TRAINED = dict(resample=True, privileged=True)
+#: What a plain step leaves out because it is only read in training and evaluation, by environment.
+PLAIN = {"explorer": dict(metrics=False)}
+#: Explorer's settings in training: a new home per episode, a privileged observation, metrics.
+AS_TRAINED = dict(resample=True, privileged=True, metrics=True)
 
 
 def step(device: torch.device) -> Iterator[dict]:
-    """Frames per second of the whole `env.step` with default settings. "As trained" is Explorer
-    with the settings of training: a new home for every episode, and a privileged observation for
-    the critic.
+    """Frames per second of the whole `env.step` with default settings; Explorer without its
+    metrics. "As trained" is Explorer with the settings of training: a new home for every episode, a
+    privileged observation for the critic, and metrics.
     """
     for name in ("explorer", "minimal", "pointgoal"):
         for n_envs in N_ENVS[device.type]:
-            seconds = seconds_per_call(walk_in_homes(name, n_envs, device)[1], device)
+            _, take_step = walk_in_homes(name, n_envs, device, **PLAIN.get(name, {}))
+            seconds = seconds_per_call(take_step, device)
             yield rate(f"{name}, `env.step`, {n_envs:,} environments", n_envs, seconds)
     for n_envs in N_ENVS_AS_TRAINED[device.type]:
         _, take_step = walk_in_homes("explorer", n_envs, device, **AS_TRAINED)

@@ -200,9 +200,11 @@ def test_learns_corridor(name):
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_remembers_cue(name):
-    """A policy without a hidden state earns 1/4."""
+    """A policy without a hidden state earns 1/4. Of R2D2's actions 14 % are random, and three in
+    four of these are wrong, so that it earns 0.9 at best.
+    """
     _, rewards, ends, *_ = learn(Cue(), 60, name=name, lr=3e-3)
-    assert rewards / ends > 0.9
+    assert rewards / ends > (0.85 if name == "r2d2" else 0.9)
 
 
 @pytest.mark.parametrize(

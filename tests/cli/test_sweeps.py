@@ -350,13 +350,39 @@ def test_job_folder_names():
     assert len(name("folder=" + 1000 * "ü").encode()) <= 200
 
 
-def test_score_is_the_mean_of_the_last_reports(here):
-    lines = [{"samples": n, "episode/return": float(n)} for n in range(1, 13)]
-    lines.insert(5, {"samples": 5, "loss/value": 1.0})
+def report(step, count, window, mean):
+    """A line of metrics: `count` episodes ended, and `mean` is over `window`."""
+    counts = {"samples": step, "episode/count": count}
+    return counts | ({"episode/window": window, "episode/return": mean} if window else {})
+
+
+def score(here, *lines):
     (here / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert runs.outcome(here)["score"] == 7.5  # of 3 to 12
+    return runs.outcome(here)["score"]
+
+
+def test_score_is_the_mean_over_the_episodes_of_the_last_reports(here):
+    # ten reports of 100 n episodes each, after two that do not count
+    lines = [report(n, 100 * n, 100 * n, float(n)) for n in range(1, 13)]
+    assert score(here, *lines) == pytest.approx(
+        sum(n * n for n in range(3, 13)) / sum(range(3, 13))
+    )
+    assert score(here, *[report(n, 0, 0, None) for n in range(3)]) is None
     (here / "empty").mkdir()
     assert runs.outcome(here / "empty")["score"] is None
+
+
+def test_score_counts_every_episode_once(here):
+    """A lucky episode of 3.68 begins a run of 0.75. Means over all episodes so far repeat it."""
+    means = [(3.68 + 0.75 * (n - 1)) / n for n in range(1, 11)]
+    lines = [report(n, 1, n, mean) for n, mean in enumerate(means, 1)]
+    assert score(here, *lines) == pytest.approx((3.68 + 9 * 0.75) / 10)
+    # reports without an episode repeat a mean, and a mean may reach back beyond ten reports
+    lines = [report(n, 10 * (n > 0), 10 * n, 2.0) for n in range(11)]
+    lines += [report(n, 0, 100, 2.0) for n in range(11, 20)]
+    assert score(here, report(0, 50, 50, 9.0), *lines) == pytest.approx(2)
+    lines += [report(20, 200, 200, 5.0)]
+    assert score(here, *lines) == pytest.approx((200 * 5 + 100 * 2) / 300)
 
 
 # ---- --config-dir; completion ----

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from megastep import arrdict, capture, contract, envs, plotting, toys
+from megastep import arrdict, capture, contract, engine, envs, plotting, toys
 from megastep.engine import EngineError
 from megastep.engine.state_tree import state_tree
 from megastep.geometries import sample
@@ -72,6 +72,31 @@ def test_contract(name, device):
     worlds = contract.rollout(make(name, device), 60)
     n_ends = sum(int((w.terminal | w.truncated).sum()) for w in worlds)
     assert n_ends >= 12, "no clause about ends is tested unless episodes end"
+
+
+@pytest.mark.parametrize(
+    "name, settings",
+    [
+        ("minimal", dict(shortest=20, longest=40)),
+        ("explorer", dict(patience=30)),
+        ("deathmatch", dict(limit=20)),
+        ("pointgoal", dict(limit=20)),
+    ],
+)
+def test_desynced_lanes_are_in_the_middle_of_their_episodes(name, settings, device):
+    ages = []
+    for where, seed in ((device, 1), ("cpu", 1), ("cpu", 2)):
+        env = make(name, where, 64, seed, **settings)
+        first = env.reset().clone()
+        env.desync()
+        ages.append(getattr(env, "lifecycle", env).ages.cpu().clone())
+    assert torch.equal(ages[0], ages[1]) and not torch.equal(ages[0], ages[2])
+    limits = env.lifecycle.limits if hasattr(env, "lifecycle") else torch.tensor([20])
+    assert ages[2].min() >= 0 and (ages[2] < limits).all() and len(ages[2].unique()) > 10
+    world = env.step(idle(env))
+    contract.check_world(env, world, last=arrdict.arrdict(first))
+    new_limits = env.lifecycle.limits if name == "explorer" else limits
+    assert torch.equal(world.truncated, ages[2] + 1 >= new_limits) and world.truncated.any()
 
 
 @pytest.mark.parametrize("name", SHORT)
@@ -275,6 +300,18 @@ def test_explorer_counts_the_texels_of_its_bitmap():
     contract.rollout(env, 10, check=False)
     state = env.state(3)
     assert int(state.seen.sum()) == int(state.n_seen) == int(env.n_seen[3])
+
+
+def test_explorer_without_metrics_is_the_same_otherwise(monkeypatch):
+    names = ("explorer", "explorer, privileged")
+    expected = [contract.rollout(make(name), 10) for name in names]
+    monkeypatch.setattr(engine, "coverage", None)  # a call would fail
+    for name, worlds in zip(names, expected):
+        env = make(name, metrics=False)
+        for world, plain in zip(worlds, contract.rollout(env, 10)):
+            del world["metrics"]
+            assert contract.same(world, plain)
+        assert hasattr(env, "visible") == ("privileged" in name)
 
 
 def test_explorer_resamples_homes_at_resets_only(device):

@@ -97,6 +97,19 @@ def test_random_lifespans_are_uniform_and_constant_within_an_episode():
         assert torch.equal(lifecycle.limits[running], first[running])
 
 
+def test_random_ages_are_uniform_below_the_limit():
+    limits = torch.tensor([1, 4, modules.ENDLESS], dtype=torch.int32).repeat_interleave(3000)
+    ages = modules.random_ages(limits, seed=1)
+    assert torch.equal(modules.random_ages(limits, seed=1), ages)
+    assert not torch.equal(modules.random_ages(limits, seed=2), ages)
+    first, second, endless = ages.view(3, -1)
+    assert not first.any() and not endless.any(), "without a limit there is no middle"
+    counts = torch.bincount(second).tolist()
+    assert len(counts) == 4 and all(abs(count - 750) < 120 for count in counts)
+    largest = torch.full((3000,), modules.ENDLESS - 1, dtype=torch.int32)
+    assert 0 <= modules.random_ages(largest, seed=1).min()
+
+
 def test_lifecycle_state_is_a_copy_of_one_environment():
     c = core_of([toys.box()], n_agents=2, n_envs=3)
     lifecycle = modules.Lifecycle(c, 7)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.generator import SeededGenerator
+from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.cores import CORES
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, stack
@@ -139,6 +139,17 @@ def test_weights_load_with_weights_only():
 def test_zero_width_raises():
     with pytest.raises(ValueError, match="width: 0"):
         Policy(OBS, MOVES, width=0)
+
+
+def test_streams_of_a_run_differ_and_repeat():
+    streams = {
+        (seed, name): stream_seed(seed, name)
+        for seed in (0, 1, 2, 2**63 - 1)
+        for name in ("policy", "learner", "opponents")
+    }
+    assert len(set(streams.values())) == 12 and streams[1, "policy"] == stream_seed(1, "policy")
+    # an environment uses its seed and adds multiples of 2**32
+    assert all(0 <= seed < 2**63 and (seed - own) % 2**32 for (own, _), seed in streams.items())
 
 
 def test_generator_resumes():

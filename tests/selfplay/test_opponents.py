@@ -167,6 +167,17 @@ class Rigged(Matrix):
         return arrdict(world, learns=self.mask) if self.shows else world
 
 
+def test_policy_learner_and_opponents_draw_different_numbers_from_one_seed():
+    def draws(seed):
+        policy = policy_of(Matrix(16), seed)
+        parts = policy, PPO(policy, seed=seed), make_opponents(policy=policy, seed=seed)
+        return [
+            torch.rand(3, generator=part.generator.on(policy.device)).tolist() for part in parts
+        ]
+
+    assert draws(5) == draws(5) and len(set(map(tuple, draws(5) + draws(6)))) == 6
+
+
 @pytest.mark.parametrize("other", [0.0, 7.0, -1e6])
 def test_update_does_not_depend_on_opponents_rewards(tmp_path, other):
     weights = []

@@ -200,7 +200,22 @@ def test_old_checkpoints_are_kept_until_the_new_one_is_verified(folder, monkeypa
     monkeypatch.setattr(checkpoint_format, "write_synced", write)
     with pytest.raises(CheckpointError, match="step_40"):
         checkpoint.save(folder, 40, state(40), CONFIG, keep_checkpoints=2)
-    assert names(folder) == ["step_10", "step_20", "step_30", "step_40"]
+    assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_20", "step_30"]
+
+
+@pytest.mark.parametrize("error, is_alive", [(ProcessLookupError, False), (PermissionError, True)])
+def test_unfinished_checkpoint_of_a_living_process_is_kept(tmp_path, monkeypatch, error, is_alive):
+    def signalled(pid, number):
+        assert number == 0, "a signal that ends nothing"
+        if pid == 77:
+            raise error
+
+    monkeypatch.setattr(os, "kill", signalled)  # where there is no /proc, only signals tell
+    paths = [tmp_path / f"step_9.tmp-{pid}" for pid in (76, 77, os.getpid())]
+    for path in paths:
+        path.mkdir()
+    checkpoint.delete_leftovers(tmp_path)
+    assert [path.exists() for path in paths] == [True, is_alive, False]
 
 
 def test_same_step_can_be_saved_repeatedly(folder):

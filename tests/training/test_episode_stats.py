@@ -31,14 +31,16 @@ def test_two_steps_and_an_end_are_an_episode_of_length_two():
         torch.tensor([[False], [True], [False], [False]]),
     )
     episodes.add(torch.tensor([[1.0], [2.0], [0.0], [5.0]]), reset, done)
-    assert episodes.pop() == {
+    stats = {
         "episode/count": 1,
+        "episode/window": 1,
         "episode/return": 3.0,
         "episode/length": 2.0,
         "episode/return_std": 0.0,
     }
+    assert episodes.pop() == stats
     assert episodes.returns.tolist() == [5.0] and episodes.lengths.tolist() == [1.0]
-    assert episodes.pop() == {"episode/count": 0}
+    assert episodes.pop() == {**stats, "episode/count": 0}
 
 
 def test_episodes_across_rollouts_match_slow_count():
@@ -92,28 +94,33 @@ def test_metrics_are_read_at_episode_ends_and_split_by_role():
     stats = episodes.pop()
     assert stats == {
         "episode/count": 4,
+        "episode/window": 4,
         "episode/return": (1 + 7 + 9 + 11) / 4,
         "episode/length": 7 / 4,
         "episode/laps": 10 * (1 + 5 + 6 + 7) / 4,
         "episode/falls": 1,
         "episode/return_std": pytest.approx(14**0.5),
+        "episode/count/leader": 2,
+        "episode/window/leader": 2,
         "episode/return/leader": (1 + 7) / 2,
         "episode/length/leader": 3 / 2,
         "episode/laps/leader": 30,
         "episode/falls/leader": 1,
+        "episode/count/follower": 2,
+        "episode/window/follower": 2,
         "episode/return/follower": (9 + 11) / 2,
         "episode/length/follower": 2,
         "episode/laps/follower": 65,
         "episode/falls/follower": 1,
     }
-    assert list(stats)[:6] == [
-        f"episode/{name}" for name in ("count", "return", "length", "laps", "falls", "return_std")
-    ]
+    names = ("count", "window", "return", "length", "laps", "falls", "return_std")
+    assert list(stats)[:7] == [f"episode/{name}" for name in names]
     done[:] = False
     done[1, 0] = True
     episodes.add(reward, torch.zeros_like(done), done, metrics=metrics)
     stats = episodes.pop()
-    assert stats["episode/return/leader"] == 1 and "episode/return/follower" not in stats
+    assert stats["episode/count/leader"] == 1 and stats["episode/return/leader"] == (8 + 1) / 3
+    assert stats["episode/count/follower"] == 0 and stats["episode/return/follower"] == 10
 
 
 def test_lane_groups_by_role_and_matchup():
@@ -137,12 +144,69 @@ def test_only_episodes_of_learning_lanes_count():
         episodes.add(rewards, none, done, learns, dict(laps=rewards))
     assert episodes.pop() == {
         "episode/count": 2,
+        "episode/window": 2,
         "episode/return": 3,
         "episode/length": 1,
         "episode/laps": 3,
         "episode/return_std": 2,
     }
     assert not episodes.returns.any(), "the lane that does not learn is cleared too"
+
+
+def add_episodes(episodes, *returns):
+    """Adds episodes of one step, one after the other, in the only lane."""
+    for value in returns:
+        none = torch.tensor([[False]])
+        episodes.add(torch.tensor([[float(value)]]), none, ~none)
+
+
+def test_means_reach_back_over_100_episodes():
+    """A lucky episode that ends alone is one of a hundred in its report's mean."""
+    episodes = EpisodeStats(1, "cpu")
+    for _ in range(4):
+        add_episodes(episodes, *[1.0] * 30)
+        episodes.pop()
+    add_episodes(episodes, 101.0)
+    stats = episodes.pop()
+    # without the oldest report 91 would be left
+    assert (stats["episode/count"], stats["episode/window"]) == (1, 121)
+    assert stats["episode/return"] == pytest.approx(1 + 100 / 121)
+    assert stats["episode/return_std"] == pytest.approx(100 / 121 * 120**0.5)
+    add_episodes(episodes, *[1.0] * 9)
+    assert episodes.pop()["episode/window"] == 100, "the oldest report is dropped"
+    add_episodes(episodes, *[2.0] * 250)
+    stats = episodes.pop()
+    assert (stats["episode/window"], stats["episode/return"]) == (250, 2)
+
+
+def test_means_of_a_group_reach_back_over_its_own_episodes():
+    """Lane 1's episodes end in every report, lane 0's in the first only."""
+    groups = {"rare": torch.tensor([True, False]), "often": torch.tensor([False, True])}
+    episodes, none = EpisodeStats(2, "cpu", groups=groups), torch.zeros(60, 2, dtype=torch.bool)
+    reward = torch.tensor([[3.0, 5.0]]).expand(60, 2)
+    for lanes in ([True, True], [False, True], [False, True]):
+        episodes.add(reward, none, torch.tensor([lanes]).expand(60, 2))
+        stats = episodes.pop()
+    assert (stats["episode/count/rare"], stats["episode/window/rare"]) == (0, 60)
+    assert (stats["episode/window/often"], stats["episode/return/often"]) == (120, 5)
+    assert stats["episode/return/rare"] == 3 and stats["episode/window"] == 120
+
+
+def test_first_episodes_are_left_out_where_they_are_cut():
+    """Lane 0's first episode ends in the first rollout, lane 1's in the second."""
+    episodes, none = EpisodeStats(2, "cpu", skip_first=True), torch.zeros(3, 2, dtype=torch.bool)
+    done = none.clone()
+    done[0, 0] = done[2, 0] = True
+    episodes.add(torch.ones(3, 2), none, done)
+    assert (episodes.is_whole.tolist(), episodes.pop()["episode/length"]) == ([True, False], 2)
+    episodes.add(torch.ones(3, 2), none, ~none)
+    assert episodes.pop()["episode/count"] == 3 + 2
+
+
+def test_nonfinite_metric_counts_as_zero():
+    episodes, none = EpisodeStats(2, "cpu", ["laps"]), torch.zeros(1, 2, dtype=torch.bool)
+    episodes.add(torch.ones(1, 2), none, ~none, metrics=dict(laps=torch.tensor([[torch.nan, 3]])))
+    assert episodes.pop()["episode/laps"] == 1.5
 
 
 def test_sums_are_restored_only_for_the_same_metrics():
@@ -156,3 +220,9 @@ def test_sums_are_restored_only_for_the_same_metrics():
     for episodes in (same, other):
         episodes.load_state_dict(first.state_dict())
     assert same.pop() == first.pop() and other.pop() == {"episode/count": 0}
+    add_episodes(rest := EpisodeStats(1, "cpu"), 1.0)
+    rest.pop()
+    resumed = EpisodeStats(1, "cpu")
+    resumed.load_state_dict(rest.state_dict())
+    assert resumed.pop() == rest.pop() and resumed.windows == rest.windows
+    assert resumed.windows[0][0] == [1, 1, 1, 1]

@@ -10,7 +10,7 @@ import types
 import pytest
 
 from megastep.agents.training import json_lines, loggers
-from megastep.agents.training.curves import plot_curves
+from megastep.agents.training.curves import panels_of, plot_curves
 from megastep.agents.training.loggers import Loggers
 from tests.helpers import faults
 
@@ -231,10 +231,38 @@ def test_curves_are_drawn_from_the_files(tmp_path):
     from matplotlib.image import imread
 
     rows = [{"samples": n, "episode/return": n, "loss/value": None} for n in range(3)]
-    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (tmp_path / "metrics.jsonl").write_text("")
     (tmp_path / "perf.jsonl").write_text("")
     plot_curves(tmp_path)
-    assert imread(tmp_path / "curves.png").shape[1] > 500
+    assert not (tmp_path / "curves.png").exists(), "there is nothing to draw yet"
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    plot_curves(tmp_path)
+    assert imread(tmp_path / "curves.png").shape[1] > 200
+
+
+def test_curves_are_those_that_the_rows_have():
+    """A learner without entropy has a panel for each loss that it does have."""
+    none = {"samples": 1, "episode/count": 0, "loss/td": None, "updates": 1, "anneal": "never"}
+    row = {
+        "samples": 2,
+        "episode/count": 3,
+        "episode/window": 5,
+        "episode/return": 1.0,
+        "episode/coverage": 0.5,
+        "episode/return_std": 0.1,
+        "episode/count/left": 1,
+        "episode/return/left": 3.0,
+        "episode/won/past": 0.25,
+        "loss/td": 7.0,
+    }
+    perf = [{"samples": 1, "perf/seconds": 0.0}, {"samples": 2, "perf/rate": 9.0}]
+    assert panels_of([none, row], perf) == {
+        "return": {"all": [(2, 1.0)], "left": [(2, 3.0)]},
+        "coverage": {"all": [(2, 0.5)]},
+        "won": {"past": [(2, 0.25)]},
+        "loss/td": {"": [(2, 7.0)]},
+        "samples / s": {"": [(2, 9.0)]},
+    }
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from megastep.agents.algorithms import nonfinite
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
-from megastep.agents.training import checkpoint, trainer
+from megastep.agents.training import checkpoint, performance, trainer
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.saver import Saver
 from megastep.agents.training.trainer import Trainer
@@ -105,21 +105,116 @@ def same(a, b):
 def test_trainer_collects_updates_logs_and_saves(tmp_path):
     run = make_trainer(tmp_path, samples=5 * UPDATE, every=2)
     run.train()
-    assert [row["samples"] for row in run.logger] == [2 * UPDATE, 4 * UPDATE]
-    assert [row["updates"] for row in run.logger] == [2, 4]
-    assert run.env.steps == 5 * T and run.env.n_checks == 2
+    # the last report is of the update since the second
+    assert [row["samples"] for row in run.logger] == [2 * UPDATE, 4 * UPDATE, 5 * UPDATE]
+    assert [row["updates"] for row in run.logger] == [2, 4, 5]
+    assert run.env.steps == 5 * T and run.env.n_checks == 3
     assert checkpoint.load_latest(tmp_path).step == 5 * UPDATE
     # episodes of 7 steps and one for the reset: the first ends in step 7, the second in step 15
-    assert [row["episode/count"] for row in run.logger] == [B, B]
-    assert [row["episode/return"] for row in run.logger] == [7, 7]
-    assert run.score == 7 and run.fraction_left == 0
+    assert [row["episode/count"] for row in run.logger] == [B, B, 0]
+    assert [row["episode/return"] for row in run.logger] == [7, 7, 7]
+    assert run.score is None and run.fraction_left == 0
+
+
+def test_score_waits_for_100_episodes(tmp_path):
+    """Six episodes of 8 steps end at a time: 96 after 128 steps, 102 after 136."""
+    run = make_trainer(tmp_path, samples=33 * UPDATE, every=1)
+    run.train()
+    assert run.logger[-1]["episode/window"] == 96 and run.score is None
+    run.budget = Budget(34 * UPDATE)
+    run.train()
+    assert run.logger[-1]["episode/window"] == 102 and run.score == 7
+
+
+def test_cut_first_episodes_are_no_statistics(tmp_path):
+    class Desynced(Numbers):
+        def desync(self):
+            self.age = torch.arange(B)  # a first episode of 7 to 2 steps
+
+    assert make_trainer(tmp_path, env=Desynced()).env.age.tolist() == [0] * B
+    run = make_trainer(tmp_path, samples=4 * UPDATE, every=4, env=Desynced(), desync=True)
+    run.train()
+    (row,) = run.logger
+    # 16 steps: lane i is truncated at step 7 - i and, one step for the reset later, at 15 - i
+    assert (row["episode/count"], row["episode/length"], row["episode/return"]) == (B, 7, 7)
+
+
+def test_seconds_of_each_phase_and_the_rest_add_up(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(performance.time, "perf_counter", lambda: now[0])
+    run, perf = make_trainer(tmp_path, samples=5 * UPDATE, every=2), []
+    collect, update = run.collect, run.learner.update
+
+    def taking(seconds, function):
+        def call(*args):
+            now[0] += seconds
+            return function(*args)
+
+        return call
+
+    run.collect, run.learner.update = taking(3, collect), taking(5, update)
+    run.snapshot_saver = taking(1, lambda trainer: None)
+    run.logger.write = lambda samples, metrics, row: perf.append(row)
+    run.train()
+    phases = [{name: row[f"perf/{name}"] for name in ("collect", "update", "rest")} for row in perf]
+    # the first update compiles, so the first report counts from its end
+    assert phases == [
+        {"collect": 3, "update": 5, "rest": 2},
+        {"collect": 6, "update": 10, "rest": 2},
+        {"collect": 3, "update": 5, "rest": 1},
+    ]
+
+
+@pytest.mark.cuda
+def test_phases_are_timed_on_a_gpu_without_waiting_for_it():
+    timer, matrix = performance.PhaseTimer("cuda"), torch.rand(2048, 2048, device="cuda")
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(20):
+            timer.start("work")
+            matrix @ matrix
+            timer.start("rest")
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    seconds = timer.pop()
+    assert set(seconds) == {"work", "rest"} and seconds["work"] > seconds["rest"] >= 0
+    assert set(timer.pop()) == {"rest"}
+    memory = performance.device_memory("cuda")
+    assert matrix.nbytes <= memory["allocated"] <= min(memory["peak"], memory["reserved"])
+
+
+def test_loss_without_a_gradient_step_is_left_out(tmp_path):
+    run = make_trainer(tmp_path, always("reward", 2, torch.nan, n=5), samples=2 * UPDATE)
+    with pytest.warns(UserWarning, match="reward of lane 2"):
+        run.train()
+    first, second = run.logger
+    assert "loss/value" not in first and first["loss/skipped_steps"] == 2
+    assert second["loss/value"] > 0
+
+
+@pytest.mark.parametrize(
+    "fault", [checkpoint.DamagedCheckpoint("other bytes"), OSError(5, "other bytes")]
+)
+def test_failed_saves_are_one_warning_also_where_the_run_folder_is_gone(
+    tmp_path, monkeypatch, fault
+):
+    def failing(*_):
+        raise fault
+
+    monkeypatch.setattr(checkpoint, "save", failing)
+    saver = Saver(tmp_path / "gone" / "checkpoints", {})
+    with pytest.warns(UserWarning, match=r"\(other bytes\).*gone, which cannot be read") as caught:
+        assert not saver(1, {}) and not saver(2, {})
+    assert len(caught) == 1 and "at 2 samples" in saver.error
 
 
 def test_metrics_are_logged_by_name_and_role_for_lanes_that_learn(tmp_path):
     run = make_trainer(tmp_path, samples=2 * UPDATE, every=2, env=Pairs())
     run.train()
     (row,) = run.logger
-    assert row["episode/count"] == 4 and row["episode/age"] == 75 and run.score == 7.5
+    assert row["episode/count"] == 4 and row["episode/age"] == 75
+    assert row["episode/return"] == 7.5
     assert (row["episode/age/leader"], row["episode/age/follower"]) == (70, 80)
     assert (row["episode/return/leader"], row["episode/return/follower"]) == (7, 8)
     assert run.latest_stats["episode/age"] == 75
@@ -149,12 +244,13 @@ def test_async_collector_is_waited_for_before_checks_and_at_the_end(tmp_path):
     run.collect = AsyncCollector()
     run.env.check = lambda: order.append("check")
     run.train()
-    assert order == ["collect", "collect", "wait", "check", "collect", "wait"]
+    assert order == [*["collect"] * 2, "wait", "check", "collect", "wait", "check", "wait"]
 
 
 def test_trainer_stops_on_request(tmp_path):
-    run = make_trainer(tmp_path)
+    run = make_trainer(tmp_path, every=5)
     run.train(lambda: run.updates == 2)
+    assert [row["updates"] for row in run.logger] == [2], "what was not reported yet is reported"
     assert run.samples == checkpoint.load_latest(tmp_path).step == 2 * UPDATE
 
 

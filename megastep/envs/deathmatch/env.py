@@ -155,6 +155,11 @@ class Deathmatch(SceneryEnv):
         self.ended.fill_(True)
         return self._world()
 
+    def desync(self) -> None:
+        """Gives every lane a random age, from the seed, so that episodes do not end together."""
+        limits = torch.full_like(self.ages, self.rules["limit"])
+        self.ages.copy_(modules.random_ages(limits, self.core.seed))
+
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
         actions = decision["actions"].masked_fill(self.ended[:, None], 0)
