@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from megastep.agents.algorithms.nonfinite import LIMIT
-from megastep.types import Env
+from megastep.types import Env, optional
 
 
 class EpisodeStats:
@@ -134,11 +134,11 @@ def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch
     Returns:
         Group name -> (B,) bool.
     """
-    groups, roles = {}, getattr(env, "roles", None) or ()
+    groups, roles = {}, optional(env, "roles") or ()
     for role in dict.fromkeys(roles):
         has_role = torch.tensor([name == role for name in roles], device=env.device)
         groups[role] = has_role.repeat(env.n_envs)
-    groups |= getattr(env, "matchups", {})
+    groups |= optional(env, "matchups")
     return groups if stored is None else {name: lanes[stored] for name, lanes in groups.items()}
 
 

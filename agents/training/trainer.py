@@ -13,7 +13,7 @@ import torch
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import EpisodeStats, lane_groups
-from megastep.types import Env
+from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
@@ -178,8 +178,7 @@ class Trainer:
         Raises the errors that `env.check()` does, and NonFiniteError as `check_finite` does.
         """
         self.wait_for_collector()
-        if hasattr(self.env, "check"):
-            self.env.check()
+        optional(self.env, "check")()
         loss_values = torch.stack(list(losses.values())).tolist()
         stats = self.episode_stats.pop()
         if self.opponents is not None:
