@@ -69,7 +69,7 @@ class Env(Protocol):
 
 
 #: Optional attributes of an environment, with their defaults.
-DEFAULTS = {
+DEFAULTS: dict[str, Any] = {
     "n_agents": 1,
     "fps": 10.0,
     "check": lambda: None,
@@ -82,9 +82,15 @@ DEFAULTS = {
 }
 
 
-def optional(env: Env, name: str) -> Any:
-    """Returns an optional attribute of an environment, or its default."""
-    return getattr(env, name, DEFAULTS[name])
+def optional(owner: Any, name: str, defaults: Mapping[str, Any] = DEFAULTS) -> Any:
+    """Returns an optional attribute of an environment, or its default.
+
+    Args:
+        owner: an environment, or whatever else ``defaults`` are for.
+        name: a key of ``defaults``.
+        defaults: the default of each optional attribute.
+    """
+    return getattr(owner, name, defaults[name])
 
 
 def n_lanes(env: Env) -> int:

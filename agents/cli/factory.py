@@ -16,6 +16,7 @@ from megastep.agents.imports import import_object
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.training import checkpoint, evaluation, loggers
+from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.capture import state_tree
 from megastep.types import n_lanes, optional
 
@@ -93,12 +94,12 @@ def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **argume
     The `sample` gives an upper bound of what an environment takes, as it counts what environments
     share. Only if that does not fit, more of them are made.
     """
-    n_bytes, total = learner.bytes_per_env(sample), _nbytes(sample)
+    n_bytes = optional(learner, "bytes_per_env", LEARNER_DEFAULTS)(sample)
+    n, each = optional(learner, "replay_size", LEARNER_DEFAULTS)(sample)
+    total = _nbytes(sample)
     with errors():
-        if hasattr(learner, "replay_size"):
-            n, each = learner.replay_size(sample)
-            engine.fit(n, each, sample.device, "observations of learner.replay.capacity")
-            n_bytes += n * each / env.n_envs
+        engine.fit(n, each, sample.device, "observations of learner.replay.capacity")
+        n_bytes += n * each / env.n_envs
         try:
             engine.fit(env.n_envs, total + n_bytes, sample.device)
         except engine.EngineError:
