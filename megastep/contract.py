@@ -4,6 +4,7 @@
 the first world that breaks a clause. Axes: N environments, A agents, B = N A lanes.
 """
 
+import numbers
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 
 from megastep import spaces
 from megastep.arrdict import arrdict
-from megastep.types import DEFAULTS, Env, Space, Tree, World, n_lanes, optional
+from megastep.types import Env, Space, Tree, World, n_lanes, optional
 
 __all__ = [
     "ATTRIBUTES",
@@ -59,10 +60,11 @@ def check_environment(env: Env) -> None:
     """
     for name, meaning in ATTRIBUTES.items():
         _require(env, hasattr(env, name), f"it has no {name}: {meaning}")
-    n_agents, fps, check, layout, roles, *_ = (optional(env, name) for name in DEFAULTS)
-    is_count = isinstance(n_agents, int) and n_agents > 0
+    names = "n_agents", "fps", "check", "layout", "roles"
+    n_agents, fps, check, layout, roles = (optional(env, name) for name in names)
+    is_count = isinstance(n_agents, numbers.Integral) and n_agents > 0
     _require(env, is_count, f"n_agents must be a positive integer, not {n_agents!r}")
-    is_rate = isinstance(fps, (int, float)) and fps > 0
+    is_rate = isinstance(fps, numbers.Real) and fps > 0
     _require(env, is_rate, f"fps must be a positive number, not {fps!r}")
     _require(env, callable(check), f"check must be a method without arguments, not {check!r}")
     check()

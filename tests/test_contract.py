@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from megastep import arrdict, contract, dotdict, spaces
+from megastep import arrdict, capture, contract, dotdict, spaces, types
 
 
 class TinyEnv:
@@ -109,6 +109,12 @@ class TinyEnv:
 
 def test_a_valid_environment_passes():
     assert len(contract.rollout(TinyEnv(), 9)) == 10
+
+
+def test_wrappers_leave_optional_attributes_to_their_defaults():
+    env = capture.Captured(TinyEnv())
+    assert types.n_lanes(env) == 2 and types.optional(env, "fps") == 10
+    contract.rollout(env, 9)
 
 
 def test_a_world_that_is_no_arrdict_is_refused():
