@@ -7,16 +7,13 @@ are in :mod:`megastep.agents.algorithms.learner`. T steps, B lanes.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
 from megastep.types import Env, Policy
 
-if TYPE_CHECKING:
-    from megastep.agents.algorithms.nonfinite import NonFiniteCheck
-
-__all__ = ["Actor", "Collector", "Learner", "Logger", "Rollout"]
+__all__ = ["LEARNER_DEFAULTS", "Actor", "Collector", "Learner", "Logger", "Rollout"]
 
 
 class Actor(Policy, Protocol):
@@ -46,7 +43,7 @@ class Rollout(Protocol):
     learners: torch.Tensor | None  # bool per lane of the environment: True if stored; None: all
 
     def floats(self) -> dict[str, torch.Tensor]:
-        """Returns the float tensors by name, (T, B, ...) or (T+1, B, ...), for `learner.check`."""
+        """Returns the float tensors by name, (T, B, ...) or (T+1, B, ...), to check them."""
 
 
 class Collector(Protocol):
@@ -66,30 +63,36 @@ class Collector(Protocol):
 class Learner(Protocol):
     """Improves a policy: ``rollout = collect()``, ``losses = learner.update(rollout)``, repeat.
 
-    A learner with a replay buffer also has `replay_size(env)`, which returns the number of
-    observations the buffer will hold and the bytes that each takes.
+    Optional attributes, whose defaults are in `LEARNER_DEFAULTS`:
+        set_lr(lr): changes the learning rate. Without it the rate is constant.
+        check: a `NonFiniteCheck` that `update` calls.
+        bytes_per_env(env): the bytes needed per environment like `env`, rollouts included.
+        replay_size(env): the number of observations that a replay buffer will hold, and the bytes
+            that each takes.
     """
 
     lr: float  # initial learning rate
-    check: NonFiniteCheck  # called by `update`
 
     def collector(self, env: Env) -> Collector:
         """Returns a collector for `env`."""
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
-        """Learns from a rollout and returns metrics, tensors () by name."""
-
-    def bytes_per_env(self, env: Env) -> float:
-        """Returns the bytes needed per environment like `env`, rollouts included."""
-
-    def set_lr(self, lr: float) -> None:
-        """Changes the learning rate."""
+        """Learns from a rollout and returns metrics, tensors () or numbers by name."""
 
     def state_dict(self) -> dict[str, Any]:
         """Returns everything that changes, except the policy's weights."""
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continues from a `state_dict`."""
+
+
+#: Optional attributes of a learner, with their defaults.
+LEARNER_DEFAULTS: dict[str, Any] = {
+    "set_lr": None,
+    "check": None,
+    "bytes_per_env": lambda env: 0.0,
+    "replay_size": lambda env: (0, 0.0),
+}
 
 
 class Logger(Protocol):

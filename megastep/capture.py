@@ -224,7 +224,12 @@ class Captured:
         self.env, self._step = env, None
 
     def __getattr__(self, name: str) -> Any:
+        if name == "env":  # not set yet while the object is being copied
+            raise AttributeError(name)
         return getattr(self.env, name)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"env": self.env, "_step": None}  # a copy records a graph of its own
 
     def step(self, decision: Mapping) -> World:
         """Steps the environment by ``decision["actions"]``; other keys are dropped.

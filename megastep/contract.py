@@ -4,6 +4,7 @@
 the first world that breaks a clause. Axes: N environments, A agents, B = N A lanes.
 """
 
+import numbers
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 
 from megastep import spaces
 from megastep.arrdict import arrdict
-from megastep.types import Env, Space, Tree, World
+from megastep.types import Env, Space, Tree, World, n_lanes, optional
 
 __all__ = [
     "ATTRIBUTES",
@@ -31,14 +32,11 @@ INTEGERS = tuple(
 RESERVED = "count", "window", "return", "length", "return_std"  # reported of every episode
 ATTRIBUTES = {
     "n_envs": "the number of environments, N",
-    "n_agents": "the number of lanes per environment, A",
     "device": "the device that the tensors are on",
-    "fps": "steps per second of simulated time",
     "obs_space": "the space, or dict of spaces, of one lane's observation",
     "action_space": "the space, or dict of spaces, of one lane's actions",
     "reset": "a method that starts every episode and returns a world",
     "step": "a method that takes a decision and returns a world",
-    "check": "a method that raises the errors flagged on the device",
 }
 
 
@@ -55,27 +53,31 @@ def _require(env: Env, holds: bool, clause: str) -> None:
 
 
 def check_environment(env: Env) -> None:
-    """Checks the attributes of an environment: the required ones, ``layout`` and ``roles``.
+    """Checks the attributes of an environment, the required and the optional ones.
 
     Raises:
         ContractError: if one is missing or wrong.
     """
     for name, meaning in ATTRIBUTES.items():
         _require(env, hasattr(env, name), f"it has no {name}: {meaning}")
-    _require(env, env.fps > 0, f"fps must be a positive number, not {env.fps}")
-    env.check()
-    layout = getattr(env, "layout", None)
+    names = "n_agents", "fps", "check", "layout", "roles"
+    n_agents, fps, check, layout, roles = (optional(env, name) for name in names)
+    is_count = isinstance(n_agents, numbers.Integral) and n_agents > 0
+    _require(env, is_count, f"n_agents must be a positive integer, not {n_agents!r}")
+    is_rate = isinstance(fps, numbers.Real) and fps > 0
+    _require(env, is_rate, f"fps must be a positive number, not {fps!r}")
+    _require(env, callable(check), f"check must be a method without arguments, not {check!r}")
+    check()
     _require(
         env,
         layout is None or (layout.shape == (env.n_envs,) and not layout.is_floating_point()),
         f"layout must hold one integer per environment, shape ({env.n_envs},)",
     )
-    roles = getattr(env, "roles", None)
-    is_list = isinstance(roles, (tuple, list)) and len(roles) == env.n_agents
+    is_list = isinstance(roles, (tuple, list)) and len(roles) == n_agents
     _require(
         env,
         roles is None or (is_list and _are_names(roles)),
-        f"roles must hold one name per agent, {env.n_agents} in all, not {roles!r}",
+        f"roles must hold one name per agent, {n_agents} in all, not {roles!r}",
     )
 
 
@@ -97,6 +99,8 @@ def check_world(env: Env, world: World, last: World | None = None) -> None:
     Raises:
         ContractError: if the world breaks a clause.
     """
+    kind = type(world).__name__
+    _require(env, isinstance(world, arrdict), f"a world must be a megastep.arrdict, not a {kind}")
     for key in ("obs", "reward", *FLAGS):
         _require(env, key in world, f"the world has no {key}")
     _check_per_lane(env, "reward", world["reward"], torch.float32)
@@ -134,7 +138,7 @@ def _check_tensor(env, path, values, shape, dtypes, kind=None):
 
 
 def _check_per_lane(env, path, values, dtype):
-    _check_tensor(env, path, values, (env.n_envs * env.n_agents,), (dtype,))
+    _check_tensor(env, path, values, (n_lanes(env),), (dtype,))
 
 
 def _leaves(env: Env, space: Space, values: Tree, name: str) -> Iterator[tuple[str, Space, Any]]:
@@ -150,7 +154,7 @@ def _leaves(env: Env, space: Space, values: Tree, name: str) -> Iterator[tuple[s
 
 
 def _check_observation(env, path, space, values):
-    shape = env.n_envs * env.n_agents, *space.shape
+    shape = n_lanes(env), *space.shape
     if isinstance(space, spaces.MultiDiscrete):
         _check_tensor(env, path, values, shape, INTEGERS, "integers")
         inside = bool(((values >= 0) & (values < space.n_actions)).all())
@@ -162,7 +166,7 @@ def _check_observation(env, path, space, values):
 
 
 def _check_privileged(env, world):
-    space = getattr(env, "privileged_space", None)
+    space = optional(env, "privileged_space")
     has_values, has_space = "privileged" in world, space is not None
     _require(
         env,
@@ -172,7 +176,7 @@ def _check_privileged(env, world):
     if space is None:
         return
     for path, leaf, values in _leaves(env, space, world["privileged"], "privileged"):
-        shape = env.n_envs * env.n_agents, *leaf.shape
+        shape = n_lanes(env), *leaf.shape
         _check_tensor(env, path, values, shape, (torch.float32,))
         _require(env, bool(values.isfinite().all()), f"{path} must be finite")
 
@@ -234,11 +238,10 @@ def random_actions(env: Env, generator: torch.Generator) -> Tree:
     """Returns uniformly random actions, (B, ...) per leaf of the action space, on the environment's
     device. ``generator`` is a CPU generator, so the actions are the same on every device.
     """
-    n_lanes = env.n_envs * env.n_agents
 
     def draw(space):
-        actions = torch.randint(space.n_actions, (n_lanes, *space.shape), generator=generator)
-        return actions.to(env.device)
+        shape = n_lanes(env), *space.shape
+        return torch.randint(space.n_actions, shape, generator=generator).to(env.device)
 
     return spaces.map(draw, env.action_space)
 
@@ -268,7 +271,7 @@ def rollout(env: Env, n_steps: int, seed: int = 1, check: bool = True) -> list[a
     for _ in range(n_steps):
         add(env.step(arrdict(actions=random_actions(env, generator))))
     if check:
-        env.check()
+        optional(env, "check")()
     return worlds
 
 

@@ -1,6 +1,6 @@
-"""Protocols of an environment, its worlds and a policy, for readers and type checkers.
+"""Protocols of an environment, its worlds and a policy, and the defaults of what is optional.
 
-No class needs to inherit from them: any object with these attributes is one.
+No class needs to inherit from the protocols: any object with these attributes is one.
 :mod:`megastep.contract` checks an environment at run time. Axes: N environments, A agents per
 environment that are controlled independently, B = N A lanes.
 """
@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-__all__ = ["Env", "Policy", "Space", "Tree", "World"]
+__all__ = ["DEFAULTS", "Env", "Policy", "Space", "Tree", "World", "n_lanes", "optional"]
 
 #: A space of :mod:`megastep.spaces`, or a (nested) dict of spaces.
 Space = Any
@@ -45,21 +45,22 @@ class World(Protocol):
 class Env(Protocol):
     """N copies of a game that are stepped together on one device.
 
-    Optional attributes:
+    Optional attributes, whose defaults are in ``DEFAULTS``; read them with :func:`optional`:
+        n_agents: number of lanes per environment, A. Default: 1.
+        fps: steps per second of simulated time, for videos. Default: 10.
+        check(): raises the errors that were flagged on the device. Synchronises host and device.
         layout: (N,) integers, the floor plan that each environment shows now. Confidence intervals
-            of an evaluation are over layouts.
+            of an evaluation are over layouts. Default: None, intervals are over environments.
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
-        privileged_space: space of ``world.privileged``.
+        privileged_space: space of ``world.privileged``. Default: None, there is none.
         desync(): gives every lane a random age, as if its episode had been going on for some steps.
             Training calls it after ``reset``, so that lanes do not end their episodes in the same
-            steps.
-        state(e), plot_state(state): draw environment ``e``, for videos.
+            steps. Default: none.
+        state(e), plot_state(state): draw environment ``e``. Without them there are no videos.
     """
 
     n_envs: int
-    n_agents: int  # lanes per environment
     device: torch.device
-    fps: float  # steps per second of simulated time
     obs_space: Space  # of one lane
     action_space: Space  # of one lane
 
@@ -69,8 +70,36 @@ class Env(Protocol):
     def step(self, decision: Mapping) -> World:
         """Takes one step by ``decision["actions"]``, (B, ...) per leaf of the action space."""
 
-    def check(self) -> None:
-        """Raises the errors that were flagged on the device. Synchronises host and device."""
+
+#: Optional attributes of an environment, with their defaults.
+DEFAULTS: dict[str, Any] = {
+    "n_agents": 1,
+    "fps": 10.0,
+    "check": lambda: None,
+    "layout": None,
+    "roles": None,
+    "privileged_space": None,
+    "desync": None,
+    # of environments with opponents
+    "learners": None,  # (B,) bool, lanes whose transitions are stored; None: all
+    "matchups": {},  # (B,) bool by name, groups of lanes that are reported apart
+}
+
+
+def optional(owner: Any, name: str, defaults: Mapping[str, Any] = DEFAULTS) -> Any:
+    """Returns an optional attribute of an environment, or its default.
+
+    Args:
+        owner: an environment, or whatever else ``defaults`` are for.
+        name: a key of ``defaults``.
+        defaults: the default of each optional attribute.
+    """
+    return getattr(owner, name, defaults[name])
+
+
+def n_lanes(env: Env) -> int:
+    """Returns the number of lanes of an environment, B = N A."""
+    return env.n_envs * optional(env, "n_agents")
 
 
 @runtime_checkable

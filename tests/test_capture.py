@@ -3,6 +3,7 @@ themselves need a GPU; most tests replace them and run anywhere.
 """
 
 import contextlib
+import copy
 from operator import attrgetter
 
 import pytest
@@ -298,6 +299,16 @@ def test_only_the_actions_of_a_decision_reach_the_environment():
     decision = arrdict.arrdict(**actions("cpu"), logits=torch.zeros(4))
     capture.Captured(env).step(decision)
     assert set(decisions[0]) == {"actions"}
+
+
+def test_a_copy_steps_its_own_environment():
+    env = capture.Captured(Counter())
+    env.step(actions("cpu"))
+    copied = copy.deepcopy(env)
+    for _ in range(2):
+        copied.step(actions("cpu"))
+    assert env.parts["total"].tolist() == 4 * [1] and copied.parts["total"].tolist() == 4 * [3]
+    assert copy.copy(env).parts is env.parts
 
 
 def test_on_the_cpu_steps_are_not_captured():

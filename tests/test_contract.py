@@ -3,16 +3,17 @@
 import pytest
 import torch
 
-from megastep import arrdict, contract, dotdict, spaces
+from megastep import arrdict, capture, contract, dotdict, spaces, types
 
 
 class TinyEnv:
     """Two environments whose episodes last three steps and whose worlds have every optional key.
+    The optional attributes `n_agents`, `fps`, `check` and `layout` have their defaults.
 
     ``fault`` names a change that breaks one clause of the contract.
     """
 
-    n_envs, n_agents, device, fps = 2, 1, "cpu", 10.0
+    n_envs, device = 2, "cpu"
     obs_space = dotdict.dotdict(
         age=spaces.MultiVector(1, 1),
         sky=spaces.MultiImage(1, 3, 1, 2, dtype=torch.uint8),
@@ -23,9 +24,6 @@ class TinyEnv:
 
     def __init__(self, fault=None):
         self.fault, self.age = fault, torch.tensor([0, 1])
-
-    def check(self):
-        pass
 
     def _world(self, reset):
         ended = (self.age == 3) & ~reset
@@ -113,6 +111,19 @@ def test_a_valid_environment_passes():
     assert len(contract.rollout(TinyEnv(), 9)) == 10
 
 
+def test_wrappers_leave_optional_attributes_to_their_defaults():
+    env = capture.Captured(TinyEnv())
+    assert types.n_lanes(env) == 2 and types.optional(env, "fps") == 10
+    contract.rollout(env, 9)
+
+
+def test_a_world_that_is_no_arrdict_is_refused():
+    env = TinyEnv()
+    env.reset = lambda: (torch.zeros(2), {})
+    with pytest.raises(contract.ContractError, match="megastep.arrdict, not a tuple"):
+        contract.rollout(env, 0)
+
+
 @pytest.mark.parametrize("name", contract.ATTRIBUTES)
 def test_a_missing_attribute_is_named(name):
     class Incomplete:
@@ -129,6 +140,9 @@ def test_a_missing_attribute_is_named(name):
     "name, value, clause",
     [
         ("fps", 0, "fps .*positive.*not 0"),
+        ("fps", "10", "fps .*not '10'"),
+        ("n_agents", 0, "n_agents .*positive integer, not 0"),
+        ("check", True, "check must be a method .*not True"),
         ("layout", torch.zeros(3, dtype=torch.int32), r"layout .*integer.*\(2,\)"),
         ("layout", torch.zeros(2), "layout .*integer"),
         ("roles", ("leader", "follower"), "roles .*one name per agent, 1 in all, not .*'follower'"),

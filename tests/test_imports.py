@@ -58,6 +58,7 @@ OWN_USERS = {
     "megastep.kernels.build.launch": (
         "megastep/engine/*.py",
         "megastep/envs/*/step.py",
+        "megastep/envs/pointgoal/path_graph.py",
         "megastep/kernels/build/*.py",
         "megastep/modules/visibility.py",  # its cache depends on the kernels' sources
         "agents/networks/kernels/*.py",

@@ -10,10 +10,11 @@ import torch
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015) for parameters that all have gradients.
+    """Adam (Kingma and Ba 2015). A step skips parameters without a gradient: frozen or unused ones.
 
     Args:
-        parameters: parameters to optimise.
+        parameters: parameters to optimise. They share one count of steps, as if every step had
+            had a gradient for each.
         lr: step size, a tensor () on their device that may be changed in place.
         betas: decay of the running means of gradients and of squared gradients.
         eps: added to the denominator.
@@ -36,13 +37,12 @@ class Adam:
     def step(self, is_taken: torch.Tensor) -> None:
         """Takes one step if `is_taken`, a bool () on the device; otherwise changes nothing."""
         self.n_steps += is_taken
+        everything = zip(self.parameters, self.means, self.squares, strict=True)
+        rows = [(p, p.grad, *moments) for p, *moments in everything if p.grad is not None]
         torch._fused_adam_(
-            self.parameters,
-            [p.grad for p in self.parameters],
-            self.means,
-            self.squares,
+            *map(list, zip(*rows)),
             [],
-            [self.n_steps] * len(self.parameters),
+            [self.n_steps] * len(rows),
             lr=self.lr,
             beta1=self.betas[0],
             beta2=self.betas[1],

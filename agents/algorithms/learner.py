@@ -15,8 +15,10 @@ Rules:
   collector owns the rollout and may return the same object every time. `collect.rollout` exists
   before the first call, too.
 - `collect()` and `update()` do not synchronise host and device.
-- `update()` passes `rollout.floats()` to `learner.check` before it learns, and skips a rollout with
-  non-finite numbers. The trainer reads the check and stops after many skipped updates in a row.
+- A learner with a `check`, a `nonfinite.NonFiniteCheck`, passes `rollout.floats()` to it in every
+  `update()` and skips a rollout with non-finite numbers. The trainer reads the check and stops
+  after many skipped updates in a row. Without a check, a run stops when it is about to save weights
+  that are not finite.
 - Only transitions with `rollout.learns` and without `rollout.reset` count in a loss. An environment
   with opponents has an attribute `learners`, a bool per lane; only those lanes need to be stored.
 - A collector that acts in the background may return an older rollout. It has a method `wait()`,
@@ -24,8 +26,10 @@ Rules:
 - The constructor's arguments `seed` and `graph` are optional. `seed` receives the run's seed, which
   `generator.stream_seed(seed, name)` turns into that of a random stream of its own; `graph` is true
   if updates should be captured as a CUDA graph.
-- A replay buffer belongs to the learner or to its collector. The learner then has a method
-  `replay_size(env)`, which returns (observations, bytes per observation) before the buffer exists.
+- A replay buffer belongs to the learner or to its collector.
+- `megastep.agents.types.LEARNER_DEFAULTS` lists the optional attributes of a learner.
+  `bytes_per_env(env)` and, with a replay buffer, `replay_size(env)` are what a run checks its
+  memory with before it starts.
 
 Building blocks for your own learner: `GradientLearner`, `storage.rollout.make_rollout`,
 `storage.rollout.bytes_per_step`, `storage.collector.Collector`, `gradient_steps.GradientSteps`,
@@ -51,10 +55,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 _ATTRIBUTES = {
     "collector": "a method collector(env) that returns a collector",
     "update": "a method update(rollout) that learns and returns scalar tensors by name",
-    "bytes_per_env": "a method bytes_per_env(env) that returns the bytes needed per environment",
-    "check": "a nonfinite.NonFiniteCheck that update calls",
     "lr": "the initial learning rate",
-    "set_lr": "a method set_lr(lr) that changes the learning rate",
     "state_dict": "a method state_dict() that returns everything but the policy's weights",
     "load_state_dict": "a method load_state_dict(state) that continues from a state_dict",
 }
@@ -65,7 +66,7 @@ class LearnerError(AssertionError):
 
 
 def check_learner(learner: Any) -> None:
-    """Raises LearnerError if an attribute of the contract is missing."""
+    """Raises LearnerError if a required attribute is missing."""
     for name, description in _ATTRIBUTES.items():
         if not hasattr(learner, name):
             raise LearnerError(f"it has no {name}: {description}")

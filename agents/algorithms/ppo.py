@@ -28,7 +28,7 @@ from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
 from megastep.arrdict import arrdict
 from megastep.settings import MAX_ENVS, checked
-from megastep.types import Env
+from megastep.types import Env, optional
 
 
 class PPO(GradientLearner):
@@ -96,7 +96,7 @@ class PPO(GradientLearner):
         rollout = bytes_per_step(env, self.policy)
         minibatch = (rollout + self.policy.activation_bytes) / self.n_minibatches
         per_step = rollout + (minibatch + 4 * self.policy.width)
-        return env.n_agents * (self.n_steps + 1) * per_step
+        return optional(env, "n_agents") * (self.n_steps + 1) * per_step
 
     def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Learns from a rollout.

@@ -21,7 +21,7 @@ from megastep.agents.storage.rollout import bytes_per_step, make_rollout, withou
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.settings import MAX_ENVS, checked
-from megastep.types import Env
+from megastep.types import Env, optional
 
 #: R2D2's default replay settings. A configuration that sets some of them keeps the others.
 REPLAY = ReplaySettings(capacity=8_000_000, burn_in=32, ratio=4.0, alpha=0.9)
@@ -146,7 +146,7 @@ class R2D2(GradientLearner):
         share = self.replay_settings.ratio / self.gradient_steps
         rollout = (self.n_steps + 1) * per_step
         minibatch = share * (self.length + 1) * (per_step + 2 * self.policy.activation_bytes)
-        return env.n_agents * (rollout + minibatch)
+        return optional(env, "n_agents") * (rollout + minibatch)
 
     def replay_size(self, env: Env) -> tuple[int, float]:
         """Returns the number of observations that the replay buffer will hold, and the bytes per

@@ -33,7 +33,7 @@ from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
 from megastep.settings import MAX_ENVS, checked
-from megastep.types import Env
+from megastep.types import Env, optional
 
 # Metrics count larger ratios as e^20, so that their squares stay finite.
 _MAX_LOG_RATIO = 20.0
@@ -147,7 +147,7 @@ class VTrace(GradientLearner):
             share *= 1 + self.replay_settings.ratio
         per_step = bytes_per_step(env, self.policy) * (1 + self.lag + share)
         per_step += self.policy.activation_bytes * share
-        return env.n_agents * (self.n_steps + 1) * per_step
+        return optional(env, "n_agents") * (self.n_steps + 1) * per_step
 
     def replay_size(self, env: Env) -> tuple[int, float]:
         """Returns the number of observations that the replay buffer will hold, and the bytes per

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from megastep.agents.cli import command, compose, console, factory, program, runs, settings
 from megastep.agents.selfplay import duels, ratings
 from megastep.agents.training import checkpoint, evaluation
+from megastep.types import n_lanes, optional
 
 HELP = """Measures what a run's agent earns in the first episode of each lane, with a 95 % interval
 over homes. Prints a table and writes it to the run's folder: evaluations/*.md.
@@ -71,7 +72,7 @@ def run(cfg: settings.Evaluate) -> Path:
         players += [("random", evaluation.RandomActions(env.action_space), False)] * cfg.baseline
         for name, player, greedy in players:
             episodes = evaluation.first_episodes(env, player, cfg.seed, greedy)
-            summaries = evaluation.summaries(episodes, getattr(env, "roles", None))
+            summaries = evaluation.summaries(episodes, optional(env, "roles"))
             rows += [{"agent": name, **row} for row in summaries]
         place, source = runs.place(env_settings, geometry, homes, cfg.split)
         path = runs.write_table(
@@ -79,7 +80,7 @@ def run(cfg: settings.Evaluate) -> Path:
             loaded,
             [source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
             f"{place}, after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, "
-            f"{env.n_envs * env.n_agents:,} lanes",
+            f"{n_lanes(env):,} lanes",
             rows,
             [*map(cells, rows)],
         )
@@ -146,7 +147,7 @@ def find_player(
     Raises:
         UserError: if nobody can be met there, or this player cannot play there.
     """
-    if env.n_agents < 2:
+    if optional(env, "n_agents") < 2:
         raise program.UserError(
             f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
             "one here; choose another with env= and its settings"
@@ -173,10 +174,11 @@ class Arena:
         sample = factory.make_sample(env, homes, **where)
         self.others = [find_player(name, run, env, sample) for name in cfg.against or ()]
         self.agent = load_player(run, sample, run)
-        n_duels = max(1, cfg.episodes // sample.n_agents)  # from each place
+        n_agents = optional(sample, "n_agents")
+        n_duels = max(1, cfg.episodes // n_agents)  # from each place
         homes = homes[:n_duels]
         n_duels -= n_duels % max(1, len(homes))
-        env = factory.changed(env, n_envs=n_duels * sample.n_agents)
+        env = factory.changed(env, n_envs=n_duels * n_agents)
         self.env, self.sample = factory.construct(env, geometries=homes, **where), sample
         self.place, self.source = runs.place(env, geometry, homes, cfg.split)
 

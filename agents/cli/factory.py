@@ -16,7 +16,9 @@ from megastep.agents.imports import import_object
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.training import checkpoint, evaluation, loggers
+from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.capture import state_tree
+from megastep.types import n_lanes, optional
 
 #: Number of environments in which the memory of one is measured.
 PROBE = 65
@@ -92,12 +94,12 @@ def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **argume
     The `sample` gives an upper bound of what an environment takes, as it counts what environments
     share. Only if that does not fit, more of them are made.
     """
-    n_bytes, total = learner.bytes_per_env(sample), _nbytes(sample)
+    n_bytes = optional(learner, "bytes_per_env", LEARNER_DEFAULTS)(sample)
+    n, each = optional(learner, "replay_size", LEARNER_DEFAULTS)(sample)
+    total = _nbytes(sample)
     with errors():
-        if hasattr(learner, "replay_size"):
-            n, each = learner.replay_size(sample)
-            engine.fit(n, each, sample.device, "observations of learner.replay.capacity")
-            n_bytes += n * each / env.n_envs
+        engine.fit(n, each, sample.device, "observations of learner.replay.capacity")
+        n_bytes += n * each / env.n_envs
         try:
             engine.fit(env.n_envs, total + n_bytes, sample.device)
         except engine.EngineError:
@@ -113,7 +115,7 @@ def make_policy(agent: Agent, env: Any, seed: int = 1, critic: str | None = None
     if torch.device(env.device).type == "cpu":
         share_threads(agent.width)
     with errors():
-        spaces = env.obs_space, env.action_space, getattr(env, "privileged_space", None)
+        spaces = env.obs_space, env.action_space, optional(env, "privileged_space")
         return Policy(*spaces, seed=seed, **vars(agent) | {"critic": critic}).to(env.device)
 
 
@@ -161,17 +163,17 @@ def make_bot(name: str, settings: Env, env: Any) -> Any:
     """
     if name == "random":
         return evaluation.RandomActions(env.action_space)
-    n_lanes, where = env.n_envs * env.n_agents, type(env).__name__
+    where = type(env).__name__
 
     def check_actions(space, leaf):
-        fits = tuple(leaf.shape) == (n_lanes, *space.shape) and not leaf.is_floating_point()
+        fits = tuple(leaf.shape) == (n_lanes(env), *space.shape) and not leaf.is_floating_point()
         if not fits or not ((leaf >= 0) & (leaf < space.n_actions)).all():
             raise ValueError(f"its actions are not those of {space!r}")
 
     # a policy may do whatever, where it was not made for
     with program.errors(f"{name} cannot play in {where}; name one made for it: ", (Exception,)):
         bot = construct(settings, name)
-        decision, _ = bot(env.reset(), bot.initial(n_lanes, env.device))
+        decision, _ = bot(env.reset(), bot.initial(n_lanes(env), env.device))
         spaces.map(check_actions, env.action_space, decision["actions"])
     return bot
 

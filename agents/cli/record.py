@@ -24,6 +24,7 @@ from megastep.agents.cli import (
 from megastep.agents.selfplay import duels
 from megastep.agents.training.evaluation import RandomActions
 from megastep.arrdict import numpyify
+from megastep.types import n_lanes, optional
 
 HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
 
@@ -80,23 +81,28 @@ def film(
         path: an .mp4, or a .png, which is the last frame.
 
     Raises:
-        ValueError: for another kind of file.
+        ValueError: for another kind of file, or an environment that cannot be drawn.
         RuntimeError: naming the first frame that failed.
     """
+    if not (hasattr(env, "state") and hasattr(env, "plot_state")):
+        raise ValueError(
+            f"{type(env).__name__} cannot be drawn: it needs the methods state(e) and "
+            "plot_state(state), which docs/new-environment.md shows"
+        )
     path, states = Path(path), _states(env, policy, steps, greedy, seed)
     if path.suffix == ".png":
         (last,) = collections.deque(states, maxlen=1)
         path.parent.mkdir(parents=True, exist_ok=True)
         imsave(path, recording.draw(env.plot_state, numpyify(last)))
         return path
-    with recording.ParallelEncoder(env.plot_state, fps=env.fps) as encoder:
+    with recording.ParallelEncoder(env.plot_state, fps=optional(env, "fps")) as encoder:
         for state in states:
             encoder(state)
     return encoder.save(path)
 
 
 def _states(env, policy, steps, greedy, seed):
-    world, hidden = env.reset(), policy.initial(env.n_envs * env.n_agents, env.device)
+    world, hidden = env.reset(), policy.initial(n_lanes(env), env.device)
     generator = torch.Generator(env.device).manual_seed(seed)
     yield env.state(0)
     for _ in range(steps - 1):

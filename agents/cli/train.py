@@ -28,6 +28,8 @@ from megastep.agents.cli import (
 from megastep.agents.training import budget, checkpoint, curves, loggers, provenance, saver
 from megastep.agents.training.atomic_files import write_atomically
 from megastep.agents.training.trainer import Trainer
+from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.types import optional
 
 HELP = """Trains a policy in an environment.
 
@@ -81,6 +83,7 @@ def make_trainer(
     sample = factory.make_sample(cfg.env, **where)
     policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
     learner = factory.make_learner(cfg.learner, policy, cfg.seed)
+    cfg = annealed(cfg, optional(learner, "set_lr", LEARNER_DEFAULTS) is not None)
     factory.check_memory(cfg.env, sample, learner, **where)
     env = factory.construct(cfg.env, **where)
     if cfg.resume or cfg.init:
@@ -147,18 +150,18 @@ def few_means(latest: dict[str, float], metrics: Sequence[str], groups: Sequence
     return shown if len(names) <= 4 else []
 
 
-def annealed(cfg: settings.Train) -> settings.Train:
+def annealed(cfg: settings.Train, has_set_lr: bool = True) -> settings.Train:
     """Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
-    limited, else by never.
+    limited, else by never; by never if the learner has no `set_lr`.
     """
-    limits = [name for name in ("samples", "seconds") if getattr(cfg, name) is not None]
+    limits = [n for n in ("samples", "seconds") if has_set_lr and getattr(cfg, n) is not None]
     anneal = [*limits, "never"][0] if cfg.learner.anneal == "auto" else cfg.learner.anneal
     return factory.changed(cfg, learner=factory.changed(cfg.learner, anneal=anneal))
 
 
 def run(cfg: settings.Train) -> Path:
     """Trains as `cfg` says, and returns the run folder. A signal saves and raises Interrupted."""
-    cfg, device, progress = annealed(cfg), factory.make_device(cfg.device), console.Progress()
+    device, progress = factory.make_device(cfg.device), console.Progress()
     folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
     with runs.locked(folder):
         with contextlib.ExitStack() as undo:
@@ -169,7 +172,10 @@ def run(cfg: settings.Train) -> Path:
                 write_atomically(
                     folder / "config.yaml",
                     yaml.safe_dump(
-                        check.as_tree(cfg), sort_keys=False, allow_unicode=True, encoding="utf-8"
+                        running.saver.config["train"],
+                        sort_keys=False,
+                        allow_unicode=True,
+                        encoding="utf-8",
                     ),
                 )
             undo.pop_all()

@@ -8,7 +8,7 @@ import torch
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.training.evaluation import CHECK_EVERY
 from megastep.arrdict import arrdict
-from megastep.types import Env, Policy
+from megastep.types import Env, Policy, n_lanes, optional
 
 #: A duel is a draw after this many steps.
 MAX_STEPS = 500
@@ -94,8 +94,8 @@ def play(
     generator = torch.Generator(device).manual_seed(seed)
     slots = rotating_slots(*shape, device)
     both = duel_policy(policy, opponent, slots, env.n_agents)
-    world, state = env.reset(), both.initial(env.n_envs * env.n_agents, device)
-    homes = {} if getattr(env, "layout", None) is None else {"homes": env.layout.clone()}
+    world, state = env.reset(), both.initial(n_lanes(env), device)
+    homes = {} if optional(env, "layout") is None else {"homes": env.layout.clone()}
     returns, lengths = torch.zeros(shape, device=device), torch.zeros(env.n_envs, device=device)
     score, is_over = torch.full_like(lengths, 0.5), torch.zeros_like(lengths, dtype=torch.bool)
     for step in range(max_steps):
@@ -111,5 +111,5 @@ def play(
         won, decided = score_pairs(terminal, returns, slots)
         score = torch.where((decided > 0) & ~is_over, won / decided, score)
         is_over |= (terminal | truncated).any(1)
-    env.check()
+    optional(env, "check")()
     return arrdict(score=score, lengths=lengths, slots=slots[:, 0], **homes)

@@ -15,7 +15,7 @@ from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.settings import checked
-from megastep.types import Env, World
+from megastep.types import Env, World, optional
 from megastep.types import Policy as AnyPolicy
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -191,7 +191,7 @@ def count_environments(env: Env, past: float, bot: float, snapshots: int) -> tup
     Raises:
         ValueError: as for `Opponents`.
     """
-    if env.n_agents < 2:
+    if optional(env, "n_agents") < 2:
         raise ValueError(
             f"opponents need an environment with at least two agents; {type(env).__name__} has one"
         )

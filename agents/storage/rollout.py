@@ -13,7 +13,7 @@ from megastep import spaces
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, clone
 from megastep.dotdict import leaves, mapping
-from megastep.types import Env, Space, Tree
+from megastep.types import Env, Space, Tree, n_lanes, optional
 
 _SEQUENCES = "obs starts learns actions logprobs reward terminal truncated".split()
 _BYTES_OF_THE_REST = 64  # of a step: everything except observations
@@ -209,14 +209,14 @@ def make_rollout(env: Env, policy: Policy, n_steps: int, values: bool = True) ->
 
     It holds all lanes, or only those that learn if the environment has `learners` (opponents).
     """
-    learners = getattr(env, "learners", None)
-    n_lanes = env.n_envs * env.n_agents if learners is None else int(learners.sum())
+    learners = optional(env, "learners")
+    n_stored = n_lanes(env) if learners is None else int(learners.sum())
     return Rollout(
         n_steps,
-        n_lanes,
+        n_stored,
         env.obs_space,
         env.action_space,
-        policy.initial(n_lanes),
+        policy.initial(n_stored),
         env.device,
         policy.privileged_space,
         learners=learners,

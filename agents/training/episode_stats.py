@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from megastep.agents.algorithms.nonfinite import LIMIT
-from megastep.types import Env
+from megastep.types import Env, optional
 
 #: Means are over at least this many episodes, once so many have ended.
 MIN_EPISODES = 100
@@ -161,11 +161,11 @@ def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch
     Returns:
         Group name -> (B,) bool.
     """
-    groups, roles = {}, getattr(env, "roles", None) or ()
+    groups, roles = {}, optional(env, "roles") or ()
     for role in dict.fromkeys(roles):
         has_role = torch.tensor([name == role for name in roles], device=env.device)
         groups[role] = has_role.repeat(env.n_envs)
-    groups |= getattr(env, "matchups", {})
+    groups |= optional(env, "matchups")
     return groups if stored is None else {name: lanes[stored] for name, lanes in groups.items()}
 
 

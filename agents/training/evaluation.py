@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
-from megastep.types import Env, Policy, Space
+from megastep.types import Env, Policy, Space, n_lanes, optional
 
 #: Steps between two checks of whether all episodes have ended. A check waits for the GPU, which
 #: costs more than a few superfluous steps.
@@ -67,14 +67,14 @@ def first_episodes(
         - homes: (B,) int32, the lane's layout; only if `env.layout` exists. Layouts change only at
           respawns, so the whole episode is played in it.
     """
-    device, n_lanes = torch.device(env.device), env.n_envs * env.n_agents
+    device, n_agents = torch.device(env.device), optional(env, "n_agents")
     generator = torch.Generator(device).manual_seed(seed)
-    world, state = env.reset(), policy.initial(n_lanes, device)
-    layout = getattr(env, "layout", None)
-    envs = torch.arange(env.n_envs, device=device).repeat_interleave(env.n_agents)
-    homes = {} if layout is None else {"homes": layout.repeat_interleave(env.n_agents)}
-    returns, lengths = (torch.zeros(n_lanes, device=device) for _ in range(2))
-    done = torch.zeros(n_lanes, dtype=torch.bool, device=device)
+    world, state = env.reset(), policy.initial(n_lanes(env), device)
+    layout = optional(env, "layout")
+    envs = torch.arange(env.n_envs, device=device).repeat_interleave(n_agents)
+    homes = {} if layout is None else {"homes": layout.repeat_interleave(n_agents)}
+    returns, lengths = (torch.zeros(n_lanes(env), device=device) for _ in range(2))
+    done = torch.zeros(n_lanes(env), dtype=torch.bool, device=device)
     learns = torch.ones_like(done) if "learns" not in world else world["learns"].clone()
     metrics = arrdict(
         {name: torch.full_like(returns, torch.nan) for name in world.get("metrics", {})}

@@ -15,7 +15,8 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.performance import PhaseTimer, device_memory
-from megastep.types import Env
+from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
@@ -67,6 +68,9 @@ class Trainer:
         samples_per_second: speed between the last two reports, or None.
         latest_stats: name -> the last value of each episode statistic.
         nonfinite_value: the first NaN or infinity of the run, or None.
+
+    Raises:
+        ValueError: the budget anneals the learning rate of a learner without `set_lr`.
     """
 
     def __init__(
@@ -89,9 +93,15 @@ class Trainer:
         self.logger, self.saver, self.budget = logger, saver, budget
         self.log_every, self.checkpoint_seconds = log_every, checkpoint_seconds
         self.on_log, self.opponents, self.snapshot_saver = on_log, opponents, snapshot_saver
+        self.check = optional(learner, "check", LEARNER_DEFAULTS)
+        if budget.anneal != "never" and not optional(learner, "set_lr", LEARNER_DEFAULTS):
+            raise ValueError(
+                f"{type(learner).__name__} has no set_lr(lr), so its learning rate cannot fall "
+                f"with {budget.anneal}: use learner.anneal=never, or add the method"
+            )
         self.collect = learner.collector(env)
         self.rollout = self.collect.rollout
-        desync = desync and hasattr(env, "desync")
+        desync = desync and optional(env, "desync") is not None
         if desync:
             env.desync()  # the collector has reset the environment, and has not stepped it yet
         self.episode_stats = EpisodeStats(
@@ -197,9 +207,10 @@ class Trainer:
         Raises the errors that `env.check()` does, and NonFiniteError as `check_finite` does.
         """
         self.wait_for_collector()
-        if hasattr(self.env, "check"):
-            self.env.check()
-        loss_values = zip(losses, torch.stack(list(losses.values())).tolist(), strict=True)
+        optional(self.env, "check")()
+        loss_values = [torch.as_tensor(loss, device=self.env.device) for loss in losses.values()]
+        loss_values = torch.stack(loss_values).tolist() if losses else []
+        loss_values = zip(losses, loss_values, strict=True)
         stats = self.episode_stats.pop()
         if self.opponents is not None:
             stats |= self.opponents.pop_win_rates()
@@ -230,12 +241,14 @@ class Trainer:
     def check_finite(self) -> bool:
         """Returns True if the last update was applied, False if it was skipped. Synchronises.
 
-        Warns about the first NaN or infinity of the run.
+        Warns about the first NaN or infinity of the run. Without `learner.check` it does nothing.
 
         Raises:
             NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
         """
-        value, n_skipped = self.learner.check.read(self.rollout.floats())
+        if self.check is None:
+            return True
+        value, n_skipped = self.check.read(self.rollout.floats())
         if value and self.rollout.learners is not None:
             lanes = self.rollout.learners.nonzero()[:, 0]
             value = dataclasses.replace(value, lane=int(lanes[value.lane]))

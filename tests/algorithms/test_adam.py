@@ -59,6 +59,16 @@ def test_skipped_step_changes_nothing():
     assert all(map(torch.equal, first.squares, second.squares))
 
 
+def test_parameters_without_gradient_are_skipped():
+    params, frozen = parameters(), torch.nn.Parameter(torch.ones(2), requires_grad=False)
+    adam, alone = Adam([frozen, *params], torch.tensor(0.1)), Adam(parameters(), torch.tensor(0.1))
+    for seed in range(2):
+        set_gradients(params, alone.parameters, seed=seed)
+        adam.step(YES)
+        alone.step(YES)
+    assert frozen.tolist() == [1, 1] and all(map(torch.equal, params, alone.parameters))
+
+
 def test_state_dict_resumes():
     params, resumed = parameters(), parameters()
     first = Adam(params, torch.tensor(0.1))

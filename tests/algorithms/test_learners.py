@@ -119,6 +119,22 @@ def test_skipped_updates_are_counted(name, bad_steps):
     assert counts == [0] * first + [*range(1, n_bad + 1)] + [0] * (9 - first - n_bad)
 
 
+@pytest.mark.parametrize("name", ["ppo", "vtrace", "r2d2"])
+@pytest.mark.parametrize("graph", [False, pytest.param(True, marks=pytest.mark.cuda)])
+def test_frozen_and_unused_parameters_stay_as_they_are(name, graph):
+    env = Numbers("cuda" if graph else "cpu")
+    policy = LEARNERS[name].make_policy(env, width=8)
+    policy.intake.requires_grad_(False)
+    policy.unused = torch.nn.Parameter(torch.ones(3, device=env.device))
+    untrained = [policy.unused, *policy.intake.parameters()]
+    before, all_before = [p.clone() for p in untrained], flat(policy)
+    _, learner, collect = make(name, env, policy=policy, graph=graph)
+    for _ in range(5):
+        losses = learner.update(collect())
+    assert all(map(torch.equal, untrained, before)) and not torch.equal(flat(policy), all_before)
+    assert losses["loss/grad_norm"] > 0
+
+
 @NAMES
 def test_bytes_per_env_bounds_stored_bytes(name):
     env = Numbers()

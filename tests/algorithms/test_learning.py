@@ -19,7 +19,7 @@ class Env:
     """
 
     obs_dim, n_actions = 1, 4
-    n_envs, n_agents, device = B, 1, torch.device("cpu")
+    n_envs, device = B, torch.device("cpu")
 
     def __init__(self, seed=0):
         self.obs_space = spaces.MultiVector(1, self.obs_dim)

@@ -37,7 +37,6 @@ from megastep import arrdict, spaces
 class Counter:
     """A counter: action 1 counts up and gives reward 1. Truncated after `limit` steps."""
 
-    n_agents, fps = 1, 5.0
     action_space = spaces.MultiDiscrete(1, 2)
 
     def __init__(
@@ -73,9 +72,6 @@ class Counter:
             terminal=torch.zeros_like(reset),
             truncated=self.age >= self.limit,
         )
-
-    def check(self):
-        pass
 
     def state(self, e=0):
         return arrdict.arrdict(count=self.count[e].clone())
@@ -193,6 +189,7 @@ def test_custom_learner(outside, capsys):
         from megastep.agents.algorithms.nonfinite import NonFiniteCheck
         from megastep.agents.storage.collector import Collector
         from megastep.agents.storage.rollout import Rollout
+        from megastep.types import n_lanes
 
 
         class Reinforce:
@@ -204,7 +201,7 @@ def test_custom_learner(outside, capsys):
                 self.optimizer = torch.optim.SGD(policy.parameters(), lr)
 
             def collector(self, env):
-                lanes, policy = env.n_envs * env.n_agents, self.policy
+                lanes, policy = n_lanes(env), self.policy
                 spaces = env.obs_space, env.action_space
                 rollout = Rollout(self.length, lanes, *spaces, policy.initial(lanes), env.device)
                 return Collector(env, policy, rollout)
@@ -381,7 +378,7 @@ def test_unusable_class_error(outside, capsys, words, sentence):
 @pytest.mark.parametrize(
     "change, clause",
     [
-        (("n_agents, fps = 1, 5.0", "n_agents = 1"), "it has no fps"),
+        (("limit, self.sizes = limit", "fps, self.sizes = 0"), "fps must be a positive number"),
         (("reward=reward,", "reward=reward.double(),"), "reward must be torch.float32"),
         (("torch.zeros_like(reset),", "self.age >= self.limit,"), "exclude each other"),
         (("[:, None],", ","), "obs must be "),

@@ -26,15 +26,31 @@ def names(tmp_path_factory):
 
 
 def test_commands_train_evaluate_and_record(tmp_path, monkeypatch, capsys):
-    """The commands of the first part, in an empty folder. test_two_agents.py has the second's."""
+    """The commands of the first parts, in an empty folder. test_two_agents.py has the last one's.
+    Safe has only what is required, so it trains and is evaluated, but cannot be filmed.
+    """
     pytest.importorskip("av")
     text = PAGE.read_text().split("## Two agents")[0]
-    assert "This is `rover.py`" in text
-    (tmp_path / "rover.py").write_text(pages.code(text)[0])
-    assert pages.type_all(text, tmp_path, monkeypatch) == list(pages.MAINS)
-    assert "rover in the test homes of column" in capsys.readouterr().out
-    (run,) = (path for path in (tmp_path / "runs").iterdir() if path.is_dir())
-    assert (run / "video.mp4").stat().st_size > 1000
+    for name, body in zip(("safe.py", "rover.py"), pages.code(text)):
+        assert f"This is `{name}`" in text
+        (tmp_path / name).write_text(body)
+    assert pages.type_all(text, tmp_path, monkeypatch) == [*pages.MAINS][:2] + [*pages.MAINS]
+    shown = capsys.readouterr().out
+    assert "safe, after" in shown and "rover in the test homes of column" in shown
+    safe, rover = sorted(path for path in (tmp_path / "runs").iterdir() if path.is_dir())
+    assert (rover / "video.mp4").stat().st_size > 1000
+    with pages.inside(tmp_path, monkeypatch):
+        assert pages.MAINS["record.py"]([f"run={safe}"]) == 2
+    assert "Safe cannot be drawn: it needs the methods state(e)" in capsys.readouterr().err
+
+
+def test_safe_is_open_where_dial_and_press_are_right(names):
+    env = names["Safe"](n_envs=3, device="cpu")
+    contract.rollout(env, 20)
+    env.reset()
+    dial = env.number + torch.tensor([0, 0, 1])
+    actions = arrdict.arrdict(dial=dial[:, None] % 4, press=torch.tensor([[1], [0], [1]]))
+    assert env.step(arrdict.arrdict(actions=actions)).reward.tolist() == [1, 0, 0]
 
 
 def test_python_code_trains(names):

@@ -21,7 +21,6 @@ class Matrix:
         played: the actions of each step, (n_envs, n_agents).
     """
 
-    fps = 1.0
     obs_space, action_space = spaces.MultiVector(1, 6), spaces.MultiDiscrete(1, 3)
 
     def __init__(
@@ -64,9 +63,6 @@ class Matrix:
             truncated=truncated,
             metrics=arrdict(points=reward.clone()),
         )
-
-    def check(self):
-        pass
 
 
 class Always:

@@ -26,11 +26,14 @@ class Kind:
     settings: dict[str, Any]
     agent: dict[str, Any] = dataclasses.field(default_factory=dict)
 
-    def make(self, env, width=32, seed=1, **settings):
-        """Returns (policy, learner). `n_minibatches` also sets R2D2's gradient_steps."""
+    def make_policy(self, env, width=32, seed=1):
         env_spaces = env.obs_space, env.action_space, getattr(env, "privileged_space", None)
         policy = Policy(*env_spaces, width=width, seed=seed, bf16=False, **self.agent)
-        policy = policy.to(env.device)
+        return policy.to(env.device)
+
+    def make(self, env, width=32, seed=1, policy=None, **settings):
+        """Returns (policy, learner). `n_minibatches` also sets R2D2's gradient_steps."""
+        policy = policy or self.make_policy(env, width, seed)
         if self.learner is R2D2 and "n_minibatches" in settings:
             settings["gradient_steps"] = settings.pop("n_minibatches")
         return policy, self.learner(policy, seed=seed, **{**self.settings, **settings})

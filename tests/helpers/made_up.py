@@ -22,7 +22,7 @@ class Numbers:
     """
 
     obs_space, action_space = spaces.MultiVector(1, 3), spaces.MultiDiscrete(1, 3)
-    n_envs, n_agents = B, 1
+    n_envs = B
 
     def __init__(self, device="cpu", bad_steps=()):
         self.n_steps, self.bad_steps = 0, bad_steps

@@ -62,19 +62,53 @@ def test_constants_have_the_compilers_values(program, tmp_path):
         assert read() == pytest.approx(number, rel=1e-7, abs=0), name
 
 
-def test_float_constants_are_read():
-    text = "constexpr float SHARE = 0.25f;  // a comment\nconstexpr int LEAST = -3;\n"
+def test_constants_between_other_lines_are_read():
+    text = """/* A comment
+    of two lines. */
+#ifndef CONSTANTS_H
+#define CONSTANTS_H
+    constexpr float SHARE = 0.25f;  // a comment
+constexpr int  LEAST=-3;
+#endif
+"""
     assert headers.constants({"constants.h": text}) == dict(SHARE=0.25, LEAST=-3)
 
 
 @pytest.mark.parametrize(
     "line",
-    ["constexpr int N = 2 * 3;", "constexpr int A = 1, B = 2;", "constexpr int TWICE = 2;"],
+    [
+        "constexpr int N = 2 * 3;",
+        "constexpr int A = 1, B = 2;",
+        "constexpr int TWICE = 2;",
+        "constexpr int OCTAL = 010;",
+        "constexpr int HALF = 0.5;",
+        "static constexpr int N = 1;",
+        "const int N = 1;",
+        "#define N 1",
+        "constexpr int",
+    ],
 )
-def test_a_constant_that_cannot_be_read_is_named(line):
-    text = f"constexpr int TWICE = 1;\n{line}\n"
-    with pytest.raises(ValueError, match="constants.h: .*constexpr int"):
+def test_a_constant_that_cannot_be_read_is_named_with_its_line(line):
+    text = f"constexpr int TWICE = 1;\n/*\n*/ {line}\n"
+    message = rf"constants.h:3: cannot read '{re.escape(line)}'\. .*constexpr int MAX_RES"
+    with pytest.raises(ValueError, match=message):
         headers.constants({"common/constants.h": text})
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "KERNEL drain(DrainParams p, int n) {",
+        "KERNEL drain(Drain p) {",
+        "KERNEL void drain(DrainParams p) {",
+        "static KERNEL drain(DrainParams p) {",
+        "KERNEL drain() {",
+        "KERNEL BOUNDS(MANY) drain(DrainParams p) {",
+    ],
+)
+def test_an_operation_that_cannot_be_read_is_named_with_its_line(line):
+    with pytest.raises(ValueError, match=rf"drain.cu:2: cannot read '{re.escape(line)}'.*KERNEL"):
+        headers.operations({"drain.cu": f"// KERNEL\n{line}\n}}\n"})
 
 
 @pytest.mark.parametrize("field", ["double x;", "float x, y;", "OtherParams other;", "int x[3];"])

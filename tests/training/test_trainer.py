@@ -209,6 +209,16 @@ def test_failed_saves_are_one_warning_also_where_the_run_folder_is_gone(
     assert len(caught) == 1 and "at 2 samples" in saver.error
 
 
+def test_losses_may_be_numbers_or_none_at_all(tmp_path):
+    run = make_trainer(tmp_path)
+    run.update()
+    for losses in {"loss/a": 0.5, "loss/b": torch.tensor(2), "loss/c": 3}, {}:
+        run.log(losses)
+    first, second = run.logger
+    assert [first[f"loss/{name}"] for name in "abc"] == [0.5, 2, 3]
+    assert not any(name.startswith("loss/") for name in second)
+
+
 def test_metrics_are_logged_by_name_and_role_for_lanes_that_learn(tmp_path):
     run = make_trainer(tmp_path, samples=2 * UPDATE, every=2, env=Pairs())
     run.train()

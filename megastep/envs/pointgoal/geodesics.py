@@ -16,27 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from megastep.engine.devices import threads
-from megastep.envs.pointgoal.program import PROGRAM
-from megastep.kernels.build.launch import BLOCK, launch
+from megastep.envs.pointgoal.path_graph import CELL, MAX_GOALS, PathGraph
 from megastep.modules.spawning import CLEARANCE, candidates
 
 __all__ = ["CELL", "Geodesics", "geodesics"]
 
-CELL = 0.1  # metres, of fields
 SPARE = 1.5  # times as many points are drawn as needed, as some may be in rooms without a door
-SIDES = 16  # of the polygon around the end of a wall
-INFLATION = 1.001  # of the radius, as in physics
-SLACK = 5e-5  # metres between a path and the clearance that is tested, for rounding
-MAX_GOALS, GROUP, N_SCRATCH = (
-    PROGRAM.constants[name] for name in ("MAX_GOALS", "GROUP", "N_SCRATCH")
-)
-GROUP_SIDE = 1.5  # metres: walls with their middles in one square are neighbours
-STEP = 5e-3  # metres from a corner where it is tested if a path can turn there
-TURN = 0.026  # radians of that turn
 HOMES_AT_ONCE = {"cpu": 16, "cuda": 512}  # on a CPU, signals are handled in between
-
-_NO_LINKS = dict(targets=0, metres=0)
 
 
 class Geodesics(NamedTuple):
@@ -78,266 +64,47 @@ def geodesics(
     step = HOMES_AT_ONCE[device.type]
     for first in range(0, len(geometries), step):
         chunk = slice(first, first + step)
-        homes = _Homes(geometries[chunk], radius, device)
-        points = _points(homes, int(SPARE * (n_spawns + n_goals)), generators[chunk])
-        goals, spawns = _largest_part(homes, points, n_goals, n_spawns)
-        lengths = homes.lengths(goals, spawns).cpu().numpy()
-        fields = homes.fields(goals)
-        for d, origin in enumerate(homes.origins):
+        graph = PathGraph(geometries[chunk], radius, device)
+        points = _points(graph, int(SPARE * (n_spawns + n_goals)), generators[chunk])
+        goals, spawns = _largest_part(graph, points, n_goals, n_spawns)
+        lengths = graph.lengths(goals, spawns).cpu().numpy()
+        fields = graph.fields(goals)
+        for d, origin in enumerate(graph.origins):
             yield Geodesics(origin, fields[d], spawns[d] + origin, goals[d] + origin, lengths[d].T)
-
-
-class _Homes:
-    """The walls of homes, and the corners where paths may bend, on a device.
-
-    Args:
-        geometries: D of them.
-        radius: of the agents, in metres.
-        device: where to compute.
-
-    Attributes:
-        origins: (D, 2) float32. All points are relative to these.
-    """
-
-    def __init__(self, geometries, radius, device):
-        self.geometries, self.device, self.radius = geometries, device, radius
-        n_walls = np.array([len(g.walls) for g in geometries])
-        firsts, home = self._starts(n_walls)[:-1], np.repeat(np.arange(len(n_walls)), n_walls)
-        walls = np.concatenate([g.walls for g in geometries]).astype(np.float64)
-        low = np.minimum.reduceat(walls.min(1), firsts)
-        high = np.maximum.reduceat(walls.max(1), firsts)
-        self.origins = low.astype(np.float32)
-        self.shapes = np.ceil((high - low) / CELL).astype(int)[:, ::-1] + 2  # (D, 2) rows, columns
-        walls -= self.origins[home, None]
-        self._group(walls, home, n_walls)
-        self.tensors["corners"], self.corner_homes = torch.empty((6, 0)), torch.empty(0)
-        self.tensors["corner_starts"] = torch.empty(0)
-        self.tensors["corners"], self.corner_homes = self._find_corners(walls, home)
-        homes = torch.arange(len(n_walls) + 1, dtype=torch.int32, device=device)
-        starts = torch.searchsorted(self.corner_homes, homes)
-        self.tensors["corner_starts"] = starts.int()
-        self.links = self._link()
-
-    def _group(self, walls, home, n_walls):
-        """Sets walls (W, 2, 2), neighbours together, in groups with bounding boxes."""
-        cells = (walls.mean(1) / GROUP_SIDE).astype(int)
-        walls = walls[np.lexsort((cells[:, 0], cells[:, 1], home))].astype(np.float32)
-        n_groups = -(-n_walls // GROUP)
-        # the last group of a home is filled up with its last wall
-        index = np.arange(GROUP * n_groups.sum()) - np.repeat(
-            GROUP * self._starts(n_groups)[:-1], GROUP * n_groups
-        )
-        index = np.minimum(index, np.repeat(n_walls - 1, GROUP * n_groups))
-        walls = walls[index + np.repeat(self._starts(n_walls)[:-1], GROUP * n_groups)]
-        grouped = walls.reshape(-1, 2 * GROUP, 2)
-        boxes = np.concatenate([grouped.min(1), grouped.max(1)], 1)
-        self.n_groups = len(boxes)
-        self.tensors = dict(
-            walls=self.tensor(walls.reshape(-1, 4).T, np.float32),
-            # groups are looked at GROUP at once, so some beyond the last one are read
-            boxes=self.tensor(np.append(boxes.T, np.zeros(GROUP)), np.float32),
-            group_starts=self.tensor(self._starts(n_groups), np.int32),
-        )
-
-    def _starts(self, counts):
-        return np.concatenate([[0], np.cumsum(counts)])
-
-    def tensor(self, array, dtype):
-        """Returns an array on the device."""
-        return torch.from_numpy(np.ascontiguousarray(array, dtype)).to(self.device)
-
-    def _params(self):
-        inradius = INFLATION * self.radius + 2 * SLACK
-        circumradius = inradius / np.cos(np.pi / SIDES)
-        return PROGRAM.params.HomesParams(
-            **{name: tensor.data_ptr() for name, tensor in self.tensors.items()},
-            n_groups=self.n_groups,
-            n_corners=len(self.corner_homes),
-            n_homes=len(self.geometries),
-            n_threads=threads(),
-            clearance=inradius - SLACK,
-            rebate=(circumradius - inradius) * 2 * np.pi / SIDES,
-        )
-
-    def _launch(self, operation, params, n_threads, **values):
-        """Launches an operation. Values that are tensors are passed by address."""
-        packed = {
-            name: value.data_ptr() if isinstance(value, torch.Tensor) else value
-            for name, value in values.items()
-        }
-        struct = getattr(PROGRAM.params, params)(homes=self._params(), **packed)
-        launch(PROGRAM, operation, struct, self.device, threads=n_threads)
-
-    # ---- The visibility graph ----
-
-    def _find_corners(self, walls, home):
-        """Returns the corners where a disc fits and a path may turn around the end of a wall:
-        columns (6, V) as in HomesParams, and the home of each, (V,) int32, ascending.
-        """
-        ends, owner = walls.reshape(-1, 2), np.repeat(home, 2)
-        order = np.lexsort((*ends.T, owner))
-        ends, owner = ends[order], owner[order]
-        is_new = np.ones(len(ends), bool)
-        is_new[1:] = (ends[1:] != ends[:-1]).any(1) | (owner[1:] != owner[:-1])
-        ends, owner = ends[is_new], owner[is_new]
-
-        inradius, side = INFLATION * self.radius + 2 * SLACK, 2 * np.pi / SIDES
-        angles = side * (np.arange(SIDES) + 0.5)
-        # along the side before a corner and the one behind it, turned a little to the wall's end
-        ahead = _directions(angles - side / 2 + np.pi / 2 + TURN)
-        back = _directions(angles + side / 2 - np.pi / 2 - TURN)
-        ends, owner = self.tensor(ends, np.float64), self.tensor(owner, np.int32)
-        corner, fits = inradius / np.cos(side / 2) * _directions(angles), None
-        for step in (0.0, STEP * ahead, STEP * back):
-            points = (ends[:, None] + self.tensor(corner + step, np.float64)).view(-1, 2)
-            candidates = torch.arange(len(points), device=self.device) if fits is None else fits
-            clearances = self.clearances(points[candidates], owner[candidates // SIDES], inradius)
-            fits = candidates[clearances >= inradius - SLACK]
-        sides = [_directions(angles - side / 2), _directions(angles + side / 2)]
-        sides = self.tensor(np.concatenate(sides, 1), np.float32)[fits % SIDES]
-        corners = (ends[:, None] + self.tensor(corner, np.float64)).view(-1, 2)[fits]
-        return torch.cat([corners.float(), sides], 1).T.contiguous(), owner[fits // SIDES]
-
-    def clearances(self, points, home, most):
-        """Returns the metres (P,) float32 from points (P, 2) to the nearest wall of their home, by
-        its number (P,) int32; at most `most`.
-        """
-        clearances = torch.empty(len(points), device=self.device)
-        self._launch(
-            "clearances",
-            "ClearancesParams",
-            len(points),
-            points=points.float().contiguous(),
-            home_index=home,
-            clearances=clearances,
-            most=most,
-            n_points=len(points),
-        )
-        return clearances
-
-    def _link(self):
-        """Returns the links between corners that see each other: starts (V + 1,) int32, targets
-        int32, metres float32.
-        """
-        v, device = len(self.corner_homes), self.device
-        counts, tangent = torch.empty((2, v), dtype=torch.int32, device=device)
-        always = dict(corner_homes=self.corner_homes, tangent=tangent)
-        self._launch(
-            "corner_links", "CornerLinksParams", v, **always, starts=0, counts=counts, **_NO_LINKS
-        )
-        ends = counts.cumsum(0, dtype=torch.int32)
-        n_links = int(ends[-1]) if v else 0
-        links = dict(
-            starts=torch.cat([torch.zeros_like(ends[:1]), ends]),
-            targets=torch.empty(n_links, dtype=torch.int32, device=device),
-            metres=torch.empty(n_links, device=device),
-        )
-        self._launch("corner_links", "CornerLinksParams", v, **always, counts=0, **links)
-        return links
-
-    # ---- Shortest paths ----
-
-    def lengths(self, goals, points):
-        """Returns the lengths of the shortest paths from points (D, K, 2) to goals (D, G, 2), as
-        (D, G, K) float32. Infinite where there is no path.
-        """
-        counts = np.full(points.shape[0], points.shape[1])
-        lengths = self._all_lengths(goals, counts, self.tensor(points, np.float32))
-        return lengths.view(len(points), -1, points.shape[1])
-
-    def fields(self, goals):
-        """Returns the lengths of the shortest paths from all cells to goals (D, G, 2), as float16
-        (G, H, W) of each home.
-        """
-        shapes = [(goals.shape[1], *shape) for shape in self.shapes.tolist()]
-        lengths = self._all_lengths(goals, self.shapes.prod(1)).half().cpu().numpy()
-        ends = np.prod(shapes, 1).cumsum()[:-1]
-        return [field.reshape(s) for field, s in zip(np.split(lengths, ends), shapes)]
-
-    def _all_lengths(self, goals, counts, points=None):
-        """Returns lengths (P * G,): for each home G rows, one after the other.
-
-        Args:
-            goals: (D, G, 2).
-            counts: (D,), number of points in each home.
-            points: (P, 2); by default the centres of all cells.
-        """
-        n_goals = goals.shape[1]
-        if n_goals > MAX_GOALS:
-            parts = np.array_split(goals, -(-n_goals // MAX_GOALS), axis=1)
-            by_home = [
-                self._all_lengths(part, counts, points).split((part.shape[1] * counts).tolist())
-                for part in parts
-            ]
-            return torch.cat([rows[d] for d in range(len(counts)) for rows in by_home])
-        goals = self.tensor(goals, np.float32)
-        distances = torch.empty((len(self.corner_homes), MAX_GOALS), device=self.device)
-        self._launch(
-            "corner_distances",
-            "CornerDistancesParams",
-            BLOCK * len(counts),
-            goals=goals,
-            distances=distances,
-            n_goals=n_goals,
-            **self.links,
-        )
-        n_points = int(counts.sum())
-        lengths = torch.empty(n_points * n_goals, device=self.device)
-        n_scratch = N_SCRATCH * len(self.corner_homes) if self.device.type == "cpu" else 0
-        self._launch(
-            "path_lengths",
-            "PathLengthsParams",
-            n_points,
-            goals=goals,
-            distances=distances,
-            points=0 if points is None else points,
-            widths=self.tensor(self.shapes[:, 1], np.int32),
-            point_starts=self.tensor(self._starts(counts), np.int32),
-            lengths=lengths,
-            scratch=torch.empty(n_scratch, dtype=torch.int32),
-            cell=CELL,
-            n_points=n_points,
-            n_goals=n_goals,
-        )
-        return lengths
-
-
-def _directions(angles):
-    return np.stack([np.cos(angles), np.sin(angles)], 1)
 
 
 # ---- Goals and spawn points ----
 
 
-def _points(homes, n, generators):
-    """Returns random points (D, n, 2) float32 in the rooms of homes, 5 cm clear of the walls. If
-    fewer fit, they are repeated.
+def _points(graph, n, generators):
+    """Returns random points (D, n, 2) float32 in the rooms of a graph's homes, 5 cm clear of the
+    walls. If fewer fit, they are repeated.
     """
     found = [np.empty((0, 2), np.float32)] * len(generators)
-    streams = [candidates(*each) for each in zip(homes.geometries, itertools.repeat(n), generators)]
+    streams = [candidates(*each) for each in zip(graph.geometries, itertools.repeat(n), generators)]
     lacking = range(len(found))
     while len(lacking):
         batches = {d: batch for d in lacking if (batch := next(streams[d], None)) is not None}
         if not batches:
             break
-        drawn = np.stack([batch - homes.origins[d] for d, batch in batches.items()])
+        drawn = np.stack([batch - graph.origins[d] for d, batch in batches.items()])
         drawn = drawn.astype(np.float32)
-        home = homes.tensor(np.repeat([*batches], n), np.int32)
-        clearances = homes.clearances(homes.tensor(drawn.reshape(-1, 2), np.float32), home, 1.0)
-        fits = (clearances > homes.radius + CLEARANCE).cpu().numpy().reshape(-1, n)
+        home = graph.tensor(np.repeat([*batches], n), np.int32)
+        clearances = graph.clearances(graph.tensor(drawn.reshape(-1, 2), np.float32), home, 1.0)
+        fits = (clearances > graph.radius + CLEARANCE).cpu().numpy().reshape(-1, n)
         for d, points, fitting in zip(batches, drawn, fits):
             found[d] = np.concatenate([found[d], points[fitting]])[:n]
         lacking = [d for d in batches if len(found[d]) < n]
     for d, points in enumerate(found):
         if not len(points):
             raise ValueError(
-                f"geometry {homes.geometries[d].id} has no point in a room that is "
-                f"{homes.radius + CLEARANCE:.2f} m from every wall"
+                f"geometry {graph.geometries[d].id} has no point in a room that is "
+                f"{graph.radius + CLEARANCE:.2f} m from every wall"
             )
     return np.stack([np.resize(points, (n, 2)) for points in found])
 
 
-def _largest_part(homes, points, n_goals, n_spawns):
+def _largest_part(graph, points, n_goals, n_spawns):
     """Returns goals (D, n_goals, 2) and spawn points (D, n_spawns, 2): the first of points (D, K,
     2) in the connected part of each home that holds most of them.
     """
@@ -347,7 +114,7 @@ def _largest_part(homes, points, n_goals, n_spawns):
     unknown = np.ones((n_homes, n_points), bool)  # points in parts that were not measured yet
     while (unknown.sum(1) > largest.sum(1)).any():
         probes = np.argsort(~unknown, 1, kind="stable")[:, :MAX_GOALS]
-        lengths = homes.lengths(points[homes_range, probes], points)
+        lengths = graph.lengths(points[homes_range, probes], points)
         parts = lengths.isfinite().cpu().numpy()  # (D, probes, K)
         parts &= unknown[homes_range, probes][:, :, None]
         best = parts[homes_range[:, 0], parts.sum(2).argmax(1)]

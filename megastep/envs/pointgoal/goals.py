@@ -24,6 +24,7 @@ MIN_PROGRESS = 48  # layouts; fewer take less than a second or two
 SOURCES = (
     Path(__file__),
     Path(__file__).with_name("geodesics.py"),
+    Path(__file__).with_name("path_graph.py"),
     *sorted(Path(__file__).with_name("kernels").iterdir()),
     Path(spawning.__file__),
 )

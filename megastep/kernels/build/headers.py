@@ -14,8 +14,12 @@ from collections.abc import Callable, Mapping
 __all__ = ["constants", "operations", "packer", "struct_fields"]
 
 FORMATS = {"int": "i", "float": "f", "unsigned int": "I"}  # characters of the module struct
-CONSTANT = re.compile(r"constexpr (int|float) (\w+) = (-?\d[\d.e-]*)f?;")
-OPERATION = re.compile(r"^KERNEL\s+(?:BOUNDS\(\d+\)\s+)?(\w+)\((?:const\s+)?(\w+)", re.M)
+INT = re.compile(r"constexpr\s+int\s+(\w+)\s*=\s*(-?(?:0|[1-9]\d*));")
+FLOAT = re.compile(r"constexpr\s+float\s+(\w+)\s*=\s*(-?\d+(?:\.\d*)?(?:e-?\d+)?)f?;")
+DIRECTIVE = re.compile(r"#\s*(?!define)\w.*|#\s*define\s+\w+")  # include guards; no macros
+OPERATION = re.compile(
+    r"KERNEL\s+(?:BOUNDS\(\d+\)\s+)?(\w+)\((?:const\s+)?(\w+Params)\s*&?\s*\w+\)"
+)
 STRUCT = re.compile(r"^struct (\w+Params) \{(.*?)^\};", re.M | re.S)
 FIELD = re.compile(r"([\w ]+?)\s*(\*?)\s+(\w+)")
 
@@ -71,29 +75,49 @@ def constants(sources: Mapping[str, str]) -> dict[str, int | float]:
     """Returns the constants of all files called ``constants.h``.
 
     Raises:
-        ValueError: if one is not a plain number, or two have the same name.
+        ValueError: naming file and line, if one is not a plain number, if two have the same name,
+            or if a line is neither a constant nor an include guard.
     """
     numbers = {}
     for header, text in sources.items():
         if header.rpartition("/")[2] != "constants.h":
             continue
-        for line in _without_comments(text).splitlines():
-            if not line.startswith("constexpr"):
+        for number, line in enumerate(map(str.strip, _without_comments(text).splitlines()), 1):
+            if not line or DIRECTIVE.fullmatch(line):
                 continue
-            match = CONSTANT.fullmatch(line.strip())
-            if not match or match[2] in numbers:
+            integer, real = INT.fullmatch(line), FLOAT.fullmatch(line)
+            match = integer or real
+            if not match or match[1] in numbers:
                 raise ValueError(
-                    f"{header}: cannot read '{line.strip()}'. Write one constant per line, with a "
+                    f"{header}:{number}: cannot read '{line}'. Write one constant per line, with a "
                     f"unique name, as a plain int or float: constexpr int MAX_RES = 1024;"
                 )
-            numbers[match[2]] = {"int": int, "float": float}[match[1]](match[3])
+            numbers[match[1]] = int(match[2]) if integer else float(match[2])
     return numbers
 
 
 def operations(sources: Mapping[str, str]) -> dict[str, str]:
-    """Returns {operation: name of its struct} for the KERNELs that these sources define."""
-    return dict(pair for text in sources.values() for pair in OPERATION.findall(text))
+    """Returns {operation: name of its struct} for the KERNELs that these sources define.
+
+    Raises:
+        ValueError: naming file and line, if one cannot be read.
+    """
+    structs = {}
+    for source, text in sources.items():
+        text = _without_comments(text)
+        for line in re.finditer(r"^(?!#).*\bKERNEL\b.*", text, re.M):
+            match = OPERATION.match(text, line.start())
+            if not match:
+                number = text.count("\n", 0, line.start()) + 1
+                raise ValueError(
+                    f"{source}:{number}: cannot read '{line[0].strip()}'. Start a line with KERNEL "
+                    f"and give the operation one struct: KERNEL drain(const DrainParams& p) in a "
+                    f".cpp file, KERNEL drain(DrainParams p) in a .cu file."
+                )
+            structs[match[1]] = match[2]
+    return structs
 
 
 def _without_comments(text):
-    return re.sub(r"//.*", "", text)
+    """Returns C++ without comments. Every line keeps its number."""
+    return re.sub(r"//.*|/\*[\s\S]*?\*/", lambda comment: "\n" * comment[0].count("\n"), text)
