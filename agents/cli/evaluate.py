@@ -62,7 +62,8 @@ def run(cfg: settings.Evaluate) -> Path:
         arena = Arena(cfg, loaded, env_settings, geometry, device)
         path = arena.rate() if cfg.ratings else arena.duel()
     else:
-        homes = factory.homes(env_settings, geometry, cfg.split, cfg.episodes)
+        homes = factory.homes(env_settings, geometry, cfg.split)
+        homes = factory.spread(homes, cfg.episodes)
         env_settings = factory.changed(env_settings, n_envs=cfg.episodes, resample=False)
         where = dict(geometries=homes, seed=cfg.seed, device=device)
         env, rows = factory.construct(env_settings, **where), []
@@ -174,7 +175,7 @@ class Arena:
         self.others = [find_player(name, run, env, sample) for name in cfg.against or ()]
         self.agent = load_player(run, sample, run)
         n_duels = max(1, cfg.episodes // sample.n_agents)  # from each place
-        homes = homes[:n_duels]
+        homes = factory.spread(homes, n_duels)
         n_duels -= n_duels % max(1, len(homes))
         env = factory.changed(env, n_envs=n_duels * sample.n_agents)
         self.env, self.sample = factory.construct(env, geometries=homes, **where), sample

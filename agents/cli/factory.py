@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from megastep import contract, engine, spaces
+from megastep import contract, engine, scene, spaces
 from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.cli import check, program, runs
 from megastep.agents.cli.settings import Agent, Env, Geometry, Learner, Train
@@ -63,11 +63,16 @@ def make_device(name: str) -> torch.device:
     return device
 
 
-def homes(env: Env, geometry: Geometry, split: str, max_homes: int | None = None) -> list[dict]:
+def homes(env: Env, geometry: Geometry, split: str) -> list[dict]:
     """Returns the different geometries of a split, in order; none if `env` takes no geometries."""
     if "geometries" not in inspect.signature(import_object(env.name)).parameters:
         return []
-    return [*{id(home): home for home in construct(geometry, split=split)}.values()][:max_homes]
+    return [*{id(home): home for home in construct(geometry, split=split)}.values()]
+
+
+def spread(homes: list[dict], n_envs: int) -> list[dict]:
+    """Returns the homes, or `n_envs` evenly spaced ones of more. Without homes, returns none."""
+    return scene.spread(homes, n_envs) if homes else []
 
 
 def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:

@@ -21,7 +21,7 @@ from megastep.envs.deathmatch.step import (
     deathmatch_step,
     privileged_size,
 )
-from megastep.scene import scenery
+from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Deathmatch"]
@@ -107,7 +107,7 @@ class Deathmatch(SceneryEnv):
     ):
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
-        geometries = geometries[:n_envs]
+        geometries = spread(geometries, n_envs)
         homes = scenery(geometries, n_agents, n_envs=n_envs, seed=seed, device=device)
         self.core = Core(homes, res, fov, fps, seed=seed)
         self.n_envs, self.n_agents = n_envs, n_agents

@@ -17,7 +17,7 @@ from megastep.dotdict import dotdict
 from megastep.envs.common import SceneryEnv
 from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import N_PRIVILEGED, PROGRESS_ROWS, pointgoal_step
-from megastep.scene import scenery
+from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["PointGoal"]
@@ -89,7 +89,7 @@ class PointGoal(SceneryEnv):
     ):
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
-        geometries = geometries if resample else geometries[:n_envs]
+        geometries = geometries if resample else spread(geometries, n_envs)
         self.core = Core(
             scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
             res,
