@@ -48,6 +48,8 @@ class Env(Protocol):
     Optional attributes:
         layout: (N,) integers, the floor plan that each environment shows now. Confidence intervals
             of an evaluation are over layouts.
+        bot: class of a scripted policy for this environment, whose arguments are settings of the
+            environment. It plays as ``opponents.bot`` and ``against=bot``.
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
         privileged_space: space of ``world.privileged``.
         state(e), plot_state(state): draw environment ``e``, for videos.

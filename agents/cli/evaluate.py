@@ -74,13 +74,19 @@ def run(cfg: settings.Evaluate) -> Path:
             episodes = evaluation.first_episodes(env, player, cfg.seed, greedy)
             summaries = evaluation.summaries(episodes, getattr(env, "roles", None))
             rows += [{"agent": name, **row} for row in summaries]
-        place, source = runs.place(env_settings, geometry, homes, cfg.split)
+        place = runs.place(env_settings, geometry, homes, cfg.split)
+        n_episodes, n_homes = rows[0]["lanes"], rows[0]["homes"]
+        if homes and n_homes is None:
+            console.warn(
+                f"{type(env).__name__} has no `layout`, the home of each environment: intervals "
+                "take every environment for a home of its own"
+            )
         path = runs.write_table(
             cfg,
             loaded,
-            [source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
-            f"{place}, after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, "
-            f"{env.n_envs * env.n_agents:,} lanes",
+            [place.source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
+            f"{place.title(f'{n_episodes:,} episodes', n_homes)}, after {loaded.step:,} samples "
+            f"({loaded.path.name}), seed {cfg.seed}",
             rows,
             [*map(cells, rows)],
         )
@@ -113,8 +119,9 @@ class Player(NamedTuple):
     step: int | None = None  # the number of samples it has learnt from
 
 
-#: Settings of an environment for duels, where it has them.
-FOR_TWO = {"n_agents": 2, "resample": False}
+#: Settings of an environment for duels, where it has them: two agents, each environment in one
+#: home.
+FOR_TWO = {"n_agents": 2, "self_play": True, "resample": False}
 
 
 def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpoint) -> Player:
@@ -141,8 +148,8 @@ def find_player(
     """Returns who is to meet the agent of `run` in `env`.
 
     Args:
-        name: a run's folder or checkpoint; an import path, `random`, or `bot`, the scripted policy
-            of the run, none of which needs weights.
+        name: a run's folder or checkpoint; or what needs no weights: an import path, `random`, or
+            `bot`, which is the run's `opponents.bot_class`, or else the environment's own bot.
 
     Raises:
         UserError: if nobody can be met there, or this player cannot play there.
@@ -152,9 +159,10 @@ def find_player(
             f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
             "one here; choose another with env= and its settings"
         )
-    name = factory.config_of(run).opponents.bot_class if name == "bot" else name
-    if name == "random" or (":" in name and not Path(name).exists()):
-        return Player(name, factory.make_bot(name, env_settings, env))
+    if name == "bot":
+        name = factory.config_of(run).opponents.bot_class or name
+    if name in ("bot", "random") or (":" in name and not Path(name).exists()):
+        return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
     return load_player(factory.load_checkpoint(runs.find(name), env.device), env, run)
 
 
@@ -179,7 +187,7 @@ class Arena:
         n_duels -= n_duels % max(1, len(homes))
         env = factory.changed(env, n_envs=n_duels * sample.n_agents)
         self.env, self.sample = factory.construct(env, geometries=homes, **where), sample
-        self.place, self.source = runs.place(env, geometry, homes, cfg.split)
+        self.place = runs.place(env, geometry, homes, cfg.split)
 
     def play(self, player: Player, opponent: Player) -> Any:
         with factory.errors():
@@ -191,21 +199,27 @@ class Arena:
         """Plays the run's agent against each of `cfg.against`. Prints and writes a table, and
         returns the path of its .json.
         """
-        rows = [{"against": p.name, **summary(self.play(self.agent, p))} for p in self.others]
+        roles = getattr(self.env, "roles", None)
+        rows = [
+            {"against": opponent.name, **row}
+            for opponent in self.others
+            for row in duels.summaries(self.play(self.agent, opponent), roles)
+        ]
+        title = self.place.title(f"{rows[0]['duels']:,} duels", rows[0]["homes"])
         return runs.write_table(
             self.cfg,
             self.run,
             [
                 "duels",
-                self.source,
+                self.place.source,
                 self.cfg.split,
                 str(self.run.step),
                 "against",
                 *self.cfg.against,
             ],
-            f"{self.agent.name}: duels of {self.place}, seed {self.cfg.seed}",
+            f"{self.agent.name}, in {title}, seed {self.cfg.seed}",
             rows,
-            [{key: form.format_map(row) for key, form in DUELS.items()} for row in rows],
+            [*map(duel_cells, rows)],
         )
 
     def rate(self) -> Path:
@@ -232,7 +246,9 @@ class Arena:
         rows = ratings.rows(
             [(player.name, player.step) for player in players], scores, self.cfg.seed
         )
-        title = f"Ratings by duels of {self.place}, seed {self.cfg.seed}"
+        n_homes = len(set(self.env.layout.tolist())) if hasattr(self.env, "layout") else None
+        what = f"{self.env.n_envs:,} duels of each pair"
+        title = f"Ratings in {self.place.title(what, n_homes)}, seed {self.cfg.seed}"
         table = console.table(
             [*RATINGS], [[form.format_map(row) for form in RATINGS.values()] for row in rows]
         )
@@ -243,23 +259,10 @@ class Arena:
         return folder / "ratings.csv"
 
 
-def summary(played: dict) -> dict:
-    """Returns a table's row for what `duels.play` returned: the share won, a draw counting half,
-    with its 95 % interval over homes, or over duels where there are none.
-    """
-    score, *homes = (played[k].cpu().numpy() for k in ("score", "homes") if k in played)
-    mean, lower, upper = evaluation.interval(score, *homes)
-    return {
-        "won": mean,
-        "lower": lower,
-        "upper": upper,
-        "wins": int((score == 1).sum()),
-        "losses": int((score == 0).sum()),
-        "draws": int(((score != 1) & (score != 0)).sum()),
-        "length": float(played["lengths"].mean()),
-        "duels": len(score),
-        "homes": len(set(homes[0].tolist())) if homes else None,
-    }
+def duel_cells(row: dict) -> dict[str, str]:
+    against = f"{row['against']}, as {row['role']}" if "role" in row else row["against"]
+    row = row | {"against": against, "homes": row["homes"] or "none"}
+    return {key: form.format_map(row) for key, form in DUELS.items()}
 
 
 SCRIPT = compose.Script("evaluate", settings.Evaluate, run, HELP)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +40,14 @@ KINDS = (
 errors = functools.partial(program.errors, kinds=KINDS)
 
 
-def construct(settings: Any, name: str | None = None, **arguments: Any) -> Any:
-    """Calls the class or function called `name`, by default the one that settings name, with those
-    of the settings and arguments that it takes.
+def construct(settings: Any, constructor: Callable | None = None, **arguments: Any) -> Any:
+    """Calls a class or function with those of the settings and arguments that it takes.
+
+    Args:
+        constructor: default: the one at the import path in `settings.name`.
     """
     with errors():
-        constructor = import_object(name or settings.name)
+        constructor = constructor or import_object(settings.name)
         taken = inspect.signature(constructor).parameters
         return constructor(**{k: v for k, v in (vars(settings) | arguments).items() if k in taken})
 
@@ -158,15 +161,29 @@ def make_opponents(cfg: Train, env: Any, sample: Any, policy: Policy) -> Opponen
         return Opponents(env, policy, bot, seed=cfg.seed, **shares)
 
 
-def make_bot(name: str, settings: Env, env: Any) -> Any:
-    """Returns a policy that needs no weights: `random`, or a class by import path.
+def make_bot(name: str | None, settings: Env, env: Any) -> Any:
+    """Returns a policy that needs no weights.
 
-    The class is given the environment's settings that it takes, such as `fov`, and takes one step
-    in `env`. Raises UserError if it cannot play there.
+    It is given the environment's settings that it takes, such as `fov`, and takes one step in
+    `env`.
+
+    Args:
+        name: `random`, the import path of a class, or None, the class that is `env.bot`.
+
+    Raises:
+        UserError: if there is no such class, or it cannot play there.
     """
     if name == "random":
         return evaluation.RandomActions(env.action_space)
     n_lanes, where = env.n_envs * env.n_agents, type(env).__name__
+    with errors():
+        constructor = getattr(env, "bot", None) if name is None else import_object(name)
+    if constructor is None:
+        raise program.UserError(
+            f"{where} has no bot of its own; name a policy, in training with "
+            "opponents.bot_class=module:Class and in duels with against=module:Class"
+        )
+    name = name or constructor.__name__
 
     def check_actions(space, leaf):
         fits = tuple(leaf.shape) == (n_lanes, *space.shape) and not leaf.is_floating_point()
@@ -175,7 +192,7 @@ def make_bot(name: str, settings: Env, env: Any) -> Any:
 
     # a policy may do whatever, where it was not made for
     with program.errors(f"{name} cannot play in {where}; name one made for it: ", (Exception,)):
-        bot = construct(settings, name)
+        bot = construct(settings, constructor)
         decision, _ = bot(env.reset(), bot.initial(n_lanes, env.device))
         spaces.map(check_actions, env.action_space, decision["actions"])
     return bot

@@ -300,7 +300,8 @@ def test_evaluate_prints_and_writes_a_table(trained, capsys):
     for text in (capsys.readouterr().out, written.with_suffix(".md").read_text()):
         assert "95 % interval" in text and "random" in text
         assert (
-            "minimal in the test homes of box, after 32 samples (step_32), seed 1, 6 lanes" in text
+            "minimal: 6 episodes in 1 home, geometry=box, split=test, after 32 samples (step_32), "
+            "seed 1" in text
         )
     row = dict(evaluated=0.0, lower=0.0, upper=0.0)
     assert runs.outcome(written) == dict(score=0.0, **row)
@@ -345,7 +346,8 @@ def test_evaluate_in_homes_from_a_file(trained, tmp_path):
     )
     assert written.name == "files-plans-all-32.json"
     result = json.loads(written.read_text())
-    assert "in all homes of files-plans" in result["title"] and result["rows"][0]["homes"] == 3
+    assert "in 3 homes, geometry=files (plans.npz), split=all, " in result["title"]
+    assert result["rows"][0]["homes"] == 3
 
 
 def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):

@@ -32,7 +32,7 @@ def test_commands_train_evaluate_and_record(tmp_path, monkeypatch, capsys):
     assert "This is `rover.py`" in text
     (tmp_path / "rover.py").write_text(pages.code(text)[0])
     assert pages.type_all(text, tmp_path, monkeypatch) == list(pages.MAINS)
-    assert "rover in the test homes of column" in capsys.readouterr().out
+    assert "rover: 64 episodes in 1 home, geometry=column, split=test" in capsys.readouterr().out
     (run,) = (path for path in (tmp_path / "runs").iterdir() if path.is_dir())
     assert (run / "video.mp4").stat().st_size > 1000
 

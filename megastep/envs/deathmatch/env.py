@@ -15,6 +15,7 @@ from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.envs.common import SceneryEnv
+from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.deathmatch.step import (
     MAX_AGENTS,
     TALLY_ROWS,
@@ -78,6 +79,8 @@ class Deathmatch(SceneryEnv):
         fps: steps per second.
         privileged: worlds hold ``privileged`` for a critic: every agent's health and pose.
     """
+
+    bot = Bot
 
     @checked
     def __init__(

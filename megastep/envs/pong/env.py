@@ -14,6 +14,7 @@ from pydantic import Field
 from megastep import engine, spaces
 from megastep.arrdict import arrdict, numpyify
 from megastep.envs.common import DisplayedEnv
+from megastep.envs.pong.bot import Tracker
 from megastep.envs.pong.step import CELL, FEATURES, GAME_FIELDS, PIXELS, PROGRAM, pong_step
 from megastep.settings import MAX_ENVS, checked
 
@@ -62,7 +63,7 @@ class Pong(DisplayedEnv):
         pixels: observe pixels instead of features.
     """
 
-    fps = 30.0
+    fps, bot = 30.0, Tracker
 
     @checked
     def __init__(
