@@ -5,20 +5,25 @@ import json
 import math
 import re
 import xml.etree.ElementTree
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 import yaml
 
-from megastep.agents.cli import evaluate, record, runs, train
+from megastep import envs, toys
+from megastep.agents.cli import evaluate, factory, record, runs, train
+from megastep.agents.cli.program import UserError
 from megastep.agents.selfplay import duels, ratings
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.training import checkpoint
 from megastep.agents.training.evaluation import interval
 from megastep.arrdict import arrdict
+from megastep.envs.deathmatch import Bot
+from megastep.envs.pong import Tracker
 from tests.cli.test_train import configured
-from tests.helpers.games import Always, Matrix
+from tests.helpers.games import Always, High, Matrix
 
 # ---- Duels ----
 
@@ -241,7 +246,7 @@ def test_snapshots_are_spread_over_the_budget(here):
 
 
 def test_evaluate_against(here, capsys):
-    names = f"a/snapshots/step_{2 * UPDATE},b,random,tests.helpers.games:High"
+    names = f"a/snapshots/step_{2 * UPDATE},b,random,bot,tests.helpers.games:High"
     assert evaluate.main(["run=a", f"against={names}", "episodes=20", "device=cpu"]) == 0
     (path,) = (here / "a" / "evaluations").glob("duels-*.json")
     result = json.loads(path.read_text())
@@ -250,6 +255,7 @@ def test_evaluate_against(here, capsys):
         f"a, {2 * UPDATE:,} samples",
         f"b, {UPDATE:,} samples",
         "random",
+        "bot",
         "tests.helpers.games:High",
     ]
     for i, row in enumerate(overall):
@@ -335,6 +341,32 @@ def test_duel_needs_two_agents(here, capsys):
     assert "at least two agents, and Minimal has one" in capsys.readouterr().err
     assert record.main(["run=null", "env=pong", "against=b"]) == 2
     assert "against: needs run=" in capsys.readouterr().err
+
+
+def test_environments_name_their_bot():
+    pong = envs.Pong(2, self_play=True, device="cpu")
+    chosen = SimpleNamespace(tracker_speed=0.25)
+    bot = factory.make_bot(None, chosen, pong)
+    assert isinstance(bot, Tracker) and bot.tracker_speed == 0.25
+    rooms = envs.Deathmatch(2, [toys.box()], device="cpu")
+    assert isinstance(factory.make_bot(None, SimpleNamespace(), rooms), Bot)
+    assert isinstance(factory.make_bot("tests.helpers.games:High", chosen, pong), High)
+    with pytest.raises(UserError, match="Matrix has no bot .* opponents.bot_class=module:Class"):
+        factory.make_bot(None, SimpleNamespace(), Matrix(2))
+
+
+def test_bot_meets_a_run_that_trained_in_one_lane(here, monkeypatch):
+    """Pong has two lanes for the duel; the trained agent has the left one."""
+    lone = [word for word in PONG if word != "env.self_play=true"]
+    train.run(configured("samples=1", "folder=lone", tiny=lone))
+    assert evaluate.main(["run=lone", "against=bot", "episodes=8", "device=cpu"]) == 0
+    (path,) = (here / "lone" / "evaluations").glob("duels-*bot.json")
+    assert [row["duels"] for row in json.loads(path.read_text())["rows"]] == [8, 4, 4]
+    players = []
+    monkeypatch.setattr(record, "film", lambda env, both, path, *_: players.append((env, both)))
+    assert record.main(["run=lone", "against=bot", "device=cpu"]) == 0
+    ((env, both),) = players
+    assert env.n_agents == 2 and isinstance(both.policies[1], Tracker)
 
 
 def test_ratings_need_two_checkpoints(here, capsys):
