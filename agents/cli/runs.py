@@ -194,9 +194,7 @@ def place(env: Env, geometry: Geometry, homes: list, split: str) -> Place:
     is_ours = geometry.name.startswith("megastep.")
     name = label(geometry.name) if is_ours else geometry.name
     choice = f", geometry={name}{f' ({path.name})' * bool(path.name)}, split={split}"
-    return Place(
-        label(env.name), "-".join(filter(None, [label(geometry.name), path.stem])), choice
-    )
+    return Place(label(env.name), "-".join(filter(None, [label(geometry.name), path.stem])), choice)
 
 
 def write_table(

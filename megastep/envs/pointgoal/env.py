@@ -143,7 +143,7 @@ class PointGoal(SceneryEnv):
             self.ages,
             self.ended,
             self.n_draws,
-            self.spawner.chosen,
+            self.spawner.point_index,
             free,
             seed=self.seed,
             privileged=self.privileged_space is not None,

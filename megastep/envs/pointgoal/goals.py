@@ -14,7 +14,7 @@ import numpy as np
 from megastep import cache, engine
 from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics
 from megastep.envs.pointgoal.goal_fields import GoalFields
-from megastep.geometry import hashed
+from megastep.geometry import content_hash
 from megastep.modules import spawning
 from megastep.workers import parallel_map
 
@@ -119,7 +119,7 @@ def all_geodesics(geometries: Sequence[Any], radius: float, seed: int) -> list[G
         seed: of goals and spawn points.
     """
     distinct = list({id(g): g for g in geometries}.values())
-    key = hashed(distinct)
+    key = content_hash(distinct)
     for path in SOURCES:
         key.update(path.read_bytes())
     key.update(repr((np.__version__, radius, seed)).encode())
