@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import envs, spaces
+from megastep import envs, scene, spaces
 from megastep.agents.cli import evaluate, runs, train
 from megastep.agents.cli.program import UserError
 from megastep.agents.training import evaluation
@@ -368,6 +368,39 @@ def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):
     evaluate.run(configured(run=str(run), split="all", episodes=10, baseline=False))
     assert seen["episodes"].homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1]
     assert torch.equal(seen["env"].core.scenery.layout, seen["episodes"].homes)
+
+
+class Homeless(envs.Minimal):
+    """Does not tell which home an environment is in."""
+
+    layout = None
+
+
+def test_environment_without_a_layout_is_warned_of(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["env=test_evaluate:Homeless", *TINY[1:], "folder=run"]
+    train.run(settings(*words))
+    result = json.loads(evaluate.run(configured(run="run", baseline=False)).read_text())
+    assert result["rows"][0]["homes"] is None
+    assert result["title"].startswith("homeless: 6 episodes, geometry=box, split=test, ")
+    assert "Homeless has no `layout`" in capsys.readouterr().err
+
+
+def test_few_episodes_are_spread_over_all_homes(trained, monkeypatch):
+    lists = []
+
+    def first_episodes(env, *args):
+        lists.append(env)
+        return real(env, *args)
+
+    real = evaluation.first_episodes
+    monkeypatch.setattr(evaluation, "first_episodes", first_episodes)
+    homes = sample("bench", 40)
+    monkeypatch.setattr(evaluate.factory, "homes", lambda *_: homes)
+    evaluate.run(configured(run=str(trained), episodes=2, baseline=False))
+    layouts = lists[0].core.scenery.layouts
+    expected = scene.scenery([homes[0], homes[20]], device="cpu").layouts
+    assert torch.equal(layouts.lines.vals, expected.lines.vals)
 
 
 def test_unwritable_table(trained, monkeypatch, tmp_path):

@@ -63,6 +63,13 @@ def test_few_environments_are_spread_over_all_homes(name):
     assert [round(float(np.ptp(lines[..., 0].numpy()))) for lines in walls] == [4, 6, 8]
 
 
+@pytest.mark.parametrize("cls", envs.ENVS.values())
+def test_docstrings_have_the_same_sections(cls):
+    titles = ["Observation", "Actions", "Reward", "Episode end", "Metrics", "Args"]
+    lines = inspect.getdoc(cls).splitlines()
+    assert [line[:-1] for line in lines if line[:-1] in titles and line.endswith(":")] == titles
+
+
 def idle(env):
     """The decision of action 0 in every lane."""
     n_lanes = env.n_envs * env.n_agents
