@@ -76,11 +76,7 @@ def run(cfg: settings.Evaluate) -> Path:
             rows += [{"agent": name, **row} for row in summaries]
         place = runs.place(env_settings, geometry, homes, cfg.split)
         n_episodes, n_homes = rows[0]["lanes"], rows[0]["homes"]
-        if homes and n_homes is None:
-            console.warn(
-                f"{type(env).__name__} has no `layout`, the home of each environment: intervals "
-                "take every environment for a home of its own"
-            )
+        warn_without_layout(env, homes)
         path = runs.write_table(
             cfg,
             loaded,
@@ -92,6 +88,15 @@ def run(cfg: settings.Evaluate) -> Path:
         )
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
+
+
+def warn_without_layout(env: Any, homes: list) -> None:
+    """Warns if environments share homes and it is unknown which."""
+    if getattr(env, "layout", None) is None and 1 < len(homes) < env.n_envs:
+        console.warn(
+            f"{type(env).__name__} has no `layout`, the home of each environment: intervals take "
+            "every environment for a home of its own, and are too narrow"
+        )
 
 
 def cells(row: dict) -> dict[str, str]:
@@ -188,6 +193,7 @@ class Arena:
         env = factory.changed(env, n_envs=n_duels * sample.n_agents)
         self.env, self.sample = factory.construct(env, geometries=homes, **where), sample
         self.place = runs.place(env, geometry, homes, cfg.split)
+        warn_without_layout(self.env, homes)
 
     def play(self, player: Player, opponent: Player) -> Any:
         with factory.errors():
@@ -246,8 +252,8 @@ class Arena:
         rows = ratings.rows(
             [(player.name, player.step) for player in players], scores, self.cfg.seed
         )
-        n_homes = len(set(self.env.layout.tolist())) if hasattr(self.env, "layout") else None
-        what = f"{self.env.n_envs:,} duels of each pair"
+        layout, what = getattr(self.env, "layout", None), f"{self.env.n_envs:,} duels of each pair"
+        n_homes = None if layout is None else len(layout.unique())
         title = f"Ratings in {self.place.title(what, n_homes)}, seed {self.cfg.seed}"
         table = console.table(
             [*RATINGS], [[form.format_map(row) for form in RATINGS.values()] for row in rows]

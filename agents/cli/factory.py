@@ -183,7 +183,7 @@ def make_bot(name: str | None, settings: Env, env: Any) -> Any:
             f"{where} has no bot of its own; name a policy, in training with "
             "opponents.bot_class=module:Class and in duels with against=module:Class"
         )
-    name = name or constructor.__name__
+    name = name or f"{where}.bot"
 
     def check_actions(space, leaf):
         fits = tuple(leaf.shape) == (n_lanes, *space.shape) and not leaf.is_floating_point()

@@ -67,26 +67,26 @@ def run(cfg: settings.Record) -> Path:
         console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
         seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
         policy = duels.duel_policy(policy, opponent.policy, seat, env.n_agents)
-    path = Path(cfg.file) if cfg.file else folder / "video.mp4"
-    # a video is the last thing that a run should fail for
-    with program.errors(f"The video {path} could not be made: ", (Exception,)):
-        with contextlib.ExitStack() as undo:
-            if not cfg.file:
-                path = take_free_name(path)
-                undo.callback(path.unlink, missing_ok=True)
+    with contextlib.ExitStack() as undo:
+        path = Path(cfg.file) if cfg.file else take_free_name(folder / "video.mp4")
+        if not cfg.file:
+            undo.callback(path.unlink, missing_ok=True)
+        # a video is the last thing that a run should fail for
+        with program.errors(f"The video {path} could not be made: ", (Exception,)):
             film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)
-            undo.pop_all()
+        undo.pop_all()
     console.say(f"Filmed {cfg.steps} steps: {path}")
     return path
 
 
 def take_free_name(path: Path) -> Path:
     """Creates an empty file, `video.mp4` or else `video-2.mp4` and so on, and returns its path."""
-    for number in itertools.count(1):
-        name = path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
-        with contextlib.suppress(FileExistsError):
-            name.touch(exist_ok=False)
-            return name
+    with program.errors(f"The video {path} could not be made: "):
+        for number in itertools.count(1):
+            name = path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
+            with contextlib.suppress(FileExistsError):
+                name.touch(exist_ok=False)
+                return name
 
 
 @torch.no_grad()

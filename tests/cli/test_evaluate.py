@@ -380,10 +380,14 @@ def test_environment_without_a_layout_is_warned_of(tmp_path, monkeypatch, capsys
     monkeypatch.chdir(tmp_path)
     words = ["env=test_evaluate:Homeless", *TINY[1:], "folder=run"]
     train.run(settings(*words))
-    result = json.loads(evaluate.run(configured(run="run", baseline=False)).read_text())
+    homes = settings("run=x", "geometry=homes", "geometry.n=3", script="evaluate").geometry
+    written = evaluate.run(configured(run="run", geometry=homes, baseline=False))
+    result = json.loads(written.read_text())
     assert result["rows"][0]["homes"] is None
-    assert result["title"].startswith("homeless: 6 episodes, geometry=box, split=test, ")
+    assert result["title"].startswith("homeless: 6 episodes, geometry=homes, split=test, ")
     assert "Homeless has no `layout`" in capsys.readouterr().err
+    evaluate.run(configured(run="run", baseline=False))
+    assert "layout" not in capsys.readouterr().err, "the box is one home"
 
 
 def test_few_episodes_are_spread_over_all_homes(trained, monkeypatch):
