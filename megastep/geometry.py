@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from megastep.dotdict import dotdict
 
-__all__ = ["centers", "display", "hashed", "indices", "masks", "validate_geometry"]
+__all__ = ["centers", "content_hash", "display", "indices", "masks", "validate_geometry"]
 
 # Metres per cell, as in the original: coarse enough to be cheap, fine enough for a 0.6 m door.
 RES = 0.2
@@ -216,7 +216,7 @@ def validate_geometry(g: dict) -> dict:
     return type(g)(g, id=number, walls=walls, lights=lights, masks=cells.astype(np.int16), res=res)
 
 
-def hashed(geometries: Sequence[dotdict]) -> "hashlib._Hash":
+def content_hash(geometries: Sequence[dotdict]) -> "hashlib._Hash":
     """Returns a SHA-256 hash object of the walls and rooms of geometries. It can be updated
     further.
     """

@@ -12,7 +12,15 @@ from megastep.engine import checks
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.ragged import Ragged
 
-__all__ = ["TEXEL", "agent_model", "display", "scenery", "texel_widths", "wall_textures"]
+__all__ = [
+    "TEXEL",
+    "agent_model",
+    "display",
+    "scenery",
+    "spread",
+    "texel_widths",
+    "wall_textures",
+]
 
 TEXEL = 0.05  # metres per texel
 STRIPE = (0.4, 2.0)  # metres, min and max of the period of a wall's stripes
@@ -140,6 +148,26 @@ def _part(geometries, name, shape):
     return parts
 
 
+def _first_layouts(n_envs, n_layouts):
+    """Returns the layout that each environment starts with, (N,) int64."""
+    environments = torch.arange(n_envs)
+    if n_envs < n_layouts:
+        return environments * n_layouts // n_envs
+    return environments % n_layouts
+
+
+def spread(geometries: Sequence, n_envs: int) -> list:
+    """Returns the geometries that ``n_envs`` environments start in, each once, in order.
+
+    That is all of them, or ``n_envs`` evenly spaced ones if there are more. Environments that never
+    change their layout need no others.
+    """
+    n_envs = checks.integer("n_envs", n_envs, 1)
+    n_geometries = len(checks.items("geometries", geometries))
+    indices = _first_layouts(min(n_envs, n_geometries), n_geometries).tolist()
+    return [geometries[i] for i in indices]
+
+
 def scenery(
     geometries: Sequence,
     n_agents: int = 1,
@@ -150,8 +178,9 @@ def scenery(
     """Returns the baked :class:`~megastep.engine.Scenery` of ``n_envs`` environments.
 
     Each geometry becomes a layout: a floor plan with random textures and light intensities. A
-    geometry that is listed twice becomes two layouts. Environment e starts with layout
-    ``e % len(geometries)``.
+    geometry that is listed twice becomes two layouts. Environment e of N starts with layout
+    ``e % D`` of the D geometries; with more geometries than environments, with ``e * D // N``, so
+    that environments are spread over all geometries.
 
     Args:
         geometries: floor plans.
@@ -190,7 +219,7 @@ def scenery(
         ),
         device=device,
     )
-    layout = torch.arange(n_envs) % len(geometries)
+    layout = _first_layouts(n_envs, len(geometries))
     result = Scenery.of_layouts(n_agents, layouts, model, model_widths, layout)
     engine.bake(result)
     return result

@@ -51,6 +51,8 @@ class Env(Protocol):
         check(): raises the errors that were flagged on the device. Synchronises host and device.
         layout: (N,) integers, the floor plan that each environment shows now. Confidence intervals
             of an evaluation are over layouts. Default: None, intervals are over environments.
+        bot: class of a scripted policy for this environment, whose arguments are settings of the
+            environment. It plays as ``opponents.bot`` and ``against=bot``. Default: none.
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
         privileged_space: space of ``world.privileged``. Default: None, there is none.
         desync(): gives every lane a random age, as if its episode had been going on for some steps.
@@ -77,6 +79,7 @@ DEFAULTS: dict[str, Any] = {
     "fps": 10.0,
     "check": lambda: None,
     "layout": None,
+    "bot": None,
     "roles": None,
     "privileged_space": None,
     "desync": None,

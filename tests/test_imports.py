@@ -51,8 +51,13 @@ SHARED = {
     "megastep.spaces",
     "megastep.types",
 }
-# The command line also chooses a device, checks environments and writes videos.
-SHARED_WITH_CLI = SHARED | {"megastep.contract", "megastep.engine", "megastep.recording"}
+# The command line also chooses a device and homes, checks environments and writes videos.
+SHARED_WITH_CLI = SHARED | {
+    "megastep.contract",
+    "megastep.engine",
+    "megastep.recording",
+    "megastep.scene",
+}
 # The files that may import these modules of ours, as glob patterns.
 OWN_USERS = {
     "megastep.kernels.build.launch": (

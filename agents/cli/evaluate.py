@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from megastep.agents.cli import command, compose, console, factory, program, runs, settings
 from megastep.agents.selfplay import duels, ratings
 from megastep.agents.training import checkpoint, evaluation
-from megastep.types import n_lanes, optional
+from megastep.types import optional
 
 HELP = """Measures what a run's agent earns in the first episode of each lane, with a 95 % interval
 over homes. Prints a table and writes it to the run's folder: evaluations/*.md.
@@ -63,7 +63,8 @@ def run(cfg: settings.Evaluate) -> Path:
         arena = Arena(cfg, loaded, env_settings, geometry, device)
         path = arena.rate() if cfg.ratings else arena.duel()
     else:
-        homes = factory.homes(env_settings, geometry, cfg.split, cfg.episodes)
+        homes = factory.homes(env_settings, geometry, cfg.split)
+        homes = factory.spread(homes, cfg.episodes)
         env_settings = factory.changed(env_settings, n_envs=cfg.episodes, resample=False)
         where = dict(geometries=homes, seed=cfg.seed, device=device)
         env, rows = factory.construct(env_settings, **where), []
@@ -74,18 +75,29 @@ def run(cfg: settings.Evaluate) -> Path:
             episodes = evaluation.first_episodes(env, player, cfg.seed, greedy)
             summaries = evaluation.summaries(episodes, optional(env, "roles"))
             rows += [{"agent": name, **row} for row in summaries]
-        place, source = runs.place(env_settings, geometry, homes, cfg.split)
+        place = runs.place(env_settings, geometry, homes, cfg.split)
+        n_episodes, n_homes = rows[0]["lanes"], rows[0]["homes"]
+        warn_without_layout(env, homes)
         path = runs.write_table(
             cfg,
             loaded,
-            [source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
-            f"{place}, after {loaded.step:,} samples ({loaded.path.name}), seed {cfg.seed}, "
-            f"{n_lanes(env):,} lanes",
+            [place.source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
+            f"{place.title(f'{n_episodes:,} episodes', n_homes)}, after {loaded.step:,} samples "
+            f"({loaded.path.name}), seed {cfg.seed}",
             rows,
             [*map(cells, rows)],
         )
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
+
+
+def warn_without_layout(env: Any, homes: list) -> None:
+    """Warns if environments share homes and it is unknown which."""
+    if optional(env, "layout") is None and 1 < len(homes) < env.n_envs:
+        console.warn(
+            f"{type(env).__name__} has no `layout`, the home of each environment: intervals take "
+            "every environment for a home of its own, and are too narrow"
+        )
 
 
 def cells(row: dict) -> dict[str, str]:
@@ -113,8 +125,9 @@ class Player(NamedTuple):
     step: int | None = None  # the number of samples it has learnt from
 
 
-#: Settings of an environment for duels, where it has them.
-FOR_TWO = {"n_agents": 2, "resample": False}
+#: Settings of an environment for duels, where it has them: two agents, each environment in one
+#: home.
+FOR_TWO = {"n_agents": 2, "self_play": True, "resample": False}
 
 
 def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpoint) -> Player:
@@ -141,8 +154,8 @@ def find_player(
     """Returns who is to meet the agent of `run` in `env`.
 
     Args:
-        name: a run's folder or checkpoint; an import path, `random`, or `bot`, the scripted policy
-            of the run, none of which needs weights.
+        name: a run's folder or checkpoint; or what needs no weights: an import path, `random`, or
+            `bot`, which is the run's `opponents.bot_class`, or else the environment's own bot.
 
     Raises:
         UserError: if nobody can be met there, or this player cannot play there.
@@ -152,9 +165,10 @@ def find_player(
             f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
             "one here; choose another with env= and its settings"
         )
-    name = factory.config_of(run).opponents.bot_class if name == "bot" else name
-    if name == "random" or (":" in name and not Path(name).exists()):
-        return Player(name, factory.make_bot(name, env_settings, env))
+    if name == "bot":
+        name = factory.config_of(run).opponents.bot_class or name
+    if name in ("bot", "random") or (":" in name and not Path(name).exists()):
+        return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
     return load_player(factory.load_checkpoint(runs.find(name), env.device), env, run)
 
 
@@ -176,11 +190,12 @@ class Arena:
         self.agent = load_player(run, sample, run)
         n_agents = optional(sample, "n_agents")
         n_duels = max(1, cfg.episodes // n_agents)  # from each place
-        homes = homes[:n_duels]
+        homes = factory.spread(homes, n_duels)
         n_duels -= n_duels % max(1, len(homes))
         env = factory.changed(env, n_envs=n_duels * n_agents)
         self.env, self.sample = factory.construct(env, geometries=homes, **where), sample
-        self.place, self.source = runs.place(env, geometry, homes, cfg.split)
+        self.place = runs.place(env, geometry, homes, cfg.split)
+        warn_without_layout(self.env, homes)
 
     def play(self, player: Player, opponent: Player) -> Any:
         with factory.errors():
@@ -192,21 +207,27 @@ class Arena:
         """Plays the run's agent against each of `cfg.against`. Prints and writes a table, and
         returns the path of its .json.
         """
-        rows = [{"against": p.name, **summary(self.play(self.agent, p))} for p in self.others]
+        roles = optional(self.env, "roles")
+        rows = [
+            {"against": opponent.name, **row}
+            for opponent in self.others
+            for row in duels.summaries(self.play(self.agent, opponent), roles)
+        ]
+        title = self.place.title(f"{rows[0]['duels']:,} duels", rows[0]["homes"])
         return runs.write_table(
             self.cfg,
             self.run,
             [
                 "duels",
-                self.source,
+                self.place.source,
                 self.cfg.split,
                 str(self.run.step),
                 "against",
                 *self.cfg.against,
             ],
-            f"{self.agent.name}: duels of {self.place}, seed {self.cfg.seed}",
+            f"{self.agent.name}, in {title}, seed {self.cfg.seed}",
             rows,
-            [{key: form.format_map(row) for key, form in DUELS.items()} for row in rows],
+            [*map(duel_cells, rows)],
         )
 
     def rate(self) -> Path:
@@ -233,7 +254,9 @@ class Arena:
         rows = ratings.rows(
             [(player.name, player.step) for player in players], scores, self.cfg.seed
         )
-        title = f"Ratings by duels of {self.place}, seed {self.cfg.seed}"
+        layout, what = optional(self.env, "layout"), f"{self.env.n_envs:,} duels of each pair"
+        n_homes = None if layout is None else len(layout.unique())
+        title = f"Ratings in {self.place.title(what, n_homes)}, seed {self.cfg.seed}"
         table = console.table(
             [*RATINGS], [[form.format_map(row) for form in RATINGS.values()] for row in rows]
         )
@@ -244,23 +267,10 @@ class Arena:
         return folder / "ratings.csv"
 
 
-def summary(played: dict) -> dict:
-    """Returns a table's row for what `duels.play` returned: the share won, a draw counting half,
-    with its 95 % interval over homes, or over duels where there are none.
-    """
-    score, *homes = (played[k].cpu().numpy() for k in ("score", "homes") if k in played)
-    mean, lower, upper = evaluation.interval(score, *homes)
-    return {
-        "won": mean,
-        "lower": lower,
-        "upper": upper,
-        "wins": int((score == 1).sum()),
-        "losses": int((score == 0).sum()),
-        "draws": int(((score != 1) & (score != 0)).sum()),
-        "length": float(played["lengths"].mean()),
-        "duels": len(score),
-        "homes": len(set(homes[0].tolist())) if homes else None,
-    }
+def duel_cells(row: dict) -> dict[str, str]:
+    against = f"{row['against']}, as {row['role']}" if "role" in row else row["against"]
+    row = row | {"against": against, "homes": row["homes"] or "none"}
+    return {key: form.format_map(row) for key, form in DUELS.items()}
 
 
 SCRIPT = compose.Script("evaluate", settings.Evaluate, run, HELP)

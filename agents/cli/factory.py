@@ -3,12 +3,13 @@
 import dataclasses
 import functools
 import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from megastep import contract, engine, spaces
+from megastep import contract, engine, scene, spaces
 from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.cli import check, program, runs
 from megastep.agents.cli.settings import Agent, Env, Geometry, Learner, Train
@@ -41,12 +42,14 @@ KINDS = (
 errors = functools.partial(program.errors, kinds=KINDS)
 
 
-def construct(settings: Any, name: str | None = None, **arguments: Any) -> Any:
-    """Calls the class or function called `name`, by default the one that settings name, with those
-    of the settings and arguments that it takes.
+def construct(settings: Any, constructor: Callable | None = None, **arguments: Any) -> Any:
+    """Calls a class or function with those of the settings and arguments that it takes.
+
+    Args:
+        constructor: default: the one at the import path in `settings.name`.
     """
     with errors():
-        constructor = import_object(name or settings.name)
+        constructor = constructor or import_object(settings.name)
         taken = inspect.signature(constructor).parameters
         return constructor(**{k: v for k, v in (vars(settings) | arguments).items() if k in taken})
 
@@ -65,11 +68,16 @@ def make_device(name: str) -> torch.device:
     return device
 
 
-def homes(env: Env, geometry: Geometry, split: str, max_homes: int | None = None) -> list[dict]:
+def homes(env: Env, geometry: Geometry, split: str) -> list[dict]:
     """Returns the different geometries of a split, in order; none if `env` takes no geometries."""
     if "geometries" not in inspect.signature(import_object(env.name)).parameters:
         return []
-    return [*{id(home): home for home in construct(geometry, split=split)}.values()][:max_homes]
+    return [*{id(home): home for home in construct(geometry, split=split)}.values()]
+
+
+def spread(homes: list[dict], n_envs: int) -> list[dict]:
+    """Returns the homes, or `n_envs` evenly spaced ones of more. Without homes, returns none."""
+    return scene.spread(homes, n_envs) if homes else []
 
 
 def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:
@@ -155,15 +163,29 @@ def make_opponents(cfg: Train, env: Any, sample: Any, policy: Policy) -> Opponen
         return Opponents(env, policy, bot, seed=cfg.seed, **shares)
 
 
-def make_bot(name: str, settings: Env, env: Any) -> Any:
-    """Returns a policy that needs no weights: `random`, or a class by import path.
+def make_bot(name: str | None, settings: Env, env: Any) -> Any:
+    """Returns a policy that needs no weights.
 
-    The class is given the environment's settings that it takes, such as `fov`, and takes one step
-    in `env`. Raises UserError if it cannot play there.
+    It is given the environment's settings that it takes, such as `fov`, and takes one step in
+    `env`.
+
+    Args:
+        name: `random`, the import path of a class, or None, the class that is `env.bot`.
+
+    Raises:
+        UserError: if there is no such class, or it cannot play there.
     """
     if name == "random":
         return evaluation.RandomActions(env.action_space)
     where = type(env).__name__
+    with errors():
+        constructor = optional(env, "bot") if name is None else import_object(name)
+    if constructor is None:
+        raise program.UserError(
+            f"{where} has no bot of its own; name a policy, in training with "
+            "opponents.bot_class=module:Class and in duels with against=module:Class"
+        )
+    name = name or f"{where}.bot"
 
     def check_actions(space, leaf):
         fits = tuple(leaf.shape) == (n_lanes(env), *space.shape) and not leaf.is_floating_point()
@@ -172,7 +194,7 @@ def make_bot(name: str, settings: Env, env: Any) -> Any:
 
     # a policy may do whatever, where it was not made for
     with program.errors(f"{name} cannot play in {where}; name one made for it: ", (Exception,)):
-        bot = construct(settings, name)
+        bot = construct(settings, constructor)
         decision, _ = bot(env.reset(), bot.initial(n_lanes(env), env.device))
         spaces.map(check_actions, env.action_space, decision["actions"])
     return bot

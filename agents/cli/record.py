@@ -4,6 +4,8 @@
 """
 
 import collections
+import contextlib
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -34,21 +36,24 @@ The most common words:
   steps=400        frames
   against=RUN      its duel with another run's agent, `bot`, or an import path, in one home
   home=3           another of the unseen homes; split=training: one it was trained in
-  file=out.mp4     instead of video.mp4 in the run folder; out.png: the last frame only"""
+  file=out.mp4     this file, overwritten if it exists; out.png: the last frame only. Otherwise
+                   video.mp4 in the run folder, or video-2.mp4, ... if there is one"""
 
 #: Where random actions are filmed unless geometry= says otherwise.
 HOMES = "megastep.geometries.sources:homes"
 
 
 def run(cfg: settings.Record) -> Path:
-    """Films a run's agent, or random actions. Returns the path of the video."""
-    path, device = Path(cfg.file or "video.mp4"), factory.make_device(cfg.device)
+    """Films a run's agent, or random actions. Returns the path of the video: `cfg.file`, or the
+    first free name of `video.mp4`, `video-2.mp4`, ...
+    """
+    folder, device = Path(), factory.make_device(cfg.device)
     env_settings, geometry = cfg.env, cfg.geometry
     if cfg.run is not None:
         loaded = factory.load_checkpoint(runs.find(cfg.run), device)
         trained = factory.config_of(loaded)
         env_settings, geometry = trained.env, geometry or trained.geometry
-        path = path if cfg.file else runs.folder_of(loaded.path) / path
+        folder = runs.folder_of(loaded.path)
     if cfg.against is not None:
         env_settings = factory.changed(env_settings, **evaluate.FOR_TWO)
     geometry = geometry or settings.kind_of("geometry", HOMES)(name=HOMES)
@@ -63,11 +68,26 @@ def run(cfg: settings.Record) -> Path:
         console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
         seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
         policy = duels.duel_policy(policy, opponent.policy, seat, env.n_agents)
-    # a video is the last thing that a run should fail for
-    with program.errors(f"The video {path} could not be made: ", (Exception,)):
-        film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)
+    with contextlib.ExitStack() as undo:
+        path = Path(cfg.file) if cfg.file else take_free_name(folder / "video.mp4")
+        if not cfg.file:
+            undo.callback(path.unlink, missing_ok=True)
+        # a video is the last thing that a run should fail for
+        with program.errors(f"The video {path} could not be made: ", (Exception,)):
+            film(env, policy, path, cfg.steps, cfg.greedy, cfg.seed)
+        undo.pop_all()
     console.say(f"Filmed {cfg.steps} steps: {path}")
     return path
+
+
+def take_free_name(path: Path) -> Path:
+    """Creates an empty file, `video.mp4` or else `video-2.mp4` and so on, and returns its path."""
+    with program.errors(f"The video {path} could not be made: "):
+        for number in itertools.count(1):
+            name = path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
+            with contextlib.suppress(FileExistsError):
+                name.touch(exist_ok=False)
+                return name
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ import shlex
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import filelock
 from rich import box
@@ -162,12 +162,38 @@ def folder_of(path: Path) -> Path:
 # ---- Results ----
 
 
-def place(env: Env, geometry: Geometry, homes: list, split: str) -> tuple[str, str]:
-    """Returns where a run is evaluated, for titles, and the source of homes, for file names."""
-    stem = Path(getattr(geometry, "path", None) or "").stem
-    source = "-".join(filter(None, [label(geometry.name), stem])) if homes else label(env.name)
-    place = f" in {'all' if split == 'all' else f'the {split}'} homes of {source}" if homes else ""
-    return label(env.name) + place, source
+class Place(NamedTuple):
+    """Where a run is evaluated.
+
+    Attributes:
+        env: the environment's name.
+        source: that of the homes, or of the environment if there are none, for file names.
+        choice: the choice of homes, for titles; empty if there are none.
+    """
+
+    env: str
+    source: str
+    choice: str
+
+    def title(self, what: str, n_homes: int | None) -> str:
+        """Returns `minimal: 1,024 episodes in 512 homes, geometry=homes, split=test`.
+
+        Args:
+            what: such as `1,024 episodes`.
+            n_homes: number of homes, if known.
+        """
+        homes = f" in {n_homes:,} home{'s' * (n_homes > 1)}" if n_homes else ""
+        return f"{self.env}: {what}{homes}{self.choice}"
+
+
+def place(env: Env, geometry: Geometry, homes: list, split: str) -> Place:
+    if not homes:
+        return Place(label(env.name), label(env.name), "")
+    path = Path(getattr(geometry, "path", None) or "")
+    is_ours = geometry.name.startswith("megastep.")
+    name = label(geometry.name) if is_ours else geometry.name
+    choice = f", geometry={name}{f' ({path.name})' * bool(path.name)}, split={split}"
+    return Place(label(env.name), "-".join(filter(None, [label(geometry.name), path.stem])), choice)
 
 
 def write_table(

@@ -128,7 +128,7 @@ Agent = settings_of(Policy, ("obs_space", "action_space", "privileged_space", "s
 Opposition = settings_of(
     Opponents,
     ("env", "policy", "scripted", "seed"),
-    bot_class=(str, "megastep.envs.deathmatch:Bot"),
+    bot_class=(str | None, None),  # None: the environment's own
 )
 
 

@@ -48,7 +48,7 @@ The most common words:
                                past selves and a scripted policy; snapshots=8 keeps what ratings
                                compare
   resume=RUN                   continue a run (its folder, or latest) under its own configuration
-  init=RUN                     start a new run from its weights, in its environment
+  init=RUN                     start a new run from its weights, in its environment and homes
   env=my_package.rover:Rover   a class of your own; also for geometry, learner, agent.core
   logger=wandb logger.mode=offline"""
 #: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
@@ -219,7 +219,7 @@ def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
     returned as it is.
 
     A run that is resumed keeps its own settings, except for typed keys. A run that starts from the
-    weights of another has its environment and agent, except for typed keys and groups.
+    weights of another has its environment, geometry and agent, except for typed keys and groups.
     """
     resume, init = tree.get("resume"), tree.get("init")
     if not isinstance(resume or init, str) or (resume and init):
@@ -230,7 +230,8 @@ def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
     loaded = factory.load_checkpoint(runs.find(resume or init))
     saved, state = loaded.config["train"], loaded.state
     if init:
-        groups = {group: saved[group] for group in ("env", "agent") if group not in typed}
+        groups = ("env", "geometry", "agent")
+        groups = {group: saved[group] for group in groups if group not in typed}
         saved, typed = tree | groups, [key for key in typed if key.partition(".")[0] in groups]
     elif "learner" not in state:
         raise program.UserError(

@@ -3,10 +3,14 @@
 Axes: N environments, A agents, B = N A lanes. A slot is the index of an agent in its environment.
 """
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
 import torch
 
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
-from megastep.agents.training.evaluation import CHECK_EVERY
+from megastep.agents.training.evaluation import CHECK_EVERY, interval
 from megastep.arrdict import arrdict
 from megastep.types import Env, Policy, n_lanes, optional
 
@@ -113,3 +117,38 @@ def play(
         is_over |= (terminal | truncated).any(1)
     optional(env, "check")()
     return arrdict(score=score, lengths=lengths, slots=slots[:, 0], **homes)
+
+
+def summaries(played: Mapping, roles: Sequence[str] | None = None) -> list[dict[str, Any]]:
+    """Returns table rows for the result of `play`: one overall, then one per role.
+
+    `won` is the share of duels won, a draw counting half; `lower` and `upper` are its 95 % interval
+    over homes, or over duels if there are no homes.
+
+    Args:
+        roles: the role of each agent slot. A role's row has the duels in which `policy` played it.
+    """
+    arrays = {key: values.cpu().numpy() for key, values in played.items()}
+    rows, slots = [_summary(arrays)], arrays["slots"]
+    for role in dict.fromkeys(roles or ()):
+        has_role = np.array([name == role for name in roles])[slots]
+        if has_role.any():
+            of_role = {key: values[has_role] for key, values in arrays.items()}
+            rows.append({"role": role, **_summary(of_role)})
+    return rows
+
+
+def _summary(arrays):
+    score, homes = arrays["score"], arrays.get("homes")
+    mean, lower, upper = interval(score, homes)
+    return {
+        "won": mean,
+        "lower": lower,
+        "upper": upper,
+        "wins": int((score == 1).sum()),
+        "losses": int((score == 0).sum()),
+        "draws": int(((score != 1) & (score != 0)).sum()),
+        "length": float(arrays["lengths"].mean()),
+        "duels": len(score),
+        "homes": None if homes is None else len(np.unique(homes)),
+    }

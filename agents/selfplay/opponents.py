@@ -50,8 +50,8 @@ class Opponents:
     All other attributes are those of `env`.
 
     Raises:
-        ValueError: the environment has one agent, `past + bot > 1`, or a snapshot or the bot would
-            get no environment.
+        ValueError: the environment has one agent, `past + bot` is 0 or above 1, `bot > 0` without
+            `scripted`, or a snapshot or the bot would get no environment.
     """
 
     @checked
@@ -69,6 +69,10 @@ class Opponents:
     ):
         self.env, self.every, device = env, every, env.device
         n_per_snapshot, n_bot = count_environments(env, past, bot, snapshots)
+        if bot and scripted is None:
+            raise ValueError(
+                f"opponents.bot={bot} needs a bot that plays: pass scripted=, a policy, or bot=0"
+            )
         n_snapshots = snapshots if past else 0
         # autocast caches the cast of a weight only if the weight requires a gradient
         self.snapshots = [policy.actor().requires_grad_(True) for _ in range(n_snapshots)]
@@ -161,27 +165,45 @@ class Opponents:
         Keys are metric names. A kind of opponent without a decided pair is absent.
         """
         win_rates = {}
-        by_kind = self.pairs.double().tensor_split([self.n_past], 1)
-        for name, pairs in zip(("past", "bot"), by_kind):
-            won, decided = pairs.sum(1).tolist()
+        for name, pairs in self._pairs_by_kind().items():
+            won, decided = pairs.double().sum(1).tolist()
             if decided:
                 win_rates[f"episode/won/{name}"] = won / decided
         self.pairs.zero_()
         return win_rates
 
+    def _pairs_by_kind(self):
+        """Returns the parts of `pairs`, (2, m) by kind of opponent. They are views."""
+        past, bot = self.pairs.tensor_split([self.n_past], 1)
+        return {"past": past, "bot": bot}
+
     def state_dict(self) -> dict[str, Any]:
-        """Returns the snapshots, the pairs counted and the generator's state."""
+        """Returns the snapshots, the pairs counted by kind of opponent and the generator's state.
+
+        None of it depends on the number of environments.
+        """
         return dict(
             snapshots={str(i): policy.state_dict() for i, policy in enumerate(self.snapshots)},
-            pairs=self.pairs,
+            pairs={name: pairs.sum(1) for name, pairs in self._pairs_by_kind().items()},
             generator=self.generator.state_dict(),
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores a `state_dict`. Episodes start anew."""
+        """Restores a `state_dict`, also one of another number of environments. Episodes start anew.
+
+        Raises:
+            ValueError: the state has another number of snapshots.
+        """
+        if len(state["snapshots"]) != len(self.snapshots):
+            raise ValueError(
+                f"the saved opponents have {len(state['snapshots'])} snapshots, these have "
+                f"{len(self.snapshots)}: use the opponents.snapshots and opponents.past of the run"
+            )
         for i, snapshot in enumerate(self.snapshots):
             snapshot.load_state_dict(state["snapshots"][str(i)])
-        self.pairs.copy_(state["pairs"])
+        self.pairs.zero_()
+        for name, pairs in self._pairs_by_kind().items():
+            pairs[:, :1] = state["pairs"][name][:, None]  # counted as of the kind's first, if any
         self.generator.load_state_dict(state["generator"], self.learners.device)
 
 
@@ -194,6 +216,11 @@ def count_environments(env: Env, past: float, bot: float, snapshots: int) -> tup
     if optional(env, "n_agents") < 2:
         raise ValueError(
             f"opponents need an environment with at least two agents; {type(env).__name__} has one"
+        )
+    if not past + bot:
+        raise ValueError(
+            "opponents need opponents.past or opponents.bot above 0; without opponents, use the "
+            "environment itself"
         )
     if past + bot > 1:
         raise ValueError(

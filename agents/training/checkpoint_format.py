@@ -19,9 +19,9 @@ from megastep.agents.training.atomic_files import write_synced
 
 #: The format number. Increase it whenever older readers would misread a new checkpoint, or newer
 #: readers an old one, and add the last commit of the old format to `READERS`.
-FORMAT = 5
+FORMAT = 6
 #: Commits of megastep that read the older formats.
-READERS = {1: "e17fabe", 2: "6f4fbf1", 3: "3ffd1d5", 4: "e9908db"}
+READERS = {1: "e17fabe", 2: "6f4fbf1", 3: "3ffd1d5", 4: "e9908db", 5: "916221d"}
 FILES = ("state.pt", "config.json")
 
 

@@ -12,7 +12,7 @@ from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.envs.common import SceneryEnv
-from megastep.scene import scenery
+from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Explorer"]
@@ -84,7 +84,7 @@ class Explorer(SceneryEnv):
     ):
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
-        geometries = geometries if resample else geometries[:n_envs]
+        geometries = geometries if resample else spread(geometries, n_envs)
         self.core = Core(
             scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
             res,

@@ -10,7 +10,7 @@ from megastep import engine, modules, plotting, toys
 from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.envs.common import SceneryEnv
-from megastep.scene import scenery
+from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Minimal"]
@@ -63,7 +63,7 @@ class Minimal(SceneryEnv):
         shortest: Annotated[int, Field(ge=1, le=10**6)] = 128,
         longest: Annotated[int, Field(ge=1, le=10**6)] = 256,
     ):
-        geometries = [toys.box()] if geometries is None else geometries[:n_envs]
+        geometries = [toys.box()] if geometries is None else spread(geometries, n_envs)
         self.core = Core(
             scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
             res=res,

@@ -3,6 +3,7 @@
 They are callables. Sensors and movements have a ``.space``.
 """
 
+from megastep.modules.free_points import FreePoints
 from megastep.modules.lanes import to_agents, to_lanes
 from megastep.modules.lifecycle import (
     ENDLESS,
@@ -31,6 +32,7 @@ __all__ = [
     "TEXELS_PER_POINT",
     "TURNS",
     "Depth",
+    "FreePoints",
     "Lifecycle",
     "MomentumMovement",
     "RandomLifespans",

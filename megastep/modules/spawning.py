@@ -12,7 +12,7 @@ import torch
 from megastep import cache, engine
 from megastep.core import Core
 from megastep.dotdict import dotdict
-from megastep.geometry import centers, hashed
+from megastep.geometry import centers, content_hash
 from megastep.modules.lanes import to_agents
 
 CLEARANCE = 0.05  # metres between a spawned agent's disc and walls, or other spawned agents
@@ -118,7 +118,7 @@ class RandomSpawns:
 
     Attributes:
         points: (D, A * (n_spawns // A), 2) float32, those of agent 0 first.
-        chosen: (N, A) int32, index of the point where each agent last spawned.
+        point_index: (N, A) int32, index into ``points`` of each agent's last spawn point.
     """
 
     def __init__(
@@ -139,11 +139,11 @@ class RandomSpawns:
         self.seed = core.seed if seed is None else seed
         if points is None:
             geometries = geometries[: len(core.scenery.layouts)]
-            points = _cached_points(
+            points = cached_points(
                 geometries, n_spawns, core.n_agents, core.agents.radius, self.seed
             )
         self.points = torch.as_tensor(points, device=core.device)
-        self.counts, self.chosen = (
+        self.counts, self.point_index = (
             torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
             for _ in range(2)
         )
@@ -159,26 +159,29 @@ class RandomSpawns:
             self.seed,
             self.resample,
             self.hidden,
-            self.chosen,
+            self.point_index,
         )
 
 
-def _all_points(geometries, n_spawns, n_agents, radius, seed):
-    """Returns the points of every layout, (D, A * (n_spawns // A), 2) float32."""
+def _all_points(geometries, n, n_agents, radius, seed):
     points = [
-        spawn_points(
-            g, n_spawns, n_agents, radius, np.random.Generator(np.random.Philox([seed, d]))
-        )
+        spawn_points(g, n, n_agents, radius, np.random.Generator(np.random.Philox([seed, d])))
         for d, g in enumerate(geometries)
     ]
     return np.stack(points).astype(np.float32)
 
 
-def _cached_points(geometries, *arguments):
-    """Returns :func:`_all_points`, from the cache if it holds them."""
+def cached_points(
+    geometries: Sequence[dotdict], n: int, n_agents: int, radius: float, seed: int
+) -> np.ndarray:
+    """Returns the :func:`spawn_points` of every layout, (D, n_agents * (n // n_agents), 2) float32.
+
+    Keeps those of many layouts in the cache.
+    """
+    arguments = n, n_agents, radius, seed
     if len(geometries) < MIN_CACHED:
         return _all_points(geometries, *arguments)
-    key = hashed(geometries)
+    key = content_hash(geometries)
     key.update(Path(__file__).read_bytes() + repr((np.__version__, arguments)).encode())
 
     def build():

@@ -441,11 +441,11 @@ def test_missing_class_of_a_checkpoint(outside, capsys):
 # ---- init, and recording without a run ----
 
 
-def test_init_takes_environment_and_agent_unless_typed(outside):
+def test_init_takes_environment_geometry_and_agent_unless_typed(outside):
     outside({"counter.py": COUNTER})
     own = ["env=counter:Counter", "env.limit=7", "agent.core=gru", "agent.critic=plain"]
-    assert train.main([*RUN, *own, "folder=first"]) == 0
-    common = [w for w in RUN if not w.startswith(("agent.", "env."))]
+    assert train.main([*RUN, *own, "geometry.width=6", "folder=first"]) == 0
+    common = [w for w in RUN if not w.startswith(("agent.", "env.", "geometry"))]
     assert train.main([*common, "init=first", "env.n_envs=8", "folder=second"]) == 0
     config = checkpoint.load_latest("second/checkpoints").config["train"]
     assert config["env"] == {
@@ -455,9 +455,12 @@ def test_init_takes_environment_and_agent_unless_typed(outside):
         "sizes": [1, 2],
     }
     assert config["agent"]["core"] == "gru" and config["agent"]["width"] == 8
-    words = ["init=first", "env=counter:Counter", "env.n_envs=4", "folder=third"]
-    assert train.main([*common, *words]) == 0
-    assert checkpoint.load_latest("third/checkpoints").config["train"]["env"]["limit"] == 6
+    box = {"name": "megastep.geometries.sources:box", "n": 1, "seed": 1, "width": 6.0}
+    assert config["geometry"] == box
+    words = ["init=first", "env=counter:Counter", "env.n_envs=4", "geometry=column"]
+    assert train.main([*common, *words, "folder=third"]) == 0
+    config = checkpoint.load_latest("third/checkpoints").config["train"]
+    assert config["env"]["limit"] == 6 and config["geometry"]["name"].endswith(":column")
 
 
 def test_record_random_actions_without_a_run(outside, capsys):

@@ -5,20 +5,25 @@ import json
 import math
 import re
 import xml.etree.ElementTree
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 import yaml
 
-from megastep.agents.cli import evaluate, record, runs, train
+from megastep import envs, toys
+from megastep.agents.cli import evaluate, factory, record, runs, train
+from megastep.agents.cli.program import UserError
 from megastep.agents.selfplay import duels, ratings
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.training import checkpoint
 from megastep.agents.training.evaluation import interval
 from megastep.arrdict import arrdict
+from megastep.envs.deathmatch import Bot
+from megastep.envs.pong import Tracker
 from tests.cli.test_train import configured
-from tests.helpers.games import Always, Matrix
+from tests.helpers.games import Always, High, Matrix
 
 # ---- Duels ----
 
@@ -49,14 +54,14 @@ def test_win_share_matches_independent_count(mortal):
     )
     mean, lower, upper = interval(played.score.numpy())
     assert lower < win / (win + lose) < upper and upper - lower < 0.04
-    row = evaluate.summary(played)
+    (row,) = duels.summaries(played)
     assert row["won"] == mean and row["wins"] + row["losses"] == row["duels"] == 2000
 
 
 def test_unfinished_duel_is_a_draw():
     played = duels.play(Matrix(4), Always(1), Always(1), max_steps=70)
     assert (played.score == 0.5).all() and (played.lengths == 70).all()
-    row = evaluate.summary(played)
+    (row,) = duels.summaries(played)
     assert (row["draws"], row["wins"], row["losses"], row["won"]) == (4, 0, 0, 0.5)
     cut = duels.play(Matrix(4, limit=3), Always(1), Always(1))
     assert (cut.score == 0.5).all() and (cut.lengths == 3).all()
@@ -92,10 +97,27 @@ def test_intervals_are_over_homes():
     # each home was played in from both slots
     pairs = set(zip(played.homes.tolist(), played.slots.tolist(), strict=True))
     assert len(pairs) == 8
-    assert evaluate.summary(played)["homes"] == 4
+    assert duels.summaries(played)[0]["homes"] == 4
     score = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0])
-    row = evaluate.summary(arrdict(played, score=score))
+    (row,) = duels.summaries(arrdict(played, score=score))
     assert (row["won"], row["lower"], row["upper"]) == interval(score.numpy(), played.homes.numpy())
+
+
+def test_rows_by_role():
+    """Of three agents, the second and the third are hunters; whoever plays a hunter loses."""
+    played = arrdict(
+        score=torch.tensor([1.0, 1, 0.5, 0, 0, 0]),
+        lengths=torch.tensor([2.0, 4, 6, 8, 10, 12]),
+        slots=torch.tensor([0, 0, 1, 1, 2, 2]),
+        homes=torch.tensor([0, 1, 0, 1, 0, 1]),
+    )
+    every, prey, hunter = duels.summaries(played, ("prey", "hunter", "hunter"))
+    assert (prey["role"], hunter["role"]) == ("prey", "hunter") and "role" not in every
+    assert (every["duels"], prey["duels"], hunter["duels"]) == (6, 2, 4)
+    assert (every["won"], prey["won"], hunter["won"]) == (2.5 / 6, 1, 0.125)
+    assert (hunter["length"], hunter["homes"], hunter["draws"]) == (9, 2, 1)
+    expected = interval([0.5, 0, 0, 0], [0, 1, 0, 1])
+    assert (hunter["won"], hunter["lower"], hunter["upper"]) == expected
 
 
 def test_duels_are_reproducible():
@@ -224,21 +246,28 @@ def test_snapshots_are_spread_over_the_budget(here):
 
 
 def test_evaluate_against(here, capsys):
-    names = f"a/snapshots/step_{2 * UPDATE},b,random,tests.helpers.games:High"
+    names = f"a/snapshots/step_{2 * UPDATE},b,random,bot,tests.helpers.games:High"
     assert evaluate.main(["run=a", f"against={names}", "episodes=20", "device=cpu"]) == 0
     (path,) = (here / "a" / "evaluations").glob("duels-*.json")
     result = json.loads(path.read_text())
-    assert [row["against"] for row in result["rows"]] == [
+    overall = [row for row in result["rows"] if "role" not in row]
+    assert [row["against"] for row in overall] == [
         f"a, {2 * UPDATE:,} samples",
         f"b, {UPDATE:,} samples",
         "random",
+        "bot",
         "tests.helpers.games:High",
     ]
-    for row in result["rows"]:
+    for i, row in enumerate(overall):
         assert row["duels"] == row["wins"] + row["draws"] + row["losses"] == 20
         assert row["lower"] <= row["won"] <= row["upper"] and row["homes"] is None
+        left, right = result["rows"][3 * i + 1 : 3 * i + 3]
+        assert (left["role"], right["role"]) == ("left", "right")
+        assert left["duels"] == right["duels"] == 10
+        assert row["won"] == pytest.approx((left["won"] + right["won"]) / 2)
     text = path.with_suffix(".md").read_text()
     assert "95 % interval" in text and "95 % interval" in capsys.readouterr().out
+    assert "random, as left" in text and "in pong: 20 duels, seed 1" in text
     row = result["rows"][0]
     expected = dict(score=row["won"], evaluated=row["won"], lower=row["lower"])
     assert expected.items() <= runs.outcome(path).items()
@@ -308,10 +337,36 @@ class Elsewhere(Always):
 
 
 def test_duel_needs_two_agents(here, capsys):
-    assert evaluate.main(["run=a", "env=pong", "against=b", "device=cpu"]) == 2
-    assert "at least two agents, and Pong has one" in capsys.readouterr().err
+    assert evaluate.main(["run=minimal", "against=random", "device=cpu"]) == 2
+    assert "at least two agents, and Minimal has one" in capsys.readouterr().err
     assert record.main(["run=null", "env=pong", "against=b"]) == 2
     assert "against: needs run=" in capsys.readouterr().err
+
+
+def test_environments_name_their_bot():
+    pong = envs.Pong(2, self_play=True, device="cpu")
+    chosen = SimpleNamespace(tracker_speed=0.25)
+    bot = factory.make_bot(None, chosen, pong)
+    assert isinstance(bot, Tracker) and bot.tracker_speed == 0.25
+    rooms = envs.Deathmatch(2, [toys.box()], device="cpu")
+    assert isinstance(factory.make_bot(None, SimpleNamespace(), rooms), Bot)
+    assert isinstance(factory.make_bot("tests.helpers.games:High", chosen, pong), High)
+    with pytest.raises(UserError, match="Matrix has no bot .* opponents.bot_class=module:Class"):
+        factory.make_bot(None, SimpleNamespace(), Matrix(2))
+
+
+def test_bot_meets_a_run_that_trained_in_one_lane(here, monkeypatch):
+    """Pong has two lanes for the duel; the trained agent has the left one."""
+    lone = [word for word in PONG if word != "env.self_play=true"]
+    train.run(configured("samples=1", "folder=lone", tiny=lone))
+    assert evaluate.main(["run=lone", "against=bot", "episodes=8", "device=cpu"]) == 0
+    (path,) = (here / "lone" / "evaluations").glob("duels-*bot.json")
+    assert [row["duels"] for row in json.loads(path.read_text())["rows"]] == [8, 4, 4]
+    players = []
+    monkeypatch.setattr(record, "film", lambda env, both, path, *_: players.append((env, both)))
+    assert record.main(["run=lone", "against=bot", "device=cpu"]) == 0
+    ((env, both),) = players
+    assert env.n_agents == 2 and isinstance(both.policies[1], Tracker)
 
 
 def test_ratings_need_two_checkpoints(here, capsys):
@@ -341,7 +396,9 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
     counts = torch.stack([result.homes, result.slots.int()], 1).unique(dim=0, return_counts=True)[1]
     assert counts.tolist() == [2] * 14
     (path,) = (tmp_path / "run" / "evaluations").glob("*.json")
-    assert json.loads(path.read_text())["rows"][0]["homes"] == 7
+    table = json.loads(path.read_text())
+    assert table["rows"][0]["homes"] == 7
+    assert "matrix: 28 duels in 7 homes, geometry=homes, split=test, seed 1" in table["title"]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import envs, spaces
+from megastep import envs, scene, spaces
 from megastep.agents.cli import evaluate, runs, train
 from megastep.agents.cli.program import UserError
 from megastep.agents.training import evaluation
@@ -300,7 +300,8 @@ def test_evaluate_prints_and_writes_a_table(trained, capsys):
     for text in (capsys.readouterr().out, written.with_suffix(".md").read_text()):
         assert "95 % interval" in text and "random" in text
         assert (
-            "minimal in the test homes of box, after 32 samples (step_32), seed 1, 6 lanes" in text
+            "minimal: 6 episodes in 1 home, geometry=box, split=test, after 32 samples (step_32), "
+            "seed 1" in text
         )
     row = dict(evaluated=0.0, lower=0.0, upper=0.0)
     assert runs.outcome(written) == dict(score=0.0, **row)
@@ -345,7 +346,8 @@ def test_evaluate_in_homes_from_a_file(trained, tmp_path):
     )
     assert written.name == "files-plans-all-32.json"
     result = json.loads(written.read_text())
-    assert "in all homes of files-plans" in result["title"] and result["rows"][0]["homes"] == 3
+    assert "in 3 homes, geometry=files (plans.npz), split=all, " in result["title"]
+    assert result["rows"][0]["homes"] == 3
 
 
 def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):
@@ -366,6 +368,43 @@ def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):
     evaluate.run(configured(run=str(run), split="all", episodes=10, baseline=False))
     assert seen["episodes"].homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1]
     assert torch.equal(seen["env"].core.scenery.layout, seen["episodes"].homes)
+
+
+class Homeless(envs.Minimal):
+    """Does not tell which home an environment is in."""
+
+    layout = None
+
+
+def test_environment_without_a_layout_is_warned_of(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["env=test_evaluate:Homeless", *TINY[1:], "folder=run"]
+    train.run(settings(*words))
+    homes = settings("run=x", "geometry=homes", "geometry.n=3", script="evaluate").geometry
+    written = evaluate.run(configured(run="run", geometry=homes, baseline=False))
+    result = json.loads(written.read_text())
+    assert result["rows"][0]["homes"] is None
+    assert result["title"].startswith("homeless: 6 episodes, geometry=homes, split=test, ")
+    assert "Homeless has no `layout`" in capsys.readouterr().err
+    evaluate.run(configured(run="run", baseline=False))
+    assert "layout" not in capsys.readouterr().err, "the box is one home"
+
+
+def test_few_episodes_are_spread_over_all_homes(trained, monkeypatch):
+    lists = []
+
+    def first_episodes(env, *args):
+        lists.append(env)
+        return real(env, *args)
+
+    real = evaluation.first_episodes
+    monkeypatch.setattr(evaluation, "first_episodes", first_episodes)
+    homes = sample("bench", 40)
+    monkeypatch.setattr(evaluate.factory, "homes", lambda *_: homes)
+    evaluate.run(configured(run=str(trained), episodes=2, baseline=False))
+    layouts = lists[0].core.scenery.layouts
+    expected = scene.scenery([homes[0], homes[20]], device="cpu").layouts
+    assert torch.equal(layouts.lines.vals, expected.lines.vals)
 
 
 def test_unwritable_table(trained, monkeypatch, tmp_path):

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 
 import numpy as np
@@ -33,6 +34,27 @@ def test_video_has_a_frame_per_step(trained):
         assert video.streams.video[0].average_rate == 10  # the environment's
     assert len(frames) == 3 and frames[0].std() > 10
     assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
+
+
+def test_recordings_take_the_next_free_name(trained, tmp_path, monkeypatch, capsys):
+    copy = shutil.copytree(trained, tmp_path / "copy", ignore=lambda *_: ["video.mp4"])
+    filmed = []
+
+    def film(env, policy, path, *_):
+        filmed.append(path.name)
+        if len(filmed) == 3:
+            raise RuntimeError("Frame 0 could not be drawn: by chance")
+        path.write_text(str(len(filmed)))
+
+    monkeypatch.setattr(record, "film", film)
+    words = [f"run={copy}", "steps=1", "device=cpu"]
+    assert [record.main(words) for _ in range(4)] == [0, 0, 2, 0]
+    names = ["video.mp4", "video-2.mp4", "video-3.mp4"]
+    assert filmed == [*names, names[2]], "the third failed and left no file"
+    assert [(copy / name).read_text() for name in names] == ["1", "2", "4"]
+    assert f"{copy / 'video-2.mp4'}" in capsys.readouterr().out
+    assert record.main([*words, f"file={copy / 'video.mp4'}"]) == 0
+    assert (copy / "video.mp4").read_text() == "5", "a file that is named is overwritten"
 
 
 def test_png_is_the_last_frame(trained, tmp_path, monkeypatch):

@@ -341,3 +341,22 @@ def test_scenery_from_the_parts_of_another():
 def test_tables_beyond_32_bits_are_refused():
     with pytest.raises(ValueError, match="at most 2,147,483,647 .* but 2147483648 were given"):
         scenery_module._starts("texel_starts", torch.tensor([2**31 - 1, 1]))
+
+
+# ---- Which environment starts with which layout ----
+
+
+@pytest.mark.parametrize(
+    "n_geometries, n_envs, layouts",
+    [
+        (3, 7, [0, 1, 2, 0, 1, 2, 0]),
+        (10, 4, [0, 2, 5, 7]),
+        (50, 3, [0, 16, 33]),
+        (4, 4, [0, 1, 2, 3]),
+    ],
+)
+def test_environments_are_spread_over_all_geometries(n_geometries, n_envs, layouts):
+    geometries = n_geometries * [toys.box()]
+    made = scene.scenery(geometries, n_envs=n_envs, device="cpu")
+    assert made.layout.tolist() == layouts
+    assert scene.spread(range(n_geometries), n_envs) == sorted(set(layouts))

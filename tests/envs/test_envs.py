@@ -54,6 +54,22 @@ def make(name, device="cpu", n_envs=12, seed=1, **settings):
     return cls(n_envs, seed=seed, device=device, **{**SHORT[name], **settings})
 
 
+@pytest.mark.parametrize("name", ["minimal", "explorer", "deathmatch", "pointgoal"])
+def test_few_environments_are_spread_over_all_homes(name):
+    """Three environments and seven rooms, 4 to 10 m wide."""
+    rooms = [toys.box(width) for width in range(4, 11)]
+    env = envs.ENVS[name](3, rooms, device="cpu", **SHORT[name])
+    walls = [env.core.scenery.layouts.lines[d] for d in env.layout.tolist()]
+    assert [round(float(np.ptp(lines[..., 0].numpy()))) for lines in walls] == [4, 6, 8]
+
+
+@pytest.mark.parametrize("cls", envs.ENVS.values())
+def test_docstrings_have_the_same_sections(cls):
+    titles = ["Observation", "Actions", "Reward", "Episode end", "Metrics", "Args"]
+    lines = inspect.getdoc(cls).splitlines()
+    assert [line[:-1] for line in lines if line[:-1] in titles and line.endswith(":")] == titles
+
+
 def idle(env):
     """The decision of action 0 in every lane."""
     n_lanes = env.n_envs * env.n_agents

@@ -237,7 +237,7 @@ def test_drawn_goals_are_in_range(n_agents, device):
     truth = geodesics_of(homes, c.seed)
     drawn = set()
     spawner(c.agent_full(True))
-    _, state = step(c, goals, torch.zeros_like(spawner.chosen), spawner.chosen)
+    _, state = step(c, goals, torch.zeros_like(spawner.point_index), spawner.point_index)
     lengths = state.progress[4].cpu()
     assert 2 <= lengths.min() and lengths.max() <= 4 and (state.n_draws == 1).all()
     for lane, (e, a) in enumerate(np.ndindex(n, n_agents)):

@@ -36,7 +36,8 @@ def test_commands_train_evaluate_and_record(tmp_path, monkeypatch, capsys):
         (tmp_path / name).write_text(body)
     assert pages.type_all(text, tmp_path, monkeypatch) == [*pages.MAINS][:2] + [*pages.MAINS]
     shown = capsys.readouterr().out
-    assert "safe, after" in shown and "rover in the test homes of column" in shown
+    assert "safe: 64 episodes, after" in shown
+    assert "rover: 64 episodes in 1 home, geometry=column, split=test" in shown
     safe, rover = sorted(path for path in (tmp_path / "runs").iterdir() if path.is_dir())
     assert (rover / "video.mp4").stat().st_size > 1000
     with pages.inside(tmp_path, monkeypatch):
@@ -64,6 +65,20 @@ def test_rover_is_rewarded_for_metres_and_ends_at_walls(names):
     assert any(bool(world.terminal.any()) for world in worlds)
     assert any(bool(world.truncated.any()) for world in worlds)
     assert max(float(world.reward.max()) for world in worlds) < 0.5, "at most 4 m/s for 0.1 s"
+
+
+def test_fetch_is_rewarded_at_targets_which_then_move(names):
+    env = names["Fetch"](n_envs=64, device="cpu", limit=50)
+    worlds = contract.rollout(env, 100)
+    assert 0 < sum(world.reward.sum() for world in worlds) < 640
+    env.reset()
+    env.core.agents.positions[:32] = env.targets[:32]
+    there, before = torch.arange(64) < 32, env.targets.clone()
+    world = env.step(arrdict.arrdict(actions=torch.zeros(64, 1, dtype=torch.int64)))
+    assert world.reward[there].all() and (env.targets != before)[there].any(-1).all()
+    assert torch.equal(env.targets[~there], before[~there]), "agents spawn away from targets"
+    offsets = (env.targets - env.core.agents.positions).norm(dim=-1)
+    assert torch.allclose(world.obs.target.norm(dim=-1), offsets, atol=1e-4)
 
 
 def test_rover_is_displayed(names):

@@ -17,6 +17,7 @@ def objects():
     made = core.Core(scenery, res=SIZES["R"])
     classes = [kind for name, kind in vars(modules).items() if name in modules.__all__]
     arguments = {
+        "FreePoints": (geometries, made, SIZES["n"]),
         "RandomSpawns": (geometries, made),
         "CounterGenerator": (SIZES["B"], 1, "cpu"),
     }

@@ -2,6 +2,8 @@
 are refreshed and saved, how wins are counted, and that a policy learns against them.
 """
 
+import copy
+
 import pytest
 import torch
 
@@ -121,6 +123,8 @@ def test_opponents_act_on_a_copy_of_observations():
         (dict(past=0.7, bot=0.4), "opponents.past=0.7 and opponents.bot=0.4"),
         (dict(past=0.5, snapshots=9), "is 8 environments.*opponents.snapshots=9"),
         (dict(bot=0.01), "opponents.bot=0.01 of 16 environments is none.*env.n_envs"),
+        (dict(past=0.0, bot=0.0), "opponents.past or opponents.bot above 0"),
+        (dict(scripted=None), "opponents.bot=0.25 needs a bot that plays: pass scripted="),
         (dict(past=1.5), "past: 1.5"),
         (dict(snapshots=0), "snapshots: 0"),
     ],
@@ -381,6 +385,29 @@ def test_wins_are_decided_by_the_return_of_one_episode():
     for action in (0, 0, 0, 0, 2):  # every second step is the reset after an end
         env.step(arrdict(actions=torch.full((8, 1), action)))
     assert env.pop_win_rates() == {"episode/won/bot": pytest.approx(1 / 3)}
+
+
+def test_results_and_snapshots_load_with_other_numbers_of_environments():
+    """Two kinds of opponents; of the new ones, the bot has no environment."""
+    env = make_opponents(16, past=0.5, bot=0.25)
+    env.reset()
+    for action in (1, 1, 2):  # the second step is the reset after an end
+        env.step(arrdict(actions=torch.full((32, 1), action)))
+    state = copy.deepcopy(env.state_dict())
+    won = env.pop_win_rates()
+    assert "episode/won/bot" in won
+    for n_envs, bot in ((16, 0.25), (40, 0.25), (8, 0.0)):
+        other = make_opponents(n_envs, past=0.5, bot=bot)
+        other.load_state_dict(state)
+        kinds = ("past", "bot") if bot else ("past",)
+        assert other.pop_win_rates() == {
+            f"episode/won/{kind}": won[f"episode/won/{kind}"]
+            for kind in kinds
+            if f"episode/won/{kind}" in won
+        }
+        assert same(other.snapshots[1].state_dict(), env.snapshots[1].state_dict())
+    with pytest.raises(ValueError, match="have 2 snapshots, these have 3"):
+        make_opponents(snapshots=3).load_state_dict(state)
 
 
 def test_means_by_role_and_matchup(tmp_path):

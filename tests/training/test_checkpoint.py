@@ -167,7 +167,7 @@ def test_earlier_format_names_the_commit_that_reads_it(folder, version, commit):
         checkpoint.load_latest(folder)
 
 
-@pytest.mark.parametrize("version", [0, checkpoint_format.FORMAT + 1, "5"])
+@pytest.mark.parametrize("version", [0, checkpoint_format.FORMAT + 1, "6"])
 def test_unknown_format_is_refused_and_not_skipped(folder, version):
     with_format(folder / "step_30", version)
     with pytest.raises(CheckpointError, match=f"step_30 has format {version}.*Update megastep"):

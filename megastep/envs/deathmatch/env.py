@@ -15,13 +15,14 @@ from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.envs.common import SceneryEnv
+from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.deathmatch.step import (
     MAX_AGENTS,
     TALLY_ROWS,
     deathmatch_step,
     privileged_size,
 )
-from megastep.scene import scenery
+from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["Deathmatch"]
@@ -41,19 +42,29 @@ class Deathmatch(SceneryEnv):
     costs the target health. An agent on its first observation neither hits nor is hit. Agents whose
     episode ended respawn in the next step, out of the other agents' sight if possible.
 
-    Observation, all fp16: ``rgb`` (1, 3, 1, 128) and ``d`` (1, 1, 1, 128), 128 pixels over 70
-    degrees, each the mean of 4 rays; ``imu`` (1, 3); ``health`` (1, 3): the agent's health from 0
-    to 1, whether it hit another agent in the last step, how many agents hit it. Agents have
-    saturated colours and a red front; walls are paler.
+    Observation:
+        A dict of float16, W = ``res / subsample`` pixels (128).
 
-    Actions: seven, with momentum; see :class:`~megastep.modules.MomentumMovement`.
+        - ``rgb``: (B, 1, 3, 1, W), linear light. A pixel is the mean of ``subsample`` rays. Agents
+          have saturated colours and a red front; walls are paler.
+        - ``d``: (B, 1, 1, 1, W), depth: 1 at the agent's edge, 0 at 10 m and beyond.
+        - ``imu``: (B, 1, 3), angular velocity / 360 deg/s, velocity forward and left / 10 m/s.
+        - ``health``: (B, 1, 3), the agent's health from 0 to 1, whether it hit another agent in the
+          last step, how many agents hit it.
 
-    Reward: the sum of the rewards and costs below; by default hits - wounds.
+    Actions:
+        (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
+        They accelerate the agent (:class:`~megastep.modules.MomentumMovement`).
 
-    Episode end: an agent's episode is terminal at health 0 and truncated after ``limit`` steps.
+    Reward:
+        The sum of the rewards and costs below; by default hits - wounds.
 
-    Metrics: ``kills``, shared among the agents that hit the target in its last step; ``deaths``;
-    ``damage``, health taken from others; ``accuracy``, the fraction of steps with a hit.
+    Episode end:
+        Terminal at health 0, for that agent alone. Truncated after ``limit`` steps.
+
+    Metrics:
+        ``kills``: shared among the agents that hit the target in its last step. ``deaths``.
+        ``damage``: health taken from others. ``accuracy``: the fraction of steps with a hit.
 
     Args:
         n_envs: number of environments.
@@ -78,6 +89,8 @@ class Deathmatch(SceneryEnv):
         fps: steps per second.
         privileged: worlds hold ``privileged`` for a critic: every agent's health and pose.
     """
+
+    bot = Bot
 
     @checked
     def __init__(
@@ -107,7 +120,7 @@ class Deathmatch(SceneryEnv):
     ):
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
-        geometries = geometries[:n_envs]
+        geometries = spread(geometries, n_envs)
         homes = scenery(geometries, n_agents, n_envs=n_envs, seed=seed, device=device)
         self.core = Core(homes, res, fov, fps, seed=seed)
         self.n_envs, self.n_agents = n_envs, n_agents

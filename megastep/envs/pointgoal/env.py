@@ -17,7 +17,7 @@ from megastep.dotdict import dotdict
 from megastep.envs.common import SceneryEnv
 from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import N_PRIVILEGED, PROGRESS_ROWS, pointgoal_step
-from megastep.scene import scenery
+from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
 
 __all__ = ["PointGoal"]
@@ -29,21 +29,31 @@ REACH = 0.2  # metres from the goal that count as success
 class PointGoal(SceneryEnv):
     """Point-goal navigation: walk to a point given by its distance and bearing.
 
-    Observation, all fp16: ``rgb`` and ``d``, 64 pixels over 130 degrees, each the mean of 4 rays;
-    ``imu`` (1, 3); ``goal`` (1, 3), in the agent's frame: straight-line distance in tens of metres,
-    cosine and sine of the bearing.
+    Observation:
+        A dict of float16, W = ``res / subsample`` pixels (64).
 
-    Actions: seven, with momentum; see :class:`~megastep.modules.MomentumMovement`.
+        - ``rgb``: (B, 1, 3, 1, W), linear light. A pixel is the mean of ``subsample`` rays.
+        - ``d``: (B, 1, 1, 1, W), depth: 1 at the agent's edge, 0 at 10 m and beyond.
+        - ``imu``: (B, 1, 3), angular velocity / 360 deg/s, velocity forward and left / 10 m/s.
+        - ``goal``: (B, 1, 3), in the agent's frame: straight-line distance / 10 m, cosine and sine
+          of the bearing.
 
-    Reward: metres by which the shortest path to the goal became shorter, minus ``cost``, plus
-    ``bonus`` at success.
+    Actions:
+        (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
+        They accelerate the agent (:class:`~megastep.modules.MomentumMovement`).
 
-    Episode end: terminal within 0.2 m of the goal (success), truncated after ``limit`` steps.
+    Reward:
+        Metres by which the shortest path to the goal became shorter, minus ``cost``, plus ``bonus``
+        at success.
 
-    Metrics: ``success``; ``spl``, success weighted by path length (Anderson et al. 2018): 0 without
-    success, else the length of the shortest path divided by the length walked, at most 1;
-    ``soft_spl``, the same with the fraction of the distance covered in place of success (Datta et
-    al. 2020); ``collisions``, steps that a wall cut short.
+    Episode end:
+        Terminal within 0.2 m of the goal (success). Truncated after ``limit`` steps.
+
+    Metrics:
+        ``success``: 1 if the goal was reached. ``spl``: success weighted by path length (Anderson
+        et al. 2018): 0 without success, else the length of the shortest path divided by the length
+        walked, at most 1. ``soft_spl``: the same with the fraction of the distance covered in place
+        of success (Datta et al. 2020). ``collisions``: steps that a wall cut short.
 
     Args:
         n_envs: number of environments.
@@ -89,7 +99,7 @@ class PointGoal(SceneryEnv):
     ):
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
-        geometries = geometries if resample else geometries[:n_envs]
+        geometries = geometries if resample else spread(geometries, n_envs)
         self.core = Core(
             scenery(geometries, n_agents=1, n_envs=n_envs, seed=seed, device=device),
             res,
@@ -148,7 +158,7 @@ class PointGoal(SceneryEnv):
             self.ages,
             self.ended,
             self.n_draws,
-            self.spawner.chosen,
+            self.spawner.point_index,
             free,
             seed=self.seed,
             privileged=self.privileged_space is not None,

@@ -14,7 +14,7 @@ import torch
 from megastep import cache, engine
 from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics
 from megastep.envs.pointgoal.goal_fields import GoalFields
-from megastep.geometry import hashed
+from megastep.geometry import content_hash
 from megastep.modules import spawning
 
 PREFIX = "geodesics-"  # of the cached files
@@ -114,7 +114,7 @@ def all_geodesics(
 
 def _cached(found, geometries, radius, seed):
     """Returns the list of what the iterator `found` yields, from the cache if it holds it."""
-    key = hashed(geometries)
+    key = content_hash(geometries)
     for path in SOURCES:
         key.update(path.read_bytes())
     key.update(repr((np.__version__, radius, seed)).encode())

@@ -14,6 +14,7 @@ from pydantic import Field
 from megastep import engine, spaces
 from megastep.arrdict import arrdict, numpyify
 from megastep.envs.common import DisplayedEnv
+from megastep.envs.pong.bot import Tracker
 from megastep.envs.pong.step import CELL, FEATURES, GAME_FIELDS, PIXELS, PROGRAM, pong_step
 from megastep.settings import MAX_ENVS, checked
 
@@ -35,21 +36,26 @@ class Pong(DisplayedEnv):
     paddle is a tracker that follows the ball or, with ``self_play``, a lane that observes the game
     mirrored.
 
-    Observation: (1, 8) fp16 features: y of the lane's paddle, y of the opponent's, x and y of the
-    ball, all in [-1, 1]; the ball's velocity in x and y, in cells per step; how far the ball is
-    below the centre of the lane's paddle and of the opponent's, 1 at the paddle's edge, clamped to
-    [-2, 2].
-    With ``pixels``: (1, 1, 30, 40) uint8, the ball 255, paddles 170, the ball's last position 85.
-    All steps write to the same buffer of images.
+    Observation:
+        (B, 1, 8) float16: y of the lane's paddle, y of the opponent's, x and y of the ball, all in
+        [-1, 1]; the ball's velocity in x and y, in cells per step; how far the ball is below the
+        centre of the lane's paddle and of the opponent's, 1 at the paddle's edge, clamped to
+        [-2, 2].
 
-    Actions: 0 nothing, 1 up, 2 down; a paddle moves one cell per step.
+        With ``pixels``: (B, 1, 1, 30, 40) uint8, the ball 255, paddles 170, the ball's last
+        position 85. All steps write to the same buffer of images.
 
-    Reward: 1 for a point won, -1 for a point lost.
+    Actions:
+        (B, 1) integers: 0 nothing, 1 up, 2 down. A paddle moves one cell per step.
 
-    Episode end: terminal once a side has ``points`` points; truncated after ``limit * points``
-        steps.
+    Reward:
+        1 for a point won, -1 for a point lost.
 
-    Metrics: ``points_won``, the fraction of the episode's points won; 0.5 if there were none.
+    Episode end:
+        Terminal once a side has ``points`` points. Truncated after ``limit * points`` steps.
+
+    Metrics:
+        ``points_won``: points won, divided by the episode's points; 0.5 if there were none.
 
     Args:
         n_envs: number of environments.
@@ -62,7 +68,7 @@ class Pong(DisplayedEnv):
         pixels: observe pixels instead of features.
     """
 
-    fps = 30.0
+    fps, bot = 30.0, Tracker
 
     @checked
     def __init__(
