@@ -12,7 +12,7 @@ import pathlib
 import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
-SCRIPTS = ("train", "evaluate", "record")
+SCRIPTS = ("train", "evaluate", "record", "megastep.__main__")
 
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
@@ -51,8 +51,13 @@ SHARED = {
     "megastep.spaces",
     "megastep.types",
 }
-# The command line also chooses a device, checks environments and writes videos.
-SHARED_WITH_CLI = SHARED | {"megastep.contract", "megastep.engine", "megastep.recording"}
+# The command line also caches arguments, chooses a device, checks environments, writes videos.
+SHARED_WITH_CLI = SHARED | {
+    "megastep.cache",
+    "megastep.contract",
+    "megastep.engine",
+    "megastep.recording",
+}
 # The files that may import these modules of ours, as glob patterns.
 OWN_USERS = {
     "megastep.kernels.build.launch": (
@@ -145,7 +150,7 @@ def is_agents(name):
 
 
 def is_simulator(name):
-    return is_below(name, "megastep") and not is_agents(name)
+    return is_below(name, "megastep") and not is_agents(name) and name not in SCRIPTS
 
 
 def is_own(name):

@@ -4,6 +4,7 @@
 """
 
 import collections
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -13,27 +14,17 @@ from matplotlib.image import imsave
 from megastep import recording
 from megastep.agents.cli import (
     command,
-    compose,
     console,
     evaluate,
     factory,
     program,
     runs,
+    scripts,
     settings,
 )
 from megastep.agents.selfplay import duels
 from megastep.agents.training.evaluation import RandomActions
 from megastep.arrdict import numpyify
-
-HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
-
-The most common words:
-  run=RUN          a run folder, one of its checkpoints, or latest
-  env=explorer     random actions in an environment, without a run
-  steps=400        frames
-  against=RUN      its duel with another run's agent, `bot`, or an import path, in one home
-  home=3           another of the unseen homes; split=training: one it was trained in
-  file=out.mp4     instead of video.mp4 in the run folder; out.png: the last frame only"""
 
 #: Where random actions are filmed unless geometry= says otherwise.
 HOMES = "megastep.geometries.sources:homes"
@@ -44,7 +35,7 @@ def run(cfg: settings.Record) -> Path:
     path, device = Path(cfg.file or "video.mp4"), factory.make_device(cfg.device)
     env_settings, geometry = cfg.env, cfg.geometry
     if cfg.run is not None:
-        loaded = factory.load_checkpoint(runs.find(cfg.run), device)
+        loaded = runs.load_checkpoint(runs.find(cfg.run), device)
         trained = factory.config_of(loaded)
         env_settings, geometry = trained.env, geometry or trained.geometry
         path = path if cfg.file else runs.folder_of(loaded.path) / path
@@ -105,8 +96,5 @@ def _states(env, policy, steps, greedy, seed):
         yield env.state(0)
 
 
-SCRIPT = compose.Script("record", settings.Record, run, HELP)
-
-
-def main(argv: list[str] | None = None) -> int:
-    return command.run_command(SCRIPT, argv)
+#: Runs the script with words of a command line, by default this process's.
+main = functools.partial(command.run_command, scripts.RECORD)

@@ -9,13 +9,12 @@ import pytest
 import yaml
 
 from megastep import envs, geometries
-from megastep.agents.cli import sweeps, train
+from megastep.agents.cli import scripts, sweeps, train
 from megastep.agents.cli.check import CONFIGS, as_tree, check
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.program import ConfigErrors
 from megastep.agents.cli.settings import IMPORTED, Agent, Train, WandbLogger, kind_of
 from megastep.agents.training.loggers import Wandb
-from tests.helpers.tiny import SCRIPTS
 from tests.helpers.tiny import settings as compose
 
 
@@ -30,7 +29,7 @@ MORE = {"geometry=files": ["geometry.path=plans.npz"]}
 
 
 def test_every_group_member_composes():
-    groups = Composer(train.SCRIPT).groups()
+    groups = Composer(scripts.TRAIN).groups()
     assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "preset", "experiment"}
     assert set(groups["env"]) == set(envs.ENVS)
     assert set(groups["geometry"]) == set(geometries.SOURCES)
@@ -67,7 +66,7 @@ def compositions():
     """Yields for each member of each group the files it is composed of, [(file, {key: value})], in
     order of precedence.
     """
-    for name, script in SCRIPTS.items():
+    for name, script in scripts.SCRIPTS.items():
         composer = Composer(script)
         groups = composer.groups()
         for choice in [[]] + [[f"{group}={m}"] for group in groups for m in groups[group]]:
@@ -347,7 +346,7 @@ def test_bad_overrides(override, key, sentence):
 
 
 def test_launcher_not_installed(monkeypatch):
-    composer = Composer(train.SCRIPT)
+    composer = Composer(scripts.TRAIN)
     composer.members = lambda group: ["basic"]
     _, errors = composer.config(composer.parse(["hydra/launcher=joblib"]))
     assert "pip install 'megastep-flatland[sweep]'" in dict(errors)["hydra/launcher"]
@@ -363,7 +362,7 @@ def test_value_with_equals_sign():
     assert compose("folder=sweeps/1/0_seed=1").folder == "sweeps/1/0_seed=1"
     cfg = compose("run=x", "against=[a/0_seed=1,bot]", script="evaluate")
     assert cfg.against == ("a/0_seed=1", "bot")
-    words, _ = sweeps.jobs_of(Composer(SCRIPTS["evaluate"]), ["run=a/0_seed=1,a/1_seed=2"])
+    words, _ = sweeps.jobs_of(Composer(scripts.SCRIPTS["evaluate"]), ["run=a/0_seed=1,a/1_seed=2"])
     runs = [compose(*job, script="evaluate").run for job in words]
     assert runs == ["a/0_seed=1", "a/1_seed=2"]
 
@@ -390,7 +389,7 @@ def test_several_values_need_multirun():
 
 def jobs(*words):
     """Returns the words of each job of a sweep."""
-    return sweeps.jobs_of(Composer(train.SCRIPT), [*words])[0]
+    return sweeps.jobs_of(Composer(scripts.TRAIN), [*words])[0]
 
 
 def test_grid_jobs():
