@@ -19,11 +19,10 @@ import functools
 import inspect
 import os
 import pathlib
-import signal
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
@@ -85,7 +84,7 @@ class ParallelEncoder:
             with _frame_errors(self._n_frames):
                 self._add(draw(self._plot_state, state))
         else:
-            with _terminal_signals_blocked():
+            with workers.terminal_signals_blocked():
                 future = self._workers().submit(_draw_pickled, self._pickled_plot_state, state)
             self._add(future)
 
@@ -217,19 +216,6 @@ class _frame_errors:
             raise RuntimeError(
                 f"frame {self.number} could not be recorded: {kind.__name__}: {first_line}"
             ) from error
-
-
-@contextlib.contextmanager
-def _terminal_signals_blocked() -> Iterator[None]:
-    """Processes started inside never receive Ctrl-C or SIGHUP; the encoder stops them instead.
-
-    A terminal sends both to every process it runs, and a child inherits its parent's signal mask.
-    """
-    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
 
 
 # ---- Drawing ----

@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import inspect
 import json
+import os
 import re
 from typing import Annotated, Any, Literal
 
@@ -115,6 +116,14 @@ def label(name: str) -> str:
 Env, Geometry, Learner, Logger = map(_group, GROUPS)
 Agent = kind_of("agent", components.POLICY)
 Opposition = kind_of("opponents", components.OPPONENTS)
+
+
+def missing_files(tree: dict[str, Any]) -> list[tuple[str, str]]:
+    """Returns [(key, sentence)] of files that are named in nested dicts and do not exist."""
+    match tree.get("geometry"):
+        case {"name": components.FILES, "path": str(path)} if not os.path.isfile(path):
+            return [("geometry.path", f"there is no file {path!r}; give an .npz of geometries")]
+    return []
 
 
 # ---- Scripts ----

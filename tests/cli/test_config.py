@@ -15,6 +15,7 @@ from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.program import ConfigErrors
 from megastep.agents.cli.settings import IMPORTED, Agent, Train, WandbLogger, kind_of
 from megastep.agents.training.loggers import Wandb
+from megastep.geometries import sources
 from tests.helpers.tiny import settings as compose
 
 
@@ -25,7 +26,7 @@ def errors(*overrides, script="train"):
 
 
 #: What a member of a group needs beside itself.
-MORE = {"geometry=files": ["geometry.path=plans.npz"]}
+MORE = {"geometry=files": [f"geometry.path={sources.BENCH}"]}
 
 
 def test_every_group_member_composes():
@@ -284,6 +285,12 @@ def test_list_too_short():
     assert compose("env.cameras=[0,120,240]").env.cameras == [0, 120, 240]
     messages = errors("env.cameras=[]")["env.cameras"]
     assert messages == "a list of 0 is out of range: allowed is at least 1"
+
+
+def test_missing_geometry_file_is_told_with_all_else():
+    messages = errors("geometry=files", "geometry.path=nope.npz", "learner.lrr=1")
+    assert set(messages) == {"geometry.path", "learner.lrr"}
+    assert messages["geometry.path"] == "there is no file 'nope.npz'; give an .npz of geometries"
 
 
 def test_contradicting_settings():
