@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from matplotlib.image import imsave
 
 from megastep import recording
 from megastep.agents.cli import (
@@ -76,6 +75,8 @@ def film(
     """
     path, states = Path(path), _states(env, policy, steps, greedy, seed)
     if path.suffix == ".png":
+        from matplotlib.image import imsave  # a third of a second, which train.py needs not wait
+
         (last,) = collections.deque(states, maxlen=1)
         path.parent.mkdir(parents=True, exist_ok=True)
         imsave(path, recording.draw(env.plot_state, numpyify(last)))
