@@ -114,9 +114,9 @@ def sweep(composer: Composer, words: list[str]) -> int:
     }
     words = [f"{key}={value}" for key, value in options.items() if key not in overrides]
     words += [override.input_line for override in overrides.values()]
-    # processes of launchers find the modules that this one finds
+    # processes of launchers find megastep; a job's settings find modules of the current folder
     os.environ["PYTHONPATH"] = os.pathsep.join(
-        filter(None, [str(program.ROOT), os.getcwd(), os.environ.get("PYTHONPATH")])
+        filter(None, [str(program.ROOT), os.environ.get("PYTHONPATH")])
     )
     job, problem = Job(composer, folder), ""
     try:
