@@ -3,14 +3,17 @@
 import importlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import PurePath
 from typing import Any
 
 from megastep.settings import closest
 
 
 def import_object(name: str) -> Callable:
-    """Returns the class or function at `module:attribute`. Also searches the current folder.
+    """Returns the class or function at `module:attribute`.
+
+    Modules of the current folder come before installed ones, and after those of Python.
 
     Raises:
         ValueError: if it cannot be imported, in one sentence.
@@ -18,8 +21,7 @@ def import_object(name: str) -> Callable:
     module, _, attribute = name.partition(":")
     if not (module and attribute):
         raise ValueError(f"{name!r} is no import path, such as my_package.rover:Rover")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
+    search_current_folder()
     try:
         imported: Any = importlib.import_module(module)
     except Exception as error:  # whatever a module does as it is imported
@@ -36,14 +38,36 @@ def import_object(name: str) -> Callable:
     return imported
 
 
+def search_current_folder() -> None:
+    """Adds the current folder to `sys.path`: before installed packages, so that none shadows a
+    module of the user, and after the standard library, so that a `random.py` there breaks nothing.
+
+    Worker processes get `sys.path`, and so find the same modules.
+    """
+    here = os.getcwd()
+    if here not in sys.path:
+        installed = [PurePath(path).name in ("site-packages", "dist-packages") for path in sys.path]
+        sys.path.insert([*installed, True].index(True), here)
+
+
 def resolve(name: str, table: dict[str, Any]) -> Callable:
     """Returns the entry of `table` called `name`, or the class or function at this import path.
 
     Raises:
         ValueError: if it is neither, in one sentence.
     """
-    if name in table:
-        return table[name]
-    if ":" in name:
-        return import_object(name)
-    raise ValueError(f"{name!r} is unknown; {closest(name, [*table, 'module:Class'])}")
+    known_name(name, [*table])
+    return table[name] if name in table else import_object(name)
+
+
+def known_name(name: str, names: Sequence[str]) -> str:
+    """Returns `name`, which is one of `names` or an import path that can be imported.
+
+    Raises:
+        ValueError: if it is neither, in one sentence.
+    """
+    if name not in names:
+        if ":" not in name:
+            raise ValueError(f"{name!r} is unknown; {closest(name, [*names, 'module:Class'])}")
+        import_object(name)
+    return name

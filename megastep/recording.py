@@ -19,17 +19,17 @@ import functools
 import inspect
 import os
 import pathlib
-import signal
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from megastep import workers
 from megastep.arrdict import clone, numpyify
 from megastep.types import Tree
 from megastep.video import Mp4Writer, as_image
@@ -40,15 +40,6 @@ if TYPE_CHECKING:
 __all__ = ["ParallelEncoder", "draw"]
 
 MAX_WORKERS = 8  # about 80 figures per second; each imports torch, about half a gigabyte of memory
-#: Environment variables of a worker process: one thread, no screen, and no GPU, because even an
-#: idle CUDA context takes half a gigabyte.
-WORKER_ENV = {
-    "MPLBACKEND": "Agg",
-    "CUDA_VISIBLE_DEVICES": "",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-}
 
 
 class ParallelEncoder:
@@ -93,7 +84,7 @@ class ParallelEncoder:
             with _frame_errors(self._n_frames):
                 self._add(draw(self._plot_state, state))
         else:
-            with _terminal_signals_blocked():
+            with workers.terminal_signals_blocked():
                 future = self._workers().submit(_draw_pickled, self._pickled_plot_state, state)
             self._add(future)
 
@@ -181,7 +172,7 @@ class ParallelEncoder:
             import loky
 
             self._n_workers = self._n_workers or min(loky.cpu_count(), MAX_WORKERS)
-            self._pool = loky.ProcessPoolExecutor(self._n_workers, env=WORKER_ENV)
+            self._pool = loky.ProcessPoolExecutor(self._n_workers, env=workers.WORKER_ENV)
         return self._pool
 
     def _add(self, image: np.ndarray | Future) -> None:
@@ -225,19 +216,6 @@ class _frame_errors:
             raise RuntimeError(
                 f"frame {self.number} could not be recorded: {kind.__name__}: {first_line}"
             ) from error
-
-
-@contextlib.contextmanager
-def _terminal_signals_blocked() -> Iterator[None]:
-    """Processes started inside never receive Ctrl-C or SIGHUP; the encoder stops them instead.
-
-    A terminal sends both to every process it runs, and a child inherits its parent's signal mask.
-    """
-    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
 
 
 # ---- Drawing ----

@@ -24,7 +24,17 @@ import pydantic.dataclasses
 from pydantic.fields import FieldInfo
 from pydantic_core import InitErrorDetails, PydanticCustomError, ValidationError
 
-__all__ = ["MAX_ENVS", "checked", "closest", "frozen", "located", "sentence", "settings_of"]
+__all__ = [
+    "MAX_ENVS",
+    "arguments_of",
+    "checked",
+    "closest",
+    "frozen",
+    "located",
+    "sentence",
+    "settings_class",
+    "settings_of",
+]
 
 #: 2**26 copies of the smallest environment fill the largest GPU there is; more is a typing error.
 MAX_ENVS = 2**26
@@ -64,6 +74,27 @@ def settings_of(
 ) -> type:
     """Returns a frozen dataclass of the arguments of a class or function: types, bounds, defaults.
 
+    Takes the arguments of `arguments_of`.
+
+    Raises:
+        ValueError: if an annotation cannot be read, or an argument has the name of a field of
+            `more`.
+    """
+    try:
+        return settings_class(*arguments_of(constructor, reserved, missing, **more))
+    except (NameError, TypeError, pydantic.errors.PydanticUserError) as error:
+        raise ValueError(f"its arguments cannot be read: {str(error).splitlines()[0]}") from None
+
+
+def arguments_of(
+    constructor: Callable,
+    reserved: Sequence[str] = (),
+    missing: Mapping[str, Any] | None = None,
+    **more: Any,
+) -> tuple[str, dict[str, tuple]]:
+    """Returns the name of a class or function, and its arguments: {name: (type, default)}, or
+    (type,) without a default.
+
     An argument without an annotation has the type of its default.
 
     Args:
@@ -71,27 +102,25 @@ def settings_of(
         reserved: arguments to leave out.
         missing: defaults for arguments that may have none.
         more: fields to add: a type, or (type, default).
-
-    Raises:
-        ValueError: if an annotation cannot be read, or an argument has the name of a field of
-            `more`.
     """
     function = constructor.__init__ if inspect.isclass(constructor) else constructor
     fields = {name: f if isinstance(f, tuple) else (f,) for name, f in more.items()}
-    try:
-        hints = typing.get_type_hints(function, include_extras=True)
-        for name, argument in inspect.signature(constructor).parameters.items():
-            if name in reserved or argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
-                continue
-            if name in more:
-                raise ValueError(f"none of its arguments can be called {name}")
-            default = argument.default
-            if default is inspect.Parameter.empty:
-                default = (missing or {}).get(name, default)
-            fields[name] = _field(hints.get(name), default)
-        return frozen(_class(constructor.__name__, fields))
-    except (NameError, TypeError, pydantic.errors.PydanticUserError) as error:
-        raise ValueError(f"its arguments cannot be read: {str(error).splitlines()[0]}") from None
+    hints = typing.get_type_hints(function, include_extras=True)
+    for name, argument in inspect.signature(constructor).parameters.items():
+        if name in reserved or argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
+            continue
+        if name in more:
+            raise ValueError(f"none of its arguments can be called {name}")
+        default = argument.default
+        if default is inspect.Parameter.empty:
+            default = (missing or {}).get(name, default)
+        fields[name] = _field(hints.get(name), default)
+    return constructor.__name__, fields
+
+
+def settings_class(name: str, fields: Mapping[str, tuple]) -> type:
+    """Returns a frozen dataclass of what `arguments_of` returned."""
+    return frozen(_class(name, fields))
 
 
 def _field(hint, default):

@@ -12,11 +12,11 @@ import pathlib
 import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
-SCRIPTS = ("train", "evaluate", "record")
+SCRIPTS = ("train", "evaluate", "record", "megastep.__main__")
 
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
-    ("cache", "colour", "dotdict", "read_only", "settings", "types", "video"),
+    ("cache", "colour", "dotdict", "read_only", "settings", "types", "video", "workers"),
     ("arrdict", "geometry", "kernels", "plotting", "ragged"),
     ("engine", "recording", "spaces"),
     ("capture", "contract", "geometries", "scene"),
@@ -51,8 +51,10 @@ SHARED = {
     "megastep.spaces",
     "megastep.types",
 }
-# The command line also chooses a device and homes, checks environments and writes videos.
+# The command line also caches arguments, chooses a device and homes, checks environments and writes
+# videos.
 SHARED_WITH_CLI = SHARED | {
+    "megastep.cache",
     "megastep.contract",
     "megastep.engine",
     "megastep.recording",
@@ -150,7 +152,7 @@ def is_agents(name):
 
 
 def is_simulator(name):
-    return is_below(name, "megastep") and not is_agents(name)
+    return is_below(name, "megastep") and not is_agents(name) and name not in SCRIPTS
 
 
 def is_own(name):

@@ -268,11 +268,13 @@ def test_rasterise_keeps_a_pyplot_figure_open():
     assert pyplot.fignum_exists(figure.number)
 
 
-def test_importing_the_simulator_imports_no_optional_package():
+def test_importing_the_simulator_and_training_imports_no_optional_package():
     code = (
         "import sys; import megastep; assert 'torch' not in sys.modules; "
         "from megastep import core, modules, envs, plotting; "
-        "print([m for m in ('matplotlib', 'av', 'IPython', 'hydra', 'wandb', 'loky') if m in "
+        "assert 'hydra' not in sys.modules; "
+        "from megastep.agents.cli import train; "
+        "print([m for m in ('matplotlib', 'tensorboard', 'av', 'IPython', 'wandb', 'loky') if m in "
         "sys.modules])"
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

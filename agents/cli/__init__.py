@@ -8,5 +8,6 @@ two cores taken, training was 100 times slower. Asleep, they lose a few microsec
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-# PyTorch would search all installed packages for drivers of other accelerators.
+# PyTorch would search all installed packages for drivers, and pydantic for plugins.
 os.environ.setdefault("TORCH_DEVICE_BACKEND_AUTOLOAD", "0")
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")

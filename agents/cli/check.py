@@ -5,19 +5,16 @@ import dataclasses
 import difflib
 import json
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from megastep.agents.cli import settings
-from megastep.agents.cli.program import ConfigErrors
+from megastep.agents.cli.program import CONFIGS, ConfigErrors
 from megastep.settings import sentence
 
 Tree = dict[str, Any]
-#: configs/ of the repository, which the package carries as data.
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
 
 def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:

@@ -10,7 +10,16 @@ import hydra
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from megastep.agents.cli import check, compose, console, factory, program, signals, sweeps
+from megastep.agents.cli import (
+    check,
+    compose,
+    console,
+    gpu,
+    program,
+    scripts,
+    signals,
+    sweeps,
+)
 
 #: Hydra's options: their names, and argparse's arguments.
 OPTIONS = {
@@ -41,21 +50,18 @@ OPTIONS = {
     "-h --help": {"action": "store_true", "help": "print this and stop"},
     "--hydra-help": {"action": "store_true", "help": "print Hydra's own help and stop"},
     "-r --run": {"action": "store_true", "help": argparse.SUPPRESS},
-    "--version": {
-        "action": "version",
-        "version": f"{program.version()}, Hydra {hydra.__version__}",
-        "help": "print the versions and stop",
-    },
+    "--version": {"action": "store_true", "help": "print the versions and stop"},
     "overrides": {"nargs": "*", "help": argparse.SUPPRESS},
 }
 
 
-def run_command(script: compose.Script, argv: list[str] | None = None) -> int:
+def run_command(script: scripts.Script, argv: list[str] | None = None) -> int:
     """Parses, composes, checks and runs. Returns the exit code."""
     warnings.showwarning, arguments = console.warn, sys.argv[:]
     try:
         with signals.handled(signals.interrupt) as numbers:
-            code = _run(script, sys.argv[1:] if argv is None else argv)
+            words = sys.argv[1:] if argv is None else argv
+            code = _run(script, [*map(script.reword, words)])
         return 128 + numbers[0] if numbers else code
     except SystemExit as end:  # of argparse, and of Hydra's help
         return end.code or 0
@@ -69,7 +75,7 @@ def run_command(script: compose.Script, argv: list[str] | None = None) -> int:
         sys.argv[:] = arguments
 
 
-def _run(script: compose.Script, argv: list[str]) -> int:
+def _run(script: scripts.Script, argv: list[str]) -> int:
     command = program.name(script.name, "python ")
     parser = argparse.ArgumentParser(
         program.name(script.name),
@@ -83,6 +89,9 @@ def _run(script: compose.Script, argv: list[str]) -> int:
         arguments = arguments | {"help": arguments["help"].replace("{command}", command)}
         parser.add_argument(*names.split(), **arguments)
     options = parser.parse_intermixed_args(argv)
+    if options.version:
+        console.say(f"{program.version()}, Hydra {hydra.__version__}")
+        return 0
     composer = compose.Composer(
         script, options.config_name, options.config_dir, options.config_path
     )
@@ -111,9 +120,13 @@ def _run(script: compose.Script, argv: list[str]) -> int:
     elif options.multirun or "hydra.mode=MULTIRUN" in words:
         return sweeps.sweep(composer, words)
     else:
+        if "device=cpu" not in words:
+            gpu.start_driver()  # beside composing
         settings, config = composer.compose(words)
         if config.hydra.mode == RunMode.MULTIRUN:
             return sweeps.sweep(composer, words)
+        script.ready(settings)
+        gpu.wake(settings.device)  # beside the imports of what runs
         script.run(settings)
     return 0
 
@@ -122,5 +135,5 @@ def _show(composer: compose.Composer, tree: Any, arguments: list[str]) -> None:
     """Has Hydra show or complete a configuration that has every key there is."""
     node = {"defaults": [composer.name, "_self_"], **tree}
     compose.STORE.store(name="every-key", node=node)
-    with factory.errors():
+    with program.errors():
         composer.call_hydra([*arguments, "--config-name=every-key"])

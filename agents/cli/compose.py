@@ -12,10 +12,9 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
 import hydra
-import torch
 import yaml
 from hydra.core import config_store, global_hydra, plugins
 from hydra.core.override_parser import overrides_parser, types
@@ -24,8 +23,9 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from megastep.agents.cli import check, program, settings
+from megastep.agents.cli import check, gpu, program, settings
 from megastep.agents.cli.program import ConfigErrors
+from megastep.agents.cli.scripts import Script
 from megastep.settings import closest
 
 #: The longest key and member of a group, and the most brackets of a word: Python's recursion ends
@@ -40,19 +40,13 @@ OPEN = {
     key: OmegaConf.create({}, flags={"struct": False})
     for key in (*settings.IMPORTED, "agent", "opponents", "logger")
 }
+#: Words that choose a preset, or add folders with files that may.
+NOT_OURS = ("preset=", "+preset=", "++preset=", "hydra.searchpath")
 STORE = config_store.ConfigStore.instance()
+# Hydra copies its sources of files time and again, and in them this one, which took a third of a
+# second: there is only one
+config_store.ConfigStore.__deepcopy__ = lambda store, memo: store
 STORE.store(name="open", node=OmegaConf.create(OPEN))
-
-
-class Script(NamedTuple):
-    """One of the programs: train, evaluate, record."""
-
-    name: str  # of the file of its configuration
-    kind: type  # the dataclass of its settings
-    run: Callable[[Any], Any]
-    help: str  # the head of --help
-    #: Changes the composed tree before it is checked, given the typed keys.
-    prepare: Callable[[check.Tree, list[str]], check.Tree] = lambda tree, typed: tree
 
 
 class FolderOfUser(SearchPathPlugin):
@@ -82,6 +76,7 @@ class Composer:
         self.main = os.path.abspath(main or check.CONFIGS)
         if absent := [p for p in (folder, self.main) if p and not os.path.isdir(p)]:
             raise program.UserError(f"There is no folder {absent[0]} with configurations")
+        self.has_our_presets = (self.name, folder, main) == ("train", None, None)
         FolderOfUser.path = folder and os.path.abspath(folder)
         plugins.Plugins.instance().register(FolderOfUser)
         global_hydra.GlobalHydra.instance().clear()
@@ -140,6 +135,7 @@ class Composer:
             typed = [key for key in map(key_of, overrides) if not key.startswith("hydra")]
             tree = self.script.prepare(own(config, resolve=not secret), typed)
             groups = [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
+            errors += settings.missing_files(tree)
             chosen = check.check(self.script.kind, tree, groups + self.loader.list_groups(""))
         except OmegaConfBaseException as error:
             errors.append((error.full_key or "configuration", str(error).partition("\n")[0]))
@@ -193,11 +189,13 @@ class Composer:
         return config, errors
 
     def _composed(self, *groups: str, device: str | None = None) -> DictConfig:
-        # preset=auto stands for gpu or cpu, by the device of the process that composes
+        # preset=auto stands for gpu or cpu, by the device of the process that composes. It is the
+        # default in train.yaml and no other file of ours, so this often saves composing twice
+        if self.has_our_presets and not any(one.startswith(NOT_OURS) for one in groups):
+            groups = *groups, preset_for(device)
         config = hydra.compose(self.name, [*groups], return_hydra_config=True)
         if config.hydra.runtime.choices.get("preset") == "auto":
-            on_gpu = (device or config.get("device")) != "cpu" and torch.cuda.is_available()
-            groups = *groups, "preset=gpu" if on_gpu else "preset=cpu"
+            groups = *groups, preset_for(device or config.get("device"))
             config = hydra.compose(self.name, [*groups], return_hydra_config=True)
         OmegaConf.set_struct(config, False)
         return config
@@ -209,6 +207,10 @@ class Composer:
         hydra.main(config_path=self.main, config_name=self.name, version_base="1.3")(
             task or self.script.run
         )()
+
+
+def preset_for(device: str | None) -> str:
+    return "preset=gpu" if device != "cpu" and gpu.is_available() else "preset=cpu"
 
 
 def key_of(override: types.Override) -> str:

@@ -12,10 +12,6 @@ from collections.abc import Iterator, Sequence
 from io import StringIO
 from typing import Any, TextIO
 
-from rich import box, progress
-from rich.console import Console
-from rich.table import Table
-
 from megastep.agents.cli import program
 
 #: Seconds between two lines of progress where a line cannot be redrawn.
@@ -92,39 +88,47 @@ def is_unicode() -> bool:
     return (sys.stdout.encoding or "").lower().startswith("utf")
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], style: box.Box | None = None) -> str:
-    """Returns a table as text, by default in characters that stdout can show. In Markdown with
-    `style=box.MARKDOWN`.
-    """
-    grid, text = (
-        Table(*head, box=style or (box.HEAVY_HEAD if is_unicode() else box.ASCII)),
-        StringIO(),
-    )
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], is_markdown: bool = False) -> str:
+    """Returns a table as text: in Markdown, or in characters that stdout can show."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    style = box.HEAVY_HEAD if is_unicode() else box.ASCII
+    grid, text = Table(*head, box=box.MARKDOWN if is_markdown else style), StringIO()
     for row in rows:
-        grid.add_row(*(cell.replace("|", "\\|") if style is box.MARKDOWN else cell for cell in row))
+        grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row))
     Console(file=text, width=10_000, force_terminal=False, color_system=None).print(grid)
     return text.getvalue().strip()
 
 
-class Progress(progress.Progress):
+class Progress:
     """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds."""
 
-    shown_at = -LINE_EVERY
-
     def __init__(self):
+        from rich import progress  # only for those who wait
+
         is_dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
-        super().__init__(
+        self.shown_at = -LINE_EVERY
+        self.bar = progress.Progress(
             progress.BarColumn(24),
             progress.TextColumn("{task.description}"),
             disable=is_dumb or bool(prefix) or not sys.stdout.isatty(),
         )
-        self.bar = self.add_task("starting", total=1)
+        self.task = self.bar.add_task("starting", total=1)
+
+    def __enter__(self) -> "Progress":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.stop()
 
     def show(self, fraction: float | None, words: Sequence[str]) -> None:
         """Shows words on one line; `fraction` of the work is done, None if it has no end."""
         text, total = (" · " if is_unicode() else "  ").join(words), None if fraction is None else 1
-        self.update(self.bar, completed=fraction or 0, total=total, description=text)
-        if self.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
+        self.bar.update(self.task, completed=fraction or 0, total=total, description=text)
+        if self.bar.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
             self.shown_at = time.monotonic()
             say(text)
 

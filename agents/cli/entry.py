@@ -1,11 +1,7 @@
-"""Starts train, evaluate and record, as scripts or as the command `megastep`.
-
-The GPU wakes up while Python imports; signals and closed streams are handled before that.
+"""Starts train, evaluate and record: as scripts, as the command `megastep`, or with `python -m
+megastep`. Signals and closed streams are handled before anything else is imported.
 """
 
-import contextlib
-import ctypes
-import importlib
 import os
 import sys
 import threading
@@ -17,20 +13,11 @@ SCRIPTS = {
     "evaluate": "measures a trained policy",
     "record": "films a trained policy",
 }
-#: Options that need no GPU in this process: they print something, or start jobs elsewhere.
-WITHOUT_GPU = (
-    "-h",
-    "--h",
-    "-c",
-    "--cfg",
-    "-i",
-    "--info",
-    "-s",
-    "--shell",
-    "--version",
-    "-m",
-    "--m",
-)
+#: What only a clone of the repository has, and what runs it there.
+IN_A_CLONE = {
+    "bench": "python scripts/benchmarks/benchmark.py step",
+    "show": "python scripts/show_homes.py homes.png",
+}
 
 
 def main() -> int:
@@ -55,9 +42,14 @@ def main() -> int:
     console.open_streams()
     if words[0] in ("-h", "--help"):
         for name, text in SCRIPTS.items():
-            console.say(f"  megastep {name:<10}{text}; --help says more")
+            console.say(f"  {program.name(name, 'python -m '):<28}{text}; --help says more")
+        console.say("Benchmarks and sheets of homes are in scripts/ of the repository.")
     elif words[0] == "--version":
         console.say(program.version())
+    elif words[0] in IN_A_CLONE:
+        text = f"{words[0]} needs a clone of the repository: {IN_A_CLONE[words[0]]}"
+        console.say(f"megastep: {text}", sys.stderr)
+        return 2
     elif words[0]:
         console.say(f"megastep: {words[0]!r} is unknown; {closest(words[0], SCRIPTS)}", sys.stderr)
         return 2
@@ -67,30 +59,10 @@ def main() -> int:
 def run_script(name: str) -> int:
     """Runs a script of this package by its name. Returns the exit code."""
     signals.exit_on_signals(name)
-    if wants_first_gpu(sys.argv[1:]):
-        # the interpreter waits for this thread: a process must not end within the driver
-        threading.Thread(target=create_cuda_context).start()
-    from megastep.agents.cli import console  # its imports take a while, too
+    from megastep.agents.cli import console  # its imports take a while
 
     console.open_streams()
     threading.excepthook = console.warn_of_thread
-    return importlib.import_module(f"megastep.agents.cli.{name}").main()
+    from megastep.agents.cli import command, scripts
 
-
-def wants_first_gpu(words: list[str]) -> bool:
-    """Returns whether a command line may use the first GPU in this process."""
-    devices = {word.partition("=")[2] for word in words if word.startswith("device=")}
-    is_elsewhere = any(word.startswith(WITHOUT_GPU) for word in words)
-    return devices <= {"auto", "cuda", "cuda:0"} and not is_elsewhere
-
-
-def create_cuda_context() -> None:
-    """Creates the primary context of the first GPU, if there is one; PyTorch finds it there later.
-
-    It takes half a second in the driver, which passes beside Python's imports.
-    """
-    device, context = ctypes.c_int(), ctypes.c_void_p()
-    with contextlib.suppress(OSError):  # no driver
-        driver = ctypes.CDLL("libcuda.so.1")
-        if driver.cuInit(0) == 0 and driver.cuDeviceGet(ctypes.byref(device), 0) == 0:
-            driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
+    return command.run_command(scripts.SCRIPTS[name])

@@ -3,32 +3,17 @@
 `evaluate --help`; `run(cfg)` is the same from Python.
 """
 
+import functools
 import itertools
-import re
-import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from megastep.agents.cli import command, compose, console, factory, program, runs, settings
+from megastep.agents.cli import command, console, factory, program, runs, scripts, settings
 from megastep.agents.selfplay import duels, ratings
 from megastep.agents.training import checkpoint, evaluation
 from megastep.types import optional
 
-HELP = """Measures what a run's agent earns in the first episode of each lane, with a 95 % interval
-over homes. Prints a table and writes it to the run's folder: evaluations/*.md.
-
-The most common words:
-  run=RUN              a run folder, one of its checkpoints, or latest
-  split=training       the homes it was trained in, instead of unseen ones
-  geometry=bench       other homes
-  env=pong             another environment with the same spaces: after self-play, the tracker
-  greedy=true          the most likely actions instead of sampled ones
-  episodes=256         fewer episodes
-  baseline=false       no row for random actions
-  against=RUN,bot      duels instead: with other runs or checkpoints, the scripted policy, random
-                       actions, or an import path
-  ratings=true         ratings of the run's snapshots, by duels of each with each"""
 #: Columns of a table of duels, and of one of ratings, as templates.
 DUELS = {
     "against": "{against}",
@@ -56,7 +41,7 @@ def run(cfg: settings.Evaluate) -> Path:
     instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device)
-    loaded = factory.load_checkpoint(runs.find(cfg.run), device)
+    loaded = runs.load_checkpoint(runs.find(cfg.run), device)
     trained = factory.config_of(loaded)
     env_settings, geometry = cfg.env or trained.env, cfg.geometry or trained.geometry
     if cfg.ratings or cfg.against is not None:
@@ -169,7 +154,7 @@ def find_player(
         name = factory.config_of(run).opponents.bot_class or name
     if name in ("bot", "random") or (":" in name and not Path(name).exists()):
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
-    return load_player(factory.load_checkpoint(runs.find(name), env.device), env, run)
+    return load_player(runs.load_checkpoint(runs.find(name), env.device), env, run)
 
 
 class Arena:
@@ -273,11 +258,5 @@ def duel_cells(row: dict) -> dict[str, str]:
     return {key: form.format_map(row) for key, form in DUELS.items()}
 
 
-SCRIPT = compose.Script("evaluate", settings.Evaluate, run, HELP)
-
-
-def main(argv: list[str] | None = None) -> int:
-    words = sys.argv[1:] if argv is None else argv
-    # a list of names, not the sweep that Hydra takes it for
-    words = [re.sub(r"^against=(?!\[|null$)(.*)", r"against=[\1]", word) for word in words]
-    return command.run_command(SCRIPT, words)
+#: Runs the script with words of a command line, by default this process's.
+main = functools.partial(command.run_command, scripts.EVALUATE)

@@ -1,18 +1,16 @@
 """Builds the objects of a run from its settings: device, homes, environment, policy, learner."""
 
-import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from megastep import contract, engine, scene, spaces
 from megastep.agents.algorithms.learner import LearnerError, check_learner
-from megastep.agents.cli import check, program, runs
-from megastep.agents.cli.settings import Agent, Env, Geometry, Learner, Train
+from megastep.agents.cli import check, program
+from megastep.agents.cli.settings import Agent, Env, Geometry, Learner, Train, changed
 from megastep.agents.imports import import_object
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.opponents import Opponents
@@ -52,12 +50,6 @@ def construct(settings: Any, constructor: Callable | None = None, **arguments: A
         constructor = constructor or import_object(settings.name)
         taken = inspect.signature(constructor).parameters
         return constructor(**{k: v for k, v in (vars(settings) | arguments).items() if k in taken})
-
-
-def changed(settings: Any, **changes: Any) -> Any:
-    return dataclasses.replace(
-        settings, **{k: v for k, v in changes.items() if hasattr(settings, k)}
-    )
 
 
 def make_device(name: str) -> torch.device:
@@ -198,12 +190,6 @@ def make_bot(name: str | None, settings: Env, env: Any) -> Any:
         decision, _ = bot(env.reset(), bot.initial(n_lanes(env), env.device))
         spaces.map(check_actions, env.action_space, decision["actions"])
     return bot
-
-
-def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> checkpoint.Checkpoint:
-    """Returns the checkpoint of a run found with `runs.find`. Warns of damaged ones it skips."""
-    with errors():
-        return checkpoint.load_latest(runs.checkpoints_of(path), device)
 
 
 def config_of(loaded: checkpoint.Checkpoint) -> Train:

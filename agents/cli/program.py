@@ -4,21 +4,26 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from importlib import metadata
 from pathlib import Path
 
 #: The distribution; the package and the command are called megastep.
 DISTRIBUTION = "megastep-flatland"
 ROOT = Path(__file__).resolve().parents[2]
+#: configs/ of the repository, which the package carries as data.
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 
 
 def name(script: str, python: str = "") -> str:
     """`megastep train`, or `train.py` after `python`."""
+    if Path(sys.argv[0]).parts[-2:] == ("megastep", "__main__.py"):
+        return f"{python and 'python -m '}megastep {script}"
     is_installed = os.path.basename(sys.argv[0]) == "megastep" or not (ROOT / "train.py").exists()
     return f"megastep {script}" if is_installed else f"{python}{script}.py"
 
 
 def version() -> str:
+    from importlib import metadata  # which takes a while
+
     versions = [found.version for found in metadata.distributions(name=DISTRIBUTION)]
     return f"{DISTRIBUTION} {(versions or ['(not installed)'])[0]}"
 

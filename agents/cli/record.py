@@ -5,39 +5,28 @@
 
 import collections
 import contextlib
+import functools
 import itertools
 from pathlib import Path
 from typing import Any
 
 import torch
-from matplotlib.image import imsave
 
 from megastep import recording
 from megastep.agents.cli import (
     command,
-    compose,
     console,
     evaluate,
     factory,
     program,
     runs,
+    scripts,
     settings,
 )
 from megastep.agents.selfplay import duels
 from megastep.agents.training.evaluation import RandomActions
 from megastep.arrdict import numpyify
 from megastep.types import n_lanes, optional
-
-HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
-
-The most common words:
-  run=RUN          a run folder, one of its checkpoints, or latest
-  env=explorer     random actions in an environment, without a run
-  steps=400        frames
-  against=RUN      its duel with another run's agent, `bot`, or an import path, in one home
-  home=3           another of the unseen homes; split=training: one it was trained in
-  file=out.mp4     this file, overwritten if it exists; out.png: the last frame only. Otherwise
-                   video.mp4 in the run folder, or video-2.mp4, ... if there is one"""
 
 #: Where random actions are filmed unless geometry= says otherwise.
 HOMES = "megastep.geometries.sources:homes"
@@ -50,7 +39,7 @@ def run(cfg: settings.Record) -> Path:
     folder, device = Path(), factory.make_device(cfg.device)
     env_settings, geometry = cfg.env, cfg.geometry
     if cfg.run is not None:
-        loaded = factory.load_checkpoint(runs.find(cfg.run), device)
+        loaded = runs.load_checkpoint(runs.find(cfg.run), device)
         trained = factory.config_of(loaded)
         env_settings, geometry = trained.env, geometry or trained.geometry
         folder = runs.folder_of(loaded.path)
@@ -111,6 +100,8 @@ def film(
         )
     path, states = Path(path), _states(env, policy, steps, greedy, seed)
     if path.suffix == ".png":
+        from matplotlib.image import imsave  # a third of a second, which train.py needs not wait
+
         (last,) = collections.deque(states, maxlen=1)
         path.parent.mkdir(parents=True, exist_ok=True)
         imsave(path, recording.draw(env.plot_state, numpyify(last)))
@@ -131,8 +122,5 @@ def _states(env, policy, steps, greedy, seed):
         yield env.state(0)
 
 
-SCRIPT = compose.Script("record", settings.Record, run, HELP)
-
-
-def main(argv: list[str] | None = None) -> int:
-    return command.run_command(SCRIPT, argv)
+#: Runs the script with words of a command line, by default this process's.
+main = functools.partial(command.run_command, scripts.RECORD)

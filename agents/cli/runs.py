@@ -13,9 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import filelock
-from rich import box
-
 from megastep.agents.cli import console, program
 from megastep.agents.cli.check import as_tree
 from megastep.agents.cli.program import UserError, shortened
@@ -52,17 +49,22 @@ def new(cfg: Train) -> Path:
     if cfg.folder is None:
         name = f"{label(cfg.env.name)}-{label(cfg.geometry.name)}-{cfg.seed}"
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{name}")
+    check_free(cfg.folder)
     folder = Path(cfg.folder)
+    return folder if os.path.exists(folder) else make(folder)
+
+
+def check_free(name: str | None) -> None:
+    """Raises UserError if the folder of a new run is not empty, or cannot be read."""
+    folder = Path(name or "")
     with program.errors(CANNOT.format(shortened(folder))):
-        if not os.path.exists(folder):
-            return make(folder)
-        # Hydra writes .hydra/ and a log before the job of a sweep starts
-        if [path for path in folder.iterdir() if path.name != ".hydra" and path.suffix != ".log"]:
-            raise UserError(
-                f"The run folder {folder} is not empty; choose another with folder=, or continue "
-                f"its run: {resume_command(folder)}"
-            )
-    return folder
+        entries = [*folder.iterdir()] if name is not None and os.path.exists(folder) else []
+    # Hydra writes .hydra/ and a log before the job of a sweep starts
+    if [path for path in entries if path.name != ".hydra" and path.suffix != ".log"]:
+        raise UserError(
+            f"The run folder {folder} is not empty; choose another with folder=, or continue "
+            f"its run: {resume_command(folder)}"
+        )
 
 
 @contextlib.contextmanager
@@ -75,6 +77,8 @@ def locked(folder: Path) -> Iterator[None]:
     Raises:
         UserError: naming the process that trains there, or that the folder cannot be written.
     """
+    import filelock  # which takes a while
+
     # its last owner may just be deleting it
     lock = filelock.FileLock(path := folder / "lock", timeout=0.2)
     try:
@@ -140,6 +144,14 @@ def find(name: str) -> Path:
         f"{shortened(name)} {problem}; "
         + (f"did you mean {near[0]}?" if near else "train.py makes runs")
     )
+
+
+def load_checkpoint(path: Path, device: Any = None) -> checkpoint.Checkpoint:
+    """Returns the checkpoint of a run found with `find`, on a device; without one, all but its
+    state, and PyTorch is not imported. Warns of damaged ones it skips.
+    """
+    with program.errors(kinds=(OSError, ValueError, checkpoint.CheckpointError)):
+        return checkpoint.load_latest(checkpoints_of(path), device)
 
 
 def resume_command(folder: Path) -> str:
@@ -222,7 +234,7 @@ def write_table(
         folder.mkdir(exist_ok=True)
         write_atomically(
             folder / f"{name[:200]}.md",
-            f"{title}\n\n{console.table(head, lines, box.MARKDOWN)}\n".encode(),
+            f"{title}\n\n{console.table(head, lines, is_markdown=True)}\n".encode(),
         )
         write_atomically(folder / f"{name[:200]}.json", json.dumps(result, indent=2).encode())
     return folder / f"{name[:200]}.json"

@@ -8,15 +8,15 @@ import dataclasses
 import functools
 import inspect
 import json
+import os
 import re
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_validator
 
+from megastep.agents.cli import components
 from megastep.agents.imports import import_object
-from megastep.agents.networks.policy import Policy
-from megastep.agents.selfplay.opponents import Opponents
-from megastep.settings import closest, frozen, located, settings_of
+from megastep.settings import closest, frozen, located, settings_class, settings_of
 
 
 def _device(name: str) -> str:
@@ -28,6 +28,7 @@ def _device(name: str) -> str:
 Above0 = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Steps = Annotated[int, Field(ge=1, le=100_000)]
+Samples = Annotated[int, Field(ge=1, le=10**18)]
 Split = Literal["training", "test", "all"]
 
 
@@ -53,29 +54,11 @@ class WandbLogger:
 
 LOGGERS = {"none": LocalLogger, "wandb": WandbLogger}
 #: Groups of configs/ whose member has `name`, the import path of a class or function, and decides
-#: which settings there are: its arguments. Of these, `reserved` are passed by the program,
-#: `required` must be there (with what each means), and `defaults` are for those without a default;
-#: `more` are settings beside them.
+#: which settings there are: its arguments. Those it must have, with what each means.
 IMPORTED = {
-    "env": dict(
-        reserved=("geometries", "seed", "device", "privileged"),
-        required={"n_envs": "the number of environments"},
-        defaults={"n_envs": 128},
-        more={},
-    ),
-    "geometry": dict(
-        reserved=("split",),
-        required={"n": "the number of geometries", "split": "its split", "seed": "an integer"},
-        defaults={"n": 512, "seed": 1},
-        more={},
-    ),
-    "learner": dict(
-        reserved=("policy", "seed", "graph"),
-        required={"policy": "the policy to improve"},
-        defaults={},
-        # what lr falls to 0 over; auto: samples if given, else seconds if given
-        more={"anneal": (Literal["auto", "never", "samples", "seconds"], "auto")},
-    ),
+    "env": {"n_envs": "the number of environments"},
+    "geometry": {"n": "the number of geometries", "split": "its split", "seed": "an integer"},
+    "learner": {"policy": "the policy to improve"},
 }
 GROUPS = (*IMPORTED, "logger")
 
@@ -91,14 +74,14 @@ def kind_of(group: str, name: str) -> type:
         if name not in LOGGERS:
             raise ValueError(f"{name!r} is unknown; {closest(name, LOGGERS)}")
         return LOGGERS[name]
-    constructor, spec = import_object(name), IMPORTED[group]
+    if (group, name) in components.built_in():
+        return settings_class(*components.built_in()[group, name])
+    constructor, spec = import_object(name), components.ARGUMENTS[group]
     try:
         taken = inspect.signature(constructor).parameters
-        if missing := [f"{k}, {text}" for k, text in spec["required"].items() if k not in taken]:
+        if missing := [f"{k}, {text}" for k, text in IMPORTED[group].items() if k not in taken]:
             raise ValueError(f"it takes no {missing[0]}")
-        return settings_of(
-            constructor, spec["reserved"], spec["defaults"], name=str, **spec["more"]
-        )
+        return settings_of(constructor, **spec)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{name} cannot be used: {error}") from error
 
@@ -118,18 +101,29 @@ def _group(group: str) -> Any:
     return Annotated[Any, BeforeValidator(settings)]
 
 
+def changed(settings: Any, **changes: Any) -> Any:
+    """Returns a copy of settings with those of the changes that it has."""
+    return dataclasses.replace(
+        settings, **{k: v for k, v in changes.items() if hasattr(settings, k)}
+    )
+
+
 def label(name: str) -> str:
     """`explorer` for megastep.envs.explorer:Explorer."""
     return name.rpartition(":")[2].rpartition(".")[2].lower()
 
 
 Env, Geometry, Learner, Logger = map(_group, GROUPS)
-Agent = settings_of(Policy, ("obs_space", "action_space", "privileged_space", "seed"))
-Opposition = settings_of(
-    Opponents,
-    ("env", "policy", "scripted", "seed"),
-    bot_class=(str | None, None),  # None: the environment's own
-)
+Agent = kind_of("agent", components.POLICY)
+Opposition = kind_of("opponents", components.OPPONENTS)
+
+
+def missing_files(tree: dict[str, Any]) -> list[tuple[str, str]]:
+    """Returns [(key, sentence)] of files that are named in nested dicts and do not exist."""
+    match tree.get("geometry"):
+        case {"name": components.FILES, "path": str(path)} if not os.path.isfile(path):
+            return [("geometry.path", f"there is no file {path!r}; give an .npz of geometries")]
+    return []
 
 
 # ---- Scripts ----
@@ -172,8 +166,10 @@ class Train(Common):
     opponents: Opposition = Opposition()
     logger: Logger
     finish: Finish
-    samples: Annotated[int, Field(ge=1, le=10**18)] | None
+    samples: Samples | None
     seconds: Above0 | None
+    more_samples: Samples | None = None
+    more_seconds: Above0 | None = None
     log_every: Count
     checkpoint_seconds: Above0
     keep_checkpoints: Annotated[int, Field(ge=2, le=1000)]
@@ -195,9 +191,14 @@ class Train(Common):
             "learner.anneal": over in ("samples", "seconds")
             and getattr(self, over) is None
             and f"is {over}, and no {over}= is given for the learning rate to fall over",
+            **{
+                f"more_{name}": self.resume is None
+                and getattr(self, f"more_{name}") is not None
+                and f"comes on top of what a resumed run has had; give resume=RUN, or {name}="
+                for name in ("samples", "seconds")
+            },
             "snapshots": self.snapshots
-            and self.samples is None
-            and self.seconds is None
+            and not (self.samples or self.seconds or self.more_samples or self.more_seconds)
             and "are spread over the budget; give samples= or seconds=",
             "init": self.resume
             and self.init

@@ -21,14 +21,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
-import filelock
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
-from rich import box
 
-from megastep.agents.cli import console, factory, program, runs, signals
+from megastep.agents.cli import console, program, runs, settings, signals
 from megastep.agents.cli.compose import Composer, key_of
 from megastep.agents.cli.program import ConfigErrors, UserError, shortened
 from megastep.agents.training.atomic_files import write_atomically
@@ -117,9 +114,9 @@ def sweep(composer: Composer, words: list[str]) -> int:
     }
     words = [f"{key}={value}" for key, value in options.items() if key not in overrides]
     words += [override.input_line for override in overrides.values()]
-    # processes of launchers find the modules that this one finds
+    # processes of launchers find megastep; a job's settings find modules of the current folder
     os.environ["PYTHONPATH"] = os.pathsep.join(
-        filter(None, [str(program.ROOT), os.getcwd(), os.environ.get("PYTHONPATH")])
+        filter(None, [str(program.ROOT), os.environ.get("PYTHONPATH")])
     )
     job, problem = Job(composer, folder), ""
     try:
@@ -160,6 +157,8 @@ class Job:
         """Returns the job's score, None if it failed: a sweeper is to go on. Raises Interrupted
         alone.
         """
+        import filelock  # which takes a while
+
         hydra, began, result = HydraConfig.get(), time.monotonic(), None
         words, number = [*hydra.overrides.task], hydra.job.num
         os.chdir(self.start)  # where paths are relative to, whatever hydra.job.chdir says
@@ -187,11 +186,13 @@ class Job:
                 gpu = stack.enter_context(one_gpu())
                 words += [word for word in hydra.overrides.hydra if "searchpath" in word]
                 cfg = Composer(*self.source).settings(words)
-                cfg = factory.changed(cfg, folder=os.path.relpath(row["folder"]))
+                cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
                 if cfg.device == "cuda" and gpu is not None:
-                    cfg = factory.changed(cfg, device=f"cuda:{gpu}")
-                if getattr(getattr(cfg, "logger", None), "group", "") is None:
-                    cfg = factory.changed(cfg, logger=factory.changed(cfg.logger, group=self.group))
+                    cfg = settings.changed(cfg, device=f"cuda:{gpu}")
+                logger = getattr(cfg, "logger", None)
+                if getattr(logger, "group", "") is None:
+                    logger = settings.changed(logger, group=self.group)
+                    cfg = settings.changed(cfg, logger=logger)
                 result = self.source[0].run(cfg)
                 row |= {"state": DONE, **(runs.outcome(result) if result else {})}
             except signals.Interrupted as stop:
@@ -213,6 +214,8 @@ class Job:
 
     def rows(self) -> list[dict[str, Any]]:
         """Returns what the jobs of this sweep recorded, in order."""
+        import filelock
+
         rows = []
         for path in self.records.glob("*.json"):
             state = RUNNING
@@ -248,6 +251,9 @@ def one_gpu() -> Iterator[int | None]:
     files, one for each place on each GPU of this machine; the system drops them when a process
     ends.
     """
+    import filelock
+    import torch
+
     n_gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     with contextlib.ExitStack() as stack:
         for place in itertools.count() if n_gpus > 1 else ():
@@ -275,9 +281,8 @@ def report(folder: Path, rows: list[dict[str, Any]]) -> None:
     console.say(f"Sweep\n{console.table(head[:-1], cells)}")
     with console.warned(f"{folder} cannot be written: "):
         write_atomically(folder / "sweep.csv", text.getvalue().encode())
-        write_atomically(
-            folder / "sweep.md", console.table(head[:-1], cells, box.MARKDOWN).encode()
-        )
+        table = console.table(head[:-1], cells, is_markdown=True)
+        write_atomically(folder / "sweep.md", table.encode())
         console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")
 
 

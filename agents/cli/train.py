@@ -5,7 +5,6 @@ import functools
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 import yaml
@@ -15,13 +14,13 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.cli import (
     check,
     command,
-    compose,
     console,
     evaluate,
     factory,
     program,
     record,
     runs,
+    scripts,
     settings,
     signals,
 )
@@ -30,42 +29,6 @@ from megastep.agents.training.atomic_files import write_atomically
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.types import optional
-
-HELP = """Trains a policy in an environment.
-
-The most common words:
-  experiment=quickstart        the recipe of `make train`: train, evaluate on unseen homes, film
-  env=minimal geometry=box     another environment, other homes
-  seconds=60 samples=1e6       when to stop, whichever comes first; Ctrl-C stops too, and saves
-  preset=gpu env.n_envs=256    the sizes for a GPU, or your own
-  learner.lr=3e-4 seed=2       any key that --cfg job prints
-  learner=vtrace               instead of ppo: learner.lag=1 acts while it learns,
-                               learner.buffer=replay also learns from old experience
-  finish.evaluate=true finish.record=true
-                               a table and a video at the end
-  opponents.past=0.4 opponents.bot=0.1
-                               in environments with several agents: shares of environments against
-                               past selves and a scripted policy; snapshots=8 keeps what ratings
-                               compare
-  resume=RUN                   continue a run (its folder, or latest) under its own configuration
-  init=RUN                     start a new run from its weights, in its environment and homes
-  env=my_package.rover:Rover   a class of your own; also for geometry, learner, agent.core
-  logger=wandb logger.mode=offline"""
-#: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
-#: what it learns.
-RESUMABLE = (
-    "resume",
-    "samples",
-    "seconds",
-    "device",
-    "log_every",
-    "checkpoint_seconds",
-    "keep_checkpoints",
-    "desync",
-    "snapshots",
-    "logger",
-    "finish",
-)
 
 
 def make_trainer(
@@ -87,7 +50,7 @@ def make_trainer(
     factory.check_memory(cfg.env, sample, learner, **where)
     env = factory.construct(cfg.env, **where)
     if cfg.resume or cfg.init:
-        loaded = factory.load_checkpoint(runs.find(cfg.resume or cfg.init), device)
+        loaded = runs.load_checkpoint(runs.find(cfg.resume or cfg.init), device)
         factory.load_weights(policy, env, loaded)
     opponents = factory.make_opponents(cfg, env, sample, policy)
     for name in ("checkpoints", "snapshots") if cfg.resume else ():
@@ -156,12 +119,23 @@ def annealed(cfg: settings.Train, has_set_lr: bool = True) -> settings.Train:
     """
     limits = [n for n in ("samples", "seconds") if has_set_lr and getattr(cfg, n) is not None]
     anneal = [*limits, "never"][0] if cfg.learner.anneal == "auto" else cfg.learner.anneal
-    return factory.changed(cfg, learner=factory.changed(cfg.learner, anneal=anneal))
+    return settings.changed(cfg, learner=settings.changed(cfg.learner, anneal=anneal))
+
+
+def with_more(cfg: settings.Train) -> settings.Train:
+    """Returns `cfg` with more_samples and more_seconds added to what the resumed run has had."""
+    totals = {}
+    for name in ("samples", "seconds"):
+        if (more := getattr(cfg, f"more_{name}")) is not None:
+            had = runs.load_checkpoint(runs.find(cfg.resume)).numbers[name]
+            totals |= {name: had + more, f"more_{name}": None}
+    return settings.changed(cfg, **totals)
 
 
 def run(cfg: settings.Train) -> Path:
     """Trains as `cfg` says, and returns the run folder. A signal saves and raises Interrupted."""
     device, progress = factory.make_device(cfg.device), console.Progress()
+    cfg = with_more(cfg)
     folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
     with runs.locked(folder):
         with contextlib.ExitStack() as undo:
@@ -214,45 +188,5 @@ def run(cfg: settings.Train) -> Path:
     return folder
 
 
-def prepare(tree: dict[str, Any], typed: list[str]) -> dict[str, Any]:
-    """Returns the tree of a run that resumes another or starts from its weights; any other is
-    returned as it is.
-
-    A run that is resumed keeps its own settings, except for typed keys. A run that starts from the
-    weights of another has its environment, geometry and agent, except for typed keys and groups.
-    """
-    resume, init = tree.get("resume"), tree.get("init")
-    if not isinstance(resume or init, str) or (resume and init):
-        return tree
-    if refused := [key for key in typed if resume and key.split(".")[0] not in RESUMABLE]:
-        cure = "cannot change when a run is resumed; init=RUN starts a new one from its weights"
-        raise program.ConfigErrors((key, cure) for key in refused)
-    loaded = factory.load_checkpoint(runs.find(resume or init))
-    saved, state = loaded.config["train"], loaded.state
-    if init:
-        groups = ("env", "geometry", "agent")
-        groups = {group: saved[group] for group in groups if group not in typed}
-        saved, typed = tree | groups, [key for key in typed if key.partition(".")[0] in groups]
-    elif "learner" not in state:
-        raise program.UserError(
-            f"{loaded.path} is a snapshot, which has the weights only. init={loaded.path} starts "
-            "a new run from it; resume= takes the run's folder"
-        )
-    for key in typed:
-        *groups, leaf = key.split(".")
-        source, target = (functools.reduce(dict.get, groups, one) for one in (tree, saved))
-        target[leaf] = source[leaf]
-    if spent := [
-        (name, f"the run has had {round(state[name], 1):,} of {saved[name]:,}; give {name}= more")
-        for name in ("samples", "seconds")
-        if resume and saved[name] is not None and state[name] >= saved[name]
-    ]:
-        raise program.ConfigErrors(spent)
-    return saved | {"init": init}
-
-
-SCRIPT = compose.Script("train", settings.Train, run, HELP, prepare)
-
-
-def main(argv: list[str] | None = None) -> int:
-    return command.run_command(SCRIPT, argv)
+#: Runs the script with words of a command line, by default this process's.
+main = functools.partial(command.run_command, scripts.TRAIN)

@@ -5,6 +5,7 @@ T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, 
 """
 
 import copy
+import functools
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -13,7 +14,7 @@ from pydantic import AfterValidator, Field
 from torch import nn
 
 from megastep.agents.generator import SeededGenerator, stream_seed
-from megastep.agents.imports import resolve
+from megastep.agents.imports import known_name
 from megastep.agents.networks import cores, encoders, heads
 from megastep.agents.networks.critic import Critic
 from megastep.arrdict import arrdict
@@ -24,12 +25,7 @@ from megastep.types import Space, Tree
 
 def _name_in(table: Mapping[str, Any]) -> AfterValidator:
     """Returns a validator of names: a name in the table, or an import path."""
-
-    def check(name):
-        resolve(name, table)
-        return name
-
-    return AfterValidator(check)
+    return AfterValidator(functools.partial(known_name, names=tuple(table)))
 
 
 class Policy(nn.Module):

@@ -1,7 +1,8 @@
 """Settings of the replay buffer."""
 
 import dataclasses
-from typing import Annotated, Any, Literal
+import functools
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -79,8 +80,8 @@ def defaults_from(settings: ReplaySettings) -> BeforeValidator:
     """Returns a validator for annotations: a dict of some settings takes the others from `settings`
     instead of from the class.
     """
+    return BeforeValidator(functools.partial(_complete, settings))
 
-    def complete(value: Any) -> Any:
-        return {**dataclasses.asdict(settings), **value} if isinstance(value, dict) else value
 
-    return BeforeValidator(complete)
+def _complete(settings, value):
+    return {**dataclasses.asdict(settings), **value} if isinstance(value, dict) else value

@@ -6,14 +6,14 @@ checkpoint is overwritten: a second one of the same step is `step_<N>-2`, and th
 after the second is verified.
 """
 
+from __future__ import annotations
+
 import os
 import re
 import shutil
 import warnings
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 from megastep.agents.training import checkpoint_format
 from megastep.agents.training.checkpoint_format import (
@@ -21,6 +21,9 @@ from megastep.agents.training.checkpoint_format import (
     CheckpointError,
     DamagedCheckpoint,
 )
+
+if TYPE_CHECKING:
+    import torch
 
 __all__ = [
     "Checkpoint",
@@ -75,10 +78,11 @@ def save(
     return path
 
 
-def load_latest(folder: Path | str, device: torch.device | str = "cpu") -> Checkpoint:
+def load_latest(folder: Path | str, device: torch.device | str | None = "cpu") -> Checkpoint:
     """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`.
 
-    Warns about each damaged checkpoint that is skipped.
+    With `device=None` it leaves out the state, and does not import PyTorch. Warns about each
+    damaged checkpoint that is skipped.
 
     Raises:
         CheckpointError: there is none, all are damaged, or another version of megastep wrote it.

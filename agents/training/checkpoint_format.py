@@ -1,8 +1,11 @@
 """The format of one checkpoint: a folder of `state.pt`, `config.json` and `manifest.json`.
 
 `state.pt` holds plain dicts of tensors and numbers. The manifest has the size and SHA-256 of the
-other two files, and a SHA-256 of itself, so any damaged byte is detected.
+other two files, and a SHA-256 of itself, so any damaged byte is detected. It repeats the numbers at
+the top of the state, such as samples and seconds. All but `state.pt` is read without PyTorch.
 """
+
+from __future__ import annotations
 
 import dataclasses
 import hashlib
@@ -11,11 +14,12 @@ import json
 import os
 import pickle
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 from megastep.agents.training.atomic_files import write_synced
+
+if TYPE_CHECKING:
+    import torch
 
 #: The format number. Increase it whenever older readers would misread a new checkpoint, or newer
 #: readers an old one, and add the last commit of the old format to `READERS`.
@@ -40,14 +44,16 @@ class Checkpoint:
     Attributes:
         path: its folder.
         step: environment steps of all lanes before it was saved.
-        state: dicts of tensors and numbers, as saved.
+        numbers: the numbers at the top of the state.
         config: the run's configuration, as saved.
+        state: dicts of tensors and numbers, as saved; None if it was not loaded.
     """
 
     path: Path
     step: int
-    state: dict[str, Any]
+    numbers: dict[str, float]
     config: dict[str, Any]
+    state: dict[str, Any] | None = None
 
 
 # ---- Writing ----
@@ -57,6 +63,8 @@ def write(
     path: Path, step: int, state: dict[str, Any], config: dict[str, Any], score: float | None
 ) -> None:
     """Writes a checkpoint into a new folder and flushes it to disk."""
+    import torch
+
     path.mkdir()
     buffer = io.BytesIO()
     torch.save(state, buffer)
@@ -65,7 +73,9 @@ def write(
         name: {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
         for name, data in contents.items()
     }
-    manifest = dict(format=FORMAT, step=step, score=score, torch=torch.__version__, files=files)
+    numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
+    manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
+    manifest |= dict(torch=torch.__version__, files=files)
     for name, data in {**contents, "manifest.json": sealed(manifest)}.items():
         write_synced(path / name, data)
     sync_folder(path)
@@ -92,14 +102,20 @@ def sync_folder(folder: Path) -> None:
 # ---- Reading ----
 
 
-def read(path: Path, device: torch.device | str) -> Checkpoint:
-    """Loads a checkpoint onto a device.
+def read(path: Path, device: torch.device | str | None) -> Checkpoint:
+    """Loads a checkpoint onto a device, or, if that is None, all but its state.
 
     Raises:
         DamagedCheckpoint: a file is missing or damaged, or could run code when loaded.
         CheckpointError: another version of megastep wrote it.
     """
     contents, manifest = read_files(path)
+    config = json.loads(contents["config.json"])
+    checkpoint = Checkpoint(path, manifest["step"], manifest["numbers"], config)
+    if device is None:
+        return checkpoint
+    import torch
+
     try:
         state = torch.load(io.BytesIO(contents["state.pt"]), map_location=device, weights_only=True)
     except pickle.UnpicklingError:
@@ -111,7 +127,7 @@ def read(path: Path, device: torch.device | str) -> Checkpoint:
         raise DamagedCheckpoint(
             f"Checkpoint {path} is damaged: state.pt cannot be read ({str(error).splitlines()[0]})"
         ) from None
-    return Checkpoint(path, manifest["step"], state, json.loads(contents["config.json"]))
+    return dataclasses.replace(checkpoint, state=state)
 
 
 def read_files(path: Path) -> tuple[dict[str, bytes], dict[str, Any]]:

@@ -4,8 +4,10 @@
 bytes. Rates and times are in `perf.jsonl`. After start-up no failure of a logger stops a run.
 """
 
-import importlib
+import importlib.util
 import os
+import queue
+import threading
 import warnings
 from pathlib import Path
 from types import ModuleType
@@ -26,28 +28,52 @@ class LoggerError(RuntimeError):
 class TensorBoard:
     """Writes TensorBoard event files.
 
+    A thread writes, and imports what it needs at the first report: training waits for neither.
+
     Args:
         folder: where the event files go.
         step: environment steps at which a resumed run starts; later events are discarded.
 
     Raises:
-        RuntimeError: tensorboard is not installed.
+        RuntimeError: tensorboard is not installed. An error of the thread is raised by the next
+            `write` or `close`.
     """
 
     def __init__(self, folder: Path, step: int):
+        if importlib.util.find_spec("tensorboard") is None:
+            raise RuntimeError(not_installed("tensorboard"))
+        self.folder, self.step, self.error = folder, step, None
+        self.thread, self.reports = (
+            threading.Thread(target=self._write_reports),
+            queue.SimpleQueue(),
+        )
+
+    def _write_reports(self):
         try:
             from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            raise RuntimeError(not_installed("tensorboard")) from None
-        self.writer = SummaryWriter(str(folder), purge_step=step or None)
+
+            with SummaryWriter(str(self.folder), purge_step=self.step or None) as writer:
+                while report := self.reports.get():
+                    step, values = report
+                    for name, value in values.items():
+                        if not isinstance(value, str):
+                            writer.add_scalar(name, value, step)
+        except Exception as error:
+            self.error = error
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
-        for name, value in values.items():
-            if not isinstance(value, str):
-                self.writer.add_scalar(name, value, step)
+        if self.error:
+            raise self.error
+        if not self.thread.ident:
+            self.thread.start()
+        self.reports.put((step, values))
 
     def close(self) -> None:
-        self.writer.close()
+        self.reports.put(None)
+        if self.thread.ident:
+            self.thread.join()
+        if self.error:
+            raise self.error
 
 
 class Wandb:

@@ -9,13 +9,13 @@ import pytest
 import yaml
 
 from megastep import envs, geometries
-from megastep.agents.cli import sweeps, train
+from megastep.agents.cli import scripts, sweeps, train
 from megastep.agents.cli.check import CONFIGS, as_tree, check
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.program import ConfigErrors
 from megastep.agents.cli.settings import IMPORTED, Agent, Train, WandbLogger, kind_of
 from megastep.agents.training.loggers import Wandb
-from tests.helpers.tiny import SCRIPTS
+from megastep.geometries import sources
 from tests.helpers.tiny import settings as compose
 
 
@@ -26,11 +26,11 @@ def errors(*overrides, script="train"):
 
 
 #: What a member of a group needs beside itself.
-MORE = {"geometry=files": ["geometry.path=plans.npz"]}
+MORE = {"geometry=files": [f"geometry.path={sources.BENCH}"]}
 
 
 def test_every_group_member_composes():
-    groups = Composer(train.SCRIPT).groups()
+    groups = Composer(scripts.TRAIN).groups()
     assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "preset", "experiment"}
     assert set(groups["env"]) == set(envs.ENVS)
     assert set(groups["geometry"]) == set(geometries.SOURCES)
@@ -67,7 +67,7 @@ def compositions():
     """Yields for each member of each group the files it is composed of, [(file, {key: value})], in
     order of precedence.
     """
-    for name, script in SCRIPTS.items():
+    for name, script in scripts.SCRIPTS.items():
         composer = Composer(script)
         groups = composer.groups()
         for choice in [[]] + [[f"{group}={m}"] for group in groups for m in groups[group]]:
@@ -287,6 +287,12 @@ def test_list_too_short():
     assert messages == "a list of 0 is out of range: allowed is at least 1"
 
 
+def test_missing_geometry_file_is_told_with_all_else():
+    messages = errors("geometry=files", "geometry.path=nope.npz", "learner.lrr=1")
+    assert set(messages) == {"geometry.path", "learner.lrr"}
+    assert messages["geometry.path"] == "there is no file 'nope.npz'; give an .npz of geometries"
+
+
 def test_contradicting_settings():
     assert "2" in errors("env.n_envs=2")["learner.n_minibatches"]
     assert errors("geometry=files") == {"geometry.path": "is missing"}
@@ -347,7 +353,7 @@ def test_bad_overrides(override, key, sentence):
 
 
 def test_launcher_not_installed(monkeypatch):
-    composer = Composer(train.SCRIPT)
+    composer = Composer(scripts.TRAIN)
     composer.members = lambda group: ["basic"]
     _, errors = composer.config(composer.parse(["hydra/launcher=joblib"]))
     assert "pip install 'megastep-flatland[sweep]'" in dict(errors)["hydra/launcher"]
@@ -363,7 +369,7 @@ def test_value_with_equals_sign():
     assert compose("folder=sweeps/1/0_seed=1").folder == "sweeps/1/0_seed=1"
     cfg = compose("run=x", "against=[a/0_seed=1,bot]", script="evaluate")
     assert cfg.against == ("a/0_seed=1", "bot")
-    words, _ = sweeps.jobs_of(Composer(SCRIPTS["evaluate"]), ["run=a/0_seed=1,a/1_seed=2"])
+    words, _ = sweeps.jobs_of(Composer(scripts.SCRIPTS["evaluate"]), ["run=a/0_seed=1,a/1_seed=2"])
     runs = [compose(*job, script="evaluate").run for job in words]
     assert runs == ["a/0_seed=1", "a/1_seed=2"]
 
@@ -390,7 +396,7 @@ def test_several_values_need_multirun():
 
 def jobs(*words):
     """Returns the words of each job of a sweep."""
-    return sweeps.jobs_of(Composer(train.SCRIPT), [*words])[0]
+    return sweeps.jobs_of(Composer(scripts.TRAIN), [*words])[0]
 
 
 def test_grid_jobs():

@@ -1,45 +1,34 @@
-"""The start of the scripts: the GPU wakes up while Python imports."""
+"""The command `megastep`, also as `python -m megastep`."""
 
-import subprocess
+import runpy
 import sys
 
 import pytest
 
-from megastep.agents.cli import entry
+from megastep.agents.cli import entry, program
+
+
+def test_python_m_megastep_lists_the_scripts(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["megastep"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module("megastep", run_name="__main__", alter_sys=True)
+    assert end.value.code == 0
+    shown = capsys.readouterr().out
+    assert all(f"python -m megastep {name}" in shown for name in ("train", "evaluate", "record"))
+
+
+def test_name_under_python_m(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/somewhere/megastep/__main__.py", "train"])
+    assert program.name("train") == "megastep train"
+    assert program.name("train", "python ") == "python -m megastep train"
 
 
 @pytest.mark.parametrize(
-    "words, wanted",
-    [
-        ([], True),
-        (["env=minimal", "device=auto"], True),
-        (["device=cuda:0"], True),
-        (["device=cuda:1"], False),
-        (["device=cpu"], False),
-        (["-m", "device=cpu,cuda"], False),
-        (["--help"], False),
-        (["--cfg", "job"], False),
-    ],
+    "word, text",
+    [("bench", "scripts/benchmarks/benchmark.py"), ("show", "show_homes.py"), ("trian", "train?")],
 )
-def test_wants_first_gpu(words, wanted):
-    assert entry.wants_first_gpu(words) == wanted
-
-
-def test_cuda_context_without_driver(monkeypatch):
-    def absent(name):
-        raise OSError(f"{name}: cannot open shared object file")
-
-    monkeypatch.setattr(entry.ctypes, "CDLL", absent)
-    assert entry.create_cuda_context() is None
-
-
-@pytest.mark.cuda
-def test_pytorch_uses_the_created_context():
-    code = """
-from megastep.agents.cli.entry import create_cuda_context
-create_cuda_context()
-import torch
-assert torch.cuda.memory_allocated() == 0
-assert (torch.ones(8, device="cuda") @ torch.ones(8, device="cuda")).item() == 8
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
+def test_words_that_are_no_script(monkeypatch, capsys, word, text):
+    monkeypatch.setattr(sys, "argv", ["megastep", word])
+    assert entry.main() == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert text in sentence

@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-from megastep.agents.cli import runs, train
+from megastep.agents.cli import runs, scripts
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.program import UserError
 from megastep.agents.cli.runs import locked
@@ -65,7 +65,7 @@ def test_resume_command_is_quoted(name):
         stdout=subprocess.PIPE,
     )
     python, script, override = typed.stdout.splitlines()
-    composer = Composer(train.SCRIPT)
+    composer = Composer(scripts.TRAIN)
     config, errors = composer.config(composer.parse([override]))
     assert (python, script, errors) == ("python", "train.py", [])
     assert config["resume"] == name

@@ -21,7 +21,7 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
-from megastep.agents.cli import evaluate, runs, sweeps, train
+from megastep.agents.cli import evaluate, runs, scripts, sweeps, train
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.program import ConfigErrors
 from megastep.agents.cli.settings import kind_of
@@ -306,7 +306,7 @@ def test_killed_job(here):
 
 def test_preset_is_chosen_where_the_job_runs(here, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    job = sweeps.Job(Composer(train.SCRIPT), here)
+    job = sweeps.Job(Composer(scripts.TRAIN), here)
     job = cloudpickle.loads(cloudpickle.dumps(job))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for words, n_envs in ((["seed=1"], 4096), (["seed=1", "device=cpu"], 256)):
@@ -442,5 +442,5 @@ def test_shell_completion(monkeypatch, capsys, line, expected):
 
 
 def test_wandb_group_without_a_sweep():
-    settings = Composer(train.SCRIPT).settings(["logger=wandb"])
+    settings = Composer(scripts.TRAIN).settings(["logger=wandb"])
     assert dataclasses.asdict(settings.logger)["group"] is None

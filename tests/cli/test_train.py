@@ -280,19 +280,13 @@ def test_resume_after_a_signal(here, monkeypatch, capsys):
 def test_resume_refuses_a_spent_budget(here, capsys):
     folder = train.run(configured(f"samples={2 * UPDATE}", "seconds=600"))
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    capsys.readouterr()
-    for more, message in (
-        ([], "samples: .* 64 of 64; .*samples="),
-        (["samples=40"], "samples: .* 64 of 40; .*samples="),
-        (
-            ["samples=9e3", "seconds=1e-9"],
-            "seconds: .* of 1e-09; .*seconds=",
-        ),
-    ):
+    for more in ([], ["samples=40"], ["samples=9e3", "seconds=1e-9"]):
         assert train.main([f"resume={folder}", *more]) == 2
-        assert re.search(message, capsys.readouterr().err)
     assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    assert train.main([f"resume={folder}", f"samples={3 * UPDATE}"]) == 0
+    assert train.main([f"resume={folder}", f"more_samples={UPDATE}"]) == 0
+    assert checkpoint.load_latest(folder / "checkpoints").step == 3 * UPDATE
+    written = yaml.safe_load((folder / "config.yaml").read_text())
+    assert (written["samples"], written["more_samples"]) == (3 * UPDATE, None)
 
 
 def test_latest_is_trained_last(here):

@@ -1,7 +1,7 @@
 """The smallest run, as words of the command line: an update takes milliseconds."""
 
-from megastep.agents.cli import evaluate, record, train
 from megastep.agents.cli.compose import Composer
+from megastep.agents.cli.scripts import SCRIPTS
 
 TINY = [
     "env=minimal",
@@ -16,7 +16,6 @@ TINY = [
 ]
 SHORT_EPISODES = ["env.shortest=5", "env.longest=9"]
 UPDATE = 4 * 8  # samples of one update
-SCRIPTS = {script.name: script for script in (train.SCRIPT, evaluate.SCRIPT, record.SCRIPT)}
 
 
 def settings(*words, script="train"):

@@ -1,0 +1,78 @@
+"""The arguments of the components of megastep, known without importing them.
+
+Settings are arguments of constructors, whose modules import PyTorch: that takes seconds, in which a
+typing error should long have been named. So all arguments are read once and cached on disk under a
+hash of the sources.
+"""
+
+import functools
+import hashlib
+import pickle
+import sys
+from pathlib import Path
+from typing import Literal
+
+import pydantic
+import yaml
+
+import megastep
+from megastep import cache
+from megastep.agents.cli import program
+from megastep.agents.imports import import_object
+from megastep.settings import arguments_of
+
+POLICY = "megastep.agents.networks.policy:Policy"
+FILES = "megastep.geometries.sources:files"
+OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
+#: How the arguments of a group's members become settings, as `arguments_of` takes it: `reserved`
+#: are passed by the program, `missing` are defaults, and the others are settings beside them.
+ARGUMENTS = {
+    "env": dict(
+        reserved=("geometries", "seed", "device", "privileged"), missing={"n_envs": 128}, name=str
+    ),
+    "geometry": dict(reserved=("split",), missing={"n": 512, "seed": 1}, name=str),
+    "learner": dict(
+        reserved=("policy", "seed", "graph"),
+        name=str,
+        # what lr falls to 0 over; auto: samples if given, else seconds if given
+        anneal=(Literal["auto", "never", "samples", "seconds"], "auto"),
+    ),
+    "agent": dict(reserved=("obs_space", "action_space", "privileged_space", "seed")),
+    "opponents": dict(
+        reserved=("env", "policy", "scripted", "seed"),
+        bot_class=(str | None, None),  # None: the environment's own
+    ),
+}
+#: Number of versions of the sources whose arguments stay in the cache.
+VERSIONS = 8
+
+
+@functools.cache
+def built_in() -> dict[tuple[str, str], tuple[str, dict[str, tuple]]]:
+    """Returns what `arguments_of` returns of each component, by (group, import path)."""
+    content, _ = cache.fetch(f"arguments-{_sources()}", lambda: pickle.dumps(read()))
+    cache.prune("arguments-", VERSIONS)
+    return pickle.loads(content)
+
+
+def read() -> dict[tuple[str, str], tuple[str, dict[str, tuple]]]:
+    """Imports every component of megastep, for `built_in`."""
+    names = [("agent", POLICY), ("opponents", OPPONENTS)]
+    for path in program.CONFIGS.glob("*/*.yaml"):
+        tree = yaml.safe_load(path.read_text()) or {}
+        names.append((path.parent.name, str(tree.get("name"))))
+    return {
+        (group, name): arguments_of(import_object(name), **ARGUMENTS[group])
+        for group, name in names
+        if group in ARGUMENTS and name.startswith("megastep.")
+    }
+
+
+def _sources():
+    """A hash of whatever decides how arguments are read and stored."""
+    folders = Path(megastep.__file__).parent, program.CONFIGS.parent
+    files = sorted({path for folder in folders for path in folder.rglob("*.py")})
+    digest = hashlib.sha256(f"{sys.version} {pydantic.VERSION}".encode())
+    for path in files:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:32]

@@ -1,0 +1,56 @@
+"""The first look at GPUs, through NVIDIA's driver: PyTorch takes seconds to import."""
+
+import contextlib
+import ctypes
+import functools
+import importlib.util
+import runpy
+import sys
+import threading
+from pathlib import Path
+
+
+@functools.cache
+def driver() -> ctypes.CDLL | None:
+    """Returns the initialised driver, or None if there is none or it finds no GPU."""
+    with contextlib.suppress(OSError):
+        library = ctypes.CDLL("libcuda.so.1")
+        if library.cuInit(0) == 0:
+            return library
+
+
+def start_driver() -> None:
+    """Initialises the driver in a thread, which takes a while."""
+    # the interpreter waits for this thread: a process must not end within the driver
+    threading.Thread(target=driver).start()
+
+
+def is_available() -> bool:
+    """Returns what `torch.cuda.is_available` does, without importing PyTorch."""
+    if "torch" in sys.modules:
+        return sys.modules["torch"].cuda.is_available()
+    package = importlib.util.find_spec("torch")
+    built_for = runpy.run_path(str(Path(package.origin).with_name("version.py")))["cuda"]
+    if not built_for or driver() is None:
+        return False
+    version, count = ctypes.c_int(), ctypes.c_int()
+    driver().cuDriverGetVersion(ctypes.byref(version))
+    driver().cuDeviceGetCount(ctypes.byref(count))
+    return count.value > 0 and version.value // 1000 >= int(built_for.split(".")[0])
+
+
+def wake(device: str) -> None:
+    """Creates the context of the GPU that is called `device`, if it is one, in a thread. PyTorch
+    finds it there later.
+
+    It takes half a second in the driver, which passes beside Python's imports.
+    """
+    if device != "cpu":
+        index = int(device.partition(":")[2] or 0)
+        threading.Thread(target=_create_context, args=(index,)).start()
+
+
+def _create_context(index):
+    device, context = ctypes.c_int(), ctypes.c_void_p()
+    if driver() and driver().cuDeviceGet(ctypes.byref(device), index) == 0:
+        driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), device)

@@ -1,0 +1,173 @@
+"""The scripts as the command line knows them: their help, their settings, and what is checked
+before PyTorch is imported.
+"""
+
+import functools
+import importlib
+import re
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+from megastep.agents.cli import program, runs, settings
+
+Tree = dict[str, Any]
+
+
+class Script(NamedTuple):
+    """One of the programs."""
+
+    name: str  # of the file of its configuration, and of the module of its `run`
+    kind: type  # the dataclass of its settings
+    help: str  # the head of --help
+    #: Raises UserError for checked settings that cannot be run here.
+    ready: Callable[[Any], None]
+    #: Changes the composed tree before it is checked, given the typed keys.
+    prepare: Callable[[Tree, list[str]], Tree] = lambda tree, typed: tree
+    #: Changes a word of the command line.
+    reword: Callable[[str], str] = str
+
+    def run(self, cfg: Any) -> Any:
+        """Runs the script; imports what it needs."""
+        return importlib.import_module(f"megastep.agents.cli.{self.name}").run(cfg)
+
+
+# ---- Train ----
+
+TRAIN_HELP = """Trains a policy in an environment.
+
+The most common words:
+  experiment=quickstart        the recipe of `make train`: train, evaluate on unseen homes, film
+  env=minimal geometry=box     another environment, other homes
+  seconds=60 samples=1e6       when to stop, whichever comes first; Ctrl-C stops too, and saves
+  preset=gpu env.n_envs=256    the sizes for a GPU, or your own
+  learner.lr=3e-4 seed=2       any key that --cfg job prints
+  learner=vtrace               instead of ppo: learner.lag=1 acts while it learns,
+                               learner.buffer=replay also learns from old experience
+  finish.evaluate=true finish.record=true
+                               a table and a video at the end
+  opponents.past=0.4 opponents.bot=0.1
+                               in environments with several agents: shares of environments against
+                               past selves and a scripted policy; snapshots=8 keeps what ratings
+                               compare
+  resume=RUN                   continue a run (its folder, or latest) under its own configuration;
+                               more_seconds=60 more_samples=1e6 add to what it has had
+  init=RUN                     start a new run from its weights, in its environment and homes
+  env=my_package.rover:Rover   a class of your own; also for geometry, learner, agent.core
+  logger=wandb logger.mode=offline"""
+#: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
+#: what it learns.
+RESUMABLE = (
+    "resume",
+    "samples",
+    "seconds",
+    "more_samples",
+    "more_seconds",
+    "device",
+    "log_every",
+    "checkpoint_seconds",
+    "keep_checkpoints",
+    "desync",
+    "snapshots",
+    "logger",
+    "finish",
+)
+
+
+def prepare_training(tree: Tree, typed: list[str]) -> Tree:
+    """Returns the tree of a run that resumes another or starts from its weights; any other is
+    returned as it is.
+
+    A run that is resumed keeps its own settings, except for typed keys. A run that starts from the
+    weights of another has its environment, geometry and agent, except for typed keys and groups.
+    """
+    resume, init = tree.get("resume"), tree.get("init")
+    if not isinstance(resume or init, str) or (resume and init):
+        return tree
+    if refused := [key for key in typed if resume and key.split(".")[0] not in RESUMABLE]:
+        cure = "cannot change when a run is resumed; init=RUN starts a new one from its weights"
+        raise program.ConfigErrors((key, cure) for key in refused)
+    loaded = runs.load_checkpoint(runs.find(resume or init))
+    saved = loaded.config["train"]
+    if init:
+        groups = ("env", "geometry", "agent")
+        groups = {group: saved[group] for group in groups if group not in typed}
+        saved, typed = tree | groups, [key for key in typed if key.partition(".")[0] in groups]
+    elif not loaded.numbers:
+        raise program.UserError(
+            f"{loaded.path} is a snapshot, which has the weights only. init={loaded.path} starts "
+            "a new run from it; resume= takes the run's folder"
+        )
+    for key in typed:
+        *groups, leaf = key.split(".")
+        source, target = (functools.reduce(dict.get, groups, one) for one in (tree, saved))
+        target[leaf] = source[leaf]
+    if resume and (errors := [*budget_errors(saved, typed, loaded.numbers)]):
+        raise program.ConfigErrors(errors)
+    return saved | {"init": init}
+
+
+def budget_errors(tree: Tree, typed: list[str], had: dict[str, float]) -> Iterator[tuple[str, str]]:
+    """Yields (key, sentence) of a resumed run's budgets that are given twice or spent."""
+    for name in ("samples", "seconds"):
+        total, more = tree[name], tree.get(f"more_{name}")
+        if more is not None and name in typed:
+            yield f"more_{name}", f"comes on top of what the run has had, {name}= is the total"
+        elif more is None and isinstance(total, (int, float)) and had[name] >= total:
+            spent = f"the run has had {round(had[name], 1):,} of {name}={total:,}"
+            yield name, f"{spent}; to continue, give more_{name}= or a larger {name}="
+
+
+def check_folder(cfg: settings.Train) -> None:
+    """Raises UserError if the run's folder is taken: by another run or, if it is resumed, by the
+    process that trains in it.
+    """
+    if cfg.resume is None:
+        runs.check_free(cfg.folder)
+    else:
+        with runs.locked(runs.folder_of(runs.find(cfg.resume))):
+            pass
+
+
+# ---- Evaluate and record ----
+
+EVALUATE_HELP = """Measures what a run's agent earns in the first episode of each lane, with a 95 %
+interval over homes. Prints a table and writes it to the run's folder: evaluations/*.md.
+
+The most common words:
+  run=RUN              a run folder, one of its checkpoints, or latest
+  split=training       the homes it was trained in, instead of unseen ones
+  geometry=bench       other homes
+  env=pong             another environment with the same spaces: after self-play, the tracker
+  greedy=true          the most likely actions instead of sampled ones
+  episodes=256         fewer episodes
+  baseline=false       no row for random actions
+  against=RUN,bot      duels instead: with other runs or checkpoints, the scripted policy, random
+                       actions, or an import path
+  ratings=true         ratings of the run's snapshots, by duels of each with each"""
+RECORD_HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
+
+The most common words:
+  run=RUN          a run folder, one of its checkpoints, or latest
+  env=explorer     random actions in an environment, without a run
+  steps=400        frames
+  against=RUN      its duel with another run's agent, `bot`, or an import path, in one home
+  home=3           another of the unseen homes; split=training: one it was trained in
+  file=out.mp4     this file, overwritten if it exists; out.png: the last frame only. Otherwise
+                   video.mp4 in the run folder, or video-2.mp4, ... if there is one"""
+
+
+def check_run(cfg: settings.Evaluate | settings.Record) -> None:
+    """Raises UserError if the run does not exist."""
+    if cfg.run is not None:
+        runs.find(cfg.run)
+
+
+def names_in_list(word: str) -> str:
+    """Returns `against=a,b` as the list that it means here, not the sweep that it is to Hydra."""
+    return re.sub(r"^against=(?!\[|null$)(.*)", r"against=[\1]", word)
+
+
+TRAIN = Script("train", settings.Train, TRAIN_HELP, check_folder, prepare_training)
+EVALUATE = Script("evaluate", settings.Evaluate, EVALUATE_HELP, check_run, reword=names_in_list)
+RECORD = Script("record", settings.Record, RECORD_HELP, check_run)
+SCRIPTS = {script.name: script for script in (TRAIN, EVALUATE, RECORD)}

@@ -1,0 +1,131 @@
+"""The first look at GPUs, before PyTorch is imported, at a stand-in for the driver."""
+
+import subprocess
+import sys
+import threading
+import types
+
+import pytest
+
+from megastep.agents.cli import gpu, scripts, train
+from megastep.agents.training import checkpoint
+from tests.helpers.tiny import TINY, settings
+
+
+class Driver:
+    """CUDA's driver with some GPUs. `retained`: the GPUs whose context was created."""
+
+    def __init__(self, n_gpus=4, version=12_040):
+        self.n_gpus, self.version, self.retained = n_gpus, version, []
+
+    def cuInit(self, flags):
+        return 0 if self.n_gpus else 100  # CUDA_ERROR_NO_DEVICE
+
+    def cuDriverGetVersion(self, result):
+        result._obj.value = self.version
+
+    def cuDeviceGetCount(self, result):
+        result._obj.value = self.n_gpus
+
+    def cuDeviceGet(self, result, index):
+        result._obj.value = index
+        return 0 if index < self.n_gpus else 101  # CUDA_ERROR_INVALID_DEVICE
+
+    def cuDevicePrimaryCtxRetain(self, context, device):
+        self.retained.append(device.value)
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """Installs a driver and a PyTorch that is built for a version of CUDA."""
+
+    def install(driver, built_for="12.6"):
+        gpu.driver.cache_clear()
+        monkeypatch.setattr(gpu.ctypes, "CDLL", lambda name: driver)
+        monkeypatch.setattr(gpu.runpy, "run_path", lambda path: {"cuda": built_for})
+        return driver
+
+    yield install
+    gpu.driver.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "n_gpus, version, built_for, available",
+    [
+        (1, 12_040, "12.6", True),
+        (1, 13_000, "12.6", True),
+        (1, 11_080, "12.6", False),
+        (0, 12_040, "12.6", False),
+        (1, 12_040, None, False),
+    ],
+)
+def test_is_available_without_pytorch(
+    installed, monkeypatch, n_gpus, version, built_for, available
+):
+    installed(Driver(n_gpus, version), built_for)
+    monkeypatch.delitem(sys.modules, "torch")
+    assert gpu.is_available() == available and "torch" not in sys.modules
+
+
+def test_is_available_is_pytorchs_word(installed, monkeypatch):
+    installed(Driver(n_gpus=1))
+    monkeypatch.setitem(sys.modules, "torch", types.SimpleNamespace(cuda=types.SimpleNamespace()))
+    sys.modules["torch"].cuda.is_available = lambda: False
+    assert not gpu.is_available()
+
+
+def test_no_driver(monkeypatch, installed):
+    installed(None)
+
+    def absent(name):
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr(gpu.ctypes, "CDLL", absent)
+    assert gpu.driver() is None
+    gpu.wake("cuda")
+
+
+def contexts(driver):
+    """Returns the GPUs with a context, once all threads are through."""
+    for thread in set(threading.enumerate()) - {threading.main_thread()}:
+        thread.join(timeout=10)
+    return driver.retained
+
+
+@pytest.mark.parametrize(
+    "device, woken", [("auto", [0]), ("cuda", [0]), ("cuda:3", [3]), ("cpu", []), ("cuda:9", [])]
+)
+def test_wakes_its_own_gpu(installed, device, woken):
+    driver = installed(Driver())
+    gpu.wake(device)
+    assert contexts(driver) == woken
+
+
+def test_resumed_run_wakes_its_own_gpu_alone(installed, monkeypatch, tmp_path):
+    from megastep.agents.cli.check import as_tree
+
+    config = {"train": as_tree(settings(*TINY)) | {"device": "cuda:3"}, "spaces": {}}
+    checkpoint.save(tmp_path / "run/checkpoints", 32, dict(samples=32, seconds=1.0), config)
+    driver, ran = installed(Driver()), []
+    monkeypatch.setattr(scripts.Script, "run", lambda script, cfg: ran.append(cfg.device))
+    assert train.main([f"resume={tmp_path / 'run'}"]) == 0
+    assert ran == ["cuda:3"] and contexts(driver) == [3]
+
+
+def test_errors_wake_no_gpu(installed):
+    driver = installed(Driver())
+    assert train.main(["device=cuda", "learner.lrr=1"]) == 2
+    assert contexts(driver) == []
+
+
+@pytest.mark.cuda
+def test_pytorch_uses_the_created_context():
+    code = """
+from megastep.agents.cli import gpu
+assert gpu.is_available()
+gpu.wake("cuda")
+import torch
+assert torch.cuda.memory_allocated() == 0
+assert (torch.ones(8, device="cuda") @ torch.ones(8, device="cuda")).item() == 8
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
