@@ -16,6 +16,7 @@ import torch
 from megastep import recording
 from megastep.arrdict import arrdict
 from megastep.recording import ParallelEncoder
+from tests.helpers.processes import HUNG
 
 SIZE = 32
 TOLERANCE = 6  # grey levels: the loss of h264 at this quality on a flat colour
@@ -378,7 +379,7 @@ def test_script_without_a_main_guard_can_record(tmp_path):
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HUNG,
         env={**os.environ, "PYTHONPATH": root},
     )
     assert (process.returncode, process.stdout) == (0, "started\n"), process.stderr

@@ -134,17 +134,21 @@ def test_lock_names_the_process(here):
 
 
 HOLDS = """
-import pathlib, sys, time
+import pathlib, sys
 from megastep.agents.cli.runs import locked
 with locked(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
-    time.sleep(60)
+    sys.stdin.read()
 """
 
 
 def test_lock_of_a_killed_process(here):
     holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDS, here], cwd=ROOT, text=True, stdout=subprocess.PIPE
+        [sys.executable, "-c", HOLDS, here],
+        cwd=ROOT,
+        text=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
     )
     assert holder.stdout.readline() == "held\n"
     with pytest.raises(UserError, match=f"process {holder.pid}"), locked(here):
