@@ -5,6 +5,10 @@ PYTHON ?= .venv/bin/python
 CORES := $(shell nproc 2>/dev/null || echo 1)
 SEED ?= 1
 
+# Neighbouring tests share a process, and what they prepare. Tests start many processes, which
+# import faster from bytecode.
+PYTEST = PYTHONDONTWRITEBYTECODE= $(PYTHON) -m pytest -q -n $(CORES) --dist worksteal
+
 # Create the virtual environment only if it is the interpreter in use.
 SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 
@@ -17,13 +21,13 @@ train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen hom
 	$(PYTHON) train.py experiment=quickstart
 
 test: $(SETUP)             ## run the fast tests: 4 minutes on two cores
-	$(PYTHON) -m pytest -q -n $(CORES)
+	$(PYTEST)
 
 test-slow: $(SETUP)        ## run the thorough tests: 12 minutes; .ci/run runs them as well
-	$(PYTHON) -m pytest -q -n $(CORES) -m slow
+	$(PYTEST) -m slow
 
 test-nightly: $(SETUP)     ## soak, CPU sanitizers and 30 mutants: an hour, by hand; SEED=2 makes others
-	$(PYTHON) -m pytest -q -n $(CORES) -m nightly
+	$(PYTEST) -m nightly
 	$(PYTHON) scripts/mutants.py 30 --seed $(SEED) --jobs $(CORES)
 
 lint: $(SETUP)             ## check style and formatting of Python and kernels
