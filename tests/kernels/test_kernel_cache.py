@@ -228,6 +228,7 @@ def test_file_of_another_user_is_built_again(fetch, tmp_path):
     assert path.stat().st_uid == 0
 
 
+@pytest.mark.slow
 def test_planted_library_is_never_loaded(built, tmp_path, monkeypatch):
     """Another user left it in a shared folder, with the right name and digest. It leaves a mark if
     loaded.
