@@ -46,7 +46,8 @@ def composed_once():
 
     def once(loader, method, *arguments, **options):
         paths = [entry.path for entry in loader.get_search_path().get_path()]
-        if [Path(path).resolve() for path in paths if "://" not in path] != [CONFIGS]:
+        folders = [path for path in paths if not path.startswith(("pkg://", "structured://"))]
+        if [Path(folder).resolve() for folder in folders] != [CONFIGS]:
             return method(loader, *arguments, **options)
         key = str((method, JobRuntime.instance().get("name"), arguments, options))
         if key not in cached:
