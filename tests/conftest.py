@@ -12,10 +12,13 @@ import functools
 import subprocess
 from pathlib import Path
 
+import loky
 import pytest
 import torch
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.utils import JobRuntime
+
+from tests.helpers.in_this_process import InThisProcess
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 torch.set_num_threads(1)
@@ -82,6 +85,14 @@ def no_curves():
 def with_curves(no_curves, monkeypatch):
     """Has runs in this test draw curves.png."""
     monkeypatch.setattr("megastep.agents.training.curves.plot_curves", no_curves)
+
+
+@pytest.fixture
+def drawn_in_this_process(monkeypatch):
+    """Replaces pools of worker processes, which test_recording.py and scripts in processes of their
+    own have.
+    """
+    monkeypatch.setattr(loky, "ProcessPoolExecutor", InThisProcess)
 
 
 @pytest.fixture(scope="session")

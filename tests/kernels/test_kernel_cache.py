@@ -118,6 +118,7 @@ def test_damaged_file_is_built_again(fetch, damage, tmp_path):
     assert fetch(tmp_path) == (BODY, path, 0)
 
 
+@pytest.mark.slow
 def test_two_processes_build_at_once(built, quick, tmp_path):
     env = {**os.environ, "MEGASTEP_CACHE": str(tmp_path), "CXX": quick}
     command = [sys.executable, "-c", STEP]
