@@ -324,6 +324,7 @@ def test_cached_files_are_limited_in_size(folder, monkeypatch):
     assert len(list(folder.glob("geodesics-*"))) == 2
 
 
+@pytest.mark.slow
 def test_worker_processes_compute_the_same(folder, monkeypatch, capfd):
     boxes_ = [room(width=2 + 0.01 * i, height=1.5, id=i) for i in range(workers.MIN_PARALLEL)]
     out = all_of(boxes_)

@@ -25,6 +25,7 @@ def names(tmp_path_factory):
     return variables
 
 
+@pytest.mark.usefixtures("drawn_in_this_process")
 def test_commands_train_evaluate_and_record(tmp_path, monkeypatch, capsys):
     """The commands of the first part, in an empty folder. test_two_agents.py has the second's."""
     pytest.importorskip("av")
