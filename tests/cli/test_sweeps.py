@@ -202,6 +202,7 @@ def test_job_refuses_a_used_folder(here):
     assert (here / "mine/0_default/metrics.jsonl").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_paths_with_hydra_job_chdir(here):
     assert train.main([*SHORT, "folder=first", "hydra.job.chdir=true"]) == 0
     assert os.getcwd() == str(here) and (here / "first/checkpoints").is_dir()
@@ -218,6 +219,7 @@ def test_hydra_run_dir_is_the_folder(here, capsys):
     assert "folder: no such key" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_wandb_group_of_a_sweep(here, monkeypatch):
     loggers_added = []
     monkeypatch.setattr(
@@ -268,6 +270,7 @@ def test_signal_saves_jobs_in_other_processes(here):
     assert len(list(here.glob("mine/*/checkpoints/step_*"))) == 2
 
 
+@pytest.mark.slow
 def test_optuna_maximises_and_skips_failed_trials(here):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
     words = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=4", "hydra.sweeper.n_jobs=1"]
