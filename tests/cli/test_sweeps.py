@@ -373,6 +373,7 @@ def test_score_is_the_mean_of_the_last_reports(here):
 # ---- --config-dir; completion ----
 
 
+@pytest.mark.slow
 def test_config_dir_and_config_name(here, capsys):
     files = {
         "env/mine.yaml": "name: payer:Payer\npay: 7\n",

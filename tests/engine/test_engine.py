@@ -80,16 +80,20 @@ VIEWS = [
 ]
 
 
+ROUNDS = [(1, 0), (1, 1), (4, 0), (4, 1)]  # number of agents and seed, in the slow tests
+
+
 @pytest.mark.parametrize(
-    "n_agents, seed",
-    [(1, 0), (4, 1), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((1, 1), (4, 0)))],
+    "n_envs, n_agents, seed",
+    [(2, 1, 0), (2, 4, 1), *(pytest.param(4, n, s, marks=pytest.mark.slow) for n, s in ROUNDS)],
 )
 @pytest.mark.parametrize("view", VIEWS, ids=str)
 @pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
-def test_render_matches_twin(view, n_agents, seed, degenerate, device, poison):
+def test_render_matches_twin(view, n_envs, n_agents, seed, degenerate, device, poison):
     envs = random_scenery.random_environments(
         seed,
-        n_agents=n_agents,
+        n_envs,
+        n_agents,
         degenerate=degenerate,
         res=view["res"],
         fov=view["fov"],
