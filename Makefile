@@ -3,6 +3,11 @@
 BASE ?= python3
 PYTHON ?= .venv/bin/python
 CORES := $(shell nproc 2>/dev/null || echo 1)
+SEED ?= 1
+
+# Neighbouring tests share a process, and what they prepare. Tests start many processes, which
+# import faster from bytecode.
+PYTEST = PYTHONDONTWRITEBYTECODE= $(PYTHON) -m pytest -q -n $(CORES) --dist worksteal
 
 # Create the virtual environment only if it is the interpreter in use.
 SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
@@ -10,16 +15,20 @@ SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 # `find` does not follow links, so agents/ is not listed twice through megastep/agents.
 KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
-.PHONY: train test test-all lint setup clean
+.PHONY: train test test-slow test-nightly lint setup clean
 
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
 
-test: $(SETUP)             ## run the tests, except those marked slow
-	$(PYTHON) -m pytest -q -n $(CORES)
+test: $(SETUP)             ## run the fast tests: 4 minutes on two cores
+	$(PYTEST)
 
-test-all: $(SETUP)         ## run every test
-	$(PYTHON) -m pytest -q -n $(CORES) -m "slow or not slow"
+test-slow: $(SETUP)        ## run the thorough tests: 12 minutes; .ci/run runs them as well
+	$(PYTEST) -m slow
+
+test-nightly: $(SETUP)     ## soak, CPU sanitizers and 30 mutants: an hour, by hand; SEED=2 makes others
+	$(PYTEST) -m nightly
+	$(PYTHON) scripts/mutants.py 30 --seed $(SEED) --jobs $(CORES)
 
 lint: $(SETUP)             ## check style and formatting of Python and kernels
 	$(PYTHON) -m ruff check .

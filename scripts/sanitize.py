@@ -3,8 +3,13 @@
 for tool in memcheck racecheck initcheck; do
     compute-sanitizer --tool $tool python scripts/sanitize.py
 done
+
+`python scripts/sanitize.py cpu` runs the same on the CPU; tests/kernels/test_sanitizers.py does so
+with kernels built for AddressSanitizer and UndefinedBehaviorSanitizer.
 """
 
+import contextlib
+import itertools
 import sys
 from pathlib import Path
 
@@ -19,13 +24,17 @@ from megastep.modules import RandomSpawns
 
 def out_of_range(c, spawn):
     """Runs operations with a layout that does not exist. They must set a flag and read nothing."""
-    for layout in (-1, 3, 2**31 - 1):
+    spawn.resample = False
+    operations = (
+        lambda: engine.physics(c.scenery, c.agents),
+        lambda: engine.observe(c.scenery, c.agents),
+        lambda: engine.render(c.scenery, c.agents),
+        lambda: spawn(c.agent_full(True)),
+    )
+    for layout, operation in itertools.product((-1, 3, 2**31 - 1), operations):
         c.scenery.layout[4] = layout
-        for operation in (engine.physics, engine.observe, engine.render):
-            operation(c.scenery, c.agents)
-        spawn.resample = False
-        spawn(c.agent_full(True))
         try:
+            operation()
             engine.check(c.agents)
         except engine.EngineError:
             c.scenery.layout[4] = 0
@@ -33,15 +42,22 @@ def out_of_range(c, spawn):
             raise AssertionError("a bad layout was not flagged")
 
 
-def main():
+def step(env, n_lanes, action):
+    """Steps an environment. On the CPU an action out of range raises at once."""
+    actions = torch.full((n_lanes, 1), action, device=env.device)
+    with contextlib.suppress(engine.EngineError):
+        env.step(arrdict.arrdict(actions=actions))
+
+
+def main(device):
     homes = sample("bench", 3)
     for n_agents, res, cameras in [(1, 63, None), (4, 96, [0, 120, 240])]:
         c = core.Core(
-            scene.scenery(homes, n_agents, n_envs=5, device="cuda"), res=res, cameras=cameras
+            scene.scenery(homes, n_agents, n_envs=5, device=device), res=res, cameras=cameras
         )
         spawn = RandomSpawns(homes, c, resample=True)
         words = -(-c.scenery.layouts.max_texels // 32)
-        seen = torch.zeros((5, n_agents, words), dtype=torch.int32, device="cuda")
+        seen = torch.zeros((5, n_agents, words), dtype=torch.int32, device=device)
         for _ in range(3):
             spawn(c.agent_full(True))
             c.agents.velocity.fill_(3.0)
@@ -57,25 +73,24 @@ def main():
             )
             engine.render(c.scenery, c.agents)
         out_of_range(c, spawn)
-    for env in (envs.Explorer(7, homes, device="cuda"), envs.Minimal(7, homes, device="cuda")):
+    for env in (envs.Explorer(7, homes, device=device), envs.Minimal(7, homes, device=device)):
         env.reset()
         for action in range(7):
-            env.step(arrdict.arrdict(actions=torch.full((7, 1), action, device="cuda")))
+            step(env, 7, action)
     for n_agents in (2, 16):
-        env = envs.Deathmatch(7, homes, n_agents=n_agents, device="cuda", damage=1, privileged=True)
+        env = envs.Deathmatch(7, homes, n_agents=n_agents, device=device, damage=1, privileged=True)
         env.reset()
         for action in (*range(7), 7) * 5:
-            actions = torch.full((7 * n_agents, 1), action, device="cuda")
-            env.step(arrdict.arrdict(actions=actions))
+            step(env, 7 * n_agents, action)
     for settings in (dict(), dict(self_play=True), dict(pixels=True, points=2)):
-        env = envs.Pong(67, device="cuda", **settings)
+        env = envs.Pong(67, device=device, **settings)
         env.reset()
         for action in (*range(3), 7) * 20:
-            actions = torch.full((67 * env.n_agents, 1), action, device="cuda")
-            env.step(arrdict.arrdict(actions=actions))
-    torch.cuda.synchronize()
+            step(env, 67 * env.n_agents, action)
+    if device == "cuda":
+        torch.cuda.synchronize()
     print("done")
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:] or ["cuda"])

@@ -4,14 +4,23 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")  # each worker imports torch, in seconds
 
+import copy
 import ctypes
+import functools
 import subprocess
 from pathlib import Path
 
+import loky
 import pytest
 import torch
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.utils import JobRuntime
 
+from tests.helpers.in_this_process import InThisProcess
+
+CONFIGS = Path(__file__).parents[1] / "configs"
 torch.set_num_threads(1)
 
 
@@ -26,6 +35,64 @@ def pytest_collection_modifyitems(items):
 def device(request):
     """Each device in turn, for tests that hold on both."""
     return request.param
+
+
+@pytest.fixture(scope="session", autouse=True)
+def composed_once():
+    """Has Hydra compose the same words, and list a group's files, once per session.
+
+    Each takes a tenth of a second or more, and tests repeat the same few. Folders other than
+    configs/ are read anew.
+    """
+    load, list_options = ConfigLoaderImpl.load_configuration, ConfigLoaderImpl.get_group_options
+    cached = {}
+
+    def once(loader, method, *arguments, **options):
+        paths = [entry.path for entry in loader.get_search_path().get_path()]
+        folders = [path for path in paths if not path.startswith(("pkg://", "structured://"))]
+        if [Path(folder).resolve() for folder in folders] != [CONFIGS]:
+            return method(loader, *arguments, **options)
+        key = str((method, JobRuntime.instance().get("name"), arguments, options))
+        if key not in cached:
+            cached[key] = method(loader, *arguments, **options)
+        return copy.deepcopy(cached[key])
+
+    def load_once(loader, *arguments, **options):
+        config = once(loader, load, *arguments, **options)
+        config.hydra.runtime.cwd = os.getcwd()
+        return config
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ConfigLoaderImpl, "load_configuration", load_once)
+        patch.setattr(
+            ConfigLoaderImpl, "get_group_options", functools.partialmethod(once, list_options)
+        )
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_curves():
+    """Leaves out curves.png, which is most of the time of a short run. Yields what draws it."""
+    from megastep.agents.training import curves
+
+    plot_curves = curves.plot_curves
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(curves, "plot_curves", lambda folder: None)
+        yield plot_curves
+
+
+@pytest.fixture
+def with_curves(no_curves, monkeypatch):
+    """Has runs in this test draw curves.png."""
+    monkeypatch.setattr("megastep.agents.training.curves.plot_curves", no_curves)
+
+
+@pytest.fixture
+def drawn_in_this_process(monkeypatch):
+    """Replaces pools of worker processes, which test_recording.py and scripts in processes of their
+    own have.
+    """
+    monkeypatch.setattr(loky, "ProcessPoolExecutor", InThisProcess)
 
 
 @pytest.fixture(scope="session")

@@ -260,6 +260,7 @@ def test_pytrees_keep_the_type(kind):
     assert paths == ["['a']", "['b']['c']"]
 
 
+@pytest.mark.slow
 def test_torch_compile_with_trees():
     def f(tree):
         total = tree.a * 2 + tree.b.c

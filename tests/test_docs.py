@@ -25,7 +25,13 @@ def commands():
                 yield page.name, script, re.sub(r" +# .*", "", arguments)
 
 
-@pytest.mark.parametrize("page, script, arguments", list(commands()))
+@pytest.mark.parametrize(
+    "page, script, arguments",
+    [
+        pytest.param(*command, marks=[] if command[0] == "README.md" else pytest.mark.slow)
+        for command in commands()
+    ],
+)
 def test_command_composes(page, script, arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code = MAINS[script]([*shlex.split(arguments), "--cfg", "job"])

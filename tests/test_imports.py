@@ -109,11 +109,18 @@ MODULES = {module_name(path): path for path in SOURCES}
 
 def running_nodes(tree):
     """All nodes of a syntax tree, without the bodies of `if TYPE_CHECKING:`."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            continue
-        yield node
-        yield from running_nodes(node)
+    nodes = [tree]
+    while nodes:
+        for node in ast.iter_child_nodes(nodes.pop()):
+            if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+                continue
+            yield node
+            nodes.append(node)
+
+
+def called(node):
+    """The name of a called function or method."""
+    return getattr(node.func, "attr", getattr(node.func, "id", None))
 
 
 def imports(path):
@@ -131,7 +138,7 @@ def imports(path):
             for alias in node.names:
                 submodule = f"{base}.{alias.name}"
                 names.add(submodule if submodule in MODULES else base)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+        elif isinstance(node, ast.Call) and called(node) == "import_module":
             names.update(arg.value for arg in node.args if isinstance(arg, ast.Constant))
     return names
 

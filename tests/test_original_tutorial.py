@@ -180,7 +180,7 @@ def test_random_actions_run():
     assert ((positions > 1 + 0.1) & (positions < 6 - 0.1)).all()
 
 
-def test_the_whole_notebook_records_a_video(tmp_path):
+def test_the_whole_notebook_records_a_video(tmp_path, drawn_in_this_process):
     import av
 
     names = notebook("plot state")

@@ -176,6 +176,12 @@ def learn(env, n_updates, policy=None, name="ppo", **settings):
     return policy, *counts.tolist()
 
 
+#: The fast tests have one learner, the slow ones all.
+ONE_OR_ALL = [
+    name if name == "ppo" else pytest.param(name, marks=pytest.mark.slow) for name in LEARNERS
+]
+
+
 class NeverResets(Policy):
     """A policy whose hidden state leaks from one episode into the next."""
 
@@ -189,7 +195,7 @@ def test_learns_bandit(name):
     assert rewards / ends > 0.9
 
 
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", ONE_OR_ALL)
 def test_learns_corridor(name):
     """The shortest way takes 6 steps. A random policy arrives in a third of the episodes. R2D2
     takes some random actions while it learns.
@@ -198,7 +204,7 @@ def test_learns_corridor(name):
     assert valid / rewards < (8 if name == "r2d2" else 7)
 
 
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", ONE_OR_ALL)
 def test_remembers_cue(name):
     """A policy without a hidden state earns 1/4. Of R2D2's actions 14 % are random, and three in
     four of these are wrong, so that it earns 0.9 at best.
@@ -207,6 +213,7 @@ def test_remembers_cue(name):
     assert rewards / ends > (0.85 if name == "r2d2" else 0.9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "core, min_return, max_return", [("gru", 0.9, 1), ("mingru", 0.9, 1), ("none", 0.1, 0.4)]
 )
@@ -217,6 +224,7 @@ def test_recurrent_cores_remember_cue(core, min_return, max_return):
     assert min_return < rewards / ends <= max_return
 
 
+@pytest.mark.slow
 def test_hidden_state_is_reset_with_episode():
     env, settings = Clock(), dict(n_updates=60, lr=1e-2, entropy_coef=0.03)
     _, rewards, _, valid, _ = learn(env, **settings)
@@ -226,6 +234,7 @@ def test_hidden_state_is_reset_with_episode():
     assert rewards / valid < 0.5  # no observation shows when an episode begins
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ends, expected",
     [
@@ -241,6 +250,7 @@ def test_truncated_bootstraps_and_terminal_does_not(ends, expected):
     torch.testing.assert_close(value, torch.full((12,), expected), rtol=0.1, atol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "critic, min_explained, max_explained", [("asymmetric", 0.95, 1), ("plain", -0.1, 0.1)]
 )

@@ -87,6 +87,7 @@ def compositions():
             yield [(file, values(file, name)) for file in order]
 
 
+@pytest.mark.slow
 def test_no_config_value_is_unused_or_repeated(monkeypatch):
     written, in_force, twice = set(), set(), set()
     for gpu in (False, True):

@@ -1,5 +1,5 @@
-"""The package as a user installs it: the wheel's contents, and a wheel installed in a fresh virtual
-environment beside the OpenAI Agents SDK. Tests that install are slow: they download PyTorch.
+"""The package as a user installs it: the wheel's contents; the wheel in a virtual environment with
+the dependencies of this one; and, nightly, in one that downloads them and the OpenAI Agents SDK.
 """
 
 import os
@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tarfile
 import zipfile
 from pathlib import Path
@@ -56,6 +57,20 @@ def source(tmp_path_factory):
 @pytest.fixture(scope="module")
 def wheel(source, tmp_path_factory):
     return build_wheel(source, tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """The interpreter of a virtual environment with the wheel, and this one's packages below."""
+    folder = tmp_path_factory.mktemp("installed")
+    python = folder / "bin" / "python"
+    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+    command = [str(python), "-m", "pip", "install", "-q", "--no-index", "--no-deps", str(wheel)]
+    subprocess.run(command, check=True, env=ENVIRONMENT, cwd=folder)
+    (packages,) = folder.glob("lib/*/site-packages")
+    # such a path is searched last, and .pth files in it, as that of this checkout, are not read
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    return python
 
 
 @pytest.fixture(scope="module")
@@ -135,10 +150,35 @@ def test_sdist_builds_the_same_wheel(wheel, source, tmp_path):
     assert names_in(build_wheel(unpacked, tmp_path)) == names_in(wheel)
 
 
-# ---- A fresh virtual environment ----
+# ---- Installed ----
+
+
+def commands(python, folder, cache):
+    """Returns a function that runs the command `megastep` in a folder, and returns its output."""
+    folder.mkdir()
+
+    def megastep(*arguments, returncode=0):
+        command = [python.with_name("megastep"), *arguments]
+        return run(command, folder, returncode, MEGASTEP_CACHE=str(cache))
+
+    return megastep
 
 
 @pytest.mark.slow
+def test_installed_command_trains_evaluates_and_records(installed, tmp_path):
+    megastep = commands(installed, tmp_path / "empty", tmp_path / "cache")
+    assert "Traceback" not in megastep("train", *tiny.TINY, "samples=64", "folder=run")
+    assert "trained" in megastep("evaluate", "run=run", "episodes=4")
+    megastep("record", "run=latest", "steps=3")
+    assert (tmp_path / "empty/run/video.mp4").exists()
+    errors = megastep("train", "lr=1", returncode=2)
+    assert "lr" in errors and "learner.lr" in errors
+    config = yaml.safe_load(megastep("train", "--cfg", "job", "env=pong"))
+    assert config["env"]["name"] == "megastep.envs.pong:Pong"
+    assert re.match(r"megastep-flatland \d", megastep("--version"))
+
+
+@pytest.mark.nightly
 def test_installed_beside_openai_agents(python, tmp_path):
     """`agents` is OpenAI's and `megastep.agents` is ours, in one process."""
     code = """
@@ -155,7 +195,7 @@ print(agents.Agent.__module__, agents.__file__, megastep.agents.__file__)
     assert "agents/agent.py" in files
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_installed_package_claims_no_other_import_name(python, tmp_path):
     for name in ("train", "evaluate", "configs", "scripts", "tests", "hydra_plugins"):
         output = run([python, "-c", f"import {name}"], tmp_path, returncode=1)
@@ -164,25 +204,10 @@ def test_installed_package_claims_no_other_import_name(python, tmp_path):
     assert not any(name in packages for name in ("wandb", "optuna", "pytest"))
 
 
-@pytest.mark.slow
-def test_installed_command_trains_evaluates_and_records(python, tmp_path):
-    folder = tmp_path / "empty"
-    folder.mkdir()
-
-    def megastep(*arguments, returncode=0):
-        command = [python.with_name("megastep"), *arguments]
-        return run(command, folder, returncode, MEGASTEP_CACHE=str(tmp_path / "cache"))
-
-    assert "Traceback" not in megastep("train", *tiny.TINY, "samples=64", "folder=run")
-    assert "trained" in megastep("evaluate", "run=run", "episodes=4")
-    megastep("record", "run=latest", "steps=3")
-    assert (folder / "run/video.mp4").exists()
+@pytest.mark.nightly
+def test_sweeps_without_the_extra_packages(python, tmp_path):
+    megastep = commands(python, tmp_path / "empty", tmp_path / "cache")
     sweep = ["-m", "seed=1,2", "samples=64", "hydra.sweep.dir=mine"]
     assert "sweep.md" in megastep("train", *tiny.TINY, *sweep)
-    errors = megastep("train", "lr=1", returncode=2)
-    assert "lr" in errors and "learner.lr" in errors
-    config = yaml.safe_load(megastep("train", "--cfg", "job", "env=pong"))
-    assert config["env"]["name"] == "megastep.envs.pong:Pong"
     error = megastep("train", "hydra/launcher=joblib", "-m", returncode=2)
     assert "pip install 'megastep-flatland[sweep]'" in error
-    assert re.match(r"megastep-flatland \d", megastep("--version"))

@@ -132,7 +132,7 @@ def test_training_survives_a_failed_video(trained, tmp_path, monkeypatch, capsys
     assert not list(tmp_path.glob("runs/*/*.mp4"))
 
 
-def test_training_without_the_encoder(tmp_path, monkeypatch, capsys):
+def test_training_without_the_encoder(tmp_path, monkeypatch, capsys, with_curves):
     monkeypatch.chdir(tmp_path)
     faults.not_installed(monkeypatch, "av")
     assert train.main([*TINY, "finish.record=true"]) == 0

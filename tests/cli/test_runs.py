@@ -16,6 +16,7 @@ from megastep.agents.cli import runs, scripts
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.program import UserError
 from megastep.agents.cli.runs import locked
+from tests.helpers.processes import HUNG
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -134,17 +135,21 @@ def test_lock_names_the_process(here):
 
 
 HOLDS = """
-import pathlib, sys, time
+import pathlib, sys
 from megastep.agents.cli.runs import locked
 with locked(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
-    time.sleep(60)
+    sys.stdin.read()
 """
 
 
 def test_lock_of_a_killed_process(here):
     holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDS, here], cwd=ROOT, text=True, stdout=subprocess.PIPE
+        [sys.executable, "-c", HOLDS, here],
+        cwd=ROOT,
+        text=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
     )
     assert holder.stdout.readline() == "held\n"
     with pytest.raises(UserError, match=f"process {holder.pid}"), locked(here):
@@ -186,8 +191,30 @@ def test_file_system_without_locks(here, monkeypatch, capsys):
         assert "file system without locks" in capsys.readouterr().err
 
 
+def test_lock_refuses_all_but_one(here):
+    inside, refused, start, decided = [], [], threading.Barrier(8), threading.Event()
+
+    def work():
+        start.wait()
+        try:
+            with locked(here):
+                inside.append(1)
+                decided.wait(HUNG)
+        except UserError:
+            refused.append(1)
+            if len(refused) == 7:
+                decided.set()
+
+    threads = [threading.Thread(target=work) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (len(inside), len(refused)) == (1, 7) and not (here / "lock").exists()
+
+
 def test_lock_excludes_threads(here):
-    inside, most, refused = [], [], []
+    inside, most = [], []
 
     def work():
         for _ in range(50):
@@ -198,11 +225,11 @@ def test_lock_excludes_threads(here):
                     time.sleep(1e-4)
                     inside.pop()
             except UserError:
-                refused.append(1)
+                pass
 
     threads = [threading.Thread(target=work) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert set(most) == {1} and refused and not (here / "lock").exists()
+    assert set(most) == {1} and not (here / "lock").exists()

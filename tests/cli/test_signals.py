@@ -12,16 +12,30 @@ import time
 import pytest
 
 from megastep import recording
-from megastep.agents.cli import factory, train
+from megastep.agents.cli import factory, signals, train
 from megastep.agents.storage.collector import Collector
 from megastep.agents.training import checkpoint, checkpoint_format, evaluation, loggers
 from tests.helpers import tiny
+from tests.helpers.processes import HUNG, wait_until
 
 ROOT = pathlib.Path(__file__).parents[2]
 TINY = [*tiny.TINY, "log_every=1"]
 UPDATE = tiny.UPDATE
 WHOLE = ["finish.evaluate=true", "finish.episodes=4", "finish.record=true", "finish.steps=3"]
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+ONE_SIGNAL = [SIGNALS[0], *(pytest.param(n, marks=pytest.mark.slow) for n in SIGNALS[1:])]
+
+
+def pairs(moments):
+    """All pairs of a moment and a signal. Those with a signal each are fast, the rest is slow."""
+    once = {*zip(moments, SIGNALS)}
+    return [
+        (moment, number)
+        if (moment, number) in once
+        else pytest.param(moment, number, marks=pytest.mark.slow)
+        for moment in moments
+        for number in SIGNALS
+    ]
 
 
 @pytest.fixture(autouse=True)
@@ -61,11 +75,10 @@ def setting_up(monkeypatch, number):
     signalled(monkeypatch, factory, "make_learner", number, call=1)
 
 
-@pytest.mark.parametrize("number", SIGNALS)
-@pytest.mark.parametrize("moment", [composing, setting_up])
+@pytest.mark.parametrize("moment, number", pairs([composing, setting_up]))
 def test_signal_before_training(here, monkeypatch, capsys, moment, number):
     moment(monkeypatch, number)
-    assert train.main([*TINY, "seconds=60", "folder=run"]) == 128 + number
+    assert train.main([*TINY, "samples=1e9", "folder=run"]) == 128 + number
     assert capsys.readouterr().err == f"train.py: stopped by {number.name}\n"
     assert not (here / "run").exists()
 
@@ -84,12 +97,11 @@ def saving(monkeypatch, number):
     )  # in the second checkpoint
 
 
-@pytest.mark.parametrize("number", SIGNALS)
-@pytest.mark.parametrize("moment", [collecting, reporting, saving])
+@pytest.mark.parametrize("moment, number", pairs([collecting, reporting, saving]))
 def test_signal_while_training(here, monkeypatch, capsys, moment, number):
     moment(monkeypatch, number)
     assert (
-        train.main([*TINY, "seconds=60", "folder=run", "checkpoint_seconds=1e-9"]) == 128 + number
+        train.main([*TINY, "samples=1e9", "folder=run", "checkpoint_seconds=1e-9"]) == 128 + number
     )
     expected = (
         f"train.py: Stopped after {2 * UPDATE} samples. To continue: python train.py resume=run\n"
@@ -109,9 +121,7 @@ def filming(monkeypatch, number):
 
 
 # filming, which is slow, gets the others in test_record.py
-@pytest.mark.parametrize(
-    "moment, number", [*((evaluating, number) for number in SIGNALS), (filming, signal.SIGHUP)]
-)
+@pytest.mark.parametrize("moment, number", [*pairs([evaluating]), (filming, signal.SIGHUP)])
 def test_signal_after_training(here, monkeypatch, capsys, moment, number):
     moment(monkeypatch, number)
     assert train.main([*TINY, f"samples={UPDATE}", "folder=run", *WHOLE]) == 128 + number
@@ -131,8 +141,9 @@ def test_signal_stops_a_sweep(here, monkeypatch, capsys):
 
 def test_double_signal_counts_once(here, monkeypatch):
     """coreutils' timeout sends two, and so do a shell and the system when a terminal is closed."""
+    monkeypatch.setattr(signals, "SAME", 3600)  # seconds: the second one is never late
     signalled(monkeypatch, Collector, "__call__", signal.SIGTERM, signal.SIGTERM)
-    assert train.main([*TINY, "seconds=60", "folder=run"]) == 143
+    assert train.main([*TINY, "samples=1e9", "folder=run"]) == 143
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == 2 * UPDATE
 
 
@@ -152,17 +163,17 @@ from megastep.agents.cli import train
 
 def write(*arguments):
     print("stuck", flush=True)
-    time.sleep(60)
+    time.sleep(3600)
 
 loggers.Loggers.write = write
 sys.exit(train.main(sys.argv[1:]))
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", ONE_SIGNAL[:2])
 def test_second_signal_quits(here, number):
     process = subprocess.Popen(
-        [sys.executable, "-c", STUCK, *TINY, "seconds=60", "folder=run"],
+        [sys.executable, "-c", STUCK, *TINY, "samples=1e9", "folder=run"],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         text=True,
         stdout=subprocess.PIPE,
@@ -173,7 +184,7 @@ def test_second_signal_quits(here, number):
     assert "again" in process.stdout.readline() + process.stdout.readline()
     time.sleep(0.5)
     process.send_signal(number)
-    assert process.wait(timeout=5) == 128 + number
+    assert process.wait(timeout=HUNG) == 128 + number
 
 
 def launched(*arguments, script="train", **environment):
@@ -194,19 +205,18 @@ def is_caught(process, number):
     return bool(int(mask, 16) >> number - 1 & 1)
 
 
-@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("number", ONE_SIGNAL)
 def test_signal_during_imports(here, number):
-    process = launched(*TINY, "seconds=60")
-    while not is_caught(process, signal.SIGTERM) or not is_caught(process, number):
-        assert process.poll() is None
-        time.sleep(0.005)
+    process = launched(*TINY, "samples=1e9")
+    wait_until(lambda: is_caught(process, signal.SIGTERM) and is_caught(process, number), process)
     process.send_signal(number)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=HUNG)
     assert process.returncode == 128 + number and out == ""
     assert err == f"train.py: stopped by {number.name}\n"
     assert not any(here.iterdir())
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_compiling(here):
     """A terminal's Ctrl-C reaches the compiler as well, which then fails."""
     compiler = here / "compiler"
@@ -214,22 +224,21 @@ def test_ctrl_c_while_compiling(here):
     compiler.write_text("\n".join(lines) + "\n")
     compiler.chmod(0o755)
     cache = str(here / "cache")
-    process = launched(*TINY, "seconds=60", "folder=run", CXX=str(compiler), MEGASTEP_CACHE=cache)
-    _, err = process.communicate(timeout=60)
+    process = launched(*TINY, "samples=1e9", "folder=run", CXX=str(compiler), MEGASTEP_CACHE=cache)
+    _, err = process.communicate(timeout=HUNG)
     assert (process.returncode, err) == (130, "train.py: stopped by SIGINT\n")
     assert not (here / "run").exists()
 
 
+@pytest.mark.slow
 def test_closed_terminal_while_filming(here):
     """The signal reaches this process, its workers and their resource tracker."""
     filming = ["finish.record=true", "finish.steps=5000"]
     process = launched(*TINY, f"samples={UPDATE}", "folder=run", *filming)
     children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    while len(children.read_text().split()) < 2:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.01)
+    wait_until(lambda: len(children.read_text().split()) > 1, process)
     os.killpg(process.pid, signal.SIGHUP)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=HUNG)
     assert (process.returncode, err) == (129, "train.py: stopped by SIGHUP\n")
 
 
@@ -245,7 +254,7 @@ def at_any_moment(here, seed):
         os.killpg(process.pid, number)  # as a terminal does: workers get it, too
     else:
         process.send_signal(number)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=HUNG)
     case = (seed, number.name, process.returncode, out, err)
     if process.returncode == -number or (number == signal.SIGINT and "runpy" in err):
         assert not folder.exists(), case  # before the script's first line
@@ -267,7 +276,12 @@ def at_any_moment(here, seed):
         assert not folder.exists(), case
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(100))
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(seed, marks=pytest.mark.slow if seed < 10 else pytest.mark.nightly)
+        for seed in range(50)
+    ],
+)
 def test_signal_at_a_random_moment(here, seed):
     at_any_moment(here, seed)

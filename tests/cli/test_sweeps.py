@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 
 import cloudpickle
 import pytest
@@ -27,6 +26,7 @@ from megastep.agents.cli.program import ConfigErrors
 from megastep.agents.cli.settings import kind_of
 from megastep.agents.cli.signals import Interrupted
 from megastep.agents.training import loggers
+from tests.helpers.processes import HUNG, wait_until
 
 ROOT = pathlib.Path(__file__).parents[2]
 PAYER = '''
@@ -117,7 +117,7 @@ def start(*words, **environment):
 def finished(*words):
     """Runs train.py. Returns (exit code, stdout, stderr)."""
     process = start(*words)
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=HUNG)
     return process.returncode, out, err
 
 
@@ -145,7 +145,9 @@ def test_sweep_folders_and_table(here, capsys):
     assert runs.find("latest") == pathlib.Path("mine/3_env.pay=3_seed=2")
 
 
-@pytest.mark.parametrize("more", [[], ["hydra.sweeper.max_batch_size=1"]])
+@pytest.mark.parametrize(
+    "more", [[], pytest.param(["hydra.sweeper.max_batch_size=1"], marks=pytest.mark.slow)]
+)
 def test_failed_jobs(here, capsys, more):
     words = [*SHORT, "-m", "env.mood=cross,fine,cross", "hydra.sweep.dir=mine", *more]
     assert train.main(words) == 1
@@ -200,6 +202,7 @@ def test_job_refuses_a_used_folder(here):
     assert (here / "mine/0_default/metrics.jsonl").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_paths_with_hydra_job_chdir(here):
     assert train.main([*SHORT, "folder=first", "hydra.job.chdir=true"]) == 0
     assert os.getcwd() == str(here) and (here / "first/checkpoints").is_dir()
@@ -216,6 +219,7 @@ def test_hydra_run_dir_is_the_folder(here, capsys):
     assert "folder: no such key" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_wandb_group_of_a_sweep(here, monkeypatch):
     loggers_added = []
     monkeypatch.setattr(
@@ -237,6 +241,7 @@ def test_wandb_group_of_a_sweep(here, monkeypatch):
 # ---- Other launchers and sweepers ----
 
 
+@pytest.mark.slow
 def test_joblib(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
@@ -248,20 +253,24 @@ def test_joblib(here):
     assert "job 0: Training on cpu in mine/0_env.pay=1" in out
 
 
+@pytest.mark.slow
 def test_signal_saves_jobs_in_other_processes(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
-    process, deadline = start(*SMALL, "seconds=100", "-m", "seed=1,2,3", *words), time.time() + 60
-    while sum(path.stat().st_size > 0 for path in here.glob("mine/*/metrics.jsonl")) < 2:
-        assert process.poll() is None and time.time() < deadline, process.communicate()
-        time.sleep(0.1)
+    process = start(*SMALL, "samples=1e12", "-m", "seed=1,2,3", *words)
+
+    def n_learning():
+        return sum(path.stat().st_size > 0 for path in here.glob("mine/*/metrics.jsonl"))
+
+    wait_until(lambda: n_learning() == 2, process)
     process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=HUNG)
     assert process.returncode == 143 and err.splitlines()[-1] == "train.py: stopped by SIGTERM"
     assert [row["state"][:11] for row in rows("mine")] == ["interrupted", "interrupted"]
     assert len(list(here.glob("mine/*/checkpoints/step_*"))) == 2
 
 
+@pytest.mark.slow
 def test_optuna_maximises_and_skips_failed_trials(here):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
     words = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=4", "hydra.sweeper.n_jobs=1"]
@@ -282,6 +291,7 @@ def test_optuna_maximises_and_skips_failed_trials(here):
     assert set(best["best_params"]) == {"env.pay", "env.mood"}
 
 
+@pytest.mark.slow
 def test_submitit(here):
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     code, _, err = finished(
@@ -293,6 +303,7 @@ def test_submitit(here):
     assert list((here / "mine/.submitit").rglob("*_log.out"))
 
 
+@pytest.mark.slow
 def test_killed_job(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
@@ -388,6 +399,7 @@ def test_score_counts_every_episode_once(here):
 # ---- --config-dir; completion ----
 
 
+@pytest.mark.slow
 def test_config_dir_and_config_name(here, capsys):
     files = {
         "env/mine.yaml": "name: payer:Payer\npay: 7\n",

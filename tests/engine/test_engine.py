@@ -80,23 +80,29 @@ VIEWS = [
 ]
 
 
-@pytest.mark.parametrize("n_agents", [1, 4])
+ROUNDS = [(1, 0), (1, 1), (4, 0), (4, 1)]  # number of agents and seed, in the slow tests
+
+
+@pytest.mark.parametrize(
+    "n_envs, n_agents, seed",
+    [(2, 1, 0), (2, 4, 1), *(pytest.param(4, n, s, marks=pytest.mark.slow) for n, s in ROUNDS)],
+)
 @pytest.mark.parametrize("view", VIEWS, ids=str)
 @pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
-def test_render_matches_twin(view, n_agents, degenerate, device, poison):
-    for seed in range(2):
-        envs = random_scenery.random_environments(
-            seed,
-            n_agents=n_agents,
-            degenerate=degenerate,
-            res=view["res"],
-            fov=view["fov"],
-            origin=190.0 if seed else 1.0,
-        )
-        core = core_of(envs, device, **view)
-        r = baked_and_rendered(core, poison)
-        compare.check_render(r, envs, **view)
-        compare.check_baked(core.scenery.baked.vals, envs, static_only=False)
+def test_render_matches_twin(view, n_envs, n_agents, seed, degenerate, device, poison):
+    envs = random_scenery.random_environments(
+        seed,
+        n_envs,
+        n_agents,
+        degenerate=degenerate,
+        res=view["res"],
+        fov=view["fov"],
+        origin=190.0 if seed else 1.0,
+    )
+    core = core_of(envs, device, **view)
+    r = baked_and_rendered(core, poison)
+    compare.check_render(r, envs, **view)
+    compare.check_baked(core.scenery.baked.vals, envs, static_only=False)
 
 
 @pytest.mark.parametrize("n_agents", [1, 4])

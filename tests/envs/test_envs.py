@@ -40,6 +40,10 @@ SHORT = {
 }
 
 
+#: The slow tests have all settings, the fast ones those of each environment's first line.
+FIRST = [name if "," not in name else pytest.param(name, marks=pytest.mark.slow) for name in SHORT]
+
+
 @pytest.fixture(params=DEVICES)
 def device(request):
     if request.param == "cuda" and not GPU:
@@ -115,7 +119,7 @@ def test_desynced_lanes_are_in_the_middle_of_their_episodes(name, settings, devi
     assert torch.equal(world.truncated, ages[2] + 1 >= new_limits) and world.truncated.any()
 
 
-@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize("name", FIRST)
 def test_equal_seeds_give_equal_episodes(name, device):
     first, second, other = (
         contract.rollout(make(name, device, seed=seed), 20, check=False) for seed in (1, 1, 2)
@@ -124,7 +128,7 @@ def test_equal_seeds_give_equal_episodes(name, device):
     assert not contract.same(arrdict.stack(first).obs, arrdict.stack(other).obs)
 
 
-@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize("name", FIRST)
 def test_decision_after_the_end_of_an_episode_is_ignored(name):
     a, b = make(name), make(name)
     worlds, generator, n_ignored = [a.reset(), b.reset()], torch.Generator().manual_seed(3), 0
@@ -139,7 +143,7 @@ def test_decision_after_the_end_of_an_episode_is_ignored(name):
     assert n_ignored
 
 
-@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize("name", FIRST)
 def test_state_is_drawn_and_does_not_change_the_environment(name, device):
     env = make(name, device)
     contract.rollout(env, 3, check=False)
@@ -301,7 +305,7 @@ def test_envs_holds_the_modules_that_have_an_environment():
     assert "common" not in envs.ENVS and envs.ENVS["explorer"] is envs.Explorer
 
 
-@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize("name", FIRST)
 def test_display_draws_the_current_state(name):
     env = make(name)
     env.reset()

@@ -340,6 +340,7 @@ def rows_of(run):
     return json.loads(newest.read_text())["rows"]
 
 
+@pytest.mark.usefixtures("drawn_in_this_process")
 def test_evaluate_self_play_against_itself_and_the_tracker(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small = ["env.n_envs=8", "learner.n_minibatches=2", "agent.width=8", "device=cpu"]
@@ -367,7 +368,8 @@ def test_evaluation_refuses_other_spaces(tmp_path, monkeypatch, capsys):
 def test_recipe_beats_the_tracker(tmp_path, monkeypatch):
     """Random actions win 0.15 of the points, following the ball 0.7, the whole recipe 0.98."""
     monkeypatch.chdir(tmp_path)
-    words = ["experiment=pong", "samples=3e6", "device=cpu", "finish.record=false", "folder=run"]
+    words = ["experiment=pong", "samples=3e6", "seconds=null", "device=cpu", "folder=run"]
+    words += ["finish.record=false"]
     assert train.main(words) == 0
     trained, random = rows_of("run")
     assert trained["metrics"]["points_won"]["lower"] > 0.8

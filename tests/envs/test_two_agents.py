@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from megastep import arrdict, capture, contract, plotting
-from megastep.agents.cli import evaluate, record, train
+from megastep.agents.cli import train
 from megastep.agents.training import checkpoint
+from tests.helpers import pages
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "new-environment.md"
-MAINS = {"train.py": train.main, "evaluate.py": evaluate.main, "record.py": record.main}
 SMALL = ["preset=cpu", "learner.n_steps=8", "learner.n_minibatches=2", "agent.width=8"]
 
 
@@ -37,12 +37,13 @@ def convoy(section, tmp_path, monkeypatch):
     del sys.modules["convoy"]
 
 
+@pytest.mark.usefixtures("drawn_in_this_process")
 def test_commands_train_evaluate_and_record(section, convoy, tmp_path, capsys):
     pytest.importorskip("av")
     commands = re.findall(r"^python (\S+\.py) (.*)$", section, re.M)
-    assert [script for script, _ in commands] == list(MAINS)
+    assert [script for script, _ in commands] == list(pages.MAINS)
     for script, words in commands:
-        assert MAINS[script](shlex.split(words)) == 0
+        assert pages.MAINS[script](pages.few(script, shlex.split(words))) == 0
     output = capsys.readouterr().out
     (run,) = (path for path in (tmp_path / "runs").iterdir() if path.is_dir())
     last = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])

@@ -242,22 +242,21 @@ def test_flipped_bits_give_a_geometry_or_a_value_error(tmp_path):
     assert n_refused > 200
 
 
-def test_a_zip_bomb_costs_little_memory_and_time(tmp_path):
+def test_a_zip_bomb_costs_little_memory(tmp_path):
     masks = {f"{i}/masks.npy": bytes(30 << 20) for i in range(1, 12)}
     path = write_box(tmp_path / "bomb.npz", **masks)
     script = (
-        "import re, sys, time; from megastep.geometries import files; start = time.time()\n"
+        "import re, sys; from megastep.geometries import files\n"
         "try: files.load(sys.argv[1])\nexcept ValueError as error: print(error)\n"
         # of this program alone, unlike ru_maxrss
         "peak = re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read())\n"
-        "print(time.time() - start, int(peak[1])/1024)"
+        "print(int(peak[1]) / 1024)"
     )
     run = subprocess.run(
         [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True
     )
-    message, measured = run.stdout.strip().split("\n")
-    seconds, megabytes = map(float, measured.split())
-    assert "unpacks to 346" in message and seconds < 5 and megabytes < 500
+    message, megabytes = run.stdout.strip().split("\n")
+    assert "unpacks to 346" in message and float(megabytes) < 500
 
 
 def test_too_many_geometries_are_refused(tmp_path, monkeypatch):

@@ -337,7 +337,7 @@ def test_explorer_runs_in_mazes():
 def test_two_thousand_mazes_take_seconds():
     start = time.process_time()
     sample("maze", 2_000)
-    assert time.process_time() - start < 8  # seconds; 2 on one core of an EPYC
+    assert time.process_time() - start < 20  # seconds, ten times what one core takes
 
 
 def test_show_mazes_draws_every_maze():

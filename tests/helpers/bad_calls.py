@@ -554,8 +554,15 @@ def _call(table, i, name, value):
 
 
 def cases(device):
-    for source in (wrong_arguments, replacements, resizings, others):
-        yield from source(device)
+    """(label, name, act, environments) of every call. Refused arguments change no environment, so
+    those calls share one; the others get their own.
+    """
+    for label, name, act in wrong_arguments(device):
+        if name is None:
+            shared = fixture(device)
+        yield label, name, act, shared
+    for source in (replacements, resizings, others):
+        yield from ((*case, fixture(device)) for case in source(device))
 
 
 def verdict(name, act, f):
@@ -583,9 +590,9 @@ def verdict(name, act, f):
 
 def main(device):
     torch.set_num_threads(1)
-    for label, name, act in cases(device):
+    for label, name, act, environments in cases(device):
         print(json.dumps(dict(call=label)), flush=True)
-        problem = verdict(name, act, fixture(device))
+        problem = verdict(name, act, environments)
         if device != "cpu":
             torch.cuda.synchronize()
         print(json.dumps(dict(call=label, wrong=problem)), flush=True)

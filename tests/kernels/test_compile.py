@@ -131,6 +131,7 @@ def test_a_failing_compiler_is_quoted(tmp_path, monkeypatch):
         compile._build_cpu(ENGINE, str(false))
 
 
+@pytest.mark.slow
 @programs
 @pytest.mark.skipif(shutil.which("objdump") is None, reason="needs objdump")
 def test_no_fused_multiply_adds(kernels, tmp_path):

@@ -10,7 +10,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from test_compile import ROOT, STEP, run
@@ -18,6 +17,7 @@ from test_compile import ROOT, STEP, run
 from megastep import cache
 from megastep.kernels.build import compile
 from megastep.kernels.build.launch import ENGINE
+from tests.helpers.processes import HUNG, wait_until
 
 UNUSED = "the cache is not used"
 BODY = b"what was built " * 10_000
@@ -42,10 +42,14 @@ def built(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def quick(built, tmp_path_factory):
-    """A path for CXX: a compiler that takes one second and returns the library built before."""
+    """A path for CXX: a compiler that returns the library built before, after one second, or once
+    there is a file $MARKER.go.
+    """
     path = tmp_path_factory.mktemp("compiler") / "c++"
     path.write_text(
-        f'#!/bin/sh\n[ "$1" = --version ] && exec echo quick\ntouch "$MARKER"\nsleep 1\n'
+        '#!/bin/sh\n[ "$1" = --version ] && exec echo quick\n'
+        'if [ "$MARKER" ]; then touch "$MARKER"; for i in $(seq 9999); do '
+        '[ -e "$MARKER.go" ] && break; sleep 0.05; done; else sleep 1; fi\n'
         f'for out; do :; done\ncp {built[0]} "$out"\n'
     )
     path.chmod(0o755)
@@ -114,6 +118,7 @@ def test_damaged_file_is_built_again(fetch, damage, tmp_path):
     assert fetch(tmp_path) == (BODY, path, 0)
 
 
+@pytest.mark.slow
 def test_two_processes_build_at_once(built, quick, tmp_path):
     env = {**os.environ, "MEGASTEP_CACHE": str(tmp_path), "CXX": quick}
     command = [sys.executable, "-c", STEP]
@@ -224,6 +229,7 @@ def test_file_of_another_user_is_built_again(fetch, tmp_path):
     assert path.stat().st_uid == 0
 
 
+@pytest.mark.slow
 def test_planted_library_is_never_loaded(built, tmp_path, monkeypatch):
     """Another user left it in a shared folder, with the right name and digest. It leaves a mark if
     loaded.
@@ -269,11 +275,10 @@ def interrupted(folder, compiler, code):
         stderr=subprocess.PIPE,
         start_new_session=True,
     )
-    deadline = time.monotonic() + 60
-    while not mark.exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_until(mark.exists, process)
     os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    (folder / "mark.go").touch()
+    out, err = process.communicate(timeout=HUNG)
     return process.returncode, out.strip(), err
 
 

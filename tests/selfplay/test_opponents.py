@@ -245,7 +245,10 @@ def test_nonfinite_number_is_named_by_its_lane_in_the_environment(tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [dict(past=1.0, snapshots=2, every=10), dict(bot=1.0, scripted=Middle())],
+    [
+        dict(bot=1.0, scripted=Middle()),
+        pytest.param(dict(past=1.0, snapshots=2, every=10), marks=pytest.mark.slow),
+    ],
 )
 def test_policy_learns_to_beat_its_opponents(tmp_path, options):
     """A policy that beats its own past ends at the highest number."""

@@ -13,6 +13,7 @@ from megastep.agents.training import json_lines, loggers
 from megastep.agents.training.curves import panels_of, plot_curves
 from megastep.agents.training.loggers import Loggers
 from tests.helpers import faults
+from tests.helpers.processes import HUNG
 
 
 def test_files_and_tensorboard_hold_what_was_written(tmp_path):
@@ -276,7 +277,7 @@ run_loggers.close()"""
     process = subprocess.run(
         [sys.executable, "-W", "always::UserWarning", "-c", script],
         text=True,
-        timeout=120,
+        timeout=HUNG,
         stderr=subprocess.PIPE,
         cwd=pathlib.Path(__file__).parents[2],
     )
