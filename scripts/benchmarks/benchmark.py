@@ -87,7 +87,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--budgets", nargs="+", type=int, metavar="SECONDS", help="for train and learners"
     )
-    parser.add_argument("--envs", nargs="+", choices=COMPARED, help="for learners")
+    parser.add_argument("--envs", nargs="+", choices=COMPARED, help="for worlds and learners")
     parser.add_argument(
         "--samples", type=int, metavar="N", help="samples per run, for duels and ablation"
     )

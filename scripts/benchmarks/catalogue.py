@@ -9,6 +9,7 @@ from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, memory, pong, step
 from nsight_counters import counters
 from replay_buffer import replay
+from shortest_paths import paths
 from startup_times import compile_kernels, first_step, startup
 from training_benchmarks import ablation, duels, learners, train, worlds
 
@@ -22,6 +23,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "memory": memory,
     "replay": replay,
     "pong": pong,
+    "paths": paths,
     "compile": compile_kernels,
     "first": first_step,
     "startup": startup,

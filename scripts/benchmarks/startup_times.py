@@ -20,9 +20,10 @@ if device.type == 'cuda': torch.zeros(1, device=device)
 COMPILE_KERNELS = (
     CUDA_CONTEXT
     + """
-from megastep.kernels.build import compile
+from megastep.kernels.build import compile, launch
 start = time.perf_counter()
-compile.cuda(device.index or 0, compile.ENGINE) if device.type == 'cuda' else compile.cpu()
+engine = launch.ENGINE
+compile.cuda(engine, device.index or 0) if device.type == 'cuda' else compile.cpu(engine)
 print(time.perf_counter() - start)
 """
 )

@@ -32,6 +32,8 @@ PLACES = {
     "mazes": "geometry=maze geometry.braid=0.3",
     "a box": "geometry=box",
 }
+#: Where agents trained in those are evaluated as well: homes of another make.
+OTHER_PLACES = {"dense homes": "geometry=bench"}
 AGENTS = {"Explorer": "env=explorer", "PointGoal": "experiment=pointgoal"}
 #: Title: (overrides of training, {place: overrides of its evaluation}).
 RECIPES = {
@@ -44,7 +46,7 @@ RECIPES = {
     **{
         f"{name}, trained in {place}": (
             f"{overrides} {PLACES[place]} geometry.n=2000 seconds=60",
-            PLACES,
+            PLACES | OTHER_PLACES,
         )
         for name, overrides in AGENTS.items()
         for place in ("homes", "mazes")
@@ -114,11 +116,12 @@ def train(
             yield training_rate(what, curve)
 
 
-def worlds(device: torch.device) -> Iterator[dict]:
+def worlds(device: torch.device, envs: Sequence[str] = tuple(COMPARED)) -> Iterator[dict]:
     """Each environment's recipe, one seed: metrics of first episodes in unseen places, of the
     trained agent and of random actions.
     """
-    for title, (recipe, places) in RECIPES.items():
+    chosen = {title: recipe for title, recipe in RECIPES.items() if title.startswith(tuple(envs))}
+    for title, (recipe, places) in chosen.items():
         with trained(device, (*recipe.split(), *NO_FINISH)) as (run,):
             curve = learning_curve(run, curve_metric(title))
             seconds, samples, _ = curve[-1]
