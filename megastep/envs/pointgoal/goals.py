@@ -28,6 +28,8 @@ SOURCES = (
     *sorted(Path(__file__).with_name("kernels").iterdir()),
     Path(spawning.__file__),
 )
+#: Fields of Geodesics that are arrays of one shape for all layouts.
+REST = ("origin", "spawns", "goals", "lengths")
 N_GOALS = 16  # per layout
 N_SPAWNS = 128
 
@@ -122,28 +124,20 @@ def _cached(found, geometries, radius, seed):
     def build():
         layouts = list(_with_progress(found, len(geometries)))
         file = io.BytesIO()
-        shapes = np.array([layout.fields.shape for layout in layouts])
-        fields = np.concatenate([layout.fields.ravel() for layout in layouts])
-        rest = {
-            name: np.stack([getattr(layout, name) for layout in layouts])
-            for name in ("origin", "spawns", "goals", "lengths")
-        }
-        np.savez(file, shapes=shapes, fields=fields, **rest)
+        np.save(file, np.array([layout.fields.shape for layout in layouts]))
+        np.save(file, np.concatenate([layout.fields.ravel() for layout in layouts]))
+        for name in REST:
+            np.save(file, np.stack([getattr(layout, name) for layout in layouts]))
         cache.prune(PREFIX, MAX_FILES - 1, MAX_BYTES - file.tell())
         return file.getbuffer()
 
     body, _ = cache.fetch(f"{PREFIX}{key.hexdigest()[:20]}", build)
-    with np.load(io.BytesIO(body)) as arrays:
-        parts = dict(arrays)
-    shapes = parts.pop("shapes")
-    ends = shapes.prod(1).cumsum()[:-1]
-    fields = [
-        field.reshape(shape)
-        for field, shape in zip(np.split(parts.pop("fields"), ends), shapes, strict=True)
-    ]
+    file = io.BytesIO(body)
+    shapes, fields, *rest = (np.load(file) for _ in range(2 + len(REST)))
+    fields = np.split(fields, shapes.prod(1).cumsum()[:-1])
     return [
-        Geodesics(fields=field, **dict(zip(parts, rest)))
-        for field, *rest in zip(fields, *parts.values(), strict=True)
+        Geodesics(fields=field.reshape(shape), **dict(zip(REST, values)))
+        for field, shape, *values in zip(fields, shapes, *rest, strict=True)
     ]
 
 

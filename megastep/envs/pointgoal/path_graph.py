@@ -19,8 +19,8 @@ CELL = 0.1  # metres, of fields
 SIDES = 16  # of the polygon around the end of a wall
 INFLATION = 1.001  # of the radius, as in physics
 SLACK = 5e-5  # metres between a path and the clearance that is tested, for rounding
-MAX_GOALS, GROUP, N_SCRATCH = (
-    PROGRAM.constants[name] for name in ("MAX_GOALS", "GROUP", "N_SCRATCH")
+MAX_GOALS, GROUP, KEPT, N_SCRATCH = (
+    PROGRAM.constants[name] for name in ("MAX_GOALS", "GROUP", "KEPT", "N_SCRATCH")
 )
 GROUP_SIDE = 1.5  # metres: walls with their middles in one square are neighbours
 STEP = 5e-3  # metres from a corner where it is tested if a path can turn there
@@ -162,7 +162,8 @@ class PathGraph:
         """
         v, device = len(self.corner_homes), self.device
         counts, tangent = torch.empty((2, v), dtype=torch.int32, device=device)
-        always = dict(corner_homes=self.corner_homes, tangent=tangent)
+        kept = torch.empty((v, KEPT), dtype=torch.int32, device=device)
+        always = dict(corner_homes=self.corner_homes, tangent=tangent, kept=kept)
         self._launch(
             "corner_links", "CornerLinksParams", v, **always, starts=0, counts=counts, **_NO_LINKS
         )

@@ -9,11 +9,15 @@ KERNEL corner_links(const CornerLinksParams& p) {
         int first = homes.corner_starts[home], end = homes.corner_starts[home + 1];
         int* tangent = p.tangent + first;
         for (int corner = first; corner < end; corner++) {
+            if (p.starts) {
+                write_links(p, corner, nullptr);
+                continue;
+            }
             Point here = corner_at(corners, corner);
 #pragma omp simd
             for (int other = first; other < end; other++)
                 tangent[other - first] = is_tangent(corners, other, here);
-            link_corner(p, corner, tangent);
+            count_links(p, corner, tangent);
         }
     }
 }

@@ -3,6 +3,10 @@
 
 KERNEL corner_links(CornerLinksParams p) {
     int corner = blockIdx.x * blockDim.x + threadIdx.x;
-    if (corner < p.homes.n_corners)
-        link_corner(p, corner, nullptr);
+    if (corner >= p.homes.n_corners)
+        return;
+    if (p.starts)
+        write_links(p, corner, nullptr);
+    else
+        count_links(p, corner, nullptr);
 }

@@ -70,8 +70,9 @@ struct ClearancesParams {
 struct CornerLinksParams {
     HomesParams homes;
     const int* corner_homes;  // (V) the home of each corner
-    const int* starts;        // (V) first link of each corner; null: the links are only counted
-    int* counts;              // (V) out: links of each corner, if they are counted
+    const int* starts;        // (V + 1) first link of each corner; null: the links are only counted
+    int* counts;              // (V) out, if they are counted, as is the next: links of each corner
+    int* kept;                // (V, KEPT) the first links of each corner; read if links are written
     int* targets;             // (links) out: the corner at the other end
     float* metres;            // (links) out
     int* tangent;             // (V) scratch on the CPU

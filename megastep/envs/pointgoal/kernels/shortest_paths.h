@@ -183,30 +183,54 @@ HD int is_tangent(const Corners& corners, int corner, Point p) {
     return (a * b <= 0.f) | (a * a <= slack2) | (b * b <= slack2);
 }
 
-// Links a corner to the corners of its home that a shortest path may visit next to it, or counts
-// these. `tangent` may hold which corners have a tangent from here, from the home's first on.
-HD void link_corner(const CornerLinksParams& p, int corner, const int* tangent) {
-    int home = p.corner_homes[corner], first = p.homes.corner_starts[home];
-    int end = p.homes.corner_starts[home + 1], next = p.starts ? p.starts[corner] : 0;
-    HomeWalls walls = walls_of(p.homes, home);
-    Corners corners = corners_of(p.homes);
+// Metres along a link.
+HD float link_metres(const HomesParams& p, const Corners& corners, int corner, int other) {
+    float straight = distance_between(corner_at(corners, corner), corner_at(corners, other));
+    return maxf(straight - p.rebate, 0.f);
+}
+
+// Calls found(other) for each corner of a home that a shortest path may visit next to `corner`.
+// `tangent` may hold which corners have a tangent from here, from the home's first on.
+template <class Found>
+HD void each_link(const HomesParams& p, int home, int corner, const int* tangent, Found found) {
+    int first = p.corner_starts[home], end = p.corner_starts[home + 1];
+    HomeWalls walls = walls_of(p, home);
+    Corners corners = corners_of(p);
     Point here = corner_at(corners, corner);
-    float least2 = p.homes.clearance * p.homes.clearance;
     for (int other = first; other < end; other++) {
         if (tangent ? !tangent[other - first] : !is_tangent(corners, other, here))
             continue;
         Point there = corner_at(corners, other);
-        if (other == corner || !is_tangent(corners, corner, there) ||
-            !is_clear(walls, here, there, least2, nullptr))
-            continue;
-        if (p.starts) {
-            p.targets[next] = other;
-            p.metres[next] = maxf(distance_between(here, there) - p.homes.rebate, 0.f);
-        }
-        next++;
+        if (other != corner && is_tangent(corners, corner, there) &&
+            is_clear(walls, here, there, p.clearance * p.clearance, nullptr))
+            found(other);
     }
-    if (!p.starts)
-        p.counts[corner] = next;
+}
+
+// Counts a corner's links, and keeps the first KEPT.
+HD void count_links(const CornerLinksParams& p, int corner, const int* tangent) {
+    int n = 0;
+    each_link(p.homes, p.corner_homes[corner], corner, tangent, [&](int other) {
+        if (n < KEPT)
+            p.kept[(long long)KEPT * corner + n] = other;
+        n++;
+    });
+    p.counts[corner] = n;
+}
+
+// Writes a corner's links behind those of the corners before.
+HD void write_links(const CornerLinksParams& p, int corner, const int* tangent) {
+    Corners corners = corners_of(p.homes);
+    int next = p.starts[corner], n = p.starts[corner + 1] - next;
+    auto write = [&](int other) {
+        p.targets[next] = other;
+        p.metres[next++] = link_metres(p.homes, corners, corner, other);
+    };
+    if (n > KEPT)
+        each_link(p.homes, p.corner_homes[corner], corner, tangent, write);
+    else
+        for (int k = 0; k < n; k++)
+            write(p.kept[(long long)KEPT * corner + k]);
 }
 
 // The distance of a corner from a goal in a straight line, infinite if that is no path.
