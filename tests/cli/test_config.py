@@ -29,6 +29,7 @@ def errors(*overrides, script="train"):
 MORE = {"geometry=files": ["geometry.path=plans.npz"]}
 
 
+@pytest.mark.slow
 def test_every_group_member_composes():
     groups = Composer(train.SCRIPT).groups()
     assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "preset", "experiment"}

@@ -335,6 +335,7 @@ def test_worker_processes_compute_the_same(folder, monkeypatch, capfd):
     assert all((x == y).all() for a, b in zip(out, alone) for x, y in zip(a, b))
 
 
+@pytest.mark.slow
 def test_an_error_in_a_worker_names_the_geometry(folder):
     boxes_ = [room(width=2 + 0.01 * i, height=1.5, id=i) for i in range(workers.MIN_PARALLEL)]
     boxes_[40]["masks"] = boxes_[40].masks * 0
