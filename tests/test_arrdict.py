@@ -274,6 +274,7 @@ def test_torch_compile_with_trees():
     assert out.total.tolist() == [4] and out.tree.b.c.tolist() == [2] and out.parts.x == 4
 
 
+@pytest.mark.slow
 def test_torch_compile_with_tree_arithmetic():
     torch._dynamo.reset()
     out = torch.compile(lambda tree: (1 + tree * tree)[0].float(), backend="eager")(

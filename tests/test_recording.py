@@ -88,6 +88,7 @@ def frames(path):
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
+@pytest.mark.slow
 def test_frames_keep_their_order(tmp_path):
     greys = [int(grey) for grey in np.linspace(0, 255, 12)]
     states = [arrdict(i=i, grey=torch.tensor(grey)) for i, grey in enumerate(greys)]

@@ -195,7 +195,8 @@ def test_learns_bandit(name):
     assert rewards / ends > 0.9
 
 
-@pytest.mark.parametrize("name", ONE_OR_ALL)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LEARNERS)
 def test_learns_corridor(name):
     """The shortest way takes 6 steps. A random policy arrives in a third of the episodes. R2D2
     takes some random actions while it learns.

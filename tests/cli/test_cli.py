@@ -94,18 +94,14 @@ def test_run_folder_lock_and_closed_terminal(tmp_path, monkeypatch, capsys):
     assert saved.step >= rows[-1] and saved.path.name == f"step_{saved.step}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "redirected",
     [
+        "{command} | true",
         "{command} >/dev/full 2>/dev/full",
-        *(
-            pytest.param(redirected, marks=pytest.mark.slow)
-            for redirected in (
-                "{command} | true",
-                "{command} >&- 2>&-",
-                "{command} <&- | head -1 >/dev/full",
-            )
-        ),
+        "{command} >&- 2>&-",
+        "{command} <&- | head -1 >/dev/full",
     ],
 )
 def test_run_continues_without_output(tmp_path, redirected):

@@ -29,6 +29,7 @@ def errors(*overrides, script="train"):
 MORE = {"geometry=files": [f"geometry.path={sources.BENCH}"]}
 
 
+@pytest.mark.slow
 def test_every_group_member_composes():
     groups = Composer(scripts.TRAIN).groups()
     assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "preset", "experiment"}

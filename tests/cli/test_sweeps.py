@@ -175,6 +175,7 @@ def test_invalid_sweep_leaves_nothing(here, capsys):
         assert not {name for name in left if not name.startswith("payer.")}, words
 
 
+@pytest.mark.slow
 def test_sweeps_in_the_same_second(here, monkeypatch):
     monkeypatch.setattr(train, "run", lambda cfg: None)
     monkeypatch.setattr(

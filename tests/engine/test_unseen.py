@@ -122,7 +122,7 @@ def check_unseen(c, seen, visible):
 
 @pytest.mark.parametrize("n_agents", [1, 3])
 @pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
-@pytest.mark.parametrize("density", [0.02, 0.5, 1.0])
+@pytest.mark.parametrize("density", [0.02, 0.5, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_counts_match_twin(n_agents, degenerate, density, device, monkeypatch):
     """Walls begin anywhere in a word, and some take hundreds of words. Two of four environments
     share a layout. `visible` has bits beyond a layout's texels.
@@ -244,7 +244,7 @@ def explorer(device="cpu", n_envs=6, **settings):
     return envs.Explorer(n_envs, sample("bench", 4), device=device, **{**defaults, **settings})
 
 
-@pytest.mark.parametrize("resample", [False, True])
+@pytest.mark.parametrize("resample", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_explorers_privileged_observation_by_hand(resample, device):
     """Computed from the flags, the texels seen and the visible texels."""
     env = explorer(device, resample=resample)

@@ -1,5 +1,5 @@
-"""No agent ever passes a wall or gets stuck: a million agent steps that try to, ten million in the
-slow tests, a hundred million on a GPU. `scripts/check_walls.py` makes a billion.
+"""No agent ever passes a wall or gets stuck: half a million agent steps that try to, ten million in
+the slow tests, a hundred million on a GPU. `scripts/check_walls.py` makes a billion.
 """
 
 import math
@@ -48,7 +48,7 @@ def check(total, n_steps):
 
 @pytest.mark.parametrize("name", COURSES)
 def test_no_agent_passes_a_wall(name):
-    check(walls.run(name, STEPS_PER_COURSE // 10, 256), STEPS_PER_COURSE // 10)
+    check(walls.run(name, STEPS_PER_COURSE // 20, 256), STEPS_PER_COURSE // 20)
 
 
 @pytest.mark.slow

@@ -310,6 +310,7 @@ def test_statistics_outside_their_bands_are_named(generated):
     assert any(message.startswith("rooms: the 50 %") for message in messages)
 
 
+@pytest.mark.slow
 def test_no_two_homes_are_equal(packaged):
     assert len({make_homes.fingerprint(g) for g in packaged[:1000] + packaged[4500:]}) == 1500
 

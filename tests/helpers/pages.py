@@ -24,8 +24,10 @@ def commands(text):
 
 def few(script, words):
     """Returns a command's words with few samples or frames."""
-    fewer = {"train.py": ["samples=10000"], "record.py": ["steps=20"]}.get(script, [])
-    return [word for word in words if not word.startswith(("samples=", "steps="))] + fewer
+    budget = "more_samples" if any(word.startswith("resume=") for word in words) else "samples"
+    fewer = {"train.py": [f"{budget}=10000"], "record.py": ["steps=20"]}.get(script, [])
+    replaced = "samples=", "more_samples=", "steps="
+    return [word for word in words if not word.startswith(replaced)] + fewer
 
 
 @contextlib.contextmanager

@@ -157,6 +157,7 @@ def test_failed_write_leaves_nothing(fetch, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_noexec_folder(built, quick, tmp_path):
     with mounted(tmp_path / "noexec", "size=4m,noexec") as folder:
         status, out, err = run(STEP, folder, CXX=quick)
@@ -288,6 +289,7 @@ def test_ctrl_c_while_building_reaches_the_programs_handler(built, quick, tmp_pa
     assert (status, out.split()) == (0, ["noted", built[1]]), err
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_building_ends_a_program_without_handler(quick, tmp_path):
     # Python's own handler, since signals are ignored in the background of a shell.
     usual = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"

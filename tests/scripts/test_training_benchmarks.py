@@ -35,6 +35,7 @@ def test_metric_mean_has_interval_of_its_metric():
     assert mean_return == dict(what="a", value=3.0, unit="", lower=2.0, upper=4.0, n=99)
 
 
+@pytest.mark.slow
 def test_failing_run_raises():
     with pytest.raises(Exception, match="train.py"):
         with training_runs.trained(CPU, ("env=unknown",)):
