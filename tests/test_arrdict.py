@@ -242,6 +242,7 @@ def test_copies_keep_type_and_values(tensors, make_copy):
     assert type(copied) is type(copied.b) is arrdict and numbers(copied) == numbers(tensors)
 
 
+@pytest.mark.slow
 def test_worker_processes_return_trees_unchanged(tensors):
     pool = loky.ProcessPoolExecutor(1)
     try:

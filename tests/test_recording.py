@@ -136,6 +136,7 @@ def test_states_are_copied(tmp_path):
     assert abs(frames(encoder.save(tmp_path / "video.mp4")).mean() - 200) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_workers_have_one_thread_and_no_gpu(tmp_path):
     record(plot_facts, [arrdict(path=str(tmp_path / "facts"), x=torch.zeros(1))], n_workers=1)
     pid, *facts = (tmp_path / "facts").read_text().split(" ")

@@ -85,6 +85,7 @@ def test_state_dict_resumes():
     assert all(map(torch.equal, params, resumed))
 
 
+@pytest.mark.slow
 def test_update_does_not_import_torch_dynamo():
     # importing it would delay the first update by more than a second
     script = """

@@ -38,6 +38,7 @@ def finished(script, *arguments, cwd, **environment):
     return process.returncode, out, err
 
 
+@pytest.mark.slow
 def test_typo_exits_with_2_and_leaves_nothing(tmp_path):
     code, out, err = finished("train", "env=explorr", "learner.lrr=1", "env.n_envs=0", cwd=tmp_path)
     assert code == 2 and out == ""

@@ -283,6 +283,7 @@ def interrupted(folder, compiler, code):
     return process.returncode, out.strip(), err
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_building_reaches_the_programs_handler(built, quick, tmp_path):
     handled = "import signal; signal.signal(signal.SIGINT, lambda *args: print('noted'))"
     status, out, err = interrupted(tmp_path, quick, handled + STEP)

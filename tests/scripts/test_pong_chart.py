@@ -24,6 +24,7 @@ def test_sizes_alternate_factors_of_three_and_ten():
     assert pong_chart.sizes(50)[-2:] == [30, 50]
 
 
+@pytest.mark.slow
 def test_installed_implementations_are_measured_and_drawn(tiny_measurements, tmp_path, capsys):
     path, chart = tmp_path / "pong.jsonl", tmp_path / "pong.svg"
     arguments = ["--records", str(path), "--chart", str(chart)]
