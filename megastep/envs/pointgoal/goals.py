@@ -3,7 +3,7 @@
 D layouts, S spawn points and G goals per layout.
 """
 
-import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,10 +28,15 @@ SOURCES = (
     *sorted(Path(__file__).with_name("kernels").iterdir()),
     Path(spawning.__file__),
 )
-#: Fields of Geodesics that are arrays of one shape for all layouts.
-REST = ("origin", "spawns", "goals", "lengths")
 N_GOALS = 16  # per layout
 N_SPAWNS = 128
+#: Fields of Geodesics whose shape is the same for all layouts.
+REST = {
+    "origin": (2,),
+    "spawns": (N_SPAWNS, 2),
+    "goals": (N_GOALS, 2),
+    "lengths": (N_SPAWNS, N_GOALS),
+}
 
 
 def goal_fields(
@@ -123,21 +128,27 @@ def _cached(found, geometries, radius, seed):
 
     def build():
         layouts = list(_with_progress(found, len(geometries)))
-        file = io.BytesIO()
-        np.save(file, np.array([layout.fields.shape for layout in layouts]))
-        np.save(file, np.concatenate([layout.fields.ravel() for layout in layouts]))
-        for name in REST:
-            np.save(file, np.stack([getattr(layout, name) for layout in layouts]))
-        cache.prune(PREFIX, MAX_FILES - 1, MAX_BYTES - file.tell())
-        return file.getbuffer()
+        shapes = np.array([layout.fields.shape for layout in layouts], np.int64)
+        parts = [np.stack([getattr(layout, name) for layout in layouts]) for name in REST]
+        parts = [shapes, *parts, *(layout.fields for layout in layouts)]
+        cache.prune(PREFIX, MAX_FILES - 1, MAX_BYTES - sum(part.nbytes for part in parts))
+        return b"".join(map(np.ascontiguousarray, parts))
 
     body, _ = cache.fetch(f"{PREFIX}{key.hexdigest()[:20]}", build)
-    file = io.BytesIO(body)
-    shapes, fields, *rest = (np.load(file) for _ in range(2 + len(REST)))
-    fields = np.split(fields, shapes.prod(1).cumsum()[:-1])
+    n, start = len(geometries), 0
+
+    def read(shape, dtype):
+        nonlocal start
+        array = np.frombuffer(body, dtype, math.prod(shape), start).reshape(shape)
+        start += array.nbytes
+        return array
+
+    shapes = read((n, 3), np.int64)
+    rest = [read((n, *shape), np.float32) for shape in REST.values()]
+    fields = [read(shape, np.float16) for shape in shapes.tolist()]
     return [
-        Geodesics(fields=field.reshape(shape), **dict(zip(REST, values)))
-        for field, shape, *values in zip(fields, shapes, *rest, strict=True)
+        Geodesics(fields=field, **dict(zip(REST, values)))
+        for field, *values in zip(fields, *rest, strict=True)
     ]
 
 

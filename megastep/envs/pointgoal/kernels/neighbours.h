@@ -64,3 +64,51 @@ HD int is_off_tangents(const Corners& corners, int corner, const Box& box) {
     }
     return beyond | behind;
 }
+
+// The groups of walls that may block a line from p into a box, a bit each: those whose bounding
+// boxes lie in a strip around the lines. Not to be used with more than MAX_MASKED groups.
+typedef unsigned long long Groups;
+constexpr int MAX_MASKED = 64;
+
+HD Groups groups_between(const HomeWalls& walls, Point p, const Box& box, float margin) {
+    Point middle = {0.5f * (box.at[0].x + box.at[3].x), 0.5f * (box.at[0].y + box.at[3].y)};
+    float length = maxf(distance_between(p, middle), 1e-6f);
+    float ux = (middle.x - p.x) / length, uy = (middle.y - p.y) / length;  // along the strip
+    float first = 0.f, last = 0.f, width = 0.f;
+    for (int k = 0; k < 4; k++) {
+        float dx = box.at[k].x - p.x, dy = box.at[k].y - p.y;
+        float along = dx * ux + dy * uy, across = dy * ux - dx * uy;
+        first = minf(first, along);
+        last = maxf(last, along);
+        width = maxf(width, maxf(across, -across));
+    }
+    float abs_ux = maxf(ux, -ux), abs_uy = maxf(uy, -uy);
+    Groups groups = 0;
+#pragma omp simd reduction(| : groups)
+    for (int k = 0; k < walls.n_groups; k++) {
+        float half_x = 0.5f * (walls.high_x[k] - walls.low_x[k]);
+        float half_y = 0.5f * (walls.high_y[k] - walls.low_y[k]);
+        float dx = walls.low_x[k] + half_x - p.x, dy = walls.low_y[k] + half_y - p.y;
+        float along = dx * ux + dy * uy, across = dy * ux - dx * uy;
+        float reach_along = half_x * abs_ux + half_y * abs_uy + margin;
+        float reach_across = half_x * abs_uy + half_y * abs_ux + margin + width;
+        int meets = (along + reach_along >= first) & (along - reach_along <= last) &
+                    (across <= reach_across) & (across >= -reach_across);
+        groups |= (Groups)meets << (k % MAX_MASKED);
+    }
+    return groups;
+}
+
+// As is_clear, if no wall outside of `groups` can block the line.
+HD int is_clear_of(const HomeWalls& walls, Groups groups, Point p, Point q, float least2,
+                   int* hint) {
+    if (walls.n_groups > MAX_MASKED)
+        return is_clear(walls, p, q, least2, hint);
+    Line line = line_between(p, q, least2);
+    if (*hint >= 0 && blocks(walls, *hint, line))
+        return 0;
+    for (; groups; groups &= groups - 1)
+        if (group_blocks(walls, __builtin_ctzll(groups), line, hint))
+            return 0;
+    return 1;
+}

@@ -18,6 +18,9 @@ struct Search {
     float *rows[6], *hint_walls[4];
     int *nearby, n_nearby, *is_open;
     int goals[MAX_GOALS], n_goals;
+    // per corner: 1 if it matters to the group of points, and the walls between them, see Groups
+    int *is_near, *low_groups, *high_groups;
+    Groups goal_groups[MAX_GOALS];
 
     Search(const PathLengthsParams& p, int home)
         : p(p),
@@ -39,6 +42,9 @@ struct Search {
             rows[row] = (float*)scratch[5 + row];
         for (int row = 0; row < 4; row++)
             hint_walls[row] = (float*)scratch[11 + row];
+        is_near = scratch[15];
+        low_groups = scratch[16];
+        high_groups = scratch[17];
         for (int i = 0; i < n_corners; i++) {
             hints[i] = box_hints[i] = -1;
             leads[i] = 0;
@@ -59,6 +65,7 @@ struct Search {
 
     // Finds the corners and goals that some point in the box may see.
     void find_nearby(const Box& box) {
+        float margin = 1.001f * p.homes.clearance;  // more than rounding takes away
         int is_small = maxf(box.at[3].x - box.at[0].x, box.at[3].y - box.at[0].y) < MAX_BOX;
         int* off = is_open;  // no longer needed by the group before
 #pragma omp simd
@@ -66,30 +73,48 @@ struct Search {
             off[i] = is_off_tangents(corners, first + i, box) | !leads[i];
         n_nearby = n_goals = 0;
         for (int i = 0; i < n_corners; i++) {
+            is_near[i] = 0;
             if (off[i] || (is_small && is_hidden(walls, corner_at(corners, first + i), box, least2,
                                                  box_hints[i])))
                 continue;
             for (int row = 0; row < 6; row++)
                 rows[row][n_nearby] = corners.x[(long long)row * p.homes.n_corners + first + i];
+            Groups groups = groups_between(walls, corner_at(corners, first + i), box, margin);
+            low_groups[i] = (int)groups;
+            high_groups[i] = (int)(groups >> 32);
+            is_near[i] = 1;
             nearby[n_nearby] = first + i;
             copy_hint(n_nearby++);
         }
         for (int goal = 0; goal < p.n_goals; goal++)
             if (!is_small ||
-                !is_hidden(walls, goal_at(p, home, goal), box, least2, box_goal_hints[goal]))
+                !is_hidden(walls, goal_at(p, home, goal), box, least2, box_goal_hints[goal])) {
+                goal_groups[goal] = groups_between(walls, goal_at(p, home, goal), box, margin);
                 goals[n_goals++] = goal;
+            }
     }
 
     void try_hinted(int corner, Paths& paths) {
-        try_corner(p, walls, corner, paths, hints + corner - first);
+        int i = corner - first;
+        Groups groups = (Groups)(unsigned)high_groups[i] << 32 | (unsigned)low_groups[i];
+        try_corner(p, corner, paths, [&](Point from, Point to) {
+            return is_clear_of(walls, groups, from, to, least2, hints + i);
+        });
+    }
+
+    void try_goal(int goal, Paths& paths) {
+        try_straight(p, home, goal, paths, [&](Point from, Point to) {
+            return is_clear_of(walls, goal_groups[goal], from, to, least2, goal_hints + goal);
+        });
     }
 
     void find_paths(Paths& paths) {
         clear_paths(paths);
         for (int i = 0; i < n_goals; i++)
-            try_straight(p, home, walls, goals[i], paths, goal_hints + goals[i]);
+            try_goal(goals[i], paths);
         for (int goal = 0; goal < p.n_goals; goal++)
-            if (last[goal] >= 0 && (!goal || last[goal] != last[goal - 1]) &&
+            if (last[goal] >= 0 && is_near[last[goal] - first] &&
+                (!goal || last[goal] != last[goal - 1]) &&
                 is_tangent(corners, last[goal], paths.from))
                 try_hinted(last[goal], paths);
         Corners copies = {rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]};

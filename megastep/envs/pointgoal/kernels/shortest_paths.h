@@ -141,18 +141,22 @@ HD int group_blocks(const HomeWalls& walls, int group, const Line& line) {
     return blocked;
 }
 
+// Returns 1 if a wall of the group blocks the line. If `hint` is given, the wall is stored there.
+HD int group_blocks(const HomeWalls& walls, int group, const Line& line, int* hint) {
+    int blocked = group_blocks(walls, group, line);
+    for (int i = GROUP * group; hint && blocked && i < GROUP * group + GROUP; i++)
+        *hint = blocks(walls, i, line) ? i : *hint;
+    return blocked;
+}
+
 // Returns 1 if the straight line between two points keeps sqrt(least2) metres from all walls. If
 // `hint` is given, it holds the wall that blocked a similar line, which is tried first.
 HD int is_clear(const HomeWalls& walls, Point p, Point q, float least2, int* hint) {
     Line line = line_between(p, q, least2);
     if (hint && *hint >= 0 && blocks(walls, *hint, line))
         return 0;
-    return !any_group(walls, bounds_of(p, q, SQRT(least2)), [&](int k) {
-        int blocked = group_blocks(walls, k, line);
-        for (int i = GROUP * k; hint && blocked && i < GROUP * k + GROUP; i++)
-            *hint = blocks(walls, i, line) ? i : *hint;
-        return blocked;
-    });
+    return !any_group(walls, bounds_of(p, q, SQRT(least2)),
+                      [&](int k) { return group_blocks(walls, k, line, hint); });
 }
 
 // ---- Corners ----
@@ -314,11 +318,11 @@ HD void clear_paths(Paths& paths) {
     }
 }
 
-// Goes from the point to a goal in a straight line, if that is possible.
-HD void try_straight(const PathLengthsParams& p, int home, const HomeWalls& walls, int goal,
-                     Paths& paths, int* hint) {
+// Goes from the point to a goal in a straight line, if clear(from, to) says that it is possible.
+template <class Clear>
+HD void try_straight(const PathLengthsParams& p, int home, int goal, Paths& paths, Clear clear) {
     Point end = goal_at(p, home, goal);
-    if (is_clear(walls, paths.from, end, p.homes.clearance * p.homes.clearance, hint)) {
+    if (clear(paths.from, end)) {
         paths.shortest[goal] = distance_between(paths.from, end);
         paths.length[goal] = distance_between(paths.at, end);
     }
@@ -326,9 +330,9 @@ HD void try_straight(const PathLengthsParams& p, int home, const HomeWalls& wall
 
 // Goes from the point to all goals by way of a corner to which its line is a tangent, where that is
 // shorter. Of equal paths, the one by the corner with the lower number is kept, so that the outcome
-// does not depend on the order of trials.
-HD void try_corner(const PathLengthsParams& p, const HomeWalls& walls, int corner, Paths& paths,
-                   int* hint) {
+// does not depend on the order of trials. clear is as above.
+template <class Clear>
+HD void try_corner(const PathLengthsParams& p, int corner, Paths& paths, Clear clear) {
     Point bend = corner_at(corners_of(p.homes), corner);
     const float* distances = p.distances + (long long)MAX_GOALS * corner;
     float straight = distance_between(paths.from, bend);
@@ -339,8 +343,7 @@ HD void try_corner(const PathLengthsParams& p, const HomeWalls& walls, int corne
         improves |= (metres < paths.shortest[goal]) |
                     ((metres == paths.shortest[goal]) & (corner < paths.corner[goal]));
     }
-    float least2 = p.homes.clearance * p.homes.clearance;
-    if (!improves || !is_clear(walls, paths.from, bend, least2, hint))
+    if (!improves || !clear(paths.from, bend))
         return;
     float extrapolated = distance_between(paths.at, bend);
 #pragma omp simd
