@@ -113,7 +113,7 @@ def budget_errors(tree: Tree, typed: list[str], had: dict[str, float]) -> Iterat
         if more is not None and name in typed:
             yield f"more_{name}", f"comes on top of what the run has had, {name}= is the total"
         elif more is None and isinstance(total, (int, float)) and had[name] >= total:
-            spent = f"the run has had {round(had[name], 1):,} of {name}={total:,}"
+            spent = f"the run has had {round(had[name], 1):,} of {name}={round(total, 1):,}"
             yield name, f"{spent}; to continue, give more_{name}= or a larger {name}="
 
 
