@@ -22,7 +22,9 @@ from megastep.modules.spawning import CLEARANCE, candidates
 __all__ = ["CELL", "Geodesics", "geodesics"]
 
 SPARE = 1.5  # times as many points are drawn as needed, as some may be in rooms without a door
-HOMES_AT_ONCE = {"cpu": 16, "cuda": 512}  # on a CPU, signals are handled in between
+#: Cells of the homes that are searched at once. A cell takes 100 bytes. On a CPU, signals are
+#: handled between two searches.
+CELLS_AT_ONCE = {"cpu": 250_000, "cuda": 10_000_000}
 
 
 class Geodesics(NamedTuple):
@@ -61,9 +63,7 @@ def geodesics(
         ValueError: naming the geometry, if it has no room for an agent.
     """
     device = torch.device(device)
-    step = HOMES_AT_ONCE[device.type]
-    for first in range(0, len(geometries), step):
-        chunk = slice(first, first + step)
+    for chunk in _chunks(geometries, CELLS_AT_ONCE[device.type]):
         graph = PathGraph(geometries[chunk], radius, device)
         points = _points(graph, int(SPARE * (n_spawns + n_goals)), generators[chunk])
         goals, spawns = _largest_part(graph, points, n_goals, n_spawns)
@@ -74,6 +74,17 @@ def geodesics(
 
 
 # ---- Goals and spawn points ----
+
+
+def _chunks(geometries, most):
+    """Yields slices of geometries whose grids have about `most` cells in all, at least one each."""
+    first = n_cells = 0
+    for d, g in enumerate(geometries):
+        if n_cells >= most:
+            yield slice(first, d)
+            first, n_cells = d, 0
+        n_cells += np.prod((g.walls.max((0, 1)) - g.walls.min((0, 1))) / CELL + 2)
+    yield slice(first, len(geometries))
 
 
 def _points(graph, n, generators):
