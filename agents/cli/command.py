@@ -126,7 +126,8 @@ def _run(script: scripts.Script, argv: list[str]) -> int:
         if config.hydra.mode == RunMode.MULTIRUN:
             return sweeps.sweep(composer, words)
         script.ready(settings)
-        gpu.wake(settings.device)  # beside the imports of what runs
+        if settings.device != "auto" or gpu.is_available():
+            gpu.wake(settings.device)  # beside the imports of what runs
         script.run(settings)
     return 0
 

@@ -71,7 +71,8 @@ def read() -> dict[tuple[str, str], tuple[str, dict[str, tuple]]]:
 def _sources():
     """A hash of whatever decides how arguments are read and stored."""
     folders = Path(megastep.__file__).parent, program.CONFIGS.parent
-    files = sorted({path for folder in folders for path in folder.rglob("*.py")})
+    files = {path for folder in folders for path in folder.rglob("*.py")}
+    files = sorted(files | {*program.CONFIGS.glob("*/*.yaml")})
     digest = hashlib.sha256(f"{sys.version} {pydantic.VERSION}".encode())
     for path in files:
         digest.update(path.read_bytes())

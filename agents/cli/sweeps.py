@@ -114,10 +114,12 @@ def sweep(composer: Composer, words: list[str]) -> int:
     }
     words = [f"{key}={value}" for key, value in options.items() if key not in overrides]
     words += [override.input_line for override in overrides.values()]
-    # processes of launchers find megastep; a job's settings find modules of the current folder
-    os.environ["PYTHONPATH"] = os.pathsep.join(
-        filter(None, [str(program.ROOT), os.environ.get("PYTHONPATH")])
-    )
+    # processes of launchers find megastep, in a checkout too; a job's settings find modules of the
+    # current folder
+    if (program.ROOT / "train.py").exists():
+        os.environ["PYTHONPATH"] = os.pathsep.join(
+            filter(None, [str(program.ROOT), os.environ.get("PYTHONPATH")])
+        )
     job, problem = Job(composer, folder), ""
     try:
         with signals.handled(job.interrupt):

@@ -135,9 +135,9 @@ def with_more(cfg: settings.Train) -> settings.Train:
 def run(cfg: settings.Train) -> Path:
     """Trains as `cfg` says, and returns the run folder. A signal saves and raises Interrupted."""
     device, progress = factory.make_device(cfg.device), console.Progress()
-    cfg = with_more(cfg)
     folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
     with runs.locked(folder):
+        cfg = with_more(cfg)
         with contextlib.ExitStack() as undo:
             if not cfg.resume:
                 undo.callback(shutil.rmtree, folder, ignore_errors=True)

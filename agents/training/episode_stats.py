@@ -145,7 +145,7 @@ class EpisodeStats:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores a `state_dict`. Ignores one with other metrics or groups."""
-        if state["sums"].shape == self.sums.shape and "windows" in state:
+        if state["sums"].shape == self.sums.shape:
             self.sums.copy_(state["sums"])
             self.windows = [deque(window.tolist()) for window in state["windows"]]
 

@@ -72,13 +72,13 @@ def test_train_evaluates_in_unseen_homes(monkeypatch):
 
 @pytest.mark.slow
 def test_deathmatch_runs_are_trained_side_by_side_and_duel(monkeypatch):
-    small = "geometry=box", "env.n_envs=16", "log_every=1", "preset=cpu"
+    small = "geometry=box", "env.n_envs=16", "log_every=1", "preset=cpu", "desync=false"
     deathmatch = *training_benchmarks.DEATHMATCH, *small
     monkeypatch.setattr(training_benchmarks, "DEATHMATCH", deathmatch)
     monkeypatch.setattr(training_benchmarks, "ABLATIONS", {"one": "", "other": "env.fov=130"})
     monkeypatch.setattr(training_benchmarks, "N_SNAPSHOTS", 2)
     monkeypatch.setattr(training_benchmarks, "N_DUELS", 16)
-    rows = list(training_benchmarks.duels(CPU, seeds=(1, 2), samples=8192))
+    rows = list(training_benchmarks.duels(CPU, seeds=(1, 2), samples=32_768))
     for seed in (1, 2):
         names = [row["what"] for row in rows if f"seed {seed}" in row["what"]]
         assert len(names) == 6

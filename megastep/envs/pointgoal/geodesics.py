@@ -16,15 +16,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from megastep.engine.devices import threads
 from megastep.envs.pointgoal.path_graph import CELL, MAX_GOALS, PathGraph
 from megastep.modules.spawning import CLEARANCE, candidates
 
 __all__ = ["CELL", "Geodesics", "geodesics"]
 
 SPARE = 1.5  # times as many points are drawn as needed, as some may be in rooms without a door
-#: Cells of the homes that are searched at once. A cell takes 100 bytes. On a CPU, signals are
-#: handled between two searches.
-CELLS_AT_ONCE = {"cpu": 250_000, "cuda": 10_000_000}
+#: Cells of the homes that are searched at once, per thread on a CPU, where signals are handled
+#: between two searches. A cell takes 100 bytes, a wall as much as WALL cells.
+CELLS_AT_ONCE = {"cpu": 125_000, "cuda": 10_000_000}
+WALL = 20
 
 
 class Geodesics(NamedTuple):
@@ -63,7 +65,8 @@ def geodesics(
         ValueError: naming the geometry, if it has no room for an agent.
     """
     device = torch.device(device)
-    for chunk in _chunks(geometries, CELLS_AT_ONCE[device.type]):
+    n_threads = threads() if device.type == "cpu" else 1
+    for chunk in _chunks(geometries, n_threads * CELLS_AT_ONCE[device.type]):
         graph = PathGraph(geometries[chunk], radius, device)
         points = _points(graph, int(SPARE * (n_spawns + n_goals)), generators[chunk])
         goals, spawns = _largest_part(graph, points, n_goals, n_spawns)
@@ -84,6 +87,7 @@ def _chunks(geometries, most):
             yield slice(first, d)
             first, n_cells = d, 0
         n_cells += np.prod((g.walls.max((0, 1)) - g.walls.min((0, 1))) / CELL + 2)
+        n_cells += WALL * len(g.walls)
     yield slice(first, len(geometries))
 
 

@@ -15,6 +15,7 @@ from megastep import cache, engine
 from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.geometry import content_hash
+from megastep.kernels.build.program import KERNELS
 from megastep.modules import spawning
 
 PREFIX = "geodesics-"  # of the cached files
@@ -25,7 +26,8 @@ SOURCES = (
     Path(__file__),
     Path(__file__).with_name("geodesics.py"),
     Path(__file__).with_name("path_graph.py"),
-    *sorted(Path(__file__).with_name("kernels").iterdir()),
+    *sorted(Path(__file__).with_name("kernels").glob("*.[hc]*")),
+    *sorted((KERNELS / "common").glob("*.h")),
     Path(spawning.__file__),
 )
 N_GOALS = 16  # per layout

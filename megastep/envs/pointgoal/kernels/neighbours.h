@@ -66,11 +66,13 @@ HD int is_off_tangents(const Corners& corners, int corner, const Box& box) {
 }
 
 // The groups of walls that may block a line from p into a box, a bit each: those whose bounding
-// boxes lie in a strip around the lines. Not to be used with more than MAX_MASKED groups.
+// boxes lie in a strip around the lines. None if there are more than MAX_MASKED groups.
 typedef unsigned long long Groups;
 constexpr int MAX_MASKED = 64;
 
 HD Groups groups_between(const HomeWalls& walls, Point p, const Box& box, float margin) {
+    if (walls.n_groups > MAX_MASKED)
+        return 0;
     Point middle = {0.5f * (box.at[0].x + box.at[3].x), 0.5f * (box.at[0].y + box.at[3].y)};
     float length = maxf(distance_between(p, middle), 1e-6f);
     float ux = (middle.x - p.x) / length, uy = (middle.y - p.y) / length;  // along the strip
@@ -94,7 +96,7 @@ HD Groups groups_between(const HomeWalls& walls, Point p, const Box& box, float 
         float reach_across = half_x * abs_uy + half_y * abs_ux + margin + width;
         int meets = (along + reach_along >= first) & (along - reach_along <= last) &
                     (across <= reach_across) & (across >= -reach_across);
-        groups |= (Groups)meets << (k % MAX_MASKED);
+        groups |= (Groups)meets << k;
     }
     return groups;
 }
