@@ -21,6 +21,7 @@ Rules:
   that are not finite.
 - Only transitions with `rollout.learns` and without `rollout.reset` count in a loss. An environment
   with opponents has an attribute `learners`, a bool per lane; only those lanes need to be stored.
+- `collector(env)` resets the environment before it returns: a run then gives the lanes random ages.
 - A collector that acts in the background may return an older rollout. It has a method `wait()`,
   which blocks until nothing acts in the environment.
 - The constructor's arguments `seed` and `graph` are optional. `seed` receives the run's seed, which

@@ -78,9 +78,10 @@ def test_fetch_is_rewarded_at_targets_which_then_move(names):
     env.reset()
     env.core.agents.positions[:32] = env.targets[:32]
     there, before = torch.arange(64) < 32, env.targets.clone()
+    away = (env.core.agents.positions - env.targets).norm(dim=-1)[:, 0] > 0.4
     world = env.step(arrdict.arrdict(actions=torch.zeros(64, 1, dtype=torch.int64)))
     assert world.reward[there].all() and (env.targets != before)[there].any(-1).all()
-    assert torch.equal(env.targets[~there], before[~there]), "agents spawn away from targets"
+    assert away.sum() > 20 and torch.equal(env.targets[away], before[away])
     offsets = (env.targets - env.core.agents.positions).norm(dim=-1)
     assert torch.allclose(world.obs.target.norm(dim=-1), offsets, atol=1e-4)
 
