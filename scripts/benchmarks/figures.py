@@ -203,7 +203,7 @@ def plot_ratings(records: list[dict], path: Path) -> None:
         style = dict(color=f"C{i}", marker="o", markersize=4, capsize=3)
         ax.errorbar(samples, values, spreads, label=f"seed {seed}", **style)
         for player, value, _ in ratings:
-            if player == "Bot":
+            if player.lower() == "bot":
                 label = "the scripted bot, in each run's ratings" if i == 0 else None
                 ax.axhline(value, color=f"C{i}", linestyle="--", linewidth=1, label=label)
     ax.set(xlabel="million samples", ylabel="rating ± two standard deviations")

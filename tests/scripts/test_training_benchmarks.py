@@ -82,7 +82,7 @@ def test_deathmatch_runs_are_trained_side_by_side_and_duel(monkeypatch):
     for seed in (1, 2):
         names = [row["what"] for row in rows if f"seed {seed}" in row["what"]]
         assert len(names) == 6
-        assert "against Bot (" in " ".join(names) and "rating of Bot" in " ".join(names)
+        assert "against bot (" in " ".join(names) and "rating of bot" in " ".join(names)
     rows = list(training_benchmarks.ablation(CPU, samples=2048))
     assert len(rows) == 4 and all(0 <= row["value"] <= 1 for row in rows)
 
