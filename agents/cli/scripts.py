@@ -2,6 +2,7 @@
 before PyTorch is imported.
 """
 
+import contextlib
 import functools
 import importlib
 import re
@@ -86,7 +87,10 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     if refused := [key for key in typed if resume and key.split(".")[0] not in RESUMABLE]:
         cure = "cannot change when a run is resumed; init=RUN starts a new one from its weights"
         raise program.ConfigErrors((key, cure) for key in refused)
-    loaded = runs.load_checkpoint(runs.find(resume or init))
+    path = runs.find(resume or init)
+    # a run in use is refused before its checkpoints are read, which come and go
+    with runs.locked(runs.folder_of(path)) if resume else contextlib.nullcontext():
+        loaded = runs.load_checkpoint(path)
     saved = loaded.config["train"]
     if init:
         groups = ("env", "geometry", "agent")
