@@ -59,10 +59,9 @@ def run_command(script: scripts.Script, argv: list[str] | None = None) -> int:
     """Parses, composes, checks and runs. Returns the exit code."""
     warnings.showwarning, arguments = console.warn, sys.argv[:]
     try:
-        with signals.handled(signals.interrupt) as numbers:
+        with signals.interrupting():
             words = sys.argv[1:] if argv is None else argv
-            code = _run(script, [*map(script.reword, words)])
-        return 128 + numbers[0] if numbers else code
+            return _run(script, [*map(script.reword, words)])
     except SystemExit as end:  # of argparse, and of Hydra's help
         return end.code or 0
     except program.UserError as error:

@@ -169,8 +169,6 @@ class Composer:
             device = keys["device"].value() if "device" in keys else None
             config = copy.deepcopy(self.composed(*groups, device=device))
         except (HydraException, OmegaConfBaseException, yaml.YAMLError) as error:
-            if interruption := _interruption(error):
-                raise interruption from None
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
             text = "is in none of the folders searched; --config-dir adds one" if absent else error
             text = program.shortened(text, 400)
@@ -235,12 +233,3 @@ def leaves(tree: check.Tree, prefix: str = "") -> list[tuple[str, Any]]:
     if not isinstance(tree, dict):
         return [(prefix[1:], tree)]
     return [leaf for key, below in tree.items() for leaf in leaves(below, f"{prefix}.{key}")]
-
-
-def _interruption(error):
-    """Returns the signal's exception that an error replaced, or None. Interrupted in the middle,
-    OmegaConf may fail while it cleans up.
-    """
-    while error is not None and isinstance(error, Exception):
-        error = error.__context__
-    return error

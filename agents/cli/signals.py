@@ -73,6 +73,23 @@ def handled(on_first: Callable[[int], None] = announce) -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
+@contextlib.contextmanager
+def interrupting(on_first: Callable[[int], None] = interrupt) -> Iterator[None]:
+    """As `handled`, for an `on_first` that raises Interrupted.
+
+    After a signal the block ends with Interrupted, whatever it raises or returns: libraries swallow
+    the exception, and fail in their clean-up or on a module that was imported in part.
+    """
+    with handled(on_first) as numbers:
+        try:
+            yield
+        except (Exception, SystemExit):
+            if not numbers:
+                raise
+    if numbers:
+        interrupt(numbers[0])
+
+
 def stop(process: int) -> None:
     """Has another process stop in good order, once, though a terminal's Ctrl-C may have reached it
     as well: a second SIGHUP never ends a program.

@@ -122,7 +122,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
         )
     job, problem = Job(composer, folder), ""
     try:
-        with signals.handled(job.interrupt):
+        with signals.interrupting(job.interrupt):
             composer.call_hydra(["--multirun", *words], job)
     except Exception as error:  # a launcher's or a sweeper's, as when a process is killed
         problem = shortened(error, 400)
@@ -184,19 +184,18 @@ class Job:
                 stack.enter_context(filelock.FileLock(path.with_suffix(".lock"), blocking=False))
                 write_atomically(path, json.dumps(row).encode())
             try:
-                stack.enter_context(signals.handled(signals.interrupt))
-                gpu = stack.enter_context(one_gpu())
-                words += [word for word in hydra.overrides.hydra if "searchpath" in word]
-                cfg = Composer(*self.source).settings(words)
-                cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
-                if cfg.device == "cuda" and gpu is not None:
-                    cfg = settings.changed(cfg, device=f"cuda:{gpu}")
-                logger = getattr(cfg, "logger", None)
-                if getattr(logger, "group", "") is None:
-                    logger = settings.changed(logger, group=self.group)
-                    cfg = settings.changed(cfg, logger=logger)
-                result = self.source[0].run(cfg)
-                row |= {"state": DONE, **(runs.outcome(result) if result else {})}
+                with signals.interrupting(), one_gpu() as gpu:
+                    words += [word for word in hydra.overrides.hydra if "searchpath" in word]
+                    cfg = Composer(*self.source).settings(words)
+                    cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
+                    if cfg.device == "cuda" and gpu is not None:
+                        cfg = settings.changed(cfg, device=f"cuda:{gpu}")
+                    logger = getattr(cfg, "logger", None)
+                    if getattr(logger, "group", "") is None:
+                        logger = settings.changed(logger, group=self.group)
+                        cfg = settings.changed(cfg, logger=logger)
+                    result = self.source[0].run(cfg)
+                    row |= {"state": DONE, **(runs.outcome(result) if result else {})}
             except signals.Interrupted as stop:
                 row["state"] = f"interrupted: {stop.args[1]}"
                 raise

@@ -1,5 +1,6 @@
 """Signals at every moment of a run: the exit code is 128 + the number, and nothing is lost."""
 
+import contextlib
 import json
 import os
 import pathlib
@@ -71,11 +72,30 @@ def composing(monkeypatch, number):
     signalled(monkeypatch, DictConfig, "_validate_set", number, call=20)
 
 
+def importing(monkeypatch, number):
+    """A library swallows the interruption, and fails on what it imported in part."""
+
+    def swallowed(*arguments):
+        with contextlib.suppress(BaseException):
+            os.kill(os.getpid(), number)
+        raise AttributeError("module has no attribute")
+
+    monkeypatch.setattr(factory, "make_policy", swallowed)
+
+
+def swallowing(monkeypatch, number):
+    def swallowed(*arguments):
+        with contextlib.suppress(BaseException):
+            os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(train, "run", swallowed)
+
+
 def setting_up(monkeypatch, number):
     signalled(monkeypatch, factory, "make_learner", number, call=1)
 
 
-@pytest.mark.parametrize("moment, number", pairs([composing, setting_up]))
+@pytest.mark.parametrize("moment, number", pairs([composing, setting_up, importing, swallowing]))
 def test_signal_before_training(here, monkeypatch, capsys, moment, number):
     moment(monkeypatch, number)
     assert train.main([*TINY, "samples=1e9", "folder=run"]) == 128 + number
