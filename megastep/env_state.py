@@ -68,7 +68,8 @@ class EnvState:
         first, missing = self._first_values, object()
         values = self._plain_values()
         values = {path: now for path, now in values.items() if first.get(path, missing) != now}
-        return {"arrays": arrays, "generators": generators, "values": values}
+        lengths = {path: len(node) for path, node in self._nodes_of_user() if _is_list(node)}
+        return {"arrays": arrays, "generators": generators, "values": values, "lengths": lengths}
 
     @torch.no_grad()
     def load_state_dict(self, state: dict[str, dict[str, Any]]) -> None:
@@ -88,6 +89,9 @@ class EnvState:
         for path, value in state["generators"].items():
             if not _set_generator_state(leaves.get(path), value):
                 raise ValueError(f"{path[1:]} is no longer the kind of generator that was saved")
+        for path, length in state["lengths"].items():
+            while len(node_at(self.root, path)) > length:
+                node_at(self.root, path).pop()
         fits = {path for path, value in state["arrays"].items() if _fits(leaves.get(path), value)}
         for path in fits:
             torch.as_tensor(leaves[path]).copy_(state["arrays"][path])
@@ -101,7 +105,11 @@ class EnvState:
             self._replace(path, collections.deque(value, now.maxlen) if is_queue else value)
 
     def _replace(self, path, value):
-        rebind(node_at(self.root, _parent(path)), path[len(_parent(path)) :], value)
+        parent, step = node_at(self.root, _parent(path)), path[len(_parent(path)) :]
+        if _is_list(parent) and step == f"[{len(parent)}]":
+            parent.append(value)
+        else:
+            rebind(parent, step, value)
 
     def unreachable(self) -> list[str]:
         """Returns what may change and cannot be saved, as `name (type)`."""
@@ -109,9 +117,9 @@ class EnvState:
         for path, node in self._nodes_of_user():
             is_opaque = isinstance(node, np.ndarray) and node.dtype == object
             known = (*SCALARS, *_CONSTANT, *_STATEFUL, dict, list, tuple, collections.deque)
-            if is_opaque or not (isinstance(node, known) or hasattr(node, "__dict__")):
-                if not _is_plain(node):
-                    names.append(f"{path[1:]} ({type(node).__name__})")
+            is_reached = isinstance(node, known) or hasattr(node, "__dict__") or _is_plain(node)
+            if is_opaque or not is_reached:
+                names.append(f"{path.removeprefix('.env.')} ({type(node).__name__})")
         return names
 
     def _plain_values(self):
@@ -144,6 +152,10 @@ class EnvState:
 
 def _is_ours(node):
     return type(node).__module__.startswith(("megastep.", "torch."))
+
+
+def _is_list(node):
+    return isinstance(node, (list, collections.deque))
 
 
 def _is_plain(node):

@@ -46,7 +46,7 @@ def save(
     keep_checkpoints: int = 2,
     score: float | None = None,
     made_with: dict[str, Any] | None = None,
-    replay_seconds: float = float("inf"),
+    replay_seconds: float | None = None,
 ) -> Path:
     """Writes a checkpoint and deletes old ones. Returns its folder.
 

@@ -78,12 +78,12 @@ def write(
     config: dict[str, Any],
     score: float | None,
     made_with: dict[str, Any] | None = None,
-    replay_seconds: float = float("inf"),
+    replay_seconds: float | None = None,
 ) -> None:
     """Writes a checkpoint into a new folder and flushes it to disk.
 
     Args:
-        replay_seconds: `replay.pt` is left out if it takes longer.
+        replay_seconds: `replay.pt` is left out if it takes longer; None for no limit.
     """
     import torch
 
@@ -95,7 +95,9 @@ def write(
             parts[name] = part
     files = {}
     for name, part in parts.items():
-        deadline = time.monotonic() + (replay_seconds if name == "replay.pt" else float("inf"))
+        deadline = None
+        if name == "replay.pt" and replay_seconds is not None:
+            deadline = time.monotonic() + replay_seconds
         try:
             files[name] = _write_file(path / name, functools.partial(torch.save, part), deadline)
         except _TooLate:
@@ -115,34 +117,43 @@ class _TooLate(Exception):
 
 
 class _HashedFile:
-    """A file that counts and hashes what is written to it."""
+    """A file that counts and hashes what is written to it.
 
-    def __init__(self, file: BinaryIO, deadline: float):
-        self.file, self.deadline = file, deadline
+    Attributes:
+        error: the first error. `torch.save` would hide it behind others, so nothing is raised.
+    """
+
+    def __init__(self, file: BinaryIO, deadline: float | None):
+        self.file, self.deadline, self.error = file, deadline, None
         self.n_bytes, self.sha256 = 0, hashlib.sha256()
 
     def write(self, data) -> int:
         data = memoryview(data).cast("B")
-        for start in range(0, len(data), _CHUNK):
-            if time.monotonic() > self.deadline:
-                raise _TooLate
+        for start in range(0, len(data) if self.error is None else 0, _CHUNK):
             chunk = data[start : start + _CHUNK]
-            self.file.write(chunk)
+            try:
+                self.file.write(chunk)
+            except OSError as error:
+                self.error = error
             self.sha256.update(chunk)
+            if self.deadline is not None and time.monotonic() > self.deadline:
+                self.error = _TooLate()
         self.n_bytes += len(data)
         return len(data)
 
     def flush(self) -> None:
-        self.file.flush()
+        pass
 
 
 def _write_file(
-    path: Path, write: Callable[[Any], Any], deadline: float = float("inf")
+    path: Path, write: Callable[[Any], Any], deadline: float | None = None
 ) -> dict[str, Any]:
     """Writes a file and flushes it to disk. Returns its entry in the manifest."""
     with open(path, "wb") as file:
         hashed = _HashedFile(file, deadline)
         write(hashed)
+        if hashed.error is not None:
+            raise hashed.error
         file.flush()
         os.fsync(file.fileno())
     return {"sha256": hashed.sha256.hexdigest(), "bytes": hashed.n_bytes}

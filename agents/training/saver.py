@@ -90,13 +90,13 @@ class Saver:
         """
         self.lacks_replay = False
         if "replay" not in state or _nbytes(state["replay"]) <= SMALL_REPLAY:
-            return state, float("inf")
+            return state, None
         self._n_since_replay += 1
         if is_last or self._n_since_replay >= self.replay_every:
             self._n_since_replay = 0
-            return state, REPLAY_SECONDS if is_last else float("inf")
+            return state, REPLAY_SECONDS if is_last else None
         self.lacks_replay = True
-        return {name: part for name, part in state.items() if name != "replay"}, float("inf")
+        return {name: part for name, part in state.items() if name != "replay"}, None
 
     def _write(self, step, state, score, replay_seconds):
         try:

@@ -1,6 +1,8 @@
 """A run that is interrupted and resumed has the bits of one that is left alone."""
 
 import os
+import pathlib
+import shutil
 import signal
 
 import numpy as np
@@ -8,9 +10,9 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.cli import train
+from megastep.agents.cli import entry, train
 from megastep.agents.storage.collector import Collector
-from megastep.agents.training import checkpoint
+from megastep.agents.training import annealing, checkpoint, json_lines
 from megastep.arrdict import arrdict
 from tests.helpers import tiny
 
@@ -22,6 +24,7 @@ FIGHT = [
     *("learner.n_minibatches=2", "preset=cpu"),
 ]
 PONG = ["env=pong", "env.n_envs=8", "agent.width=8", "learner.n_steps=8", "device=cpu"]
+DATA = pathlib.Path(__file__).parents[1] / "data"
 EVERY_UPDATE = ["checkpoint_seconds=1e-9", "keep_checkpoints=99"]
 slow = pytest.mark.slow
 CASES = {
@@ -67,17 +70,20 @@ class Drifting:
         obs = torch.stack([self.places, drift, torch.full_like(drift, len(self.history))], 1)
         return arrdict(
             obs=obs[:, None],
-            reward=self.places.clone(),
+            reward=torch.where(ended, 0.0, self.places),
             reset=ended,
-            terminal=torch.full((self.n_envs,), self.n_steps % 5 == 0),
+            terminal=torch.full((self.n_envs,), self.ends()),
             truncated=torch.zeros(self.n_envs, dtype=torch.bool),
         )
+
+    def ends(self):
+        return self.n_steps % 5 == 0 and self.n_steps > 0
 
     def reset(self):
         return self.world(torch.ones(self.n_envs, dtype=torch.bool))
 
     def step(self, decision):
-        ended = torch.full((self.n_envs,), self.n_steps % 5 == 0 and self.n_steps > 0)
+        ended = torch.full((self.n_envs,), self.ends())
         self.n_steps += 1
         self.wind += self.random.normal(size=self.n_envs) + np.random.random() * 0.1
         self.places = self.places * 0.9 + torch.rand(self.n_envs)  # of the global generator
@@ -113,11 +119,22 @@ def here(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "case", [case if case in FAST else pytest.param(case, marks=slow) for case in CASES]
+    "case, device",
+    [
+        *(pytest.param(name, "cpu", marks=[slow] * (name not in FAST)) for name in CASES),
+        *(
+            pytest.param(name, "cuda", marks=pytest.mark.cuda)
+            for name in CASES
+            if name != "stranger"
+        ),
+    ],
 )
-def test_resumed_run_has_the_same_bits(here, case):
-    """Killed after one of its checkpoints, and when it is resumed after a later one."""
-    run(*CASES[case], "samples=256", "log_every=2", "folder=run", *EVERY_UPDATE)
+def test_resumed_run_has_the_same_bits(here, case, device):
+    """Killed after one of its checkpoints, and when it is resumed after a later one. On a GPU the
+    first updates of a process are eager, the others replay graphs.
+    """
+    words = [*CASES[case], f"device={device}", "samples=512", "log_every=2"]
+    run(*words, "folder=run", *EVERY_UPDATE)
     alone = checkpoint.load_latest("run/checkpoints").state
     metrics = (here / "run/metrics.jsonl").read_bytes()
     paths = checkpoint.list_checkpoints("run/checkpoints")
@@ -158,9 +175,45 @@ def test_interrupted_run_has_the_same_bits(here, monkeypatch):
     assert differences(*states) == []
 
 
+def test_format_6_is_migrated(here, capsys):
+    """A checkpoint of the format before environments were saved, of a run with opponents."""
+    shutil.copytree(DATA / "format6", here / "run")
+    assert entry.inspect_run(["run"]) == 0 and "format 6" in capsys.readouterr().out
+    saved = checkpoint.load_latest("run/checkpoints").state
+    run("resume=run", "more_samples=96")
+    assert "not bit for bit: its environments were not saved" in capsys.readouterr().out
+    state = checkpoint.load_latest("run/checkpoints").state
+    assert state["updates"] == saved["updates"] + 2
+    assert state["learner"]["optimizer"]["n_steps"] > saved["learner"]["optimizer"]["n_steps"]
+    rows = json_lines.read("run/metrics.jsonl")
+    assert [row["updates"] for row in rows] == [2, 4, 6, 7, 8, 9]
+
+
+def test_inspect(here, capsys):
+    run(*tiny.TINY, "samples=64", "folder=run", "log_every=1")
+    capsys.readouterr()
+    assert entry.inspect_run(["rum"]) == 2 and "did you mean run?" in capsys.readouterr().err
+    assert entry.inspect_run(["latest"]) == 0
+    out = capsys.readouterr().out
+    assert "step_64: intact, format 7" in out and "updates 2" in out
+    assert all(word in out for word in ("world.pt", "policy", "actor_state.world.obs", "torch"))
+    with open(here / "run/checkpoints/step_64/world.pt", "r+b") as file:
+        file.seek(1000)
+        file.write(b"?")
+    assert entry.inspect_run(["run"]) == 1
+    assert "world.pt does not match the SHA-256" in capsys.readouterr().out
+
+
 def test_rerun(here, capsys):
     """A run whose learning rate followed the clock is repeated, though it was interrupted."""
-    run(*tiny.TINY, "seconds=0.3", "log_every=2", "folder=run")
+    words = ["seconds=0.3", "checkpoint_seconds=0.05", "keep_checkpoints=99"]
+    run(*tiny.TINY, *words, "log_every=2", "folder=run")
+    *reports, _ = (here / "run/metrics.jsonl").read_bytes().splitlines()
+    factors = annealing.read("run")
+    killed_after = checkpoint.list_checkpoints("run/checkpoints")[1]
+    run(f"resume={killed_after}")
+    assert (here / "run/metrics.jsonl").read_bytes().splitlines()[: len(reports)] == reports
+    assert annealing.read("run")[: len(factors)] == factors
     capsys.readouterr()
     run("rerun=run", "folder=again")
     assert "metrics.jsonl equals that of run, byte for byte" in capsys.readouterr().out
