@@ -44,7 +44,7 @@ CASES = {
     "gru": [*tiny.TINY, "agent.core=gru"],
     "mingru": [*tiny.TINY, "agent.core=mingru"],
     "none": [*tiny.TINY, "agent.core=none"],
-    "explorer": ["env=explorer", "env.res=8", *SMALL, "learner.n_minibatches=2", "env.patience=5"],
+    "explorer": ["env=explorer", "env.res=8", *SMALL, "learner.n_minibatches=2"],
     "pointgoal": ["env=pointgoal", "env.res=8", *SMALL, "learner.n_minibatches=2"],
     "deathmatch": FIGHT,
     "opponents": [*FIGHT, *SELF_PLAY, "opponents.bot=0.25"],
