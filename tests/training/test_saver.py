@@ -1,4 +1,4 @@
-"""The saver: a thread writes while training goes on; large replay buffers are in some checkpoints."""
+"""The saver: a thread writes while training goes on. Some checkpoints have large replay buffers."""
 
 import threading
 
