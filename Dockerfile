@@ -1,8 +1,8 @@
 # Runs `megastep` on a GPU with `docker run --gpus all`, otherwise on the CPU: docs/docker.md. There
 # is no CUDA base image because PyTorch's wheels include NVRTC; g++ compiles the CPU kernels at first
 # use. scripts/check_dockerfile.py runs these lines without Docker.
-ARG PYTHON=python:3.11.14-slim-bookworm
-FROM ${PYTHON}
+ARG BASE=python:3.11.14-slim-bookworm
+FROM ${BASE}
 RUN apt-get update && apt-get install -y --no-install-recommends g++ libgomp1 && rm -rf /var/lib/apt/lists/*
 ENV PIP_NO_CACHE_DIR=1 PIP_NO_DEPS=1 PIP_ROOT_USER_ACTION=ignore
 WORKDIR /source
@@ -14,7 +14,7 @@ RUN pip install ${TORCH}
 COPY . .
 RUN pip install --no-build-isolation . && pip check && rm -rf /source/*
 # Any user may run this image (docker run --user), so both folders are everybody's, like /tmp.
-RUN useradd --uid 1000 megastep && install -d -m 1777 /megastep /megastep/runs /cache
+RUN useradd megastep && install -d -m 1777 /megastep /megastep/runs /cache
 ENV HOME=/megastep USER=megastep XDG_CACHE_HOME=/cache
 USER megastep
 WORKDIR /megastep
