@@ -1,6 +1,6 @@
 """Runs the lines of the Dockerfile without Docker, then the image's command without a network.
 
-    python scripts/check_dockerfile.py --python /usr/bin/python3.11 -- train env=minimal samples=1e5
+    python scripts/check_dockerfile.py --python PYTHON -- train env=minimal geometry=box samples=1e5
 
 The clean root is this machine's file system below a layer that is thrown away (overlayfs), with
 empty /root, /tmp, /home and /usr/local, Python in the latter, and an empty environment. So the

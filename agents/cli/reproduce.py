@@ -76,7 +76,8 @@ class Row(NamedTuple):
 
 def read() -> dict[str, Row]:
     """Returns the rows by name."""
-    rows = yaml.safe_load(FILE.read_text(encoding="utf-8"))["rows"]
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where it is built
+    rows = yaml.load(FILE.read_text(encoding="utf-8"), loader)["rows"]
     return {name: Row(name, **{**row, "results": [*_results(row)]}) for name, row in rows.items()}
 
 
