@@ -90,6 +90,10 @@ def _results(row: dict) -> Iterator[Result]:
 def main(words: Sequence[str]) -> int:
     """Runs the command. Returns the exit code: 1 if a result differs from what is stated."""
     rows = read()
+    if words and words[0] in ("-sc", "--shell-completion"):
+        start = os.environ.get("COMP_LINE", "").split(" ")[-1]
+        console.say(" ".join(name for name in rows if name.startswith(start)))
+        return 0
     if not words or words[0] in ("-h", "--help"):
         console.say(listing(rows.values()))
         return 0

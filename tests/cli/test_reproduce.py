@@ -1,6 +1,7 @@
 """`megastep reproduce`: its rows beside the pages that state them, its verdicts, its errors."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -117,6 +118,15 @@ def test_a_run_gives_the_same_bytes_again(tmp_path, monkeypatch, capsys):
     assert "byte for byte" in capsys.readouterr().out
 
 
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", [row.name for row in ROWS.values() if row.exact])
+def test_recorded_bytes_come_out_again(name, tmp_path):
+    """On the kinds of machine that are recorded; elsewhere, that the results do."""
+    words = [sys.executable, "-m", "megastep", "reproduce", name]
+    env = os.environ | {"PYTHONPATH": str(LAB.parents[1])}
+    assert subprocess.run(words, cwd=tmp_path, env=env).returncode == 0
+
+
 def test_each_place_is_evaluated_once(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
@@ -153,6 +163,13 @@ def test_a_result_outside_its_interval_is_not_reproduced(tmp_path, capsys):
     assert "The run had 64 samples" in shown
 
 
+def test_other_bytes_on_the_same_kind_of_machine_are_not_reproduced(tmp_path, monkeypatch):
+    monkeypatch.setattr(reproduce, "machine", lambda device: HERE)
+    (tmp_path / "metrics.jsonl").write_text('{"samples": 64}\n')
+    row = Row("row", "cpu", "env=minimal samples=64", [NOTHING], exact=[HERE | {"sha256": "b"}])
+    assert reproduce.compare(row, tmp_path, [0.0]) == 1
+
+
 # ---- The command ----
 
 
@@ -180,6 +197,13 @@ def test_errors_are_one_sentence(tmp_path, monkeypatch, capsys, words, text):
     (sentence,) = capsys.readouterr().err.splitlines()
     assert text in sentence
     assert not [*tmp_path.iterdir()]
+
+
+def test_names_of_rows_are_completed(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["megastep", "-sc", "query=bash"])
+    monkeypatch.setenv("COMP_LINE", "megastep reproduce pong-cpu-1")
+    assert entry.main() == 0
+    assert capsys.readouterr().out.split() == ["pong-cpu-10m", "pong-cpu-1.5m"]
 
 
 def test_rows_are_listed_without_pytorch():
