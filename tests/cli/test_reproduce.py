@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from megastep.agents.cli import command, entry, gpu, reproduce
+from megastep.agents.cli import command, entry, gpu, reproduce, scripts
 from megastep.agents.cli.reproduce import Result, Row
 from tests.helpers import tiny
 
@@ -60,7 +60,8 @@ def test_words_of_a_row_compose(row):
     preset = f"preset={'cpu' if row.device == 'cpu' else 'gpu'}"
     tiny.settings(*row.train.split(), preset)
     for result in row.results:
-        tiny.settings("run=runs/x", *result.evaluate.split(), script="evaluate")
+        words = map(scripts.EVALUATE.reword, result.evaluate.split())
+        tiny.settings("run=runs/x", *words, script="evaluate")
 
 
 # ---- Verdicts ----
