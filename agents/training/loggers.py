@@ -44,7 +44,7 @@ class TensorBoard:
             raise RuntimeError(not_installed("tensorboard"))
         self.folder, self.step, self.error = folder, step, None
         self.thread, self.reports = (
-            threading.Thread(target=self._write_reports),
+            threading.Thread(target=self._write_reports, daemon=True),
             queue.SimpleQueue(),
         )
 
