@@ -302,9 +302,8 @@ def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_pat
     assert all(map(torch.equal, run.learner.optimizer.means, before[1]))
     with pytest.warns(UserWarning, match=rf"{name} of lane 3 was (nan|inf|1e\+30) at step"):
         run.train()
-    # an observation is stored with the step that acts on it
     assert (run.nonfinite_value.name, run.nonfinite_value.lane) == (name, lane)
-    assert run.nonfinite_value.step == step + (name == "obs") and run.nonfinite_value.is_from_env
+    assert run.nonfinite_value.step == step and run.nonfinite_value.is_from_env
     assert not same(copied(run.policy), before[0])
     skipped = [row["loss/skipped_steps"] for row in run.logger]
     assert skipped == [0] * 6  # of the third and later updates
