@@ -186,7 +186,6 @@ def test_a_wrong_attribute_is_named(name, value, clause):
         ("metric number", "metrics.laps .*not 3.0"),
         ("metric reserved", "name of a metric .*not 'return'"),
         ("metric no identifier", "name of a metric .*not 'lap/time'"),
-        ("metric nan", "metrics.laps must be finite where an episode ends"),
         ("metrics tensor", "metrics must be a dict"),
         ("metric added", "metrics must have the same keys"),
         ("no privileged", "privileged .*if, and only if"),

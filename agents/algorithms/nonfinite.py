@@ -36,6 +36,7 @@ class NonFiniteValue:
         rollout: number of the rollout, from 1.
         others: the first numbers of up to `MAX_NAMED - 1` other lanes of the same rollout.
         n_lanes: number of lanes of that rollout with such numbers.
+        n_agents: lanes per environment.
     """
 
     name: str
@@ -45,23 +46,36 @@ class NonFiniteValue:
     rollout: int = 1
     others: tuple["NonFiniteValue", ...] = ()
     n_lanes: int = 1
+    n_agents: int = 1
+
+    @property
+    def env(self) -> int:
+        """The lane's environment."""
+        return self.lane // self.n_agents
 
     @property
     def is_from_env(self) -> bool:
         """True if the environment produced the number, false if the policy did."""
         return self.name.split(".")[0] in ("obs", "privileged", "reward")
 
-    def in_lanes(self, lanes: Sequence[int]) -> "NonFiniteValue":
-        """Returns the same with other numbers of lanes: `lanes[i]` in place of i."""
+    def in_env(self, lanes: Sequence[int], n_agents: int) -> "NonFiniteValue":
+        """Returns the same with lanes of an environment.
+
+        Args:
+            lanes: the environment's lane of each lane of the rollout.
+            n_agents: lanes per environment.
+        """
         return dataclasses.replace(
             self,
             lane=int(lanes[self.lane]),
-            others=tuple(other.in_lanes(lanes) for other in self.others),
+            others=tuple(other.in_env(lanes, n_agents) for other in self.others),
+            n_agents=n_agents,
         )
 
     def __str__(self):
         texts = [
-            f"{one.name} of lane {one.lane} was {one.size:.3g} at step {one.step:,}"
+            f"{one.name} of {lane_name(one.lane, one.n_agents)} was {one.size:.3g} at step "
+            f"{one.step:,}"
             for one in (self, *self.others)
         ]
         if (n_unnamed := self.n_lanes - len(texts)) > 0:
@@ -87,8 +101,8 @@ class NonFiniteCheck:
 
     @property
     def found(self) -> torch.Tensor:
-        """(1,) bool on the device, whether there was a non-finite number since the last `read`."""
-        return self.record[2:3] > 0
+        """() bool on the device, whether there was a non-finite number since the last `read`."""
+        return self.record[2] > 0
 
     def __call__(self, floats: dict[str, torch.Tensor]) -> torch.Tensor:
         """Checks a rollout and keeps the first non-finite number of each lane until `read`.
@@ -172,11 +186,17 @@ def _value_at(floats, rollout, index, size):
     return NonFiniteValue(list(floats)[i], lane, (rollout - 1) * n_steps + row, size, rollout)
 
 
+def lane_name(lane: int, n_agents: int) -> str:
+    """Returns a lane's name for messages, with its environment if that has several lanes."""
+    return f"lane {lane}" + (f" (environment {lane // n_agents})" if n_agents > 1 else "")
+
+
 def nonfinite_leaf(tree: Any) -> str | None:
-    """Returns the dotted path of the first non-finite tensor or float in nested dicts and lists, or
-    None.
+    """Returns the dotted path of the first non-finite tensor in nested dicts and lists, or None.
+
+    Numbers pass, since some are infinite for good reasons, such as the best loss so far.
     """
     for path, leaf in tree_leaves_with_path(tree):
-        if isinstance(leaf, (torch.Tensor, float)) and not torch.as_tensor(leaf).isfinite().all():
+        if isinstance(leaf, torch.Tensor) and not leaf.isfinite().all():
             return ".".join(str(getattr(part, "key", getattr(part, "idx", part))) for part in path)
     return None

@@ -68,6 +68,7 @@ RESUMABLE = (
     "checkpoint_seconds",
     "keep_checkpoints",
     "desync",
+    "nonfinite_replay",
     "snapshots",
     "logger",
     "finish",

@@ -174,6 +174,7 @@ class Train(Common):
     checkpoint_seconds: Above0
     keep_checkpoints: Annotated[int, Field(ge=2, le=1000)]
     desync: bool = True
+    nonfinite_replay: bool = True
     snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
     folder: str | None
     resume: str | None

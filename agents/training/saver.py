@@ -16,6 +16,9 @@ from megastep.agents.training import checkpoint
 if TYPE_CHECKING:
     from megastep.agents.training.trainer import Trainer
 
+#: The parts of a state that must be finite. What comes from the environment need not be.
+LEARNED = ("policy", "learner", "opponents")
+
 
 class Saver:
     """Writes the checkpoints of one run.
@@ -43,11 +46,11 @@ class Saver:
             score: for example the mean return, higher is better; None if unknown.
 
         Raises:
-            NonFiniteError: the state holds a NaN or infinity. Earlier checkpoints are kept.
+            NonFiniteError: what was learnt holds a NaN or infinity. Earlier checkpoints are kept.
         """
         # copied to the CPU first: the GPU may have no memory left for the check
         state = tree_map_only(torch.Tensor, lambda leaf: leaf.detach().cpu(), state)
-        if path := nonfinite_leaf(state):
+        if path := nonfinite_leaf({name: state.get(name) for name in LEARNED}):
             raise NonFiniteError(
                 f"The checkpoint at {step:,} samples was not saved: {path} is not finite"
             )

@@ -81,8 +81,9 @@ def test_first_eight_of_many_lanes_are_named_by_time():
     assert named == [("reward", 19, 2), *(("obs", lane, 3) for lane in range(2, 9))]
     assert value.n_lanes == 12 and str(value).endswith("; and so for 4 more lanes")
     assert "reward of lane 19 was nan at step 2; obs of lane 2 was inf at step 3;" in str(value)
-    in_env = value.in_lanes(range(100, 120))
+    in_env = value.in_env(range(100, 120), n_agents=2)
     assert [one.lane for one in (in_env, *in_env.others)] == [119, *range(102, 109)]
+    assert "reward of lane 119 (environment 59) was nan at step 2; obs of lane 102 (en" in str(in_env)
 
 
 @pytest.mark.parametrize("n_lanes", [1, 8, 9])
@@ -108,7 +109,8 @@ def test_nonfinite_leaf_returns_path():
     tree = {"policy": OrderedDict([("a.b", torch.ones(2)), ("c", torch.ones(()))]), "n": [1, 0.5]}
     tree |= {"none": None, "word": "nan", "generator": torch.zeros(3, dtype=torch.uint8)}
     assert nonfinite_leaf(tree) is None
-    assert nonfinite_leaf({**tree, "n": [1, torch.inf]}) == "n.1"
+    assert nonfinite_leaf({**tree, "best": -torch.inf}) is None
+    assert nonfinite_leaf({**tree, "n": [1, torch.tensor(torch.inf)]}) == "n.1"
     tree["policy"]["a.b"][1] = torch.nan
     assert nonfinite_leaf(tree) == "policy.a.b"
 
