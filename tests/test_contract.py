@@ -202,6 +202,10 @@ def test_a_broken_clause_is_named(fault, clause):
         contract.rollout(TinyEnv(fault), 9)
 
 
+def test_nan_metric_is_an_episode_without_that_number():
+    contract.rollout(TinyEnv("metric nan"), 9)
+
+
 @pytest.mark.parametrize("space", [None, spaces.MultiVector(1, 1)])
 def test_privileged_is_optional_and_may_be_one_tensor(space):
     class Env(TinyEnv):

@@ -59,7 +59,10 @@ def main() -> int:
         console.say(f"megastep: {text}", sys.stderr)
         return 2
     elif words[0]:
-        console.say(f"megastep: {words[0]!r} is unknown; {closest(words[0], SCRIPTS | COMMANDS)}", sys.stderr)
+        console.say(
+            f"megastep: {words[0]!r} is unknown; {closest(words[0], SCRIPTS | COMMANDS)}",
+            sys.stderr,
+        )
         return 2
     return 0
 

@@ -30,6 +30,11 @@ from megastep.types import Env, n_lanes, optional
 #: Tensors that all environments share are kept up to this size. Larger ones, such as floor plans,
 #: do not change, and are made again from the configuration.
 MAX_SHARED_BYTES = 2**20
+#: What a run without a recorder says in place of a command.
+NOT_RECORDED = (
+    ". Nothing was recorded to see it again: that needs a run without opponents, learner.lag and "
+    "a collector of the learner's own"
+)
 _FORMAT = 1
 
 

@@ -284,7 +284,9 @@ class Trainer:
     def env_lanes(self) -> range | list[int]:
         """Returns the environment's lane of each lane of the rollout."""
         learners = self.rollout.learners
-        return range(self.rollout.n_lanes) if learners is None else learners.nonzero()[:, 0].tolist()
+        return (
+            range(self.rollout.n_lanes) if learners is None else learners.nonzero()[:, 0].tolist()
+        )
 
     def name_bad_metrics(self) -> None:
         """Warns once of each metric that was not finite at the end of an episode. Synchronises."""
@@ -299,7 +301,10 @@ class Trainer:
     def write_replay(self, value: NonFiniteValue) -> None:
         """Writes the file that replays a number of the environment, and stops recording."""
         recorder, self.recorder = self.recorder, None
-        if recorder is None or not value.is_from_env:
+        if self.replay_folder is None or not value.is_from_env:
+            return
+        if recorder is None:
+            self.replay_hint = nonfinite_replay.NOT_RECORDED
             return
         path = self.replay_folder / f"nonfinite-{self.samples}.npz"
         try:

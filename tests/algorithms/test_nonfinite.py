@@ -83,7 +83,9 @@ def test_first_eight_of_many_lanes_are_named_by_time():
     assert "reward of lane 19 was nan at step 2; obs of lane 2 was inf at step 3;" in str(value)
     in_env = value.in_env(range(100, 120), n_agents=2)
     assert [one.lane for one in (in_env, *in_env.others)] == [119, *range(102, 109)]
-    assert "reward of lane 119 (environment 59) was nan at step 2; obs of lane 102 (en" in str(in_env)
+    assert "reward of lane 119 (environment 59) was nan at step 2; obs of lane 102 (en" in str(
+        in_env
+    )
 
 
 @pytest.mark.parametrize("n_lanes", [1, 8, 9])

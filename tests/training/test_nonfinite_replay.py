@@ -1,10 +1,13 @@
 """Files that replay a non-finite number: the same steps from the same state show it again."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from megastep import spaces
+from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
@@ -71,8 +74,10 @@ def trainer_in(folder, env=None, learner=PPO, **options):
     )
 
 
-def recorded(folder):
-    """Trains until a number is reported. Returns the trainer and the only file."""
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A trainer that trained until a number was reported, and the only file."""
+    folder = tmp_path_factory.mktemp("run")
     run = trainer_in(folder)
     with pytest.warns(UserWarning, match="To see it again: python -m megastep replay"):
         run.train(lambda: run.nonfinite_value is not None)
@@ -81,9 +86,9 @@ def recorded(folder):
     return run, path
 
 
-def test_replay_shows_the_same_number_in_the_same_lanes(tmp_path):
+def test_replay_shows_the_same_number_in_the_same_lanes(recorded):
     """Later rollouts, bad as well, are collected before the report: the first one is kept."""
-    run, path = recorded(tmp_path)
+    run, path = recorded
     value = run.nonfinite_value
     assert run.updates > value.rollout and run.recorder is None, "recorded until the first"
     again = Recording(path).replay(Walks())
@@ -92,8 +97,8 @@ def test_replay_shows_the_same_number_in_the_same_lanes(tmp_path):
     assert again.others == value.others
 
 
-def test_file_holds_the_bad_environments_only(tmp_path):
-    run, path = recorded(tmp_path)
+def test_file_holds_the_bad_environments_only(recorded):
+    run, path = recorded
     value = run.nonfinite_value
     n_bad = len({one.env for one in (value, *value.others)})
     with np.load(path) as file:
@@ -104,8 +109,8 @@ def test_file_holds_the_bad_environments_only(tmp_path):
     assert "state.map" not in shapes, "large and shared by all environments"
 
 
-def test_replay_in_another_environment_shows_nothing(tmp_path):
-    _, path = recorded(tmp_path)
+def test_replay_in_another_environment_shows_nothing(recorded):
+    _, path = recorded
     assert Recording(path).replay(Walks(edge=1e9)) is None
 
 
@@ -118,8 +123,8 @@ def test_replay_in_another_environment_shows_nothing(tmp_path):
         (lambda env: setattr(env, "action_space", spaces.MultiDiscrete(2, 3)), "actions"),
     ],
 )
-def test_what_does_not_fit_is_named(tmp_path, change, sentence):
-    _, path = recorded(tmp_path)
+def test_what_does_not_fit_is_named(recorded, change, sentence):
+    _, path = recorded
     env = Walks()
     env.reset = lambda world=env.reset(): world
     change(env)
@@ -134,9 +139,8 @@ def test_file_of_something_else_is_refused(tmp_path, content):
         Recording(tmp_path / "a.npz")
 
 
-def test_truncated_file_and_other_format_are_refused(tmp_path):
-    _, path = recorded(tmp_path)
-    whole = path.read_bytes()
+def test_truncated_file_and_other_format_are_refused(tmp_path, recorded):
+    path, whole = tmp_path / "a.npz", recorded[1].read_bytes()
     for n in (len(whole) // 2, len(whole) - 5):
         path.write_bytes(whole[:n])
         with pytest.raises(ReplayError):
@@ -173,9 +177,35 @@ def test_numbers_of_the_policy_leave_no_file(tmp_path):
 
 
 def test_where_steps_cannot_be_repeated_nothing_is_recorded(tmp_path):
-    lagging = trainer_in(tmp_path, Walks(), VTrace, lag=1)
-    assert lagging.recorder is None
+    lagging = trainer_in(tmp_path, learner=VTrace, lag=1)
+    with pytest.warns(UserWarning, match="Nothing was recorded to see it again: .* learner.lag"):
+        lagging.train(lambda: lagging.nonfinite_value is not None)
+    assert not list(tmp_path.glob("*.npz"))
     policy = Policy(Walks.obs_space, Walks.action_space, width=8)
     env, learner = Opponents(Walks(), policy, past=1.0, snapshots=1), PPO(policy, n_minibatches=2)
     assert make_recorder(env, learner.check, learner.collector(env)) is None
     assert make_recorder(env := Walks(), None, learner.collector(env)) is None
+
+
+@pytest.mark.cuda
+def test_recording_never_synchronises():
+    env, check = Walks(), NonFiniteCheck(torch.device("cuda"))
+    tensors = ("places", "scales", "wind", "marks")
+    for name in tensors:
+        setattr(env, name, getattr(env, name).cuda())
+    env.generator = torch.Generator("cuda")
+    actions = torch.zeros(T, N * A, 1, dtype=torch.int64, device="cuda")
+    recorder, rollout = RolloutRecorder(env, check), SimpleNamespace(actions=actions)
+    recorder.start()
+    recorder.end(rollout)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        env.places.add_(1)
+        recorder.start()
+        recorder.end(rollout)
+        check.record[2:3].fill_(2)  # a number was found
+        env.places.add_(1)
+        recorder.start()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert bool((recorder.state[".places"] == 1).all()) and len(recorder.on_host) == 3
