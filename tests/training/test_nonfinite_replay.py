@@ -126,7 +126,8 @@ def test_replay_in_another_environment_shows_nothing(recorded):
 def test_what_does_not_fit_is_named(recorded, change, sentence):
     _, path = recorded
     env = Walks()
-    env.reset = lambda world=env.reset(): world
+    world = env.reset()
+    env.reset = lambda: world
     change(env)
     with pytest.raises(ReplayError, match=sentence):
         Recording(path).replay(env)
