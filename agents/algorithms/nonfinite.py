@@ -4,6 +4,7 @@ T time, B lanes.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -96,7 +97,8 @@ class NonFiniteCheck:
     def __init__(self, device: torch.device):
         # [rollouts checked, updates skipped in a row, then of the first rollout with non-finite
         #  numbers: its number (from 1; 0: none), its bad lanes, and of the first `MAX_NAMED` of
-        #  those the index in `_sizes` and the magnitude of the lane's first number]
+        #  those the index in `_sizes` and the magnitude of the lane's first number; NaN as -1 and
+        #  infinity as 1.8e308, since checkpoints hold this]
         self.record = torch.zeros(4 + 2 * MAX_NAMED, dtype=torch.float64, device=device)
 
     @property
@@ -124,7 +126,8 @@ class NonFiniteCheck:
         latest = torch.zeros_like(first)
         latest[0], latest[1] = count[0], n_bad
         latest[2 : 2 + len(index)] = index
-        latest[-MAX_NAMED:][: len(index)] = sizes.flatten()[index.clamp(max=sizes.numel() - 1)]
+        worst = sizes.flatten()[index.clamp(max=sizes.numel() - 1)].double()
+        latest[-MAX_NAMED:][: len(index)] = worst.nan_to_num(nan=-1.0)
         first.copy_(torch.where((n_bad == 0) | self.found, first, latest))
         return n_bad == 0
 
@@ -183,6 +186,7 @@ def _value_at(floats, rollout, index, size):
     n_steps, n_lanes = min(map(len, floats.values())), next(iter(floats.values())).shape[1]
     row, lane = divmod(index, n_lanes)
     row, i = divmod(row, len(floats))
+    size = math.nan if size < 0 else math.inf if size > torch.finfo(torch.float32).max else size
     return NonFiniteValue(list(floats)[i], lane, (rollout - 1) * n_steps + row, size, rollout)
 
 

@@ -2,7 +2,6 @@
 megastep`. Signals and closed streams are handled before anything else is imported.
 """
 
-import importlib
 import os
 import sys
 import threading
@@ -14,9 +13,11 @@ SCRIPTS = {
     "evaluate": "measures a trained policy",
     "record": "films a trained policy",
 }
-#: Commands without a configuration of their own: modules of this package with a `main(words)`.
-COMMANDS = {
-    "replay": "shows a run's NaN again",
+#: Commands about one run, which is their argument, or a file of it.
+ON_RUNS = {
+    "inspect": "verifies a run's checkpoints and prints what is in them",
+    "rerun": "repeats a run and compares its metrics, byte for byte",
+    "replay": "shows a NaN of a run again, from the file that the run wrote",
 }
 #: What only a clone of the repository has, and what runs it there.
 IN_A_CLONE = {
@@ -36,21 +37,27 @@ def main() -> int:
             os.environ["COMP_LINE"] = line.replace(script, "", 1)
             words = [script, *words]
         else:
-            print(" ".join(name for name in SCRIPTS | COMMANDS if name.startswith(script)))
+            print(" ".join(name for name in SCRIPTS | ON_RUNS if name.startswith(script)))
             words = [""]
+    if words[0] == "rerun" and len(words) > 1:
+        words = ["train", f"rerun={words[1]}", *words[2:]]
     if words[0] in SCRIPTS:
         sys.argv[1:] = words[1:]
         return run_script(words[0])
-    if words[0] in COMMANDS:
+    if words[0] == "inspect":
+        return inspect_run(words[1:])
+    if words[0] == "replay":
         sys.argv[1:] = words[1:]
-        return run_module(words[0])
+        return replay_file()
     from megastep.agents.cli import console
     from megastep.settings import closest
 
     console.open_streams()
     if words[0] in ("-h", "--help"):
-        for name, text in (SCRIPTS | COMMANDS).items():
+        for name, text in SCRIPTS.items():
             console.say(f"  {program.name(name, 'python -m '):<28}{text}; --help says more")
+        for name, text in ON_RUNS.items():
+            console.say(f"  {program.name(name, 'python -m '):<28}{text}")
         console.say("Benchmarks and sheets of homes are in scripts/ of the repository.")
     elif words[0] == "--version":
         console.say(program.version())
@@ -60,7 +67,7 @@ def main() -> int:
         return 2
     elif words[0]:
         console.say(
-            f"megastep: {words[0]!r} is unknown; {closest(words[0], SCRIPTS | COMMANDS)}",
+            f"megastep: {words[0]!r} is unknown; {closest(words[0], [*SCRIPTS, *ON_RUNS])}",
             sys.stderr,
         )
         return 2
@@ -69,22 +76,33 @@ def main() -> int:
 
 def run_script(name: str) -> int:
     """Runs a script of this package by its name. Returns the exit code."""
-    prepare(name)
-    from megastep.agents.cli import command, scripts
-
-    return command.run_command(scripts.SCRIPTS[name])
-
-
-def run_module(name: str) -> int:
-    """Runs a command of `COMMANDS` by its name. Returns the exit code."""
-    prepare(name)
-    return importlib.import_module(f"megastep.agents.cli.{name}").main()
-
-
-def prepare(name: str) -> None:
-    """Handles signals, closed streams and threads that fail."""
     signals.exit_on_signals(name)
     from megastep.agents.cli import console  # its imports take a while
 
     console.open_streams()
     threading.excepthook = console.warn_of_thread
+    from megastep.agents.cli import command, scripts
+
+    return command.run_command(scripts.SCRIPTS[name])
+
+
+def inspect_run(words: list[str]) -> int:
+    """Runs `megastep inspect`. Returns the exit code."""
+    signals.exit_on_signals("inspect")
+    from megastep.agents.cli import console, inspect
+
+    console.open_streams()
+    try:
+        return inspect.run(words)
+    except program.UserError as error:
+        console.say(f"megastep inspect: {error}", sys.stderr)
+        return error.code
+
+
+def replay_file() -> int:
+    """Runs `megastep replay`. Returns the exit code."""
+    signals.exit_on_signals("replay")
+    from megastep.agents.cli import console, replay
+
+    console.open_streams()
+    return replay.main()

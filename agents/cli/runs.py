@@ -146,12 +146,17 @@ def find(name: str) -> Path:
     )
 
 
-def load_checkpoint(path: Path, device: Any = None) -> checkpoint.Checkpoint:
+def load_checkpoint(
+    path: Path, device: Any = None, is_whole: bool = False
+) -> checkpoint.Checkpoint:
     """Returns the checkpoint of a run found with `find`, on a device; without one, all but its
     state, and PyTorch is not imported. Warns of damaged ones it skips.
+
+    Args:
+        is_whole: loads environments and replay buffer, too, as for a run that is resumed.
     """
     with program.errors(kinds=(OSError, ValueError, checkpoint.CheckpointError)):
-        return checkpoint.load_latest(checkpoints_of(path), device)
+        return checkpoint.load_latest(checkpoints_of(path), device, is_whole)
 
 
 def resume_command(folder: Path) -> str:

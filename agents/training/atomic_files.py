@@ -27,3 +27,45 @@ def write_synced(path: Path, data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
+
+
+class AppendedFile:
+    """A file that grows. What a full disk refuses is kept, and written by the next call from the
+    byte where it stopped, so the file never has a hole.
+
+    Args:
+        path: the file, made if it does not exist.
+        n_bytes: length to cut it to first; None keeps all.
+
+    Raises:
+        OSError: the file cannot be opened or cut.
+
+    Attributes:
+        unwritten: bytes to write.
+    """
+
+    def __init__(self, path: Path, n_bytes: int | None = None):
+        self.path, self.unwritten = path, bytearray()
+        self.file = open(path, "ab", buffering=0)
+        if n_bytes is not None:
+            self.file.truncate(n_bytes)
+
+    def write(self, data: bytes) -> None:
+        """Appends bytes.
+
+        Raises:
+            OSError: the disk is full or not writable.
+        """
+        self.unwritten += data
+        self.flush()
+
+    def flush(self) -> None:
+        """Writes what is left, with errors as `write`."""
+        while self.unwritten:
+            del self.unwritten[: self.file.write(self.unwritten)]
+
+    def close(self) -> None:
+        try:
+            self.flush()
+        finally:
+            self.file.close()

@@ -58,13 +58,14 @@ class RolloutRecorder:
         self.env, self.check = env, check
         self.state, self.actions = {}, {}
         self.on_host = {}  # rollout -> what the host holds of the state: generators, tensors
-        self.n_rollouts = None
+        self.first_rollout = self.n_rollouts = None
 
     @torch.no_grad()
     def start(self) -> None:
         """Copies the state. Call before each rollout, from the thread that collects it."""
         if self.n_rollouts is None:
             self.n_rollouts = int(self.check.record[0])
+            self.first_rollout = self.n_rollouts + 1
         self.n_rollouts += 1
         host = self.on_host[self.n_rollouts] = {}
         device = self.check.record.device
