@@ -32,8 +32,8 @@ from megastep.types import Env, n_lanes, optional
 MAX_SHARED_BYTES = 2**20
 #: What a run without a recorder says in place of a command.
 NOT_RECORDED = (
-    ". Nothing was recorded to see it again: that needs a run without opponents, learner.lag and "
-    "a collector of the learner's own"
+    "Nothing was recorded to see it again: steps are not with learner.lag, with a learner's own "
+    "collector, and before a resume"
 )
 _FORMAT = 1
 
@@ -50,13 +50,16 @@ class RolloutRecorder:
     to 1.5 kB per environment.
 
     Args:
-        env: the environment that the rollouts are collected in.
+        env: the environment that the rollouts are collected in, without opponents around it.
         check: the learner's check of the same rollouts.
+
+    Attributes:
+        played: the actions of all lanes by path, (T, B, ...), of a rollout with opponents.
     """
 
     def __init__(self, env: Env, check: NonFiniteCheck):
         self.env, self.check = env, check
-        self.state, self.actions = {}, {}
+        self.state, self.actions, self.played, self.n_played = {}, {}, {}, 0
         self.on_host = {}  # rollout -> what the host holds of the state: generators, tensors
         self.first_rollout = self.n_rollouts = None
 
@@ -67,6 +70,7 @@ class RolloutRecorder:
             self.n_rollouts = int(self.check.record[0])
             self.first_rollout = self.n_rollouts + 1
         self.n_rollouts += 1
+        self.n_played = 0
         host = self.on_host[self.n_rollouts] = {}
         device = self.check.record.device
         for path, leaf in state_tree(self.env).items():
@@ -81,8 +85,22 @@ class RolloutRecorder:
     @torch.no_grad()
     def end(self, rollout: Rollout) -> None:
         """Copies the actions. Call after each rollout, before it is checked."""
-        for path, leaf in spaces.leaves(rollout.actions, "actions").items():
+        actions = self.played or spaces.leaves(rollout.actions, "actions")
+        for path, leaf in actions.items():
             self._keep(self.actions, path, leaf)
+
+    def watch(self, opponents: Any, n_steps: int) -> None:
+        """Has opponents report the actions of all lanes, as rollouts of T steps store some only."""
+        for path, space in spaces.leaves(self.env.action_space, "actions").items():
+            shape = n_steps, n_lanes(self.env), *space.shape
+            self.played[path] = torch.zeros(shape, dtype=torch.int64, device=self.env.device)
+        opponents.on_actions = self._play
+
+    def _play(self, actions):
+        for path, leaf in spaces.leaves(actions, "actions").items():
+            self.played[path][self.n_played].copy_(leaf)
+        # a CUDA graph is captured over whole rollouts, and must leave this number as it was
+        self.n_played = (self.n_played + 1) % len(self.played[path])
 
     def _keep(self, copies, path, leaf):
         copy = copies.get(path)
@@ -90,6 +108,18 @@ class RolloutRecorder:
             copies[path] = leaf.clone()
         else:
             torch.where(self.check.found, copy, leaf, out=copy)
+
+    def has(self, value: NonFiniteValue) -> bool:
+        """Returns False if the number is of a rollout before the first `start`, of a resumed run.
+
+        Args:
+            value: of `check.read`.
+        """
+        return self.first_rollout is not None and value.rollout >= self.first_rollout
+
+    def close(self) -> None:
+        """Drops the copies. A CUDA graph may still write into `played`."""
+        self.state, self.actions, self.on_host = {}, {}, {}
 
     def forget(self) -> None:
         """Drops what the host kept of rollouts. Call after each `check.read`."""
@@ -117,12 +147,15 @@ class RolloutRecorder:
                 index = self._rows(rows, leaf.shape[axis]).to(leaf.device)
                 leaf = leaf.index_select(axis, index)
             arrays[f"state{name}"] = leaf
+        is_checked = torch.ones(n_lanes(self.env), dtype=torch.bool)
+        is_checked = is_checked if rollout.learners is None else rollout.learners.cpu()
         header = dict(
             format=_FORMAT,
             place=(value.name, value.lane, value.step),
             rollout=value.rollout,
             device=self.check.record.device.type,
             envs=envs,
+            lanes=[lane for lane in lanes.tolist() if is_checked[lane]],
             n_envs=self.env.n_envs,
             n_steps=rollout.n_steps,
             privileged=rollout.privileged is not None,
@@ -139,14 +172,24 @@ class RolloutRecorder:
         return _rows(envs, size // self.env.n_envs)
 
 
-def make_recorder(env: Env, check: NonFiniteCheck | None, collect: Any) -> RolloutRecorder | None:
-    """Returns a recorder of what `collect` collects, or None where steps cannot be repeated.
+def make_recorder(
+    env: Env, opponents: Any, check: NonFiniteCheck | None, collect: Any
+) -> RolloutRecorder | None:
+    """Returns a recorder of what `collect` collects, or None where steps cannot be repeated: an
+    async collector starts rollouts before the earlier ones are checked, and a learner's own
+    collector may do anything.
 
-    Opponents' actions are not stored, an async collector starts rollouts before the earlier ones
-    are checked, and a learner's own collector may do anything.
+    Args:
+        env: the environment.
+        opponents: `env`, if it is an `Opponents`.
     """
-    is_plain = isinstance(collect, Collector) and collect.rollout.learners is None
-    return RolloutRecorder(env, check) if is_plain and check is not None else None
+    if not isinstance(collect, Collector) or check is None:
+        return None
+    if opponents is None:
+        return RolloutRecorder(env, check)
+    recorder = RolloutRecorder(env.env, check)
+    recorder.watch(opponents, collect.rollout.n_steps)
+    return recorder
 
 
 def command(path: Path) -> str:
@@ -256,9 +299,11 @@ class Recording:
             rollout.store_world(t + 1, world)
         check = NonFiniteCheck(torch.device(env.device))
         check.record[0] = self.header["rollout"] - 1
-        check(rollout.floats())
-        value, _ = check.read(rollout.floats())
-        lanes = stored.nonzero()[:, 0].tolist()
+        lanes = self.header["lanes"]  # the others are opponents'
+        columns = [i for i, lane in enumerate(stored.nonzero()[:, 0].tolist()) if lane in lanes]
+        floats = {name: leaf[:, columns] for name, leaf in rollout.floats().items()}
+        check(floats)
+        value, _ = check.read(floats)
         return value and value.in_env(lanes, optional(env, "n_agents"))
 
 

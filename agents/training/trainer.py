@@ -150,7 +150,7 @@ class Trainer:
         self.nonfinite_value, self.replay_hint = None, ""
         self.replay_folder, self.recorder = replay_folder, None
         if replay_folder is not None:
-            self.recorder = nonfinite_replay.make_recorder(env, self.check, self.collect)
+            self.recorder = nonfinite_replay.make_recorder(env, opponents, self.check, self.collect)
         self.has_named_unreachable = False
 
     @property
@@ -335,17 +335,17 @@ class Trainer:
     def write_replay(self, value: NonFiniteValue) -> None:
         """Writes the file that replays a number of the environment, and stops recording."""
         recorder, self.recorder = self.recorder, None
-        if self.replay_folder is None or not value.is_from_env:
-            return
-        if recorder is None or value.rollout < recorder.first_rollout:  # of before a resume
-            self.replay_hint = nonfinite_replay.NOT_RECORDED
-            return
-        path = self.replay_folder / f"nonfinite-{self.samples}.npz"
-        try:
-            recorder.write(path, value, self.rollout)
-            self.replay_hint = f". To see it again: {nonfinite_replay.command(path)}"
-        except OSError as error:
-            self.replay_hint = f". {path} could not be written ({error.strerror or error})"
+        if value.is_from_env and recorder is not None and recorder.has(value):
+            path = self.replay_folder / f"nonfinite-{self.samples}.npz"
+            try:
+                recorder.write(path, value, self.rollout)
+                self.replay_hint = f". To see it again: {nonfinite_replay.command(path)}"
+            except OSError as error:
+                self.replay_hint = f". {path} could not be written ({error.strerror or error})"
+        elif value.is_from_env and self.replay_folder is not None:
+            self.replay_hint = f". {nonfinite_replay.NOT_RECORDED}"
+        if recorder is not None:
+            recorder.close()
 
     def save_checkpoint(self, state: dict[str, Any] | None = None, is_last: bool = False) -> None:
         """Begins to save a checkpoint, unless the last one holds every update.

@@ -1,5 +1,6 @@
 """Files that replay a non-finite number: the same steps from the same state show it again."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.algorithms.nonfinite import NonFiniteCheck
+from megastep.agents.algorithms.nonfinite import NonFiniteCheck, NonFiniteValue
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
@@ -64,13 +65,22 @@ class Walks:
         return arrdict(obs=obs, reward=reward, reset=reset, terminal=none, truncated=none)
 
 
-def trainer_in(folder, env=None, learner=PPO, **options):
+def trainer_in(folder, env=None, learner=PPO, past=0.0, **options):
     env = env or Walks()
     policy = Policy(env.obs_space, env.action_space, width=8)
+    opponents = Opponents(env, policy, past=past, snapshots=1) if past else None
     learner = learner(policy, n_steps=T, n_minibatches=2, **options)
     logger = type("Silent", (), {"write": lambda *args: None})()
     return Trainer(
-        env, policy, learner, logger, Saver(folder, {}), Budget(), replay_folder=folder, log_every=7
+        opponents or env,
+        policy,
+        learner,
+        logger,
+        Saver(folder, {}),
+        Budget(),
+        log_every=7,
+        opponents=opponents,
+        replay_folder=folder,
     )
 
 
@@ -182,10 +192,29 @@ def test_where_steps_cannot_be_repeated_nothing_is_recorded(tmp_path):
     with pytest.warns(UserWarning, match="Nothing was recorded to see it again: .* learner.lag"):
         lagging.train(lambda: lagging.nonfinite_value is not None)
     assert not list(tmp_path.glob("*.npz"))
-    policy = Policy(Walks.obs_space, Walks.action_space, width=8)
-    env, learner = Opponents(Walks(), policy, past=1.0, snapshots=1), PPO(policy, n_minibatches=2)
-    assert make_recorder(env, learner.check, learner.collector(env)) is None
-    assert make_recorder(env := Walks(), None, learner.collector(env)) is None
+    learner = PPO(lagging.policy, n_minibatches=2)
+    assert make_recorder(Walks(), None, None, learner.collector(Walks())) is None
+
+
+def test_replay_needs_no_opponents(tmp_path):
+    """Opponents' actions are recorded; their lanes, which may be bad before, are not checked."""
+    run = trainer_in(tmp_path, past=1.0)
+    is_bad_early = ~run.env.learners
+    assert run.recorder.played["actions"].shape == (T, N * A, 1)
+    with pytest.warns(UserWarning, match="To see it again"):
+        run.train(lambda: run.nonfinite_value is not None)
+    value, (path,) = run.nonfinite_value, tmp_path.glob("*.npz")
+    again = Recording(path).replay(Walks())
+    assert (again, again.env) == (dataclasses.replace(value, n_lanes=again.n_lanes), value.env)
+    assert not is_bad_early[value.lane] and run.recorder is None
+
+
+def test_rollouts_before_a_resume_are_not_those_recorded(tmp_path):
+    run = trainer_in(tmp_path)
+    run.check.record[0] = 5
+    assert not run.recorder.has(NonFiniteValue("reward", 0, 20, 1e13, rollout=5))
+    run.recorder.start()
+    assert [n for n in (5, 6) if run.recorder.has(NonFiniteValue("reward", 0, 24, 1e13, n))] == [6]
 
 
 @pytest.mark.cuda
