@@ -198,7 +198,7 @@ class Trainer:
             raise
         except Exception:
             with contextlib.suppress(Exception):  # the first error is the one to report
-                self.save_checkpoint(is_last=True)
+                self.save_what_was_learnt()
             raise
         finally:
             with contextlib.suppress(Exception):  # as above
@@ -308,7 +308,7 @@ class Trainer:
             return n_skipped == 0
         advice = f"The policy diverged: try a learning rate smaller than {self.learner.lr:g}"
         if value and value.is_from_env:
-            self.save_checkpoint()  # the skipped updates left the policy unchanged
+            self.save_what_was_learnt()  # the skipped updates left the policy unchanged
             advice = f"It came from the environment: check how it computes {value.name}"
         raise NonFiniteError(
             f"The last {n_skipped} updates were skipped because of numbers that were not finite or "
@@ -367,6 +367,15 @@ class Trainer:
         state = self.state_dict() if state is None else state
         self.saver(self.samples, state, self.score, is_last)
         self.updates_at_checkpoint = self.updates
+
+    def save_what_was_learnt(self) -> None:
+        """Begins to save a checkpoint from which a resumed run starts new episodes: after an error
+        the environment may be the cause, or in the middle of a rollout.
+        """
+        state = self.state_dict()
+        for name in ("env", "collector"):
+            state.pop(name, None)
+        self.save_checkpoint(state, is_last=True)
 
     def state_dict(self) -> dict[str, Any]:
         """Returns all that a resumed run needs, as dicts of tensors and plain values, most of which
