@@ -69,7 +69,8 @@ class EnvState:
         values = self._plain_values()
         values = {path: now for path, now in values.items() if first.get(path, missing) != now}
         lengths = {path: len(node) for path, node in self._nodes_of_user() if _is_list(node)}
-        return {"arrays": arrays, "generators": generators, "values": values, "lengths": lengths}
+        state = {"values": copy.deepcopy(values), "lengths": lengths}
+        return {"arrays": arrays, "generators": generators, **state}
 
     @torch.no_grad()
     def load_state_dict(self, state: dict[str, dict[str, Any]]) -> None:

@@ -28,7 +28,7 @@ DATA = pathlib.Path(__file__).parents[1] / "data"
 EVERY_UPDATE = ["checkpoint_seconds=1e-9", "keep_checkpoints=99"]
 slow = pytest.mark.slow
 CASES = {
-    "ppo": tiny.TINY,
+    "ppo": [*tiny.TINY, *tiny.SHORT_EPISODES],
     "vtrace": [*tiny.TINY, "learner=vtrace"],
     "lag": [*tiny.TINY, "learner=vtrace", "learner.lag=1"],
     "lag2": [*tiny.TINY, "learner=vtrace", "learner.lag=2"],
@@ -51,7 +51,7 @@ CASES = {
     "pong": [*PONG, "learner.n_minibatches=2"],
     "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[1:]],
 }
-FAST = "ppo", "lag", "priorities", "r2d2", "opponents", "pointgoal", "stranger"
+FAST = "explorer", "lag", "priorities", "r2d2", "opponents", "stranger"
 
 
 class Drifting:
@@ -159,7 +159,7 @@ def interrupt_collecting(monkeypatch, call):
 
 def test_interrupted_run_has_the_same_bits(here, monkeypatch):
     """Ctrl-C twice, between reports: the reports of the stops are not in the file in the end."""
-    words = [*tiny.TINY, "samples=320", "log_every=4"]
+    words = [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=320", "log_every=4"]
     run(*words, "folder=left-alone")
     for command in ([*words, "folder=run"], ["resume=run"]):
         interrupt_collecting(monkeypatch, 3)
