@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue, lane_name
-from megastep.agents.training import nonfinite_replay
+from megastep.agents.training import nonfinite_recorder
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.performance import PhaseTimer, device_memory
@@ -75,7 +75,7 @@ class Trainer:
         snapshot_saver: such as `saver.SnapshotSaver`: called with the trainer before the first
             update and after each.
         replay_folder: where a file is written that replays the first NaN or infinity of the
-            environment, see `nonfinite_replay`; None for no file.
+            environment, see `nonfinite_recorder`; None for no file.
         annealing_record: such as `annealing.AnnealingRecord`: gets the factor of the learning rate
             in each update, and is flushed before each report.
 
@@ -150,7 +150,9 @@ class Trainer:
         self.nonfinite_value, self.replay_hint = None, ""
         self.replay_folder, self.recorder = replay_folder, None
         if replay_folder is not None:
-            self.recorder = nonfinite_replay.make_recorder(env, opponents, self.check, self.collect)
+            self.recorder = nonfinite_recorder.make_recorder(
+                env, opponents, self.check, self.collect
+            )
         self.has_named_unreachable = False
 
     @property
@@ -339,11 +341,11 @@ class Trainer:
             path = self.replay_folder / f"nonfinite-{self.samples}.npz"
             try:
                 recorder.write(path, value, self.rollout)
-                self.replay_hint = f". To see it again: {nonfinite_replay.command(path)}"
+                self.replay_hint = f". To see it again: {nonfinite_recorder.command(path)}"
             except OSError as error:
                 self.replay_hint = f". {path} could not be written ({error.strerror or error})"
         elif value.is_from_env and self.replay_folder is not None:
-            self.replay_hint = f". {nonfinite_replay.NOT_RECORDED}"
+            self.replay_hint = f". {nonfinite_recorder.NOT_RECORDED}"
         if recorder is not None:
             recorder.close()
 

@@ -14,13 +14,12 @@ from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.training.budget import Budget
-from megastep.agents.training.nonfinite_replay import (
+from megastep.agents.training.nonfinite_recorder import (
     MAX_SHARED_BYTES,
-    Recording,
-    ReplayError,
     RolloutRecorder,
     make_recorder,
 )
+from megastep.agents.training.nonfinite_replay import Recording, ReplayError
 from megastep.agents.training.saver import Saver
 from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict
