@@ -15,7 +15,7 @@ SETUP := $(if $(filter .venv/bin/python,$(PYTHON)),.venv/stamp)
 # `find` does not follow links, so agents/ is not listed twice through megastep/agents.
 KERNELS := $(shell find megastep agents tests -name "*.h" -o -name "*.cu" -o -name "*.cpp")
 
-.PHONY: train test test-slow test-nightly lint setup clean
+.PHONY: train test test-slow test-nightly lint setup lock clean
 
 train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen homes and film it
 	$(PYTHON) train.py experiment=quickstart
@@ -37,13 +37,22 @@ lint: $(SETUP)             ## check style and formatting of Python and kernels
 
 setup: $(SETUP)            ## create .venv
 
-.venv/stamp: pyproject.toml constraints.txt
+# Python 3.10 to 3.13 get the versions in requirements/, checked against their hashes; other Pythons,
+# and those for which that fails, the newest versions. PyTorch comes from wherever pip finds it.
+LOCKED = $(BASE) -c 'import sys; sys.exit(sys.version_info >= (3, 14))' \
+	&& .venv/bin/python -m pip install --no-deps --require-hashes -r requirements/build.txt -r requirements/packages.txt
+
+.venv/stamp: pyproject.toml constraints.txt $(wildcard requirements/*.txt)
 	@$(BASE) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { echo "megastep needs Python 3.10 or newer. Choose one with: make BASE=python3.12"; exit 1; }
 	@$(BASE) -c 'import ensurepip' 2>/dev/null || { echo "This Python cannot create virtual environments. On Debian: apt install python3-venv"; exit 1; }
 	$(BASE) -m venv .venv
+	{ $(LOCKED); } || echo "The versions in requirements/ cannot be installed here; taking the newest that fit."
 	.venv/bin/python -m pip install -c constraints.txt torch==2.13.0
 	.venv/bin/python -m pip install -c constraints.txt -e '.[test]'
 	touch .venv/stamp
+
+lock:                      ## resolve the versions in requirements/ anew; needs uv
+	$(BASE) scripts/lock.py
 
 clean:                     ## delete .venv, build folders and caches
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache

@@ -1,5 +1,5 @@
-"""Starts train, evaluate and record: as scripts, as the command `megastep`, or with `python -m
-megastep`. Signals and closed streams are handled before anything else is imported.
+"""Starts train, evaluate, record and reproduce: as scripts, as the command `megastep`, or with
+`python -m megastep`. Signals and closed streams are handled before anything else is imported.
 """
 
 import os
@@ -12,6 +12,7 @@ SCRIPTS = {
     "train": "trains a policy",
     "evaluate": "measures a trained policy",
     "record": "films a trained policy",
+    "reproduce": "lists the results in docs/lab; makes one again",
 }
 #: Commands about one run, which is their argument, or a file of it.
 ON_RUNS = {
@@ -81,6 +82,10 @@ def run_script(name: str) -> int:
 
     console.open_streams()
     threading.excepthook = console.warn_of_thread
+    if name == "reproduce":
+        from megastep.agents.cli import reproduce
+
+        return reproduce.main(sys.argv[1:])
     from megastep.agents.cli import command, scripts
 
     return command.run_command(scripts.SCRIPTS[name])

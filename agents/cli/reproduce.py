@@ -1,0 +1,237 @@
+"""Makes results of docs/lab again. `megastep reproduce` lists them, `megastep reproduce ROW` trains
+and evaluates as `megastep train` and `megastep evaluate` do, and compares.
+"""
+
+import hashlib
+import itertools
+import json
+import os
+import re
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from megastep.agents.cli import console, program
+from megastep.agents.training import json_lines
+from megastep.agents.training.atomic_files import write_atomically
+from megastep.settings import closest
+
+#: The rows; its head says what they consist of.
+FILE = Path(__file__).with_name("reproductions.yaml")
+#: Threads of rows for a CPU: as many as the stated results were made with.
+CPU_THREADS = 2
+#: `value (lower to upper)`, or two cells of a table: `value | lower to upper`. In percent or not.
+STATED = re.compile(r"(-?[\d.]+)( %)? (?:\(|\| )(-?[\d.]+) to (-?[\d.]+)\)?")
+
+
+class Result(NamedTuple):
+    """A number that a page states.
+
+    Attributes:
+        page: of docs/lab. One of its lines contains both `line` and `text`.
+        evaluate: words of `megastep evaluate`.
+        metric: of the evaluation's table; in duels, the opponent.
+        text: value and 95 % interval as the page writes them.
+    """
+
+    page: str
+    line: str
+    evaluate: str
+    metric: str
+    text: str
+
+    def __str__(self):
+        value, percent, lower, upper = STATED.fullmatch(self.text).groups(default="")
+        return f"{self.metric} {value}{percent} ({lower} to {upper})"
+
+    def contains(self, value: float) -> bool:
+        """Returns true if a value, rounded as the interval's bounds are, lies in the interval."""
+        _, percent, *bounds = STATED.fullmatch(self.text).groups()
+        decimals = max(len(bound.partition(".")[2]) for bound in bounds)
+        lower, upper = map(float, bounds)
+        return lower <= round(100 * value if percent else value, decimals) <= upper
+
+
+class Row(NamedTuple):
+    """A training run with its results.
+
+    Attributes:
+        device: cpu or cuda.
+        train: words of `megastep train`.
+        minutes: of the run and its evaluations, about; given for a CPU.
+        exact: machines and the SHA-256 of the run's metrics.jsonl on each.
+    """
+
+    name: str
+    device: str
+    train: str
+    results: list[Result]
+    minutes: int | None = None
+    exact: Sequence[dict[str, Any]] = ()
+
+
+def read() -> dict[str, Row]:
+    """Returns the rows by name."""
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where it is built
+    rows = yaml.load(FILE.read_text(encoding="utf-8"), loader)["rows"]
+    return {name: Row(name, **{**row, "results": [*_results(row)]}) for name, row in rows.items()}
+
+
+def _results(row: dict) -> Iterator[Result]:
+    for result in row["results"]:
+        for metric, text in result["states"].items():
+            yield Result(result["page"], result["line"], result.get("evaluate", ""), metric, text)
+
+
+def main(words: Sequence[str]) -> int:
+    """Runs the command. Returns the exit code: 1 if a result differs from what is stated."""
+    rows = read()
+    if words and words[0] in ("-sc", "--shell-completion"):
+        start = os.environ.get("COMP_LINE", "").split(" ")[-1]
+        console.say(" ".join(name for name in rows if name.startswith(start)))
+        return 0
+    if not words or words[0] in ("-h", "--help"):
+        console.say(listing(rows.values()))
+        return 0
+    try:
+        if len(words) > 1 or words[0] not in rows:
+            unknown = f"{words[0]!r} is unknown; {closest(words[0], rows)}"
+            raise program.UserError("takes the name of one row" if words[1:] else unknown)
+        return reproduce(rows[words[0]])
+    except program.UserError as error:
+        console.say(f"{program.name('reproduce')}: {error}", sys.stderr)
+        return error.code
+
+
+def listing(rows: Iterable[Row]) -> str:
+    """Returns a table of the rows for each device."""
+    rows, parts = [*rows], []
+    for device, title in ("cpu", "On two CPU cores"), ("cuda", "On one H200"):
+        lines = [
+            [row.name, str(row.minutes or ""), row.train, "; ".join(map(str, row.results))]
+            for row in rows
+            if row.device == device
+        ]
+        parts += [title, console.table(["row", "minutes", "megastep train", "result"], lines)]
+    return "\n".join([*parts, f"To run one: {program.name('reproduce', 'python ')} ROW"])
+
+
+# ---- Running a row ----
+
+
+def reproduce(row: Row) -> int:
+    """Trains and evaluates a row, and says whether its results are as stated.
+
+    Returns:
+        The exit code of the training or an evaluation if it fails, else 1 if a result differs.
+
+    Raises:
+        UserError: the row needs a GPU and there is none.
+    """
+    from megastep.agents.cli import command, gpu, runs, scripts  # a list takes none of these
+
+    if row.device == "cpu":
+        os.environ["OMP_NUM_THREADS"] = str(CPU_THREADS)  # before PyTorch is imported
+    elif not gpu.is_available():
+        raise program.UserError(
+            f"{row.name} needs a GPU, and PyTorch finds none here; choose a row for two CPU cores"
+        )
+    folder = runs.RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-reproduce-{row.name}"
+    device = f"device={row.device}"
+    finish = "finish.evaluate=false", "finish.record=false"
+    words = [*row.train.split(), *finish, device, f"folder={folder}"]
+    if code := command.run_command(scripts.TRAIN, words):
+        return code
+    values = []
+    for evaluate, group in itertools.groupby(row.results, lambda result: result.evaluate):
+        words = [f"run={folder}", device, "baseline=false", *evaluate.split()]
+        if code := command.run_command(scripts.EVALUATE, words):
+            return code
+        tables = (folder / "evaluations").glob("*.json")
+        newest = max(tables, key=lambda path: path.stat().st_mtime_ns)
+        rows = json.loads(newest.read_bytes())["rows"]
+        values += [value_of(rows, result.metric) for result in group]
+    return compare(row, folder, values)
+
+
+def value_of(rows: list[dict], metric: str) -> float:
+    """Returns a number of an evaluation's table: the share of duels won against the opponent of
+    this name, else the mean return or a metric's mean.
+    """
+    if "against" in rows[0]:
+        return next(row["won"] for row in rows if row["against"] == metric)
+    return rows[0]["return"] if metric == "return" else rows[0]["metrics"][metric]["mean"]
+
+
+def compare(row: Row, folder: Path, values: Sequence[float]) -> int:
+    """Prints how a run's results compare with those stated, and writes reproduction.json into its
+    folder. Returns the exit code.
+
+    Args:
+        values: one for each of the row's results.
+    """
+    metrics = (folder / "metrics.jsonl").read_bytes()
+    samples = json_lines.read(folder / "metrics.jsonl")[-1]["samples"]
+    here, digest = machine(row.device), hashlib.sha256(metrics).hexdigest()
+    is_exact, sentence = compare_bits(row.exact, here, digest)
+    are_inside = [*map(Result.contains, row.results, values)]
+    is_reproduced = all(are_inside) and is_exact is not False
+    for result, value, is_inside in zip(row.results, values, are_inside, strict=True):
+        place = "inside" if is_inside else "OUTSIDE"
+        console.say(f"{place}: {value:.4g}, stated {result}, docs/lab/{result.page}")
+    console.say(sentence)
+    if not all(are_inside) and "samples=" not in row.train:
+        console.say(
+            f"The run had {samples:,} samples; in the same seconds a slower or busier machine has "
+            "fewer"
+        )
+    console.say(f"{row.name} is {'' if is_reproduced else 'NOT '}reproduced: {folder}")
+    report = {
+        "row": row.name,
+        "is_reproduced": is_reproduced,
+        "samples": samples,
+        "values": {str(result): value for result, value in zip(row.results, values)},
+        "exact": {**here, "sha256": digest},
+    }
+    with program.errors(f"{folder} cannot be written: "):
+        write_atomically(folder / "reproduction.json", json.dumps(report, indent=2).encode())
+    return 0 if is_reproduced else 1
+
+
+def machine(device: str) -> dict[str, Any]:
+    """Returns what the bits of a run depend on, besides configuration and code."""
+    import torch  # after OMP_NUM_THREADS is set
+
+    from megastep.agents.training import provenance
+
+    facts = {"device": provenance.device_name(torch.device(device)), "torch": torch.__version__}
+    if device == "cpu":
+        facts["instructions"] = torch.backends.cpu.get_cpu_capability()
+        facts["threads"] = torch.get_num_threads()
+    return facts
+
+
+def compare_bits(
+    known: Sequence[dict[str, Any]], here: dict[str, Any], digest: str
+) -> tuple[bool | None, str]:
+    """Compares the digest of a run's metrics.jsonl with those known for its row.
+
+    Returns:
+        True if it equals one of them, False if it differs from that of this kind of machine, None
+        if there is none of this kind; and a sentence.
+    """
+    if any(one["sha256"] == digest for one in known):
+        return True, "metrics.jsonl is equal to the recorded one, byte for byte"
+    if any(here.items() <= one.items() for one in known):
+        return False, "metrics.jsonl DIFFERS from the one recorded on this kind of machine"
+    if not known:
+        return None, "metrics.jsonl is not compared: none is recorded for this row"
+    others = " or ".join(
+        ", ".join(f"{key} {one[key]}, here {here[key]}" for key in here if one[key] != here[key])
+        for one in known
+    )
+    return None, f"metrics.jsonl differs from the recorded one, of another machine: {others}"

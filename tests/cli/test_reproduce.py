@@ -1,0 +1,218 @@
+"""`megastep reproduce`: its rows beside the pages that state them, its verdicts, its errors."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from megastep.agents.cli import command, entry, gpu, reproduce, scripts
+from megastep.agents.cli.reproduce import Result, Row
+from tests.helpers import tiny
+
+LAB = Path(__file__).parents[2] / "docs" / "lab"
+ROWS = reproduce.read()
+RESULTS = [result for row in ROWS.values() for result in row.results]
+WITHOUT_ROW = yaml.safe_load(reproduce.FILE.read_text())["without_row"]
+HERE = {"device": "cpu EPYC", "torch": "2.13.0+cpu", "instructions": "AVX2", "threads": 2}
+#: Minimal pays nothing, so every return is 0.
+NOTHING = Result("page.md", "line", "episodes=4", "return", "0 (0 to 0)")
+
+
+def lines_of(page):
+    """A page's paragraphs, and the lines of its tables."""
+    text = re.sub(r"^\|.*", r"\n\g<0>\n", (LAB / page).read_text(), flags=re.M)
+    return [" ".join(block.split()) for block in re.split(r"\n\n+", text)]
+
+
+# ---- The rows and the pages ----
+
+
+@pytest.mark.parametrize("page", sorted({result.page for result in RESULTS}))
+def test_page_states_the_results_of_the_rows(page):
+    lines = lines_of(page)
+    for result in RESULTS:
+        if result.page == page:
+            assert any(result.line in line and result.text in line for line in lines), result
+
+
+@pytest.mark.parametrize("page", WITHOUT_ROW)
+def test_every_interval_of_a_page_has_a_row_or_a_reason(page):
+    stated = {match[0] for match in reproduce.STATED.finditer("\n".join(lines_of(page)))}
+    have_row = {result.text for result in RESULTS if result.page == page}
+    have_reason = {text for texts in WITHOUT_ROW[page].values() for text in texts}
+    assert stated == have_row | have_reason
+    assert not have_row & have_reason
+
+
+def test_rows_for_two_cores_end_within_ten_minutes():
+    assert all(row.minutes <= 10 for row in ROWS.values() if row.device == "cpu")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", ROWS.values(), ids=ROWS)
+def test_words_of_a_row_compose(row):
+    """Those for a GPU with its preset, as `auto` would choose on a machine with one."""
+    preset = f"preset={'cpu' if row.device == 'cpu' else 'gpu'}"
+    tiny.settings(*row.train.split(), preset)
+    for result in row.results:
+        words = map(scripts.EVALUATE.reword, result.evaluate.split())
+        tiny.settings("run=runs/x", *words, script="evaluate")
+
+
+# ---- Verdicts ----
+
+
+@pytest.mark.parametrize(
+    "text, inside, outside",
+    [
+        ("0.999 (0.997 to 1)", (0.9966, 1.0), (0.9964,)),
+        ("29.1 (27.2 to 31.0)", (27.2, 31.04), (27.1, 31.06)),
+        ("92.9 % (91.9 to 93.9)", (0.919, 0.93), (0.918, 0.94)),
+        ("-6.4 | -6.8 to -6.1", (-6.8, -6.1), (-6.9, -6.0)),
+    ],
+)
+def test_interval_contains_a_value_rounded_as_its_bounds(text, inside, outside):
+    result = Result("page.md", "line", "", "return", text)
+    assert all(map(result.contains, inside))
+    assert not any(map(result.contains, outside))
+
+
+@pytest.mark.parametrize(
+    "known, is_exact, words",
+    [
+        ([], None, "none is recorded"),
+        ([HERE | {"sha256": "a"}], True, "byte for byte"),
+        ([HERE | {"sha256": "b", "threads": 1}, HERE | {"sha256": "b"}], False, "DIFFERS"),
+        ([HERE | {"sha256": "b", "threads": 1}], None, "threads 1, here 2"),
+        ([HERE | {"sha256": "a", "threads": 1}], True, "byte for byte"),
+    ],
+)
+def test_metrics_are_compared_on_the_same_kind_of_machine(known, is_exact, words):
+    verdict, sentence = reproduce.compare_bits(known, HERE, "a")
+    assert verdict is is_exact
+    assert words in sentence
+
+
+def test_values_of_an_evaluation_and_of_duels():
+    rows = [{"return": 3.0, "metrics": {"spl": {"mean": 0.5}}}, {"return": 1.0, "metrics": {}}]
+    assert reproduce.value_of(rows, "return") == 3
+    assert reproduce.value_of(rows, "spl") == 0.5
+    rows = [{"against": "random", "won": 0.9}, {"against": "bot", "won": 0.3}]
+    assert reproduce.value_of(rows, "bot") == 0.3
+
+
+@pytest.mark.slow
+def test_a_run_gives_the_same_bytes_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    row = Row("first", "cpu", " ".join([*tiny.TINY, f"samples={2 * tiny.UPDATE}"]), [NOTHING])
+    assert reproduce.reproduce(row) == 0
+    (path,) = tmp_path.glob("runs/*-reproduce-first/reproduction.json")
+    report = json.loads(path.read_text())
+    assert (report["is_reproduced"], report["samples"]) == (True, 2 * tiny.UPDATE)
+    assert reproduce.reproduce(row._replace(name="again", exact=[report["exact"]])) == 0
+    assert "byte for byte" in capsys.readouterr().out
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", [row.name for row in ROWS.values() if row.exact])
+def test_recorded_bytes_come_out_again(name, tmp_path):
+    """On the kinds of machine that are recorded; elsewhere, that the results do."""
+    words = [sys.executable, "-m", "megastep", "reproduce", name]
+    env = os.environ | {"PYTHONPATH": str(LAB.parents[1])}
+    assert subprocess.run(words, cwd=tmp_path, env=env).returncode == 0
+
+
+def test_each_place_is_evaluated_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    calls = []
+
+    def run_command(script, words):
+        """Writes what training and evaluation leave behind; the n-th call earns n."""
+        calls.append(" ".join([script.name, *words]))
+        folder = Path(re.search(r"(?:folder|run)=(\S+)", calls[-1])[1])
+        (folder / "evaluations").mkdir(parents=True, exist_ok=True)
+        (folder / "metrics.jsonl").write_text('{"samples": 64}\n')
+        rows = [{"return": len(calls), "metrics": {"spl": {"mean": 0.5}}}]
+        (folder / f"evaluations/{len(calls)}.json").write_text(json.dumps({"rows": rows}))
+
+    monkeypatch.setattr(command, "run_command", run_command)
+    homes = [("return", "2 (1 to 3)"), ("spl", "0.5 (0.4 to 0.6)")]
+    results = [Result("page.md", "line", "", *stated) for stated in homes]
+    results.append(Result("page.md", "line", "geometry=bench", "return", "2 (1 to 2)"))
+    assert reproduce.reproduce(Row("row", "cpu", "env=minimal samples=64", results)) == 1
+    training, homes, bench = calls
+    assert training.startswith("train env=minimal samples=64 ") and "device=cpu" in training
+    assert "geometry" not in homes and bench.endswith(" geometry=bench")
+    shown = capsys.readouterr().out
+    assert "inside: 2, stated return 2" in shown and "OUTSIDE: 3, stated return 2" in shown
+
+
+def test_a_result_outside_its_interval_is_not_reproduced(tmp_path, capsys):
+    (tmp_path / "metrics.jsonl").write_text('{"samples": 64}\n')
+    row = Row("slow", "cpu", "env=minimal seconds=9", [NOTHING])
+    assert reproduce.compare(row, tmp_path, [0.0]) == 0
+    assert reproduce.compare(row, tmp_path, [1.0]) == 1
+    shown = capsys.readouterr().out
+    assert "OUTSIDE: 1, stated return 0 (0 to 0), docs/lab/page.md" in shown
+    assert "The run had 64 samples" in shown
+
+
+def test_other_bytes_on_the_same_kind_of_machine_are_not_reproduced(tmp_path, monkeypatch):
+    monkeypatch.setattr(reproduce, "machine", lambda device: HERE)
+    (tmp_path / "metrics.jsonl").write_text('{"samples": 64}\n')
+    row = Row("row", "cpu", "env=minimal samples=64", [NOTHING], exact=[HERE | {"sha256": "b"}])
+    assert reproduce.compare(row, tmp_path, [0.0]) == 1
+
+
+# ---- The command ----
+
+
+def test_a_training_that_fails_ends_the_command_with_its_code(tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    scripts = []
+    monkeypatch.setattr(command, "run_command", lambda script, _: scripts.append(script) or 130)
+    assert reproduce.main(["pong-cpu"]) == 130
+    assert [script.name for script in scripts] == ["train"]
+
+
+@pytest.mark.parametrize(
+    "words, text",
+    [
+        (["pong-12s"], "pong-12s needs a GPU"),
+        (["pong-cpu-10"], "did you mean pong-cpu-10m?"),
+        (["pong-cpu", "seed=2"], "takes the name of one row"),
+    ],
+)
+def test_errors_are_one_sentence(tmp_path, monkeypatch, capsys, words, text):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(gpu, "is_available", lambda: False)
+    monkeypatch.setattr(sys, "argv", ["megastep", "reproduce", *words])
+    assert entry.main() == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert text in sentence
+    assert not [*tmp_path.iterdir()]
+
+
+def test_names_of_rows_are_completed(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["megastep", "-sc", "query=bash"])
+    monkeypatch.setenv("COMP_LINE", "megastep reproduce pong-cpu-1")
+    assert entry.main() == 0
+    assert capsys.readouterr().out.split() == ["pong-cpu-10m", "pong-cpu-1.5m"]
+
+
+def test_rows_are_listed_without_pytorch():
+    code = (
+        "import sys; sys.argv = ['megastep', 'reproduce']\n"
+        "from megastep.agents.cli import entry\n"
+        "assert entry.main() == 0 and 'torch' not in sys.modules"
+    )
+    listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert listed.returncode == 0, listed.stderr
+    assert all(name in listed.stdout for name in ROWS)
