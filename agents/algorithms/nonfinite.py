@@ -4,6 +4,8 @@ T time, B lanes.
 """
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,6 +14,8 @@ from torch.utils._pytree import tree_leaves_with_path
 #: The largest magnitude allowed in a rollout. Squares of returns made of such rewards, summed over
 #: millions of steps, still fit into float32 (3e38). A float16 that overflowed is inf, so larger.
 LIMIT = 1e12
+#: At most this many lanes with non-finite numbers are named.
+MAX_NAMED = 8
 
 
 class NonFiniteError(RuntimeError):
@@ -22,80 +26,150 @@ class NonFiniteError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class NonFiniteValue:
-    """A number that is NaN, infinite or beyond `LIMIT`.
+    """A number that is NaN, infinite or beyond `LIMIT`: the first of its lane.
 
     Attributes:
         name: name of the tensor, such as `obs.rgb` or `reward`.
         lane: lane of the rollout.
-        step: step of that lane since the environment was reset, from 1.
+        step: step of that lane, since the environment was reset, that returned the number or that
+            an action was chosen for, from 1; 0 for the world that `reset` returned.
         size: magnitude of the number.
+        rollout: number of the rollout, from 1.
+        others: the first numbers of up to `MAX_NAMED - 1` other lanes of the same rollout.
+        n_lanes: number of lanes of that rollout with such numbers.
+        n_agents: lanes per environment.
     """
 
     name: str
     lane: int
     step: int
     size: float
+    rollout: int = 1
+    others: tuple["NonFiniteValue", ...] = ()
+    n_lanes: int = 1
+    n_agents: int = 1
+
+    @property
+    def env(self) -> int:
+        """The lane's environment."""
+        return self.lane // self.n_agents
 
     @property
     def is_from_env(self) -> bool:
         """True if the environment produced the number, false if the policy did."""
         return self.name.split(".")[0] in ("obs", "privileged", "reward")
 
+    def in_env(self, lanes: Sequence[int], n_agents: int) -> "NonFiniteValue":
+        """Returns the same with lanes of an environment.
+
+        Args:
+            lanes: the environment's lane of each lane of the rollout.
+            n_agents: lanes per environment.
+        """
+        return dataclasses.replace(
+            self,
+            lane=int(lanes[self.lane]),
+            others=tuple(other.in_env(lanes, n_agents) for other in self.others),
+            n_agents=n_agents,
+        )
+
     def __str__(self):
-        return f"{self.name} of lane {self.lane} was {self.size:.3g} at step {self.step:,}"
+        texts = [
+            f"{one.name} of {lane_name(one.lane, one.n_agents)} was {one.size:.3g} at step "
+            f"{one.step:,}"
+            for one in (self, *self.others)
+        ]
+        if (n_unnamed := self.n_lanes - len(texts)) > 0:
+            texts.append(f"and so for {n_unnamed:,} more lane{'s' * (n_unnamed > 1)}")
+        return "; ".join(texts)
 
 
 class NonFiniteCheck:
     """Checks one rollout after another for non-finite numbers, and counts skipped updates.
 
-    Only `read` synchronises. Everything is in place, so checks can be part of a CUDA graph.
+    Only `read` synchronises. Everything is in place and of a fixed shape, so checks can be part of
+    a CUDA graph.
 
     Args:
         device: device of the rollouts.
     """
 
     def __init__(self, device: torch.device):
-        # [rollouts checked, then of the first non-finite number: its rollout (from 1; 0: none),
-        #  its index among all numbers, its magnitude, and the updates skipped in a row]
-        self.record = torch.zeros(5, dtype=torch.float64, device=device)
+        # [rollouts checked, updates skipped in a row, then of the first rollout with non-finite
+        #  numbers: its number (from 1; 0: none), its bad lanes, and of the first `MAX_NAMED` of
+        #  those the index in `_sizes` and the magnitude of the lane's first number; NaN as -1 and
+        #  infinity as 1.8e308, since checkpoints hold this]
+        self.record = torch.zeros(4 + 2 * MAX_NAMED, dtype=torch.float64, device=device)
+
+    @property
+    def found(self) -> torch.Tensor:
+        """() bool on the device, whether there was a non-finite number since the last `read`."""
+        return self.record[2] > 0
 
     def __call__(self, floats: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Checks a rollout and keeps its first non-finite number until `read`.
+        """Checks a rollout and keeps the first non-finite number of each lane until `read`.
 
         Args:
-            floats: tensors by name, each (T, B, ...) or (T+1, B, ...).
+            floats: tensors by name, each (T, B, ...) or (T+1, B, ...), at least one of T.
 
         Returns:
             () bool on the device, whether all numbers are finite and within `LIMIT`.
         """
-        count, first = self.record[:1], self.record[1:4]
+        count, first = self.record[:1], self.record[2:]
         count += 1
-        sizes = torch.cat([_sizes(values) for values in floats.values()])
-        is_finite, index = (sizes <= LIMIT).byte().min(0, keepdim=True)
-        is_finite = is_finite.bool()
-        latest = torch.cat([count, index, sizes.gather(0, index)])
-        first.copy_(torch.where(is_finite | (first[:1] > 0), first, latest))
-        return is_finite[0]
+        sizes = _sizes(floats)
+        is_finite, row = (sizes <= LIMIT).byte().min(0)  # of each lane
+        lanes = torch.arange(len(row), device=row.device)
+        index = torch.where(is_finite.bool(), sizes.numel(), row * len(row) + lanes)
+        index = index.topk(min(MAX_NAMED, len(row)), largest=False).values
+        n_bad = len(row) - is_finite.sum(dtype=torch.float64)
+        latest = torch.zeros_like(first)
+        latest[0], latest[1] = count[0], n_bad
+        latest[2 : 2 + len(index)] = index
+        worst = sizes.flatten()[index.clamp(max=sizes.numel() - 1)].double()
+        latest[-MAX_NAMED:][: len(index)] = worst.nan_to_num(nan=-1.0)
+        first.copy_(torch.where((n_bad == 0) | self.found, first, latest))
+        return n_bad == 0
 
     def count(self, is_skipped: torch.Tensor) -> None:
         """Counts one update, () bool whether it was skipped."""
-        self.record[4].add_(1).mul_(is_skipped)
+        self.record[1].add_(1).mul_(is_skipped)
 
     def read(self, floats: dict[str, torch.Tensor]) -> tuple[NonFiniteValue | None, int]:
-        """Returns the first non-finite number since the last call, and the number of updates
-        skipped in a row. Synchronises.
+        """Returns the first non-finite number since the last call, with those of other lanes, and
+        the number of updates skipped in a row. Synchronises.
 
         Args:
             floats: tensors of any rollout; only names and shapes are used.
         """
-        count, index, size, n_skipped = self.record[1:].tolist()
-        self.record[1:4].zero_()
-        value = _value_at(floats, int(count), int(index), size) if count else None
-        return value, int(n_skipped)
+        _, n_skipped, rollout, n_bad, *numbers = self.record.tolist()
+        self.record[2:].zero_()
+        n_named = min(int(n_bad), MAX_NAMED)
+        values = [
+            _value_at(floats, int(rollout), int(index), size)
+            for index, size in zip(numbers[:n_named], numbers[MAX_NAMED:], strict=False)
+        ]
+        if not values:
+            return None, int(n_skipped)
+        others = tuple(values[1:])
+        return dataclasses.replace(values[0], others=others, n_lanes=int(n_bad)), int(n_skipped)
 
 
-def _sizes(values):
-    """Returns the largest magnitude per time and lane, (T B,), NaN where there is a NaN."""
+def _sizes(floats):
+    """Returns the largest magnitudes, ((T+1) F, B) for F tensors, NaN where there is a NaN.
+
+    Rows are ordered by time, then by tensor. Row t of a tensor of T rows came with world t+1.
+    """
+    tensors = list(floats.values())
+    n_steps, n_lanes = min(map(len, tensors)), tensors[0].shape[1]
+    sizes = tensors[0].new_zeros(n_steps + 1, len(tensors), n_lanes, dtype=torch.float32)
+    for i, values in enumerate(tensors):
+        sizes[-len(values) :, i] = _largest(values)
+    return sizes.flatten(0, 1)
+
+
+def _largest(values):
+    """Returns the largest magnitude per time and lane, (T, B), NaN where there is a NaN."""
     if values.dim() > 2:
         values = values.flatten(2)
         if torch.finfo(values.dtype).max < LIMIT:
@@ -104,25 +178,29 @@ def _sizes(values):
             values = values.sum(-1, dtype=torch.float32)
         else:
             values = torch.maximum(values.amax(-1), -values.amin(-1))
-    return values.abs().flatten().float()
+    return values.abs()
 
 
-def _value_at(floats, count, index, size):
-    n_steps = min(len(values) for values in floats.values())
-    for name, values in floats.items():
-        n_lanes = values.shape[1]
-        if index < len(values) * n_lanes:
-            row, lane = divmod(index, n_lanes)
-            return NonFiniteValue(name, lane, (count - 1) * n_steps + row + 1, size)
-        index -= len(values) * n_lanes
-    raise AssertionError("the index is beyond all numbers")
+def _value_at(floats, rollout, index, size):
+    """Returns the number at an index of `_sizes`."""
+    n_steps, n_lanes = min(map(len, floats.values())), next(iter(floats.values())).shape[1]
+    row, lane = divmod(index, n_lanes)
+    row, i = divmod(row, len(floats))
+    size = math.nan if size < 0 else math.inf if size > torch.finfo(torch.float32).max else size
+    return NonFiniteValue(list(floats)[i], lane, (rollout - 1) * n_steps + row, size, rollout)
+
+
+def lane_name(lane: int, n_agents: int) -> str:
+    """Returns a lane's name for messages, with its environment if that has several lanes."""
+    return f"lane {lane}" + (f" (environment {lane // n_agents})" if n_agents > 1 else "")
 
 
 def nonfinite_leaf(tree: Any) -> str | None:
-    """Returns the dotted path of the first non-finite tensor or float in nested dicts and lists, or
-    None.
+    """Returns the dotted path of the first non-finite tensor in nested dicts and lists, or None.
+
+    Numbers pass, since some are infinite for good reasons, such as the best loss so far.
     """
     for path, leaf in tree_leaves_with_path(tree):
-        if isinstance(leaf, (torch.Tensor, float)) and not torch.as_tensor(leaf).isfinite().all():
+        if isinstance(leaf, torch.Tensor) and not leaf.isfinite().all():
             return ".".join(str(getattr(part, "key", getattr(part, "idx", part))) for part in path)
     return None

@@ -14,10 +14,11 @@ SCRIPTS = {
     "record": "films a trained policy",
     "reproduce": "lists the results in docs/lab; makes one again",
 }
-#: Commands about one run, which is their argument.
+#: Commands about one run, which is their argument, or a file of it.
 ON_RUNS = {
     "inspect": "verifies a run's checkpoints and prints what is in them",
     "rerun": "repeats a run and compares its metrics, byte for byte",
+    "replay": "shows a NaN of a run again, from the file that the run wrote",
 }
 #: What only a clone of the repository has, and what runs it there.
 IN_A_CLONE = {
@@ -37,7 +38,7 @@ def main() -> int:
             os.environ["COMP_LINE"] = line.replace(script, "", 1)
             words = [script, *words]
         else:
-            print(" ".join(name for name in SCRIPTS if name.startswith(script)))
+            print(" ".join(name for name in SCRIPTS | ON_RUNS if name.startswith(script)))
             words = [""]
     if words[0] == "rerun" and len(words) > 1:
         words = ["train", f"rerun={words[1]}", *words[2:]]
@@ -46,6 +47,9 @@ def main() -> int:
         return run_script(words[0])
     if words[0] == "inspect":
         return inspect_run(words[1:])
+    if words[0] == "replay":
+        sys.argv[1:] = words[1:]
+        return replay_file()
     from megastep.agents.cli import console
     from megastep.settings import closest
 
@@ -98,3 +102,12 @@ def inspect_run(words: list[str]) -> int:
     except program.UserError as error:
         console.say(f"megastep inspect: {error}", sys.stderr)
         return error.code
+
+
+def replay_file() -> int:
+    """Runs `megastep replay`. Returns the exit code."""
+    signals.exit_on_signals("replay")
+    from megastep.agents.cli import console, replay
+
+    console.open_streams()
+    return replay.main()

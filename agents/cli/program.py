@@ -17,7 +17,8 @@ def name(script: str, python: str = "") -> str:
     """`megastep train`, or `train.py` after `python`."""
     if Path(sys.argv[0]).parts[-2:] == ("megastep", "__main__.py"):
         return f"{python and 'python -m '}megastep {script}"
-    is_installed = os.path.basename(sys.argv[0]) == "megastep" or not (ROOT / "train.py").exists()
+    is_installed = os.path.basename(sys.argv[0]) == "megastep"
+    is_installed = is_installed or not (ROOT / f"{script}.py").exists()
     return f"megastep {script}" if is_installed else f"{python}{script}.py"
 
 

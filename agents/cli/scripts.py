@@ -71,6 +71,7 @@ RESUMABLE = (
     "keep_checkpoints",
     "replay_every",
     "desync",
+    "nonfinite_replay",
     "snapshots",
     "logger",
     "finish",

@@ -175,6 +175,7 @@ class Train(Common):
     keep_checkpoints: Annotated[int, Field(ge=2, le=1000)]
     replay_every: Count = 20
     desync: bool = True
+    nonfinite_replay: bool = True
     snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
     folder: str | None
     resume: str | None

@@ -61,7 +61,8 @@ def make_trainer(
     policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
     learner = factory.make_learner(cfg.learner, policy, cfg.seed)
     cfg = annealed(cfg, optional(learner, "set_lr", LEARNER_DEFAULTS) is not None)
-    factory.check_memory(cfg.env, sample, learner, **where)
+    n_copies = 2 if cfg.nonfinite_replay else 1  # of the environments' state
+    factory.check_memory(cfg.env, sample, learner, n_copies, **where)
     env = factory.construct(cfg.env, **where)
     if cfg.resume or cfg.init:
         path = runs.find(cfg.resume or cfg.init)
@@ -95,6 +96,7 @@ def make_trainer(
             snapshot_saver=saver.SnapshotSaver(
                 saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9), cfg.snapshots
             ),
+            replay_folder=folder if cfg.nonfinite_replay else None,
             annealing_record=annealing.AnnealingRecord(
                 folder, loaded.state["updates"] if cfg.resume else 0
             ),
@@ -230,7 +232,8 @@ def run(cfg: settings.Train) -> Path:
             ):
                 running.train(lambda: bool(numbers))
         except NonFiniteError as error:
-            raise program.NonFinite(f"{error}. What was saved before is in {folder}") from error
+            saved = f"What was saved before is in {folder}{running.replay_hint}"
+            raise program.NonFinite(f"{error}. {saved}") from error
         except (engine.EngineError, torch.OutOfMemoryError) as error:
             saved = running.saver.error or "What was learnt last could not be saved"
             saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
@@ -243,6 +246,7 @@ def run(cfg: settings.Train) -> Path:
                 numbers[0], f"Stopped after {running.samples:,} samples. {resume}"
             )
         nonfinite, unsaved = running.nonfinite_value, running.saver.error
+        replay = running.replay_hint
         if unsaved:
             raise program.UserError(unsaved)
         del running  # its memory is the evaluation's now
@@ -253,7 +257,8 @@ def run(cfg: settings.Train) -> Path:
             with console.warned():
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
         if nonfinite and nonfinite.is_from_env:
-            raise program.NonFinite(f"{nonfinite}. All else was learnt from, and is in {folder}")
+            learnt = f"All else was learnt from, and is in {folder}"
+            raise program.NonFinite(f"{nonfinite}. {learnt}{replay}")
         if cfg.rerun:
             compare(folder, runs.folder_of(runs.find(cfg.rerun)))
     return folder

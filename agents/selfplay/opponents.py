@@ -47,6 +47,7 @@ class Opponents:
         matchups: (B,) bool by name, the lanes of environments played against "now" (the current
             policy), "past" and "bot". Names without environments are absent.
         snapshots: the snapshots, as policies. Refreshed in place.
+        on_actions: called in each step with the actions of all lanes, (B, ...), if not None.
 
     All other attributes are those of `env`.
 
@@ -69,6 +70,7 @@ class Opponents:
         seed: int = 1,
     ):
         self.env, self.every, device = env, every, env.device
+        self.on_actions = None
         n_per_snapshot, n_bot = count_environments(env, past, bot, snapshots)
         if bot and scripted is None:
             raise ValueError(
@@ -127,6 +129,8 @@ class Opponents:
         lanes = self.mixed_policy.lanes
         replace = mapping(lambda leaf, theirs: leaf.index_copy(0, lanes, theirs.to(leaf)))
         actions = replace(decision["actions"], opponent_actions)
+        if self.on_actions is not None:
+            self.on_actions(actions)
         world = self.env.step(arrdict(actions=actions))
         self._count_pairs(world)
         return self._observed(world)

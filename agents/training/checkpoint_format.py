@@ -230,11 +230,20 @@ def _load(path, device):
 def _migrated(state, manifest):
     """Returns a state of the last format as one of this format."""
     import torch
+    from torch.nn.functional import pad
+
+    from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 
     if manifest["format"] == FORMAT:
         return state
     if "learner" in state and "optimizer" in state["learner"]:
-        state["learner"].setdefault("check", torch.zeros(5, dtype=torch.float64))
+        state["learner"].setdefault("check", NonFiniteCheck(torch.device("cpu")).record)
+    if stats := state.get("episode_stats"):  # no episode was left out of a metric
+        n_metrics = len(stats["sums"]) - 4
+        stats["sums"] = pad(stats["sums"], (0, 0, 0, n_metrics))
+        stats["windows"] = [
+            pad(one, (0, n_metrics)) if len(one) else one for one in stats["windows"]
+        ]
     return state | {"samples_at_report": state.get("samples", 0)}
 
 

@@ -32,9 +32,10 @@ class EpisodeStats:
     Attributes:
         returns, lengths: (B,) float64, of the episode that each lane is in.
         is_whole: (B,) bool, whether that episode is to be counted.
-        sums: (4 + metrics, 1 + G) float64, over the episodes that ended since the last `pop`:
-            count, return, squared return, length, and each metric; for all lanes and for each
-            group.
+        sums: (4 + 2 M, 1 + G) float64 for M metrics, over the episodes that ended since the last
+            `pop`: count, return, squared return, length, each metric, and for each metric the
+            number of episodes left out of it; for all lanes and for each group.
+        bad_lanes: (M,) int64, the first lane with a metric that was left out; `n_lanes` if none.
         windows: for all lanes and for each group, the sums of the last reports, on the host. The
             oldest report is dropped once the others hold `MIN_EPISODES`.
     """
@@ -53,8 +54,10 @@ class EpisodeStats:
         self.returns = torch.zeros(n_lanes, dtype=torch.float64, device=device)
         self.lengths = torch.zeros(n_lanes, dtype=torch.float64, device=device)
         self.is_whole = torch.full((n_lanes,), not skip_first, device=device)
-        shape = 4 + len(self.metrics), 1 + len(self.groups)
+        shape = 4 + 2 * len(self.metrics), 1 + len(self.groups)
         self.sums = torch.zeros(shape, dtype=torch.float64, device=device)
+        self.bad_lanes = torch.full((len(self.metrics),), n_lanes, device=device)
+        self.named = set()
         self.windows = [deque() for _ in range(1 + len(self.groups))]
 
     def add(
@@ -72,8 +75,8 @@ class EpisodeStats:
             reset: (T, B) bool, true if the transition only started a new episode.
             done: (T, B) bool, true if the episode ended.
             learns: (T, B) bool. An episode counts if this was true when its last action was chosen.
-            metrics: name -> (T, B), read where `done`. Numbers that are not finite or beyond the
-                limit count as 0, too.
+            metrics: name -> (T, B), read where `done`. An episode whose metric is not finite or
+                beyond the limit is left out of that metric's mean.
         """
         reward = _without_nonfinite(reward)
         # cumulative sums over all T rows, minus the sum at the last episode end before each row
@@ -89,13 +92,35 @@ class EpisodeStats:
             episode_returns,
             episode_returns**2,
             _sum_since(lengths, previous_end),
-            *(_without_nonfinite(metrics[name]).double() for name in self.metrics),
         ]
         sums = torch.stack([torch.where(counts, value, 0.0).sum(0) for value in values])
+        if self.metrics:
+            sums = torch.cat([sums, *self._sum_metrics(counts, metrics)])
         self.sums += sums @ self.members
         self.returns = _sum_since(returns, last_end, slice(-1, None))[0]
         self.lengths = _sum_since(lengths, last_end, slice(-1, None))[0]
         self.is_whole |= done.any(0)
+
+    def _sum_metrics(self, counts, metrics):
+        """Returns the sums of the metrics and the number of episodes left out of each, (M, B)."""
+        values = torch.stack([metrics[name] for name in self.metrics])  # (M, T, B)
+        is_good = values.abs() <= LIMIT
+        sums = torch.where(counts & is_good, values, 0.0).sum(1, dtype=torch.float64)
+        n_left_out = (counts & ~is_good).sum(1, dtype=torch.float64)
+        lanes = torch.arange(counts.shape[1], device=counts.device)
+        bad_lanes = torch.where(n_left_out > 0, lanes, counts.shape[1]).amin(1)
+        torch.minimum(self.bad_lanes, bad_lanes, out=self.bad_lanes)
+        return sums, n_left_out
+
+    def pop_bad_metrics(self) -> dict[str, int]:
+        """Returns metrics that some episode was left out of, each once, with the first such lane.
+        Synchronises.
+        """
+        lanes = dict(zip(self.metrics, self.bad_lanes.tolist(), strict=True))
+        n_lanes = len(self.returns)
+        bad = {k: lane for k, lane in lanes.items() if lane < n_lanes and k not in self.named}
+        self.named |= bad.keys()
+        return bad
 
     def pop(self) -> dict[str, float]:
         """Returns statistics for a report. Synchronises.
@@ -105,7 +130,8 @@ class EpisodeStats:
 
         - `episode/count`: episodes that ended since the last call
         - `episode/window`: episodes that the means are over; absent, like the means, if it is 0
-        - `episode/return`, `episode/length` and `episode/NAME` for each metric: the means
+        - `episode/return`, `episode/length` and `episode/NAME` for each metric: the means; a metric
+          is absent if every episode was left out of it
         - `episode/return_std`: standard deviation of the return
         - all but the last for each group, such as `episode/return/leader`
         """
@@ -130,10 +156,13 @@ class EpisodeStats:
         n, returns, _, lengths, *metrics = totals
         stats = {"episode/count": int(report[0])}
         if n:
-            by_metric = dict(zip(self.metrics, metrics, strict=True))
-            by_name = {"return": returns, "length": lengths, **by_metric}
-            stats["episode/window"] = int(n)
-            stats |= {f"episode/{name}": total / n for name, total in by_name.items()}
+            stats |= {"episode/window": int(n), "episode/return": returns / n}
+            stats["episode/length"] = lengths / n
+            n_metrics = len(self.metrics)
+            pairs = zip(self.metrics, metrics[:n_metrics], metrics[n_metrics:], strict=True)
+            for name, total, n_left_out in pairs:
+                if n > n_left_out:
+                    stats[f"episode/{name}"] = total / (n - n_left_out)
         return stats
 
     def state_dict(self) -> dict[str, Any]:

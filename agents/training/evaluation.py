@@ -3,6 +3,7 @@
 Axes: B lanes, N environments. The host synchronises with the device every `CHECK_EVERY` steps.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -135,13 +136,22 @@ def interval(
 def summaries(episodes: Mapping, roles: Sequence[str] | None = None) -> list[dict[str, Any]]:
     """Returns table rows for the result of `first_episodes`: one overall, then one per role.
 
-    Only lanes that learn are counted, or all lanes if none learns.
+    Only lanes that learn are counted, or all lanes if none learns. An episode whose metric is not
+    finite is left out of that metric; a warning names the metric.
 
     Args:
         roles: the role of each agent slot, repeated over environments.
     """
     learns = episodes["learns"].cpu().numpy()
     learns = learns if learns.any() else ~learns
+    is_counted = learns & episodes["done"].cpu().numpy()
+    for name, values in episodes["metrics"].items():
+        if n_left_out := int((~np.isfinite(values.cpu().numpy()[is_counted])).sum()):
+            warnings.warn(
+                f"metrics.{name} was not finite at the end of {n_left_out:,} of "
+                f"{is_counted.sum():,} episodes, which are left out of its mean",
+                stacklevel=2,
+            )
     rows = [_summary(episodes, learns)]
     role_of_lane = np.resize(np.array(roles or ()), len(learns))
     for role in dict.fromkeys(roles or ()):
@@ -176,6 +186,10 @@ def _summary(episodes, lanes):
 
 
 def _metric(values, groups):
-    """Returns a mean with its 95 % interval by name; None for each if no episode ended."""
+    """Returns the mean of finite values with its 95 % interval by name; None for each if there are
+    none.
+    """
+    is_finite = np.isfinite(values)
+    values, groups = values[is_finite], groups[is_finite]
     numbers = interval(values, groups) if len(values) else (None,) * 3
     return dict(zip(("mean", "lower", "upper"), numbers, strict=True))

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
-from megastep.agents.algorithms.nonfinite import NonFiniteError
+from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue, lane_name
+from megastep.agents.training import nonfinite_recorder
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.performance import PhaseTimer, device_memory
@@ -73,6 +74,8 @@ class Trainer:
         opponents: `env`, if it is an `Opponents`.
         snapshot_saver: such as `saver.SnapshotSaver`: called with the trainer before the first
             update and after each.
+        replay_folder: where a file is written that replays the first NaN or infinity of the
+            environment, see `nonfinite_recorder`; None for no file.
         annealing_record: such as `annealing.AnnealingRecord`: gets the factor of the learning rate
             in each update, and is flushed before each report.
 
@@ -85,6 +88,7 @@ class Trainer:
         samples_per_second: speed between the last two reports, or None.
         latest_stats: name -> the last value of each episode statistic.
         nonfinite_value: the first NaN or infinity of the run, or None.
+        replay_hint: how to replay it, as the rest of a sentence, or "".
         samples_at_report: samples at the last report that is due every `log_every` updates. A
             resumed run has all reports up to it, and writes the later ones.
 
@@ -107,6 +111,7 @@ class Trainer:
         on_log: Callable[[Trainer], None] = lambda trainer: None,
         opponents: OpponentPool | None = None,
         snapshot_saver: Callable[[Trainer], None] = lambda trainer: None,
+        replay_folder: Path | None = None,
         annealing_record: AnnealingRecord | None = None,
     ):
         self.env, self.policy, self.learner = env, policy, learner
@@ -142,8 +147,13 @@ class Trainer:
         self.samples_at_log = self.updates_at_log = self.samples_at_report = 0
         self.seconds_at_log = self.seconds_at_checkpoint = 0.0
         self.updates_at_checkpoint = None
+        self.nonfinite_value, self.replay_hint = None, ""
+        self.replay_folder, self.recorder = replay_folder, None
+        if replay_folder is not None:
+            self.recorder = nonfinite_recorder.make_recorder(
+                env, opponents, self.check, self.collect
+            )
         self.has_named_unreachable = False
-        self.nonfinite_value = None
 
     @property
     def fraction_left(self) -> float:
@@ -167,7 +177,11 @@ class Trainer:
             self.snapshot_saver(self)
             while self.fraction_left > 0 and not stop():
                 self.timer.start("collect")
+                if self.recorder is not None:
+                    self.recorder.start()
                 self.rollout = self.collect()
+                if self.recorder is not None:
+                    self.recorder.end(self.rollout)
                 self.timer.start("update")
                 losses = self.update()
                 self.timer.start("rest")
@@ -186,7 +200,7 @@ class Trainer:
             raise
         except Exception:
             with contextlib.suppress(Exception):  # the first error is the one to report
-                self.save_checkpoint(is_last=True)
+                self.save_what_was_learnt()
             raise
         finally:
             with contextlib.suppress(Exception):  # as above
@@ -242,6 +256,7 @@ class Trainer:
         loss_values = [torch.as_tensor(loss, device=self.env.device) for loss in losses.values()]
         loss_values = torch.stack(loss_values).tolist() if losses else []
         loss_values = zip(losses, loss_values, strict=True)
+        self.name_bad_metrics()
         stats = self.episode_stats.pop()
         if self.opponents is not None:
             stats |= self.opponents.pop_win_rates()
@@ -283,22 +298,56 @@ class Trainer:
         if self.check is None:
             return True
         value, n_skipped = self.check.read(self.rollout.floats())
-        if value and self.rollout.learners is not None:
-            lanes = self.rollout.learners.nonzero()[:, 0]
-            value = dataclasses.replace(value, lane=int(lanes[value.lane]))
+        if value:
+            value = value.in_env(self.env_lanes(), optional(self.env, "n_agents"))
         if value and self.nonfinite_value is None:
             self.nonfinite_value = value
-            warnings.warn(f"{value}; its rollout was skipped", stacklevel=2)
+            self.write_replay(value)
+            warnings.warn(f"{value}; its rollout was skipped{self.replay_hint}", stacklevel=2)
+        if self.recorder is not None:
+            self.recorder.forget()
         if n_skipped < MAX_SKIPPED:
             return n_skipped == 0
         advice = f"The policy diverged: try a learning rate smaller than {self.learner.lr:g}"
         if value and value.is_from_env:
-            self.save_checkpoint()  # the skipped updates left the policy unchanged
+            self.save_what_was_learnt()  # the skipped updates left the policy unchanged
             advice = f"It came from the environment: check how it computes {value.name}"
         raise NonFiniteError(
             f"The last {n_skipped} updates were skipped because of numbers that were not finite or "
             f"too large ({value or 'gradients'}). {advice}"
         )
+
+    def env_lanes(self) -> range | list[int]:
+        """Returns the environment's lane of each lane of the rollout."""
+        learners = self.rollout.learners
+        return (
+            range(self.rollout.n_lanes) if learners is None else learners.nonzero()[:, 0].tolist()
+        )
+
+    def name_bad_metrics(self) -> None:
+        """Warns once of each metric that was not finite at the end of an episode. Synchronises."""
+        for name, lane in self.episode_stats.pop_bad_metrics().items():
+            lane = lane_name(self.env_lanes()[lane], optional(self.env, "n_agents"))
+            warnings.warn(
+                f"metrics.{name} of {lane} was not finite at the end of an episode; such episodes "
+                f"are left out of episode/{name}",
+                stacklevel=3,
+            )
+
+    def write_replay(self, value: NonFiniteValue) -> None:
+        """Writes the file that replays a number of the environment, and stops recording."""
+        recorder, self.recorder = self.recorder, None
+        if value.is_from_env and recorder is not None and recorder.has(value):
+            path = self.replay_folder / f"nonfinite-{self.samples}.npz"
+            try:
+                recorder.write(path, value, self.rollout)
+                self.replay_hint = f". To see it again: {nonfinite_recorder.command(path)}"
+            except OSError as error:
+                self.replay_hint = f". {path} could not be written ({error.strerror or error})"
+        elif value.is_from_env and self.replay_folder is not None:
+            self.replay_hint = f". {nonfinite_recorder.NOT_RECORDED}"
+        if recorder is not None:
+            recorder.close()
 
     def save_checkpoint(self, state: dict[str, Any] | None = None, is_last: bool = False) -> None:
         """Begins to save a checkpoint, unless the last one holds every update.
@@ -320,6 +369,15 @@ class Trainer:
         state = self.state_dict() if state is None else state
         self.saver(self.samples, state, self.score, is_last)
         self.updates_at_checkpoint = self.updates
+
+    def save_what_was_learnt(self) -> None:
+        """Begins to save a checkpoint from which a resumed run starts new episodes: after an error
+        the environment may be the cause, or in the middle of a rollout.
+        """
+        state = self.state_dict()
+        for name in ("env", "collector"):
+            state.pop(name, None)
+        self.save_checkpoint(state, is_last=True)
 
     def state_dict(self) -> dict[str, Any]:
         """Returns all that a resumed run needs, as dicts of tensors and plain values, most of which

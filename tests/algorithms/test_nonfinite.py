@@ -34,16 +34,19 @@ def test_nonfinite_value_has_name_lane_and_step(name, value):
     rollout[name][2, 1] = value  # infinite or NaN in float16
     assert not check(rollout)
     bad, _ = check.read(rollout)
-    # the third row of the second rollout
-    assert (bad.name, bad.lane, bad.step) == (name, 1, T + 3)
+    # the third row of the second rollout: the world after T + 2 steps, or the step after that
+    step = T + 3 if len(rollout[name]) == T else T + 2
+    assert (bad.name, bad.lane, bad.step, bad.rollout) == (name, 1, step, 2)
     assert not bad.size <= LIMIT and name in str(bad)
+    if name != "obs.rgb":  # which overflows
+        assert bad.size == pytest.approx(abs(value), nan_ok=True)
 
 
 def test_single_nan_pixel_is_found():
     check, rollout = NonFiniteCheck("cpu"), floats()
     rollout["obs.rgb"][4, 2, 0, 1, 0, 7] = torch.nan
     assert not check(rollout)
-    assert check.read(rollout)[0].step == 5
+    assert check.read(rollout)[0].step == 4
 
 
 def test_largest_allowed_numbers_pass():
@@ -60,12 +63,42 @@ def test_first_value_is_kept_until_read():
     for rollout in (good, bad, worse, good):
         check(rollout)
     value, _ = check.read(good)
-    assert value == NonFiniteValue("reward", 2, T + 2, pytest.approx(1e13))
+    assert value == NonFiniteValue("reward", 2, T + 2, pytest.approx(1e13), rollout=2)
     assert value.is_from_env
     assert all(part in str(value) for part in ("reward", "lane 2", "1e+13", f"step {T + 2}"))
     assert check.read(good)[0] is None
     check(worse)
-    assert check.read(good)[0].step == 4 * T + 1
+    assert check.read(good)[0].step == 4 * T
+
+
+def test_first_eight_of_many_lanes_are_named_by_time():
+    """Lane 19 is bad first, 2 to 11 follow in the same step, 0 later. Each has several numbers."""
+    floats = {"obs": torch.zeros(T + 1, 20, 1, 2), "reward": torch.zeros(T, 20)}
+    floats["obs"][3:, 19] = floats["reward"][1:, 19] = torch.nan
+    floats["obs"][3:, 2:12], floats["reward"][3:, 0] = torch.inf, 1e13
+    check = NonFiniteCheck("cpu")
+    check(floats)
+    value, _ = check.read(floats)
+    named = [(one.name, one.lane, one.step) for one in (value, *value.others)]
+    assert named == [("reward", 19, 2), *(("obs", lane, 3) for lane in range(2, 9))]
+    assert value.n_lanes == 12 and str(value).endswith("; and so for 4 more lanes")
+    assert "reward of lane 19 was nan at step 2; obs of lane 2 was inf at step 3;" in str(value)
+    in_env = value.in_env(range(100, 120), n_agents=2)
+    assert [one.lane for one in (in_env, *in_env.others)] == [119, *range(102, 109)]
+    assert "reward of lane 119 (environment 59) was nan at step 2; obs of lane 102 (en" in str(
+        in_env
+    )
+
+
+@pytest.mark.parametrize("n_lanes", [1, 8, 9])
+def test_every_lane_may_be_bad(n_lanes):
+    floats = {"reward": torch.full((T, n_lanes), torch.nan)}
+    check = NonFiniteCheck("cpu")
+    check(floats)
+    value, _ = check.read(floats)
+    assert [one.lane for one in (value, *value.others)] == list(range(min(n_lanes, 8)))
+    assert value.step == 1 and ("more lane" in str(value)) == (n_lanes > 8)
+    assert check.read(floats) == (None, 0)
 
 
 def test_consecutive_skipped_updates_are_counted():
@@ -80,7 +113,8 @@ def test_nonfinite_leaf_returns_path():
     tree = {"policy": OrderedDict([("a.b", torch.ones(2)), ("c", torch.ones(()))]), "n": [1, 0.5]}
     tree |= {"none": None, "word": "nan", "generator": torch.zeros(3, dtype=torch.uint8)}
     assert nonfinite_leaf(tree) is None
-    assert nonfinite_leaf({**tree, "n": [1, torch.inf]}) == "n.1"
+    assert nonfinite_leaf({**tree, "best": -torch.inf}) is None
+    assert nonfinite_leaf({**tree, "n": [1, torch.tensor(torch.inf)]}) == "n.1"
     tree["policy"]["a.b"][1] = torch.nan
     assert nonfinite_leaf(tree) == "policy.a.b"
 
@@ -98,4 +132,4 @@ def test_check_never_synchronises():
     finally:
         torch.cuda.set_sync_debug_mode("default")
     bad, n_skipped = check.read(rollout)
-    assert (bad.name, bad.lane, bad.step, n_skipped) == ("obs.imu", 1, 4, 1)
+    assert (bad.name, bad.lane, bad.step, n_skipped) == ("obs.imu", 1, 3, 1)

@@ -109,6 +109,24 @@ def test_summaries_by_role():
     assert (leader["role"], follower["role"]) == ("leader", "follower") and "role" not in every
 
 
+def test_nonfinite_metric_is_left_out_of_its_mean():
+    """Of `laps`, a half has no number; of `falls`, no episode has one."""
+    ones = torch.ones(4)
+    laps = torch.tensor([2.0, torch.nan, 4.0, torch.inf])
+    episodes = arrdict(
+        returns=ones,
+        lengths=ones,
+        done=ones > 0,
+        learns=ones > 0,
+        metrics=arrdict(laps=laps, falls=ones * torch.nan),
+        envs=torch.arange(4),
+    )
+    with pytest.warns(UserWarning, match="metrics.laps was not finite at the end of 2 of 4 episo"):
+        (row,) = evaluation.summaries(episodes)
+    assert row["metrics"]["laps"]["mean"] == 3 and row["metrics"]["laps"]["lower"] >= 2
+    assert row["metrics"]["falls"] == {"mean": None, "lower": None, "upper": None}
+
+
 def test_agents_of_one_environment_are_one_sample():
     """Two agents with equal returns: half as many samples as episodes."""
     alike = torch.arange(100.0).repeat_interleave(2)

@@ -308,18 +308,35 @@ def test_second_training_in_one_folder(here, capsys):
     assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
-def test_non_finite_position(here, monkeypatch, capsys):
-    real = train.Trainer.log
+@pytest.mark.parametrize(
+    "damage, sentence",
+    [
+        (lambda env, actions: env.core.agents.positions[2].fill_(torch.nan), "non-finite"),
+        (lambda env, actions: env.core.scenery.layout[2].fill_(10**6), "layout"),
+        (lambda env, actions: actions[2].fill_(99), "action"),
+    ],
+)
+def test_error_on_the_device_names_the_environment_and_keeps_what_was_learnt(
+    here, monkeypatch, capsys, damage, sentence
+):
+    real, steps = envs.Minimal.step, itertools.count(1)
 
-    def report(self, losses):
-        real(self, losses)
-        self.env.core.agents.positions[2] = float("nan")
+    def step(self, decision):
+        if next(steps) == 13:
+            damage(self, decision["actions"])
+        return real(self, decision)
 
-    monkeypatch.setattr(train.Trainer, "log", report)
+    monkeypatch.setattr(envs.Minimal, "step", step)
     assert train.main([*TINY, "samples=1e9", "folder=run"]) == 2
-    (sentence,) = capsys.readouterr().err.splitlines()
-    assert "environment 2" in sentence and "non-finite" in sentence and "run" in sentence
+    (text,) = capsys.readouterr().err.splitlines()
+    assert re.search(rf"[Ee]nvironment 2 .*{sentence}", text) and "run" in text
     assert len(json_lines.read(here / "run" / "metrics.jsonl")) == 1
+    loaded = checkpoint.load_latest(here / "run" / "checkpoints")
+    assert loaded.step == UPDATE and nonfinite_leaf(loaded.state) is None
+    assert f"All {UPDATE} samples are saved" in text
+    # the damaged environments are not saved: a resumed run begins new episodes
+    assert train.main(["resume=run", f"samples={2 * UPDATE}"]) == 0
+    assert "new episodes begin" in capsys.readouterr().out
 
 
 def inject(monkeypatch, name, step, value, lane=2):

@@ -240,7 +240,9 @@ def test_nonfinite_number_is_named_by_its_lane_in_the_environment(tmp_path):
     env.scored = lambda reward: reward.index_fill(0, torch.tensor(lane), torch.nan)
     run.rollout = run.collect()
     run.update()
-    with pytest.warns(UserWarning, match=f"reward of lane {lane} was nan"):
+    with pytest.warns(
+        UserWarning, match=rf"reward of lane {lane} \(environment {lane // 2}\) was nan"
+    ):
         run.check_finite()
 
 

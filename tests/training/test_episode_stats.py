@@ -203,10 +203,33 @@ def test_first_episodes_are_left_out_where_they_are_cut():
     assert episodes.pop()["episode/count"] == 3 + 2
 
 
-def test_nonfinite_metric_counts_as_zero():
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -1e30])
+def test_episode_with_a_nonfinite_metric_is_left_out_of_its_mean(bad):
+    """Lanes 0 and 2 are group a, 1 and 3 group b. Of `laps`, lanes 1 and 3 have none."""
+    groups = {"a": torch.tensor([True, False] * 2), "b": torch.tensor([False, True] * 2)}
+    episodes = EpisodeStats(4, "cpu", ["laps", "hits"], groups)
+    none = torch.zeros(1, 4, dtype=torch.bool)
+    metrics = dict(laps=torch.tensor([[3.0, bad, 5, bad]]), hits=torch.tensor([[1.0, 2, 3, 4]]))
+    episodes.add(torch.ones(1, 4), none, ~none, metrics=metrics)
+    assert episodes.pop_bad_metrics() == {"laps": 1}
+    stats = episodes.pop()
+    assert (stats["episode/laps"], stats["episode/hits"], stats["episode/window"]) == (4, 2.5, 4)
+    assert stats["episode/laps/a"] == 4 and "episode/laps/b" not in stats
+    assert (stats["episode/hits/a"], stats["episode/hits/b"]) == (2, 3)
+    metrics["laps"][0, 1] = 10
+    episodes.add(torch.ones(1, 4), none, ~none, metrics=metrics)
+    stats = episodes.pop()  # the window holds both reports
+    assert (stats["episode/laps"], stats["episode/laps/b"]) == ((3 + 5 + 3 + 5 + 10) / 5, 10)
+    assert episodes.pop_bad_metrics() == {}, "named once"
+    assert torch.isfinite(episodes.sums).all()
+
+
+def test_metric_is_only_read_where_an_episode_counts():
     episodes, none = EpisodeStats(2, "cpu", ["laps"]), torch.zeros(1, 2, dtype=torch.bool)
-    episodes.add(torch.ones(1, 2), none, ~none, metrics=dict(laps=torch.tensor([[torch.nan, 3]])))
-    assert episodes.pop()["episode/laps"] == 1.5
+    laps = torch.tensor([[torch.nan, torch.nan]])
+    done, learns = torch.tensor([[True, False]]), torch.tensor([[False, True]])
+    episodes.add(torch.ones(1, 2), none, done, learns, dict(laps=laps))
+    assert episodes.pop_bad_metrics() == {} and episodes.pop() == {"episode/count": 0}
 
 
 def test_sums_are_restored_only_for_the_same_metrics():

@@ -317,9 +317,8 @@ def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_pat
     assert all(map(torch.equal, run.learner.optimizer.means, before[1]))
     with pytest.warns(UserWarning, match=rf"{name} of lane 3 was (nan|inf|1e\+30) at step"):
         run.train()
-    # an observation is stored with the step that acts on it
     assert (run.nonfinite_value.name, run.nonfinite_value.lane) == (name, lane)
-    assert run.nonfinite_value.step == step + (name == "obs") and run.nonfinite_value.is_from_env
+    assert run.nonfinite_value.step == step and run.nonfinite_value.is_from_env
     assert not same(copied(run.policy), before[0])
     skipped = [row["loss/skipped_steps"] for row in run.logger]
     assert skipped == [0] * 6  # of the third and later updates
@@ -327,6 +326,42 @@ def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_pat
     assert nonfinite.nonfinite_leaf([state[name] for name in ("policy", "learner")]) is None
     returns = [row["episode/return"] for row in run.logger if row["episode/count"]]
     assert all(0 < r <= 7 for r in returns)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_nonfinite_metric_is_named_once_and_left_out(tmp_path, bad):
+    """The metric of lane 2, a leader, is never finite; that of lane 3, a follower, is 80."""
+
+    class BadMetric(Pairs):
+        def _world(self, reset):
+            world = super()._world(reset)
+            world.metrics.age[2] = bad
+            return world
+
+    run = make_trainer(tmp_path, env=BadMetric(), samples=50 * UPDATE, every=5)
+    sentence = r"metrics.age of lane 2 \(environment 1\) was not finite at the end of an episode"
+    with pytest.warns(UserWarning, match=sentence) as warned:
+        run.train()
+    assert len(warned) == 1 and run.nonfinite_value is None and run.is_saved
+    loaded = checkpoint.load_latest(tmp_path).state
+    assert loaded["samples"] == 50 * UPDATE
+    assert nonfinite.nonfinite_leaf(loaded["episode_stats"]) is None
+    row = [row for row in run.logger if "episode/age" in row][-1]
+    assert (row["episode/age/leader"], row["episode/age/follower"]) == (70, 80)
+    n_followers = row["episode/window/follower"]
+    n_leaders = row["episode/window/leader"] / 2  # those of lane 0
+    mean = (70 * n_leaders + 80 * n_followers) / (n_leaders + n_followers)
+    assert row["episode/age"] == pytest.approx(mean)
+
+
+@pytest.mark.parametrize("part", ["env", "obs", "episode_stats"])
+def test_what_is_not_learnt_may_be_nonfinite_in_a_checkpoint(tmp_path, part):
+    run = make_trainer(tmp_path)
+    state = {**run.state_dict(), part: {"x": torch.tensor([torch.inf, torch.nan])}}
+    run.saver(UPDATE, state)
+    run.saver.wait()
+    assert checkpoint.load_latest(tmp_path).state[part]["x"].isnan().any()
 
 
 def test_nonfinite_number_is_named_without_a_later_report(tmp_path):

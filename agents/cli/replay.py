@@ -1,0 +1,95 @@
+"""Shows a run's NaN or infinity again: replays the steps that led to it, from a file of the run."""
+
+import argparse
+import functools
+import sys
+from pathlib import Path
+
+import yaml
+
+from megastep.agents.algorithms.nonfinite import NonFiniteValue
+from megastep.agents.cli import check, console, factory, program, settings, signals
+from megastep.agents.training.nonfinite_replay import Recording, ReplayError
+
+
+class NotRepeated(program.UserError):
+    """The steps were replayed, and the number was another or finite."""
+
+    code = 1
+
+
+def main(words: list[str] | None = None) -> int:
+    """Replays the file that the words of a command line name. Returns the exit code."""
+    parser = argparse.ArgumentParser(
+        program.name("replay"), description=__doc__, allow_abbrev=False
+    )
+    parser.add_argument("file", type=Path, help="nonfinite-SAMPLES.npz, in the folder of its run")
+    parser.add_argument(
+        "device", nargs="?", type=_device, help="such as device=cpu; default: as in the run"
+    )
+    try:
+        with signals.interrupting():
+            arguments = parser.parse_args(words)
+            run(arguments.file, arguments.device)
+    except SystemExit as end:  # of argparse
+        return end.code or 0
+    except program.UserError as error:
+        console.say(f"{program.name('replay')}: {error}", sys.stderr)
+        return error.code
+    except signals.Interrupted as stop:
+        console.say(f"{program.name('replay')}: {stop.args[1]}", sys.stderr)
+        return 128 + stop.args[0]
+    return 0
+
+
+def _device(word):
+    if not word.startswith("device="):
+        raise argparse.ArgumentTypeError(f"{word!r} is unknown; give device=cpu or device=cuda")
+    return word.removeprefix("device=")
+
+
+def run(path: Path, device: str | None = None) -> NonFiniteValue:
+    """Builds the environment of a run, replays a file in it, and says what was not finite.
+
+    Args:
+        path: the file, in the folder of its run.
+        device: where; None for the kind of device that wrote it.
+
+    Returns:
+        the first non-finite number, which is the file's.
+
+    Raises:
+        UserError: the file, its run or the device cannot be used.
+        NotRepeated: the number was another one or finite.
+    """
+    errors = functools.partial(program.errors, f"{path} cannot be replayed: ")
+    with errors():
+        recording = Recording(path)
+    cfg = config_of(path.parent)
+    device = factory.make_device(device or recording.device)
+    env = factory.construct(
+        cfg.env,
+        geometries=factory.homes(cfg.env, cfg.geometry, "training"),
+        seed=cfg.seed,
+        device=device,
+        privileged=cfg.agent.critic == "asymmetric",
+    )
+    with errors(kinds=(ReplayError,)):
+        value = recording.replay(env)
+    if value and (value.name, value.lane, value.step) == recording.place:
+        console.say(f"As in the run, on {device}: {value}")
+        return value
+    name, lane, step = recording.place
+    raise NotRepeated(
+        f"{path} was replayed on {device}, where {value or 'all numbers were finite'}; in the run, "
+        f"{name} of lane {lane} was not finite at step {step:,}. The environment must have changed "
+        "since, or what it does depends on more than its tensors and generators"
+    )
+
+
+def config_of(folder: Path) -> settings.Train:
+    """Returns the settings of a run. UserError if they cannot be read."""
+    path = folder / "config.yaml"
+    kinds = (OSError, yaml.YAMLError, program.ConfigErrors)
+    with program.errors(f"{path}, with which the environment is built, cannot be used: ", kinds):
+        return check.check(settings.Train, yaml.safe_load(path.read_bytes()))

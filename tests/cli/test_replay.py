@@ -1,0 +1,79 @@
+"""A run's NaN, replayed by the command that its last sentence names."""
+
+import shlex
+import sys
+
+import pytest
+import torch
+
+from megastep import envs
+from megastep.agents.cli import entry, replay, train
+from tests.helpers import tiny
+
+TINY = [*tiny.TINY, *tiny.SHORT_EPISODES]
+
+
+def with_fault(real):
+    """Lane 2 earns a huge number made of its place, in its third episode and later."""
+
+    def step(self, decision):
+        world = real(self, decision)
+        is_late = (self.spawner.counts[:, 0] >= 3) & (torch.arange(4, device=self.device) == 2)
+        is_bad = is_late & (self.lifecycle.ages >= 2)
+        reward = 1e13 * self.core.agents.positions[:, 0, 0]
+        return type(world)(world, reward=torch.where(is_bad, reward, world.reward))
+
+    return step
+
+
+def call(monkeypatch, *words):
+    """Returns the exit code of `python -m megastep` with these words."""
+    monkeypatch.setattr(sys, "argv", ["/megastep/__main__.py", *words])
+    return entry.main()
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_the_command_of_the_last_sentence_shows_the_number_again(
+    tmp_path, monkeypatch, capsys, device
+):
+    monkeypatch.chdir(tmp_path)
+    real = envs.Minimal.step
+    monkeypatch.setattr(envs.Minimal, "step", with_fault(real))
+    words = [*TINY, f"samples={20 * tiny.UPDATE}", "folder=run", "log_every=6", f"device={device}"]
+    assert train.main(words) == 1
+    warning, sentence = capsys.readouterr().err.splitlines()
+    sentence, command = sentence.split(". To see it again: ")
+    assert warning.endswith(command)
+    _, _, module, *replay_words = shlex.split(command)
+    assert module == "megastep" and call(monkeypatch, *replay_words) == 0
+    number = sentence.partition("train.py: ")[2].partition(". All else")[0]
+    assert number.startswith("reward of lane 2 was ") and number.count(" at step ") == 1
+    shown = capsys.readouterr().out.strip()
+    assert shown.startswith(f"As in the run, on {device}") and shown.endswith(f": {number}")
+
+    monkeypatch.setattr(envs.Minimal, "step", real)
+    assert call(monkeypatch, *replay_words, f"device={device}") == 1
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert "all numbers were finite; in the run, reward of lane 2 was not" in sentence
+
+    (tmp_path / "run" / "config.yaml").unlink()
+    assert call(monkeypatch, *replay_words) == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert "config.yaml, with which the environment is built, cannot be used" in sentence
+
+
+@pytest.mark.parametrize("words", [["nothing.npz"], ["config.yaml"], []])
+def test_what_cannot_be_replayed(tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.yaml").write_text("seed: 1")
+    assert replay.main(words) == 2
+    assert "Traceback" not in (text := capsys.readouterr().err)
+    assert text.count("\n") == 1 or "usage:" in text
+
+
+def test_without_the_copy_no_file_is_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(envs.Minimal, "step", with_fault(envs.Minimal.step))
+    words = [*TINY, f"samples={8 * tiny.UPDATE}", "folder=run", "nonfinite_replay=false"]
+    assert train.main(words) == 1
+    assert "again" not in capsys.readouterr().err and not list(tmp_path.glob("run/*.npz"))
