@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import threading
+import time
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +42,7 @@ class Saver:
         error: why the last checkpoint could not be written, as a sentence; None if it was written.
             Valid after `wait`.
         lacks_replay: True if the last checkpoint was to leave out the replay buffer.
+        seconds: how long the thread took for the last checkpoint.
     """
 
     def __init__(
@@ -54,7 +56,7 @@ class Saver:
         self.folder, self.config, self.keep_checkpoints = folder, config, keep_checkpoints
         self.made_with, self.replay_every = made_with, replay_every
         self.error, self.lacks_replay = None, False
-        self._n_since_replay = 0
+        self.seconds, self._n_since_replay = 0.0, 0
         self._host_copy, self._thread, self._failure = _HostCopy(), None, None
 
     def __call__(
@@ -98,7 +100,13 @@ class Saver:
         self.lacks_replay = True
         return {name: part for name, part in state.items() if name != "replay"}, None
 
+    @property
+    def is_writing(self) -> bool:
+        """True while the thread writes."""
+        return self._thread is not None and self._thread.is_alive()
+
     def _write(self, step, state, score, replay_seconds):
+        began = time.monotonic()
         try:
             checkpoint.save(
                 self.folder,
@@ -112,6 +120,7 @@ class Saver:
             )
         except Exception as error:
             self._failure = step, _nbytes(state), error
+        self.seconds = time.monotonic() - began
 
     def wait(self) -> None:
         """Returns when nothing is being written. Warns if the last checkpoint failed.

@@ -5,6 +5,7 @@ Each is a function of a device that yields measurements. Its docstring is printe
 
 from collections.abc import Callable, Iterator
 
+from checkpoints import checkpoints
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, memory, pong, step
 from nsight_counters import counters
@@ -24,6 +25,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "replay": replay,
     "pong": pong,
     "paths": paths,
+    "checkpoints": checkpoints,
     "compile": compile_kernels,
     "first": first_step,
     "startup": startup,
