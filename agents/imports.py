@@ -13,15 +13,17 @@ from megastep.settings import closest
 def import_object(name: str) -> Callable:
     """Returns the class or function at `module:attribute`.
 
-    Modules of the current folder come before installed ones, and after those of Python.
+    Modules of the current folder come before installed ones, and after those of Python. For what
+    is in megastep, that folder is not searched: a downloaded one may hold anything.
 
     Raises:
         ValueError: if it cannot be imported, in one sentence.
     """
     module, _, attribute = name.partition(":")
-    if not (module and attribute):
+    if not all(part.isidentifier() for part in [*module.split("."), *attribute.split(".")]):
         raise ValueError(f"{name!r} is no import path, such as my_package.rover:Rover")
-    search_current_folder()
+    if module.partition(".")[0] != "megastep":
+        search_current_folder()
     try:
         imported: Any = importlib.import_module(module)
     except Exception as error:  # whatever a module does as it is imported

@@ -146,12 +146,22 @@ def find(name: str) -> Path:
     )
 
 
-def load_checkpoint(path: Path, device: Any = None) -> checkpoint.Checkpoint:
+def load_checkpoint(path: Path, trust: bool, device: Any = None) -> checkpoint.Checkpoint:
     """Returns the checkpoint of a run found with `find`, on a device; without one, all but its
     state, and PyTorch is not imported. Warns of damaged ones it skips.
+
+    Raises:
+        UserError: there is none; or, without `trust`, another user's run names modules to import.
     """
     with program.errors(kinds=(OSError, ValueError, checkpoint.CheckpointError)):
-        return checkpoint.load_latest(checkpoints_of(path), device)
+        loaded = checkpoint.load_latest(checkpoints_of(path), device)
+    if loaded.untrusted and not trust:
+        raise UserError(
+            f"{loaded.path} was not made by this user here, and would import "
+            f"{shortened(', '.join(loaded.untrusted))}, which runs code outside megastep; if you "
+            "trust it, add trust=true"
+        )
+    return loaded
 
 
 def resume_command(folder: Path) -> str:

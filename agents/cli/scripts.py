@@ -64,6 +64,7 @@ RESUMABLE = (
     "more_samples",
     "more_seconds",
     "device",
+    "trust",
     "log_every",
     "checkpoint_seconds",
     "keep_checkpoints",
@@ -90,7 +91,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     path = runs.find(resume or init)
     # a run in use is refused before its checkpoints are read, which come and go
     with runs.locked(runs.folder_of(path)) if resume else contextlib.nullcontext():
-        loaded = runs.load_checkpoint(path)
+        loaded = runs.load_checkpoint(path, tree.get("trust") is True)
     saved = loaded.config["train"]
     if init:
         groups = ("env", "geometry", "agent")
@@ -107,7 +108,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
         target[leaf] = source[leaf]
     if resume and (errors := [*budget_errors(saved, typed, loaded.numbers)]):
         raise program.ConfigErrors(errors)
-    return saved | {"init": init}
+    return saved | {"init": init, "trust": tree.get("trust", False)}
 
 
 def budget_errors(tree: Tree, typed: list[str], had: dict[str, float]) -> Iterator[tuple[str, str]]:

@@ -50,7 +50,7 @@ def make_trainer(
     factory.check_memory(cfg.env, sample, learner, **where)
     env = factory.construct(cfg.env, **where)
     if cfg.resume or cfg.init:
-        loaded = runs.load_checkpoint(runs.find(cfg.resume or cfg.init), device)
+        loaded = runs.load_checkpoint(runs.find(cfg.resume or cfg.init), cfg.trust, device)
         factory.load_weights(policy, env, loaded)
     opponents = factory.make_opponents(cfg, env, sample, policy)
     for name in ("checkpoints", "snapshots") if cfg.resume else ():
@@ -127,7 +127,7 @@ def with_more(cfg: settings.Train) -> settings.Train:
     totals = {}
     for name in ("samples", "seconds"):
         if (more := getattr(cfg, f"more_{name}")) is not None:
-            had = runs.load_checkpoint(runs.find(cfg.resume)).numbers[name]
+            had = runs.load_checkpoint(runs.find(cfg.resume), cfg.trust).numbers[name]
             totals |= {name: had + more, f"more_{name}": None}
     return settings.changed(cfg, **totals)
 
@@ -178,6 +178,7 @@ def run(cfg: settings.Train) -> Path:
             raise program.UserError(unsaved)
         del running  # its memory is the evaluation's now
         common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
+        common["trust"] = True  # what it names has just run
         if cfg.finish.evaluate:
             evaluate.run(settings.Evaluate(episodes=cfg.finish.episodes, baseline=True, **common))
         if cfg.finish.record:

@@ -16,6 +16,7 @@ import pickle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from megastep.agents.training import trust
 from megastep.agents.training.atomic_files import write_synced
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ class Checkpoint:
         numbers: the numbers at the top of the state.
         config: the run's configuration, as saved.
         state: dicts of tensors and numbers, as saved; None if it was not loaded.
+        untrusted: import paths outside megastep that it names, if this user did not make it.
     """
 
     path: Path
@@ -54,6 +56,7 @@ class Checkpoint:
     numbers: dict[str, float]
     config: dict[str, Any]
     state: dict[str, Any] | None = None
+    untrusted: tuple[str, ...] = ()
 
 
 # ---- Writing ----
@@ -76,6 +79,7 @@ def write(
     numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
     manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
     manifest |= dict(torch=torch.__version__, files=files)
+    manifest["signature"] = trust.sign(contents["config.json"])
     for name, data in {**contents, "manifest.json": sealed(manifest)}.items():
         write_synced(path / name, data)
     sync_folder(path)
@@ -110,8 +114,13 @@ def read(path: Path, device: torch.device | str | None) -> Checkpoint:
         CheckpointError: another version of megastep wrote it.
     """
     contents, manifest = read_files(path)
-    config = json.loads(contents["config.json"])
-    checkpoint = Checkpoint(path, manifest["step"], manifest["numbers"], config)
+    try:
+        config = json.loads(contents["config.json"])
+    except (ValueError, RecursionError):
+        raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is no JSON") from None
+    untrusted = trust.untrusted_names(contents["config.json"], manifest.get("signature"))
+    numbers = manifest["numbers"]
+    checkpoint = Checkpoint(path, manifest["step"], numbers, config, untrusted=tuple(untrusted))
     if device is None:
         return checkpoint
     import torch
@@ -161,7 +170,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         version = manifest["format"]
         body = {key: value for key, value in manifest.items() if key != "sha256"}
         is_intact = data == sealed(body)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         version, is_intact = None, False
     is_without_digest = version == 1 and "sha256" not in manifest
     if not (is_intact or is_without_digest):
