@@ -1,6 +1,7 @@
 """Imports classes and functions by path: `module:attribute`."""
 
 import importlib
+import inspect
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -52,14 +53,24 @@ def search_current_folder() -> None:
         sys.path.insert([*installed, True].index(True), here)
 
 
-def resolve(name: str, table: dict[str, Any]) -> Callable:
-    """Returns the entry of `table` called `name`, or the class or function at this import path.
+def resolve(name: str, table: dict[str, type], base: type) -> type:
+    """Returns the entry of `table` called `name`, or the class at this import path.
 
     Raises:
-        ValueError: if it is neither, in one sentence.
+        ValueError: if it is neither, or no class derived from `base` that takes one argument, in
+            one sentence.
     """
     known_name(name, [*table])
-    return table[name] if name in table else import_object(name)
+    if name in table:
+        return table[name]
+    imported = import_object(name)
+    if not (isinstance(imported, type) and issubclass(imported, base)):
+        raise ValueError(f"{name} must be a class derived from {base.__name__}")
+    try:
+        inspect.signature(imported).bind(None)
+    except TypeError as error:
+        raise ValueError(f"{name} must take one argument ({error})") from None
+    return imported
 
 
 def known_name(name: str, names: Sequence[str]) -> str:

@@ -1,6 +1,7 @@
 """What worker processes have in common."""
 
 import contextlib
+import functools
 import os
 import signal
 import threading
@@ -47,6 +48,7 @@ def end_with(is_running: Callable[[], bool]) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+@functools.cache
 def end_with_parent(parent: int) -> None:
     """As :func:`end_with`, for a child of process ``parent``. Can initialise a pool's workers."""
     end_with(lambda: os.getppid() == parent)

@@ -162,10 +162,13 @@ def run(cfg: settings.Train) -> Path:
                 running.train(lambda: bool(numbers))
         except NonFiniteError as error:
             raise program.NonFinite(f"{error}. What was saved before is in {folder}") from error
-        except (engine.EngineError, torch.OutOfMemoryError) as error:
+        except (MemoryError, RuntimeError) as error:
+            problem = program.memory_problem(error)
+            if not (problem or isinstance(error, engine.EngineError)):
+                raise
             saved = running.saver.error or "What was learnt last could not be saved"
             saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
-            reason = str(error).partition("\n")[0].rstrip(".")
+            reason = problem or str(error).partition("\n")[0].rstrip(".")
             raise program.UserError(f"{reason}. {saved}. {resume}") from error
         finally:
             curves.plot_curves(folder)

@@ -341,6 +341,8 @@ def test_minibatch_needs_an_environment():
         ("env@x=minimal", "configuration", "+env@x=minimal"),
         ("+env@x=minimal", "x", "no such key"),
         ("nope@x=y", "nope@x", "no such key"),
+        ("+env@x.y='${oc.decode:null}'", "env@x.y", "is unknown"),
+        ("hydra.searchpath=ppo", "configuration", "hydra.searchpath must be a list"),
         ("seed=${nothere}", "seed", "Interpolation key 'nothere' not found"),
         ("hydra=3", "hydra", "3 is unknown"),
         ("hydra.swep.dir=x", "hydra.swep.dir", "no such key; did you mean hydra.sweep.dir?"),
