@@ -40,7 +40,6 @@ from megastep.agents.training.atomic_files import write_atomically
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
 #: Columns of the table beside the job and the keys that vary.
 COLUMNS = ("state", "score", "evaluated", "lower", "upper", "seconds")
-KINDS = ("sweeper", "launcher")
 #: What a search is to do, if nothing else is typed: look for high returns, and go past failed jobs.
 SEARCH = {"hydra.sweeper.direction": "maximize", "hydra.sweeper.max_failure_rate": "1.0"}
 
@@ -142,10 +141,11 @@ def sweep(composer: Composer, words: list[str]) -> int:
                 with signals.interrupting(job.interrupt):
                     while job.running():
                         time.sleep(0.2)
-                choices = [config.runtime.choices[f"hydra/{name}"] for name in KINDS]
-                if choices != ["basic", "joblib"] or len(job.rows()) == n_started:
+                # if joblib lost a worker, it dropped the jobs of a grid that had not started
+                choices = config.runtime.choices
+                kinds = choices["hydra/sweeper"], choices["hydra/launcher"]
+                if kinds != ("basic", "joblib") or len(job.rows()) == n_started:
                     break
-                # the jobs of a grid that have not started yet, which joblib dropped with a worker
     finally:
         if rows := job.rows():
             report(folder, rows)
@@ -233,6 +233,8 @@ class Job:
                 subprocess.run(command, pass_fds=[write], check=True)
             with workers.terminal_signals_blocked():
                 pipe.read()
+        if not self.path(f"{row['number']}.json").exists():  # it could not even say that it began
+            self.record(row)
         row = self.recorded(row["number"])
         if row["state"] == LOST:
             console.say(f"Job {row['number']} {LOST}", sys.stderr)

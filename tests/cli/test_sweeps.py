@@ -176,6 +176,18 @@ def test_invalid_sweep_leaves_nothing(here, capsys):
         assert not {name for name in left if not name.startswith("payer.")}, words
 
 
+def test_table_stands_while_jobs_run(here, monkeypatch):
+    """Even if a job of the basic launcher ends this process, with `os._exit` or worse."""
+    states = []
+
+    def run(cfg):
+        states.append([row["state"] for row in rows("mine")])
+
+    monkeypatch.setattr(train, "run", run)
+    assert train.main([*SHORT, "-m", "seed=1,2", "hydra.sweep.dir=mine"]) == 0
+    assert states == [["running"], ["done", "running"]]
+
+
 @pytest.mark.slow
 def test_sweeps_in_the_same_second(here, monkeypatch):
     monkeypatch.setattr(train, "run", lambda cfg: None)
