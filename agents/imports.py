@@ -65,7 +65,8 @@ def resolve(name: str, table: dict[str, type], base: type) -> type:
         return table[name]
     imported = import_object(name)
     if not (isinstance(imported, type) and issubclass(imported, base)):
-        raise ValueError(f"{name} must be a class derived from {base.__name__}")
+        package = base.__module__.partition(".")[0]
+        raise ValueError(f"{name} must be a class derived from {package}'s {base.__name__}")
     try:
         inspect.signature(imported).bind(None)
     except TypeError as error:

@@ -188,7 +188,7 @@ class Composer:
                 else:
                     force = override.is_add() or override.is_force_add() or key[:6] != "hydra."
                     OmegaConf.update(config, key, override.value(), force_add=force)
-            except (ConfigKeyError, ConfigAttributeError):
+            except (ConfigKeyError, ConfigAttributeError, TypeError):
                 hint = check.closest_key(key, dict(leaves({"hydra": plain(config.hydra)})))
                 errors.append((key, f"no such key; {hint}"))
             except OmegaConfBaseException as error:

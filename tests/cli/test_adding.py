@@ -417,8 +417,8 @@ def test_core_contract_error_names_the_clause(outside, capsys, change, clause):
 @pytest.mark.parametrize(
     "name, reason",
     [
-        ("builtins:dict", "must be a class derived from Module"),
-        ("builtins:bytes.decode", "must be a class derived from Module"),
+        ("builtins:dict", "must be a class derived from torch's Module"),
+        ("builtins:bytes.decode", "must be a class derived from torch's Module"),
         ("torch.nn:Linear", "must take one argument (missing a required argument"),
     ],
 )

@@ -336,6 +336,7 @@ def test_minibatch_needs_an_environment():
         ("env=null", "env", "None is unknown"),
         ("~env", "env", "None is unknown"),
         ("~nothing", "nothing", "no such key"),
+        ("~opponents@finish.evaluate=null", "opponents@finish.evaluate", "no such key"),
         ("env=glob(*)", "env", "add -m"),
         ("env=3", "env", "3 is unknown"),
         ("env@x=minimal", "configuration", "+env@x=minimal"),
