@@ -50,7 +50,8 @@ class Collector(Protocol):
     """Acts in an environment and stores what happened.
 
     A collector that runs in the background also has `wait()`, which blocks until nothing acts in
-    the environment.
+    the environment. One with `state_dict()` and `load_state_dict(state)`, of all that it carries
+    from rollout to rollout, lets a run be resumed bit for bit.
     """
 
     rollout: Rollout  # what the last call returned; allocated and empty before the first call
@@ -69,6 +70,8 @@ class Learner(Protocol):
         bytes_per_env(env): the bytes needed per environment like `env`, rollouts included.
         replay_size(env): the number of observations that a replay buffer will hold, and the bytes
             that each takes.
+        replay_buffer: what `collector` allocates to replay from, with state_dict() and
+            load_state_dict(state). Checkpoints hold it where it is small enough.
     """
 
     lr: float  # initial learning rate
@@ -92,6 +95,7 @@ LEARNER_DEFAULTS: dict[str, Any] = {
     "check": None,
     "bytes_per_env": lambda env: 0.0,
     "replay_size": lambda env: (0, 0.0),
+    "replay_buffer": None,
 }
 
 

@@ -104,10 +104,12 @@ class GradientSteps:
         return {**means, "skipped_steps": n_skipped}
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the optimizer's state and the step size."""
-        return dict(optimizer=self.optimizer.state_dict(), lr=self._lr.clone())
+        """Returns the optimizer's state, the step size and what `check` has counted."""
+        optimizer, record = self.optimizer.state_dict(), self.check.record
+        return dict(optimizer=optimizer, lr=self._lr.clone(), check=record.nan_to_num())
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from a `state_dict`."""
         self.optimizer.load_state_dict(state["optimizer"])
         self._lr.copy_(state["lr"])
+        self.check.record.copy_(state["check"])

@@ -13,6 +13,11 @@ SCRIPTS = {
     "evaluate": "measures a trained policy",
     "record": "films a trained policy",
 }
+#: Commands about one run, which is their argument.
+ON_RUNS = {
+    "inspect": "verifies a run's checkpoints and prints what is in them",
+    "rerun": "repeats a run and compares its metrics, byte for byte",
+}
 #: What only a clone of the repository has, and what runs it there.
 IN_A_CLONE = {
     "bench": "python scripts/benchmarks/benchmark.py step",
@@ -33,9 +38,13 @@ def main() -> int:
         else:
             print(" ".join(name for name in SCRIPTS if name.startswith(script)))
             words = [""]
+    if words[0] == "rerun" and len(words) > 1:
+        words = ["train", f"rerun={words[1]}", *words[2:]]
     if words[0] in SCRIPTS:
         sys.argv[1:] = words[1:]
         return run_script(words[0])
+    if words[0] == "inspect":
+        return inspect_run(words[1:])
     from megastep.agents.cli import console
     from megastep.settings import closest
 
@@ -43,6 +52,8 @@ def main() -> int:
     if words[0] in ("-h", "--help"):
         for name, text in SCRIPTS.items():
             console.say(f"  {program.name(name, 'python -m '):<28}{text}; --help says more")
+        for name, text in ON_RUNS.items():
+            console.say(f"  {program.name(name, 'python -m '):<28}{text}")
         console.say("Benchmarks and sheets of homes are in scripts/ of the repository.")
     elif words[0] == "--version":
         console.say(program.version())
@@ -51,7 +62,10 @@ def main() -> int:
         console.say(f"megastep: {text}", sys.stderr)
         return 2
     elif words[0]:
-        console.say(f"megastep: {words[0]!r} is unknown; {closest(words[0], SCRIPTS)}", sys.stderr)
+        console.say(
+            f"megastep: {words[0]!r} is unknown; {closest(words[0], [*SCRIPTS, *ON_RUNS])}",
+            sys.stderr,
+        )
         return 2
     return 0
 
@@ -66,3 +80,16 @@ def run_script(name: str) -> int:
     from megastep.agents.cli import command, scripts
 
     return command.run_command(scripts.SCRIPTS[name])
+
+
+def inspect_run(words: list[str]) -> int:
+    """Runs `megastep inspect`. Returns the exit code."""
+    signals.exit_on_signals("inspect")
+    from megastep.agents.cli import console, inspect
+
+    console.open_streams()
+    try:
+        return inspect.run(words)
+    except program.UserError as error:
+        console.say(f"megastep inspect: {error}", sys.stderr)
+        return error.code

@@ -44,6 +44,12 @@ class NonFinite(UserError):
     code = 1
 
 
+class Differs(UserError):
+    """A run that was repeated gave other numbers."""
+
+    code = 1
+
+
 class ConfigErrors(UserError):
     """All errors of one configuration: `errors`, (dotted key, sentence) each."""
 

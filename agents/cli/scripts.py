@@ -52,6 +52,8 @@ The most common words:
                                compare
   resume=RUN                   continue a run (its folder, or latest) under its own configuration;
                                more_seconds=60 more_samples=1e6 add to what it has had
+  rerun=RUN                    repeat a run, with the learning rates that its clock chose, and
+                               compare its metrics.jsonl
   init=RUN                     start a new run from its weights, in its environment and homes
   env=my_package.rover:Rover   a class of your own; also for geometry, learner, agent.core
   logger=wandb logger.mode=offline"""
@@ -68,6 +70,7 @@ RESUMABLE = (
     "log_every",
     "checkpoint_seconds",
     "keep_checkpoints",
+    "replay_every",
     "desync",
     "snapshots",
     "logger",
@@ -75,40 +78,66 @@ RESUMABLE = (
 )
 
 
-def prepare_training(tree: Tree, typed: list[str]) -> Tree:
-    """Returns the tree of a run that resumes another or starts from its weights; any other is
-    returned as it is.
+#: What may differ when a run is repeated.
+REPEATABLE = (
+    "rerun",
+    "folder",
+    "device",
+    "trust",
+    "checkpoint_seconds",
+    "keep_checkpoints",
+    "replay_every",
+    "logger",
+    "finish",
+)
+#: The keys that take a run, each with what is said of a key that cannot go with it.
+CURES = {
+    "resume": "cannot change when a run is resumed; init=RUN starts a new one from its weights",
+    "rerun": "cannot change when a run is repeated; init=RUN starts a new one from its weights",
+    "init": "",
+}
 
-    A run that is resumed keeps its own settings, except for typed keys. A run that starts from the
-    weights of another has its environment, geometry and agent, except for typed keys and groups.
+
+def prepare_training(tree: Tree, typed: list[str]) -> Tree:
+    """Returns the tree of a run that resumes or repeats another or starts from its weights; any
+    other is returned as it is.
+
+    A run that is resumed or repeated keeps its own settings, except for typed keys. A run that
+    starts from the weights of another has its environment, geometry and agent, except for typed
+    keys and groups.
     """
-    resume, init = tree.get("resume"), tree.get("init")
-    if not isinstance(resume or init, str) or (resume and init):
+    given = [key for key in CURES if isinstance(tree.get(key), str)]
+    if len(given) > 1:
+        raise program.ConfigErrors([(given[1], f"cannot be combined with {given[0]}")])
+    if not given:
         return tree
-    if refused := [key for key in typed if resume and key.split(".")[0] not in RESUMABLE]:
-        cure = "cannot change when a run is resumed; init=RUN starts a new one from its weights"
-        raise program.ConfigErrors((key, cure) for key in refused)
-    path = runs.find(resume or init)
+    how, allowed = given[0], {"resume": RESUMABLE, "rerun": REPEATABLE}.get(given[0], typed)
+    if refused := [key for key in typed if not {key, key.split(".")[0]} & {*allowed}]:
+        raise program.ConfigErrors((key, CURES[how]) for key in refused)
+    path = runs.find(tree[how])
     # a run in use is refused before its checkpoints are read, which come and go
-    with runs.locked(runs.folder_of(path)) if resume else contextlib.nullcontext():
+    locked = runs.locked(runs.folder_of(path)) if how == "resume" else contextlib.nullcontext()
+    with locked:
         loaded = runs.load_checkpoint(path, tree.get("trust") is True)
     saved = loaded.config["train"]
-    if init:
+    if how == "init":
         groups = ("env", "geometry", "agent")
         groups = {group: saved[group] for group in groups if group not in typed}
         saved, typed = tree | groups, [key for key in typed if key.partition(".")[0] in groups]
     elif not loaded.numbers:
         raise program.UserError(
             f"{loaded.path} is a snapshot, which has the weights only. init={loaded.path} starts "
-            "a new run from it; resume= takes the run's folder"
+            f"a new run from it; {how}= takes the run's folder"
         )
+    elif how == "rerun":
+        saved |= {"resume": None, "folder": None}
     for key in typed:
         *groups, leaf = key.split(".")
         source, target = (functools.reduce(dict.get, groups, one) for one in (tree, saved))
         target[leaf] = source[leaf]
-    if resume and (errors := [*budget_errors(saved, typed, loaded.numbers)]):
+    if how == "resume" and (errors := [*budget_errors(saved, typed, loaded.numbers)]):
         raise program.ConfigErrors(errors)
-    return saved | {"init": init, "trust": tree.get("trust", False)}
+    return saved | {"trust": tree.get("trust", False)}
 
 
 def budget_errors(tree: Tree, typed: list[str], had: dict[str, float]) -> Iterator[tuple[str, str]]:

@@ -174,10 +174,12 @@ class Train(Common):
     log_every: Count
     checkpoint_seconds: Above0
     keep_checkpoints: Annotated[int, Field(ge=2, le=1000)]
+    replay_every: Count = 20
     desync: bool = True
     snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
     folder: str | None
     resume: str | None
+    rerun: str | None = None
     init: str | None
 
     def errors(self):
@@ -201,9 +203,6 @@ class Train(Common):
             "snapshots": self.snapshots
             and not (self.samples or self.seconds or self.more_samples or self.more_seconds)
             and "are spread over the budget; give samples= or seconds=",
-            "init": self.resume
-            and self.init
-            and "cannot be combined with resume: init starts a new run, resume continues one",
         }
 
 

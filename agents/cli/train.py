@@ -2,10 +2,14 @@
 
 import contextlib
 import functools
+import itertools
+import math
+import random
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 import yaml
 
@@ -24,7 +28,16 @@ from megastep.agents.cli import (
     settings,
     signals,
 )
-from megastep.agents.training import budget, checkpoint, curves, loggers, provenance, saver
+from megastep.agents.generator import stream_seed
+from megastep.agents.training import (
+    annealing,
+    budget,
+    checkpoint,
+    curves,
+    loggers,
+    provenance,
+    saver,
+)
 from megastep.agents.training.atomic_files import write_atomically
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LEARNER_DEFAULTS
@@ -37,6 +50,7 @@ def make_trainer(
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
     """
+    seed_everything(cfg.seed)
     where = {
         "geometries": factory.homes(cfg.env, cfg.geometry, "training"),
         "seed": cfg.seed,
@@ -50,13 +64,15 @@ def make_trainer(
     factory.check_memory(cfg.env, sample, learner, **where)
     env = factory.construct(cfg.env, **where)
     if cfg.resume or cfg.init:
-        loaded = runs.load_checkpoint(runs.find(cfg.resume or cfg.init), cfg.trust, device)
+        path = runs.find(cfg.resume or cfg.init)
+        loaded = runs.load_checkpoint(path, cfg.trust, device, is_whole=cfg.resume is not None)
         factory.load_weights(policy, env, loaded)
     opponents = factory.make_opponents(cfg, env, sample, policy)
     for name in ("checkpoints", "snapshots") if cfg.resume else ():
         checkpoint.set_aside_after(folder / name, loaded.step)
     config = {"train": check.as_tree(cfg), "spaces": factory.spaces_of(env)}
     wandb = vars(cfg.logger) | {"name": folder.name, "config": config["train"]}
+    made_with = provenance.made_with(device, program.version())
     with factory.errors():
         improves = Trainer(
             opponents or env,
@@ -64,11 +80,13 @@ def make_trainer(
             learner,
             loggers.Loggers(
                 folder,
-                loaded.step if cfg.resume else 0,
+                loaded.state["samples_at_report"] if cfg.resume else 0,
                 wandb if cfg.logger.name == "wandb" else None,
             ),
-            saver.Saver(folder / "checkpoints", config, cfg.keep_checkpoints),
-            budget.Budget(cfg.samples, cfg.seconds, cfg.learner.anneal),
+            saver.Saver(
+                folder / "checkpoints", config, cfg.keep_checkpoints, made_with, cfg.replay_every
+            ),
+            budget_of(cfg, folder, loaded if cfg.resume else None),
             log_every=cfg.log_every,
             checkpoint_seconds=cfg.checkpoint_seconds,
             desync=cfg.desync,
@@ -77,10 +95,56 @@ def make_trainer(
             snapshot_saver=saver.SnapshotSaver(
                 saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9), cfg.snapshots
             ),
+            annealing_record=annealing.AnnealingRecord(
+                folder, loaded.state["updates"] if cfg.resume else 0
+            ),
         )
         if cfg.resume:
-            improves.load_state_dict(loaded.state)
+            before = loaded.made_with
+            differing = [
+                f"{name} was {before[name]} and is {made_with.get(name)}"
+                for name in before
+                if before[name] != made_with.get(name)
+            ]
+            if lost := [*improves.load_state_dict(loaded.state), *differing]:
+                console.say(f"This run goes on, but not bit for bit: {'; '.join(lost)}.")
     return improves
+
+
+def seed_everything(seed: int) -> None:
+    """Seeds the global generators of PyTorch, NumPy and Python, which only code of the user's draws
+    from.
+    """
+    seed = stream_seed(seed, "global")
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)
+    random.seed(seed)
+
+
+def budget_of(
+    cfg: settings.Train, folder: Path, loaded: checkpoint.Checkpoint | None
+) -> budget.Budget:
+    """Returns the budget of a run, with the factors of the learning rate that are to be repeated.
+
+    Raises:
+        UserError: the run to repeat did not record them.
+    """
+    limits, recorded = (cfg.samples, cfg.seconds, cfg.learner.anneal), ()
+    if cfg.rerun:
+        source = runs.folder_of(runs.find(cfg.rerun))
+        recorded = annealing.read(source)
+        if not recorded or any(map(math.isnan, recorded)):
+            raise program.UserError(
+                f"{source} cannot be repeated: {annealing.FILE} does not hold the learning rate of "
+                "each update, as an earlier version began the run; start a new one with its "
+                f"settings, which are in {source / 'config.yaml'}"
+            )
+    elif loaded is not None:
+        recorded = annealing.read(folder)
+        # a clock of another budget would have chosen others
+        if cfg.learner.anneal != "seconds" or loaded.config["train"]["seconds"] != cfg.seconds:
+            recorded = recorded[: loaded.state["updates"]]
+    return budget.Budget(*limits, recorded, is_rerun=cfg.rerun is not None)
 
 
 def progress_of(running: Trainer) -> tuple[float | None, list[str]]:
@@ -158,7 +222,12 @@ def run(cfg: settings.Train) -> Path:
         console.say(f"Training on {device} in {folder}")
         resume = f"To continue: {runs.resume_command(folder)}"
         try:
-            with signals.handled() as numbers, progress, contextlib.closing(running.logger):
+            with (
+                signals.handled() as numbers,
+                progress,
+                contextlib.closing(running.logger),
+                contextlib.closing(running.annealing_record),
+            ):
                 running.train(lambda: bool(numbers))
         except NonFiniteError as error:
             raise program.NonFinite(f"{error}. What was saved before is in {folder}") from error
@@ -189,7 +258,23 @@ def run(cfg: settings.Train) -> Path:
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
         if nonfinite and nonfinite.is_from_env:
             raise program.NonFinite(f"{nonfinite}. All else was learnt from, and is in {folder}")
+        if cfg.rerun:
+            compare(folder, runs.folder_of(runs.find(cfg.rerun)))
     return folder
+
+
+def compare(folder: Path, original: Path) -> None:
+    """Says whether two runs have the same metrics, byte for byte. Raises Differs if not."""
+    ours, theirs = ((run / "metrics.jsonl").read_bytes() for run in (folder, original))
+    if ours == theirs:
+        console.say(f"metrics.jsonl equals that of {original}, byte for byte.")
+        return
+    pairs = enumerate(itertools.zip_longest(ours.split(b"\n"), theirs.split(b"\n")), 1)
+    number = next(number for number, (one, other) in pairs if one != other)
+    raise program.Differs(
+        f"metrics.jsonl differs from that of {original} from line {number} on; equal bits need the "
+        f"same versions, device and threads: see {provenance.FILE} of both"
+    )
 
 
 #: Runs the script with words of a command line, by default this process's.

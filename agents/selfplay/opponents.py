@@ -12,6 +12,7 @@ from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay import duels
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
+from megastep.agents.storage.rollout import copy_tree
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.settings import checked
@@ -178,18 +179,17 @@ class Opponents:
         return {"past": past, "bot": bot}
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the snapshots, the pairs counted by kind of opponent and the generator's state.
-
-        None of it depends on the number of environments.
+        """Returns the snapshots, the generator's state, and by lane what opponents see and remember
+        and the scores of the episodes in progress. The environment has a state of its own.
         """
         return dict(
             snapshots={str(i): policy.state_dict() for i, policy in enumerate(self.snapshots)},
-            pairs={name: pairs.sum(1) for name, pairs in self._pairs_by_kind().items()},
             generator=self.generator.state_dict(),
+            lanes=dict(self._lanes(), pairs=self.pairs.clone(), returns=self.returns.clone()),
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores a `state_dict`, also one of another number of environments. Episodes start anew.
+        """Restores a `state_dict`. Without `lanes`, the opponents begin new episodes.
 
         Raises:
             ValueError: the state has another number of snapshots.
@@ -201,10 +201,13 @@ class Opponents:
             )
         for i, snapshot in enumerate(self.snapshots):
             snapshot.load_state_dict(state["snapshots"][str(i)])
-        self.pairs.zero_()
-        for name, pairs in self._pairs_by_kind().items():
-            pairs[:, :1] = state["pairs"][name][:, None]  # counted as of the kind's first, if any
         self.generator.load_state_dict(state["generator"], self.learners.device)
+        if "lanes" in state:
+            copy_tree(self._lanes(), state["lanes"])
+
+    def _lanes(self):
+        names = "hidden_state", "opponent_world", "pairs", "returns"
+        return {name: getattr(self, name) for name in names}
 
 
 def count_environments(env: Env, past: float, bot: float, snapshots: int) -> tuple[int, int]:

@@ -8,14 +8,14 @@ work in the same order, one after the other, with the same numbers.
 """
 
 import copy
-from collections.abc import Callable, Iterator
-from itertools import cycle
+from collections.abc import Callable
+from typing import Any
 
 import torch
 
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector, initial_actor_state
-from megastep.agents.storage.rollout import Rollout
+from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.arrdict import arrdict
 from megastep.capture import Graph
 from megastep.types import Env
@@ -44,8 +44,7 @@ class _Slot:
 class AsyncCollector:
     """Collects `lag` rollouts in advance. Returns them one after the other, copied into `rollout`.
 
-    Rollouts store no values, since those of old weights are of no use. A resumed run starts
-    collecting again with the weights it loaded; rollouts that were in progress are not saved.
+    Rollouts store no values, since those of old weights are of no use.
 
     Args:
         env: environment without opponents.
@@ -68,7 +67,9 @@ class AsyncCollector:
         self.stream = torch.cuda.Stream(env.device) if self.on_gpu else None
         actor_state = initial_actor_state(env, policy, rollout)
         self.slots = [_Slot(env, policy, rollout, actor_state) for _ in range(lag)]
-        self._next: Iterator[_Slot] | None = None
+        self.actor_state = actor_state
+        self.n_returned = 0  # rollouts; the next is of slot n_returned % lag
+        self.is_ahead = False  # whether every slot has been launched
 
     @property
     def graph(self) -> Callable | None:
@@ -76,12 +77,13 @@ class AsyncCollector:
         return self.slots[0].collect.graph
 
     def __call__(self) -> Rollout:
-        if self._next is None:
-            self._next = cycle(self.slots)
+        if not self.is_ahead:
+            self.is_ahead = True
             for slot in self.slots:
                 self._launch(slot)
-        slot = next(self._next)
-        if self.on_gpu:
+        slot = self.slots[self.n_returned % len(self.slots)]
+        self.n_returned += 1
+        if slot.end is not None:
             torch.cuda.current_stream(self.rollout.reward.device).wait_event(slot.end)
         self.rollout.copy_(slot.rollout)
         self._launch(slot)
@@ -107,3 +109,15 @@ class AsyncCollector:
         """Blocks until nothing is being collected, so that others may use the environment."""
         if self.on_gpu:
             self.stream.synchronize()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the actor state and the rollouts collected in advance. Call `wait` first."""
+        rollouts = [slot.rollout.state_dict() for slot in self.slots] if self.is_ahead else []
+        return dict(actor_state=self.actor_state, rollouts=rollouts, n_returned=self.n_returned)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from a `state_dict` of a collector with the same lag."""
+        copy_tree(self.actor_state, state["actor_state"])
+        self.n_returned, self.is_ahead = state["n_returned"], bool(state["rollouts"])
+        for slot, rollout in zip(self.slots, state["rollouts"]):
+            slot.rollout.load_state_dict(rollout)

@@ -5,12 +5,12 @@ T time, B lanes.
 
 import torch
 
-from megastep.agents.storage.rollout import Rollout
+from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.types import Actor
 from megastep.arrdict import arrdict
 from megastep.capture import capture
 from megastep.dotdict import leaves
-from megastep.types import Env
+from megastep.types import Env, Tree
 
 _STORED = "obs", "reset", "learns", "privileged"  # what `Rollout.store_world` reads
 
@@ -99,6 +99,17 @@ class Collector:
         else:
             self.graph()
         return self.rollout
+
+    def state_dict(self) -> dict[str, Tree]:
+        """Returns the actor state: what the next rollout starts from, besides the environment."""
+        return {"actor_state": self.parts[-1]}
+
+    def load_state_dict(self, state: dict[str, Tree]) -> None:
+        """Continues from a `state_dict`, which may come from another device. The next call is eager
+        again.
+        """
+        copy_tree(self.parts[-1], state["actor_state"])
+        self.n_collected, self.graph = 0, None
 
 
 def _stored(world):

@@ -15,11 +15,11 @@ from megastep import spaces
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.replay_columns import Column, stored_dtype
 from megastep.agents.storage.replay_settings import ReplaySettings
-from megastep.agents.storage.rollout import Rollout
+from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.storage.sum_tree import SumTree
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
-from megastep.types import Env, Space
+from megastep.types import Env, Space, Tree
 
 #: Bool tensors of a row, stored as one bit each.
 _FLAGS = "starts", "learns", "terminal", "truncated"
@@ -193,6 +193,25 @@ class ReplayBuffer:
         self.tree.set(index, torch.where(is_set, new, old))
         largest = torch.where(is_set, new, 0.0).amax()
         self.new_priority.copy_(torch.where(largest > 0, largest, self.new_priority))
+
+    def state_dict(self) -> dict[str, Tree]:
+        """Returns all that is stored, with its priorities. Synchronises."""
+        n_filled = min(int(self.n_added), self.n_rollouts)
+        stored = self._rows(n_filled)
+        levels = {str(i): level for i, level in enumerate(self.tree.levels)}
+        names = "is_finite", "n_added", "n_available", "new_priority"
+        return dict(stored=stored, tree=levels, **{name: getattr(self, name) for name in names})
+
+    def load_state_dict(self, state: dict[str, Tree]) -> None:
+        """Copies a `state_dict` of a buffer with the same settings. It may be on another device."""
+        self.n_added.copy_(state["n_added"])
+        copy_tree(self.state_dict(), state)
+
+    def _rows(self, n_rollouts):
+        """Returns the first rollouts of every column, as views."""
+        rows = mapping(lambda column: column.rows[: n_rollouts * self.n_steps])
+        state = mapping(lambda column: column.rows[:n_rollouts])(self.state)
+        return dict(rows(self.columns), flags=rows(self.flags), state=state)
 
 
 def bytes_per_observation(

@@ -12,7 +12,7 @@ import torch
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, clone
-from megastep.dotdict import leaves, mapping
+from megastep.dotdict import mapping
 from megastep.types import Env, Space, Tree, n_lanes, optional
 
 _SEQUENCES = "obs starts learns actions logprobs reward terminal truncated".split()
@@ -122,13 +122,17 @@ class Rollout:
 
     def copy_(self, other: "Rollout") -> None:
         """Copies every tensor of another rollout of the same shape."""
-        for target, source in zip(self._tensors(), other._tensors(), strict=True):
-            target.copy_(source)
+        self.load_state_dict(other.state_dict())
 
-    def _tensors(self):
-        parts = [getattr(self, name) for name in (*_SEQUENCES, "privileged", "values")]
-        parts = [part for part in parts if part is not None]
-        return [leaf for part in (*parts, self.metrics, self.state) for leaf in leaves(part)]
+    def state_dict(self) -> dict[str, Tree]:
+        """Returns every tensor: trees by name."""
+        names = *_SEQUENCES, "privileged", "values", "metrics", "state"
+        parts = {name: getattr(self, name) for name in names}
+        return {name: part for name, part in parts.items() if part is not None}
+
+    def load_state_dict(self, state: dict[str, Tree]) -> None:
+        """Copies the tensors of a `state_dict`, which may be on another device."""
+        copy_tree(self.state_dict(), state)
 
     # ---- Lanes of the environment and lanes of the rollout ----
 
@@ -231,6 +235,15 @@ def bytes_per_step(env: Env, policy: Policy) -> int:
     if policy.privileged_space:
         privileged = _bytes(policy.privileged_space, default_itemsize=4)
     return obs + privileged + _BYTES_OF_THE_REST
+
+
+def copy_tree(target: Tree, source: Tree) -> None:
+    """Copies the tensors of a tree into those of another with the same keys, on any device."""
+    if isinstance(target, torch.Tensor):
+        target.copy_(source)
+        return
+    for key, part in target.items():
+        copy_tree(part, source[key])
 
 
 def without_last(tree: Tree | None) -> Tree | None:

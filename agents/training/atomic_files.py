@@ -88,3 +88,45 @@ def _machine():
     with contextlib.suppress(OSError):  # not all systems have namespaces
         name += "-" + re.sub(r"\D", "", os.readlink("/proc/self/ns/pid"))
     return name
+
+
+class AppendedFile:
+    """A file that grows. What a full disk refuses is kept, and written by the next call from the
+    byte where it stopped, so the file never has a hole.
+
+    Args:
+        path: the file, made if it does not exist.
+        n_bytes: length to cut it to first; None keeps all.
+
+    Raises:
+        OSError: the file cannot be opened or cut.
+
+    Attributes:
+        unwritten: bytes to write.
+    """
+
+    def __init__(self, path: Path, n_bytes: int | None = None):
+        self.path, self.unwritten = path, bytearray()
+        self.file = open(path, "ab", buffering=0)
+        if n_bytes is not None:
+            self.file.truncate(n_bytes)
+
+    def write(self, data: bytes) -> None:
+        """Appends bytes.
+
+        Raises:
+            OSError: the disk is full or not writable.
+        """
+        self.unwritten += data
+        self.flush()
+
+    def flush(self) -> None:
+        """Writes what is left, with errors as `write`."""
+        while self.unwritten:
+            del self.unwritten[: self.file.write(self.unwritten)]
+
+    def close(self) -> None:
+        try:
+            self.flush()
+        finally:
+            self.file.close()

@@ -5,6 +5,7 @@ A sample is one environment step of one lane.
 
 import dataclasses
 import time
+from collections.abc import Sequence
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,26 +16,35 @@ class Budget:
         samples: environment steps of all lanes together; None for no limit.
         seconds: seconds of training; None for no limit.
         anneal: "samples" or "seconds": the learning rate falls linearly to 0 over that limit.
-            "never": it is constant. Annealing over samples is reproducible, over seconds is not.
+            "never": it is constant.
+        recorded: the factors of the learning rate in the first updates, as an earlier run of the
+            same configuration recorded them (`annealing`). They replace the clock's.
+        is_rerun: the run ends after the updates that are recorded.
     """
 
     samples: int | None = None
     seconds: float | None = None
     anneal: str = "never"
+    recorded: Sequence[float] = ()
+    is_rerun: bool = False
 
     @property
     def is_limited(self) -> bool:
-        """True if either limit is set."""
-        return self.samples is not None or self.seconds is not None
+        """True if the run ends by itself."""
+        return self.is_rerun or self.samples is not None or self.seconds is not None
 
-    def fraction_left(self, samples: int, seconds: float) -> float:
+    def fraction_left(self, updates: int, samples: int, seconds: float) -> float:
         """Returns the fraction of the budget that is left: 1 if there is no limit, below 0 if it is
         overspent.
         """
+        if self.is_rerun:
+            return _fraction_left(updates, len(self.recorded))
         return min(_fraction_left(samples, self.samples), _fraction_left(seconds, self.seconds))
 
-    def lr_fraction(self, samples: int, seconds: float) -> float:
-        """Returns the factor for the learning rate, from 1 to 0."""
+    def lr_fraction(self, updates: int, samples: int, seconds: float) -> float:
+        """Returns the factor for the learning rate in the next update, from 1 to 0."""
+        if updates < len(self.recorded):
+            return self.recorded[updates]
         if self.anneal == "never":
             return 1.0
         if self.anneal == "samples":

@@ -45,6 +45,8 @@ def save(
     config: dict[str, Any],
     keep_checkpoints: int = 2,
     score: float | None = None,
+    made_with: dict[str, Any] | None = None,
+    replay_seconds: float | None = None,
 ) -> Path:
     """Writes a checkpoint and deletes old ones. Returns its folder.
 
@@ -55,6 +57,8 @@ def save(
         config: the run's configuration, as JSON.
         keep_checkpoints: number of latest steps kept, besides the one with the highest score.
         score: for example the mean return, higher is better; None if unknown.
+        made_with: what the numbers depend on besides the configuration, such as versions.
+        replay_seconds: a replay buffer that takes longer to write is left out.
 
     Raises:
         OSError: the disk is full or not writable. Nothing has changed.
@@ -65,8 +69,9 @@ def save(
     delete_leftovers(folder)
     temporary = temporary_path(folder / f"step_{step}")
     try:
-        checkpoint_format.write(temporary, step, state, config, score)
-        checkpoint_format.read_files(temporary)  # verified before any old one is deleted
+        checkpoint_format.write(temporary, step, state, config, score, made_with, replay_seconds)
+        # verified before any old one is deleted
+        checkpoint_format.verify(temporary, checkpoint_format.read_manifest(temporary))
         path = folder / _next_name(folder, step)
         os.replace(temporary, path)
         checkpoint_format.sync_folder(folder)
@@ -78,22 +83,28 @@ def save(
     return path
 
 
-def load_latest(folder: Path | str, device: torch.device | str | None = "cpu") -> Checkpoint:
+def load_latest(
+    folder: Path | str, device: torch.device | str | None = "cpu", is_whole: bool = True
+) -> Checkpoint:
     """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`.
 
-    With `device=None` it leaves out the state, and does not import PyTorch. Warns about each
-    damaged checkpoint that is skipped.
+    Warns about each damaged checkpoint that is skipped.
+
+    Args:
+        device: where what was learnt goes; all else goes to the CPU. None leaves out the state, and
+            does not import PyTorch.
+        is_whole: loads environments and replay buffer, too.
 
     Raises:
         CheckpointError: there is none, all are damaged, or another version of megastep wrote it.
     """
     folder = Path(folder)
     if (folder / "manifest.json").exists():
-        return checkpoint_format.read(folder, device)
+        return checkpoint_format.read(folder, device, is_whole)
     messages = []
     for path in reversed(list_checkpoints(folder)):
         try:
-            checkpoint = checkpoint_format.read(path, device)
+            checkpoint = checkpoint_format.read(path, device, is_whole)
         except DamagedCheckpoint as error:
             messages.append(str(error))
             continue
@@ -145,15 +156,16 @@ def _next_name(folder: Path, step: int) -> str:
 def _prune(folder: Path, keep_checkpoints: int, step: int) -> None:
     """Deletes old checkpoints, and set-aside ones up to `step`.
 
-    Keeps the last `keep_checkpoints` steps and the step with the best score. Of each step only the
-    last checkpoint is kept.
+    Keeps the last `keep_checkpoints` steps, the step with the best score and the last one with a
+    replay buffer. Of each step only the last checkpoint is kept.
     """
     checkpoints = list_checkpoints(folder)
     last_of_each_step = list({step_of(path): path for path in checkpoints}.values())
     scores = {path: _score(path) for path in last_of_each_step}
     scored = [path for path in last_of_each_step if scores[path] is not None]
     best = max(scored, key=scores.get, default=None)
-    kept = {*last_of_each_step[-keep_checkpoints:], best}
+    with_replay = [path for path in last_of_each_step if (path / "replay.pt").exists()]
+    kept = {*last_of_each_step[-keep_checkpoints:], best, *with_replay[-1:]}
     aside = [path for path in folder.glob("step_*.aside") if step_of(path) <= step]
     for path in [*(path for path in checkpoints if path not in kept), *aside]:
         _delete(path)

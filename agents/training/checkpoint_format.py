@@ -1,33 +1,44 @@
-"""The format of one checkpoint: a folder of `state.pt`, `config.json` and `manifest.json`.
+"""The format of one checkpoint: a folder of these files.
 
-`state.pt` holds plain dicts of tensors and numbers. The manifest has the size and SHA-256 of the
-other two files, and a SHA-256 of itself, so any damaged byte is detected. It repeats the numbers at
-the top of the state, such as samples and seconds. All but `state.pt` is read without PyTorch.
+    manifest.json  size and SHA-256 of each other file and of itself, so any damaged byte is found;
+                   format, step, score, what it was made with, and the numbers at the top of the
+                   state, such as samples and seconds
+    config.json    the run's configuration
+    state.pt       what was learnt, and all else that is small
+    world.pt       the environments, and what the policy remembers of their episodes
+    replay.pt      the replay buffer, if there is one and it was saved
+
+The last three hold plain dicts of tensors, numbers and strings. A run that is resumed reads all; to
+evaluate needs `state.pt` alone. JSON is read without PyTorch.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
-import io
 import json
 import os
 import pickle
+import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from megastep.agents.training import trust
-from megastep.agents.training.atomic_files import write_synced
 
 if TYPE_CHECKING:
     import torch
 
 #: The format number. Increase it whenever older readers would misread a new checkpoint, or newer
 #: readers an old one, and add the last commit of the old format to `READERS`.
-FORMAT = 6
-#: Commits of megastep that read the older formats.
+FORMAT = 7
+#: Commits of megastep that read the older formats. The last one is migrated, see `_migrated`.
 READERS = {1: "e17fabe", 2: "6f4fbf1", 3: "3ffd1d5", 4: "e9908db", 5: "916221d"}
-FILES = ("state.pt", "config.json")
+MIGRATED = 6
+#: The keys of a state that are in files of their own.
+PARTS = {"world.pt": ("env", "collector"), "replay.pt": ("replay",)}
+_CHUNK = 2**24  # bytes
 
 
 class CheckpointError(RuntimeError):
@@ -47,6 +58,7 @@ class Checkpoint:
         step: environment steps of all lanes before it was saved.
         numbers: the numbers at the top of the state.
         config: the run's configuration, as saved.
+        made_with: what the numbers depend on besides the configuration: versions, device, threads.
         state: dicts of tensors and numbers, as saved; None if it was not loaded.
         untrusted: import paths outside megastep that it names, if this user did not make it.
     """
@@ -55,6 +67,7 @@ class Checkpoint:
     step: int
     numbers: dict[str, float]
     config: dict[str, Any]
+    made_with: dict[str, Any]
     state: dict[str, Any] | None = None
     untrusted: tuple[str, ...] = ()
 
@@ -63,26 +76,92 @@ class Checkpoint:
 
 
 def write(
-    path: Path, step: int, state: dict[str, Any], config: dict[str, Any], score: float | None
+    path: Path,
+    step: int,
+    state: dict[str, Any],
+    config: dict[str, Any],
+    score: float | None,
+    made_with: dict[str, Any] | None = None,
+    replay_seconds: float | None = None,
 ) -> None:
-    """Writes a checkpoint into a new folder and flushes it to disk."""
+    """Writes a checkpoint into a new folder and flushes it to disk.
+
+    Args:
+        replay_seconds: `replay.pt` is left out if it takes longer; None for no limit.
+    """
     import torch
 
     path.mkdir()
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    contents = {"state.pt": buffer.getvalue(), "config.json": json.dumps(config, indent=2).encode()}
-    files = {
-        name: {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
-        for name, data in contents.items()
-    }
+    apart = {key for keys in PARTS.values() for key in keys}
+    parts = {"state.pt": {key: part for key, part in state.items() if key not in apart}}
+    for name, keys in PARTS.items():
+        if part := {key: state[key] for key in keys if key in state}:
+            parts[name] = part
+    files = {}
+    for name, part in parts.items():
+        deadline = None
+        if name == "replay.pt" and replay_seconds is not None:
+            deadline = time.monotonic() + replay_seconds
+        try:
+            files[name] = _write_file(path / name, functools.partial(torch.save, part), deadline)
+        except _TooLate:
+            (path / name).unlink()
+    text = json.dumps(config, indent=2).encode()
+    files["config.json"] = _write_file(path / "config.json", lambda file: file.write(text))
     numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
     manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
-    manifest |= dict(torch=torch.__version__, files=files)
-    manifest["signature"] = trust.sign(contents["config.json"])
-    for name, data in {**contents, "manifest.json": sealed(manifest)}.items():
-        write_synced(path / name, data)
+    manifest |= dict(torch=torch.__version__, made_with=made_with or {}, files=files)
+    manifest["signature"] = trust.sign(text)
+    text = sealed(manifest)
+    _write_file(path / "manifest.json", lambda file: file.write(text))
     sync_folder(path)
+
+
+class _TooLate(Exception):
+    """A file took longer to write than it may."""
+
+
+class _HashedFile:
+    """A file that counts and hashes what is written to it.
+
+    Attributes:
+        error: the first error. `torch.save` would hide it behind others, so nothing is raised.
+    """
+
+    def __init__(self, file: BinaryIO, deadline: float | None):
+        self.file, self.deadline, self.error = file, deadline, None
+        self.n_bytes, self.sha256 = 0, hashlib.sha256()
+
+    def write(self, data) -> int:
+        data = memoryview(data).cast("B")
+        for start in range(0, len(data) if self.error is None else 0, _CHUNK):
+            chunk = data[start : start + _CHUNK]
+            try:
+                self.file.write(chunk)
+            except OSError as error:
+                self.error = error
+            self.sha256.update(chunk)
+            if self.deadline is not None and time.monotonic() > self.deadline:
+                self.error = _TooLate()
+        self.n_bytes += len(data)
+        return len(data)
+
+    def flush(self) -> None:
+        pass
+
+
+def _write_file(
+    path: Path, write: Callable[[Any], Any], deadline: float | None = None
+) -> dict[str, Any]:
+    """Writes a file and flushes it to disk. Returns its entry in the manifest."""
+    with open(path, "wb") as file:
+        hashed = _HashedFile(file, deadline)
+        write(hashed)
+        if hashed.error is not None:
+            raise hashed.error
+        file.flush()
+        os.fsync(file.fileno())
+    return {"sha256": hashed.sha256.hexdigest(), "bytes": hashed.n_bytes}
 
 
 def sealed(manifest: dict[str, Any]) -> bytes:
@@ -106,57 +185,98 @@ def sync_folder(folder: Path) -> None:
 # ---- Reading ----
 
 
-def read(path: Path, device: torch.device | str | None) -> Checkpoint:
-    """Loads a checkpoint onto a device, or, if that is None, all but its state.
+def read(path: Path, device: torch.device | str | None, is_whole: bool = False) -> Checkpoint:
+    """Loads a checkpoint.
+
+    Args:
+        device: where the tensors of `state.pt` go; None: verifies everything and loads no state.
+        is_whole: loads the other parts, too, onto the CPU.
 
     Raises:
         DamagedCheckpoint: a file is missing or damaged, or could run code when loaded.
         CheckpointError: another version of megastep wrote it.
     """
-    contents, manifest = read_files(path)
+    manifest = read_manifest(path)
+    parts = [name for name in manifest["files"] if name.endswith(".pt")]
+    if device is None or is_whole:
+        verify(path, manifest)
+    else:
+        parts = ["state.pt"]
+        verify(path, manifest, ("state.pt", "config.json"))
+    text = (path / "config.json").read_bytes()
     try:
-        config = json.loads(contents["config.json"])
+        config = json.loads(text)
     except (ValueError, RecursionError):
         raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is no JSON") from None
-    untrusted = trust.untrusted_names(contents["config.json"], manifest.get("signature"))
-    numbers = manifest["numbers"]
-    checkpoint = Checkpoint(path, manifest["step"], numbers, config, untrusted=tuple(untrusted))
+    checkpoint = Checkpoint(
+        path,
+        manifest["step"],
+        manifest["numbers"],
+        config,
+        manifest.get("made_with", {}),
+        untrusted=tuple(trust.untrusted_names(text, manifest.get("signature"))),
+    )
     if device is None:
         return checkpoint
+    state = {}
+    for name in parts:
+        state |= _load(path / name, device if name == "state.pt" else "cpu")
+    return dataclasses.replace(checkpoint, state=_migrated(state, manifest))
+
+
+def _load(path, device):
+    """Returns the state in a file."""
     import torch
 
     try:
-        state = torch.load(io.BytesIO(contents["state.pt"]), map_location=device, weights_only=True)
+        return torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError:
         raise DamagedCheckpoint(
-            f"Checkpoint {path} is refused: state.pt holds more than tensors and numbers, so "
-            "loading it could run code"
+            f"Checkpoint {path.parent} is refused: {path.name} holds more than tensors and "
+            "numbers, so loading it could run code"
         ) from None
     except (RuntimeError, EOFError, ValueError) as error:
         raise DamagedCheckpoint(
-            f"Checkpoint {path} is damaged: state.pt cannot be read ({str(error).splitlines()[0]})"
+            f"Checkpoint {path.parent} is damaged: {path.name} cannot be read "
+            f"({str(error).splitlines()[0]})"
         ) from None
-    return dataclasses.replace(checkpoint, state=state)
 
 
-def read_files(path: Path) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Returns a checkpoint's files by name, and its manifest. Verifies every SHA-256.
+def _migrated(state, manifest):
+    """Returns a state of the last format as one of this format."""
+    import torch
+
+    if manifest["format"] == FORMAT:
+        return state
+    if "learner" in state and "optimizer" in state["learner"]:
+        state["learner"].setdefault("check", torch.zeros(5, dtype=torch.float64))
+    return state | {"samples_at_report": state.get("samples", 0)}
+
+
+def verify(path: Path, manifest: dict[str, Any], names: Iterable[str] | None = None) -> None:
+    """Compares files of a checkpoint, by default all, with the SHA-256 in its manifest.
 
     Raises: as `read`.
     """
-    manifest, contents = read_manifest(path), {}
-    for name in FILES:
+    for name in manifest["files"] if names is None else names:
         try:
-            contents[name] = (path / name).read_bytes()
+            digest = _digest(path / name)
         except OSError as error:
             raise DamagedCheckpoint(
                 f"Checkpoint {path} is damaged: {name} cannot be read ({error.strerror})"
             ) from None
-        if hashlib.sha256(contents[name]).hexdigest() != manifest["files"][name]["sha256"]:
+        if digest != manifest["files"][name]["sha256"]:
             raise DamagedCheckpoint(
                 f"Checkpoint {path} is damaged: {name} does not match the SHA-256 in its manifest"
             )
-    return contents, manifest
+
+
+def _digest(path):
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()
 
 
 def read_manifest(path: Path) -> dict[str, Any]:
@@ -183,7 +303,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
             f"Checkpoint {path} was written by an earlier version (format {version}); commit "
             f"{READERS[version]} reads it"
         )
-    if version != FORMAT:
+    if version not in (FORMAT, MIGRATED):
         raise CheckpointError(
             f"Checkpoint {path} has format {version}, which is unknown: this version reads format "
             f"{FORMAT}. Update megastep"

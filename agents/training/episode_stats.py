@@ -15,6 +15,7 @@ from megastep.types import Env, optional
 
 #: Means are over at least this many episodes, once so many have ended.
 MIN_EPISODES = 100
+_SAVED = "returns", "lengths", "is_whole", "sums"
 
 
 class EpisodeStats:
@@ -136,18 +137,20 @@ class EpisodeStats:
         return stats
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the sums over finished episodes, since the last report and of earlier ones.
-
-        Unfinished episodes are not saved: a resumed run starts new episodes.
+        """Returns a copy of the episodes in progress, the sums since the last report and those of
+        earlier ones.
         """
         windows = [torch.tensor(window, dtype=torch.float64) for window in self.windows]
-        return {"sums": self.sums, "windows": windows}
+        return {name: getattr(self, name).clone() for name in _SAVED} | {"windows": windows}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores a `state_dict`. Ignores one with other metrics or groups."""
-        if state["sums"].shape == self.sums.shape:
-            self.sums.copy_(state["sums"])
-            self.windows = [deque(window.tolist()) for window in state["windows"]]
+        if state["sums"].shape != self.sums.shape:
+            return
+        for name in _SAVED:
+            if name in state:
+                getattr(self, name).copy_(state[name])
+        self.windows = [deque(window.tolist()) for window in state["windows"]]
 
 
 def lane_groups(env: Env, stored: torch.Tensor | None = None) -> dict[str, torch.Tensor]:

@@ -9,15 +9,17 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from megastep.agents.training.atomic_files import write_atomically
+from megastep.agents.training.atomic_files import AppendedFile, write_atomically
 
 
 class JsonLines:
-    """A file that lines are appended to. Each line is flushed when it is written."""
+    """A file that lines are appended to. Each line is flushed when it is written; lines that a full
+    disk refuses are written with the next one.
+    """
 
     def __init__(self, path: Path | str):
         self.path = Path(path)
-        self.file = open(self.path, "a", encoding="utf-8")
+        self.file = AppendedFile(self.path)
 
     def write(self, step: int, values: dict[str, float | str]) -> None:
         """Appends a line of numbers and strings. Writes NaN and infinity as null."""
@@ -25,8 +27,7 @@ class JsonLines:
             key: value if isinstance(value, str) or math.isfinite(value) else None
             for key, value in values.items()
         }
-        self.file.write(json.dumps({"samples": step, **json_values}) + "\n")
-        self.file.flush()
+        self.file.write((json.dumps({"samples": step, **json_values}) + "\n").encode())
 
     def close(self) -> None:
         self.file.close()

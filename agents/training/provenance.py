@@ -42,6 +42,21 @@ def record(folder: Path, samples: int, device: torch.device, version: str, sourc
         lines.write(samples, {name: text for name, text in facts.items() if text})
 
 
+def made_with(device: torch.device, version: str) -> dict[str, str | int]:
+    """Returns what a run's numbers depend on besides its configuration and its code: where these
+    are equal, equal seeds give equal bits.
+
+    Args:
+        version: of megastep.
+    """
+    facts = {"torch": torch.__version__, "megastep": version}
+    if device.type == "cuda":
+        name = torch.cuda.get_device_name(device)
+        return facts | {"device": f"cuda {name}", "cuda": torch.version.cuda}
+    instructions, n_threads = torch.backends.cpu.get_cpu_capability(), torch.get_num_threads()
+    return facts | dict(device=device_name(device), instructions=instructions, threads=n_threads)
+
+
 def commit(folder: Path) -> str | None:
     """Returns the commit of the git checkout at a folder, followed by `-dirty` if files under
     version control have changed; None if there is no checkout or no git.

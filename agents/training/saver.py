@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shutil
+import threading
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch.utils._pytree import tree_leaves, tree_map_only
+from torch.utils._pytree import tree_leaves
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, nonfinite_leaf
 from megastep.agents.training import checkpoint
@@ -16,58 +17,127 @@ from megastep.agents.training import checkpoint
 if TYPE_CHECKING:
     from megastep.agents.training.trainer import Trainer
 
+#: Bytes of a replay buffer that every checkpoint holds.
+SMALL_REPLAY = 2**28
+#: Seconds that a larger one may take to write when a run ends.
+REPLAY_SECONDS = 5.0
+
 
 class Saver:
-    """Writes the checkpoints of one run.
+    """Writes the checkpoints of one run, in a thread of its own.
 
-    A full, read-only or faulty disk causes one warning; each later call tries again.
+    A full, read-only or faulty disk causes one warning, at the next call or `wait`; each later call
+    tries again.
 
     Args:
         folder: where the checkpoints go.
         config: the run's configuration, stored in each checkpoint.
         keep_checkpoints: number of checkpoints kept, besides the one with the best score.
+        made_with: what a run's numbers depend on besides its configuration, such as versions.
+        replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is in every so many
+            checkpoints, and in the last one if it can be written in `REPLAY_SECONDS`.
 
     Attributes:
         error: why the last checkpoint could not be written, as a sentence; None if it was written.
+            Valid after `wait`.
+        lacks_replay: True if the last checkpoint was to leave out the replay buffer.
     """
 
-    def __init__(self, folder: Path, config: dict[str, Any], keep_checkpoints: int = 2):
+    def __init__(
+        self,
+        folder: Path,
+        config: dict[str, Any],
+        keep_checkpoints: int = 2,
+        made_with: dict[str, Any] | None = None,
+        replay_every: int = 20,
+    ):
         self.folder, self.config, self.keep_checkpoints = folder, config, keep_checkpoints
-        self.error = None
+        self.made_with, self.replay_every = made_with, replay_every
+        self.error, self.lacks_replay = None, False
+        self._n_since_replay = 0
+        self._host_copy, self._thread, self._failure = _HostCopy(), None, None
 
-    def __call__(self, step: int, state: dict[str, Any], score: float | None = None) -> bool:
-        """Writes a checkpoint of `state` after `step` environment steps. Returns True if it could.
+    def __call__(
+        self, step: int, state: dict[str, Any], score: float | None = None, is_last: bool = False
+    ) -> None:
+        """Begins to write a checkpoint of `state` after `step` environment steps.
+
+        What `state` holds may change as soon as this returns.
 
         Args:
-            state: dicts and lists of tensors and numbers.
+            state: dicts and lists of tensors and plain values.
             score: for example the mean return, higher is better; None if unknown.
+            is_last: no other checkpoint follows.
 
         Raises:
-            NonFiniteError: the state holds a NaN or infinity. Earlier checkpoints are kept.
+            NonFiniteError: what was learnt has a NaN or infinity. Earlier checkpoints are kept.
         """
-        # copied to the CPU first: the GPU may have no memory left for the check
-        state = tree_map_only(torch.Tensor, lambda leaf: leaf.detach().cpu(), state)
-        if path := nonfinite_leaf(state):
+        self.wait()
+        state, seconds = self._with_replay(state, is_last)
+        state = self._host_copy(state)
+        # an environment may keep an infinity; weights may not
+        learnt = {name: state[name] for name in ("policy", "learner") if name in state}
+        if path := nonfinite_leaf(learnt):
             raise NonFiniteError(
                 f"The checkpoint at {step:,} samples was not saved: {path} is not finite"
             )
-        try:
-            checkpoint.save(self.folder, step, state, self.config, self.keep_checkpoints, score)
-        except (OSError, checkpoint.DamagedCheckpoint) as error:
-            has_warned = self.error is not None
-            self.error = self._message(step, state, error)
-            if not has_warned:
-                warnings.warn(
-                    f"{self.error}. Training goes on; the next checkpoint tries again",
-                    stacklevel=2,
-                )
-            return False
-        self.error = None
-        return True
+        self._thread = threading.Thread(target=self._write, args=(step, state, score, seconds))
+        self._thread.start()
 
-    def _message(self, step, state, error):
+    def _with_replay(self, state, is_last):
+        """Returns the state, without its replay buffer if it is not due, and the seconds that the
+        buffer may take.
+        """
+        self.lacks_replay = False
+        if "replay" not in state or _nbytes(state["replay"]) <= SMALL_REPLAY:
+            return state, None
+        self._n_since_replay += 1
+        if is_last or self._n_since_replay >= self.replay_every:
+            self._n_since_replay = 0
+            return state, REPLAY_SECONDS if is_last else None
+        self.lacks_replay = True
+        return {name: part for name, part in state.items() if name != "replay"}, None
+
+    def _write(self, step, state, score, replay_seconds):
+        try:
+            checkpoint.save(
+                self.folder,
+                step,
+                state,
+                self.config,
+                self.keep_checkpoints,
+                score,
+                self.made_with,
+                replay_seconds,
+            )
+        except Exception as error:
+            self._failure = step, _nbytes(state), error
+
+    def wait(self) -> None:
+        """Returns when nothing is being written. Warns if the last checkpoint failed.
+
+        Raises:
+            Exception: what is not the disk's fault.
+        """
+        if self._thread is None:
+            return
+        self._thread.join()
+        self._thread = None
+        failure, self._failure = self._failure, None
+        if failure is None:
+            self.error = None
+            return
+        if not isinstance(failure[-1], (OSError, checkpoint.DamagedCheckpoint)):
+            raise failure[-1]
+        has_warned = self.error is not None
+        self.error = self._message(*failure)
+        if not has_warned:
+            warnings.warn(
+                f"{self.error}. Training goes on; the next checkpoint tries again", stacklevel=2
+            )
+
+    def _message(self, step, n_bytes, error):
         reason = getattr(error, "strerror", None) or str(error)
-        n_bytes = sum(getattr(leaf, "nbytes", 0) for leaf in tree_leaves(state))
         sentence = (
             f"The checkpoint at {step:,} samples could not be saved ({reason}): it needs about "
             f"{n_bytes / 1e6:.1f} MB"
@@ -77,6 +147,46 @@ class Saver:
         except OSError:
             return f"{sentence} in {self.folder.parent}, which cannot be read"
         return f"{sentence}, and {free_bytes / 1e6:.1f} MB are free in {self.folder.parent}"
+
+
+class _HostCopy:
+    """Copies a state to the CPU. Copies from a GPU go through pinned memory that is kept."""
+
+    def __init__(self):
+        self.pinned = {}
+
+    def __call__(self, state: dict[str, Any]) -> dict[str, Any]:
+        """Returns the copy: plain dicts, lists and tuples. Synchronises."""
+        self.devices = set()
+        copy = self._copied(state, ())
+        for device in self.devices:
+            torch.cuda.synchronize(device)
+        return copy
+
+    def _copied(self, node, path):
+        if isinstance(node, torch.Tensor):
+            return self._copied_tensor(node.detach(), path)
+        if isinstance(node, dict):
+            return {key: self._copied(part, (*path, key)) for key, part in node.items()}
+        if isinstance(node, (list, tuple)):
+            return type(node)(self._copied(part, (*path, i)) for i, part in enumerate(node))
+        return node
+
+    def _copied_tensor(self, tensor, path):
+        if tensor.device.type != "cuda":
+            return tensor.clone()
+        if path[0] == "replay":  # too large to pin, and rarely saved
+            return tensor.cpu()
+        kept = self.pinned.get(path)
+        if kept is None or kept.shape != tensor.shape or kept.dtype != tensor.dtype:
+            kept = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+            self.pinned[path] = kept
+        self.devices.add(tensor.device)
+        return kept.copy_(tensor, non_blocking=True)
+
+
+def _nbytes(state):
+    return sum(getattr(leaf, "nbytes", 0) for leaf in tree_leaves(state))
 
 
 class SnapshotSaver:
@@ -97,4 +207,5 @@ class SnapshotSaver:
         n_parts_done = int((1 - trainer.fraction_left) * self.n + 1e-9)
         if self.n_parts_done is not None and n_parts_done > self.n_parts_done:
             self.saver(trainer.samples, {"policy": trainer.policy.state_dict()})
+            self.saver.wait()
         self.n_parts_done = n_parts_done

@@ -16,10 +16,12 @@ from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.performance import PhaseTimer, device_memory
 from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.env_state import EnvState
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
+    from megastep.agents.training.annealing import AnnealingRecord
     from megastep.agents.types import Learner, Logger
 
 #: Training stops after this many skipped updates in a row.
@@ -38,6 +40,20 @@ class OpponentPool(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
+class Saver(Protocol):
+    """Saves a trainer's state, possibly while training goes on."""
+
+    error: str | None  # why the last checkpoint that was begun could not be saved
+    lacks_replay: bool  # it was not due to hold the replay buffer
+
+    def __call__(
+        self, step: int, state: dict[str, Any], score: float | None, is_last: bool
+    ) -> None: ...
+
+    def wait(self) -> None:
+        """Returns when everything is saved, or has failed."""
+
+
 class Trainer:
     """Trains a policy in an environment until a budget is spent.
 
@@ -46,8 +62,7 @@ class Trainer:
         policy: the policy that the learner improves.
         learner: such as `PPO`.
         logger: such as `loggers.Loggers`.
-        saver: such as `saver.Saver`: called with (samples, state, score), returns True if the
-            checkpoint was written.
+        saver: such as `saver.Saver`.
         budget: when the run ends and how its learning rate falls.
         log_every: updates between two reports.
         checkpoint_seconds: seconds between two checkpoints.
@@ -58,6 +73,8 @@ class Trainer:
         opponents: `env`, if it is an `Opponents`.
         snapshot_saver: such as `saver.SnapshotSaver`: called with the trainer before the first
             update and after each.
+        annealing_record: such as `annealing.AnnealingRecord`: gets the factor of the learning rate
+            in each update, and is flushed before each report.
 
     Attributes:
         samples, updates: environment steps of all lanes, and updates, so far.
@@ -68,6 +85,8 @@ class Trainer:
         samples_per_second: speed between the last two reports, or None.
         latest_stats: name -> the last value of each episode statistic.
         nonfinite_value: the first NaN or infinity of the run, or None.
+        samples_at_report: samples at the last report that is due every `log_every` updates. A
+            resumed run has all reports up to it, and writes the later ones.
 
     Raises:
         ValueError: the budget anneals the learning rate of a learner without `set_lr`.
@@ -79,7 +98,7 @@ class Trainer:
         policy: Policy,
         learner: Learner,
         logger: Logger,
-        saver: Callable[[int, dict[str, Any], float | None], bool],
+        saver: Saver,
         budget: Budget,
         *,
         log_every: int = 1,
@@ -88,11 +107,13 @@ class Trainer:
         on_log: Callable[[Trainer], None] = lambda trainer: None,
         opponents: OpponentPool | None = None,
         snapshot_saver: Callable[[Trainer], None] = lambda trainer: None,
+        annealing_record: AnnealingRecord | None = None,
     ):
         self.env, self.policy, self.learner = env, policy, learner
         self.logger, self.saver, self.budget = logger, saver, budget
         self.log_every, self.checkpoint_seconds = log_every, checkpoint_seconds
         self.on_log, self.opponents, self.snapshot_saver = on_log, opponents, snapshot_saver
+        self.annealing_record = annealing_record
         self.check = optional(learner, "check", LEARNER_DEFAULTS)
         if budget.anneal != "never" and not optional(learner, "set_lr", LEARNER_DEFAULTS):
             raise ValueError(
@@ -104,6 +125,8 @@ class Trainer:
         desync = desync and optional(env, "desync") is not None
         if desync:
             env.desync()  # the collector has reset the environment, and has not stepped it yet
+        self.env_state = EnvState(env if opponents is None else env.env)
+        self.replay_buffer = optional(learner, "replay_buffer", LEARNER_DEFAULTS)
         self.episode_stats = EpisodeStats(
             self.rollout.n_lanes,
             env.device,
@@ -116,20 +139,21 @@ class Trainer:
         self.lr = learner.lr
         self.score = self.samples_per_second = None
         self.latest_stats = {}
-        self.samples_at_log = self.updates_at_log = 0
+        self.samples_at_log = self.updates_at_log = self.samples_at_report = 0
         self.seconds_at_log = self.seconds_at_checkpoint = 0.0
         self.updates_at_checkpoint = None
+        self.has_named_unreachable = False
         self.nonfinite_value = None
 
     @property
     def fraction_left(self) -> float:
         """The fraction of the budget that is left."""
-        return self.budget.fraction_left(self.samples, self.clock.seconds)
+        return self.budget.fraction_left(self.updates, self.samples, self.clock.seconds)
 
     @property
     def is_saved(self) -> bool:
-        """True if the last checkpoint holds every update."""
-        return self.updates_at_checkpoint == self.updates
+        """True if the last checkpoint holds every update, once `saver.wait()` has returned."""
+        return self.updates_at_checkpoint == self.updates and self.saver.error is None
 
     def train(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Trains until the budget is spent or `stop()` returns True, then saves a checkpoint.
@@ -149,10 +173,12 @@ class Trainer:
                 self.timer.start("rest")
                 self.snapshot_saver(self)
                 if self.updates % self.log_every == 0:
+                    self.samples_at_report = self.samples
                     self.log(losses)
                 seconds_since = self.clock.seconds - self.seconds_at_checkpoint
                 if seconds_since >= self.checkpoint_seconds and self.check_finite():
                     self.save_checkpoint()
+            state = self.state_dict()  # a resumed run repeats what this last report empties
             if self.updates > self.updates_at_log:
                 self.log(losses)
             self.check_finite()
@@ -160,12 +186,14 @@ class Trainer:
             raise
         except Exception:
             with contextlib.suppress(Exception):  # the first error is the one to report
-                self.save_checkpoint()
+                self.save_checkpoint(is_last=True)
             raise
         finally:
             with contextlib.suppress(Exception):  # as above
                 self.wait_for_collector()
-        self.save_checkpoint()
+            self.saver.wait()
+        self.save_checkpoint(state, is_last=True)
+        self.saver.wait()
 
     def wait_for_collector(self) -> None:
         """Waits until an async collector has stopped stepping the environment."""
@@ -175,8 +203,11 @@ class Trainer:
     def update(self) -> dict[str, torch.Tensor]:
         """Learns from the current rollout. Returns the learner's metrics, tensors of shape ()."""
         rollout = self.rollout
+        factor = self.budget.lr_fraction(self.updates, self.samples, self.clock.seconds)
+        if self.annealing_record is not None:
+            self.annealing_record.append(factor)
         if self.budget.anneal != "never":
-            self.lr = self.learner.lr * self.budget.lr_fraction(self.samples, self.clock.seconds)
+            self.lr = self.learner.lr * factor
             self.learner.set_lr(self.lr)
         losses = self.learner.update(rollout)
         self.episode_stats.add(
@@ -232,6 +263,9 @@ class Trainer:
         perf |= {f"perf/memory_{name}": n for name, n in device_memory(self.env.device).items()}
         self.samples_at_log, self.seconds_at_log = self.samples, seconds
         self.updates_at_log = self.updates
+        if self.annealing_record is not None:
+            with contextlib.suppress(OSError):  # the next report tries again
+                self.annealing_record.flush()
         self.logger.write(self.samples, metrics, perf)
         if stats.get("episode/window", 0) >= MIN_EPISODES:
             self.score = stats["episode/return"]
@@ -266,32 +300,90 @@ class Trainer:
             f"too large ({value or 'gradients'}). {advice}"
         )
 
-    def save_checkpoint(self) -> None:
-        """Writes a checkpoint, unless the last one holds every update."""
+    def save_checkpoint(self, state: dict[str, Any] | None = None, is_last: bool = False) -> None:
+        """Begins to save a checkpoint, unless the last one holds every update.
+
+        Args:
+            state: of `state_dict`; default: that of now.
+            is_last: no other checkpoint follows.
+        """
         self.seconds_at_checkpoint = self.clock.seconds
-        if not self.is_saved and self.saver(self.samples, self.state_dict(), self.score):
-            self.updates_at_checkpoint = self.updates
+        if self.is_saved and not (is_last and self.saver.lacks_replay):
+            return
+        if not self.has_named_unreachable and (names := self.env_state.unreachable()):
+            self.has_named_unreachable = True
+            warnings.warn(
+                f"Checkpoints cannot hold {', '.join(names)} of the environment: if they change, a "
+                "resumed run differs from one left alone",
+                stacklevel=2,
+            )
+        state = self.state_dict() if state is None else state
+        self.saver(self.samples, state, self.score, is_last)
+        self.updates_at_checkpoint = self.updates
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns all that a resumed run needs, as plain dicts of tensors and numbers."""
-        opponents = {} if self.opponents is None else {"opponents": self.opponents.state_dict()}
-        return dict(
-            **opponents,
+        """Returns all that a resumed run needs, as dicts of tensors and plain values, most of which
+        share their memory with what trains.
+        """
+        self.wait_for_collector()
+        parts = dict(
             policy=self.policy.state_dict(),
             learner=self.learner.state_dict(),
             episode_stats=self.episode_stats.state_dict(),
             samples=self.samples,
             updates=self.updates,
             seconds=self.clock.seconds,
+            samples_at_report=self.samples_at_report,
+            env=self.env_state.state_dict(),
         )
+        optional_parts = dict(
+            collector=getattr(self.collect, "state_dict", dict)(),
+            opponents=None if self.opponents is None else self.opponents.state_dict(),
+            replay=None if self.replay_buffer is None else self.replay_buffer.state_dict(),
+        )
+        return parts | {name: part for name, part in optional_parts.items() if part}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores a `state_dict`. The environment starts new episodes."""
+    def load_state_dict(self, state: dict[str, Any]) -> list[str]:
+        """Restores a `state_dict`.
+
+        Returns what could not be restored and begins anew, a clause each; then the run does not
+        continue bit for bit.
+        """
+        lost = []
         self.policy.load_state_dict(state["policy"])
         self.learner.load_state_dict(state["learner"])
-        self.episode_stats.load_state_dict(state["episode_stats"])
         if self.opponents is not None:
             self.opponents.load_state_dict(state["opponents"])
         self.samples, self.updates = state["samples"], state["updates"]
         self.clock.seconds_before = state["seconds"]
+        self.samples_at_report = state["samples_at_report"]
         self.updates_at_checkpoint = self.updates_at_log = self.updates
+        lost += self._load_episodes(state)
+        if self.replay_buffer is not None:
+            if "replay" in state:
+                self.replay_buffer.load_state_dict(state["replay"])
+            else:
+                lost.append("the replay buffer was not saved and fills again")
+        return lost
+
+    def _load_episodes(self, state):
+        """Restores the environment, what the policy remembers of it and the statistics."""
+        lost = []
+        if "env" not in state:
+            lost.append("its environments were not saved, so new episodes begin")
+        elif "collector" not in state:
+            name = type(self.collect).__name__
+            lost.append(f"{name} has no state_dict, so new episodes begin")
+        else:
+            try:
+                self.env_state.load_state_dict(state["env"])
+            except ValueError as error:
+                lost.append(f"{error}; new episodes begin")
+        if lost:  # only finished episodes can be counted on
+            state["episode_stats"] = {
+                name: state["episode_stats"][name] for name in ("sums", "windows")
+            }
+        else:
+            self.collect.load_state_dict(state["collector"])
+        self.episode_stats.load_state_dict(state["episode_stats"])
+        return lost

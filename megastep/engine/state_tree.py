@@ -1,11 +1,12 @@
 """The state of an environment: every tensor and generator reachable from its attributes.
 
 :func:`state_tree` finds them by path, :func:`snapshot` copies them, and :func:`restore` writes such
-a copy back in place. :mod:`~megastep.capture` uses this while it records a CUDA graph. Checkpoints
-of a run do not hold an environment's state: a resumed run starts new episodes.
+a copy back in place. :mod:`~megastep.capture` uses this while it records a CUDA graph, and
+checkpoints of a run hold the state (:mod:`~megastep.env_state`).
 """
 
 import ast
+import collections
 import types as python_types
 from typing import Any
 
@@ -13,13 +14,13 @@ import torch
 
 from megastep.read_only import ReadOnlyTensor
 
-__all__ = ["rebind", "restore", "snapshot", "state_tree", "walk"]
+__all__ = ["children", "node_at", "rebind", "restore", "snapshot", "state_tree", "walk"]
 
 State = dict[str, torch.Tensor]
 
 SCALARS = (bool, int, float, str, type(None))
 _LEAVES = (torch.Tensor, torch.Generator)
-_OPAQUE = (  # types whose attributes hold no state of an environment
+OPAQUE = (  # types whose attributes hold no state of an environment
     python_types.ModuleType,
     python_types.FunctionType,
     python_types.MethodType,
@@ -30,11 +31,11 @@ _OPAQUE = (  # types whose attributes hold no state of an environment
 )
 
 
-def _children(node):
+def children(node):
     """Returns [(step of the path, child)] of a node."""
     if isinstance(node, dict):
         return [(f"[{key!r}]", child) for key, child in dict.items(node)]
-    if isinstance(node, (list, tuple)):
+    if isinstance(node, (list, tuple, collections.deque)):
         return [(f"[{i}]", child) for i, child in enumerate(node)]
     if isinstance(node, torch.nn.Module):
         groups = [getattr(node, group) for group in ("_parameters", "_buffers", "_modules")]
@@ -57,12 +58,22 @@ def walk(root: Any, types: tuple[type, ...]) -> dict[str, tuple[Any, str, Any]]:
         path, parent, step, node = stack.pop()
         if isinstance(node, types):
             leaves[path] = (parent, step, node)
-        elif not isinstance(node, (*_OPAQUE, *SCALARS, *_LEAVES)) and id(node) not in visited:
+        elif not isinstance(node, (*OPAQUE, *SCALARS, *_LEAVES)) and id(node) not in visited:
             visited.add(id(node))
             stack += [
-                (path + below, node, below, child) for below, child in reversed(_children(node))
+                (path + below, node, below, child) for below, child in reversed(children(node))
             ]
     return leaves
+
+
+def node_at(root: Any, path: str) -> Any:
+    """Returns the node at a path of :func:`walk`, None if there is none."""
+    node = root
+    while path and node is not None:
+        below = {step: child for step, child in children(node) if path.startswith(step)}
+        step = max(below, key=len, default=None)  # the longest: .limit is a part of .limits
+        node, path = (None, path) if step is None else (below[step], path[len(step) :])
+    return node
 
 
 def rebind(parent: Any, step: str, leaf: Any) -> None:

@@ -300,7 +300,7 @@ def test_train_resume_evaluate_and_init(tmp_path, monkeypatch):
     assert state["learner"]["n_taken"] == 2 * 3 and "output.advantage.weight" in state["policy"]
     assert train.main(["resume=run", f"samples={6 * UPDATE}"]) == 0
     state = checkpoint.load_latest(tmp_path / "run" / "checkpoints").state
-    assert state["learner"]["n_taken"] == 2 * 4, "the first rollout after a resume is only stored"
+    assert state["learner"]["n_taken"] == 2 * 5, "the replay buffer continues, too"
     assert evaluate.main(["run=run", "episodes=4", "device=cpu"]) == 0
     assert train.main([*RUN, "init=run", f"samples={UPDATE}", "folder=second"]) == 0
 

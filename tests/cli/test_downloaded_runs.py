@@ -56,6 +56,7 @@ def changed(tree, key, value):
 
 COMMANDS = [
     (train.main, ["resume=run"]),
+    (train.main, ["rerun=run"]),
     (train.main, ["init=run", *TINY]),
     (train.main, ["-m", "init=run", "seed=1,2"]),
     (evaluate.main, ["run=run"]),

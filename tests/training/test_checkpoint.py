@@ -181,15 +181,16 @@ def test_earlier_format_names_the_commit_that_reads_it(folder, version, commit):
         checkpoint.load_latest(folder)
 
 
-@pytest.mark.parametrize("version", [0, checkpoint_format.FORMAT + 1, "6"])
+@pytest.mark.parametrize("version", [0, checkpoint_format.FORMAT + 1, "7"])
 def test_unknown_format_is_refused_and_not_skipped(folder, version):
     with_format(folder / "step_30", version)
     with pytest.raises(CheckpointError, match=f"step_30 has format {version}.*Update megastep"):
         checkpoint.load_latest(folder)
 
 
-def test_every_earlier_format_has_a_reader():
-    assert list(checkpoint_format.READERS) == list(range(1, checkpoint_format.FORMAT))
+def test_every_earlier_format_is_read_here_or_by_a_commit():
+    versions = [*checkpoint_format.READERS, checkpoint_format.MIGRATED]
+    assert versions == list(range(1, checkpoint_format.FORMAT))
 
 
 def test_format_1_without_a_digest_is_an_earlier_format_and_not_damage(folder):
@@ -208,10 +209,14 @@ def test_last_checkpoints_and_the_best_are_kept(tmp_path):
 
 
 def test_old_checkpoints_are_kept_until_the_new_one_is_verified(folder, monkeypatch):
-    def write(path, data):
-        path.write_bytes(data[: len(data) // 2])
+    write_file = checkpoint_format._write_file
 
-    monkeypatch.setattr(checkpoint_format, "write_synced", write)
+    def write_half(path, *arguments):
+        entry = write_file(path, *arguments)
+        os.truncate(path, entry["bytes"] // 2)
+        return entry
+
+    monkeypatch.setattr(checkpoint_format, "_write_file", write_half)
     with pytest.raises(CheckpointError, match="step_40"):
         checkpoint.save(folder, 40, state(40), CONFIG, keep_checkpoints=2)
     assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_20", "step_30"]
@@ -249,7 +254,7 @@ def test_kill_between_any_two_file_operations_leaves_an_intact_checkpoint(
         (os, "replace"),
         (os, "mkdir"),
         (shutil, "rmtree"),
-        (checkpoint_format, "write_synced"),
+        (checkpoint_format, "_write_file"),
     ]
     for n in itertools.count():
         folder = tmp_path / str(n)
@@ -368,11 +373,11 @@ def test_same_step_can_be_set_aside_twice(folder):
 
 
 def test_full_disk_leaves_existing_checkpoints(folder, monkeypatch):
-    def write(path, data):
-        path.write_bytes(data[:10])
+    def write(path, *_):
+        path.write_bytes(b"half")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(checkpoint_format, "write_synced", write)
+    monkeypatch.setattr(checkpoint_format, "_write_file", write)
     with pytest.raises(OSError, match="No space left"):
         checkpoint.save(folder, 40, state(40), CONFIG)
     assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_20", "step_30"]

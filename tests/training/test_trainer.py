@@ -2,6 +2,8 @@
 other errors.
 """
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -205,7 +207,9 @@ def test_failed_saves_are_one_warning_also_where_the_run_folder_is_gone(
     monkeypatch.setattr(checkpoint, "save", failing)
     saver = Saver(tmp_path / "gone" / "checkpoints", {})
     with pytest.warns(UserWarning, match=r"\(other bytes\).*gone, which cannot be read") as caught:
-        assert not saver(1, {}) and not saver(2, {})
+        for step in (1, 2):
+            saver(step, {})
+            saver.wait()
     assert len(caught) == 1 and "at 2 samples" in saver.error
 
 
@@ -251,10 +255,14 @@ def test_async_collector_is_waited_for_before_checks_and_at_the_end(tmp_path):
         def wait(self):
             order.append("wait")
 
+        def state_dict(self):
+            return collect.state_dict()
+
     run.collect = AsyncCollector()
     run.env.check = lambda: order.append("check")
     run.train()
-    assert order == [*["collect"] * 2, "wait", "check", "collect", "wait", "check", "wait"]
+    reported = ["wait", "check"]
+    assert order == ["collect", "collect", *reported, "collect", "wait", *reported, "wait"]
 
 
 def test_trainer_stops_on_request(tmp_path):
@@ -273,19 +281,26 @@ def test_resumed_trainer_continues_and_does_not_save_again(tmp_path):
     assert (second.samples, second.updates) == (2 * UPDATE, 2)
     assert second.clock.seconds == pytest.approx(first.clock.seconds, abs=1)
     second.train()
-    assert second.env.steps == 0 and not (tmp_path / "second").exists()
+    assert second.env.steps == first.env.steps and not (tmp_path / "second").exists()
 
 
 def test_budget_ends_at_the_nearer_limit():
     budget = Budget(samples=100, seconds=10.0)
-    assert budget.fraction_left(50, 2.0) == 0.5 and budget.fraction_left(20, 9.0) == pytest.approx(
-        0.1
-    )
-    assert Budget().fraction_left(10**9, 1e9) == 1 and not Budget().is_limited
-    assert budget.lr_fraction(50, 9.0) == 1
-    assert Budget(100, 10.0, "samples").lr_fraction(50, 9.0) == 0.5
-    assert Budget(100, 10.0, "seconds").lr_fraction(50, 9.0) == pytest.approx(0.1)
-    assert Budget(100, 10.0, "samples").lr_fraction(120, 9.0) == 0
+    assert budget.fraction_left(1, 50, 2.0) == 0.5
+    assert budget.fraction_left(1, 20, 9.0) == pytest.approx(0.1)
+    assert Budget().fraction_left(1, 10**9, 1e9) == 1 and not Budget().is_limited
+    assert budget.lr_fraction(1, 50, 9.0) == 1
+    assert Budget(100, 10.0, "samples").lr_fraction(1, 50, 9.0) == 0.5
+    assert Budget(100, 10.0, "seconds").lr_fraction(1, 50, 9.0) == pytest.approx(0.1)
+    assert Budget(100, 10.0, "samples").lr_fraction(1, 120, 9.0) == 0
+
+
+def test_recorded_factors_replace_the_clocks():
+    budget = Budget(100, 10.0, "seconds", recorded=[0.9, 0.7])
+    factors = [budget.lr_fraction(updates, 50, 4.0) for updates in range(3)]
+    assert factors == [0.9, 0.7, 0.6] and budget.fraction_left(1, 50, 4.0) == 0.5
+    again = dataclasses.replace(budget, is_rerun=True)
+    assert again.fraction_left(1, 50, 99.0) == 0.5 and again.fraction_left(2, 50, 1.0) == 0
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e30])
@@ -308,7 +323,8 @@ def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_pat
     assert not same(copied(run.policy), before[0])
     skipped = [row["loss/skipped_steps"] for row in run.logger]
     assert skipped == [0] * 6  # of the third and later updates
-    assert nonfinite.nonfinite_leaf(checkpoint.load_latest(tmp_path).state) is None
+    state = checkpoint.load_latest(tmp_path).state
+    assert nonfinite.nonfinite_leaf([state[name] for name in ("policy", "learner")]) is None
     returns = [row["episode/return"] for row in run.logger if row["episode/count"]]
     assert all(0 < r <= 7 for r in returns)
 
@@ -414,6 +430,6 @@ def test_first_error_is_raised_if_saving_fails_too(tmp_path, monkeypatch):
 
     run = make_trainer(tmp_path)
     monkeypatch.setattr(run, "collect", fails("the device is lost"))
-    monkeypatch.setattr(run, "saver", fails("the state cannot be read"))
+    monkeypatch.setattr(run.policy, "state_dict", fails("the state cannot be read"))
     with pytest.raises(RuntimeError, match="lost"):
         run.train()

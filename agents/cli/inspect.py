@@ -1,0 +1,74 @@
+"""megastep inspect RUN: what is in a run's checkpoints, every byte of them verified."""
+
+import datetime
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from megastep.agents.cli import console, program, runs
+from megastep.agents.training import checkpoint, checkpoint_format
+
+HELP = """Verifies a run's checkpoints and prints what is in them.
+
+  megastep inspect RUN     a run folder, one of its checkpoints, or latest"""
+
+
+def run(words: list[str]) -> int:
+    """Inspects the run named by the words of a command line. Returns the exit code: 1 if one of its
+    checkpoints is damaged.
+    """
+    if len(words) != 1 or words[0] in ("-h", "--help"):
+        console.say(HELP)
+        return 0 if words in (["-h"], ["--help"]) else 2
+    path = runs.checkpoints_of(runs.find(words[0]))
+    paths = [path] if (path / "manifest.json").exists() else checkpoint.list_checkpoints(path)
+    if not paths:
+        raise program.UserError(f"There is no checkpoint in {path}; has the run saved one yet?")
+    is_damaged = False
+    for path in paths:
+        try:
+            console.say("\n".join(_lines(path)))
+        except checkpoint.CheckpointError as error:
+            is_damaged = True
+            console.say(str(error))
+    return int(is_damaged)
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yields the text about a checkpoint."""
+    manifest = checkpoint_format.read_manifest(path)
+    loaded = checkpoint_format.read(path, "cpu", is_whole=True)
+    written = datetime.datetime.fromtimestamp((path / "manifest.json").stat().st_mtime)
+    numbers = [f"{name} {value:,.6g}" for name, value in loaded.numbers.items()]
+    made_with = [f"{name} {value}" for name, value in loaded.made_with.items()]
+    yield f"{path}: intact, format {manifest['format']}, written {written:%Y-%m-%d %H:%M:%S}"
+    yield f"  {'; '.join(numbers)}"
+    if made_with:
+        yield f"  {'; '.join(made_with)}"
+    for name, entry in manifest["files"].items():
+        yield f"  {name:<14}{console.number(entry['bytes'])} bytes, sha256 {entry['sha256'][:16]}"
+    head = ["part", "tensors", "numbers", "bytes", "largest"]
+    rows = [_row(name, part) for name, part in loaded.state.items() if isinstance(part, dict)]
+    yield from (f"  {line}" for line in console.table(head, rows).splitlines())
+
+
+def _row(name: str, part: dict[str, Any]) -> list[str]:
+    """Returns the cells about a part of a checkpoint's state."""
+    tensors = dict(_tensors(part))
+    n_numbers = sum(math.prod(leaf.shape) for leaf in tensors.values())
+    n_bytes = sum(leaf.nbytes for leaf in tensors.values())
+    path, leaf = max(tensors.items(), key=lambda item: item[1].nbytes, default=("", None))
+    largest = "" if leaf is None else f"{path.lstrip('.')} {tuple(leaf.shape)}"
+    numbers = [console.number(number) for number in (len(tensors), n_numbers, n_bytes)]
+    return [name, *numbers, largest]
+
+
+def _tensors(tree, path=""):
+    """Yields (path, tensor) of nested dicts and lists."""
+    if hasattr(tree, "nbytes"):
+        yield path, tree
+    elif isinstance(tree, (dict, list, tuple)):
+        pairs = tree.items() if isinstance(tree, dict) else enumerate(tree)
+        for key, part in pairs:
+            yield from _tensors(part, f"{path}.{key}".replace("..", "."))

@@ -1,0 +1,228 @@
+"""A run that is interrupted and resumed has the bits of one that is left alone."""
+
+import os
+import pathlib
+import shutil
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+from megastep import spaces
+from megastep.agents.cli import entry, train
+from megastep.agents.storage.collector import Collector
+from megastep.agents.training import annealing, checkpoint, json_lines
+from megastep.arrdict import arrdict
+from tests.helpers import tiny
+
+SELF_PLAY = ["opponents.past=0.5", "opponents.snapshots=2", "opponents.every=3"]
+REPLAY = ["learner.replay.capacity=200"]
+SMALL = ["geometry=box", "env.n_envs=4", "agent.width=8", "learner.n_steps=8", "device=cpu"]
+FIGHT = [
+    *("env=deathmatch", "env.n_agents=2", "env.res=8", *SMALL),
+    *("learner.n_minibatches=2", "preset=cpu"),
+]
+PONG = ["env=pong", "env.n_envs=8", "agent.width=8", "learner.n_steps=8", "device=cpu"]
+DATA = pathlib.Path(__file__).parents[1] / "data"
+EVERY_UPDATE = ["checkpoint_seconds=1e-9", "keep_checkpoints=99"]
+slow = pytest.mark.slow
+CASES = {
+    "ppo": [*tiny.TINY, *tiny.SHORT_EPISODES],
+    "vtrace": [*tiny.TINY, "learner=vtrace"],
+    "lag": [*tiny.TINY, "learner=vtrace", "learner.lag=1"],
+    "lag2": [*tiny.TINY, "learner=vtrace", "learner.lag=2"],
+    "replay": [*tiny.TINY, "learner=vtrace", "learner.buffer=replay", *REPLAY],
+    "priorities": [
+        *(*tiny.TINY, "learner=vtrace", "learner.buffer=replay", *REPLAY),
+        *("learner.replay.alpha=0.6", "learner.lag=1"),
+    ],
+    "r2d2": [
+        *("env=minimal", "env.res=8", *SMALL, "learner=r2d2", "learner.gradient_steps=2"),
+        *("learner.replay.burn_in=4", "learner.target_period=3", *REPLAY),
+    ],
+    "gru": [*tiny.TINY, "agent.core=gru"],
+    "mingru": [*tiny.TINY, "agent.core=mingru"],
+    "none": [*tiny.TINY, "agent.core=none"],
+    "explorer": ["env=explorer", "env.res=8", *SMALL, "learner.n_minibatches=2"],
+    "pointgoal": ["env=pointgoal", "env.res=8", *SMALL, "learner.n_minibatches=2"],
+    "deathmatch": FIGHT,
+    "opponents": [*FIGHT, *SELF_PLAY, "opponents.bot=0.25"],
+    "pong": [*PONG, "learner.n_minibatches=2"],
+    "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[1:]],
+}
+FAST = "explorer", "lag", "priorities", "r2d2", "opponents", "stranger"
+
+
+class Drifting:
+    """An environment by somebody who keeps state in all the ways there are."""
+
+    def __init__(self, n_envs, res=8, seed=1, device="cpu"):
+        self.n_envs, self.device = n_envs, torch.device(device)
+        self.obs_space, self.action_space = spaces.MultiVector(1, 3), spaces.MultiDiscrete(1, 2)
+        self.places = torch.zeros(n_envs)
+        self.wind, self.random = np.zeros(n_envs), np.random.default_rng(seed)
+        self.n_steps, self.history, self.best = 0, [], {}
+        self.last = None
+
+    def world(self, ended):
+        drift = torch.as_tensor(self.wind, dtype=torch.float32)
+        obs = torch.stack([self.places, drift, torch.full_like(drift, len(self.history))], 1)
+        return arrdict(
+            obs=obs[:, None],
+            reward=torch.where(ended, 0.0, self.places),
+            reset=ended,
+            terminal=torch.full((self.n_envs,), self.ends()),
+            truncated=torch.zeros(self.n_envs, dtype=torch.bool),
+        )
+
+    def ends(self):
+        return self.n_steps % 5 == 0 and self.n_steps > 0
+
+    def reset(self):
+        return self.world(torch.ones(self.n_envs, dtype=torch.bool))
+
+    def step(self, decision):
+        ended = torch.full((self.n_envs,), self.ends())
+        self.n_steps += 1
+        self.wind += self.random.normal(size=self.n_envs) + np.random.random() * 0.1
+        self.places = self.places * 0.9 + torch.rand(self.n_envs)  # of the global generator
+        self.last = self.places if self.last is None else self.last + self.places
+        self.history = [*self.history[-3:], self.n_steps]
+        self.best["place"] = float(self.last.max())
+        self.places = self.places + 1e-3 * self.best["place"]
+        return self.world(ended)
+
+
+def differences(one, other, path=""):
+    """Returns the paths at which two states differ."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys(), path
+        return [d for key in one for d in differences(one[key], other[key], f"{path}.{key}")]
+    if isinstance(one, (list, tuple)):
+        assert len(one) == len(other), path
+        return [
+            d for i, pair in enumerate(zip(one, other)) for d in differences(*pair, f"{path}.{i}")
+        ]
+    is_equal = torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
+    return [] if is_equal or path == ".seconds" else [path]
+
+
+def run(*words):
+    assert train.main([*words]) == 0
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "case, device",
+    [
+        *(pytest.param(name, "cpu", marks=[slow] * (name not in FAST)) for name in CASES),
+        *(
+            pytest.param(name, "cuda", marks=pytest.mark.cuda)
+            for name in CASES
+            if name != "stranger"
+        ),
+    ],
+)
+def test_resumed_run_has_the_same_bits(here, case, device):
+    """Killed after one of its checkpoints, and when it is resumed after a later one. On a GPU the
+    first updates of a process are eager, the others replay graphs.
+    """
+    words = [*CASES[case], f"device={device}", "samples=512", "log_every=2"]
+    run(*words, "folder=run", *EVERY_UPDATE)
+    alone = checkpoint.load_latest("run/checkpoints").state
+    metrics = (here / "run/metrics.jsonl").read_bytes()
+    paths = checkpoint.list_checkpoints("run/checkpoints")
+    for killed_after in (paths[len(paths) // 3], paths[2 * len(paths) // 3]):
+        run(f"resume={killed_after}")
+        assert (here / "run/metrics.jsonl").read_bytes() == metrics
+        assert differences(checkpoint.load_latest("run/checkpoints").state, alone) == []
+    assert len(paths) >= 4 and len(metrics.splitlines()) >= len(paths) // 2
+
+
+def interrupt_collecting(monkeypatch, call):
+    calls, collect = [], Collector.__call__
+
+    def signalled(self):
+        calls.append(1)
+        if len(calls) == call:
+            os.kill(os.getpid(), signal.SIGINT)
+        return collect(self)
+
+    monkeypatch.setattr(Collector, "__call__", signalled)
+
+
+def test_interrupted_run_has_the_same_bits(here, monkeypatch):
+    """Ctrl-C twice, between reports: the reports of the stops are not in the file in the end."""
+    words = [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=320", "log_every=4"]
+    run(*words, "folder=left-alone")
+    for command in ([*words, "folder=run"], ["resume=run"]):
+        interrupt_collecting(monkeypatch, 3)
+        assert train.main(command) == 130
+        monkeypatch.undo()
+        monkeypatch.chdir(here)
+    stopped = (here / "run/metrics.jsonl").read_bytes()
+    run("resume=run")
+    expected = (here / "left-alone/metrics.jsonl").read_bytes()
+    assert (here / "run/metrics.jsonl").read_bytes() == expected
+    assert stopped not in expected
+    states = [checkpoint.load_latest(f"{name}/checkpoints").state for name in ("run", "left-alone")]
+    assert differences(*states) == []
+
+
+def test_format_6_is_migrated(here, capsys):
+    """A checkpoint of the format before environments were saved, of a run with opponents."""
+    shutil.copytree(DATA / "format6", here / "run")
+    assert entry.inspect_run(["run"]) == 0 and "format 6" in capsys.readouterr().out
+    saved = checkpoint.load_latest("run/checkpoints").state
+    run("resume=run", "more_samples=96")
+    assert "not bit for bit: its environments were not saved" in capsys.readouterr().out
+    state = checkpoint.load_latest("run/checkpoints").state
+    assert state["updates"] == saved["updates"] + 2
+    assert state["learner"]["optimizer"]["n_steps"] > saved["learner"]["optimizer"]["n_steps"]
+    rows = json_lines.read("run/metrics.jsonl")
+    assert [row["updates"] for row in rows] == [2, 4, 6, 7, 8, 9]
+
+
+def test_inspect(here, capsys):
+    run(*tiny.TINY, "samples=64", "folder=run", "log_every=1")
+    capsys.readouterr()
+    assert entry.inspect_run(["rum"]) == 2 and "did you mean run?" in capsys.readouterr().err
+    assert entry.inspect_run(["latest"]) == 0
+    out = capsys.readouterr().out
+    assert "step_64: intact, format 7" in out and "updates 2" in out
+    assert all(word in out for word in ("world.pt", "policy", "actor_state.world.obs", "torch"))
+    with open(here / "run/checkpoints/step_64/world.pt", "r+b") as file:
+        file.seek(1000)
+        file.write(b"?")
+    assert entry.inspect_run(["run"]) == 1
+    assert "world.pt does not match the SHA-256" in capsys.readouterr().out
+
+
+def test_rerun(here, capsys):
+    """A run whose learning rate followed the clock is repeated, though it was interrupted."""
+    words = ["seconds=0.3", "checkpoint_seconds=0.05", "keep_checkpoints=99"]
+    run(*tiny.TINY, *words, "log_every=2", "folder=run")
+    *reports, _ = (here / "run/metrics.jsonl").read_bytes().splitlines()
+    factors = annealing.read("run")
+    killed_after = checkpoint.list_checkpoints("run/checkpoints")[1]
+    run(f"resume={killed_after}")
+    assert (here / "run/metrics.jsonl").read_bytes().splitlines()[: len(reports)] == reports
+    assert annealing.read("run")[: len(factors)] == factors
+    capsys.readouterr()
+    run("rerun=run", "folder=again")
+    assert "metrics.jsonl equals that of run, byte for byte" in capsys.readouterr().out
+    assert (here / "again/annealing.f64").read_bytes() == (here / "run/annealing.f64").read_bytes()
+    lines = (here / "run/metrics.jsonl").read_text().splitlines(keepends=True)
+    (here / "run/metrics.jsonl").write_text("".join([lines[0], lines[-1]]))
+    assert train.main(["rerun=run", "folder=third"]) == 1
+    assert "from line 2 on" in capsys.readouterr().err
+    (here / "run/annealing.f64").unlink()
+    assert train.main(["rerun=run", "folder=fourth"]) == 2
+    assert "does not hold the learning rate" in capsys.readouterr().err
+    assert not (here / "fourth").exists()
