@@ -1,6 +1,7 @@
 """Imports classes and functions by path: `module:attribute`."""
 
 import importlib
+import inspect
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -13,15 +14,17 @@ from megastep.settings import closest
 def import_object(name: str) -> Callable:
     """Returns the class or function at `module:attribute`.
 
-    Modules of the current folder come before installed ones, and after those of Python.
+    Modules of the current folder come before installed ones, and after those of Python. For what
+    is in megastep, that folder is not searched: a downloaded one may hold anything.
 
     Raises:
         ValueError: if it cannot be imported, in one sentence.
     """
     module, _, attribute = name.partition(":")
-    if not (module and attribute):
+    if not all(part.isidentifier() for part in [*module.split("."), *attribute.split(".")]):
         raise ValueError(f"{name!r} is no import path, such as my_package.rover:Rover")
-    search_current_folder()
+    if module.partition(".")[0] != "megastep":
+        search_current_folder()
     try:
         imported: Any = importlib.import_module(module)
     except Exception as error:  # whatever a module does as it is imported
@@ -50,14 +53,25 @@ def search_current_folder() -> None:
         sys.path.insert([*installed, True].index(True), here)
 
 
-def resolve(name: str, table: dict[str, Any]) -> Callable:
-    """Returns the entry of `table` called `name`, or the class or function at this import path.
+def resolve(name: str, table: dict[str, type], base: type) -> type:
+    """Returns the entry of `table` called `name`, or the class at this import path.
 
     Raises:
-        ValueError: if it is neither, in one sentence.
+        ValueError: if it is neither, or no class derived from `base` that takes one argument, in
+            one sentence.
     """
     known_name(name, [*table])
-    return table[name] if name in table else import_object(name)
+    if name in table:
+        return table[name]
+    imported = import_object(name)
+    if not (isinstance(imported, type) and issubclass(imported, base)):
+        package = base.__module__.partition(".")[0]
+        raise ValueError(f"{name} must be a class derived from {package}'s {base.__name__}")
+    try:
+        inspect.signature(imported).bind(None)
+    except TypeError as error:
+        raise ValueError(f"{name} must take one argument ({error})") from None
+    return imported
 
 
 def known_name(name: str, names: Sequence[str]) -> str:

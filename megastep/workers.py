@@ -1,10 +1,14 @@
 """What worker processes have in common."""
 
 import contextlib
+import functools
+import os
 import signal
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 
-__all__ = ["WORKER_ENV", "terminal_signals_blocked"]
+__all__ = ["WORKER_ENV", "end_with", "end_with_parent", "terminal_signals_blocked"]
 
 #: Environment variables of a worker process: one thread, no screen, and no GPU, because even an
 #: idle CUDA context takes half a gigabyte.
@@ -28,3 +32,23 @@ def terminal_signals_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)
+
+
+def end_with(is_running: Callable[[], bool]) -> None:
+    """Sends this process SIGTERM once `is_running()`, asked every second, is false.
+
+    For a process whose starter may be killed, which then stops nothing itself.
+    """
+
+    def watch():
+        while is_running():
+            time.sleep(1)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@functools.cache
+def end_with_parent(parent: int) -> None:
+    """As :func:`end_with`, for a child of process ``parent``. Can initialise a pool's workers."""
+    end_with(lambda: os.getppid() == parent)

@@ -71,6 +71,14 @@ def composed_once():
 
 
 @pytest.fixture(scope="session", autouse=True)
+def home(tmp_path_factory):
+    """Has runs signed with a key of this session, and not with the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("home")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def no_curves():
     """Leaves out curves.png, which is most of the time of a short run. Yields what draws it."""
     from megastep.agents.training import curves

@@ -52,14 +52,15 @@ SHARED = {
     "megastep.spaces",
     "megastep.types",
 }
-# The command line also caches arguments, chooses a device and homes, checks environments and writes
-# videos.
+# The command line also caches arguments, chooses a device and homes, checks environments, writes
+# videos and starts processes.
 SHARED_WITH_CLI = SHARED | {
     "megastep.cache",
     "megastep.contract",
     "megastep.engine",
     "megastep.recording",
     "megastep.scene",
+    "megastep.workers",
 }
 # The files that may import these modules of ours, as glob patterns.
 OWN_USERS = {

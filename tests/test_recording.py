@@ -16,7 +16,7 @@ import torch
 from megastep import recording
 from megastep.arrdict import arrdict
 from megastep.recording import ParallelEncoder
-from tests.helpers.processes import HUNG
+from tests.helpers.processes import HUNG, is_running, wait_until
 
 SIZE = 32
 TOLERANCE = 6  # grey levels: the loss of h264 at this quality on a flat colour
@@ -388,3 +388,36 @@ def test_script_without_a_main_guard_can_record(tmp_path):
     )
     assert (process.returncode, process.stdout) == (0, "started\n"), process.stderr
     assert frames(tmp_path / "video.mp4").shape == (4, 64, 64, 3)
+
+
+LEFT_BEHIND = """
+import os, pathlib, time
+from megastep import arrdict, recording
+
+class Env:
+    @staticmethod
+    def plot_state(state):
+        pathlib.Path(str(os.getpid())).touch()
+        time.sleep(1000)
+
+with recording.ParallelEncoder(Env.plot_state, n_workers=2) as encoder:
+    for i in range(2):
+        encoder(arrdict.arrdict(i=i))
+"""
+
+
+@pytest.mark.slow
+def test_workers_end_with_a_killed_parent(tmp_path):
+    root = os.path.dirname(os.path.dirname(recording.__file__))
+    process = subprocess.Popen(
+        [sys.executable, "-c", LEFT_BEHIND],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": root},
+    )
+    wait_until(lambda: len(os.listdir(tmp_path)) == 2, process)
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 5
+    while any(is_running(pid) for pid in os.listdir(tmp_path)):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)

@@ -1,11 +1,14 @@
 """What worker processes have in common."""
 
+import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 from megastep.workers import terminal_signals_blocked
+from tests.helpers.processes import is_running
 
 
 def blocked_signals(process):
@@ -25,3 +28,38 @@ def test_processes_started_inside_never_receive_signals_of_the_terminal():
         assert blocked_signals("self") == before
     finally:
         child.communicate(b"\n")
+
+
+#: Starts itself once more, as the process that is left behind and prints its number.
+PARENT_AND_CHILD = """
+import os, subprocess, sys, time
+from megastep import workers
+if len(sys.argv) == 1:
+    subprocess.Popen([sys.executable, "-c", os.environ["CODE"], str(os.getpid())])
+else:
+    workers.end_with_parent(int(sys.argv[1]))
+    print(os.getpid(), flush=True)
+time.sleep(1000)
+"""
+
+
+def test_worker_ends_soon_after_its_parent_is_killed():
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT_AND_CHILD],
+        env={**os.environ, "CODE": PARENT_AND_CHILD},
+        cwd=Path(__file__).parents[1],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    child = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    try:
+        deadline = time.monotonic() + 5
+        while is_running(child):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+    finally:
+        if is_running(child):
+            os.kill(child, signal.SIGKILL)
+        parent.stdout.close()

@@ -67,6 +67,12 @@ def run_command(script: scripts.Script, argv: list[str] | None = None) -> int:
     except program.UserError as error:
         console.say(f"{program.name(script.name)}: {error}", sys.stderr)
         return error.code
+    except (MemoryError, RuntimeError) as error:
+        if not (problem := program.memory_problem(error)):
+            raise
+        cure = "choose fewer environments or episodes, or a smaller network"
+        console.say(f"{program.name(script.name)}: {problem}; {cure}", sys.stderr)
+        return program.UserError.code
     except signals.Interrupted as stop:
         console.say(f"{program.name(script.name)}: {stop.args[1]}", sys.stderr)
         return 128 + stop.args[0]
@@ -115,7 +121,8 @@ def _run(script: scripts.Script, argv: list[str]) -> int:
             print("---\n" * (i > 0), end="", flush=True)
             _show(composer, check.as_tree(composer.settings(job)), flags + job)
     elif options.info or options.hydra_help:
-        composer.call_hydra(flags + words)
+        with program.errors(kinds=compose.HYDRA_ERRORS):
+            composer.call_hydra(flags + words)
     elif options.multirun or "hydra.mode=MULTIRUN" in words:
         return sweeps.sweep(composer, words)
     else:
@@ -135,5 +142,5 @@ def _show(composer: compose.Composer, tree: Any, arguments: list[str]) -> None:
     """Has Hydra show or complete a configuration that has every key there is."""
     node = {"defaults": [composer.name, "_self_"], **tree}
     compose.STORE.store(name="every-key", node=node)
-    with program.errors():
+    with program.errors(kinds=(OSError, ValueError, *compose.HYDRA_ERRORS)):
         composer.call_hydra([*arguments, "--config-name=every-key"])

@@ -40,6 +40,8 @@ OPEN = {
     key: OmegaConf.create({}, flags={"struct": False})
     for key in (*settings.IMPORTED, "agent", "opponents", "logger")
 }
+#: What Hydra raises for words that it cannot use.
+HYDRA_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, AssertionError)
 #: Words that choose a preset, or add folders with files that may.
 NOT_OURS = ("preset=", "+preset=", "++preset=", "hydra.searchpath")
 STORE = config_store.ConfigStore.instance()
@@ -157,7 +159,12 @@ class Composer:
                 groups.append(override.input_line)
             elif not options or isinstance(value, dict):
                 keys[key] = override
-            elif group in settings.IMPORTED and ":" in str(value) and len(str(value)) <= LONGEST:
+            elif (
+                group in settings.IMPORTED
+                and ":" in str(value)
+                and "$" not in str(value)  # which Hydra would interpolate
+                and len(str(value)) <= LONGEST
+            ):
                 STORE.store(group=group, name=value, node={"name": value})
                 groups.append(override.input_line)
             else:
@@ -168,7 +175,7 @@ class Composer:
         try:
             device = keys["device"].value() if "device" in keys else None
             config = copy.deepcopy(self.composed(*groups, device=device))
-        except (HydraException, OmegaConfBaseException, yaml.YAMLError) as error:
+        except HYDRA_ERRORS as error:
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
             text = "is in none of the folders searched; --config-dir adds one" if absent else error
             text = program.shortened(text, 400)
@@ -181,7 +188,7 @@ class Composer:
                 else:
                     force = override.is_add() or override.is_force_add() or key[:6] != "hydra."
                     OmegaConf.update(config, key, override.value(), force_add=force)
-            except (ConfigKeyError, ConfigAttributeError):
+            except (ConfigKeyError, ConfigAttributeError, TypeError):
                 hint = check.closest_key(key, dict(leaves({"hydra": plain(config.hydra)})))
                 errors.append((key, f"no such key; {hint}"))
             except OmegaConfBaseException as error:

@@ -41,7 +41,7 @@ def run(cfg: settings.Evaluate) -> Path:
     instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device)
-    loaded = runs.load_checkpoint(runs.find(cfg.run), device)
+    loaded = runs.load_checkpoint(runs.find(cfg.run), cfg.trust, device)
     trained = factory.config_of(loaded)
     env_settings, geometry = cfg.env or trained.env, cfg.geometry or trained.geometry
     if cfg.ratings or cfg.against is not None:
@@ -134,13 +134,14 @@ def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpo
 
 
 def find_player(
-    name: str, run: checkpoint.Checkpoint, env_settings: settings.Env, env: Any
+    name: str, run: checkpoint.Checkpoint, env_settings: settings.Env, env: Any, trust: bool
 ) -> Player:
     """Returns who is to meet the agent of `run` in `env`.
 
     Args:
         name: a run's folder or checkpoint; or what needs no weights: an import path, `random`, or
             `bot`, which is the run's `opponents.bot_class`, or else the environment's own bot.
+        trust: import what a run that another user made names.
 
     Raises:
         UserError: if nobody can be met there, or this player cannot play there.
@@ -154,7 +155,7 @@ def find_player(
         name = factory.config_of(run).opponents.bot_class or name
     if name in ("bot", "random") or (":" in name and not Path(name).exists()):
         return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
-    return load_player(runs.load_checkpoint(runs.find(name), env.device), env, run)
+    return load_player(runs.load_checkpoint(runs.find(name), trust, env.device), env, run)
 
 
 class Arena:
@@ -171,7 +172,7 @@ class Arena:
         homes = factory.homes(env, geometry, cfg.split)
         where = dict(seed=cfg.seed, device=device)
         sample = factory.make_sample(env, homes, **where)
-        self.others = [find_player(name, run, env, sample) for name in cfg.against or ()]
+        self.others = [find_player(name, run, env, sample, cfg.trust) for name in cfg.against or ()]
         self.agent = load_player(run, sample, run)
         n_agents = optional(sample, "n_agents")
         n_duels = max(1, cfg.episodes // n_agents)  # from each place
@@ -224,7 +225,7 @@ class Arena:
         for path in checkpoint.list_checkpoints(
             folder / "snapshots"
         ) or checkpoint.list_checkpoints(folder / "checkpoints"):
-            player = find_player(str(path), self.run, None, self.sample)
+            player = find_player(str(path), self.run, None, self.sample, self.cfg.trust)
             players.append(player._replace(name=f"{player.step:,} samples"))
         players += self.others
         if len(players) < 2:

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -71,6 +72,14 @@ def errors(
         yield
     except kinds as error:
         raise UserError(prefix + shortened(error, 400)) from error
+
+
+def memory_problem(error: MemoryError | RuntimeError) -> str | None:
+    """Returns what Python or PyTorch says of too little memory; None if the error is another."""
+    if isinstance(error, MemoryError):
+        return "Out of memory"
+    problem = re.search("(DefaultCPUAllocator|CUDA out of memory|std::bad_alloc).*", str(error))
+    return problem and problem[0].rstrip(".")
 
 
 def shortened(text: object, length: int = 120) -> str:

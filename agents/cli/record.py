@@ -39,7 +39,7 @@ def run(cfg: settings.Record) -> Path:
     folder, device = Path(), factory.make_device(cfg.device)
     env_settings, geometry = cfg.env, cfg.geometry
     if cfg.run is not None:
-        loaded = runs.load_checkpoint(runs.find(cfg.run), device)
+        loaded = runs.load_checkpoint(runs.find(cfg.run), cfg.trust, device)
         trained = factory.config_of(loaded)
         env_settings, geometry = trained.env, geometry or trained.geometry
         folder = runs.folder_of(loaded.path)
@@ -53,7 +53,7 @@ def run(cfg: settings.Record) -> Path:
     random = RandomActions(env.action_space)
     policy = evaluate.load_player(loaded, env, loaded).policy if cfg.run else random
     if cfg.against is not None:
-        opponent = evaluate.find_player(cfg.against, loaded, env_settings, env)
+        opponent = evaluate.find_player(cfg.against, loaded, env_settings, env, cfg.trust)
         console.say(f"The first agent is that of {loaded.path}, the other is {opponent.name}")
         seat = torch.zeros(env.n_envs, 1, dtype=torch.int64, device=env.device)
         policy = duels.duel_policy(policy, opponent.policy, seat, env.n_agents)

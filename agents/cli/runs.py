@@ -147,16 +147,27 @@ def find(name: str) -> Path:
 
 
 def load_checkpoint(
-    path: Path, device: Any = None, is_whole: bool = False
+    path: Path, trust: bool, device: Any = None, is_whole: bool = False
 ) -> checkpoint.Checkpoint:
     """Returns the checkpoint of a run found with `find`, on a device; without one, all but its
     state, and PyTorch is not imported. Warns of damaged ones it skips.
 
     Args:
+        trust: whether a run that another user made may name modules to import.
         is_whole: loads environments and replay buffer, too, as for a run that is resumed.
+
+    Raises:
+        UserError: there is none; or, without `trust`, it names modules and another user made it.
     """
     with program.errors(kinds=(OSError, ValueError, checkpoint.CheckpointError)):
-        return checkpoint.load_latest(checkpoints_of(path), device, is_whole)
+        loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole)
+    if loaded.untrusted and not trust:
+        raise UserError(
+            f"{loaded.path} was not made by this user here, and would import "
+            f"{shortened(', '.join(loaded.untrusted))}, which runs code outside megastep; if you "
+            "trust it, add trust=true"
+        )
+    return loaded
 
 
 def resume_command(folder: Path) -> str:

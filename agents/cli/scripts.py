@@ -66,6 +66,7 @@ RESUMABLE = (
     "more_samples",
     "more_seconds",
     "device",
+    "trust",
     "log_every",
     "checkpoint_seconds",
     "keep_checkpoints",
@@ -83,6 +84,7 @@ REPEATABLE = (
     "rerun",
     "folder",
     "device",
+    "trust",
     "checkpoint_seconds",
     "keep_checkpoints",
     "replay_every",
@@ -117,7 +119,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     # a run in use is refused before its checkpoints are read, which come and go
     locked = runs.locked(runs.folder_of(path)) if how == "resume" else contextlib.nullcontext()
     with locked:
-        loaded = runs.load_checkpoint(path)
+        loaded = runs.load_checkpoint(path, tree.get("trust") is True)
     saved = loaded.config["train"]
     if how == "init":
         groups = ("env", "geometry", "agent")
@@ -136,7 +138,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
         target[leaf] = source[leaf]
     if how == "resume" and (errors := [*budget_errors(saved, typed, loaded.numbers)]):
         raise program.ConfigErrors(errors)
-    return saved
+    return saved | {"trust": tree.get("trust", False)}
 
 
 def budget_errors(tree: Tree, typed: list[str], had: dict[str, float]) -> Iterator[tuple[str, str]]:

@@ -135,6 +135,7 @@ class Common:
 
     seed: Annotated[int, Field(ge=0, lt=2**63)]
     device: Annotated[str, AfterValidator(_device)]
+    trust: bool = False  # import what checkpoints that others made name
 
     def errors(self) -> dict[str, Any]:
         # {dotted key: sentence} of settings that contradict each other, false for those that do not

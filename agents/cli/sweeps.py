@@ -1,9 +1,13 @@
 """Sweeps are Hydra's own, with its launchers and sweepers. Added here: the check of all jobs before
 the first starts, the GPU of each job, what a job returns, and the table of them all.
+
+The basic launcher's jobs run in this process. Each of joblib's has a process of its own, which no
+worker of joblib's is the parent of: if a worker is killed, joblib kills all others.
 """
 
 import contextlib
 import csv
+import dataclasses
 import io
 import itertools
 import json
@@ -11,8 +15,10 @@ import os
 import re
 import shutil
 import socket
+import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import uuid
@@ -25,14 +31,15 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
-from megastep.agents.cli import console, program, runs, settings, signals
+from megastep import workers
+from megastep.agents.cli import console, program, runs, scripts, settings, signals
 from megastep.agents.cli.compose import Composer, key_of
 from megastep.agents.cli.program import ConfigErrors, UserError, shortened
 from megastep.agents.training.atomic_files import write_atomically
 
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
 #: Columns of the table beside the job and the keys that vary.
-COLUMNS = ("state", "score", "evaluated", "lower", "upper", "seconds", "folder")
+COLUMNS = ("state", "score", "evaluated", "lower", "upper", "seconds")
 #: What a search is to do, if nothing else is typed: look for high returns, and go past failed jobs.
 SEARCH = {"hydra.sweeper.direction": "maximize", "hydra.sweeper.max_failure_rate": "1.0"}
 
@@ -120,12 +127,25 @@ def sweep(composer: Composer, words: list[str]) -> int:
         os.environ["PYTHONPATH"] = os.pathsep.join(
             filter(None, [str(program.ROOT), os.environ.get("PYTHONPATH")])
         )
-    job, problem = Job(composer, folder), ""
+    job, problem = new_job(composer, folder), ""
     try:
-        with signals.interrupting(job.interrupt):
-            composer.call_hydra(["--multirun", *words], job)
-    except Exception as error:  # a launcher's or a sweeper's, as when a process is killed
-        problem = shortened(error, 400)
+        with _lock(job.path("sweep.lock")):
+            while True:
+                n_started = len(job.rows())
+                try:
+                    with signals.interrupting(job.interrupt):
+                        composer.call_hydra(["--multirun", *words], job)
+                    break
+                except Exception as error:  # a launcher's or a sweeper's
+                    problem = shortened(error, 400)
+                with signals.interrupting(job.interrupt):
+                    while job.running():
+                        time.sleep(0.2)
+                # if joblib lost a worker, it dropped the jobs of a grid that had not started
+                choices = config.runtime.choices
+                kinds = choices["hydra/sweeper"], choices["hydra/launcher"]
+                if kinds != ("basic", "joblib") or len(job.rows()) == n_started:
+                    break
     finally:
         if rows := job.rows():
             report(folder, rows)
@@ -136,65 +156,109 @@ def sweep(composer: Composer, words: list[str]) -> int:
     if not rows:
         raise UserError(f"The sweep cannot start: {problem}")
     if problem and all(row["state"] in (DONE, LOST) for row in rows):
-        console.say(f"The sweep ended early: {problem}", sys.stderr)
+        console.say(f"The launcher failed: {problem}", sys.stderr)
     return 1 if problem or any(row["state"] != DONE for row in rows) else 0
 
 
 # ---- Jobs ----
 
+#: Runs a job in a process without a parent, before anything that could not be forked is imported.
+APART = """import os, sys
+os.fork() and os._exit(0)
+sys.path[:] = filter(None, sys.path)
+from megastep.agents.cli import sweeps
+sweeps.run_apart(*sys.argv[1:])"""
 
+
+def new_job(composer: Composer, folder: Path) -> "Job":
+    """Returns what Hydra is to call for the jobs of a sweep."""
+    records = folder.absolute() / ".jobs" / uuid.uuid4().hex[:8]
+    records.mkdir(parents=True)
+    source = composer.script.name, composer.name, composer.folder, composer.main
+    return Job(source, str(folder.absolute()), str(records), os.getpid(), os.getcwd())
+
+
+@dataclasses.dataclass(frozen=True)
 class Job:
     """Runs one job, in whichever process a launcher starts, and records what became of it.
 
     It is what Hydra's main calls. Composes again, since `preset=auto` depends on the machine.
+
+    Attributes:
+        source: the script's name, and the other arguments of the Composer.
+        folder: that of the sweep.
+        records: a folder of files about the jobs.
+        process: that of the sweep.
+        start: the folder it was started in.
     """
 
-    def __init__(self, composer: Composer, folder: Path):
-        self.source = composer.script, composer.name, composer.folder, composer.main
-        self.group, self.process, self.start = folder.absolute().name, os.getpid(), os.getcwd()
-        self.records = folder.absolute() / ".jobs" / uuid.uuid4().hex[:8]
-        self.records.mkdir(parents=True)
+    source: tuple
+    folder: str
+    records: str
+    process: int
+    start: str
 
     def __call__(self, config: Any) -> float | None:
         """Returns the job's score, None if it failed: a sweeper is to go on. Raises Interrupted
         alone.
         """
-        import filelock  # which takes a while
-
-        hydra, began, result = HydraConfig.get(), time.monotonic(), None
+        hydra = HydraConfig.get()
         words, number = [*hydra.overrides.task], hydra.job.num
         os.chdir(self.start)  # where paths are relative to, whatever hydra.job.chdir says
-        if os.getpid() != self.process:  # its lines are among those of others
-            warnings.showwarning, console.prefix = console.warn, f"job {number}: "
         pairs = (word.lstrip("+~").partition("=") for word in words)
-        fixed, path = (
-            hydra.job.config.override_dirname.exclude_keys,
-            self.records / f"{number}.json",
-        )
+        fixed = hydra.job.config.override_dirname.exclude_keys
         row = dict(
             number=number,
             varied={key: value.strip("\"'") for key, _, value in pairs if key not in fixed},
             state=RUNNING,
             folder=hydra.runtime.output_dir,
-            host=socket.gethostname(),
-            process=os.getpid(),
         )
-        with contextlib.ExitStack() as stack:
-            with contextlib.suppress(OSError):  # no locks, or a full disk: the job is worth more
-                stack.enter_context(filelock.FileLock(path.with_suffix(".lock"), blocking=False))
-                write_atomically(path, json.dumps(row).encode())
+        words += [word for word in hydra.overrides.hydra if "searchpath" in word]
+        if self.path(f"{number}.json").exists():  # it started before joblib lost a worker
+            row = self.recorded(number)
+        elif hydra.runtime.choices["hydra/launcher"] != "joblib":
+            row = self.run(row, words)
+        elif not self.path("stopped").exists():
+            row = self.start_apart(row, words)
+        return row.get("score")
+
+    def start_apart(self, row: dict[str, Any], words: list[str]) -> dict[str, Any]:
+        """Runs a job in a process of its own. Returns what became of it."""
+        read, write = os.pipe()  # which closes when that process ends, however it does
+        job = json.dumps([dataclasses.asdict(self), row, words])
+        command = [sys.executable, "-c", APART, str(write), job]
+        workers.end_with_parent(self.process)
+        with open(read, "rb") as pipe:
+            with open(write, "wb"):
+                subprocess.run(command, pass_fds=[write], check=True)
+            with workers.terminal_signals_blocked():
+                pipe.read()
+        if not self.path(f"{row['number']}.json").exists():  # it could not even say that it began
+            self.record(row)
+        row = self.recorded(row["number"])
+        if row["state"] == LOST:
+            console.say(f"Job {row['number']} {LOST}", sys.stderr)
+        return row
+
+    def run(self, row: dict[str, Any], words: list[str]) -> dict[str, Any]:
+        """Runs a job in this process. Returns what became of it."""
+        began, number, result = time.monotonic(), row["number"], None
+        if os.getpid() != self.process:  # its lines are among those of others
+            warnings.showwarning, console.prefix = console.warn, f"job {number}: "
+        row |= dict(host=socket.gethostname(), process=os.getpid())
+        with _lock(self.path(f"{number}.lock")):
+            self.record(row)
             try:
                 with signals.interrupting(), one_gpu() as gpu:
-                    words += [word for word in hydra.overrides.hydra if "searchpath" in word]
-                    cfg = Composer(*self.source).settings(words)
+                    cfg = self.composer().settings(words)
                     cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
                     if cfg.device == "cuda" and gpu is not None:
                         cfg = settings.changed(cfg, device=f"cuda:{gpu}")
                     logger = getattr(cfg, "logger", None)
                     if getattr(logger, "group", "") is None:
-                        logger = settings.changed(logger, group=self.group)
+                        logger = settings.changed(logger, group=Path(self.folder).name)
                         cfg = settings.changed(cfg, logger=logger)
-                    result = self.source[0].run(cfg)
+                    result = scripts.SCRIPTS[self.source[0]].run(cfg)
                     row |= {"state": DONE, **(runs.outcome(result) if result else {})}
             except signals.Interrupted as stop:
                 row["state"] = f"interrupted: {stop.args[1]}"
@@ -207,30 +271,39 @@ class Job:
                 Path(row["folder"], "error.txt").write_text(traceback.format_exc())
             finally:
                 row["seconds"] = round(time.monotonic() - began, 1)
-                with contextlib.suppress(OSError):
-                    write_atomically(path, json.dumps(row).encode())
+                self.record(row)
         if result and result.is_dir() and row["score"] is None:
             console.warn(f"job {number}: no episode finished, so it has no score; train longer")
-        return row.get("score")
+        return row
+
+    def composer(self) -> Composer:
+        return Composer(scripts.SCRIPTS[self.source[0]], *self.source[1:])
+
+    def path(self, name: str) -> Path:
+        return Path(self.records, name)
+
+    def record(self, row: dict[str, Any]) -> None:
+        """Writes what is known of a job, and the table of all jobs so far."""
+        with contextlib.suppress(OSError):  # a full disk: the job is worth more
+            write_atomically(self.path(f"{row['number']}.json"), json.dumps(row).encode())
+            write_table(Path(self.folder), self.rows())
+
+    def recorded(self, number: int) -> dict[str, Any]:
+        """Returns what became of a job."""
+        row = {"number": number, "varied": {}, "state": RUNNING}
+        with contextlib.suppress(OSError):  # of a process that ended before it wrote this
+            row = json.loads(self.path(f"{number}.json").read_text())
+        is_lost = row["state"] == RUNNING and not _is_locked(self.path(f"{number}.lock"))
+        return row | {"state": LOST} if is_lost else row
 
     def rows(self) -> list[dict[str, Any]]:
         """Returns what the jobs of this sweep recorded, in order."""
-        import filelock
-
-        rows = []
-        for path in self.records.glob("*.json"):
-            state = RUNNING
-            with (
-                contextlib.suppress(OSError),
-                filelock.FileLock(path.with_suffix(".lock"), timeout=0),
-            ):
-                state = LOST  # if it says that it is running, for no process holds its lock
-            row = json.loads(path.read_text())
-            rows.append(row | {"state": state} if row["state"] == RUNNING else row)
-        return sorted(rows, key=lambda row: row["number"])
+        return [self.recorded(n) for n in sorted(int(p.stem) for p in self.path("").glob("*.json"))]
 
     def interrupt(self, number: int) -> NoReturn:
         """Has jobs in other processes save and end, then raises Interrupted."""
+        with contextlib.suppress(OSError):
+            self.path("stopped").touch()
         deadline = time.monotonic() + 30  # seconds, for jobs to save
         for process in self.running():
             signals.stop(process)
@@ -240,8 +313,40 @@ class Job:
 
     def running(self) -> list[int]:
         here = RUNNING, socket.gethostname()
-        pids = [row["process"] for row in self.rows() if (row["state"], row["host"]) == here]
+        pids = [row["process"] for row in self.rows() if (row["state"], row.get("host")) == here]
         return [pid for pid in pids if pid != os.getpid()]
+
+
+def run_apart(pipe: str, job: str) -> None:
+    """Runs a job of `Job.start_apart`, and ends with the sweep."""
+    os.set_inheritable(int(pipe), False)
+    fields, row, words = json.loads(job)
+    job = Job(**fields)
+    signals.exit_on_signals(job.source[0])
+    console.open_streams()
+    threading.excepthook = console.warn_of_thread
+    workers.end_with(lambda: _is_locked(job.path("sweep.lock")))
+    with contextlib.suppress(signals.Interrupted):
+        job.run(row, words)
+
+
+@contextlib.contextmanager
+def _lock(path: Path) -> Iterator[None]:
+    """Holds a file's lock, which the system drops when this process ends."""
+    import filelock  # which takes a while
+
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # no locks, or a full disk: the work is worth more
+            stack.enter_context(filelock.FileLock(path, blocking=False))
+        yield
+
+
+def _is_locked(path: Path) -> bool:
+    import filelock
+
+    with contextlib.suppress(OSError), filelock.FileLock(path, blocking=False):
+        return False
+    return True
 
 
 @contextlib.contextmanager
@@ -271,20 +376,31 @@ def one_gpu() -> Iterator[int | None]:
 
 
 def report(folder: Path, rows: list[dict[str, Any]]) -> None:
-    """Prints the table of a sweep and writes it into its folder: sweep.md as it is printed, and
-    sweep.csv with all digits.
-    """
-    head, text = ["job", *dict.fromkeys(k for row in rows for k in row["varied"])], io.StringIO()
-    head += COLUMNS
-    rows = [{**row, **row["varied"], "job": row["number"]} for row in rows]
-    csv.writer(text).writerows([head, *([row.get(name) for name in head] for row in rows)])
-    cells = [[_brief(row.get(name)) for name in head[:-1]] for row in rows]
-    console.say(f"Sweep\n{console.table(head[:-1], cells)}")
+    """Prints the table of a sweep and writes it into its folder."""
+    console.say(f"Sweep\n{console.table(*_cells(rows))}")
     with console.warned(f"{folder} cannot be written: "):
-        write_atomically(folder / "sweep.csv", text.getvalue().encode())
-        table = console.table(head[:-1], cells, is_markdown=True)
-        write_atomically(folder / "sweep.md", table.encode())
+        write_table(folder, rows)
         console.say(f"Table: {folder / 'sweep.md'}, with all digits in sweep.csv")
+
+
+def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
+    """Writes sweep.md, the table as it is printed, and sweep.csv, with all digits and folders."""
+    table = console.table(*_cells(rows), is_markdown=True)
+    write_atomically(folder / "sweep.md", table.encode())
+    head, text = [*_head(rows), "folder"], io.StringIO()
+    rows = [row | row["varied"] | {"job": row["number"]} for row in rows]
+    csv.writer(text).writerows([head, *([row.get(name) for name in head] for row in rows)])
+    write_atomically(folder / "sweep.csv", text.getvalue().encode())
+
+
+def _head(rows):
+    return ["job", *dict.fromkeys(key for row in rows for key in row["varied"]), *COLUMNS]
+
+
+def _cells(rows):
+    """Returns the head and the rows of a table, as text."""
+    rows, head = [row | row["varied"] | {"job": row["number"]} for row in rows], _head(rows)
+    return head, [[_brief(row.get(name)) for name in head] for row in rows]
 
 
 def _brief(value: Any) -> str:

@@ -66,7 +66,7 @@ def make_trainer(
     env = factory.construct(cfg.env, **where)
     if cfg.resume or cfg.init:
         path = runs.find(cfg.resume or cfg.init)
-        loaded = runs.load_checkpoint(path, device, is_whole=cfg.resume is not None)
+        loaded = runs.load_checkpoint(path, cfg.trust, device, is_whole=cfg.resume is not None)
         factory.load_weights(policy, env, loaded)
     opponents = factory.make_opponents(cfg, env, sample, policy)
     for name in ("checkpoints", "snapshots") if cfg.resume else ():
@@ -193,7 +193,7 @@ def with_more(cfg: settings.Train) -> settings.Train:
     totals = {}
     for name in ("samples", "seconds"):
         if (more := getattr(cfg, f"more_{name}")) is not None:
-            had = runs.load_checkpoint(runs.find(cfg.resume)).numbers[name]
+            had = runs.load_checkpoint(runs.find(cfg.resume), cfg.trust).numbers[name]
             totals |= {name: had + more, f"more_{name}": None}
     return settings.changed(cfg, **totals)
 
@@ -234,10 +234,13 @@ def run(cfg: settings.Train) -> Path:
         except NonFiniteError as error:
             saved = f"What was saved before is in {folder}{running.replay_hint}"
             raise program.NonFinite(f"{error}. {saved}") from error
-        except (engine.EngineError, torch.OutOfMemoryError) as error:
+        except (MemoryError, RuntimeError) as error:
+            problem = program.memory_problem(error)
+            if not (problem or isinstance(error, engine.EngineError)):
+                raise
             saved = running.saver.error or "What was learnt last could not be saved"
             saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
-            reason = str(error).partition("\n")[0].rstrip(".")
+            reason = problem or str(error).partition("\n")[0].rstrip(".")
             raise program.UserError(f"{reason}. {saved}. {resume}") from error
         finally:
             curves.plot_curves(folder)
@@ -251,6 +254,7 @@ def run(cfg: settings.Train) -> Path:
             raise program.UserError(unsaved)
         del running  # its memory is the evaluation's now
         common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
+        common["trust"] = True  # what it names has just run
         if cfg.finish.evaluate:
             evaluate.run(settings.Evaluate(episodes=cfg.finish.episodes, baseline=True, **common))
         if cfg.finish.record:

@@ -115,7 +115,7 @@ def make_core(name: str, width: int, layers: int = 1) -> nn.Module:
     Raises:
         ValueError: if there is no such core, or it breaks the contract at the head of this file.
     """
-    kind = resolve(name, CORES)
+    kind = resolve(name, CORES, nn.Module)
     cores = [kind(width) for _ in range(layers)]
     if ":" in name:
         _check(name, cores[0], width)

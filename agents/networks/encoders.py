@@ -129,7 +129,7 @@ def make_image_encoder(name: str, space: spaces.MultiImage) -> nn.Module:
     Raises:
         ValueError: if there is no such encoder, or its features have the wrong shape.
     """
-    encoder = resolve(name, ENCODERS)(space)
+    encoder = resolve(name, ENCODERS, nn.Module)(space)
     if ":" in name:
         _check_encoder(name, encoder, space)
     return encoder

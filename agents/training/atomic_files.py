@@ -1,18 +1,34 @@
-"""Writes that a crash cannot leave half done."""
+"""Writes that a crash cannot leave half done, in folders that several writers may share."""
 
+import contextlib
+import itertools
 import os
+import re
+import secrets
+import shutil
+import socket
+import time
 from pathlib import Path
+
+#: Age in seconds at which another machine's temporary files are deleted: its processes cannot be
+#: seen from here.
+ABANDONED = 24 * 3600
+_NAME = re.compile(r".*\.tmp-(?P<machine>.+)-(?P<pid>\d+)-(?P<token>\w+)-\d+")
+#: The token tells this process from an earlier one with the same number.
+_TOKEN, _COUNT = secrets.token_hex(4), itertools.count()
 
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Writes a file through a temporary one that is renamed into place.
 
-    A reader sees either the old or the new content, even if the process is killed.
+    A reader sees either the old or the new content, even if the process is killed or others write
+    the same file: the last one wins. Deletes what killed writers left in the folder.
 
     Raises:
         OSError: the disk is full or not writable. The old file is unchanged.
     """
-    temporary = path.with_name(f"{path.name}.tmp")
+    delete_leftovers(path.parent)
+    temporary = temporary_path(path)
     try:
         write_synced(temporary, data)
         os.replace(temporary, path)
@@ -27,6 +43,51 @@ def write_synced(path: Path, data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
+
+
+def temporary_path(path: Path) -> Path:
+    """Returns an unused path beside `path` for a temporary file or folder of this process."""
+    owner = f"{_machine()}-{os.getpid()}-{_TOKEN}-{next(_COUNT)}"
+    return path.with_name(f"{path.name[:40]}.tmp-{owner}")  # of at most 255 bytes
+
+
+def delete_leftovers(folder: Path | str) -> None:
+    """Deletes temporary files and folders in `folder` whose process no longer runs. Those of
+    another machine go when they are a day old.
+    """
+    for path in Path(folder).glob("*.tmp-*"):
+        name = _NAME.fullmatch(path.name)
+        with contextlib.suppress(OSError):  # another process deletes or renames it
+            if not name or _is_in_use(path, name["machine"], int(name["pid"]), name["token"]):
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+
+def _is_in_use(path, machine, pid, token):
+    if machine != _machine():
+        return time.time() - path.stat().st_mtime < ABANDONED
+    return token == _TOKEN if pid == os.getpid() else _is_alive(pid)
+
+
+def _is_alive(pid):
+    try:
+        os.kill(pid, 0)  # sends nothing; not all systems have /proc
+    except PermissionError:  # it is another user's
+        return True
+    except (ProcessLookupError, OverflowError):
+        return False
+    return True
+
+
+def _machine():
+    """The name of what process numbers belong to: a host, or a container on it."""
+    name = re.sub(r"[^\w.]", "_", socket.gethostname())[:32]
+    with contextlib.suppress(OSError):  # not all systems have namespaces
+        name += "-" + re.sub(r"\D", "", os.readlink("/proc/self/ns/pid"))
+    return name
 
 
 class AppendedFile:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from megastep.agents.training import checkpoint_format
+from megastep.agents.training.atomic_files import delete_leftovers, temporary_path
 from megastep.agents.training.checkpoint_format import (
     Checkpoint,
     CheckpointError,
@@ -29,7 +30,6 @@ __all__ = [
     "Checkpoint",
     "CheckpointError",
     "DamagedCheckpoint",
-    "delete_leftovers",
     "list_checkpoints",
     "load_latest",
     "save",
@@ -67,7 +67,7 @@ def save(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     delete_leftovers(folder)
-    temporary = folder / f"step_{step}.tmp-{os.getpid()}"
+    temporary = temporary_path(folder / f"step_{step}")
     try:
         checkpoint_format.write(temporary, step, state, config, score, made_with, replay_seconds)
         # verified before any old one is deleted
@@ -140,25 +140,6 @@ def step_of(path: Path) -> int:
     return _step_and_number(path)[0]
 
 
-def delete_leftovers(folder: Path | str) -> None:
-    """Deletes temporary folders of processes that no longer run."""
-    for path in Path(folder).glob("step_*.tmp-*"):
-        pid = path.name.rpartition("-")[2]
-        if not (pid.isdigit() and int(pid) != os.getpid() and _is_alive(int(pid))):
-            shutil.rmtree(path, ignore_errors=True)
-
-
-def _is_alive(pid: int) -> bool:
-    """Returns whether a process exists."""
-    try:
-        os.kill(pid, 0)  # sends nothing; not all systems have /proc
-    except PermissionError:  # it is another user's
-        return True
-    except (ProcessLookupError, OverflowError):
-        return False
-    return True
-
-
 def _step_and_number(path: Path) -> tuple[int, int]:
     """Returns a checkpoint's step, and its number among the checkpoints of that step, from 1."""
     step, number = re.match(r"step_(\d+)(?:-(\d+))?", path.name).groups()
@@ -199,7 +180,7 @@ def _score(path: Path) -> float | None:
 
 def _delete(path: Path) -> None:
     """Deletes a checkpoint. If killed, leaves a temporary folder and no damaged checkpoint."""
-    leftover = path.with_name(f"{path.name}.tmp-{os.getpid()}")
+    leftover = temporary_path(path)
     try:
         os.replace(path, leftover)
     except OSError:  # it does not exist or cannot be moved

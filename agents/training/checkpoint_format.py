@@ -25,6 +25,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+from megastep.agents.training import trust
+
 if TYPE_CHECKING:
     import torch
 
@@ -58,6 +60,7 @@ class Checkpoint:
         config: the run's configuration, as saved.
         made_with: what the numbers depend on besides the configuration: versions, device, threads.
         state: dicts of tensors and numbers, as saved; None if it was not loaded.
+        untrusted: import paths outside megastep that it names, if this user did not make it.
     """
 
     path: Path
@@ -66,6 +69,7 @@ class Checkpoint:
     config: dict[str, Any]
     made_with: dict[str, Any]
     state: dict[str, Any] | None = None
+    untrusted: tuple[str, ...] = ()
 
 
 # ---- Writing ----
@@ -107,6 +111,7 @@ def write(
     numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
     manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
     manifest |= dict(torch=torch.__version__, made_with=made_with or {}, files=files)
+    manifest["signature"] = trust.sign(text)
     text = sealed(manifest)
     _write_file(path / "manifest.json", lambda file: file.write(text))
     sync_folder(path)
@@ -198,9 +203,19 @@ def read(path: Path, device: torch.device | str | None, is_whole: bool = False) 
     else:
         parts = ["state.pt"]
         verify(path, manifest, ("state.pt", "config.json"))
-    config = json.loads((path / "config.json").read_bytes())
-    made_with = manifest.get("made_with", {})
-    checkpoint = Checkpoint(path, manifest["step"], manifest["numbers"], config, made_with)
+    text = (path / "config.json").read_bytes()
+    try:
+        config = json.loads(text)
+    except (ValueError, RecursionError):
+        raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is no JSON") from None
+    checkpoint = Checkpoint(
+        path,
+        manifest["step"],
+        manifest["numbers"],
+        config,
+        manifest.get("made_with", {}),
+        untrusted=tuple(trust.untrusted_names(text, manifest.get("signature"))),
+    )
     if device is None:
         return checkpoint
     state = {}
@@ -284,7 +299,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
         version = manifest["format"]
         body = {key: value for key, value in manifest.items() if key != "sha256"}
         is_intact = data == sealed(body)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         version, is_intact = None, False
     is_without_digest = version == 1 and "sha256" not in manifest
     if not (is_intact or is_without_digest):

@@ -104,6 +104,7 @@ def test_errors_need_no_pytorch(stopped):
         ("train", 2, ["learner=r2d2", "learner.replay.capacity=0"]),
         ("train", 2, ["geometry=files", "geometry.path=nope"]),
         ("train", 2, ["-m", "seed=1,2", "learner.lr=-1"]),
+        ("train", 2, ["hydra.searchpath=ppo", "--info", "searchpath"]),
         ("train", 2, ["resume=run"]),
         ("train", 2, ["resume=nope"]),
         ("train", 2, ["folder=full"]),

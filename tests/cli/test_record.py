@@ -11,6 +11,7 @@ from matplotlib import pyplot as plt
 
 from megastep import plotting, recording
 from megastep.agents.cli import record, train
+from megastep.agents.training import checkpoint
 from tests.helpers import faults, tiny
 from tests.helpers.tiny import settings
 
@@ -89,6 +90,16 @@ def test_several_cameras(tmp_path):
 def test_unwritable_video(trained, capsys):
     assert record.main([f"run={trained}", "steps=1", "device=cpu", "file=/proc/video.mp4"]) == 2
     assert "/proc/video.mp4 could not be made" in capsys.readouterr().err
+
+
+def test_run_of_another_environment(trained, tmp_path, capsys):
+    loaded = checkpoint.load_latest(trained / "checkpoints")
+    loaded.config["train"]["env"]["res"] = 16
+    checkpoint.save(tmp_path / "checkpoints", 32, loaded.state, loaded.config)
+    assert record.main([f"run={tmp_path}", "steps=1", "device=cpu"]) == 2
+    error = capsys.readouterr().err
+    assert re.search(r"obs was MultiImage\(.*W=8\) and is MultiImage\(.*W=16\)", error)
+    assert os.listdir(tmp_path) == ["checkpoints"]
 
 
 def test_unknown_file_type(trained, capsys):

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 
 import cloudpickle
 import pytest
@@ -26,7 +27,7 @@ from megastep.agents.cli.program import ConfigErrors
 from megastep.agents.cli.settings import kind_of
 from megastep.agents.cli.signals import Interrupted
 from megastep.agents.training import loggers
-from tests.helpers.processes import HUNG, wait_until
+from tests.helpers.processes import HUNG, is_running, wait_until
 
 ROOT = pathlib.Path(__file__).parents[2]
 PAYER = '''
@@ -175,6 +176,18 @@ def test_invalid_sweep_leaves_nothing(here, capsys):
         assert not {name for name in left if not name.startswith("payer.")}, words
 
 
+def test_table_stands_while_jobs_run(here, monkeypatch):
+    """Even if a job of the basic launcher ends this process, with `os._exit` or worse."""
+    states = []
+
+    def run(cfg):
+        states.append([row["state"] for row in rows("mine")])
+
+    monkeypatch.setattr(train, "run", run)
+    assert train.main([*SHORT, "-m", "seed=1,2", "hydra.sweep.dir=mine"]) == 0
+    assert states == [["running"], ["done", "running"]]
+
+
 @pytest.mark.slow
 def test_sweeps_in_the_same_second(here, monkeypatch):
     monkeypatch.setattr(train, "run", lambda cfg: None)
@@ -304,13 +317,54 @@ def test_submitit(here):
     assert list((here / "mine/.submitit").rglob("*_log.out"))
 
 
+JOBLIB = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
+
+
 @pytest.mark.slow
-def test_killed_job(here):
+def test_job_that_ends_its_process_leaves_the_others(here):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    words = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
-    code, _, err = finished(*SHORT, "-m", "env.mood=dead", *words)
-    assert code == 1 and "The sweep ended early" in err and "Traceback" not in err
-    assert [row["state"] for row in rows("mine")] == [sweeps.LOST]
+    code, _, err = finished(*SHORT, "-m", "env.mood=dead,fine", *JOBLIB)
+    assert code == 1 and f"Job 0 {sweeps.LOST}" in err and "Traceback" not in err
+    assert [row["state"] for row in rows("mine")] == [sweeps.LOST, "done"]
+
+
+def children(process):
+    """Returns the numbers of a process's children."""
+    text = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text()
+    return [int(pid) for pid in text.split()]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("victim", ["worker", "job", "sweep"])
+def test_kill_9(here, victim):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    process = start(*SMALL, "seconds=8", "checkpoint_seconds=1", "-m", "seed=1,2,3", *JOBLIB)
+
+    def jobs():
+        return [json.loads(path.read_text()) for path in here.glob("mine/.jobs/*/*.json")]
+
+    def n_learning():
+        return sum(path.stat().st_size > 0 for path in here.glob("mine/*/metrics.jsonl"))
+
+    wait_until(lambda: n_learning() == 2, process)
+    pids = {"worker": children(process), "sweep": [process.pid]}
+    pids["job"] = [job["process"] for job in jobs()]
+    os.kill(pids[victim][-1], signal.SIGKILL)  # the first child is a tracker
+    if victim == "sweep":
+        process.communicate(timeout=HUNG)
+        deadline = time.monotonic() + 5
+        while any(is_running(pid) for pid in pids["job"] + pids["worker"]):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        assert all("interrupted" in job["state"] for job in jobs())
+        return
+    _, err = process.communicate(timeout=HUNG)
+    assert process.returncode == 1 and "Traceback" not in err, err
+    states = {row["job"]: row["state"] for row in rows("mine")}
+    if victim == "job":
+        (killed,) = [job["number"] for job in jobs() if job["process"] == pids["job"][-1]]
+        assert states.pop(str(killed)) == sweeps.LOST
+    assert set(states.values()) == {"done"} and len(states) == 3 - (victim == "job")
 
 
 # ---- Where jobs run ----
@@ -318,11 +372,11 @@ def test_killed_job(here):
 
 def test_preset_is_chosen_where_the_job_runs(here, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    job = sweeps.Job(Composer(scripts.TRAIN), here)
+    job = sweeps.new_job(Composer(scripts.TRAIN), here)
     job = cloudpickle.loads(cloudpickle.dumps(job))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     for words, n_envs in ((["seed=1"], 4096), (["seed=1", "device=cpu"], 256)):
-        assert Composer(*job.source).settings(words).env.n_envs == n_envs
+        assert job.composer().settings(words).env.n_envs == n_envs
 
 
 def test_jobs_share_gpus(here, monkeypatch):

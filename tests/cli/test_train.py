@@ -392,19 +392,37 @@ def test_divergence_stops_with_advice(here, capsys):
     assert nonfinite_leaf(checkpoint.load_latest(here / "run" / "checkpoints").state) is None
 
 
-def test_out_of_memory_while_training(here, monkeypatch, capsys):
+@pytest.mark.parametrize("take", [lambda: torch.empty(2**55), lambda: bytearray(2**60)])
+def test_too_little_memory_is_one_sentence(monkeypatch, capsys, take):
+    monkeypatch.setattr(train, "run", lambda cfg: take())
+    assert train.main([*TINY]) == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert re.search(r"(can't allocate|Out of) memory.*; choose fewer environments", sentence)
+
+
+def error_of_allocator():
+    with pytest.raises(RuntimeError) as error:
+        torch.empty(2**55)
+    return error.value
+
+
+CUDA_ERROR = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nMore")
+
+
+@pytest.mark.parametrize("error", [CUDA_ERROR, error_of_allocator(), MemoryError()])
+def test_out_of_memory_while_training(here, monkeypatch, capsys, error):
     real = ppo.PPO.update
 
     def update(self, rollout):
         if self.check.record[0] == 2:
-            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nMore")
+            raise error
         return real(self, rollout)
 
     with monkeypatch.context() as patch:
         patch.setattr(ppo.PPO, "update", update)
         assert train.main([*TINY, "samples=1e9", "folder=run"]) == 2
     (sentence,) = capsys.readouterr().err.splitlines()
-    assert "out of memory" in sentence and f"All {2 * UPDATE} samples are saved" in sentence
+    assert " memory" in sentence and f"All {2 * UPDATE} samples are saved" in sentence
     assert "python train.py resume=run" in sentence
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == 2 * UPDATE
     assert train.main(["resume=run", f"samples={3 * UPDATE}"]) == 0

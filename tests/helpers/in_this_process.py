@@ -6,7 +6,7 @@ from concurrent.futures import Future
 class InThisProcess:
     """Calls functions when they are submitted."""
 
-    def __init__(self, n_workers, env):
+    def __init__(self, n_workers, **options):
         pass
 
     def submit(self, function, *arguments):

@@ -1,0 +1,104 @@
+"""Signatures of runs: which checkpoints may have modules imported.
+
+A checkpoint's configuration names classes by import path, and importing a module runs its code.
+Classes of megastep may always be imported. A configuration that names others is signed with an
+HMAC-SHA256 (RFC 2104) of `config.json`, so that each user's own runs are told from downloaded ones.
+The key is made once per user: `megastep/key` in `$XDG_CONFIG_HOME`, else in `~/.config`. Does not
+import PyTorch.
+"""
+
+import contextlib
+import hmac
+import json
+import os
+import re
+import secrets
+import stat
+import tempfile
+import warnings
+from pathlib import Path
+
+KEY_BYTES = 32
+#: Groups of settings that may hold import paths.
+GROUPS = ("env", "geometry", "agent", "learner", "opponents")
+#: Import paths of megastep's own components.
+OWN = re.compile(r"megastep\.(envs|geometries|agents\.(algorithms|networks|selfplay))(\.\w+)*:\w+")
+
+
+def sign(config: bytes) -> str | None:
+    """Returns the signature of a `config.json`; None if it names no modules outside megastep.
+
+    Makes the user's key at the first use. If there can be none, warns and returns None.
+    """
+    if not foreign_names(config):
+        return None
+    try:
+        return _digest(_make_key(), config)
+    except (OSError, RuntimeError) as error:
+        warnings.warn(
+            f"this run cannot be signed ({error}), so whatever loads it later needs trust=true",
+            stacklevel=2,
+        )
+        return None
+
+
+def untrusted_names(config: bytes, signature: object) -> list[str]:
+    """Returns the import paths outside megastep in a `config.json`; none if this user signed it."""
+    names = foreign_names(config)
+    with contextlib.suppress(OSError, RuntimeError):
+        given = str(signature).encode(errors="replace")
+        if names and hmac.compare_digest(_digest(_read_key(), config).encode(), given):
+            return []
+    return names
+
+
+def foreign_names(config: bytes) -> list[str]:
+    """Returns the import paths in a `config.json` that are not megastep's own."""
+    tree, names = json.loads(config), []
+    train = tree.get("train") if isinstance(tree, dict) else None
+    stack = [train.get(group) for group in GROUPS] if isinstance(train, dict) else []
+    while stack:  # not recursive: a planted file may be nested deeply
+        value = stack.pop()
+        if isinstance(value, (dict, list)):
+            stack += value.values() if isinstance(value, dict) else value
+        elif isinstance(value, str) and ":" in value and not OWN.fullmatch(value):
+            names.append(value)
+    return sorted({*names})
+
+
+def _digest(key, config):
+    return hmac.new(key, config, "sha256").hexdigest()
+
+
+def _path():
+    base = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    return Path(base) / "megastep" / "key"
+
+
+def _read_key():
+    """Returns the key. Raises OSError if there is none, or others could have read or written it."""
+    with open(_path(), "rb") as file:
+        status, key = os.fstat(file.fileno()), file.read()
+    is_private = status.st_uid == os.geteuid() and not stat.S_IMODE(status.st_mode) & 0o077
+    if not is_private or len(key) != KEY_BYTES:
+        raise OSError(f"{_path()} is no private file of {KEY_BYTES} bytes; delete it")
+    return key
+
+
+def _make_key():
+    """Returns the key, which is made if there is none. The first of several processes makes it."""
+    with contextlib.suppress(FileNotFoundError):
+        return _read_key()
+    path = _path()
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent)  # of mode 0600
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(secrets.token_bytes(KEY_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+        with contextlib.suppress(FileExistsError):
+            os.link(temporary, path)  # which, unlike a rename, replaces none
+    finally:
+        os.unlink(temporary)
+    return _read_key()
