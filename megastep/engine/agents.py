@@ -102,7 +102,8 @@ def check(agents: Agents) -> None:
         EngineError: naming an environment with a non-finite position, angle or velocity, or with an
             action, layout or goal that does not exist.
     """
-    check_flag(checks.instance("agents", agents, Agents).error_flag)
+    flag = checks.instance("agents", agents, Agents).error_flag
+    check_flag(checks.stored("agents.error_flag", flag))
 
 
 def check_flag(error_flag: torch.Tensor) -> None:

@@ -23,6 +23,7 @@ __all__ = [
     "length",
     "number",
     "ragged",
+    "stored",
 ]
 
 LIMIT = 1e9  # of numbers that kernels compute with: a product of four still fits into float32
@@ -97,8 +98,9 @@ def floats(name: str, value: Any, shape: Sequence, device: Any) -> torch.Tensor:
     """
     try:
         tensor = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
-        tensor = tensor.clone() if isinstance(tensor, ReadOnlyTensor) else tensor
-        tensor = None if tensor.is_complex() else tensor.to(device=device, dtype=torch.float32)
+        usable = _is_stored(tensor) and not tensor.is_complex()
+        tensor = tensor.clone() if usable and isinstance(tensor, ReadOnlyTensor) else tensor
+        tensor = tensor.resolve_neg().to(device=device, dtype=torch.float32) if usable else None
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         tensor = None
     if tensor is None or not _fits(tensor, shape):
@@ -125,10 +127,10 @@ def integers(
         ValueError: unless all are integers from ``min`` to ``max``.
     """
     try:
-        tensor = torch.as_tensor(value).detach().clone()
-        tensor = tensor.to(torch.int64) if not tensor.numel() else tensor
+        tensor = torch.as_tensor(value).detach()
         real = tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool
-        tensor = None if real else tensor.to(device=device, dtype=torch.int64)
+        usable = _is_stored(tensor) and not (real and tensor.numel())
+        tensor = tensor.clone().to(device=device, dtype=torch.int64) if usable else None
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         tensor = None
     if tensor is None or not _fits(tensor, (size,)):
@@ -179,15 +181,22 @@ def address(
 
     Raises:
         TypeError: unless it is a tensor.
-        ValueError: unless it is contiguous, on ``device``, and of that shape and dtype.
+        ValueError: unless it is contiguous, on ``device``, of that shape and dtype, and inside its
+            storage, which may have been resized.
     """
-    if (
-        not isinstance(value, torch.Tensor)
-        or value.dtype != dtype
-        or value.device != device
-        or value.shape != shape
-        or not value.is_contiguous()
-    ):
+    try:
+        fits = (
+            value.dtype is dtype
+            and value.device == device
+            and value.shape == shape
+            and value.is_contiguous()
+            and not value.is_neg()
+            and value.nbytes + value.storage_offset() * value.itemsize
+            <= value.untyped_storage().nbytes()
+        )
+    except (AttributeError, RuntimeError):  # no tensor, or one without memory such as a sparse one
+        fits = False
+    if not fits:
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
             f"{name} must be a contiguous {dtype} tensor of shape {tuple(shape)} on {device}, but "
             f"{_described(value)} was given"
@@ -195,15 +204,41 @@ def address(
     return value.data_ptr()
 
 
+def stored(name: str, tensor: torch.Tensor) -> torch.Tensor:
+    """Returns ``tensor``. ValueError unless it lies inside its storage: most functions of PyTorch
+    crash the interpreter if the storage was resized.
+    """
+    if not _is_stored(tensor):
+        raise ValueError(f"{name} must lie inside its storage, but is {_described(tensor)}")
+    return tensor
+
+
 def _sizes(shape):
     return ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
+
+
+def _is_stored(tensor):
+    """Returns True if a tensor has memory and lies inside its storage."""
+    if tensor.layout is not torch.strided:
+        return False
+    last = sum((size - 1) * stride for size, stride in zip(tensor.shape, tensor.stride()))
+    end = tensor.storage_offset() + last + 1 if tensor.numel() else 0
+    return end * tensor.itemsize <= tensor.untyped_storage().nbytes()
 
 
 def _described(value):
     """Describes a value in a few words."""
     if isinstance(value, torch.Tensor):
+        if value.layout is not torch.strided:
+            return f"a {value.layout} tensor"
         layout = "" if value.is_contiguous() else "non-contiguous "
-        return f"a {layout}{value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
+        text = f"a {layout}{value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
+        if value.is_neg():
+            return f"{text} that is negated lazily (call resolve_neg)"
+        if not _is_stored(value):
+            n_bytes = value.untyped_storage().nbytes()
+            return f"{text} whose storage has only {n_bytes} bytes"
+        return text
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"a {value.dtype} array of shape {tuple(value.shape)}"
     if value is None or isinstance(value, (bool, int, float, str)):
