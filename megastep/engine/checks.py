@@ -13,6 +13,7 @@ from megastep.read_only import ReadOnlyTensor
 
 __all__ = [
     "address",
+    "alike",
     "device",
     "flag",
     "floats",
@@ -20,12 +21,16 @@ __all__ = [
     "integer",
     "integers",
     "items",
+    "lanes",
     "length",
     "number",
     "ragged",
     "stored",
 ]
 
+_KINDS = dict(
+    integers=(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8), bools=(torch.bool,)
+)
 LIMIT = 1e9  # of numbers that kernels compute with: a product of four still fits into float32
 
 
@@ -213,6 +218,37 @@ def stored(name: str, tensor: torch.Tensor) -> torch.Tensor:
     return tensor
 
 
+def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
+    """Returns ``value``. TypeError or ValueError unless it is a tensor of the shape and dtype of
+    ``like``, on its device. Does not synchronise.
+    """
+    fits = isinstance(value, torch.Tensor) and value.shape == like.shape
+    if not fits or value.dtype != like.dtype or value.device != like.device or not _is_stored(value):
+        raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
+            f"{name} must be a {like.dtype} tensor of shape {tuple(like.shape)} on {like.device}, "
+            f"but {_described(value)} was given"
+        )
+    return value
+
+
+def lanes(
+    name: str, value: Any, n_lanes: int, device: torch.device, kind: str = "integers"
+) -> torch.Tensor:
+    """Returns ``value``. TypeError or ValueError unless it is a tensor with one number per lane, in
+    any shape, on ``device``. Does not synchronise.
+
+    Args:
+        kind: ``"integers"`` or ``"bools"``.
+    """
+    fits = isinstance(value, torch.Tensor) and value.numel() == n_lanes and value.device == device
+    if not fits or value.dtype not in _KINDS[kind] or not _is_stored(value):
+        raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
+            f"{name} must be a tensor of {kind}, one for each of the {n_lanes} lanes, on {device}, "
+            f"but {_described(value)} was given"
+        )
+    return value
+
+
 def _sizes(shape):
     return ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
 
@@ -221,9 +257,12 @@ def _is_stored(tensor):
     """Returns True if a tensor has memory and lies inside its storage."""
     if tensor.layout is not torch.strided:
         return False
-    last = sum((size - 1) * stride for size, stride in zip(tensor.shape, tensor.stride()))
-    end = tensor.storage_offset() + last + 1 if tensor.numel() else 0
-    return end * tensor.itemsize <= tensor.untyped_storage().nbytes()
+    if tensor.is_contiguous():
+        n = tensor.numel()
+    else:
+        n = 1 + sum((size - 1) * stride for size, stride in zip(tensor.shape, tensor.stride()))
+    n_bytes = (tensor.storage_offset() + n) * tensor.itemsize
+    return n_bytes <= tensor.untyped_storage().nbytes() or not tensor.numel()
 
 
 def _described(value):

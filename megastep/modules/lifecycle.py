@@ -8,6 +8,7 @@ import torch
 from megastep import engine
 from megastep.arrdict import arrdict
 from megastep.core import Core
+from megastep.engine import checks
 
 ENDLESS = 2**31 - 1  # steps; the largest int32, which ages and limits are
 
@@ -34,6 +35,7 @@ class CounterGenerator:
 
         Returns (B, 4) float32. The other lanes keep the numbers of their last draw.
         """
+        checks.lanes("mask", mask, len(self.counts), self.counts.device, "bools")
         return engine.uniform(self.counts, mask.reshape(-1), self.seed, self.values)
 
 
@@ -135,7 +137,13 @@ class Lifecycle:
             reset: (B,) bool, lanes that begin an episode in this step.
             terminal: (B,) bool, lanes whose episode ends by the environment's own rule. Ignored
                 where ``reset`` is True; takes precedence over the time limit.
+
+        Raises:
+            TypeError, ValueError: naming the mask that does not fit.
         """
+        checks.alike("reset", reset, self.ended)
+        if terminal is not None:
+            checks.alike("terminal", terminal, self.ended)
         if self.lifespans is not None:
             self.lifespans.draw(reset, self.limits)
         self.ages.add_(1).masked_fill_(reset, 0)

@@ -9,6 +9,7 @@ import torch
 
 from megastep import engine, spaces
 from megastep.core import Core
+from megastep.engine import checks
 from megastep.modules.lanes import to_agents
 
 # The direction in the agent's frame (forward, left) and the turn of each action:
@@ -55,7 +56,10 @@ class _Movement:
 
         Returns the :class:`~megastep.engine.Physics` of the step.
         """
-        actions = to_agents(decision["actions"], self.core.n_agents).long().contiguous()
+        n_agents, device = self.core.n_agents, self.core.device
+        n_lanes = self.core.n_envs * n_agents
+        actions = checks.lanes("actions", decision["actions"], n_lanes, device)
+        actions = to_agents(actions, n_agents).long().contiguous()
         return engine.physics(
             self.core.scenery, self.core.agents, actions, self.moves, self.damping
         )
