@@ -37,7 +37,8 @@ LIMIT = 1e9  # of numbers that kernels compute with: a product of four still fit
 def integer(name: str, value: Any, min: int, max: float = math.inf) -> int:
     """Returns ``value`` as an int. ValueError unless it is an integer from ``min`` to ``max``."""
     try:
-        number = None if isinstance(value, bool) else operator.index(value)
+        unusable = isinstance(value, torch.Tensor) and not _is_stored(value)
+        number = None if unusable or isinstance(value, bool) else operator.index(value)
     except (TypeError, RuntimeError, ValueError):
         number = None
     if number is None or not min <= number <= max:
@@ -223,7 +224,12 @@ def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
     ``like``, on its device. Does not synchronise.
     """
     fits = isinstance(value, torch.Tensor) and value.shape == like.shape
-    if not fits or value.dtype != like.dtype or value.device != like.device or not _is_stored(value):
+    if (
+        not fits
+        or value.dtype != like.dtype
+        or value.device != like.device
+        or not _is_stored(value)
+    ):
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
             f"{name} must be a {like.dtype} tensor of shape {tuple(like.shape)} on {like.device}, "
             f"but {_described(value)} was given"

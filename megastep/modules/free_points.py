@@ -44,7 +44,8 @@ class FreePoints:
         per_env = core.n_agents if per_env is None else per_env
         self.core, self.per_env = core, checks.integer("per_env", per_env, 1)
         n_points = checks.integer("n_points", n_points, 1, MAX_SPAWNS)
-        seed = (core.seed if seed is None else seed) + (4 << 32)  # differs from the spawns' seed
+        seed = core.seed if seed is None else checks.integer("seed", seed, 0)
+        seed = seed + (4 << 32)  # differs from the spawns' seed
         geometries = geometries[: len(core.scenery.layouts)]
         points = cached_points(geometries, n_points, 1, core.agents.radius, seed)
         self.points = torch.as_tensor(points, device=core.device)

@@ -3,6 +3,7 @@
 Axes: N environments, A agents, B = N A lanes.
 """
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -75,6 +76,8 @@ class SimpleMovement(_Movement):
     """
 
     def __init__(self, core: Core, speed: float = 10.0, ang_speed: float = 180.0):
+        speed = checks.number("speed", speed, -math.inf, math.inf)
+        ang_speed = checks.number("ang_speed", ang_speed, -math.inf, math.inf)
         super().__init__(core, speed, ang_speed, damping=1.0)
 
 
@@ -91,4 +94,7 @@ class MomentumMovement(_Movement):
     def __init__(
         self, core: Core, accel: float = 5.0, ang_accel: float = 180.0, decay: float = 0.125
     ):
+        accel = checks.number("accel", accel, -math.inf, math.inf)
+        ang_accel = checks.number("ang_accel", ang_accel, -math.inf, math.inf)
+        decay = checks.number("decay", decay, -math.inf, math.inf)
         super().__init__(core, accel / core.fps, ang_accel / core.fps, damping=decay)

@@ -140,8 +140,10 @@ class RandomSpawns:
             raise ValueError(
                 f"n_spawns={n_spawns} is less than one point for each of the {core.n_agents} agents"
             )
-        self.core, self.resample, self.hidden = core, resample, hidden
-        self.seed = core.seed if seed is None else seed
+        self.core = core
+        self.resample = checks.flag("resample", resample)
+        self.hidden = checks.flag("hidden", hidden)
+        self.seed = core.seed if seed is None else checks.integer("seed", seed, 0)
         if points is None:
             geometries = geometries[: len(core.scenery.layouts)]
             points = cached_points(

@@ -450,7 +450,9 @@ def constructors(f):
         cell=1.0,
         device=f.device,
     )
-    each = dict.fromkeys(("points", "origins", "spawns", "lengths", "allowed", "fields"), arrays_by_layout)
+    each = dict.fromkeys(
+        ("points", "origins", "spawns", "lengths", "allowed", "fields"), arrays_by_layout
+    )
     yield GoalFields, right, dict(each, cell=numbers(0, -1), device=device)
     yield engine.set_threads, dict(n=None), dict(n=lambda good: [*integers(1, 10**6 - 1)(1)][1:])
     yield f.scenery.env, dict(e=0), dict(e=integers(-N, N - 1))

@@ -360,3 +360,23 @@ def test_wrong_actions_are_named(name):
         with pytest.raises((TypeError, ValueError), match="^actions must be .* was given"):
             env.step(dict(actions=wrong))
     env.step(dict(actions=right))
+
+
+@pytest.mark.parametrize(
+    "make, name",
+    [
+        (modules.Lifecycle, "limit"),
+        (modules.RandomLifespans, "longest"),
+        (modules.SimpleMovement, "speed"),
+        (modules.MomentumMovement, "accel"),
+        (modules.Depth, "subsample"),
+        (lambda c, **options: modules.RandomSpawns([toys.box()], c, **options), "seed"),
+    ],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+def test_wrong_settings_of_modules_are_named(make, name):
+    without_memory = torch.ones(1, dtype=torch.int64)
+    without_memory.untyped_storage().resize_(0)  # PyTorch crashes where it is read
+    for wrong in ("text", math.nan, [1], without_memory):
+        with pytest.raises(ValueError, match=f"^{name} must be .* was given"):
+            make(core_of([toys.box()]), **{name: wrong})

@@ -114,4 +114,3 @@ class GoalFields:
         """
         checks.address("goals.points", self.points, self.points.shape, torch.float32, self.device)
         return {name: tensor.data_ptr() for name, tensor in self._tensors.items()}
-
