@@ -112,7 +112,7 @@ def check_flag(error_flag: torch.Tensor) -> None:
     Args:
         error_flag: (1,) int32, cleared by this call.
     """
-    flag = int(error_flag)
+    flag = error_flag.item()
     if flag:
         error_flag.zero_()
         env, kind = divmod(flag, ENGINE.constants["ERROR_KINDS"])
@@ -126,5 +126,5 @@ def check_on_cpu(agents: Agents) -> None:
 
 def check_flag_on_cpu(error_flag: torch.Tensor) -> None:
     """Does what :func:`check_flag` does if the flag is on the CPU, where nothing synchronises."""
-    if error_flag.device.type == "cpu":
+    if error_flag.is_cpu:
         check_flag(error_flag)

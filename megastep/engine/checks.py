@@ -28,23 +28,27 @@ __all__ = [
     "stored",
 ]
 
-_KINDS = dict(
-    integers=(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8), bools=(torch.bool,)
-)
+_INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 LIMIT = 1e9  # of numbers that kernels compute with: a product of four still fits into float32
 
 
 def integer(name: str, value: Any, min: int, max: float = math.inf) -> int:
     """Returns ``value`` as an int. ValueError unless it is an integer from ``min`` to ``max``."""
-    try:
-        unusable = isinstance(value, torch.Tensor) and not _is_stored(value)
-        number = None if unusable or isinstance(value, bool) else operator.index(value)
-    except (TypeError, RuntimeError, ValueError):
-        number = None
+    number = value if type(value) is int else _index(value)
     if number is None or not min <= number <= max:
         range_ = f"from {min} to {max}" if max < math.inf else f"of at least {min}"
         raise ValueError(f"{name} must be an integer {range_}, but {_described(value)} was given")
     return number
+
+
+def _index(value):
+    """Returns a value as an int, or None if it is none."""
+    if isinstance(value, bool) or isinstance(value, torch.Tensor) and not _is_stored(value):
+        return None
+    try:
+        return operator.index(value)
+    except (TypeError, RuntimeError, ValueError):
+        return None
 
 
 def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: str = "") -> float:
@@ -197,7 +201,7 @@ def address(
             and value.shape == shape
             and value.is_contiguous()
             and not value.is_neg()
-            and value.nbytes + value.storage_offset() * value.itemsize
+            and value.storage_offset() * value.itemsize + value.nbytes
             <= value.untyped_storage().nbytes()
         )
     except (AttributeError, RuntimeError):  # no tensor, or one without memory such as a sparse one
@@ -237,20 +241,15 @@ def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
     return value
 
 
-def lanes(
-    name: str, value: Any, n_lanes: int, device: torch.device, kind: str = "integers"
-) -> torch.Tensor:
-    """Returns ``value``. TypeError or ValueError unless it is a tensor with one number per lane, in
-    any shape, on ``device``. Does not synchronise.
-
-    Args:
-        kind: ``"integers"`` or ``"bools"``.
+def lanes(name: str, value: Any, n_lanes: int, device: torch.device) -> torch.Tensor:
+    """Returns ``value``. TypeError or ValueError unless it is a tensor on ``device``, of any shape,
+    with one integer per lane. Does not synchronise.
     """
     fits = isinstance(value, torch.Tensor) and value.numel() == n_lanes and value.device == device
-    if not fits or value.dtype not in _KINDS[kind] or not _is_stored(value):
+    if not fits or value.dtype not in _INTEGERS or not _is_stored(value):
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
-            f"{name} must be a tensor of {kind}, one for each of the {n_lanes} lanes, on {device}, "
-            f"but {_described(value)} was given"
+            f"{name} must be a tensor of integers, one for each of the {n_lanes} lanes, on "
+            f"{device}, but {_described(value)} was given"
         )
     return value
 

@@ -110,18 +110,44 @@ _STATE = dict(
 )
 
 
+class _Checked:
+    """The agents' tensors that were last checked for a scenery: {name: (tensor, memory)}.
+
+    Has no ``__dict__``, as :class:`_Packed`.
+    """
+
+    __slots__ = ("scenery", "tensors")
+
+    def __init__(self, scenery):
+        self.scenery, self.tensors = scenery, {}
+
+
 def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int]:
     """Returns {name: address} of the agents' tensors ``names``.
+
+    Each is checked only if it is another one than in the last call, or has moved or changed size.
 
     Raises:
         TypeError, ValueError: naming the first tensor that does not fit the scenery.
     """
-    lanes, device, tensors = (scenery.n_envs, scenery.n_agents), scenery.device, vars(agents)
+    tensors = vars(agents)
+    checked = tensors.get("_checked")
+    if checked is None or checked.scenery is not scenery:
+        checked = tensors["_checked"] = _Checked(scenery)
     addresses = {}
     for name in names:
-        title, axes = _STATE[name]
-        addresses[name] = checks.address(title, tensors[name], lanes + axes, torch.float32, device)
+        tensor, last = tensors[name], checked.tensors.get(name)
+        if last is None or tensor is not last[0] or _memory(tensor) != last[1]:
+            title, axes = _STATE[name]
+            shape = (scenery.n_envs, scenery.n_agents, *axes)
+            checks.address(title, tensor, shape, torch.float32, scenery.device)
+            last = checked.tensors[name] = tensor, _memory(tensor)
+        addresses[name] = last[1][0]
     return addresses
+
+
+def _memory(tensor):
+    return tensor.data_ptr(), tensor.nbytes, tensor.untyped_storage().nbytes()
 
 
 def error_flag_address(scenery: Scenery, agents: Agents) -> int:

@@ -157,7 +157,7 @@ class RandomSpawns:
 
     def __call__(self, reset: torch.Tensor) -> None:
         """Respawns the agents where ``reset``, (N, A) or (B,) bool, is True."""
-        checks.lanes("reset", reset, self.counts.numel(), self.counts.device, "bools")
+        checks.length("reset", reset)
         engine.spawn(
             self.core.scenery,
             self.core.agents,

@@ -122,7 +122,7 @@ def test_lifecycle_state_is_a_copy_of_one_environment():
 
 @pytest.mark.parametrize("limit", [0, -1, 2**31])
 def test_limit_out_of_range_is_refused(limit):
-    with pytest.raises(ValueError, match=f"limit .*from 1 to 2147483647 .*{limit}"):
+    with pytest.raises(ValueError, match=f"limit .*from 1 to 2147483647, .*{limit}"):
         modules.Lifecycle(core_of([toys.box()]), limit)
 
 
@@ -339,15 +339,15 @@ def test_wrong_masks_are_named(wrong):
     c = core.Core(scene.scenery([toys.box()], 1, 4, device="cpu"))
     lifecycle, right = modules.Lifecycle(c, 9), torch.zeros(4, dtype=torch.bool)
     spawner = modules.RandomSpawns([toys.box()], c)
-    calls = dict(
-        reset=(lambda: lifecycle(wrong), lambda: spawner(wrong)),
-        terminal=(lambda: lifecycle(right, wrong),),
-        mask=(lambda: modules.CounterGenerator(4, 1, "cpu")(wrong),),
-    )
-    for name, attempts in calls.items():
-        for attempt in attempts:
-            with pytest.raises((TypeError, ValueError), match=f"^{name} must be .* was given"):
-                attempt()
+    calls = [
+        ("reset", lambda: lifecycle(wrong)),
+        ("terminal", lambda: lifecycle(right, wrong)),
+        ("(mask|reset)", lambda: spawner(wrong)),
+        ("mask", lambda: modules.CounterGenerator(4, 1, "cpu")(wrong)),
+    ]
+    for name, call in calls:
+        with pytest.raises((TypeError, ValueError), match=f"^{name} must be .* was given"):
+            call()
     assert not lifecycle.ages.any(), "a refused step is not counted"
 
 
