@@ -486,8 +486,6 @@ BUFFERS = {
     "yaws": lambda f: f.agents.yaws,
     "ray_lengths": lambda f: f.agents.ray_lengths,
     "error_flag": lambda f: f.agents.error_flag,
-    "positions": lambda f: f.agents.positions,
-    "angles": lambda f: f.agents.angles,
 }
 
 
