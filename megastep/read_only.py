@@ -13,7 +13,7 @@ _WRITING = ("__setitem__", "__delitem__", "__set__", "__delete__")
 
 class ReadOnlyTensor(torch.Tensor):
     """A tensor that cannot be written, nor can its views. Results of operations are plain tensors;
-    ``numpy()`` returns a read-only array.
+    ``numpy()`` returns a read-only array, ``untyped_storage()`` a copy.
 
     Args:
         tensor: the tensor to protect.
@@ -47,6 +47,8 @@ class ReadOnlyTensor(torch.Tensor):
         out = function(*tree_map_only(cls, plain, args), **tree_map_only(cls, plain, kwargs))
         if isinstance(out, np.ndarray):
             out.setflags(write=False)
+        if isinstance(out, (torch.UntypedStorage, torch.TypedStorage)):
+            return out.clone()
         return out if isinstance(out, torch.Size) else tree_map_only(torch.Tensor, guarded, out)
 
     def set_(self, *args, **kwargs):  # the one method that skips __torch_function__

@@ -25,8 +25,8 @@ SIMULATOR = (
     ("envs",),
 )
 ENGINE = (
-    ("checks", "devices", "outputs", "state_tree", "views"),
-    ("agents", "scenery"),
+    ("checks", "outputs", "state_tree", "views"),
+    ("agents", "devices", "scenery"),
     ("launch_params",),
     ("lighting", "movement", "spawning", "texels"),
     ("rendering",),

@@ -18,7 +18,7 @@ from megastep.agents.imports import known_name
 from megastep.agents.networks import cores, encoders, heads
 from megastep.agents.networks.critic import Critic
 from megastep.arrdict import arrdict
-from megastep.dotdict import mapping
+from megastep.dotdict import leaves, mapping
 from megastep.settings import checked
 from megastep.types import Space, Tree
 
@@ -122,7 +122,17 @@ class Policy(nn.Module):
 
         Returns:
             arrdict(actions, logits, logprobs (B,), features (B, width)) and the next hidden state.
+
+        Raises:
+            ValueError: if `obs`, `reset` and `state` are not of equally many lanes.
         """
+        n_lanes = len(world["reset"])
+        for name, tree in (("world.obs", world["obs"]), ("state", state)):
+            for leaf in leaves(tree):
+                if len(leaf) != n_lanes:
+                    raise ValueError(
+                        f"{name} is of {len(leaf)} lanes, but world.reset is of {n_lanes}"
+                    )
         out = self.unroll(mapping(torch.unsqueeze)(world["obs"], 0), world["reset"][None], state)
         logits = mapping(torch.squeeze)(out["logits"], 0)
         if sample:

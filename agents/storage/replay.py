@@ -117,7 +117,15 @@ class ReplayBuffer:
             is_finite: () bool. If false, no sequence with a row of this rollout is drawn, and its
                 rows are stored as zeros, since `sample` returns some of them while nothing can be
                 drawn.
+
+        Raises:
+            ValueError: if the rollout has another number of steps or lanes than the buffer's.
         """
+        if (rollout.n_steps, rollout.n_lanes) != (self.n_steps, self.n_lanes):
+            raise ValueError(
+                f"rollout must have {self.n_steps} steps of {self.n_lanes} lanes as the buffer's, "
+                f"but it has {rollout.n_steps} of {rollout.n_lanes}"
+            )
         is_finite = torch.ones_like(self.is_finite[:1]) & is_finite
         steps = torch.arange(self.n_steps, device=self.n_added.device)
         lanes = torch.arange(self.n_lanes, device=self.n_added.device)
@@ -185,6 +193,11 @@ class ReplayBuffer:
         Non-finite values change nothing. Does nothing if alpha is 0, or until `is_ready`, because
         nothing is learned from earlier samples.
         """
+        if index.shape != values.shape:
+            raise ValueError(
+                f"values must have one priority for each index, so shape {tuple(index.shape)}, but "
+                f"it is {tuple(values.shape)}"
+            )
         if self.settings.alpha == 0:
             return
         old = self.tree.priorities.index_select(0, index)

@@ -57,7 +57,15 @@ class SumTree:
         Args:
             index: (M,) int64. If an index occurs several times, its largest value is stored.
             values: (M,), finite and at least 0.
+
+        Raises:
+            ValueError: if index and values are not of one shape (M,).
         """
+        if index.ndim != 1 or index.shape != values.shape:
+            raise ValueError(
+                f"index and values must have one shape (M,), but index is {tuple(index.shape)} and "
+                f"values is {tuple(values.shape)}"
+            )
         values = values.to(torch.float64)
         self.priorities.scatter_reduce_(0, index, values, "amax", include_self=False)
         for lower, upper in itertools.pairwise(self.levels):
@@ -74,6 +82,8 @@ class SumTree:
         Sampling is stratified: one index from each of n equal parts of the total. An index of
         priority 0 is never drawn; only if all are 0, the result is index 0.
         """
+        if n < 1:
+            raise ValueError(f"n must be at least 1 index to draw, but {n} was given")
         top = self.levels[-1]
         share = torch.rand(n, generator=generator, dtype=torch.float64, device=top.device)
         rest = (share + torch.arange(n, device=top.device)) / n * self.total

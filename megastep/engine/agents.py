@@ -102,7 +102,8 @@ def check(agents: Agents) -> None:
         EngineError: naming an environment with a non-finite position, angle or velocity, or with an
             action, layout or goal that does not exist.
     """
-    check_flag(checks.instance("agents", agents, Agents).error_flag)
+    flag = checks.instance("agents", agents, Agents).error_flag
+    check_flag(checks.stored("agents.error_flag", flag))
 
 
 def check_flag(error_flag: torch.Tensor) -> None:
@@ -111,7 +112,7 @@ def check_flag(error_flag: torch.Tensor) -> None:
     Args:
         error_flag: (1,) int32, cleared by this call.
     """
-    flag = int(error_flag)
+    flag = error_flag.item()
     if flag:
         error_flag.zero_()
         env, kind = divmod(flag, ENGINE.constants["ERROR_KINDS"])
@@ -125,5 +126,5 @@ def check_on_cpu(agents: Agents) -> None:
 
 def check_flag_on_cpu(error_flag: torch.Tensor) -> None:
     """Does what :func:`check_flag` does if the flag is on the CPU, where nothing synchronises."""
-    if error_flag.device.type == "cpu":
+    if error_flag.is_cpu:
         check_flag(error_flag)

@@ -13,6 +13,7 @@ from megastep.read_only import ReadOnlyTensor
 
 __all__ = [
     "address",
+    "alike",
     "device",
     "flag",
     "floats",
@@ -20,24 +21,34 @@ __all__ = [
     "integer",
     "integers",
     "items",
+    "lanes",
     "length",
     "number",
     "ragged",
+    "stored",
 ]
 
+_INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 LIMIT = 1e9  # of numbers that kernels compute with: a product of four still fits into float32
 
 
 def integer(name: str, value: Any, min: int, max: float = math.inf) -> int:
     """Returns ``value`` as an int. ValueError unless it is an integer from ``min`` to ``max``."""
-    try:
-        number = None if isinstance(value, bool) else operator.index(value)
-    except (TypeError, RuntimeError, ValueError):
-        number = None
+    number = value if type(value) is int else _index(value)
     if number is None or not min <= number <= max:
         range_ = f"from {min} to {max}" if max < math.inf else f"of at least {min}"
         raise ValueError(f"{name} must be an integer {range_}, but {_described(value)} was given")
     return number
+
+
+def _index(value):
+    """Returns a value as an int, or None if it is none."""
+    if isinstance(value, bool) or isinstance(value, torch.Tensor) and not _is_stored(value):
+        return None
+    try:
+        return operator.index(value)
+    except (TypeError, RuntimeError, ValueError):
+        return None
 
 
 def number(name: str, value: Any, min: float, max: float, unit: str = "", hint: str = "") -> float:
@@ -97,8 +108,9 @@ def floats(name: str, value: Any, shape: Sequence, device: Any) -> torch.Tensor:
     """
     try:
         tensor = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
-        tensor = tensor.clone() if isinstance(tensor, ReadOnlyTensor) else tensor
-        tensor = None if tensor.is_complex() else tensor.to(device=device, dtype=torch.float32)
+        usable = _is_stored(tensor) and not tensor.is_complex()
+        tensor = tensor.clone() if usable and isinstance(tensor, ReadOnlyTensor) else tensor
+        tensor = tensor.resolve_neg().to(device=device, dtype=torch.float32) if usable else None
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         tensor = None
     if tensor is None or not _fits(tensor, shape):
@@ -125,10 +137,10 @@ def integers(
         ValueError: unless all are integers from ``min`` to ``max``.
     """
     try:
-        tensor = torch.as_tensor(value).detach().clone()
-        tensor = tensor.to(torch.int64) if not tensor.numel() else tensor
+        tensor = torch.as_tensor(value).detach()
         real = tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool
-        tensor = None if real else tensor.to(device=device, dtype=torch.int64)
+        usable = _is_stored(tensor) and not (real and tensor.numel())
+        tensor = tensor.clone().to(device=device, dtype=torch.int64) if usable else None
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         tensor = None
     if tensor is None or not _fits(tensor, (size,)):
@@ -179,15 +191,22 @@ def address(
 
     Raises:
         TypeError: unless it is a tensor.
-        ValueError: unless it is contiguous, on ``device``, and of that shape and dtype.
+        ValueError: unless it is contiguous, on ``device``, of that shape and dtype, and inside its
+            storage, which may have been resized.
     """
-    if (
-        not isinstance(value, torch.Tensor)
-        or value.dtype != dtype
-        or value.device != device
-        or value.shape != shape
-        or not value.is_contiguous()
-    ):
+    try:
+        fits = (
+            value.dtype is dtype
+            and value.device == device
+            and value.shape == shape
+            and value.is_contiguous()
+            and not value.is_neg()
+            and value.storage_offset() * value.itemsize + value.nbytes
+            <= value.untyped_storage().nbytes()
+        )
+    except (AttributeError, RuntimeError):  # no tensor, or one without memory such as a sparse one
+        fits = False
+    if not fits:
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
             f"{name} must be a contiguous {dtype} tensor of shape {tuple(shape)} on {device}, but "
             f"{_described(value)} was given"
@@ -195,15 +214,75 @@ def address(
     return value.data_ptr()
 
 
+def stored(name: str, tensor: torch.Tensor) -> torch.Tensor:
+    """Returns ``tensor``. ValueError unless it lies inside its storage: most functions of PyTorch
+    crash the interpreter if the storage was resized.
+    """
+    if not _is_stored(tensor):
+        raise ValueError(f"{name} must lie inside its storage, but is {_described(tensor)}")
+    return tensor
+
+
+def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
+    """Returns ``value``. TypeError or ValueError unless it is a tensor of the shape and dtype of
+    ``like``, on its device. Does not synchronise.
+    """
+    fits = isinstance(value, torch.Tensor) and value.shape == like.shape
+    if (
+        not fits
+        or value.dtype != like.dtype
+        or value.device != like.device
+        or not _is_stored(value)
+    ):
+        raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
+            f"{name} must be a {like.dtype} tensor of shape {tuple(like.shape)} on {like.device}, "
+            f"but {_described(value)} was given"
+        )
+    return value
+
+
+def lanes(name: str, value: Any, n_lanes: int, device: torch.device) -> torch.Tensor:
+    """Returns ``value``. TypeError or ValueError unless it is a tensor on ``device``, of any shape,
+    with one integer per lane. Does not synchronise.
+    """
+    fits = isinstance(value, torch.Tensor) and value.numel() == n_lanes and value.device == device
+    if not fits or value.dtype not in _INTEGERS or not _is_stored(value):
+        raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
+            f"{name} must be a tensor of integers, one for each of the {n_lanes} lanes, on "
+            f"{device}, but {_described(value)} was given"
+        )
+    return value
+
+
 def _sizes(shape):
     return ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
+
+
+def _is_stored(tensor):
+    """Returns True if a tensor has memory and lies inside its storage."""
+    if tensor.layout is not torch.strided:
+        return False
+    if tensor.is_contiguous():
+        n = tensor.numel()
+    else:
+        n = 1 + sum((size - 1) * stride for size, stride in zip(tensor.shape, tensor.stride()))
+    n_bytes = (tensor.storage_offset() + n) * tensor.itemsize
+    return n_bytes <= tensor.untyped_storage().nbytes() or not tensor.numel()
 
 
 def _described(value):
     """Describes a value in a few words."""
     if isinstance(value, torch.Tensor):
+        if value.layout is not torch.strided:
+            return f"a {value.layout} tensor"
         layout = "" if value.is_contiguous() else "non-contiguous "
-        return f"a {layout}{value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
+        text = f"a {layout}{value.dtype} tensor of shape {tuple(value.shape)} on {value.device}"
+        if value.is_neg():
+            return f"{text} that is negated lazily (call resolve_neg)"
+        if not _is_stored(value):
+            n_bytes = value.untyped_storage().nbytes()
+            return f"{text} whose storage has only {n_bytes} bytes"
+        return text
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"a {value.dtype} array of shape {tuple(value.shape)}"
     if value is None or isinstance(value, (bool, int, float, str)):

@@ -1,13 +1,17 @@
 """Devices by name, their free memory, and the number of CPU threads."""
 
+import os
 from typing import Any
 
 import torch
 
+from megastep.engine import checks
 from megastep.kernels.build.compile import EngineError
 
 __all__ = ["device", "fit", "free_memory", "set_threads", "threads"]
 
+#: GNU OpenMP ends the process if it cannot start as many as it is asked for.
+MAX_THREADS = max(1024, os.cpu_count() or 1)
 _n_threads = None  # None: as many as PyTorch
 
 
@@ -52,9 +56,13 @@ def threads() -> int:
 
 
 def set_threads(n: int | None) -> None:
-    """Sets the number of CPU threads per operation; None means as many as PyTorch uses."""
+    """Sets the number of CPU threads per operation; None means as many as PyTorch uses.
+
+    Raises:
+        ValueError: unless it is from 1 to 1,024, or to the number of processors if that is more.
+    """
     global _n_threads
-    _n_threads = n
+    _n_threads = None if n is None else checks.integer("n", n, 1, MAX_THREADS)
 
 
 def fit(n: int, bytes_each: float, device: Any, what: str = "environments") -> None:

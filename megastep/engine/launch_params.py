@@ -1,7 +1,5 @@
 """The fields that many launches share: tensors' addresses, checked without synchronisation."""
 
-import operator
-
 import torch
 
 from megastep.engine import checks, devices
@@ -11,11 +9,11 @@ from megastep.kernels.build.launch import ENGINE
 
 __all__ = ["error_flag_address", "lanes_of", "scenery_params", "seed_params", "state_params"]
 
-_address, _shape = torch.Tensor.data_ptr, operator.attrgetter("shape")
+_address, _n_bytes = torch.Tensor.data_ptr, torch.Tensor.nbytes.__get__
 
 
 class _Packed:
-    """The packed SceneryParams of a scenery, and the addresses and sizes they were packed from.
+    """The packed SceneryParams of a scenery, and the addresses and bytes they were packed from.
 
     Has no ``__dict__``, so that :func:`~megastep.engine.state_tree.state_tree` does not look
     inside.
@@ -42,8 +40,8 @@ class _Packed:
 def scenery_params(scenery: Scenery, radius: float) -> bytes:
     """Returns the packed SceneryParams of a scenery.
 
-    Its tensors cannot be replaced, so they are checked only if the address or shape of one has
-    changed since the last call.
+    Its tensors cannot be replaced, so they are checked only if the address or size of one has
+    changed since the last call. A storage that is resized moves, so its address changes too.
 
     Raises:
         ValueError: naming the tensor that no longer fits.
@@ -52,7 +50,7 @@ def scenery_params(scenery: Scenery, radius: float) -> bytes:
     if packed is None:
         packed = vars(scenery)["_packed"] = _Packed(scenery)
     n_threads = devices.threads()
-    inputs = [*map(_address, packed.tensors), *map(_shape, packed.tensors), radius, n_threads]
+    inputs = [*map(_address, packed.tensors), *map(_n_bytes, packed.tensors), radius, n_threads]
     if packed.inputs != inputs:
         packed.params = _pack(scenery, radius, n_threads)
         packed.inputs = inputs
@@ -104,22 +102,52 @@ def _pack(scenery, radius, n_threads):
     )
 
 
-_STATE = {"positions": (2,), "angles": (), "velocity": (2,), "angvelocity": ()}
+_STATE = dict(
+    positions=("agents.positions", (2,)),
+    angles=("agents.angles", ()),
+    velocity=("agents.velocity", (2,)),
+    angvelocity=("agents.angvelocity", ()),
+)
+
+
+class _Checked:
+    """The agents' tensors that were last checked for a scenery: {name: (tensor, memory)}.
+
+    Has no ``__dict__``, as :class:`_Packed`.
+    """
+
+    __slots__ = ("scenery", "tensors")
+
+    def __init__(self, scenery):
+        self.scenery, self.tensors = scenery, {}
 
 
 def state_params(scenery: Scenery, agents: Agents, *names: str) -> dict[str, int]:
     """Returns {name: address} of the agents' tensors ``names``.
 
+    Each is checked only if it is another one than in the last call, or has moved or changed size.
+
     Raises:
         TypeError, ValueError: naming the first tensor that does not fit the scenery.
     """
-    lanes, device, tensors = (scenery.n_envs, scenery.n_agents), scenery.device, vars(agents)
-    return {
-        name: checks.address(
-            f"agents.{name}", tensors[name], lanes + _STATE[name], torch.float32, device
-        )
-        for name in names
-    }
+    tensors = vars(agents)
+    checked = tensors.get("_checked")
+    if checked is None or checked.scenery is not scenery:
+        checked = tensors["_checked"] = _Checked(scenery)
+    addresses = {}
+    for name in names:
+        tensor, last = tensors[name], checked.tensors.get(name)
+        if last is None or tensor is not last[0] or _memory(tensor) != last[1]:
+            title, axes = _STATE[name]
+            shape = (scenery.n_envs, scenery.n_agents, *axes)
+            checks.address(title, tensor, shape, torch.float32, scenery.device)
+            last = checked.tensors[name] = tensor, _memory(tensor)
+        addresses[name] = last[1][0]
+    return addresses
+
+
+def _memory(tensor):
+    return tensor.data_ptr(), tensor.nbytes, tensor.untyped_storage().nbytes()
 
 
 def error_flag_address(scenery: Scenery, agents: Agents) -> int:

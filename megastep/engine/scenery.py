@@ -209,15 +209,25 @@ class Scenery(SetOnce):
         self.agent_light = torch.ones((self.n_envs, n_texels), device=device)
         self.reach = float(model.norm(dim=-1).max()) if len(model) else 0.0
 
+    def _stored(self):
+        """Returns self. ValueError if the storage of a tensor that may be written was resized."""
+        for name in ("layout", "agent_lines", "agent_light"):
+            checks.stored(f"scenery.{name}", getattr(self, name))
+        for name in ("texels", "agent_textures"):
+            checks.stored(f"scenery.layouts.{name}", getattr(self.layouts, name))
+        for name in ("lines", "lights"):
+            checks.stored(f"scenery.layouts.{name}.vals", getattr(self.layouts, name).vals)
+        return self
+
     @property
     def lines(self) -> JoinedRagged:
         """The lines (l, 2, 2) of each environment, agents' first, as last rendered. Read-only."""
-        return views.lines(self)
+        return views.lines(self._stored())
 
     @property
     def lights(self) -> JoinedRagged:
         """The lights (l, 3) of each environment. Read-only."""
-        return views.lights(self)
+        return views.lights(self._stored())
 
     @property
     def textures(self) -> JoinedRagged:
@@ -225,12 +235,12 @@ class Scenery(SetOnce):
 
         Line l of environment e has the index ``lines.starts[e] + l``.
         """
-        return views.textures(self)
+        return views.textures(self._stored())
 
     @property
     def baked(self) -> JoinedRagged:
         """The light (w,) on each line of all environments, indexed as ``textures``. Read-only."""
-        return views.baked(self)
+        return views.baked(self._stored())
 
     def env(self, e: int) -> tuple[torch.Tensor, tuple[torch.Tensor, ...], torch.Tensor]:
         """Returns copies of one environment's lines, lit textures and lights.
@@ -241,7 +251,7 @@ class Scenery(SetOnce):
             (lines (l, 2, 2), one lit texture (w, 3) per line, lights (l, 3)), agents' lines first.
         """
         e = checks.integer("e", e, -self.n_envs, self.n_envs - 1)
-        layouts, d = self.layouts, int(self.layout[e])
+        layouts, d = self._stored().layouts, int(self.layout[e])
         lines = torch.cat([self.agent_lines[e], layouts.lines[d]])
         first, last = layouts.wall_starts[d : d + 2].tolist()
         bounds = layouts.texel_starts[first : last + 1].tolist()

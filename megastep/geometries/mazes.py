@@ -11,6 +11,8 @@ bottom.
 """
 
 import functools
+import math
+import numbers
 
 import numpy as np
 
@@ -34,8 +36,11 @@ def validate_lengths(size: int, corridor: float, thickness: float) -> tuple[int,
     Raises:
         ValueError: if the maze would be too small or too large, or a corridor too narrow.
     """
-    if size < 2:
-        raise ValueError(f"size={size}: a maze needs at least 2 x 2 cells")
+    if not isinstance(size, numbers.Integral) or size < 2:
+        raise ValueError(f"size={size!r}: a maze needs at least 2 x 2 cells")
+    for name, metres in dict(corridor=corridor, thickness=thickness).items():
+        if not isinstance(metres, numbers.Real) or not 0 <= metres < math.inf:
+            raise ValueError(f"{name}={metres!r} must be a length of at least 0 m")
     if corridor < MIN_CORRIDOR:
         raise ValueError(
             f"corridor={corridor:g} m is too narrow for an agent: take at least {MIN_CORRIDOR:g}"
@@ -163,8 +168,15 @@ def generate(
         corridor: width in metres, rounded to a millimetre.
         thickness: of the walls in metres, rounded to a millimetre.
         braid: fraction of the dead ends that is opened.
+
+    Raises:
+        ValueError: naming the argument that is out of range.
     """
+    if not isinstance(seed, numbers.Integral):
+        raise ValueError(f"seed={seed!r} must be an integer")
     wide, thick = validate_lengths(size, corridor, thickness)
+    if not isinstance(braid, numbers.Real) or not 0 <= braid <= 1:
+        raise ValueError(f"braid={braid!r} must be a fraction from 0 to 1")
     pitch = wide + thick
     opened = passages(size, braid, PortableGenerator(seed))
     grid = _paint(size, opened)

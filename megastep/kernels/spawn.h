@@ -38,7 +38,7 @@ HD int hidden_point(const SpawnParams& p, const Group& group, int env, int a, in
 }
 
 HD void place(const SpawnParams& p, int i, const float* at, float angle) {
-    p.counts[i]++;
+    p.counts[i] = (int)((unsigned int)p.counts[i] + 1u);  // wraps, as Philox's counter does
     p.positions[2 * i] = at[0];
     p.positions[2 * i + 1] = at[1];
     p.angles[i] = angle;

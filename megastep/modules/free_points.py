@@ -8,7 +8,7 @@ from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.engine import checks
 from megastep.modules.lifecycle import CounterGenerator
-from megastep.modules.spawning import cached_points
+from megastep.modules.spawning import MAX_SPAWNS, cached_points
 
 
 class FreePoints:
@@ -43,8 +43,9 @@ class FreePoints:
     ):
         per_env = core.n_agents if per_env is None else per_env
         self.core, self.per_env = core, checks.integer("per_env", per_env, 1)
-        n_points = checks.integer("n_points", n_points, 1)
-        seed = (core.seed if seed is None else seed) + (4 << 32)  # differs from the spawns' seed
+        n_points = checks.integer("n_points", n_points, 1, MAX_SPAWNS)
+        seed = core.seed if seed is None else checks.integer("seed", seed, 0)
+        seed = seed + (4 << 32)  # differs from the spawns' seed
         geometries = geometries[: len(core.scenery.layouts)]
         points = cached_points(geometries, n_points, 1, core.agents.radius, seed)
         self.points = torch.as_tensor(points, device=core.device)

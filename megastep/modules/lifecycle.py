@@ -8,6 +8,7 @@ import torch
 from megastep import engine
 from megastep.arrdict import arrdict
 from megastep.core import Core
+from megastep.engine import checks
 
 ENDLESS = 2**31 - 1  # steps; the largest int32, which ages and limits are
 
@@ -25,7 +26,8 @@ class CounterGenerator:
     """
 
     def __init__(self, n_lanes: int, seed: int, device: torch.device | str):
-        self.seed = seed
+        n_lanes = checks.integer("n_lanes", n_lanes, 0, ENDLESS)
+        self.seed = checks.integer("seed", seed, 0, 2**64 - 1)
         self.counts = torch.zeros(n_lanes, dtype=torch.int32, device=device)
         self.values = torch.zeros((n_lanes, 4), device=device)
 
@@ -34,6 +36,7 @@ class CounterGenerator:
 
         Returns (B, 4) float32. The other lanes keep the numbers of their last draw.
         """
+        checks.length("mask", mask)
         return engine.uniform(self.counts, mask.reshape(-1), self.seed, self.values)
 
 
@@ -66,13 +69,16 @@ class RandomLifespans:
     def __init__(
         self, core: Core, shortest: int = 128, longest: int = 256, seed: int | None = None
     ):
+        shortest = checks.integer("shortest", shortest, 0, ENDLESS)
+        longest = checks.integer("longest", longest, 0, ENDLESS)
         if not 0 < shortest <= longest:
             raise ValueError(
                 f"lifespans need 0 < shortest <= longest, but shortest={shortest} and "
                 f"longest={longest} were given"
             )
         self.shortest, self.longest = shortest, longest
-        seed = (core.seed if seed is None else seed) + (1 << 32)  # differs from the spawns' seed
+        seed = core.seed if seed is None else checks.integer("seed", seed, 0)
+        seed = seed + (1 << 32)  # differs from the spawns' seed
         self.random = CounterGenerator(core.n_envs * core.n_agents, seed, core.device)
 
     def draw(self, reset: torch.Tensor, limits: torch.Tensor) -> None:
@@ -99,10 +105,10 @@ class Lifecycle:
     """
 
     def __init__(self, core: Core, limit: int | RandomLifespans | None = None):
-        n_steps = ENDLESS if limit is None else limit
         self.lifespans = limit if isinstance(limit, RandomLifespans) else None
-        if self.lifespans is None and not 1 <= n_steps <= ENDLESS:
-            raise ValueError(f"limit must be from 1 to {ENDLESS} steps, but {limit} was given")
+        n_steps = ENDLESS
+        if limit is not None and self.lifespans is None:
+            n_steps = checks.integer("limit", limit, 1, ENDLESS)
         n_lanes, device = core.n_envs * core.n_agents, core.device
         self.n_agents, self.seed = core.n_agents, core.seed
         self.ages = torch.zeros(n_lanes, dtype=torch.int32, device=device)
@@ -135,7 +141,13 @@ class Lifecycle:
             reset: (B,) bool, lanes that begin an episode in this step.
             terminal: (B,) bool, lanes whose episode ends by the environment's own rule. Ignored
                 where ``reset`` is True; takes precedence over the time limit.
+
+        Raises:
+            TypeError, ValueError: naming the mask that does not fit.
         """
+        checks.alike("reset", reset, self.ended)
+        if terminal is not None:
+            checks.alike("terminal", terminal, self.ended)
         if self.lifespans is not None:
             self.lifespans.draw(reset, self.limits)
         self.ages.add_(1).masked_fill_(reset, 0)

@@ -3,12 +3,14 @@
 Axes: N environments, A agents, B = N A lanes.
 """
 
+import math
 from collections.abc import Mapping
 
 import torch
 
 from megastep import engine, spaces
 from megastep.core import Core
+from megastep.engine import checks
 from megastep.modules.lanes import to_agents
 
 # The direction in the agent's frame (forward, left) and the turn of each action:
@@ -55,7 +57,10 @@ class _Movement:
 
         Returns the :class:`~megastep.engine.Physics` of the step.
         """
-        actions = to_agents(decision["actions"], self.core.n_agents).long().contiguous()
+        n_agents, device = self.core.n_agents, self.core.device
+        n_lanes = self.core.n_envs * n_agents
+        actions = checks.lanes("actions", decision["actions"], n_lanes, device)
+        actions = to_agents(actions, n_agents).long().contiguous()
         return engine.physics(
             self.core.scenery, self.core.agents, actions, self.moves, self.damping
         )
@@ -71,6 +76,8 @@ class SimpleMovement(_Movement):
     """
 
     def __init__(self, core: Core, speed: float = 10.0, ang_speed: float = 180.0):
+        speed = checks.number("speed", speed, -math.inf, math.inf)
+        ang_speed = checks.number("ang_speed", ang_speed, -math.inf, math.inf)
         super().__init__(core, speed, ang_speed, damping=1.0)
 
 
@@ -87,4 +94,7 @@ class MomentumMovement(_Movement):
     def __init__(
         self, core: Core, accel: float = 5.0, ang_accel: float = 180.0, decay: float = 0.125
     ):
+        accel = checks.number("accel", accel, -math.inf, math.inf)
+        ang_accel = checks.number("ang_accel", ang_accel, -math.inf, math.inf)
+        decay = checks.number("decay", decay, -math.inf, math.inf)
         super().__init__(core, accel / core.fps, ang_accel / core.fps, damping=decay)

@@ -11,6 +11,7 @@ import torch
 
 from megastep import engine, plotting, spaces
 from megastep.core import Core
+from megastep.engine import checks
 from megastep.modules.movement import to_local
 
 
@@ -28,7 +29,7 @@ def downsample(screen: torch.Tensor, subsample: int) -> torch.Tensor:
         ValueError: if ``subsample`` does not divide R.
     """
     n_rays = screen.shape[-1]
-    if subsample < 1 or n_rays % subsample:
+    if n_rays % checks.integer("subsample", subsample, 1):
         raise ValueError(f"subsample={subsample} does not divide the {n_rays} rays of the screen")
     return screen.reshape(*screen.shape[:-1], screen.shape[-1] // subsample, subsample)
 

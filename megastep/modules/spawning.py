@@ -12,6 +12,7 @@ import torch
 from megastep import cache, engine
 from megastep.core import Core
 from megastep.dotdict import dotdict
+from megastep.engine import checks
 from megastep.geometry import centers, content_hash
 from megastep.modules.lanes import to_agents
 
@@ -19,18 +20,21 @@ CLEARANCE = 0.05  # metres between a spawned agent's disc and walls, or other sp
 PREFIX = "spawn-points-"  # of the files in the cache
 MAX_FILES = 64  # in the cache, half a megabyte each for 512 layouts
 MIN_CACHED = 32  # layouts; the search is quick for fewer
+MAX_SPAWNS = 1_000_000  # points per layout; four times as many are drawn at once
 BATCHES = 20  # of candidate points; then the search ends
 
 
 def distances(points, walls):
-    """Returns the metres, (P,) float64, from points (P, 2) to the nearest of walls (M, 2, 2)."""
+    """Returns the metres, (P,) float64, from points (P, 2) to the nearest of walls (M, 2, 2);
+    infinite without walls.
+    """
     (ax, ay), (vx, vy) = walls[:, 0].T, (walls[:, 1] - walls[:, 0]).T
     dx, dy = points[:, :1] - ax, points[:, 1:] - ay
     along = (dx * vx + dy * vy) / np.maximum(vx * vx + vy * vy, 1e-12)
     np.clip(along, 0, 1, out=along)
     dx -= along * vx
     dy -= along * vy
-    return np.sqrt((dx * dx + dy * dy).min(1))
+    return np.sqrt((dx * dx + dy * dy).min(1, initial=np.inf))
 
 
 def candidates(g, n, random):
@@ -131,12 +135,15 @@ class RandomSpawns:
         hidden: bool = False,
         points: torch.Tensor | None = None,
     ):
+        n_spawns = checks.integer("n_spawns", n_spawns, 1, MAX_SPAWNS)
         if n_spawns < core.n_agents:
             raise ValueError(
                 f"n_spawns={n_spawns} is less than one point for each of the {core.n_agents} agents"
             )
-        self.core, self.resample, self.hidden = core, resample, hidden
-        self.seed = core.seed if seed is None else seed
+        self.core = core
+        self.resample = checks.flag("resample", resample)
+        self.hidden = checks.flag("hidden", hidden)
+        self.seed = core.seed if seed is None else checks.integer("seed", seed, 0)
         if points is None:
             geometries = geometries[: len(core.scenery.layouts)]
             points = cached_points(
@@ -150,6 +157,7 @@ class RandomSpawns:
 
     def __call__(self, reset: torch.Tensor) -> None:
         """Respawns the agents where ``reset``, (N, A) or (B,) bool, is True."""
+        checks.length("reset", reset)
         engine.spawn(
             self.core.scenery,
             self.core.agents,

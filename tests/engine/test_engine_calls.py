@@ -215,6 +215,37 @@ def test_wrong_tensors_are_named(broken, description):
     cuda.render(core.scenery, core.agents)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda positions: positions.untyped_storage().resize_(0),
+        lambda positions: positions.untyped_storage().resize_(9),
+        lambda positions: positions.resize_(1, 1, 2),
+        lambda positions: setattr(positions, "data", positions.double()),
+    ],
+    ids=["no storage", "short storage", "shape", "dtype"],
+)
+def test_changed_memory_of_agents_is_named(change):
+    core = box("cpu")
+    cuda.render(core.scenery, core.agents)
+    change(core.agents.positions)
+    with pytest.raises(ValueError, match="agents.positions must be a contiguous torch.float32"):
+        cuda.render(core.scenery, core.agents)
+
+
+def test_agents_are_checked_for_each_scenery():
+    core, more = box("cpu"), scene.scenery(3 * [toys.box()], n_agents=1, device="cpu")
+    cuda.render(core.scenery, core.agents)
+    with pytest.raises(ValueError, match=r"agents.positions must be .* \(3, 1, 2\)"):
+        cuda.render(more, core.agents)
+
+
+@pytest.mark.parametrize("n", [-1, 0, 10**6, "2", 2.0])
+def test_wrong_numbers_of_threads_are_refused(n):
+    with pytest.raises(ValueError, match="n must be an integer from 1 to .* was given"):
+        engine.set_threads(n)
+
+
 def test_unknown_devices():
     with pytest.raises(engine.EngineError, match="device=tpu is unknown"):
         engine.device("tpu")

@@ -1,7 +1,10 @@
 """PointGoal's goals: how they are drawn and observed, and the cache of shortest paths."""
 
+import copy
 import math
 import re
+import resource
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,9 +12,9 @@ import pytest
 import torch
 from test_geodesics import room
 
-from megastep import core, engine, geometry, modules, scene, toys
+from megastep import core, engine, envs, geometry, modules, scene, toys
 from megastep.envs.pointgoal import goals as module
-from megastep.envs.pointgoal.geodesics import geodesics
+from megastep.envs.pointgoal.geodesics import geodesics, n_cells
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
@@ -337,3 +340,67 @@ def test_errors_name_the_geometry():
     boxes_[18]["masks"] = masks
     with pytest.raises(ValueError, match="geometry 18 has no point in a room"):
         all_of(boxes_)
+
+
+# ---- Homes that are too large, or have no walls ----
+
+
+def square_home(side, walls=True):
+    """A home of `side` x `side` metres from (1, 1), with an inner wall."""
+    a, b, middle = 1, 1 + side, 1 + side / 2
+    outline = [(a, a), (b, a), (b, b), (a, b)]
+    lines = [*zip(outline, outline[1:] + outline[:1]), ((middle, a), (middle, middle))]
+    lines = np.array(lines, np.float32) if walls else np.zeros((0, 2, 2), np.float32)
+    masks = geometry.masks(lines, [np.array(outline, float)] if walls else [])
+    masks = masks if walls else np.ones((40, 40), np.int16)
+    return toys.box() | dict(id=7, walls=lines, lights=np.array([[2.0, 2.0]]), masks=masks)
+
+
+def test_home_of_198_metres_takes_little_time_and_memory():
+    home = geometry.validate_geometry(square_home(198.0))
+    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    for env in (envs.Explorer, envs.Deathmatch):
+        env(4, [home], device="cpu").reset()
+    with pytest.raises(ValueError, match="^geometry 7 is 198 m x 198 m, but .* at most 10,000 m2"):
+        envs.PointGoal(4, [home], device="cpu")
+    assert time.process_time() - start < 5
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500 * 1024  # kB
+
+
+def test_largest_home_is_one_of_a_million_cells():
+    assert n_cells(square_home(99.7)) == 999**2
+    with pytest.raises(ValueError, match="geometry 7 is 100 m x 100 m"):
+        n_cells(square_home(100.0))
+
+
+def test_fields_that_do_not_fit_are_refused_before_they_are_computed(monkeypatch):
+    c = core.Core(scene.scenery(3 * [toys.box()], 1, 3, device="cpu"))
+    monkeypatch.setattr(module, "all_geodesics", None)
+    monkeypatch.setattr("megastep.engine.devices.free_memory", lambda device: 10**5)
+    with pytest.raises(engine.EngineError, match="3 layouts need .* at most 1 fit"):
+        goal_fields(3 * [toys.box()], c)
+
+
+def test_homes_without_walls(monkeypatch):
+    home = square_home(6.0, walls=False)
+    with pytest.raises(ValueError, match="^geometry 7 has no walls"):
+        envs.PointGoal(2, [home], device="cpu")
+    env = envs.Explorer(2, [home], device="cpu")
+    env.reset()
+    world = env.step(dict(actions=torch.full((2, 1), 3)))
+    assert not world.reward.any() and not world.metrics.coverage.any()
+
+
+def test_goal_fields_cannot_be_changed():
+    arguments = fields_of(np.random.default_rng(1))
+    goals = GoalFields(**arguments, cell=CELL)
+    for name in ("n_goals", "n_spawns", "points", "cell"):
+        with pytest.raises(AttributeError, match=f"{name} of GoalFields cannot be changed"):
+            setattr(goals, name, 1)
+    copied, core_ = copy.deepcopy(goals), boxes("cpu", 3)
+    index = torch.zeros((3, 1), dtype=torch.int32)
+    expected = step(core_, goals, index)[0].goal_obs
+    goals.points.untyped_storage().resize_(0)
+    with pytest.raises(ValueError, match="goals.points must be .* storage has only 0 bytes"):
+        step(core_, goals, index)
+    assert torch.equal(step(core_, copied, index)[0].goal_obs, expected)

@@ -346,3 +346,20 @@ def test_show_mazes_draws_every_maze():
     assert len(titles) == 12 and titles[0].startswith("maze 0, braid 0: ")
     assert all(": 0 dead ends" in title for title in titles[8:])
     matplotlib.pyplot.close(figure)
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("thickness", -1.0),
+        ("thickness", float("nan")),
+        ("corridor", float("inf")),
+        ("corridor", "wide"),
+        ("braid", 2.0),
+        ("size", 2.5),
+        ("seed", 1.5),
+    ],
+)
+def test_wrong_arguments_of_a_maze_are_named(name, value):
+    with pytest.raises(ValueError, match=f"^{name}={value!r}"):
+        mazes.generate(**{"seed": 1, name: value})

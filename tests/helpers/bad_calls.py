@@ -102,6 +102,24 @@ def wrong_tensors(good):
     yield "a column less", good[..., 1:].contiguous()
     yield "not contiguous", torch.stack([good, good], -1)[..., 0]
     yield "on another device", good.to("cpu" if good.device.type == "cuda" else "meta")
+    yield "sparse", good.to_sparse()
+    yield from unsound(good)
+
+
+def unsound(good):
+    """Tensors whose memory is not what their shape and dtype say."""
+    if good.numel():
+        yield "of an empty storage", in_storage(good.clone(), 0)
+        yield "of a short storage", in_storage(good.clone(), good.nbytes - 1)
+        yield "beyond its storage", in_storage(torch.cat([good, good])[len(good) :], good.nbytes)
+    if good.dtype != torch.bool:
+        yield "negated lazily", torch._neg_view(good)
+
+
+def in_storage(tensor, n_bytes):
+    """The tensor, after its storage was resized."""
+    tensor.untyped_storage().resize_(n_bytes)
+    return tensor
 
 
 def tensors(good):
@@ -126,10 +144,24 @@ def arrays(good):
     yield "a column less", good[..., 1:]
     yield "complex", good.to(torch.complex64)
     yield "meta", good.to("meta")
+    yield "sparse", good.to_sparse()
+    yield from (case for case in unsound(good) if case[0] != "negated lazily")
     if good.numel():
         yield "NaN", good * math.nan
         yield "infinite", good + math.inf
         yield "too large", good + 1e12
+
+
+def arrays_by_layout(good):
+    """Lists that do not hold one array per layout, or not one like `good`'s."""
+    array = good[0]
+    yield from [("None", None), ("a string", "text"), ("empty", []), ("of None", D * [None])]
+    yield from [("of strings", D * ["text"]), ("one more", [*good, array]), ("a number", 3.5)]
+    yield from [("of no rows", D * [array[:0]]), ("an axis more", D * [array[None]])]
+    if array.dtype == bool:
+        yield from [("of -1", D * [-array.astype(int)]), ("of False", D * [array & False])]
+    if array.dtype == float:
+        yield from [("NaN", D * [array * math.nan]), ("complex", D * [array * 1j])]
 
 
 def raggeds(good):
@@ -139,6 +171,9 @@ def raggeds(good):
     yield "NaN", Ragged(good.vals * math.nan, good.widths)
     yield "a subarray less", good[1:]
     yield "complex", Ragged(good.vals.to(torch.complex64), good.widths)
+    for label, vals in unsound(good.vals):
+        if label != "negated lazily":
+            yield label, Ragged(vals, good.widths)
 
 
 def integers(min, max=None):
@@ -184,6 +219,7 @@ def ids(good):
     yield from [("None", None), ("a string", "text"), ("floats", good.float()), ("2d", good[None])]
     yield from [("bools", good.bool()), ("negative", good - 9), ("too large", good + 10**6)]
     yield from [("none", good[:0]), ("huge", good.long() + 2**40)]
+    yield from (case for case in unsound(good) if case[0] != "negated lazily")
 
 
 # ---- The calls: function, right arguments, and the wrong values of each ----
@@ -404,11 +440,27 @@ def constructors(f):
             device=device,
         ),
     )  # fmt: skip
+    right = dict(
+        points=D * [np.ones((2, 2))],
+        fields=D * [np.ones((2, 3, 3), np.float16)],
+        origins=D * [np.ones(2)],
+        spawns=D * [np.ones((4, 2))],
+        lengths=D * [np.ones((4, 2))],
+        allowed=D * [np.ones((4, 2), bool)],
+        cell=1.0,
+        device=f.device,
+    )
+    each = dict.fromkeys(
+        ("points", "origins", "spawns", "lengths", "allowed", "fields"), arrays_by_layout
+    )
+    yield GoalFields, right, dict(each, cell=numbers(0, -1), device=device)
+    yield engine.set_threads, dict(n=None), dict(n=lambda good: [*integers(1, 10**6 - 1)(1)][1:])
     yield f.scenery.env, dict(e=0), dict(e=integers(-N, N - 1))
 
 
 # ---- Buffers that were replaced or resized before a call ----
 
+READ_ONLY = "model", "model_texels", "wall_starts", "texel_starts", "light_starts", "box_starts"
 CALLS = {
     "render": lambda f: engine.render(f.scenery, f.agents),
     "physics": lambda f: engine.physics(f.scenery, f.agents),
@@ -470,6 +522,7 @@ def _set(owner, name, value, call):
 
 def resizings(device):
     """(label, name, act): exchanges a buffer's memory between two calls."""
+    f = fixture(device)
 
     def between_calls(change):
         return lambda f: (CALLS["render"](f), change(f), CALLS["render"](f))
@@ -484,6 +537,11 @@ def resizings(device):
         yield f"{name}.data a row less", name, exchange(buffer, lambda t: t[1:].clone())
         yield f"{name}.data of float64", name, exchange(buffer, lambda t: t.clone().double())
         yield f"{name}.data empty", name, exchange(buffer, lambda t: t.new_empty(0))
+        resizable = buffer(f).untyped_storage().resizable()  # not if it is a NumPy array's
+        for n_bytes in (0, 3) if resizable else ():
+            shrink = lambda f, b=buffer, n=n_bytes: b(f).untyped_storage().resize_(n)  # noqa: E731
+            label = f"{name}, a storage of {n_bytes} bytes"
+            yield label, None if name in READ_ONLY else name, between_calls(shrink)
     for name in ("textures", "baked"):
         views = lambda f, name=name: getattr(f.layouts, name).vals  # noqa: E731
         yield f"{name}.vals.data elsewhere", name, exchange(views, torch.clone)

@@ -77,7 +77,7 @@ def test_points_follow_environments_to_other_homes():
 
 @pytest.mark.parametrize("name", ["n_points", "per_env"])
 def test_numbers_below_one_are_refused(name):
-    with pytest.raises(ValueError, match=f"{name} must be an integer of at least 1"):
+    with pytest.raises(ValueError, match=f"{name} must be an integer (of at least|from) 1"):
         modules.FreePoints([toys.box()], core_of([toys.box()], 1), **{name: 0})
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import core, dotdict, engine, modules, plotting, scene, toys
+from megastep import core, dotdict, engine, envs, modules, plotting, scene, toys
 from megastep.arrdict import numpyify
 from megastep.geometries import sample
 from megastep.modules import spawning
@@ -122,7 +122,7 @@ def test_lifecycle_state_is_a_copy_of_one_environment():
 
 @pytest.mark.parametrize("limit", [0, -1, 2**31])
 def test_limit_out_of_range_is_refused(limit):
-    with pytest.raises(ValueError, match=f"limit .*from 1 to 2147483647 .*{limit}"):
+    with pytest.raises(ValueError, match=f"limit .*from 1 to 2147483647, .*{limit}"):
         modules.Lifecycle(core_of([toys.box()]), limit)
 
 
@@ -241,6 +241,12 @@ def test_a_geometry_without_space_is_refused(n_agents, message):
         modules.RandomSpawns([g], c)
 
 
+def test_too_many_spawn_points_are_refused():
+    c = core.Core(scene.scenery([toys.box()], 1, 1, device="cpu"))
+    with pytest.raises(ValueError, match="n_spawns must be .* to 1000000, but 2147483647 was"):
+        modules.RandomSpawns([toys.box()], c, n_spawns=2**31 - 1)
+
+
 def test_fewer_points_than_agents_are_refused():
     with pytest.raises(ValueError, match="n_spawns=2 .*3 agents"):
         modules.RandomSpawns([toys.box()], core_of([toys.box()], 3), n_spawns=2)
@@ -312,3 +318,65 @@ def test_sensors_draw_their_states():
     bars = imu.plot_state(numpyify(imu.state(0))).patches
     assert [bar.get_height() for bar in bars] == [0.5, 0, 0, 0, 0, 0]
     plotting.rasterise(bars[0].figure)
+
+
+# ---- Wrong numbers of lanes ----
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        torch.zeros(3, dtype=torch.bool),
+        torch.zeros(1, dtype=torch.bool),  # would broadcast
+        torch.zeros((4, 4), dtype=torch.bool),
+        torch.zeros(4, dtype=torch.int64),
+        torch.zeros(4, dtype=torch.bool, device="meta"),
+        "text",
+    ],
+    ids=["too few", "one", "square", "integers", "another device", "words"],
+)
+def test_wrong_masks_are_named(wrong):
+    c = core.Core(scene.scenery([toys.box()], 1, 4, device="cpu"))
+    lifecycle, right = modules.Lifecycle(c, 9), torch.zeros(4, dtype=torch.bool)
+    spawner = modules.RandomSpawns([toys.box()], c)
+    calls = [
+        ("reset", lambda: lifecycle(wrong)),
+        ("terminal", lambda: lifecycle(right, wrong)),
+        ("(mask|reset)", lambda: spawner(wrong)),
+        ("mask", lambda: modules.CounterGenerator(4, 1, "cpu")(wrong)),
+    ]
+    for name, call in calls:
+        with pytest.raises((TypeError, ValueError), match=f"^{name} must be .* was given"):
+            call()
+    assert not lifecycle.ages.any(), "a refused step is not counted"
+
+
+@pytest.mark.parametrize("name", ["Minimal", "Explorer", "PointGoal", "Deathmatch", "Pong"])
+def test_wrong_actions_are_named(name):
+    homes = {} if name == "Pong" else dict(geometries=[toys.column()])
+    env = getattr(envs, name)(4, device="cpu", **homes)
+    right = torch.zeros_like(env.reset().reward, dtype=torch.int64)[:, None]
+    for wrong in (right[1:], torch.cat([right, right]), right.float(), right.to("meta"), None):
+        with pytest.raises((TypeError, ValueError), match="^actions must be .* was given"):
+            env.step(dict(actions=wrong))
+    env.step(dict(actions=right))
+
+
+@pytest.mark.parametrize(
+    "make, name",
+    [
+        (modules.Lifecycle, "limit"),
+        (modules.RandomLifespans, "longest"),
+        (modules.SimpleMovement, "speed"),
+        (modules.MomentumMovement, "accel"),
+        (modules.Depth, "subsample"),
+        (lambda c, **options: modules.RandomSpawns([toys.box()], c, **options), "seed"),
+    ],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+def test_wrong_settings_of_modules_are_named(make, name):
+    without_memory = torch.ones(1, dtype=torch.int64)
+    without_memory.untyped_storage().resize_(0)  # PyTorch crashes where it is read
+    for wrong in ("text", math.nan, [1], without_memory):
+        with pytest.raises(ValueError, match=f"^{name} must be .* was given"):
+            make(core_of([toys.box()]), **{name: wrong})

@@ -194,3 +194,11 @@ def test_gpu_never_synchronises_and_bf16_is_close():
             torch.cuda.set_sync_debug_mode("default")
     # logits of an untrained policy differ by some .01, bfloat16 by 1 %
     torch.testing.assert_close(*results, rtol=0, atol=5e-3)
+
+
+def test_wrong_numbers_of_lanes_are_named():
+    policy, world = Policy(OBS, MOVES, width=16), worlds()[0]
+    with pytest.raises(ValueError, match=f"^state is of {B + 1} lanes, but world.reset is of {B}"):
+        policy(world, policy.initial(B + 1))
+    with pytest.raises(ValueError, match=f"^world.obs is of {B} lanes, .* is of {B - 1}"):
+        policy(arrdict(world, reset=world.reset[1:]), policy.initial(B))

@@ -433,3 +433,12 @@ def test_captured_buffer_matches_eager_and_never_synchronises():
         results.append([leaf.cpu() for leaf in [*leaves(out.batch), replay.tree.priorities]])
     for eager, captured in zip(*results, strict=True):
         assert torch.equal(eager, captured)
+
+
+def test_wrong_shapes_are_named():
+    replay = buffer_of(World(4), 3, length=4)
+    with pytest.raises(ValueError, match="^rollout must have 4 steps of 3 lanes .* it has 5 of 3"):
+        replay.add(World(5).rollout)
+    with pytest.raises(ValueError, match=r"^values must have one .*\(6,\), but it is \(1,\)"):
+        replay.set_priorities(torch.arange(6), torch.ones(1))
+    assert replay.n_added == 0 and not replay.tree.total

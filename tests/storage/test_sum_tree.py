@@ -155,3 +155,13 @@ def test_never_synchronises():
         tree.probability(tree.sample(64, generator))
     finally:
         torch.cuda.set_sync_debug_mode("default")
+
+
+@pytest.mark.parametrize("values", [torch.ones(2), torch.ones(5), torch.ones(1), torch.ones(1, 3)])
+def test_values_of_another_shape_are_named(values):
+    tree = filled(np.ones(9))
+    with pytest.raises(ValueError, match=r"^index and values .*\(3,\) and values is"):
+        tree.set(torch.arange(3), values)
+    with pytest.raises(ValueError, match="^n must be at least 1 .* 0 was given"):
+        tree.sample(0)
+    assert tree.priorities.tolist() == 9 * [1.0]

@@ -14,6 +14,7 @@ from megastep import geometries as sources
 from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
+from megastep.engine import checks
 from megastep.envs.common import SceneryEnv
 from megastep.envs.deathmatch.bot import Bot
 from megastep.envs.deathmatch.step import (
@@ -175,7 +176,9 @@ class Deathmatch(SceneryEnv):
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
-        actions = decision["actions"].masked_fill(self.ended[:, None], 0)
+        n_lanes = len(self.ended)
+        actions = checks.lanes("actions", decision["actions"], n_lanes, self.device)
+        actions = actions.reshape(n_lanes, 1).masked_fill(self.ended[:, None], 0)
         self.movement(dict(actions=actions))
         return self._world()
 

@@ -20,13 +20,15 @@ from megastep.engine.devices import threads
 from megastep.envs.pointgoal.path_graph import CELL, MAX_GOALS, PathGraph
 from megastep.modules.spawning import CLEARANCE, candidates
 
-__all__ = ["CELL", "Geodesics", "geodesics"]
+__all__ = ["CELL", "Geodesics", "geodesics", "n_cells"]
 
 SPARE = 1.5  # times as many points are drawn as needed, as some may be in rooms without a door
 #: Cells of the homes that are searched at once, per thread on a CPU, where signals are handled
 #: between two searches. A cell takes 100 bytes, a wall as much as WALL cells.
 CELLS_AT_ONCE = {"cpu": 125_000, "cuda": 10_000_000}
 WALL = 20
+#: Cells of one home: 100 m x 100 m take a CPU some seconds and 100 MB.
+MAX_CELLS = 1_000_000
 
 
 class Geodesics(NamedTuple):
@@ -62,7 +64,7 @@ def geodesics(
         The geodesics of each geometry, in order.
 
     Raises:
-        ValueError: naming the geometry, if it has no room for an agent.
+        ValueError: naming the geometry, if it has no room for an agent, no walls or is too large.
     """
     device = torch.device(device)
     n_threads = threads() if device.type == "cpu" else 1
@@ -79,15 +81,32 @@ def geodesics(
 # ---- Goals and spawn points ----
 
 
+def n_cells(g: Any) -> int:
+    """Returns the number of cells in the grid of a geometry.
+
+    Raises:
+        ValueError: naming the geometry, if it has no walls, or more than a million cells.
+    """
+    if not len(g.walls):
+        raise ValueError(f"geometry {g.id} has no walls, but PointGoal needs homes with walls")
+    size = g.walls.max((0, 1)) - g.walls.min((0, 1))
+    n = int(np.prod(np.ceil(size / CELL) + 2))
+    if not n <= MAX_CELLS:
+        raise ValueError(
+            f"geometry {g.id} is {size[0]:.0f} m x {size[1]:.0f} m, but PointGoal's homes have at "
+            f"most {MAX_CELLS * CELL**2:,.0f} m2: use smaller ones, or check the unit"
+        )
+    return n
+
+
 def _chunks(geometries, most):
     """Yields slices of geometries whose grids have about `most` cells in all, at least one each."""
-    first = n_cells = 0
+    first = total = 0
     for d, g in enumerate(geometries):
-        if n_cells >= most:
+        if total >= most:
             yield slice(first, d)
-            first, n_cells = d, 0
-        n_cells += np.prod((g.walls.max((0, 1)) - g.walls.min((0, 1))) / CELL + 2)
-        n_cells += WALL * len(g.walls)
+            first, total = d, 0
+        total += n_cells(g) + WALL * len(g.walls)
     yield slice(first, len(geometries))
 
 

@@ -38,7 +38,7 @@ class GoalFields:
     """
 
     __slots__ = (
-        *("_tensors", "addresses", "cell", "device", "n_goals", "n_layouts", "n_spawns"),
+        *("_tensors", "cell", "device", "n_goals", "n_layouts", "n_spawns"),
         *("points", "spawns"),
     )
 
@@ -54,19 +54,10 @@ class GoalFields:
         device: torch.device | str | None = None,
     ):
         self.cell = checks.number("cell", cell, 0, 1e3, "metres")
-        self.n_layouts, self.n_goals = len(checks.items("fields", fields)), len(fields[0])
-        self.n_spawns = s = len(checks.items("spawns", spawns)[0])
-        g = self.n_goals
-        per_layout = dict(
-            points=points, origins=origins, spawns=spawns, lengths=lengths, allowed=allowed
-        )
-        shapes = dict(points=(g, 2), origins=(2,), spawns=(s, 2), lengths=(s, g), allowed=(s, g))
-        for name, shape in shapes.items():
-            actual_shapes = {np.shape(array) for array in per_layout[name]}
-            if len(per_layout[name]) != self.n_layouts or actual_shapes != {shape}:
-                raise ValueError(
-                    f"{name} must have one array {shape} for each of the {self.n_layouts} layouts"
-                )
+        device = None if device is None else checks.device("device", device)
+        d = self.n_layouts = len(checks.items("fields", fields))
+        g = self.n_goals = len(checks.items("fields[0]", fields[0]))
+        s = self.n_spawns = len(checks.items("spawns[0]", checks.items("spawns", spawns)[0]))
         for field in fields:
             fits = np.ndim(field) == 3 and field.dtype == np.float16 and len(field) == g
             if not fits or min(field.shape[1:]) < 2:
@@ -74,25 +65,52 @@ class GoalFields:
                     f"fields must be float16 ({g}, H, W) of at least 2 x 2 cells, but one is "
                     f"{getattr(field, 'dtype', type(field).__name__)} {np.shape(field)}"
                 )
-        counts = np.stack([mask.sum(1) for mask in allowed]).astype(np.int32)
+        per_layout = dict(
+            points=points, origins=origins, spawns=spawns, lengths=lengths, allowed=allowed
+        )
+        shapes = dict(points=(g, 2), origins=(2,), spawns=(s, 2), lengths=(s, g), allowed=(s, g))
+        for name, shape in shapes.items():
+            actual_shapes = [np.shape(array) for array in checks.items(name, per_layout[name])]
+            if actual_shapes != d * [shape]:
+                raise ValueError(f"{name} must have one array {shape} for each of the {d} fields")
+        if any(np.asarray(mask).dtype != bool for mask in allowed):
+            raise ValueError("allowed must hold True and False")
+        allowed = np.stack(allowed)
+        counts = allowed.sum(2, dtype=np.int32)
         if not counts.all():
             raise ValueError("allowed must have at least one goal for each spawn point")
+        numbers = dict(
+            points=np.stack(points),
+            origins=np.stack(origins),
+            lengths=np.where(allowed, np.stack(lengths), 0.0),  # of others it may be infinite
+            spawns=np.stack(spawns),
+        )
+        tensors = {
+            name: checks.floats(name, array, array.shape, device) for name, array in numbers.items()
+        }
         distinct = {id(field): field for field in fields}
         ends = np.cumsum([field.size for field in distinct.values()])
         starts = {key: end - field.size for (key, field), end in zip(distinct.items(), ends)}
         arrays = dict(
-            points=np.stack(points).astype(np.float32),
             fields=np.concatenate([field.reshape(-1) for field in distinct.values()]),
             starts=np.array([starts[id(field)] for field in fields], np.int64),
             shapes=np.array([field.shape[1:] for field in fields], np.int32),
-            origins=np.stack(origins).astype(np.float32),
-            lengths=np.stack(lengths).astype(np.float32),
-            in_range=np.argsort(~np.stack(allowed), axis=2, kind="stable").astype(np.int32),
+            in_range=np.argsort(~allowed, axis=2, kind="stable").astype(np.int32),
             n_in_range=counts,
         )
-        tensors = {name: torch.from_numpy(array).to(device) for name, array in arrays.items()}
-        self._tensors, self.points = tensors, tensors["points"]
-        self.spawns = torch.from_numpy(np.stack(spawns).astype(np.float32)).to(device)
-        self.device = self.points.device
-        #: {field of PointgoalStepParams: address}.
-        self.addresses = {name: tensor.data_ptr() for name, tensor in tensors.items()}
+        tensors |= {name: torch.from_numpy(array).to(device) for name, array in arrays.items()}
+        self.points, self.spawns = tensors["points"], tensors.pop("spawns")
+        self._tensors, self.device = tensors, self.points.device
+
+    def __setattr__(self, name, value):
+        if hasattr(self, name):
+            raise AttributeError(f"{name} of GoalFields cannot be changed: make another GoalFields")
+        super().__setattr__(name, value)
+
+    @property
+    def addresses(self) -> dict[str, int]:
+        """{field of PointgoalStepParams: address}. ValueError if the storage of ``points`` was
+        resized.
+        """
+        checks.address("goals.points", self.points, self.points.shape, torch.float32, self.device)
+        return {name: tensor.data_ptr() for name, tensor in self._tensors.items()}

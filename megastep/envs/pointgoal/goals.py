@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from megastep import cache, engine
-from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics
+from megastep.envs.pointgoal.geodesics import CELL, Geodesics, geodesics, n_cells
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.geometry import content_hash
 from megastep.kernels.build.program import KERNELS
@@ -58,7 +58,8 @@ def goal_fields(
         seed: of goals and spawn points. Default: the core's.
 
     Raises:
-        ValueError: naming the geometry, if one has no goal in that range.
+        ValueError: naming the geometry, if one has no goal in that range, no walls or is too large.
+        EngineError: if the shortest paths of all layouts do not fit into memory.
     """
     if not 0 <= nearest < furthest:
         raise ValueError(
@@ -67,9 +68,9 @@ def goal_fields(
         )
     seed, device = core.seed if seed is None else seed, core.device
     geometries = geometries[: len(core.scenery.layouts)]
+    mean_bytes = np.mean([2 * N_GOALS * n_cells(g) for g in geometries])  # of fields in fp16
+    engine.fit(len(geometries), mean_bytes, device, "layouts")
     layouts = all_geodesics(geometries, core.agents.radius, seed, device)
-    mean_bytes = np.mean([layout.fields.nbytes for layout in layouts])
-    engine.fit(len(layouts), mean_bytes, device, "layouts")
     spawns, lengths, allowed = zip(
         *[_in_range(*pair, nearest, furthest) for pair in zip(layouts, geometries, strict=True)]
     )

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from megastep import engine, spaces
 from megastep.arrdict import arrdict, numpyify
+from megastep.engine import checks
 from megastep.envs.common import DisplayedEnv
 from megastep.envs.pong.bot import Tracker
 from megastep.envs.pong.step import CELL, FEATURES, GAME_FIELDS, PIXELS, PROGRAM, pong_step
@@ -108,7 +109,7 @@ class Pong(DisplayedEnv):
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
-        return self._world(decision["actions"])
+        return self._world(checks.alike("actions", decision["actions"], self.no_actions))
 
     def _world(self, actions, restart=False):
         step = pong_step(

@@ -22,6 +22,7 @@ from typing import Any
 import torch
 
 from megastep import cache
+from megastep.kernels.build.forks import end_threads_at_forks
 from megastep.kernels.build.program import KERNELS, Program
 
 __all__ = ["EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"]
@@ -63,6 +64,7 @@ def cpu(program: Program) -> dict[str, Callable[[bytes], None]]:
     key = _key(*files, *files.values(), *CPU_FLAGS, command, version, _processor())
     name = f"cpu-{key}.so"
     library = _load(name, *cache.fetch(name, lambda: _build_cpu(program, command)))
+    end_threads_at_forks(library)
     functions = {operation: getattr(library, operation) for operation in program.cpu_operations}
     for function in functions.values():
         function.argtypes, function.restype = [ctypes.c_char_p], None

@@ -58,7 +58,9 @@ HD int checked_index(int index, int n, int* error_flag, int env) {
 
 // Draws a goal within range of the spawn point. Returns the length of the shortest path to it.
 HD float draw_goal(const PointgoalStepParams& p, int agent, int env, int layout) {
-    Philox bits = philox((unsigned int)agent, (unsigned int)p.n_draws[agent]++, p.key0, p.key1);
+    unsigned int draw = (unsigned int)p.n_draws[agent];
+    p.n_draws[agent] = (int)(draw + 1u);  // wraps, as Philox's counter does
+    Philox bits = philox((unsigned int)agent, draw, p.key0, p.key1);
     int spawn = checked_index(p.spawn_index[agent], p.n_spawns, p.error_flag, env);
     long long row = (long long)layout * p.n_spawns + spawn;
     int column = (int)(unit_float(bits.a) * (float)p.n_in_range[row]);
