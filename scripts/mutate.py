@@ -7,10 +7,10 @@ or keyword; a fifth are in kernels' headers, whose mutants are compiled. On each
 checkout, the tests run that execute its line, the nearest first. Which ones do is recorded once, in
 a run of all fast tests that must pass.
 
-Results are appended to --results. A second call with the same file leaves out mutants that were
-caught before, so after writing tests it runs the survivors, and a longer sample continues a
-shorter one. docs/lab/equivalent_mutants.jsonl lists mutants that no test can find, each with the
-reason, as two readers judged it.
+With --results FILE, results are appended to a file of JSON lines, and mutants that it says were
+caught are left out: after writing tests a second call runs the survivors, and a longer sample
+continues a shorter one. docs/lab/equivalent_mutants.jsonl lists mutants that no test can find, with
+the reason, as two readers judged them.
 
 Libraries of this kind, mutmut and Cosmic Ray, change Python only.
 """
@@ -157,17 +157,17 @@ def main():
     parser.add_argument("--seed", type=int, default=1, help="of the sample")
     parser.add_argument("--jobs", type=int, default=1, help="mutants tested at a time")
     parser.add_argument("--minutes", type=float, help="start no mutant after so many")
-    parser.add_argument("--results", type=Path, default=ROOT / "build" / "mutants.jsonl")
-    parser.add_argument("--lines", type=Path, help="folder of the record of executed lines; reused")
+    parser.add_argument("--results", type=Path, help="file that keeps the results")
+    parser.add_argument("--lines", type=Path, help="folder that keeps which lines tests execute")
     parser.add_argument("--list", action="store_true", help="print the sample and stop")
     options = parser.parse_args()
     sample = choose(options.n, options.seed, options.folders)
     if options.list:
         print(*sample, sep="\n")
         return
-    results = {row["name"]: row["result"] for row in read_rows(options.results)}
+    rows = read_rows(options.results) if options.results else []
+    results = {row["name"]: row["result"] for row in rows}
     results |= {row["name"]: "equivalent" for row in read_rows(EQUIVALENT)}
-    options.results.parent.mkdir(parents=True, exist_ok=True)
 
     with tempfile.TemporaryDirectory(prefix="mutants-") as base:
         base, copies = Path(base), queue.Queue()
@@ -189,8 +189,9 @@ def main():
             results[mutant.name] = result
             row = dict(name=mutant.name, result=result, mutant=str(mutant), failed=failed)
             row["seconds"] = round(time.monotonic() - start, 1)
-            with open(options.results, "a") as file:
-                file.write(json.dumps(row) + "\n")
+            if options.results:
+                with open(options.results, "a") as file:
+                    file.write(json.dumps(row) + "\n")
             print(f"{result:8} {mutant}", flush=True)
 
         with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:

@@ -24,7 +24,7 @@ METHODS |= {"masked_fill", "resolve", "round", "sqrt", "square"}
 FUNCTIONS = {"abs", "int", "max", "maximum", "min", "minimum", "round", "sorted", "sqrt"}
 #: In headers, formatters put blanks around binary operators and around nothing that looks like one.
 HEADER_SITE = re.compile(
-    r"(?<= )(?:[<>=!]=|&&|\|\||[-<>+*/%])(?= )|(?<![\w.])\d+(?:\.\d+)?(?![\w.])"
+    r"(?<= )(?:[<>=!]=|&&|\|\||[-<>+*/%])(?= )|(?<![\w.])\d+(?:\.\d*f)?(?![\w.])"
 )
 HEADER_NOT_CODE = re.compile(r'//.*|/\*[\s\S]*?\*/|"[^"\n]*"|^#.*', re.M)
 
@@ -118,8 +118,12 @@ def _header_sites(text):
     code = HEADER_NOT_CODE.sub(lambda match: re.sub(r"\S", "_", match[0]), text)
     for match in HEADER_SITE.finditer(code):
         before, line = match[0], code.count("\n", 0, match.start()) + 1
-        number = str(int(before) + 1) if before.isdigit() else f"{before}1"
-        yield match.start(), before, SWAPS.get(before, number), (line, line)
+        yield match.start(), before, SWAPS.get(before) or _other_number(before), (line, line)
+
+
+def _other_number(text):
+    """Returns twice a float, such as 0.5f, or the next integer."""
+    return f"{2 * float(text[:-1]) or 1.0}f" if text.endswith("f") else str(int(text) + 1)
 
 
 class _Sites(ast.NodeVisitor):
