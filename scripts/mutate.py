@@ -60,24 +60,26 @@ def choose(n, seed, folders):
 
 
 def tests_of(mutant, lines, seconds):
-    """Returns files of tests to run on a mutant in turn: ([its folder's], [others])."""
+    """Returns files of tests to run on a mutant in turn: ([near ones], [others])."""
     executing = lines.get(mutant.path, {})
     first, last = mutant.lines
     tests = {test for line in range(first, last + 1) for test in executing.get(line, ())}
     if not tests and any(line in executing for line in range(first, last + 1)):
         tests = {test for each in executing.values() for test in each}  # it runs at import
     _, *folders, name = Path(mutant.path).parts
-    room = folders[0] if folders else ""
-    if room == "kernels" and folders[1:2] != ["build"]:
-        room = "engine"  # what the engine's kernels compute
-    tests = tests or {f"tests/{room}"}
-    stem = Path(name).stem
+    room = Path("tests", *folders[:1])
+    if folders[:1] == ["kernels"] and folders[1:2] != ["build"]:
+        room = Path("tests/engine")  # what the engine's kernels compute
+    if not tests:  # a kernel, or nothing executes it in the tests' own process
+        tests = {str(path.relative_to(ROOT)) for path in (ROOT / room).glob("test_*.py")}
+    names = {Path(name).stem, *folders[1:]}
 
-    def order(test):
-        return stem not in Path(test).stem, seconds.get(test, 0.0)
+    def is_near(test):
+        is_named = any(part in Path(test).stem for part in names)
+        return is_named or bool(executing) and Path(test).parent == room
 
-    near = sorted((t for t in tests if f"tests/{room}" in t or stem in Path(t).stem), key=order)
-    return near, sorted(tests - {*near}, key=order)
+    near = sorted(filter(is_near, tests), key=lambda test: seconds.get(test, 0.0))
+    return near, sorted(tests - {*near}, key=lambda test: seconds.get(test, 0.0))
 
 
 def copied(folder):
