@@ -36,6 +36,8 @@ EQUIVALENT = ROOT / "docs" / "lab" / "equivalent_mutants.jsonl"
 PYTHON = [f"agents/{name}" for name in "algorithms networks storage training selfplay".split()]
 PYTHON += [f"megastep/{name}" for name in "capture.py modules envs geometries engine".split()]
 HEADERS = ["megastep", "agents"]
+#: Ends although a thread that a failed test left still runs.
+PYTEST = "import os, sys, pytest; status = pytest.main(); sys.stdout.flush(); os._exit(status)"
 #: Seconds: a mutant may run for ever. The same tests without it take a tenth.
 MIN_TIMEOUT, TIMEOUT_FACTOR = 300, 10
 
@@ -98,7 +100,7 @@ def run_tests(folder, tests, *options, timeout=None):
     environment = {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
     environment |= {"MEGASTEP_CACHE": str(folder.parent / "cache"), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
-        [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *options, *tests],
+        [sys.executable, "-c", PYTEST, "-q", "-x", "-p", "no:cacheprovider", *options, *tests],
         cwd=folder,
         env=environment,
         stdout=subprocess.PIPE,
@@ -197,7 +199,10 @@ def main():
             print(f"{result:8} {mutant}", flush=True)
 
         with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
-            list(pool.map(test, sample))
+            try:
+                list(pool.map(test, sample))
+            except KeyboardInterrupt:  # the mutants that are being tested are the last
+                pool.shutdown(cancel_futures=True)
     report(sample, results)
 
 
