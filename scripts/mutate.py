@@ -4,8 +4,9 @@
 
 A mutant is one changed operator, condition, number or return value, or one dropped statement, call
 or keyword; a fifth are in kernels' headers, whose mutants are compiled. On each, in a copy of the
-checkout, the tests run that execute its line, the nearest first. Which ones do is recorded once, in
-a run of all fast tests that must pass.
+checkout, the tests run that execute its line: first those of its folder, then others, the fastest
+first, up to --seconds. So a mutant that only a long test elsewhere finds counts as survived. Which
+tests execute a line is recorded once, in a run of all fast tests that must pass.
 
 With --results FILE, results are appended to a file of JSON lines, and mutants that it says were
 caught are left out: after writing tests a second call runs the survivors, and a longer sample
@@ -18,6 +19,7 @@ Libraries of this kind, mutmut and Cosmic Ray, change Python only.
 import argparse
 import collections
 import concurrent.futures
+import itertools
 import json
 import os
 import queue
@@ -61,8 +63,10 @@ def choose(n, seed, folders):
     return [mutant for mutant in chosen if mutant]
 
 
-def tests_of(mutant, lines, seconds):
-    """Returns files of tests to run on a mutant in turn: ([near ones], [others])."""
+def tests_of(mutant, lines, seconds, limit=float("inf")):
+    """Returns files of tests to run on a mutant in turn: ([near ones], [others]). The others are
+    the fastest that together take `limit` seconds.
+    """
     executing = lines.get(mutant.path, {})
     first, last = mutant.lines
     tests = {test for line in range(first, last + 1) for test in executing.get(line, ())}
@@ -80,8 +84,13 @@ def tests_of(mutant, lines, seconds):
         is_named = any(part in Path(test).stem for part in names)
         return is_named or bool(executing) and Path(test).parent == room
 
-    near = sorted(filter(is_near, tests), key=lambda test: seconds.get(test, 0.0))
-    return near, sorted(tests - {*near}, key=lambda test: seconds.get(test, 0.0))
+    def duration(test):
+        return seconds.get(test, 0.0)
+
+    near = sorted(filter(is_near, tests), key=duration)
+    others = sorted(tests - {*near}, key=duration)
+    totals = itertools.accumulate(map(duration, others))
+    return near, [test for test, total in zip(others, totals) if total <= limit]
 
 
 def copied(folder):
@@ -131,15 +140,15 @@ def record_lines(folder, into, jobs):
         sys.exit(f"The tests fail without any fault:\n{output[-3000:]}")
 
 
-def result_of(mutant, folder, lines, seconds):
+def result_of(mutant, folder, lines, seconds, limit):
     """Returns "caught", "timeout" or "survived", and the test that failed."""
     path = folder / mutant.path
     original = path.read_text()
     path.write_text(mutant.text())
     try:
-        for tests in filter(None, tests_of(mutant, lines, seconds)):
-            limit = TIMEOUT_FACTOR * sum(seconds.get(test, 0.0) for test in tests)
-            status, output = run_tests(folder, tests, "-n0", timeout=max(MIN_TIMEOUT, limit))
+        for tests in filter(None, tests_of(mutant, lines, seconds, limit)):
+            timeout = TIMEOUT_FACTOR * sum(seconds.get(test, 0.0) for test in tests)
+            status, output = run_tests(folder, tests, "-n0", timeout=max(MIN_TIMEOUT, timeout))
             if status is None:
                 return "timeout", ""
             if status not in (0, 5):  # 5: all of them need a GPU, or are slow
@@ -160,6 +169,9 @@ def main():
     parser.add_argument("--n", type=int, default=200, help="number of mutants")
     parser.add_argument("--seed", type=int, default=1, help="of the sample")
     parser.add_argument("--jobs", type=int, default=1, help="mutants tested at a time")
+    parser.add_argument(
+        "--seconds", type=float, default=60, help="of tests of other folders that run on a mutant"
+    )
     parser.add_argument("--minutes", type=float, help="start no mutant after so many")
     parser.add_argument("--results", type=Path, help="file that keeps the results")
     parser.add_argument("--lines", type=Path, help="folder that keeps which lines tests execute")
@@ -188,7 +200,7 @@ def main():
             if results.get(mutant.name, "survived") != "survived" or time.monotonic() > end:
                 return
             folder, start = copies.get(), time.monotonic()
-            result, failed = result_of(mutant, folder, lines, seconds)
+            result, failed = result_of(mutant, folder, lines, seconds, options.seconds)
             copies.put(folder)
             results[mutant.name] = result
             row = dict(name=mutant.name, result=result, mutant=str(mutant), failed=failed)
