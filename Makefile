@@ -26,9 +26,10 @@ test: $(SETUP)             ## run the fast tests: 4 minutes on two cores
 test-slow: $(SETUP)        ## run the thorough tests: 12 minutes; .ci/run runs them as well
 	$(PYTEST) -m slow
 
-test-nightly: $(SETUP)     ## soak, CPU sanitizers and 30 mutants: an hour, by hand; SEED=2 makes others
+test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour, by hand; SEED=2 makes others
 	$(PYTEST) -m nightly
-	$(PYTHON) scripts/mutants.py 30 --seed $(SEED) --jobs $(CORES)
+	EXAMPLES=2000 $(PYTEST) tests/test_laws.py
+	$(PYTHON) scripts/mutate.py --n 30 --seed $(SEED) --jobs $(CORES)
 
 lint: $(SETUP)             ## check style and formatting of Python and kernels
 	$(PYTHON) -m ruff check .

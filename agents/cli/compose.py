@@ -159,12 +159,7 @@ class Composer:
                 groups.append(override.input_line)
             elif not options or isinstance(value, dict):
                 keys[key] = override
-            elif (
-                group in settings.IMPORTED
-                and ":" in str(value)
-                and "$" not in str(value)  # which Hydra would interpolate
-                and len(str(value)) <= LONGEST
-            ):
+            elif group in settings.IMPORTED and is_import_path(value):
                 STORE.store(group=group, name=value, node={"name": value})
                 groups.append(override.input_line)
             else:
@@ -173,7 +168,7 @@ class Composer:
                     hint = f"is not installed: pip install '{program.DISTRIBUTION}[sweep]'"
                 errors.append((key, f"{program.shortened(repr(value))} {hint}"))
         try:
-            device = keys["device"].value() if "device" in keys else None
+            device = str(keys["device"].value()) if "device" in keys else None
             config = copy.deepcopy(self.composed(*groups, device=device))
         except HYDRA_ERRORS as error:
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
@@ -188,7 +183,7 @@ class Composer:
                 else:
                     force = override.is_add() or override.is_force_add() or key[:6] != "hydra."
                     OmegaConf.update(config, key, override.value(), force_add=force)
-            except (ConfigKeyError, ConfigAttributeError, TypeError):
+            except (ConfigKeyError, ConfigAttributeError, TypeError):  # TypeError: below a value
                 hint = check.closest_key(key, dict(leaves({"hydra": plain(config.hydra)})))
                 errors.append((key, f"no such key; {hint}"))
             except OmegaConfBaseException as error:
@@ -223,6 +218,11 @@ def preset_for(device: str | None) -> str:
 def key_of(override: types.Override) -> str:
     """The key or group@package of a word, without the sign before it."""
     return override.get_key_element().lstrip("+~")
+
+
+def is_import_path(value: Any) -> bool:
+    # Hydra would interpolate a $
+    return isinstance(value, str) and ":" in value and "$" not in value and len(value) <= LONGEST
 
 
 def own(config: DictConfig, resolve: bool = False) -> check.Tree:

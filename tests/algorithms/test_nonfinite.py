@@ -42,9 +42,10 @@ def test_nonfinite_value_has_name_lane_and_step(name, value):
         assert bad.size == pytest.approx(abs(value), nan_ok=True)
 
 
-def test_single_nan_pixel_is_found():
+@pytest.mark.parametrize("name, value", [("obs.rgb", torch.nan), ("obs.imu", -1e30)])
+def test_single_number_is_found(name, value):
     check, rollout = NonFiniteCheck("cpu"), floats()
-    rollout["obs.rgb"][4, 2, 0, 1, 0, 7] = torch.nan
+    rollout[name][4, 2].view(-1)[1] = value
     assert not check(rollout)
     assert check.read(rollout)[0].step == 4
 

@@ -182,6 +182,28 @@ def test_steps_after_target_kl_are_not_counted_as_skipped():
     assert continued.check.read(rollout.floats()) == (None, 1)
 
 
+def test_update_stays_stopped_after_target_kl():
+    """Each minibatch is a lane. One lane has a KL divergence of .31 nats, the others of 0."""
+    policy, rollout = made_up()
+    rollout.logprobs[:, 2] -= math.log(2)
+    learner = PPO(policy, n_epochs=3, n_minibatches=B, lr=1e-30, target_kl=0.1)
+    learner.update(rollout)
+    assert learner.optimizer.n_steps < B
+
+
+@pytest.mark.parametrize("ratio, loss", [(2.0, 0.4), (0.5, 0.15)])
+def test_surrogate_is_the_smaller_of_clipped_and_unclipped(ratio, loss):
+    """Half of the advantages are 1, the others -1. With a clip of .2, a ratio of 2 gives 1.2 and
+    -2, a ratio of 1/2 gives .5 and -.8.
+    """
+    policy, rollout = made_up()
+    rollout.logprobs -= math.log(ratio)
+    rollout.values.zero_()
+    rollout.reward[:] = torch.tensor([1.0, -1.0]).repeat(B // 2)
+    learner = PPO(policy, n_epochs=1, n_minibatches=1, lr=1e-30, gamma=0.0, clip=0.2)
+    assert learner.update(rollout)["loss/policy"].item() == pytest.approx(loss, abs=1e-4)
+
+
 def test_target_kl_stops_update():
     ends = []
     for settings in (dict(n_epochs=1), dict(n_epochs=4, target_kl=1e-4), dict(n_epochs=4)):

@@ -192,6 +192,19 @@ def test_priorities_follow_errors():
     assert set(uniform.replay_buffer.tree.priorities.tolist()) == {0.0, 1.0}
 
 
+def test_priorities_are_those_of_replayed_lanes():
+    """Rewards of fresh lanes do not change them."""
+    learner, _ = replaying(12, replay=dict(alpha=1.0))
+    batch, priorities = learner._batch(learner.collect(), torch.arange(B)), []
+    for lanes in (None, slice(B), slice(B, None)):
+        if lanes is not None:
+            batch.reward[:, lanes] += 10.0
+        learner._losses(batch, B)
+        priorities.append(learner.replay_buffer.tree.priorities.clone())
+    first, fresh, replayed = priorities
+    assert torch.equal(first, fresh) and not torch.equal(first, replayed)
+
+
 def test_importance_weights_scale_losses():
     policy, rollout = made_up(values=False)
     learner = VTrace(policy)

@@ -132,6 +132,14 @@ def test_actions_damp_and_add_their_move(device):
     assert torch.allclose(core.agents.positions[:, 0].cpu(), 3 + expected / 10, atol=1e-6)
 
 
+def test_actions_replace_velocities_by_default(device):
+    core = box(device)
+    core.agents.velocity[:] = 3.0
+    moves, actions = torch.ones(1, 3, device=device), torch.zeros(2, 1, dtype=int, device=device)
+    engine.physics(core.scenery, core.agents, actions, moves)
+    assert torch.allclose(core.agents.velocity, torch.ones_like(core.agents.velocity))
+
+
 def test_spawn_changes_masked_agents_only(device):
     scenery = scene.scenery([toys.box(), toys.column()], 1, 8, device=device)
     core = cuda.Core(scenery)

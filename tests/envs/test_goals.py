@@ -253,6 +253,17 @@ def test_drawn_goals_are_in_range(n_agents, device):
     assert len(drawn) > 40, "of 64"
 
 
+def test_goals_are_from_1_to_15_metres_away_by_default():
+    homes = [toys.box(4), toys.box(20)]
+    c = core.Core(scene.scenery(homes, 1, 1000, device="cpu"), res=8)
+    goals = goal_fields(homes, c)
+    spawner = modules.RandomSpawns(homes, c, resample=True, points=goals.spawns)
+    spawner(c.agent_full(True))
+    _, state = step(c, goals, torch.zeros_like(spawner.point_index), spawner.point_index)
+    lengths = state.progress[4]
+    assert 1 <= lengths.min() < 1.2 and 14.5 < lengths.max() <= 15
+
+
 @pytest.mark.parametrize(
     "range_, words",
     [

@@ -87,6 +87,11 @@ def test_regions_of_an_l_shape():
             assert at % regions.LATTICE == 0 and abs(below - share) < 0.01
 
 
+def test_of_equally_wide_rectangles_the_largest_is_the_widest():
+    """Both are 400 cm wide. The smaller one is the further from the origin."""
+    assert regions.widest([(0, 1000, 400, 1400), (600, 0, 1000, 600)]) == (600, 0, 1000, 600)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_a_partition_covers_its_footprint_once(seed):
     generator = PortableGenerator(seed)

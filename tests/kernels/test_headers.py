@@ -48,6 +48,32 @@ def test_packed_structs_have_the_compilers_layout(program, tmp_path):
         assert getattr(checks, f"check_{name}")(data, len(data)), name
 
 
+CORRIDOR = """
+#include "corridor.h"
+#include "light.h"
+extern "C" int ruled_out(float y, int box) {
+    Corridor corridor = corridor_of(0.f, 0.f, pose_at(4.f, 0.f, 0.f), 0.1f);
+    return box ? !box_may_occlude(corridor, 3.995f, y, 3.995f, 1.f)
+               : !may_occlude(corridor, 3.995f, y, 3.995f, 1.f);
+}
+extern "C" int occluded(float y) {
+    return occludes(occluder_of(0.f, 0.f, 3.995f, y, 3.995f, 1.f), 4.f, 0.1f);
+}
+"""
+
+
+def test_no_wall_that_occludes_a_light_is_ruled_out(tmp_path):
+    """The light is 4 m from an agent whose outermost texel is 0.1 m aside. Walls across the path
+    begin at y, just in front of that texel.
+    """
+    library = compiled(tmp_path, ENGINE, CORRIDOR)
+    for name in ("occluded", "ruled_out"):
+        getattr(library, name).argtypes = [ctypes.c_float, ctypes.c_int][: 1 + (name[0] == "r")]
+    assert library.occluded(0.0998) and not library.occluded(0.0999)
+    for is_box in (0, 1):
+        assert not library.ruled_out(0.0998, is_box) and library.ruled_out(0.11, is_box)
+
+
 @programs
 def test_constants_have_the_compilers_values(program, tmp_path):
     own = '#include "constants.h"\n' if (program.folder / "constants.h").exists() else ""

@@ -102,6 +102,12 @@ def test_new_folder_is_private(fetch, tmp_path):
     assert fetch(tmp_path / "new") == (BODY, path, 0)
 
 
+def test_file_under_another_name_is_built_again(fetch, tmp_path):
+    _, path, _ = fetch(tmp_path)
+    path.rename(tmp_path / "other")
+    assert cache.intact(tmp_path / "other") is None
+
+
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "garbage", "missing"])
 def test_damaged_file_is_built_again(fetch, damage, tmp_path):
     _, path, _ = fetch(tmp_path)

@@ -391,6 +391,16 @@ def test_wins_are_decided_by_the_return_of_one_episode():
     assert env.pop_win_rates() == {"episode/won/bot": pytest.approx(1 / 3)}
 
 
+def test_reset_forgets_the_returns_of_unfinished_episodes():
+    """The learning agents earn 9 or more in a step that ends nothing, and lose after a reset."""
+    env = make_opponents(env=Rigged(4), bot=1.0, past=0.0, scripted=Middle())
+    for other, action in ((9.0, 1), (0.0, 0)):
+        env.env.mask, env.env.other = ~env.learners, other
+        env.reset()
+        env.step(arrdict(actions=torch.full((8, 1), action)))
+    assert env.pop_win_rates() == {"episode/won/bot": 0.0}
+
+
 def test_state_is_whole():
     """A copy goes on with the same snapshots, memories, scores and random numbers."""
     env, other = (make_opponents(16, past=0.5, bot=0.25) for _ in range(2))

@@ -286,6 +286,28 @@ def test_kill_between_any_two_file_operations_leaves_an_intact_checkpoint(
     assert n >= 5 and checkpoint.load_latest(folder).state["samples"] == 99
 
 
+def test_checkpoint_is_on_disk_before_it_is_renamed(tmp_path, monkeypatch):
+    """After a power cut, the disk holds what was flushed: its files and folder, then the rename."""
+    events = []
+
+    def recorded(operation, of):
+        def call(*args):
+            operation(*args)
+            events.append(of(*args))
+
+        return call
+
+    def renamed(temporary, path):
+        return {entry.stat().st_ino for entry in (path, *path.iterdir())}
+
+    monkeypatch.setattr(os, "fsync", recorded(os.fsync, lambda handle: os.fstat(handle).st_ino))
+    monkeypatch.setattr(os, "replace", recorded(os.replace, renamed))
+    path = checkpoint.save(tmp_path, 10, state(10), CONFIG)
+    (rename,) = [at for at, event in enumerate(events) if isinstance(event, set)]
+    assert events[rename] == set(events[:rename]) and len(list(path.iterdir())) == 3
+    assert events[rename + 1 :] == [tmp_path.stat().st_ino]
+
+
 SAVES_UNTIL_KILLED = """
 import os, random, signal, sys, time
 import torch
