@@ -39,7 +39,10 @@ class Budget:
         """
         if self.is_rerun:
             return _fraction_left(updates, len(self.recorded))
-        return min(_fraction_left(samples, self.samples), _fraction_left(seconds, self.seconds))
+        seconds_left = _fraction_left(seconds, self.seconds)
+        if updates < len(self.recorded):  # which the clock once left time for
+            seconds_left = max(seconds_left, 1e-9)
+        return min(_fraction_left(samples, self.samples), seconds_left)
 
     def lr_fraction(self, updates: int, samples: int, seconds: float) -> float:
         """Returns the factor for the learning rate in the next update, from 1 to 0."""

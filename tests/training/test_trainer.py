@@ -299,6 +299,8 @@ def test_recorded_factors_replace_the_clocks():
     budget = Budget(100, 10.0, "seconds", recorded=[0.9, 0.7])
     factors = [budget.lr_fraction(updates, 50, 4.0) for updates in range(3)]
     assert factors == [0.9, 0.7, 0.6] and budget.fraction_left(1, 50, 4.0) == 0.5
+    assert budget.fraction_left(1, 50, 99.0) > 0 > budget.fraction_left(2, 50, 99.0)
+    assert budget.fraction_left(1, 100, 1.0) == 0
     again = dataclasses.replace(budget, is_rerun=True)
     assert again.fraction_left(1, 50, 99.0) == 0.5 and again.fraction_left(2, 50, 1.0) == 0
 
