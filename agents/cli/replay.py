@@ -2,14 +2,16 @@
 
 import argparse
 import functools
+import json
 import sys
 from pathlib import Path
 
 import yaml
 
 from megastep.agents.algorithms.nonfinite import NonFiniteValue
-from megastep.agents.cli import check, console, factory, program, settings, signals
+from megastep.agents.cli import check, console, factory, program, runs, settings, signals
 from megastep.agents.training.nonfinite_replay import Recording, ReplayError
+from megastep.agents.training.trust import foreign_names
 
 
 class NotRepeated(program.UserError):
@@ -25,12 +27,16 @@ def main(words: list[str] | None = None) -> int:
     )
     parser.add_argument("file", type=Path, help="nonfinite-SAMPLES.npz, in the folder of its run")
     parser.add_argument(
-        "device", nargs="?", type=_device, help="such as device=cpu; default: as in the run"
+        "settings",
+        nargs="*",
+        type=_setting,
+        help="device=cpu; default: as in the run. trust=true, if another user made the run and it "
+        "names modules outside megastep",
     )
     try:
         with signals.interrupting():
             arguments = parser.parse_args(words)
-            run(arguments.file, arguments.device)
+            run(arguments.file, **dict(arguments.settings))
     except SystemExit as end:  # of argparse
         return end.code or 0
     except program.UserError as error:
@@ -42,18 +48,22 @@ def main(words: list[str] | None = None) -> int:
     return 0
 
 
-def _device(word):
-    if not word.startswith("device="):
-        raise argparse.ArgumentTypeError(f"{word!r} is unknown; give device=cpu or device=cuda")
-    return word.removeprefix("device=")
+def _setting(word):
+    key, _, value = word.partition("=")
+    if key == "device" and value:
+        return key, value
+    if key == "trust" and value in ("true", "false"):
+        return key, value == "true"
+    raise argparse.ArgumentTypeError(f"{word!r} is unknown; give device=cpu or trust=true")
 
 
-def run(path: Path, device: str | None = None) -> NonFiniteValue:
+def run(path: Path, device: str | None = None, trust: bool = False) -> NonFiniteValue:
     """Builds the environment of a run, replays a file in it, and says what was not finite.
 
     Args:
         path: the file, in the folder of its run.
         device: where; None for the kind of device that wrote it.
+        trust: imports modules that the run names, whoever made it.
 
     Returns:
         the first non-finite number, which is the file's.
@@ -65,7 +75,7 @@ def run(path: Path, device: str | None = None) -> NonFiniteValue:
     errors = functools.partial(program.errors, f"{path} cannot be replayed: ")
     with errors():
         recording = Recording(path)
-    cfg = config_of(path.parent)
+    cfg = config_of(path.parent, trust)
     device = factory.make_device(device or recording.device)
     env = factory.construct(
         cfg.env,
@@ -87,9 +97,21 @@ def run(path: Path, device: str | None = None) -> NonFiniteValue:
     )
 
 
-def config_of(folder: Path) -> settings.Train:
-    """Returns the settings of a run. UserError if they cannot be read."""
+def config_of(folder: Path, trust: bool) -> settings.Train:
+    """Returns the settings of a run. UserError if they cannot be read, or if they name modules that
+    neither `trust` nor a checkpoint that this user made allows.
+    """
     path = folder / "config.yaml"
-    kinds = (OSError, yaml.YAMLError, program.ConfigErrors)
+    kinds = (OSError, ValueError, RecursionError, yaml.YAMLError, program.ConfigErrors)
     with program.errors(f"{path}, with which the environment is built, cannot be used: ", kinds):
-        return check.check(settings.Train, yaml.safe_load(path.read_bytes()))
+        tree = yaml.safe_load(path.read_bytes())
+        names = set() if trust else {*foreign_names(json.dumps({"train": tree}, default=str))}
+        if names and (folder / "checkpoints").is_dir():
+            saved = json.dumps(runs.load_checkpoint(folder, trust).config)
+            names -= {*foreign_names(saved.encode())}
+        if names:
+            raise program.UserError(
+                f"{path} would import {program.shortened(', '.join(sorted(names)))}, which runs "
+                "code outside megastep; if you trust it, add trust=true"
+            )
+        return check.check(settings.Train, tree)

@@ -4,13 +4,15 @@ import copy
 import importlib
 import json
 import pathlib
+import shutil
 import sys
 from contextlib import suppress
 
 import pytest
+import yaml
 
-from megastep.agents.cli import check, evaluate, record, train
-from megastep.agents.cli.program import ConfigErrors
+from megastep.agents.cli import check, evaluate, record, replay, train
+from megastep.agents.cli.program import ConfigErrors, UserError
 from megastep.agents.cli.settings import Train, kind_of
 from megastep.agents.training import checkpoint, trust
 from tests.helpers.tiny import TINY, settings
@@ -124,3 +126,27 @@ def test_every_setting_that_imports_is_known_to_do_so():
                 importing.add(key)
                 kind_of.cache_clear()
     assert importing == {*KEYS} - {"opponents.bot_class"}  # which is imported later
+
+
+def replay_config(monkeypatch, user):
+    """Reads the config.yaml of a run with a checkpoint of a user's, as `megastep replay` does."""
+    save(monkeypatch, "env.name", user=user)
+    tree = changed(check.as_tree(settings(*TINY)), "env.name", "planted:Thing")
+    pathlib.Path("run/config.yaml").write_text(yaml.safe_dump(tree))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(pathlib.Path("mine").absolute()))
+    replay.config_of(pathlib.Path("run"), trust=False)
+
+
+def test_replay_of_a_downloaded_run_is_refused(monkeypatch):
+    with pytest.raises(UserError, match="would import planted:Thing.*trust=true"):
+        replay_config(monkeypatch, "another")
+    shutil.rmtree("run/checkpoints")
+    with pytest.raises(UserError, match="would import planted:Thing.*trust=true"):
+        replay.config_of(pathlib.Path("run"), trust=False)
+    assert not IMPORTED.exists()
+
+
+def test_replay_of_an_own_run_imports_what_its_checkpoint_names(monkeypatch):
+    with suppress(UserError):  # there is no such class
+        replay_config(monkeypatch, "mine")
+    assert IMPORTED.exists()
