@@ -3,7 +3,6 @@ what the environments of users keep besides tensors.
 """
 
 import collections
-import copy
 import enum
 import pathlib
 import random
@@ -14,125 +13,185 @@ from typing import Any
 import numpy as np
 import torch
 
-from megastep.engine.state_tree import OPAQUE, SCALARS, children, node_at, rebind, walk
+from megastep.engine.state_tree import OPAQUE, children, node_at, rebind, walk
 from megastep.read_only import ReadOnlyTensor
 
 __all__ = ["EnvState"]
 
 _GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
 _STATEFUL = (torch.Tensor, np.ndarray, *_GENERATORS)
+_NUMBERS = (bool, int, float, str, type(None), complex, bytes, enum.Enum, np.generic)
+_CONTAINERS = (list, tuple, dict, set, frozenset, collections.deque)
 #: Types without attributes that hold nothing that changes.
 _CONSTANT = (
     *OPAQUE,
-    *(bytes, complex, range, slice, frozenset, type(Ellipsis), enum.Enum, pathlib.PurePath),
-    *(torch.Size, torch.layout, torch.memory_format, np.generic, np.dtype, re.Pattern),
+    *(range, slice, type(Ellipsis), pathlib.PurePath, torch.Size, torch.layout),
+    *(torch.memory_format, np.dtype, re.Pattern),
 )
 
 
 class EnvState:
     """Saves and restores everything in an environment that changes: tensors, NumPy arrays, random
     generators, and the plain values that have changed since this object was made. A plain value is
-    a number, a string, or a list, set or dict of these. The global generators of PyTorch, NumPy and
-    Python are saved as well.
+    a number, a string, or lists, tuples, sets and dicts of these. The global generators of PyTorch,
+    NumPy and Python are saved as well.
 
     It reaches what attributes, lists and dicts lead to; `unreachable` names the rest. Make it after
     ``env.reset()``.
 
     Args:
         env: the environment.
+        bot: a policy that plays in it and may have a state of its own, or None.
     """
 
-    def __init__(self, env: Any):
+    def __init__(self, env: Any, bot: Any = None):
         self.env, device = env, torch.device(env.device)
         generators = dict(torch=torch.default_generator)
         if device.type == "cuda":
             index = torch.cuda.current_device() if device.index is None else device.index
             generators["cuda"] = torch.cuda.default_generators[index]
         generators |= dict(numpy=np.random.mtrand._rand, python=random.seed.__self__)
-        self.root = python_types.SimpleNamespace(env=env, generators=generators)
-        self._first_values = copy.deepcopy(self._plain_values())
+        self.root = python_types.SimpleNamespace(env=env, bot=bot, generators=generators)
+        self._first_values = {path: _encoded(node) for path, node in self._plain_values()}
+        nodes = self._nodes_of_user()
+        self._first_constants = {path: node for path, node in nodes if isinstance(node, _CONSTANT)}
+
+    # ---- Saving ----
 
     def state_dict(self) -> dict[str, dict[str, Any]]:
-        """Returns the state by path: tensors, states of generators and plain values. Tensors share
-        their memory with the environment.
+        """Returns the state by path. Tensors share their memory with the environment; all else is
+        a copy, in types that `torch.load(weights_only=True)` reads.
         """
-        arrays, generators = {}, {}
+        arrays, kinds, generators = {}, {}, {}
         for path, (_, _, leaf) in walk(self.root, _STATEFUL).items():
             if isinstance(leaf, _GENERATORS):
                 generators[path] = _generator_state(leaf)
             elif isinstance(leaf, np.ndarray):
-                if leaf.dtype != object:
-                    arrays[path] = torch.from_numpy(leaf)
+                if _is_savable(leaf):
+                    arrays[path] = torch.from_numpy(np.array(leaf, order="C"))
+                    kinds[path] = "numpy"
             elif not isinstance(leaf, ReadOnlyTensor):
-                arrays[path] = leaf.detach()
+                arrays[path], kinds[path] = leaf.detach(), leaf.device.type
+        values = {path: _encoded(node) for path, node in self._plain_values()}
         first, missing = self._first_values, object()
-        values = self._plain_values()
         values = {path: now for path, now in values.items() if first.get(path, missing) != now}
-        lengths = {path: len(node) for path, node in self._nodes_of_user() if _is_list(node)}
-        state = {"values": copy.deepcopy(values), "lengths": lengths}
-        return {"arrays": arrays, "generators": generators, **state}
+        state = dict(arrays=arrays, kinds=kinds, generators=generators, values=values)
+        return state | self._members() | {"aliases": self._aliases(arrays)}
 
-    @torch.no_grad()
+    def _members(self):
+        """Returns the lengths of lists and the keys of dicts that hold tensors or objects."""
+        nodes = [(path, node) for path, node in self._nodes_of_user() if not _is_plain(node)]
+        return dict(
+            lengths={path: len(node) for path, node in nodes if _is_list(node)},
+            keys={path: _encoded([*node]) for path, node in nodes if _is_dict(node)},
+        )
+
+    def _aliases(self, arrays):
+        """Returns {path: an earlier path} of tensors that are the same."""
+        first, aliases = {}, {}
+        for path, leaf in arrays.items():
+            key = _place(leaf)
+            if leaf.numel() and first.setdefault(key, path) != path:
+                aliases[path] = first[key]
+        return aliases
+
+    # ---- Restoring ----
+
     def load_state_dict(self, state: dict[str, dict[str, Any]]) -> None:
         """Restores a `state_dict`, whose tensors may be on any device. Tensors change in place, so
         that whatever refers to them sees it.
 
         Raises:
-            ValueError: naming what this environment does not have. Nothing has changed.
+            ValueError: it does not fit this environment. Nothing has changed.
         """
-        leaves = {path: leaf for path, (_, _, leaf) in walk(self.root, _STATEFUL).items()}
-        for path in [*state["arrays"], *state["generators"], *state["values"]]:
-            if path not in leaves and node_at(self.root, _parent(path)) is None:
-                raise ValueError(
-                    f"the state holds {path[1:]}, which this {type(self.env).__name__} does not "
-                    "have: its class has changed, or it was made with other arguments"
-                )
-        for path, value in state["generators"].items():
-            if not _set_generator_state(leaves.get(path), value):
-                raise ValueError(f"{path[1:]} is no longer the kind of generator that was saved")
+        before = self.state_dict()
+        before["arrays"] = {path: leaf.clone() for path, leaf in before["arrays"].items()}
+        before["values"] = {path: _encoded(node) for path, node in self._plain_values()}
+        try:
+            self._load(state)
+        except Exception as error:
+            self._load(before)
+            raise ValueError(
+                f"the state of {type(self.env).__name__} does not fit: {error}"
+            ) from error
+
+    @torch.no_grad()
+    def _load(self, state):
         for path, length in state["lengths"].items():
+            if not _is_list(node_at(self.root, path)):
+                self._replace(path, [])
             while len(node_at(self.root, path)) > length:
                 node_at(self.root, path).pop()
+        for path, keys in state["keys"].items():
+            if not isinstance(node_at(self.root, path), dict):
+                self._replace(path, {})
+            node = node_at(self.root, path)
+            for key in [key for key in node if key not in _decoded(keys)]:
+                del node[key]
+        for path, value in state["values"].items():
+            self._set_value(path, value)
+        leaves = {path: leaf for path, (_, _, leaf) in walk(self.root, _STATEFUL).items()}
+        for path, value in state["generators"].items():
+            is_of_another_device = path.startswith(".generators") and path not in leaves
+            if not is_of_another_device and not _set_generator_state(leaves.get(path), value):
+                raise ValueError(f"{_name(path)} is no longer the kind of generator that was saved")
         fits = {path for path, value in state["arrays"].items() if _fits(leaves.get(path), value)}
         for path in fits:
             torch.as_tensor(leaves[path]).copy_(state["arrays"][path])
         for path, value in state["arrays"].items():
             # what has no such tensor yet, or began as one tensor with another
             if path not in fits or not _equal(leaves[path], value):
-                self._replace(path, _like(value, leaves.get(path), self.env.device))
-        for path, value in state["values"].items():
-            now = node_at(self.root, path)
-            is_queue = isinstance(now, collections.deque)
-            self._replace(path, collections.deque(value, now.maxlen) if is_queue else value)
+                self._replace(path, _as_kind(value, state["kinds"][path]))
+        for path, first in state["aliases"].items():
+            same, now = node_at(self.root, first), node_at(self.root, path)
+            if _place(same) != _place(now):
+                self._replace(path, same)
+
+    def _set_value(self, path, value):
+        now, value = node_at(self.root, path), _decoded(value)
+        if isinstance(now, enum.Enum):
+            value = type(now)[value]
+        if isinstance(now, (list, collections.deque)) and type(now) is type(value):
+            now.clear()
+            now.extend(value)
+        elif isinstance(now, (dict, set)) and type(now) is type(value):
+            now.clear()
+            now.update(value)
+        else:
+            self._replace(path, value)
 
     def _replace(self, path, value):
         parent, step = node_at(self.root, _parent(path)), path[len(_parent(path)) :]
+        if parent is None:
+            raise ValueError(f"it has no {_name(path)}")
         if _is_list(parent) and step == f"[{len(parent)}]":
             parent.append(value)
         else:
             rebind(parent, step, value)
 
+    # ---- What there is ----
+
     def unreachable(self) -> list[str]:
         """Returns what may change and cannot be saved, as `name (type)`."""
-        names = []
-        for path, node in self._nodes_of_user():
-            is_opaque = isinstance(node, np.ndarray) and node.dtype == object
-            known = (*SCALARS, *_CONSTANT, *_STATEFUL, dict, list, tuple, collections.deque)
-            is_reached = isinstance(node, known) or hasattr(node, "__dict__") or _is_plain(node)
-            if is_opaque or not is_reached:
-                names.append(f"{path.removeprefix('.env.')} ({type(node).__name__})")
-        return names
+        return [
+            f"{_name(path)} ({type(node).__name__})"
+            for path, node in self._nodes_of_user()
+            if not self._is_reached(path, node)
+        ]
+
+    def _is_reached(self, path, node):
+        if isinstance(node, np.ndarray):
+            return _is_savable(node)
+        if isinstance(node, _CONSTANT):
+            return self._first_constants.get(path, node) == node
+        is_known = isinstance(node, (*_STATEFUL, *_NUMBERS, list, tuple, dict, collections.deque))
+        return is_known or _is_plain(node) or hasattr(node, "__dict__")
 
     def _plain_values(self):
-        """Returns the plain values by path, without those of megastep's own objects, which never
+        """Yields (path, value) of plain values but those of megastep's own objects, which never
         change or are addresses.
         """
-        nodes = self._nodes_of_user()
-        return {
-            path: list(node) if isinstance(node, collections.deque) else node
-            for path, node in nodes
-            if _is_plain(node)
-        }
+        return ((path, node) for path, node in self._nodes_of_user() if _is_plain(node))
 
     def _nodes_of_user(self):
         """Yields (path, node) of what is below objects of a class that is not megastep's."""
@@ -141,9 +200,8 @@ class EnvState:
             path, node, is_users = stack.pop()
             if is_users:
                 yield path, node
-            if isinstance(node, (*SCALARS, *_CONSTANT, *_STATEFUL)) or id(node) in visited:
-                continue
-            if is_users and _is_plain(node):
+            is_leaf = isinstance(node, (*_NUMBERS, *_CONSTANT, *_STATEFUL))
+            if is_leaf or id(node) in visited or (is_users and _is_plain(node)):
                 continue
             visited.add(id(node))
             if hasattr(node, "__dict__"):
@@ -159,12 +217,19 @@ def _is_list(node):
     return isinstance(node, (list, collections.deque))
 
 
+def _is_dict(node):
+    return isinstance(node, dict) and _is_plain([*node])
+
+
 def _is_plain(node):
-    if isinstance(node, dict):
-        return type(node) is dict and _is_plain([*node, *node.values()])
-    if isinstance(node, (list, set, collections.deque)):
-        return all(isinstance(value, SCALARS) for value in node)
-    return isinstance(node, SCALARS)
+    if type(node) in _CONTAINERS:
+        parts = [*node, *node.values()] if type(node) is dict else node
+        return all(map(_is_plain, parts))
+    return isinstance(node, _NUMBERS)
+
+
+def _is_savable(array):
+    return array.dtype.kind in "biufc" and array.dtype.itemsize <= 16
 
 
 def _parent(path):
@@ -172,11 +237,24 @@ def _parent(path):
     return re.sub(r"(\.[^.\[\]]+|\[('[^']*'|[^\]]*)\])$", "", path)
 
 
+def _name(path):
+    return path.removeprefix(".env").lstrip(".")
+
+
+def _place(leaf):
+    """Returns what is equal for tensors that are the same."""
+    if not isinstance(leaf, torch.Tensor):
+        return id(leaf)
+    return leaf.device, leaf.data_ptr(), leaf.shape, leaf.stride(), leaf.dtype
+
+
 def _fits(leaf, value):
     """Returns whether a tensor or array can take a saved value in place."""
-    if not isinstance(leaf, (torch.Tensor, np.ndarray)):
+    if isinstance(leaf, np.ndarray):
+        is_usable = _is_savable(leaf) and leaf.flags.writeable and min(leaf.strides, default=0) >= 0
+        return is_usable and _fits(torch.from_numpy(leaf), value)
+    if not isinstance(leaf, torch.Tensor):
         return False
-    leaf = torch.as_tensor(leaf)
     is_expanded = any(n > 1 and not stride for n, stride in zip(leaf.shape, leaf.stride()))
     return leaf.shape == value.shape and leaf.dtype == value.dtype and not is_expanded
 
@@ -187,21 +265,71 @@ def _equal(leaf, value):
     return torch.equal(*(one.view(torch.uint8) for one in pair))
 
 
-def _like(value, leaf, device):
-    """Returns a saved value as what it takes the place of: a tensor on its device, or an array."""
-    if isinstance(leaf, np.ndarray):
+def _as_kind(value, kind):
+    """Returns a saved tensor as what it was: an array, or a tensor on a kind of device."""
+    if kind == "numpy":
         return value.cpu().numpy().copy()
-    return value.to(device if leaf is None else leaf.device, copy=True)
+    has_device = kind != "cuda" or torch.cuda.is_available()
+    return value.to(kind if has_device else "cpu", copy=True)
+
+
+# ---- Plain values and generators, in types that a file without code can hold ----
+
+
+def _encoded(value):
+    if isinstance(value, np.generic):
+        return {"numpy": (value.dtype.str, value.tobytes().hex())}
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, dict):
+        return {"dict": [[_encoded(key), _encoded(part)] for key, part in value.items()]}
+    if isinstance(value, (set, frozenset)):
+        return {type(value).__name__: sorted(map(_encoded, value), key=repr)}
+    if isinstance(value, collections.deque):
+        return {"deque": [*map(_encoded, value)], "maxlen": value.maxlen}
+    if isinstance(value, tuple):
+        return {"tuple": [*map(_encoded, value)]}
+    if isinstance(value, list):
+        return [*map(_encoded, value)]
+    if isinstance(value, bytes):
+        return {"bytes": value.hex()}
+    if isinstance(value, complex):
+        return {"complex": [value.real, value.imag]}
+    kinds = (bool, int, float, str)
+    return next((kind(value) for kind in kinds if isinstance(value, kind)), value)
+
+
+def _decoded(value):
+    if isinstance(value, list):
+        return [*map(_decoded, value)]
+    match value:
+        case {"numpy": (dtype, data)}:
+            return np.frombuffer(bytes.fromhex(data), dtype)[0]
+        case {"dict": pairs}:
+            return {_decoded(key): _decoded(part) for key, part in pairs}
+        case {"set": parts}:
+            return {*map(_decoded, parts)}
+        case {"frozenset": parts}:
+            return frozenset(map(_decoded, parts))
+        case {"deque": parts, "maxlen": length}:
+            return collections.deque(map(_decoded, parts), length)
+        case {"tuple": parts}:
+            return tuple(map(_decoded, parts))
+        case {"bytes": text}:
+            return bytes.fromhex(text)
+        case {"complex": (real, imaginary)}:
+            return complex(real, imaginary)
+    return value
 
 
 def _generator_state(generator):
     if isinstance(generator, torch.Generator):
         return generator.get_state()
     if isinstance(generator, random.Random):
-        return generator.getstate()
+        return _encoded(generator.getstate())
     if isinstance(generator, np.random.RandomState):
-        return _without_arrays(generator.get_state(legacy=False))
-    return _without_arrays(generator.bit_generator.state)
+        return _encoded(_without_arrays(generator.get_state(legacy=False)))
+    return _encoded(_without_arrays(generator.bit_generator.state))
 
 
 def _set_generator_state(generator, state):
@@ -210,11 +338,11 @@ def _set_generator_state(generator, state):
         if isinstance(generator, torch.Generator):
             generator.set_state(state.cpu())
         elif isinstance(generator, random.Random):
-            generator.setstate(state)
+            generator.setstate(_decoded(state))
         elif isinstance(generator, np.random.RandomState):
-            generator.set_state(_with_arrays(state))
+            generator.set_state(_with_arrays(_decoded(state)))
         else:
-            generator.bit_generator.state = _with_arrays(state)
+            generator.bit_generator.state = _with_arrays(_decoded(state))
     except (TypeError, ValueError, RuntimeError, AttributeError, KeyError):
         return False
     return True

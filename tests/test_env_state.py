@@ -1,6 +1,8 @@
 """The state of an environment: what it reaches, what it names, and that it is restored in place."""
 
 import collections
+import enum
+import io
 import random
 
 import numpy as np
@@ -8,6 +10,17 @@ import pytest
 import torch
 
 from megastep.env_state import EnvState
+
+
+class Colour(enum.Enum):
+    RED, BLUE = "red", "blue"
+
+
+class Inner:
+    n = np.int32(0)
+
+    def __init__(self):
+        self.n = self.n
 
 
 class Env:
@@ -20,7 +33,10 @@ class Env:
         self.n, self.name, self.seen, self.pages = 0, "calm", {1}, {"a": 1}
         self.queue, self.frames = collections.deque(maxlen=2), [torch.zeros(1)]
         self.pair = self.also = torch.zeros(2)
-        self.later = None
+        self.later = self.later_array = self.later_list = None
+        self.place_of_two, self.nested, self.total = (3, 4), [[1]], 0.0
+        self.colour, self.key, self.by_name = Colour.RED, b"a", {"a": torch.zeros(1), 2: Inner()}
+        self.one, self.other = torch.zeros(2), torch.zeros(2)
 
     def draw(self):
         return (
@@ -42,7 +58,15 @@ class Env:
         self.queue += [self.n, self.n + 1, self.n + 2]
         self.frames = [*self.frames, torch.full((1,), float(self.n))]
         self.pair = torch.full((2,), float(self.n))  # no longer `also`
-        self.later = torch.ones(self.n)
+        self.later, self.later_array = torch.ones(self.n), np.arange(self.n)[::-1]
+        self.later_list = [torch.full((1,), float(self.n)), np.ones(self.n)]
+        self.place_of_two, self.nested = (self.n, 1j), [*self.nested, [self.n, {self.n: "x"}]]
+        self.total += np.float64(self.n)
+        self.colour, self.key = Colour.BLUE, bytes([self.n])
+        self.by_name.pop("a", None)
+        self.by_name[2].n = np.int32(self.n)
+        self.other = self.one
+        self.one += 1  # both
         return self.draw()
 
 
@@ -50,7 +74,10 @@ def facts(env):
     arrays = env.place, env.wind, env.pair, env.also, *env.frames
     arrays += () if env.later is None else (env.later,)
     plain = env.n, env.name, env.seen, env.pages, list(env.queue), env.queue.maxlen
-    return [*(torch.as_tensor(one).tolist() for one in arrays), *plain]
+    kinds = type(env.later_array), [*map(type, env.later_list or ())], type(env.total)
+    more = env.place_of_two, env.nested, env.total, env.colour, env.key, {*map(str, env.by_name)}
+    rest = env.later_array, env.later_list, env.by_name[2].n, env.one, env.other
+    return [*(torch.as_tensor(one).tolist() for one in arrays), *plain, *more, *rest, kinds]
 
 
 def restored(source, n_steps_of_target=0):
@@ -70,8 +97,10 @@ def test_everything_is_restored_and_goes_on(n_steps_of_target):
     env = Env()
     state = EnvState(env)
     env.step(), env.step()
-    saved = {key: dict(part) for key, part in state.state_dict().items()}
-    saved["arrays"] = {path: array.clone() for path, array in saved["arrays"].items()}
+    file = io.BytesIO()
+    torch.save(state.state_dict(), file)  # as a checkpoint does
+    file.seek(0)
+    saved = torch.load(file, weights_only=True)
     expected, draws = str(facts(env)), [env.step(), env.draw()]
     target = restored(saved, n_steps_of_target)
     assert str(facts(target)) == expected
@@ -82,12 +111,13 @@ def test_what_cannot_be_saved_is_named():
     env = Env()
     assert EnvState(env).unreachable() == []
     env.counter, env.nodes, env.objects = iter([1]), {object()}, np.array([env])
+    env.words, env.span = np.array(["a"]), range(2)
     env.fixed = (1, 2.0, b"bytes", range(3), slice(1), torch.float16, np.float32(1), len)
-    assert EnvState(env).unreachable() == [
-        "counter (list_iterator)",
-        "nodes (set)",
-        "objects (ndarray)",
-    ]
+    state = EnvState(env)
+    names = ["counter (list_iterator)", "nodes (set)", "objects (ndarray)", "words (ndarray)"]
+    assert state.unreachable() == names
+    env.span = range(3)
+    assert state.unreachable() == [*names, "span (range)"]
 
 
 def test_plain_values_that_never_change_are_not_saved():
@@ -105,6 +135,34 @@ def test_another_environment_is_refused_and_unchanged():
     env.inner.extra = torch.ones(1)
     saved = EnvState(env).state_dict()
     target = Env()
-    with pytest.raises(ValueError, match=r"holds env.inner.\S+, which this Env does not have"):
+    with pytest.raises(ValueError, match="of Env does not fit: it has no inner"):
         EnvState(target).load_state_dict(saved)
     assert str(facts(target)[:4]) == str(facts(Env())[:4])
+
+
+def test_state_that_fails_in_the_middle_is_put_back():
+    """A tuple cannot take another tensor."""
+    env, target = Env(), Env()
+    for one, n in ((env, 2), (target, 3)):
+        one.pair_of_tensors = torch.zeros(n), torch.zeros(n)
+    env.step()
+    saved = EnvState(env).state_dict()
+    before = str(facts(target))
+    with pytest.raises(ValueError, match="a tensor inside a tuple was replaced"):
+        EnvState(target).load_state_dict(saved)
+    assert str(facts(target)) == before
+
+
+def test_state_of_a_gpu_is_restored_without_one():
+    env = Env()
+    saved = EnvState(env).state_dict()
+    saved["generators"][".generators['cuda']"] = torch.zeros(16, dtype=torch.uint8)
+    EnvState(Env()).load_state_dict(saved)
+
+
+def test_bot_is_part_of_the_state():
+    bots = [Inner(), Inner()]
+    state, other = (EnvState(Env(), bot) for bot in bots)
+    bots[0].n = 7
+    other.load_state_dict(state.state_dict())
+    assert bots[1].n == 7
