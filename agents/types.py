@@ -107,5 +107,8 @@ class Logger(Protocol):
     ) -> None:
         """Writes one report after ``step`` environment steps."""
 
+    def sync(self) -> None:
+        """Flushes to disk what resuming reads. Raises OSError if it cannot be written."""
+
     def close(self) -> None:
         """Writes what is buffered and closes files and connections."""

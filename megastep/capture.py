@@ -114,6 +114,8 @@ class Graph:
     are valid until the next call.
     """
 
+    IS_STATELESS = True  # its tensors are copies, see :func:`megastep.engine.state_tree.walk`
+
     def __init__(self, function: Callable, args: tuple, roots: tuple, warmup: int = 3):
         leaves, self._spec = _pytree.tree_flatten(args)
         self._leaves = [leaf.clone() if isinstance(leaf, torch.Tensor) else leaf for leaf in leaves]

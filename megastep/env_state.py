@@ -78,6 +78,18 @@ class EnvState:
         state = dict(arrays=arrays, kinds=kinds, generators=generators, values=values)
         return state | self._members() | {"aliases": self._aliases(arrays)}
 
+    def host_state(self) -> dict[str, dict[str, Any]]:
+        """Returns the part of the state that is not in tensors, for `restore_host`."""
+        state = self.state_dict()
+        arrays = {k: leaf for k, leaf in state["arrays"].items() if state["kinds"][k] == "numpy"}
+        values = {path: _encoded(node) for path, node in self._plain_values()}
+        none = {name: {} for name in ("lengths", "keys", "aliases")}
+        return state | {"arrays": arrays, "values": values} | none
+
+    def restore_host(self, state: dict[str, dict[str, Any]]) -> None:
+        """Restores a `host_state` in the same process."""
+        self._load(state)
+
     def _members(self):
         """Returns the lengths of lists and the keys of dicts that hold tensors or objects."""
         nodes = [(path, node) for path, node in self._nodes_of_user() if not _is_plain(node)]

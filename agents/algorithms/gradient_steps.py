@@ -105,11 +105,11 @@ class GradientSteps:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the optimizer's state, the step size and what `check` has counted."""
-        optimizer, record = self.optimizer.state_dict(), self.check.record
-        return dict(optimizer=optimizer, lr=self._lr.clone(), check=record.nan_to_num())
+        check = self.check.state_dict()
+        return dict(optimizer=self.optimizer.state_dict(), lr=self._lr.clone(), check=check)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from a `state_dict`."""
         self.optimizer.load_state_dict(state["optimizer"])
         self._lr.copy_(state["lr"])
-        self.check.record.copy_(state["check"])
+        self.check.load_state_dict(state["check"])

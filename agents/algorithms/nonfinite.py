@@ -131,6 +131,17 @@ class NonFiniteCheck:
         first.copy_(torch.where((n_bad == 0) | self.found, first, latest))
         return n_bad == 0
 
+    def state_dict(self) -> torch.Tensor:
+        """Returns the rollouts checked and the updates skipped in a row.
+
+        What was found and is not read yet is left out, since reading it follows the clock.
+        """
+        return self.record[:2].clone()
+
+    def load_state_dict(self, counts: torch.Tensor) -> None:
+        """Continues from a `state_dict`."""
+        self.record.zero_()[:2] = counts.to(self.record)
+
     def count(self, is_skipped: torch.Tensor) -> None:
         """Counts one update, () bool whether it was skipped."""
         self.record[1].add_(1).mul_(is_skipped)

@@ -80,8 +80,8 @@ class R2D2(GradientLearner):
         seed: seed of replay sampling.
 
     A rollout with a NaN, an infinity or a number beyond `nonfinite.LIMIT` changes no weight and no
-    statistic, and is never drawn. `state_dict` does not include the replay buffer: a resumed run
-    fills it again before it learns.
+    statistic, and is never drawn. `state_dict` does not include the replay buffer, which has one
+    of its own.
     """
 
     @checked

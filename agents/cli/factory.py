@@ -14,7 +14,7 @@ from megastep.agents.cli.settings import Agent, Env, Geometry, Learner, Train, c
 from megastep.agents.imports import import_object
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.opponents import Opponents
-from megastep.agents.training import checkpoint, evaluation, loggers
+from megastep.agents.training import checkpoint, checkpoint_format, evaluation, loggers
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.capture import state_tree
 from megastep.types import n_lanes, optional
@@ -134,6 +134,10 @@ def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
     learner = construct(settings, policy=policy, seed=seed, graph=True)
     with errors(f"{settings.name} is no learner: "):
         check_learner(learner)
+        try:
+            checkpoint_format.check_plain(learner.state_dict(), "state_dict")
+        except TypeError as error:
+            raise LearnerError(error) from error
     return learner
 
 

@@ -47,6 +47,7 @@ class Opponents:
         matchups: (B,) bool by name, the lanes of environments played against "now" (the current
             policy), "past" and "bot". Names without environments are absent.
         snapshots: the snapshots, as policies. Refreshed in place.
+        scripted: the bot, or None if it does not play.
         on_actions: called in each step with the actions of all lanes, (B, ...), if not None.
 
     All other attributes are those of `env`.
@@ -70,7 +71,7 @@ class Opponents:
         seed: int = 1,
     ):
         self.env, self.every, device = env, every, env.device
-        self.on_actions = None
+        self.on_actions, self.scripted = None, scripted if bot else None
         n_per_snapshot, n_bot = count_environments(env, past, bot, snapshots)
         if bot and scripted is None:
             raise ValueError(

@@ -10,6 +10,7 @@ from megastep.agents.types import Actor
 from megastep.arrdict import arrdict
 from megastep.capture import capture
 from megastep.dotdict import leaves
+from megastep.env_state import EnvState
 from megastep.types import Env, Tree
 
 _STORED = "obs", "reset", "learns", "privileged"  # what `Rollout.store_world` reads
@@ -92,7 +93,11 @@ class Collector:
 
     def __call__(self) -> Rollout:
         if self.on_gpu and self.n_collected == 1:
+            env_state = EnvState(self.parts[0])
+            before = env_state.host_state()
             self.graph = capture(lambda: collect(*self.parts), (), self.parts)
+            # capturing leaves tensors as they were; in another process it may come at another time
+            env_state.restore_host(before)
         self.n_collected += 1
         if self.graph is None:
             collect(*self.parts)

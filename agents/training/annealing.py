@@ -3,6 +3,7 @@
 What the clock decided is in it, so a run can be repeated: `megastep rerun RUN`.
 """
 
+import contextlib
 import math
 from array import array
 from pathlib import Path
@@ -13,7 +14,9 @@ FILE = "annealing.f64"
 
 
 def read(folder: Path | str) -> array:
-    """Returns the factors of a run's updates, in order; none if there is no record."""
+    """Returns the factors of a run's updates, in order; none if there is no record. NaN stands for
+    those of an earlier version, which recorded none.
+    """
     factors, path = array("d"), Path(folder) / FILE
     if path.exists():
         data = path.read_bytes()
@@ -47,5 +50,11 @@ class AnnealingRecord:
         """Writes what was added."""
         self.file.flush()
 
+    def sync(self) -> None:
+        """Writes what was added and flushes it to disk."""
+        self.file.sync()
+
     def close(self) -> None:
-        self.file.close()
+        """Writes what was added, if the disk has room for it."""
+        with contextlib.suppress(OSError):
+            self.file.close()

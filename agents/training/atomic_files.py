@@ -32,6 +32,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     try:
         write_synced(temporary, data)
         os.replace(temporary, path)
+        sync_folder(path.parent)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -90,6 +91,18 @@ def _machine():
     return name
 
 
+def sync_folder(folder: Path) -> None:
+    """Flushes a folder's entries to disk. Does nothing on systems that cannot open folders."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 class AppendedFile:
     """A file that grows. What a full disk refuses is kept, and written by the next call from the
     byte where it stopped, so the file never has a hole.
@@ -124,6 +137,11 @@ class AppendedFile:
         """Writes what is left, with errors as `write`."""
         while self.unwritten:
             del self.unwritten[: self.file.write(self.unwritten)]
+
+    def sync(self) -> None:
+        """Writes what is left and flushes the file to disk, with errors as `write`."""
+        self.flush()
+        os.fsync(self.file.fileno())
 
     def close(self) -> None:
         try:

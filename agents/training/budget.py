@@ -4,6 +4,7 @@ A sample is one environment step of one lane.
 """
 
 import dataclasses
+import math
 import time
 from collections.abc import Sequence
 
@@ -46,7 +47,7 @@ class Budget:
 
     def lr_fraction(self, updates: int, samples: int, seconds: float) -> float:
         """Returns the factor for the learning rate in the next update, from 1 to 0."""
-        if updates < len(self.recorded):
+        if updates < len(self.recorded) and not math.isnan(self.recorded[updates]):
             return self.recorded[updates]
         if self.anneal == "never":
             return 1.0

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from megastep.agents.training import checkpoint_format
-from megastep.agents.training.atomic_files import delete_leftovers, temporary_path
+from megastep.agents.training.atomic_files import delete_leftovers, sync_folder, temporary_path
 from megastep.agents.training.checkpoint_format import (
     Checkpoint,
     CheckpointError,
@@ -74,7 +74,7 @@ def save(
         checkpoint_format.verify(temporary, checkpoint_format.read_manifest(temporary))
         path = folder / _next_name(folder, step)
         os.replace(temporary, path)
-        checkpoint_format.sync_folder(folder)
+        sync_folder(folder)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise

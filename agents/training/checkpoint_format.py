@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from megastep.agents.training import trust
+from megastep.agents.training.atomic_files import sync_folder
 
 if TYPE_CHECKING:
     import torch
@@ -117,6 +118,28 @@ def write(
     sync_folder(path)
 
 
+def check_plain(tree: Any, name: str) -> None:
+    """Raises TypeError for what loading without code refuses. It allows tensors, numbers, strings
+    and None, and lists, tuples and dicts of these.
+
+    Args:
+        name: of the tree, for the message.
+    """
+    if isinstance(tree, dict):
+        for key, part in tree.items():
+            check_plain(part, f"{name}.{key}")
+    elif isinstance(tree, (list, tuple)):
+        for i, part in enumerate(tree):
+            check_plain(part, f"{name}.{i}")
+    elif type(tree) not in (bool, int, float, str, type(None)) and not hasattr(
+        tree, "untyped_storage"
+    ):
+        raise TypeError(
+            f"{name} is a {type(tree).__module__}.{type(tree).__name__}, and checkpoints hold "
+            "tensors, numbers, strings, lists and dicts only: convert it, for example with float()"
+        )
+
+
 class _TooLate(Exception):
     """A file took longer to write than it may."""
 
@@ -168,18 +191,6 @@ def sealed(manifest: dict[str, Any]) -> bytes:
     """Returns the text of a manifest, with its own SHA-256 added."""
     digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
     return json.dumps({**manifest, "sha256": digest}, indent=2).encode()
-
-
-def sync_folder(folder: Path) -> None:
-    """Flushes a folder's entries to disk. Does nothing on systems that cannot open folders."""
-    try:
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 # ---- Reading ----
@@ -247,12 +258,10 @@ def _migrated(state, manifest):
     import torch
     from torch.nn.functional import pad
 
-    from megastep.agents.algorithms.nonfinite import NonFiniteCheck
-
     if manifest["format"] == FORMAT:
         return state
     if "learner" in state and "optimizer" in state["learner"]:
-        state["learner"].setdefault("check", NonFiniteCheck(torch.device("cpu")).record)
+        state["learner"].setdefault("check", torch.zeros(2, dtype=torch.float64))
     if stats := state.get("episode_stats"):  # no episode was left out of a metric
         n_metrics = len(stats["sums"]) - 4
         stats["sums"] = pad(stats["sums"], (0, 0, 0, n_metrics))
@@ -301,6 +310,8 @@ def read_manifest(path: Path) -> dict[str, Any]:
         is_intact = data == sealed(body)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         version, is_intact = None, False
+    if is_intact and not {*manifest["files"]} <= {"config.json", "state.pt", *PARTS}:
+        is_intact = False  # a planted one may name any file
     is_without_digest = version == 1 and "sha256" not in manifest
     if not (is_intact or is_without_digest):
         raise DamagedCheckpoint(

@@ -192,6 +192,10 @@ class Loggers:
         for logger in list(self.optional):
             self._call(logger, "write", step, {**metrics, **perf})
 
+    def sync(self) -> None:
+        """Flushes the metrics to disk. Raises OSError if they cannot be written."""
+        self.metrics.file.sync()
+
     def close(self) -> None:
         for logger in [self.metrics, self.perf, *self.optional]:
             self._call(logger, "close")

@@ -65,13 +65,13 @@ class RolloutRecorder:
         self.n_rollouts += 1
         self.n_played = 0
         host = self.on_host[self.n_rollouts] = {}
-        device = self.check.record.device
+        found, device = self.check.found, self.check.record.device
         for path, leaf in state_tree(self.env).items():
             if isinstance(leaf, torch.Generator):
                 host[path] = leaf.get_state()
             elif self._axis(leaf) is not None or leaf.nbytes <= MAX_SHARED_BYTES:
                 if leaf.device == device:
-                    self._keep(self.state, path, leaf)
+                    _keep(self.state, path, leaf, found)
                 else:
                     host[path] = leaf.clone()
 
@@ -79,8 +79,9 @@ class RolloutRecorder:
     def end(self, rollout: Rollout) -> None:
         """Copies the actions. Call after each rollout, before it is checked."""
         actions = self.played or spaces.leaves(rollout.actions, "actions")
+        found = self.check.found
         for path, leaf in actions.items():
-            self._keep(self.actions, path, leaf)
+            _keep(self.actions, path, leaf, found)
 
     def watch(self, opponents: Any, n_steps: int) -> None:
         """Has opponents report the actions of all lanes, as rollouts of T steps store some only."""
@@ -94,13 +95,6 @@ class RolloutRecorder:
             self.played[path][self.n_played].copy_(leaf)
         # a CUDA graph is captured over whole rollouts, and must leave this number as it was
         self.n_played = (self.n_played + 1) % len(self.played[path])
-
-    def _keep(self, copies, path, leaf):
-        copy = copies.get(path)
-        if copy is None or (copy.shape, copy.dtype) != (leaf.shape, leaf.dtype):
-            copies[path] = leaf.clone()
-        else:
-            torch.where(self.check.found, copy, leaf, out=copy)
 
     def has(self, value: NonFiniteValue) -> bool:
         """Returns False if the number is of a rollout before the first `start`, of a resumed run.
@@ -163,6 +157,15 @@ class RolloutRecorder:
 
     def _rows(self, envs, size):
         return rows_of(envs, size // self.env.n_envs)
+
+
+def _keep(copies, path, leaf, found):
+    """Copies a tensor, unless a non-finite number was found: then the last copy stays."""
+    copy = copies.get(path)
+    if copy is None or (copy.shape, copy.dtype) != (leaf.shape, leaf.dtype):
+        copies[path] = leaf.clone()
+    else:
+        torch.where(found, copy, leaf, out=copy)
 
 
 def make_recorder(

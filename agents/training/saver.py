@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import shutil
 import threading
 import time
@@ -13,7 +15,7 @@ import torch
 from torch.utils._pytree import tree_leaves
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, nonfinite_leaf
-from megastep.agents.training import checkpoint
+from megastep.agents.training import checkpoint, checkpoint_format
 
 if TYPE_CHECKING:
     from megastep.agents.training.trainer import Trainer
@@ -55,7 +57,7 @@ class Saver:
     ):
         self.folder, self.config, self.keep_checkpoints = folder, config, keep_checkpoints
         self.made_with, self.replay_every = made_with, replay_every
-        self.error, self.lacks_replay = None, False
+        self.error, self.lacks_replay, self.has_warned_of_memory = None, False, False
         self.seconds, self._n_since_replay = 0.0, 0
         self._host_copy, self._thread, self._failure = _HostCopy(), None, None
 
@@ -95,10 +97,22 @@ class Saver:
             return state, None
         self._n_since_replay += 1
         if is_last or self._n_since_replay >= self.replay_every:
-            self._n_since_replay = 0
-            return state, REPLAY_SECONDS if is_last else None
+            if _nbytes(state["replay"]) > _free_memory() / 2:
+                self._warn_of_memory()
+            else:
+                self._n_since_replay = 0
+                return state, REPLAY_SECONDS if is_last else None
         self.lacks_replay = True
         return {name: part for name, part in state.items() if name != "replay"}, None
+
+    def _warn_of_memory(self):
+        if not self.has_warned_of_memory:
+            self.has_warned_of_memory = True
+            warnings.warn(
+                "There is too little memory for a copy of the replay buffer, so checkpoints do "
+                "not hold it",
+                stacklevel=4,
+            )
 
     @property
     def is_writing(self) -> bool:
@@ -138,6 +152,7 @@ class Saver:
             return
         if not isinstance(failure[-1], (OSError, checkpoint.DamagedCheckpoint)):
             raise failure[-1]
+        self._n_since_replay = self.replay_every  # the next one is to have it
         has_warned = self.error is not None
         self.error = self._message(*failure)
         if not has_warned:
@@ -179,12 +194,13 @@ class _HostCopy:
             return {key: self._copied(part, (*path, key)) for key, part in node.items()}
         if isinstance(node, (list, tuple)):
             return type(node)(self._copied(part, (*path, i)) for i, part in enumerate(node))
+        checkpoint_format.check_plain(node, ".".join(map(str, path)))
         return node
 
     def _copied_tensor(self, tensor, path):
         if tensor.device.type != "cuda":
             return tensor.clone()
-        if path[0] == "replay":  # too large to pin, and rarely saved
+        if path[0] == "replay" or "rollouts" in path:  # may be too large to pin
             return tensor.cpu()
         kept = self.pinned.get(path)
         if kept is None or kept.shape != tensor.shape or kept.dtype != tensor.dtype:
@@ -192,6 +208,14 @@ class _HostCopy:
             self.pinned[path] = kept
         self.devices.add(tensor.device)
         return kept.copy_(tensor, non_blocking=True)
+
+
+def _free_memory():
+    """Returns bytes of memory that are free, infinity where the system does not tell."""
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, OSError, AttributeError):
+        return math.inf
 
 
 def _nbytes(state):

@@ -32,6 +32,8 @@ MAX_SKIPPED = 20
 class OpponentPool(Protocol):
     """The part of `selfplay.opponents.Opponents` that a trainer uses."""
 
+    scripted: Any  # the bot, or None
+
     def refresh_snapshots(self, policy: Policy, n_updates: int) -> None: ...
 
     def pop_win_rates(self) -> dict[str, float]: ...
@@ -130,7 +132,10 @@ class Trainer:
         desync = desync and optional(env, "desync") is not None
         if desync:
             env.desync()  # the collector has reset the environment, and has not stepped it yet
-        self.env_state = EnvState(env if opponents is None else env.env)
+        if opponents is None:
+            self.env_state = EnvState(env)
+        else:
+            self.env_state = EnvState(env.env, opponents.scripted)
         self.replay_buffer = optional(learner, "replay_buffer", LEARNER_DEFAULTS)
         self.episode_stats = EpisodeStats(
             self.rollout.n_lanes,
@@ -190,7 +195,8 @@ class Trainer:
                     self.samples_at_report = self.samples
                     self.log(losses)
                 seconds_since = self.clock.seconds - self.seconds_at_checkpoint
-                if seconds_since >= self.checkpoint_seconds and self.check_finite():
+                is_due = seconds_since >= self.checkpoint_seconds and not self.saver.is_writing
+                if is_due and self.check_finite():
                     self.save_checkpoint()
             state = self.state_dict()  # a resumed run repeats what this last report empties
             if self.updates > self.updates_at_log:
@@ -342,8 +348,9 @@ class Trainer:
             try:
                 recorder.write(path, value, self.rollout)
                 self.replay_hint = f". To see it again: {nonfinite_recorder.command(path)}"
-            except OSError as error:
-                self.replay_hint = f". {path} could not be written ({error.strerror or error})"
+            except Exception as error:  # the run is worth more than this file
+                reason = getattr(error, "strerror", None) or error
+                self.replay_hint = f". {path} could not be written ({reason})"
         elif value.is_from_env and self.replay_folder is not None:
             self.replay_hint = f". {nonfinite_recorder.NOT_RECORDED}"
         if recorder is not None:
@@ -367,6 +374,13 @@ class Trainer:
                 stacklevel=2,
             )
         state = self.state_dict() if state is None else state
+        try:  # a checkpoint must not reach further than what is on disk of the run's files
+            self.logger.sync()
+            if self.annealing_record is not None:
+                self.annealing_record.sync()
+        except OSError:
+            if not is_last:
+                return
         self.saver(self.samples, state, self.score, is_last)
         self.updates_at_checkpoint = self.updates
 
@@ -374,14 +388,14 @@ class Trainer:
         """Begins to save a checkpoint from which a resumed run starts new episodes: after an error
         the environment may be the cause, or in the middle of a rollout.
         """
-        state = self.state_dict()
-        for name in ("env", "collector"):
-            state.pop(name, None)
-        self.save_checkpoint(state, is_last=True)
+        self.save_checkpoint(self.state_dict(has_episodes=False), is_last=True)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self, has_episodes: bool = True) -> dict[str, Any]:
         """Returns all that a resumed run needs, as dicts of tensors and plain values, most of which
         share their memory with what trains.
+
+        Args:
+            has_episodes: includes the environment, and what the policy remembers of it.
         """
         self.wait_for_collector()
         parts = dict(
@@ -392,14 +406,15 @@ class Trainer:
             updates=self.updates,
             seconds=self.clock.seconds,
             samples_at_report=self.samples_at_report,
-            env=self.env_state.state_dict(),
         )
+        if has_episodes:
+            parts["env"] = self.env_state.state_dict()
+            parts["collector"] = getattr(self.collect, "state_dict", dict)()
         optional_parts = dict(
-            collector=getattr(self.collect, "state_dict", dict)(),
             opponents=None if self.opponents is None else self.opponents.state_dict(),
             replay=None if self.replay_buffer is None else self.replay_buffer.state_dict(),
         )
-        return parts | {name: part for name, part in optional_parts.items() if part}
+        return parts | {name: part for name, part in optional_parts.items() if part is not None}
 
     def load_state_dict(self, state: dict[str, Any]) -> list[str]:
         """Restores a `state_dict`.
@@ -410,13 +425,15 @@ class Trainer:
         lost = []
         self.policy.load_state_dict(state["policy"])
         self.learner.load_state_dict(state["learner"])
-        if self.opponents is not None:
-            self.opponents.load_state_dict(state["opponents"])
         self.samples, self.updates = state["samples"], state["updates"]
         self.clock.seconds_before = state["seconds"]
         self.samples_at_report = state["samples_at_report"]
         self.updates_at_checkpoint = self.updates_at_log = self.updates
         lost += self._load_episodes(state)
+        if self.opponents is not None:
+            of_episodes = {"lanes"} if lost else set()
+            parts = state["opponents"].items()
+            self.opponents.load_state_dict({k: v for k, v in parts if k not in of_episodes})
         if self.replay_buffer is not None:
             if "replay" in state:
                 self.replay_buffer.load_state_dict(state["replay"])
@@ -429,7 +446,7 @@ class Trainer:
         lost = []
         if "env" not in state:
             lost.append("its environments were not saved, so new episodes begin")
-        elif "collector" not in state:
+        elif not state["collector"]:
             name = type(self.collect).__name__
             lost.append(f"{name} has no state_dict, so new episodes begin")
         else:

@@ -32,7 +32,12 @@ OPAQUE = (  # types whose attributes hold no state of an environment
 
 
 def children(node):
-    """Returns [(step of the path, child)] of a node."""
+    """Returns [(step of the path, child)] of a node.
+
+    An object of a class with an attribute ``IS_STATELESS`` has none.
+    """
+    if getattr(type(node), "IS_STATELESS", False):
+        return []
     if isinstance(node, dict):
         return [(f"[{key!r}]", child) for key, child in dict.items(node)]
     if isinstance(node, (list, tuple, collections.deque)):

@@ -448,7 +448,8 @@ def test_disk_that_fills_up(here, monkeypatch, capsys, with_curves):
 
     def report(self, losses):
         real(self, losses)
-        if self.updates == 2:  # the first checkpoint is written
+        if self.updates == 2:
+            self.saver.wait()  # the first checkpoint is written
             full.enter_context(faults.full_disk(5000))
 
     with full, monkeypatch.context() as patch:

@@ -150,6 +150,10 @@ def trainer_of(folder, env, samples, seed=1, **options):
         def write(samples, metrics, perf):
             rows.append({"samples": samples, **metrics})
 
+        @staticmethod
+        def sync():
+            pass
+
     saver = Saver(folder, {})
     opponents = env if options else None
     run = Trainer(env, policy, learner, Rows, saver, Budget(samples), opponents=opponents)

@@ -69,7 +69,7 @@ def trainer_in(folder, env=None, learner=PPO, past=0.0, **options):
     policy = Policy(env.obs_space, env.action_space, width=8)
     opponents = Opponents(env, policy, past=past, snapshots=1) if past else None
     learner = learner(policy, n_steps=T, n_minibatches=2, **options)
-    logger = type("Silent", (), {"write": lambda *args: None})()
+    logger = type("Silent", (), {name: lambda *_: None for name in ("write", "sync")})()
     return Trainer(
         opponents or env,
         policy,

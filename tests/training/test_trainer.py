@@ -64,6 +64,9 @@ class Rows(list):
     def write(self, samples, metrics, perf):
         self.append({"samples": samples, **metrics})
 
+    def sync(self):
+        pass
+
 
 class Pairs(Numbers):
     """The same lanes as three environments of a leader and a follower. The follower's episodes end
