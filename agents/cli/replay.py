@@ -5,10 +5,8 @@ import functools
 import sys
 from pathlib import Path
 
-import yaml
-
 from megastep.agents.algorithms.nonfinite import NonFiniteValue
-from megastep.agents.cli import check, console, factory, program, settings, signals
+from megastep.agents.cli import console, factory, program, runs, signals
 from megastep.agents.training.nonfinite_replay import Recording, ReplayError
 
 
@@ -25,12 +23,17 @@ def main(words: list[str] | None = None) -> int:
     )
     parser.add_argument("file", type=Path, help="nonfinite-SAMPLES.npz, in the folder of its run")
     parser.add_argument(
-        "device", nargs="?", type=_device, help="such as device=cpu; default: as in the run"
+        "options",
+        nargs="*",
+        type=_option,
+        metavar="key=value",
+        help="device=cpu: where, default: as in the run; trust=true: import what a run that another "
+        "user made names",
     )
     try:
         with signals.interrupting():
             arguments = parser.parse_args(words)
-            run(arguments.file, arguments.device)
+            run(arguments.file, **dict(arguments.options))
     except SystemExit as end:  # of argparse
         return end.code or 0
     except program.UserError as error:
@@ -42,18 +45,22 @@ def main(words: list[str] | None = None) -> int:
     return 0
 
 
-def _device(word):
-    if not word.startswith("device="):
-        raise argparse.ArgumentTypeError(f"{word!r} is unknown; give device=cpu or device=cuda")
-    return word.removeprefix("device=")
+def _option(word):
+    key, _, value = word.partition("=")
+    if word == "trust=true":
+        return key, True
+    if key != "device" or not value:
+        raise argparse.ArgumentTypeError(f"{word!r} is unknown; give device=cpu or trust=true")
+    return key, value
 
 
-def run(path: Path, device: str | None = None) -> NonFiniteValue:
+def run(path: Path, device: str | None = None, trust: bool = False) -> NonFiniteValue:
     """Builds the environment of a run, replays a file in it, and says what was not finite.
 
     Args:
         path: the file, in the folder of its run.
         device: where; None for the kind of device that wrote it.
+        trust: whether a run that another user made may name modules to import.
 
     Returns:
         the first non-finite number, which is the file's.
@@ -65,7 +72,7 @@ def run(path: Path, device: str | None = None) -> NonFiniteValue:
     errors = functools.partial(program.errors, f"{path} cannot be replayed: ")
     with errors():
         recording = Recording(path)
-    cfg = config_of(path.parent)
+    cfg = factory.config_of(runs.load_checkpoint(path.parent, trust))
     device = factory.make_device(device or recording.device)
     env = factory.construct(
         cfg.env,
@@ -85,11 +92,3 @@ def run(path: Path, device: str | None = None) -> NonFiniteValue:
         f"{name} of lane {lane} was not finite at step {step:,}. The environment must have changed "
         "since, or what it does depends on more than its tensors and generators"
     )
-
-
-def config_of(folder: Path) -> settings.Train:
-    """Returns the settings of a run. UserError if they cannot be read."""
-    path = folder / "config.yaml"
-    kinds = (OSError, yaml.YAMLError, program.ConfigErrors)
-    with program.errors(f"{path}, with which the environment is built, cannot be used: ", kinds):
-        return check.check(settings.Train, yaml.safe_load(path.read_bytes()))
