@@ -27,8 +27,8 @@ def main(words: list[str] | None = None) -> int:
         nargs="*",
         type=_option,
         metavar="key=value",
-        help="device=cpu: where, default: as in the run; trust=true: import what a run that another "
-        "user made names",
+        help="device=cpu: where; default: as in the run. trust=true: import what it names, though "
+        "another user made it",
     )
     try:
         with signals.interrupting():
