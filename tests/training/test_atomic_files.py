@@ -11,7 +11,6 @@ import pytest
 from megastep.agents.training import atomic_files
 from megastep.agents.training.atomic_files import delete_leftovers, temporary_path, write_atomically
 
-
 FORK = multiprocessing.get_context("fork")
 
 
