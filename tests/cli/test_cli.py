@@ -80,25 +80,20 @@ def test_missing_compiler(tmp_path):
 @pytest.mark.slow
 def test_same_seed_in_two_processes(tmp_path):
     words = [*TINY, *tiny.SHORT_EPISODES, "samples=256", "log_every=2"]
-    for name, seed in (("one", 1), ("two", 1), ("other", 2)):
-        arguments = [*words, f"seed={seed}", f"folder={name}"]
-        hashed_by = {"PYTHONHASHSEED": str(len(name) * seed)}
-        assert finished("train", *arguments, cwd=tmp_path, **hashed_by)[0] == 0
-    metrics, weights = zip(
-        *(
-            (
-                (tmp_path / name / "metrics.jsonl").read_bytes(),
-                checkpoint.load_latest(tmp_path / name / "checkpoints").state["policy"],
-            )
-            for name in ("one", "two", "other")
+    metrics, weights = [], []
+    for n, seed in enumerate([1, 1, 2]):
+        process = start(
+            "train", *words, f"seed={seed}", f"folder={n}", cwd=tmp_path, PYTHONHASHSEED=str(n)
         )
-    )
+        assert process.communicate(timeout=HUNG)[1] == "" and process.returncode == 0
+        metrics.append((tmp_path / str(n) / "metrics.jsonl").read_bytes())
+        weights.append(checkpoint.load_latest(tmp_path / str(n) / "checkpoints").state["policy"])
     assert metrics[0] == metrics[1] != metrics[2] and len(metrics[0].splitlines()) == 4
-    is_equal = [
-        [torch.equal(value, other[key]) for key, value in weights[0].items()]
-        for other in weights[1:]
-    ]
-    assert all(is_equal[0]) and not all(is_equal[1])
+    same, other = (
+        [torch.equal(value, those[key]) for key, value in weights[0].items()]
+        for those in weights[1:]
+    )
+    assert all(same) and not all(other)
 
 
 def test_run_folder_lock_and_closed_terminal(tmp_path, monkeypatch, capsys):
