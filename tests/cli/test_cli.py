@@ -83,11 +83,11 @@ def test_same_seed_in_two_processes(tmp_path):
     metrics, weights = [], []
     for n, seed in enumerate([1, 1, 2]):
         process = start(
-            "train", *words, f"seed={seed}", f"folder={n}", cwd=tmp_path, PYTHONHASHSEED=str(n)
+            "train", *words, f"seed={seed}", f"folder=run{n}", cwd=tmp_path, PYTHONHASHSEED=str(n)
         )
         assert process.communicate(timeout=HUNG)[1] == "" and process.returncode == 0
-        metrics.append((tmp_path / str(n) / "metrics.jsonl").read_bytes())
-        weights.append(checkpoint.load_latest(tmp_path / str(n) / "checkpoints").state["policy"])
+        metrics.append((tmp_path / f"run{n}" / "metrics.jsonl").read_bytes())
+        weights.append(checkpoint.load_latest(tmp_path / f"run{n}" / "checkpoints").state["policy"])
     assert metrics[0] == metrics[1] != metrics[2] and len(metrics[0].splitlines()) == 4
     same, other = (
         [torch.equal(value, those[key]) for key, value in weights[0].items()]
