@@ -33,6 +33,7 @@ from megastep.settings import closest
 LONGEST, MOST_BRACKETS = 200, 40
 #: Bytes that the locale's encoding does not have.
 UNDECODED = re.compile(r"[\ud800-\udfff]")
+NO_TEXT = "is no text in this locale; PYTHONUTF8=1 reads UTF-8"
 #: An element of a value with = in it, as folders of sweeps have, and what quotes it.
 WITH_EQUALS, QUOTED = re.compile(r"[^\[\],]*=[^\[\],]*"), r'"\g<0>"'
 #: Members of Hydra's own groups that come with the optional dependencies.
@@ -114,7 +115,7 @@ class Composer:
                     break
             else:
                 cure = "cannot be read; write key=value, and quote blanks: 'key=\"a b\"'"
-                cure = cure if is_text else "is no text in this locale; PYTHONUTF8=1 reads UTF-8"
+                cure = cure if is_text else NO_TEXT
                 errors.append((program.shortened(word), cure))
         if errors:
             raise ConfigErrors(errors)
