@@ -178,6 +178,7 @@ def test_invalid_sweep_leaves_nothing(here, capsys):
 
 def test_folder_that_is_no_text(here, monkeypatch, capsys):
     (here / "r\udcff").mkdir()
+    monkeypatch.syspath_prepend(here)
     monkeypatch.chdir(here / "r\udcff")
     assert train.main([*SHORT, "-m", "seed=1,2"]) == 2
     (sentence,) = capsys.readouterr().err.splitlines()
