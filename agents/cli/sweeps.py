@@ -107,7 +107,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
     config = jobs_of(composer, words)[1]
     folder = Path(config.sweep.dir)
     if UNDECODED.search(str(folder.absolute())):  # which the settings of jobs hold as text
-        raise UserError(f"{folder.absolute()} {NO_TEXT}")
+        raise UserError(f"{str(folder.absolute())!r} {NO_TEXT}")
     is_new = not folder.exists()
     with program.errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
         if "hydra.sweep.dir" not in overrides:
