@@ -64,7 +64,7 @@ def test_every_environment_has_a_section():
 
 @functools.cache
 def tiers(path):
-    """Returns {test: what it is marked as among slow, nightly and cuda} of a file of tests."""
+    """Returns {test: (its marks among slow, nightly and cuda, decorators)} of a file of tests."""
     functions, of_all = {}, set()
     for node in ast.parse((ROOT / "tests" / path).read_text()).body:
         if isinstance(node, ast.FunctionDef):
@@ -73,7 +73,7 @@ def tiers(path):
             of_all.add(ast.unparse(node.value))
     known = {"slow", "nightly", "cuda"}
     return {
-        name: {mark.rpartition(".")[2] for mark in marks | of_all} & known
+        name: ({mark.rpartition(".")[2] for mark in marks | of_all} & known, str(marks))
         for name, marks in functions.items()
     }
 
@@ -85,5 +85,8 @@ def test_tests_of_all_faults_exist():
         named = re.findall(r"`([\w/]+\.py)::(\w+)`(?: \((\w+)\))?", tests)
         assert named and len(named) == tests.count("::"), fault
         for path, name, tier in named:
-            assert tiers(path).get(name) == {tier} - {""}, (fault, path, name)
+            marks, decorators = tiers(path).get(name, ({"absent"}, ""))
+            # every case of a test may have a mark of its own
+            is_of_tier = marks == {tier} - {""} or not marks and f"mark.{tier}" in decorators
+            assert is_of_tier, (fault, path, name)
     assert len(rows) == 49
