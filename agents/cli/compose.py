@@ -31,6 +31,9 @@ from megastep.settings import closest
 #: The longest key and member of a group, and the most brackets of a word: Python's recursion ends
 #: not far above.
 LONGEST, MOST_BRACKETS = 200, 40
+#: Bytes that the locale's encoding does not have.
+UNDECODED = re.compile(r"[\ud800-\udfff]")
+NO_TEXT = "is no text in this locale; PYTHONUTF8=1 reads UTF-8"
 #: An element of a value with = in it, as folders of sweeps have, and what quotes it.
 WITH_EQUALS, QUOTED = re.compile(r"[^\[\],]*=[^\[\],]*"), r'"\g<0>"'
 #: Members of Hydra's own groups that come with the optional dependencies.
@@ -103,13 +106,16 @@ class Composer:
         overrides, errors, parser = [], [], overrides_parser.OverridesParser.create(self.loader)
         for word in words:
             key, _, value = word.partition("=")
-            fits = len(key) <= LONGEST and value.count("[") + value.count("{") <= MOST_BRACKETS
+            n_brackets = value.count("[") + value.count("{")
+            is_text = not UNDECODED.search(word)
+            fits = is_text and len(key) <= LONGEST and n_brackets <= MOST_BRACKETS
             for text in (word, f"{key}={WITH_EQUALS.sub(QUOTED, value)}") if key and fits else ():
                 with suppress(HydraException, ValueError):
                     overrides += parser.parse_overrides([text])
                     break
             else:
                 cure = "cannot be read; write key=value, and quote blanks: 'key=\"a b\"'"
+                cure = cure if is_text else NO_TEXT
                 errors.append((program.shortened(word), cure))
         if errors:
             raise ConfigErrors(errors)

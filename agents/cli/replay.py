@@ -2,16 +2,12 @@
 
 import argparse
 import functools
-import json
 import sys
 from pathlib import Path
 
-import yaml
-
 from megastep.agents.algorithms.nonfinite import NonFiniteValue
-from megastep.agents.cli import check, console, factory, program, runs, settings, signals
+from megastep.agents.cli import console, factory, program, runs, signals
 from megastep.agents.training.nonfinite_replay import Recording, ReplayError
-from megastep.agents.training.trust import foreign_names
 
 
 class NotRepeated(program.UserError):
@@ -27,16 +23,17 @@ def main(words: list[str] | None = None) -> int:
     )
     parser.add_argument("file", type=Path, help="nonfinite-SAMPLES.npz, in the folder of its run")
     parser.add_argument(
-        "settings",
+        "options",
         nargs="*",
-        type=_setting,
-        help="device=cpu; default: as in the run. trust=true, if another user made the run and it "
-        "names modules outside megastep",
+        type=_option,
+        metavar="key=value",
+        help="device=cpu: where; default: as in the run. trust=true: import what it names, though "
+        "another user made it",
     )
     try:
         with signals.interrupting():
             arguments = parser.parse_args(words)
-            run(arguments.file, **dict(arguments.settings))
+            run(arguments.file, **dict(arguments.options))
     except SystemExit as end:  # of argparse
         return end.code or 0
     except program.UserError as error:
@@ -48,13 +45,13 @@ def main(words: list[str] | None = None) -> int:
     return 0
 
 
-def _setting(word):
+def _option(word):
     key, _, value = word.partition("=")
-    if key == "device" and value:
-        return key, value
-    if key == "trust" and value in ("true", "false"):
-        return key, value == "true"
-    raise argparse.ArgumentTypeError(f"{word!r} is unknown; give device=cpu or trust=true")
+    if word == "trust=true":
+        return key, True
+    if key != "device" or not value:
+        raise argparse.ArgumentTypeError(f"{word!r} is unknown; give device=cpu or trust=true")
+    return key, value
 
 
 def run(path: Path, device: str | None = None, trust: bool = False) -> NonFiniteValue:
@@ -63,7 +60,7 @@ def run(path: Path, device: str | None = None, trust: bool = False) -> NonFinite
     Args:
         path: the file, in the folder of its run.
         device: where; None for the kind of device that wrote it.
-        trust: imports modules that the run names, whoever made it.
+        trust: whether a run that another user made may name modules to import.
 
     Returns:
         the first non-finite number, which is the file's.
@@ -75,7 +72,7 @@ def run(path: Path, device: str | None = None, trust: bool = False) -> NonFinite
     errors = functools.partial(program.errors, f"{path} cannot be replayed: ")
     with errors():
         recording = Recording(path)
-    cfg = config_of(path.parent, trust)
+    cfg = factory.config_of(runs.load_checkpoint(path.parent, trust))
     device = factory.make_device(device or recording.device)
     env = factory.construct(
         cfg.env,
@@ -95,23 +92,3 @@ def run(path: Path, device: str | None = None, trust: bool = False) -> NonFinite
         f"{name} of lane {lane} was not finite at step {step:,}. The environment must have changed "
         "since, or what it does depends on more than its tensors and generators"
     )
-
-
-def config_of(folder: Path, trust: bool) -> settings.Train:
-    """Returns the settings of a run. UserError if they cannot be read, or if they name modules that
-    neither `trust` nor a checkpoint that this user made allows.
-    """
-    path = folder / "config.yaml"
-    kinds = (OSError, ValueError, RecursionError, yaml.YAMLError, program.ConfigErrors)
-    with program.errors(f"{path}, with which the environment is built, cannot be used: ", kinds):
-        tree = yaml.safe_load(path.read_bytes())
-        names = set() if trust else {*foreign_names(json.dumps({"train": tree}, default=str))}
-        if names and (folder / "checkpoints").is_dir():
-            saved = json.dumps(runs.load_checkpoint(folder, trust).config)
-            names -= {*foreign_names(saved.encode())}
-        if names:
-            raise program.UserError(
-                f"{path} would import {program.shortened(', '.join(sorted(names)))}, which runs "
-                "code outside megastep; if you trust it, add trust=true"
-            )
-        return check.check(settings.Train, tree)

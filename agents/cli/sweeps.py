@@ -33,7 +33,7 @@ from omegaconf import OmegaConf
 
 from megastep import workers
 from megastep.agents.cli import console, program, runs, scripts, settings, signals
-from megastep.agents.cli.compose import Composer, key_of
+from megastep.agents.cli.compose import NO_TEXT, UNDECODED, Composer, key_of
 from megastep.agents.cli.program import ConfigErrors, UserError, shortened
 from megastep.agents.training.atomic_files import write_atomically
 
@@ -106,6 +106,8 @@ def sweep(composer: Composer, words: list[str]) -> int:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])
     config = jobs_of(composer, words)[1]
     folder = Path(config.sweep.dir)
+    if UNDECODED.search(str(folder.absolute())):  # which the settings of jobs hold as text
+        raise UserError(f"{str(folder.absolute())!r} {NO_TEXT}")
     is_new = not folder.exists()
     with program.errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
         if "hydra.sweep.dir" not in overrides:

@@ -20,6 +20,15 @@ from megastep.types import Env, n_lanes, optional
 
 #: The format of the files.
 FORMAT = 1
+#: What reading another file raises.
+UNREADABLE = (
+    zipfile.BadZipFile,
+    ValueError,
+    KeyError,
+    TypeError,
+    EOFError,
+    RecursionError,  # a header of many brackets
+)
 
 
 class ReplayError(ValueError):
@@ -52,7 +61,7 @@ class Recording:
                     f"{FORMAT}: use the megastep that wrote it"
                 )
             self.place, self.device = tuple(self.header["place"]), self.header["device"]
-        except (zipfile.BadZipFile, ValueError, KeyError, TypeError, EOFError) as error:
+        except UNREADABLE as error:
             if isinstance(error, ReplayError):
                 raise
             raise ReplayError(f"{path} is no file of a non-finite number, or damaged") from error

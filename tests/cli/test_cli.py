@@ -8,8 +8,9 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
-from megastep.agents.cli import train
+from megastep.agents.cli import runs, train
 from megastep.agents.training import checkpoint
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, wait_until
@@ -58,6 +59,8 @@ def test_missing_gpu(tmp_path, monkeypatch, capsys):
     err = capsys.readouterr().err
     assert "device=cpu" in err and len(err.splitlines()) == 1
     assert not any(tmp_path.glob("runs/*"))
+    assert train.main([*TINY, "device=auto", "samples=1", "folder=run"]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == "Training on cpu in run"
 
 
 @pytest.mark.slow
@@ -72,6 +75,25 @@ def test_missing_compiler(tmp_path):
     )
     assert code == 2 and "compiler" in err and len(err.splitlines()) == 1
     assert not any(tmp_path.glob("runs/*"))
+
+
+@pytest.mark.slow
+def test_same_seed_in_two_processes(tmp_path):
+    words = [*TINY, *tiny.SHORT_EPISODES, "samples=256", "log_every=2"]
+    metrics, weights = [], []
+    for n, seed in enumerate([1, 1, 2]):
+        process = start(
+            "train", *words, f"seed={seed}", f"folder=run{n}", cwd=tmp_path, PYTHONHASHSEED=str(n)
+        )
+        assert process.communicate(timeout=HUNG)[1] == "" and process.returncode == 0
+        metrics.append((tmp_path / f"run{n}" / "metrics.jsonl").read_bytes())
+        weights.append(checkpoint.load_latest(tmp_path / f"run{n}" / "checkpoints").state["policy"])
+    assert metrics[0] == metrics[1] != metrics[2] and len(metrics[0].splitlines()) == 4
+    same, other = (
+        [torch.equal(value, those[key]) for key, value in weights[0].items()]
+        for those in weights[1:]
+    )
+    assert all(same) and not all(other)
 
 
 def test_run_folder_lock_and_closed_terminal(tmp_path, monkeypatch, capsys):
@@ -130,3 +152,26 @@ def test_ascii_output(tmp_path):
     assert (code, err) == (0, "") and (out + err).isascii()
     assert "Training on cpu in \\xfc" in out and "| trained |" in out and "95 % interval" in out
     assert list((tmp_path / "ü" / "evaluations").iterdir())
+
+
+@pytest.mark.slow
+def test_folder_that_the_locale_cannot_spell(tmp_path, monkeypatch):
+    """And a clock that is put back by a day, as the time zone changes."""
+    folder = tmp_path / "r n ü"
+    folder.mkdir()
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "TERM": "dumb"}
+    finish = ["finish.evaluate=true", "finish.episodes=4", "finish.record=true", "finish.steps=2"]
+    for words, zone in (
+        ([*TINY, "samples=32"], "Pacific/Kiritimati"),
+        (["resume=latest", "more_samples=32"], "Pacific/Midway"),
+        ([*TINY, "samples=1", *finish], "Pacific/Midway"),
+    ):
+        code, _, err = finished("train", *words, cwd=folder, TZ=zone, **ascii_only)
+        assert (code, err) == (0, "")
+    monkeypatch.chdir(folder)
+    latest, first = sorted(folder.glob("runs/*/checkpoints"))  # by name, which has the local time
+    assert runs.find("latest").resolve() == latest.parent
+    assert [checkpoint.load_latest(path).step for path in (first, latest)] == [64, 32]
+    assert (latest.parent / "video.mp4").exists() and any(latest.parent.glob("evaluations/*.json"))
+    code, _, err = finished("train", *TINY, "folder='ü'", cwd=folder, **ascii_only)
+    assert code == 2 and "is no text in this locale" in err and "Traceback" not in err

@@ -350,6 +350,7 @@ def test_minibatch_needs_an_environment():
         ("hydra.job.chdir=maybe", "hydra.job.chdir", "Value 'maybe' is not a valid bool"),
         ("hydra/launcher=basik", "hydra/launcher", "'basik' is unknown; did you mean basic?"),
         ("hydra/lancher=basic", "hydra/lancher", "did you mean hydra/launcher?"),
+        ("folder='r\udcff'", "folder='r\udcff'", "is no text in this locale"),
     ],
 )
 def test_bad_overrides(override, key, sentence):

@@ -4,17 +4,16 @@ import copy
 import importlib
 import json
 import pathlib
-import shutil
 import sys
 from contextlib import suppress
 
+import numpy as np
 import pytest
-import yaml
 
 from megastep.agents.cli import check, evaluate, record, replay, train
-from megastep.agents.cli.program import ConfigErrors, UserError
+from megastep.agents.cli.program import ConfigErrors
 from megastep.agents.cli.settings import Train, kind_of
-from megastep.agents.training import checkpoint, trust
+from megastep.agents.training import checkpoint, nonfinite_replay, trust
 from tests.helpers.tiny import TINY, settings
 
 KEYS = ("env.name", "geometry.name", "learner.name", "opponents.bot_class")
@@ -64,12 +63,15 @@ COMMANDS = [
     (evaluate.main, ["run=run"]),
     (evaluate.main, ["run=run", "against=bot"]),
     (record.main, ["run=run"]),
+    (replay.main, ["run/nonfinite-64.npz"]),
 ]
 
 
 @pytest.mark.parametrize("main, words", COMMANDS)
 def test_downloaded_run_is_refused_before_anything_is_imported(main, words, monkeypatch, capsys):
     save(monkeypatch, *KEYS)
+    header = {"format": nonfinite_replay.FORMAT, "place": ["obs", 0, 1], "device": "cpu"}
+    np.savez("run/nonfinite-64.npz", header=json.dumps(header))
     assert main(words) == 2
     err = capsys.readouterr().err
     assert err.count("planted:Thing") == 1 and "trust=true" in err and err.count("\n") == 1
@@ -82,6 +84,13 @@ def test_downloaded_opponent_is_refused(monkeypatch, capsys):
     assert train.main([*mine, "agent.width=8", "learner.n_minibatches=2", "samples=64"]) == 0
     assert evaluate.main(["run=mine", "against=run", "episodes=8"]) == 2
     assert "planted:Thing" in capsys.readouterr().err and not IMPORTED.exists()
+
+
+def test_replay_of_a_trusted_run_is_imported(monkeypatch, capsys):
+    test_downloaded_run_is_refused_before_anything_is_imported(*COMMANDS[-1], monkeypatch, capsys)
+    assert replay.main(["run/nonfinite-64.npz", "trust=true"]) == 2
+    assert "planted has no Thing" in capsys.readouterr().err and IMPORTED.exists()
+    assert replay.main(["run/nonfinite-64.npz", "trust=ja"]) == 2
 
 
 @pytest.mark.parametrize("word, user", [("trust=true", "another"), ("seed=1", None)])
@@ -126,27 +135,3 @@ def test_every_setting_that_imports_is_known_to_do_so():
                 importing.add(key)
                 kind_of.cache_clear()
     assert importing == {*KEYS} - {"opponents.bot_class"}  # which is imported later
-
-
-def replay_config(monkeypatch, user):
-    """Reads the config.yaml of a run with a checkpoint of a user's, as `megastep replay` does."""
-    save(monkeypatch, "env.name", user=user)
-    tree = changed(check.as_tree(settings(*TINY)), "env.name", "planted:Thing")
-    pathlib.Path("run/config.yaml").write_text(yaml.safe_dump(tree))
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(pathlib.Path("mine").absolute()))
-    replay.config_of(pathlib.Path("run"), trust=False)
-
-
-def test_replay_of_a_downloaded_run_is_refused(monkeypatch):
-    with pytest.raises(UserError, match="would import planted:Thing.*trust=true"):
-        replay_config(monkeypatch, "another")
-    shutil.rmtree("run/checkpoints")
-    with pytest.raises(UserError, match="would import planted:Thing.*trust=true"):
-        replay.config_of(pathlib.Path("run"), trust=False)
-    assert not IMPORTED.exists()
-
-
-def test_replay_of_an_own_run_imports_what_its_checkpoint_names(monkeypatch):
-    with suppress(UserError):  # there is no such class
-        replay_config(monkeypatch, "mine")
-    assert IMPORTED.exists()

@@ -128,10 +128,13 @@ def test_init(stopped, trainers, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_resume_on_another_device(stopped, device):
-    step = checkpoint.load_latest(stopped / "checkpoints").step
+def test_resume_on_another_device(stopped, device, capsys):
+    loaded = checkpoint.load_latest(stopped / "checkpoints")
+    step, was_on_gpu = loaded.step, loaded.made_with["device"].startswith("cuda")
     words = [f"resume={stopped}", f"device={device}", f"samples={step + 4 * UPDATE}"]
     assert train.main(words) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "not bit for bit" in line]
+    assert any("device was" in line for line in lines) == (was_on_gpu != (device == "cuda"))
     assert checkpoint.load_latest(stopped / "checkpoints").step == step + 4 * UPDATE
 
 

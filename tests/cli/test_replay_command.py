@@ -1,6 +1,7 @@
 """A run's NaN, replayed by the command that its last sentence names."""
 
 import shlex
+import shutil
 import sys
 
 import pytest
@@ -56,10 +57,10 @@ def test_the_command_of_the_last_sentence_shows_the_number_again(
     (sentence,) = capsys.readouterr().err.splitlines()
     assert "all numbers were finite; in the run, reward of lane 2 was not" in sentence
 
-    (tmp_path / "run" / "config.yaml").unlink()
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
     assert call(monkeypatch, *replay_words) == 2
     (sentence,) = capsys.readouterr().err.splitlines()
-    assert "config.yaml, with which the environment is built, cannot be used" in sentence
+    assert "There is no checkpoint in run" in sentence
 
 
 @pytest.mark.parametrize("words", [["nothing.npz"], ["config.yaml"], []])

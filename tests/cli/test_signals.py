@@ -179,9 +179,13 @@ import os, signal, sys, time
 from megastep.agents.training import loggers
 from megastep.agents.cli import train
 
-def write(*arguments):
-    print("stuck", flush=True)
-    time.sleep(3600)
+real = loggers.Loggers.write
+
+def write(self, step, *values):
+    real(self, step, *values)
+    if step > int(os.environ["STUCK_AFTER"]):
+        print("stuck", flush=True)
+        time.sleep(3600)
 
 loggers.Loggers.write = write
 sys.exit(train.main(sys.argv[1:]))
@@ -190,9 +194,10 @@ sys.exit(train.main(sys.argv[1:]))
 
 @pytest.mark.parametrize("number", ONE_SIGNAL[:2])
 def test_second_signal_quits(here, number):
+    words = [*TINY, "samples=1e9", "folder=run", "checkpoint_seconds=1e-9"]
     process = subprocess.Popen(
-        [sys.executable, "-c", STUCK, *TINY, "samples=1e9", "folder=run"],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        [sys.executable, "-c", STUCK, *words],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "STUCK_AFTER": str(2 * UPDATE)},
         text=True,
         stdout=subprocess.PIPE,
     )
@@ -203,6 +208,10 @@ def test_second_signal_quits(here, number):
     time.sleep(0.5)
     process.send_signal(number)
     assert process.wait(timeout=HUNG) == 128 + number
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step in (UPDATE, 2 * UPDATE)
+    assert train.main(["resume=run", f"samples={4 * UPDATE}"]) == 0, "nothing is corrupt"
+    rows = (here / "run" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(row)["updates"] for row in rows] == [1, 2, 3, 4]
 
 
 def launched(*arguments, script="train", **environment):

@@ -176,6 +176,15 @@ def test_invalid_sweep_leaves_nothing(here, capsys):
         assert not {name for name in left if not name.startswith("payer.")}, words
 
 
+def test_folder_that_is_no_text(here, monkeypatch, capsys):
+    (here / "r\udcff").mkdir()
+    monkeypatch.syspath_prepend(here)
+    monkeypatch.chdir(here / "r\udcff")
+    assert train.main([*SHORT, "-m", "seed=1,2"]) == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert "is no text in this locale" in sentence and not any((here / "r\udcff").iterdir())
+
+
 def test_table_stands_while_jobs_run(here, monkeypatch):
     """Even if a job of the basic launcher ends this process, with `os._exit` or worse."""
     states = []

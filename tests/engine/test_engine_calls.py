@@ -268,6 +268,19 @@ def test_too_many_environments_say_how_many_fit(monkeypatch):
         scene.scenery([toys.box()], n_agents=1, n_envs=10**6, device="cpu")
 
 
+def test_memory_of_a_gpu_includes_what_pytorch_caches(monkeypatch):
+    """1 GB is free, and PyTorch keeps 0.2 GB that nothing uses."""
+    for name, value in (
+        ("mem_get_info", (10**9, 10**10)),
+        ("memory_reserved", 3 * 10**8),
+        ("memory_allocated", 10**8),
+    ):
+        monkeypatch.setattr(torch.cuda, name, lambda device, value=value: value)
+    sentence = "16,777,216 .* need 16.8 GB, but 1.2 GB are free on cuda: at most 1,140,000 fit"
+    with pytest.raises(engine.EngineError, match=sentence):
+        devices.fit(2**24, 1000, "cuda")
+
+
 # ---- On a GPU ----
 
 

@@ -152,6 +152,17 @@ def test_missing_cuda_bindings_are_named(monkeypatch):
         compile.bindings()
 
 
+def test_missing_nvrtc_is_named(monkeypatch):
+    def absent():
+        raise RuntimeError("libnvrtc.so.12: cannot open shared object file")
+
+    nvrtc = SimpleNamespace(nvrtcVersion=absent)
+    monkeypatch.setattr(compile, "bindings", lambda: (None, nvrtc))
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (9, 0))
+    with pytest.raises(compile.EngineError, match="NVRTC.*libnvrtc.so.12.*reinstall torch"):
+        compile.cuda.__wrapped__(ENGINE, 0)
+
+
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_damaged_cubin_is_built_again(tmp_path):

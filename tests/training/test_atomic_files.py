@@ -1,5 +1,6 @@
 """Small files that many write at once, and what killed writers leave."""
 
+import multiprocessing
 import os
 import socket
 import threading
@@ -10,27 +11,30 @@ import pytest
 from megastep.agents.training import atomic_files
 from megastep.agents.training.atomic_files import delete_leftovers, temporary_path, write_atomically
 
+FORK = multiprocessing.get_context("fork")
 
-def test_concurrent_writes_of_one_file_all_succeed(tmp_path, monkeypatch):
+
+@pytest.mark.parametrize(
+    "worker, barrier", [(threading.Thread, threading.Barrier), (FORK.Process, FORK.Barrier)]
+)
+def test_concurrent_writes_of_one_file_all_succeed(tmp_path, monkeypatch, worker, barrier):
     monkeypatch.setattr(os, "fsync", lambda handle: None)  # which would take most of the time
     path, contents = tmp_path / "table.json", [bytes([65 + n]) * 10_000 for n in range(8)]
-    errors, start = [], threading.Barrier(8)
+    start, is_done = barrier(8), [FORK.Event() for _ in contents]
 
-    def write(content):
+    def write(content, done):
         start.wait()
         for _ in range(50):
-            try:
-                write_atomically(path, content)
-                assert path.read_bytes() in contents, "mixed"
-            except BaseException as error:
-                errors.append(error)
+            write_atomically(path, content)
+            assert path.read_bytes() in contents, "mixed"
+        done.set()
 
-    threads = [threading.Thread(target=write, args=(content,)) for content in contents]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not errors and os.listdir(tmp_path) == ["table.json"]
+    workers = [worker(target=write, args=pair) for pair in zip(contents, is_done)]
+    for one in workers:
+        one.start()
+    for one in workers:
+        one.join()
+    assert all(done.is_set() for done in is_done) and os.listdir(tmp_path) == ["table.json"]
 
 
 def left(tmp_path, monkeypatch, what, **faked):

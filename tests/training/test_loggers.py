@@ -266,12 +266,13 @@ def test_curves_are_those_that_the_rows_have():
     }
 
 
-@pytest.mark.slow
-def test_real_wandb_writes_an_offline_run(tmp_path):
+def logged_with_real_wandb(folder, mode, **environment):
+    """Writes one report in a process of its own. Returns the warnings."""
     script = f"""
-from megastep.agents.training.loggers import Loggers
-wandb = dict(project="p", mode="offline", name="n", config=dict(a=1))
-run_loggers = Loggers({str(tmp_path)!r}, wandb=wandb)
+from megastep.agents.training import loggers
+loggers.WANDB_TIMEOUT = 2
+wandb = dict(project="p", mode={mode!r}, name="n", config=dict(a=1))
+run_loggers = loggers.Loggers({str(folder)!r}, wandb=wandb)
 run_loggers.write(1, dict(x=1), dict(y=2))
 run_loggers.close()"""
     process = subprocess.run(
@@ -280,8 +281,25 @@ run_loggers.close()"""
         timeout=HUNG,
         stderr=subprocess.PIPE,
         cwd=pathlib.Path(__file__).parents[2],
+        env={**os.environ, "HOME": str(folder), **environment},
     )
-    assert process.returncode == 0 and "skipped" not in process.stderr, process.stderr
+    assert process.returncode == 0 and "Traceback" not in process.stderr, process.stderr
+    assert json_lines.read(folder / "metrics.jsonl") == [{"samples": 1, "x": 1}]
+    return [line for line in process.stderr.splitlines() if "UserWarning" in line]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key, message", [("", "it has no key here"), (40 * "a", "did not start")])
+def test_real_wandb_without_a_network_is_one_warning(tmp_path, key, message):
+    (warning,) = logged_with_real_wandb(
+        tmp_path, "online", WANDB_BASE_URL="http://127.0.0.1:9", WANDB_API_KEY=key
+    )
+    assert message in warning
+
+
+@pytest.mark.slow
+def test_real_wandb_writes_an_offline_run(tmp_path):
+    assert not logged_with_real_wandb(tmp_path, "offline")
     assert [
         path.stat().st_size > 1000 for path in tmp_path.glob("wandb/offline-run-*/*.wandb")
     ] == [True]

@@ -155,6 +155,9 @@ def test_truncated_file_and_other_format_are_refused(tmp_path, recorded):
         path.write_bytes(whole[:n])
         with pytest.raises(ReplayError):
             Recording(path)
+    np.savez(path, header=200_000 * "[")
+    with pytest.raises(ReplayError, match="or damaged"):
+        Recording(path)
     np.savez(path, header='{"format": 99}')
     with pytest.raises(ReplayError, match="has format 99"):
         Recording(path)
