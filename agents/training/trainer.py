@@ -48,6 +48,7 @@ class Saver(Protocol):
 
     error: str | None  # why the last checkpoint that was begun could not be saved
     lacks_replay: bool  # it was not due to hold the replay buffer
+    is_writing: bool
 
     def __call__(
         self, step: int, state: dict[str, Any], score: float | None, is_last: bool
@@ -68,7 +69,8 @@ class Trainer:
         saver: such as `saver.Saver`.
         budget: when the run ends and how its learning rate falls.
         log_every: updates between two reports.
-        checkpoint_seconds: seconds between two checkpoints.
+        checkpoint_seconds: seconds between two checkpoints. One that is due while the last is still
+            being written comes after it; below a second, training waits for it.
         desync: starts the first episodes at random ages, so that not all lanes end theirs at the
             same time, if the environment has a method `desync()`. Statistics leave these episodes
             out.
@@ -195,7 +197,9 @@ class Trainer:
                     self.samples_at_report = self.samples
                     self.log(losses)
                 seconds_since = self.clock.seconds - self.seconds_at_checkpoint
-                is_due = seconds_since >= self.checkpoint_seconds and not self.saver.is_writing
+                # a slow disk does not stop training, unless a checkpoint of each update is wanted
+                is_behind = self.saver.is_writing and self.checkpoint_seconds >= 1
+                is_due = seconds_since >= self.checkpoint_seconds and not is_behind
                 if is_due and self.check_finite():
                     self.save_checkpoint()
             state = self.state_dict()  # a resumed run repeats what this last report empties
