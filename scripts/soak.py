@@ -34,10 +34,11 @@ WORDS = "preset=cpu device=cpu env.n_envs=4 agent.width=8 learner.n_steps=8 log_
 WORDS += " checkpoint_seconds=0.05"
 MINIMAL = "env=minimal geometry=box env.res=8"
 PONG = "env=pong env.self_play=true opponents.past=0.5 opponents.snapshots=2 opponents.every=10"
+REPLAY = "learner.gradient_steps=2 learner.replay.capacity=400 learner.replay.burn_in=4"
 CONFIGURATIONS = {
     "PPO": f"{MINIMAL} learner=ppo learner.n_minibatches=2",
     "V-trace, an update behind": f"{MINIMAL} learner=vtrace learner.n_minibatches=2 learner.lag=1",
-    "R2D2": f"{MINIMAL} learner=r2d2",
+    "R2D2": f"{MINIMAL} learner=r2d2 {REPLAY}",
     "PPO, against its past": f"{PONG} learner=ppo learner.n_minibatches=2",
 }
 SIGNALS = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129, "SIGKILL": -9}
@@ -112,9 +113,9 @@ def disturb(words, folder, seconds, draw, deadline):
             process.wait(draw.uniform(0, seconds) if fault else HUNG)
         except subprocess.TimeoutExpired:
             process.send_signal(number) if number else None
-        # on a full disk the run ends with 1, as its last checkpoint is missing
+        # on a full disk the run cannot begin, or ends without its last checkpoint
         allowed = {0, SIGNALS[number.name]} if number else {0}
-        status = end(process, allowed | ({1} if fault == "full disk" else set()))
+        status = end(process, allowed | ({1, 2} if fault == "full disk" else set()))
         if status == 0:
             return faults
 
