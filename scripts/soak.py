@@ -10,6 +10,7 @@ Prints what differs and exits with 1 if anything does.
 """
 
 import argparse
+import contextlib
 import itertools
 import os
 import random
@@ -90,7 +91,7 @@ def damage(path, fault, draw):
     path.write_bytes(content)
 
 
-def disturb(words, folder, seconds, draw, deadline):
+def disturb(words, folder, samples, seconds, draw, deadline):
     """Trains with faults at random moments, each within `seconds` of a process's start, then to the
     end. Returns the faults.
     """
@@ -114,10 +115,19 @@ def disturb(words, folder, seconds, draw, deadline):
         except subprocess.TimeoutExpired:
             process.send_signal(number) if number else None
         # on a full disk the run cannot begin, or ends without its last checkpoint
-        allowed = {0, SIGNALS[number.name]} if number else {0}
+        # a signal may come before Python handles it
+        allowed = {0, SIGNALS[number.name], -number} if number else {0}
         status = end(process, allowed | ({1, 2} if fault == "full disk" else set()))
-        if status == 0:
+        if status == 0 or is_spent(folder, samples):
             return faults
+
+
+def is_spent(folder, samples):
+    """Returns whether a run's last checkpoint has its whole budget, after a signal at its end."""
+    saved = checkpoint.list_checkpoints(folder / "checkpoints")
+    with contextlib.suppress(checkpoint.CheckpointError):
+        return bool(saved) and checkpoint.load_latest(saved[-1], None).step >= samples
+    return False
 
 
 def differences(expected, actual):
@@ -163,7 +173,7 @@ def soak(minutes, seed, samples, folder):
         alone, disturbed = (folder / f"{n}-{kind}" for kind in ("alone", "disturbed"))
         before = time.monotonic()
         end(start([*words, f"folder={alone}"]), {0})
-        faults = disturb(words, disturbed, time.monotonic() - before, draw, deadline)
+        faults = disturb(words, disturbed, samples, time.monotonic() - before, draw, deadline)
         found = list(differences(alone, disturbed))
         print(f"{name}, {len(faults)} faults ({'; '.join(faults)}):", flush=True)
         print(*(found or ["equal"]), sep="\n", flush=True)

@@ -200,6 +200,7 @@ class Trainer:
                 # a slow disk does not stop training, unless a checkpoint of each update is wanted
                 is_behind = self.saver.is_writing and self.checkpoint_seconds >= 1
                 is_due = seconds_since >= self.checkpoint_seconds and not is_behind
+                is_due &= self.fraction_left > 0  # the last one follows the last report
                 if is_due and self.check_finite():
                     self.save_checkpoint()
             state = self.state_dict()  # a resumed run repeats what this last report empties
