@@ -42,7 +42,7 @@ def test_commands_train_evaluate_and_record(tmp_path, monkeypatch, capsys):
     shown = capsys.readouterr().out
     assert "safe: 64 episodes, after" in shown
     assert "rover: 64 episodes in 1 home, geometry=column, split=test" in shown
-    safe, rover = sorted(path for path in (tmp_path / "runs").iterdir() if path.is_dir())
+    (safe,), (rover,) = ([*(tmp_path / "runs").glob(f"*-{name}-*")] for name in ("safe", "rover"))
     assert (rover / "video.mp4").stat().st_size > 1000
     with pages.inside(tmp_path, monkeypatch):
         assert pages.MAINS["record.py"]([f"run={safe}"]) == 2
