@@ -22,6 +22,9 @@ _GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, rand
 _STATEFUL = (torch.Tensor, np.ndarray, *_GENERATORS)
 _NUMBERS = (bool, int, float, str, type(None), complex, bytes, enum.Enum, np.generic)
 _CONTAINERS = (list, tuple, dict, set, frozenset, collections.deque)
+#: Bytes of a tensor that is left out if it has not changed.
+_LARGE = 2**20
+_CHUNK, _FACTOR = 2**20, 0x9E3779B1  # an odd number without a pattern
 #: Types without attributes that hold nothing that changes.
 _CONSTANT = (
     *OPAQUE,
@@ -35,6 +38,9 @@ class EnvState:
     generators, and the plain values that have changed since this object was made. A plain value is
     a number, a string, or lists, tuples, sets and dicts of these. The global generators of PyTorch,
     NumPy and Python are saved as well.
+
+    Tensors of a MB and more that have not changed since, such as floor plans, are left out: a new
+    environment of the same settings has them.
 
     It reaches what attributes, lists and dicts lead to; `unreachable` names the rest. Make it after
     ``env.reset()``.
@@ -53,6 +59,12 @@ class EnvState:
         generators |= dict(numpy=np.random.mtrand._rand, python=random.seed.__self__)
         self.root = python_types.SimpleNamespace(env=env, bot=bot, generators=generators)
         self._first_values = {path: _encoded(node) for path, node in self._plain_values()}
+        leaves = walk(self.root, torch.Tensor).items()
+        self._first_digests = {
+            path: _digest(leaf)
+            for path, (_, _, leaf) in leaves
+            if leaf.nbytes >= _LARGE and not isinstance(leaf, ReadOnlyTensor)
+        }
         nodes = self._nodes_of_user()
         self._first_constants = {path: node for path, node in nodes if isinstance(node, _CONSTANT)}
 
@@ -75,15 +87,22 @@ class EnvState:
         values = {path: _encoded(node) for path, node in self._plain_values()}
         first, missing = self._first_values, object()
         values = {path: now for path, now in values.items() if first.get(path, missing) != now}
-        state = dict(arrays=arrays, kinds=kinds, generators=generators, values=values)
-        return state | self._members() | {"aliases": self._aliases(arrays)}
+        state = dict(kinds=kinds, generators=generators, values=values, **self._members())
+        aliases, first = self._aliases(arrays), self._first_digests
+        unchanged = {
+            path: first[path]
+            for path in first
+            if path in arrays and _digest(arrays[path]) == first[path]
+        }
+        arrays = {path: leaf for path, leaf in arrays.items() if path not in unchanged}
+        return state | dict(arrays=arrays, aliases=aliases, unchanged=unchanged)
 
     def host_state(self) -> dict[str, dict[str, Any]]:
         """Returns the part of the state that is not in tensors, for `restore_host`."""
         state = self.state_dict()
         arrays = {k: leaf for k, leaf in state["arrays"].items() if state["kinds"][k] == "numpy"}
         values = {path: _encoded(node) for path, node in self._plain_values()}
-        none = {name: {} for name in ("lengths", "keys", "aliases")}
+        none = {name: {} for name in ("lengths", "keys", "aliases", "unchanged")}
         return state | {"arrays": arrays, "values": values} | none
 
     def restore_host(self, state: dict[str, dict[str, Any]]) -> None:
@@ -143,6 +162,11 @@ class EnvState:
         for path, value in state["values"].items():
             self._set_value(path, value)
         leaves = {path: leaf for path, (_, _, leaf) in walk(self.root, _STATEFUL).items()}
+        for path, digest in state["unchanged"].items():
+            if path not in leaves or _digest(leaves[path]) != digest:
+                raise ValueError(
+                    f"{_name(path)} is not that of the run; have its homes or its class changed?"
+                )
         for path, value in state["generators"].items():
             is_of_another_device = path.startswith(".generators") and path not in leaves
             if not is_of_another_device and not _set_generator_state(leaves.get(path), value):
@@ -258,6 +282,18 @@ def _place(leaf):
     if not isinstance(leaf, torch.Tensor):
         return id(leaf)
     return leaf.device, leaf.data_ptr(), leaf.shape, leaf.stride(), leaf.dtype
+
+
+def _digest(tensor):
+    """Returns a number that differs if a tensor has other bytes or these in another order."""
+    data = tensor.detach().contiguous().view(-1).view(torch.uint8)
+    data = data.view(torch.int32) if len(data) % 4 == 0 else data
+    places = torch.arange(1, _CHUNK + 1, device=data.device) * _FACTOR
+    places = places.to(torch.int32) | 1  # odd, so each bit counts
+    total = torch.zeros((), dtype=torch.int64, device=data.device)
+    for chunk in data.split(_CHUNK):  # all modulo a power of 2
+        total = total * _FACTOR + (chunk * places[: len(chunk)]).sum(dtype=torch.int64)
+    return int(total)
 
 
 def _fits(leaf, value):

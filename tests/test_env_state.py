@@ -73,9 +73,16 @@ class Env:
 def facts(env):
     arrays = env.place, env.wind, env.pair, env.also, *env.frames
     arrays += () if env.later is None else (env.later,)
-    plain = env.n, env.name, env.seen, env.pages, list(env.queue), env.queue.maxlen
+    plain = env.n, env.name, sorted(env.seen), env.pages, list(env.queue), env.queue.maxlen
     kinds = type(env.later_array), [*map(type, env.later_list or ())], type(env.total)
-    more = env.place_of_two, env.nested, env.total, env.colour, env.key, {*map(str, env.by_name)}
+    more = (
+        env.place_of_two,
+        env.nested,
+        env.total,
+        env.colour,
+        env.key,
+        sorted(map(str, env.by_name)),
+    )
     rest = env.later_array, env.later_list, env.by_name[2].n, env.one, env.other
     return [*(torch.as_tensor(one).tolist() for one in arrays), *plain, *more, *rest, kinds]
 
@@ -166,3 +173,23 @@ def test_bot_is_part_of_the_state():
     bots[0].n = 7
     other.load_state_dict(state.state_dict())
     assert bots[1].n == 7
+
+
+def test_large_tensors_are_saved_only_if_they_have_changed():
+    def with_plans():
+        env = Env()
+        env.plans, env.places = torch.arange(2**19).float(), torch.zeros(2**18 + 3)
+        return env
+
+    env, target, other = with_plans(), with_plans(), with_plans()
+    state, restored = EnvState(env), EnvState(target)
+    env.places[7] = 1
+    saved = state.state_dict()
+    assert ".env.plans" not in saved["arrays"] and ".env.places" in saved["arrays"]
+    restored.load_state_dict(saved)
+    assert torch.equal(target.places, env.places)
+    assert ".env.places" in restored.state_dict()["arrays"], "not what a new environment has"
+    other.plans[[3, 2**18]] = other.plans[[2**18, 3]]
+    with pytest.raises(ValueError, match="plans is not that of the run"):
+        EnvState(other).load_state_dict(saved)
+    assert not other.places.any()
