@@ -422,7 +422,7 @@ def test_core_contract_error_names_the_clause(outside, capsys, change, clause):
         ("torch.nn:Linear", "must take one argument (missing a required argument"),
     ],
 )
-def test_core_or_encoder_of_another_kind(capsys, key, name, reason):
+def test_core_or_encoder_of_another_kind(outside, capsys, key, name, reason):
     error = refused(capsys, "env=minimal", "env.res=8", *SMALL, f"{key}={name}")
     assert f"{name} {reason}" in error and "Traceback" not in error
 
