@@ -105,8 +105,9 @@ def copied(folder):
 
 def run_tests(folder, tests, *options, timeout=None):
     """Runs tests in a copy. Returns (status, output); the status is None after a timeout."""
-    path = os.pathsep.join([str(folder), str(folder / "scripts"), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
+    paths = [str(folder), str(folder / "scripts"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    environment |= {"PYTHONDONTWRITEBYTECODE": "1"}
     environment |= {"MEGASTEP_CACHE": str(folder.parent / "cache"), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
         [sys.executable, "-c", PYTEST, "-q", "-x", "-p", "no:cacheprovider", *options, *tests],
