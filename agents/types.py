@@ -1,4 +1,5 @@
-"""Protocols of the learner's parts: Actor, Rollout, Collector, Learner and Logger.
+"""Protocols of the learner's parts: Actor, Rollout, Collector, Learner, Logger, Saver and
+OpponentPool.
 
 Nothing has to inherit from them: any object with these attributes will do. The rules behind them
 are in :mod:`megastep.agents.algorithms.learner`. T steps, B lanes.
@@ -13,7 +14,16 @@ import torch
 
 from megastep.types import Env, Policy
 
-__all__ = ["LEARNER_DEFAULTS", "Actor", "Collector", "Learner", "Logger", "Rollout"]
+__all__ = [
+    "LEARNER_DEFAULTS",
+    "Actor",
+    "Collector",
+    "Learner",
+    "Logger",
+    "OpponentPool",
+    "Rollout",
+    "Saver",
+]
 
 
 class Actor(Policy, Protocol):
@@ -112,3 +122,32 @@ class Logger(Protocol):
 
     def close(self) -> None:
         """Writes what is buffered and closes files and connections."""
+
+
+class Saver(Protocol):
+    """Saves a trainer's state, possibly while training goes on."""
+
+    error: str | None  # why the last checkpoint that was begun could not be saved
+    lacks_replay: bool  # it was not due to hold the replay buffer
+    is_writing: bool
+
+    def __call__(
+        self, step: int, state: dict[str, Any], score: float | None, is_last: bool
+    ) -> None: ...
+
+    def wait(self) -> None:
+        """Returns when everything is saved, or has failed."""
+
+
+class OpponentPool(Protocol):
+    """The part of `selfplay.opponents.Opponents` that a trainer uses."""
+
+    scripted: Any  # the bot, or None
+
+    def refresh_snapshots(self, policy: Actor, n_updates: int) -> None: ...
+
+    def pop_win_rates(self) -> dict[str, float]: ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...

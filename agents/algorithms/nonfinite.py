@@ -21,7 +21,14 @@ MAX_NAMED = 8
 class NonFiniteError(RuntimeError):
     """Training cannot continue because of non-finite numbers. The message names the first one and
     the likely cure.
+
+    Args:
+        is_from_env: True if the environment produced them, so that the policy is as good as before.
     """
+
+    def __init__(self, message: str, is_from_env: bool = False):
+        super().__init__(message)
+        self.is_from_env = is_from_env
 
 
 @dataclasses.dataclass(frozen=True)

@@ -232,7 +232,7 @@ def run(cfg: settings.Train) -> Path:
             ):
                 running.train(lambda: bool(numbers))
         except NonFiniteError as error:
-            saved = f"What was saved before is in {folder}{running.replay_hint}"
+            saved = f"What was saved before is in {folder}{running.nonfinite_guard.replay_hint}"
             raise program.NonFinite(f"{error}. {saved}") from error
         except (MemoryError, RuntimeError) as error:
             problem = program.memory_problem(error)
@@ -248,8 +248,8 @@ def run(cfg: settings.Train) -> Path:
             raise signals.Interrupted(
                 numbers[0], f"Stopped after {running.samples:,} samples. {resume}"
             )
-        nonfinite, unsaved = running.nonfinite_value, running.saver.error
-        replay = running.replay_hint
+        nonfinite, unsaved = running.nonfinite_guard.value, running.saver.error
+        replay = running.nonfinite_guard.replay_hint
         if unsaved:
             raise program.UserError(unsaved)
         del running  # its memory is the evaluation's now

@@ -4,58 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import math
-import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from megastep.agents.algorithms.nonfinite import NonFiniteError, NonFiniteValue, lane_name
-from megastep.agents.training import nonfinite_recorder
+from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
+from megastep.agents.training.nonfinite_guard import NonFiniteGuard
 from megastep.agents.training.performance import PhaseTimer, device_memory
+from megastep.agents.training.run_state import RunState
 from megastep.agents.types import LEARNER_DEFAULTS
-from megastep.env_state import EnvState
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.training.annealing import AnnealingRecord
-    from megastep.agents.types import Learner, Logger
-
-#: Training stops after this many skipped updates in a row.
-MAX_SKIPPED = 20
-
-
-class OpponentPool(Protocol):
-    """The part of `selfplay.opponents.Opponents` that a trainer uses."""
-
-    scripted: Any  # the bot, or None
-
-    def refresh_snapshots(self, policy: Policy, n_updates: int) -> None: ...
-
-    def pop_win_rates(self) -> dict[str, float]: ...
-
-    def state_dict(self) -> dict[str, Any]: ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
-
-
-class Saver(Protocol):
-    """Saves a trainer's state, possibly while training goes on."""
-
-    error: str | None  # why the last checkpoint that was begun could not be saved
-    lacks_replay: bool  # it was not due to hold the replay buffer
-    is_writing: bool
-
-    def __call__(
-        self, step: int, state: dict[str, Any], score: float | None, is_last: bool
-    ) -> None: ...
-
-    def wait(self) -> None:
-        """Returns when everything is saved, or has failed."""
+    from megastep.agents.types import Learner, Logger, OpponentPool, Saver
 
 
 class Trainer:
@@ -91,8 +58,7 @@ class Trainer:
             of few episodes is luck, and would mark the first checkpoint as the best.
         samples_per_second: speed between the last two reports, or None.
         latest_stats: name -> the last value of each episode statistic.
-        nonfinite_value: the first NaN or infinity of the run, or None.
-        replay_hint: how to replay it, as the rest of a sentence, or "".
+        nonfinite_guard: has the first NaN or infinity of the run.
         samples_at_report: samples at the last report that is due every `log_every` updates. A
             resumed run has all reports up to it, and writes the later ones.
 
@@ -123,7 +89,6 @@ class Trainer:
         self.log_every, self.checkpoint_seconds = log_every, checkpoint_seconds
         self.on_log, self.opponents, self.snapshot_saver = on_log, opponents, snapshot_saver
         self.annealing_record = annealing_record
-        self.check = optional(learner, "check", LEARNER_DEFAULTS)
         if budget.anneal != "never" and not optional(learner, "set_lr", LEARNER_DEFAULTS):
             raise ValueError(
                 f"{type(learner).__name__} has no set_lr(lr), so its learning rate cannot fall "
@@ -134,11 +99,6 @@ class Trainer:
         desync = desync and optional(env, "desync") is not None
         if desync:
             env.desync()  # the collector has reset the environment, and has not stepped it yet
-        if opponents is None:
-            self.env_state = EnvState(env)
-        else:
-            self.env_state = EnvState(env.env, opponents.scripted)
-        self.replay_buffer = optional(learner, "replay_buffer", LEARNER_DEFAULTS)
         self.episode_stats = EpisodeStats(
             self.rollout.n_lanes,
             env.device,
@@ -146,6 +106,8 @@ class Trainer:
             lane_groups(env, self.rollout.learners),
             skip_first=desync,
         )
+        self.run_state = RunState(env, policy, learner, self.collect, self.episode_stats, opponents)
+        self.nonfinite_guard = NonFiniteGuard(env, learner, self.collect, opponents, replay_folder)
         self.clock, self.timer = Stopwatch(), PhaseTimer(env.device)
         self.samples = self.updates = 0
         self.lr = learner.lr
@@ -154,13 +116,6 @@ class Trainer:
         self.samples_at_log = self.updates_at_log = self.samples_at_report = 0
         self.seconds_at_log = self.seconds_at_checkpoint = 0.0
         self.updates_at_checkpoint = None
-        self.nonfinite_value, self.replay_hint = None, ""
-        self.replay_folder, self.recorder = replay_folder, None
-        if replay_folder is not None:
-            self.recorder = nonfinite_recorder.make_recorder(
-                env, opponents, self.check, self.collect
-            )
-        self.has_named_unreachable = False
 
     @property
     def fraction_left(self) -> float:
@@ -184,11 +139,9 @@ class Trainer:
             self.snapshot_saver(self)
             while self.fraction_left > 0 and not stop():
                 self.timer.start("collect")
-                if self.recorder is not None:
-                    self.recorder.start()
+                self.nonfinite_guard.start_rollout()
                 self.rollout = self.collect()
-                if self.recorder is not None:
-                    self.recorder.end(self.rollout)
+                self.nonfinite_guard.end_rollout(self.rollout)
                 self.timer.start("update")
                 losses = self.update()
                 self.timer.start("rest")
@@ -196,18 +149,21 @@ class Trainer:
                 if self.updates % self.log_every == 0:
                     self.samples_at_report = self.samples
                     self.log(losses)
+                    self.nonfinite_guard.check(self.rollout, self.samples)
                 seconds_since = self.clock.seconds - self.seconds_at_checkpoint
                 # a slow disk does not stop training, unless a checkpoint of each update is wanted
                 is_behind = self.saver.is_writing and self.checkpoint_seconds >= 1
                 is_due = seconds_since >= self.checkpoint_seconds and not is_behind
                 is_due &= self.fraction_left > 0  # the last one follows the last report
-                if is_due and self.check_finite():
+                if is_due and self.nonfinite_guard.check(self.rollout, self.samples):
                     self.save_checkpoint()
             state = self.state_dict()  # a resumed run repeats what this last report empties
             if self.updates > self.updates_at_log:
                 self.log(losses)
-            self.check_finite()
-        except NonFiniteError:
+            self.nonfinite_guard.check(self.rollout, self.samples)
+        except NonFiniteError as error:
+            if error.is_from_env:  # the skipped updates left the policy unchanged
+                self.save_what_was_learnt()
             raise
         except Exception:
             with contextlib.suppress(Exception):  # the first error is the one to report
@@ -260,14 +216,14 @@ class Trainer:
 
         A loss that is NaN has no value, as no gradient step was taken; it is left out.
 
-        Raises the errors that `env.check()` does, and NonFiniteError as `check_finite` does.
+        Raises the errors that `env.check()` does.
         """
         self.wait_for_collector()
         optional(self.env, "check")()
         loss_values = [torch.as_tensor(loss, device=self.env.device) for loss in losses.values()]
         loss_values = torch.stack(loss_values).tolist() if losses else []
         loss_values = zip(losses, loss_values, strict=True)
-        self.name_bad_metrics()
+        self.nonfinite_guard.warn_of_metrics(self.episode_stats, self.rollout)
         stats = self.episode_stats.pop()
         if self.opponents is not None:
             stats |= self.opponents.pop_win_rates()
@@ -296,70 +252,6 @@ class Trainer:
         if stats.get("episode/window", 0) >= MIN_EPISODES:
             self.score = stats["episode/return"]
         self.on_log(self)
-        self.check_finite()
-
-    def check_finite(self) -> bool:
-        """Returns True if the last update was applied, False if it was skipped. Synchronises.
-
-        Warns about the first NaN or infinity of the run. Without `learner.check` it does nothing.
-
-        Raises:
-            NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
-        """
-        if self.check is None:
-            return True
-        value, n_skipped = self.check.read(self.rollout.floats())
-        if value:
-            value = value.in_env(self.env_lanes(), optional(self.env, "n_agents"))
-        if value and self.nonfinite_value is None:
-            self.nonfinite_value = value
-            self.write_replay(value)
-            warnings.warn(f"{value}; its rollout was skipped{self.replay_hint}", stacklevel=2)
-        if self.recorder is not None:
-            self.recorder.forget()
-        if n_skipped < MAX_SKIPPED:
-            return n_skipped == 0
-        advice = f"The policy diverged: try a learning rate smaller than {self.learner.lr:g}"
-        if value and value.is_from_env:
-            self.save_what_was_learnt()  # the skipped updates left the policy unchanged
-            advice = f"It came from the environment: check how it computes {value.name}"
-        raise NonFiniteError(
-            f"The last {n_skipped} updates were skipped because of numbers that were not finite or "
-            f"too large ({value or 'gradients'}). {advice}"
-        )
-
-    def env_lanes(self) -> range | list[int]:
-        """Returns the environment's lane of each lane of the rollout."""
-        learners = self.rollout.learners
-        return (
-            range(self.rollout.n_lanes) if learners is None else learners.nonzero()[:, 0].tolist()
-        )
-
-    def name_bad_metrics(self) -> None:
-        """Warns once of each metric that was not finite at the end of an episode. Synchronises."""
-        for name, lane in self.episode_stats.pop_bad_metrics().items():
-            lane = lane_name(self.env_lanes()[lane], optional(self.env, "n_agents"))
-            warnings.warn(
-                f"metrics.{name} of {lane} was not finite at the end of an episode; such episodes "
-                f"are left out of episode/{name}",
-                stacklevel=3,
-            )
-
-    def write_replay(self, value: NonFiniteValue) -> None:
-        """Writes the file that replays a number of the environment, and stops recording."""
-        recorder, self.recorder = self.recorder, None
-        if value.is_from_env and recorder is not None and recorder.has(value):
-            path = self.replay_folder / f"nonfinite-{self.samples}.npz"
-            try:
-                recorder.write(path, value, self.rollout)
-                self.replay_hint = f". To see it again: {nonfinite_recorder.command(path)}"
-            except Exception as error:  # the run is worth more than this file
-                reason = getattr(error, "strerror", None) or error
-                self.replay_hint = f". {path} could not be written ({reason})"
-        elif value.is_from_env and self.replay_folder is not None:
-            self.replay_hint = f". {nonfinite_recorder.NOT_RECORDED}"
-        if recorder is not None:
-            recorder.close()
 
     def save_checkpoint(self, state: dict[str, Any] | None = None, is_last: bool = False) -> None:
         """Begins to save a checkpoint, unless the last one holds every update.
@@ -371,13 +263,7 @@ class Trainer:
         self.seconds_at_checkpoint = self.clock.seconds
         if self.is_saved and not (is_last and self.saver.lacks_replay):
             return
-        if not self.has_named_unreachable and (names := self.env_state.unreachable()):
-            self.has_named_unreachable = True
-            warnings.warn(
-                f"Checkpoints cannot hold {', '.join(names)} of the environment: if they change, a "
-                "resumed run differs from one left alone",
-                stacklevel=2,
-            )
+        self.run_state.warn_of_unreachable()
         state = self.state_dict() if state is None else state
         try:  # a checkpoint must not reach further than what is on disk of the run's files
             self.logger.sync()
@@ -403,23 +289,13 @@ class Trainer:
             has_episodes: includes the environment, and what the policy remembers of it.
         """
         self.wait_for_collector()
-        parts = dict(
-            policy=self.policy.state_dict(),
-            learner=self.learner.state_dict(),
-            episode_stats=self.episode_stats.state_dict(),
+        counts = dict(
             samples=self.samples,
             updates=self.updates,
             seconds=self.clock.seconds,
             samples_at_report=self.samples_at_report,
         )
-        if has_episodes:
-            parts["env"] = self.env_state.state_dict()
-            parts["collector"] = getattr(self.collect, "state_dict", dict)()
-        optional_parts = dict(
-            opponents=None if self.opponents is None else self.opponents.state_dict(),
-            replay=None if self.replay_buffer is None else self.replay_buffer.state_dict(),
-        )
-        return parts | {name: part for name, part in optional_parts.items() if part is not None}
+        return counts | self.run_state.state_dict(has_episodes)
 
     def load_state_dict(self, state: dict[str, Any]) -> list[str]:
         """Restores a `state_dict`.
@@ -427,43 +303,8 @@ class Trainer:
         Returns what could not be restored and begins anew, a clause each; then the run does not
         continue bit for bit.
         """
-        lost = []
-        self.policy.load_state_dict(state["policy"])
-        self.learner.load_state_dict(state["learner"])
         self.samples, self.updates = state["samples"], state["updates"]
         self.clock.seconds_before = state["seconds"]
         self.samples_at_report = state["samples_at_report"]
         self.updates_at_checkpoint = self.updates_at_log = self.updates
-        lost += self._load_episodes(state)
-        if self.opponents is not None:
-            of_episodes = {"lanes"} if lost else set()
-            parts = state["opponents"].items()
-            self.opponents.load_state_dict({k: v for k, v in parts if k not in of_episodes})
-        if self.replay_buffer is not None:
-            if "replay" in state:
-                self.replay_buffer.load_state_dict(state["replay"])
-            else:
-                lost.append("the replay buffer was not saved and fills again")
-        return lost
-
-    def _load_episodes(self, state):
-        """Restores the environment, what the policy remembers of it and the statistics."""
-        lost = []
-        if "env" not in state:
-            lost.append("its environments were not saved, so new episodes begin")
-        elif not state["collector"]:
-            name = type(self.collect).__name__
-            lost.append(f"{name} has no state_dict, so new episodes begin")
-        else:
-            try:
-                self.env_state.load_state_dict(state["env"])
-            except ValueError as error:
-                lost.append(f"{error}; new episodes begin")
-        if lost:  # only finished episodes can be counted on
-            state["episode_stats"] = {
-                name: state["episode_stats"][name] for name in ("sums", "windows")
-            }
-        else:
-            self.collect.load_state_dict(state["collector"])
-        self.episode_stats.load_state_dict(state["episode_stats"])
-        return lost
+        return self.run_state.load_state_dict(state)

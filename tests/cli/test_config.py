@@ -1,6 +1,5 @@
 """Composing and checking configurations. No test starts a run."""
 
-import copy
 import dataclasses
 import inspect
 import re
@@ -16,6 +15,7 @@ from megastep.agents.cli.program import ConfigErrors
 from megastep.agents.cli.settings import IMPORTED, Agent, Train, WandbLogger, kind_of
 from megastep.agents.training.loggers import Wandb
 from megastep.geometries import sources
+from tests.helpers.tiny import changed
 from tests.helpers.tiny import settings as compose
 
 
@@ -260,14 +260,8 @@ NAN, INFINITY = float("nan"), float("inf")
     ],
 )
 def test_out_of_range_values(tree, key, value):
-    *groups, last = key.split(".")
-    changed = copy.deepcopy(tree)
-    target = changed
-    for group in groups:
-        target = target[group]
-    target[last] = value
     with pytest.raises(ConfigErrors) as error:
-        check(Train, changed)
+        check(Train, changed(tree, key, value))
     assert [path for path, _ in error.value.errors] == [key]
 
 

@@ -1,6 +1,5 @@
 """A run that another user made is imported only with trust=true."""
 
-import copy
 import importlib
 import json
 import pathlib
@@ -14,7 +13,7 @@ from megastep.agents.cli import check, evaluate, record, replay, train
 from megastep.agents.cli.program import ConfigErrors
 from megastep.agents.cli.settings import Train, kind_of
 from megastep.agents.training import checkpoint, nonfinite_replay, trust
-from tests.helpers.tiny import TINY, settings
+from tests.helpers.tiny import TINY, changed, settings
 
 KEYS = ("env.name", "geometry.name", "learner.name", "opponents.bot_class")
 KEYS += ("agent.core", "agent.encoder")
@@ -43,16 +42,6 @@ def save(monkeypatch, *keys, value="planted:Thing", user="another"):
     with monkeypatch.context() as patch:
         patch.setenv("XDG_CONFIG_HOME", str(pathlib.Path(user).absolute()))
         checkpoint.save("run/checkpoints", 64, state, {"train": tree, "spaces": {}})
-
-
-def changed(tree, key, value):
-    tree = copy.deepcopy(tree)
-    *groups, leaf = key.split(".")
-    node = tree
-    for group in groups:
-        node = node[group]
-    node[leaf] = value
-    return tree
 
 
 COMMANDS = [

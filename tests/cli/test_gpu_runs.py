@@ -94,7 +94,8 @@ def test_resumed_run_uses_cuda_graphs(stopped, trainers):
     assert all(row["loss/skipped_steps"] == 0 and row["loss/value"] >= 0 for row in reports)
     after = weights(stopped)
     assert any(not torch.equal(after[name], before[name]) for name in after)
-    assert trainer.nonfinite_value is None and trainer.env.core.agents.positions.isfinite().all()
+    assert trainer.nonfinite_guard.value is None
+    assert trainer.env.core.agents.positions.isfinite().all()
     assert checkpoint.load_latest(stopped / "checkpoints").step == 2 * STOPPED
 
 
@@ -176,7 +177,7 @@ def test_every_core_in_cuda_graphs(core, layers, trainers, monkeypatch, tmp_path
     monkeypatch.chdir(tmp_path)
     words = f"agent.core={core}", f"agent.layers={layers}", f"samples={6 * UPDATE}"
     assert train.main([*TINY, *words]) == 0
-    assert is_captured(trainers[0]) and trainers[0].nonfinite_value is None
+    assert is_captured(trainers[0]) and trainers[0].nonfinite_guard.value is None
 
 
 REPLAY = "learner.replay.capacity=4096"
@@ -195,7 +196,7 @@ def test_every_learner_resumes(words, trainers, monkeypatch, tmp_path):
     assert is_captured(trainers[0])
     monkeypatch.chdir(tmp_path)
     assert train.main(["resume=run", f"samples={2 * STOPPED}"]) == 0
-    assert is_captured(trainers[1]) and trainers[1].nonfinite_value is None
+    assert is_captured(trainers[1]) and trainers[1].nonfinite_guard.value is None
     reports = rows(tmp_path / "run")
     assert [row["updates"] for row in reports] == list(range(1, 13))
     assert all(row["loss/skipped_steps"] == 0 for row in reports)

@@ -52,16 +52,7 @@ def fixture(device):
         games=torch.zeros((GAME_FIELDS, N), dtype=torch.int32, device=device),
         actions=torch.zeros((N, 1), dtype=torch.int64, device=device),
         error_flag=torch.zeros(1, dtype=torch.int32, device=device),
-        goals=GoalFields(
-            points=D * [np.ones((2, 2))],
-            fields=D * [np.ones((2, 3, 3), np.float16)],
-            origins=D * [np.ones(2)],
-            spawns=D * [np.ones((4, 2))],
-            lengths=D * [np.ones((4, 2))],
-            allowed=D * [np.ones((4, 2), bool)],
-            cell=1.0,
-            device=scenery.device,
-        ),
+        goals=GoalFields(**goal_fields(scenery.device)),
         numbers=torch.zeros(N * A, dtype=torch.int32, device=device),
         progress=torch.zeros((PROGRESS_ROWS, N * A), device=device),
         free=torch.ones((N, A), device=device),
@@ -72,6 +63,20 @@ def fixture(device):
         tally=torch.zeros((TALLY_ROWS, N * A), device=device),
         ages=torch.zeros(N * A, dtype=torch.int32, device=device),
         ended=torch.zeros(N * A, dtype=torch.bool, device=device),
+    )
+
+
+def goal_fields(device):
+    """Right arguments of `GoalFields`."""
+    return dict(
+        points=D * [np.ones((2, 2))],
+        fields=D * [np.ones((2, 3, 3), np.float16)],
+        origins=D * [np.ones(2)],
+        spawns=D * [np.ones((4, 2))],
+        lengths=D * [np.ones((4, 2))],
+        allowed=D * [np.ones((4, 2), bool)],
+        cell=1.0,
+        device=device,
     )
 
 
@@ -440,20 +445,10 @@ def constructors(f):
             device=device,
         ),
     )  # fmt: skip
-    right = dict(
-        points=D * [np.ones((2, 2))],
-        fields=D * [np.ones((2, 3, 3), np.float16)],
-        origins=D * [np.ones(2)],
-        spawns=D * [np.ones((4, 2))],
-        lengths=D * [np.ones((4, 2))],
-        allowed=D * [np.ones((4, 2), bool)],
-        cell=1.0,
-        device=f.device,
-    )
     each = dict.fromkeys(
         ("points", "origins", "spawns", "lengths", "allowed", "fields"), arrays_by_layout
     )
-    yield GoalFields, right, dict(each, cell=numbers(0, -1), device=device)
+    yield GoalFields, goal_fields(f.device), dict(each, cell=numbers(0, -1), device=device)
     yield engine.set_threads, dict(n=None), dict(n=lambda good: [*integers(1, 10**6 - 1)(1)][1:])
     yield f.scenery.env, dict(e=0), dict(e=integers(-N, N - 1))
 

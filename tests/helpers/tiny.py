@@ -1,5 +1,7 @@
 """The smallest run, as words of the command line: an update takes milliseconds."""
 
+import copy
+
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.scripts import SCRIPTS
 
@@ -21,3 +23,14 @@ UPDATE = 4 * 8  # samples of one update
 def settings(*words, script="train"):
     """Returns the settings that a script makes of words."""
     return Composer(SCRIPTS[script]).settings(words)
+
+
+def changed(tree, key, value):
+    """Returns a copy of nested dicts with another value of a dotted key."""
+    tree = copy.deepcopy(tree)
+    *groups, leaf = key.split(".")
+    node = tree
+    for group in groups:
+        node = node[group]
+    node[leaf] = value
+    return tree

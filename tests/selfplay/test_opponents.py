@@ -247,7 +247,7 @@ def test_nonfinite_number_is_named_by_its_lane_in_the_environment(tmp_path):
     with pytest.warns(
         UserWarning, match=rf"reward of lane {lane} \(environment {lane // 2}\) was nan"
     ):
-        run.check_finite()
+        run.nonfinite_guard.check(run.rollout, run.samples)
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,7 @@ def test_snapshots_act_with_their_current_weights(here, monkeypatch, device):
     (trainer,) = trainers
     if device == "cuda":
         assert isinstance(trainer.collect.graph, capture.Graph) and trainer.learner.cuda_graph.graph
-    assert trainer.nonfinite_value is None and trainer.updates == 12
+    assert trainer.nonfinite_guard.value is None and trainer.updates == 12
     rows = json_lines.read(folder / "metrics.jsonl")
     for name in ("return/past", "return/bot", "won/past", "won/bot"):
         assert any(f"episode/{name}" in row for row in rows)

@@ -89,17 +89,18 @@ def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     run = trainer_in(folder)
     with pytest.warns(UserWarning, match="To see it again: python -m megastep replay"):
-        run.train(lambda: run.nonfinite_value is not None)
+        run.train(lambda: run.nonfinite_guard.value is not None)
     (path,) = folder.glob("nonfinite-*.npz")
-    assert path.name == f"nonfinite-{run.samples}.npz" and str(path) in run.replay_hint
+    assert path.name == f"nonfinite-{run.samples}.npz"
+    assert str(path) in run.nonfinite_guard.replay_hint
     return run, path
 
 
 def test_replay_shows_the_same_number_in_the_same_lanes(recorded):
     """Later rollouts, bad as well, are collected before the report: the first one is kept."""
     run, path = recorded
-    value = run.nonfinite_value
-    assert run.updates > value.rollout and run.recorder is None, "recorded until the first"
+    value, recorder = run.nonfinite_guard.value, run.nonfinite_guard.recorder
+    assert run.updates > value.rollout and recorder is None, "recorded until the first"
     again = Recording(path).replay(Walks())
     assert (again.name, again.lane, again.step) == (value.name, value.lane, value.step)
     assert again.size == value.size, "the same bits"
@@ -108,7 +109,7 @@ def test_replay_shows_the_same_number_in_the_same_lanes(recorded):
 
 def test_file_holds_the_bad_environments_only(recorded):
     run, path = recorded
-    value = run.nonfinite_value
+    value = run.nonfinite_guard.value
     n_bad = len({one.env for one in (value, *value.others)})
     with np.load(path) as file:
         shapes = {name: file[name].shape for name in file}
@@ -170,8 +171,8 @@ def test_full_disk_ends_no_run(tmp_path, monkeypatch):
     monkeypatch.setattr(RolloutRecorder, "write", full)
     run = trainer_in(tmp_path)
     with pytest.warns(UserWarning, match=r"npz could not be written \(No space left"):
-        run.train(lambda: run.nonfinite_value is not None)
-    assert run.recorder is None and run.is_saved
+        run.train(lambda: run.nonfinite_guard.value is not None)
+    assert run.nonfinite_guard.recorder is None and run.is_saved
 
 
 def test_numbers_of_the_policy_leave_no_file(tmp_path):
@@ -185,14 +186,14 @@ def test_numbers_of_the_policy_leave_no_file(tmp_path):
 
     run.collect = bad
     with pytest.warns(UserWarning, match="value of lane 3 .* was skipped$"):
-        run.train(lambda: run.nonfinite_value is not None)
+        run.train(lambda: run.nonfinite_guard.value is not None)
     assert not list(tmp_path.glob("*.npz"))
 
 
 def test_where_steps_cannot_be_repeated_nothing_is_recorded(tmp_path):
     lagging = trainer_in(tmp_path, learner=VTrace, lag=1)
     with pytest.warns(UserWarning, match="Nothing was recorded to see it again: .* learner.lag"):
-        lagging.train(lambda: lagging.nonfinite_value is not None)
+        lagging.train(lambda: lagging.nonfinite_guard.value is not None)
     assert not list(tmp_path.glob("*.npz"))
     learner = PPO(lagging.policy, n_minibatches=2)
     assert make_recorder(Walks(), None, None, learner.collector(Walks())) is None
@@ -202,21 +203,22 @@ def test_replay_needs_no_opponents(tmp_path):
     """Opponents' actions are recorded; their lanes, which may be bad before, are not checked."""
     run = trainer_in(tmp_path, past=1.0)
     is_bad_early = ~run.env.learners
-    assert run.recorder.played["actions"].shape == (T, N * A, 1)
+    assert run.nonfinite_guard.recorder.played["actions"].shape == (T, N * A, 1)
     with pytest.warns(UserWarning, match="To see it again"):
-        run.train(lambda: run.nonfinite_value is not None)
-    value, (path,) = run.nonfinite_value, tmp_path.glob("*.npz")
+        run.train(lambda: run.nonfinite_guard.value is not None)
+    value, (path,) = run.nonfinite_guard.value, tmp_path.glob("*.npz")
     again = Recording(path).replay(Walks())
     assert (again, again.env) == (dataclasses.replace(value, n_lanes=again.n_lanes), value.env)
-    assert not is_bad_early[value.lane] and run.recorder is None
+    assert not is_bad_early[value.lane] and run.nonfinite_guard.recorder is None
 
 
 def test_rollouts_before_a_resume_are_not_those_recorded(tmp_path):
     run = trainer_in(tmp_path)
-    run.check.record[0] = 5
-    assert not run.recorder.has(NonFiniteValue("reward", 0, 20, 1e13, rollout=5))
-    run.recorder.start()
-    assert [n for n in (5, 6) if run.recorder.has(NonFiniteValue("reward", 0, 24, 1e13, n))] == [6]
+    run.learner.check.record[0] = 5
+    recorder = run.nonfinite_guard.recorder
+    assert not recorder.has(NonFiniteValue("reward", 0, 20, 1e13, rollout=5))
+    recorder.start()
+    assert [n for n in (5, 6) if recorder.has(NonFiniteValue("reward", 0, 24, 1e13, n))] == [6]
 
 
 @pytest.mark.cuda

@@ -12,8 +12,9 @@ from megastep.agents.algorithms import nonfinite
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
-from megastep.agents.training import checkpoint, performance, trainer
+from megastep.agents.training import checkpoint, performance
 from megastep.agents.training.budget import Budget
+from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
 from megastep.agents.training.saver import Saver
 from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict
@@ -322,8 +323,9 @@ def test_one_nonfinite_number_skips_its_rollout_and_changes_nothing_else(tmp_pat
     assert all(map(torch.equal, run.learner.optimizer.means, before[1]))
     with pytest.warns(UserWarning, match=rf"{name} of lane 3 was (nan|inf|1e\+30) at step"):
         run.train()
-    assert (run.nonfinite_value.name, run.nonfinite_value.lane) == (name, lane)
-    assert run.nonfinite_value.step == step and run.nonfinite_value.is_from_env
+    first = run.nonfinite_guard.value
+    assert (first.name, first.lane, first.step) == (name, lane, step)
+    assert first.is_from_env
     assert not same(copied(run.policy), before[0])
     skipped = [row["loss/skipped_steps"] for row in run.logger]
     assert skipped == [0] * 6  # of the third and later updates
@@ -348,7 +350,7 @@ def test_nonfinite_metric_is_named_once_and_left_out(tmp_path, bad):
     sentence = r"metrics.age of lane 2 \(environment 1\) was not finite at the end of an episode"
     with pytest.warns(UserWarning, match=sentence) as warned:
         run.train()
-    assert len(warned) == 1 and run.nonfinite_value is None and run.is_saved
+    assert len(warned) == 1 and run.nonfinite_guard.value is None and run.is_saved
     loaded = checkpoint.load_latest(tmp_path).state
     assert loaded["samples"] == 50 * UPDATE
     assert nonfinite.nonfinite_leaf(loaded["episode_stats"]) is None
@@ -373,7 +375,7 @@ def test_nonfinite_number_is_named_without_a_later_report(tmp_path):
     run = make_trainer(tmp_path, {("reward", 6, 3): torch.nan}, samples=8 * UPDATE, every=100)
     with pytest.warns(UserWarning, match="reward of lane 3 was nan at step 6"):
         run.train()
-    assert run.nonfinite_value.step == 6
+    assert run.nonfinite_guard.value.step == 6
 
 
 @pytest.mark.parametrize("every", [1, 7])
@@ -384,7 +386,7 @@ def test_environment_of_only_nan_ends_the_run(tmp_path, every):
         run.train()
     assert "reward of lane 2 was nan" in str(error.value)
     assert "environment" in str(error.value)
-    next_report = -(-trainer.MAX_SKIPPED // every) * every
+    next_report = -(-MAX_SKIPPED // every) * every
     assert run.updates == next_report
     assert same(copied(run.policy), before)
     assert same(checkpoint.load_latest(tmp_path).state["policy"], before)
@@ -395,14 +397,14 @@ def test_nonfinite_gradients_end_the_run_with_advice(tmp_path):
     next(run.policy.parameters()).register_hook(lambda grad: grad * torch.nan)
     with pytest.raises(NonFiniteError, match=r"\(gradients\).*learning rate smaller than 0.25"):
         run.train()
-    assert run.updates == trainer.MAX_SKIPPED
-    assert [row["loss/skipped_steps"] for row in run.logger] == [2] * trainer.MAX_SKIPPED
+    assert run.updates == MAX_SKIPPED
+    assert [row["loss/skipped_steps"] for row in run.logger] == [2] * MAX_SKIPPED
     assert nonfinite.nonfinite_leaf(run.state_dict()) is None
 
 
 def test_finite_gradient_restarts_the_count_of_skipped_updates(tmp_path):
     run = make_trainer(tmp_path, samples=50 * UPDATE)
-    is_bad = lambda: run.updates % 25 < trainer.MAX_SKIPPED - 1  # noqa: E731
+    is_bad = lambda: run.updates % 25 < MAX_SKIPPED - 1  # noqa: E731
     next(run.policy.parameters()).register_hook(lambda grad: grad * torch.nan if is_bad() else grad)
     run.train()
     assert run.updates == 50
@@ -417,7 +419,7 @@ def test_divergence_ends_the_run_and_keeps_the_last_good_checkpoint(tmp_path, lr
     assert run.updates < 200
     loaded = checkpoint.load_latest(tmp_path)
     assert nonfinite.nonfinite_leaf(loaded.state) is None
-    assert loaded.step <= (run.updates - trainer.MAX_SKIPPED) * UPDATE
+    assert loaded.step <= (run.updates - MAX_SKIPPED) * UPDATE
 
 
 @pytest.mark.parametrize(

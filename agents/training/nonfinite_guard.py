@@ -1,0 +1,134 @@
+"""What a run does about NaN and infinity: it names the first, records it, and ends if they persist.
+
+The learner skips the updates, see `nonfinite.NonFiniteCheck`.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from megastep.agents.algorithms.nonfinite import NonFiniteError, lane_name
+from megastep.agents.training import nonfinite_recorder
+from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.types import Env, optional
+
+if TYPE_CHECKING:
+    from megastep.agents.training.episode_stats import EpisodeStats
+    from megastep.agents.types import Collector, Learner, OpponentPool, Rollout
+
+#: Training stops after this many skipped updates in a row.
+MAX_SKIPPED = 20
+
+
+class NonFiniteGuard:
+    """Warns of the first NaN or infinity of a run, writes a file that replays it if it came from
+    the environment, and ends a run whose updates are all skipped.
+
+    Args:
+        env: the environment.
+        learner: its `check` is read. Without one, only metrics are guarded.
+        collect: the learner's collector.
+        opponents: `env`, if it is an `Opponents`.
+        replay_folder: where the file is written, see `nonfinite_recorder`; None for no file.
+
+    Attributes:
+        value: the first NaN or infinity of the run, or None.
+        replay_hint: how to replay it, as the rest of a sentence, or "".
+        recorder: records rollouts until `value` is known; None if nothing is recorded.
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        learner: Learner,
+        collect: Collector,
+        opponents: OpponentPool | None = None,
+        replay_folder: Path | None = None,
+    ):
+        self.learner, self.replay_folder = learner, replay_folder
+        self.n_agents = optional(env, "n_agents")
+        self.nonfinite_check = optional(learner, "check", LEARNER_DEFAULTS)
+        self.value, self.replay_hint, self.recorder = None, "", None
+        if replay_folder is not None:
+            self.recorder = nonfinite_recorder.make_recorder(
+                env, opponents, self.nonfinite_check, collect
+            )
+
+    def start_rollout(self) -> None:
+        """Call before each rollout."""
+        if self.recorder is not None:
+            self.recorder.start()
+
+    def end_rollout(self, rollout: Rollout) -> None:
+        """Call after each rollout, before the learner's update."""
+        if self.recorder is not None:
+            self.recorder.end(rollout)
+
+    def check(self, rollout: Rollout, samples: int) -> bool:
+        """Returns True if the last update was applied, False if it was skipped. Synchronises.
+
+        Warns about the first NaN or infinity of the run.
+
+        Args:
+            rollout: the latest one.
+            samples: environment steps so far, for the name of the file.
+
+        Raises:
+            NonFiniteError: the last `MAX_SKIPPED` updates were all skipped.
+        """
+        if self.nonfinite_check is None:
+            return True
+        value, n_skipped = self.nonfinite_check.read(rollout.floats())
+        if value:
+            value = value.in_env(_env_lanes(rollout), self.n_agents)
+        if value and self.value is None:
+            self.value = value
+            self._write_replay(rollout, samples)
+            warnings.warn(f"{value}; its rollout was skipped{self.replay_hint}", stacklevel=2)
+        if self.recorder is not None:
+            self.recorder.forget()
+        if n_skipped < MAX_SKIPPED:
+            return n_skipped == 0
+        advice = f"The policy diverged: try a learning rate smaller than {self.learner.lr:g}"
+        is_from_env = value is not None and value.is_from_env
+        if is_from_env:
+            advice = f"It came from the environment: check how it computes {value.name}"
+        raise NonFiniteError(
+            f"The last {n_skipped} updates were skipped because of numbers that were not finite or "
+            f"too large ({value or 'gradients'}). {advice}",
+            is_from_env,
+        )
+
+    def _write_replay(self, rollout, samples):
+        """Writes the file that replays `value`, and stops recording."""
+        value, recorder, self.recorder = self.value, self.recorder, None
+        if value.is_from_env and recorder is not None and recorder.has(value):
+            path = self.replay_folder / f"nonfinite-{samples}.npz"
+            try:
+                recorder.write(path, value, rollout)
+                self.replay_hint = f". To see it again: {nonfinite_recorder.command(path)}"
+            except Exception as error:  # the run is worth more than this file
+                reason = getattr(error, "strerror", None) or error
+                self.replay_hint = f". {path} could not be written ({reason})"
+        elif value.is_from_env and self.replay_folder is not None:
+            self.replay_hint = f". {nonfinite_recorder.NOT_RECORDED}"
+        if recorder is not None:
+            recorder.close()
+
+    def warn_of_metrics(self, episode_stats: EpisodeStats, rollout: Rollout) -> None:
+        """Warns once of each metric that was not finite at the end of an episode. Synchronises."""
+        for name, lane in episode_stats.pop_bad_metrics().items():
+            lane = lane_name(_env_lanes(rollout)[lane], self.n_agents)
+            warnings.warn(
+                f"metrics.{name} of {lane} was not finite at the end of an episode; such episodes "
+                f"are left out of episode/{name}",
+                stacklevel=3,
+            )
+
+
+def _env_lanes(rollout):
+    """Returns the environment's lane of each lane of the rollout."""
+    learners = rollout.learners
+    return range(rollout.n_lanes) if learners is None else learners.nonzero()[:, 0].tolist()

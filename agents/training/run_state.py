@@ -1,0 +1,119 @@
+"""The state of what trains: gathered for a checkpoint, and restored from it in a resumed run."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Any
+
+from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.env_state import EnvState
+from megastep.types import Env, optional
+
+if TYPE_CHECKING:
+    from megastep.agents.networks.policy import Policy
+    from megastep.agents.training.episode_stats import EpisodeStats
+    from megastep.agents.types import Collector, Learner, OpponentPool
+
+
+class RunState:
+    """Gathers and restores the state of the parts of a run. Its counts are the trainer's.
+
+    Args:
+        env: the environment, after `reset()`.
+        policy: the policy that the learner improves.
+        learner: with its replay buffer, if it has one.
+        collect: the learner's collector.
+        episode_stats: statistics of the episodes.
+        opponents: `env`, if it is an `Opponents`.
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        policy: Policy,
+        learner: Learner,
+        collect: Collector,
+        episode_stats: EpisodeStats,
+        opponents: OpponentPool | None = None,
+    ):
+        self.policy, self.learner, self.collect = policy, learner, collect
+        self.episode_stats, self.opponents = episode_stats, opponents
+        if opponents is None:
+            self.env_state = EnvState(env)
+        else:
+            self.env_state = EnvState(env.env, opponents.scripted)
+        self.replay_buffer = optional(learner, "replay_buffer", LEARNER_DEFAULTS)
+        self.has_named_unreachable = False
+
+    def state_dict(self, has_episodes: bool = True) -> dict[str, Any]:
+        """Returns the state as dicts of tensors and plain values, most of which share their memory
+        with what trains. Nothing may step the environment meanwhile.
+
+        Args:
+            has_episodes: includes the environment, and what the policy remembers of it.
+        """
+        parts = dict(
+            policy=self.policy.state_dict(),
+            learner=self.learner.state_dict(),
+            episode_stats=self.episode_stats.state_dict(),
+        )
+        if has_episodes:
+            parts["env"] = self.env_state.state_dict()
+            parts["collector"] = getattr(self.collect, "state_dict", dict)()
+        if self.opponents is not None:
+            parts["opponents"] = self.opponents.state_dict()
+        if self.replay_buffer is not None:
+            parts["replay"] = self.replay_buffer.state_dict()
+        return parts
+
+    def load_state_dict(self, state: dict[str, Any]) -> list[str]:
+        """Restores a `state_dict`.
+
+        Returns what could not be restored and begins anew, a clause each; then the run does not
+        continue bit for bit.
+        """
+        self.policy.load_state_dict(state["policy"])
+        self.learner.load_state_dict(state["learner"])
+        lost = self._load_episodes(state)
+        if self.opponents is not None:
+            of_episodes = {"lanes"} if lost else set()
+            parts = state["opponents"].items()
+            self.opponents.load_state_dict({k: v for k, v in parts if k not in of_episodes})
+        if self.replay_buffer is not None:
+            if "replay" in state:
+                self.replay_buffer.load_state_dict(state["replay"])
+            else:
+                lost.append("the replay buffer was not saved and fills again")
+        return lost
+
+    def _load_episodes(self, state):
+        """Restores the environment, what the policy remembers of it and the statistics."""
+        lost = []
+        if "env" not in state:
+            lost.append("its environments were not saved, so new episodes begin")
+        elif not state["collector"]:
+            name = type(self.collect).__name__
+            lost.append(f"{name} has no state_dict, so new episodes begin")
+        else:
+            try:
+                self.env_state.load_state_dict(state["env"])
+            except ValueError as error:
+                lost.append(f"{error}; new episodes begin")
+        if lost:  # only finished episodes can be counted on
+            state["episode_stats"] = {
+                name: state["episode_stats"][name] for name in ("sums", "windows")
+            }
+        else:
+            self.collect.load_state_dict(state["collector"])
+        self.episode_stats.load_state_dict(state["episode_stats"])
+        return lost
+
+    def warn_of_unreachable(self) -> None:
+        """Warns once of what the environment keeps where checkpoints cannot reach it."""
+        if not self.has_named_unreachable and (names := self.env_state.unreachable()):
+            self.has_named_unreachable = True
+            warnings.warn(
+                f"Checkpoints cannot hold {', '.join(names)} of the environment: if they change, a "
+                "resumed run differs from one left alone",
+                stacklevel=3,
+            )
