@@ -38,8 +38,12 @@ EQUIVALENT = ROOT / "docs" / "lab" / "equivalent_mutants.jsonl"
 PYTHON = [f"agents/{name}" for name in "algorithms networks storage training selfplay".split()]
 PYTHON += [f"megastep/{name}" for name in "capture.py modules envs geometries engine".split()]
 HEADERS = ["megastep", "agents"]
-#: Ends although a thread that a failed test left still runs.
-PYTEST = "import os, sys, pytest; status = pytest.main(); sys.stdout.flush(); os._exit(status)"
+#: Ends although a thread that a failed test left still runs. Modules of the current folder do not
+#: come before those of Python, which a test is about.
+PYTEST = (
+    "import os, sys; sys.path.remove(''); import pytest; status = pytest.main(); "
+    "sys.stdout.flush(); os._exit(status)"
+)
 #: Seconds: a mutant may run for ever. The same tests without it take a tenth.
 MIN_TIMEOUT, TIMEOUT_FACTOR = 300, 10
 
