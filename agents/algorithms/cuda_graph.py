@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import torch
 
+from megastep.agents.distributed.segments import SegmentedGraph
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.types import Rollout
 
@@ -15,7 +16,8 @@ Metrics = dict[str, torch.Tensor]
 
 
 class CudaGraphUpdate:
-    """Calls an update function, on a GPU through a CUDA graph.
+    """Calls an update function, on a GPU through a CUDA graph, or several with the communication of
+    ranks between them.
 
     The first updates run eagerly, on the stream that captures afterwards. A graph reads the memory
     of the rollout it was captured with, so another rollout object causes another capture: pass the
@@ -46,8 +48,8 @@ class CudaGraphUpdate:
         """Discards the graph. The next updates warm up and capture again. Call it after replacing
         generators.
         """
-        self.graph: torch.cuda.CUDAGraph | None = None
-        self._rollout = self._metrics = None
+        self.graph: SegmentedGraph | None = None
+        self._rollout = None
         self._n_warm_ups_left = _N_WARM_UPS
 
     def __call__(self, rollout: Rollout) -> Metrics:
@@ -59,9 +61,11 @@ class CudaGraphUpdate:
                 self._n_warm_ups_left -= 1
                 return self._warm_up(rollout)
             if self._rollout is not rollout:
-                self._capture(rollout)
+                generators = [generator.on(self.device) for generator in self.generators]
+                self.graph = SegmentedGraph(lambda: self.update(rollout), self.stream, generators)
+                self._rollout = rollout
             self.graph.replay()
-            return {name: value.clone() for name, value in self._metrics.items()}
+            return {name: value.clone() for name, value in self.graph.output.items()}
 
     def _warm_up(self, rollout):
         # PyTorch would warn of gradients accumulated on another stream, which this one waits for
@@ -71,15 +75,3 @@ class CudaGraphUpdate:
             metrics = self.update(rollout)
         torch.cuda.current_stream().wait_stream(self.stream)
         return metrics
-
-    def _capture(self, rollout):
-        graph = torch.cuda.CUDAGraph()
-        for generator in self.generators:
-            graph.register_generator_state(generator.on(self.device))
-        try:
-            with torch.cuda.graph(graph, stream=self.stream):
-                self._metrics = self.update(rollout)
-        except RuntimeError as error:
-            # ending a failed capture raises as well; the first error is the informative one
-            raise error.__context__ or error from None
-        self.graph, self._rollout = graph, rollout

@@ -7,6 +7,7 @@ import torch
 
 from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
+from megastep.agents.distributed.pooling import average_gradients, on_all_ranks
 
 
 class GradientSteps:
@@ -14,8 +15,12 @@ class GradientSteps:
 
         is_finite = steps.begin(rollout.floats())
         for batch in minibatches:
-            steps.take(loss, metrics, batch.valid.any())
+            steps.backward(loss, metrics, batch.valid.sum())
+            steps.take()
         return steps.end()
+
+    With several ranks, gradients and metrics are those of all ranks' minibatches together, and all
+    take or skip the same steps.
 
     Nothing changes if the rollout holds a NaN, an infinity or a number beyond `nonfinite.LIMIT`, or
     if the gradient is not finite. Nothing synchronises: conditions are bool tensors on the device.
@@ -41,7 +46,7 @@ class GradientSteps:
         self._lr = torch.tensor(lr, device=device)
         self.optimizer = Adam(parameters, self._lr)
         self.check = NonFiniteCheck(device)
-        self._is_finite, self._rows, self._names = None, [], ()  # of the update in progress
+        self._is_finite, self._rows, self._metrics = None, [], {}  # of the update in progress
 
     def set_lr(self, lr: float) -> None:
         """Changes Adam's step size, also for a captured update."""
@@ -54,42 +59,50 @@ class GradientSteps:
             floats: the tensors to learn from, as for `NonFiniteCheck`.
 
         Returns:
-            () bool, whether they are all finite. If not, no step of this update is taken.
+            () bool, whether they are all finite, on every rank. If not, no step of this update is
+            taken.
         """
-        self._is_finite, self._rows = self.check(floats), []
+        self._is_finite, self._rows = on_all_ranks(self.check(floats)), []
         return self._is_finite
 
-    def take(
-        self,
-        loss: torch.Tensor,
-        metrics: dict[str, torch.Tensor],
-        has_valid: torch.Tensor,
-        is_enabled: torch.Tensor | bool = True,
-    ) -> torch.Tensor:
-        """Takes one step down the gradient of a loss ().
+    def backward(
+        self, loss: torch.Tensor, metrics: dict[str, torch.Tensor], n_valid: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """Computes the gradient of a loss ().
 
         Args:
-            loss: () tensor.
+            loss: () tensor, a mean over the valid transitions of a minibatch.
             metrics: tensors () by name, which `end` averages over the steps taken.
-            has_valid: () bool, whether the minibatch has a valid transition. Without one, the step
-                is not taken.
+            n_valid: () number of those transitions.
+
+        Returns:
+            The metrics of all ranks.
+        """
+        self.optimizer.zero_grad()
+        loss.backward()
+        parameters = self.optimizer.parameters
+        n_valid, means = average_gradients(parameters, n_valid, [*metrics.values()])
+        self._has_valid, self._metrics = n_valid > 0, dict(zip(metrics, means, strict=True))
+        return self._metrics
+
+    def take(self, is_enabled: torch.Tensor | bool = True) -> torch.Tensor:
+        """Takes one step down the gradient. Without a valid transition, it is not taken.
+
+        Args:
             is_enabled: () bool. A step that is not enabled is neither taken nor counted as skipped.
 
         Returns:
             () bool, whether the step was taken.
         """
-        self.optimizer.zero_grad()
-        loss.backward()
         grad_norm = torch.nn.utils.clip_grad_norm_(self.optimizer.parameters, self.max_grad_norm)
         is_finite = grad_norm.isfinite() & self._is_finite
-        is_taken = is_finite & is_enabled & has_valid
+        is_taken = is_finite & is_enabled & self._has_valid
         self.optimizer.step(is_taken)
-        metrics = dict(metrics, grad_norm=grad_norm)
-        row = torch.stack([value.detach() for value in metrics.values()])
+        self._metrics["grad_norm"] = grad_norm
+        row = torch.stack([*self._metrics.values()])
         row = row.masked_fill(~is_taken, 0.0)
         is_skipped = ~is_finite & is_enabled
         self._rows.append(torch.cat([row, torch.stack([is_taken, is_skipped]).float()]))
-        self._names = tuple(metrics)
         return is_taken
 
     def end(self) -> dict[str, torch.Tensor]:
@@ -100,7 +113,7 @@ class GradientSteps:
         """
         *sums, n_taken, n_skipped = sum(self._rows).unbind()
         self.check.count((n_taken == 0) & (n_skipped > 0))
-        means = {name: total / n_taken for name, total in zip(self._names, sums, strict=True)}
+        means = {name: total / n_taken for name, total in zip(self._metrics, sums, strict=True)}
         return {**means, "skipped_steps": n_skipped}
 
     def state_dict(self) -> dict[str, Any]:

@@ -5,16 +5,26 @@
 
 import torch
 
+from megastep.agents.distributed.pooling import masked_moments, pool_moments
+
 
 def masked_mean(x: torch.Tensor, valid: torch.Tensor, axis: int | None = None) -> torch.Tensor:
     """Returns the mean of the valid entries, overall or along an axis; 0 if none is valid."""
     return x.masked_fill(~valid, 0.0).sum(axis) / valid.sum(axis).clamp(min=1)
 
 
-def masked_normalise(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """Returns x minus its mean, divided by its standard deviation; 0 where invalid."""
-    centred = (x - masked_mean(x, valid)).masked_fill(~valid, 0.0)
-    return centred / (masked_mean(centred.square(), valid).sqrt() + 1e-8)
+def pooled_mean(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Returns the mean of the valid entries of all ranks."""
+    mean = masked_mean(x, valid)
+    return pool_moments((valid.sum(), mean, torch.zeros_like(mean)))[0][1]
+
+
+def pooled_normalise(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Returns x minus its mean over all ranks, divided by its standard deviation there; 0 where
+    invalid.
+    """
+    ((_, mean, variance),) = pool_moments(masked_moments(x, valid))
+    return (x - mean).masked_fill(~valid, 0.0) / (variance.sqrt() + 1e-8)
 
 
 def explained_variance(

@@ -21,7 +21,7 @@ from megastep.agents.algorithms.learner import (
 from megastep.agents.algorithms.masked_stats import (
     explained_variance,
     masked_mean,
-    masked_normalise,
+    pooled_normalise,
 )
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
@@ -117,7 +117,7 @@ class PPO(GradientLearner):
         estimates["valid"] = estimates.valid & rollout.learns[:-1]
         self.policy.critic.output.update_stats(estimates.targets, estimates.valid & is_finite)
         explained = explained_variance(transitions["value"], estimates.targets, estimates.valid)
-        estimates["advantages"] = masked_normalise(estimates.advantages, estimates.valid)
+        estimates["advantages"] = pooled_normalise(estimates.advantages, estimates.valid)
 
         is_stopped = torch.zeros((), dtype=torch.bool, device=self.device)
         for _ in range(self.n_epochs):
@@ -127,8 +127,9 @@ class PPO(GradientLearner):
                 selected = estimates.map(torch.index_select, 1, lanes)
                 batch = arrdict({**rollout.sequences(lanes), **selected})
                 loss, metrics = self._losses(batch)
-                is_stopped = is_stopped | (metrics["kl"] > self.target_kl)
-                self.steps.take(loss, metrics, batch.valid.any(), ~is_stopped)
+                kl = self.steps.backward(loss, metrics, batch.valid.sum())["kl"]
+                is_stopped = is_stopped | (kl > self.target_kl)
+                self.steps.take(~is_stopped)
         # Observation statistics change only now, so the whole update saw the normalisation that
         # acted. One row is enough: every rollout brings another B observations.
         last = rollout.world(-1)

@@ -168,7 +168,8 @@ class R2D2(GradientLearner):
             batch = self.replay_buffer.sample(n_sequences, generator)
             loss, metrics, priorities, valid = self._losses(batch)
             # A non-finite rollout counts as skipped even while the replay buffer is not ready.
-            self.n_taken += self.steps.take(loss, metrics, valid.any(), is_ready | ~is_finite)
+            self.steps.backward(loss, metrics, valid.sum())
+            self.n_taken += self.steps.take(is_ready | ~is_finite)
             self.replay_buffer.set_priorities(batch.index, priorities)
         last = rollout.world(-1)
         self.policy.update_stats(last.obs, is_counted=is_finite & rollout.learns[-1])

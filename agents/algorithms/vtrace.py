@@ -24,6 +24,7 @@ from megastep.agents.algorithms.masked_stats import (
     effective_sample_size,
     explained_variance,
     masked_mean,
+    pooled_mean,
 )
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage import mixed_batches
@@ -180,7 +181,8 @@ class VTrace(GradientLearner):
             order = torch.rand(rollout.n_lanes, generator=generator, device=self.device).argsort()
             for lanes in order.tensor_split(self.n_minibatches):
                 loss, metrics, estimates = self._losses(self._batch(rollout, lanes), len(lanes))
-                self.steps.take(loss, metrics, estimates.valid.any())
+                self.steps.backward(loss, metrics, estimates.valid.sum())
+                self.steps.take()
                 all_estimates.append(estimates)
         # Statistics change only now, so the whole update saw the normalisation that acted. One row
         # of observations is enough: every rollout brings another B.
@@ -229,7 +231,7 @@ class VTrace(GradientLearner):
         scale = self.policy.critic.output.scale
         error = (value[:-1] - estimates.targets) / scale
         advantages = estimates.advantages / scale  # in standard deviations of the return
-        size = masked_mean(advantages.square(), valid).sqrt()
+        size = pooled_mean(advantages.square(), valid).sqrt()
         advantages = advantages / size.clamp(min=self.advantage_floor)
         metrics = dict(
             policy=-masked_mean(weight * logprobs * advantages, valid),

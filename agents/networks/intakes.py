@@ -10,6 +10,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from megastep import spaces
+from megastep.agents.distributed.pooling import Moments
 from megastep.agents.networks.encoders import make_encoder
 from megastep.agents.networks.precision import compute_dtype
 from megastep.agents.networks.running_norm import RunningNorm
@@ -82,16 +83,21 @@ class ConcatIntake(nn.Module):
             for leaf, norm, encoder in zip(leaves, self.norms, self.encoders, strict=True)
         ]
 
-    def update_stats(self, obs: Tree, is_counted: torch.Tensor | bool = True) -> None:
-        """Adds observations to the running statistics of the normalisation.
+    def moments(
+        self, obs: Tree, is_counted: torch.Tensor | bool = True
+    ) -> list[tuple[RunningNorm, Moments]]:
+        """Returns each normalisation with the moments of its observations, for `update_norms`.
 
         Args:
             obs: (B, ...) per leaf.
             is_counted: () or (B,) bool, lanes to count.
         """
-        for leaf, norm in zip(self._leaves(obs), self.norms, strict=True):
-            if isinstance(norm, RunningNorm):
-                norm.update_stats(leaf, is_counted)
+        pairs = zip(self._leaves(obs), self.norms, strict=True)
+        return [
+            (norm, norm.moments(leaf, is_counted))
+            for leaf, norm in pairs
+            if isinstance(norm, RunningNorm)
+        ]
 
     def _leaves(self, obs):
         values = spaces.leaves(obs)

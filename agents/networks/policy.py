@@ -17,6 +17,7 @@ from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.imports import known_name
 from megastep.agents.networks import cores, encoders, heads
 from megastep.agents.networks.critic import Critic
+from megastep.agents.networks.running_norm import update_norms
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
 from megastep.settings import checked
@@ -211,13 +212,15 @@ class Policy(nn.Module):
         privileged: Tree | None = None,
         is_counted: torch.Tensor | bool = True,
     ) -> None:
-        """Adds observations to the running statistics of the actor's and the critic's intake.
+        """Adds observations to the running statistics of the actor's and the critic's intake, those
+        of all ranks together.
 
         Args:
             obs: (B, ...) per leaf.
             privileged: (B, ...) per leaf, for an asymmetric critic.
             is_counted: () or (B,) bool, lanes to count.
         """
-        self.intake.update_stats(obs, is_counted)
+        pairs = self.intake.moments(obs, is_counted)
         if self.privileged_space:
-            self.critic.intake.update_stats(privileged, is_counted)
+            pairs += self.critic.intake.moments(privileged, is_counted)
+        update_norms(pairs)

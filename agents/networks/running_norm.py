@@ -3,12 +3,13 @@
 B lanes; `...` any further axes.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import nn
 
 from megastep import spaces
+from megastep.agents.distributed.pooling import Moments, pool_moments
 from megastep.types import Space
 
 
@@ -37,11 +38,18 @@ class RunningNorm(nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return (obs - self.mean) / self.scale
 
-    @torch.no_grad()
     def update_stats(self, obs: torch.Tensor, is_counted: torch.Tensor | bool = True) -> None:
-        """Adds observations to the statistics, the n-th call with weight 1/n.
+        """Adds observations to the statistics, those of all ranks together.
 
-        Changes nothing if no lane is counted, or if a mean or variance is not finite.
+        Args:
+            obs: (B, ...).
+            is_counted: () or (B,) bool, lanes to count.
+        """
+        update_norms([(self, self.moments(obs, is_counted))])
+
+    @torch.no_grad()
+    def moments(self, obs: torch.Tensor, is_counted: torch.Tensor | bool = True) -> Moments:
+        """Returns the number of lanes that count, and the mean and variance of their observations.
 
         Args:
             obs: (B, ...).
@@ -54,10 +62,25 @@ class RunningNorm(nn.Module):
         mean = obs.float().masked_fill(is_masked, 0.0).sum(self.pooled_axes, keepdim=True) / n
         error = (obs - mean).masked_fill(is_masked, 0.0)
         variance = error.square().sum(self.pooled_axes, keepdim=True) / n
+        return n_lanes, mean[0], variance[0]
+
+    @torch.no_grad()
+    def add(self, n_lanes: torch.Tensor, mean: torch.Tensor, variance: torch.Tensor) -> None:
+        """Adds moments to the statistics, the n-th call with weight 1/n.
+
+        Changes nothing if no lane was counted, or if a mean or variance is not finite.
+        """
         count = self.count + 1
-        mean, scale = mix_moments(self, mean[0], variance[0], 1 / count)
+        mean, scale = mix_moments(self, mean, variance, 1 / count)
         is_stored = (n_lanes > 0) & (mean + scale).isfinite().all()
         store_if(is_stored, [(self.mean, mean), (self.scale, scale), (self.count, count)])
+
+
+def update_norms(pairs: Sequence[tuple[RunningNorm, Moments]]) -> None:
+    """Adds to each norm's statistics its moments, pooled over the ranks in one operation."""
+    pooled = pool_moments(*(moments for _, moments in pairs))
+    for (norm, _), moments in zip(pairs, pooled, strict=True):
+        norm.add(*moments)
 
 
 def mix_moments(

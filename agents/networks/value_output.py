@@ -6,6 +6,7 @@
 import torch
 from torch import nn
 
+from megastep.agents.distributed.pooling import masked_moments, pool_moments
 from megastep.agents.networks.precision import compute_dtype
 from megastep.agents.networks.running_norm import mix_moments, store_if
 
@@ -39,7 +40,8 @@ class ValueOutput(nn.Module):
     def update_stats(
         self, targets: torch.Tensor, valid: torch.Tensor, min_rate: float = 0.05
     ) -> None:
-        """Adds returns to the statistics, the n-th call with weight max(min_rate, 1/n).
+        """Adds returns to the statistics, those of all ranks together, the n-th call with weight
+        max(min_rate, 1/n).
 
         Changes nothing if none is valid, or if their mean or variance is not finite.
 
@@ -48,10 +50,7 @@ class ValueOutput(nn.Module):
             valid: (...,) bool.
             min_rate: smallest weight of a call.
         """
-        n_valid = valid.sum()
-        n = n_valid.clamp(min=1)
-        mean = targets.masked_fill(~valid, 0.0).sum() / n
-        variance = (targets - mean).square().masked_fill(~valid, 0.0).sum() / n
+        ((n_valid, mean, variance),) = pool_moments(masked_moments(targets, valid))
         count = self.count + 1
         rate = (1 / count).clamp(min=min_rate, max=1.0)
         mean, scale = mix_moments(self, mean, variance, rate)

@@ -16,7 +16,7 @@ def test_mean_and_normalise_use_valid_only():
     assert masked_stats.masked_mean(x, valid).item() == 3
     std = math.sqrt(8 / 3)
     expected = torch.tensor([[-2 / std, 2 / std], [0.0, 0.0]])
-    torch.testing.assert_close(masked_stats.masked_normalise(x, valid), expected)
+    torch.testing.assert_close(masked_stats.pooled_normalise(x, valid), expected)
     assert masked_stats.masked_mean(x, torch.zeros_like(valid)).item() == 0
 
 

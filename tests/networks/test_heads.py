@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.networks import encoders, heads
+from megastep.agents.networks import encoders, heads, running_norm
 from megastep.arrdict import arrdict
 
 IMAGE, DEPTH, VECTOR = (
@@ -236,6 +236,10 @@ def test_unknown_spaces_raise(make, error):
         make()
 
 
+def update(intake, obs):
+    running_norm.update_norms(intake.moments(obs))
+
+
 def test_normalises_images_per_channel_and_vectors_per_number():
     space = arrdict(rgb=spaces.MultiImage(1, 2, 1, 3), imu=spaces.MultiVector(1, 2))
     intake = heads.intake(space, WIDTH)
@@ -245,7 +249,7 @@ def test_normalises_images_per_channel_and_vectors_per_number():
         .expand(4, -1, -1, -1, -1)
     )
     imu = torch.tensor([[5.0, 0.0], [7.0, 0.0], [5.0, 0.0], [7.0, 0.0]])[:, None]
-    intake.update_stats(arrdict(rgb=rgb.half(), imu=imu.half()))
+    update(intake, arrdict(rgb=rgb.half(), imu=imu.half()))
     rgb_norm, imu_norm = intake.norms
     torch.testing.assert_close(
         rgb_norm(rgb)[0, 0, 0, 0], torch.tensor([-(1.5**0.5), 0.0, 1.5**0.5])
@@ -257,7 +261,7 @@ def test_normalises_images_per_channel_and_vectors_per_number():
     assert not imu_norm(imu)[..., 1].any()  # a constant divides by min_scale, not by 0
 
     # the second call has weight 1/2: mean (6 + 10) / 2, mean square (37 + 100) / 2
-    intake.update_stats(arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
+    update(intake, arrdict(rgb=rgb, imu=torch.full((4, 1, 2), 10.0)))
     assert imu_norm.mean[0, 0].item() == 8 and imu_norm.scale[0, 0].item() == pytest.approx(
         (137 / 2 - 64) ** 0.5
     )
@@ -265,6 +269,6 @@ def test_normalises_images_per_channel_and_vectors_per_number():
 
 def test_statistics_are_saved_with_weights():
     intake, other, obs = heads.intake(TREE, WIDTH), heads.intake(TREE, WIDTH), random_obs(TREE, 6)
-    intake.update_stats(obs)
+    update(intake, obs)
     other.load_state_dict(intake.state_dict())
     assert torch.equal(other(obs), intake(obs))
