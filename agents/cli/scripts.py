@@ -52,6 +52,9 @@ The most common words:
                                compare
   resume=RUN                   continue a run (its folder, or latest) under its own configuration;
                                more_seconds=60 more_samples=1e6 add to what it has had
+  ranks=2                      two processes that train together, on a GPU each; all: every GPU;
+                               restarts=2 starts them again if one is killed; dry_run=true only
+                               prints what would run
   rerun=RUN                    repeat a run, with the learning rates that its clock chose, and
                                compare its metrics.jsonl
   init=RUN                     start a new run from its weights, in its environment and homes
@@ -74,6 +77,9 @@ RESUMABLE = (
     "desync",
     "nonfinite_replay",
     "snapshots",
+    "ranks",
+    "restarts",
+    "dry_run",
     "logger",
     "finish",
 )
@@ -88,6 +94,8 @@ REPEATABLE = (
     "checkpoint_seconds",
     "keep_checkpoints",
     "replay_every",
+    "restarts",
+    "dry_run",
     "logger",
     "finish",
 )
