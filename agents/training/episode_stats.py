@@ -124,7 +124,7 @@ class EpisodeStats:
         return bad
 
     def pop(self) -> dict[str, float]:
-        """Returns statistics of all ranks for a report. Synchronises, and waits for the other ranks.
+        """Returns statistics for a report, of all ranks. Synchronises, and waits for the others.
 
         Means are over the episodes that ended since the last call and, if those are fewer than
         `MIN_EPISODES`, those of earlier calls, a call at a time. A dict of

@@ -141,8 +141,8 @@ class NonFiniteGuard:
         for name, (lane, place_of_lane) in of_all.items():
             of_rank = f" ({place_of_lane})" * (len(reports) > 1)
             warnings.warn(
-                f"metrics.{name} of {lane}{of_rank} was not finite at the end of an episode; such episodes "
-                f"are left out of episode/{name}",
+                f"metrics.{name} of {lane}{of_rank} was not finite at the end of an episode; such "
+                f"episodes are left out of episode/{name}",
                 stacklevel=3,
             )
 

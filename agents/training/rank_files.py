@@ -41,7 +41,7 @@ class RankFiles:
                 path.unlink()
 
     def _paths(self, rank, number):
-        """Returns the paths of a rank's state, and of its entry in the manifest, which comes last."""
+        """Returns the paths of a rank's state and of its entry in the manifest, written last."""
         name = f".rank{rank}-{self.launch}-{number}"
         return self.folder / f"{name}.pt", self.folder / f"{name}.json"
 
