@@ -7,10 +7,12 @@ R ranks.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
+import math
 import os
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -18,6 +20,10 @@ from torch import distributed
 
 #: Seconds within which all ranks must have started.
 START_SECONDS = 300.0
+
+
+class RankLost(RuntimeError):
+    """Another rank has ended, or does not answer."""
 
 
 class Launched(NamedTuple):
@@ -66,6 +72,20 @@ def hostname() -> str:
     return socket.gethostname()
 
 
+def place() -> str:
+    """Returns this rank's place for messages, such as `rank 1 on node-7`."""
+    return f"rank {rank()} on {hostname()}"
+
+
+@contextlib.contextmanager
+def communicating() -> Iterator[None]:
+    """Turns an error of PyTorch's communication into `RankLost`."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise RankLost(str(error).partition("\n")[0]) from error
+
+
 def exchange(numbers: Sequence[float]) -> list[list[float]]:
     """Returns the numbers of every rank, in the order of ranks. Waits for the others; touches no
     GPU.
@@ -77,7 +97,8 @@ def exchange(numbers: Sequence[float]) -> list[list[float]]:
     if n_ranks() == 1:
         return [row.tolist()]
     rows = [torch.empty_like(row) for _ in range(n_ranks())]
-    distributed.all_gather(rows, row)
+    with communicating():
+        distributed.all_gather(rows, row)
     return [other.tolist() for other in rows]
 
 
@@ -86,5 +107,29 @@ def gather_objects(value: Any) -> list[Any]:
     if n_ranks() == 1:
         return [value]
     values = [None] * n_ranks()
-    distributed.all_gather_object(values, value)
+    with communicating():
+        distributed.all_gather_object(values, value)
     return values
+
+
+def sum_over_ranks(values: torch.Tensor) -> torch.Tensor:
+    """Returns the sum of the ranks' tensors, float64 on the host. Synchronises, and waits for the
+    others.
+    """
+    if n_ranks() == 1:
+        return values.double().cpu()
+    rows = torch.tensor(exchange(values.flatten().tolist()), dtype=torch.float64)
+    return rows.sum(0).view(values.shape)
+
+
+def mean_over_ranks(values: dict[str, float]) -> dict[str, float]:
+    """Returns the means over the ranks of numbers by name. Waits for the others.
+
+    NaN does not count; a number that is NaN on all ranks is left out.
+    """
+    rows, means = gather_objects(values), {}
+    for name in values:
+        column = [row[name] for row in rows if not math.isnan(row.get(name, math.nan))]
+        if column:
+            means[name] = math.fsum(column) / len(column)
+    return means

@@ -66,12 +66,17 @@ class RunState:
             parts["replay"] = self.replay_buffer.state_dict()
         return parts
 
-    def load_state_dict(self, state: dict[str, Any]) -> list[str]:
+    def load_state_dict(self, state: dict[str, Any], is_new_rank: bool = False) -> list[str]:
         """Restores a `state_dict`.
+
+        Args:
+            is_new_rank: it is rank 0's without episodes, and this rank keeps generators of its own.
 
         Returns what could not be restored and begins anew, a clause each; then the run does not
         continue bit for bit.
         """
+        if is_new_rank:
+            state = self._of_new_rank(state)
         self.policy.load_state_dict(state["policy"])
         self.learner.load_state_dict(state["learner"])
         lost = self._load_episodes(state)
@@ -85,6 +90,15 @@ class RunState:
             else:
                 lost.append("the replay buffer was not saved and fills again")
         return lost
+
+    def _of_new_rank(self, state):
+        """Returns a state of rank 0 with this rank's generators, and without what rank 0 counted
+        since the last report.
+        """
+        stats, own = state["episode_stats"], self.state_dict(has_episodes=False)
+        pairs = ((name, state[name]) for name in ("learner", "opponents") if name in state)
+        parts = {name: _with_generators(saved, own[name]) for name, saved in pairs}
+        return {**state, **parts, "episode_stats": stats | {"sums": 0 * stats["sums"]}}
 
     def _load_episodes(self, state):
         """Restores the environment, what the policy remembers of it and the statistics."""
@@ -117,3 +131,12 @@ class RunState:
                 "resumed run differs from one left alone",
                 stacklevel=3,
             )
+
+
+def _with_generators(saved, own):
+    """Returns a saved state with the states of `SeededGenerator`s replaced by those of `own`."""
+    if not isinstance(saved, dict) or not isinstance(own, dict):
+        return saved
+    if "seed" in saved and saved.keys() <= {"seed", "device", "generator"}:
+        return own
+    return {name: _with_generators(part, own.get(name)) for name, part in saved.items()}
