@@ -10,9 +10,9 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 from megastep import workers
 from megastep.agents.cli import console, endings, launch, program, signals
@@ -20,6 +20,9 @@ from megastep.agents.distributed import environment
 
 #: Seconds that a rank with an error gives rank 0 to tell of the same one, and to save.
 GRACE_SECONDS, SAVING_SECONDS = 10.0, 60.0
+#: The ranks that this process has joined.
+_team = None
+T = TypeVar("T")
 
 
 def main() -> int:
@@ -74,19 +77,18 @@ def tell(ending: endings.Ending) -> None:
 
 
 class Team:
-    """The ranks of a training run, as one of them sees them; in a process of its own, that alone.
+    """The ranks of a training run, as one of them sees them.
 
     Attributes:
         folder: the run's folder, once it is known.
-        watch: watches over the other ranks; None in a process of its own.
     """
 
     def __init__(self):
-        self.folder = self.watch = None
+        from megastep.agents.distributed import watch
 
-    def exempt(self) -> contextlib.AbstractContextManager:
-        """Returns a context in which the others wait for this rank as long as it takes."""
-        return self.watch.exempt() if self.watch else contextlib.nullcontext()
+        self.folder = None
+        self.watch = watch.Watch(self.end)
+        self.watch.start()
 
     def end(self, problem: str | None) -> NoReturn:
         """Ends this process in the middle of training, since a rank is lost.
@@ -100,33 +102,38 @@ class Team:
         is_ours = launch.JOB in os.environ
         os._exit(launch.LOST if problem or not is_ours else 0)
 
+    def leave(self, seconds: float = 0.0) -> None:
+        """Lets the others go on without this rank.
+
+        Args:
+            seconds: how long to wait for rank 0 to leave as well.
+        """
+        self.watch.leave(seconds)
+
 
 @contextlib.contextmanager
-def joined() -> Iterator[Team]:
+def joined() -> Iterator[Team | None]:
     """Joins the ranks that torchrun started, and ends with them: one of them tells of an error. Does
-    nothing in a process of its own.
+    nothing in a process of its own, and inside itself.
 
     Raises:
         UserError, Interrupted: as in a process of its own, if this rank is the one to tell.
         SystemExit: another rank tells.
     """
-    team = Team()
-    if environment.launched() is None:
-        yield team
+    global _team
+    with program.errors():
+        place = environment.launched()
+    if place is None or place.n_ranks == 1 or _team is not None:
+        yield _team
         return
-    from megastep.agents.distributed import process_group, watch
+    from megastep.agents.distributed import process_group
 
     with program.errors("The ranks cannot be joined: ", (RuntimeError,)):
         process_group.start()
-    if process_group.n_ranks() == 1:
-        yield team
-        process_group.stop()
-        return
-    if process_group.rank() > 0:
+    if place.rank > 0:
         console.is_silent = True
         console.prefix = f"{console.prefix}{process_group.place()}: "
-    team.watch = watch.Watch(team.end)
-    team.watch.start()
+    _team = team = Team()
     try:
         yield team
     except process_group.RankLost as error:
@@ -134,9 +141,20 @@ def joined() -> Iterator[Team]:
         team.end(f"A rank is lost: {error}" if team.watch.claim() else None)
     except (Exception, signals.Interrupted) as error:
         is_signal = isinstance(error, signals.Interrupted)
-        team.watch.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
-        if not team.watch.claim():
-            raise SystemExit(128 + error.args[0] if is_signal else 1) from None
-        raise
-    team.watch.leave()
-    process_group.stop()
+        team.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
+        if team.watch.claim():
+            raise
+        code = 128 + error.args[0] if is_signal else getattr(error, "code", 1)
+        raise SystemExit(code) from None
+    finally:
+        _team = None
+    team.leave()
+
+
+def together(function: Callable[[], T]) -> T:
+    """Calls a function on every rank, as `agreement.together` does, once the ranks have joined."""
+    if _team is None:
+        return function()
+    from megastep.agents.distributed import agreement
+
+    return agreement.together(function)

@@ -17,6 +17,7 @@ from megastep.agents.cli import console, program
 from megastep.agents.cli.check import as_tree
 from megastep.agents.cli.program import UserError, shortened
 from megastep.agents.cli.settings import Env, Evaluate, Geometry, Train, label
+from megastep.agents.distributed import environment
 from megastep.agents.training import checkpoint, json_lines
 from megastep.agents.training.atomic_files import write_atomically
 
@@ -72,11 +73,15 @@ def locked(folder: Path) -> Iterator[None]:
     """Keeps other processes from training in a run folder.
 
     The system holds the lock for as long as this process lives, so none is ever stale: neither
-    after kill -9, nor when another process gets the number in the file.
+    after kill -9, nor when another process gets the number in the file. Of several ranks, rank 0
+    has the lock for all.
 
     Raises:
         UserError: naming the process that trains there, or that the folder cannot be written.
     """
+    if environment.rank() > 0:
+        yield
+        return
     import filelock  # which takes a while
 
     # its last owner may just be deleting it

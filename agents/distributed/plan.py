@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from megastep.agents.distributed.process_group import exchange
+from megastep.agents.distributed.process_group import counts, exchange
 
 
 class Plan(NamedTuple):
@@ -28,6 +28,7 @@ def agree(plan: Plan, is_stopped: bool, is_behind: bool) -> Plan:
         is_stopped: a signal stops this rank, and so all.
         is_behind: this rank still writes its part of the last checkpoint, so none is saved.
     """
+    counts.n_updates += 1
     rows = exchange([*plan, is_stopped, is_behind])
     goes_on, saves, lr_fraction, *_ = rows[0]
     *_, are_stopped, are_behind = zip(*rows, strict=True)

@@ -11,12 +11,13 @@ import contextlib
 import datetime
 import math
 import os
-import socket
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import distributed
+
+from megastep.agents.distributed.environment import hostname, launched
 
 #: Seconds within which all ranks must have started.
 START_SECONDS = 300.0
@@ -26,20 +27,33 @@ class RankLost(RuntimeError):
     """Another rank has ended, or does not answer."""
 
 
-class Launched(NamedTuple):
-    """This process's place among the ranks, as torchrun says."""
+class Counts:
+    """What this rank has done, for `watch` to compare.
 
-    rank: int
-    n_ranks: int
-    local_rank: int  # among the ranks of this machine
+    Attributes:
+        n_operations: number of operations of all ranks that it has begun.
+        n_updates: number of updates that the ranks have agreed to begin.
+        is_exempt: it does something for which the others wait, however long it takes.
+    """
+
+    n_operations = n_updates = 0
+    is_exempt = False
 
 
-def launched() -> Launched | None:
-    """Returns this process's place if torchrun started it, None for a process of its own."""
-    names = "RANK", "WORLD_SIZE", "LOCAL_RANK"
-    if any(name not in os.environ for name in names):
-        return None
-    return Launched(*(int(os.environ[name]) for name in names))
+counts = Counts()
+
+
+@contextlib.contextmanager
+def unhurried() -> Iterator[None]:
+    """In this context the other ranks wait for this one as long as it takes: an evaluation, files.
+
+    Otherwise a rank that the others have waited for, for `watch.LOST_SECONDS`, counts as hung.
+    """
+    counts.is_exempt, before = True, counts.is_exempt
+    try:
+        yield
+    finally:
+        counts.is_exempt = before
 
 
 def start(seconds: float = START_SECONDS) -> None:
@@ -50,6 +64,20 @@ def start(seconds: float = START_SECONDS) -> None:
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     distributed.init_process_group(backend, timeout=datetime.timedelta(seconds=seconds))
+
+
+def store() -> distributed.Store:
+    """Returns a connection of its own to the ranks' key-value store: no other thread waits on it.
+
+    Each start of the ranks has keys of its own.
+    """
+    attempt = launched().attempt
+    port = int(os.environ["MASTER_PORT"])
+    wait = datetime.timedelta(seconds=START_SECONDS)
+    client = distributed.TCPStore(
+        os.environ["MASTER_ADDR"], port, is_master=False, timeout=wait, wait_for_workers=False
+    )
+    return distributed.PrefixStore(f"megastep {attempt}", client)
 
 
 def stop() -> None:
@@ -68,10 +96,6 @@ def n_ranks() -> int:
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
-def hostname() -> str:
-    return socket.gethostname()
-
-
 def place() -> str:
     """Returns this rank's place for messages, such as `rank 1 on node-7`."""
     return f"rank {rank()} on {hostname()}"
@@ -79,7 +103,8 @@ def place() -> str:
 
 @contextlib.contextmanager
 def communicating() -> Iterator[None]:
-    """Turns an error of PyTorch's communication into `RankLost`."""
+    """An operation of all ranks, which is counted. An error of PyTorch's becomes `RankLost`."""
+    counts.n_operations += 1
     try:
         yield
     except RuntimeError as error:
@@ -100,6 +125,20 @@ def exchange(numbers: Sequence[float]) -> list[list[float]]:
     with communicating():
         distributed.all_gather(rows, row)
     return [other.tolist() for other in rows]
+
+
+def gather_integers(numbers: torch.Tensor) -> torch.Tensor:
+    """Returns the vectors of int64 of every rank, (R, ...), on the host. Waits for the others.
+
+    Args:
+        numbers: int64 on the host, of the same shape on every rank.
+    """
+    if n_ranks() == 1:
+        return numbers[None]
+    rows = [torch.empty_like(numbers) for _ in range(n_ranks())]
+    with communicating():
+        distributed.all_gather(rows, numbers)
+    return torch.stack(rows)
 
 
 def gather_objects(value: Any) -> list[Any]:

@@ -10,16 +10,13 @@ that is if another has for some time been ahead of it in the operations that all
 from __future__ import annotations
 
 import contextlib
-import datetime
 import json
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
-
-from torch import distributed
 
 from megastep.agents.distributed import process_group
 
@@ -28,7 +25,7 @@ PERIOD = 2.0
 #: Seconds without a heartbeat, or behind another rank, after which a rank is lost; and without a
 #: heartbeat once a connection has broken.
 LOST_SECONDS, BROKEN_SECONDS = 20.0, 5.0
-#: Seconds behind another rank before the second exchange: kernels are compiled, graphs recorded.
+#: Seconds behind another rank in the first two updates: kernels are compiled, graphs recorded.
 FIRST_SECONDS = 300.0
 #: An operation that once took long and went well may take so many times as long.
 PATIENCE = 5
@@ -42,7 +39,7 @@ class Heartbeat(NamedTuple):
     Attributes:
         number: counts heartbeats.
         n_operations: number of operations of all ranks that it has begun.
-        n_exchanges: number of these that were exchanges, of which an update has one.
+        n_updates: number of updates that it has begun.
         is_exempt: it does something that others wait for, such as an evaluation.
         has_left: it is done.
         host: its machine.
@@ -50,7 +47,7 @@ class Heartbeat(NamedTuple):
 
     number: int
     n_operations: int
-    n_exchanges: int
+    n_updates: int
     is_exempt: bool
     has_left: bool
     host: str
@@ -82,11 +79,11 @@ class Patience:
         if is_ahead and theirs.n_operations == before.n_operations:
             self.n_ahead += 1
         else:
-            if min(ours.n_exchanges, theirs.n_exchanges) > 1:
+            if min(ours.n_updates, theirs.n_updates) > 2:
                 self.longest = max(self.longest, self.n_ahead)
             self.n_ahead = 0
         seconds = max(LOST_SECONDS, PATIENCE * self.longest * PERIOD)
-        if min(ours.n_exchanges, theirs.n_exchanges) < 2:
+        if min(ours.n_updates, theirs.n_updates) <= 2:
             seconds = FIRST_SECONDS
         if self.n_ahead * PERIOD > seconds:
             waited = round(self.n_ahead * PERIOD)
@@ -104,7 +101,7 @@ class Watch:
 
     def __init__(self, on_lost: Callable[[str | None], None]):
         self.on_lost = on_lost
-        self.is_broken = self.is_exempt = self.has_left = False
+        self.is_broken = self.has_left = False
         self.rank, self.n_ranks = process_group.rank(), process_group.n_ranks()
         self.number = 0
         self._wakes = threading.Event()
@@ -114,15 +111,6 @@ class Watch:
         self.store = process_group.store()
         self._beat()
         self._thread.start()
-
-    @contextlib.contextmanager
-    def exempt(self) -> Iterator[None]:
-        """In this context the others wait for this rank as long as it takes."""
-        self.is_exempt = True
-        try:
-            yield
-        finally:
-            self.is_exempt = False
 
     def claim(self) -> bool:
         """Returns whether this rank is the first to tell of an error. The others end then."""
@@ -181,8 +169,8 @@ class Watch:
         heartbeat = Heartbeat(
             self.number,
             process_group.counts.n_operations,
-            process_group.counts.n_exchanges,
-            self.is_exempt,
+            process_group.counts.n_updates,
+            process_group.counts.is_exempt,
             self.has_left,
             process_group.hostname(),
         )
