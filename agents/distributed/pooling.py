@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import distributed
 
-from megastep.agents.distributed.process_group import n_ranks
+from megastep.agents.distributed.process_group import n_ranks, rank
 from megastep.agents.distributed.segments import between_graphs
 
 #: Number of entries, their mean and their variance; () or, for several quantities, mean and
@@ -27,9 +27,9 @@ def all_gather(tensor: torch.Tensor) -> torch.Tensor:
     """Returns the tensors of all ranks, (R, ...)."""
     if n_ranks() == 1:
         return tensor[None]
-    gathered = tensor.new_empty(n_ranks(), *tensor.shape)
-    between_graphs(lambda: distributed.all_gather_into_tensor(gathered, tensor))
-    return gathered
+    gathered = tensor.new_zeros(n_ranks(), *tensor.shape)
+    gathered[rank()] = tensor
+    return all_reduce(gathered)  # each number is added to zeros, so it keeps its bits
 
 
 def on_all_ranks(condition: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,7 @@
 """Starts ranks as torchrun does: processes with its environment variables, on CPUs."""
 
 import contextlib
+import inspect
 import os
 import pickle
 import socket
@@ -84,7 +85,9 @@ def call(function, *arguments, n_ranks=2, **env):
     Args:
         arguments: can be pickled, as must be what is returned.
     """
-    name = f"{function.__module__}:{function.__qualname__}"
+    # pytest imports a file of tests under its bare name
+    path = Path(inspect.getfile(function)).relative_to(ROOT).with_suffix("")
+    name = f"{'.'.join(path.parts)}:{function.__qualname__}"
     words = ["-m", "tests.helpers.ranks", name, pickle.dumps(arguments).hex()]
     results = run(words, n_ranks, **env)
     assert not any(result.returncode for result in results), [one.stderr for one in results]
