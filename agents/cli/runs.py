@@ -152,7 +152,7 @@ def find(name: str) -> Path:
 
 
 def load_checkpoint(
-    path: Path, trust: bool, device: Any = None, is_whole: bool = False
+    path: Path, trust: bool, device: Any = None, is_whole: bool = False, rank: int = 0
 ) -> checkpoint.Checkpoint:
     """Returns the checkpoint of a run found with `find`, on a device; without one, all but its
     state, and PyTorch is not imported. Warns of damaged ones it skips.
@@ -160,12 +160,13 @@ def load_checkpoint(
     Args:
         trust: whether a run that another user made may name modules to import.
         is_whole: loads environments and replay buffer, too, as for a run that is resumed.
+        rank: whose environments and replay buffer.
 
     Raises:
         UserError: there is none; or, without `trust`, it names modules and another user made it.
     """
     with program.errors(kinds=(OSError, ValueError, checkpoint.CheckpointError)):
-        loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole)
+        loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
     if loaded.untrusted and not trust:
         raise UserError(
             f"{loaded.path} was not made by this user here, and would import "

@@ -89,7 +89,7 @@ class RunState:
                 self.replay_buffer.load_state_dict(state["replay"])
             else:
                 lost.append("the replay buffer was not saved and fills again")
-        return lost
+        return ["ranks that it did not have begin new episodes"] if is_new_rank else lost
 
     def _of_new_rank(self, state):
         """Returns a state of rank 0 with this rank's generators, and without what rank 0 counted

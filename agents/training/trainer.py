@@ -62,6 +62,8 @@ class Trainer:
             of few episodes is luck, and would mark the first checkpoint as the best.
         samples_per_second: speed between the last two reports, or None.
         latest_stats: name -> the last value of each episode statistic.
+        lost: what could not be restored of a resumed run and begins anew, a clause each; if any,
+            the run does not continue bit for bit.
         nonfinite_guard: has the first NaN or infinity of the run.
         samples_at_report: samples at the last report that is due every `log_every` updates. A
             resumed run has all reports up to it, and writes the later ones.
@@ -119,7 +121,7 @@ class Trainer:
         self.latest_stats = {}
         self.samples_at_log = self.updates_at_log = self.samples_at_report = 0
         self.seconds_at_log = self.seconds_at_checkpoint = 0.0
-        self.updates_at_checkpoint = None
+        self.updates_at_checkpoint, self.lost = None, []
 
     @property
     def fraction_left(self) -> float:
@@ -177,6 +179,12 @@ class Trainer:
             self.saver.wait()
         self.save_checkpoint(state, is_last=True)
         self.saver.wait()
+
+    def close(self) -> None:
+        """Closes the files of metrics, after training."""
+        if self.annealing_record is not None:
+            self.annealing_record.close()
+        self.logger.close()
 
     def plan(self, is_stopped: bool) -> Plan:
         """Returns what all ranks do next.
@@ -325,17 +333,14 @@ class Trainer:
         )
         return counts | self.run_state.state_dict(has_episodes)
 
-    def load_state_dict(self, state: dict[str, Any], is_new_rank: bool = False) -> list[str]:
-        """Restores a `state_dict`.
+    def load_state_dict(self, state: dict[str, Any], is_new_rank: bool = False) -> None:
+        """Restores a `state_dict`. `lost` names what cannot be restored.
 
         Args:
             is_new_rank: it is rank 0's, as this rank has none of its own.
-
-        Returns what could not be restored and begins anew, a clause each; then the run does not
-        continue bit for bit.
         """
         self.samples, self.updates = state["samples"], state["updates"]
         self.clock.seconds_before = state["seconds"]
         self.samples_at_report = state["samples_at_report"]
         self.updates_at_checkpoint = self.updates_at_log = self.updates
-        return self.run_state.load_state_dict(state, is_new_rank)
+        self.lost = self.run_state.load_state_dict(state, is_new_rank)
