@@ -277,7 +277,6 @@ def run(cfg: settings.Train) -> Path:
             )
             console.say(f"Training on {device} in {folder}")
         resume = f"To continue: {runs.resume_command(folder)}"
-        place = f"{process_group.place()}: " * (len(hosts) > 1)
         try:
             with (
                 signals.handled() as numbers,
@@ -295,7 +294,7 @@ def run(cfg: settings.Train) -> Path:
             saved = running.saver.error or "What was learnt last could not be saved"
             saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
             reason = problem or str(error).partition("\n")[0].rstrip(".")
-            raise program.UserError(f"{place}{reason}. {saved}. {resume}") from error
+            raise program.UserError(f"{reason}. {saved}. {resume}") from error
         finally:
             if is_first:
                 curves.plot_curves(folder)
@@ -312,7 +311,10 @@ def run(cfg: settings.Train) -> Path:
         common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
         common["trust"] = True  # what it names has just run
         if cfg.finish.evaluate:
-            evaluate.run(settings.Evaluate(episodes=cfg.finish.episodes, baseline=True, **common))
+            with process_group.unhurried():
+                evaluate.run(
+                    settings.Evaluate(episodes=cfg.finish.episodes, baseline=True, **common)
+                )
         if cfg.finish.record and is_first:
             with console.warned():
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))

@@ -16,6 +16,7 @@ import torch
 from torch.utils._pytree import tree_leaves
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, nonfinite_leaf
+from megastep.agents.distributed.process_group import unhurried
 from megastep.agents.training import checkpoint, checkpoint_format
 from megastep.agents.training.rank_files import RankFiles
 
@@ -159,7 +160,8 @@ class Saver:
         """
         if self._thread is None:
             return
-        self._thread.join()
+        with unhurried():
+            self._thread.join()
         self._thread = None
         failure, self._failure = self._failure, None
         if failure is None:
