@@ -26,8 +26,8 @@ T = TypeVar("T")
 
 
 def main() -> int:
-    """Trains as one of the ranks that `launch` has started. Returns the exit code: 0 unless torchrun
-    should start the ranks again.
+    """Trains as one of the ranks that `launch` has started. Returns the exit code: 0, or another if
+    torchrun is to start the ranks again.
     """
     place, job = environment.launched(), Path(os.environ[launch.JOB])
     for number in signals.SIGNALS:  # while there is nothing to save
@@ -67,8 +67,8 @@ def tell(ending: endings.Ending) -> None:
     place = environment.launched()
     if launch.JOB in os.environ:
         if place.rank > 0 and ending.code != launch.LOST:
-            named = f"rank {place.rank} on {environment.hostname()}: {ending.text}"
-            ending = ending._replace(text=named)
+            name = f"rank {place.rank} on {environment.hostname()}: "
+            ending = ending._replace(text=f"{name}{ending.text.removeprefix(name)}")
         path = Path(os.environ[launch.JOB], f"ending-{place.attempt}")
         if not path.exists():
             ending.write(path)
@@ -84,11 +84,25 @@ class Team:
     """
 
     def __init__(self):
-        from megastep.agents.distributed import watch
+        from megastep.agents.distributed import process_group, watch
 
         self.folder = None
+        self.store = process_group.store("job")
         self.watch = watch.Watch(self.end)
         self.watch.start()
+
+    def set_folder(self, folder: Path) -> None:
+        """Tells where the run is, for those who end it or start it again."""
+        self.folder = folder
+        if environment.rank() == 0:
+            self.store.set("run", str(folder))
+            if launch.JOB in os.environ:
+                Path(os.environ[launch.JOB], launch.RUN).write_text(str(folder))
+
+    def earlier_folder(self) -> Path | None:
+        """Returns the run that was trained before torchrun started the ranks again."""
+        is_again = environment.launched().attempt > 0 and self.store.check(["run"])
+        return Path(self.store.get("run").decode()) if is_again else None
 
     def end(self, problem: str | None) -> NoReturn:
         """Ends this process in the middle of training, since a rank is lost.
@@ -113,8 +127,9 @@ class Team:
 
 @contextlib.contextmanager
 def joined() -> Iterator[Team | None]:
-    """Joins the ranks that torchrun started, and ends with them: one of them tells of an error. Does
-    nothing in a process of its own, and inside itself.
+    """Joins the ranks that torchrun started, and ends with them: one of them tells of an error.
+
+    Does nothing in a process of its own, and inside itself.
 
     Raises:
         UserError, Interrupted: as in a process of its own, if this rank is the one to tell.
@@ -149,6 +164,7 @@ def joined() -> Iterator[Team | None]:
     finally:
         _team = None
     team.leave()
+    process_group.stop()
 
 
 def together(function: Callable[[], T]) -> T:

@@ -53,7 +53,8 @@ def exit_on_signals(script: str) -> None:
 
 @contextlib.contextmanager
 def handled(
-    on_first: Callable[[int], None] = announce, on_second: Callable[[int], None] = lambda number: None
+    on_first: Callable[[int], None] = announce,
+    on_second: Callable[[int], None] = lambda number: None,
 ) -> Iterator[list[int]]:
     """Calls `on_first(number)` at the first signal; another Ctrl-C or SIGTERM ends the program, after
     `on_second(number)`.
