@@ -57,7 +57,7 @@ def main() -> int:
         traceback.print_exc()
         text = f"{type(error).__name__}: {program.shortened(error, 400)}"
         ending, code = endings.Ending(1, text), 1
-    if ending.text or place.rank == 0:
+    if ending.text or ending.folder:
         tell(ending)
     return code
 
@@ -156,8 +156,9 @@ def joined() -> Iterator[Team | None]:
         team.end(f"A rank is lost: {error}" if team.watch.claim() else None)
     except (Exception, signals.Interrupted) as error:
         is_signal = isinstance(error, signals.Interrupted)
+        tells = place.rank == 0 and team.watch.claim()
         team.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
-        if team.watch.claim():
+        if tells or team.watch.claim():
             raise
         code = 128 + error.args[0] if is_signal else getattr(error, "code", 1)
         raise SystemExit(code) from None

@@ -1,5 +1,5 @@
-"""What the ranks of a training run check together before they train. In a process of its own there is
-nothing to check.
+"""What the ranks of a training run check together before they train. One process has nothing to
+check.
 """
 
 import contextlib
@@ -48,7 +48,7 @@ def check_world(cfg: settings.Train, running: Trainer) -> None:
     if process_group.n_ranks() > 1:
         homes = factory.homes(cfg.env, cfg.geometry, "training")
         _check_equal(
-            {"the training homes' digest": digest(homes), **running.saver.config["spaces"]}
+            {"the digest of the training homes": digest(homes), **running.saver.config["spaces"]}
         )
         if difference := first_difference(running.policy):
             raise program.UserError(f"The ranks begin with different weights: {difference}")
@@ -91,8 +91,8 @@ def check_shared(folder: Path) -> str:
         while not (folder.is_dir() and token in os.listdir(folder)):
             if time.monotonic() > deadline:
                 raise program.UserError(
-                    f"The run folder {folder.absolute()} of rank 0 is not here; give folder= with a "
-                    "path that leads to the same place on all machines, and start all in one folder"
+                    f"The run folder {folder.absolute()} of rank 0 is not here; start all ranks "
+                    "in one folder that their machines share, or give folder= with a path there"
                 )
             time.sleep(0.1)
 
