@@ -62,6 +62,15 @@ def main() -> int:
     return code
 
 
+def announce(number: int) -> None:
+    """Rank 0 announces a signal, unless it is torchrun's, which ends what is left of the ranks."""
+    job = os.environ.get(launch.JOB)
+    if environment.rank() == 0 and (
+        job is None or os.path.exists(os.path.join(job, launch.STOPPED))
+    ):
+        signals.announce(number)
+
+
 def tell(ending: endings.Ending) -> None:
     """Says how the ranks end: on stderr, or to the process that launched them, which says it."""
     place = environment.launched()
@@ -152,7 +161,8 @@ def joined() -> Iterator[Team | None]:
     try:
         yield team
     except process_group.RankLost as error:
-        team.watch.await_verdict()  # which ends this process
+        with signals.handled(lambda number: None):  # torchrun sends SIGTERM
+            team.watch.await_verdict()  # which ends this process
         team.end(f"A rank is lost: {error}" if team.watch.claim() else None)
     except (Exception, signals.Interrupted) as error:
         is_signal = isinstance(error, signals.Interrupted)

@@ -29,8 +29,7 @@ class Interrupted(BaseException):
 
 
 def announce(number: int) -> None:
-    if environment.rank() == 0:
-        _write(sys.__stdout__, "\nStopping after this update (Ctrl-C again to quit now).")
+    _write(sys.__stdout__, "\nStopping after this update (Ctrl-C again to quit now).")
 
 
 def interrupt(number: int) -> NoReturn:

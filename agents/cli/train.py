@@ -291,7 +291,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         place = f"{process_group.place()}: " * (len(hosts) > 1)
         try:
             with (
-                signals.handled() as numbers,
+                signals.handled(rank.announce) as numbers,
                 progress if is_first else contextlib.nullcontext(),
                 contextlib.closing(running),
             ):
