@@ -160,11 +160,11 @@ def joined() -> Iterator[Team | None]:
     _team = team = Team()
     try:
         yield team
-    except process_group.RankLost as error:
-        with signals.handled(lambda number: None):  # torchrun sends SIGTERM
-            team.watch.await_verdict()  # which ends this process
-        team.end(f"A rank is lost: {error}" if team.watch.claim() else None)
     except (Exception, signals.Interrupted) as error:
+        if loss := _cause(error, process_group.RankLost):
+            with signals.handled(lambda number: None):  # torchrun sends SIGTERM
+                team.watch.await_verdict()  # which ends this process
+            team.end(f"A rank is lost: {loss}" if team.watch.claim() else None)
         is_signal = isinstance(error, signals.Interrupted)
         tells = place.rank == 0 and team.watch.claim()
         team.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
@@ -176,6 +176,13 @@ def joined() -> Iterator[Team | None]:
         _team = None
     team.leave()
     process_group.stop()
+
+
+def _cause(error, kind):
+    """Returns the error of a kind that another was raised from or after, None if there is none."""
+    while error is not None and not isinstance(error, kind):
+        error = error.__context__
+    return error
 
 
 def together(function: Callable[[], T]) -> T:
