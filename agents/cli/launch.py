@@ -104,6 +104,7 @@ class Job:
     def __init__(self, folder: Path, cfg: settings.Train):
         self.folder, self.cfg = folder, cfg
         self.attempt, self.error = 0, None
+        self.cleared: set[int] = set()  # attempts of which nothing is left
         facts = dict(
             settings=check.as_tree(cfg),
             argv=sys.argv,
@@ -123,6 +124,7 @@ class Job:
     def stop(self, number: int) -> None:
         """Passes a signal on to the ranks; those that begin later end at once."""
         (self.folder / STOPPED).touch()
+        self.look()
         self.send(number)
 
     def quit(self, number: int) -> None:
@@ -139,7 +141,9 @@ class Job:
         """Ends what is left of ranks that lost one; torchrun gives them 30 s. Says so if the ranks
         start again.
         """
-        if (ending := self.ending_of(self.attempt)) and ending.code == LOST:
+        ending = self.ending_of(self.attempt)
+        if ending and ending.code == LOST and self.attempt not in self.cleared:
+            self.cleared.add(self.attempt)
             self.send(signal.SIGKILL)
         if [*self.folder.glob(f"pid-{self.attempt + 1}-*")]:
             ending = self.ending_of(self.attempt) or self.unknown_ending()
@@ -195,8 +199,7 @@ def launch_ranks(n_ranks: int, n_restarts: int) -> None:
 
     # its warnings and errors are those of the ranks, which are told in one sentence
     logger = logging.getLogger("torch.distributed")
-    logger.addHandler(logging.NullHandler())
-    logger.propagate = False
+    logger.handlers, logger.propagate = [logging.NullHandler()], False
     config = LaunchConfig(
         min_nodes=1,
         max_nodes=1,

@@ -26,8 +26,8 @@ T = TypeVar("T")
 
 
 def main() -> int:
-    """Trains as one of the ranks that `launch` has started. Returns the exit code: 0 unless torchrun
-    should start the ranks again.
+    """Trains as one of the ranks that `launch` has started. Returns the exit code: 0, or another if
+    torchrun is to start the ranks again.
     """
     place, job = environment.launched(), Path(os.environ[launch.JOB])
     for number in signals.SIGNALS:  # while there is nothing to save
@@ -57,9 +57,18 @@ def main() -> int:
         traceback.print_exc()
         text = f"{type(error).__name__}: {program.shortened(error, 400)}"
         ending, code = endings.Ending(1, text), 1
-    if ending.text or place.rank == 0:
+    if ending.text or ending.folder:
         tell(ending)
     return code
+
+
+def announce(number: int) -> None:
+    """Rank 0 announces a signal, unless it is torchrun's, which ends what is left of the ranks."""
+    job = os.environ.get(launch.JOB)
+    if environment.rank() == 0 and (
+        job is None or os.path.exists(os.path.join(job, launch.STOPPED))
+    ):
+        signals.announce(number)
 
 
 def tell(ending: endings.Ending) -> None:
@@ -67,8 +76,8 @@ def tell(ending: endings.Ending) -> None:
     place = environment.launched()
     if launch.JOB in os.environ:
         if place.rank > 0 and ending.code != launch.LOST:
-            named = f"rank {place.rank} on {environment.hostname()}: {ending.text}"
-            ending = ending._replace(text=named)
+            name = f"rank {place.rank} on {environment.hostname()}: "
+            ending = ending._replace(text=f"{name}{ending.text.removeprefix(name)}")
         path = Path(os.environ[launch.JOB], f"ending-{place.attempt}")
         if not path.exists():
             ending.write(path)
@@ -84,11 +93,25 @@ class Team:
     """
 
     def __init__(self):
-        from megastep.agents.distributed import watch
+        from megastep.agents.distributed import process_group, watch
 
         self.folder = None
+        self.store = process_group.store("job")
         self.watch = watch.Watch(self.end)
         self.watch.start()
+
+    def set_folder(self, folder: Path) -> None:
+        """Tells where the run is, for those who end it or start it again."""
+        self.folder = folder
+        if environment.rank() == 0:
+            self.store.set("run", str(folder))
+            if launch.JOB in os.environ:
+                Path(os.environ[launch.JOB], launch.RUN).write_text(str(folder))
+
+    def earlier_folder(self) -> Path | None:
+        """Returns the run that was trained before torchrun started the ranks again."""
+        is_again = environment.launched().attempt > 0 and self.store.check(["run"])
+        return Path(self.store.get("run").decode()) if is_again else None
 
     def end(self, problem: str | None) -> NoReturn:
         """Ends this process in the middle of training, since a rank is lost.
@@ -113,8 +136,9 @@ class Team:
 
 @contextlib.contextmanager
 def joined() -> Iterator[Team | None]:
-    """Joins the ranks that torchrun started, and ends with them: one of them tells of an error. Does
-    nothing in a process of its own, and inside itself.
+    """Joins the ranks that torchrun started, and ends with them: one of them tells of an error.
+
+    Does nothing in a process of its own, and inside itself.
 
     Raises:
         UserError, Interrupted: as in a process of its own, if this rank is the one to tell.
@@ -136,19 +160,29 @@ def joined() -> Iterator[Team | None]:
     _team = team = Team()
     try:
         yield team
-    except process_group.RankLost as error:
-        team.watch.await_verdict()  # which ends this process
-        team.end(f"A rank is lost: {error}" if team.watch.claim() else None)
     except (Exception, signals.Interrupted) as error:
+        if loss := _cause(error, process_group.RankLost):
+            with signals.handled(lambda number: None):  # torchrun sends SIGTERM
+                team.watch.await_verdict()  # which ends this process
+            team.end(f"A rank is lost: {loss}" if team.watch.claim() else None)
         is_signal = isinstance(error, signals.Interrupted)
+        tells = place.rank == 0 and team.watch.claim()
         team.leave(SAVING_SECONDS if is_signal else GRACE_SECONDS)
-        if team.watch.claim():
+        if tells or team.watch.claim():
             raise
         code = 128 + error.args[0] if is_signal else getattr(error, "code", 1)
         raise SystemExit(code) from None
     finally:
         _team = None
     team.leave()
+    process_group.stop()
+
+
+def _cause(error, kind):
+    """Returns the error of a kind that another was raised from or after, None if there is none."""
+    while error is not None and not isinstance(error, kind):
+        error = error.__context__
+    return error
 
 
 def together(function: Callable[[], T]) -> T:

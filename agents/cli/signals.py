@@ -29,8 +29,7 @@ class Interrupted(BaseException):
 
 
 def announce(number: int) -> None:
-    if environment.rank() == 0:
-        _write(sys.__stdout__, "\nStopping after this update (Ctrl-C again to quit now).")
+    _write(sys.__stdout__, "\nStopping after this update (Ctrl-C again to quit now).")
 
 
 def interrupt(number: int) -> NoReturn:
@@ -56,8 +55,8 @@ def handled(
     on_first: Callable[[int], None] = announce,
     on_second: Callable[[int], None] = lambda number: None,
 ) -> Iterator[list[int]]:
-    """Calls `on_first(number)` at the first signal; another Ctrl-C or SIGTERM ends the program, after
-    `on_second(number)`.
+    """Calls `on_first(number)` at the first signal. Another Ctrl-C or SIGTERM ends the program,
+    after `on_second(number)`.
 
     Ending harms nothing: checkpoints are renamed into place when whole. Yields a list that gets the
     number of the first signal.

@@ -5,7 +5,6 @@ import functools
 import itertools
 import math
 import random
-import secrets
 import shutil
 from collections import Counter
 from collections.abc import Sequence
@@ -22,9 +21,13 @@ from megastep.agents.cli import (
     check,
     command,
     console,
+    dry_run,
     evaluate,
     factory,
+    launch,
     program,
+    rank,
+    rank_checks,
     record,
     runs,
     scripts,
@@ -33,6 +36,7 @@ from megastep.agents.cli import (
 )
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.agreement import from_rank_0, together
+from megastep.agents.distributed.drift import DriftError
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
 from megastep.agents.training import (
     annealing,
@@ -55,7 +59,7 @@ def make_trainer(
     folder: Path,
     device: torch.device,
     progress: console.Progress,
-    launch: str = "",
+    token: str = "",
 ) -> Trainer:
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
@@ -63,10 +67,10 @@ def make_trainer(
     Each rank has one. All begin with the same weights; whatever else a seed decides differs.
 
     Args:
-        launch: a name that all ranks of this launch have, and no other launch.
+        token: a name that all ranks of this start have, and no other start.
     """
-    rank, n_ranks = process_group.rank(), process_group.n_ranks()
-    seed = rank_seed(cfg.seed, rank)
+    number, n_ranks = process_group.rank(), process_group.n_ranks()
+    seed = rank_seed(cfg.seed, number)
     seed_everything(seed)
     where = {
         "geometries": factory.homes(cfg.env, cfg.geometry, "training"),
@@ -84,23 +88,20 @@ def make_trainer(
     env = factory.construct(cfg.env, **where)
     if cfg.resume or cfg.init:
         path = runs.find(cfg.resume or cfg.init)
-        loaded = runs.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, rank)
+        loaded = runs.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
         factory.load_weights(policy, env, loaded)
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
-    for name in ("checkpoints", "snapshots") if cfg.resume and rank == 0 else ():
+    for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
         checkpoint.set_aside_after(folder / name, loaded.step)
     config = {"train": check.as_tree(cfg), "spaces": factory.spaces_of(env)}
     wandb = vars(cfg.logger) | {"name": folder.name, "config": config["train"]}
     made_with = provenance.made_with(device, program.version(), n_ranks)
     checkpoints, had = folder / "checkpoints", loaded.state if cfg.resume else Counter()
     with factory.errors():
-        spends, logger, writers = (
-            budget_of(cfg, folder, loaded if cfg.resume else None),
-            loggers.NoLogger(),
-            {},
-        )
-        rank_files = RankFiles(checkpoints, launch, rank, n_ranks)
-        if rank == 0:  # which alone writes these
+        limits = budget_of(cfg, folder, loaded if cfg.resume else None)
+        logger, writers = loggers.NoLogger(), {}
+        rank_files = RankFiles(checkpoints, token, number, n_ranks)
+        if number == 0:  # which alone writes these
             wandb = wandb if cfg.logger.name == "wandb" else None
             logger = loggers.Loggers(folder, had["samples_at_report"], wandb)
             snapshots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
@@ -117,7 +118,7 @@ def make_trainer(
             saver.Saver(
                 checkpoints, config, cfg.keep_checkpoints, made_with, cfg.replay_every, rank_files
             ),
-            spends,
+            limits,
             log_every=cfg.log_every,
             checkpoint_seconds=cfg.checkpoint_seconds,
             desync=cfg.desync,
@@ -126,7 +127,7 @@ def make_trainer(
             **writers,
         )
         if cfg.resume:
-            improves.load_state_dict(loaded.state, is_new_rank=rank >= loaded.n_ranks)
+            improves.load_state_dict(loaded.state, is_new_rank=number >= loaded.n_ranks)
             improves.lost += differing(loaded.made_with, made_with)
     return improves
 
@@ -235,51 +236,55 @@ def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path,
     return folder, cfg.resume
 
 
-def check_shared(folder: Path) -> None:
-    """Raises UserError if this rank does not see the run folder that rank 0 has opened."""
-    if not folder.is_dir():
-        raise program.UserError(
-            f"The run folder {folder.resolve()}, which rank 0 has made, is not here; choose one "
-            "that all ranks share with folder="
-        )
+def run(cfg: settings.Train) -> Path | None:
+    """Trains as `cfg` says, and returns the run folder, None for a dry run. A signal saves and
+    raises Interrupted.
 
-
-def run(cfg: settings.Train) -> Path:
-    """Trains as `cfg` says, and returns the run folder. A signal saves and raises Interrupted.
-
-    Where torchrun started this process as a rank, all ranks train together. Rank 0 writes.
+    Where torchrun started this process as a rank, all ranks train together. Rank 0 writes. With
+    `cfg.ranks`, other processes are started that do so.
     """
-    process_group.start()
+    if cfg.dry_run:
+        return dry_run.show(cfg)
+    if launch.is_needed(cfg):
+        return launch.run(cfg)
+    with rank.joined() as team:
+        return train_here(cfg, team)
+
+
+def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
+    """Trains in this process, as one of a team of ranks if it is one. Returns the run folder."""
     is_first = process_group.rank() == 0
     device, progress = together(lambda: factory.make_device(cfg.device)), console.Progress()
+    rank_checks.check_start(cfg)
+    cfg = rank_checks.started_again(cfg, team)
     with contextlib.ExitStack() as locks:
         folder, resume = from_rank_0(lambda: open_folder(cfg, locks))
         with contextlib.ExitStack() as undo:
             if is_first and not cfg.resume:
                 undo.callback(shutil.rmtree, folder, ignore_errors=True)
-            together(lambda: check_shared(folder))
+            token = rank_checks.check_shared(folder)
+            if team:
+                team.set_folder(folder)
             cfg = together(lambda: with_more(settings.changed(cfg, resume=resume)))
-            launch = from_rank_0(secrets.token_hex)
-            running = together(lambda: make_trainer(cfg, folder, device, progress, launch))
+            running = together(lambda: make_trainer(cfg, folder, device, progress, token))
+            rank_checks.check_world(cfg, running)
             from_rank_0(functools.partial(write_config, folder, running.saver.config["train"]))
             undo.pop_all()
         hosts = process_group.gather_objects(process_group.hostname())
-        lost = [
-            clause for clauses in process_group.gather_objects(running.lost) for clause in clauses
-        ]
+        clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(running.lost)))
         if is_first:
-            if lost:
-                clauses = "; ".join(dict.fromkeys(lost))
-                console.say(f"This run goes on, but not bit for bit: {clauses}.")
+            if clauses:
+                console.say(f"This run goes on, but not bit for bit: {'; '.join(clauses)}.")
             runs.record_start(folder)
             provenance.record(
                 folder, running.samples, device, program.version(), program.ROOT, hosts
             )
-            console.say(f"Training on {device} in {folder}")
+            ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
+            console.say(f"Training on {ranks} in {folder}")
         resume = f"To continue: {runs.resume_command(folder)}"
         try:
             with (
-                signals.handled() as numbers,
+                signals.handled(rank.announce) as numbers,
                 progress if is_first else contextlib.nullcontext(),
                 contextlib.closing(running),
             ):
@@ -287,6 +292,8 @@ def run(cfg: settings.Train) -> Path:
         except NonFiniteError as error:
             saved = f"What was saved before is in {folder}{running.nonfinite_guard.replay_hint}"
             raise program.NonFinite(f"{error}. {saved}") from error
+        except DriftError as error:
+            raise program.UserError(f"{error}. What was saved before is in {folder}") from error
         except (MemoryError, RuntimeError) as error:
             problem = program.memory_problem(error)
             if not (problem or isinstance(error, engine.EngineError)):
@@ -297,7 +304,8 @@ def run(cfg: settings.Train) -> Path:
             raise program.UserError(f"{reason}. {saved}. {resume}") from error
         finally:
             if is_first:
-                curves.plot_curves(folder)
+                with process_group.unhurried():
+                    curves.plot_curves(folder)
         # a signal that one rank got stops all, and so does a checkpoint that one could not save
         ends = process_group.gather_objects((numbers[:1], running.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
@@ -312,9 +320,8 @@ def run(cfg: settings.Train) -> Path:
         common["trust"] = True  # what it names has just run
         if cfg.finish.evaluate:
             with process_group.unhurried():
-                evaluate.run(
-                    settings.Evaluate(episodes=cfg.finish.episodes, baseline=True, **common)
-                )
+                episodes = cfg.finish.episodes
+                evaluate.run(settings.Evaluate(episodes=episodes, baseline=True, **common))
         if cfg.finish.record and is_first:
             with console.warned():
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))

@@ -17,8 +17,8 @@ class DriftError(RuntimeError):
 
 
 def first_difference(policy: torch.nn.Module) -> str | None:
-    """Returns the first parameter or buffer in which ranks differ, such as `policy.core.bias differs
-    on rank 1`, None if all are equal, bit for bit. Synchronises, and waits for the other ranks.
+    """Returns the first parameter or buffer in which ranks differ, None if all bits are equal:
+    `policy.core.bias differs on rank 1`. Synchronises, and waits for the other ranks.
     """
     if n_ranks() == 1:
         return None

@@ -7,6 +7,7 @@ R ranks.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import datetime
 import math
@@ -64,20 +65,21 @@ def start(seconds: float = START_SECONDS) -> None:
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     distributed.init_process_group(backend, timeout=datetime.timedelta(seconds=seconds))
+    atexit.register(stop)  # threads of gloo that still run would abort the interpreter's end
 
 
-def store() -> distributed.Store:
+def store(name: str) -> distributed.Store:
     """Returns a connection of its own to the ranks' key-value store: no other thread waits on it.
 
-    Each start of the ranks has keys of its own.
+    Args:
+        name: of a set of keys.
     """
-    attempt = launched().attempt
     port = int(os.environ["MASTER_PORT"])
     wait = datetime.timedelta(seconds=START_SECONDS)
     client = distributed.TCPStore(
         os.environ["MASTER_ADDR"], port, is_master=False, timeout=wait, wait_for_workers=False
     )
-    return distributed.PrefixStore(f"megastep {attempt}", client)
+    return distributed.PrefixStore(f"megastep {name}", client)
 
 
 def stop() -> None:

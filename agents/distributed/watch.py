@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from megastep.agents.distributed import process_group
+from megastep.agents.distributed import environment, process_group
 
 #: Seconds between two heartbeats.
 PERIOD = 2.0
@@ -108,7 +108,7 @@ class Watch:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        self.store = process_group.store()
+        self.store = process_group.store(f"start {environment.launched().attempt}")
         self._beat()
         self._thread.start()
 

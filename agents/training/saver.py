@@ -68,6 +68,7 @@ class Saver:
         self.seconds, self._n_since_replay, self._number = 0.0, 0, 0
         self._host_copy, self._thread, self._failure = _HostCopy(), None, None
 
+    @unhurried()
     def __call__(
         self, step: int, state: dict[str, Any], score: float | None = None, is_last: bool = False
     ) -> None:
@@ -152,6 +153,7 @@ class Saver:
         """Waits no longer for the parts of other ranks, as one has ended."""
         self.rank_files.give_up()
 
+    @unhurried()
     def wait(self) -> None:
         """Returns when nothing is being written. Warns if the last checkpoint failed.
 
@@ -160,8 +162,7 @@ class Saver:
         """
         if self._thread is None:
             return
-        with unhurried():
-            self._thread.join()
+        self._thread.join()
         self._thread = None
         failure, self._failure = self._failure, None
         if failure is None:

@@ -11,8 +11,9 @@ import torch
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.agreement import any_rank
+from megastep.agents.distributed.drift import check_drift
 from megastep.agents.distributed.plan import Plan, agree
-from megastep.agents.distributed.process_group import mean_over_ranks, n_ranks
+from megastep.agents.distributed.process_group import mean_over_ranks, n_ranks, unhurried
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
@@ -246,10 +247,11 @@ class Trainer:
 
         A loss that is NaN has no value, as no gradient step was taken; it is left out.
 
-        Raises the errors that `env.check()` does.
+        Raises the errors that `env.check()` does, and DriftError if the ranks' weights differ.
         """
         self.wait_for_collector()
         optional(self.env, "check")()
+        check_drift(self.policy)
         loss_values = [torch.as_tensor(loss, device=self.env.device) for loss in losses.values()]
         loss_values = torch.stack(loss_values).tolist() if losses else []
         loss_values = dict(zip(losses, loss_values, strict=True))
@@ -275,10 +277,11 @@ class Trainer:
         perf |= {f"perf/memory_{name}": n for name, n in device_memory(self.env.device).items()}
         self.samples_at_log, self.seconds_at_log = self.samples, seconds
         self.updates_at_log = self.updates
-        if self.annealing_record is not None:
-            with contextlib.suppress(OSError):  # the next report tries again
-                self.annealing_record.flush()
-        self.logger.write(self.samples, metrics, perf)
+        with unhurried():
+            if self.annealing_record is not None:
+                with contextlib.suppress(OSError):  # the next report tries again
+                    self.annealing_record.flush()
+            self.logger.write(self.samples, metrics, perf)
         if stats.get("episode/window", 0) >= MIN_EPISODES:
             self.score = stats["episode/return"]
         self.on_log(self)
@@ -301,6 +304,7 @@ class Trainer:
         self.saver(self.samples, state, self.score, is_last)
         self.updates_at_checkpoint = self.updates
 
+    @unhurried()
     def _sync_files(self):
         """Returns whether the files of metrics are on disk, where this rank writes them."""
         try:
