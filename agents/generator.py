@@ -19,6 +19,13 @@ def stream_seed(seed: int, name: str) -> int:
     return int.from_bytes(digest[:8], "little") >> 1
 
 
+def rank_seed(seed: int, rank: int) -> int:
+    """Returns the seed of a rank: the run's seed for rank 0, for each other one of its own, below
+    2**31 as NumPy and environments of others want it.
+    """
+    return seed if rank == 0 else stream_seed(seed, f"rank {rank}") % 2**31
+
+
 class SeededGenerator:
     """A `torch.Generator` that is created from a seed on the device where it is first used.
 

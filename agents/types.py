@@ -135,6 +135,9 @@ class Saver(Protocol):
         self, step: int, state: dict[str, Any], score: float | None, is_last: bool
     ) -> None: ...
 
+    def give_up(self) -> None:
+        """Waits no longer for the parts of other ranks, as one has ended."""
+
     def wait(self) -> None:
         """Returns when everything is saved, or has failed."""
 

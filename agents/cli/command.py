@@ -1,6 +1,7 @@
 """Runs a script from a command line: options, help, exit codes."""
 
 import argparse
+import contextlib
 import os
 import sys
 import warnings
@@ -14,10 +15,11 @@ from megastep.agents.cli import (
     check,
     compose,
     console,
+    endings,
     gpu,
     program,
+    rank,
     scripts,
-    signals,
     sweeps,
 )
 
@@ -58,26 +60,14 @@ OPTIONS = {
 def run_command(script: scripts.Script, argv: list[str] | None = None) -> int:
     """Parses, composes, checks and runs. Returns the exit code."""
     warnings.showwarning, arguments = console.warn, sys.argv[:]
+    words = sys.argv[1:] if argv is None else argv
     try:
-        with signals.interrupting():
-            words = sys.argv[1:] if argv is None else argv
-            return _run(script, [*map(script.reword, words)])
-    except SystemExit as end:  # of argparse, and of Hydra's help
-        return end.code or 0
-    except program.UserError as error:
-        console.say(f"{program.name(script.name)}: {error}", sys.stderr)
-        return error.code
-    except (MemoryError, RuntimeError) as error:
-        if not (problem := program.memory_problem(error)):
-            raise
-        cure = "choose fewer environments or episodes, or a smaller network"
-        console.say(f"{program.name(script.name)}: {problem}; {cure}", sys.stderr)
-        return program.UserError.code
-    except signals.Interrupted as stop:
-        console.say(f"{program.name(script.name)}: {stop.args[1]}", sys.stderr)
-        return 128 + stop.args[0]
+        ending = endings.ending_of(lambda: _run(script, [*map(script.reword, words)]))
     finally:
         sys.argv[:] = arguments
+    if ending.text:
+        console.say(f"{program.name(script.name)}: {ending.text}", sys.stderr)
+    return ending.code
 
 
 def _run(script: scripts.Script, argv: list[str]) -> int:
@@ -128,14 +118,22 @@ def _run(script: scripts.Script, argv: list[str]) -> int:
     else:
         if "device=cpu" not in words:
             gpu.start_driver()  # beside composing
-        settings, config = composer.compose(words)
-        if config.hydra.mode == RunMode.MULTIRUN:
-            return sweeps.sweep(composer, words)
-        script.ready(settings)
-        if settings.device != "auto" or gpu.is_available():
-            gpu.wake(settings.device)  # beside the imports of what runs
-        script.run(settings)
+        with rank.joined() if script is scripts.TRAIN else contextlib.nullcontext() as team:
+            settings, config = rank.together(lambda: _checked(composer, words))
+            if config.hydra.mode == RunMode.MULTIRUN:
+                return sweeps.sweep(composer, words)
+            if team is None and (settings.device != "auto" or gpu.is_available()):
+                gpu.wake(settings.device)  # beside the imports of what runs
+            script.run(settings)
     return 0
+
+
+def _checked(composer: compose.Composer, words: list[str]) -> tuple[Any, Any]:
+    """Returns settings that can be run, and the configuration they are from."""
+    settings, config = composer.compose(words)
+    if config.hydra.mode != RunMode.MULTIRUN:
+        composer.script.ready(settings)
+    return settings, config
 
 
 def _show(composer: compose.Composer, tree: Any, arguments: list[str]) -> None:

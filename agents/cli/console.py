@@ -18,6 +18,8 @@ from megastep.agents.cli import program
 LINE_EVERY = 10
 #: The beginning of every line, where one of several processes prints.
 prefix = ""
+#: Nothing is printed on stdout, as another process prints it.
+is_silent = False
 
 
 class TolerantStream:
@@ -59,6 +61,8 @@ def open_streams() -> None:
 
 
 def say(text: str, file: TextIO | None = None) -> None:
+    if is_silent and file is None:
+        return
     print(textwrap.indent(text, prefix, bool), file=file or sys.stdout, flush=True)
 
 
@@ -100,6 +104,13 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], is_markdown: bool 
         grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row))
     Console(file=text, width=10_000, force_terminal=False, color_system=None).print(grid)
     return text.getvalue().strip()
+
+
+def restore() -> None:
+    """Shows the cursor, which a progress bar hides, where a process ends at once."""
+    if sys.stdout.isatty():
+        sys.stdout.write("\x1b[?25h\n")
+        sys.stdout.flush()
 
 
 class Progress:

@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from megastep.agents.cli import command, console, factory, program, runs, scripts, settings
+from megastep.agents.distributed import process_group
+from megastep.agents.distributed.share import Share
+from megastep.agents.generator import rank_seed
 from megastep.agents.selfplay import duels, ratings
 from megastep.agents.training import checkpoint, evaluation
 from megastep.types import optional
@@ -36,11 +39,15 @@ RATINGS = {
 def run(cfg: settings.Evaluate) -> Path:
     """Evaluates a run, each environment in one home throughout. Returns the path of the table.
 
+    At the end of a run of several ranks, each plays its share. Rank 0 writes the table; the others
+    return the run's folder.
+
     Writes .json and .md into the run's folder `evaluations`, one of each per source of geometries
     (per environment where it has none), split and checkpoint. With `cfg.against` plays duels
     instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device)
+    rank, n_ranks = process_group.rank(), process_group.n_ranks()
     loaded = runs.load_checkpoint(runs.find(cfg.run), cfg.trust, device)
     trained = factory.config_of(loaded)
     env_settings, geometry = cfg.env or trained.env, cfg.geometry or trained.geometry
@@ -50,16 +57,24 @@ def run(cfg: settings.Evaluate) -> Path:
     else:
         homes = factory.homes(env_settings, geometry, cfg.split)
         homes = factory.spread(homes, cfg.episodes)
-        env_settings = factory.changed(env_settings, n_envs=cfg.episodes, resample=False)
-        where = dict(geometries=homes, seed=cfg.seed, device=device)
+        if cfg.episodes < n_ranks:
+            n_ranks = 1  # the others have nothing to do
+        if rank >= n_ranks:
+            return runs.folder_of(loaded.path)
+        share, seed = Share(cfg.episodes, len(homes), rank, n_ranks), rank_seed(cfg.seed, rank)
+        env_settings = factory.changed(env_settings, n_envs=len(share.envs), resample=False)
+        where = dict(geometries=[homes[home] for home in share.homes], seed=seed, device=device)
         env, rows = factory.construct(env_settings, **where), []
         policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
         players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
         players += [("random", evaluation.RandomActions(env.action_space), False)] * cfg.baseline
         for name, player, greedy in players:
-            episodes = evaluation.first_episodes(env, player, cfg.seed, greedy)
+            episodes = evaluation.first_episodes(env, player, seed, greedy)
+            episodes = share.with_others(episodes)
             summaries = evaluation.summaries(episodes, optional(env, "roles"))
             rows += [{"agent": name, **row} for row in summaries]
+        if rank > 0:
+            return runs.folder_of(loaded.path)
         place = runs.place(env_settings, geometry, homes, cfg.split)
         n_episodes, n_homes = rows[0]["lanes"], rows[0]["homes"]
         warn_without_layout(env, homes)

@@ -11,6 +11,7 @@ from megastep import contract, engine, scene, spaces
 from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.cli import check, program
 from megastep.agents.cli.settings import Agent, Env, Geometry, Learner, Train, changed
+from megastep.agents.distributed import process_group
 from megastep.agents.imports import import_object
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.opponents import Opponents
@@ -53,6 +54,10 @@ def construct(settings: Any, constructor: Callable | None = None, **arguments: A
 
 
 def make_device(name: str) -> torch.device:
+    """Returns the device of this name, for a rank without a number the GPU of its own."""
+    place = process_group.launched()
+    if place and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
+        name = f"cuda:{place.local_rank}"
     with errors():
         device = engine.device(name)
     if device.type == "cuda":
@@ -141,10 +146,14 @@ def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
     return learner
 
 
-def make_opponents(cfg: Train, env: Any, sample: Any, policy: Policy) -> Opponents | None:
+def make_opponents(
+    cfg: Train, env: Any, sample: Any, policy: Policy, seed: int = 1
+) -> Opponents | None:
     """Returns the environment with opponents in it, None if there are to be none.
 
-    `sample` is a small environment, in which a scripted opponent is tried.
+    Args:
+        sample: a small environment, in which a scripted opponent is tried.
+        seed: of the opponents' actions.
 
     Raises:
         UserError: if the opponent cannot play there; with the number of snapshots that fits.
@@ -158,7 +167,7 @@ def make_opponents(cfg: Train, env: Any, sample: Any, policy: Policy) -> Opponen
             n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())
             n_bytes *= 2 if torch.device(env.device).type == "cuda" else 1  # one for the graph
             engine.fit(cfg.opponents.snapshots, n_bytes, env.device, "snapshots")
-        return Opponents(env, policy, bot, seed=cfg.seed, **shares)
+        return Opponents(env, policy, bot, seed=seed, **shares)
 
 
 def make_bot(name: str | None, settings: Env, env: Any) -> Any:

@@ -33,10 +33,21 @@ def is_available() -> bool:
     built_for = runpy.run_path(str(Path(package.origin).with_name("version.py")))["cuda"]
     if not built_for or driver() is None:
         return False
-    version, count = ctypes.c_int(), ctypes.c_int()
+    version, n_gpus = ctypes.c_int(), ctypes.c_int()
     driver().cuDriverGetVersion(ctypes.byref(version))
-    driver().cuDeviceGetCount(ctypes.byref(count))
-    return count.value > 0 and version.value // 1000 >= int(built_for.split(".")[0])
+    driver().cuDeviceGetCount(ctypes.byref(n_gpus))
+    return n_gpus.value > 0 and version.value // 1000 >= int(built_for.split(".")[0])
+
+
+def count() -> int:
+    """Returns the number of GPUs that PyTorch can use, without importing it."""
+    if not is_available():
+        return 0
+    if "torch" in sys.modules:
+        return sys.modules["torch"].cuda.device_count()
+    n_gpus = ctypes.c_int()
+    driver().cuDeviceGetCount(ctypes.byref(n_gpus))
+    return n_gpus.value
 
 
 def wake(device: str) -> None:

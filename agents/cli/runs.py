@@ -17,6 +17,7 @@ from megastep.agents.cli import console, program
 from megastep.agents.cli.check import as_tree
 from megastep.agents.cli.program import UserError, shortened
 from megastep.agents.cli.settings import Env, Evaluate, Geometry, Train, label
+from megastep.agents.distributed import environment
 from megastep.agents.training import checkpoint, json_lines
 from megastep.agents.training.atomic_files import write_atomically
 
@@ -72,11 +73,15 @@ def locked(folder: Path) -> Iterator[None]:
     """Keeps other processes from training in a run folder.
 
     The system holds the lock for as long as this process lives, so none is ever stale: neither
-    after kill -9, nor when another process gets the number in the file.
+    after kill -9, nor when another process gets the number in the file. Of several ranks, rank 0
+    has the lock for all.
 
     Raises:
         UserError: naming the process that trains there, or that the folder cannot be written.
     """
+    if environment.rank() > 0:
+        yield
+        return
     import filelock  # which takes a while
 
     # its last owner may just be deleting it
@@ -147,7 +152,7 @@ def find(name: str) -> Path:
 
 
 def load_checkpoint(
-    path: Path, trust: bool, device: Any = None, is_whole: bool = False
+    path: Path, trust: bool, device: Any = None, is_whole: bool = False, rank: int = 0
 ) -> checkpoint.Checkpoint:
     """Returns the checkpoint of a run found with `find`, on a device; without one, all but its
     state, and PyTorch is not imported. Warns of damaged ones it skips.
@@ -155,12 +160,13 @@ def load_checkpoint(
     Args:
         trust: whether a run that another user made may name modules to import.
         is_whole: loads environments and replay buffer, too, as for a run that is resumed.
+        rank: whose environments and replay buffer.
 
     Raises:
         UserError: there is none; or, without `trust`, it names modules and another user made it.
     """
     with program.errors(kinds=(OSError, ValueError, checkpoint.CheckpointError)):
-        loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole)
+        loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
     if loaded.untrusted and not trust:
         raise UserError(
             f"{loaded.path} was not made by this user here, and would import "

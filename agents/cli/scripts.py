@@ -9,7 +9,8 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-from megastep.agents.cli import program, runs, settings
+from megastep.agents.cli import launch, program, runs, settings
+from megastep.agents.distributed import environment
 
 Tree = dict[str, Any]
 
@@ -52,6 +53,9 @@ The most common words:
                                compare
   resume=RUN                   continue a run (its folder, or latest) under its own configuration;
                                more_seconds=60 more_samples=1e6 add to what it has had
+  ranks=2                      two processes that train together, on a GPU each; all: every GPU;
+                               restarts=2 starts them again if one is killed; dry_run=true only
+                               prints what would run
   rerun=RUN                    repeat a run, with the learning rates that its clock chose, and
                                compare its metrics.jsonl
   init=RUN                     start a new run from its weights, in its environment and homes
@@ -74,6 +78,9 @@ RESUMABLE = (
     "desync",
     "nonfinite_replay",
     "snapshots",
+    "ranks",
+    "restarts",
+    "dry_run",
     "logger",
     "finish",
 )
@@ -88,6 +95,8 @@ REPEATABLE = (
     "checkpoint_seconds",
     "keep_checkpoints",
     "replay_every",
+    "restarts",
+    "dry_run",
     "logger",
     "finish",
 )
@@ -107,6 +116,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     starts from the weights of another has its environment, geometry and agent, except for typed
     keys and groups.
     """
+    set_ranks(tree, typed)
     given = [key for key in CURES if isinstance(tree.get(key), str)]
     if len(given) > 1:
         raise program.ConfigErrors([(given[1], f"cannot be combined with {given[0]}")])
@@ -138,7 +148,10 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
         target[leaf] = source[leaf]
     if how == "resume" and (errors := [*budget_errors(saved, typed, loaded.numbers)]):
         raise program.ConfigErrors(errors)
-    return saved | {"trust": tree.get("trust", False)}
+    saved |= {"trust": tree.get("trust", False)}
+    if environment.launched() is not None:
+        saved["ranks"] = tree["ranks"]
+    return saved
 
 
 def budget_errors(tree: Tree, typed: list[str], had: dict[str, float]) -> Iterator[tuple[str, str]]:
@@ -152,10 +165,31 @@ def budget_errors(tree: Tree, typed: list[str], had: dict[str, float]) -> Iterat
             yield name, f"{spent}; to continue, give more_{name}= or a larger {name}="
 
 
-def check_folder(cfg: settings.Train) -> None:
-    """Raises UserError if the run's folder is taken: by another run or, if it is resumed, by the
-    process that trains in it.
+def set_ranks(tree: Tree, typed: list[str]) -> None:
+    """Sets the number of ranks that torchrun has started, if it has.
+
+    Raises:
+        ConfigErrors: another number was typed.
     """
+    with program.errors():
+        place = environment.launched()
+    if place is None:
+        return
+    if "ranks" in typed and tree["ranks"] != place.n_ranks:
+        text = f"{tree['ranks']!r} is not the number of ranks that torchrun has started, "
+        cure = f"{place.n_ranks}; leave it out, or start train.py without torchrun"
+        raise program.ConfigErrors([("ranks", text + cure)])
+    tree["ranks"] = place.n_ranks
+
+
+def check_training(cfg: settings.Train) -> None:
+    """Raises UserError if there are fewer GPUs than ranks, or the run's folder is taken: by another
+    run or, if it is resumed, by the process that trains in it.
+    """
+    if environment.rank() > 0:  # rank 0 checks
+        return
+    if environment.launched() is None:
+        launch.n_ranks(cfg)
     if cfg.resume is None:
         runs.check_free(cfg.folder)
     else:
@@ -202,7 +236,7 @@ def names_in_list(word: str) -> str:
     return re.sub(r"^against=(?!\[|null$)(.*)", r"against=[\1]", word)
 
 
-TRAIN = Script("train", settings.Train, TRAIN_HELP, check_folder, prepare_training)
+TRAIN = Script("train", settings.Train, TRAIN_HELP, check_training, prepare_training)
 EVALUATE = Script("evaluate", settings.Evaluate, EVALUATE_HELP, check_run, reword=names_in_list)
 RECORD = Script("record", settings.Record, RECORD_HELP, check_run)
 SCRIPTS = {script.name: script for script in (TRAIN, EVALUATE, RECORD)}

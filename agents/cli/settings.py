@@ -25,6 +25,12 @@ def _device(name: str) -> str:
     return name
 
 
+def _ranks(n: int | str) -> int | str:
+    if n != "all" and (isinstance(n, str) or not 1 <= n <= 10_000):
+        raise ValueError(f"{n!r} is no number of ranks; use a number from 1 on, or all")
+    return n
+
+
 Above0 = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Steps = Annotated[int, Field(ge=1, le=100_000)]
@@ -178,6 +184,9 @@ class Train(Common):
     desync: bool = True
     nonfinite_replay: bool = True
     snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
+    ranks: Annotated[int | str, AfterValidator(_ranks)] = 1
+    restarts: Annotated[int, Field(ge=0, le=1000)] = 0
+    dry_run: bool = False
     folder: str | None
     resume: str | None
     rerun: str | None = None

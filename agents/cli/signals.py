@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import NoReturn, TextIO
 
 from megastep.agents.cli import program
+from megastep.agents.distributed import environment
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: Seconds within which a repeated signal counts as the same one: `timeout` and closing terminals
@@ -41,15 +42,21 @@ def exit_on_signals(script: str) -> None:
     """
 
     def exit_at_once(number, frame):
-        _write(sys.__stderr__, f"{program.name(script)}: stopped by {signal.Signals(number).name}")
+        if environment.rank() == 0:
+            name = signal.Signals(number).name
+            _write(sys.__stderr__, f"{program.name(script)}: stopped by {name}")
         os._exit(128 + number)
 
     _install(exit_at_once)
 
 
 @contextlib.contextmanager
-def handled(on_first: Callable[[int], None] = announce) -> Iterator[list[int]]:
-    """Calls `on_first(number)` at the first signal; another Ctrl-C or SIGTERM ends the program.
+def handled(
+    on_first: Callable[[int], None] = announce,
+    on_second: Callable[[int], None] = lambda number: None,
+) -> Iterator[list[int]]:
+    """Calls `on_first(number)` at the first signal. Another Ctrl-C or SIGTERM ends the program,
+    after `on_second(number)`.
 
     Ending harms nothing: checkpoints are renamed into place when whole. Yields a list that gets the
     number of the first signal.
@@ -63,6 +70,7 @@ def handled(on_first: Callable[[int], None] = announce) -> Iterator[list[int]]:
             ends_after = time.monotonic() + SAME
             on_first(number)
         elif number != signal.SIGHUP and time.monotonic() > ends_after:
+            on_second(number)
             os._exit(128 + number)
 
     before = _install(handle)

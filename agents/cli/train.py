@@ -6,8 +6,10 @@ import itertools
 import math
 import random
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,16 +21,23 @@ from megastep.agents.cli import (
     check,
     command,
     console,
+    dry_run,
     evaluate,
     factory,
+    launch,
     program,
+    rank,
+    rank_checks,
     record,
     runs,
     scripts,
     settings,
     signals,
 )
-from megastep.agents.generator import stream_seed
+from megastep.agents.distributed import process_group
+from megastep.agents.distributed.agreement import from_rank_0, together
+from megastep.agents.distributed.drift import DriftError
+from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
 from megastep.agents.training import (
     annealing,
     budget,
@@ -39,78 +48,98 @@ from megastep.agents.training import (
     saver,
 )
 from megastep.agents.training.atomic_files import write_atomically
+from megastep.agents.training.rank_files import RankFiles
 from megastep.agents.training.trainer import Trainer
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.types import optional
 
 
 def make_trainer(
-    cfg: settings.Train, folder: Path, device: torch.device, progress: console.Progress
+    cfg: settings.Train,
+    folder: Path,
+    device: torch.device,
+    progress: console.Progress,
+    token: str = "",
 ) -> Trainer:
     """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
     says so.
+
+    Each rank has one. All begin with the same weights; whatever else a seed decides differs.
+
+    Args:
+        token: a name that all ranks of this start have, and no other start.
     """
-    seed_everything(cfg.seed)
+    number, n_ranks = process_group.rank(), process_group.n_ranks()
+    seed = rank_seed(cfg.seed, number)
+    seed_everything(seed)
     where = {
         "geometries": factory.homes(cfg.env, cfg.geometry, "training"),
-        "seed": cfg.seed,
+        "seed": seed,
         "device": device,
         "privileged": cfg.agent.critic == "asymmetric",
     }
     sample = factory.make_sample(cfg.env, **where)
     policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
-    learner = factory.make_learner(cfg.learner, policy, cfg.seed)
+    policy.generator = SeededGenerator(stream_seed(seed, "policy"))
+    learner = factory.make_learner(cfg.learner, policy, seed)
     cfg = annealed(cfg, optional(learner, "set_lr", LEARNER_DEFAULTS) is not None)
     n_copies = 2 if cfg.nonfinite_replay else 1  # of the environments' state
     factory.check_memory(cfg.env, sample, learner, n_copies, **where)
     env = factory.construct(cfg.env, **where)
     if cfg.resume or cfg.init:
         path = runs.find(cfg.resume or cfg.init)
-        loaded = runs.load_checkpoint(path, cfg.trust, device, is_whole=cfg.resume is not None)
+        loaded = runs.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
         factory.load_weights(policy, env, loaded)
-    opponents = factory.make_opponents(cfg, env, sample, policy)
-    for name in ("checkpoints", "snapshots") if cfg.resume else ():
+    opponents = factory.make_opponents(cfg, env, sample, policy, seed)
+    for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
         checkpoint.set_aside_after(folder / name, loaded.step)
     config = {"train": check.as_tree(cfg), "spaces": factory.spaces_of(env)}
     wandb = vars(cfg.logger) | {"name": folder.name, "config": config["train"]}
-    made_with = provenance.made_with(device, program.version())
+    made_with = provenance.made_with(device, program.version(), n_ranks)
+    checkpoints, had = folder / "checkpoints", loaded.state if cfg.resume else Counter()
     with factory.errors():
+        limits = budget_of(cfg, folder, loaded if cfg.resume else None)
+        logger, writers = loggers.NoLogger(), {}
+        rank_files = RankFiles(checkpoints, token, number, n_ranks)
+        if number == 0:  # which alone writes these
+            wandb = wandb if cfg.logger.name == "wandb" else None
+            logger = loggers.Loggers(folder, had["samples_at_report"], wandb)
+            snapshots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
+            writers = dict(
+                on_log=lambda running: progress.show(*progress_of(running)),
+                snapshot_saver=saver.SnapshotSaver(snapshots, cfg.snapshots),
+                annealing_record=annealing.AnnealingRecord(folder, had["updates"]),
+            )
         improves = Trainer(
             opponents or env,
             policy,
             learner,
-            loggers.Loggers(
-                folder,
-                loaded.state["samples_at_report"] if cfg.resume else 0,
-                wandb if cfg.logger.name == "wandb" else None,
-            ),
+            logger,
             saver.Saver(
-                folder / "checkpoints", config, cfg.keep_checkpoints, made_with, cfg.replay_every
+                checkpoints, config, cfg.keep_checkpoints, made_with, cfg.replay_every, rank_files
             ),
-            budget_of(cfg, folder, loaded if cfg.resume else None),
+            limits,
             log_every=cfg.log_every,
             checkpoint_seconds=cfg.checkpoint_seconds,
             desync=cfg.desync,
-            on_log=lambda running: progress.show(*progress_of(running)),
             opponents=opponents,
-            snapshot_saver=saver.SnapshotSaver(
-                saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9), cfg.snapshots
-            ),
             replay_folder=folder if cfg.nonfinite_replay else None,
-            annealing_record=annealing.AnnealingRecord(
-                folder, loaded.state["updates"] if cfg.resume else 0
-            ),
+            **writers,
         )
         if cfg.resume:
-            before = loaded.made_with
-            differing = [
-                f"{name} was {before[name]} and is {made_with.get(name)}"
-                for name in before
-                if before[name] != made_with.get(name)
-            ]
-            if lost := [*improves.load_state_dict(loaded.state), *differing]:
-                console.say(f"This run goes on, but not bit for bit: {'; '.join(lost)}.")
+            improves.load_state_dict(loaded.state, is_new_rank=number >= loaded.n_ranks)
+            improves.lost += differing(loaded.made_with, made_with)
     return improves
+
+
+def differing(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """Returns a clause for each of the things that a run's bits depend on that has changed."""
+    before, now = {"ranks": 1, **before}, {"ranks": 1, **now}
+    return [
+        f"{name} was {value} and is {now.get(name)}"
+        for name, value in before.items()
+        if value != now.get(name)
+    ]
 
 
 def seed_everything(seed: int) -> None:
@@ -198,42 +227,73 @@ def with_more(cfg: settings.Train) -> settings.Train:
     return settings.changed(cfg, **totals)
 
 
-def run(cfg: settings.Train) -> Path:
-    """Trains as `cfg` says, and returns the run folder. A signal saves and raises Interrupted."""
-    device, progress = factory.make_device(cfg.device), console.Progress()
+def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path, str | None]:
+    """Returns the run folder, locked, and what to resume."""
     folder = runs.folder_of(runs.find(cfg.resume)) if cfg.resume else runs.new(cfg)
-    with runs.locked(folder):
-        cfg = with_more(cfg)
+    locks.enter_context(runs.locked(folder))
+    if cfg.resume and process_group.n_ranks() > 1:  # all from the newest one that is intact
+        return folder, str(runs.load_checkpoint(runs.find(cfg.resume), cfg.trust).path)
+    return folder, cfg.resume
+
+
+def run(cfg: settings.Train) -> Path | None:
+    """Trains as `cfg` says, and returns the run folder, None for a dry run. A signal saves and
+    raises Interrupted.
+
+    Where torchrun started this process as a rank, all ranks train together. Rank 0 writes. With
+    `cfg.ranks`, other processes are started that do so.
+    """
+    if cfg.dry_run:
+        return dry_run.show(cfg)
+    if launch.is_needed(cfg):
+        return launch.run(cfg)
+    with rank.joined() as team:
+        return train_here(cfg, team)
+
+
+def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
+    """Trains in this process, as one of a team of ranks if it is one. Returns the run folder."""
+    is_first = process_group.rank() == 0
+    device, progress = together(lambda: factory.make_device(cfg.device)), console.Progress()
+    rank_checks.check_start(cfg)
+    cfg = rank_checks.started_again(cfg, team)
+    with contextlib.ExitStack() as locks:
+        folder, resume = from_rank_0(lambda: open_folder(cfg, locks))
         with contextlib.ExitStack() as undo:
-            if not cfg.resume:
+            if is_first and not cfg.resume:
                 undo.callback(shutil.rmtree, folder, ignore_errors=True)
-            running = make_trainer(cfg, folder, device, progress)
-            with program.errors(runs.CANNOT.format(folder)):
-                write_atomically(
-                    folder / "config.yaml",
-                    yaml.safe_dump(
-                        running.saver.config["train"],
-                        sort_keys=False,
-                        allow_unicode=True,
-                        encoding="utf-8",
-                    ),
-                )
+            token = rank_checks.check_shared(folder)
+            if team:
+                team.set_folder(folder)
+            cfg = together(lambda: with_more(settings.changed(cfg, resume=resume)))
+            running = together(lambda: make_trainer(cfg, folder, device, progress, token))
+            rank_checks.check_world(cfg, running)
+            from_rank_0(functools.partial(write_config, folder, running.saver.config["train"]))
             undo.pop_all()
-        runs.record_start(folder)
-        provenance.record(folder, running.samples, device, program.version(), program.ROOT)
-        console.say(f"Training on {device} in {folder}")
+        hosts = process_group.gather_objects(process_group.hostname())
+        clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(running.lost)))
+        if is_first:
+            if clauses:
+                console.say(f"This run goes on, but not bit for bit: {'; '.join(clauses)}.")
+            runs.record_start(folder)
+            provenance.record(
+                folder, running.samples, device, program.version(), program.ROOT, hosts
+            )
+            ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
+            console.say(f"Training on {ranks} in {folder}")
         resume = f"To continue: {runs.resume_command(folder)}"
         try:
             with (
-                signals.handled() as numbers,
-                progress,
-                contextlib.closing(running.logger),
-                contextlib.closing(running.annealing_record),
+                signals.handled(rank.announce) as numbers,
+                progress if is_first else contextlib.nullcontext(),
+                contextlib.closing(running),
             ):
                 running.train(lambda: bool(numbers))
         except NonFiniteError as error:
             saved = f"What was saved before is in {folder}{running.nonfinite_guard.replay_hint}"
             raise program.NonFinite(f"{error}. {saved}") from error
+        except DriftError as error:
+            raise program.UserError(f"{error}. What was saved before is in {folder}") from error
         except (MemoryError, RuntimeError) as error:
             problem = program.memory_problem(error)
             if not (problem or isinstance(error, engine.EngineError)):
@@ -243,29 +303,41 @@ def run(cfg: settings.Train) -> Path:
             reason = problem or str(error).partition("\n")[0].rstrip(".")
             raise program.UserError(f"{reason}. {saved}. {resume}") from error
         finally:
-            curves.plot_curves(folder)
-        if numbers:
+            if is_first:
+                with process_group.unhurried():
+                    curves.plot_curves(folder)
+        # a signal that one rank got stops all, and so does a checkpoint that one could not save
+        ends = process_group.gather_objects((numbers[:1], running.saver.error))
+        if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
             raise signals.Interrupted(
-                numbers[0], f"Stopped after {running.samples:,} samples. {resume}"
+                signal, f"Stopped after {running.samples:,} samples. {resume}"
             )
-        nonfinite, unsaved = running.nonfinite_guard.value, running.saver.error
-        replay = running.nonfinite_guard.replay_hint
-        if unsaved:
+        if unsaved := next((error for _, error in ends if error), None):
             raise program.UserError(unsaved)
+        nonfinite, replay = running.nonfinite_guard.value, running.nonfinite_guard.replay_hint
         del running  # its memory is the evaluation's now
         common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
         common["trust"] = True  # what it names has just run
         if cfg.finish.evaluate:
-            evaluate.run(settings.Evaluate(episodes=cfg.finish.episodes, baseline=True, **common))
-        if cfg.finish.record:
+            with process_group.unhurried():
+                episodes = cfg.finish.episodes
+                evaluate.run(settings.Evaluate(episodes=episodes, baseline=True, **common))
+        if cfg.finish.record and is_first:
             with console.warned():
                 record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
         if nonfinite and nonfinite.is_from_env:
             learnt = f"All else was learnt from, and is in {folder}"
             raise program.NonFinite(f"{nonfinite}. {learnt}{replay}")
-        if cfg.rerun:
+        if cfg.rerun and is_first:
             compare(folder, runs.folder_of(runs.find(cfg.rerun)))
     return folder
+
+
+def write_config(folder: Path, config: dict[str, Any]) -> None:
+    """Writes a run's configuration into its folder."""
+    with program.errors(runs.CANNOT.format(folder)):
+        text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, encoding="utf-8")
+        write_atomically(folder / "config.yaml", text)
 
 
 def compare(folder: Path, original: Path) -> None:

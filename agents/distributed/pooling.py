@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import distributed
 
-from megastep.agents.distributed.process_group import n_ranks, rank
+from megastep.agents.distributed.process_group import communicating, n_ranks, rank
 from megastep.agents.distributed.segments import between_graphs
 
 #: Number of entries, their mean and their variance; () or, for several quantities, mean and
@@ -18,8 +18,13 @@ Moments = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 def all_reduce(tensor: torch.Tensor) -> torch.Tensor:
     """Sums a tensor over the ranks, in place, and returns it."""
+
+    def call():
+        with communicating():
+            distributed.all_reduce(tensor)
+
     if n_ranks() > 1:
-        between_graphs(lambda: distributed.all_reduce(tensor))
+        between_graphs(call)
     return tensor
 
 

@@ -7,33 +7,54 @@ R ranks.
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import datetime
+import math
 import os
-import socket
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import distributed
+
+from megastep.agents.distributed.environment import hostname, launched
 
 #: Seconds within which all ranks must have started.
 START_SECONDS = 300.0
 
 
-class Launched(NamedTuple):
-    """This process's place among the ranks, as torchrun says."""
-
-    rank: int
-    n_ranks: int
-    local_rank: int  # among the ranks of this machine
+class RankLost(RuntimeError):
+    """Another rank has ended, or does not answer."""
 
 
-def launched() -> Launched | None:
-    """Returns this process's place if torchrun started it, None for a process of its own."""
-    names = "RANK", "WORLD_SIZE", "LOCAL_RANK"
-    if any(name not in os.environ for name in names):
-        return None
-    return Launched(*(int(os.environ[name]) for name in names))
+class Counts:
+    """What this rank has done, for `watch` to compare.
+
+    Attributes:
+        n_operations: number of operations of all ranks that it has begun.
+        n_updates: number of updates that the ranks have agreed to begin.
+        is_exempt: it does something for which the others wait, however long it takes.
+    """
+
+    n_operations = n_updates = 0
+    is_exempt = False
+
+
+counts = Counts()
+
+
+@contextlib.contextmanager
+def unhurried() -> Iterator[None]:
+    """In this context the other ranks wait for this one as long as it takes: an evaluation, files.
+
+    Otherwise a rank that the others have waited for, for `watch.LOST_SECONDS`, counts as hung.
+    """
+    counts.is_exempt, before = True, counts.is_exempt
+    try:
+        yield
+    finally:
+        counts.is_exempt = before
 
 
 def start(seconds: float = START_SECONDS) -> None:
@@ -44,6 +65,21 @@ def start(seconds: float = START_SECONDS) -> None:
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     distributed.init_process_group(backend, timeout=datetime.timedelta(seconds=seconds))
+    atexit.register(stop)  # threads of gloo that still run would abort the interpreter's end
+
+
+def store(name: str) -> distributed.Store:
+    """Returns a connection of its own to the ranks' key-value store: no other thread waits on it.
+
+    Args:
+        name: of a set of keys.
+    """
+    port = int(os.environ["MASTER_PORT"])
+    wait = datetime.timedelta(seconds=START_SECONDS)
+    client = distributed.TCPStore(
+        os.environ["MASTER_ADDR"], port, is_master=False, timeout=wait, wait_for_workers=False
+    )
+    return distributed.PrefixStore(f"megastep {name}", client)
 
 
 def stop() -> None:
@@ -62,8 +98,19 @@ def n_ranks() -> int:
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
-def hostname() -> str:
-    return socket.gethostname()
+def place() -> str:
+    """Returns this rank's place for messages, such as `rank 1 on node-7`."""
+    return f"rank {rank()} on {hostname()}"
+
+
+@contextlib.contextmanager
+def communicating() -> Iterator[None]:
+    """An operation of all ranks, which is counted. An error of PyTorch's becomes `RankLost`."""
+    counts.n_operations += 1
+    try:
+        yield
+    except RuntimeError as error:
+        raise RankLost(str(error).partition("\n")[0]) from error
 
 
 def exchange(numbers: Sequence[float]) -> list[list[float]]:
@@ -77,8 +124,23 @@ def exchange(numbers: Sequence[float]) -> list[list[float]]:
     if n_ranks() == 1:
         return [row.tolist()]
     rows = [torch.empty_like(row) for _ in range(n_ranks())]
-    distributed.all_gather(rows, row)
+    with communicating():
+        distributed.all_gather(rows, row)
     return [other.tolist() for other in rows]
+
+
+def gather_integers(numbers: torch.Tensor) -> torch.Tensor:
+    """Returns the vectors of int64 of every rank, (R, ...), on the host. Waits for the others.
+
+    Args:
+        numbers: int64 on the host, of the same shape on every rank.
+    """
+    if n_ranks() == 1:
+        return numbers[None]
+    rows = [torch.empty_like(numbers) for _ in range(n_ranks())]
+    with communicating():
+        distributed.all_gather(rows, numbers)
+    return torch.stack(rows)
 
 
 def gather_objects(value: Any) -> list[Any]:
@@ -86,5 +148,29 @@ def gather_objects(value: Any) -> list[Any]:
     if n_ranks() == 1:
         return [value]
     values = [None] * n_ranks()
-    distributed.all_gather_object(values, value)
+    with communicating():
+        distributed.all_gather_object(values, value)
     return values
+
+
+def sum_over_ranks(values: torch.Tensor) -> torch.Tensor:
+    """Returns the sum of the ranks' tensors, float64 on the host. Synchronises, and waits for the
+    others.
+    """
+    if n_ranks() == 1:
+        return values.double().cpu()
+    rows = torch.tensor(exchange(values.flatten().tolist()), dtype=torch.float64)
+    return rows.sum(0).view(values.shape)
+
+
+def mean_over_ranks(values: dict[str, float]) -> dict[str, float]:
+    """Returns the means over the ranks of numbers by name. Waits for the others.
+
+    NaN does not count; a number that is NaN on all ranks is left out.
+    """
+    rows, means = gather_objects(values), {}
+    for name in values:
+        column = [row[name] for row in rows if not math.isnan(row.get(name, math.nan))]
+        if column:
+            means[name] = math.fsum(column) / len(column)
+    return means

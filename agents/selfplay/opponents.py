@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, SkipValidation
 
+from megastep.agents.distributed.process_group import sum_over_ranks
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay import duels
@@ -166,13 +167,14 @@ class Opponents:
         state[:] = snapshot.initial(self.mixed_policy.sizes[index], self.env.device)
 
     def pop_win_rates(self) -> dict[str, float]:
-        """Returns the fraction of decided pairs that were won since the last call. Synchronises.
+        """Returns the fraction of decided pairs that were won since the last call, on all ranks.
+        Synchronises, and waits for the other ranks.
 
         Keys are metric names. A kind of opponent without a decided pair is absent.
         """
-        win_rates = {}
-        for name, pairs in self._pairs_by_kind().items():
-            won, decided = pairs.double().sum(1).tolist()
+        win_rates, by_kind = {}, self._pairs_by_kind()
+        sums = torch.stack([pairs.double().sum(1) for pairs in by_kind.values()])
+        for name, (won, decided) in zip(by_kind, sum_over_ranks(sums).tolist(), strict=True):
             if decided:
                 win_rates[f"episode/won/{name}"] = won / decided
         self.pairs.zero_()

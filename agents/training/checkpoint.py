@@ -12,6 +12,7 @@ import os
 import re
 import shutil
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,6 +48,7 @@ def save(
     score: float | None = None,
     made_with: dict[str, Any] | None = None,
     replay_seconds: float | None = None,
+    add_files: Callable[[Path], dict[str, Any]] = lambda path: {},
 ) -> Path:
     """Writes a checkpoint and deletes old ones. Returns its folder.
 
@@ -59,6 +61,7 @@ def save(
         score: for example the mean return, higher is better; None if unknown.
         made_with: what the numbers depend on besides the configuration, such as versions.
         replay_seconds: a replay buffer that takes longer to write is left out.
+        add_files: as for `checkpoint_format.write`.
 
     Raises:
         OSError: the disk is full or not writable. Nothing has changed.
@@ -69,7 +72,9 @@ def save(
     delete_leftovers(folder)
     temporary = temporary_path(folder / f"step_{step}")
     try:
-        checkpoint_format.write(temporary, step, state, config, score, made_with, replay_seconds)
+        checkpoint_format.write(
+            temporary, step, state, config, score, made_with, replay_seconds, add_files
+        )
         # verified before any old one is deleted
         checkpoint_format.verify(temporary, checkpoint_format.read_manifest(temporary))
         path = folder / _next_name(folder, step)
@@ -84,7 +89,10 @@ def save(
 
 
 def load_latest(
-    folder: Path | str, device: torch.device | str | None = "cpu", is_whole: bool = True
+    folder: Path | str,
+    device: torch.device | str | None = "cpu",
+    is_whole: bool = True,
+    rank: int = 0,
 ) -> Checkpoint:
     """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`.
 
@@ -94,17 +102,18 @@ def load_latest(
         device: where what was learnt goes; all else goes to the CPU. None leaves out the state, and
             does not import PyTorch.
         is_whole: loads environments and replay buffer, too.
+        rank: whose state is loaded, see `checkpoint_format.read`.
 
     Raises:
         CheckpointError: there is none, all are damaged, or another version of megastep wrote it.
     """
     folder = Path(folder)
     if (folder / "manifest.json").exists():
-        return checkpoint_format.read(folder, device, is_whole)
+        return checkpoint_format.read(folder, device, is_whole, rank)
     messages = []
     for path in reversed(list_checkpoints(folder)):
         try:
-            checkpoint = checkpoint_format.read(path, device, is_whole)
+            checkpoint = checkpoint_format.read(path, device, is_whole, rank)
         except DamagedCheckpoint as error:
             messages.append(str(error))
             continue

@@ -7,9 +7,11 @@
     state.pt       what was learnt, and all else that is small
     world.pt       the environments, and what the policy remembers of their episodes
     replay.pt      the replay buffer, if there is one and it was saved
+    rank1.pt       of a run with several ranks: all of the state of rank 1 but the policy's weights,
+                   which ranks share; and so on. The other files are rank 0's
 
-The last three hold plain dicts of tensors, numbers and strings. A run that is resumed reads all; to
-evaluate needs `state.pt` alone. JSON is read without PyTorch.
+All but the first two hold plain dicts of tensors, numbers and strings. A run that is resumed reads
+all; to evaluate needs `state.pt` alone. JSON is read without PyTorch.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import hashlib
 import json
 import os
 import pickle
+import re
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -39,6 +42,7 @@ READERS = {1: "e17fabe", 2: "6f4fbf1", 3: "3ffd1d5", 4: "e9908db", 5: "916221d"}
 MIGRATED = 6
 #: The keys of a state that are in files of their own.
 PARTS = {"world.pt": ("env", "collector"), "replay.pt": ("replay",)}
+_RANK_FILE = re.compile(r"rank[1-9]\d*\.pt")
 _CHUNK = 2**24  # bytes
 
 
@@ -62,6 +66,7 @@ class Checkpoint:
         made_with: what the numbers depend on besides the configuration: versions, device, threads.
         state: dicts of tensors and numbers, as saved; None if it was not loaded.
         untrusted: import paths outside megastep that it names, if this user did not make it.
+        n_ranks: ranks whose state it holds.
     """
 
     path: Path
@@ -71,6 +76,12 @@ class Checkpoint:
     made_with: dict[str, Any]
     state: dict[str, Any] | None = None
     untrusted: tuple[str, ...] = ()
+    n_ranks: int = 1
+
+
+def rank_file(rank: int) -> str:
+    """Returns the name of the file with a rank's state."""
+    return f"rank{rank}.pt"
 
 
 # ---- Writing ----
@@ -84,11 +95,14 @@ def write(
     score: float | None,
     made_with: dict[str, Any] | None = None,
     replay_seconds: float | None = None,
+    add_files: Callable[[Path], dict[str, Any]] = lambda path: {},
 ) -> None:
     """Writes a checkpoint into a new folder and flushes it to disk.
 
     Args:
         replay_seconds: `replay.pt` is left out if it takes longer; None for no limit.
+        add_files: puts the files of other ranks into the folder. Returns their entries in the
+            manifest, by name.
     """
     import torch
 
@@ -109,6 +123,7 @@ def write(
             (path / name).unlink()
     text = json.dumps(config, indent=2).encode()
     files["config.json"] = _write_file(path / "config.json", lambda file: file.write(text))
+    files |= add_files(path)
     numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
     manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
     manifest |= dict(torch=torch.__version__, made_with=made_with or {}, files=files)
@@ -116,6 +131,27 @@ def write(
     text = sealed(manifest)
     _write_file(path / "manifest.json", lambda file: file.write(text))
     sync_folder(path)
+
+
+def write_state(
+    path: Path, state: dict[str, Any], replay_seconds: float | None = None
+) -> dict[str, Any]:
+    """Writes a rank's whole state into one file and flushes it to disk. Returns its entry in the
+    manifest.
+
+    Args:
+        replay_seconds: if it takes longer, the replay buffer is left out; None for no limit.
+    """
+    import torch
+
+    deadline = None
+    if "replay" in state and replay_seconds is not None:
+        deadline = time.monotonic() + replay_seconds
+    try:
+        return _write_file(path, functools.partial(torch.save, state), deadline)
+    except _TooLate:
+        state = {key: part for key, part in state.items() if key != "replay"}
+        return _write_file(path, functools.partial(torch.save, state))
 
 
 def check_plain(tree: Any, name: str) -> None:
@@ -196,24 +232,30 @@ def sealed(manifest: dict[str, Any]) -> bytes:
 # ---- Reading ----
 
 
-def read(path: Path, device: torch.device | str | None, is_whole: bool = False) -> Checkpoint:
+def read(
+    path: Path, device: torch.device | str | None, is_whole: bool = False, rank: int = 0
+) -> Checkpoint:
     """Loads a checkpoint.
 
     Args:
         device: where the tensors of `state.pt` go; None: verifies everything and loads no state.
-        is_whole: loads the other parts, too, onto the CPU.
+        is_whole: loads the other parts of this rank, too, onto the CPU; rank 0 verifies everything.
+        rank: whose state is loaded. One without a file gets that in rank 0's `state.pt`.
 
     Raises:
         DamagedCheckpoint: a file is missing or damaged, or could run code when loaded.
         CheckpointError: another version of megastep wrote it.
     """
     manifest = read_manifest(path)
-    parts = [name for name in manifest["files"] if name.endswith(".pt")]
-    if device is None or is_whole:
+    n_ranks = 1 + sum(map(bool, map(_RANK_FILE.fullmatch, manifest["files"])))
+    parts = ["state.pt"]
+    if is_whole:
+        parts += [rank_file(rank)] if rank else PARTS
+        parts = [name for name in parts if name in manifest["files"]]
+    if device is None or (is_whole and rank == 0):
         verify(path, manifest)
     else:
-        parts = ["state.pt"]
-        verify(path, manifest, ("state.pt", "config.json"))
+        verify(path, manifest, [*parts, "config.json"])
     text = (path / "config.json").read_bytes()
     try:
         config = json.loads(text)
@@ -226,6 +268,7 @@ def read(path: Path, device: torch.device | str | None, is_whole: bool = False) 
         config,
         manifest.get("made_with", {}),
         untrusted=tuple(trust.untrusted_names(text, manifest.get("signature"))),
+        n_ranks=n_ranks,
     )
     if device is None:
         return checkpoint
@@ -310,8 +353,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
         is_intact = data == sealed(body)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         version, is_intact = None, False
-    if is_intact and not {*manifest["files"]} <= {"config.json", "state.pt", *PARTS}:
-        is_intact = False  # a planted one may name any file
+    if is_intact:
+        others = {*manifest["files"]} - {"config.json", "state.pt", *PARTS}
+        is_intact = all(map(_RANK_FILE.fullmatch, others))  # a planted one may name any file
     is_without_digest = version == 1 and "sha256" not in manifest
     if not (is_intact or is_without_digest):
         raise DamagedCheckpoint(

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from megastep.agents.algorithms.nonfinite import LIMIT
+from megastep.agents.distributed.process_group import sum_over_ranks
 from megastep.types import Env, optional
 
 #: Means are over at least this many episodes, once so many have ended.
@@ -36,8 +37,8 @@ class EpisodeStats:
             `pop`: count, return, squared return, length, each metric, and for each metric the
             number of episodes left out of it; for all lanes and for each group.
         bad_lanes: (M,) int64, the first lane with a metric that was left out; `n_lanes` if none.
-        windows: for all lanes and for each group, the sums of the last reports, on the host. The
-            oldest report is dropped once the others hold `MIN_EPISODES`.
+        windows: for all lanes and for each group, the sums of the last reports, of all ranks, on
+            the host. The oldest report is dropped once the others hold `MIN_EPISODES`.
     """
 
     def __init__(
@@ -123,7 +124,7 @@ class EpisodeStats:
         return bad
 
     def pop(self) -> dict[str, float]:
-        """Returns statistics for a report. Synchronises.
+        """Returns statistics for a report, of all ranks. Synchronises, and waits for the others.
 
         Means are over the episodes that ended since the last call and, if those are fewer than
         `MIN_EPISODES`, those of earlier calls, a call at a time. A dict of
@@ -135,7 +136,7 @@ class EpisodeStats:
         - `episode/return_std`: standard deviation of the return
         - all but the last for each group, such as `episode/return/leader`
         """
-        reports = self.sums.T.tolist()
+        reports = sum_over_ranks(self.sums.T).tolist()
         self.sums.zero_()
         totals = [
             _add_report(window, report)

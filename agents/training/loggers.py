@@ -217,5 +217,18 @@ class Loggers:
                 )
 
 
+class NoLogger:
+    """Writes nothing, as on ranks other than 0."""
+
+    def write(self, step: int, metrics: dict[str, float | str], perf: dict[str, float]) -> None:
+        pass
+
+    def sync(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
 def _first_line(error: Exception) -> str:
     return (str(error) or type(error).__name__).splitlines()[0]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, lane_name
+from megastep.agents.distributed.process_group import gather_objects, place, rank
 from megastep.agents.training import nonfinite_recorder
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.types import Env, optional
@@ -25,6 +26,8 @@ MAX_SKIPPED = 20
 class NonFiniteGuard:
     """Warns of the first NaN or infinity of a run, writes a file that replays it if it came from
     the environment, and ends a run whose updates are all skipped.
+
+    With several ranks, all call it at the same updates, and know the same of each other's numbers.
 
     Args:
         env: the environment.
@@ -81,12 +84,22 @@ class NonFiniteGuard:
         if self.nonfinite_check is None:
             return True
         value, n_skipped = self.nonfinite_check.read(rollout.floats())
+        hint = ""
         if value:
             value = value.in_env(_env_lanes(rollout), self.n_agents)
+            if self.value is None:
+                hint = self._write_replay(value, rollout, samples)
+        reports = gather_objects((n_skipped, value, hint, place()))
+        n_skipped = max(report[0] for report in reports)
+        _, value, hint, place_of_value = next((one for one in reports if one[1]), reports[0])
+        text = f"{value}{f' ({place_of_value})' * (len(reports) > 1)}"
         if value and self.value is None:
-            self.value = value
-            self._write_replay(rollout, samples)
-            warnings.warn(f"{value}; its rollout was skipped{self.replay_hint}", stacklevel=2)
+            self.value, self.replay_hint = value, hint
+            if rank() == 0:
+                warnings.warn(f"{text}; its rollout was skipped{hint}", stacklevel=2)
+            if self.recorder is not None:
+                self.recorder.close()
+                self.recorder = None
         if self.recorder is not None:
             self.recorder.forget()
         if n_skipped < MAX_SKIPPED:
@@ -97,33 +110,40 @@ class NonFiniteGuard:
             advice = f"It came from the environment: check how it computes {value.name}"
         raise NonFiniteError(
             f"The last {n_skipped} updates were skipped because of numbers that were not finite or "
-            f"too large ({value or 'gradients'}). {advice}",
+            f"too large ({text if value else 'gradients'}). {advice}",
             is_from_env,
         )
 
-    def _write_replay(self, rollout, samples):
-        """Writes the file that replays `value`, and stops recording."""
-        value, recorder, self.recorder = self.value, self.recorder, None
+    def _write_replay(self, value, rollout, samples):
+        """Writes the file that replays a value. Returns the hint."""
+        hint, recorder = "", self.recorder
         if value.is_from_env and recorder is not None and recorder.has(value):
-            path = self.replay_folder / f"nonfinite-{samples}.npz"
+            name = f"nonfinite-{samples}{f'-rank{rank()}' * (rank() > 0)}.npz"
+            path = self.replay_folder / name
             try:
                 recorder.write(path, value, rollout)
-                self.replay_hint = f". To see it again: {nonfinite_recorder.command(path)}"
+                hint = f". To see it again: {nonfinite_recorder.command(path)}"
             except Exception as error:  # the run is worth more than this file
                 reason = getattr(error, "strerror", None) or error
-                self.replay_hint = f". {path} could not be written ({reason})"
+                hint = f". {path} could not be written ({reason})"
         elif value.is_from_env and self.replay_folder is not None:
-            self.replay_hint = f". {nonfinite_recorder.NOT_RECORDED}"
-        if recorder is not None:
-            recorder.close()
+            hint = f". {nonfinite_recorder.NOT_RECORDED}"
+        return hint
 
     def warn_of_metrics(self, episode_stats: EpisodeStats, rollout: Rollout) -> None:
         """Warns once of each metric that was not finite at the end of an episode. Synchronises."""
-        for name, lane in episode_stats.pop_bad_metrics().items():
-            lane = lane_name(_env_lanes(rollout)[lane], self.n_agents)
+        bad = {
+            name: lane_name(_env_lanes(rollout)[lane], self.n_agents)
+            for name, lane in episode_stats.pop_bad_metrics().items()
+        }
+        reports = gather_objects({name: (lane, place()) for name, lane in bad.items()})
+        of_all = {name: lane for report in reversed(reports) for name, lane in report.items()}
+        episode_stats.named |= of_all.keys()
+        for name, (lane, place_of_lane) in of_all.items() if rank() == 0 else ():
+            of_rank = f" ({place_of_lane})" * (len(reports) > 1)
             warnings.warn(
-                f"metrics.{name} of {lane} was not finite at the end of an episode; such episodes "
-                f"are left out of episode/{name}",
+                f"metrics.{name} of {lane}{of_rank} was not finite at the end of an episode; such "
+                f"episodes are left out of episode/{name}",
                 stacklevel=3,
             )
 

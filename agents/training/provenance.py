@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -18,7 +19,14 @@ FILE = "provenance.jsonl"
 GIT_TIMEOUT = 5  # seconds, as for a repository on a slow disk
 
 
-def record(folder: Path, samples: int, device: torch.device, version: str, source: Path) -> None:
+def record(
+    folder: Path,
+    samples: int,
+    device: torch.device,
+    version: str,
+    source: Path,
+    hosts: Sequence[str] = (),
+) -> None:
     """Appends a line to `provenance.jsonl` in a run folder. What cannot be found out is left out.
 
     Never raises: what a run learns is worth more than this.
@@ -27,6 +35,7 @@ def record(folder: Path, samples: int, device: torch.device, version: str, sourc
         samples: environment steps so far, of a run that is resumed.
         version: of megastep.
         source: the folder that megastep is in, which may be a git checkout.
+        hosts: the machine of each rank, if there are several.
     """
     with contextlib.suppress(Exception), contextlib.closing(JsonLines(folder / FILE)) as lines:
         facts = {
@@ -38,11 +47,13 @@ def record(folder: Path, samples: int, device: torch.device, version: str, sourc
             "cuda": torch.version.cuda,
             "python": platform.python_version(),
             "device": device_name(device),
+            "ranks": len(hosts) if len(hosts) > 1 else None,
+            "hosts": ", ".join(dict.fromkeys(hosts)) if len(hosts) > 1 else None,
         }
         lines.write(samples, {name: text for name, text in facts.items() if text})
 
 
-def made_with(device: torch.device, version: str) -> dict[str, str | int]:
+def made_with(device: torch.device, version: str, n_ranks: int = 1) -> dict[str, str | int]:
     """Returns what a run's numbers depend on besides its configuration and its code: where these
     are equal, equal seeds give equal bits.
 
@@ -50,6 +61,8 @@ def made_with(device: torch.device, version: str) -> dict[str, str | int]:
         version: of megastep.
     """
     facts = {"torch": torch.__version__, "megastep": version}
+    if n_ranks > 1:
+        facts["ranks"] = n_ranks
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
         return facts | {"device": f"cuda {name}", "cuda": torch.version.cuda}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING, Any
 
+from megastep.agents.distributed.process_group import rank
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.env_state import EnvState
 from megastep.types import Env, optional
@@ -66,12 +67,17 @@ class RunState:
             parts["replay"] = self.replay_buffer.state_dict()
         return parts
 
-    def load_state_dict(self, state: dict[str, Any]) -> list[str]:
+    def load_state_dict(self, state: dict[str, Any], is_new_rank: bool = False) -> list[str]:
         """Restores a `state_dict`.
+
+        Args:
+            is_new_rank: it is rank 0's without episodes, and this rank keeps generators of its own.
 
         Returns what could not be restored and begins anew, a clause each; then the run does not
         continue bit for bit.
         """
+        if is_new_rank:
+            state = self._of_new_rank(state)
         self.policy.load_state_dict(state["policy"])
         self.learner.load_state_dict(state["learner"])
         lost = self._load_episodes(state)
@@ -84,7 +90,16 @@ class RunState:
                 self.replay_buffer.load_state_dict(state["replay"])
             else:
                 lost.append("the replay buffer was not saved and fills again")
-        return lost
+        return ["ranks that it did not have begin new episodes"] if is_new_rank else lost
+
+    def _of_new_rank(self, state):
+        """Returns a state of rank 0 with this rank's generators, and without what rank 0 counted
+        since the last report.
+        """
+        stats, own = state["episode_stats"], self.state_dict(has_episodes=False)
+        pairs = ((name, state[name]) for name in ("learner", "opponents") if name in state)
+        parts = {name: _with_generators(saved, own[name]) for name, saved in pairs}
+        return {**state, **parts, "episode_stats": stats | {"sums": 0 * stats["sums"]}}
 
     def _load_episodes(self, state):
         """Restores the environment, what the policy remembers of it and the statistics."""
@@ -110,10 +125,21 @@ class RunState:
 
     def warn_of_unreachable(self) -> None:
         """Warns once of what the environment keeps where checkpoints cannot reach it."""
-        if not self.has_named_unreachable and (names := self.env_state.unreachable()):
+        if self.has_named_unreachable or rank() > 0:
+            return
+        if names := self.env_state.unreachable():
             self.has_named_unreachable = True
             warnings.warn(
                 f"Checkpoints cannot hold {', '.join(names)} of the environment: if they change, a "
                 "resumed run differs from one left alone",
                 stacklevel=3,
             )
+
+
+def _with_generators(saved, own):
+    """Returns a saved state with the states of `SeededGenerator`s replaced by those of `own`."""
+    if not isinstance(saved, dict) or not isinstance(own, dict):
+        return saved
+    if "seed" in saved and saved.keys() <= {"seed", "device", "generator"}:
+        return own
+    return {name: _with_generators(part, own.get(name)) for name, part in saved.items()}

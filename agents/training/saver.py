@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import shutil
@@ -15,7 +16,9 @@ import torch
 from torch.utils._pytree import tree_leaves
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, nonfinite_leaf
+from megastep.agents.distributed.process_group import unhurried
 from megastep.agents.training import checkpoint, checkpoint_format
+from megastep.agents.training.rank_files import RankFiles
 
 if TYPE_CHECKING:
     from megastep.agents.training.trainer import Trainer
@@ -39,6 +42,8 @@ class Saver:
         made_with: what a run's numbers depend on besides its configuration, such as versions.
         replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is in every so many
             checkpoints, and in the last one if it can be written in `REPLAY_SECONDS`.
+        rank_files: where there are other ranks: each rank has a saver, and all save the same
+            checkpoints. That of rank 0 writes them, the others hand in their part.
 
     Attributes:
         error: why the last checkpoint could not be written, as a sentence; None if it was written.
@@ -54,13 +59,16 @@ class Saver:
         keep_checkpoints: int = 2,
         made_with: dict[str, Any] | None = None,
         replay_every: int = 20,
+        rank_files: RankFiles | None = None,
     ):
         self.folder, self.config, self.keep_checkpoints = folder, config, keep_checkpoints
         self.made_with, self.replay_every = made_with, replay_every
+        self.rank_files = rank_files or RankFiles(folder)
         self.error, self.lacks_replay, self.has_warned_of_memory = None, False, False
-        self.seconds, self._n_since_replay = 0.0, 0
+        self.seconds, self._n_since_replay, self._number = 0.0, 0, 0
         self._host_copy, self._thread, self._failure = _HostCopy(), None, None
 
+    @unhurried()
     def __call__(
         self, step: int, state: dict[str, Any], score: float | None = None, is_last: bool = False
     ) -> None:
@@ -77,6 +85,7 @@ class Saver:
             NonFiniteError: what was learnt has a NaN or infinity. Earlier checkpoints are kept.
         """
         self.wait()
+        self._number += 1
         state, seconds = self._with_replay(state, is_last)
         state = self._host_copy(state)
         # an environment may keep an infinity; weights may not
@@ -122,20 +131,29 @@ class Saver:
     def _write(self, step, state, score, replay_seconds):
         began = time.monotonic()
         try:
-            checkpoint.save(
-                self.folder,
-                step,
-                state,
-                self.config,
-                self.keep_checkpoints,
-                score,
-                self.made_with,
-                replay_seconds,
-            )
+            if self.rank_files.rank > 0:
+                self.rank_files.hand_in(self._number, state, replay_seconds)
+            else:
+                checkpoint.save(
+                    self.folder,
+                    step,
+                    state,
+                    self.config,
+                    self.keep_checkpoints,
+                    score,
+                    self.made_with,
+                    replay_seconds,
+                    functools.partial(self.rank_files.collect, self._number),
+                )
         except Exception as error:
             self._failure = step, _nbytes(state), error
         self.seconds = time.monotonic() - began
 
+    def give_up(self) -> None:
+        """Waits no longer for the parts of other ranks, as one has ended."""
+        self.rank_files.give_up()
+
+    @unhurried()
     def wait(self) -> None:
         """Returns when nothing is being written. Warns if the last checkpoint failed.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError
+from megastep.agents.distributed.agreement import any_rank
+from megastep.agents.distributed.drift import check_drift
+from megastep.agents.distributed.plan import Plan, agree
+from megastep.agents.distributed.process_group import mean_over_ranks, n_ranks, unhurried
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
 
 class Trainer:
     """Trains a policy in an environment until a budget is spent.
+
+    With several ranks, each has a trainer, and all do the same updates: rank 0's clock decides.
 
     Args:
         env: the environment.
@@ -51,13 +56,15 @@ class Trainer:
             in each update, and is flushed before each report.
 
     Attributes:
-        samples, updates: environment steps of all lanes, and updates, so far.
+        samples, updates: environment steps of all lanes of all ranks, and updates, so far.
         clock: counts the seconds of training.
         lr: the current learning rate.
         score: the last mean return that was logged, or None before `MIN_EPISODES` have ended: that
             of few episodes is luck, and would mark the first checkpoint as the best.
         samples_per_second: speed between the last two reports, or None.
         latest_stats: name -> the last value of each episode statistic.
+        lost: what could not be restored of a resumed run and begins anew, a clause each; if any,
+            the run does not continue bit for bit.
         nonfinite_guard: has the first NaN or infinity of the run.
         samples_at_report: samples at the last report that is due every `log_every` updates. A
             resumed run has all reports up to it, and writes the later ones.
@@ -115,7 +122,7 @@ class Trainer:
         self.latest_stats = {}
         self.samples_at_log = self.updates_at_log = self.samples_at_report = 0
         self.seconds_at_log = self.seconds_at_checkpoint = 0.0
-        self.updates_at_checkpoint = None
+        self.updates_at_checkpoint, self.lost = None, []
 
     @property
     def fraction_left(self) -> float:
@@ -133,30 +140,25 @@ class Trainer:
         Raises:
             NonFiniteError: training diverged, or the environment returns only NaN or infinity. The
                 last good checkpoint is kept.
-            Exception: any other error, after a checkpoint was saved.
+            Exception: any other error, after a checkpoint was saved if there are no other ranks.
         """
         try:
             self.snapshot_saver(self)
-            while self.fraction_left > 0 and not stop():
+            while (plan := self.plan(stop())).goes_on:
+                if plan.saves and self.nonfinite_guard.check(self.rollout, self.samples):
+                    self.save_checkpoint()
                 self.timer.start("collect")
                 self.nonfinite_guard.start_rollout()
                 self.rollout = self.collect()
                 self.nonfinite_guard.end_rollout(self.rollout)
                 self.timer.start("update")
-                losses = self.update()
+                losses = self.update(plan.lr_fraction)
                 self.timer.start("rest")
                 self.snapshot_saver(self)
                 if self.updates % self.log_every == 0:
                     self.samples_at_report = self.samples
                     self.log(losses)
                     self.nonfinite_guard.check(self.rollout, self.samples)
-                seconds_since = self.clock.seconds - self.seconds_at_checkpoint
-                # a slow disk does not stop training, unless a checkpoint of each update is wanted
-                is_behind = self.saver.is_writing and self.checkpoint_seconds >= 1
-                is_due = seconds_since >= self.checkpoint_seconds and not is_behind
-                is_due &= self.fraction_left > 0  # the last one follows the last report
-                if is_due and self.nonfinite_guard.check(self.rollout, self.samples):
-                    self.save_checkpoint()
             state = self.state_dict()  # a resumed run repeats what this last report empties
             if self.updates > self.updates_at_log:
                 self.log(losses)
@@ -166,6 +168,9 @@ class Trainer:
                 self.save_what_was_learnt()
             raise
         except Exception:
+            if n_ranks() > 1:  # the others are elsewhere
+                self.saver.give_up()
+                raise
             with contextlib.suppress(Exception):  # the first error is the one to report
                 self.save_what_was_learnt()
             raise
@@ -176,19 +181,45 @@ class Trainer:
         self.save_checkpoint(state, is_last=True)
         self.saver.wait()
 
+    def close(self) -> None:
+        """Closes the files of metrics, after training."""
+        if self.annealing_record is not None:
+            self.annealing_record.close()
+        self.logger.close()
+
+    def plan(self, is_stopped: bool) -> Plan:
+        """Returns what all ranks do next.
+
+        Args:
+            is_stopped: a signal stops this rank.
+        """
+        seconds = self.clock.seconds
+        seconds_since = seconds - self.seconds_at_checkpoint
+        plan = Plan(
+            goes_on=self.fraction_left > 0,
+            saves=self.clock.is_running and seconds_since >= self.checkpoint_seconds,
+            lr_fraction=self.budget.lr_fraction(self.updates, self.samples, seconds),
+        )
+        # a slow disk does not stop training, unless a checkpoint of each update is wanted
+        is_behind = self.saver.is_writing and self.checkpoint_seconds >= 1
+        return agree(plan, is_stopped, is_behind)
+
     def wait_for_collector(self) -> None:
         """Waits until an async collector has stopped stepping the environment."""
         if hasattr(self.collect, "wait"):
             self.collect.wait()
 
-    def update(self) -> dict[str, torch.Tensor]:
-        """Learns from the current rollout. Returns the learner's metrics, tensors of shape ()."""
+    def update(self, lr_fraction: float = 1.0) -> dict[str, torch.Tensor]:
+        """Learns from the current rollout. Returns the learner's metrics, tensors of shape ().
+
+        Args:
+            lr_fraction: factor of the learning rate.
+        """
         rollout = self.rollout
-        factor = self.budget.lr_fraction(self.updates, self.samples, self.clock.seconds)
         if self.annealing_record is not None:
-            self.annealing_record.append(factor)
+            self.annealing_record.append(lr_fraction)
         if self.budget.anneal != "never":
-            self.lr = self.learner.lr * factor
+            self.lr = self.learner.lr * lr_fraction
             self.learner.set_lr(self.lr)
         losses = self.learner.update(rollout)
         self.episode_stats.add(
@@ -198,7 +229,7 @@ class Trainer:
             rollout.learns[:-1],
             rollout.metrics,
         )
-        self.samples += rollout.n_steps * rollout.n_lanes
+        self.samples += rollout.n_steps * rollout.n_lanes * n_ranks()
         self.updates += 1
         if self.opponents is not None:
             self.opponents.refresh_snapshots(self.policy, self.updates)
@@ -212,17 +243,18 @@ class Trainer:
         return losses
 
     def log(self, losses: dict[str, torch.Tensor]) -> None:
-        """Writes the metrics since the last report. Synchronises.
+        """Writes the metrics of all ranks since the last report. Synchronises.
 
         A loss that is NaN has no value, as no gradient step was taken; it is left out.
 
-        Raises the errors that `env.check()` does.
+        Raises the errors that `env.check()` does, and DriftError if the ranks' weights differ.
         """
         self.wait_for_collector()
         optional(self.env, "check")()
+        check_drift(self.policy)
         loss_values = [torch.as_tensor(loss, device=self.env.device) for loss in losses.values()]
         loss_values = torch.stack(loss_values).tolist() if losses else []
-        loss_values = zip(losses, loss_values, strict=True)
+        loss_values = dict(zip(losses, loss_values, strict=True))
         self.nonfinite_guard.warn_of_metrics(self.episode_stats, self.rollout)
         stats = self.episode_stats.pop()
         if self.opponents is not None:
@@ -230,7 +262,7 @@ class Trainer:
         self.latest_stats.update(stats)
         metrics = {
             **stats,
-            **{name: value for name, value in loss_values if not math.isnan(value)},
+            **mean_over_ranks(loss_values),
             "updates": self.updates,
             "lr": self.lr,
             "anneal": self.budget.anneal,
@@ -245,35 +277,43 @@ class Trainer:
         perf |= {f"perf/memory_{name}": n for name, n in device_memory(self.env.device).items()}
         self.samples_at_log, self.seconds_at_log = self.samples, seconds
         self.updates_at_log = self.updates
-        if self.annealing_record is not None:
-            with contextlib.suppress(OSError):  # the next report tries again
-                self.annealing_record.flush()
-        self.logger.write(self.samples, metrics, perf)
+        with unhurried():
+            if self.annealing_record is not None:
+                with contextlib.suppress(OSError):  # the next report tries again
+                    self.annealing_record.flush()
+            self.logger.write(self.samples, metrics, perf)
         if stats.get("episode/window", 0) >= MIN_EPISODES:
             self.score = stats["episode/return"]
         self.on_log(self)
 
     def save_checkpoint(self, state: dict[str, Any] | None = None, is_last: bool = False) -> None:
-        """Begins to save a checkpoint, unless the last one holds every update.
+        """Begins to save a checkpoint, unless the last one holds every update. All ranks call it.
 
         Args:
             state: of `state_dict`; default: that of now.
             is_last: no other checkpoint follows.
         """
         self.seconds_at_checkpoint = self.clock.seconds
-        if self.is_saved and not (is_last and self.saver.lacks_replay):
+        if not any_rank(not self.is_saved or (is_last and self.saver.lacks_replay)):
             return
         self.run_state.warn_of_unreachable()
         state = self.state_dict() if state is None else state
-        try:  # a checkpoint must not reach further than what is on disk of the run's files
+        # a checkpoint must not reach further than what is on disk of the run's files
+        if any_rank(not self._sync_files()) and not is_last:
+            return
+        self.saver(self.samples, state, self.score, is_last)
+        self.updates_at_checkpoint = self.updates
+
+    @unhurried()
+    def _sync_files(self):
+        """Returns whether the files of metrics are on disk, where this rank writes them."""
+        try:
             self.logger.sync()
             if self.annealing_record is not None:
                 self.annealing_record.sync()
         except OSError:
-            if not is_last:
-                return
-        self.saver(self.samples, state, self.score, is_last)
-        self.updates_at_checkpoint = self.updates
+            return False
+        return True
 
     def save_what_was_learnt(self) -> None:
         """Begins to save a checkpoint from which a resumed run starts new episodes: after an error
@@ -297,14 +337,14 @@ class Trainer:
         )
         return counts | self.run_state.state_dict(has_episodes)
 
-    def load_state_dict(self, state: dict[str, Any]) -> list[str]:
-        """Restores a `state_dict`.
+    def load_state_dict(self, state: dict[str, Any], is_new_rank: bool = False) -> None:
+        """Restores a `state_dict`. `lost` names what cannot be restored.
 
-        Returns what could not be restored and begins anew, a clause each; then the run does not
-        continue bit for bit.
+        Args:
+            is_new_rank: it is rank 0's, as this rank has none of its own.
         """
         self.samples, self.updates = state["samples"], state["updates"]
         self.clock.seconds_before = state["seconds"]
         self.samples_at_report = state["samples_at_report"]
         self.updates_at_checkpoint = self.updates_at_log = self.updates
-        return self.run_state.load_state_dict(state)
+        self.lost = self.run_state.load_state_dict(state, is_new_rank)

@@ -1,0 +1,35 @@
+"""Prints what a training run would do: the sizes of a rank, and of all."""
+
+from megastep.agents.cli import console, factory, launch, settings
+from megastep.agents.distributed import environment
+from megastep.types import n_lanes
+
+
+def show(cfg: settings.Train) -> None:
+    """Prints the sizes of a run, per rank and in total. Trains nothing and writes no file."""
+    place = environment.launched()
+    n_ranks = place.n_ranks if place else launch.n_ranks(cfg)
+    device = factory.make_device(cfg.device)
+    names = ["", "a rank", "in total"] if n_ranks > 1 else ["", "in total"]
+    rows = [
+        [name, *(f"{number * factor:,}" for factor in {1: None, n_ranks: None})]
+        for name, number in sizes(cfg, device).items()
+    ]
+    ranks = f"{n_ranks} x " if n_ranks > 1 else ""
+    console.say(f"Would train on {ranks}{device.type}:\n{console.table(names, rows)}")
+
+
+def sizes(cfg: settings.Train, device) -> dict[str, int]:
+    """Returns the numbers of one rank, as far as the learner has them."""
+    geometries = factory.homes(cfg.env, cfg.geometry, "training")
+    options = dict(seed=cfg.seed, device=device, privileged=cfg.agent.critic == "asymmetric")
+    sample = factory.make_sample(cfg.env, geometries, **options)
+    lanes = cfg.env.n_envs * n_lanes(sample) // sample.n_envs
+    n_steps = getattr(cfg.learner, "n_steps", None)
+    n_minibatches = getattr(cfg.learner, "n_minibatches", None)
+    numbers = {"environments": cfg.env.n_envs, "lanes": lanes}
+    if n_steps:
+        numbers["samples of an update"] = lanes * n_steps
+    if n_steps and n_minibatches:
+        numbers["samples of a minibatch"] = lanes * n_steps // n_minibatches
+    return numbers

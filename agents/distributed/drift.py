@@ -1,0 +1,81 @@
+"""Differences between the ranks: in what they were started with, and in what they learn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+
+from megastep.agents.distributed.process_group import gather_integers, gather_objects, n_ranks
+
+#: Integer types of as many bytes, through which the bits of a number are read.
+INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
+
+
+class DriftError(RuntimeError):
+    """The ranks' weights differ, so they no longer train one policy."""
+
+
+def first_difference(policy: torch.nn.Module) -> str | None:
+    """Returns the first parameter or buffer in which ranks differ, None if all bits are equal:
+    `policy.core.bias differs on rank 1`. Synchronises, and waits for the other ranks.
+    """
+    if n_ranks() == 1:
+        return None
+    tensors = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
+    rows = gather_integers(checksums(tensors.values()))
+    for name, sums in zip(tensors, rows.T.tolist(), strict=True):
+        if different := [rank for rank, value in enumerate(sums) if value != sums[0]]:
+            return f"policy.{name} differs on {_ranks(different)}"
+    return None
+
+
+def check_drift(policy: torch.nn.Module) -> None:
+    """Checks that all ranks have the same weights. Synchronises, and waits for the other ranks.
+
+    Raises:
+        DriftError: on all ranks, naming the first parameter or buffer that differs.
+    """
+    if difference := first_difference(policy):
+        raise DriftError(
+            f"The ranks drift apart: {difference}; a learner averages gradients with "
+            "megastep.agents.distributed.pooling.average_gradients"
+        )
+
+
+def checksums(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
+    """Returns the sum of the bits of each tensor as integers, modulo 2^64: an int64 vector on the
+    host. Synchronises.
+    """
+    with torch.no_grad():
+        parts = [_bits(tensor.detach()).sum(dtype=torch.int64) for tensor in tensors]
+        return torch.stack(parts).cpu() if parts else torch.zeros(0, dtype=torch.int64)
+
+
+def _bits(tensor):
+    if tensor.is_complex():
+        tensor = torch.view_as_real(tensor)
+    return tensor if tensor.dtype == torch.bool else tensor.view(INTEGERS[tensor.element_size()])
+
+
+def first_differing_fact(facts: dict[str, object]) -> str | None:
+    """Returns what the ranks were started with differently, such as `learner.lr is 0.001 on rank 0,
+    and 0.01 on ranks 1 and 3`; None if nothing is different. Waits for the other ranks.
+
+    Args:
+        facts: of this rank, by name, in the order of their importance.
+    """
+    everyones = gather_objects({name: str(value) for name, value in facts.items()})
+    for name in dict.fromkeys(name for facts in everyones for name in facts):
+        holders: dict[str, list[int]] = {}
+        for rank, facts in enumerate(everyones):
+            holders.setdefault(facts.get(name, "missing"), []).append(rank)
+        if len(holders) > 1:
+            values = (f"{value} on {_ranks(ranks)}" for value, ranks in holders.items())
+            return f"{name} is {', and '.join(values)}"
+    return None
+
+
+def _ranks(ranks):
+    *others, last = map(str, ranks)
+    return f"ranks {', '.join(others)} and {last}" if others else f"rank {last}"

@@ -1,0 +1,47 @@
+"""This process's place among the ranks, as torchrun's environment variables say. Knows no PyTorch,
+which takes seconds to import.
+"""
+
+import os
+import socket
+from typing import NamedTuple
+
+NAMES = "RANK", "WORLD_SIZE", "LOCAL_RANK"
+
+
+class Launched(NamedTuple):
+    """This process's place among the ranks, as torchrun says."""
+
+    rank: int
+    n_ranks: int
+    local_rank: int  # among the ranks of this machine
+    attempt: int = 0  # how often torchrun has started the ranks again
+
+
+def launched() -> Launched | None:
+    """Returns this process's place if torchrun started it, None for a process of its own.
+
+    Raises:
+        ValueError: torchrun's variables contradict each other.
+    """
+    if any(name not in os.environ for name in NAMES):
+        return None
+    texts = [os.environ[name] for name in NAMES]
+    texts.append(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
+    if not all(text.isdecimal() for text in texts) or int(texts[0]) >= int(texts[1]):
+        variables = " ".join(f"{name}={text}" for name, text in zip(NAMES, texts))
+        raise ValueError(
+            f"{variables} is no rank of torchrun; to train in one process, unset these "
+            "environment variables"
+        )
+    return Launched(*map(int, texts))
+
+
+def rank() -> int:
+    """Returns the number of the rank that this process is, 0 for a process of its own."""
+    place = launched()
+    return place.rank if place else 0
+
+
+def hostname() -> str:
+    return socket.gethostname()
