@@ -1,14 +1,12 @@
 """Prints what a training run would do: the sizes of a rank, and of all."""
 
 from megastep.agents.cli import console, factory, launch, settings
-from megastep.agents.distributed import environment
 from megastep.types import n_lanes
 
 
 def show(cfg: settings.Train) -> None:
     """Prints the sizes of a run, per rank and in total. Trains nothing and writes no file."""
-    place = environment.launched()
-    n_ranks = place.n_ranks if place else launch.n_ranks(cfg)
+    n_ranks = launch.n_ranks(cfg)
     device = factory.make_device(cfg.device)
     names = ["", "a rank", "in total"] if n_ranks > 1 else ["", "in total"]
     rows = [

@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from megastep.agents.cli import check, console, gpu, program, settings, signals
+from megastep.agents.cli import check, console, gpu, program, runs, settings, signals
 from megastep.agents.cli.endings import Ending
 from megastep.agents.distributed import environment
 
@@ -34,19 +34,19 @@ LOST = 3
 #: Runs a rank. The current folder is not searched for modules before those of Python are.
 RANK = """import sys
 sys.path[:] = filter(None, sys.path)
-from megastep.agents.cli import rank
-sys.exit(rank.main())"""
+from megastep.agents.cli import rank_process
+sys.exit(rank_process.main())"""
 
 
 def n_ranks(cfg: settings.Train) -> int:
     """Returns the number of ranks of a training run.
 
     Raises:
-        ConfigErrors: there are fewer GPUs.
+        ConfigErrors: they are to share a GPU.
     """
     if cfg.ranks == 1:
         return 1
-    n_gpus = gpu.count() if cfg.device != "cpu" else 0
+    place, n_gpus = environment.launched(), gpu.count() if cfg.device != "cpu" else 0
     if ":" in cfg.device:
         text = f"{cfg.device!r} is one GPU, and ranks have one each; use device=cuda"
         raise program.ConfigErrors([("device", text)])
@@ -56,7 +56,7 @@ def n_ranks(cfg: settings.Train) -> int:
             text = f"'all' is every GPU, and {where}; give a number, such as ranks=2"
             raise program.ConfigErrors([("ranks", text)])
         return n_gpus
-    if n_gpus and cfg.ranks > n_gpus:
+    if n_gpus and cfg.ranks > n_gpus and place is None:
         n_here = f"{n_gpus} GPU{'s' * (n_gpus > 1)}"
         text = f"{cfg.ranks} is more than the {n_here} of this machine; ranks=all is one for each"
         raise program.ConfigErrors([("ranks", text)])
@@ -181,8 +181,6 @@ class Job:
 
 def hint(folder: Path | None) -> str:
     """Returns what is left of a training run that ended in the middle of an update."""
-    from megastep.agents.cli import runs  # which imports this for rank 0's folder
-
     if folder is None or not any((folder / "checkpoints").glob("*")):
         return "Nothing was saved yet"
     return f"Its last checkpoint is whole. To continue: {runs.resume_command(folder)}"

@@ -3,18 +3,12 @@ others, speaks with one voice, and ends with them.
 """
 
 import contextlib
-import json
 import os
-import signal
 import sys
-import threading
-import traceback
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
-from megastep import workers
 from megastep.agents.cli import console, endings, launch, program, signals
 from megastep.agents.distributed import environment
 
@@ -23,43 +17,6 @@ GRACE_SECONDS, SAVING_SECONDS = 10.0, 60.0
 #: The ranks that this process has joined.
 _team = None
 T = TypeVar("T")
-
-
-def main() -> int:
-    """Trains as one of the ranks that `launch` has started. Returns the exit code: 0, or another if
-    torchrun is to start the ranks again.
-    """
-    place, job = environment.launched(), Path(os.environ[launch.JOB])
-    for number in signals.SIGNALS:  # while there is nothing to save
-        signal.signal(number, lambda number, frame: os._exit(128 + number))
-    (job / f"pid-{place.attempt}-{place.rank}").write_text(str(os.getpid()))
-    if (job / launch.STOPPED).exists():
-        return 0
-    facts = json.loads((job / launch.SETTINGS).read_text())
-    sys.argv[:], sys.orig_argv[:] = facts["argv"], facts["command"]
-    workers.end_with_parent(facts["parent"])
-    console.open_streams()
-    console.prefix = facts["prefix"]
-    threading.excepthook = console.warn_of_thread
-    warnings.showwarning = console.warn
-    from megastep.agents.cli import check, settings, train
-
-    folder = None
-
-    def work():
-        nonlocal folder
-        folder = train.run(check.check(settings.Train, facts["settings"]))
-
-    try:
-        ending = endings.ending_of(work)._replace(folder=folder and str(folder))
-        code = 0
-    except Exception as error:
-        traceback.print_exc()
-        text = f"{type(error).__name__}: {program.shortened(error, 400)}"
-        ending, code = endings.Ending(1, text), 1
-    if ending.text or ending.folder:
-        tell(ending)
-    return code
 
 
 def announce(number: int) -> None:
@@ -152,11 +109,11 @@ def joined() -> Iterator[Team | None]:
         return
     from megastep.agents.distributed import process_group
 
-    with program.errors("The ranks cannot be joined: ", (RuntimeError,)):
-        process_group.start()
     if place.rank > 0:
         console.is_silent = True
-        console.prefix = f"{console.prefix}{process_group.place()}: "
+        console.prefix = f"{console.prefix}rank {place.rank} on {environment.hostname()}: "
+    with program.errors("The ranks cannot join each other: ", (RuntimeError,)):
+        process_group.start()
     _team = team = Team()
     try:
         yield team

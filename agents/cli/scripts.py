@@ -188,8 +188,7 @@ def check_training(cfg: settings.Train) -> None:
     """
     if environment.rank() > 0:  # rank 0 checks
         return
-    if environment.launched() is None:
-        launch.n_ranks(cfg)
+    launch.n_ranks(cfg)
     if cfg.resume is None:
         runs.check_free(cfg.folder)
     else:

@@ -35,6 +35,7 @@ from megastep import workers
 from megastep.agents.cli import console, program, runs, scripts, settings, signals
 from megastep.agents.cli.compose import NO_TEXT, UNDECODED, Composer, key_of
 from megastep.agents.cli.program import ConfigErrors, UserError, shortened
+from megastep.agents.distributed import environment
 from megastep.agents.training.atomic_files import write_atomically
 
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
@@ -101,6 +102,12 @@ def sweep(composer: Composer, words: list[str]) -> int:
     """Checks all jobs, then hands the sweep over to Hydra, past jobs that fail. Returns the exit
     code.
     """
+    if environment.launched():
+        if environment.rank() > 0:
+            raise SystemExit(UserError.code)  # rank 0 says it
+        raise UserError(
+            "The jobs of a sweep start their own ranks; leave torchrun out, and add ranks="
+        )
     overrides = {key_of(override): override for override in composer.parse(words)}
     if "folder" in overrides:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])
