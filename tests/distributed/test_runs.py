@@ -17,6 +17,7 @@ from tests.helpers import ranks, tiny
 
 pytestmark = pytest.mark.slow
 LEARNERS = "ppo", "lag", "priorities", "r2d2", "opponents"
+NO_FINISH = "finish.evaluate=false", "finish.record=false"
 PPO = [*tiny.TINY, *tiny.SHORT_EPISODES]
 
 
@@ -105,7 +106,8 @@ def test_resumed_ranks_have_the_same_bits(on_ranks, name):
 def alone(here):
     """A run of two ranks in processes of their own, with its output."""
     words = *PPO, "samples=1280", "log_every=2", "folder=alone", "snapshots=2"
-    return ranks.train(*words, "finish.evaluate=true", "finish.episodes=9", "finish.record=true")
+    finish = "finish.evaluate=true", "finish.episodes=9", "finish.record=true", "finish.steps=2"
+    return ranks.train(*words, *finish)
 
 
 def test_rank_0_writes_and_speaks(alone, here):
@@ -145,13 +147,34 @@ def test_killed_ranks_go_on_bit_for_bit(alone, here):
 
 
 def test_another_number_of_ranks_goes_on(alone, here, capsys):
-    assert train.main(["resume=alone", "samples=1408", "finish.evaluate=false", "ranks=1"]) == 0
+    assert train.main(["resume=alone", "samples=1408", "ranks=1", *NO_FINISH]) == 0
     line = "goes on, but not bit for bit: ranks was 2 and is 1."
     assert line in capsys.readouterr().out
     assert not (here / "alone/checkpoints/step_1408/rank1.pt").exists()
-    first, _ = ranks.train("resume=alone", "samples=1536")
+    first, _ = ranks.train("resume=alone", "samples=1536", *NO_FINISH)
     assert "ranks was 1 and is 2; ranks that it did not have begin new episodes." in first.stdout
     assert checkpoint.load_latest("alone/checkpoints/step_1536").n_ranks == 2
     states = whole(checkpoint.list_checkpoints("alone/checkpoints")[-1])
     generators = [state["learner"]["policy_generator"] for state in states.values()]
     assert not torch.equal(*(generator["generator"] for generator in generators))
+
+
+def test_ranks_share_duels_and_evaluations(here):
+    """Together they play what one process plays: as often in each home and from each place."""
+    words = ["env=tests.helpers.games:Matrix", "env.n_agents=2", "env.n_envs=4", "geometry=homes"]
+    words += ["geometry.n=7", "samples=1", "folder=games", "preset=cpu", "agent.width=8"]
+    device = "device=cpu"
+    assert train.main([*words, device, *NO_FINISH, "learner.n_minibatches=2"]) == 0
+    counts, script = [], ranks.ROOT / "evaluate.py"
+    for n_ranks in 1, 2:
+        for against in (), ("against=tests.helpers.games:High",):
+            results = ranks.run(
+                [script, "run=games", "episodes=41", device, *against], n_ranks=n_ranks
+            )
+            assert not any(one.returncode for one in results), [one.stderr for one in results]
+            assert not any(one.stdout for one in results[1:])
+        tables = sorted((here / "games/evaluations").glob("*.json"))
+        rows = [json.loads(path.read_text())["rows"][0] for path in tables]
+        names = "lanes", "duels", "homes", "unfinished"
+        counts.append([[row.get(name) for name in names] for row in rows])
+    assert counts[0] == counts[1] and len(counts[0]) == 2
