@@ -154,7 +154,11 @@ class Job:
 
     def ending(self) -> Ending:
         """Returns how the ranks ended."""
-        return self.ending_of(self.attempt) or self.unknown_ending()
+        ending, failures = self.ending_of(self.attempt), getattr(self.error, "failures", None)
+        is_stopped = (self.folder / STOPPED).exists()
+        if ending and ending.code > 128 and failures and not is_stopped:
+            ending = None  # torchrun's own signal, to what is left of the ranks
+        return ending or self.unknown_ending()
 
     def ending_of(self, attempt: int) -> Ending | None:
         path = self.folder / f"ending-{attempt}"

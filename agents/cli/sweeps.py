@@ -100,9 +100,10 @@ def sweep(composer: Composer, words: list[str]) -> int:
     code.
     """
     if environment.launched():
-        with rank.joined():  # so that one of them tells
-            text = "A sweep starts the ranks of its jobs itself; start it without torchrun, "
-            raise UserError(text + "and give the number of GPUs of a job: ranks=2")
+        with rank.joined():  # so that one of them says it
+            raise UserError(
+                "The jobs of a sweep start their own ranks; leave torchrun out, and add ranks="
+            )
     overrides = {key_of(override): override for override in composer.parse(words)}
     if "folder" in overrides:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])

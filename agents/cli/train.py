@@ -98,11 +98,8 @@ def make_trainer(
     made_with = provenance.made_with(device, program.version(), n_ranks)
     checkpoints, had = folder / "checkpoints", loaded.state if cfg.resume else Counter()
     with factory.errors():
-        spends, logger, writers = (
-            budget_of(cfg, folder, loaded if cfg.resume else None),
-            loggers.NoLogger(),
-            {},
-        )
+        limits = budget_of(cfg, folder, loaded if cfg.resume else None)
+        logger, writers = loggers.NoLogger(), {}
         rank_files = RankFiles(checkpoints, token, number, n_ranks)
         if number == 0:  # which alone writes these
             wandb = wandb if cfg.logger.name == "wandb" else None
@@ -121,7 +118,7 @@ def make_trainer(
             saver.Saver(
                 checkpoints, config, cfg.keep_checkpoints, made_with, cfg.replay_every, rank_files
             ),
-            spends,
+            limits,
             log_every=cfg.log_every,
             checkpoint_seconds=cfg.checkpoint_seconds,
             desync=cfg.desync,
@@ -274,13 +271,10 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             from_rank_0(functools.partial(write_config, folder, running.saver.config["train"]))
             undo.pop_all()
         hosts = process_group.gather_objects(process_group.hostname())
-        lost = [
-            clause for clauses in process_group.gather_objects(running.lost) for clause in clauses
-        ]
+        clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(running.lost)))
         if is_first:
-            if lost:
-                clauses = "; ".join(dict.fromkeys(lost))
-                console.say(f"This run goes on, but not bit for bit: {clauses}.")
+            if clauses:
+                console.say(f"This run goes on, but not bit for bit: {'; '.join(clauses)}.")
             runs.record_start(folder)
             provenance.record(
                 folder, running.samples, device, program.version(), program.ROOT, hosts
@@ -288,7 +282,6 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
             console.say(f"Training on {ranks} in {folder}")
         resume = f"To continue: {runs.resume_command(folder)}"
-        place = f"{process_group.place()}: " * (len(hosts) > 1)
         try:
             with (
                 signals.handled(rank.announce) as numbers,
@@ -308,7 +301,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             saved = running.saver.error or "What was learnt last could not be saved"
             saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
             reason = problem or str(error).partition("\n")[0].rstrip(".")
-            raise program.UserError(f"{place}{reason}. {saved}. {resume}") from error
+            raise program.UserError(f"{reason}. {saved}. {resume}") from error
         finally:
             if is_first:
                 with process_group.unhurried():

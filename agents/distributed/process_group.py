@@ -7,6 +7,7 @@ R ranks.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import datetime
 import math
@@ -64,6 +65,7 @@ def start(seconds: float = START_SECONDS) -> None:
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
     distributed.init_process_group(backend, timeout=datetime.timedelta(seconds=seconds))
+    atexit.register(stop)  # threads of gloo that still run would abort the interpreter's end
 
 
 def store(name: str) -> distributed.Store:

@@ -95,7 +95,8 @@ class NonFiniteGuard:
         text = f"{value}{f' ({place_of_value})' * (len(reports) > 1)}"
         if value and self.value is None:
             self.value, self.replay_hint = value, hint
-            warnings.warn(f"{text}; its rollout was skipped{hint}", stacklevel=2)
+            if rank() == 0:
+                warnings.warn(f"{text}; its rollout was skipped{hint}", stacklevel=2)
             if self.recorder is not None:
                 self.recorder.close()
                 self.recorder = None
@@ -138,7 +139,7 @@ class NonFiniteGuard:
         reports = gather_objects({name: (lane, place()) for name, lane in bad.items()})
         of_all = {name: lane for report in reversed(reports) for name, lane in report.items()}
         episode_stats.named |= of_all.keys()
-        for name, (lane, place_of_lane) in of_all.items():
+        for name, (lane, place_of_lane) in of_all.items() if rank() == 0 else ():
             of_rank = f" ({place_of_lane})" * (len(reports) > 1)
             warnings.warn(
                 f"metrics.{name} of {lane}{of_rank} was not finite at the end of an episode; such "

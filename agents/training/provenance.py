@@ -47,8 +47,8 @@ def record(
             "cuda": torch.version.cuda,
             "python": platform.python_version(),
             "device": device_name(device),
-            "ranks": len(hosts),
-            "hosts": ", ".join(dict.fromkeys(hosts)),
+            "ranks": len(hosts) if len(hosts) > 1 else None,
+            "hosts": ", ".join(dict.fromkeys(hosts)) if len(hosts) > 1 else None,
         }
         lines.write(samples, {name: text for name, text in facts.items() if text})
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING, Any
 
+from megastep.agents.distributed.process_group import rank
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.env_state import EnvState
 from megastep.types import Env, optional
@@ -124,7 +125,9 @@ class RunState:
 
     def warn_of_unreachable(self) -> None:
         """Warns once of what the environment keeps where checkpoints cannot reach it."""
-        if not self.has_named_unreachable and (names := self.env_state.unreachable()):
+        if self.has_named_unreachable or rank() > 0:
+            return
+        if names := self.env_state.unreachable():
             self.has_named_unreachable = True
             warnings.warn(
                 f"Checkpoints cannot hold {', '.join(names)} of the environment: if they change, a "

@@ -10,6 +10,7 @@ from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, memory, pong, step
 from nsight_counters import counters
 from replay_buffer import replay
+from scaling import ranks, scaling
 from shortest_paths import paths
 from startup_times import compile_kernels, first_step, startup
 from training_benchmarks import ablation, duels, learners, train, worlds
@@ -35,4 +36,6 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "duels": duels,
     "ablation": ablation,
     "learners": learners,
+    "scaling": scaling,
+    "ranks": ranks,
 }

@@ -22,7 +22,8 @@ CurvePoint = tuple[float, int, float]
 
 @contextlib.contextmanager
 def trained(device: torch.device, *runs: tuple[str, ...]) -> Iterator[list[Path]]:
-    """Trains one run per tuple of overrides, all at the same time on one device.
+    """Trains one run per tuple of overrides, all at the same time, on one device unless overrides
+    name another.
 
     Gives the run folders, which are deleted at the end of the context. CalledProcessError if a run
     fails.
@@ -30,7 +31,7 @@ def trained(device: torch.device, *runs: tuple[str, ...]) -> Iterator[list[Path]
     with tempfile.TemporaryDirectory() as parent:
         folders = [Path(parent) / f"run{i}" for i in range(len(runs))]
         commands = [
-            [sys.executable, "train.py", *overrides, f"folder={folder}", f"device={device}"]
+            [sys.executable, "train.py", f"device={device}", *overrides, f"folder={folder}"]
             for overrides, folder in zip(runs, folders)
         ]
         # stdout is for the table of measurements
@@ -44,6 +45,12 @@ def trained(device: torch.device, *runs: tuple[str, ...]) -> Iterator[list[Path]
                 process.terminate()
                 process.wait()
         yield folders
+
+
+def rates(run: Path) -> list[float]:
+    """Returns the samples per second between each two reports of a run."""
+    rows = map(json.loads, (run / "perf.jsonl").read_text().splitlines())
+    return [row["perf/rate"] for row in rows if "perf/rate" in row]
 
 
 def evaluate(run: Path, device: torch.device, *overrides: str) -> list[dict]:

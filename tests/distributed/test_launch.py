@@ -80,14 +80,22 @@ def test_ranks_under_torchrun(monkeypatch):
         tiny.settings(*TINY, "ranks=3")
 
 
+@pytest.mark.parametrize("rank, n_lines", [(0, 1), (1, 0)])
+def test_sweep_under_torchrun(here, monkeypatch, capsys, rank, n_lines):
+    as_rank(monkeypatch, rank, 2)
+    assert train.main([*tiny.TINY, "-m", "seed=1,2"]) == 2
+    assert capsys.readouterr().err.count("leave torchrun out") == n_lines
+    assert not any(here.iterdir())
+
+
 def test_dry_run(here, capsys):
     assert train.main([*TINY, "ranks=3", "dry_run=true"]) == 0
     text = capsys.readouterr().out
-    n_envs, n_steps = 4, 8
     assert "3 x cpu" in text and not any(here.iterdir())
-    for number in (n_envs, n_envs * n_steps, n_envs * n_steps // 2):
-        (line,) = (line for line in text.splitlines() if f"{3 * number:,}" in line.split())
-        assert f"{number:,}" in line.split()
+    numbers = {"environments": 4, "an update": 4 * 8, "a minibatch": 4 * 8 // 2}
+    for name, number in numbers.items():
+        (line,) = (line for line in text.splitlines() if name in line)
+        assert {str(number), str(3 * number)} <= set(line.split())
 
 
 # ---- What the ranks' endings mean for the process that launched them ----
@@ -102,7 +110,7 @@ def launched(monkeypatch, *attempts, failure=None):
             (folder / f"pid-{attempt}-0").write_text("999999999")
             if ending:
                 ending.write(folder / f"ending-{attempt}")
-            time.sleep(0.5)
+            time.sleep(0.4 * (len(attempts) > 1))  # more than the launching process sleeps
         if failure:
             raise failure
 

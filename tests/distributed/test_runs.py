@@ -1,0 +1,157 @@
+"""Runs of two ranks: equal weights, exact resume, another number of ranks, an evaluation."""
+
+import json
+import os
+import re
+import signal
+import time
+
+import pytest
+import torch
+
+from megastep.agents.cli import train
+from megastep.agents.distributed import process_group
+from megastep.agents.training import annealing, checkpoint, json_lines
+from tests.cli.test_exact_resume import CASES, EVERY_UPDATE, differences
+from tests.helpers import ranks, tiny
+
+pytestmark = pytest.mark.slow
+LEARNERS = "ppo", "lag", "priorities", "r2d2", "opponents"
+PPO = [*tiny.TINY, *tiny.SHORT_EPISODES]
+
+
+def trained(*words):
+    """Trains in this rank. Returns what it learnt, and a copy of its state."""
+    trainers, make_trainer = [], train.make_trainer
+
+    def remember(*arguments):
+        trainers.append(make_trainer(*arguments))
+        return trainers[-1]
+
+    train.make_trainer = remember
+    try:
+        assert train.main([*words]) == 0
+    finally:
+        train.make_trainer = make_trainer
+    (trainer,) = trainers
+    state = trainer.state_dict()
+    return dict(
+        policy=state["policy"],
+        optimizer=state["learner"]["optimizer"],
+        actions=trainer.rollout.actions,
+        generators=[state["learner"][name] for name in ("generator", "policy_generator")],
+        n=(trainer.samples, trainer.updates, trainer.episode_stats.windows),
+        parts=trainer.saver.rank_files.rank,
+    )
+
+
+def run_and_resume():
+    """Trains each learner, resumes it after a checkpoint in the middle, and returns by name what it
+    learnt, and what differs when it was resumed.
+    """
+    results = {}
+    for name in LEARNERS:
+        words = [*CASES[name], "samples=512", "log_every=2", f"folder={name}"]
+        learnt = trained(*words, *EVERY_UPDATE)
+        folder = f"{name}/checkpoints"
+        alone = whole(checkpoint.list_checkpoints(folder)[-1])
+        metrics = open(f"{name}/metrics.jsonl", "rb").read()
+        paths = process_group.gather_objects(checkpoint.list_checkpoints(folder))[0]
+        trained(f"resume={paths[len(paths) // 2]}")
+        again = whole(checkpoint.list_checkpoints(folder)[-1])
+        is_same = open(f"{name}/metrics.jsonl", "rb").read() == metrics
+        results[name] = learnt, len(paths), differences(alone, again), is_same
+        process_group.exchange([0])  # before either goes on
+    return results
+
+
+def whole(path):
+    """Returns the state of both ranks in a checkpoint, without the seconds."""
+    states = {str(rank): checkpoint.load_latest(path, rank=rank).state for rank in range(2)}
+    return {rank: state | {"seconds": 0} for rank, state in states.items()}
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def on_ranks(here):
+    return ranks.call(run_and_resume)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_ranks_learn_the_same_from_different_samples(on_ranks, name):
+    (first, *_), (second, *_) = (results[name] for results in on_ranks)
+    assert differences(first["policy"], second["policy"]) == []
+    assert differences(first["optimizer"], second["optimizer"]) == []
+    assert first["n"] == second["n"] and first["n"][0] >= 512
+    assert differences(first["generators"], second["generators"])
+    assert differences(first["actions"], second["actions"])
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_resumed_ranks_have_the_same_bits(on_ranks, name):
+    for results in on_ranks:
+        _, n_checkpoints, differing, has_same_metrics = results[name]
+        assert differing == [] and has_same_metrics and n_checkpoints >= 4
+
+
+@pytest.fixture(scope="module")
+def alone(here):
+    """A run of two ranks in processes of their own, with its output."""
+    words = *PPO, "samples=1280", "log_every=2", "folder=alone", "snapshots=2"
+    return ranks.train(*words, "finish.evaluate=true", "finish.episodes=9", "finish.record=true")
+
+
+def test_rank_0_writes_and_speaks(alone, here):
+    first, second = alone
+    assert not (second.stdout + second.stderr + first.stderr).strip()
+    assert re.search("trained .* 9 ", first.stdout)
+    samples = [row["samples"] for row in json_lines.read("alone/metrics.jsonl")]
+    assert samples == [*range(128, 1281, 128)]  # of both ranks
+    assert len(annealing.read("alone")) == 20
+    (row,) = json_lines.read("alone/provenance.jsonl")
+    assert row["ranks"] == 2 and row["hosts"]
+    assert len(checkpoint.list_checkpoints("alone/snapshots")) == 2
+    assert (here / "alone/video.mp4").exists()
+    left = {path.name for path in (here / "alone/checkpoints").iterdir()}
+    assert left == {"step_1280"}
+    (table,) = (here / "alone/evaluations").glob("*.json")
+    assert [row["lanes"] for row in json.loads(table.read_text())["rows"]] == [9, 9]
+
+
+def test_killed_ranks_go_on_bit_for_bit(alone, here):
+    words = *PPO, "samples=1280", "log_every=2", "folder=killed", *EVERY_UPDATE
+    with ranks.started([ranks.ROOT / "train.py", *words]) as processes:
+        deadline = time.monotonic() + ranks.HUNG
+        while not checkpoint.list_checkpoints("killed/checkpoints"):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        for process in processes:
+            os.kill(process.pid, signal.SIGKILL)
+    assert not (here / "killed/checkpoints/step_1280").exists()
+    resumed, _ = ranks.train("resume=killed")
+    assert "bit for bit" not in resumed.stdout
+    for name in "metrics.jsonl", "annealing.f64":
+        assert (here / "killed" / name).read_bytes() == (here / "alone" / name).read_bytes()
+    paths = (f"{name}/checkpoints/step_1280" for name in ("killed", "alone"))
+    assert differences(*map(whole, paths)) == []
+    assert not [*(here / "killed/checkpoints").glob(".rank*")]
+
+
+def test_another_number_of_ranks_goes_on(alone, here, capsys):
+    assert train.main(["resume=alone", "samples=1408", "finish.evaluate=false", "ranks=1"]) == 0
+    line = "goes on, but not bit for bit: ranks was 2 and is 1."
+    assert line in capsys.readouterr().out
+    assert not (here / "alone/checkpoints/step_1408/rank1.pt").exists()
+    first, _ = ranks.train("resume=alone", "samples=1536")
+    assert "ranks was 1 and is 2; ranks that it did not have begin new episodes." in first.stdout
+    assert checkpoint.load_latest("alone/checkpoints/step_1536").n_ranks == 2
+    states = whole(checkpoint.list_checkpoints("alone/checkpoints")[-1])
+    generators = [state["learner"]["policy_generator"] for state in states.values()]
+    assert not torch.equal(*(generator["generator"] for generator in generators))

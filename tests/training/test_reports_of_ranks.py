@@ -1,0 +1,114 @@
+"""Reports of several ranks, whose exchange is made up in this process."""
+
+import contextlib
+
+import pytest
+import torch
+
+from megastep.agents.training import (
+    episode_stats,
+    json_lines,
+    nonfinite_guard,
+    provenance,
+    trainer,
+)
+from megastep.agents.training.episode_stats import EpisodeStats
+from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
+from tests.training.test_trainer import UPDATE, Pairs, always, make_trainer
+
+PLACES = "rank 0 on here", "rank 1 on there"
+
+
+@pytest.fixture
+def one_by_one(monkeypatch):
+    """Makes `gather_objects` of the guard return the reports of two ranks: rank 1's first call gets
+    two copies of rank 1's, rank 0's next call rank 0's and rank 1's.
+    """
+    of_rank_1 = []
+
+    def act_as(rank):
+        def gather(value):
+            if rank == 1:
+                of_rank_1.append(value)
+                return [value, value]
+            return [value, of_rank_1.pop(0)]
+
+        monkeypatch.setattr(nonfinite_guard, "gather_objects", gather)
+        monkeypatch.setattr(nonfinite_guard, "rank", lambda: rank)
+        monkeypatch.setattr(nonfinite_guard, "place", lambda: PLACES[rank])
+
+    return act_as
+
+
+def test_means_are_over_the_episodes_of_all_ranks(monkeypatch):
+    ranks = [EpisodeStats(2, "cpu") for _ in range(2)]
+    ended = torch.ones(1, 2, dtype=torch.bool)
+    for stats, reward in zip(ranks, ([1.0, 2.0], [6.0, 7.0])):
+        stats.add(torch.tensor([reward]), ~ended, ended)
+    total = sum(stats.sums.T.clone() for stats in ranks)
+    monkeypatch.setattr(episode_stats, "sum_over_ranks", lambda sums: total)
+    first, second = (stats.pop() for stats in ranks)
+    assert first == second and ranks[0].windows == ranks[1].windows
+    assert (first["episode/count"], first["episode/return"]) == (4, 4)
+
+
+def test_nan_of_another_rank_is_told_by_rank_0(tmp_path, one_by_one, recwarn):
+    trainers = []
+    for rank, faults in ((1, {("reward", 2, 3): torch.nan}), (0, {})):
+        one_by_one(rank)
+        run = make_trainer(tmp_path, faults)
+        run.rollout = run.collect()
+        run.update()
+        assert not run.nonfinite_guard.check(run.rollout, run.samples)
+        trainers.append(run)
+    (warning,) = recwarn
+    sentence = r"reward of lane 3 was nan at step 2 \(rank 1 on there\); its rollout was skipped"
+    assert sentence.replace("\\", "") in str(warning.message)
+    assert len({str(run.nonfinite_guard.value) for run in trainers}) == 1
+
+
+def test_all_ranks_end_with_the_same_sentence(tmp_path, one_by_one):
+    sentences = []
+    for rank, faults in ((1, always("reward", 2, torch.nan)), (0, {})):
+        one_by_one(rank)
+        run = make_trainer(tmp_path, faults)
+        for _ in range(MAX_SKIPPED):
+            run.rollout = run.collect()
+            run.update()
+        told = pytest.warns(UserWarning) if rank == 0 else contextlib.nullcontext()
+        with told, pytest.raises(nonfinite_guard.NonFiniteError) as caught:
+            run.nonfinite_guard.check(run.rollout, run.samples)
+        assert caught.value.is_from_env
+        sentences.append(str(caught.value))
+    of_rank_1, of_rank_0 = sentences
+    assert "(rank 1 on there)" in of_rank_0
+
+
+def test_metric_of_another_rank_is_named_once(tmp_path, one_by_one, recwarn):
+    for rank in (1, 0):
+        one_by_one(rank)
+        run = make_trainer(tmp_path, env=Pairs({}))
+        run.rollout = run.collect()
+        run.episode_stats.bad_lanes[0] = 2 if rank else 6
+        run.nonfinite_guard.warn_of_metrics(run.episode_stats, run.rollout)
+    (warning,) = recwarn
+    assert "metrics.age of lane 2 (environment 1) (rank 1 on there)" in str(warning.message)
+    assert run.episode_stats.named == {"age"}
+
+
+def test_samples_of_all_ranks_are_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(trainer, "n_ranks", lambda: 3)
+    run = make_trainer(tmp_path, samples=6 * UPDATE)
+    run.train()
+    assert run.updates == 2 and run.samples == 6 * UPDATE
+
+
+def test_provenance_has_the_ranks(tmp_path):
+    device = torch.device("cpu")
+    for hosts in (["a"], ["a", "a", "b"]):
+        provenance.record(tmp_path, 0, device, "1", tmp_path, hosts)
+    alone, three = json_lines.read(tmp_path / provenance.FILE)
+    assert "hosts" not in alone and "ranks" not in alone
+    assert (three["ranks"], three["hosts"]) == (3, "a, b")
+    assert provenance.made_with(device, "1", 2)["ranks"] == 2
+    assert "ranks" not in provenance.made_with(device, "1")
