@@ -31,7 +31,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
 from megastep import workers
-from megastep.agents.cli import console, places, program, rank, runs, scripts, settings, signals
+from megastep.agents.cli import console, places, program, runs, scripts, settings, signals
 from megastep.agents.cli.compose import NO_TEXT, UNDECODED, Composer, key_of
 from megastep.agents.cli.program import ConfigErrors, UserError, shortened
 from megastep.agents.distributed import environment
@@ -100,10 +100,11 @@ def sweep(composer: Composer, words: list[str]) -> int:
     code.
     """
     if environment.launched():
-        with rank.joined():  # so that one of them says it
-            raise UserError(
-                "The jobs of a sweep start their own ranks; leave torchrun out, and add ranks="
-            )
+        if environment.rank() > 0:
+            raise SystemExit(UserError.code)  # rank 0 says it
+        raise UserError(
+            "The jobs of a sweep start their own ranks; leave torchrun out, and add ranks="
+        )
     overrides = {key_of(override): override for override in composer.parse(words)}
     if "folder" in overrides:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])
