@@ -112,7 +112,10 @@ def joined() -> Iterator[Team | None]:
     if place.rank > 0:
         console.is_silent = True
         console.prefix = f"{console.prefix}rank {place.rank} on {environment.hostname()}: "
-    with program.errors("The ranks cannot join each other: ", (RuntimeError,)):
+    address = f"{os.environ.get('MASTER_ADDR')}:{os.environ.get('MASTER_PORT')}"
+    problem = f"The ranks cannot meet at {address}; is the port in use, or closed? "
+    with program.errors(problem, (RuntimeError, ValueError)):
+        has_joined = process_group.n_ranks() == 1
         process_group.start()
     _team = team = Team()
     try:
@@ -132,7 +135,8 @@ def joined() -> Iterator[Team | None]:
     finally:
         _team = None
     team.leave()
-    process_group.stop()
+    if has_joined:
+        process_group.stop()
 
 
 def _cause(error, kind):

@@ -10,6 +10,8 @@ from __future__ import annotations
 import atexit
 import contextlib
 import datetime
+import functools
+import itertools
 import math
 import os
 from collections.abc import Iterator, Sequence
@@ -61,11 +63,36 @@ def start(seconds: float = START_SECONDS) -> None:
     """Joins the ranks that torchrun started. Returns when all have. Does nothing in a process of
     its own.
     """
-    if launched() is None or distributed.is_initialized():
+    place = launched()
+    if place is None or distributed.is_initialized():
         return
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
-    distributed.init_process_group(backend, timeout=datetime.timedelta(seconds=seconds))
-    atexit.register(stop)  # threads of gloo that still run would abort the interpreter's end
+    wait = datetime.timedelta(seconds=seconds)
+    # torchrun may keep the store when it starts the ranks again, with addresses of the dead in it
+    keys = distributed.PrefixStore(f"ranks {place.attempt} {next(_STARTS)}", _store())
+    distributed.init_process_group(
+        backend, store=keys, rank=place.rank, world_size=place.n_ranks, timeout=wait
+    )
+
+
+_STARTS = itertools.count()
+
+
+@functools.cache
+def _store() -> distributed.Store:
+    """Returns the key-value store of the ranks, which torchrun's agent has, or else rank 0."""
+    place, has_agent = launched(), os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+    return _connection(is_master=place.rank == 0 and not has_agent)
+
+
+def _connection(is_master=False):
+    return distributed.TCPStore(
+        os.environ["MASTER_ADDR"],
+        int(os.environ["MASTER_PORT"]),
+        is_master=is_master,
+        timeout=datetime.timedelta(seconds=START_SECONDS),
+        wait_for_workers=False,
+    )
 
 
 def store(name: str) -> distributed.Store:
@@ -74,12 +101,7 @@ def store(name: str) -> distributed.Store:
     Args:
         name: of a set of keys.
     """
-    port = int(os.environ["MASTER_PORT"])
-    wait = datetime.timedelta(seconds=START_SECONDS)
-    client = distributed.TCPStore(
-        os.environ["MASTER_ADDR"], port, is_master=False, timeout=wait, wait_for_workers=False
-    )
-    return distributed.PrefixStore(f"megastep {name}", client)
+    return distributed.PrefixStore(f"megastep {name}", _connection())
 
 
 def stop() -> None:

@@ -10,6 +10,7 @@ that is if another has for some time been ahead of it in the operations that all
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -31,6 +32,9 @@ FIRST_SECONDS = 300.0
 PATIENCE = 5
 #: Seconds in which a rank may still save and end once the store is gone.
 LAST_SECONDS = 60.0
+
+#: Numbers of the watches in this process, equal on all ranks: each watch has keys of its own.
+NUMBERS = itertools.count()
 
 
 class Heartbeat(NamedTuple):
@@ -108,7 +112,8 @@ class Watch:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> None:
-        self.store = process_group.store(f"start {environment.launched().attempt}")
+        attempt = environment.launched().attempt
+        self.store = process_group.store(f"watch {attempt} {next(NUMBERS)}")
         self._beat()
         self._thread.start()
 

@@ -89,6 +89,11 @@ class RankFiles:
             entry_path.unlink()
         return entries
 
+    @property
+    def is_given_up(self) -> bool:
+        """True if another rank has ended, so that its parts of checkpoints are missing."""
+        return self._is_given_up.is_set()
+
     def give_up(self) -> None:
         """Has `collect` wait no longer, as another rank has ended."""
         self._is_given_up.set()

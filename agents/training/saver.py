@@ -171,7 +171,7 @@ class Saver:
         if not isinstance(failure[-1], (OSError, checkpoint.DamagedCheckpoint)):
             raise failure[-1]
         self._n_since_replay = self.replay_every  # the next one is to have it
-        has_warned = self.error is not None
+        has_warned = self.error is not None or self.rank_files.is_given_up
         self.error = self._message(*failure)
         if not has_warned:
             warnings.warn(

@@ -219,7 +219,7 @@ def test_one_voice(here):
 
 @pytest.mark.slow
 def test_error_of_the_ranks_is_told_once(here):
-    with started(here, "geometry=files", "geometry.path=no.npz", "device=cuda") as run:
+    with started(here, "device=cuda", CUDA_VISIBLE_DEVICES="") as run:
         code, _, err, _ = wait_for_end(run)
     assert code == 2 and err.count("train.py: ") == 1 and not (here / "run").exists()
 
