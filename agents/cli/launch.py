@@ -154,7 +154,11 @@ class Job:
 
     def ending(self) -> Ending:
         """Returns how the ranks ended."""
-        return self.ending_of(self.attempt) or self.unknown_ending()
+        ending, failures = self.ending_of(self.attempt), getattr(self.error, "failures", None)
+        is_stopped = (self.folder / STOPPED).exists()
+        if ending and ending.code > 128 and failures and not is_stopped:
+            ending = None  # torchrun's own signal, to what is left of the ranks
+        return ending or self.unknown_ending()
 
     def ending_of(self, attempt: int) -> Ending | None:
         path = self.folder / f"ending-{attempt}"
@@ -220,8 +224,11 @@ def variables(job: Path, n_ranks: int) -> Iterator[None]:
     if (program.ROOT / "train.py").exists():  # in a checkout, which need not be installed
         paths = filter(None, [str(program.ROOT), os.environ.get("PYTHONPATH")])
         changes["PYTHONPATH"] = os.pathsep.join(paths)
+    # a job of Slurm's may use some of a machine's cores only
+    is_linux = hasattr(os, "sched_getaffinity")
+    n_cores = len(os.sched_getaffinity(0)) if is_linux else os.cpu_count() or 1
     defaults = {
-        "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // n_ranks)),
+        "OMP_NUM_THREADS": str(max(1, n_cores // n_ranks)),
         "TORCH_CPP_LOG_LEVEL": "ERROR",
     }
     if os.path.exists("/sys/class/net/lo"):  # whether or not the machine's name has an address

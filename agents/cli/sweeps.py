@@ -1,5 +1,5 @@
 """Sweeps are Hydra's own, with its launchers and sweepers. Added here: the check of all jobs before
-the first starts, the GPU of each job, what a job returns, and the table of them all.
+the first starts, the GPUs of each job, what a job returns, and the table of them all.
 
 The basic launcher's jobs run in this process. Each of joblib's has a process of its own, which no
 worker of joblib's is the parent of: if a worker is killed, joblib kills all others.
@@ -17,7 +17,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 import traceback
@@ -32,7 +31,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
 from megastep import workers
-from megastep.agents.cli import console, program, runs, scripts, settings, signals
+from megastep.agents.cli import console, places, program, runs, scripts, settings, signals
 from megastep.agents.cli.compose import NO_TEXT, UNDECODED, Composer, key_of
 from megastep.agents.cli.program import ConfigErrors, UserError, shortened
 from megastep.agents.distributed import environment
@@ -56,9 +55,9 @@ OmegaConf.register_new_resolver(
 # ---- Before the first job ----
 
 
-def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], Any]:
-    """Returns (the words of each job that is known beforehand, all of them checked; the
-    configuration of the first).
+def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], list[Any], Any]:
+    """Returns (the words of each job that is known beforehand; their settings, all of them checked;
+    Hydra's configuration of the first).
 
     Of a grid these are all jobs; of a search, the first of all values, and each other value and
     bound alone.
@@ -78,9 +77,7 @@ def jobs_of(composer: Composer, words: list[str]) -> tuple[list[list[str]], Any]
     elif wide := [key for key, options in values.items() if options[0] is None]:
         cure = "interval() needs a sweeper that searches, such as hydra/sweeper=optuna"
         raise ConfigErrors((key, cure) for key in wide)
-    for job in jobs:
-        composer.compose(job)
-    return jobs, config
+    return jobs, [composer.settings(job) for job in jobs], config
 
 
 def _values(override: Override) -> list[str | None]:
@@ -111,7 +108,8 @@ def sweep(composer: Composer, words: list[str]) -> int:
     overrides = {key_of(override): override for override in composer.parse(words)}
     if "folder" in overrides:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])
-    config = jobs_of(composer, words)[1]
+    _, jobs, config = jobs_of(composer, words)
+    idle = places.check(jobs, config)
     folder = Path(config.sweep.dir)
     if UNDECODED.search(str(folder.absolute())):  # which the settings of jobs hold as text
         raise UserError(f"{str(folder.absolute())!r} {NO_TEXT}")
@@ -136,6 +134,8 @@ def sweep(composer: Composer, words: list[str]) -> int:
         os.environ["PYTHONPATH"] = os.pathsep.join(
             filter(None, [str(program.ROOT), os.environ.get("PYTHONPATH")])
         )
+    if idle:
+        console.say(idle)
     job, problem = new_job(composer, folder), ""
     try:
         with _lock(job.path("sweep.lock")):
@@ -258,16 +258,15 @@ class Job:
         with _lock(self.path(f"{number}.lock")):
             self.record(row)
             try:
-                with signals.interrupting(), one_gpu() as gpu:
+                with signals.interrupting():
                     cfg = self.composer().settings(words)
                     cfg = settings.changed(cfg, folder=os.path.relpath(row["folder"]))
-                    if cfg.device == "cuda" and gpu is not None:
-                        cfg = settings.changed(cfg, device=f"cuda:{gpu}")
                     logger = getattr(cfg, "logger", None)
                     if getattr(logger, "group", "") is None:
                         logger = settings.changed(logger, group=Path(self.folder).name)
                         cfg = settings.changed(cfg, logger=logger)
-                    result = scripts.SCRIPTS[self.source[0]].run(cfg)
+                    with places.taken(cfg) as cfg:
+                        result = scripts.SCRIPTS[self.source[0]].run(cfg)
                     row |= {"state": DONE, **(runs.outcome(result) if result else {})}
             except signals.Interrupted as stop:
                 row["state"] = f"interrupted: {stop.args[1]}"
@@ -356,29 +355,6 @@ def _is_locked(path: Path) -> bool:
     with contextlib.suppress(OSError), filelock.FileLock(path, blocking=False):
         return False
     return True
-
-
-@contextlib.contextmanager
-def one_gpu() -> Iterator[int | None]:
-    """Makes a GPU with the fewest jobs on it PyTorch's current one, which device=auto means.
-
-    Yields its index, None where there is no choice. Jobs know of each other by locks on temporary
-    files, one for each place on each GPU of this machine; the system drops them when a process
-    ends.
-    """
-    import filelock
-    import torch
-
-    n_gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    with contextlib.ExitStack() as stack:
-        for place in itertools.count() if n_gpus > 1 else ():
-            path = Path(tempfile.gettempdir(), f"megastep-{os.getuid()}-gpu-{place}.lock")
-            with contextlib.suppress(filelock.Timeout):
-                stack.enter_context(filelock.FileLock(path, blocking=False))
-                stack.callback(torch.cuda.set_device, torch.cuda.current_device())
-                torch.cuda.set_device(place % n_gpus)
-                break
-        yield place % n_gpus if n_gpus > 1 else None
 
 
 # ---- The table ----

@@ -369,7 +369,7 @@ def test_value_with_equals_sign():
     assert compose("folder=sweeps/1/0_seed=1").folder == "sweeps/1/0_seed=1"
     cfg = compose("run=x", "against=[a/0_seed=1,bot]", script="evaluate")
     assert cfg.against == ("a/0_seed=1", "bot")
-    words, _ = sweeps.jobs_of(Composer(scripts.SCRIPTS["evaluate"]), ["run=a/0_seed=1,a/1_seed=2"])
+    words, *_ = sweeps.jobs_of(Composer(scripts.SCRIPTS["evaluate"]), ["run=a/0_seed=1,a/1_seed=2"])
     runs = [compose(*job, script="evaluate").run for job in words]
     assert runs == ["a/0_seed=1", "a/1_seed=2"]
 

@@ -21,7 +21,7 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
-from megastep.agents.cli import evaluate, runs, scripts, sweeps, train
+from megastep.agents.cli import evaluate, places, runs, scripts, sweeps, train
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.program import ConfigErrors
 from megastep.agents.cli.settings import kind_of
@@ -49,6 +49,8 @@ class Payer:
             raise RuntimeError("by chance")
         if mood == "dead":
             os._exit(3)
+        if mood == "lost" and os.environ.get("RANK") == "1":
+            os.kill(os.getpid(), 9)
         self.n_envs, self.device, self.pay = n_envs, torch.device(device or "cpu"), pay
         self.age = torch.zeros(n_envs, dtype=torch.int32, device=self.device)
 
@@ -326,6 +328,20 @@ def test_submitit(here):
     assert list((here / "mine/.submitit").rglob("*_log.out"))
 
 
+@pytest.mark.slow
+def test_submitit_job_of_two_ranks(here):
+    """One rank of a job fails: the other jobs and the table stand."""
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    words = ["ranks=2", "env.mood=lost,fine", "hydra/launcher=submitit_local"]
+    code, _, err = finished(*SHORT, "-m", *words, "hydra.sweep.dir=mine")
+    lost, fine = rows("mine")
+    assert code == 1 and "Traceback" not in err, err
+    assert lost["state"].startswith("FAILED: rank 1 on ")
+    assert (fine["state"], float(fine["score"])) == ("done", 4)
+    lines = (here / "mine/1_env.mood=fine/metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["samples"] for line in lines] == [2 * UPDATE]  # of both ranks
+
+
 JOBLIB = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=mine"]
 
 
@@ -388,22 +404,119 @@ def test_preset_is_chosen_where_the_job_runs(here, monkeypatch):
         assert job.composer().settings(words).env.n_envs == n_envs
 
 
-def test_jobs_share_gpus(here, monkeypatch):
+@pytest.fixture
+def gpus(here, monkeypatch):
+    """Pretends that there are GPUs: a function that sets their number and returns a job's settings.
+    Its `current` are the numbers given to `set_device`.
+    """
     current = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "set_device", current.append)
     monkeypatch.setattr(tempfile, "tempdir", str(here))
-    jobs = [sweeps.one_gpu() for _ in range(6)]
-    assert [job.__enter__() for job in jobs[:5]] == [0, 1, 2, 0, 1]
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+
+    def settings(number, *words):
+        monkeypatch.setattr(torch.cuda, "device_count", lambda: number)
+        return Composer(scripts.TRAIN).settings(words)
+
+    settings.current = current
+    return settings
+
+
+def test_jobs_share_gpus(gpus):
+    cfg = gpus(3, "device=cuda")
+    jobs = [places.taken(cfg) for _ in range(6)]
+    devices = [job.__enter__().device for job in jobs[:5]]
+    assert devices == ["cuda:0", "cuda:1", "cuda:2", "cuda:0", "cuda:1"]
     jobs[1].__exit__(None, None, None)  # one job of two on GPU 1 ends
-    assert jobs[5].__enter__() == 1 and current[-1] == 1
+    assert jobs[5].__enter__().device == "cuda:1" and gpus.current[-1] == 1
+    with places.taken(gpus(3, "device=auto")) as cfg:
+        assert cfg.device == "auto" and gpus.current[-1] == 2
     for job in (jobs[0], *jobs[2:]):
         job.__exit__(None, None, None)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with sweeps.one_gpu() as gpu:
-        assert gpu is None
+    gpus.current.clear()
+    for n_gpus, word in ((1, "device=cuda"), (3, "device=cuda:2"), (3, "device=cpu")):
+        with places.taken(gpus(n_gpus, word)) as cfg:
+            assert f"device={cfg.device}" == word and not gpus.current
+
+
+def test_jobs_of_several_gpus(gpus, monkeypatch):
+    def enter(job):  # as another process would
+        job.__enter__()
+        visible = os.environ["CUDA_VISIBLE_DEVICES"]
+        monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+        return visible
+
+    cfg = gpus(5, "ranks=2")
+    jobs = [places.taken(cfg) for _ in range(4)]
+    assert [enter(job) for job in jobs[:3]] == ["0,1", "2,3", "0,1"]  # the fifth GPU stays idle
+    with places.taken(gpus(5, "device=cuda")) as single:
+        assert single.device == "cuda:4"  # which no rank is on
+    jobs[1].__exit__(None, None, None)
+    assert enter(jobs[3]) == "2,3"
+    for job in (jobs[0], *jobs[2:]):
+        job.__exit__(None, None, None)
+
+
+def test_ranks_see_the_gpus_of_their_place_only(gpus, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "6, 4,GPU-8a,3")
+    for words, visible in (
+        (["ranks=2"], "6,4"),
+        (["ranks=all"], "6,4,GPU-8a,3"),
+        (["restarts=1"], "6"),
+        (["ranks=2", "device=cpu"], "6, 4,GPU-8a,3"),
+    ):
+        with places.taken(gpus(4, *words)):
+            assert os.environ["CUDA_VISIBLE_DEVICES"] == visible
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "6, 4,GPU-8a,3" and not gpus.current
+
+
+LOCAL, SLURM = ["hydra/launcher=submitit_local"], ["hydra/launcher=submitit_slurm"]
+
+
+@pytest.mark.parametrize(
+    "words, text",
+    [
+        (["ranks=8"], "ranks: 8 is more than the 4 GPUs of this machine"),
+        (["ranks=2,5"], "ranks: 5 is more than the 4 GPUs of this machine"),
+        (["ranks=2", "device=cuda:1"], "device: 'cuda:1' is one GPU"),
+        ([*LOCAL, "ranks=5"], "ranks: 5 is more than the 4 GPUs of this machine"),
+        ([*SLURM, "hydra.launcher.gpus_per_node=2", "ranks=4"], "ranks: 4 is more than hydra"),
+        ([*SLURM, "hydra.launcher.nodes=2"], "hydra.launcher.nodes: 2 would run each job 2 times"),
+    ],
+)
+def test_sweep_that_has_too_few_gpus(here, gpus, capsys, words, text):
+    if any("submitit" in word for word in words):
+        pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    gpus(4)
+    assert train.main(["-m", "seed=1,2", *words]) == 2
+    assert text in capsys.readouterr().err and not (here / "sweeps").exists()
+
+
+def test_idle_gpus_are_told_of(gpus):
+    gpus(5)
+    for words, text in (
+        (["ranks=2"], "one after another leave 3 of 5 GPUs idle; hydra/launcher=joblib"),
+        (["ranks=5,3"], "Jobs with ranks=3 leave 2 of 5 GPUs idle."),
+        (["ranks=5"], None),
+    ):
+        _, jobs, hydra = sweeps.jobs_of(Composer(scripts.TRAIN), ["seed=1,2", *words])
+        idle = places.check(jobs, hydra)
+        assert text in idle if text else idle is None
+    assert places.idle(2, 5, is_parallel=True) == "Jobs with ranks=2 leave 1 of 5 GPUs idle."
+    assert places.idle(2, 4, is_parallel=True) is None
+
+
+def test_slurm_jobs_are_given_their_gpus_elsewhere(gpus):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    gpus(0)  # of the login node
+    words = [*SLURM, "ranks=2", "seed=1,2", "hydra.launcher.gpus_per_node=3"]
+    _, jobs, hydra = sweeps.jobs_of(Composer(scripts.TRAIN), words)
+    idle = "Jobs with ranks=2 leave 1 idle of hydra.launcher.gpus_per_node=3."
+    assert places.check(jobs, hydra) == idle
+    hydra.launcher.gpus_per_node = None
+    assert places.check(jobs, hydra) is None
 
 
 def test_errors_can_be_pickled():

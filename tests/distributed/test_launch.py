@@ -149,8 +149,19 @@ def test_rank_that_said_nothing(monkeypatch):
     with pytest.raises(UserError, match="rank 1 on .* SIGKILL.*Nothing was saved yet") as error:
         launched(monkeypatch, None, failure=Failed(-signal.SIGKILL))
     assert error.value.code == launch.LOST
+    with pytest.raises(UserError, match="rank 1 on .* SIGKILL"):  # and torchrun stopped rank 0
+        launched(monkeypatch, Ending(143, "stopped"), failure=Failed(-signal.SIGKILL))
     with pytest.raises(UserError, match="cannot be started: no address"):
         launched(monkeypatch, failure=OSError("no address"))
+
+
+def test_ranks_share_the_cores_that_they_may_use(here, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 128)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(16))
+    with launch.variables(here, 2):
+        assert os.environ["OMP_NUM_THREADS"] == "8"
+    assert "OMP_NUM_THREADS" not in os.environ
 
 
 # ---- Two ranks ----
