@@ -118,7 +118,7 @@ def _run(script: scripts.Script, argv: list[str]) -> int:
     else:
         if "device=cpu" not in words:
             gpu.start_driver()  # beside composing
-        with rank.joined() if script is scripts.TRAIN else contextlib.nullcontext() as team:
+        with contextlib.nullcontext() if script is scripts.RECORD else rank.joined() as team:
             settings, config = rank.together(lambda: _checked(composer, words))
             if config.hydra.mode == RunMode.MULTIRUN:
                 return sweeps.sweep(composer, words)

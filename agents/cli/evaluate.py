@@ -39,15 +39,13 @@ RATINGS = {
 def run(cfg: settings.Evaluate) -> Path:
     """Evaluates a run, each environment in one home throughout. Returns the path of the table.
 
-    At the end of a run of several ranks, each plays its share. Rank 0 writes the table; the others
-    return the run's folder.
+    Of several ranks, each plays its share. Rank 0 writes; the others return the run's folder.
 
     Writes .json and .md into the run's folder `evaluations`, one of each per source of geometries
     (per environment where it has none), split and checkpoint. With `cfg.against` plays duels
     instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device)
-    rank, n_ranks = process_group.rank(), process_group.n_ranks()
     loaded = runs.load_checkpoint(runs.find(cfg.run), cfg.trust, device)
     trained = factory.config_of(loaded)
     env_settings, geometry = cfg.env or trained.env, cfg.geometry or trained.geometry
@@ -57,11 +55,8 @@ def run(cfg: settings.Evaluate) -> Path:
     else:
         homes = factory.homes(env_settings, geometry, cfg.split)
         homes = factory.spread(homes, cfg.episodes)
-        if cfg.episodes < n_ranks:
-            n_ranks = 1  # the others have nothing to do
-        if rank >= n_ranks:
-            return runs.folder_of(loaded.path)
-        share, seed = Share(cfg.episodes, len(homes), rank, n_ranks), rank_seed(cfg.seed, rank)
+        share = Share.of_this_rank(cfg.episodes, len(homes))
+        seed = rank_seed(cfg.seed, process_group.rank())
         env_settings = factory.changed(env_settings, n_envs=len(share.envs), resample=False)
         where = dict(geometries=[homes[home] for home in share.homes], seed=seed, device=device)
         env, rows = factory.construct(env_settings, **where), []
@@ -73,7 +68,7 @@ def run(cfg: settings.Evaluate) -> Path:
             episodes = share.with_others(episodes)
             summaries = evaluation.summaries(episodes, optional(env, "roles"))
             rows += [{"agent": name, **row} for row in summaries]
-        if rank > 0:
+        if process_group.rank() > 0:
             return runs.folder_of(loaded.path)
         place = runs.place(env_settings, geometry, homes, cfg.split)
         n_episodes, n_homes = rows[0]["lanes"], rows[0]["homes"]
@@ -193,16 +188,21 @@ class Arena:
         n_duels = max(1, cfg.episodes // n_agents)  # from each place
         homes = factory.spread(homes, n_duels)
         n_duels -= n_duels % max(1, len(homes))
-        env = factory.changed(env, n_envs=n_duels * n_agents)
-        self.env, self.sample = factory.construct(env, geometries=homes, **where), sample
+        self.share = Share.of_this_rank(n_duels * n_agents, len(homes))
+        self.seed = rank_seed(cfg.seed, process_group.rank())
+        env = factory.changed(env, n_envs=len(self.share.envs))
+        where |= dict(geometries=[homes[home] for home in self.share.homes], seed=self.seed)
+        self.env, self.sample = factory.construct(env, **where), sample
+        slots = duels.rotating_slots(self.share.n_envs, n_agents, self.env.device)
+        self.slots = slots[[*self.share.envs]]
         self.place = runs.place(env, geometry, homes, cfg.split)
         warn_without_layout(self.env, homes)
 
     def play(self, player: Player, opponent: Player) -> Any:
+        policies = player.policy, opponent.policy
         with factory.errors():
-            return duels.play(
-                self.env, player.policy, opponent.policy, self.cfg.seed, self.cfg.greedy
-            )
+            played = duels.play(self.env, *policies, self.seed, self.cfg.greedy, slots=self.slots)
+        return self.share.with_others(played)
 
     def duel(self) -> Path:
         """Plays the run's agent against each of `cfg.against`. Prints and writes a table, and
@@ -214,6 +214,8 @@ class Arena:
             for opponent in self.others
             for row in duels.summaries(self.play(self.agent, opponent), roles)
         ]
+        if process_group.rank() > 0:
+            return runs.folder_of(self.run.path)
         title = self.place.title(f"{rows[0]['duels']:,} duels", rows[0]["homes"])
         return runs.write_table(
             self.cfg,
@@ -248,15 +250,18 @@ class Arena:
                 f"{folder} has one checkpoint and nothing to compare it with: train with "
                 "snapshots=8, or name others with against="
             )
-        scores = {
-            (i, j): self.play(players[i], players[j])["score"].tolist()
+        played = {
+            (i, j): self.play(players[i], players[j])
             for i, j in itertools.combinations(range(len(players)), 2)
         }
+        scores = {pair: one["score"].tolist() for pair, one in played.items()}
+        if process_group.rank() > 0:
+            return folder
         rows = ratings.rows(
             [(player.name, player.step) for player in players], scores, self.cfg.seed
         )
-        layout, what = optional(self.env, "layout"), f"{self.env.n_envs:,} duels of each pair"
-        n_homes = None if layout is None else len(layout.unique())
+        layouts, what = played[0, 1].get("homes"), f"{self.share.n_envs:,} duels of each pair"
+        n_homes = None if layouts is None else len(layouts.unique())
         title = f"Ratings in {self.place.title(what, n_homes)}, seed {self.cfg.seed}"
         table = console.table(
             [*RATINGS], [[form.format_map(row) for form in RATINGS.values()] for row in rows]

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import torch
 
-from megastep.agents.distributed.process_group import gather_objects
+from megastep.agents.distributed.process_group import gather_objects, n_ranks, rank
 from megastep.arrdict import arrdict
 
 Values = TypeVar("Values", torch.Tensor, arrdict)
@@ -21,7 +21,7 @@ class Share:
     Args:
         n_envs: N.
         n_homes: D, at most N; 0 if there are no homes.
-        rank, n_ranks: r and R, at most N.
+        number, n_ranks: r and R, at most N.
 
     Attributes:
         envs: numbers of this rank's environments.
@@ -29,10 +29,16 @@ class Share:
             number.
     """
 
-    def __init__(self, n_envs: int, n_homes: int, rank: int = 0, n_ranks: int = 1):
+    def __init__(self, n_envs: int, n_homes: int, number: int = 0, n_ranks: int = 1):
         self.n_envs, self.n_ranks = n_envs, n_ranks
-        self.envs = range(rank, n_envs, n_ranks)
+        self.envs = range(number, n_envs, n_ranks)
         self.homes = [*dict.fromkeys(env % n_homes for env in self.envs)] if n_homes else []
+
+    @classmethod
+    def of_this_rank(cls, n_envs: int, n_homes: int) -> "Share":
+        """Returns this rank's share: all of them, if there are fewer environments than ranks."""
+        is_shared = n_ranks() <= n_envs
+        return cls(n_envs, n_homes, rank(), n_ranks()) if is_shared else cls(n_envs, n_homes)
 
     def with_others(self, values: arrdict) -> arrdict:
         """Returns the values of all environments, in their order. Waits for the other ranks.
@@ -55,6 +61,6 @@ class Share:
             return arrdict({n: self._interleaved([part[n] for part in values]) for n in names})
         n_each = len(values[0]) // len(range(0, self.n_envs, self.n_ranks))  # lanes of each
         rows = values[0].new_empty(self.n_envs, n_each, *values[0].shape[1:])
-        for rank, part in enumerate(values):
-            rows[rank :: self.n_ranks] = part.view(-1, *rows.shape[1:])
+        for number, part in enumerate(values):
+            rows[number :: self.n_ranks] = part.view(-1, *rows.shape[1:])
         return rows.flatten(0, 1)

@@ -75,6 +75,7 @@ def play(
     seed: int = 1,
     greedy: bool = False,
     max_steps: int = MAX_STEPS,
+    slots: torch.Tensor | None = None,
 ) -> arrdict:
     """Plays one duel per environment, from a reset.
 
@@ -85,18 +86,19 @@ def play(
     Args:
         seed: of the action sampling.
         greedy: takes the most likely actions instead of sampling.
+        slots: (N, 1) int64, the agent that `policy` controls; by default `rotating_slots`.
 
     Returns:
         An arrdict of
 
         - score: (N,) float32, 1 if `policy` won, 0 if it lost, 0.5 for a draw
         - lengths: (N,) float32, steps
-        - slots: (N,) int64, the agent that `policy` controlled, as in `rotating_slots`
+        - slots: (N,) int64, the agent that `policy` controlled
         - homes: (N,) int32, the layouts after the reset; only if `env.layout` exists
     """
     device, shape = torch.device(env.device), (env.n_envs, env.n_agents)
     generator = torch.Generator(device).manual_seed(seed)
-    slots = rotating_slots(*shape, device)
+    slots = rotating_slots(*shape, device) if slots is None else slots
     both = duel_policy(policy, opponent, slots, env.n_agents)
     world, state = env.reset(), both.initial(n_lanes(env), device)
     homes = {} if optional(env, "layout") is None else {"homes": env.layout.clone()}

@@ -386,8 +386,8 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
     train.run(configured(*words, *options, tiny=["preset=cpu", "agent.width=8"]))
     played, real = [], duels.play
 
-    def play(env, *rest):
-        played.append((env, real(env, *rest)))
+    def play(env, *rest, **options):
+        played.append((env, real(env, *rest, **options)))
         return played[-1][1]
 
     monkeypatch.setattr(duels, "play", play)

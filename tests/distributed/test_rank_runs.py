@@ -9,14 +9,17 @@ import time
 import pytest
 import torch
 
+from megastep import spaces
 from megastep.agents.cli import train
 from megastep.agents.distributed import process_group
 from megastep.agents.training import annealing, checkpoint, json_lines
+from megastep.arrdict import arrdict
 from tests.cli.test_exact_resume import CASES, EVERY_UPDATE, differences
 from tests.helpers import ranks, tiny
 
 pytestmark = pytest.mark.slow
 LEARNERS = "ppo", "lag", "priorities", "r2d2", "opponents"
+NO_FINISH = "finish.evaluate=false", "finish.record=false"
 PPO = [*tiny.TINY, *tiny.SHORT_EPISODES]
 
 
@@ -105,7 +108,8 @@ def test_resumed_ranks_have_the_same_bits(on_ranks, name):
 def alone(here):
     """A run of two ranks in processes of their own, with its output."""
     words = *PPO, "samples=1280", "log_every=2", "folder=alone", "snapshots=2"
-    return ranks.train(*words, "finish.evaluate=true", "finish.episodes=9", "finish.record=true")
+    finish = "finish.evaluate=true", "finish.episodes=9", "finish.record=true", "finish.steps=2"
+    return ranks.train(*words, *finish)
 
 
 def test_rank_0_writes_and_speaks(alone, here):
@@ -145,13 +149,86 @@ def test_killed_ranks_go_on_bit_for_bit(alone, here):
 
 
 def test_another_number_of_ranks_goes_on(alone, here, capsys):
-    assert train.main(["resume=alone", "samples=1408", "finish.evaluate=false", "ranks=1"]) == 0
+    assert train.main(["resume=alone", "samples=1408", "ranks=1", *NO_FINISH]) == 0
     line = "goes on, but not bit for bit: ranks was 2 and is 1."
     assert line in capsys.readouterr().out
     assert not (here / "alone/checkpoints/step_1408/rank1.pt").exists()
-    first, _ = ranks.train("resume=alone", "samples=1536")
+    first, _ = ranks.train("resume=alone", "samples=1536", *NO_FINISH)
     assert "ranks was 1 and is 2; ranks that it did not have begin new episodes." in first.stdout
     assert checkpoint.load_latest("alone/checkpoints/step_1536").n_ranks == 2
     states = whole(checkpoint.list_checkpoints("alone/checkpoints")[-1])
     generators = [state["learner"]["policy_generator"] for state in states.values()]
     assert not torch.equal(*(generator["generator"] for generator in generators))
+
+
+def test_ranks_share_duels_and_evaluations(here):
+    """Together they play what one process plays: as often in each home and from each place."""
+    words = ["env=tests.helpers.games:Matrix", "env.n_agents=2", "env.n_envs=4", "geometry=homes"]
+    words += ["geometry.n=7", "samples=1", "folder=games", "preset=cpu", "agent.width=8"]
+    device = "device=cpu"
+    assert train.main([*words, device, *NO_FINISH, "learner.n_minibatches=2"]) == 0
+    counts, script = [], ranks.ROOT / "evaluate.py"
+    for n_ranks in 1, 2:
+        for against in (), ("against=tests.helpers.games:High",):
+            results = ranks.run(
+                [script, "run=games", "episodes=41", device, *against], n_ranks=n_ranks
+            )
+            assert not any(one.returncode for one in results), [one.stderr for one in results]
+            assert not any(one.stdout for one in results[1:])
+        tables = sorted((here / "games/evaluations").glob("*.json"))
+        rows = [json.loads(path.read_text())["rows"][0] for path in tables]
+        names = "lanes", "duels", "homes", "unfinished"
+        counts.append([[row.get(name) for name in names] for row in rows])
+    assert counts[0] == counts[1] and len(counts[0]) == 2
+
+
+class Copy:
+    """Reward 1 for the action that equals the observed bit; episodes of four steps."""
+
+    def __init__(self, n_envs, seed=1, device="cpu"):
+        self.n_envs, self.device = n_envs, torch.device(device)
+        self.obs_space, self.action_space = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 2)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.age, self.bits = torch.zeros(n_envs), torch.zeros(n_envs, dtype=torch.int64)
+
+    def world(self, reward, reset):
+        self.age = (self.age + 1).masked_fill(reset, 0)
+        self.bits = torch.randint(2, (self.n_envs,), generator=self.generator)
+        return arrdict(
+            obs=torch.nn.functional.one_hot(self.bits, 2)[:, None].float(),
+            reward=reward.masked_fill(reset, 0),
+            reset=reset,
+            terminal=self.age == 4,
+            truncated=torch.zeros(self.n_envs, dtype=torch.bool),
+        )
+
+    def reset(self):
+        return self.world(torch.zeros(self.n_envs), torch.ones(self.n_envs, dtype=torch.bool))
+
+    def step(self, decision):
+        return self.world((decision.actions[:, 0] == self.bits).float(), self.age == 4)
+
+
+def learning_curves(n_envs):
+    """Returns the mean returns of each report of three runs with other seeds."""
+    words = ["env=tests.distributed.test_rank_runs:Copy", "preset=cpu", "device=cpu", "agent.width=16"]
+    words += [f"env.n_envs={n_envs}", "learner.n_steps=8", "learner.lr=3e-3", "log_every=5"]
+    words += ["samples=10240", "learner.n_minibatches=2", "desync=false", *NO_FINISH]
+    curves = []
+    for seed in (1, 2, 3):
+        folder = f"copy-{n_envs}-{seed}"
+        trained(*words, f"seed={seed}", f"folder={folder}")
+        rows = json_lines.read(f"{folder}/metrics.jsonl")
+        curves.append([row["episode/return"] for row in rows])
+    return curves
+
+
+def test_two_ranks_learn_as_fast_as_one_process_of_twice_the_environments(here):
+    shared, _ = (torch.tensor(curves) for curves in ranks.call(learning_curves, 16))
+    alone = torch.tensor(learning_curves(32))
+    assert shared.shape == alone.shape  # reports at the same samples
+    assert (alone[:, 0] < 2.6).all() and (alone[:, -1] > 3.4).all()  # from chance, 2 of 4
+    spread = ((shared.var(0) + alone.var(0)) / 2).sqrt().clamp(min=0.03)  # of seeds
+    difference = (shared.mean(0) - alone.mean(0)).abs()
+    assert (difference < 3 * spread).all(), (difference / spread).tolist()
+    assert difference.mean() < 0.1
