@@ -26,7 +26,8 @@ def scaling(device: torch.device, envs: list[str] | None = None) -> Iterator[dic
         for _ in range(N_ROUNDS):
             for n, found in by_count.items():
                 samples = n * SAMPLES[device.type]
-                with trained(device, (f"env={env}", f"ranks={n}", f"samples={samples}")) as (run,):
+                words = f"env={env}", f"ranks={n}", f"samples={samples}", f"device={device.type}"
+                with trained(device, words) as (run,):
                     found.append(statistics.median(rates(run)) / 1e6)
         one = statistics.median(by_count[1])
         for n, found in by_count.items():
@@ -74,7 +75,8 @@ def _returns(device, n_ranks, seeds, *words):
     """Returns the last mean return of a run per seed. Runs on one GPU share the GPUs."""
     words = "env=explorer", "log_every=5", *words
     if n_ranks > 1 or device.type == "cpu":
-        batches = [[(*words, f"seed={seed}", f"ranks={n_ranks}")] for seed in seeds]
+        words += f"ranks={n_ranks}", f"device={device.type}"
+        batches = [[(*words, f"seed={seed}")] for seed in seeds]
     else:
         n = torch.cuda.device_count()
         runs = [(*words, f"seed={seed}", f"device=cuda:{i % n}") for i, seed in enumerate(seeds)]

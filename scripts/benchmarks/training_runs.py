@@ -31,7 +31,7 @@ def trained(device: torch.device, *runs: tuple[str, ...]) -> Iterator[list[Path]
     with tempfile.TemporaryDirectory() as parent:
         folders = [Path(parent) / f"run{i}" for i in range(len(runs))]
         commands = [
-            [sys.executable, "train.py", f"device={device}", *overrides, f"folder={folder}"]
+            [sys.executable, "train.py", *_with_device(overrides, device), f"folder={folder}"]
             for overrides, folder in zip(runs, folders)
         ]
         # stdout is for the table of measurements
@@ -45,6 +45,11 @@ def trained(device: torch.device, *runs: tuple[str, ...]) -> Iterator[list[Path]
                 process.terminate()
                 process.wait()
         yield folders
+
+
+def _with_device(overrides, device):
+    named = any(word.startswith("device=") for word in overrides)
+    return overrides if named else (*overrides, f"device={device}")
 
 
 def rates(run: Path) -> list[float]:

@@ -1,9 +1,11 @@
 """CPU and GPU, and any number of CPU threads, agree on every bit."""
 
+import math
+
 import pytest
 import torch
 
-from megastep import cuda, engine, scene
+from megastep import cuda, engine, scene, toys
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns, visible_texels
 from tests.helpers.outputs import seen_of
@@ -75,6 +77,18 @@ SETTINGS = [
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
 def test_cpu_and_gpu_agree_on_every_bit(settings):
     assert not any(differing(trajectory("cpu", **settings), trajectory("cuda", **settings)))
+
+
+@pytest.mark.cuda
+def test_cpu_and_gpu_agree_on_angles_that_no_int_holds():
+    angles = torch.tensor([2.0**31, 2.0**38, -(2.0**38), 1e30, -1e30, math.inf, math.nan])
+    lines = []
+    for device in ("cpu", "cuda"):
+        c = cuda.Core(scene.scenery([toys.box(4)], 1, n_envs=len(angles), device=device))
+        c.agents.angles[:] = angles[:, None].to(device)
+        engine.update_agent_geometry(c.scenery, c.agents)
+        lines.append(c.scenery.agent_lines.cpu())
+    assert not any(differing(*([each] for each in lines)))
 
 
 @pytest.mark.cuda

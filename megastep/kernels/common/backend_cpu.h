@@ -9,6 +9,7 @@
 #define CEIL(x) __builtin_ceilf(x)
 #define FLOOR(x) __builtin_floorf(x)
 #define RINT(x) __builtin_rintf(x)
+#define TO_INT(x) to_int(x)
 #define RECIPROCAL(x) (1.f / (x))
 #define LOAD(address) (*(address))
 #define OR_BITS(word, bits) or_bits(word, bits)
@@ -18,6 +19,15 @@
 #define HALF_VALUE(bits) half_value(bits)
 #define NAN_VALUE __builtin_nanf("")
 #define INF_VALUE __builtin_inff()
+
+// Cuts a float to an int, as a GPU does. C leaves undefined what NaN and large numbers become.
+static inline int to_int(float x) {
+    if (x >= 2147483648.f)
+        return 2147483647;
+    if (x < -2147483648.f)
+        return -2147483647 - 1;
+    return x == x ? (int)x : 0;
+}
 
 // Sets bits of a word and returns its old value. Not atomic: one thread owns an agent's words.
 static inline unsigned int or_bits(unsigned int* word, unsigned int bits) {

@@ -13,6 +13,7 @@
 #define CEIL(x) ceilf(x)
 #define FLOOR(x) floorf(x)
 #define RINT(x) rintf(x)
+#define TO_INT(x) ((int)(x))
 #define RECIPROCAL(x) reciprocal(x)
 #define LOAD(address) load(address)
 #define OR_BITS(word, bits) atomicOr(word, bits)

@@ -34,7 +34,7 @@ HD void sincos_degrees(float degrees, float& sine, float& cosine) {
     float c = 4.166664568298827e-2f + x2 * (-1.388731625493765e-3f + x2 * 2.443315711809948e-5f);
     s = x + x * x2 * s;
     c = 1.f - 0.5f * x2 + x2 * x2 * c;
-    int quadrant = (int)quarters & 3;
+    int quadrant = TO_INT(quarters) & 3;
     float turned_s = quadrant & 1 ? c : s;
     float turned_c = quadrant & 1 ? s : c;
     sine = quadrant & 2 ? -turned_s : turned_s;
