@@ -73,6 +73,7 @@ def start(seconds: float = START_SECONDS) -> None:
     distributed.init_process_group(
         backend, store=keys, rank=place.rank, world_size=place.n_ranks, timeout=wait
     )
+    atexit.register(stop)  # threads of gloo that still run would abort the interpreter's end
 
 
 _STARTS = itertools.count()
