@@ -7,7 +7,6 @@ R ranks.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import datetime
 import functools

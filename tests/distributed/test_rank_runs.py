@@ -211,13 +211,14 @@ class Copy:
 
 def learning_curves(n_envs):
     """Returns the mean returns of each report of three runs with other seeds."""
-    words = [
-        "env=tests.distributed.test_rank_runs:Copy",
-        "preset=cpu",
-        "device=cpu",
+    words = ["env=tests.distributed.test_rank_runs:Copy", "preset=cpu", "device=cpu"]
+    words += [
         "agent.width=16",
+        f"env.n_envs={n_envs}",
+        "learner.n_steps=8",
+        "learner.lr=3e-3",
+        "log_every=5",
     ]
-    words += [f"env.n_envs={n_envs}", "learner.n_steps=8", "learner.lr=3e-3", "log_every=5"]
     words += ["samples=10240", "learner.n_minibatches=2", "desync=false", *NO_FINISH]
     curves = []
     for seed in (1, 2, 3):
