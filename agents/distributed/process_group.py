@@ -7,6 +7,7 @@ R ranks.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import datetime
 import functools
