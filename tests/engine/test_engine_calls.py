@@ -2,11 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from megastep import capture, cuda, engine, scene, toys
-from megastep.engine import devices
+from megastep.dotdict import dotdict
+from megastep.engine import checks, devices
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns
 from tests.helpers.outputs import seen_of
@@ -164,6 +166,20 @@ def test_spawn_with_one_point_per_agent(device):
     assert sorted(core.agents.positions[0].tolist()) == [[2, 2], [4, 4]]
 
 
+def test_hidden_spawn_is_behind_a_short_wall(device):
+    """Agent 0 looks from 0.3 m at a wall 0.6 m wide. Agent 1 spawns behind it or in sight."""
+    short = [[(3.5, 3.2), (3.5, 3.8)]]
+    home = dotdict(toys.box(), walls=np.concatenate([toys.box().walls, short]))
+    core = cuda.Core(scene.scenery([home], 2, 1, device=device))
+    core.agents.positions[0, 0] = torch.tensor([3.2, 3.5])
+    behind, in_sight = (3.75, 3.5), (3.25, 5.5)
+    points = torch.tensor([[(2, 2), (2, 2), behind, in_sight]], device=device)
+    counts = torch.zeros((1, 2), dtype=torch.int32, device=device)
+    mask = torch.tensor([[False, True]], device=device)
+    engine.spawn(core.scenery, core.agents, mask, points, counts, seed=1, hidden=True)
+    assert core.agents.positions[0, 1].tolist() == list(behind)
+
+
 # ---- Bad arguments ----
 
 
@@ -188,6 +204,14 @@ def test_bad_max_depth(max_depth):
     core = box("cpu")
     with pytest.raises(ValueError, match="max_depth .* above 0"):
         engine.observe(core.scenery, core.agents, max_depth=max_depth)
+
+
+def test_actions_and_moves_come_together():
+    core, actions = box("cpu"), torch.zeros((2, 1), dtype=torch.int64)
+    with pytest.raises(TypeError, match="moves"):
+        engine.physics(core.scenery, core.agents, actions)
+    with pytest.raises(TypeError, match="actions"):
+        engine.physics(core.scenery, core.agents, moves=torch.zeros((1, 3)))
 
 
 def test_nonfinite_position_is_named(device):
@@ -246,6 +270,17 @@ def test_agents_are_checked_for_each_scenery():
     cuda.render(core.scenery, core.agents)
     with pytest.raises(ValueError, match=r"agents.positions must be .* \(3, 1, 2\)"):
         cuda.render(more, core.agents)
+
+
+def test_agents_are_checked_again_only_if_exchanged(monkeypatch):
+    core, address, checked = box("cpu"), checks.address, []
+    cuda.render(core.scenery, core.agents)
+    monkeypatch.setattr(checks, "address", lambda *args: checked.append(args[0]) or address(*args))
+    cuda.render(core.scenery, core.agents)
+    assert "agents.positions" not in checked
+    core.agents.positions = core.agents.positions.clone()
+    cuda.render(core.scenery, core.agents)
+    assert "agents.positions" in checked
 
 
 @pytest.mark.parametrize("n", [-1, 0, 10**6, "2", 2.0])

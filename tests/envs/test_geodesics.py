@@ -270,6 +270,14 @@ def test_more_goals_than_one_launch_takes():
     np.testing.assert_array_equal(many.fields[order], few.fields)
 
 
+def test_a_homes_paths_do_not_depend_on_the_homes_beside_it():
+    homes = toys.box(3), room(((3, 0), (3, 2)), width=5.0)
+    generators = [np.random.Generator(np.random.Philox(1)) for _ in homes]
+    together = geodesics(homes, 24, 4, RADIUS, generators)
+    for g, result in zip(homes, together, strict=True):
+        np.testing.assert_array_equal(result.fields, geodesics_of(g).fields)
+
+
 @pytest.mark.cuda
 def test_gpu_computes_the_same_bits():
     homes = [*sample("homes", 12), *sample("bench", 12), *sample("maze", 4), toys.box(5)]
