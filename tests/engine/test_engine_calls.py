@@ -39,6 +39,25 @@ def test_max_depth(device):
         assert abs(float(o.depth[0, 0, 31]) - expected) < 5e-4
 
 
+def test_observe_computes_colours_and_depth_by_default():
+    core = box("cpu")
+    fields = engine.observe(core.scenery, core.agents)._asdict()
+    assert {name for name, tensor in fields.items() if tensor is not None} == {"rgb", "depth"}
+
+
+def test_wall_shades_an_agent_whichever_of_its_ends_comes_first(device):
+    """From a light two metres from the agent, a slanted wall reaches past the agent."""
+    a, b, shades = (2.9, 3.2), (4.6, 4.0), []
+    for walls in (np.empty((0, 2, 2)), [(a, b)], [(b, a)]):
+        walls = np.concatenate([toys.box().walls, walls])
+        home = dotdict(toys.box(), walls=walls, lights=np.array([[2.0, 3.5]]))
+        core = cuda.Core(scene.scenery([home], 1, 1, device=device))
+        core.agents.positions[:] = torch.tensor([4.0, 3.5])
+        cuda.render(core.scenery, core.agents)
+        shades.append(core.scenery.agent_light.clone())
+    assert torch.equal(shades[1], shades[2]) and shades[0].max() > shades[1].max()
+
+
 def test_wall_of_the_tutorial(device):
     core = box(device)
     core.agents.velocity[:] = torch.tensor([1000.0, 0.0])
@@ -166,10 +185,13 @@ def test_spawn_with_one_point_per_agent(device):
     assert sorted(core.agents.positions[0].tolist()) == [[2, 2], [4, 4]]
 
 
-def test_hidden_spawn_is_behind_a_short_wall(device):
-    """Agent 0 looks from 0.3 m at a wall 0.6 m wide. Agent 1 spawns behind it or in sight."""
-    short = [[(3.5, 3.2), (3.5, 3.8)]]
-    home = dotdict(toys.box(), walls=np.concatenate([toys.box().walls, short]))
+@pytest.mark.parametrize(
+    "low, high, is_hidden", [(3.2, 3.8, True), (1.0, 3.52, False), (3.48, 6.0, False)]
+)
+def test_hidden_spawn_is_behind_a_wall_that_hides_all_of_it(low, high, is_hidden, device):
+    """Agent 0 looks from 0.3 m at a wall, behind which agent 1 spawns unless a side is in sight."""
+    wall = [[(3.5, low), (3.5, high)]]
+    home = dotdict(toys.box(), walls=np.concatenate([toys.box().walls, wall]))
     core = cuda.Core(scene.scenery([home], 2, 1, device=device))
     core.agents.positions[0, 0] = torch.tensor([3.2, 3.5])
     behind, in_sight = (3.75, 3.5), (3.25, 5.5)
@@ -177,7 +199,7 @@ def test_hidden_spawn_is_behind_a_short_wall(device):
     counts = torch.zeros((1, 2), dtype=torch.int32, device=device)
     mask = torch.tensor([[False, True]], device=device)
     engine.spawn(core.scenery, core.agents, mask, points, counts, seed=1, hidden=True)
-    assert core.agents.positions[0, 1].tolist() == list(behind)
+    assert core.agents.positions[0, 1].tolist() == list(behind if is_hidden else in_sight)
 
 
 # ---- Bad arguments ----
@@ -283,7 +305,7 @@ def test_agents_are_checked_again_only_if_exchanged(monkeypatch):
     assert "agents.positions" in checked
 
 
-@pytest.mark.parametrize("n", [-1, 0, 10**6, "2", 2.0])
+@pytest.mark.parametrize("n", [-1, 0, 10**6, "2", 2.0, True])
 def test_wrong_numbers_of_threads_are_refused(n):
     with pytest.raises(ValueError, match="n must be an integer from 1 to .* was given"):
         engine.set_threads(n)
