@@ -45,19 +45,6 @@ def test_observe_computes_colours_and_depth_by_default():
     assert {name for name, tensor in fields.items() if tensor is not None} == {"rgb", "depth"}
 
 
-def test_wall_shades_an_agent_whichever_of_its_ends_comes_first(device):
-    """From a light two metres from the agent, a slanted wall reaches past the agent."""
-    a, b, shades = (2.9, 3.2), (4.6, 4.0), []
-    for walls in (np.empty((0, 2, 2)), [(a, b)], [(b, a)]):
-        walls = np.concatenate([toys.box().walls, walls])
-        home = dotdict(toys.box(), walls=walls, lights=np.array([[2.0, 3.5]]))
-        core = cuda.Core(scene.scenery([home], 1, 1, device=device))
-        core.agents.positions[:] = torch.tensor([4.0, 3.5])
-        cuda.render(core.scenery, core.agents)
-        shades.append(core.scenery.agent_light.clone())
-    assert torch.equal(shades[1], shades[2]) and shades[0].max() > shades[1].max()
-
-
 def test_wall_of_the_tutorial(device):
     core = box(device)
     core.agents.velocity[:] = torch.tensor([1000.0, 0.0])

@@ -13,6 +13,7 @@ import torch
 from megastep import core, engine, geometry, scene, toys
 from megastep.dotdict import dotdict
 from megastep.envs.pointgoal.geodesics import CELL, geodesics
+from megastep.envs.pointgoal.path_graph import PathGraph
 from megastep.geometries import sample
 from megastep.modules.spawning import distances
 
@@ -246,6 +247,17 @@ def test_fields_do_not_leak_through_walls():
         for goal in (side * (goals[:, 1] - 2.04) < 0).nonzero()[0]:  # on the other side
             around = points[:, 0] - 1.03 + np.hypot(*(goals[goal] - (1.03, 2.04)))
             assert (np.abs(fields[:, goal] - around) < 0.35).all(), "half a turn and its chords"
+
+
+def test_searching_for_neighbouring_cells_together_finds_the_same_paths():
+    """A field's cells are searched in groups; points that are given, one by one."""
+    g = sample("bench", 1)[0]
+    graph, result = PathGraph([g], RADIUS, torch.device("cpu")), geodesics_of(g, 64, 16)
+    goals = (result.goals - result.origin)[None]
+    rows, columns = graph.shapes[0]
+    centres = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
+    lengths = graph.lengths(goals, np.float32(CELL) * centres.reshape(1, -1, 2))
+    np.testing.assert_array_equal(graph.fields(goals)[0], lengths.half().view(-1, rows, columns))
 
 
 def test_fields_are_known_wherever_a_body_fits():
