@@ -6,6 +6,7 @@ import contextlib
 import copy
 from operator import attrgetter
 
+import pydantic
 import pytest
 import torch
 
@@ -182,6 +183,19 @@ def test_undo_restores_none():
     env.hidden, env.tree = torch.zeros(3), {"h": torch.zeros(3)}
     state.undo()
     assert env.hidden is None and env.tree is None
+
+
+class Frozen(pydantic.BaseModel, frozen=True):
+    size: int = 4
+
+
+def test_undo_leaves_alone_what_was_not_replaced():
+    env = Counter("rebound")
+    env.settings = Frozen()  # refuses assignment, even of the same value
+    state = capture._StateBefore([env])
+    env.step(actions("cpu"))
+    state.undo()
+    assert not env.parts["total"].any()
 
 
 class Lazy:

@@ -128,6 +128,7 @@ def test_panels_per_agent_and_rows_per_camera():
         pixels = strip.images[0].get_array()
         assert np.allclose(pixels, gamma_encode(image.transpose(1, 2, 0)), atol=1e-6)
         assert [label.get_text() for label in strip.get_yticklabels()] == ["0°", "180°"]
+        assert strip.get_box_aspect() == 2 * plotting.STRIP
     assert np.ptp(rgb, axis=(0, 2)).min() > 0.01, "agents see different walls"
     assert [(note.get_text(), list(note.xy)) for note in plan.texts] == [
         ("0", [2, 2]),

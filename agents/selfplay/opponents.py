@@ -192,7 +192,7 @@ class Opponents:
         return dict(
             snapshots={str(i): policy.state_dict() for i, policy in enumerate(self.snapshots)},
             generator=self.generator.state_dict(),
-            lanes=dict(self._lanes(), pairs=self.pairs.clone(), returns=self.returns.clone()),
+            lanes=dict(self._lanes(), pairs=self.pairs.clone()),  # a report clears the pairs
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

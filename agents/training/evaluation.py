@@ -122,8 +122,7 @@ def interval(
         level: probability that the interval covers the mean.
     """
     values = np.asarray(values, float)
-    groups = np.zeros(len(values)) if groups is None else np.asarray(groups)
-    if len(np.unique(groups)) == 1:
+    if groups is None or len(np.unique(groups)) == 1:
         groups = np.arange(len(values))
     _, groups = np.unique(groups, return_inverse=True)
     sums, counts = np.bincount(groups, values), np.bincount(groups)

@@ -109,7 +109,7 @@ def floats(name: str, value: Any, shape: Sequence, device: Any) -> torch.Tensor:
     try:
         tensor = value if isinstance(value, torch.Tensor) else torch.as_tensor(value)
         usable = _is_stored(tensor) and not tensor.is_complex()
-        tensor = tensor.clone() if usable and isinstance(tensor, ReadOnlyTensor) else tensor
+        tensor = tensor.clone() if isinstance(tensor, ReadOnlyTensor) else tensor
         tensor = tensor.resolve_neg().to(device=device, dtype=torch.float32) if usable else None
     except (TypeError, ValueError, RuntimeError, NotImplementedError):
         tensor = None

@@ -75,6 +75,14 @@ def test_state_dict_resumes_bit_for_bit(name):
 
 
 @NAMES
+def test_captured_update_is_discarded_with_the_generators_it_draws_from(name):
+    _, learner, _ = make(name)
+    learner.cuda_graph.graph = object()
+    learner.load_state_dict(learner.state_dict())
+    assert learner.cuda_graph.graph is None
+
+
+@NAMES
 @pytest.mark.parametrize("other", ["PPO", "Nobody"])
 def test_state_of_other_learner_raises(name, other):
     _, learner, _ = make(name)

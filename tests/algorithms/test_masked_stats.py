@@ -27,6 +27,8 @@ def test_explained_variance():
         torch.zeros(1, 3), targets, valid
     ).item() == pytest.approx(0)
     assert masked_stats.explained_variance(-targets, targets, valid).item() == pytest.approx(-3)
+    constant = torch.ones(1, 3)  # such as where nothing is rewarded yet
+    assert masked_stats.explained_variance(constant, constant, valid).item() == 1
 
 
 def test_effective_sample_size():

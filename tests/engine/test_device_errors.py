@@ -137,11 +137,14 @@ def test_bad_action_is_named(action, device):
         engine.check(c.agents)
 
 
-@pytest.mark.parametrize("field", ["positions", "angles", "velocity", "angvelocity"])
+@pytest.mark.parametrize(
+    "field, axes",
+    [("positions", 0), ("positions", 1), ("angles", ...), ("velocity", ...), ("angvelocity", ...)],
+)
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_nonfinite_state_is_named(value, field, device):
+def test_nonfinite_state_is_named(value, field, axes, device):
     c = boxes(device, 2)
-    getattr(c.agents, field)[1] = value
+    getattr(c.agents, field)[1, 1, axes] = value
     with pytest.raises(engine.EngineError, match="environment 1 .* non-finite"):
         engine.physics(c.scenery, c.agents)
         engine.check(c.agents)

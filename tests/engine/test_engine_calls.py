@@ -2,11 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from megastep import capture, cuda, engine, scene, toys
-from megastep.engine import devices
+from megastep.dotdict import dotdict
+from megastep.engine import checks, devices
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns
 from tests.helpers.outputs import seen_of
@@ -35,6 +37,12 @@ def test_max_depth(device):
     for max_depth, expected in ((4.0, 1 - (2 - engine.AGENT_RADIUS) / 4), (1.5, 0.0)):
         o = engine.observe(core.scenery, core.agents, max_depth=max_depth)
         assert abs(float(o.depth[0, 0, 31]) - expected) < 5e-4
+
+
+def test_observe_computes_colours_and_depth_by_default():
+    core = box("cpu")
+    fields = engine.observe(core.scenery, core.agents)._asdict()
+    assert {name for name, tensor in fields.items() if tensor is not None} == {"rgb", "depth"}
 
 
 def test_wall_of_the_tutorial(device):
@@ -164,6 +172,23 @@ def test_spawn_with_one_point_per_agent(device):
     assert sorted(core.agents.positions[0].tolist()) == [[2, 2], [4, 4]]
 
 
+@pytest.mark.parametrize(
+    "low, high, is_hidden", [(3.2, 3.8, True), (1.0, 3.52, False), (3.48, 6.0, False)]
+)
+def test_hidden_spawn_is_behind_a_wall_that_hides_all_of_it(low, high, is_hidden, device):
+    """Agent 0 looks from 0.3 m at a wall, behind which agent 1 spawns unless a side is in sight."""
+    wall = [[(3.5, low), (3.5, high)]]
+    home = dotdict(toys.box(), walls=np.concatenate([toys.box().walls, wall]))
+    core = cuda.Core(scene.scenery([home], 2, 1, device=device))
+    core.agents.positions[0, 0] = torch.tensor([3.2, 3.5])
+    behind, in_sight = (3.75, 3.5), (3.25, 5.5)
+    points = torch.tensor([[(2, 2), (2, 2), behind, in_sight]], device=device)
+    counts = torch.zeros((1, 2), dtype=torch.int32, device=device)
+    mask = torch.tensor([[False, True]], device=device)
+    engine.spawn(core.scenery, core.agents, mask, points, counts, seed=1, hidden=True)
+    assert core.agents.positions[0, 1].tolist() == list(behind if is_hidden else in_sight)
+
+
 # ---- Bad arguments ----
 
 
@@ -188,6 +213,14 @@ def test_bad_max_depth(max_depth):
     core = box("cpu")
     with pytest.raises(ValueError, match="max_depth .* above 0"):
         engine.observe(core.scenery, core.agents, max_depth=max_depth)
+
+
+def test_actions_and_moves_come_together():
+    core, actions = box("cpu"), torch.zeros((2, 1), dtype=torch.int64)
+    with pytest.raises(TypeError, match="moves"):
+        engine.physics(core.scenery, core.agents, actions)
+    with pytest.raises(TypeError, match="actions"):
+        engine.physics(core.scenery, core.agents, moves=torch.zeros((1, 3)))
 
 
 def test_nonfinite_position_is_named(device):
@@ -248,7 +281,18 @@ def test_agents_are_checked_for_each_scenery():
         cuda.render(more, core.agents)
 
 
-@pytest.mark.parametrize("n", [-1, 0, 10**6, "2", 2.0])
+def test_agents_are_checked_again_only_if_exchanged(monkeypatch):
+    core, address, checked = box("cpu"), checks.address, []
+    cuda.render(core.scenery, core.agents)
+    monkeypatch.setattr(checks, "address", lambda *args: checked.append(args[0]) or address(*args))
+    cuda.render(core.scenery, core.agents)
+    assert "agents.positions" not in checked
+    core.agents.positions = core.agents.positions.clone()
+    cuda.render(core.scenery, core.agents)
+    assert "agents.positions" in checked
+
+
+@pytest.mark.parametrize("n", [-1, 0, 10**6, "2", 2.0, True])
 def test_wrong_numbers_of_threads_are_refused(n):
     with pytest.raises(ValueError, match="n must be an integer from 1 to .* was given"):
         engine.set_threads(n)

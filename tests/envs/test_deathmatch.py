@@ -305,7 +305,7 @@ def test_ten_hits_kill_and_the_next_step_respawns(device):
     assert not world.terminal.any() and ring.health[1] == pytest.approx(0.1)
     world = ring.step()
     assert world.terminal.tolist() == [False, True] and not world.truncated.any()
-    assert ring.health == [1, 0]
+    assert ring.health == [1, 0] and world.reward.tolist() == [1, -1], "as for any hit"
     assert [float(world.metrics[name][1]) for name in METRICS] == [0, 1, 0, 0]
     assert ring.env.tally[:, 0].tolist() == pytest.approx([1, 1, 10])
     world = ring.step()
@@ -393,6 +393,13 @@ def test_aim_reward_falls_from_centre_to_edge(ahead, left, device):
     slack = 2 / 512 + 0.075 / ahead / 2  # a ray, and which of its corners is nearest
     world = ring.step()
     assert float(world.reward[0]) == pytest.approx(expected, abs=slack) and world.reward[1] == 0
+
+
+def test_aim_in_the_first_of_three_rays(device):
+    """It points 25 degrees to the left, and is a third of the view's width from the centre."""
+    settings = dict(res=3, subsample=1, hit_reward=0, wound_cost=0, aim_reward=3)
+    ring = Ring(device, (2, 3.5, 0), (4, 4.43, 0), **settings)
+    assert ring.step().reward.tolist() == pytest.approx([1, 0])
 
 
 def test_aim_reward_needs_an_agent_in_view(device):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from megastep import arrdict, capture, contract, engine, envs, plotting, toys
+from megastep import arrdict, capture, contract, core, engine, envs, plotting, toys
 from megastep.engine import EngineError
 from megastep.engine.state_tree import state_tree
 from megastep.geometries import sample
@@ -313,6 +313,25 @@ def test_display_draws_the_current_state(name):
     expected = type(env).plot_state(arrdict.numpyify(env.state(3)))
     assert (plotting.rasterise(figure) == plotting.rasterise(expected)).all()
     assert figure.axes[0].get_title().startswith("step 0")
+
+
+@pytest.mark.parametrize("name", ["explorer", "pointgoal"])
+def test_drawn_views_end_at_the_walls(name, monkeypatch):
+    env, drawn = make(name), {}
+    env.reset()
+    monkeypatch.setattr(core.Core, "plot_state", lambda *args, **options: drawn.update(options))
+    type(env).plot_state(arrdict.numpyify(env.state(3)))
+    distances = engine.render(env.core.scenery, env.core.agents).distances[3].numpy()
+    np.testing.assert_allclose(drawn["distances"].ravel(), distances.ravel(), atol=5e-3)
+
+
+def test_explorer_checks_the_memory_of_its_bitmaps_and_observations(monkeypatch):
+    checked = []
+    monkeypatch.setattr(engine, "fit", lambda n, bytes_each, device: checked.append(n * bytes_each))
+    env = make("explorer", res=64)
+    images = env.reset().obs
+    needed = env.seen.nbytes + images.rgb.nbytes + images.d.nbytes
+    assert needed <= checked[-1] < 1.5 * needed
 
 
 def test_explorer_counts_the_texels_of_its_bitmap():

@@ -13,6 +13,7 @@ import torch
 from megastep import core, engine, geometry, scene, toys
 from megastep.dotdict import dotdict
 from megastep.envs.pointgoal.geodesics import CELL, geodesics
+from megastep.envs.pointgoal.path_graph import PathGraph
 from megastep.geometries import sample
 from megastep.modules.spawning import distances
 
@@ -248,6 +249,17 @@ def test_fields_do_not_leak_through_walls():
             assert (np.abs(fields[:, goal] - around) < 0.35).all(), "half a turn and its chords"
 
 
+def test_searching_for_neighbouring_cells_together_finds_the_same_paths():
+    """A field's cells are searched in groups; points that are given, one by one."""
+    g = sample("bench", 1)[0]
+    graph, result = PathGraph([g], RADIUS, torch.device("cpu")), geodesics_of(g, 64, 16)
+    goals = (result.goals - result.origin)[None]
+    rows, columns = graph.shapes[0]
+    centres = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).astype(np.float32)
+    lengths = graph.lengths(goals, np.float32(CELL) * centres.reshape(1, -1, 2))
+    np.testing.assert_array_equal(graph.fields(goals)[0], lengths.half().view(-1, rows, columns))
+
+
 def test_fields_are_known_wherever_a_body_fits():
     g = sample("bench", 1)[0]
     result, random = geodesics_of(g), np.random.default_rng(1)
@@ -268,6 +280,14 @@ def test_more_goals_than_one_launch_takes():
     order = [(many.goals == goal).all(1).nonzero()[0][0] for goal in few.goals]
     assert many.lengths.shape == (24, 40) and len(many.fields) == 40
     np.testing.assert_array_equal(many.fields[order], few.fields)
+
+
+def test_a_homes_paths_do_not_depend_on_the_homes_beside_it():
+    homes = toys.box(3), room(((3, 0), (3, 2)), width=5.0)
+    generators = [np.random.Generator(np.random.Philox(1)) for _ in homes]
+    together = geodesics(homes, 24, 4, RADIUS, generators)
+    for g, result in zip(homes, together, strict=True):
+        np.testing.assert_array_equal(result.fields, geodesics_of(g).fields)
 
 
 @pytest.mark.cuda

@@ -72,6 +72,7 @@ def test_truncated_at_the_limit():
     env = make_env(limit=3)
     worlds = [env.reset(), *(env.step(decision(env, 0)) for _ in range(3))]
     assert [bool(w.truncated.any()) for w in worlds] == [False, False, False, True]
+    assert not any(w.terminal.any() for w in worlds), "the value of the last state counts"
     assert not worlds[-1].metrics.success.any() and not worlds[-1].metrics.spl.any()
 
 

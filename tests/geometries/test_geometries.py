@@ -268,3 +268,10 @@ def test_too_many_geometries_are_refused(tmp_path, monkeypatch):
         files.load(path)
     with pytest.raises(ValueError, match="3 geometries .*from 1 to 2"):
         files.save(path, 3 * [toys.box()])
+
+
+def test_the_largest_allowed_array_is_read(tmp_path, monkeypatch):
+    path = write_box(tmp_path / "box.npz")
+    largest = max(entry.file_size for entry in zipfile.ZipFile(path).infolist())
+    monkeypatch.setattr(files, "MAX_ARRAY", largest)
+    assert len(files.load(path)) == 1

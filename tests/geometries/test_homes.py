@@ -19,6 +19,7 @@ from megastep.geometries.homes import (
     plan,
     portable_generator,
     regions,
+    walls,
 )
 from megastep.geometries.homes.portable_generator import PortableGenerator
 from scripts import check_homes, make_homes, show_homes
@@ -125,6 +126,24 @@ def test_contacts():
         (0, 400, 250, 600, 0, 2),
         (1, 250, 400, 700, 1, 2),
     ]
+
+
+def test_walls_that_meet_fill_their_corner():
+    """Walls 10 cm thick along x = 400 up to y = 250, and from there to the right."""
+    upright, level = (
+        openings.Contact(0, 400, 0, 250, 0, 1),
+        openings.Contact(1, 250, 400, 700, 1, 2),
+    )
+    rectangles = walls.solids([upright, level], walls.depths({}, thickness=10))
+    assert rectangles == [(395, 0, 405, 255), (395, 245, 700, 255)]
+
+
+def test_a_light_is_at_the_centroid_unless_a_wall_is_near_or_it_is_outside():
+    far, near = np.array([[[0, 900], [700, 900]]]), np.array([[[290, 200], [290, 400]]])
+    assert walls.light(L_SHAPE, far) == (283, 258)
+    assert walls.light(L_SHAPE, near) == (200, 300)
+    narrow = [(0, 0, 120, 600), (120, 0, 800, 100)]  # its centroid is (254, 178)
+    assert walls.light(narrow, far) == (60, 300)
 
 
 def test_a_home_is_determined_by_its_seed():

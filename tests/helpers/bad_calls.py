@@ -545,12 +545,6 @@ def resizings(device):
 
 
 def others(device):
-    yield "physics without moves", "moves", lambda f: engine.physics(f.scenery, f.agents, f.lanes)
-    yield (
-        "physics without actions",
-        "actions",
-        lambda f: engine.physics(f.scenery, f.agents, moves=f.moves),
-    )
     yield (
         "observe without seen",
         "clear_mask",

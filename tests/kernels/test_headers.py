@@ -52,12 +52,14 @@ CORRIDOR = """
 #include "corridor.h"
 #include "light.h"
 extern "C" int ruled_out(float y, int box) {
-    Corridor corridor = corridor_of(0.f, 0.f, pose_at(4.f, 0.f, 0.f), 0.1f);
-    return box ? !box_may_occlude(corridor, 3.995f, y, 3.995f, 1.f)
-               : !may_occlude(corridor, 3.995f, y, 3.995f, 1.f);
+    Corridor corridor = corridor_of(3.f, 2.f, pose_at(7.f, 2.f, 0.f), 0.1f);
+    if (box == 1)
+        return !box_may_occlude(corridor, 6.995f, 2.f + y, 8.f, 3.f);
+    return box ? !may_occlude(corridor, 8.f, 3.f, 6.995f, 2.f + y)
+               : !may_occlude(corridor, 6.995f, 2.f + y, 8.f, 3.f);
 }
 extern "C" int occluded(float y) {
-    return occludes(occluder_of(0.f, 0.f, 3.995f, y, 3.995f, 1.f), 4.f, 0.1f);
+    return occludes(occluder_of(3.f, 2.f, 6.995f, 2.f + y, 8.f, 3.f), 4.f, 0.1f);
 }
 """
 

@@ -55,6 +55,11 @@ def test_load_returns_what_was_saved(folder):
     assert loaded.state == {"samples": 30, "rate": 0.5, "none": None, "list": [1, 2]}
 
 
+def test_versions_that_a_run_was_made_with_are_saved(tmp_path):
+    checkpoint.save(tmp_path, 1, state(1), CONFIG, made_with={"torch": "2.0", "threads": 2})
+    assert checkpoint.load_latest(tmp_path).made_with == {"torch": "2.0", "threads": 2}
+
+
 def test_load_one_checkpoint_by_path(folder):
     assert checkpoint.load_latest(folder / "step_10").step == 10
 

@@ -3,6 +3,7 @@ other errors.
 """
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -286,6 +287,49 @@ def test_resumed_trainer_continues_and_does_not_save_again(tmp_path):
     assert second.clock.seconds == pytest.approx(first.clock.seconds, abs=1)
     second.train()
     assert second.env.steps == first.env.steps and not (tmp_path / "second").exists()
+
+
+def test_state_of_another_environment_begins_new_episodes_and_says_so(tmp_path):
+    first, second = (make_trainer(tmp_path) for _ in range(2))
+    for _ in range(3):  # 12 steps: an episode ended after 7
+        first.rollout = first.collect()
+        first.update()
+    state = first.state_dict()
+    state["env"] = {}
+    (lost,) = second.load_state_dict(state)
+    assert lost.endswith("new episodes begin")
+    assert first.episode_stats.returns.all() and not second.episode_stats.returns.any()
+    assert second.episode_stats.pop()["episode/count"] == B, "finished ones still count"
+
+
+@pytest.mark.parametrize("seconds, steps", [(0.9, [1, 2, 3, 4]), (1.0, [4])])
+def test_slow_disk_delays_checkpoints_of_a_second_or_more(tmp_path, seconds, steps):
+    """An update takes two seconds, and the disk is never done."""
+    run, saved = make_trainer(tmp_path, samples=4 * UPDATE, checkpoint_seconds=seconds), []
+
+    class SlowDisk(Saver):
+        is_writing = True
+
+        def __call__(self, step, *_):
+            saved.append(step // UPDATE)
+
+    run.saver, run.clock = SlowDisk(tmp_path, {}), SimpleNamespace(seconds=0.0, is_running=True)
+    run.snapshot_saver = lambda trainer: setattr(run.clock, "seconds", run.clock.seconds + 2)
+    run.train()
+    assert saved == steps
+
+
+@pytest.mark.parametrize("file", ["logger", "annealing_record"])
+def test_checkpoint_reaches_no_further_than_the_files_on_disk(tmp_path, file):
+    def full_disk():
+        raise OSError(28, "full")
+
+    run = make_trainer(tmp_path)
+    setattr(run, file, SimpleNamespace(sync=full_disk))
+    for is_last in (False, True):  # the last one is worth more than the files
+        run.save_checkpoint(is_last=is_last)
+        run.saver.wait()
+        assert len(checkpoint.list_checkpoints(tmp_path)) == is_last
 
 
 def test_budget_ends_at_the_nearer_limit():
