@@ -224,8 +224,13 @@ def test_error_of_the_ranks_is_told_once(here):
     assert code == 2 and err.count("train.py: ") == 1 and not (here / "run").exists()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number, is_group", [(signal.SIGINT, False), (signal.SIGTERM, True)])
+@pytest.mark.parametrize(
+    "number, is_group",
+    [
+        pytest.param(signal.SIGINT, False, marks=pytest.mark.nightly),
+        pytest.param(signal.SIGTERM, True, marks=pytest.mark.slow),
+    ],
+)
 def test_signal_saves_once(here, number, is_group):
     with started(here, "checkpoint_seconds=1") as run:
         wait_for_checkpoint(here, run)
@@ -241,8 +246,10 @@ def test_signal_saves_once(here, number, is_group):
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == total
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize(
+    "rank",
+    [pytest.param(0, marks=pytest.mark.nightly), pytest.param(1, marks=pytest.mark.slow)],
+)
 def test_killed_rank(here, rank):
     with started(here, "checkpoint_seconds=1") as run:
         wait_for_checkpoint(here, run)

@@ -148,8 +148,16 @@ def walk(g, route):
     assert not len(touching), f"geometry {g.id}: touches a wall after {touching.tolist()}"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("source, n", [("homes", 8), ("bench", 2), ("maze", 2)])
+@pytest.mark.parametrize(
+    "source, n",
+    [
+        *(
+            pytest.param(source, n, marks=pytest.mark.slow)
+            for source, n in [("homes", 8), ("bench", 1), ("maze", 2)]
+        ),
+        pytest.param("bench", 4, marks=pytest.mark.nightly),
+    ],
+)
 def test_match_a_visibility_graph_in_many_homes(source, n):
     for g in sample(source, n, split="test"):
         check_against_oracle(g)

@@ -121,8 +121,14 @@ def test_step_benchmark_measures_explorer_as_trained(tiny_benchmarks, monkeypatc
     assert {*as_trained} - {*plain} == {"privileged", "metrics"}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "n_records"), [("compile", 1), ("first", 2), ("startup", 1)])
+@pytest.mark.parametrize(
+    ("name", "n_records"),
+    [
+        pytest.param("compile", 1, marks=pytest.mark.slow),
+        pytest.param("first", 2, marks=pytest.mark.slow),
+        pytest.param("startup", 1, marks=pytest.mark.nightly),
+    ],
+)
 def test_startup_benchmark_measures_new_processes(name, n_records, monkeypatch):
     monkeypatch.setattr(startup_times, "N_PROCESSES", 1)
     rows = list(benchmark.measure(name, torch.device("cpu"), "abc"))

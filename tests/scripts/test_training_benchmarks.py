@@ -70,7 +70,7 @@ def test_train_evaluates_in_unseen_homes(monkeypatch):
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_deathmatch_runs_are_trained_side_by_side_and_duel(monkeypatch):
     small = "geometry=box", "env.n_envs=16", "log_every=1", "preset=cpu", "desync=false"
     deathmatch = *training_benchmarks.DEATHMATCH, *small
