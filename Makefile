@@ -23,7 +23,7 @@ train: $(SETUP)            ## train an Explorer agent, evaluate it in unseen hom
 test: $(SETUP)             ## run the fast tests: 4 minutes on two cores
 	$(PYTEST)
 
-test-slow: $(SETUP)        ## run the thorough tests: 12 minutes; .ci/run runs them as well
+test-slow: $(SETUP)        ## run the thorough tests: 10 minutes; .ci/run runs them as well
 	$(PYTEST) -m slow
 
 test-nightly: $(SETUP)     ## soak, CPU sanitizers, laws and 30 mutants: an hour, by hand; SEED=2 makes others

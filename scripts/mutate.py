@@ -77,16 +77,17 @@ def tests_of(mutant, lines, seconds, limit=float("inf")):
     if not tests and any(line in executing for line in range(first, last + 1)):
         tests = {test for each in executing.values() for test in each}  # it runs at import
     _, *folders, name = Path(mutant.path).parts
-    room = Path("tests", *folders[:1])
+    rooms = [Path("tests", *folders[:1])]
     if folders[:1] == ["kernels"] and folders[1:2] != ["build"]:
-        room = Path("tests/engine")  # what the engine's kernels compute
+        rooms.append(Path("tests/engine"))  # what the engine's kernels compute
     if not tests:  # a kernel, or nothing executes it in the tests' own process
-        tests = {str(path.relative_to(ROOT)) for path in (ROOT / room).glob("test_*.py")}
+        paths = [path for room in rooms for path in (ROOT / room).glob("test_*.py")]
+        tests = {str(path.relative_to(ROOT)) for path in paths}
     names = {Path(name).stem, *folders[1:]}
 
     def is_near(test):
         is_named = any(part in Path(test).stem for part in names)
-        return is_named or bool(executing) and Path(test).parent == room
+        return is_named or bool(executing) and Path(test).parent in rooms
 
     def duration(test):
         return seconds.get(test, 0.0)

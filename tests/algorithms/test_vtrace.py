@@ -257,3 +257,19 @@ def test_policy_without_critic_raises():
     policy = Policy(OBS, MOVES, critic=None)
     with pytest.raises(ValueError, match="critic"):
         VTrace(policy)
+
+
+def test_size_of_advantages_is_in_standard_deviations_of_the_return():
+    """Its root mean square: with twice the rewards, far larger than the values, it is twice as
+    large.
+    """
+    sizes = []
+    for factor in (1e4, 2e4):
+        policy, rollout = made_up()
+        rollout.reward *= factor
+        metrics = VTrace(policy, n_minibatches=1, gamma=0.0, rho_clip=100.0).update(rollout)
+        sizes.append(metrics["loss/advantage"].item())
+        valid = ~rollout.starts[1:]
+        expected = rollout.reward[valid].square().mean().sqrt().item()
+        assert sizes[-1] == pytest.approx(expected, rel=1e-3)
+    assert sizes[1] == pytest.approx(2 * sizes[0], rel=1e-3)
