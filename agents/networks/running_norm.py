@@ -38,15 +38,6 @@ class RunningNorm(nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return (obs - self.mean) / self.scale
 
-    def update_stats(self, obs: torch.Tensor, is_counted: torch.Tensor | bool = True) -> None:
-        """Adds observations to the statistics, those of all ranks together.
-
-        Args:
-            obs: (B, ...).
-            is_counted: () or (B,) bool, lanes to count.
-        """
-        update_norms([(self, self.moments(obs, is_counted))])
-
     @torch.no_grad()
     def moments(self, obs: torch.Tensor, is_counted: torch.Tensor | bool = True) -> Moments:
         """Returns the number of lanes that count, and the mean and variance of their observations.

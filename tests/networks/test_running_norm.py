@@ -6,17 +6,21 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.networks.running_norm import RunningNorm
+from megastep.agents.networks.running_norm import RunningNorm, update_norms
+
+
+def update(norm, *observations):
+    update_norms([(norm, norm.moments(*observations))])
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
 def test_nonfinite_observations_change_nothing(bad):
     norm = RunningNorm(spaces.MultiVector(1, 2))
-    norm.update_stats(torch.randn(64, 1, 2) + 5)
+    update(norm, torch.randn(64, 1, 2) + 5)
     before = {name: tensor.clone() for name, tensor in norm.state_dict().items()}
     # 1e30 is finite, its square is not
-    norm.update_stats(torch.tensor([1.0, 2.0, 3.0, bad]).view(2, 1, 2))
-    norm.update_stats(torch.zeros(2, 1, 2), torch.tensor(False))
+    update(norm, torch.tensor([1.0, 2.0, 3.0, bad]).view(2, 1, 2))
+    update(norm, torch.zeros(2, 1, 2), torch.tensor(False))
     assert all(torch.equal(norm.state_dict()[name], before[name]) for name in before)
 
 
@@ -24,20 +28,20 @@ def test_masked_lanes_do_not_count():
     image = spaces.MultiImage(2, 3, 1, 5, dtype=torch.uint8)
     norm, fewer = RunningNorm(image), RunningNorm(image)
     obs, is_counted = torch.randint(256, (40, 2, 3, 1, 5), dtype=torch.uint8), torch.rand(40) < 0.5
-    norm.update_stats(obs, is_counted)
-    fewer.update_stats(obs[is_counted])
+    update(norm, obs, is_counted)
+    update(fewer, obs[is_counted])
     torch.testing.assert_close(norm.mean, fewer.mean)
     torch.testing.assert_close(norm.scale, fewer.scale)
     expected = obs[is_counted].double().std((0, 3, 4), correction=0).float()
     torch.testing.assert_close(norm.scale.flatten(), expected.flatten())
     before = norm.mean.clone()
-    norm.update_stats(obs, torch.zeros(40, dtype=torch.bool))
+    update(norm, obs, torch.zeros(40, dtype=torch.bool))
     assert torch.equal(norm.mean, before) and norm.count == 1
 
 
 def test_batches_have_equal_weight():
     norm, batches = RunningNorm(spaces.MultiVector(1, 1)), torch.randn(5, 8, 1, 1) * 3 + 2
     for batch in batches:
-        norm.update_stats(batch)
+        update(norm, batch)
     torch.testing.assert_close(norm.mean, batches.mean((0, 1)))
     torch.testing.assert_close(norm.scale, batches.std((0, 1), correction=0))
