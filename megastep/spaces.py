@@ -8,6 +8,7 @@ axis B. A vector or an image may name the ``dtype`` that it is observed and stor
 would replace Python's.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -16,7 +17,7 @@ import torch
 
 from megastep.arrdict import arrdict
 
-__all__ = ["MultiDiscrete", "MultiEmpty", "MultiImage", "MultiVector"]
+__all__ = ["MultiContinuous", "MultiDiscrete", "MultiEmpty", "MultiImage", "MultiVector"]
 
 DTYPES = torch.uint8, torch.float16, torch.float32
 
@@ -87,6 +88,56 @@ class MultiDiscrete(_Space):
     @property
     def shape(self) -> tuple[int, ...]:
         return (self.n_agents,)
+
+
+@dataclass(frozen=True)
+class MultiContinuous(_Space):
+    """``dim`` float32 numbers per agent, within bounds: shape (n_agents, dim). A space of actions.
+
+    Args:
+        n_agents: A.
+        dim: D.
+        low: smallest values, a number for all or one per dimension. Kept as a tuple.
+        high: largest values, likewise.
+
+    Raises:
+        ValueError: if a size is no positive integer, or the bounds are not finite, not one per
+            dimension, or not in order.
+    """
+
+    n_agents: int
+    dim: int
+    low: float | tuple[float, ...] = -1.0
+    high: float | tuple[float, ...] = 1.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        for name in "low", "high":
+            given = getattr(self, name)
+            try:
+                values = tuple(float(value) for value in given)
+            except TypeError:
+                values = (float(given),) * self.dim
+            if len(values) != self.dim or not all(math.isfinite(value) for value in values):
+                raise ValueError(
+                    f"MultiContinuous needs {self.dim} finite numbers for {name}, or one for all, "
+                    f"not {given!r}"
+                )
+            object.__setattr__(self, name, values)
+        if not all(low < high for low, high in zip(self.low, self.high)):
+            raise ValueError(
+                f"MultiContinuous needs each low below its high, not {self.low} and {self.high}"
+            )
+
+    def _sizes(self):
+        return {"n_agents": self.n_agents, "dim": self.dim}
+
+    def tensors(self, device: torch.device | str | None = None) -> tuple[torch.Tensor, ...]:
+        """Returns (low, high), (dim,) float32 each."""
+        return tuple(
+            torch.tensor(bound, dtype=torch.float32, device=device)
+            for bound in (self.low, self.high)
+        )
 
 
 @dataclass(frozen=True)
