@@ -48,6 +48,8 @@ class Env(Protocol):
     Optional attributes, whose defaults are in ``DEFAULTS``; read them with :func:`optional`:
         n_agents: number of lanes per environment, A. Default: 1.
         fps: steps per second of simulated time, for videos. Default: 10.
+        capturable: False if it steps on the host, so that no CUDA graph can hold a step. Default:
+            True.
         check(): raises the errors that were flagged on the device. Synchronises host and device.
         layout: (N,) integers, the floor plan that each environment shows now. Confidence intervals
             of an evaluation are over layouts. Default: None, intervals are over environments.
@@ -77,6 +79,7 @@ class Env(Protocol):
 DEFAULTS: dict[str, Any] = {
     "n_agents": 1,
     "fps": 10.0,
+    "capturable": True,
     "check": lambda: None,
     "layout": None,
     "bot": None,
