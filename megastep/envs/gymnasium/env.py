@@ -12,8 +12,8 @@ from pydantic import Field
 
 from megastep import engine
 from megastep.arrdict import arrdict
-from megastep.envs.gymnasium import make
 from megastep.envs.gymnasium.host import HostBuffers
+from megastep.envs.gymnasium.make import vector_env
 from megastep.envs.gymnasium.spaces import actions, observation
 from megastep.settings import checked
 
@@ -77,7 +77,7 @@ class Gymnasium:
         device: torch.device | str | None = None,
     ):
         self.id, self.n_envs, self.device = id, n_envs, engine.device(device)
-        self.vector = make.vector_env(id, n_envs, kwargs or {}, wrappers, vectorization)
+        self.vector = vector_env(id, n_envs, kwargs or {}, wrappers, vectorization)
         self.fps = float(self.vector.metadata.get("render_fps") or 10)
         try:
             self.obs_space, self._read = observation(self.vector.single_observation_space)
@@ -86,7 +86,10 @@ class Gymnasium:
             self.close()
             raise ValueError(f"{id}: {error}") from None
         self._buffers = HostBuffers(n_envs, self.obs_space, self.action_space, self.device)
-        self._seeds = make.seeds(seed, n_envs, vectorization)
+        # one seed for all, or one each
+        n_seeds = 1 if vectorization == "own" else n_envs
+        seeds = np.random.SeedSequence(seed).generate_state(n_seeds).tolist()
+        self._seeds = seeds[0] if vectorization == "own" else seeds
         self._ended = np.ones(n_envs, bool)
 
     def reset(self) -> arrdict:
