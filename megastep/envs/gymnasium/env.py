@@ -3,6 +3,7 @@
 They step on the CPU, whichever device the learner is on.
 """
 
+import functools
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -12,10 +13,12 @@ from pydantic import Field
 
 from megastep import engine
 from megastep.arrdict import arrdict
+from megastep.env_state import EnvState
 from megastep.envs.gymnasium.host import HostBuffers
 from megastep.envs.gymnasium.make import vector_env
 from megastep.envs.gymnasium.spaces import actions, observation
 from megastep.settings import checked
+from megastep.vector_processes import VectorProcesses
 
 __all__ = ["Gymnasium"]
 
@@ -105,9 +108,36 @@ class Gymnasium:
         obs, reward, terminated, truncated, _ = self.vector.step(actions)
         return self._world(obs, reward, terminated, truncated)
 
+    @functools.cached_property
+    def resumable(self) -> bool:
+        """False if checkpoints cannot hold the environments: those in other processes, and those
+        whose state is not in Python, such as Box2D's.
+        """
+        is_here = not isinstance(self.vector, VectorProcesses)
+        return is_here and not EnvState(self).unreachable()
+
     def close(self) -> None:
-        """Closes the environments. Those in processes of their own end."""
+        """Closes the environments, and ends their processes."""
         self.vector.close()
+
+    def state(self, e: int = 0) -> arrdict:
+        """Returns the frame of environment ``e``, (H, W, 3) uint8, as the environment renders it.
+
+        Raises:
+            ValueError: if it renders no images.
+        """
+        frames = self.vector.render()
+        if frames is None or not isinstance(frames[e], np.ndarray):
+            raise ValueError(
+                f"{self.id} renders no images: it has no render mode rgb_array, or env.kwargs "
+                "chooses another"
+            )
+        return arrdict(frame=torch.from_numpy(frames[e].copy()))
+
+    @staticmethod
+    def plot_state(state: arrdict) -> np.ndarray:
+        """Returns the frame of a numpyified :meth:`state`."""
+        return state.frame
 
     def _world(self, obs, reward, terminated, truncated):
         """Returns the world after a step, in which lanes that had ended before it began again."""
