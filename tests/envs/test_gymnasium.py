@@ -1,5 +1,6 @@
 """Gymnasium's environments keep the contract, in this process and in others."""
 
+import copy
 import os
 import re
 import signal
@@ -12,6 +13,7 @@ import torch
 from megastep import capture, contract
 from megastep.agents.storage.collector import Collector
 from megastep.arrdict import arrdict
+from megastep.env_state import EnvState
 from megastep.envs import Gymnasium
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -249,6 +251,22 @@ def test_environment_that_draws_nothing_says_so():
     env.reset()
     with pytest.raises(ValueError, match="TestCounter-v0 renders no images: it has no render mode"):
         env.state(0)
+
+
+def test_state_is_restored_exactly():
+    """Into another object that began with the same seeds, as a resumed run does."""
+    env, resumed = cart_pole(), cart_pole()
+    env.reset(), resumed.reset()
+    state, state_of_resumed = EnvState(env), EnvState(resumed)
+    contract.rollout(env, 20)
+    saved = copy.deepcopy(state.state_dict())
+    generator = torch.Generator().manual_seed(1)
+    actions = [arrdict(actions=contract.random_actions(env, generator)) for _ in range(40)]
+    expected = [env.step(one) for one in actions]
+    state_of_resumed.load_state_dict(saved)
+    worlds = [resumed.step(one) for one in actions]
+    assert all(map(contract.same, worlds, expected))
+    assert any(world.reset.any() for world in worlds)
 
 
 def test_resumable_if_all_state_is_in_python():
