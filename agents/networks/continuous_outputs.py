@@ -68,9 +68,9 @@ class GaussianOutput(_BoundedOutput):
         width: number of features.
     """
 
-    # tanh(5) is 0.9999: larger means would only make gradients vanish
+    # tanh(5) is 0.9999, and the gradient of a log-probability is inverse to the standard deviation
     max_mean = 5.0
-    min_log_std = -5.0
+    min_log_std = -3.0
 
     def __init__(self, space: spaces.MultiContinuous, width: int):
         super().__init__(space, width, n_parameters=1)
