@@ -26,6 +26,7 @@ __all__ = [
     "number",
     "ragged",
     "stored",
+    "word",
 ]
 
 _INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
@@ -67,6 +68,13 @@ def flag(name: str, value: Any) -> bool:
     """Returns ``value``. TypeError unless it is True or False."""
     if value is not True and value is not False:
         raise TypeError(f"{name} must be True or False, but {_described(value)} was given")
+    return value
+
+
+def word(name: str, value: Any, words: Sequence[str]) -> str:
+    """Returns ``value``. ValueError unless it is one of ``words``."""
+    if not isinstance(value, str) or value not in words:
+        raise ValueError(f"{name} must be {' or '.join(words)}, but {_described(value)} was given")
     return value
 
 
@@ -241,15 +249,25 @@ def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
     return value
 
 
-def lanes(name: str, value: Any, n_lanes: int, device: torch.device) -> torch.Tensor:
+def lanes(
+    name: str, value: Any, n_lanes: int, device: torch.device, dim: int | None = None
+) -> torch.Tensor:
     """Returns ``value``. TypeError or ValueError unless it is a tensor on ``device``, of any shape,
-    with one integer per lane. Does not synchronise.
+    with one integer per lane, or with ``dim`` float32 numbers per lane along its last axis. Does
+    not synchronise.
     """
-    fits = isinstance(value, torch.Tensor) and value.numel() == n_lanes and value.device == device
-    if not fits or value.dtype not in _INTEGERS or not _is_stored(value):
+    dtypes, axis = (_INTEGERS, ()) if dim is None else ((torch.float32,), (dim,))
+    fits = (
+        isinstance(value, torch.Tensor)
+        and value.numel() == n_lanes * (dim or 1)
+        and value.shape[value.ndim - len(axis) :] == axis
+        and value.device == device
+    )
+    if not fits or value.dtype not in dtypes or not _is_stored(value):
+        kind = "integers, one" if dim is None else f"float32 numbers, {dim}"
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
-            f"{name} must be a tensor of integers, one for each of the {n_lanes} lanes, on "
-            f"{device}, but {_described(value)} was given"
+            f"{name} must be a tensor of {kind} for each of the {n_lanes} lanes, on {device}, but "
+            f"{_described(value)} was given"
         )
     return value
 

@@ -44,7 +44,7 @@ static void step(const PhysicsParams& p, int env, std::vector<unsigned char>& me
     const float* walls = s.walls + 4 * (long long)first_wall;
     if ((int)meets.size() < n_walls)
         meets.resize(n_walls);
-    if (p.actions)
+    if (p.n_moves)
         for (int a = 0; a < n_agents; a++)
             apply_action(p, env, a);
     for (int a = 0; a < n_agents; a++)

@@ -66,7 +66,7 @@ KERNEL BOUNDS(24) physics(PhysicsParams p) {
     if (env >= p.scenery.n_envs)
         return;
     ThreadGroup group = group_of(p.threads_per_env);
-    if (p.actions) {
+    if (p.n_moves) {
         for (int a = group.rank; a < n_agents; a += group.size)
             apply_action(p, env, a);
         __syncwarp(group.mask);

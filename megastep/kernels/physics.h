@@ -21,22 +21,50 @@ HD float progress_of(float contact) {
     return contact <= 1.f ? clamp(SHORTENING * contact, 0.f, 1.f) : 1.f;
 }
 
-// Applies agent a's action: damps its velocities and adds the action's, rotated to the agent's
-// heading.
-HD void apply_action(const PhysicsParams& p, int env, int a) {
-    int i = env * p.scenery.n_agents + a;
+// What an action adds: velocity ahead, velocity left, turning.
+struct Move {
+    float ahead, left, turn;
+};
+
+// The move that agent i's discrete action selects.
+HD Move selected_move(const PhysicsParams& p, int env, int i) {
     long long action = p.actions[i];
     if (action < 0 || action >= p.n_moves) {
         flag_error(p.error_flag, env, BAD_ACTION);
         action = 0;
     }
     const float* move = p.moves + 3 * action;
+    return {move[0], move[1], move[2]};
+}
+
+// The sum of all moves, each weighted with one number of agent i's continuous action.
+HD Move weighted_moves(const PhysicsParams& p, int env, int i) {
+    const float* controls = p.controls + (long long)p.n_moves * i;
+    Move sum = {0.f, 0.f, 0.f};
+    for (int k = 0; k < p.n_moves; k++) {
+        if (controls[k] != controls[k]) {
+            flag_error(p.error_flag, env, NAN_ACTION);
+            continue;
+        }
+        float weight = clamp(controls[k], -1.f, 1.f);
+        sum.ahead += weight * p.moves[3 * k];
+        sum.left += weight * p.moves[3 * k + 1];
+        sum.turn += weight * p.moves[3 * k + 2];
+    }
+    return sum;
+}
+
+// Applies agent a's action: damps its velocities and adds the action's, rotated to the agent's
+// heading.
+HD void apply_action(const PhysicsParams& p, int env, int a) {
+    int i = env * p.scenery.n_agents + a;
+    Move move = p.controls ? weighted_moves(p, env, i) : selected_move(p, env, i);
     float s, c;
     sincos_degrees(p.angles[i], s, c);
     float* velocity = p.velocity + 2 * i;
-    velocity[0] = p.retained * velocity[0] + (c * move[0] - s * move[1]);
-    velocity[1] = p.retained * velocity[1] + (s * move[0] + c * move[1]);
-    p.angvelocity[i] = p.retained * p.angvelocity[i] + move[2];
+    velocity[0] = p.retained * velocity[0] + (c * move.ahead - s * move.left);
+    velocity[1] = p.retained * velocity[1] + (s * move.ahead + c * move.left);
+    p.angvelocity[i] = p.retained * p.angvelocity[i] + move.turn;
 }
 
 // Moves agent a by the free part of its step. An agent that hit something stops.
