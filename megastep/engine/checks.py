@@ -26,6 +26,7 @@ __all__ = [
     "number",
     "ragged",
     "stored",
+    "vectors",
     "word",
 ]
 
@@ -249,25 +250,34 @@ def alike(name: str, value: Any, like: torch.Tensor) -> torch.Tensor:
     return value
 
 
-def lanes(
-    name: str, value: Any, n_lanes: int, device: torch.device, dim: int | None = None
-) -> torch.Tensor:
+def lanes(name: str, value: Any, n_lanes: int, device: torch.device) -> torch.Tensor:
     """Returns ``value``. TypeError or ValueError unless it is a tensor on ``device``, of any shape,
-    with one integer per lane, or with ``dim`` float32 numbers per lane along its last axis. Does
-    not synchronise.
+    with one integer per lane. Does not synchronise.
     """
-    dtypes, axis = (_INTEGERS, ()) if dim is None else ((torch.float32,), (dim,))
-    fits = (
-        isinstance(value, torch.Tensor)
-        and value.numel() == n_lanes * (dim or 1)
-        and value.shape[value.ndim - len(axis) :] == axis
-        and value.device == device
-    )
-    if not fits or value.dtype not in dtypes or not _is_stored(value):
-        kind = "integers, one" if dim is None else f"float32 numbers, {dim}"
+    fits = isinstance(value, torch.Tensor) and value.numel() == n_lanes and value.device == device
+    if not fits or value.dtype not in _INTEGERS or not _is_stored(value):
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
-            f"{name} must be a tensor of {kind} for each of the {n_lanes} lanes, on {device}, but "
-            f"{_described(value)} was given"
+            f"{name} must be a tensor of integers, one for each of the {n_lanes} lanes, on "
+            f"{device}, but {_described(value)} was given"
+        )
+    return value
+
+
+def vectors(name: str, value: Any, n_lanes: int, dim: int, device: torch.device) -> torch.Tensor:
+    """Returns ``value``. TypeError or ValueError unless it is a float32 tensor on ``device`` with
+    ``dim`` numbers per lane along its last axis. Does not synchronise.
+    """
+    fits = isinstance(value, torch.Tensor) and value.shape[-1:] == (dim,)
+    if (
+        not fits
+        or value.numel() != n_lanes * dim
+        or value.dtype != torch.float32
+        or value.device != device
+        or not _is_stored(value)
+    ):
+        raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
+            f"{name} must be a tensor of float32 numbers, {dim} for each of the {n_lanes} lanes, "
+            f"on {device}, but {_described(value)} was given"
         )
     return value
 

@@ -21,50 +21,43 @@ HD float progress_of(float contact) {
     return contact <= 1.f ? clamp(SHORTENING * contact, 0.f, 1.f) : 1.f;
 }
 
-// What an action adds: velocity ahead, velocity left, turning.
-struct Move {
-    float ahead, left, turn;
-};
+// Damps agent i's velocities and adds a move, rotated to the agent's heading.
+HD void accelerate(const PhysicsParams& p, int i, float ahead, float left, float turn) {
+    float s, c;
+    sincos_degrees(p.angles[i], s, c);
+    float* velocity = p.velocity + 2 * i;
+    velocity[0] = p.retained * velocity[0] + (c * ahead - s * left);
+    velocity[1] = p.retained * velocity[1] + (s * ahead + c * left);
+    p.angvelocity[i] = p.retained * p.angvelocity[i] + turn;
+}
 
-// The move that agent i's discrete action selects.
-HD Move selected_move(const PhysicsParams& p, int env, int i) {
+// Applies agent i's discrete action: the move that it selects.
+HD void apply_action(const PhysicsParams& p, int env, int i) {
     long long action = p.actions[i];
     if (action < 0 || action >= p.n_moves) {
         flag_error(p.error_flag, env, BAD_ACTION);
         action = 0;
     }
     const float* move = p.moves + 3 * action;
-    return {move[0], move[1], move[2]};
+    accelerate(p, i, move[0], move[1], move[2]);
 }
 
-// The sum of all moves, each weighted with one number of agent i's continuous action.
-HD Move weighted_moves(const PhysicsParams& p, int env, int i) {
+// Applies agent i's continuous action: the sum of all moves, each weighted with a number of it.
+HD void apply_controls(const PhysicsParams& p, int env, int i) {
     const float* controls = p.controls + (long long)p.n_moves * i;
-    Move sum = {0.f, 0.f, 0.f};
+    float ahead = 0.f, left = 0.f, turn = 0.f;
     for (int k = 0; k < p.n_moves; k++) {
         if (controls[k] != controls[k]) {
             flag_error(p.error_flag, env, NAN_ACTION);
             continue;
         }
         float weight = clamp(controls[k], -1.f, 1.f);
-        sum.ahead += weight * p.moves[3 * k];
-        sum.left += weight * p.moves[3 * k + 1];
-        sum.turn += weight * p.moves[3 * k + 2];
+        const float* move = p.moves + 3 * k;
+        ahead += weight * move[0];
+        left += weight * move[1];
+        turn += weight * move[2];
     }
-    return sum;
-}
-
-// Applies agent a's action: damps its velocities and adds the action's, rotated to the agent's
-// heading.
-HD void apply_action(const PhysicsParams& p, int env, int a) {
-    int i = env * p.scenery.n_agents + a;
-    Move move = p.controls ? weighted_moves(p, env, i) : selected_move(p, env, i);
-    float s, c;
-    sincos_degrees(p.angles[i], s, c);
-    float* velocity = p.velocity + 2 * i;
-    velocity[0] = p.retained * velocity[0] + (c * move.ahead - s * move.left);
-    velocity[1] = p.retained * velocity[1] + (s * move.ahead + c * move.left);
-    p.angvelocity[i] = p.retained * p.angvelocity[i] + move.turn;
+    accelerate(p, i, ahead, left, turn);
 }
 
 // Moves agent a by the free part of its step. An agent that hit something stops.

@@ -11,6 +11,7 @@ import torch
 from megastep import engine, spaces
 from megastep.core import Core
 from megastep.engine import checks
+from megastep.modules.lanes import to_agents
 
 # The direction in the agent's frame (forward, left) and the turn of each action:
 # 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
@@ -60,11 +61,14 @@ class _Movement:
 
         Returns the :class:`~megastep.engine.Physics` of the step.
         """
-        n_envs, n_agents, device = self.core.n_envs, self.core.n_agents, self.core.device
-        dim = len(CONTROLS) if self.control == "continuous" else None
-        actions = checks.lanes("actions", decision["actions"], n_envs * n_agents, device, dim)
-        actions = actions.reshape(n_envs, *self.space.shape)
-        actions = (actions if dim else actions.long()).contiguous()
+        n_agents, device = self.core.n_agents, self.core.device
+        n_lanes, actions = self.core.n_envs * n_agents, decision["actions"]
+        if self.control == "continuous":
+            actions = checks.vectors("actions", actions, n_lanes, len(CONTROLS), device)
+            actions = actions.reshape(-1, *self.space.shape).contiguous()
+        else:
+            actions = checks.lanes("actions", actions, n_lanes, device)
+            actions = to_agents(actions, n_agents).long().contiguous()
         return engine.physics(
             self.core.scenery, self.core.agents, actions, self.moves, self.damping
         )
