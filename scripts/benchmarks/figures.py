@@ -182,6 +182,26 @@ def plot_learners(records: list[dict], path: Path) -> None:
     save(grid[0, 0].figure, path)
 
 
+def plot_scaling(records: list[dict], path: Path) -> None:
+    """Plots samples per second over the number of GPUs, from `scaling`, beside linear scaling."""
+    series = {}
+    for record in newest(records):
+        match = re.fullmatch(r"(\w+), training on (\d+) GPUs?", record["what"])
+        if record["benchmark"] == "scaling" and match:
+            series.setdefault(match[1], {})[int(match[2])] = record["value"]
+    if not series:
+        return
+    ax = subplots(6, 3.6)
+    for env, by_count in series.items():
+        counts, colour = sorted(by_count), ENV_COLOURS[env]
+        rates = [by_count[n] for n in counts]
+        ax.plot(counts, rates, marker="o", color=colour, label=env)
+        linear = [n * by_count[1] for n in counts]
+        ax.plot(counts, linear, color=colour, linestyle=":", label=f"{env}, linear")
+    ax.set(xlabel="GPUs", ylabel="million samples per second", xlim=(0, None), ylim=(0, None))
+    finish(ax, path, ticks=sorted({n for by_count in series.values() for n in by_count}))
+
+
 def plot_ratings(records: list[dict], path: Path) -> None:
     """Plots the ratings of each run's snapshots, and of the scripted bot, over samples."""
     ratings_by_seed = {}

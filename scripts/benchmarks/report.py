@@ -73,4 +73,5 @@ def write(path: Path) -> None:
     figures.plot_training(rows, path.with_name("results.svg"))
     figures.plot_recipes(rows, path.with_name("worlds.svg"))
     figures.plot_ratings(rows, path.with_name("ratings.svg"))
+    figures.plot_scaling(rows, path.with_name("scaling.svg"))
     figures.plot_learners(rows, path.with_name("learners.svg"))
