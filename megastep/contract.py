@@ -60,6 +60,12 @@ def check_environment(env: Env) -> None:
     """
     for name, meaning in ATTRIBUTES.items():
         _require(env, hasattr(env, name), f"it has no {name}: {meaning}")
+    for path, space in spaces.leaves(env.action_space, "action_space").items():
+        _require(
+            env,
+            isinstance(space, (spaces.MultiDiscrete, spaces.MultiContinuous)),
+            f"{path} must be MultiDiscrete, MultiContinuous or a dict of them, not {space!r}",
+        )
     names = "n_agents", "fps", "check", "layout", "roles"
     n_agents, fps, check, layout, roles = (optional(env, name) for name in names)
     is_count = isinstance(n_agents, numbers.Integral) and n_agents > 0
@@ -234,8 +240,7 @@ def random_actions(env: Env, generator: torch.Generator) -> Tree:
     """
 
     def draw(space):
-        shape = n_lanes(env), *space.shape
-        return torch.randint(space.n_actions, shape, generator=generator).to(env.device)
+        return spaces.random_actions(space, n_lanes(env), generator=generator).to(env.device)
 
     return spaces.map(draw, env.action_space)
 

@@ -110,6 +110,8 @@ class MultiContinuous(_Space):
     low: float | tuple[float, ...] = -1.0
     high: float | tuple[float, ...] = 1.0
 
+    dtype = torch.float32
+
     def __post_init__(self):
         super().__post_init__()
         for name in "low", "high":
@@ -147,6 +149,35 @@ class MultiEmpty(_Space):
     @property
     def shape(self) -> tuple[int, ...]:
         return (0,)
+
+
+def random_actions(
+    space: MultiDiscrete | MultiContinuous,
+    n_lanes: int,
+    device: torch.device | str | None = None,
+    generator: torch.Generator | None = None,
+) -> torch.Tensor:
+    """Returns uniformly random actions of a leaf space for B lanes: (B, ...).
+
+    Args:
+        generator: on the same device.
+    """
+    shape, options = (n_lanes, *space.shape), dict(device=device, generator=generator)
+    if isinstance(space, MultiContinuous):
+        low, high = space.tensors(device)
+        return (low + (high - low) * torch.rand(shape, **options)).clamp(low, high)
+    return torch.randint(space.n_actions, shape, **options)
+
+
+def are_actions(space: MultiDiscrete | MultiContinuous, values: torch.Tensor) -> bool:
+    """Returns True if all values are actions of a leaf space, whatever their leading axes."""
+    if values.shape[-len(space.shape) :] != space.shape:
+        return False
+    if isinstance(space, MultiContinuous):
+        low, high = space.tensors(values.device)
+        return values.is_floating_point() and bool(((values >= low) & (values <= high)).all())
+    is_integer = not values.is_floating_point()
+    return is_integer and bool(((values >= 0) & (values < space.n_actions)).all())
 
 
 def leaves(space: Any, name: str = "") -> dict[str, Any]:

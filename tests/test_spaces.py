@@ -1,6 +1,7 @@
 """Spaces are immutable values with a shape."""
 
 import builtins
+import math
 import pickle
 
 import pytest
@@ -91,3 +92,43 @@ def test_star_import_leaves_map_alone():
     names = {}
     exec("from megastep.spaces import *", names)
     assert "MultiVector" in names and names.get("map", builtins.map) is builtins.map
+
+
+def test_bounds_of_continuous_actions_are_kept_per_number():
+    space = spaces.MultiContinuous(1, 2, low=(0, -1), high=3)
+    assert space.shape == (1, 2) and space == eval(repr(space), vars(spaces))
+    assert space.low == (0.0, -1.0) and space.high == (3.0, 3.0)
+    low, high = space.tensors()
+    assert low.tolist() == [0, -1] and high.dtype == torch.float32
+
+
+@pytest.mark.parametrize("bounds", [((0,), 1), (1, 1), (0, (1, -1)), (-math.inf, 1), (0, math.nan)])
+def test_bounds_that_do_not_fit_are_refused(bounds):
+    with pytest.raises(ValueError, match="MultiContinuous needs"):
+        spaces.MultiContinuous(1, 2, *bounds)
+
+
+@pytest.mark.parametrize("space", [HANDS, spaces.MultiContinuous(2, 3, (0, -1, 5), (1, 1, 1e4))])
+def test_random_actions_are_actions_and_reach_every_part(space):
+    actions = spaces.random_actions(space, 1000, generator=torch.Generator().manual_seed(1))
+    assert actions.shape == (1000, *space.shape) and spaces.are_actions(space, actions)
+    lowest, highest = (actions == 0, actions == 3)
+    if isinstance(space, spaces.MultiContinuous):
+        low, high = space.tensors()
+        lowest, highest = actions < low + (high - low) / 10, actions > high - (high - low) / 10
+    assert lowest.any(0).all() and highest.any(0).all()
+
+
+@pytest.mark.parametrize(
+    "space, wrong",
+    [
+        (HANDS, torch.tensor([[0, 4]])),
+        (HANDS, torch.tensor([[0.0, 1.0]])),
+        (HANDS, torch.tensor([[0]])),
+        (spaces.MultiContinuous(1, 1), torch.tensor([[1.1]])),
+        (spaces.MultiContinuous(1, 1), torch.tensor([[math.nan]])),
+        (spaces.MultiContinuous(1, 1), torch.tensor([[1]])),
+    ],
+)
+def test_what_is_no_action(space, wrong):
+    assert not spaces.are_actions(space, wrong)

@@ -195,8 +195,7 @@ def make_bot(name: str | None, settings: Env, env: Any) -> Any:
     name = name or f"{where}.bot"
 
     def check_actions(space, leaf):
-        fits = tuple(leaf.shape) == (n_lanes(env), *space.shape) and not leaf.is_floating_point()
-        if not fits or not ((leaf >= 0) & (leaf < space.n_actions)).all():
+        if len(leaf) != n_lanes(env) or not spaces.are_actions(space, leaf):
             raise ValueError(f"its actions are not those of {space!r}")
 
     # a policy may do whatever, where it was not made for

@@ -4,7 +4,7 @@ a vector into actions.
     intake = heads.intake(env.obs_space, width)     # (..., A, C, H, W), (..., A, D) -> (..., width)
     output = heads.output(env.action_space, width)  # (..., width) -> log-probabilities (..., A, n)
     logits = nn.Sequential(intake, output)(world.obs)
-    actions = output.sample(logits)                 # (..., A) integers
+    actions = output.sample(logits)                 # (..., A) integers, or numbers within bounds
 
 Nested dicts of spaces give nested dicts of logits and actions. Nothing here synchronises. `...` are
 any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane controls.
@@ -13,11 +13,12 @@ any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one
 from torch import nn
 
 from megastep import spaces
+from megastep.agents.networks.continuous_outputs import CONTINUOUS_OUTPUTS
 from megastep.agents.networks.intakes import ConcatIntake
 from megastep.agents.networks.outputs import DictOutput, DuellingOutput, MultiDiscreteOutput
 from megastep.types import Space
 
-#: Outputs by name: "softmax" samples by probability, "duelling" by action value.
+#: Outputs of integers by name: "softmax" samples by probability, "duelling" by action value.
 OUTPUTS = {"softmax": MultiDiscreteOutput, "duelling": DuellingOutput}
 
 
@@ -37,24 +38,36 @@ def intake(space: Space, width: int, encoder: str = "linear") -> ConcatIntake:
     return ConcatIntake(space, width, encoder)
 
 
-def output(space: Space, width: int, kind: str = "softmax") -> nn.Module:
+def output(
+    space: Space, width: int, kind: str = "softmax", continuous: str = "gaussian"
+) -> nn.Module:
     """Returns a module from vectors (..., width) to logits of an action space.
 
     Its methods are `sample`, `greedy`, `logprob`, and `entropy` ("softmax") or `action_value`
     ("duelling").
 
     Args:
-        space: action space, a MultiDiscrete or nested dicts.
+        space: action space, a MultiDiscrete, a MultiContinuous or nested dicts.
         width: number of features.
         kind: a name in `OUTPUTS`.
+        continuous: a name in `CONTINUOUS_OUTPUTS`, for continuous actions.
 
     Raises:
-        ValueError: if a space is of an unknown kind.
+        ValueError: if a space is of an unknown kind, or actions that need values are continuous.
     """
     if isinstance(space, dict) and space:
-        return DictOutput({key: output(child, width, kind) for key, child in space.items()})
+        outputs = {key: output(child, width, kind, continuous) for key, child in space.items()}
+        return DictOutput(outputs)
     if isinstance(space, spaces.MultiDiscrete):
         return OUTPUTS[kind](space, width)
+    if isinstance(space, spaces.MultiContinuous):
+        if kind == "duelling":
+            raise ValueError(
+                f"action values (agent.output=duelling, which R2D2 learns) need discrete actions, "
+                f"not {space!r}: use learner=ppo or learner=vtrace with agent.output=softmax"
+            )
+        return CONTINUOUS_OUTPUTS[continuous](space, width)
     raise ValueError(
-        f"no output is known for the action space {space!r}: use MultiDiscrete or dicts of it"
+        f"no output is known for the action space {space!r}: use MultiDiscrete, MultiContinuous or "
+        "dicts of them"
     )

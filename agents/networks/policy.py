@@ -44,8 +44,10 @@ class Policy(nn.Module):
         core: a name in `cores.CORES`, or an import path.
         layers: recurrent cores, stacked with residual connections.
         encoder: encoder of images, a name in `encoders.ENCODERS`, or an import path.
-        output: "softmax" samples actions by their probabilities; "duelling" takes the action of the
-            highest value.
+        output: "softmax" samples actions by their probabilities, continuous ones too; "duelling"
+            takes the action of the highest value.
+        continuous: distribution of continuous actions, a name in
+            `continuous_outputs.CONTINUOUS_OUTPUTS`.
         critic: "asymmetric" sees privileged observations, if there are any; "plain" sees what the
             actor sees; None: no critic. A duelling policy never has one.
         bf16: on a GPU, runs matrix products in bfloat16.
@@ -72,6 +74,7 @@ class Policy(nn.Module):
         layers: Annotated[int, Field(ge=1, le=8)] = 1,
         encoder: Annotated[str, _name_in(encoders.ENCODERS)] = "linear",
         output: Literal["softmax", "duelling"] = "softmax",
+        continuous: Literal["gaussian", "beta"] = "gaussian",
         critic: Literal["asymmetric", "plain"] | None = "asymmetric",
         bf16: bool = True,
         seed: int = 1,
@@ -85,7 +88,7 @@ class Policy(nn.Module):
             torch.manual_seed(seed)
             self.intake = heads.intake(obs_space, width, encoder)
             self.core = cores.make_core(core, width, layers)
-            self.output = heads.output(action_space, width, output)
+            self.output = heads.output(action_space, width, output, continuous)
             self.critic = None if critic is None else Critic(width, self.privileged_space)
             if self.privileged_space:
                 self.prediction = nn.Linear(width, self.critic.intake.n_features)

@@ -41,7 +41,7 @@ class Rollout:
         starts: (T+1, B) bool, whether the observation is its episode's first.
         learns: (T+1, B) bool, whether to learn from the lane at that time. True unless worlds
             have `learns`.
-        actions: (T, B, ...) int64.
+        actions: (T, B, ...) int64, or float32 if continuous.
         logprobs: (T, B), log-probabilities of the actions under the policy that took them; 0 for a
             policy that gives none.
         values: (T+1, B), the critic's values at the time of acting, or None.
@@ -79,7 +79,7 @@ class Rollout:
         self.privileged = None
         if privileged_space is not None:
             self.privileged = _zeros(privileged_space, rows_and_last, device, torch.float32)
-        self.actions = _zeros(action_space, rows, device, torch.int64)
+        self.actions = _zeros(action_space, rows, device)
         self.starts = torch.zeros(rows_and_last, dtype=torch.bool, device=device)
         self.learns = torch.ones(rows_and_last, dtype=torch.bool, device=device)
         self.terminal = torch.zeros(rows, dtype=torch.bool, device=device)
@@ -169,7 +169,7 @@ class Rollout:
 
     def floats(self) -> dict[str, torch.Tensor]:
         """Returns every tensor that may become non-finite, by name: (T, B) or (T+1, B, ...)."""
-        tensors = spaces.leaves(self.obs, "obs")
+        tensors = spaces.leaves(self.obs, "obs") | spaces.leaves(self.actions, "actions")
         if self.privileged is not None:
             tensors |= spaces.leaves(self.privileged, "privileged")
         tensors = {name: leaf for name, leaf in tensors.items() if leaf.is_floating_point()}
@@ -251,7 +251,7 @@ def without_last(tree: Tree | None) -> Tree | None:
     return None if tree is None else mapping(lambda leaf: leaf[:-1])(tree)
 
 
-def _zeros(space, lead, device, dtype):
+def _zeros(space, lead, device, dtype=torch.float32):
     """Returns zeros (*lead, ...) for a space: int64 for integers, else the dtype that the space
     names, else `dtype`.
     """

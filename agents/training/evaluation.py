@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from megastep import spaces
 from megastep.arrdict import arrdict
-from megastep.dotdict import mapping
 from megastep.types import Env, Policy, Space, n_lanes, optional
 
 #: Steps between two checks of whether all episodes have ended. A check waits for the GPU, which
@@ -38,12 +38,10 @@ class RandomActions:
     ) -> tuple[arrdict, Mapping]:
         n_lanes, device = len(state["lane"]), state["lane"].device
 
-        @mapping
         def draw(space):
-            shape = n_lanes, *space.shape
-            return torch.randint(space.n_actions, shape, device=device, generator=generator)
+            return spaces.random_actions(space, n_lanes, device, generator)
 
-        return arrdict(actions=draw(self.action_space)), state
+        return arrdict(actions=spaces.map(draw, self.action_space)), state
 
 
 @torch.no_grad()

@@ -87,7 +87,8 @@ class RolloutRecorder:
         """Has opponents report the actions of all lanes, as rollouts of T steps store some only."""
         for path, space in spaces.leaves(self.env.action_space, "actions").items():
             shape = n_steps, n_lanes(self.env), *space.shape
-            self.played[path] = torch.zeros(shape, dtype=torch.int64, device=self.env.device)
+            dtype = getattr(space, "dtype", torch.int64)
+            self.played[path] = torch.zeros(shape, dtype=dtype, device=self.env.device)
         opponents.on_actions = self._play
 
     def _play(self, actions):

@@ -227,8 +227,8 @@ def test_zero_features_have_a_gradient():
             lambda: heads.intake(IMAGE, WIDTH, "resnet"),
             "'resnet'.*conv, linear, module:Class",
         ),
-        (lambda: heads.output(VECTOR, WIDTH), "MultiDiscrete or dicts of it"),
-        (lambda: heads.output(arrdict(), WIDTH), "MultiDiscrete or dicts of it"),
+        (lambda: heads.output(VECTOR, WIDTH), "MultiContinuous or dicts of them"),
+        (lambda: heads.output(arrdict(), WIDTH), "MultiContinuous or dicts of them"),
     ],
 )
 def test_unknown_spaces_raise(make, error):
