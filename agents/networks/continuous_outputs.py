@@ -1,8 +1,8 @@
 """Outputs of continuous actions within bounds: a squashed Gaussian, or a Beta distribution.
 
-`...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane controls,
-D numbers of each. Both work on x, an action scaled to -1 to 1, and measure probabilities and
-entropy there: a uniform distribution has an entropy of log 2 per number, whatever the bounds.
+`...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane
+controls, D numbers of each. Both work on x, an action scaled to -1 to 1, and measure probabilities
+and entropy there: a uniform distribution has an entropy of log 2 per number, whatever the bounds.
 Numbers are independent of each other.
 """
 
