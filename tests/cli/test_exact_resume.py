@@ -263,6 +263,21 @@ def test_format_6_is_migrated(here, capsys):
     assert [row["updates"] for row in rows] == [2, 4, 6, 7, 8, 9]
 
 
+def test_run_of_before_a_learner_had_some_settings_resumes_bit_for_bit(here, capsys):
+    """Their defaults change nothing, the optimizer's state included."""
+    words = [*tiny.TINY, "samples=128", "log_every=1", "learner.anneal=never"]
+    run(*words, "folder=alone")
+    run(*words, "samples=64", "folder=run")
+    saved = checkpoint.load_latest("run/checkpoints")
+    for key in ("value_clip", "normalise_advantage", "critic_lr", "weight_decay"):
+        del saved.config["train"]["learner"][key]
+    state = saved.state["learner"]
+    assert set(state["optimizer"]) == {"n_steps", "means", "squares"} and state["lr"].shape == ()
+    checkpoint.save(here / "run/checkpoints", 65, saved.state, saved.config)
+    run("resume=run", "samples=128")
+    assert json_lines.read("run/metrics.jsonl") == json_lines.read("alone/metrics.jsonl")
+
+
 def test_inspect(here, capsys):
     run(*tiny.TINY, "samples=64", "folder=run", "log_every=1")
     capsys.readouterr()
