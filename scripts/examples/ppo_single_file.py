@@ -22,6 +22,7 @@ import sys
 import time
 
 import torch
+from megastep.agents.imports import import_object
 
 from megastep import engine
 from megastep.agents.algorithms import returns
@@ -31,7 +32,6 @@ from megastep.agents.algorithms.masked_stats import (
     masked_mean,
     pooled_normalise,
 )
-from megastep.agents.imports import import_object
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import make_rollout, without_last
