@@ -328,6 +328,7 @@ def test_minibatch_needs_an_environment():
         ("learner.lr={a:{b:1}}", "learner.lr", "expected a number, got {'a': {'b': 1}}"),
         ("env={a:{b:1}}", "env.a", "no such key; did you mean env.name?"),
         ("init=[a]", "init", "expected a word, got ['a']"),
+        ("env.control=continuos", "env.control", "is unknown; did you mean continuous?"),
         ("env=null", "env", "None is unknown"),
         ("~env", "env", "None is unknown"),
         ("~nothing", "nothing", "no such key"),
