@@ -22,7 +22,6 @@ import sys
 import time
 
 import torch
-from megastep.agents.imports import import_object
 
 from megastep import engine
 from megastep.agents.algorithms import returns
@@ -37,6 +36,7 @@ from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import make_rollout, without_last
 from megastep.agents.training.episode_stats import EpisodeStats
 from megastep.geometries import sources
+from megastep.imports import import_object
 from megastep.types import n_lanes, optional
 
 
