@@ -16,7 +16,7 @@ import torch
 from torch.utils import _pytree
 
 from megastep.engine.state_tree import SCALARS, rebind, restore, snapshot, state_tree, walk
-from megastep.types import Env, World
+from megastep.types import Env, World, optional
 
 __all__ = ["CaptureError", "Captured", "Graph", "capture", "restore", "snapshot", "state_tree"]
 
@@ -216,7 +216,8 @@ def _line(error):
 
 class Captured:
     """Wraps an environment on a GPU so that ``step`` replays a CUDA graph, recorded at the first
-    step. On the CPU ``step`` is the environment's own. All other attributes are the environment's.
+    step. On the CPU, or if the environment is not ``capturable``, ``step`` is the environment's own.
+    All other attributes are the environment's.
 
     Args:
         env: the environment to wrap.
@@ -242,6 +243,8 @@ class Captured:
         if self._step is None:
             on_gpu = torch.device(self.env.device).type == "cuda"
             self._step = (
-                capture(self.env.step, (decision,), (self.env,)) if on_gpu else self.env.step
+                capture(self.env.step, (decision,), (self.env,))
+                if on_gpu and optional(self.env, "capturable")
+                else self.env.step
             )
         return self._step(decision)

@@ -48,6 +48,10 @@ class Env(Protocol):
     Optional attributes, whose defaults are in ``DEFAULTS``; read them with :func:`optional`:
         n_agents: number of lanes per environment, A. Default: 1.
         fps: steps per second of simulated time, for videos. Default: 10.
+        capturable: False if it steps on the host, where no CUDA graph can repeat a step. Default:
+            True.
+        resumable: False if a checkpoint cannot hold its state: a resumed run begins new episodes.
+            Default: True.
         check(): raises the errors that were flagged on the device. Synchronises host and device.
         layout: (N,) integers, the floor plan that each environment shows now. Confidence intervals
             of an evaluation are over layouts. Default: None, intervals are over environments.
@@ -55,6 +59,7 @@ class Env(Protocol):
             environment. It plays as ``opponents.bot`` and ``against=bot``. Default: none.
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
         privileged_space: space of ``world.privileged``. Default: None, there is none.
+        close(): ends what it started, such as processes. Called after training. Default: none.
         desync(): gives every lane a random age, as if its episode had been going on for some steps.
             Training calls it after ``reset``, so that lanes do not end their episodes in the same
             steps. Default: none.
@@ -77,6 +82,9 @@ class Env(Protocol):
 DEFAULTS: dict[str, Any] = {
     "n_agents": 1,
     "fps": 10.0,
+    "capturable": True,
+    "resumable": True,
+    "close": lambda: None,
     "check": lambda: None,
     "layout": None,
     "bot": None,

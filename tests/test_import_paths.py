@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from megastep.agents.imports import import_object
+from megastep.imports import import_object
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ import yaml
 import megastep
 from megastep import cache
 from megastep.agents.cli import program
-from megastep.agents.imports import import_object
+from megastep.imports import import_object
 from megastep.settings import arguments_of
 
 POLICY = "megastep.agents.networks.policy:Policy"

@@ -12,12 +12,12 @@ from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.cli import check, program
 from megastep.agents.cli.settings import Agent, Env, Geometry, Learner, Train, changed
 from megastep.agents.distributed import process_group
-from megastep.agents.imports import import_object
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.training import checkpoint, checkpoint_format, evaluation, loggers
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.capture import state_tree
+from megastep.imports import import_object
 from megastep.types import n_lanes, optional
 
 #: Number of environments in which the memory of one is measured.

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_validator
 
 from megastep.agents.cli import components
-from megastep.agents.imports import import_object
+from megastep.imports import import_object
 from megastep.settings import closest, frozen, located, settings_class, settings_of
 
 

@@ -15,11 +15,11 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.imports import resolve
 from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.mingru import MinGRU
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
+from megastep.imports import resolve
 
 
 class GRU(nn.Module):

@@ -11,8 +11,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from megastep import spaces
-from megastep.agents.imports import resolve
 from megastep.agents.networks.precision import compute_dtype
+from megastep.imports import resolve
 from megastep.types import Space
 
 

@@ -14,12 +14,12 @@ from pydantic import AfterValidator, Field
 from torch import nn
 
 from megastep.agents.generator import SeededGenerator, stream_seed
-from megastep.agents.imports import known_name
 from megastep.agents.networks import cores, encoders, heads
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.running_norm import update_norms
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
+from megastep.imports import known_name
 from megastep.settings import checked
 from megastep.types import Space, Tree
 

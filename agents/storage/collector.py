@@ -11,7 +11,7 @@ from megastep.arrdict import arrdict
 from megastep.capture import capture
 from megastep.dotdict import leaves
 from megastep.env_state import EnvState
-from megastep.types import Env, Tree
+from megastep.types import Env, Tree, optional
 
 _STORED = "obs", "reset", "learns", "privileged"  # what `Rollout.store_world` reads
 
@@ -68,7 +68,7 @@ class Collector:
     """Fills the same rollout again and again. Each call collects T steps and returns the rollout.
 
     The first call is eager, so that libraries can initialise themselves. From the second call on, a
-    GPU replays a CUDA graph.
+    GPU replays a CUDA graph, unless the environment steps on the host.
 
     Args:
         env: environment. It is reset here, once, unless there is an `actor_state`.
@@ -87,12 +87,13 @@ class Collector:
         if actor_state is None:
             actor_state = initial_actor_state(env, policy, rollout)
         self.parts = env, policy, rollout, actor_state
-        self.on_gpu = torch.device(env.device).type == "cuda"
+        on_gpu = torch.device(env.device).type == "cuda"
+        self.can_capture = on_gpu and optional(env, "capturable")
         self.n_collected = 0
         self.graph = None
 
     def __call__(self) -> Rollout:
-        if self.on_gpu and self.n_collected == 1:
+        if self.can_capture and self.n_collected == 1:
             env_state = EnvState(self.parts[0])
             before = env_state.host_state()
             self.graph = capture(lambda: collect(*self.parts), (), self.parts)

@@ -23,7 +23,7 @@ from megastep.agents.storage.rollout import Rollout
 from megastep.agents.training.atomic_files import write_atomically
 from megastep.agents.training.nonfinite_replay import FORMAT, env_axis, rows_of
 from megastep.capture import state_tree
-from megastep.types import Env, n_lanes
+from megastep.types import Env, n_lanes, optional
 
 #: Tensors that all environments share are kept up to this size. Larger ones, such as floor plans,
 #: do not change, and are made again from the configuration.
@@ -31,7 +31,8 @@ MAX_SHARED_BYTES = 2**20
 #: What a run without a recorder says in place of a command.
 NOT_RECORDED = (
     "Nothing was recorded to see it again: recording does not work with learner.lag, with a "
-    "learner's own collector, or for rollouts before a resume"
+    "learner's own collector, in environments that step on the host, or for rollouts before a "
+    "resume"
 )
 
 
@@ -173,14 +174,14 @@ def make_recorder(
     env: Env, opponents: Any, check: NonFiniteCheck | None, collect: Any
 ) -> RolloutRecorder | None:
     """Returns a recorder of what `collect` collects, or None where steps cannot be repeated: an
-    async collector starts rollouts before the earlier ones are checked, and a learner's own
-    collector may do anything.
+    async collector starts rollouts before the earlier ones are checked, a learner's own collector
+    may do anything, and what steps on the host keeps its state elsewhere than in tensors.
 
     Args:
         env: the environment.
         opponents: `env`, if it is an `Opponents`.
     """
-    if not isinstance(collect, Collector) or check is None:
+    if not isinstance(collect, Collector) or check is None or not optional(env, "capturable"):
         return None
     if opponents is None:
         return RolloutRecorder(env, check)

@@ -46,19 +46,24 @@ class RunState:
         self.replay_buffer = optional(learner, "replay_buffer", LEARNER_DEFAULTS)
         self.has_named_unreachable = False
 
+    @property
+    def is_resumable(self) -> bool:
+        return optional(self.env_state.env, "resumable")
+
     def state_dict(self, has_episodes: bool = True) -> dict[str, Any]:
         """Returns the state as dicts of tensors and plain values, most of which share their memory
         with what trains. Nothing may step the environment meanwhile.
 
         Args:
-            has_episodes: includes the environment, and what the policy remembers of it.
+            has_episodes: includes the environment, if it is `resumable`, and what the policy
+                remembers of it.
         """
         parts = dict(
             policy=self.policy.state_dict(),
             learner=self.learner.state_dict(),
             episode_stats=self.episode_stats.state_dict(),
         )
-        if has_episodes:
+        if has_episodes and self.is_resumable:
             parts["env"] = self.env_state.state_dict()
             parts["collector"] = getattr(self.collect, "state_dict", dict)()
         if self.opponents is not None:
@@ -125,7 +130,7 @@ class RunState:
 
     def warn_of_unreachable(self) -> None:
         """Warns once of what the environment keeps where checkpoints cannot reach it."""
-        if self.has_named_unreachable or rank() > 0:
+        if self.has_named_unreachable or rank() > 0 or not self.is_resumable:
             return
         if names := self.env_state.unreachable():
             self.has_named_unreachable = True

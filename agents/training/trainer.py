@@ -182,7 +182,8 @@ class Trainer:
         self.saver.wait()
 
     def close(self) -> None:
-        """Closes the files of metrics, after training."""
+        """Closes the environment and the files of metrics, after training."""
+        optional(self.env, "close")()
         if self.annealing_record is not None:
             self.annealing_record.close()
         self.logger.close()

@@ -12,8 +12,8 @@ from pydantic import ValidationError
 from megastep.agents.cli import components, train
 from megastep.agents.cli.check import as_tree
 from megastep.agents.cli.program import ConfigErrors, UserError
-from megastep.agents.imports import import_object
 from megastep.agents.training import checkpoint
+from megastep.imports import import_object
 from megastep.settings import arguments_of, sentence, settings_class
 from tests.helpers.tiny import TINY, settings
 

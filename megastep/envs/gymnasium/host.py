@@ -1,0 +1,68 @@
+"""Memory on the host through which worlds reach the learner's device, and actions come back."""
+
+import numpy as np
+import torch
+
+from megastep import spaces
+from megastep.arrdict import arrdict
+from megastep.dotdict import leaves
+from megastep.types import Space, Tree
+
+__all__ = ["HostBuffers"]
+
+
+class HostBuffers:
+    """Buffers of a world and of actions: pinned, and so copied without a detour, if the device is a
+    GPU.
+
+    Args:
+        n_envs: number of environments, N.
+        obs_space: space of one lane's observation.
+        action_space: space of one lane's actions.
+        device: where worlds go and actions come from.
+    """
+
+    IS_STATELESS = True  # see :mod:`megastep.engine.state_tree`
+
+    def __init__(
+        self, n_envs: int, obs_space: Space, action_space: Space, device: torch.device
+    ):
+        self.device, self.on_gpu = device, device.type == "cuda"
+
+        def empty(dtype, *shape):
+            return torch.empty((n_envs, *shape), dtype=dtype, pin_memory=self.on_gpu)
+
+        def of_space(space):
+            dtypes = {spaces.MultiDiscrete: torch.int64, spaces.MultiContinuous: torch.float32}
+            return empty(dtypes.get(type(space)) or space.dtype, *space.shape)
+
+        flags = {name: empty(torch.bool) for name in ("reset", "terminal", "truncated")}
+        self.world = arrdict(
+            obs=spaces.map(of_space, obs_space), reward=empty(torch.float32), **flags
+        )
+        self.actions = spaces.map(of_space, action_space)
+        self.arrays = [leaf.numpy() for leaf in leaves(self.world)]
+        self.copied = torch.cuda.Event() if self.on_gpu else None
+
+    def send(self, world: arrdict) -> arrdict:
+        """Returns a world of arrays as one of new tensors on the device."""
+        if self.on_gpu:
+            self.copied.synchronize()  # the last world may still be on its way
+        for buffer, array in zip(self.arrays, leaves(world), strict=True):
+            np.copyto(buffer, array, casting="unsafe")
+        if not self.on_gpu:
+            return self.world.map(torch.clone)
+        sent = self.world.map(lambda leaf: leaf.to(self.device, non_blocking=True))
+        self.copied.record()
+        return sent
+
+    def receive(self, actions: Tree) -> Tree:
+        """Returns actions as arrays, once the device has chosen them. They are valid until the next
+        call.
+        """
+        if not self.on_gpu:
+            return spaces.map(lambda _, leaf: leaf.numpy(), self.actions, actions)
+        spaces.map(lambda to, leaf: to.copy_(leaf, non_blocking=True), self.actions, actions)
+        self.copied.record()
+        self.copied.synchronize()
+        return spaces.map(lambda leaf: leaf.numpy(), self.actions)

@@ -1,0 +1,126 @@
+"""Makes Gymnasium's vector environments, and says in one sentence why one cannot be made."""
+
+import difflib
+import functools
+import importlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from megastep.imports import import_object, search_current_folder
+from megastep.vector_processes import VectorProcesses
+
+__all__ = ["vector_env"]
+
+INSTALL = "pip install 'megastep-flatland[gymnasium]'"
+
+
+def vector_env(
+    id: str | None,
+    n_envs: int,
+    kwargs: Mapping[str, Any],
+    wrappers: Sequence[str],
+    vectorization: str,
+) -> Any:
+    """Returns a vector environment that resets an environment in the step after its episode's end.
+
+    Args are those of :class:`~megastep.envs.gymnasium.env.Gymnasium`.
+
+    Raises:
+        ValueError: if there is none, saying what would do.
+    """
+    try:
+        import gymnasium
+    except ImportError:
+        raise ValueError(f"Gymnasium is not installed: {INSTALL}") from None
+    spec = _spec(id)
+    try:
+        wrappers = [import_object(name) for name in wrappers]
+    except ValueError as error:
+        raise ValueError(f"env.wrappers: {error}") from None
+    make = functools.partial(gymnasium.make_vec, spec)
+    try:
+        if vectorization == "own":
+            return _checked(id, _own(make, spec, wrappers, n_envs, kwargs))
+        # a checker warns of what an environment does wrong in its first steps, once per environment
+        settings = {"disable_env_checker": True, **_rendering(spec.entry_point), **kwargs}
+        make = functools.partial(
+            make,
+            vectorization_mode="sync",
+            vector_kwargs={"copy": False},
+            wrappers=wrappers,
+            **settings,
+        )
+        return make(num_envs=n_envs) if vectorization == "sync" else VectorProcesses(make, n_envs)
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise ValueError(f"{id} needs a package that is missing: {_line(error)}") from None
+    except ValueError as error:
+        raise ValueError(f"{id} cannot be made: {_line(error)}") from None
+    except Exception as error:
+        cause = f" with env.kwargs={dict(kwargs)}" if kwargs else ""
+        raise ValueError(
+            f"{id} cannot be made{cause}: {type(error).__name__}: {_line(error)}"
+        ) from error
+
+
+def _spec(id):
+    """Returns the specification of an environment, whose package is imported if it names one."""
+    import gymnasium
+
+    if id is None:
+        raise ValueError("env.id is missing; name an environment, such as env.id=CartPole-v1")
+    package, _, name = id.rpartition(":")
+    if package:
+        search_current_folder()
+        try:
+            importlib.import_module(package)
+        except Exception as error:
+            raise ValueError(
+                f"env.id={id} needs the package {package}, which cannot be imported "
+                f"({_line(error)}); install the one that has it"
+            ) from None
+    if name not in gymnasium.registry:
+        near = difflib.get_close_matches(name, gymnasium.registry, 1)
+        raise ValueError(
+            f"Gymnasium has no environment {name!r}; "
+            + (f"did you mean {near[0]}? " if near else "")
+            + "Those of other packages are package:id, such as minigrid:MiniGrid-MemoryS7-v0"
+        )
+    return gymnasium.registry[name]
+
+
+def _rendering(entry_point):
+    """Returns the argument that lets an environment draw images, if it can."""
+    from gymnasium.envs.registration import load_env_creator
+
+    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    modes = (getattr(creator, "metadata", None) or {}).get("render_modes", ())
+    return {"render_mode": "rgb_array"} if "rgb_array" in modes else {}
+
+
+def _own(make, spec, wrappers, n_envs, kwargs):
+    if wrappers:
+        raise ValueError(
+            "env.wrappers go around single environments, which its own vector environment has "
+            "not; use env.vectorization=sync or async"
+        )
+    if spec.vector_entry_point is None:
+        raise ValueError("it has no vector environment of its own; use env.vectorization=sync")
+    settings = {**_rendering(spec.vector_entry_point), **kwargs}
+    return make(num_envs=n_envs, vectorization_mode="vector_entry_point", **settings)
+
+
+def _checked(id, env):
+    from gymnasium.vector import AutoresetMode
+
+    mode = env.metadata.get("autoreset_mode")
+    if mode != AutoresetMode.NEXT_STEP:
+        env.close()
+        raise ValueError(
+            f"its own vector environment resets by {mode}, which loses the last observation of an "
+            "episode or leaves the reset to others; use env.vectorization=sync"
+        )
+    return env
+
+
+def _line(error):
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

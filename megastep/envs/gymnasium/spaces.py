@@ -1,0 +1,173 @@
+"""Gymnasium's spaces as megastep's: each with the function that converts a batch of its values.
+
+N environments, one agent each; `...` the shape of a Gymnasium space.
+"""
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+
+from megastep import spaces
+from megastep.arrdict import arrdict
+from megastep.dotdict import dotdict
+from megastep.types import Space
+
+__all__ = ["actions", "observation"]
+
+#: The fewest rows and columns, and the most channels, of an image.
+MIN_SIDE, MAX_CHANNELS = 8, 4
+CURE = "env.wrappers=[package.module:Wrapper]"
+
+#: A space of ours, and the function that converts a batch of values.
+Conversion = tuple[Space, Callable[[Any], Any]]
+
+
+def observation(space: Any, path: str = "observation") -> Conversion:
+    """Returns the observation space for one of Gymnasium's, and a function from a batch of its
+    values, arrays (N, ...), to arrays of ours, (N, *space.shape) per leaf.
+
+    Args:
+        path: what the space is called in messages.
+
+    Raises:
+        ValueError: naming the first leaf that no encoder takes.
+    """
+    from gymnasium import spaces as gym
+
+    if isinstance(space, (gym.Dict, gym.Tuple)):
+        parts = _parts(space, observation, path)
+        return _tree(parts), lambda values: arrdict(
+            {name: convert(values[key]) for name, key, _, convert in parts}
+        )
+    if isinstance(space, gym.Discrete):
+        return spaces.MultiDiscrete(1, int(space.n)), lambda x: (x - space.start)[:, None]
+    if isinstance(space, gym.MultiDiscrete):
+        columns, sizes = (-1, space.nvec.size), [int(n) for n in space.nvec.flat]
+        if len({*sizes}) == 1:
+            whole = spaces.MultiDiscrete(len(sizes), sizes[0])
+            return whole, lambda x: (x - space.start).reshape(columns)
+        names = _identifiers(range(len(sizes)))
+        return _choices(names, sizes), lambda x: arrdict(
+            zip(names, np.split((x - space.start).reshape(columns), len(names), 1))
+        )
+    if not isinstance(space, (gym.Box, gym.MultiBinary)) or 0 in space.shape:
+        raise ValueError(
+            f"{path} is {_described(space)}, which no encoder takes; give it a wrapper that drops "
+            f"or encodes it: {CURE}"
+        )
+    return _image(space) or (
+        spaces.MultiVector(1, math.prod(space.shape), dtype=torch.float32),
+        lambda x: x.reshape(len(x), 1, -1),
+    )
+
+
+def actions(space: Any, path: str = "action") -> Conversion:
+    """Returns the action space for one of Gymnasium's, and a function from arrays of our actions,
+    (N, *space.shape) per leaf, to a batch of its values, arrays (N, ...).
+
+    Args:
+        path: what the space is called in messages.
+
+    Raises:
+        ValueError: naming the first leaf that no output chooses.
+    """
+    from gymnasium import spaces as gym
+
+    if isinstance(space, (gym.Dict, gym.Tuple)):
+        parts = _parts(space, actions, path)
+        as_batch = dict if isinstance(space, gym.Dict) else lambda pairs: tuple(dict(pairs).values())
+        return _tree(parts), lambda tree: as_batch(
+            (key, convert(tree[name])) for name, key, _, convert in parts
+        )
+    dtype, shape = space.dtype, (-1, *(space.shape or ()))
+    if isinstance(space, gym.Discrete):
+        return spaces.MultiDiscrete(1, int(space.n)), lambda x: (x[:, 0] + space.start).astype(dtype)
+    if isinstance(space, gym.MultiBinary):
+        return spaces.MultiDiscrete(math.prod(space.shape), 2), partial(_reshaped, shape, dtype)
+    if isinstance(space, gym.MultiDiscrete):
+        sizes = [int(n) for n in space.nvec.flat]
+        if len({*sizes}) == 1:
+            whole = spaces.MultiDiscrete(len(sizes), sizes[0])
+            return whole, lambda x: (x.reshape(shape) + space.start).astype(dtype)
+        names = _identifiers(range(len(sizes)))
+        return _choices(names, sizes), lambda tree: (
+            np.concatenate([tree[name] for name in names], 1).reshape(shape) + space.start
+        ).astype(dtype)
+    if not isinstance(space, gym.Box) or 0 in space.shape:
+        raise ValueError(
+            f"{path} is {_described(space)}, which no output chooses; give it a wrapper that "
+            f"replaces it: {CURE}"
+        )
+    low, high = space.low, space.high
+    if not space.is_bounded() or not (low < high).all():
+        raise ValueError(
+            f"{path} is {_described(space)}, and actions need finite bounds, each low below its "
+            f"high; give it a wrapper with a narrower space: {CURE}"
+        )
+    bounds = (tuple(float(bound) for bound in side.flat) for side in (low, high))
+    rounded = np.rint if np.issubdtype(dtype, np.integer) else np.asarray
+    return (
+        spaces.MultiContinuous(1, low.size, *bounds),
+        # float32 may have rounded beyond a bound of float64
+        lambda x: np.clip(rounded(x.reshape(shape)), low, high).astype(dtype),
+    )
+
+
+def _reshaped(shape, dtype, array):
+    return array.reshape(shape).astype(dtype)
+
+
+def _image(space):
+    """Returns the conversion of a Box that is an image, channels last or first; None if it is not.
+
+    The rows and columns of an image tell which axis has its channels.
+    """
+    if type(space).__name__ != "Box" or len(space.shape) != 3:
+        return None
+    dtype = torch.uint8 if space.dtype == np.uint8 else torch.float32
+    first, rows, last = space.shape
+    if min(first, rows) >= MIN_SIDE and last <= MAX_CHANNELS:
+        image = spaces.MultiImage(1, last, first, rows, dtype=dtype)
+        return image, lambda x: x.transpose(0, 3, 1, 2)[:, None]
+    if min(rows, last) >= MIN_SIDE and first <= MAX_CHANNELS:
+        return spaces.MultiImage(1, first, rows, last, dtype=dtype), lambda x: x[:, None]
+    return None
+
+
+def _parts(space, conversion, path):
+    """Returns [(name of ours, Gymnasium's key, space, function)] of a Dict or Tuple."""
+    children = space.spaces if isinstance(space.spaces, Mapping) else dict(enumerate(space.spaces))
+    return [
+        (name, key, *conversion(child, f"{path}[{key!r}]"))
+        for name, (key, child) in zip(_identifiers(children), children.items())
+    ]
+
+
+def _tree(parts):
+    return dotdict({name: space for name, _, space, _ in parts})
+
+
+def _choices(names, sizes):
+    return dotdict({name: spaces.MultiDiscrete(1, n) for name, n in zip(names, sizes)})
+
+
+def _identifiers(keys):
+    """Returns a name for each key: `a-b` becomes a_b, and 0 becomes part_0."""
+    names = []
+    for key in keys:
+        name = re.sub(r"\W", "_", str(key))
+        name = name if name.isidentifier() else f"part_{name}"
+        while name in names:
+            name += "_"
+        names.append(name)
+    return names
+
+
+def _described(space):
+    text = " ".join(str(space).split())
+    return text if len(text) <= 80 else f"{text[:80]}..."
