@@ -10,6 +10,7 @@ with kernels built for AddressSanitizer and UndefinedBehaviorSanitizer.
 
 import contextlib
 import itertools
+import math
 import sys
 from pathlib import Path
 
@@ -44,7 +45,7 @@ def out_of_range(c, spawn):
 
 def step(env, n_lanes, action):
     """Steps an environment. On the CPU an action out of range raises at once."""
-    actions = torch.full((n_lanes, 1), action, device=env.device)
+    actions = torch.full((n_lanes, *env.action_space.shape), action, device=env.device)
     with contextlib.suppress(engine.EngineError):
         env.step(arrdict.arrdict(actions=actions))
 
@@ -77,6 +78,10 @@ def main(device):
         env.reset()
         for action in range(7):
             step(env, 7, action)
+    env = envs.Explorer(7, homes, device=device, control="continuous")
+    env.reset()
+    for number in (0.5, -2.0, math.inf, math.nan):
+        step(env, 7, number)
     for n_agents in (2, 16):
         env = envs.Deathmatch(7, homes, n_agents=n_agents, device=device, damage=1, privileged=True)
         env.reset()

@@ -3,14 +3,16 @@
 `torch.optim.Adam` imports PyTorch's compiler first, which takes more than a second.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015). A step skips parameters without a gradient: frozen or unused ones.
+    """Adam (Kingma and Ba 2015), with decoupled weight decay (AdamW, Loshchilov and Hutter 2019).
+
+    A step skips parameters without a gradient: frozen or unused ones.
 
     Args:
         parameters: parameters to optimise. They share one count of steps, as if every step had
@@ -18,6 +20,9 @@ class Adam:
         lr: step size, a tensor () on their device that may be changed in place.
         betas: decay of the running means of gradients and of squared gradients.
         eps: added to the denominator.
+        weight_decay: a step also subtracts step size x `weight_decay` x weight. Parameters with
+            fewer than two axes, such as biases, do not decay.
+        lr_factors: factors of `lr` for some of the parameters; 1 for the others.
     """
 
     def __init__(
@@ -26,32 +31,42 @@ class Adam:
         lr: torch.Tensor,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-5,
+        weight_decay: float = 0.0,
+        lr_factors: Mapping[torch.nn.Parameter, float] | None = None,
     ):
         self.parameters, self.lr = list(parameters), lr
         self.betas, self.eps = betas, eps
         self.n_steps = torch.zeros((), device=lr.device)
         self.means = [torch.zeros_like(p) for p in self.parameters]
         self.squares = [torch.zeros_like(p) for p in self.parameters]
+        # those of one step size and one decay are updated by one operation
+        self._groups: dict[tuple[float, float], list] = {}
+        for row in zip(self.parameters, self.means, self.squares, strict=True):
+            factor = (lr_factors or {}).get(row[0], 1.0)
+            key = factor, weight_decay if row[0].ndim > 1 else 0.0
+            self._groups.setdefault(key, []).append(row)
 
     @torch.no_grad()
     def step(self, is_taken: torch.Tensor) -> None:
         """Takes one step if `is_taken`, a bool () on the device; otherwise changes nothing."""
         self.n_steps += is_taken
-        everything = zip(self.parameters, self.means, self.squares, strict=True)
-        rows = [(p, p.grad, *moments) for p, *moments in everything if p.grad is not None]
-        torch._fused_adam_(
-            *map(list, zip(*rows)),
-            [],
-            [self.n_steps] * len(rows),
-            lr=self.lr,
-            beta1=self.betas[0],
-            beta2=self.betas[1],
-            weight_decay=0.0,
-            eps=self.eps,
-            amsgrad=False,
-            maximize=False,
-            found_inf=(~is_taken).float(),
-        )
+        found_inf = (~is_taken).float()
+        for (factor, weight_decay), members in self._groups.items():
+            rows = [(p, p.grad, *moments) for p, *moments in members if p.grad is not None]
+            if rows:
+                torch._fused_adamw_(
+                    *map(list, zip(*rows)),
+                    [],
+                    [self.n_steps] * len(rows),
+                    lr=self.lr if factor == 1 else self.lr * factor,
+                    beta1=self.betas[0],
+                    beta2=self.betas[1],
+                    weight_decay=weight_decay,
+                    eps=self.eps,
+                    amsgrad=False,
+                    maximize=False,
+                    found_inf=found_inf,
+                )
 
     def zero_grad(self) -> None:
         """Frees the gradients."""

@@ -93,6 +93,8 @@ class GradientLearner:
         max_grad_norm: longer gradients are scaled down to this norm.
         graph: on a GPU, captures updates as a CUDA graph.
         seed: seed of the learner's own generator.
+        critic_lr: Adam's step size of the critic's parameters. None: `lr`.
+        weight_decay: Adam's weight decay, of all weights but biases and other vectors.
 
     Attributes:
         steps: the `GradientSteps` of the policy's parameters.
@@ -100,9 +102,23 @@ class GradientLearner:
         generator: the `SeededGenerator` of all random numbers in an update.
     """
 
-    def __init__(self, policy: Policy, lr: float, max_grad_norm: float, graph: bool, seed: int):
+    def __init__(
+        self,
+        policy: Policy,
+        lr: float,
+        max_grad_norm: float,
+        graph: bool,
+        seed: int,
+        critic_lr: float | None = None,
+        weight_decay: float = 0.0,
+    ):
         self.policy, self.device, self.lr = policy, policy.device, lr
-        self.steps = GradientSteps(policy.parameters(), lr, max_grad_norm, self.device)
+        lr_factors = {}
+        if critic_lr is not None:
+            lr_factors = dict.fromkeys(policy.critic.parameters(), critic_lr / lr)
+        self.steps = GradientSteps(
+            policy.parameters(), lr, max_grad_norm, self.device, weight_decay, lr_factors
+        )
         self.check, self.optimizer = self.steps.check, self.steps.optimizer
         self.generator = SeededGenerator(stream_seed(seed, "learner"))
         self.cuda_graph = CudaGraphUpdate(self._update, self.device, graph, (self.generator,))
@@ -120,7 +136,7 @@ class GradientLearner:
         raise NotImplementedError
 
     def set_lr(self, lr: float) -> None:
-        """Changes Adam's step size, also for a captured update."""
+        """Changes Adam's step size, the critic's by the same factor, also for a captured update."""
         self.steps.set_lr(lr)
 
     def state_dict(self) -> dict[str, Any]:

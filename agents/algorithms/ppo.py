@@ -5,7 +5,7 @@ over valid steps: those that the environment took, of lanes that learn. An updat
 synchronises: conditions are bool tensors on the device.
 """
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -38,10 +38,17 @@ class PPO(GradientLearner):
         policy: a policy with a critic.
         n_steps: steps of a rollout, T.
         lr: Adam's step size.
+        critic_lr: Adam's step size of the critic's own parameters, those under "critic."; it falls
+            with `lr`. None: `lr`.
+        weight_decay: decoupled weight decay (AdamW) of all weights but biases and other vectors.
         gamma: discount per step.
         lambda_: lambda of GAE.
         clip: how far the probability ratio of an action may move from 1 before its gradient stops.
-        entropy_coef: weight of the entropy bonus; advantages have standard deviation 1.
+        value_clip: how far the value may move from that at the time of acting before its gradient
+            stops, in the value's own scale (as in OpenAI Baselines). None: any distance.
+        normalise_advantage: over what advantages get mean 0 and standard deviation 1: "rollout",
+            "minibatch", or "none", which leaves them in units of reward.
+        entropy_coef: weight of the entropy bonus, relative to the advantages.
         value_coef: weight of the value's squared error, measured in the value's own scale.
         auxiliary_coef: weight of the policy's `prediction_error`, with an asymmetric critic.
         max_grad_norm: longer gradients are scaled down to this norm.
@@ -63,9 +70,13 @@ class PPO(GradientLearner):
         *,
         n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
         lr: Positive = 1e-3,
+        critic_lr: Positive | None = None,
+        weight_decay: Coefficient = 0.0,
         gamma: Fraction = 0.995,
         lambda_: Fraction = 0.95,
         clip: Positive = 0.2,
+        value_clip: Positive | None = None,
+        normalise_advantage: Literal["rollout", "minibatch", "none"] = "rollout",
         entropy_coef: Coefficient = 0.01,
         value_coef: Coefficient = 0.5,
         auxiliary_coef: Coefficient = 0.5,
@@ -78,9 +89,10 @@ class PPO(GradientLearner):
     ):
         if policy.critic is None:
             raise ValueError("PPO needs a policy with a critic: use agent.output=softmax")
-        super().__init__(policy, lr, max_grad_norm, graph, seed)
+        super().__init__(policy, lr, max_grad_norm, graph, seed, critic_lr, weight_decay)
         self.n_steps, self.gamma, self.lambda_ = n_steps, gamma, lambda_
-        self.clip, self.entropy_coef = clip, entropy_coef
+        self.clip, self.value_clip, self.entropy_coef = clip, value_clip, entropy_coef
+        self.normalise_advantage = normalise_advantage
         self.value_coef, self.auxiliary_coef = value_coef, auxiliary_coef
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
         self.target_kl = float("inf") if target_kl is None else target_kl
@@ -117,7 +129,10 @@ class PPO(GradientLearner):
         estimates["valid"] = estimates.valid & rollout.learns[:-1]
         self.policy.critic.output.update_stats(estimates.targets, estimates.valid & is_finite)
         explained = explained_variance(transitions["value"], estimates.targets, estimates.valid)
-        estimates["advantages"] = pooled_normalise(estimates.advantages, estimates.valid)
+        if self.normalise_advantage == "rollout":
+            estimates["advantages"] = pooled_normalise(estimates.advantages, estimates.valid)
+        if self.value_clip is not None:
+            estimates["old_value"] = transitions["value"]
 
         is_stopped = torch.zeros((), dtype=torch.bool, device=self.device)
         for _ in range(self.n_epochs):
@@ -126,6 +141,8 @@ class PPO(GradientLearner):
             for lanes in order.tensor_split(self.n_minibatches):
                 selected = estimates.map(torch.index_select, 1, lanes)
                 batch = arrdict({**rollout.sequences(lanes), **selected})
+                if self.normalise_advantage == "minibatch":
+                    batch["advantages"] = pooled_normalise(batch.advantages, batch.valid)
                 loss, metrics = self._losses(batch)
                 kl = self.steps.backward(loss, metrics, batch.valid.sum())["kl"]
                 is_stopped = is_stopped | (kl > self.target_kl)
@@ -148,10 +165,9 @@ class PPO(GradientLearner):
         clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
         surrogate = torch.minimum(ratio * batch.advantages, clipped * batch.advantages)
         value = self.policy.value(now.features, privileged)
-        error = (value - batch.targets) / self.policy.critic.output.scale
 
         policy_loss = -masked_mean(surrogate, valid)
-        value_loss = masked_mean(error.square(), valid)
+        value_loss = masked_mean(self._squared_error(value, batch), valid)
         entropy = masked_mean(output.entropy(now.logits), valid)
         with torch.no_grad():
             # this estimate of the KL divergence is never negative, unlike the mean log ratio
@@ -170,3 +186,13 @@ class PPO(GradientLearner):
             metrics["auxiliary"] = masked_mean(error, valid)
             loss = loss + self.auxiliary_coef * metrics["auxiliary"]
         return loss, metrics
+
+    def _squared_error(self, value, batch):
+        """Returns the squared error (T, M) of the value, in the value's own scale."""
+        scale = self.policy.critic.output.scale
+        squared = ((value - batch.targets) / scale).square()
+        if self.value_clip is None:
+            return squared
+        limit = self.value_clip * scale
+        clipped = batch.old_value + (value - batch.old_value).clamp(-limit, limit)
+        return torch.maximum(squared, ((clipped - batch.targets) / scale).square())

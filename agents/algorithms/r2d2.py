@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 
 from megastep.agents.algorithms import returns
-from megastep.agents.algorithms.learner import Fraction, GradientLearner, Positive
+from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
 from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import store_if
@@ -67,6 +67,7 @@ class R2D2(GradientLearner):
         policy: a policy with `output="duelling"`.
         n_steps: steps of a rollout, T.
         lr: Adam's step size.
+        weight_decay: decoupled weight decay (AdamW) of all weights but biases and other vectors.
         gamma: discount per step.
         return_steps: n of the n-step returns, the rewards summed before bootstrapping.
         target_period: gradient steps between two copies of the weights to the target network.
@@ -91,6 +92,7 @@ class R2D2(GradientLearner):
         *,
         n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
         lr: Positive = 1e-3,
+        weight_decay: Coefficient = 0.0,
         gamma: Fraction = 0.995,
         return_steps: Annotated[int, Field(ge=1, le=1000)] = 10,
         target_period: Annotated[int, Field(ge=1, le=10**6)] = 200,
@@ -105,7 +107,7 @@ class R2D2(GradientLearner):
     ):
         if policy.output_kind != "duelling":
             raise ValueError("R2D2 needs a policy of action values: use agent.output=duelling")
-        super().__init__(policy, lr, max_grad_norm, graph, seed)
+        super().__init__(policy, lr, max_grad_norm, graph, seed, weight_decay=weight_decay)
         self.n_steps, self.gamma, self.return_steps = n_steps, gamma, return_steps
         self.target_period, self.eta = target_period, eta
         self.epsilon, self.epsilon_spread = epsilon, epsilon_spread

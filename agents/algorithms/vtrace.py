@@ -53,6 +53,9 @@ class VTrace(GradientLearner):
         policy: a policy with a critic.
         n_steps: steps of a rollout, T.
         lr: Adam's step size.
+        critic_lr: Adam's step size of the critic's own parameters, those under "critic."; it falls
+            with `lr`. None: `lr`.
+        weight_decay: decoupled weight decay (AdamW) of all weights but biases and other vectors.
         gamma: discount per step.
         lambda_: decay of the traces.
         rho_clip: truncation of the ratios in the policy's gradient and the value's error. At 1,
@@ -88,6 +91,8 @@ class VTrace(GradientLearner):
         *,
         n_steps: Annotated[int, Field(ge=1, le=65_536)] = 32,
         lr: Positive = 1e-3,
+        critic_lr: Positive | None = None,
+        weight_decay: Coefficient = 0.0,
         gamma: Fraction = 0.995,
         lambda_: Fraction = 0.95,
         rho_clip: Positive = 1.0,
@@ -115,7 +120,7 @@ class VTrace(GradientLearner):
                 f"with rollouts, so after their burn-in they must have n_steps={n_steps} steps; "
                 "leave replay.length out"
             )
-        super().__init__(policy, lr, max_grad_norm, graph, seed)
+        super().__init__(policy, lr, max_grad_norm, graph, seed, critic_lr, weight_decay)
         self.n_steps, self.lag = n_steps, lag
         self.traces = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
         self.advantage_floor, self.entropy_coef = advantage_floor, entropy_coef

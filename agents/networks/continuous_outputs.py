@@ -1,8 +1,8 @@
 """Outputs of continuous actions within bounds: a squashed Gaussian, or a Beta distribution.
 
-`...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane controls,
-D numbers of each. Both work on x, an action scaled to -1 to 1, and measure probabilities and
-entropy there: a uniform distribution has an entropy of log 2 per number, whatever the bounds.
+`...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane
+controls, D numbers of each. Both work on x, an action scaled to -1 to 1, and measure probabilities
+and entropy there: a uniform distribution has an entropy of log 2 per number, whatever the bounds.
 Numbers are independent of each other.
 """
 
@@ -68,9 +68,9 @@ class GaussianOutput(_BoundedOutput):
         width: number of features.
     """
 
-    # tanh(5) is 0.9999: larger means would only make gradients vanish
+    # tanh(5) is 0.9999, and the gradient of a log-probability is inverse to the standard deviation
     max_mean = 5.0
-    min_log_std = -5.0
+    min_log_std = -3.0
 
     def __init__(self, space: spaces.MultiContinuous, width: int):
         super().__init__(space, width, n_parameters=1)

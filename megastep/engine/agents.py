@@ -85,6 +85,8 @@ _MESSAGES = dict(
     "what was last written to them.",
     BAD_ACTION="An agent of environment {env} was given an action outside of its action space: "
     "actions are integers from 0.",
+    NAN_ACTION="An agent of environment {env} was given an action that is NaN: continuous actions "
+    "are numbers from -1 to 1.",
     BAD_LAYOUT="Environment {env} shows a layout that the scenery does not have: entries of "
     "scenery.layout must be from 0 to the number of layouts - 1.",
     BAD_GOAL="An agent of environment {env} has a goal or a spawn point that its layout does not "
@@ -99,8 +101,8 @@ def check(agents: Agents) -> None:
     Synchronises host and device, so do not call it inside a step.
 
     Raises:
-        EngineError: naming an environment with a non-finite position, angle or velocity, or with an
-            action, layout or goal that does not exist.
+        EngineError: naming an environment with a non-finite position, angle or velocity, with an
+            action that is NaN, or with an action, layout or goal that does not exist.
     """
     flag = checks.instance("agents", agents, Agents).error_flag
     check_flag(checks.stored("agents.error_flag", flag))

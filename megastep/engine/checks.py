@@ -26,6 +26,8 @@ __all__ = [
     "number",
     "ragged",
     "stored",
+    "vectors",
+    "word",
 ]
 
 _INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
@@ -67,6 +69,13 @@ def flag(name: str, value: Any) -> bool:
     """Returns ``value``. TypeError unless it is True or False."""
     if value is not True and value is not False:
         raise TypeError(f"{name} must be True or False, but {_described(value)} was given")
+    return value
+
+
+def word(name: str, value: Any, words: Sequence[str]) -> str:
+    """Returns ``value``. ValueError unless it is one of ``words``."""
+    if not isinstance(value, str) or value not in words:
+        raise ValueError(f"{name} must be {' or '.join(words)}, but {_described(value)} was given")
     return value
 
 
@@ -250,6 +259,25 @@ def lanes(name: str, value: Any, n_lanes: int, device: torch.device) -> torch.Te
         raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
             f"{name} must be a tensor of integers, one for each of the {n_lanes} lanes, on "
             f"{device}, but {_described(value)} was given"
+        )
+    return value
+
+
+def vectors(name: str, value: Any, n_lanes: int, dim: int, device: torch.device) -> torch.Tensor:
+    """Returns ``value``. TypeError or ValueError unless it is a float32 tensor on ``device`` with
+    ``dim`` numbers per lane along its last axis. Does not synchronise.
+    """
+    fits = isinstance(value, torch.Tensor) and value.shape[-1:] == (dim,)
+    if (
+        not fits
+        or value.numel() != n_lanes * dim
+        or value.dtype != torch.float32
+        or value.device != device
+        or not _is_stored(value)
+    ):
+        raise (ValueError if isinstance(value, torch.Tensor) else TypeError)(
+            f"{name} must be a tensor of float32 numbers, {dim} for each of the {n_lanes} lanes, "
+            f"on {device}, but {_described(value)} was given"
         )
     return value
 

@@ -36,27 +36,28 @@ def physics(
     An agent stops just before the first wall or agent that it touches, and its velocities become 0.
 
     Args:
-        actions: (N, A) int64. If given, velocities are first multiplied by ``1 - damping``, and row
-            ``action`` of ``moves`` is added. If None, ``moves`` must be None too.
-        moves: (n_moves, 3) m/s ahead, m/s left, deg/s, added by each action.
+        actions: (N, A) int64, or (N, A, n_moves) float32. If given, velocities are first multiplied
+            by ``1 - damping``. An integer then adds one row of ``moves``. Floats, clipped to
+            [-1, 1], add all rows, weighted. If None, ``moves`` must be None too.
+        moves: (n_moves, 3) m/s ahead, m/s left, deg/s, added by actions.
         damping: fraction of the velocities lost per step.
 
     Raises:
         TypeError, ValueError: naming the argument that does not fit.
-        EngineError: on the CPU, if a position is NaN or an action is out of range. On a GPU,
-            :func:`~megastep.engine.check` raises it later.
+        EngineError: on the CPU, if a position or an action is NaN, or an integer action is out of
+            range. On a GPU, :func:`~megastep.engine.check` raises it later.
     """
     n, a = lanes = lanes_of(scenery, agents)
     checks.number("damping", damping, -math.inf, math.inf)
     device = scenery.device
     if actions is None and moves is None:
-        n_moves = actions_at = moves_at = 0
+        n_moves = actions_at = controls_at = moves_at = 0
     else:
-        actions_at = checks.address("actions", actions, lanes, torch.int64, device)
         n_moves = checks.length("moves", moves)
         if not n_moves:
             raise ValueError("moves must have one row per action, but it has none")
         moves_at = checks.address("moves", moves, (n_moves, 3), torch.float32, device)
+        actions_at, controls_at = _addresses(actions, lanes, n_moves, device)
     progress = torch.empty(lanes, device=device)
     threads_per_env = 8 if n > MANY_ENVS else WARP
     packed = ENGINE.params.PhysicsParams(
@@ -65,6 +66,7 @@ def physics(
         progress=progress.data_ptr(),
         error_flag=error_flag_address(scenery, agents),
         actions=actions_at,
+        controls=controls_at,
         moves=moves_at,
         n_moves=n_moves,
         retained=1 - damping,
@@ -74,3 +76,10 @@ def physics(
     launch(ENGINE, "physics", packed, device, threads=threads_per_env * n)
     check_on_cpu(agents)
     return Physics(progress)
+
+
+def _addresses(actions, lanes, n_moves, device):
+    """Returns the addresses of discrete and of continuous actions: one of them is 0."""
+    if isinstance(actions, torch.Tensor) and actions.is_floating_point():
+        return 0, checks.address("actions", actions, (*lanes, n_moves), torch.float32, device)
+    return checks.address("actions", actions, lanes, torch.int64, device), 0

@@ -1,7 +1,7 @@
 """Explorer: see as much of a home as possible. N environments of one agent each, so B = N lanes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -32,6 +32,9 @@ class Explorer(SceneryEnv):
         (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
         They accelerate the agent (:class:`~megastep.modules.MomentumMovement`).
 
+        With ``control="continuous"``: (B, 1, 3) float32 from -1 to 1: push ahead, push left, turn
+        left. 1 does what the action forward, left or turn left does; numbers beyond are clipped.
+
     Reward:
         Number of texels seen for the first time this episode, divided by 64. The first observation
         gives 0.
@@ -54,6 +57,7 @@ class Explorer(SceneryEnv):
         cameras: yaw of each camera, degrees; 0 looks ahead, 90 left.
         fps: steps per second of simulated time.
         patience: an episode is truncated after this many steps plus the texels seen.
+        control: discrete or continuous actions.
         resample: if True, each episode takes place in a randomly drawn floor plan. Otherwise an
             environment keeps its own.
         privileged: if True, worlds have ``privileged`` for a critic: ``episode`` (B, 1, 4), steps
@@ -78,6 +82,7 @@ class Explorer(SceneryEnv):
         cameras: Annotated[Sequence[float], Field(min_length=1, max_length=16)] = (0.0,),
         fps: Annotated[float, Field(ge=1, le=1000)] = 10.0,
         patience: Annotated[int, Field(ge=1, le=10**6)] = 200,
+        control: Literal["discrete", "continuous"] = "discrete",
         resample: bool = False,
         privileged: bool = False,
         metrics: bool = True,
@@ -96,7 +101,7 @@ class Explorer(SceneryEnv):
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, self.patience, self.has_metrics = subsample, patience, metrics
         self.spawner = modules.RandomSpawns(geometries, self.core, resample=resample)
-        self.movement = modules.MomentumMovement(self.core)
+        self.movement = modules.MomentumMovement(self.core, control=control)
         self.lifecycle = modules.Lifecycle(self.core)
         self.obs_space = dotdict(
             rgb=modules.RGB(self.core, subsample).space,
@@ -127,7 +132,7 @@ class Explorer(SceneryEnv):
         self.lifecycle.desync()
 
     def step(self, decision: Mapping) -> arrdict:
-        """Takes one step by ``decision["actions"]``, (B, 1). Returns a world."""
+        """Takes one step by ``decision["actions"]``. Returns a world."""
         self.movement(decision)
         return self._world(self.lifecycle.start_ended())
 

@@ -22,10 +22,11 @@ struct PhysicsParams {
     float* angvelocity;        // (N, A) degrees per second
     float* progress;           // (N, A) out: fraction of the step that was free, in [0, 1]
     int* error_flag;           // (1) out: see common/errors.h
-    const long long* actions;  // (N, A) null: velocities are not changed
+    const long long* actions;  // (N, A) null: there are no discrete actions
+    const float* controls;     // (N, A, n_moves) null: there are no continuous actions
     const float* moves;  // (n_moves, 3) added by an action: velocity ahead, velocity left, turning
     int n_moves;
-    float retained;       // fraction of the old velocities that is left when an action is taken
+    float retained;       // fraction of the old velocities that is left if there are actions
     float seconds;        // length of the step
     int threads_per_env;  // on the GPU: a power of two up to 32
 };

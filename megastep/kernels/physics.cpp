@@ -46,7 +46,10 @@ static void step(const PhysicsParams& p, int env, std::vector<unsigned char>& me
         meets.resize(n_walls);
     if (p.actions)
         for (int a = 0; a < n_agents; a++)
-            apply_action(p, env, a);
+            apply_action(p, env, env * n_agents + a);
+    if (p.controls)
+        for (int a = 0; a < n_agents; a++)
+            apply_controls(p, env, env * n_agents + a);
     for (int a = 0; a < n_agents; a++)
         sweep(p, env * n_agents, env * n_agents + a, walls, n_walls, meets.data());
     for (int a = 0; a < n_agents; a++)

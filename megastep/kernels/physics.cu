@@ -66,11 +66,13 @@ KERNEL BOUNDS(24) physics(PhysicsParams p) {
     if (env >= p.scenery.n_envs)
         return;
     ThreadGroup group = group_of(p.threads_per_env);
-    if (p.actions) {
+    if (p.actions)
         for (int a = group.rank; a < n_agents; a += group.size)
-            apply_action(p, env, a);
-        __syncwarp(group.mask);
-    }
+            apply_action(p, env, env * n_agents + a);
+    if (p.controls)
+        for (int a = group.rank; a < n_agents; a += group.size)
+            apply_controls(p, env, env * n_agents + a);
+    __syncwarp(group.mask);
     Walls walls = walls_of(p.scenery, layout_of(p.scenery, env, p.error_flag));
     float rho = p.scenery.radius * INFLATION;
     for (int a = 0; a < n_agents; a++)

@@ -21,22 +21,43 @@ HD float progress_of(float contact) {
     return contact <= 1.f ? clamp(SHORTENING * contact, 0.f, 1.f) : 1.f;
 }
 
-// Applies agent a's action: damps its velocities and adds the action's, rotated to the agent's
-// heading.
-HD void apply_action(const PhysicsParams& p, int env, int a) {
-    int i = env * p.scenery.n_agents + a;
+// Damps agent i's velocities and adds a move, rotated to the agent's heading.
+HD void accelerate(const PhysicsParams& p, int i, float ahead, float left, float turn) {
+    float s, c;
+    sincos_degrees(p.angles[i], s, c);
+    float* velocity = p.velocity + 2 * i;
+    velocity[0] = p.retained * velocity[0] + (c * ahead - s * left);
+    velocity[1] = p.retained * velocity[1] + (s * ahead + c * left);
+    p.angvelocity[i] = p.retained * p.angvelocity[i] + turn;
+}
+
+// Applies agent i's discrete action: the move that it selects.
+HD void apply_action(const PhysicsParams& p, int env, int i) {
     long long action = p.actions[i];
     if (action < 0 || action >= p.n_moves) {
         flag_error(p.error_flag, env, BAD_ACTION);
         action = 0;
     }
     const float* move = p.moves + 3 * action;
-    float s, c;
-    sincos_degrees(p.angles[i], s, c);
-    float* velocity = p.velocity + 2 * i;
-    velocity[0] = p.retained * velocity[0] + (c * move[0] - s * move[1]);
-    velocity[1] = p.retained * velocity[1] + (s * move[0] + c * move[1]);
-    p.angvelocity[i] = p.retained * p.angvelocity[i] + move[2];
+    accelerate(p, i, move[0], move[1], move[2]);
+}
+
+// Applies agent i's continuous action: the sum of all moves, each weighted with a number of it.
+HD void apply_controls(const PhysicsParams& p, int env, int i) {
+    const float* controls = p.controls + (long long)p.n_moves * i;
+    float ahead = 0.f, left = 0.f, turn = 0.f;
+    for (int k = 0; k < p.n_moves; k++) {
+        if (controls[k] != controls[k]) {
+            flag_error(p.error_flag, env, NAN_ACTION);
+            continue;
+        }
+        float weight = clamp(controls[k], -1.f, 1.f);
+        const float* move = p.moves + 3 * k;
+        ahead += weight * move[0];
+        left += weight * move[1];
+        turn += weight * move[2];
+    }
+    accelerate(p, i, ahead, left, turn);
 }
 
 // Moves agent a by the free part of its step. An agent that hit something stops.

@@ -17,6 +17,7 @@ from megastep.modules.lanes import to_agents
 # 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
 MOVES = [(0, 0), (0, 1), (0, -1), (1, 0), (-1, 0), (0, 0), (0, 0)]
 TURNS = [0, 0, 0, 0, 0, 1, -1]
+CONTROLS = [3, 1, 5]  # the actions that a continuous action weights: forward, left, turn left
 
 
 def to_global(angles: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
@@ -39,62 +40,88 @@ def to_local(angles: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
 
 
 class _Movement:
-    """Seven actions. A step first removes the fraction ``damping`` of the velocity, then adds the
-    action's.
-    """
+    """A step first removes the fraction ``damping`` of the velocity, then adds the action's."""
 
-    def __init__(self, core: Core, speed: float, ang_speed: float, damping: float):
+    def __init__(self, core: Core, speed: float, ang_speed: float, damping: float, control: str):
         self.core, self.damping = core, damping
+        self.control = checks.word("control", control, ("discrete", "continuous"))
         self.moves = torch.tensor(
             [(speed * x, speed * y, ang_speed * turn) for (x, y), turn in zip(MOVES, TURNS)],
             dtype=torch.float32,
             device=core.device,
         )
         self.space = spaces.MultiDiscrete(core.n_agents, len(MOVES))
+        if control == "continuous":
+            self.moves = self.moves[CONTROLS]
+            self.space = spaces.MultiContinuous(core.n_agents, len(CONTROLS))
 
     def __call__(self, decision: Mapping) -> engine.Physics:
-        """Moves the agents by ``decision["actions"]``, integers of shape (B, 1), (N, A) or (B,).
+        """Moves the agents by ``decision["actions"]``: integers of shape (B, 1), (N, A) or (B,), or
+        float32 of shape (B, 1, 3), (N, A, 3) or (B, 3).
 
         Returns the :class:`~megastep.engine.Physics` of the step.
         """
         n_agents, device = self.core.n_agents, self.core.device
-        n_lanes = self.core.n_envs * n_agents
-        actions = checks.lanes("actions", decision["actions"], n_lanes, device)
-        actions = to_agents(actions, n_agents).long().contiguous()
+        n_lanes, actions = self.core.n_envs * n_agents, decision["actions"]
+        if self.control == "continuous":
+            actions = checks.vectors("actions", actions, n_lanes, len(CONTROLS), device)
+            actions = actions.reshape(-1, *self.space.shape).contiguous()
+        else:
+            actions = checks.lanes("actions", actions, n_lanes, device)
+            actions = to_agents(actions, n_agents).long().contiguous()
         return engine.physics(
             self.core.scenery, self.core.agents, actions, self.moves, self.damping
         )
 
 
 class SimpleMovement(_Movement):
-    """Actions set the velocity for one step. The space is MultiDiscrete with seven actions.
+    """Actions set the velocity for one step.
 
     Args:
         core: the environment's core.
         speed: m/s, along an axis of the agent.
         ang_speed: deg/s.
+        control: discrete for seven actions (MultiDiscrete), or continuous for three numbers from
+            -1 to 1 (MultiContinuous): fractions of the speed ahead, the speed to the left and the
+            turning rate to the left. Numbers beyond are clipped.
     """
 
-    def __init__(self, core: Core, speed: float = 10.0, ang_speed: float = 180.0):
+    def __init__(
+        self,
+        core: Core,
+        speed: float = 10.0,
+        ang_speed: float = 180.0,
+        *,
+        control: str = "discrete",
+    ):
         speed = checks.number("speed", speed, -math.inf, math.inf)
         ang_speed = checks.number("ang_speed", ang_speed, -math.inf, math.inf)
-        super().__init__(core, speed, ang_speed, damping=1.0)
+        super().__init__(core, speed, ang_speed, 1.0, control)
 
 
 class MomentumMovement(_Movement):
-    """Actions accelerate the agent. The space is MultiDiscrete with seven actions.
+    """Actions accelerate the agent.
 
     Args:
         core: the environment's core.
         accel: m/s^2, along an axis of the agent.
         ang_accel: deg/s^2.
         decay: fraction of both velocities that is lost per step.
+        control: discrete for seven actions (MultiDiscrete), or continuous for three numbers from
+            -1 to 1 (MultiContinuous): fractions of the acceleration ahead, to the left, and of the
+            turn to the left. Numbers beyond are clipped.
     """
 
     def __init__(
-        self, core: Core, accel: float = 5.0, ang_accel: float = 180.0, decay: float = 0.125
+        self,
+        core: Core,
+        accel: float = 5.0,
+        ang_accel: float = 180.0,
+        decay: float = 0.125,
+        *,
+        control: str = "discrete",
     ):
         accel = checks.number("accel", accel, -math.inf, math.inf)
         ang_accel = checks.number("ang_accel", ang_accel, -math.inf, math.inf)
         decay = checks.number("decay", decay, -math.inf, math.inf)
-        super().__init__(core, accel / core.fps, ang_accel / core.fps, damping=decay)
+        super().__init__(core, accel / core.fps, ang_accel / core.fps, decay, control)

@@ -1,4 +1,4 @@
-"""Adam against torch.optim.Adam."""
+"""Adam against torch.optim."""
 
 import pathlib
 import subprocess
@@ -28,6 +28,28 @@ def set_gradients(*parameter_lists, seed):
         grad = torch.randn(parameters[0].shape, generator=generator)
         for p in parameters:
             p.grad = grad.to(p.device)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_matches_torch_optim_adamw(device):
+    """Only the matrix decays, and the vector has three times the step size."""
+    params, torch_params = parameters(device), parameters(device)
+    lr = torch.tensor(0.1, device=device)
+    options = dict(betas=(0.8, 0.99), eps=1e-4)
+    adam = Adam(params, lr, weight_decay=0.5, lr_factors={params[1]: 3.0}, **options)
+    options |= dict(fused=True, capturable=device == "cuda")
+    torch_adams = [
+        torch.optim.AdamW([p], lr=lr.clone(), weight_decay=decay, **options)
+        for p, decay in zip(torch_params, (0.5, 0.0, 0.0))
+    ]
+    for seed in range(4):
+        lr.fill_(0.1 / (seed + 1))
+        set_gradients(params, torch_params, seed=seed)
+        adam.step(YES.to(device))
+        for torch_adam, factor in zip(torch_adams, (1, 3, 1)):
+            torch_adam.param_groups[0]["lr"].copy_(lr * factor)
+            torch_adam.step()
+    assert all(map(torch.equal, params, torch_params))
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])

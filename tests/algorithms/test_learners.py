@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from megastep.agents.algorithms.learner import check_learner
+from megastep.agents.algorithms.ppo import PPO
+from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.cli import train
 from megastep.agents.training import checkpoint
 from megastep.dotdict import leaves
 from tests.helpers.learners import LEARNERS
-from tests.helpers.made_up import B, Numbers, weights
+from tests.helpers.made_up import PRIVILEGED, B, Numbers, made_up, weights
 from tests.helpers.tiny import TINY, UPDATE
 
 T = 5
@@ -143,6 +145,43 @@ def test_frozen_and_unused_parameters_stay_as_they_are(name, graph):
     assert losses["loss/grad_norm"] > 0
 
 
+@pytest.mark.parametrize("learner", [PPO, VTrace])
+@pytest.mark.parametrize("factor", [1.0, 0.5])
+def test_critic_lr_is_of_the_critic_alone_and_falls_with_lr(learner, factor):
+    """Adam's first step is the step size."""
+    policy, rollout = made_up(privileged=PRIVILEGED, values=learner is PPO)
+    before = {name: p.detach().clone() for name, p in policy.named_parameters()}
+    trained = learner(policy, n_minibatches=1, lr=1e-3, critic_lr=1e-2)
+    trained.set_lr(factor * 1e-3)
+    trained.update(rollout)
+    steps = {n: (p - before[n]).abs().max().item() for n, p in policy.named_parameters()}
+    for name in ("critic.hidden.weight", "critic.intake.project.weight"):
+        assert steps[name] == pytest.approx(factor * 1e-2, rel=0.02)
+    for name in ("prediction.weight", "intake.project.weight", "output.linear.weight"):
+        assert steps[name] == pytest.approx(factor * 1e-3, rel=0.02)
+
+
+@pytest.mark.parametrize("name, settings", [("ppo", {"n_epochs": 1}), ("vtrace", {}), ("r2d2", {})])
+def test_weights_decay_and_biases_do_not(name, settings):
+    """After one gradient step."""
+    ends = []
+    for weight_decay in (0.0, 2.0):
+        policy, learner, collect = make(
+            name, n_minibatches=1, weight_decay=weight_decay, **settings
+        )
+        first = {n: p.detach().clone() for n, p in policy.named_parameters()}
+        while not learner.optimizer.n_steps:
+            learner.update(collect())
+        ends.append({n: p.detach() for n, p in policy.named_parameters()})
+    plain, decayed = ends
+    assert learner.optimizer.n_steps == 1
+    moments = learner.state_dict()["optimizer"]["means"]  # in an order that no setting changes
+    assert [mean.shape for mean in moments] == [p.shape for p in policy.parameters()]
+    for key in first.keys() - {"critic.output.linear.weight"}:  # which PopArt changes, too
+        subtracted = SMALL["lr"] * 2.0 * first[key] if first[key].ndim > 1 else 0 * first[key]
+        torch.testing.assert_close(plain[key] - decayed[key], subtracted, rtol=1e-3, atol=1e-6)
+
+
 @NAMES
 def test_bytes_per_env_bounds_stored_bytes(name):
     env = Numbers()
@@ -192,7 +231,8 @@ def test_resume_from_other_learner_fails(tmp_path, monkeypatch, capsys):
     assert train.main([*TINY, f"samples={UPDATE}", "folder=run"]) == 0
     loaded = checkpoint.load_latest(tmp_path / "run" / "checkpoints")
     loaded.config["train"]["learner"] |= {"name": "megastep.agents.algorithms.vtrace:VTrace"}
-    del loaded.config["train"]["learner"]["clip"], loaded.config["train"]["learner"]["target_kl"]
+    for key in ("clip", "target_kl", "value_clip", "normalise_advantage"):
+        del loaded.config["train"]["learner"][key]
     checkpoint.save(tmp_path / "run" / "checkpoints", 2 * UPDATE, loaded.state, loaded.config)
     capsys.readouterr()
     assert train.main(["resume=run", f"samples={4 * UPDATE}"]) == 2

@@ -108,6 +108,30 @@ class Cue(Env):
         return (due & (action == self.cue)).float(), due, torch.zeros_like(due)
 
 
+class Reach(Env):
+    """Shows two numbers from -1 to 1. The reward of an action is 1 minus its squared distance from
+    them, in its own scale, and 0 or less for one that does not know them.
+    """
+
+    obs_dim = 2
+
+    def __init__(self, seed=0):
+        super().__init__(seed)
+        self.action_space = spaces.MultiContinuous(1, 2, low=(0.0, -1.0), high=(100.0, 1.0))
+
+    def begin(self, which):
+        new = 2 * torch.rand(B, 2, generator=self.generator) - 1
+        self.goal = torch.where(which[:, None], new, getattr(self, "goal", new))
+
+    def show(self):
+        return self.goal
+
+    def result(self, action):
+        scaled = torch.stack([action[:, 0] / 50 - 1, action[:, 1]], 1)
+        ended = self.age == 3
+        return 1 - 2 * (scaled - self.goal).square().sum(1), ended, torch.zeros_like(ended)
+
+
 class Clock(Env):
     """Shows nothing. At age k the action PATTERN[k] has reward 1, and an episode may be truncated
     after any step. Only a policy that counts from the start of each episode knows k.
@@ -181,6 +205,8 @@ ONE_OR_ALL = [
     name if name == "ppo" else pytest.param(name, marks=pytest.mark.slow) for name in LEARNERS
 ]
 
+CONTINUOUS = [name for name in LEARNERS if name != "r2d2"]
+
 
 class NeverResets(Policy):
     """A policy whose hidden state leaks from one episode into the next."""
@@ -212,6 +238,19 @@ def test_remembers_cue(name):
     """
     _, rewards, ends, *_ = learn(Cue(), 60, name=name, lr=3e-3)
     assert rewards / ends > (0.85 if name == "r2d2" else 0.9)
+
+
+@pytest.mark.parametrize("continuous", ["gaussian", "beta"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name != "ppo")) for name in CONTINUOUS],
+)
+def test_learns_to_reach(name, continuous):
+    env = Reach()
+    policy = Policy(env.obs_space, env.action_space, width=32, continuous=continuous)
+    n_updates, lr = (40, 1e-2) if name == "ppo" else (140, 3e-3)
+    _, rewards, _, valid, _ = learn(env, n_updates, policy, name, lr=lr, entropy_coef=1e-3)
+    assert rewards / valid > 0.8
 
 
 @pytest.mark.slow

@@ -204,6 +204,51 @@ def test_surrogate_is_the_smaller_of_clipped_and_unclipped(ratio, loss):
     assert learner.update(rollout)["loss/policy"].item() == pytest.approx(loss, abs=1e-4)
 
 
+@pytest.mark.parametrize("value_clip, loss", [(None, 1.0), (0.2, 1.345), (0.6, 1.0)])
+def test_value_clip(value_clip, loss):
+    """The value fell from .5 to 0. Half of the targets are 1, the others -1. Clipped at a distance
+    of .2 it is .3, whose squared errors are .49 and 1.69: larger only where the value improved, and
+    there the gradient stops.
+    """
+    policy, rollout = made_up()
+    rollout.reward[:] = torch.tensor([1.0, -1.0]).repeat(B // 2)
+    rollout.values[:] = 0.5
+    linear = policy.critic.output.linear
+    torch.nn.init.zeros_(linear.weight)
+    learner = PPO(policy, n_minibatches=1, lr=1e-3, gamma=0.0, value_clip=value_clip)
+    assert learner.update(rollout)["loss/value"].item() == pytest.approx(loss, abs=1e-5)
+    if loss > 1:
+        assert linear.bias.item() == pytest.approx(1e-3, rel=1e-2)
+
+
+def test_value_clip_is_in_units_of_the_values_scale():
+    losses = []
+    for unit in (1.0, 100.0):
+        policy, rollout = made_up()
+        rollout.reward *= unit
+        rollout.values[:] = 0.5 * unit
+        torch.nn.init.zeros_(policy.critic.output.linear.weight)
+        learner = PPO(policy, n_minibatches=1, gamma=0.0, value_clip=0.2)
+        losses.append(learner.update(rollout)["loss/value"].item())
+    assert losses[0] == pytest.approx(losses[1], rel=1e-4) and losses[0] > 1.1
+
+
+@pytest.mark.parametrize(
+    "over, loss, has_gradient",
+    [("none", -2.5, True), ("rollout", 0, True), ("minibatch", 0, False)],
+)
+def test_normalise_advantage(over, loss, has_gradient):
+    """Lane i is a minibatch, and all its advantages are i."""
+    policy, rollout = made_up()
+    rollout.values.zero_()
+    rollout.reward[:] = torch.arange(B)
+    settings = dict(lr=1e-30, gamma=0.0, value_coef=0.0, entropy_coef=0.0)
+    metrics = PPO(policy, n_minibatches=B, normalise_advantage=over, **settings).update(rollout)
+    # the two lanes with an invalid row count less in the mean over the rollout
+    assert metrics["loss/policy"].item() == pytest.approx(loss, abs=0.02)
+    assert (metrics["loss/grad_norm"].item() > 1e-3) == has_gradient
+
+
 def test_target_kl_stops_update():
     ends = []
     for settings in (dict(n_epochs=1), dict(n_epochs=4, target_kl=1e-4), dict(n_epochs=4)):
@@ -280,12 +325,19 @@ def test_nested_action_space():
     assert not torch.equal(weights(policy), before)
 
 
+#: Every setting that is off by default.
+OPTIONS = dict(
+    value_clip=0.2, normalise_advantage="minibatch", critic_lr=3e-3, weight_decay=0.1, target_kl=1.0
+)
+
+
 @pytest.mark.cuda
-def test_captured_update_matches_eager():
+@pytest.mark.parametrize("options", [{}, OPTIONS], ids=["defaults", "options"])
+def test_captured_update_matches_eager(options):
     ends = []
     for graph in (False, True):
         policy, rollout = made_up(device="cuda")
-        learner = PPO(policy, n_epochs=2, n_minibatches=3, lr=1e-3, graph=graph)
+        learner = PPO(policy, n_epochs=2, n_minibatches=3, lr=1e-3, graph=graph, **options)
         for i in range(5):
             learner.set_lr(1e-3 / (i + 1))
             metrics = learner.update(rollout)
@@ -333,7 +385,7 @@ def test_captured_update_skips_nonfinite_rollout():
 @pytest.mark.cuda
 def test_update_never_synchronises():
     policy, rollout = made_up(device="cuda")
-    learner = PPO(policy, n_epochs=2, n_minibatches=2, target_kl=0.01)
+    learner = PPO(policy, n_epochs=2, n_minibatches=2, **OPTIONS)
     learner.update(rollout)
     torch.cuda.set_sync_debug_mode("error")
     try:

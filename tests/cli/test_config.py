@@ -154,6 +154,7 @@ def test_cpu_and_gpu_recipes():
         value_coef=0.5,
     )
     same |= dict(max_grad_norm=0.5, target_kl=None, auxiliary_coef=0.5, lambda_=0.95, anneal="auto")
+    same |= dict(value_clip=None, normalise_advantage="rollout", critic_lr=None, weight_decay=0.0)
     cpu, gpu = compose("preset=cpu"), compose("preset=gpu")
     assert dataclasses.asdict(cpu.learner) == same | dict(lr=3e-3, gamma=0.98, entropy_coef=0.02)
     assert dataclasses.asdict(gpu.learner) == same | dict(lr=1e-3, gamma=0.995, entropy_coef=0.01)
@@ -327,6 +328,7 @@ def test_minibatch_needs_an_environment():
         ("learner.lr={a:{b:1}}", "learner.lr", "expected a number, got {'a': {'b': 1}}"),
         ("env={a:{b:1}}", "env.a", "no such key; did you mean env.name?"),
         ("init=[a]", "init", "expected a word, got ['a']"),
+        ("env.control=continuos", "env.control", "is unknown; did you mean continuous?"),
         ("env=null", "env", "None is unknown"),
         ("~env", "env", "None is unknown"),
         ("~nothing", "nothing", "no such key"),

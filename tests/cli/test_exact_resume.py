@@ -50,9 +50,16 @@ CASES = {
     "deathmatch": FIGHT,
     "opponents": [*FIGHT, *SELF_PLAY, "opponents.bot=0.25"],
     "pong": [*PONG, "learner.n_minibatches=2"],
+    "continuous": [
+        *("env=tests.cli.test_exact_resume:Steered", *tiny.TINY[1:], "learner=vtrace"),
+        *("learner.buffer=replay", *REPLAY),
+    ],
+    "beta": [
+        *("env=tests.cli.test_exact_resume:Steered", *tiny.TINY[1:], "agent.continuous=beta"),
+    ],
     "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[1:]],
 }
-FAST = "explorer", "lag", "priorities", "r2d2", "opponents", "stranger"
+FAST = "explorer", "lag", "priorities", "r2d2", "opponents", "stranger", "beta"
 
 
 class Drifting:
@@ -92,6 +99,37 @@ class Drifting:
         self.history = [*self.history[-3:], self.n_steps]
         self.best["place"] = float(self.last.max())
         self.places = self.places + 1e-3 * self.best["place"]
+        return self.world(ended)
+
+
+class Steered:
+    """An environment on any device that takes two numbers."""
+
+    def __init__(self, n_envs, res=8, device="cpu"):
+        self.n_envs, self.device = n_envs, torch.device(device)
+        self.obs_space = spaces.MultiVector(1, 2)
+        self.action_space = spaces.MultiContinuous(1, 2, low=(-2.0, 0.0), high=1.0)
+        self.places = torch.zeros(n_envs, 1, 2, device=device)
+        self.age = torch.zeros(n_envs, dtype=torch.int64, device=device)
+
+    def world(self, ended):
+        return arrdict(
+            obs=self.places.clone(),
+            reward=-self.places.square().sum((1, 2)).masked_fill(ended, 0.0),
+            reset=ended,
+            terminal=self.age == 7,
+            truncated=torch.zeros_like(ended),
+        )
+
+    def reset(self):
+        self.places.zero_()
+        self.age.zero_()
+        return self.world(torch.ones(self.n_envs, dtype=torch.bool, device=self.device))
+
+    def step(self, decision):
+        ended = self.age == 7
+        self.places.add_(decision["actions"]).masked_fill_(ended[:, None, None], 0.0)
+        self.age.add_(1).masked_fill_(ended, 0)
         return self.world(ended)
 
 
@@ -217,6 +255,21 @@ def test_format_6_is_migrated(here, capsys):
     assert state["learner"]["optimizer"]["n_steps"] > saved["learner"]["optimizer"]["n_steps"]
     rows = json_lines.read("run/metrics.jsonl")
     assert [row["updates"] for row in rows] == [2, 4, 6, 7, 8, 9]
+
+
+def test_run_of_before_a_learner_had_some_settings_resumes_bit_for_bit(here, capsys):
+    """Their defaults change nothing, the optimizer's state included."""
+    words = [*tiny.TINY, "samples=128", "log_every=1", "learner.anneal=never"]
+    run(*words, "folder=alone")
+    run(*words, "samples=64", "folder=run")
+    saved = checkpoint.load_latest("run/checkpoints")
+    for key in ("value_clip", "normalise_advantage", "critic_lr", "weight_decay"):
+        del saved.config["train"]["learner"][key]
+    state = saved.state["learner"]
+    assert set(state["optimizer"]) == {"n_steps", "means", "squares"} and state["lr"].shape == ()
+    checkpoint.save(here / "run/checkpoints", 65, saved.state, saved.config)
+    run("resume=run", "samples=128")
+    assert json_lines.read("run/metrics.jsonl") == json_lines.read("alone/metrics.jsonl")
 
 
 def test_inspect(here, capsys):

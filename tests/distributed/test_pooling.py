@@ -16,6 +16,15 @@ from tests.helpers.made_up import MOVES, OBS, PRIVILEGED, T, made_up, weights
 LEARNERS = {
     "ppo": lambda policy: PPO(policy, n_minibatches=1, n_epochs=3),
     "stops": lambda policy: PPO(policy, n_minibatches=1, n_epochs=9, lr=0.01, target_kl=0.01),
+    "options": lambda policy: PPO(
+        policy,
+        n_minibatches=1,
+        n_epochs=3,
+        normalise_advantage="minibatch",
+        value_clip=0.1,
+        critic_lr=3e-3,
+        weight_decay=0.1,
+    ),
     "vtrace": lambda policy: VTrace(policy, n_minibatches=1, n_epochs=2),
 }
 #: Of each rank. They have different numbers of valid steps.

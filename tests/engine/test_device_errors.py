@@ -137,6 +137,23 @@ def test_bad_action_is_named(action, device):
         engine.check(c.agents)
 
 
+def test_continuous_action_that_is_nan_is_named_and_other_environments_continue(device):
+    moves, after = torch.ones((3, 3), device=device), []
+    for number in (0.0, math.nan):
+        c = boxes(device, 2)
+        actions = torch.full((LAST + 1, 2, 3), 0.5, device=device)
+        actions[LAST, 1, 2] = number
+        if number == 0:
+            engine.physics(c.scenery, c.agents, actions, moves)
+            engine.check(c.agents)
+        else:
+            with pytest.raises(engine.EngineError, match=f"environment {LAST} .* NaN"):
+                engine.physics(c.scenery, c.agents, actions, moves)
+                engine.check(c.agents)
+        after.append(c.agents.velocity.clone())
+    assert torch.equal(*after), "a NaN adds nothing"
+
+
 @pytest.mark.parametrize(
     "field, axes",
     [("positions", 0), ("positions", 1), ("angles", ...), ("velocity", ...), ("angvelocity", ...)],

@@ -27,8 +27,10 @@ def trajectory(device, n_agents, subsample=1, **settings):
         some = torch.rand((24, n_agents), generator=random).to(device)
         spawn(some < (1 if step == 0 else 0.1))
         hide(some > 0.8)
-        actions = torch.randint(4, (24, n_agents), generator=random).to(device)
-        out += engine.physics(core.scenery, core.agents, actions, moves, 0.9)
+        actions = torch.randint(4, (24, n_agents), generator=random)
+        if step % 2:  # continuous ones, partly beyond their bounds
+            actions = 3 * torch.rand((24, n_agents, len(moves)), generator=random) - 1.5
+        out += engine.physics(core.scenery, core.agents, actions.to(device), moves, 0.9)
         out += engine.observe(
             core.scenery,
             core.agents,

@@ -10,7 +10,7 @@ from megastep import capture, cuda, engine, scene, toys
 from megastep.dotdict import dotdict
 from megastep.engine import checks, devices
 from megastep.geometries import sample
-from megastep.modules import RandomSpawns
+from megastep.modules import RandomSpawns, to_global
 from tests.helpers.outputs import seen_of
 
 # ---- Facts to check by hand ----
@@ -138,6 +138,27 @@ def test_actions_damp_and_add_their_move(device):
     assert torch.allclose(core.agents.velocity[:, 0].cpu(), expected, atol=1e-6)
     assert core.agents.angvelocity.flatten().tolist() == [6.0, 46.0]
     assert torch.allclose(core.agents.positions[:, 0].cpu(), 3 + expected / 10, atol=1e-6)
+
+
+def test_continuous_actions_add_weighted_moves(device):
+    """Weights beyond [-1, 1] are clipped. Rotated here by PyTorch's sine and cosine."""
+    n_envs, random = 64, torch.Generator().manual_seed(1)
+    core = cuda.Core(scene.scenery([toys.box(100)], 2, n_envs=n_envs, device=device))
+    agents = core.agents
+    agents.positions[:] = torch.tensor([[30.0, 30.0], [70.0, 70.0]])
+    agents.angles.copy_(360 * torch.rand((n_envs, 2), generator=random) - 180)
+    agents.velocity.copy_(torch.randn((n_envs, 2, 2), generator=random))
+    agents.angvelocity.copy_(90 * torch.randn((n_envs, 2), generator=random))
+    moves = torch.tensor([(2, 0.5, 10), (-1, 3, -40), (0, 0, 20), (1, 1, 0)], dtype=torch.float32)
+    weights = 3 * torch.rand((n_envs, 2, 4), generator=random) - 1.5
+    weights[0, 0] = torch.tensor([math.inf, -math.inf, 7.0, 0.0])
+    move = weights.clamp(-1, 1) @ moves
+    ahead_left = to_global(agents.angles.cpu(), move[..., :2])
+    velocity = 0.75 * agents.velocity.cpu() + ahead_left
+    angvelocity = 0.75 * agents.angvelocity.cpu() + move[..., 2]
+    engine.physics(core.scenery, agents, weights.to(device), moves.to(device), damping=0.25)
+    torch.testing.assert_close(agents.velocity.cpu(), velocity, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(agents.angvelocity.cpu(), angvelocity, rtol=1e-5, atol=1e-5)
 
 
 def test_actions_replace_velocities_by_default(device):

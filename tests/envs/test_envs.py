@@ -1,13 +1,14 @@
 """Every environment keeps the contract; the rules of Minimal and Explorer."""
 
 import inspect
+import math
 
 import numpy as np
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from megastep import arrdict, capture, contract, core, engine, envs, plotting, toys
+from megastep import arrdict, capture, contract, core, engine, envs, plotting, spaces, toys
 from megastep.engine import EngineError
 from megastep.engine.state_tree import state_tree
 from megastep.geometries import sample
@@ -19,6 +20,9 @@ SHORT = {
     "minimal": dict(shortest=3, longest=9),
     "explorer": dict(patience=1, res=1, subsample=1),
     "explorer, privileged": dict(patience=1, res=1, subsample=1, privileged=True),
+    "explorer, continuous": dict(
+        patience=1, res=1, subsample=1, privileged=True, resample=True, control="continuous"
+    ),
     "explorer, cameras": dict(patience=1, res=1, subsample=1, cameras=(0, 0)),
     "deathmatch": dict(limit=20),
     "deathmatch, privileged": dict(limit=20, n_agents=2, damage=1, privileged=True),
@@ -34,6 +38,9 @@ SHORT = {
     ),
     "pointgoal": dict(limit=15, res=1, subsample=1),
     "pointgoal, privileged": dict(limit=15, res=1, subsample=1, privileged=True),
+    "pointgoal, continuous": dict(
+        limit=15, res=1, subsample=1, privileged=True, resample=True, control="continuous"
+    ),
     "pong": dict(limit=20),
     "pong, pixels": dict(limit=20, pixels=True),
     "pong, self-play": dict(limit=20, self_play=True),
@@ -75,9 +82,14 @@ def test_docstrings_have_the_same_sections(cls):
 
 
 def idle(env):
-    """The decision of action 0 in every lane."""
-    n_lanes = env.n_envs * env.n_agents
-    return arrdict.arrdict(actions=torch.zeros((n_lanes, 1), dtype=torch.long, device=env.device))
+    """The decision of action 0, or of numbers of 0, in every lane."""
+    shape = env.n_envs * env.n_agents, *env.action_space.shape
+    dtype = torch.float32 if is_continuous(env) else torch.long
+    return arrdict.arrdict(actions=torch.zeros(shape, dtype=dtype, device=env.device))
+
+
+def is_continuous(env):
+    return isinstance(env.action_space, spaces.MultiContinuous)
 
 
 def random_decision(env, generator):
@@ -136,7 +148,8 @@ def test_decision_after_the_end_of_an_episode_is_ignored(name):
         ended = worlds[0].terminal | worlds[0].truncated
         decision = random_decision(a, generator)
         other = decision.clone()
-        other.actions[ended] = (other.actions[ended] + 1) % a.action_space.n_actions
+        n_actions = 1 if is_continuous(a) else a.action_space.n_actions
+        other.actions[ended] = (other.actions[ended] + 1) % n_actions
         n_ignored += int(ended.sum())
         worlds = [a.step(decision), b.step(other)]
         assert contract.same(*worlds)
@@ -178,6 +191,31 @@ class TestOnTheGPU:
         ]
         assert contract.same(arrdict.stack(runs[0]), arrdict.stack(runs[1]))
         assert contract.same(arrdict.stack(runs[0]), arrdict.stack(runs[2]))
+
+
+# ---- Continuous actions ----
+
+
+@pytest.mark.parametrize("name", ["explorer", "pointgoal"])
+def test_continuous_actions_of_one_do_what_discrete_actions_do(name, device):
+    """Bit for bit. Numbers beyond 1 count as 1."""
+    ahead, left, turn = torch.eye(3).tolist()
+    weights = torch.tensor([ahead, left, left, ahead, ahead, turn, turn])
+    weights *= torch.tensor([0, 1, -1, 1, -1, 1, -1])[:, None]
+    discrete, continuous = (
+        make(f"{name}, privileged", device, control=control)
+        for control in ("discrete", "continuous")
+    )
+    generator = torch.Generator().manual_seed(1)
+    assert contract.same(discrete.reset(), continuous.reset())
+    for step in range(40):
+        actions = torch.randint(7, (12, 1), generator=generator)
+        numbers = weights[actions] * (1 + step % 2)
+        worlds = [
+            env.step(arrdict.arrdict(actions=chosen.to(device)))
+            for env, chosen in ((discrete, actions), (continuous, numbers))
+        ]
+        assert contract.same(*worlds)
 
 
 # ---- Explorer ----
@@ -249,7 +287,7 @@ def test_check_raises_errors_flagged_on_the_device(name, device):
         (flag,) = [leaf for path, leaf in state_tree(env).items() if "error_flag" in path]
         flag.fill_(8 * 3 + 1)
     else:
-        env.step(idle(env).map(torch.add, 7))
+        env.step(idle(env).map(torch.add, math.nan if is_continuous(env) else 7))
     with pytest.raises(EngineError, match="nvironment"):
         env.check()
     env.check()

@@ -46,6 +46,7 @@ def fixture(device):
         counts=torch.zeros((N, A), dtype=torch.int32, device=device),
         seen=torch.zeros((N, A, words), dtype=torch.int32, device=device),
         moves=torch.zeros((7, 3), device=device),
+        weights=torch.zeros((N, A, 7), device=device),
         visible=torch.zeros((D, words), dtype=torch.int32, device=device),
         points=torch.full((D, 4, 2), 3.0, device=device),
         out=torch.zeros((N * A, 4), device=device),
@@ -239,6 +240,7 @@ def operations(f):
         dict(both, actions=f.lanes, moves=f.moves, damping=0.5),
         dict(OPERANDS, actions=tensors, moves=of_any_length, damping=numbers()),
     )
+    yield engine.physics, dict(both, actions=f.weights, moves=f.moves), dict(actions=tensors)
     yield engine.render, both, OPERANDS
     yield engine.update_agent_geometry, dict(both, lit=True), dict(OPERANDS, lit=flags)
     yield (

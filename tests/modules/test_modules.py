@@ -362,6 +362,27 @@ def test_wrong_actions_are_named(name):
     env.step(dict(actions=right))
 
 
+def test_wrong_continuous_actions_are_named():
+    move = modules.SimpleMovement(core_of([toys.box()]), control="continuous")
+    right = torch.zeros((move.core.n_envs, 1, 3))
+    for wrong in (right[1:], right.mT, right.double(), right.long(), right[..., 0], None):
+        with pytest.raises((TypeError, ValueError), match="^actions must be .*, 3 for each .* was"):
+            move(dict(actions=wrong))
+    for shape in (right.shape, (-1, 3)):
+        move(dict(actions=right.view(shape)))
+
+
+def test_continuous_actions_are_fractions_of_the_speeds():
+    """10 m/s and 180 degrees/s for a tenth of a second; the agent faces +y."""
+    c = core_of([toys.box()])
+    c.agents.positions[:], c.agents.angles[:] = 3.0, 90.0
+    move = modules.SimpleMovement(c, control="continuous")
+    move(dict(actions=torch.tensor([[[0.5, -0.25, 5.0]]])))
+    expected = torch.tensor([[[3.25, 3.5]]])
+    torch.testing.assert_close(c.agents.positions, expected)
+    torch.testing.assert_close(c.agents.angles, torch.tensor([[108.0]]))
+
+
 @pytest.mark.parametrize(
     "make, name",
     [
@@ -369,6 +390,7 @@ def test_wrong_actions_are_named(name):
         (modules.RandomLifespans, "longest"),
         (modules.SimpleMovement, "speed"),
         (modules.MomentumMovement, "accel"),
+        (modules.MomentumMovement, "control"),
         (modules.Depth, "subsample"),
         (lambda c, **options: modules.RandomSpawns([toys.box()], c, **options), "seed"),
     ],

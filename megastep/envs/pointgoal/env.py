@@ -4,7 +4,7 @@ N environments of one agent, so B = N lanes.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -42,6 +42,9 @@ class PointGoal(SceneryEnv):
         (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
         They accelerate the agent (:class:`~megastep.modules.MomentumMovement`).
 
+        With ``control="continuous"``: (B, 1, 3) float32 from -1 to 1: push ahead, push left, turn
+        left. 1 does what the action forward, left or turn left does; numbers beyond are clipped.
+
     Reward:
         Metres by which the shortest path to the goal became shorter, minus ``cost``, plus ``bonus``
         at success.
@@ -69,6 +72,7 @@ class PointGoal(SceneryEnv):
         subsample: rays per pixel.
         fov: field of view in degrees.
         fps: steps per second.
+        control: discrete or continuous actions.
         resample: draw a new home for every episode. Default: each environment keeps its home.
         privileged: worlds hold ``privileged.way`` (1, 4) for a critic: tens of metres to go by the
             shortest path, the slope of that distance ahead and to the left, and the fraction of the
@@ -94,6 +98,7 @@ class PointGoal(SceneryEnv):
         subsample: Annotated[int, Field(ge=1, le=32)] = 4,
         fov: Annotated[float, Field(gt=0, lt=180)] = 130.0,
         fps: Annotated[float, Field(ge=1, le=1000)] = 10.0,
+        control: Literal["discrete", "continuous"] = "discrete",
         resample: bool = False,
         privileged: bool = False,
     ):
@@ -114,7 +119,7 @@ class PointGoal(SceneryEnv):
         self.spawner = modules.RandomSpawns(
             geometries, self.core, resample=resample, points=self.goals.spawns
         )
-        self.movement = modules.MomentumMovement(self.core)
+        self.movement = modules.MomentumMovement(self.core, control=control)
         self.obs_space = dotdict(
             rgb=modules.RGB(self.core, subsample).space,
             d=modules.Depth(self.core, subsample).space,
@@ -142,7 +147,7 @@ class PointGoal(SceneryEnv):
         self.ages.copy_(modules.random_ages(limits, self.core.seed))
 
     def step(self, decision: Mapping) -> arrdict:
-        """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
+        """Takes one step with ``decision.actions``. Returns a world."""
         return self._world(self.movement(decision).progress)
 
     def _world(self, free=None):

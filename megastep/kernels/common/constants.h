@@ -12,3 +12,4 @@ constexpr int NONFINITE = 1;   // a position, angle or velocity is NaN or infini
 constexpr int BAD_ACTION = 2;  // an action outside of the action space
 constexpr int BAD_LAYOUT = 3;  // a layout that the scenery does not have
 constexpr int BAD_GOAL = 4;    // a goal or a spawn point that the layout does not have
+constexpr int NAN_ACTION = 5;  // a continuous action that is NaN
