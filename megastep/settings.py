@@ -53,6 +53,7 @@ WANTED = {
     "list": "a list",
     "tuple": "a list",
     "sequence": "a list",
+    "dict": "keys with values",
 }
 BOUNDS = {"ge": "at least {:,}", "gt": "more than {:,}", "le": "at most {:,}", "lt": "below {:,}"}
 OUTSIDE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number")

@@ -227,9 +227,11 @@ def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Pol
     saved, present = loaded.config["spaces"], spaces_of(env)
     if differing := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]:
         changes = [f"{k} was {saved.get(k)} and is {present.get(k)}" for k in differing]
+        ids = loaded.config["train"]["env"].get("id"), getattr(env, "id", None)
+        names = f", {ids[0]} and not {ids[1]}" if ids[0] != ids[1] else ""
         raise program.UserError(
-            f"{loaded.path} was trained in another environment: {'; '.join(changes)}. Choose the "
-            "env it was trained in"
+            f"{loaded.path} was trained in another environment{names}: {'; '.join(changes)}. "
+            "Choose the env it was trained in"
         )
     weights = loaded.state["policy"]
     if policy.critic is None:  # what only training needs

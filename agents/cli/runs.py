@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from megastep.agents.cli import console, program
 from megastep.agents.cli.check import as_tree
 from megastep.agents.cli.program import UserError, shortened
-from megastep.agents.cli.settings import Env, Evaluate, Geometry, Train, label
+from megastep.agents.cli.settings import Env, Evaluate, Geometry, Train, env_name, label
 from megastep.agents.distributed import environment
 from megastep.agents.training import checkpoint, json_lines
 from megastep.agents.training.atomic_files import write_atomically
@@ -30,6 +30,11 @@ CANNOT = "{} cannot be written; choose another with folder=: "
 
 
 # ---- New folders ----
+
+
+def for_file(name: str) -> str:
+    """Returns a name without what a file's cannot have."""
+    return re.sub(r"[^\w.-]", "-", name)
 
 
 def make(path: Path) -> Path:
@@ -48,8 +53,8 @@ def new(cfg: Train) -> Path:
     the time and the settings.
     """
     if cfg.folder is None:
-        name = f"{label(cfg.env.name)}-{label(cfg.geometry.name)}-{cfg.seed}"
-        return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{name}")
+        name = f"{env_name(cfg.env)}-{label(cfg.geometry.name)}-{cfg.seed}"
+        return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{for_file(name)}")
     check_free(cfg.folder)
     folder = Path(cfg.folder)
     return folder if os.path.exists(folder) else make(folder)
@@ -222,12 +227,12 @@ class Place(NamedTuple):
 
 def place(env: Env, geometry: Geometry, homes: list, split: str) -> Place:
     if not homes:
-        return Place(label(env.name), label(env.name), "")
+        return Place(env_name(env), env_name(env), "")
     path = Path(getattr(geometry, "path", None) or "")
     is_ours = geometry.name.startswith("megastep.")
     name = label(geometry.name) if is_ours else geometry.name
     choice = f", geometry={name}{f' ({path.name})' * bool(path.name)}, split={split}"
-    return Place(label(env.name), "-".join(filter(None, [label(geometry.name), path.stem])), choice)
+    return Place(env_name(env), "-".join(filter(None, [label(geometry.name), path.stem])), choice)
 
 
 def write_table(
@@ -242,7 +247,7 @@ def write_table(
     and `rows` for programs, .json. Returns the latter's path.
     """
     names = [name for name in (*names, "greedy" * cfg.greedy) if name]
-    folder, name = folder_of(loaded.path) / "evaluations", re.sub(r"[^\w.-]", "-", "-".join(names))
+    folder, name = folder_of(loaded.path) / "evaluations", for_file("-".join(names))
     head, lines = [*cells[0]], [[*row.values()] for row in cells]
     result = dict(
         title=title,

@@ -119,6 +119,13 @@ def label(name: str) -> str:
     return name.rpartition(":")[2].rpartition(".")[2].lower()
 
 
+def env_name(env: Any) -> str:
+    """What an environment is called in titles, from its settings: `explorer`, or the id that one of
+    other packages has, `CartPole-v1`.
+    """
+    return getattr(env, "id", None) or label(env.name)
+
+
 Env, Geometry, Learner, Logger = map(_group, GROUPS)
 Agent = kind_of("agent", components.POLICY)
 Opposition = kind_of("opponents", components.OPPONENTS)

@@ -123,4 +123,6 @@ def _checked(id, env):
 
 
 def _line(error):
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    """Returns the first line of an error, without what Gymnasium adds to it."""
+    line = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return line.partition(" was raised from the environment creator")[0]

@@ -170,4 +170,4 @@ def _identifiers(keys):
 
 def _described(space):
     text = " ".join(str(space).split())
-    return text if len(text) <= 80 else f"{text[:80]}..."
+    return text if len(text) <= 80 else f"a {type(space).__name__} of shape {space.shape}"
