@@ -102,7 +102,7 @@ class EnvState:
         state = self.state_dict()
         arrays = {k: leaf for k, leaf in state["arrays"].items() if state["kinds"][k] == "numpy"}
         values = {path: _encoded(node) for path, node in self._plain_values()}
-        none = {name: {} for name in ("lengths", "keys", "aliases", "unchanged")}
+        none = {name: {} for name in ("classes", "lengths", "keys", "aliases", "unchanged")}
         return state | {"arrays": arrays, "values": values} | none
 
     def restore_host(self, state: dict[str, dict[str, Any]]) -> None:
@@ -110,9 +110,13 @@ class EnvState:
         self._load(state)
 
     def _members(self):
-        """Returns the lengths of lists and the keys of dicts that hold tensors or objects."""
+        """Returns the classes of objects, the lengths of lists and the keys of dicts that hold
+        tensors or objects.
+        """
         nodes = [(path, node) for path, node in self._nodes_of_user() if not _is_plain(node)]
+        objects = [pair for pair in nodes if _is_object(pair[1])]
         return dict(
+            classes={path: type(node).__qualname__ for path, node in objects},
             lengths={path: len(node) for path, node in nodes if _is_list(node)},
             keys={path: _encoded([*node]) for path, node in nodes if _is_dict(node)},
         )
@@ -167,6 +171,9 @@ class EnvState:
                 raise ValueError(
                     f"{_name(path)} is not that of the run; have its homes or its class changed?"
                 )
+        for path, name in state.get("classes", {}).items():  # absent in older checkpoints
+            if (now := type(node_at(self.root, path)).__qualname__) != name:
+                raise ValueError(f"{_name(path)} was a {name} and is a {now}")
         for path, value in state["generators"].items():
             is_of_another_device = path.startswith(".generators") and path not in leaves
             if not is_of_another_device and not _set_generator_state(leaves.get(path), value):
@@ -247,6 +254,10 @@ class EnvState:
 
 def _is_ours(node):
     return type(node).__module__.startswith(("megastep.", "torch."))
+
+
+def _is_object(node):
+    return hasattr(node, "__dict__") and not isinstance(node, (*_STATEFUL, *_CONSTANT))
 
 
 def _is_list(node):

@@ -147,6 +147,14 @@ def test_another_environment_is_refused_and_unchanged():
     assert str(facts(target)[:4]) == str(facts(Env())[:4])
 
 
+def test_object_that_became_one_of_another_class_is_refused():
+    env, target = Env(), Env()
+    env.held, target.held = Inner(), Env.__new__(Env)
+    saved = EnvState(env).state_dict()
+    with pytest.raises(ValueError, match="held was a Inner and is a Env$"):
+        EnvState(target).load_state_dict(saved)
+
+
 def test_state_that_fails_in_the_middle_is_put_back():
     """A tuple cannot take another tensor."""
     env, target = Env(), Env()

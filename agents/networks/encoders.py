@@ -114,9 +114,39 @@ class Conv(nn.Module):
         return F.relu(self.second(F.relu(self.first(rows)))).reshape(*lead, self.n_features)
 
 
+class Cnn(nn.Module):
+    """Three convolutions of an image in both directions, (..., A, C, H, W) -> (..., n_features):
+    those of Mnih et al. 2015 for images of 36 x 36 pixels and more, of 3 x 3 pixels for smaller
+    ones. Agents share weights.
+    """
+
+    CHANNELS, MIN_SIDE = (32, 64, 64), 36
+    #: (kernel, stride, padding) of each layer
+    LARGE, SMALL = ((8, 4, 0), (4, 2, 0), (3, 1, 0)), ((3, 1, 1), (3, 2, 1), (3, 2, 1))
+
+    def __init__(self, space: spaces.MultiImage):
+        super().__init__()
+        is_large = min(space.H, space.W) >= self.MIN_SIDE
+        layers, sizes, n_channels = [], [space.H, space.W], space.C
+        for n_out, settings in zip(self.CHANNELS, self.LARGE if is_large else self.SMALL):
+            layer = nn.Conv2d(n_channels, n_out, *settings)
+            nn.init.orthogonal_(layer.weight, gain=math.sqrt(2))
+            nn.init.zeros_(layer.bias)
+            layers += [layer, nn.ReLU()]
+            kernel, stride, padding = settings
+            sizes = [(size + 2 * padding - kernel) // stride + 1 for size in sizes]
+            n_channels = n_out
+        self.layers = nn.Sequential(*layers)
+        self.n_features = space.n_agents * n_channels * math.prod(sizes)
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        images = obs.flatten(0, -4).to(compute_dtype(self.layers[0].weight))
+        return self.layers(images).reshape(*obs.shape[:-4], self.n_features)
+
+
 #: Encoders of images by name. An encoder is a module `Encoder(space)` with `n_features` that maps
 #: images (..., A, C, H, W) to features (..., n_features).
-ENCODERS = {"linear": Flat, "conv": Conv}
+ENCODERS = {"linear": Flat, "conv": Conv, "cnn": Cnn}
 
 
 def make_image_encoder(name: str, space: spaces.MultiImage) -> nn.Module:

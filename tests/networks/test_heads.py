@@ -225,7 +225,7 @@ def test_zero_features_have_a_gradient():
         (lambda: heads.intake(arrdict(nothing=spaces.MultiEmpty()), WIDTH), "nothing in it"),
         (
             lambda: heads.intake(IMAGE, WIDTH, "resnet"),
-            "'resnet'.*conv, linear, module:Class",
+            "'resnet'.*cnn, conv, linear, module:Class",
         ),
         (lambda: heads.output(VECTOR, WIDTH), "MultiContinuous or dicts of them"),
         (lambda: heads.output(arrdict(), WIDTH), "MultiContinuous or dicts of them"),

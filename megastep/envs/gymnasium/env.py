@@ -142,8 +142,8 @@ class Gymnasium:
     def _world(self, obs, reward, terminated, truncated):
         """Returns the world after a step, in which lanes that had ended before it began again."""
         reset = self._ended.copy()
-        terminal = terminated & ~reset
-        truncated = truncated & ~(reset | terminal)
+        terminal = terminated > reset
+        truncated = truncated > (reset | terminal)
         np.logical_or(terminal, truncated, out=self._ended)
         return self._buffers.send(
             arrdict(

@@ -46,12 +46,13 @@ class HostBuffers:
 
     def send(self, world: arrdict) -> arrdict:
         """Returns a world of arrays as one of new tensors on the device."""
-        if self.on_gpu:
-            self.copied.synchronize()  # the last world may still be on its way
-        for buffer, array in zip(self.arrays, leaves(world), strict=True):
-            np.copyto(buffer, array, casting="unsafe")
+        pairs = zip(self.arrays, leaves(world), strict=True)
         if not self.on_gpu:
-            return self.world.map(torch.clone)
+            tensors = (torch.from_numpy(np.array(array, to.dtype)) for to, array in pairs)
+            return _tree(world, tensors)
+        self.copied.synchronize()  # the last world may still be on its way
+        for buffer, array in pairs:
+            np.copyto(buffer, array, casting="unsafe")
         sent = self.world.map(lambda leaf: leaf.to(self.device, non_blocking=True))
         self.copied.record()
         return sent
@@ -66,3 +67,13 @@ class HostBuffers:
         self.copied.record()
         self.copied.synchronize()
         return spaces.map(lambda leaf: leaf.numpy(), self.actions)
+
+
+def _tree(like, values):
+    """Returns the next values of an iterator as a tree with the keys of another."""
+    return arrdict(
+        {
+            key: _tree(child, values) if isinstance(child, dict) else next(values)
+            for key, child in like.items()
+        }
+    )
