@@ -15,7 +15,6 @@ from megastep.agents.networks.precision import compute_dtype
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.types import Space, Tree
 
-
 #: Activations of hidden layers by name.
 ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
 
@@ -40,9 +39,7 @@ class ConcatIntake(nn.Module):
         ValueError: if a space is of an unknown kind, or nothing is observed.
     """
 
-    def __init__(
-        self, space: Space, width: int, encoder: str = "linear", activation: str = "relu"
-    ):
+    def __init__(self, space: Space, width: int, encoder: str = "linear", activation: str = "relu"):
         super().__init__()
         leaves = {
             path: leaf
