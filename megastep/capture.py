@@ -216,8 +216,8 @@ def _line(error):
 
 class Captured:
     """Wraps an environment on a GPU so that ``step`` replays a CUDA graph, recorded at the first
-    step. On the CPU, or if the environment is not ``capturable``, ``step`` is the environment's own.
-    All other attributes are the environment's.
+    step. On the CPU, and if the environment is not ``capturable``, ``step`` is its own. All other
+    attributes are the environment's.
 
     Args:
         env: the environment to wrap.

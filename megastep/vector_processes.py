@@ -41,7 +41,7 @@ class VectorProcesses:
         if n_processes is None:
             n_processes = loky.cpu_count() // int(os.environ.get("LOCAL_WORLD_SIZE", 1))
         example = make(num_envs=1)
-        self.metadata = example.metadata
+        self.metadata, self.render_mode = example.metadata, example.render_mode
         self.single_observation_space = example.single_observation_space
         self.single_action_space = example.single_action_space
         example.close()
@@ -49,8 +49,8 @@ class VectorProcesses:
         self.rows = [slice(*pair) for pair in zip(edges, edges[1:])]
         self.observations = create_empty_array(self.single_observation_space, n_envs)
         self.results = np.zeros(n_envs), np.zeros(n_envs, bool), np.zeros(n_envs, bool)
-        self.pipes, processes = [], []
-        self._finalizer = weakref.finalize(self, _end, self.pipes, processes)
+        self.pipes, self.processes = [], []
+        self._finalizer = weakref.finalize(self, _end, self.pipes, self.processes)
         context = get_context("loky")  # a new interpreter: a fork would share locks and threads
         with workers.terminal_signals_blocked():
             for rows in self.rows:
@@ -64,7 +64,7 @@ class VectorProcesses:
                 process.start()
                 far_end.close()
                 self.pipes.append(pipe)
-                processes.append(process)
+                self.processes.append(process)
 
     def reset(self, *, seed: Sequence[int] | None = None) -> tuple[Any, dict]:
         """Resets every environment. Returns (observations, no infos)."""

@@ -17,7 +17,7 @@ SCRIPTS = ("train", "evaluate", "record", "megastep.__main__")
 # A module may import modules of rows above its own, and of its own part or room.
 SIMULATOR = (
     ("cache", "colour", "dotdict", "read_only", "settings", "types", "video", "workers"),
-    ("arrdict", "geometry", "kernels", "plotting", "ragged"),
+    ("arrdict", "geometry", "imports", "kernels", "plotting", "ragged", "vector_processes"),
     ("engine", "recording", "spaces"),
     ("capture", "contract", "env_state", "geometries", "scene"),
     ("core", "cubicasa", "toys"),
@@ -32,7 +32,7 @@ ENGINE = (
     ("rendering",),
 )
 AGENTS = (
-    ("distributed", "generator", "imports", "types"),
+    ("distributed", "generator", "types"),
     ("networks",),
     ("storage",),
     ("algorithms",),
@@ -47,6 +47,7 @@ SHARED = {
     "megastep.capture",
     "megastep.dotdict",
     "megastep.env_state",
+    "megastep.imports",
     "megastep.ragged",
     "megastep.settings",
     "megastep.spaces",
@@ -79,9 +80,10 @@ OUTSIDE_USERS = {
     "av": ("megastep/video.py", "agents/cli/record.py"),
     "cloudpickle": ("megastep/recording.py",),
     "cuda": ("megastep/kernels/build/compile.py",),
+    "gymnasium": ("megastep/envs/gymnasium/*.py", "megastep/vector_processes.py"),
     "hydra": ("agents/cli/*.py",),
     "hydra_plugins": ("agents/cli/*.py",),
-    "loky": ("megastep/recording.py",),
+    "loky": ("megastep/recording.py", "megastep/vector_processes.py"),
     "omegaconf": ("agents/cli/*.py",),
     "openskill": ("agents/selfplay/ratings.py",),
     "rich": ("agents/cli/*.py", "megastep/envs/pointgoal/goals.py"),

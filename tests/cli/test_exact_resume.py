@@ -57,6 +57,10 @@ CASES = {
     "beta": [
         *("env=tests.cli.test_exact_resume:Steered", *tiny.TINY[1:], "agent.continuous=beta"),
     ],
+    "gymnasium": [
+        *("env=gymnasium", "env.id=CartPole-v1", *SMALL[1:]),
+        *("learner.n_minibatches=2", "preset=cpu"),
+    ],
     "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[1:]],
 }
 FAST = "explorer", "lag", "priorities", "r2d2", "opponents", "stranger", "beta"
@@ -172,6 +176,8 @@ def test_resumed_run_has_the_same_bits(here, case, device):
     """Killed after one of its checkpoints, and when it is resumed after a later one. On a GPU the
     first updates of a process are eager, the others replay graphs.
     """
+    if case == "gymnasium":
+        pytest.importorskip("gymnasium")
     words = [*CASES[case], f"device={device}", "samples=512", "log_every=2"]
     run(*words, "folder=run", *EVERY_UPDATE)
     alone = checkpoint.load_latest("run/checkpoints").state

@@ -126,13 +126,12 @@ class Gymnasium:
         Raises:
             ValueError: if it renders no images.
         """
-        frames = self.vector.render()
-        if frames is None or not isinstance(frames[e], np.ndarray):
+        if self.vector.render_mode != "rgb_array":
             raise ValueError(
                 f"{self.id} renders no images: it has no render mode rgb_array, or env.kwargs "
                 "chooses another"
             )
-        return arrdict(frame=torch.from_numpy(frames[e].copy()))
+        return arrdict(frame=torch.from_numpy(np.array(self.vector.render()[e])))
 
     @staticmethod
     def plot_state(state: arrdict) -> np.ndarray:

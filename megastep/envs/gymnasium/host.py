@@ -24,9 +24,7 @@ class HostBuffers:
 
     IS_STATELESS = True  # see :mod:`megastep.engine.state_tree`
 
-    def __init__(
-        self, n_envs: int, obs_space: Space, action_space: Space, device: torch.device
-    ):
+    def __init__(self, n_envs: int, obs_space: Space, action_space: Space, device: torch.device):
         self.device, self.on_gpu = device, device.type == "cuda"
 
         def empty(dtype, *shape):

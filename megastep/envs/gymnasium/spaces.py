@@ -80,13 +80,17 @@ def actions(space: Any, path: str = "action") -> Conversion:
 
     if isinstance(space, (gym.Dict, gym.Tuple)):
         parts = _parts(space, actions, path)
-        as_batch = dict if isinstance(space, gym.Dict) else lambda pairs: tuple(dict(pairs).values())
+        as_batch = (
+            dict if isinstance(space, gym.Dict) else lambda pairs: tuple(dict(pairs).values())
+        )
         return _tree(parts), lambda tree: as_batch(
             (key, convert(tree[name])) for name, key, _, convert in parts
         )
     dtype, shape = space.dtype, (-1, *(space.shape or ()))
     if isinstance(space, gym.Discrete):
-        return spaces.MultiDiscrete(1, int(space.n)), lambda x: (x[:, 0] + space.start).astype(dtype)
+        return spaces.MultiDiscrete(1, int(space.n)), lambda x: (x[:, 0] + space.start).astype(
+            dtype
+        )
     if isinstance(space, gym.MultiBinary):
         return spaces.MultiDiscrete(math.prod(space.shape), 2), partial(_reshaped, shape, dtype)
     if isinstance(space, gym.MultiDiscrete):
@@ -170,4 +174,5 @@ def _identifiers(keys):
 
 def _described(space):
     text = " ".join(str(space).split())
-    return text if len(text) <= 80 else f"a {type(space).__name__} of shape {space.shape}"
+    is_short = type(space).__name__ == "Box" and len(text) <= 80
+    return text if is_short else f"a {type(space).__name__}"

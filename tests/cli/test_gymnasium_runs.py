@@ -1,0 +1,75 @@
+"""Runs in environments of Gymnasium, from the command line."""
+
+import json
+
+import pytest
+
+from megastep.agents.cli import evaluate, sweeps, train
+from megastep.agents.cli.compose import Composer
+from megastep.agents.cli.scripts import SCRIPTS
+from megastep.agents.training import json_lines
+from tests.helpers import tiny
+
+pytest.importorskip("gymnasium")
+WORDS = [
+    *("env=gymnasium", "preset=cpu", "device=cpu", "env.n_envs=4", "agent.width=8"),
+    *("learner.n_steps=8", "learner.n_minibatches=2", "samples=64", "log_every=1"),
+]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("preset", ["cpu", "gpu"])
+def test_few_environments_unless_told_otherwise(preset):
+    words = ["env=gymnasium", f"preset={preset}"]
+    assert tiny.settings(*words).env.n_envs <= 64 < tiny.settings(words[1]).env.n_envs
+    assert tiny.settings(*words, "env.n_envs=7").env.n_envs == 7
+    assert tiny.settings(*words).agent.encoder == "cnn"
+
+
+def test_settings():
+    words = ["env.id=minigrid:MiniGrid-Empty-5x5-v0", "env.kwargs.size=9", "env.wrappers=[a.b:C]"]
+    env = tiny.settings("env=gymnasium", *words).env
+    assert (env.id, env.kwargs, env.wrappers) == (words[0][7:], {"size": 9}, ("a.b:C",))
+    composer = Composer(SCRIPTS["train"])
+    jobs, *_ = sweeps.jobs_of(composer, ["env=gymnasium", "env.id=CartPole-v1,ALE/Pong-v5"])
+    assert [composer.settings(job).env.id for job in jobs] == ["CartPole-v1", "ALE/Pong-v5"]
+
+
+def test_train_evaluate_and_begin_new_episodes(here, capsys):
+    """Frozen Lake cannot be saved, as it holds an array of characters."""
+    assert train.main([*WORDS, "env.id=FrozenLake-v1"]) == 0
+    (run,) = (here / "runs").glob("*FrozenLake-v1-homes-1")
+    assert evaluate.main([f"run={run}", "episodes=8"]) == 0
+    (table,) = run.glob("evaluations/FrozenLake-v1-*.json")
+    assert [row["lanes"] for row in json.loads(table.read_text())["rows"]] == [8, 8]
+    assert "Checkpoints cannot hold" not in capsys.readouterr().err
+    assert train.main([f"resume={run}", "more_samples=32"]) == 0
+    assert "its environments were not saved, so new episodes begin" in capsys.readouterr().out
+    assert [row["samples"] for row in json_lines.read(run / "metrics.jsonl")] == [32, 64, 96]
+
+
+def test_weights_of_another_environment_are_refused_by_its_name(capsys):
+    assert train.main([*WORDS, "env.id=CartPole-v1", "folder=run"]) == 0
+    assert train.main([*WORDS, "env.id=Acrobot-v1", "init=run"]) == 2
+    text = capsys.readouterr().err
+    assert "in another environment, CartPole-v1 and not Acrobot-v1: obs was MultiVector(" in text
+
+
+@pytest.mark.parametrize(
+    "words, text",
+    [
+        (["env.id=CartPol-v1"], "did you mean CartPole-v1?"),
+        ([], "env.id is missing; name an environment"),
+        (["env.kwargs=3"], "env.kwargs: expected keys with values, got 3"),
+        (["env.wrappers=a"], "env.wrappers: expected a list, got 'a'"),
+        (["env.vectorization=syn"], "did you mean sync?"),
+    ],
+)
+def test_bad_input_leaves_nothing(here, words, text, capsys):
+    assert train.main([*WORDS, *words]) == 2
+    assert text in capsys.readouterr().err and not [*here.glob("runs/*")]
