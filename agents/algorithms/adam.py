@@ -4,9 +4,12 @@
 """
 
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import torch
+
+_NONE = MappingProxyType({})
 
 
 class Adam:
@@ -20,9 +23,9 @@ class Adam:
         lr: step size, a tensor () on their device that may be changed in place.
         betas: decay of the running means of gradients and of squared gradients.
         eps: added to the denominator.
-        weight_decay: a step also subtracts step size x `weight_decay` x weight. Parameters with
-            fewer than two axes, such as biases, do not decay.
         lr_factors: factors of `lr` for some of the parameters; 1 for the others.
+        weight_decays: weight decays of some of the parameters, from each of which a step also
+            subtracts step size x decay x parameter; 0 for the others.
     """
 
     def __init__(
@@ -31,8 +34,8 @@ class Adam:
         lr: torch.Tensor,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-5,
-        weight_decay: float = 0.0,
-        lr_factors: Mapping[torch.nn.Parameter, float] | None = None,
+        lr_factors: Mapping[torch.nn.Parameter, float] = _NONE,
+        weight_decays: Mapping[torch.nn.Parameter, float] = _NONE,
     ):
         self.parameters, self.lr = list(parameters), lr
         self.betas, self.eps = betas, eps
@@ -42,8 +45,7 @@ class Adam:
         # those of one step size and one decay are updated by one operation
         self._groups: dict[tuple[float, float], list] = {}
         for row in zip(self.parameters, self.means, self.squares, strict=True):
-            factor = (lr_factors or {}).get(row[0], 1.0)
-            key = factor, weight_decay if row[0].ndim > 1 else 0.0
+            key = lr_factors.get(row[0], 1.0), weight_decays.get(row[0], 0.0)
             self._groups.setdefault(key, []).append(row)
 
     @torch.no_grad()

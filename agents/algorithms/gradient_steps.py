@@ -1,6 +1,6 @@
 """The gradient steps of an update. Non-finite steps are skipped and counted."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -30,8 +30,7 @@ class GradientSteps:
         lr: Adam's step size.
         max_grad_norm: longer gradients are scaled down to this norm.
         device: device of the parameters.
-        weight_decay: Adam's weight decay.
-        lr_factors: factors of the step size for some of the parameters.
+        options: further arguments of `Adam`, such as `lr_factors`.
 
     Attributes:
         check: the first non-finite number, and how many updates were skipped in a row.
@@ -43,14 +42,11 @@ class GradientSteps:
         lr: float,
         max_grad_norm: float,
         device: torch.device,
-        weight_decay: float = 0.0,
-        lr_factors: Mapping[torch.nn.Parameter, float] | None = None,
+        **options: Any,
     ):
         self.max_grad_norm = max_grad_norm
         self._lr = torch.tensor(lr, device=device)
-        self.optimizer = Adam(
-            parameters, self._lr, weight_decay=weight_decay, lr_factors=lr_factors
-        )
+        self.optimizer = Adam(parameters, self._lr, **options)
         self.check = NonFiniteCheck(device)
         self._is_finite, self._rows, self._metrics = None, [], {}  # of the update in progress
 

@@ -94,7 +94,8 @@ class GradientLearner:
         graph: on a GPU, captures updates as a CUDA graph.
         seed: seed of the learner's own generator.
         critic_lr: Adam's step size of the critic's parameters. None: `lr`.
-        weight_decay: Adam's weight decay, of all weights but biases and other vectors.
+        weight_decay: Adam's weight decay, of parameters of two or more axes whose name contains
+            "weight": those of layers, but no biases and no standard deviations.
 
     Attributes:
         steps: the `GradientSteps` of the policy's parameters.
@@ -113,11 +114,15 @@ class GradientLearner:
         weight_decay: float = 0.0,
     ):
         self.policy, self.device, self.lr = policy, policy.device, lr
-        lr_factors = {}
-        if critic_lr is not None:
-            lr_factors = dict.fromkeys(policy.critic.parameters(), critic_lr / lr)
+        critic = () if critic_lr is None else policy.critic.parameters()
+        layers = (p for name, p in policy.named_parameters() if p.ndim > 1 and "weight" in name)
         self.steps = GradientSteps(
-            policy.parameters(), lr, max_grad_norm, self.device, weight_decay, lr_factors
+            policy.parameters(),
+            lr,
+            max_grad_norm,
+            self.device,
+            lr_factors={p: critic_lr / lr for p in critic},
+            weight_decays=dict.fromkeys(layers, weight_decay),
         )
         self.check, self.optimizer = self.steps.check, self.steps.optimizer
         self.generator = SeededGenerator(stream_seed(seed, "learner"))

@@ -40,7 +40,7 @@ class PPO(GradientLearner):
         lr: Adam's step size.
         critic_lr: Adam's step size of the critic's own parameters, those under "critic."; it falls
             with `lr`. None: `lr`.
-        weight_decay: decoupled weight decay (AdamW) of all weights but biases and other vectors.
+        weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
         gamma: discount per step.
         lambda_: lambda of GAE.
         clip: how far the probability ratio of an action may move from 1 before its gradient stops.

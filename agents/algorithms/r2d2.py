@@ -67,7 +67,7 @@ class R2D2(GradientLearner):
         policy: a policy with `output="duelling"`.
         n_steps: steps of a rollout, T.
         lr: Adam's step size.
-        weight_decay: decoupled weight decay (AdamW) of all weights but biases and other vectors.
+        weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
         gamma: discount per step.
         return_steps: n of the n-step returns, the rewards summed before bootstrapping.
         target_period: gradient steps between two copies of the weights to the target network.

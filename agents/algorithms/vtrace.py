@@ -55,7 +55,7 @@ class VTrace(GradientLearner):
         lr: Adam's step size.
         critic_lr: Adam's step size of the critic's own parameters, those under "critic."; it falls
             with `lr`. None: `lr`.
-        weight_decay: decoupled weight decay (AdamW) of all weights but biases and other vectors.
+        weight_decay: decoupled weight decay (AdamW) of the layers' weights, not of biases.
         gamma: discount per step.
         lambda_: decay of the traces.
         rho_clip: truncation of the ratios in the policy's gradient and the value's error. At 1,

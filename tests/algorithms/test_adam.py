@@ -36,7 +36,7 @@ def test_matches_torch_optim_adamw(device):
     params, torch_params = parameters(device), parameters(device)
     lr = torch.tensor(0.1, device=device)
     options = dict(betas=(0.8, 0.99), eps=1e-4)
-    adam = Adam(params, lr, weight_decay=0.5, lr_factors={params[1]: 3.0}, **options)
+    adam = Adam(params, lr, lr_factors={params[1]: 3.0}, weight_decays={params[0]: 0.5}, **options)
     options |= dict(fused=True, capturable=device == "cuda")
     torch_adams = [
         torch.optim.AdamW([p], lr=lr.clone(), weight_decay=decay, **options)

@@ -8,6 +8,7 @@ import io
 import pytest
 import torch
 
+from megastep import spaces
 from megastep.agents.algorithms.learner import check_learner
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
@@ -161,24 +162,36 @@ def test_critic_lr_is_of_the_critic_alone_and_falls_with_lr(learner, factor):
         assert steps[name] == pytest.approx(factor * 1e-3, rel=0.02)
 
 
+class Pushes(Numbers):
+    """The first of two continuous actions is rewarded with the observation's first number."""
+
+    action_space = spaces.MultiContinuous(1, 2)
+
+    def step(self, decision):
+        return self._world(self.age == 7, decision["actions"][:, 0, 0])
+
+
 @pytest.mark.parametrize("name, settings", [("ppo", {"n_epochs": 1}), ("vtrace", {}), ("r2d2", {})])
-def test_weights_decay_and_biases_do_not(name, settings):
+def test_weights_decay_and_biases_and_standard_deviations_do_not(name, settings):
     """After one gradient step."""
     ends = []
     for weight_decay in (0.0, 2.0):
+        env = Numbers() if name == "r2d2" else Pushes()
         policy, learner, collect = make(
-            name, n_minibatches=1, weight_decay=weight_decay, **settings
+            name, env, n_minibatches=1, weight_decay=weight_decay, **settings
         )
+        for parameter in policy.parameters():
+            parameter.data += 0.01
         first = {n: p.detach().clone() for n, p in policy.named_parameters()}
         while not learner.optimizer.n_steps:
             learner.update(collect())
-        ends.append({n: p.detach() for n, p in policy.named_parameters()})
+        ends.append({n: p.detach().clone() for n, p in policy.named_parameters()})
     plain, decayed = ends
     assert learner.optimizer.n_steps == 1
     moments = learner.state_dict()["optimizer"]["means"]  # in an order that no setting changes
     assert [mean.shape for mean in moments] == [p.shape for p in policy.parameters()]
     for key in first.keys() - {"critic.output.linear.weight"}:  # which PopArt changes, too
-        subtracted = SMALL["lr"] * 2.0 * first[key] if first[key].ndim > 1 else 0 * first[key]
+        subtracted = SMALL["lr"] * 2.0 * first[key] if "weight" in key else 0 * first[key]
         torch.testing.assert_close(plain[key] - decayed[key], subtracted, rtol=1e-3, atol=1e-6)
 
 

@@ -7,7 +7,7 @@ from megastep.agents.algorithms.learner import check_learner
 from megastep.agents.cli import train
 from megastep.agents.networks.policy import Policy
 from megastep.agents.types import LEARNER_DEFAULTS
-from tests.algorithms.test_learning import Bandit, Corridor
+from tests.algorithms.test_learning import Bandit, Corridor, Reach
 from tests.helpers import pages, tiny
 
 PAGE = pages.ROOT / "docs" / "learners.md"
@@ -44,9 +44,11 @@ def test_learning_rate_that_cannot_fall_is_refused(folder, capsys):
     assert "A2C has no set_lr(lr), so its learning rate cannot fall" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("make, n_updates, least", [(Bandit, 40, 0.45), (Corridor, 40, 1 / 8)])
+@pytest.mark.parametrize(
+    "make, n_updates, least", [(Bandit, 40, 0.45), (Corridor, 40, 1 / 8), (Reach, 40, 0.2)]
+)
 def test_a2c_learns(folder, make, n_updates, least):
-    """Reward per step: 1/2 and 1/7 at best, 0.18 and 0.01 at random."""
+    """Reward per step: 1/2, 1/7 and 4/5 at best, 0.18, 0.01 and less than 0 at random."""
     import my_a2c
 
     env = make()

@@ -59,6 +59,20 @@ def test_samples_have_the_density(kind):
     torch.testing.assert_close(centre, output.greedy(logits), atol=4e-2, rtol=0)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_samples_are_reparameterised(kind):
+    """Their gradient is that of the mean, which the score function gives, too."""
+    output, logits = make(kind, spaces.MultiContinuous(1, 2, -1.0, 3.0), scale=1.0)
+    logits = logits.detach().requires_grad_()
+    actions = output.sample(logits.expand(100_000, *logits.shape))
+    (found,) = torch.autograd.grad(actions.mean(0).sum(), logits)
+    distance = (actions - actions.mean(0)).detach().sum((-1, -2))
+    surrogate = distance * output.logprob(logits, actions.detach())
+    (expected,) = torch.autograd.grad(surrogate.mean(0).sum(), logits)
+    torch.testing.assert_close(found, expected, atol=5e-2, rtol=0)
+    assert expected.abs().max() > 0.3
+
+
 def test_gaussian_is_that_of_torch_distributions():
     output, logits = make("gaussian", spaces.MultiContinuous(1, 3), scale=0.5)
     actions = output.sample(logits)
