@@ -15,8 +15,8 @@ from megastep.imports import import_object
 
 
 def returns(run: Path, n_episodes: int, seed: int) -> list[float]:
-    """Returns the return of each of `n_episodes` episodes of a run's last policy, with sampled
-    actions.
+    """Returns the return of each of `n_episodes` episodes of a run's last policy, which takes its
+    most likely actions.
     """
     import gymnasium
 
@@ -30,7 +30,6 @@ def returns(run: Path, n_episodes: int, seed: int) -> list[float]:
     for wrapper in settings.env.wrappers or ():
         env = import_object(wrapper)(env)
     actions, results = env.action_space, []
-    generator = torch.Generator().manual_seed(seed)
     for episode in range(n_episodes):
         obs, _ = env.reset(seed=seed + episode)
         state, is_first, total, done = policy.initial(1), True, 0.0, False
@@ -38,7 +37,7 @@ def returns(run: Path, n_episodes: int, seed: int) -> list[float]:
             tensor = torch.as_tensor(obs, dtype=torch.float32).reshape(1, 1, -1)
             world = arrdict.arrdict(obs=tensor, reset=torch.tensor([is_first]))
             with torch.no_grad():
-                decision, state = policy(world, state, generator=generator)
+                decision, state = policy(world, state, sample=False)
             chosen = decision.actions.numpy().reshape(actions.shape).astype(actions.dtype)
             chosen = np.clip(chosen, actions.low, actions.high) if actions.shape else chosen.item()
             obs, reward, terminated, truncated, _ = env.step(chosen)

@@ -84,7 +84,7 @@ def test_plain_evaluator_agrees_with_evaluate(tmp_path):
     pytest.importorskip("gymnasium")
     words = "env=gymnasium env.id=CartPole-v1 agent.core=none samples=20480 log_every=1"
     with training_runs.trained(CPU, tuple(words.split())) as (run,):
-        row = training_runs.evaluate(run, CPU, "episodes=256", "seed=5", "baseline=false")[0]
+        row = training_runs.evaluate(run, CPU, "episodes=256", "greedy=true")[0]
         returns = torch.tensor(plain_evaluation.returns(run, n_episodes=64, seed=5))
     # two means of independent episodes: three standard errors of the smaller sample, and some
     assert abs(returns.mean() - row["return"]) < 4 * returns.std() / 8
