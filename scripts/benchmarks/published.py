@@ -1,15 +1,18 @@
 """Benchmark of training: `published`, tasks of others beside what others publish for them.
 
 A task is one run per recurrent core and seed. Several runs may train side by side; without a GPU
-each has CPU cores of its own. A run folder that exists is measured and not trained again, so a benchmark that was cut
-short reports what its runs had reached.
+each has CPU cores of its own. A run folder that exists is measured and not trained again, so a
+benchmark that was cut short reports what its runs had reached.
+
+Options: `--tasks` are names in TASKS; `--jobs` is the number of runs side by side; a run ends after
+`--seconds`, whatever its samples; `--folder` keeps the run folders.
 """
 
 import dataclasses
 import importlib.metadata
-import itertools
 import json
 import os
+import queue
 import statistics
 import subprocess
 import sys
@@ -118,14 +121,6 @@ def published(
     return of 100 new episodes with the most likely actions, or in POPGym of the largest mean return
     of a report in training. The interval reaches from the lowest to the highest bound of the seeds'
     95 % intervals.
-
-    Args:
-        tasks: names in TASKS.
-        seeds: of training; default: the task's.
-        samples: per run; default: the task's.
-        seconds: after which a run ends, whatever its samples.
-        jobs: runs side by side.
-        folder: where run folders are kept; those in it are measured and not trained again.
     """
     with tempfile.TemporaryDirectory() as parent:
         parent = Path(folder or parent).resolve()
@@ -137,9 +132,11 @@ def published(
         ]
         limits = [] if seconds is None else [f"seconds={seconds}", "learner.anneal=seconds"]
         with ThreadPoolExecutor(jobs) as pool:
-            places = itertools.cycle(core_sets(jobs))
+            places = queue.SimpleQueue()  # core sets that no run has
+            for cores in core_sets(jobs):
+                places.put(cores)
             done = [
-                pool.submit(_train_and_evaluate, run, device, samples, limits, next(places))
+                pool.submit(_train_and_measure, run, device, samples, limits, places)
                 for run in runs
             ]
             by_run = dict(zip(runs, done))
@@ -161,7 +158,7 @@ def core_sets(jobs: int) -> list[list[int]]:
     return [[cores[(i * share + k) % len(cores)] for k in range(share)] for i in range(jobs)]
 
 
-def _train_and_evaluate(run, device, samples, limits, cores):
+def _train_and_measure(run, device, samples, limits, places):
     """Trains a run unless its folder exists. Returns its row, None if no episode ended."""
     if not run.folder.exists():
         words = (
@@ -170,12 +167,15 @@ def _train_and_evaluate(run, device, samples, limits, cores):
         )
         finish = "finish.evaluate=false", "finish.record=false"
         command = [sys.executable, "train.py", *words.split(), *limits, *finish]
+        cores = places.get()
         environment = os.environ | {"OMP_NUM_THREADS": str(len(cores))}
         process = subprocess.Popen(command, cwd=ROOT, stdout=sys.stderr, env=environment)
         if device.type == "cpu":  # a process with a GPU is helped by whatever core is idle
             os.sched_setaffinity(process.pid, cores)
-        if process.wait():
-            raise subprocess.CalledProcessError(process.returncode, command)
+        code = process.wait()
+        places.put(cores)
+        if code and not run.task.is_peak:
+            raise subprocess.CalledProcessError(code, command)
     return measured(run, device)
 
 
@@ -185,7 +185,8 @@ def measured(run: Run, device: torch.device) -> dict | None:
     A run that is evaluated takes its most likely actions. It also has `sampled`, the mean return of
     sampled actions, and `plain`, that of the independent evaluator, again of the most likely ones.
     """
-    curve = learning_curve(run.folder)
+    has_reports = (run.folder / "metrics.jsonl").exists()
+    curve = learning_curve(run.folder) if has_reports else []
     if not curve:
         return None
     seconds, samples, _ = curve[-1]
