@@ -168,7 +168,7 @@ def _train_and_measure(run, device, samples, limits, places):
         finish = "finish.evaluate=false", "finish.record=false"
         command = [sys.executable, "train.py", *words.split(), *limits, *finish]
         cores = places.get()
-        environment = os.environ | {"OMP_NUM_THREADS": str(len(cores))}
+        environment = {"OMP_NUM_THREADS": str(len(cores))} | os.environ
         process = subprocess.Popen(command, cwd=ROOT, stdout=sys.stderr, env=environment)
         if device.type == "cpu":  # a process with a GPU is helped by whatever core is idle
             os.sched_setaffinity(process.pid, cores)
