@@ -80,7 +80,12 @@ OUTSIDE_USERS = {
     "av": ("megastep/video.py", "agents/cli/record.py"),
     "cloudpickle": ("megastep/recording.py",),
     "cuda": ("megastep/kernels/build/compile.py",),
-    "gymnasium": ("megastep/envs/gymnasium/*.py", "megastep/vector_processes.py"),
+    "gymnasium": (
+        "megastep/envs/gymnasium/*.py",
+        "megastep/envs/on_host/*.py",
+        "megastep/envs/pettingzoo.py",
+        "megastep/vector_processes.py",
+    ),
     "hydra": ("agents/cli/*.py",),
     "hydra_plugins": ("agents/cli/*.py",),
     "loky": ("megastep/recording.py", "megastep/vector_processes.py"),
@@ -229,10 +234,12 @@ def simulator_knows_no_learner(graph):
 
 
 def environments_are_independent(graph):
-    """An environment is a file, or a folder with its own operation. All share envs.common alone."""
-    envs = "megastep.envs"
+    """An environment is a file, or a folder with its own operation. All share envs.common alone,
+    and those of other packages envs.on_host.
+    """
+    envs, shared = "megastep.envs", ("common", "on_host")
     for name, target in edges(graph, lambda name: name.startswith(f"{envs}.")):
-        if is_below(target, envs) and part_of(target, envs) not in (part_of(name, envs), "common"):
+        if is_below(target, envs) and part_of(target, envs) not in (part_of(name, envs), *shared):
             yield f"{name} must not import {target}"
 
 

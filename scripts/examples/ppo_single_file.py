@@ -31,12 +31,12 @@ from megastep.agents.algorithms.masked_stats import (
     masked_mean,
     pooled_normalise,
 )
-from megastep.agents.imports import import_object
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import make_rollout, without_last
 from megastep.agents.training.episode_stats import EpisodeStats
 from megastep.geometries import sources
+from megastep.imports import import_object
 from megastep.types import n_lanes, optional
 
 

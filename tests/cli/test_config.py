@@ -449,7 +449,8 @@ def test_glob_sweep():
 def test_help_lists_groups_and_members(capsys):
     assert train.main(["--help"]) == 0
     text = capsys.readouterr().out
-    assert "explorer, gymnasium, minimal" in text and "quickstart" in text and "--multirun" in text
+    assert "explorer, gymnasium, minimal, pettingzoo" in text
+    assert "quickstart" in text and "--multirun" in text
 
 
 def test_cfg_prints_composed_config(capsys):

@@ -16,7 +16,7 @@ class HostBuffers:
     GPU.
 
     Args:
-        n_envs: number of environments, N.
+        n_lanes: number of lanes, B.
         obs_space: space of one lane's observation.
         action_space: space of one lane's actions.
         device: where worlds go and actions come from.
@@ -24,11 +24,11 @@ class HostBuffers:
 
     IS_STATELESS = True  # see :mod:`megastep.engine.state_tree`
 
-    def __init__(self, n_envs: int, obs_space: Space, action_space: Space, device: torch.device):
+    def __init__(self, n_lanes: int, obs_space: Space, action_space: Space, device: torch.device):
         self.device, self.on_gpu = device, device.type == "cuda"
 
         def empty(dtype, *shape):
-            return torch.empty((n_envs, *shape), dtype=dtype, pin_memory=self.on_gpu)
+            return torch.empty((n_lanes, *shape), dtype=dtype, pin_memory=self.on_gpu)
 
         def of_space(space):
             dtypes = {spaces.MultiDiscrete: torch.int64, spaces.MultiContinuous: torch.float32}

@@ -1,0 +1,1 @@
+"""What environments of other packages share, which step on the host."""
