@@ -42,7 +42,7 @@ def vector_env(
         if vectorization == "own":
             return _checked(id, _own(make, spec, wrappers, n_envs, kwargs))
         # a checker warns of what an environment does wrong in its first steps, once per environment
-        settings = {"disable_env_checker": True, **_rendering(spec.entry_point), **kwargs}
+        settings = {"disable_env_checker": True, **kwargs}
         make = functools.partial(
             make,
             vectorization_mode="sync",
@@ -105,8 +105,7 @@ def _own(make, spec, wrappers, n_envs, kwargs):
         )
     if spec.vector_entry_point is None:
         raise ValueError("it has no vector environment of its own; use env.vectorization=sync")
-    settings = {**_rendering(spec.vector_entry_point), **kwargs}
-    return make(num_envs=n_envs, vectorization_mode="vector_entry_point", **settings)
+    return make(num_envs=n_envs, vectorization_mode="vector_entry_point", **kwargs)
 
 
 def _checked(id, env):
