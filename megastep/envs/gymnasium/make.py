@@ -88,15 +88,6 @@ def _spec(id):
     return gymnasium.registry[name]
 
 
-def _rendering(entry_point):
-    """Returns the argument that lets an environment draw images, if it can."""
-    from gymnasium.envs.registration import load_env_creator
-
-    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
-    modes = (getattr(creator, "metadata", None) or {}).get("render_modes", ())
-    return {"render_mode": "rgb_array"} if "rgb_array" in modes else {}
-
-
 def _own(make, spec, wrappers, n_envs, kwargs):
     if wrappers:
         raise ValueError(
