@@ -15,7 +15,7 @@ import numpy as np
 
 from megastep import workers
 
-__all__ = ["VectorProcesses"]
+__all__ = ["VectorProcesses", "start_rendering"]
 
 #: Seconds in which a worker that is to end may finish what it does.
 PATIENCE = 5
@@ -108,6 +108,18 @@ class VectorProcesses:
         return answers
 
 
+def start_rendering(vector: Any) -> None:
+    """Lets environments draw images from now on, if they can and no other render mode was chosen.
+
+    Not before someone looks: with a render mode LunarLander simulates the exhaust's particles, and
+    steps at a third of the speed.
+    """
+    if vector.render_mode is None and "rgb_array" in vector.metadata.get("render_modes", ()):
+        for env in getattr(vector, "envs", ()):
+            env.unwrapped.render_mode = "rgb_array"
+        vector.render_mode = "rgb_array"
+
+
 def _serve(pipe, make, n_envs):
     """Answers commands until the pipe is closed, which it is when the other process ends."""
     with contextlib.suppress(EOFError, OSError):
@@ -120,6 +132,7 @@ def _serve(pipe, make, n_envs):
                 elif command == "step":
                     pipe.send(envs.step(argument)[:4])
                 else:
+                    start_rendering(envs)
                     pipe.send(envs.render())
         except (EOFError, OSError):
             envs.close()

@@ -15,6 +15,7 @@ import torch
 from torch import nn
 
 from megastep import spaces
+from megastep.agents.networks.intakes import ACTIVATIONS
 from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.mingru import MinGRU
 from megastep.arrdict import arrdict
@@ -59,10 +60,16 @@ class GRU(nn.Module):
 
 
 class Feedforward(nn.Module):
-    """A hidden layer in the place of a recurrent core: only the current observation counts."""
+    """A hidden layer in the place of a recurrent core: only the current observation counts.
 
-    def __init__(self, width: int):
+    Args:
+        width: W.
+        activation: a name in `intakes.ACTIVATIONS`.
+    """
+
+    def __init__(self, width: int, activation: str = "relu"):
         super().__init__()
+        self.activation = ACTIVATIONS[activation]
         self.hidden = nn.Linear(width, width)
         nn.init.orthogonal_(self.hidden.weight, gain=2**0.5)
         nn.init.zeros_(self.hidden.bias)
@@ -75,7 +82,7 @@ class Feedforward(nn.Module):
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
     ) -> tuple[torch.Tensor, arrdict]:
         """Applies the layer to every step. `reset` and `state` have no effect."""
-        return self.hidden(x).relu(), state
+        return self.activation(self.hidden(x)), state
 
 
 CORES = {"lstm": LSTM, "gru": GRU, "mingru": MinGRU, "none": Feedforward}
@@ -104,19 +111,21 @@ class Stack(nn.ModuleList):
         return total, after
 
 
-def make_core(name: str, width: int, layers: int = 1) -> nn.Module:
+def make_core(name: str, width: int, layers: int = 1, activation: str = "relu") -> nn.Module:
     """Returns a recurrent core.
 
     Args:
         name: a name in `CORES`, or an import path.
         width: W.
         layers: number of cores; more than one make a `Stack`.
+        activation: of the core "none"; the others have their own.
 
     Raises:
         ValueError: if there is no such core, or it breaks the contract at the head of this file.
     """
     kind = resolve(name, CORES, nn.Module)
-    cores = [kind(width) for _ in range(layers)]
+    options = {"activation": activation} if kind is Feedforward else {}
+    cores = [kind(width, **options) for _ in range(layers)]
     if ":" in name:
         _check(name, cores[0], width)
     return cores[0] if layers == 1 else Stack(cores)

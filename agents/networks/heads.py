@@ -22,7 +22,9 @@ from megastep.types import Space
 OUTPUTS = {"softmax": MultiDiscreteOutput, "duelling": DuellingOutput}
 
 
-def intake(space: Space, width: int, encoder: str = "linear") -> ConcatIntake:
+def intake(
+    space: Space, width: int, encoder: str = "linear", activation: str = "relu"
+) -> ConcatIntake:
     """Returns a module from observations to vectors (..., width).
 
     Observations may have any dtype; features are cast to the compute dtype.
@@ -31,11 +33,12 @@ def intake(space: Space, width: int, encoder: str = "linear") -> ConcatIntake:
         space: observation space, a leaf or nested dicts.
         width: number of output features.
         encoder: encoder of images: "linear", "conv" or an import path.
+        activation: "relu" or "tanh".
 
     Raises:
         ValueError: if a space is of an unknown kind.
     """
-    return ConcatIntake(space, width, encoder)
+    return ConcatIntake(space, width, encoder, activation)
 
 
 def output(

@@ -7,7 +7,6 @@ import math
 
 import torch
 from torch import nn
-from torch.nn import functional as F
 
 from megastep import spaces
 from megastep.agents.distributed.pooling import Moments
@@ -16,10 +15,13 @@ from megastep.agents.networks.precision import compute_dtype
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.types import Space, Tree
 
+#: Activations of hidden layers by name.
+ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
+
 
 class ConcatIntake(nn.Module):
     """Normalises and encodes every leaf of an observation, concatenates the features, and projects
-    them to (..., width) with a ReLU.
+    them to (..., width) with an activation.
 
     Initially every leaf has the same weight, however many numbers it has: weights have variance
     2 / (leaves x features of the leaf), which preserves the size of the inputs (He et al. 2015).
@@ -28,6 +30,7 @@ class ConcatIntake(nn.Module):
         space: observation space, a leaf or nested dicts.
         width: number of output features.
         encoder: encoder of images, a name in `encoders.ENCODERS` or an import path.
+        activation: a name in `ACTIVATIONS`.
 
     Attributes:
         n_features: features of all leaves together, before the projection.
@@ -36,7 +39,7 @@ class ConcatIntake(nn.Module):
         ValueError: if a space is of an unknown kind, or nothing is observed.
     """
 
-    def __init__(self, space: Space, width: int, encoder: str = "linear"):
+    def __init__(self, space: Space, width: int, encoder: str = "linear", activation: str = "relu"):
         super().__init__()
         leaves = {
             path: leaf
@@ -45,6 +48,7 @@ class ConcatIntake(nn.Module):
         }
         if not leaves:
             raise ValueError(f"the observation space {space!r} has nothing in it to encode")
+        self.activation = ACTIVATIONS[activation]
         self.paths = list(leaves)
         self.encoders = nn.ModuleList(
             make_encoder(leaf, encoder, path) for path, leaf in leaves.items()
@@ -69,7 +73,7 @@ class ConcatIntake(nn.Module):
         features = self._encode_leaves(obs)
         if self.n_padding:
             features.append(features[0].new_zeros((*features[0].shape[:-1], self.n_padding)))
-        return F.relu(self.project(torch.cat(features, dim=-1)))
+        return self.activation(self.project(torch.cat(features, dim=-1)))
 
     def encode(self, obs: Tree) -> torch.Tensor:
         """Returns all leaves, normalised, encoded and concatenated: (..., n_features)."""

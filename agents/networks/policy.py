@@ -44,6 +44,8 @@ class Policy(nn.Module):
         core: a name in `cores.CORES`, or an import path.
         layers: recurrent cores, stacked with residual connections.
         encoder: encoder of images, a name in `encoders.ENCODERS`, or an import path.
+        activation: of the intake, and of the hidden layer of the core "none". "tanh" explores
+            better where reward is rare and observations are a few numbers.
         output: "softmax" samples actions by their probabilities, continuous ones too; "duelling"
             takes the action of the highest value.
         continuous: distribution of continuous actions, a name in
@@ -73,6 +75,7 @@ class Policy(nn.Module):
         core: Annotated[str, _name_in(cores.CORES)] = "lstm",
         layers: Annotated[int, Field(ge=1, le=8)] = 1,
         encoder: Annotated[str, _name_in(encoders.ENCODERS)] = "linear",
+        activation: Literal["relu", "tanh"] = "relu",
         output: Literal["softmax", "duelling"] = "softmax",
         continuous: Literal["gaussian", "beta"] = "gaussian",
         critic: Literal["asymmetric", "plain"] | None = "asymmetric",
@@ -86,8 +89,8 @@ class Policy(nn.Module):
         self.generator = SeededGenerator(stream_seed(seed, "policy"))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.intake = heads.intake(obs_space, width, encoder)
-            self.core = cores.make_core(core, width, layers)
+            self.intake = heads.intake(obs_space, width, encoder, activation)
+            self.core = cores.make_core(core, width, layers, activation)
             self.output = heads.output(action_space, width, output, continuous)
             self.critic = None if critic is None else Critic(width, self.privileged_space)
             if self.privileged_space:

@@ -16,6 +16,7 @@ import difflib
 import inspect
 import json
 import os
+import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +29,7 @@ import records
 import report
 import torch
 from catalogue import BENCHMARKS
+from published import TASKS
 from training_benchmarks import COMPARED
 
 from megastep import engine
@@ -50,7 +52,8 @@ def command_line(name: str, device: torch.device, options: dict) -> str:
     """Returns the command that repeats a benchmark."""
     words = ["python scripts/benchmarks/benchmark.py", name]
     for key, value in options.items():
-        words += [f"--{key}", *map(str, value if isinstance(value, list) else [value])]
+        values = value if isinstance(value, list) else [value]
+        words += [f"--{key}", *(shlex.quote(str(value)) for value in values)]
     words += ["--device cpu"] * (device.type == "cpu")
     return " ".join(words)
 
@@ -81,15 +84,19 @@ def main(argv: list[str] | None = None) -> int:
         help=f"{', '.join(BENCHMARKS)}; or report alone",
     )
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1")
-    parser.add_argument(
-        "--seeds", nargs="+", type=int, metavar="SEED", help="for train, duels and learners"
-    )
+    parser.add_argument("--seeds", nargs="+", type=int, metavar="SEED", help="for those that train")
     parser.add_argument(
         "--budgets", nargs="+", type=int, metavar="SECONDS", help="for train and learners"
     )
     parser.add_argument("--envs", nargs="+", choices=COMPARED, help="for worlds and learners")
     parser.add_argument(
-        "--samples", type=int, metavar="N", help="samples per run, for duels and ablation"
+        "--samples", type=int, metavar="N", help="samples per run, for duels, ablation, published"
+    )
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, metavar="TASK", help="for published")
+    parser.add_argument("--seconds", type=int, metavar="S", help="limit of a run, for published")
+    parser.add_argument("--jobs", type=int, metavar="N", help="runs side by side, for published")
+    parser.add_argument(
+        "--folder", type=Path, help="keeps run folders and measures those in it, for published"
     )
     parser.add_argument("--commit", help="the commit to record, if git is not available")
     parser.add_argument(

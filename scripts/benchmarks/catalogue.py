@@ -9,6 +9,7 @@ from checkpoints import checkpoints
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, memory, pong, step
 from nsight_counters import counters
+from published import published
 from replay_buffer import replay
 from scaling import ranks, scaling
 from shortest_paths import paths
@@ -36,6 +37,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "duels": duels,
     "ablation": ablation,
     "learners": learners,
+    "published": published,
     "scaling": scaling,
     "ranks": ranks,
 }

@@ -15,6 +15,7 @@ ORIGINAL_MEGASTEP = 16_384, 0.86e6
 #: Explorer's mean return in test homes for seeing all that is visible from 128 points.
 NEARLY_ALL_SEEN = 59.1
 ENV_COLOURS = {"explorer": "tab:blue", "minimal": "tab:orange", "pointgoal": "tab:purple"}
+CORE_ORDER = "none", "lstm", "gru", "mingru"
 BUDGET_COLOURS = "tab:green", "tab:blue", "tab:red"
 
 
@@ -179,6 +180,38 @@ def plot_learners(records: list[dict], path: Path) -> None:
             ax.set(title=f"{env}, {machine}")
             ax.grid(alpha=0.3)
     grid[0, 1].legend(fontsize=8)
+    save(grid[0, 0].figure, path)
+
+
+def plot_published(records: list[dict], path: Path) -> None:
+    """Plots the return in training over samples of each task of `published`, beside its target.
+
+    A plot per task, a colour per recurrent core, a line per seed.
+    """
+    by_task = {}
+    for record in newest(records):
+        if record["benchmark"] == "published":
+            task, core = record["what"].partition(":")[0].rsplit(", ", 1)
+            by_task.setdefault(task, {})[core] = record
+    if not by_task:
+        return
+    n_rows = -(-len(by_task) // 3)
+    grid = subplots(10, 2.7 * n_rows, n_rows, 3, squeeze=False)
+    for ax in grid.flat[len(by_task) :]:
+        ax.set_axis_off()
+    for (task, by_core), ax in zip(by_task.items(), grid.flat):
+        for core, record in by_core.items():
+            for i, run in enumerate(record["seeds"]):
+                _, samples, values = zip(*run["curve"])
+                style = dict(color=f"C{CORE_ORDER.index(core)}", linewidth=1.1)
+                ax.plot([n / 1e6 for n in samples], values, label=core * (i == 0), **style)
+        if record["target"] is not None:
+            ax.axhline(record["target"], color="grey", linewidth=1, linestyle="--")
+        ax.set(title=task.removeprefix("popgym-"), xlabel="million samples")
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=8, loc="lower right")
+    for ax in grid[:, 0]:
+        ax.set(ylabel="return in training")
     save(grid[0, 0].figure, path)
 
 

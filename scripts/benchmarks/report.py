@@ -75,3 +75,4 @@ def write(path: Path) -> None:
     figures.plot_ratings(rows, path.with_name("ratings.svg"))
     figures.plot_scaling(rows, path.with_name("scaling.svg"))
     figures.plot_learners(rows, path.with_name("learners.svg"))
+    figures.plot_published(rows, path.with_name("published.svg"))

@@ -241,6 +241,7 @@ def test_frames_are_those_of_the_environment():
     pytest.importorskip("pygame")
     env = cart_pole(2)
     env.reset()
+    assert env.vector.render_mode is None  # which would slow some environments
     frames = [env.plot_state(env.state(e)) for e in range(2)]
     assert frames[0].shape == (400, 600, 3) and frames[0].dtype == torch.uint8
     assert not torch.equal(*frames) and env.fps == 50

@@ -28,6 +28,13 @@ def case(name, layers, device="cpu", n_steps=T):
     return core.to(device), x.to(device), reset.to(device), state.map(lambda s: s.to(device))
 
 
+def test_activation_is_of_the_core_none():
+    core = make_core("none", W, activation="tanh")
+    x, reset = 1e3 * torch.randn(T, B, W), torch.zeros(T, B, dtype=torch.bool)
+    assert core(x, reset, core.initial(B))[0].abs().max() <= 1
+    assert isinstance(make_core("gru", W, activation="tanh"), GRU)
+
+
 def run(core, x, reset, state):
     """Calls a core like a policy does; outputs are converted to float32."""
     with torch.autocast(x.device.type, torch.bfloat16, enabled=x.is_cuda):

@@ -57,6 +57,14 @@ def test_every_pixel_and_leaf_has_a_gradient(encoder):
     assert not torch.equal(intake(other), intake(obs))
 
 
+def test_tanh_bounds_features_that_relu_does_not():
+    obs = random_obs(TREE, 6)
+    far = arrdict({**obs, "imu": obs.imu * 1e3})
+    for activation, is_bounded in ("tanh", True), ("relu", False):
+        features = heads.intake(TREE, WIDTH, activation=activation)(far)
+        assert (features.abs().max() <= 1) == is_bounded
+
+
 def test_order_of_keys_does_not_matter():
     intake = heads.intake(TREE, WIDTH)
     obs = random_obs(TREE, 6)

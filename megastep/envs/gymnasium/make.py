@@ -42,7 +42,7 @@ def vector_env(
         if vectorization == "own":
             return _checked(id, _own(make, spec, wrappers, n_envs, kwargs))
         # a checker warns of what an environment does wrong in its first steps, once per environment
-        settings = {"disable_env_checker": True, **_rendering(spec.entry_point), **kwargs}
+        settings = {"disable_env_checker": True, **kwargs}
         make = functools.partial(
             make,
             vectorization_mode="sync",
@@ -88,15 +88,6 @@ def _spec(id):
     return gymnasium.registry[name]
 
 
-def _rendering(entry_point):
-    """Returns the argument that lets an environment draw images, if it can."""
-    from gymnasium.envs.registration import load_env_creator
-
-    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
-    modes = (getattr(creator, "metadata", None) or {}).get("render_modes", ())
-    return {"render_mode": "rgb_array"} if "rgb_array" in modes else {}
-
-
 def _own(make, spec, wrappers, n_envs, kwargs):
     if wrappers:
         raise ValueError(
@@ -105,8 +96,7 @@ def _own(make, spec, wrappers, n_envs, kwargs):
         )
     if spec.vector_entry_point is None:
         raise ValueError("it has no vector environment of its own; use env.vectorization=sync")
-    settings = {**_rendering(spec.vector_entry_point), **kwargs}
-    return make(num_envs=n_envs, vectorization_mode="vector_entry_point", **settings)
+    return make(num_envs=n_envs, vectorization_mode="vector_entry_point", **kwargs)
 
 
 def _checked(id, env):

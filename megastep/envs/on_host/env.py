@@ -15,7 +15,7 @@ from megastep.arrdict import arrdict
 from megastep.env_state import EnvState
 from megastep.envs.on_host.buffers import HostBuffers
 from megastep.envs.on_host.spaces import actions, observation
-from megastep.vector_processes import VectorProcesses
+from megastep.vector_processes import VectorProcesses, start_rendering
 
 __all__ = ["VectorizedEnv"]
 
@@ -92,6 +92,7 @@ class VectorizedEnv:
         Raises:
             ValueError: if it renders no images.
         """
+        start_rendering(self.vector)
         if self.vector.render_mode != "rgb_array":
             raise ValueError(
                 f"{self.id} renders no images: it has no render mode rgb_array, or env.kwargs "
