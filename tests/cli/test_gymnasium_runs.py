@@ -27,7 +27,7 @@ def here(tmp_path, monkeypatch):
 def test_few_environments_unless_told_otherwise(preset):
     words = ["env=gymnasium", f"preset={preset}"]
     assert tiny.settings(*words).env.n_envs <= 64 < tiny.settings(words[1]).env.n_envs
-    assert tiny.settings(*words, "env.n_envs=7").env.n_envs == 7
+    assert tiny.settings(*words, "env.n_envs=16").env.n_envs == 16
     assert tiny.settings(*words).agent.encoder == "cnn"
 
 
