@@ -83,7 +83,7 @@ TASKS = {
     ),
     "MiniGrid-DoorKey-6x6-v0": Task(
         "experiment=minigrid",
-        500_000,
+        200_000,
         0.9,
         seeds=SEEDS[:1],
         packages=("gymnasium", "minigrid"),
