@@ -4,6 +4,7 @@ import json
 import os
 from pathlib import Path
 
+import benchmark
 import figures
 import plain_evaluation
 import published
@@ -45,11 +46,15 @@ def test_folders_that_exist_are_measured_and_not_trained(tmp_path, monkeypatch):
     monkeypatch.setattr(published.importlib.metadata, "version", lambda name: "1.0")
     for core, peak in zip(POPGYM.cores, (0.5, 0.4, 0.3, -0.5)):
         write_run(tmp_path / f"popgym-AutoencodeEasy-v0-{core}-1", [peak, -1.0])
-    tasks = ["popgym-AutoencodeEasy-v0"]
-    rows = list(published.published(CPU, tasks=tasks, folder=tmp_path, jobs=2))
+    options = dict(tasks=["popgym-AutoencodeEasy-v0"], folder=tmp_path, jobs=2)
+    rows = list(benchmark.measure("published", CPU, "abc", options))
     assert [row["value"] for row in rows] == [0.5, 0.4, 0.3, -0.5]
     assert rows[1]["what"] == "popgym-AutoencodeEasy-v0, gru: largest mean return in training"
     assert rows[0]["versions"] == {"gymnasium": "1.0", "popgym": "1.0"}
+    assert rows[0]["command"] == (  # for others to repeat, who have other folders
+        "python scripts/benchmarks/benchmark.py published --tasks popgym-AutoencodeEasy-v0 --jobs 2 "
+        "--device cpu"
+    )
 
 
 def test_interval_spans_those_of_the_seeds(monkeypatch):
