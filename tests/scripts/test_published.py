@@ -51,10 +51,8 @@ def test_folders_that_exist_are_measured_and_not_trained(tmp_path, monkeypatch):
     assert [row["value"] for row in rows] == [0.5, 0.4, 0.3, -0.5]
     assert rows[1]["what"] == "popgym-AutoencodeEasy-v0, gru: largest mean return in training"
     assert rows[0]["versions"] == {"gymnasium": "1.0", "popgym": "1.0"}
-    assert rows[0]["command"] == (  # for others to repeat, who have other folders
-        "python scripts/benchmarks/benchmark.py published --tasks popgym-AutoencodeEasy-v0 --jobs 2 "
-        "--device cpu"
-    )
+    words = "benchmark.py published --tasks popgym-AutoencodeEasy-v0 --jobs 2 --device cpu"
+    assert rows[0]["command"] == f"python scripts/benchmarks/{words}"  # others have other folders
 
 
 def test_interval_spans_those_of_the_seeds(monkeypatch):
