@@ -76,7 +76,7 @@ TASKS = {
     "Pendulum-v1": Task("env=gymnasium env.id=Pendulum-v1", 200_000, -200),
     "LunarLander-v3": Task("experiment=lunarlander", 500_000, 200, packages=("gymnasium", "box2d")),
     "LunarLander-v3, continuous": Task(
-        "experiment=lunarlander env.kwargs.continuous=true",
+        "experiment=lunarlander env.kwargs.continuous=true agent.continuous=beta",
         500_000,
         200,
         packages=("gymnasium", "box2d"),
