@@ -10,7 +10,15 @@ import torch
 from megastep import contract, engine, scene, spaces
 from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.cli import check, program
-from megastep.agents.cli.settings import Agent, Env, Geometry, Learner, Train, changed
+from megastep.agents.cli.settings import (
+    Agent,
+    Env,
+    Geometry,
+    Learner,
+    Train,
+    changed,
+    takes_geometries,
+)
 from megastep.agents.distributed import process_group
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.opponents import Opponents
@@ -67,7 +75,7 @@ def make_device(name: str) -> torch.device:
 
 def homes(env: Env, geometry: Geometry, split: str) -> list[dict]:
     """Returns the different geometries of a split, in order; none if `env` takes no geometries."""
-    if "geometries" not in inspect.signature(import_object(env.name)).parameters:
+    if not takes_geometries(env):
         return []
     return [*{id(home): home for home in construct(geometry, split=split)}.values()]
 

@@ -16,7 +16,15 @@ from typing import Any, NamedTuple
 from megastep.agents.cli import console, program
 from megastep.agents.cli.check import as_tree
 from megastep.agents.cli.program import UserError, shortened
-from megastep.agents.cli.settings import Env, Evaluate, Geometry, Train, env_name, label
+from megastep.agents.cli.settings import (
+    Env,
+    Evaluate,
+    Geometry,
+    Train,
+    env_name,
+    label,
+    takes_geometries,
+)
 from megastep.agents.distributed import environment
 from megastep.agents.training import checkpoint, json_lines
 from megastep.agents.training.atomic_files import write_atomically
@@ -53,7 +61,8 @@ def new(cfg: Train) -> Path:
     the time and the settings.
     """
     if cfg.folder is None:
-        name = f"{env_name(cfg.env)}-{label(cfg.geometry.name)}-{cfg.seed}"
+        geometry = [label(cfg.geometry.name)] if takes_geometries(cfg.env) else []
+        name = "-".join([env_name(cfg.env), *geometry, str(cfg.seed)])
         return make(RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{for_file(name)}")
     check_free(cfg.folder)
     folder = Path(cfg.folder)

@@ -114,6 +114,11 @@ def changed(settings: Any, **changes: Any) -> Any:
     )
 
 
+def takes_geometries(env: Any) -> bool:
+    """Returns True if the class of an environment's settings takes floor plans."""
+    return "geometries" in inspect.signature(import_object(env.name)).parameters
+
+
 def label(name: str) -> str:
     """`explorer` for megastep.envs.explorer:Explorer."""
     return name.rpartition(":")[2].rpartition(".")[2].lower()

@@ -147,7 +147,7 @@ def test_captured_collector_matches_eager():
         env, policy = PrivilegedEnv("cuda"), policy_of().cuda()
         rollout = rollout_of(policy, "cuda")
         collector = Collector(env, policy, rollout)
-        collector.on_gpu = is_captured
+        collector.can_capture = is_captured
         for _ in range(4):
             collector()
         assert (collector.graph is not None) == is_captured

@@ -43,7 +43,7 @@ def test_settings():
 def test_train_evaluate_and_begin_new_episodes(here, capsys):
     """Frozen Lake cannot be saved, as it holds an array of characters."""
     assert train.main([*WORDS, "env.id=FrozenLake-v1"]) == 0
-    (run,) = (here / "runs").glob("*FrozenLake-v1-homes-1")
+    (run,) = (here / "runs").glob("*FrozenLake-v1-1")
     assert evaluate.main([f"run={run}", "episodes=8"]) == 0
     (table,) = run.glob("evaluations/FrozenLake-v1-*.json")
     assert [row["lanes"] for row in json.loads(table.read_text())["rows"]] == [8, 8]
