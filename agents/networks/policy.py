@@ -44,8 +44,7 @@ class Policy(nn.Module):
         core: a name in `cores.CORES`, or an import path.
         layers: recurrent cores, stacked with residual connections.
         encoder: encoder of images, a name in `encoders.ENCODERS`, or an import path.
-        activation: of the intake, and of the hidden layer of the core "none". "tanh" explores
-            better where reward is rare and observations are a few numbers.
+        activation: of the intake, and of the hidden layer of the core "none": "relu" or "tanh".
         output: "softmax" samples actions by their probabilities, continuous ones too; "duelling"
             takes the action of the highest value.
         continuous: distribution of continuous actions, a name in

@@ -42,7 +42,8 @@ def measure(
     options = options or {}
     device = torch.device("cpu") if name == "cpu" else device
     provenance = records.provenance(device, commit)
-    command = command_line(name, device, options)
+    repeated = {key: value for key, value in options.items() if key != "folder"}
+    command = command_line(name, device, repeated)
     for measurement in BENCHMARKS[name](device, **options):
         numbers = {key: rounded(measurement[key]) for key in ("value", "lower", "upper")}
         yield dict(benchmark=name) | measurement | numbers | provenance | dict(command=command)

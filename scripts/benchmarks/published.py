@@ -28,7 +28,7 @@ from training_runs import evaluate, learning_curve
 
 SEEDS = 1, 2, 3
 EPISODES = 100  # of an evaluation
-EVALUATION_SEED = 1000  # added to the seed of training, so that no episode was trained on
+EVALUATION_SEED = 1000  # times the seed of training, so that runs share no episode
 MAX_CURVE_POINTS = 50
 
 
@@ -76,14 +76,14 @@ TASKS = {
     "Pendulum-v1": Task("env=gymnasium env.id=Pendulum-v1", 200_000, -200),
     "LunarLander-v3": Task("experiment=lunarlander", 500_000, 200, packages=("gymnasium", "box2d")),
     "LunarLander-v3, continuous": Task(
-        "experiment=lunarlander env.kwargs.continuous=true",
+        "experiment=lunarlander env.kwargs.continuous=true agent.continuous=beta",
         500_000,
         200,
         packages=("gymnasium", "box2d"),
     ),
     "MiniGrid-DoorKey-6x6-v0": Task(
         "experiment=minigrid",
-        500_000,
+        200_000,
         0.9,
         seeds=SEEDS[:1],
         packages=("gymnasium", "minigrid"),
@@ -196,13 +196,13 @@ def measured(run: Run, device: torch.device) -> dict | None:
         row |= dict(value=peak[2], lower=peak[2], upper=peak[2], peak_samples=peak[1])
         row["episodes"] = _window(run.folder, peak[1])
     else:
-        seed = EVALUATION_SEED + run.seed
+        seed = EVALUATION_SEED * run.seed
         words = f"episodes={EPISODES}", f"seed={seed}", "baseline=false"
         row["sampled"] = evaluate(run.folder, device, *words)[0]["return"]
         evaluated = evaluate(run.folder, device, *words, "greedy=true")[0]
         row |= {key: evaluated[key] for key in ("lower", "upper")}
         row |= dict(value=evaluated["return"], episodes=evaluated["lanes"])
-        returns = plain_evaluation.returns(run.folder, EPISODES // 4, seed)
+        returns = plain_evaluation.returns(run.folder, EPISODES, seed)
         row["plain"] = statistics.mean(returns)
     stride = -(-len(curve) // MAX_CURVE_POINTS)
     return row | dict(curve=[[round(s, 2), n, round(v, 4)] for s, n, v in curve[::stride]])
