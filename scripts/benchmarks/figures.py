@@ -190,7 +190,8 @@ def plot_published(records: list[dict], path: Path) -> None:
     """
     by_task = {}
     for record in newest(records):
-        if record["benchmark"] == "published":
+        has_curve = any("curve" in run for run in record.get("seeds", ()))
+        if record["benchmark"] == "published" and has_curve:
             task, core = record["what"].partition(":")[0].rsplit(", ", 1)
             by_task.setdefault(task, {})[core] = record
     if not by_task:
@@ -201,7 +202,7 @@ def plot_published(records: list[dict], path: Path) -> None:
         ax.set_axis_off()
     for (task, by_core), ax in zip(by_task.items(), grid.flat):
         for core, record in by_core.items():
-            for i, run in enumerate(record["seeds"]):
+            for i, run in enumerate(run for run in record["seeds"] if "curve" in run):
                 _, samples, values = zip(*run["curve"])
                 style = dict(color=f"C{CORE_ORDER.index(core)}", linewidth=1.1)
                 ax.plot([n / 1e6 for n in samples], values, label=core * (i == 0), **style)
