@@ -134,10 +134,19 @@ class DictOutput(nn.Module):
 
     Args:
         outputs: an output per key of the action space.
+
+    Raises:
+        ValueError: if a key is the name of an attribute that every ``nn.ModuleDict`` has.
     """
 
     def __init__(self, outputs: dict[str, nn.Module]):
         super().__init__()
+        for key in outputs:
+            if hasattr(nn.ModuleDict(), key):
+                raise ValueError(
+                    f"an action space cannot have the key {key!r}, which PyTorch's modules use; "
+                    f"rename it, for example to {key}_"
+                )
         self.outputs = nn.ModuleDict(outputs)
 
     def forward(self, x: torch.Tensor) -> arrdict:

@@ -37,6 +37,10 @@ OBSERVATIONS = [
         gym.Dict({"a b": gym.Discrete(2), "a_b": gym.Discrete(3)}),
         dotdict(a_b=discrete(1, 2), a_b_=discrete(1, 3)),
     ),
+    (
+        gym.Dict({"values": gym.Discrete(2), "forward": gym.Discrete(3)}),
+        dotdict(forward_=discrete(1, 3), values_=discrete(1, 2)),
+    ),
 ]
 ACTIONS = [
     (gym.Discrete(5, start=-2), discrete(1, 5)),
@@ -119,6 +123,8 @@ def test_each_action_goes_to_its_place():
         (actions, gym.Tuple([gym.Text(3)]), r"action\[0\] is a Text.*which no output chooses"),
         (actions, gym.Box(0, np.inf), "action is Box.*need finite bounds"),
         (actions, gym.Box(1, 1), "action is Box.*each low below its high"),
+        (actions, gym.Box(-3e38, 3e38), "action is Box.*between which float32 has numbers"),
+        (actions, gym.Box(0, 1e300, dtype=np.float64), "action is Box.*need finite bounds"),
     ],
 )
 def test_space_that_nothing_takes_is_named(convert, space, message):

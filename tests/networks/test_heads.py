@@ -87,6 +87,11 @@ def test_autocast_changes_features_not_logits():
         assert output(x).movement.dtype == torch.float32
 
 
+def test_key_that_modules_use_is_refused():
+    with pytest.raises(ValueError, match="^an action space cannot have the key 'type',.*type_$"):
+        heads.output(arrdict(type=spaces.MultiDiscrete(1, 2)), WIDTH)
+
+
 def test_leaves_have_equal_initial_weight():
     # an image of 3 x 64 numbers and a vector of 3, all 1: each leaf's part of the sum has variance
     # 1

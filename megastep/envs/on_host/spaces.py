@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from megastep import spaces
 from megastep.arrdict import arrdict
@@ -22,6 +23,8 @@ __all__ = ["actions", "observation"]
 #: The fewest rows and columns, and the most channels, of an image.
 MIN_SIDE, MAX_CHANNELS = 8, 4
 CURE = "env.wrappers=[package.module:Wrapper]"
+#: Names that no part of a space can have: attributes of the trees and modules whose keys they are.
+RESERVED = {*dir(arrdict), *dir(nn.ModuleDict())}
 
 #: A space of ours, and the function that converts a batch of values.
 Conversion = tuple[Space, Callable[[Any], Any]]
@@ -108,10 +111,13 @@ def actions(space: Any, path: str = "action") -> Conversion:
             f"replaces it: {CURE}"
         )
     low, high = space.low, space.high
-    if not space.is_bounded() or not (low < high).all():
+    with np.errstate(over="ignore"):
+        extent = high.astype(np.float32) - low.astype(np.float32)
+    if not np.isfinite(extent).all() or not (extent > 0).all():
         raise ValueError(
             f"{path} is {_described(space)}, and actions need finite bounds, each low below its "
-            f"high; give it a wrapper with a narrower space: {CURE}"
+            "high, between which float32 has numbers; give it a wrapper with a narrower space: "
+            f"{CURE}"
         )
     bounds = (tuple(float(bound) for bound in side.flat) for side in (low, high))
     rounded = np.rint if np.issubdtype(dtype, np.integer) else np.asarray
@@ -161,12 +167,12 @@ def _choices(names, sizes):
 
 
 def _identifiers(keys):
-    """Returns a name for each key: `a-b` becomes a_b, and 0 becomes part_0."""
+    """Returns a name for each key: `a-b` becomes a_b, 0 becomes part_0, and `type` becomes type_."""
     names = []
     for key in keys:
         name = re.sub(r"\W", "_", str(key))
         name = name if name.isidentifier() else f"part_{name}"
-        while name in names:
+        while name in names or name in RESERVED:
             name += "_"
         names.append(name)
     return names
