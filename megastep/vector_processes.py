@@ -6,6 +6,7 @@ Workers import Gymnasium and what the environments need, but not PyTorch.
 import contextlib
 import multiprocessing
 import os
+import sys
 import traceback
 import weakref
 from collections.abc import Callable, Sequence
@@ -114,6 +115,8 @@ def start_rendering(vector: Any) -> None:
     Not before someone looks: with a render mode LunarLander simulates the exhaust's particles, and
     steps at a third of the speed.
     """
+    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame complains of no display
     if vector.render_mode is None and "rgb_array" in vector.metadata.get("render_modes", ()):
         for env in getattr(vector, "envs", ()):
             env.unwrapped.render_mode = "rgb_array"

@@ -4,6 +4,7 @@ import copy
 import os
 import re
 import signal
+import sys
 import warnings
 
 import numpy as np
@@ -237,14 +238,19 @@ def test_gpu_learner_gets_the_same_worlds_and_no_graph():
 # ---- Drawing and resuming ----
 
 
-def test_frames_are_those_of_the_environment():
+def test_frames_are_those_of_the_environment(monkeypatch):
+    """And pygame, which draws them, does not look for a display where there is none."""
     pytest.importorskip("pygame")
+    for name in "DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER":
+        monkeypatch.setenv(name, "")  # restored after the test
+        monkeypatch.delenv(name)
     env = cart_pole(2)
     env.reset()
     assert env.vector.render_mode is None  # which would slow some environments
     frames = [env.plot_state(env.state(e)) for e in range(2)]
     assert frames[0].shape == (400, 600, 3) and frames[0].dtype == torch.uint8
     assert not torch.equal(*frames) and env.fps == 50
+    assert sys.platform != "linux" or os.environ["SDL_VIDEODRIVER"] == "dummy"
 
 
 def test_environment_that_draws_nothing_says_so():
@@ -286,6 +292,7 @@ def test_resumable_if_all_state_is_in_python():
     [
         ({}, "^env.id is missing; name an environment, such as env.id=CartPole-v1$"),
         ({"id": "CartPol-v1"}, "no environment 'CartPol-v1'; did you mean CartPole-v1?"),
+        ({"id": "xyz"}, r"^Gymnasium has no environment 'xyz'\. Those of other packages are"),
         ({"id": "no_such_package:A-v0"}, "needs the package no_such_package, which cannot be"),
         (
             {"id": "CartPole-v1", "kwargs": {"mass": 3}},

@@ -81,8 +81,8 @@ def _spec(id):
     if name not in gymnasium.registry:
         near = difflib.get_close_matches(name, gymnasium.registry, 1)
         raise ValueError(
-            f"Gymnasium has no environment {name!r}; "
-            + (f"did you mean {near[0]}? " if near else "")
+            f"Gymnasium has no environment {name!r}"
+            + (f"; did you mean {near[0]}? " if near else ". ")
             + "Those of other packages are package:id, such as minigrid:MiniGrid-MemoryS7-v0"
         )
     return gymnasium.registry[name]
