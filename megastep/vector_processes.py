@@ -1,4 +1,4 @@
-"""Gymnasium's environments in worker processes, one per CPU core, each with its share of them.
+"""Steps Gymnasium's environments in worker processes, one per CPU core.
 
 Workers import Gymnasium and what the environments need, but not PyTorch.
 """
@@ -23,10 +23,11 @@ PATIENCE = 5
 
 
 class VectorProcesses:
-    """N environments, as one of Gymnasium's vector environments has them.
+    """N environments in worker processes, with the interface of Gymnasium's vector environments.
 
-    They begin with their seeds and so compute the same numbers as in one process. The processes end
-    with :meth:`close`, with this object, or with the process that made it, however it ends.
+    Each environment gets the same seed as in one process, so the numbers are the same. The workers
+    end with :meth:`close`, with this object, or with the process that made it, even if that is
+    killed.
 
     Args:
         make: ``make(num_envs=n)`` returns a ``SyncVectorEnv``. It is sent to the workers.
@@ -110,10 +111,10 @@ class VectorProcesses:
 
 
 def start_rendering(vector: Any) -> None:
-    """Lets environments draw images from now on, if they can and no other render mode was chosen.
+    """Sets the render mode of environments to rgb_array, if they have it and no other was chosen.
 
-    Not before someone looks: with a render mode LunarLander simulates the exhaust's particles, and
-    steps at a third of the speed.
+    Called before the first frame and not earlier: with a render mode, LunarLander simulates the
+    particles of its exhaust and steps at a third of the speed.
     """
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # else pygame complains of no display
@@ -155,7 +156,7 @@ def _end(pipes, processes):
 
 
 def _write(to, rows, values):
-    """Copies a batch of a part of the environments into that of all."""
+    """Copies the values of some environments into the batch of all."""
     if isinstance(to, dict):
         to, values = to.values(), values.values()
     if isinstance(to, np.ndarray):
@@ -166,7 +167,7 @@ def _write(to, rows, values):
 
 
 def _read(batch, rows):
-    """Returns the part of a batch that belongs to some of the environments."""
+    """Returns the rows of a batch of actions."""
     if isinstance(batch, dict):
         return {key: _read(part, rows) for key, part in batch.items()}
     if isinstance(batch, tuple):

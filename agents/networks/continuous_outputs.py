@@ -1,9 +1,9 @@
 """Outputs of continuous actions within bounds: a squashed Gaussian, or a Beta distribution.
 
 `...` any leading axes, such as (B,) lanes or (T, B) time and lanes; A agents that one lane
-controls, D numbers of each. Both work on x, an action scaled to -1 to 1, and measure probabilities
-and entropy there: a uniform distribution has an entropy of log 2 per number, whatever the bounds.
-Numbers are independent of each other.
+controls, D numbers of each. Numbers are independent of each other. Probabilities and entropy are of
+x, the action scaled to -1 to 1: whatever the bounds, a uniform distribution has an entropy of log 2
+per number.
 """
 
 import math
@@ -113,8 +113,8 @@ class GaussianOutput(_BoundedOutput):
 
 
 class BetaOutput(_BoundedOutput):
-    """A Beta distribution per number (Chou et al. 2017), both of whose parameters exceed 1, so that
-    it has one mode. It depends on the state in its spread, too.
+    """A Beta distribution per number (Chou et al. 2017). Its mean and its spread depend on the
+    state. Both parameters exceed 1, so that it has a single mode.
 
     Logits are (..., A, 2 D): alphas, then betas. Actions are (..., A, D) float32 within the bounds.
     `logprob` and `entropy` (...,) belong to the lane's joint action: they are summed over agents

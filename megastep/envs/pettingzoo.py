@@ -1,6 +1,6 @@
 """PettingZoo: N copies of any parallel environment of PettingZoo, whose A agents are lanes.
 
-They step on the CPU, one after the other, whichever device the learner is on. B = N A lanes.
+They step on the CPU, one after the other, even if the learner is on a GPU. B = N A lanes.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
 """Gymnasium: N copies of any environment of Gymnasium, one agent each, so B = N lanes.
 
-They step on the CPU, whichever device the learner is on.
+They step on the CPU, even if the learner is on a GPU.
 """
 
 from typing import Annotated, Any, Literal
@@ -22,8 +22,8 @@ MAX_ENVS = 2**16
 class Gymnasium(VectorizedEnv):
     """Any environment of Gymnasium, or of a package that registers its own with it.
 
-    Gymnasium's vector environment steps them on the CPU: one after the other in this process
-    (sync), each in a process of its own (async), or together, by the environment's own class (own).
+    They step on the CPU: one after the other in this process (sync), in worker processes, one per
+    core (async), or together, by the environment's own vector class (own).
     With a learner on a GPU, observations and actions cross through pinned memory.
 
     Observation:

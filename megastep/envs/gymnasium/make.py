@@ -1,4 +1,4 @@
-"""Makes Gymnasium's vector environments, and says in one sentence why one cannot be made."""
+"""Makes Gymnasium's vector environments. Errors are one sentence with the likely cure."""
 
 import difflib
 import functools
@@ -21,12 +21,12 @@ def vector_env(
     wrappers: Sequence[str],
     vectorization: str,
 ) -> Any:
-    """Returns a vector environment that resets an environment in the step after its episode's end.
+    """Returns a vector environment. The step after an episode's end resets it.
 
     Args are those of :class:`~megastep.envs.gymnasium.env.Gymnasium`.
 
     Raises:
-        ValueError: if there is none, saying what would do.
+        ValueError: if it cannot be made, with the likely cure.
     """
     try:
         import gymnasium

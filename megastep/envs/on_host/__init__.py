@@ -1,1 +1,1 @@
-"""What environments of other packages share, which step on the host."""
+"""Shared by the environments of other packages, which step on the host."""

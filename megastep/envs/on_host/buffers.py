@@ -1,4 +1,4 @@
-"""Memory on the host through which worlds reach the learner's device, and actions come back."""
+"""Host memory through which worlds reach the learner's device and actions come back."""
 
 import numpy as np
 import torch
@@ -12,8 +12,7 @@ __all__ = ["HostBuffers"]
 
 
 class HostBuffers:
-    """Buffers of a world and of actions: pinned, and so copied without a detour, if the device is a
-    GPU.
+    """Buffers of a world and of actions. With a GPU they are pinned, so copies need no staging.
 
     Args:
         n_lanes: number of lanes, B.

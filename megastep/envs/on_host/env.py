@@ -1,4 +1,4 @@
-"""What steps on the host: environments behind a vector environment, as a learner sees them.
+"""VectorizedEnv: a vector environment that steps on the host, with the interface learners use.
 
 N environments of A agents each, B = N A lanes.
 """
@@ -21,20 +21,20 @@ __all__ = ["VectorizedEnv"]
 
 
 class VectorizedEnv:
-    """Steps a vector environment whose ended lanes begin anew in the next step.
+    """Wraps a vector environment that resets a lane in the step after its episode's end.
 
     Args:
-        id: what the environments are called in messages.
+        id: name of the environments in messages.
         vector: has ``single_observation_space``, ``single_action_space``, ``metadata``,
             ``render_mode``, ``reset(seed=)``, ``step(actions)``, ``render()`` and ``close()``, as
             Gymnasium's vector environments do, with a row per lane.
         n_envs: number of environments, N.
         n_agents: lanes per environment, A.
-        seeds: what the first ``vector.reset`` gets.
+        seeds: passed to the first ``vector.reset``, one per environment or one for all.
         device: where worlds and actions are. Default: a GPU if there is one.
 
     Raises:
-        ValueError: naming a space that nothing takes.
+        ValueError: if a space has no conversion, with its name and the cure.
     """
 
     capturable = False

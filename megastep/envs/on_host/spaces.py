@@ -1,4 +1,4 @@
-"""Gymnasium's spaces as megastep's: each with the function that converts a batch of its values.
+"""Converts Gymnasium's spaces to megastep's, each with a function that converts its values.
 
 N environments, one agent each; `...` the shape of a Gymnasium space.
 """
@@ -167,7 +167,7 @@ def _choices(names, sizes):
 
 
 def _identifiers(keys):
-    """Returns a name for each key: `a-b` becomes a_b, 0 becomes part_0, and `type` becomes type_."""
+    """Returns a name for each key: `a-b` becomes a_b, 0 becomes part_0, `type` becomes type_."""
     names = []
     for key in keys:
         name = re.sub(r"\W", "_", str(key))
