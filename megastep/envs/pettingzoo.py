@@ -3,6 +3,7 @@
 They step on the CPU, one after the other, even if the learner is on a GPU. B = N A lanes.
 """
 
+import inspect
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -94,9 +95,11 @@ class ParallelEnvs:
     def __init__(self, make: Callable, n_envs: int, kwargs: dict[str, Any]):
         from gymnasium.vector.utils import batch_space, create_empty_array
 
-        kwargs = {"render_mode": "rgb_array", **kwargs}
-        self.envs, self.render_mode = [make(**kwargs) for _ in range(n_envs)], kwargs["render_mode"]
-        env = self.envs[0]
+        parameters = inspect.signature(make).parameters
+        if "render_mode" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            kwargs = {"render_mode": "rgb_array", **kwargs}
+        self.envs = [make(**kwargs) for _ in range(n_envs)]
+        self.render_mode, env = kwargs.get("render_mode"), self.envs[0]
         self.agents, self.metadata = list(env.possible_agents), env.metadata
         env.reset()
         if set(env.agents) != set(self.agents):

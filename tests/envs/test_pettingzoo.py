@@ -56,6 +56,11 @@ class Relay:
         pass
 
 
+class Undrawn(Relay):
+    def __init__(self, odd=False):
+        super().__init__(odd=odd)
+
+
 ID = f"{__name__}:Relay"
 
 
@@ -78,6 +83,13 @@ def test_all_agents_of_an_environment_end_together():
         values = torch.stack([world[key].float().view(6) for world in worlds])
         assert values.tolist() == [[*row, *row] for row in rows], key
     assert (env.state(1).frame == 1).all()
+
+
+def test_constructor_without_a_render_mode():
+    env = PettingZoo(1, id=f"{__name__}:Undrawn", device="cpu")
+    assert env.reset().reset.all()
+    with pytest.raises(ValueError, match="renders no images"):
+        env.state(0)
 
 
 def test_agents_that_differ_or_come_later_are_refused():
