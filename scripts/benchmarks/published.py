@@ -73,9 +73,7 @@ def _popgym(name, target=None):
 TASKS = {
     "CartPole-v1": Task("env=gymnasium env.id=CartPole-v1", 100_000, 475),
     "Acrobot-v1": Task("env=gymnasium env.id=Acrobot-v1", 150_000, -100),
-    "Pendulum-v1": Task(
-        "env=gymnasium env.id=Pendulum-v1 agent.continuous=gaussian", 200_000, -200
-    ),
+    "Pendulum-v1": Task("env=gymnasium env.id=Pendulum-v1", 200_000, -200),
     "LunarLander-v3": Task("experiment=lunarlander", 500_000, 200, packages=("gymnasium", "box2d")),
     "LunarLander-v3, continuous": Task(
         "experiment=lunarlander env.kwargs.continuous=true agent.continuous=beta",

@@ -37,6 +37,10 @@ OTHER_PLACES = {"dense homes": "geometry=bench"}
 AGENTS = {"Explorer": "env=explorer", "PointGoal": "experiment=pointgoal"}
 #: Title: (overrides of training, {place: overrides of its evaluation}).
 RECIPES = {
+    "PointGoal, continuous actions, trained in homes": (
+        "experiment=pointgoal env.control=continuous seconds=60",
+        {"homes": "geometry=homes"},
+    ),
     "Pong from features": ("experiment=pong", {"": ""}),
     "Pong from pictures": ("experiment=pong_pixels", {"": ""}),
     "Pong, self-play": (

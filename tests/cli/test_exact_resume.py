@@ -295,11 +295,11 @@ def test_inspect(here, capsys):
 
 def test_rerun(here, capsys):
     """A run whose learning rate followed the clock is repeated, though it was interrupted."""
-    words = ["seconds=0.3", "checkpoint_seconds=0.05", "keep_checkpoints=99"]
+    words = ["seconds=0.6", "checkpoint_seconds=0.05", "keep_checkpoints=99"]
     run(*tiny.TINY, *words, "log_every=2", "folder=run")
     *reports, _ = (here / "run/metrics.jsonl").read_bytes().splitlines()
     factors = annealing.read("run")
-    killed_after = checkpoint.list_checkpoints("run/checkpoints")[1]
+    killed_after = checkpoint.list_checkpoints("run/checkpoints")[0]
     run(f"resume={killed_after}")
     assert (here / "run/metrics.jsonl").read_bytes().splitlines()[: len(reports)] == reports
     assert annealing.read("run")[: len(factors)] == factors
