@@ -49,7 +49,7 @@ def leaves(tree, prefix=""):
 
 
 #: Groups whose files are part of another.
-PACKAGES = {"recipe": "learner"}
+PACKAGES = {"preset/recipe": "learner", "preset/env": "learner"}
 
 
 def values(file, script):
@@ -60,8 +60,18 @@ def values(file, script):
     own = file == script or "@package _global_" in text
     if own:
         return leaves(tree)
-    group = file.split("/")[-2]
-    return leaves({PACKAGES.get(group, group): tree})
+    group = file.rpartition("/")[0]
+    return leaves({PACKAGES.get(group, group.rpartition("/")[2]): tree})
+
+
+def with_parents(file):
+    """Returns a file of configs/ after those of its folder that its defaults list names."""
+    path = CONFIGS / f"{file}.yaml"
+    if not path.exists():
+        return []
+    parents = (yaml.safe_load(path.read_text()) or {}).get("defaults", [])
+    folder = file.rpartition("/")[0]
+    return [f for parent in parents for f in with_parents(f"{folder}/{parent}")] + [file]
 
 
 def compositions():
@@ -75,8 +85,11 @@ def compositions():
             choices = composer.composed(*choice).hydra.runtime.choices
             files = [f"{g}/{choices[g]}" for g in groups if choices[g] is not None]
             last = [f for f in files if f.startswith("preset/")]
-            if last and "cpu" in last[0]:
-                last.append(f"preset/learner/cpu_{choices['learner']}")
+            env, learner, preset = (choices.get(g) for g in ("env", "learner", "preset"))
+            if last:
+                last += with_parents(f"preset/env/{preset}_{env}")
+                last += with_parents(f"preset/learner/{preset}_{learner}")
+                last += with_parents(f"preset/env/{preset}_{learner}_{env}")
             if (CONFIGS / f"preset/agent/{choices.get('learner')}.yaml").exists():
                 last.append(f"preset/agent/{choices['learner']}")
             last += [f for f in files if f.startswith("experiment/")]
