@@ -105,21 +105,29 @@ def drawn_in_this_process(monkeypatch):
 
 @pytest.fixture(scope="session")
 def launch_on_cpu(tmp_path_factory):
-    """A stand-in for `launch` that runs the learner's CUDA kernels on a CPU.
+    """A stand-in for `launch` that runs the recurrent cores' CUDA kernels on a CPU.
 
     Their source is compiled for the CPU through `cuda_on_cpu.h`.
     """
     from megastep.agents.networks.kernels.program import CORES
-    from megastep.kernels.build import compile
+    from megastep.kernels.build import compile, headers
 
     folder = tmp_path_factory.mktemp("kernels")
     source, library = folder / "kernels.cpp", folder / "kernels.so"
-    files = [Path(__file__).parent / "helpers" / "cuda_on_cpu.h", *CORES.folder.glob("*.cu")]
+    cores = {
+        name: text
+        for name, text in CORES.sources(".cu").items()
+        if name in ("lstm.cu", "mingru.cu")
+    }
+    files = [
+        Path(__file__).parent / "helpers" / "cuda_on_cpu.h",
+        *map(CORES.folder.joinpath, cores),
+    ]
     lines = [f'#include "{path}"' for path in files]
     lines += [
         f'extern "C" void run_{operation}(const {struct}* p, unsigned int threads) '
         f"{{ launch({operation}, p, threads); }}"
-        for operation, struct in CORES.cuda_operations.items()
+        for operation, struct in headers.operations(cores).items()
     ]
     source.write_text("\n".join(lines))
     command = [compile.compiler()[0], "-std=c++17", "-O1", "-shared", "-fPIC"]

@@ -18,17 +18,16 @@ from megastep.agents.algorithms.learner import (
     Positive,
     check_minibatches,
 )
-from megastep.agents.algorithms.masked_stats import (
-    explained_variance,
-    masked_mean,
-    pooled_normalise,
-)
+from megastep.agents.algorithms.masked_stats import explained_variance, pooled_normalise
+from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
 from megastep.arrdict import arrdict
 from megastep.settings import MAX_ENVS, checked
 from megastep.types import Env, optional
+
+_PARTS = "starts", "actions", "logprobs"  # of a rollout, that a minibatch copies
 
 
 class PPO(GradientLearner):
@@ -91,9 +90,8 @@ class PPO(GradientLearner):
             raise ValueError("PPO needs a policy with a critic: use agent.output=softmax")
         super().__init__(policy, lr, max_grad_norm, graph, seed, critic_lr, weight_decay)
         self.n_steps, self.gamma, self.lambda_ = n_steps, gamma, lambda_
-        self.clip, self.value_clip, self.entropy_coef = clip, value_clip, entropy_coef
+        self.coefficients = Coefficients(clip, value_clip, value_coef, entropy_coef, auxiliary_coef)
         self.normalise_advantage = normalise_advantage
-        self.value_coef, self.auxiliary_coef = value_coef, auxiliary_coef
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
         self.target_kl = float("inf") if target_kl is None else target_kl
 
@@ -131,7 +129,7 @@ class PPO(GradientLearner):
         explained = explained_variance(transitions["value"], estimates.targets, estimates.valid)
         if self.normalise_advantage == "rollout":
             estimates["advantages"] = pooled_normalise(estimates.advantages, estimates.valid)
-        if self.value_clip is not None:
+        if self.coefficients.value_clip is not None:
             estimates["old_value"] = transitions["value"]
 
         is_stopped = torch.zeros((), dtype=torch.bool, device=self.device)
@@ -140,10 +138,10 @@ class PPO(GradientLearner):
             order = torch.rand(rollout.n_lanes, generator=generator, device=self.device).argsort()
             for lanes in order.tensor_split(self.n_minibatches):
                 selected = estimates.map(torch.index_select, 1, lanes)
-                batch = arrdict({**rollout.sequences(lanes), **selected})
+                batch = arrdict({**rollout.sequences(lanes, _PARTS), **selected})
                 if self.normalise_advantage == "minibatch":
                     batch["advantages"] = pooled_normalise(batch.advantages, batch.valid)
-                loss, metrics = self._losses(batch)
+                loss, metrics = self._losses(rollout, lanes, batch)
                 kl = self.steps.backward(loss, metrics, batch.valid.sum())["kl"]
                 is_stopped = is_stopped | (kl > self.target_kl)
                 self.steps.take(~is_stopped)
@@ -153,46 +151,20 @@ class PPO(GradientLearner):
         self.policy.update_stats(last.obs, last.get("privileged"), is_finite & rollout.learns[-1])
         return {**self.steps.end(), "explained_variance": explained}
 
-    def _losses(self, batch):
-        """Returns the loss of a minibatch and its metrics, tensors ()."""
-        obs, starts = without_last(batch.obs), without_last(batch.starts)
-        privileged = without_last(batch.get("privileged"))
-        now = self.policy.unroll(obs, starts, batch.state)
-        valid, output = batch.valid, self.policy.output
-        log_ratio = output.logprob(now.logits, batch.actions) - batch.logprobs
-        log_ratio = log_ratio.masked_fill(~valid, 0.0)  # its exp may overflow, and 0 * inf is NaN
-        ratio = log_ratio.exp()
-        clipped = ratio.clamp(1 - self.clip, 1 + self.clip)
-        surrogate = torch.minimum(ratio * batch.advantages, clipped * batch.advantages)
-        value = self.policy.value(now.features, privileged)
+    def _losses(self, rollout, lanes, batch):
+        """Returns the loss of a minibatch and its metrics, tensors ().
 
-        policy_loss = -masked_mean(surrogate, valid)
-        value_loss = masked_mean(self._squared_error(value, batch), valid)
-        entropy = masked_mean(output.entropy(now.logits), valid)
-        with torch.no_grad():
-            # this estimate of the KL divergence is never negative, unlike the mean log ratio
-            kl = masked_mean(ratio - 1 - log_ratio, valid)
-            clip_fraction = masked_mean((ratio != clipped).float(), valid)
-        loss = policy_loss + self.value_coef * value_loss - self.entropy_coef * entropy
-        metrics = dict(
-            policy=policy_loss,
-            value=value_loss,
-            entropy=entropy,
-            kl=kl,
-            clip_fraction=clip_fraction,
-        )
-        if self.policy.privileged_space:
-            error = self.policy.prediction_error(now.features, privileged)
-            metrics["auxiliary"] = masked_mean(error, valid)
-            loss = loss + self.auxiliary_coef * metrics["auxiliary"]
-        return loss, metrics
-
-    def _squared_error(self, value, batch):
-        """Returns the squared error (T, M) of the value, in the value's own scale."""
-        scale = self.policy.critic.output.scale
-        squared = ((value - batch.targets) / scale).square()
-        if self.value_clip is None:
-            return squared
-        limit = self.value_clip * scale
-        clipped = batch.old_value + (value - batch.old_value).clamp(-limit, limit)
-        return torch.maximum(squared, ((clipped - batch.targets) / scale).square())
+        Args:
+            rollout: the rollout, whose observations are selected as they are normalised.
+            lanes: (M,), lanes of the minibatch.
+            batch: the other parts of its steps, (T, M) each.
+        """
+        policy, privileged = self.policy, without_last(rollout.privileged)
+        starts = without_last(batch.starts)
+        now = policy.unroll(without_last(rollout.obs), starts, batch.state, lanes)
+        logprobs, entropies = policy.output.terms(now.logits, batch.actions)
+        values, errors = policy.value(now.features, privileged, lanes), None
+        if policy.privileged_space:
+            errors = policy.prediction_error(now.features, privileged, lanes)
+        scale = policy.critic.output.scale
+        return ppo_loss(logprobs, entropies, values, errors, batch, scale, self.coefficients)

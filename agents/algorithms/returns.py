@@ -12,6 +12,7 @@ the value is 0; after a truncated step returns bootstrap from V. No sum crosses 
 import torch
 
 from megastep import arrdict
+from megastep.agents.algorithms.kernels import program
 from megastep.agents.networks.scan import linear_scan
 
 
@@ -47,6 +48,8 @@ def gae(
         arrdict(advantages, targets, valid), each (T, B). Targets are the lambda returns A + V,
         which the value should fit. A is 0 where the action was not valid.
     """
+    if value.is_cuda:
+        return _gae_on_gpu(reward, value, last_value, reset, terminal, truncated, gamma, lambda_)
     delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.0) - value
     delta = delta.masked_fill(reset, 0.0)
     discounts = torch.full_like(value, gamma * lambda_).masked_fill_(
@@ -54,6 +57,31 @@ def gae(
     )
     advantages = discounted_sum(delta, discounts)
     return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=~reset)
+
+
+def _gae_on_gpu(reward, value, last_value, reset, terminal, truncated, gamma, lambda_):
+    """Computes `gae` in one kernel, lane by lane."""
+    estimates = arrdict.arrdict(
+        advantages=torch.empty_like(reward), targets=torch.empty_like(reward), valid=~reset
+    )
+    n_steps, n_lanes = reward.shape
+    program.run(
+        "gae",
+        value.device,
+        n_lanes,
+        reward=reward.contiguous(),
+        values=torch.cat([value, last_value[None]]),
+        reset=reset.contiguous(),
+        terminal=terminal.contiguous(),
+        truncated=truncated.contiguous(),
+        advantages=estimates.advantages,
+        targets=estimates.targets,
+        n_steps=n_steps,
+        n_lanes=n_lanes,
+        gamma=gamma,
+        lambda_=lambda_,
+    )
+    return estimates
 
 
 def vtrace(

@@ -14,14 +14,15 @@ from torch import nn
 from torch.nn import functional as F
 
 from megastep import spaces
-from megastep.agents.networks.precision import compute_dtype
+from megastep.agents.networks.layers import linear
+from megastep.agents.networks.outputs import Output
 
 # Actions closer to a bound count as this far from it: atanh would be infinite.
 _MAX_X = 1 - 2**-20
 _N_NODES = 16
 
 
-class _BoundedOutput(nn.Module):
+class _BoundedOutput(Output):
     """Base: two parameters per number, from a linear layer that starts near 0.
 
     Args:
@@ -41,7 +42,7 @@ class _BoundedOutput(nn.Module):
         nn.init.zeros_(self.linear.bias)
 
     def _linear(self, x):
-        out = self.linear(x.to(compute_dtype(self.linear.weight))).float()
+        out = linear(x, self.linear).float()
         return out.unflatten(-1, (self.shape[0], -1))
 
     def _scaled(self, actions):

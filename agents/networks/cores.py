@@ -16,6 +16,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.intakes import ACTIVATIONS
+from megastep.agents.networks.layers import linear
 from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.mingru import MinGRU
 from megastep.arrdict import arrdict
@@ -82,7 +83,7 @@ class Feedforward(nn.Module):
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
     ) -> tuple[torch.Tensor, arrdict]:
         """Applies the layer to every step. `reset` and `state` have no effect."""
-        return self.activation(self.hidden(x)), state
+        return linear(x, self.hidden, self.activation), state
 
 
 CORES = {"lstm": LSTM, "gru": GRU, "mingru": MinGRU, "none": Feedforward}

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from megastep.agents.networks import heads
+from megastep.agents.networks.layers import linear
 from megastep.agents.networks.value_output import ValueOutput
 from megastep.types import Space, Tree
 
@@ -33,14 +34,20 @@ class Critic(nn.Module):
             nn.init.zeros_(self.hidden.bias)
         self.output = ValueOutput(width)
 
-    def forward(self, features: torch.Tensor, privileged: Tree | None = None) -> torch.Tensor:
+    def forward(
+        self,
+        features: torch.Tensor,
+        privileged: Tree | None = None,
+        lanes: torch.Tensor | None = None,
+    ) -> torch.Tensor:
         """Returns the value.
 
         Args:
             features: (..., width).
             privileged: (..., *shape) or a dict of them; unused by a plain critic.
+            lanes: (M,) int64, lanes to select from privileged observations (T, B, ...). None: all.
         """
         if self.is_asymmetric:
-            joined = torch.cat([features, self.intake(privileged).to(features.dtype)], -1)
-            features = self.hidden(joined).relu()
+            encoded = self.intake(privileged, lanes).to(features.dtype)
+            features = linear(torch.cat([features, encoded], -1), self.hidden, torch.relu)
         return self.output(features)

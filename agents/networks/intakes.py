@@ -10,7 +10,8 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.distributed.pooling import Moments
-from megastep.agents.networks.encoders import make_encoder
+from megastep.agents.networks.encoders import Flat, make_encoder
+from megastep.agents.networks.layers import linear, normalised
 from megastep.agents.networks.precision import compute_dtype
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.types import Space, Tree
@@ -57,6 +58,8 @@ class ConcatIntake(nn.Module):
             nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else RunningNorm(leaf)
             for leaf in leaves.values()
         )
+        #: whether every leaf is a normalised vector
+        self.is_flat = all(isinstance(encoder, Flat) for encoder in self.encoders)
         sizes = [encoder.n_features for encoder in self.encoders]
         self.n_features = sum(sizes)
         # GPUs multiply matrices whose columns are a multiple of 8 several times faster
@@ -69,23 +72,35 @@ class ConcatIntake(nn.Module):
             for block, size in zip(blocks, sizes):
                 block.normal_(std=math.sqrt(2 / (len(sizes) * size)))
 
-    def forward(self, obs: Tree) -> torch.Tensor:
-        features = self._encode_leaves(obs)
-        if self.n_padding:
-            features.append(features[0].new_zeros((*features[0].shape[:-1], self.n_padding)))
-        return self.activation(self.project(torch.cat(features, dim=-1)))
+    def forward(self, obs: Tree, lanes: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns the projected features (..., width).
 
-    def encode(self, obs: Tree) -> torch.Tensor:
-        """Returns all leaves, normalised, encoded and concatenated: (..., n_features)."""
-        return torch.cat(self._encode_leaves(obs), dim=-1)
+        Args:
+            obs: (..., *shape) per leaf.
+            lanes: (M,) int64, lanes to select from leaves (T, B, ...). None: all.
+        """
+        return linear(self.encode(obs, lanes), self.project, self.activation)
 
-    def _encode_leaves(self, obs):
-        dtype = compute_dtype(self.project.weight)
+    def encode(self, obs: Tree, lanes: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns all leaves, normalised, encoded and concatenated, with columns of zeros at the
+        end: (..., n_features + n_padding).
+        """
         leaves = self._leaves(obs)
-        return [
+        if self.is_flat:
+            n_columns = self.n_features + self.n_padding
+            features = normalised(leaves, self.norms, n_columns, lanes)
+            if features is not None:
+                return features
+        if lanes is not None:
+            leaves = [leaf.index_select(1, lanes) for leaf in leaves]
+        dtype = compute_dtype(self.project.weight)
+        features = [
             encoder(norm(leaf)).to(dtype)
             for leaf, norm, encoder in zip(leaves, self.norms, self.encoders, strict=True)
         ]
+        if self.n_padding:
+            features.append(features[0].new_zeros((*features[0].shape[:-1], self.n_padding)))
+        return torch.cat(features, dim=-1)
 
     def moments(
         self, obs: Tree, is_counted: torch.Tensor | bool = True

@@ -7,7 +7,8 @@ cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell w
 additions away.
 
 The part between two matrix products is written here for the CPU. On a GPU it is a kernel with the
-same arguments (`megastep.agents.networks.kernels.lstm`).
+same arguments (`megastep.agents.networks.kernels.lstm`). GPUs with clusters of blocks run a whole
+sequence, products included, in one kernel (`megastep.agents.networks.kernels.lstm_sequence`).
 """
 
 from types import SimpleNamespace
@@ -18,8 +19,9 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from megastep.agents.networks.kernels import lstm as kernels
+from megastep.agents.networks.kernels import lstm_sequence
 from megastep.agents.networks.kernels.program import aligned, check_shapes
-from megastep.agents.networks.precision import compute_dtype
+from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.arrdict import arrdict
 
 _sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input  # (d, y): d y (1 - y)
@@ -73,6 +75,60 @@ def _steps(x):
     return kernels if x.is_cuda else _CPU_STEPS
 
 
+def _unroll(x, input_weight, bias, weight, reset, output, cell, needs_backward):
+    """Unrolls the recurrence step by step.
+
+    Returns outputs (T, B, W), each step's recurrent input (T, B, W), the last cell (B, W), and what
+    `_unroll_backward` needs.
+    """
+    steps = _steps(x)
+    gates = F.linear(x, input_weight, bias)
+    # hiddens[t] is the output of step t - 1 as step t sees it: 0 after a reset
+    outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
+    cells = [torch.empty_like(cell)]
+    steps.start(reset[0], output, cell, hiddens[0], cells[0])
+    next_steps = [*zip(reset[1:], hiddens[1:], strict=True), (None, None)]
+    for t, (next_reset, next_hidden) in enumerate(next_steps):
+        gates[t].addmm_(hiddens[t], weight.T)
+        cells.append(torch.empty_like(cells[t]))
+        steps.forward(gates[t], cells[t], next_reset, outputs[t], next_hidden, cells[t + 1])
+    return outputs, hiddens, cells[-1], (gates, *cells[:-1])
+
+
+def _unroll_backward(weight, reset, saved, d_outputs, d_cell, needs_state):
+    """Returns the gradients of the gates (T, B, 4 W), of the bias and, if needed, of the output and
+    the cell before the sequence.
+    """
+    gates, *cells = saved
+    steps, d_gates = _steps(gates), torch.empty_like(gates)
+    next_reset = d_hidden = None
+    for t in reversed(range(len(reset))):
+        d_next_cell, d_cell = d_cell, torch.empty_like(d_cell)
+        steps.backward(
+            *(gates[t], cells[t], next_reset),
+            *(d_outputs[t], d_hidden, d_next_cell),
+            *(d_gates[t], d_cell),
+        )
+        if t or needs_state:
+            next_reset, d_hidden = reset[t], d_gates[t] @ weight
+    d_bias = d_gates.flatten(0, 1).sum(0)
+    if not needs_state:
+        return d_gates, d_bias, None, None
+    d_output = d_hidden.float().masked_fill_(reset[0, :, None], 0.0)
+    return d_gates, d_bias, d_output, d_cell.masked_fill_(reset[0, :, None], 0.0)
+
+
+def _unroll_on_chip(x, input_weight, bias, weight, reset, output, cell, needs_backward):
+    """`_unroll` in one kernel after the inputs' product."""
+    gates = F.linear(x, input_weight, bias)
+    return lstm_sequence.forward(gates, weight, reset, output, cell, needs_backward)
+
+
+def _unroll_on_chip_backward(weight, reset, saved, d_outputs, d_cell, needs_state):
+    """`_unroll_backward` in one kernel."""
+    return lstm_sequence.backward(weight, reset, *saved, d_outputs, d_cell)
+
+
 class _Sequence(torch.autograd.Function):
     """The recurrence over time with an explicit gradient.
 
@@ -86,9 +142,9 @@ class _Sequence(torch.autograd.Function):
 
         Args:
             x: (T, B, W) in the compute dtype.
-            input_weight: (4 W, W) in the compute dtype.
-            bias: (4 W,) in the compute dtype.
-            weight: (4 W, W) in the compute dtype, of the recurrent product.
+            input_weight: (4 W, W).
+            bias: (4 W,).
+            weight: (4 W, W), of the recurrent product.
             reset: (T, B) bool.
             output: (B, W) float32, last output before the sequence.
             cell: (B, W) float32, last cell before the sequence.
@@ -96,46 +152,32 @@ class _Sequence(torch.autograd.Function):
         Returns:
             outputs (T, B, W) in the compute dtype, and the last cell (B, W).
         """
-        steps, x, reset = _steps(x), x.contiguous(), reset.contiguous()
-        gates = F.linear(x, input_weight, bias)
-        # hiddens[t] is the output of step t - 1 as step t sees it: 0 after a reset
-        outputs, hiddens = torch.empty_like(x), torch.empty_like(x)
-        output, cell = aligned(output), aligned(cell)
-        cells = [torch.empty_like(cell)]
-        steps.start(reset[0], output, cell, hiddens[0], cells[0])
-        next_steps = [*zip(reset[1:], hiddens[1:], strict=True), (None, None)]
-        for t, (next_reset, next_hidden) in enumerate(next_steps):
-            gates[t].addmm_(hiddens[t], weight.T)
-            cells.append(torch.empty_like(cells[t]))
-            steps.forward(gates[t], cells[t], next_reset, outputs[t], next_hidden, cells[t + 1])
-        ctx.save_for_backward(x, input_weight, weight, reset, gates, hiddens, *cells[:-1])
-        return outputs, cells[-1]
+        ctx.on_chip = lstm_sequence.is_supported(x)
+        unroll = _unroll_on_chip if ctx.on_chip else _unroll
+        x, reset = aligned(x), reset.contiguous()
+        input_weight, bias, weight = (cast(w, x.dtype) for w in (input_weight, bias, weight))
+        outputs, hiddens, last_cell, saved = unroll(
+            *(x, input_weight, bias, weight, reset, aligned(output), aligned(cell)),
+            any(ctx.needs_input_grad),
+        )
+        ctx.save_for_backward(x, input_weight, weight, reset, hiddens, *saved)
+        return outputs, last_cell
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_outputs, d_cell):
-        x, input_weight, weight, reset, gates, hiddens, *cells = ctx.saved_tensors
-        steps = _steps(x)
-        d_outputs, d_cell, d_gates = aligned(d_outputs), aligned(d_cell), torch.empty_like(gates)
-        next_reset = d_hidden = d_output = None
-        for t in reversed(range(len(reset))):
-            d_next_cell, d_cell = d_cell, torch.empty_like(d_cell)
-            steps.backward(
-                *(gates[t], cells[t], next_reset),
-                *(d_outputs[t], d_hidden, d_next_cell),
-                *(d_gates[t], d_cell),
-            )
-            if t or any(ctx.needs_input_grad[-2:]):
-                next_reset, d_hidden = reset[t], d_gates[t] @ weight
-        if any(ctx.needs_input_grad[-2:]):
-            d_output = d_hidden.float().masked_fill_(reset[0, :, None], 0.0)
-            d_cell.masked_fill_(reset[0, :, None], 0.0)
+        x, input_weight, weight, reset, hiddens, *saved = ctx.saved_tensors
+        backward = _unroll_on_chip_backward if ctx.on_chip else _unroll_backward
+        needs_state = any(ctx.needs_input_grad[-2:])
+        d_gates, d_bias, d_output, d_cell = backward(
+            weight, reset, saved, aligned(d_outputs), aligned(d_cell), needs_state
+        )
         flat = d_gates.flatten(0, 1)
         return (
             d_gates @ input_weight,
-            flat.T @ x.flatten(0, 1),
-            flat.sum(0),
-            flat.T @ hiddens.flatten(0, 1),
+            product(flat.T, x.flatten(0, 1)),
+            d_bias.float(),
+            product(flat.T, hiddens.flatten(0, 1)),
             None,
             d_output,
             d_cell,
@@ -182,12 +224,11 @@ class LSTM(nn.Module):
         """
         check_shapes(x, reset, state, ("output", "cell"))
         dtype = compute_dtype(self.recurrent.weight) if x.is_cuda else torch.float32
-        weights = self.input.weight, self.input.bias, self.recurrent.weight
         # autocast would choose its own dtypes inside
         with torch.autocast(x.device.type, enabled=False):
             outputs, cell = _Sequence.apply(
                 x.to(dtype),
-                *(weight.to(dtype) for weight in weights),
+                *(self.input.weight, self.input.bias, self.recurrent.weight),
                 reset.bool(),
                 *(state["output"].float(), state["cell"].float()),
             )

@@ -26,6 +26,7 @@ from torch.autograd.function import once_differentiable
 
 from megastep.agents.networks.kernels import mingru as kernels
 from megastep.agents.networks.kernels.program import aligned, check_shapes
+from megastep.agents.networks.layers import linear
 from megastep.agents.networks.scan import linear_scan
 from megastep.arrdict import arrdict
 
@@ -138,5 +139,7 @@ class MinGRU(nn.Module):
             ValueError: if shapes or devices do not fit.
         """
         check_shapes(x, reset, state, ("output",))
-        outputs, last = _Sequence.apply(self.input(x), reset.bool(), state["output"].float())
+        outputs, last = _Sequence.apply(
+            linear(x, self.input), reset.bool(), state["output"].float()
+        )
         return outputs, arrdict(output=last)

@@ -8,10 +8,11 @@ import math
 
 import torch
 from torch import nn
-from torch.nn import functional as F
 
 from megastep import spaces
-from megastep.agents.networks.precision import compute_dtype
+from megastep.agents.networks.kernels import layers as kernels
+from megastep.agents.networks.layers import CategoricalTerms, linear
+from megastep.agents.networks.precision import cast, compute_dtype
 from megastep.arrdict import arrdict
 from megastep.types import Tree
 
@@ -19,7 +20,32 @@ from megastep.types import Tree
 _TINY = 1e-20
 
 
-class MultiDiscreteOutput(nn.Module):
+class Output(nn.Module):
+    """Base of the outputs of actions by probability: what acting and learning take at once.
+
+    A subclass has `forward(x)`, which returns logits, `sample`, `greedy`, `logprob` and `entropy`.
+    """
+
+    def act(
+        self, x: torch.Tensor, sample: bool = True, generator: torch.Generator | None = None
+    ) -> tuple[Tree, Tree, torch.Tensor]:
+        """Returns logits, actions and the actions' log-probability (B,).
+
+        Args:
+            x: features (B, width).
+            sample: samples; if false, takes the most likely or best actions.
+            generator: generator of the samples.
+        """
+        logits = self(x)
+        actions = self.sample(logits, generator) if sample else self.greedy(logits)
+        return logits, actions, self.logprob(logits, actions)
+
+    def terms(self, logits: Tree, actions: Tree) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the log-probability of actions and the entropy, (...,) each."""
+        return self.logprob(logits, actions), self.entropy(logits)
+
+
+class MultiDiscreteOutput(Output):
     """One categorical choice out of n per agent.
 
     Logits are log-probabilities (..., A, n), actions (..., A) int64. `logprob` and `entropy` (...,)
@@ -40,8 +66,31 @@ class MultiDiscreteOutput(nn.Module):
         nn.init.zeros_(self.linear.bias)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        scores = self.linear(x.to(compute_dtype(self.linear.weight))).float()
+        scores = linear(x, self.linear).float()
         return scores.unflatten(-1, self.shape).log_softmax(-1)
+
+    def act(
+        self, x: torch.Tensor, sample: bool = True, generator: torch.Generator | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Does the same as `Output.act`, on a GPU in one kernel."""
+        dtype = compute_dtype(self.linear.weight)
+        is_fused = x.is_cuda and dtype in kernels.DTYPES and not torch.is_grad_enabled()
+        if not is_fused or self.shape[1] > kernels.MAX_CHOICES or x.shape[-1] % 4:
+            return super().act(x, sample, generator)
+        noise = None
+        if sample:
+            noise = torch.empty(len(x), *self.shape, device=x.device)
+            noise.exponential_(generator=generator)
+        weight, bias = (cast(leaf, dtype) for leaf in self.linear.parameters())
+        return kernels.act(x.to(dtype).contiguous(), weight, bias, self.shape, noise)
+
+    def terms(
+        self, logits: torch.Tensor, actions: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Does the same as `Output.terms`, on a GPU in one kernel."""
+        if logits.is_cuda and logits.dtype == torch.float32:
+            return CategoricalTerms.apply(logits, actions)
+        return super().terms(logits, actions)
 
     def sample(
         self, logits: torch.Tensor, generator: torch.Generator | None = None
@@ -63,7 +112,7 @@ class MultiDiscreteOutput(nn.Module):
         return -(logits.exp() * logits).sum((-1, -2))
 
 
-class DuellingOutput(nn.Module):
+class DuellingOutput(Output):
     """Action values (..., A, n) of a duelling network (Wang et al. 2016): the lane's value plus
     advantages minus their mean, each behind a hidden layer, in whatever scale a learner fits.
 
@@ -92,7 +141,7 @@ class DuellingOutput(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        hidden = F.relu(self.hidden(x.to(compute_dtype(self.hidden.weight))))
+        hidden = linear(x, self.hidden, torch.relu)
         # bfloat16 would round large values by more than actions differ
         with torch.autocast(x.device.type, enabled=False):
             value, advantage = hidden.float().chunk(2, -1)
@@ -128,7 +177,7 @@ class DuellingOutput(nn.Module):
         return _gather(logits, actions)
 
 
-class DictOutput(nn.Module):
+class DictOutput(Output):
     """Independent outputs by key. Logits and actions are arrdicts with the same keys; `logprob`,
     `entropy` and `action_value` (...,) are summed over the keys.
 
@@ -151,6 +200,19 @@ class DictOutput(nn.Module):
 
     def forward(self, x: torch.Tensor) -> arrdict:
         return arrdict({key: output(x) for key, output in self.outputs.items()})
+
+    def act(
+        self, x: torch.Tensor, sample: bool = True, generator: torch.Generator | None = None
+    ) -> tuple[arrdict, arrdict, torch.Tensor]:
+        """Acts key by key."""
+        parts = {key: output.act(x, sample, generator) for key, output in self.outputs.items()}
+        logits, actions, logprobs = zip(*parts.values())
+        return arrdict(zip(parts, logits)), arrdict(zip(parts, actions)), sum(logprobs)
+
+    def terms(self, logits: Tree, actions: Tree) -> tuple[torch.Tensor, torch.Tensor]:
+        """Sums the outputs' terms."""
+        logprobs, entropies = zip(*self._map("terms", logits, actions).values())
+        return sum(logprobs), sum(entropies)
 
     def sample(
         self, logits: Tree, generator: torch.Generator | None = None, **options: torch.Tensor

@@ -16,6 +16,8 @@ from torch import nn
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, encoders, heads
 from megastep.agents.networks.critic import Critic
+from megastep.agents.networks.layers import linear
+from megastep.agents.networks.precision import ComputeDtype
 from megastep.agents.networks.running_norm import update_norms
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
@@ -139,67 +141,85 @@ class Policy(nn.Module):
                     raise ValueError(
                         f"{name} is of {len(leaf)} lanes, but world.reset is of {n_lanes}"
                     )
-        out = self.unroll(mapping(torch.unsqueeze)(world["obs"], 0), world["reset"][None], state)
-        logits = mapping(torch.squeeze)(out["logits"], 0)
-        if sample:
-            generator = self.generator.on(self.device) if generator is None else generator
-            actions = self.output.sample(logits, generator)
-        else:
-            actions = self.output.greedy(logits)
-        decision = arrdict(
-            actions=actions,
-            logits=logits,
-            logprobs=self.output.logprob(logits, actions),
-            features=out["features"][0],
-        )
-        return decision, out["state"]
+        obs, reset = mapping(torch.unsqueeze)(world["obs"], 0), world["reset"][None]
+        if sample and generator is None:
+            generator = self.generator.on(self.device)
+        with self.compute_dtype():
+            features, state = self._features(obs, reset, state)
+            logits, actions, logprobs = self.output.act(features[0], sample, generator)
+        decision = arrdict(actions=actions, logits=logits, logprobs=logprobs, features=features[0])
+        return decision, state
 
-    def unroll(self, obs: Tree, reset: torch.Tensor, state: arrdict) -> arrdict:
+    def unroll(
+        self,
+        obs: Tree,
+        reset: torch.Tensor,
+        state: arrdict,
+        lanes: torch.Tensor | None = None,
+    ) -> arrdict:
         """Runs over a sequence without acting.
 
         Args:
             obs: (T, B, ...) per leaf.
-            reset: (T, B) bool; clears a lane's hidden state before the step.
-            state: hidden state before the sequence.
+            reset: (T, B) bool; clears a lane's hidden state before the step. (T, M) with `lanes`.
+            state: hidden state before the sequence, of M lanes with `lanes`.
+            lanes: (M,) int64, the lanes of `obs` to run over. None: all.
 
         Returns:
             arrdict(logits (T, B, ...), features (T, B, width) that they were computed from, state
             after the sequence).
         """
         with self.compute_dtype():
-            encoded = self.intake(obs)
-            outputs, state = self.core(encoded, reset, state)
-            features = encoded + outputs  # a residual connection around the recurrent core
+            features, state = self._features(obs, reset, state, lanes)
             return arrdict(logits=self.output(features), features=features, state=state)
 
-    def value(self, features: torch.Tensor, privileged: Tree | None = None) -> torch.Tensor:
+    def _features(self, obs, reset, state, lanes=None):
+        encoded = self.intake(obs, lanes)
+        outputs, state = self.core(encoded, reset, state)
+        return encoded + outputs, state  # a residual connection around the recurrent core
+
+    def value(
+        self,
+        features: torch.Tensor,
+        privileged: Tree | None = None,
+        lanes: torch.Tensor | None = None,
+    ) -> torch.Tensor:
         """Returns the critic's value (...,) float32.
 
         Args:
             features: (..., width), of `unroll`.
             privileged: the world's privileged observations, for an asymmetric critic.
+            lanes: (M,) int64, the lanes of `privileged` that `features` belong to. None: all.
         """
         with self.compute_dtype():
-            return self.critic(features, privileged)
+            return self.critic(features, privileged, lanes)
 
-    def prediction_error(self, features: torch.Tensor, privileged: Tree) -> torch.Tensor:
+    def prediction_error(
+        self, features: torch.Tensor, privileged: Tree, lanes: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Returns the error (T, B) of predicting the encoded privileged observations from features:
         a mean squared error in standard deviations.
 
         An auxiliary loss that trains the core and not the critic (Mirowski et al. 2017; with
         privileged information: Lambrechts et al. 2024).
+
+        Args:
+            features: (T, B, width), of `unroll`.
+            privileged: the world's privileged observations.
+            lanes: as for `value`.
         """
-        with torch.no_grad():
-            target = self.critic.intake.encode(privileged)
+        intake = self.critic.intake
         with self.compute_dtype():
-            predicted = self.prediction(features)
+            with torch.no_grad():
+                target = intake.encode(privileged, lanes)[..., : intake.n_features]
+            predicted = linear(features, self.prediction).float()
         return (predicted - target).square().mean(-1)
 
-    def compute_dtype(self) -> torch.autocast:
-        """Returns the autocast context of matrix products. Inside one context, autocast casts each
-        weight only once.
+    def compute_dtype(self) -> ComputeDtype:
+        """Returns the autocast context of matrix products. Inside one context, each weight is cast
+        only once.
         """
-        return torch.autocast(
+        return ComputeDtype(
             self.device.type, torch.bfloat16, enabled=self.bf16 and self.device.type == "cuda"
         )
 

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from megastep.agents.distributed.pooling import masked_moments, pool_moments
-from megastep.agents.networks.precision import compute_dtype
+from megastep.agents.networks.layers import linear
 from megastep.agents.networks.running_norm import mix_moments, store_if
 
 
@@ -33,7 +33,7 @@ class ValueOutput(nn.Module):
             self.register_buffer(name, torch.tensor(start))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        normalised = self.linear(x.to(compute_dtype(self.linear.weight))).float().squeeze(-1)
+        normalised = linear(x, self.linear).float().squeeze(-1)
         return normalised * self.scale + self.mean
 
     @torch.no_grad()

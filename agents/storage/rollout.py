@@ -6,6 +6,7 @@ t+1. So row t is a valid transition unless its `reset` is set.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 
@@ -15,7 +16,8 @@ from megastep.arrdict import arrdict, clone
 from megastep.dotdict import mapping
 from megastep.types import Env, Space, Tree, n_lanes, optional
 
-_SEQUENCES = "obs starts learns actions logprobs reward terminal truncated".split()
+#: Parts of a rollout that `Rollout.sequences` selects from.
+SEQUENCES = "obs starts learns actions logprobs reward terminal truncated privileged".split()
 _BYTES_OF_THE_REST = 64  # of a step: everything except observations
 
 
@@ -126,7 +128,7 @@ class Rollout:
 
     def state_dict(self) -> dict[str, Tree]:
         """Returns every tensor: trees by name."""
-        names = *_SEQUENCES, "privileged", "values", "metrics", "state"
+        names = *SEQUENCES, "values", "metrics", "state"
         parts = {name: getattr(self, name) for name in names}
         return {name: part for name, part in parts.items() if part is not None}
 
@@ -189,11 +191,12 @@ class Rollout:
             truncated=self.truncated,
         )
 
-    def sequences(self, lanes: torch.Tensor) -> arrdict:
+    def sequences(self, lanes: torch.Tensor, names: Sequence[str] = SEQUENCES) -> arrdict:
         """Returns whole sequences of some lanes, as a copy.
 
         Args:
             lanes: (M,) int64.
+            names: which of the parts to return, besides `state`.
 
         Returns:
             arrdict of obs, starts, learns and privileged (if stored), each (T+1, M, ...); actions,
@@ -201,9 +204,8 @@ class Rollout:
             hidden state before row 0.
         """
         select = mapping(lambda leaf: leaf.index_select(1, lanes))
-        batch = arrdict({name: select(getattr(self, name)) for name in _SEQUENCES})
-        if self.privileged is not None:
-            batch["privileged"] = select(self.privileged)
+        parts = {name: getattr(self, name) for name in names}
+        batch = arrdict({name: select(part) for name, part in parts.items() if part is not None})
         batch["state"] = _select(self.state, lanes)
         return batch
 

@@ -298,3 +298,59 @@ def test_captured_unroll_matches_steps(bf16):
     lstm = LSTM(256)
     slack = SLACK[torch.bfloat16 if bf16 else torch.float32]
     check_captured(lstm, "cell", lstm.step, slack, bf16)
+
+
+# ---- A whole sequence in one kernel ----
+
+
+def whole_sequence(device, dtype, seed, n_steps, n_lanes, nan_before_reset=False):
+    """Returns outputs, last cell and gradients of a sequence of 256 units."""
+    torch.manual_seed(seed)
+    width = lstm_module.lstm_sequence.WIDTH
+    inputs = dict(
+        x=torch.randn(n_steps, n_lanes, width).bfloat16().float(),
+        reset=torch.rand(n_steps, n_lanes) < 0.2,
+        state=[torch.randn(n_lanes, width).bfloat16().float() for _ in range(2)],
+        weights=[
+            (torch.randn(shape) / width**0.5).bfloat16().float()
+            for shape in ((4 * width, width), (4 * width,), (4 * width, width))
+        ],
+        d_outputs=torch.randn(n_steps, n_lanes, width).bfloat16().float(),
+        d_cell=torch.randn(n_lanes, width),
+    )
+    if nan_before_reset:
+        inputs["reset"][n_steps // 2] = True
+        inputs["x"][: n_steps // 2] = torch.nan
+    return sequence(device, dtype, **inputs)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n_steps, n_lanes", [(2, 1), (9, 33), (32, 1024), (17, 4100)])
+def test_sequence_on_chip_matches_float32_and_is_repeatable(n_steps, n_lanes):
+    x = torch.empty(n_steps, n_lanes, 256, dtype=torch.bfloat16, device="cuda")
+    assert lstm_module.lstm_sequence.is_supported(x)
+    first = whole_sequence("cuda", torch.bfloat16, 0, n_steps, n_lanes)
+    second = whole_sequence("cuda", torch.bfloat16, 0, n_steps, n_lanes)
+    assert all(torch.equal(one, other) for one, other in zip(first, second, strict=True))
+    expected = whole_sequence("cuda", torch.float32, 0, n_steps, n_lanes)
+    assert_close(NAMES, first, expected, SLACK[torch.bfloat16])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lstm_module.lstm_sequence, "is_supported", lambda x: False)
+        by_steps = whole_sequence("cuda", torch.bfloat16, 0, n_steps, n_lanes)
+    assert_close(NAMES, first, by_steps, SLACK[torch.bfloat16])
+    errors = [
+        [((leaf - other).norm() / other.norm()).item() for leaf, other in zip(leaves, expected)]
+        for leaves in (first, by_steps)
+    ]
+    # no less exact than step by step, which rounds more often
+    assert all(one < 1.2 * other + 1e-3 for one, other in zip(*errors, strict=True)), errors
+
+
+@pytest.mark.cuda
+def test_sequence_on_chip_cuts_nan_at_resets():
+    n_steps, n_lanes = 8, 50
+    outputs, cell, d_x, *_, d_output, d_cell = whole_sequence(
+        "cuda", torch.bfloat16, 1, n_steps, n_lanes, nan_before_reset=True
+    )
+    assert outputs[: n_steps // 2].isnan().any() and outputs[n_steps // 2 :].isfinite().all()
+    assert cell.isfinite().all() and d_x[n_steps // 2 :].isfinite().all()

@@ -73,3 +73,76 @@ struct MingruBackwardParams {
     int width;
     int n_units;  // units per thread
 };
+
+// ---- Layers ----
+//
+// P policies, each with its own weights, statistics and rows: every array starts with the axis P.
+
+// One leaf of an observation. Mean and scale belong to `group` neighbouring features.
+struct IntakeLeafParams {
+    const void* values;  // (P, T, B, n_features) float16 or float32
+    const float* mean;   // (P, n_features / group)
+    const float* scale;  // (P, n_features / group)
+    int n_features;      // 0: there is no such leaf
+    int group;
+    int is_half;
+};
+
+struct NormaliseParams {
+    IntakeLeafParams leaf0;
+    IntakeLeafParams leaf1;
+    IntakeLeafParams leaf2;
+    IntakeLeafParams leaf3;
+    const long long* lanes;  // (P, M), the lanes to read; null: all, M = B
+    void* features;          // (P, T, M, n_columns) compute
+    int n_steps;
+    int n_lanes;     // B
+    int n_selected;  // M
+    int n_columns;   // a multiple of 4; those after the leaves' features are 0
+};
+
+struct BiasGradientParams {
+    const void* d;          // (P, n_rows, n_columns) compute
+    const void* activated;  // of the same shape; null: no activation
+    void* d_masked;         // d where `activated` is above 0, else 0; null without one
+    float* sums;            // (P, n_strips, n_columns), over the rows of a strip
+    int n_rows;
+    int n_columns;  // a multiple of 8
+    int n_strips;
+    int strip;  // rows of a strip
+};
+
+struct CategoricalActParams {
+    const void* features;  // (P, B, W) compute
+    const void* weight;    // (P, A n, W) compute
+    const void* bias;      // (P, A n) compute
+    const float* noise;    // (P, B, A, n), exponentially distributed; null: the most likely
+    float* logits;         // (P, B, A, n), log-probabilities
+    long long* actions;    // (P, B, A)
+    float* logprobs;       // (P, B), of the joint actions
+    int n_lanes;
+    int width;  // a multiple of 4
+    int n_agents;
+    int n_choices;  // at most 32
+};
+
+struct CategoricalTermsParams {
+    const float* logits;       // (n_rows, A, n), log-probabilities
+    const long long* actions;  // (n_rows, A)
+    float* logprobs;           // (n_rows), of the joint actions
+    float* entropies;          // (n_rows)
+    int n_rows;
+    int n_agents;
+    int n_choices;
+};
+
+struct CategoricalTermsBackwardParams {
+    const float* logits;
+    const long long* actions;
+    const float* d_logprobs;   // (n_rows)
+    const float* d_entropies;  // (n_rows)
+    float* d_logits;           // (n_rows, A, n)
+    int n_rows;
+    int n_agents;
+    int n_choices;
+};

@@ -1,13 +1,15 @@
 """Launches a program's operation on the device where its tensors are."""
 
 import ctypes
+import functools
+from typing import Any
 
 import torch
 
 from megastep.kernels.build.compile import EngineError, bindings, check_status, cpu, cuda
 from megastep.kernels.build.program import KERNELS, Program
 
-__all__ = ["ENGINE", "launch"]
+__all__ = ["ENGINE", "launch", "launch_blocks"]
 
 #: The engine's operations.
 ENGINE = Program(KERNELS)
@@ -15,6 +17,7 @@ BLOCK = ENGINE.constants["BLOCK"]  # threads per block
 WARP = ENGINE.constants["WARP"]
 INVALID_CONTEXT = 201  # CUDA_ERROR_INVALID_CONTEXT
 MAX_THREADS = 2**32 - BLOCK  # per launch: kernels count them in 32 bits
+USUAL_SHARED = 48 * 1024  # bytes of dynamic shared memory that any kernel may have
 
 
 def launch(
@@ -48,18 +51,56 @@ def launch(
             f"{operation} needs {threads:,} threads on {device}, but a launch has at most "
             f"{MAX_THREADS:,}: use fewer environments."
         )
+    n_blocks = -(-threads // BLOCK)
+    launch_blocks(program, operation, packed, device, (n_blocks, 1), BLOCK, shared * BLOCK // WARP)
+
+
+def launch_blocks(
+    program: Program,
+    operation: str,
+    packed: bytes,
+    device: torch.device,
+    n_blocks: tuple[int, int],
+    n_threads: int,
+    shared: int = 0,
+) -> None:
+    """Runs an operation of a program on a GPU's current stream, with blocks of any size.
+
+    Args:
+        program: its kernels are built if this is its first launch on the device.
+        operation: the kernel's name.
+        packed: its struct, from ``program.params``.
+        device: where its tensors are.
+        n_blocks: along x and y.
+        n_threads: per block.
+        shared: dynamic shared memory in bytes per block.
+
+    Raises:
+        EngineError: if the program has no such operation for the device, or it cannot be built.
+    """
     index = torch.cuda.current_device() if device.index is None else device.index
     function = _operation(cuda(program, index), operation, program, ".cu", "a CPU (device=cpu)")
     arguments = (ctypes.c_char_p * 1)(packed)
     with torch.cuda.device(index):
+        if shared > USUAL_SHARED:
+            _allow_shared(function, shared, index)
         stream = torch.cuda.current_stream(index).cuda_stream
-        shape = *(-(-threads // BLOCK), 1, 1), *(BLOCK, 1, 1), shared * (BLOCK // WARP)
+        shape = *n_blocks, 1, *(n_threads, 1, 1), shared
         call = function, *shape, stream, ctypes.addressof(arguments), 0
         status = bindings()[0].cuLaunchKernel(*call)
         if int(status[0]) == INVALID_CONTEXT:
             make_current(index)
             status = bindings()[0].cuLaunchKernel(*call)
     check_status(status, f"Launching {operation}")
+
+
+@functools.cache
+def _allow_shared(function: Any, shared: int, index: int) -> None:
+    """Lets a kernel have more than the usual shared memory."""
+    driver, _ = bindings()
+    make_current(index)
+    attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
+    check_status(driver.cuFuncSetAttribute(function, attribute, shared), "Reserving shared memory")
 
 
 def _operation(functions, name, program, suffix, other):

@@ -1,0 +1,24 @@
+// Generalised advantage estimates, one thread per lane, from the last step to the first.
+#include "common/constants.h"
+#include "params.h"
+
+#define KERNEL extern "C" __global__ void
+
+KERNEL gae(GaeParams p) {
+    int lane = blockIdx.x * blockDim.x + threadIdx.x;
+    if (lane >= p.n_lanes)
+        return;
+    float advantage = 0.f, next_value = p.values[p.n_steps * (long long)p.n_lanes + lane];
+#pragma unroll 4
+    for (int t = p.n_steps - 1; t >= 0; t--) {
+        long long at = t * (long long)p.n_lanes + lane;
+        float value = p.values[at];
+        bool reset = p.reset[at], terminal = p.terminal[at], truncated = p.truncated[at];
+        float delta = p.reward[at] + p.gamma * (terminal ? 0.f : next_value) - value;
+        bool ends = terminal || truncated || reset;
+        advantage = (reset ? 0.f : delta) + (ends ? 0.f : p.gamma * p.lambda_ * advantage);
+        p.advantages[at] = advantage;
+        p.targets[at] = advantage + value;
+        next_value = value;
+    }
+}

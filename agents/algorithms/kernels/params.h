@@ -1,0 +1,43 @@
+// The parameters of each launch, passed by value; see megastep/kernels/params.h.
+//
+// T steps, B lanes.
+#pragma once
+
+struct GaeParams {
+    const float* reward;             // (T, B)
+    const float* values;             // (T + 1, B)
+    const unsigned char* reset;      // (T, B)
+    const unsigned char* terminal;   // (T, B)
+    const unsigned char* truncated;  // (T, B)
+    float* advantages;               // (T, B)
+    float* targets;                  // (T, B)
+    int n_steps;
+    int n_lanes;
+    float gamma;
+    float lambda_;
+};
+
+struct PpoLossParams {
+    const float* logprobs;       // (n_rows), of the actions
+    const float* entropies;      // (n_rows)
+    const float* values;         // (n_rows)
+    const float* errors;         // (n_rows), of the prediction; null: there is none
+    const float* old_logprobs;   // (n_rows), when acting
+    const float* old_values;     // (n_rows), when acting; null: values are not clipped
+    const float* advantages;     // (n_rows)
+    const float* targets;        // (n_rows)
+    const unsigned char* valid;  // (n_rows)
+    const long long* n_valid;    // ()
+    const float* value_scale;    // ()
+    float* d_logprobs;           // (n_rows), gradients of the loss
+    float* d_entropies;          // (n_rows)
+    float* d_values;             // (n_rows)
+    float* d_errors;             // (n_rows)
+    float* sums;  // (n_blocks, 6): policy, value, entropy, kl, clip_fraction, auxiliary
+    int n_rows;
+    float clip;
+    float value_clip;
+    float value_coef;
+    float entropy_coef;
+    float auxiliary_coef;
+};

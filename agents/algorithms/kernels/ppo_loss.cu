@@ -1,0 +1,61 @@
+// PPO's loss, with its gradients and metrics. One thread per row; a block adds up its rows in a fixed
+// order, the caller the blocks.
+#include "common/constants.h"
+#include "params.h"
+
+#define KERNEL extern "C" __global__ void
+
+constexpr int N_SUMS = 6;
+
+KERNEL ppo_loss(PpoLossParams p) {
+    int row = blockIdx.x * blockDim.x + threadIdx.x;
+    float sums[N_SUMS] = {};
+    if (row < p.n_rows) {
+        float share = p.valid[row] ? 1.f / (float)max(*p.n_valid, 1ll) : 0.f;
+        float d_logprob = 0.f, d_value = 0.f;
+        if (p.valid[row]) {
+            float log_ratio = p.logprobs[row] - p.old_logprobs[row], ratio = expf(log_ratio);
+            float clipped = fminf(fmaxf(ratio, 1.f - p.clip), 1.f + p.clip);
+            float advantage = p.advantages[row], surrogate = ratio * advantage;
+            float scale = *p.value_scale, error = (p.values[row] - p.targets[row]) / scale;
+            // a NaN fails both comparisons and stays
+            bool is_clipped = surrogate > clipped * advantage;
+            float squared = error * error;
+            bool is_old = false;
+            if (p.old_values) {
+                float limit = p.value_clip * scale, old = p.old_values[row];
+                float moved = fminf(fmaxf(p.values[row] - old, -limit), limit);
+                float other = (old + moved - p.targets[row]) / scale;
+                is_old = other * other > squared;
+                squared = is_old ? other * other : squared;
+            }
+            d_logprob = is_clipped ? 0.f : -surrogate * share;
+            d_value = is_old ? 0.f : p.value_coef * 2.f * error / scale * share;
+            sums[0] = -(is_clipped ? clipped * advantage : surrogate);
+            sums[1] = squared;
+            sums[2] = p.entropies[row];
+            sums[3] = ratio - 1.f - log_ratio;
+            sums[4] = ratio != clipped ? 1.f : 0.f;
+            sums[5] = p.errors ? p.errors[row] : 0.f;
+        }
+        p.d_logprobs[row] = d_logprob;
+        p.d_values[row] = d_value;
+        p.d_entropies[row] = -p.entropy_coef * share;
+        if (p.errors)
+            p.d_errors[row] = p.auxiliary_coef * share;
+    }
+    __shared__ float of_warps[BLOCK / WARP][N_SUMS];
+    for (int i = 0; i < N_SUMS; i++) {
+        for (int mask = WARP / 2; mask; mask /= 2)
+            sums[i] += __shfl_xor_sync(~0u, sums[i], mask);
+        if (threadIdx.x % WARP == 0)
+            of_warps[threadIdx.x / WARP][i] = sums[i];
+    }
+    __syncthreads();
+    if (threadIdx.x < N_SUMS) {
+        float total = 0.f;
+        for (int warp = 0; warp < BLOCK / WARP; warp++)
+            total += of_warps[warp][threadIdx.x];
+        p.sums[blockIdx.x * N_SUMS + threadIdx.x] = total;
+    }
+}

@@ -1,0 +1,138 @@
+"""PPO's loss: the clipped objective, the value's error, the entropy bonus and the auxiliary error
+(Schulman et al. 2017, eq. 7 and 9).
+
+T time, M lanes of a minibatch.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from megastep.agents.algorithms.kernels import program
+from megastep.agents.algorithms.masked_stats import masked_mean
+from megastep.arrdict import arrdict
+
+METRICS = "policy", "value", "entropy", "kl", "clip_fraction", "auxiliary"
+
+
+class Coefficients(NamedTuple):
+    """The settings of the loss; see `PPO`."""
+
+    clip: float
+    value_clip: float | None
+    value_coef: float
+    entropy_coef: float
+    auxiliary_coef: float
+
+
+def ppo_loss(
+    logprobs: torch.Tensor,
+    entropies: torch.Tensor,
+    values: torch.Tensor,
+    errors: torch.Tensor | None,
+    batch: arrdict,
+    value_scale: torch.Tensor,
+    coefficients: Coefficients,
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """Returns the loss, a mean over the valid steps, and its metrics, tensors ().
+
+    On a GPU one kernel computes both, and the gradients.
+
+    Args:
+        logprobs: (T, M) float32, of the actions.
+        entropies: (T, M), of the policy.
+        values: (T, M), in units of reward.
+        errors: (T, M), of the auxiliary prediction, or None.
+        batch: has `logprobs`, `advantages`, `targets` and `valid`, (T, M) each; with a
+            `value_clip` also `old_value`.
+        value_scale: (), the value's own scale.
+        coefficients: the settings.
+    """
+    if logprobs.is_cuda:
+        inputs = logprobs, entropies, values, errors
+        loss, metrics = _FusedLoss.apply(*inputs, batch, value_scale, coefficients)
+        metrics = dict(zip(METRICS, metrics.unbind(), strict=True))
+    else:
+        loss, metrics = plain_loss(
+            logprobs, entropies, values, errors, batch, value_scale, coefficients
+        )
+    if errors is None:
+        metrics.pop("auxiliary", None)
+    return loss, metrics
+
+
+def plain_loss(logprobs, entropies, values, errors, batch, value_scale, coefficients):
+    """Does the same in PyTorch."""
+    clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
+    valid = batch.valid
+    log_ratio = logprobs - batch.logprobs
+    log_ratio = log_ratio.masked_fill(~valid, 0.0)  # its exp may overflow, and 0 * inf is NaN
+    ratio = log_ratio.exp()
+    clipped = ratio.clamp(1 - clip, 1 + clip)
+    surrogate = torch.minimum(ratio * batch.advantages, clipped * batch.advantages)
+    squared = ((values - batch.targets) / value_scale).square()
+    if value_clip is not None:
+        limit = value_clip * value_scale
+        moved = batch.old_value + (values - batch.old_value).clamp(-limit, limit)
+        squared = torch.maximum(squared, ((moved - batch.targets) / value_scale).square())
+    policy = -masked_mean(surrogate, valid)
+    value, entropy = masked_mean(squared, valid), masked_mean(entropies, valid)
+    with torch.no_grad():
+        # this estimate of the KL divergence is never negative, unlike the mean log ratio
+        kl = masked_mean(ratio - 1 - log_ratio, valid)
+        clip_fraction = masked_mean((ratio != clipped).float(), valid)
+    loss = policy + value_coef * value - entropy_coef * entropy
+    metrics = dict(policy=policy, value=value, entropy=entropy, kl=kl, clip_fraction=clip_fraction)
+    if errors is not None:
+        metrics["auxiliary"] = masked_mean(errors, valid)
+        loss = loss + auxiliary_coef * metrics["auxiliary"]
+    return loss, metrics
+
+
+class _FusedLoss(torch.autograd.Function):
+    """`plain_loss` in one kernel, which leaves the gradients for the backward pass."""
+
+    @staticmethod
+    def forward(ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients):
+        clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
+        inputs = [None if x is None else x.contiguous() for x in (entropies, values, errors)]
+        gradients = [torch.empty_like(logprobs) for _ in range(3 + (errors is not None))]
+        n_rows, n_valid = logprobs.numel(), batch.valid.sum()
+        sums = logprobs.new_empty(program.n_blocks(n_rows), program.N_SUMS)
+        names = "d_logprobs", "d_entropies", "d_values", "d_errors"
+        program.run(
+            "ppo_loss",
+            logprobs.device,
+            n_rows,
+            logprobs=logprobs.contiguous(),
+            **dict(zip(("entropies", "values", "errors"), inputs, strict=True)),
+            old_logprobs=batch.logprobs.contiguous(),
+            old_values=None if value_clip is None else batch.old_value.contiguous(),
+            advantages=batch.advantages.contiguous(),
+            targets=batch.targets.contiguous(),
+            valid=batch.valid.contiguous(),
+            n_valid=n_valid,
+            value_scale=value_scale,
+            **{**dict.fromkeys(names), **dict(zip(names, gradients))},
+            sums=sums,
+            n_rows=n_rows,
+            clip=clip,
+            value_clip=value_clip or 0.0,
+            value_coef=value_coef,
+            entropy_coef=entropy_coef,
+            auxiliary_coef=auxiliary_coef,
+        )
+        ctx.save_for_backward(*gradients)
+        metrics = sums.sum(0) / n_valid.clamp(min=1)
+        weights = [1.0, value_coef, -entropy_coef, 0.0, 0.0, auxiliary_coef]
+        loss = sum(metrics[i] * weight for i, weight in enumerate(weights) if weight)
+        ctx.mark_non_differentiable(metrics)
+        return loss, metrics
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_loss, d_metrics):
+        # Learners differentiate the loss itself, so that d_loss is 1; others may scale it
+        gradients = torch._foreach_mul(list(ctx.saved_tensors), d_loss)
+        return *gradients, *[None] * (7 - len(gradients))

@@ -1,0 +1,86 @@
+// Matrix products on tensor cores, asynchronous copies, and clusters of blocks (Hopper and later).
+#pragma once
+
+#define DEVICE static __device__ __forceinline__
+
+// ---- Numbers ----
+
+DEVICE float low_half(unsigned int pair) { return __uint_as_float(pair << 16); }
+
+DEVICE float high_half(unsigned int pair) { return __uint_as_float(pair & 0xffff0000u); }
+
+// Rounds two floats to bfloat16, to nearest even. NaN stays NaN.
+DEVICE unsigned int pack_bfloat16(float low, float high) {
+    unsigned int pair;
+    asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(pair) : "f"(high), "f"(low));
+    return pair;
+}
+
+DEVICE float sigmoid(float x) { return __fdividef(1.f, 1.f + __expf(-x)); }
+
+// Absolute error below 3e-7.
+DEVICE float tanh_of(float x) { return 1.f - 2.f * sigmoid(-2.f * x); }
+
+// ---- Tensor cores ----
+
+// Loads four matrices of 8 x 8 bfloat16. Lanes 8 i to 8 i + 7 of the warp give the rows of matrix i.
+DEVICE void load_matrices(unsigned int (&parts)[4], const void* row) {
+    unsigned int address = (unsigned int)__cvta_generic_to_shared(row);
+    asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
+                 : "=r"(parts[0]), "=r"(parts[1]), "=r"(parts[2]), "=r"(parts[3])
+                 : "r"(address)
+                 : "memory");
+}
+
+// sum (16 x 8) += a (16 x 16) b (16 x 8), a and b in bfloat16.
+DEVICE void multiply_add(float (&sum)[4], const unsigned int (&a)[4], unsigned int b0,
+                         unsigned int b1) {
+    asm volatile("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0, %1, %2, %3}, "
+                 "{%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
+                 : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3])
+                 : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+}
+
+// ---- Copies and clusters ----
+
+// Begins to copy 16 bytes from global to shared memory.
+DEVICE void begin_copy(void* shared, const void* global) {
+    unsigned int address = (unsigned int)__cvta_generic_to_shared(shared);
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(address), "l"(global)
+                 : "memory");
+}
+
+DEVICE void wait_for_copies() {
+    asm volatile("cp.async.commit_group;\ncp.async.wait_group 0;" ::: "memory");
+}
+
+DEVICE unsigned int cluster_rank() {
+    unsigned int rank;
+    asm("mov.u32 %0, %%cluster_ctarank;" : "=r"(rank));
+    return rank;
+}
+
+// Waits until every thread of the cluster is here. What they wrote before is then visible to all.
+DEVICE void cluster_barrier() {
+    asm volatile("barrier.cluster.arrive.release.aligned;\n"
+                 "barrier.cluster.wait.acquire.aligned;" ::
+                     : "memory");
+}
+
+// The address that this shared memory has in another block of the cluster.
+DEVICE unsigned int address_in(const void* shared, unsigned int rank) {
+    unsigned int address = (unsigned int)__cvta_generic_to_shared(shared), there;
+    asm("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(there) : "r"(address), "r"(rank));
+    return there;
+}
+
+DEVICE void write_there(unsigned int address, uint4 value) {
+    asm volatile("st.shared::cluster.v4.u32 [%0], {%1, %2, %3, %4};" ::"r"(address), "r"(value.x),
+                 "r"(value.y), "r"(value.z), "r"(value.w)
+                 : "memory");
+}
+
+DEVICE void write_there(unsigned int address, float low, float high) {
+    asm volatile("st.shared::cluster.v2.f32 [%0], {%1, %2};" ::"r"(address), "f"(low), "f"(high)
+                 : "memory");
+}

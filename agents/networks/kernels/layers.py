@@ -1,0 +1,198 @@
+"""Layers on a GPU: the intake's normalisation, the bias' gradient, and categorical actions.
+
+All tensors are contiguous and on one GPU. T steps, B lanes, M selected lanes, A agents per lane, n
+choices.
+"""
+
+import torch
+
+from megastep.agents.networks.kernels.program import CORES, DTYPES
+from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
+
+MAX_LEAVES = 4
+MAX_CHOICES = 32
+_WORD = 16  # bytes that a thread reads at once
+_NO_LEAF = CORES.params.IntakeLeafParams(
+    values=0, mean=0, scale=0, n_features=0, group=1, is_half=0
+)
+
+
+def normalise(
+    leaves: list[torch.Tensor],
+    means: list[torch.Tensor],
+    scales: list[torch.Tensor],
+    n_columns: int,
+    dtype: torch.dtype,
+    lanes: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Returns (leaf - mean) / scale of some lanes, concatenated: (T, M, n_columns) in `dtype`.
+    Columns beyond the leaves' features are 0.
+
+    Args:
+        leaves: at most `MAX_LEAVES`, (T, B, F) float16 or float32 each.
+        means: float32, one per leaf, each a number for F / len(mean) neighbouring features.
+        scales: float32, of the same shapes.
+        n_columns: at least the features of all leaves, a multiple of 4.
+        dtype: float32 or bfloat16.
+        lanes: (M,) int64. None: all, M = B.
+    """
+    n_steps, n_lanes = leaves[0].shape[:2]
+    n_selected = n_lanes if lanes is None else len(lanes)
+    features = leaves[0].new_empty(n_steps, n_selected, n_columns, dtype=dtype)
+    packed = [
+        CORES.params.IntakeLeafParams(
+            values=leaf.data_ptr(),
+            mean=mean.data_ptr(),
+            scale=scale.data_ptr(),
+            n_features=leaf.shape[-1],
+            group=leaf.shape[-1] // mean.numel(),
+            is_half=int(leaf.dtype == torch.float16),
+        )
+        for leaf, mean, scale in zip(leaves, means, scales, strict=True)
+    ]
+    packed += [_NO_LEAF] * (MAX_LEAVES - len(packed))
+    _launch(
+        f"normalise_{DTYPES[dtype]}",
+        features,
+        features.numel() // 4,
+        **{f"leaf{i}": leaf for i, leaf in enumerate(packed)},
+        lanes=lanes,
+        features=features,
+        n_steps=n_steps,
+        n_lanes=n_lanes,
+        n_selected=n_selected,
+        n_columns=n_columns,
+    )
+    return features
+
+
+def bias_gradient(
+    d: torch.Tensor, activated: torch.Tensor | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the gradient before a ReLU, and its sum over rows, float32.
+
+    Args:
+        d: (rows, columns), columns a multiple of 8; the gradient after the ReLU.
+        activated: the ReLU's outputs. None: there is no ReLU, and `d` is returned.
+    """
+    n_rows, n_columns = d.shape
+    n_words = n_columns * d.element_size() // _WORD
+    groups = max(1, WARP // n_words)  # rows that a warp reads at once
+    strip = 32 * groups
+    n_strips = -(-n_rows // strip)
+    d_masked = d if activated is None else torch.empty_like(d)
+    sums = d.new_empty(n_strips, n_columns, dtype=torch.float32)
+    _launch(
+        f"bias_gradient_{DTYPES[d.dtype]}",
+        d,
+        WARP * n_strips * -(-n_words // min(n_words, WARP)),
+        d=d,
+        activated=activated,
+        d_masked=None if activated is None else d_masked,
+        sums=sums,
+        n_rows=n_rows,
+        n_columns=n_columns,
+        n_strips=n_strips,
+        strip=strip,
+    )
+    return d_masked, sums.sum(0)
+
+
+def act(
+    features: torch.Tensor,
+    weight: torch.Tensor,
+    bias: torch.Tensor,
+    shape: tuple[int, int],
+    noise: torch.Tensor | None,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Chooses actions by the softmax of a linear layer.
+
+    Args:
+        features: (B, W), W a multiple of 4.
+        weight: (A n, W) in the same dtype.
+        bias: (A n,) in the same dtype.
+        shape: (A, n), n at most `MAX_CHOICES`.
+        noise: (B, A, n) float32, exponentially distributed. None: takes the most likely actions.
+
+    Returns:
+        log-probabilities (B, A, n), actions (B, A) int64, and their log-probability (B,).
+    """
+    n_lanes, width = features.shape
+    logits = features.new_empty(n_lanes, *shape, dtype=torch.float32)
+    actions = torch.empty(n_lanes, shape[0], dtype=torch.int64, device=features.device)
+    logprobs = torch.empty_like(logits[:, 0, 0])
+    _launch(
+        f"categorical_act_{DTYPES[features.dtype]}",
+        features,
+        WARP * n_lanes,
+        features=features,
+        weight=weight,
+        bias=bias,
+        noise=noise,
+        logits=logits,
+        actions=actions,
+        logprobs=logprobs,
+        n_lanes=n_lanes,
+        width=width,
+        n_agents=shape[0],
+        n_choices=shape[1],
+    )
+    return logits, actions, logprobs
+
+
+def terms(logits: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the log-probability of joint actions and the entropy, (rows,) each.
+
+    Args:
+        logits: log-probabilities (rows, A, n).
+        actions: (rows, A) int64.
+    """
+    logprobs, entropies = logits.new_empty(2, len(logits))
+    _launch(
+        "categorical_terms",
+        logits,
+        len(logits),
+        **_rows(logits, actions),
+        logprobs=logprobs,
+        entropies=entropies,
+    )
+    return logprobs, entropies
+
+
+def terms_backward(
+    logits: torch.Tensor,
+    actions: torch.Tensor,
+    d_logprobs: torch.Tensor,
+    d_entropies: torch.Tensor,
+) -> torch.Tensor:
+    """Returns the gradient of `terms`' logits."""
+    d_logits = torch.empty_like(logits)
+    _launch(
+        "categorical_terms_backward",
+        logits,
+        len(logits),
+        **_rows(logits, actions),
+        d_logprobs=d_logprobs,
+        d_entropies=d_entropies,
+        d_logits=d_logits,
+    )
+    return d_logits
+
+
+def _rows(logits, actions):
+    n_rows, n_agents, n_choices = logits.shape
+    return dict(
+        logits=logits, actions=actions, n_rows=n_rows, n_agents=n_agents, n_choices=n_choices
+    )
+
+
+def _launch(operation, tensor, n_threads, **fields):
+    """Launches an operation for one policy on a tensor's GPU."""
+    values = {
+        name: field.data_ptr() if isinstance(field, torch.Tensor) else 0 if field is None else field
+        for name, field in fields.items()
+    }
+    pack = getattr(CORES.params, CORES.cuda_operations[operation])
+    if n_threads:
+        n_blocks = -(-n_threads // BLOCK), 1
+        launch_blocks(CORES, operation, pack(**values), tensor.device, n_blocks, BLOCK)

@@ -1,0 +1,134 @@
+"""The LSTM over a whole sequence on a GPU with clusters of blocks (Hopper and later): one kernel
+forward and one backward, whose recurrent weights stay on the chip from the first step to the last.
+
+T steps, B lanes, W = 256 units. All tensors are contiguous, on one GPU. Gates, weights, outputs and
+their gradients are bfloat16, states are float32, resets are bool.
+"""
+
+from pathlib import Path
+
+import torch
+
+from megastep.agents.networks.kernels.program import CUDA_FLAGS
+from megastep.kernels.build.launch import launch_blocks
+from megastep.kernels.build.program import Program
+
+PROGRAM = Program(Path(__file__).parent / "clusters", CUDA_FLAGS)
+WIDTH = 256
+MIN_STEPS = 2  # for one step, loading the weights takes longer than the products
+_THREADS = PROGRAM.constants["SEQUENCE_THREADS"]
+_LANES = PROGRAM.constants["SEQUENCE_LANES"]
+_RANKS = WIDTH // PROGRAM.constants["BLOCK_UNITS"]  # blocks of a cluster
+
+
+def is_supported(x: torch.Tensor) -> bool:
+    """Returns whether the kernels run a sequence x (T, B, W) of this dtype on its device."""
+    return (
+        x.is_cuda
+        and x.dtype == torch.bfloat16
+        and x.shape[-1] == WIDTH
+        and len(x) >= MIN_STEPS
+        and torch.cuda.get_device_capability(x.device) >= (9, 0)
+    )
+
+
+def forward(gates, weight, reset, output, cell, needs_backward):
+    """Unrolls the recurrence.
+
+    Args:
+        gates: (T, B, 4 W), products of the inputs, with the bias.
+        weight: (4 W, W), recurrent.
+        reset: (T, B) bool.
+        output: (B, W) float32, before the sequence.
+        cell: (B, W) float32, before the sequence.
+        needs_backward: whether to save what `backward` needs.
+
+    Returns:
+        outputs (T, B, W), the recurrent input of each step (T, B, W), the last cell (B, W) float32,
+        and what to pass on to `backward`, two tensors or two times None.
+    """
+    n_steps, n_lanes, _ = gates.shape
+    n_clusters = -(-n_lanes // _LANES)
+    outputs = gates.new_empty(n_steps, n_lanes, WIDTH)
+    hiddens, last_cell = torch.empty_like(outputs), torch.empty_like(cell)
+    saved = None, None
+    if needs_backward:
+        lead = n_steps, n_clusters, _RANKS
+        saved = (
+            gates.new_empty(*lead, 4, _THREADS, 8),
+            cell.new_empty(*lead, 2, _THREADS, 4),
+        )
+    _launch(
+        "forward",
+        n_clusters,
+        gates=gates,
+        weight=weight,
+        reset=reset,
+        last_output=output,
+        last_cell=cell,
+        outputs=outputs,
+        hiddens=hiddens,
+        cell=last_cell,
+        saved_gates=saved[0],
+        saved_cells=saved[1],
+        n_steps=n_steps,
+        n_lanes=n_lanes,
+    )
+    return outputs, hiddens, last_cell, saved
+
+
+def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
+    """Computes the gradients of `forward`'s gates, output and cell.
+
+    Args:
+        weight: (4 W, W), recurrent.
+        reset: (T, B) bool.
+        saved_gates: of `forward`.
+        saved_cells: of `forward`.
+        d_outputs: (T, B, W).
+        d_cell: (B, W) float32, gradient of the last cell.
+
+    Returns:
+        The gradients of the gates (T, B, 4 W), of a bias (4 W,) float32, which is their sum, and of
+        the output and the cell before the sequence, (B, W) float32.
+    """
+    n_steps, n_lanes, _ = d_outputs.shape
+    n_clusters = -(-n_lanes // _LANES)
+    d_gates = d_outputs.new_empty(n_steps, n_lanes, 4 * WIDTH)
+    d_bias = d_cell.new_empty(n_clusters, 4 * WIDTH)
+    d_last_output, d_last_cell = torch.empty_like(d_cell), torch.empty_like(d_cell)
+    _launch(
+        "backward",
+        n_clusters,
+        weight=weight.T.contiguous(),
+        reset=reset,
+        saved_gates=saved_gates,
+        saved_cells=saved_cells,
+        d_outputs=d_outputs,
+        d_cell=d_cell,
+        d_gates=d_gates,
+        d_bias=d_bias,
+        d_last_output=d_last_output,
+        d_last_cell=d_last_cell,
+        n_steps=n_steps,
+        n_lanes=n_lanes,
+    )
+    return d_gates, d_bias.sum(0), d_last_output, d_last_cell
+
+
+def _launch(direction, n_clusters, **fields):
+    kernel = f"lstm_sequence_{direction}_{WIDTH}"
+    pack = getattr(PROGRAM.params, PROGRAM.cuda_operations[kernel])
+    values = {
+        name: field.data_ptr() if isinstance(field, torch.Tensor) else field or 0
+        for name, field in fields.items()
+    }
+    launch_blocks(
+        PROGRAM,
+        kernel,
+        pack(**values, n_policies=1, n_clusters=n_clusters),
+        fields["weight"].device,
+        (_RANKS * n_clusters, 1),
+        _THREADS,
+        PROGRAM.constants[f"{direction.upper()}_MEMORY"],
+    )

@@ -1,0 +1,119 @@
+"""Layers with fused forms on a GPU.
+
+Each has a plain form in PyTorch, which runs on a CPU, in float32 on a GPU, and for whatever the
+fused form does not cover. Where bfloat16 is the compute dtype, the fused form runs: kernels of
+`megastep.agents.networks.kernels.layers` around PyTorch's matrix products. Its weights' gradients
+are float32 sums that are never rounded to bfloat16.
+
+`...` any leading axes, such as (T, B) time and lanes.
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import nn
+from torch.autograd.function import once_differentiable
+
+from megastep.agents.networks.kernels import layers as kernels
+from megastep.agents.networks.precision import cast, compute_dtype, product
+from megastep.agents.networks.running_norm import RunningNorm
+
+Activation = Callable[[torch.Tensor], torch.Tensor]
+
+
+def linear(x: torch.Tensor, layer: nn.Linear, activation: Activation | None = None) -> torch.Tensor:
+    """Applies a linear layer and an activation in the compute dtype: (..., in) -> (..., out)."""
+    dtype = compute_dtype(layer.weight)
+    x = x.to(dtype)
+    is_known = activation in (None, torch.relu) and not layer.in_features % 8
+    if x.is_cuda and dtype == torch.bfloat16 and is_known and layer.bias is not None:
+        return _Linear.apply(x, layer.weight, layer.bias, activation is torch.relu)
+    y = layer(x)
+    return y if activation is None else activation(y)
+
+
+class _Linear(torch.autograd.Function):
+    """Adds the bias and the ReLU in the product's own kernel. Backward, one kernel masks the
+    gradient and adds up its rows. Odd numbers of outputs are padded to a multiple of 8, as tensor
+    cores want.
+    """
+
+    @staticmethod
+    def forward(ctx, x, weight, bias, has_relu):
+        ctx.n_outputs, ctx.has_relu = len(weight), has_relu
+        weight, bias = (cast(leaf, x.dtype, multiple=8) for leaf in (weight, bias))
+        rows = x.flatten(0, -2)
+        if has_relu:
+            y = torch._addmm_activation(bias, rows, weight.T)
+        else:
+            y = torch.addmm(bias, rows, weight.T)
+        ctx.save_for_backward(rows, weight, *[y] * has_relu)
+        return y[:, : ctx.n_outputs].unflatten(0, x.shape[:-1])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d):
+        rows, weight, *activated = ctx.saved_tensors
+        lead, n_padding = d.shape[:-1], len(weight) - ctx.n_outputs
+        d = nn.functional.pad(d.flatten(0, -2), (0, n_padding)) if n_padding else d.flatten(0, -2)
+        d, d_bias = kernels.bias_gradient(d.contiguous(), *activated)
+        d_x = (d @ weight).unflatten(0, lead) if ctx.needs_input_grad[0] else None
+        d_weight = product(d.T, rows) if ctx.needs_input_grad[1] else None
+        if n_padding:
+            d_weight, d_bias = d_weight[: ctx.n_outputs], d_bias[: ctx.n_outputs]
+        return d_x, d_weight, d_bias, None
+
+
+def normalised(
+    leaves: Sequence[torch.Tensor],
+    norms: Sequence[RunningNorm],
+    n_columns: int,
+    lanes: torch.Tensor | None = None,
+) -> torch.Tensor | None:
+    """Returns leaves normalised, flattened and concatenated in one kernel, in the compute dtype;
+    None where that is not possible.
+
+    Args:
+        leaves: (..., *shape) of each norm; (T, B, *shape) if there are lanes.
+        norms: one per leaf.
+        n_columns: of the result; those after the leaves' features are 0.
+        lanes: (M,) int64, lanes to select.
+
+    Returns:
+        (..., n_columns), or (T, M, n_columns).
+    """
+    dtype = compute_dtype(leaves[0])
+    possible = dtype == torch.bfloat16 and len(leaves) <= kernels.MAX_LEAVES
+    for leaf in leaves:
+        is_float = leaf.dtype in (torch.float16, torch.float32) and not leaf.requires_grad
+        possible = possible and leaf.is_cuda and leaf.is_contiguous() and is_float
+    if not possible:
+        return None
+    flat = [leaf.flatten(-norm.mean.dim()) for leaf, norm in zip(leaves, norms, strict=True)]
+    lead = flat[0].shape[:-1]
+    if lanes is None:
+        flat = [leaf.reshape(1, -1, leaf.shape[-1]) for leaf in flat]
+    means, scales = [norm.mean for norm in norms], [norm.scale for norm in norms]
+    features = kernels.normalise(flat, means, scales, n_columns, dtype, lanes)
+    return features.view(*lead, n_columns) if lanes is None else features
+
+
+class CategoricalTerms(torch.autograd.Function):
+    """The log-probability of joint actions and the entropy (..., ) of log-probabilities
+    (..., A, n), in one kernel each way.
+    """
+
+    @staticmethod
+    def forward(ctx, logits, actions):
+        lead = logits.shape[:-2]
+        logits, actions = logits.flatten(0, -3).contiguous(), actions.flatten(0, -2).contiguous()
+        ctx.save_for_backward(logits, actions)
+        return tuple(each.view(lead) for each in kernels.terms(logits, actions))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_logprobs, d_entropies):
+        logits, actions = ctx.saved_tensors
+        d = (d_logprobs.contiguous(), d_entropies.contiguous())
+        d_logits = kernels.terms_backward(logits, actions, *d)
+        return d_logits.unflatten(0, d_logprobs.shape), None

@@ -1,0 +1,69 @@
+"""PPO's fused loss and GAE on a GPU against their plain forms."""
+
+import pytest
+import torch
+
+from megastep.agents.algorithms import returns
+from megastep.agents.algorithms.ppo_loss import Coefficients, plain_loss, ppo_loss
+from megastep.arrdict import arrdict
+
+T, M = 7, 133
+
+
+def case(device, value_clip, auxiliary):
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(spread=1.0):
+        return (spread * torch.randn(T, M, generator=generator)).to(device)
+
+    batch = arrdict(
+        logprobs=draw(0.3) - 1,
+        advantages=draw(),
+        targets=draw(3.0),
+        old_value=draw(3.0),
+        valid=draw() > -1,
+    )
+    leaves = [draw(0.3) - 1, draw() + 2, draw(3.0), draw() if auxiliary else None]
+    leaves[0][~batch.valid] = torch.nan  # whatever is invalid does not count
+    leaves = [None if leaf is None else leaf.requires_grad_() for leaf in leaves]
+    settings = Coefficients(0.2, value_clip, 0.5, 0.01, 0.7)
+    return leaves, batch, torch.tensor(2.5, device=device), settings
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("value_clip", [None, 0.3])
+@pytest.mark.parametrize("auxiliary", [False, True])
+def test_fused_loss_matches_plain(value_clip, auxiliary):
+    results = []
+    for device, function in (("cuda", ppo_loss), ("cpu", plain_loss)):
+        leaves, batch, scale, settings = case(device, value_clip, auxiliary)
+        loss, metrics = function(*leaves, batch, scale, settings)
+        inputs = [leaf for leaf in leaves if leaf is not None]
+        gradients = torch.autograd.grad(3 * loss, inputs)
+        results.append([loss, *metrics.values(), *gradients])
+        names = ["loss", *metrics, *range(len(inputs))]
+    for name, fused, plain in zip(names, *results, strict=True):
+        close = dict(rtol=1e-4, atol=1e-6, msg=lambda text, name=name: f"{name}: {text}")
+        torch.testing.assert_close(fused.detach().cpu(), plain.detach(), **close)
+
+
+@pytest.mark.cuda
+def test_without_valid_steps_nothing_is_learned():
+    leaves, batch, scale, settings = case("cuda", None, True)
+    batch["valid"] = torch.zeros_like(batch.valid)
+    loss, metrics = ppo_loss(*leaves, batch, scale, settings)
+    assert not loss and not any(metrics.values())
+    assert not any(gradient.any() for gradient in torch.autograd.grad(loss, leaves))
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n_steps, n_lanes", [(1, 1), (32, 1000), (5, 64)])
+def test_gae_on_a_gpu_matches_the_cpu(n_steps, n_lanes):
+    torch.manual_seed(0)
+    value, reward = torch.randn(2, n_steps, n_lanes)
+    flags = [torch.rand(n_steps, n_lanes) < 0.2 for _ in range(3)]
+    inputs = [reward, value, torch.randn(n_lanes), *flags]
+    plain = returns.gae(*inputs, gamma=0.9, lambda_=0.8)
+    fused = returns.gae(*(leaf.cuda() for leaf in inputs), gamma=0.9, lambda_=0.8)
+    for name, leaf in plain.items():
+        torch.testing.assert_close(fused[name].cpu(), leaf, rtol=1e-5, atol=1e-5)

@@ -1,0 +1,162 @@
+"""The fused forms of layers on a GPU against their plain forms in float32."""
+
+import pytest
+import torch
+from torch import nn
+
+from megastep import spaces
+from megastep.agents.networks import heads, layers
+from megastep.agents.networks.precision import ComputeDtype, cast
+from megastep.arrdict import arrdict
+
+BF16 = dict(rtol=0, atol=2e-2)  # times the largest number: 8 bits, and sums of them
+
+
+def assert_close(fused, plain, **tolerance):
+    scale = plain.abs().max().item() or 1.0
+    tolerance = {**BF16, **tolerance}
+    tolerance["atol"] *= scale
+    torch.testing.assert_close(fused.float().cpu(), plain.float().cpu(), **tolerance)
+
+
+def test_weights_are_cast_once_per_context():
+    weight = nn.Parameter(torch.randn(7, 3))
+    assert cast(weight, torch.bfloat16) is not cast(weight, torch.bfloat16)
+    with ComputeDtype("cpu", torch.bfloat16), ComputeDtype("cpu", torch.bfloat16):
+        first = cast(weight, torch.bfloat16)
+        assert cast(weight, torch.bfloat16) is first
+    assert torch.equal(first, weight.bfloat16()) and not first.requires_grad
+    with torch.no_grad():
+        weight.add_(1.0)
+    with ComputeDtype("cpu", torch.bfloat16):
+        assert torch.equal(cast(weight, torch.bfloat16), weight.bfloat16())
+        padded = cast(weight, torch.bfloat16, multiple=8)
+    assert padded.shape == (8, 3) and not padded[7].any()
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("activation", [None, torch.relu])
+@pytest.mark.parametrize(
+    "n_rows, n_in, n_out", [(1, 8, 1), (100, 64, 7), (999, 264, 256), (3, 8, 52)]
+)
+def test_linear_matches_float32(activation, n_rows, n_in, n_out):
+    torch.manual_seed(0)
+    layer = nn.Linear(n_in, n_out).cuda()
+    x = torch.randn(2, n_rows, n_in, device="cuda").bfloat16().float().requires_grad_()
+    d = torch.randn(2, n_rows, n_out, device="cuda").bfloat16().float()
+    results = []
+    for is_fused in (True, False):
+        with torch.autocast("cuda", torch.bfloat16, enabled=is_fused):
+            y = layers.linear(x, layer, activation)
+        assert y.dtype == (torch.bfloat16 if is_fused else torch.float32)
+        assert ("_Linear" in type(y.grad_fn).__name__) == is_fused
+        # a unit near 0 may be on either side of the ReLU's kink
+        kept = (y.abs() > 0.05) if activation else torch.ones_like(y, dtype=torch.bool)
+        results.append((y.detach(), kept))
+    is_kept = results[0][1] & results[1][1]
+    gradients = []
+    for is_fused in (True, False):
+        with torch.autocast("cuda", torch.bfloat16, enabled=is_fused):
+            y = layers.linear(x, layer, activation)
+        loss = (y * d.to(y.dtype) * is_kept).float().sum()
+        gradients.append(torch.autograd.grad(loss, [x, *layer.parameters()]))
+    assert_close(results[0][0], results[1][0])
+    for fused, plain in zip(*gradients, strict=True):
+        assert fused.dtype == torch.float32
+        assert_close(fused, plain)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n_rows", [1, 31, 4096, 100_001])
+@pytest.mark.parametrize("n_columns", [8, 56, 256, 264, 1024])
+def test_bias_gradient_is_the_sum_of_rows_and_repeatable(n_rows, n_columns):
+    torch.manual_seed(0)
+    d = torch.randn(n_rows, n_columns, device="cuda").bfloat16()
+    y = torch.randn_like(d).relu()
+    masked, sums = layers.kernels.bias_gradient(d, y)
+    assert torch.equal(masked, d.masked_fill(y <= 0, 0.0))
+    expected = masked.double().sum(0).float()
+    torch.testing.assert_close(sums, expected, rtol=1e-4, atol=1e-5 * n_rows**0.5 + 1e-3)
+    assert torch.equal(layers.kernels.bias_gradient(d, y)[1], sums)
+    same, sums = layers.kernels.bias_gradient(d)
+    assert same is d
+    expected = d.double().sum(0).float()
+    torch.testing.assert_close(sums, expected, rtol=1e-4, atol=1e-5 * n_rows**0.5 + 1e-3)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("cameras", [1, 3])
+@pytest.mark.parametrize("lead", [(5,), (3, 40)])
+def test_intake_has_the_same_bits_as_the_plain_form(cameras, lead):
+    torch.manual_seed(0)
+    space = arrdict(
+        rgb=spaces.MultiImage(1, 3, cameras, 16),
+        near=spaces.MultiVector(2, 3),
+        imu=spaces.MultiVector(1, 3),
+    )
+    intake = heads.intake(space, 32).cuda()
+    for norm in intake.norms:
+        norm.mean.normal_()
+        norm.scale.uniform_(0.1, 2.0)
+    obs = arrdict(
+        rgb=torch.rand(*lead, 1, 3, cameras, 16, device="cuda").half(),
+        near=torch.randn(*lead, 2, 3, device="cuda"),
+        imu=torch.randn(*lead, 1, 3, device="cuda").half(),
+    )
+    lanes = torch.tensor([3, 0, 3], device="cuda") if len(lead) == 2 else None
+    with torch.autocast("cuda", torch.bfloat16):
+        fused = intake.encode(obs, lanes)
+        intake.is_flat = False
+        plain = intake.encode(obs, lanes)
+    assert fused.dtype == torch.bfloat16 and torch.equal(fused, plain)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("bf16", [False, True])
+@pytest.mark.parametrize("shape", [(1, 7), (3, 2), (1, 32)])
+def test_acting_matches_the_plain_form(bf16, shape):
+    torch.manual_seed(0)
+    output = heads.output(spaces.MultiDiscrete(*shape), 256).cuda()
+    nn.init.normal_(output.linear.weight, std=0.1)
+    x = torch.randn(1000, 256, device="cuda").bfloat16().float()
+    for sample in (True, False):
+        generators = [torch.Generator("cuda").manual_seed(3) for _ in range(2)]
+        with torch.autocast("cuda", torch.bfloat16, enabled=bf16), torch.no_grad():
+            fused = output.act(x, sample, generators[0])
+            plain = super(type(output), output).act(x, sample, generators[1])
+        torch.testing.assert_close(fused[0], plain[0], rtol=0, atol=6e-2 if bf16 else 1e-2)
+        same = (fused[1] == plain[1]).all(-1)
+        assert same.float().mean() > (0.97 if bf16 else 0.995)
+        torch.testing.assert_close(fused[2], output.logprob(fused[0], fused[1]))
+
+
+@pytest.mark.cuda
+def test_actions_follow_their_probabilities():
+    output = heads.output(spaces.MultiDiscrete(1, 4), 8).cuda()
+    nn.init.normal_(output.linear.weight)
+    x = torch.randn(1, 8, device="cuda").expand(200_000, -1)
+    with torch.no_grad():
+        logits, actions, _ = output.act(x, True, torch.Generator("cuda").manual_seed(1))
+    shares = actions.flatten().bincount(minlength=4) / len(x)
+    torch.testing.assert_close(shares, logits[0, 0].exp(), rtol=0, atol=5e-3)
+
+
+@pytest.mark.cuda
+def test_terms_match_the_plain_form():
+    torch.manual_seed(0)
+    output = heads.output(spaces.MultiDiscrete(2, 7), 8)
+    logits = torch.randn(9, 33, 2, 7).log_softmax(-1).requires_grad_()
+    actions = torch.randint(7, (9, 33, 2))
+    plain = output.logprob(logits, actions), output.entropy(logits)
+    on_gpu = logits.detach().cuda().requires_grad_()
+    fused = output.terms(on_gpu, actions.cuda())
+    weights = torch.randn(2, 9, 33)
+    for one, other in zip(fused, plain, strict=True):
+        torch.testing.assert_close(one.cpu(), other)
+    losses = [
+        sum((w.to(x.device) * x).sum() for w, x in zip(weights, terms)) for terms in (fused, plain)
+    ]
+    (d_fused,), (d_plain,) = (
+        torch.autograd.grad(loss, leaf) for loss, leaf in zip(losses, (on_gpu, logits))
+    )
+    torch.testing.assert_close(d_fused.cpu(), d_plain)
