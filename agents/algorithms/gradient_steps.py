@@ -96,10 +96,10 @@ class GradientSteps:
         Returns:
             () bool, whether the step was taken.
         """
-        grad_norm = torch.nn.utils.clip_grad_norm_(self.optimizer.parameters, self.max_grad_norm)
+        grad_norm = self.optimizer.grad_norm()
         is_finite = grad_norm.isfinite() & self._is_finite
         is_taken = is_finite & is_enabled & self._has_valid
-        self.optimizer.step(is_taken)
+        self.optimizer.step(is_taken, grad_norm, self.max_grad_norm)
         self._metrics["grad_norm"] = grad_norm
         row = torch.stack([*self._metrics.values()])
         row = row.masked_fill(~is_taken, 0.0)

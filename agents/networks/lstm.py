@@ -223,6 +223,8 @@ class LSTM(nn.Module):
             ValueError: if shapes or devices do not fit.
         """
         check_shapes(x, reset, state, ("output", "cell"))
+        if len(x) == 1 and x.is_cuda and not torch.is_grad_enabled():
+            return self._act(x, reset, state)
         dtype = compute_dtype(self.recurrent.weight) if x.is_cuda else torch.float32
         # autocast would choose its own dtypes inside
         with torch.autocast(x.device.type, enabled=False):
@@ -233,6 +235,22 @@ class LSTM(nn.Module):
                 *(state["output"].float(), state["cell"].float()),
             )
         return outputs, arrdict(output=outputs[-1].float(), cell=cell)
+
+    def _act(self, x, reset, state):
+        """Does the same as `forward` for one step on a GPU, without a gradient."""
+        dtype = compute_dtype(self.recurrent.weight)
+        parameters = self.input.weight, self.input.bias, self.recurrent.weight
+        input_weight, bias, weight = (cast(leaf, dtype) for leaf in parameters)
+        last_output, last_cell = (aligned(state[key].float()) for key in ("output", "cell"))
+        reset = reset[0].contiguous().bool()
+        output = torch.empty_like(last_output, dtype=dtype)
+        hidden, after = torch.empty_like(output), map(torch.empty_like, (last_output, last_cell))
+        after = arrdict(zip(("output", "cell"), after))
+        kernels.start(reset, last_output, None, hidden, None)
+        with torch.autocast(x.device.type, enabled=False):
+            gates = F.linear(x[0].to(dtype), input_weight, bias).addmm_(hidden, weight.T)
+        kernels.act(gates, reset, last_cell, output, after.output, after.cell)
+        return output[None], after
 
     def step(
         self, x: torch.Tensor, reset: torch.Tensor, state: arrdict

@@ -42,19 +42,18 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
     rollout.state[:] = state
     features = []
     with policy.compute_dtype():
+        seen = rollout.store_world(0, world)
         for t in range(rollout.n_steps):
-            decision, state = policy(rollout.store_world(t, world), state)
-            rollout.store_decision(t, decision)
+            decision, state = policy(seen, state)
             if rollout.values is not None:
                 features.append(decision["features"])
             with torch.autocast(rollout.reward.device.type, enabled=False):
                 world = env.step(arrdict(actions=rollout.scatter_actions(decision["actions"])))
                 world = rollout.select_lanes(world)
-            rollout.store_transition(t, world)
+            seen = rollout.store_step(t, decision, world)
 
-        last = rollout.store_world(rollout.n_steps, world)
         if rollout.values is not None:
-            features.append(policy(last, state, sample=False)[0]["features"])
+            features.append(policy(seen, state, sample=False)[0]["features"])
             rollout.values[:] = policy.value(torch.stack(features), rollout.privileged)
     # Clear a non-finite hidden state, which would otherwise last until the lane's episode ends.
     state = state.map(lambda leaf: leaf.nan_to_num(0.0, 0.0, 0.0))

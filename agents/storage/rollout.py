@@ -12,6 +12,7 @@ import torch
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
+from megastep.agents.storage.copies import copy_all
 from megastep.arrdict import arrdict, clone
 from megastep.dotdict import mapping
 from megastep.types import Env, Space, Tree, n_lanes, optional
@@ -101,26 +102,38 @@ class Rollout:
 
     def store_world(self, t: int, world: arrdict) -> arrdict:
         """Stores the world at time t. Returns it as it was stored, for the policy to act on."""
-        self.obs[t] = world["obs"]
-        self.starts[t] = world["reset"]
-        if "learns" in world:
-            self.learns[t] = world["learns"]
-        if self.privileged is not None:
-            self.privileged[t] = world["privileged"]
+        copy_all(self._of_world(t, world))
         return self.world(t)
-
-    def store_decision(self, t: int, decision: arrdict) -> None:
-        """Stores the actions of time t, and their log-probabilities if the decision has any."""
-        self.actions[t] = decision["actions"]
-        if "logprobs" in decision:
-            self.logprobs[t] = decision["logprobs"]
 
     def store_transition(self, t: int, world: arrdict) -> None:
         """Stores reward, end of episode and metrics of the world that followed time t."""
-        self.reward[t] = world["reward"]
-        self.terminal[t], self.truncated[t] = world["terminal"], world["truncated"]
-        for name, rows in self.metrics.items():
-            rows[t] = world["metrics"][name]
+        copy_all(self._of_transition(t, world))
+
+    def store_step(self, t: int, decision: arrdict, world: arrdict) -> arrdict:
+        """Stores the actions of time t, their log-probabilities if the decision has any, and the
+        world that followed, at time t + 1. Returns that as it was stored.
+        """
+        pairs = [*self._of_transition(t, world), *self._of_world(t + 1, world)]
+        pairs += _pairs(self.actions, t, decision["actions"])
+        if "logprobs" in decision:
+            pairs.append((self.logprobs[t], decision["logprobs"]))
+        copy_all(pairs)
+        return self.world(t + 1)
+
+    def _of_world(self, t, world):
+        """Returns pairs of what is stored of the world at time t."""
+        pairs = [*_pairs(self.obs, t, world["obs"]), (self.starts[t], world["reset"])]
+        if "learns" in world:
+            pairs.append((self.learns[t], world["learns"]))
+        if self.privileged is not None:
+            pairs += _pairs(self.privileged, t, world["privileged"])
+        return pairs
+
+    def _of_transition(self, t, world):
+        """Returns pairs of what is stored at time t of the world that followed."""
+        names = "reward", "terminal", "truncated"
+        metrics = [(rows[t], world["metrics"][name]) for name, rows in self.metrics.items()]
+        return [*((getattr(self, name)[t], world[name]) for name in names), *metrics]
 
     def copy_(self, other: "Rollout") -> None:
         """Copies every tensor of another rollout of the same shape."""
@@ -251,6 +264,12 @@ def copy_tree(target: Tree, source: Tree) -> None:
 def without_last(tree: Tree | None) -> Tree | None:
     """Returns the first T of T+1 rows, those with actions, of a tree of tensors or of None."""
     return None if tree is None else mapping(lambda leaf: leaf[:-1])(tree)
+
+
+def _pairs(rows, t, tree):
+    """Returns pairs of the leaves of row t and those of a tree."""
+    targets, sources = spaces.leaves(rows), spaces.leaves(tree)
+    return [(target[t], sources[path]) for path, target in targets.items()]
 
 
 def _zeros(space, lead, device, dtype=torch.float32):

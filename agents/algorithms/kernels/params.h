@@ -41,3 +41,34 @@ struct PpoLossParams {
     float entropy_coef;
     float auxiliary_coef;
 };
+
+// A parameter with its gradient and Adam's running means.
+struct AdamRowParams {
+    float* parameter;
+    const float* gradient;
+    float* mean;
+    float* square;
+    unsigned int n;
+    unsigned int first_block;  // of the launch that handles it
+    float lr_factor;
+    float weight_decay;
+};
+
+struct SquaredNormParams {
+    AdamRowParams rows[48];
+    float* sums;  // (n_blocks)
+    int n_rows;
+};
+
+struct AdamParams {
+    AdamRowParams rows[48];
+    const float* lr;                // ()
+    const float* n_steps;           // (), this one included
+    const float* grad_norm;         // (); null: gradients are not clipped
+    const unsigned char* is_taken;  // (), false: nothing changes
+    int n_rows;
+    float max_norm;
+    float beta1;
+    float beta2;
+    float eps;
+};

@@ -22,20 +22,30 @@ DEVICE float rounded(float x) {
 template <class T>
 DEVICE float score_of(const CategoricalActParams& p, long long policy, long long row, int agent,
                       int lane) {
+    constexpr int AT_ONCE = 8;  // choices, so that their loads do not wait for each other
     float score = __int_as_float(0xff800000);
-    for (int k = 0; k < p.n_choices; k++) {
-        long long choice = (policy * p.n_agents + agent) * p.n_choices + k;
-        float sum = 0.f;
+    long long first_choice = (policy * p.n_agents + agent) * p.n_choices;
+    for (int start = 0; start < p.n_choices; start += AT_ONCE) {
+        float sums[AT_ONCE] = {};
         for (int first = 4 * lane; first < p.width; first += 4 * WARP) {
-            float features[4], weights[4];
+            float features[4];
             read<T>(features, p.features, row * p.width + first);
-            read<T>(weights, p.weight, choice * p.width + first);
-            for (int n = 0; n < 4; n++)
-                sum += features[n] * weights[n];
+#pragma unroll
+            for (int k = 0; k < AT_ONCE; k++) {
+                float weights[4];
+                long long choice = first_choice + min(start + k, p.n_choices - 1);
+                read<T>(weights, p.weight, choice * p.width + first);
+#pragma unroll
+                for (int n = 0; n < 4; n++)
+                    sums[k] += features[n] * weights[n];
+            }
         }
-        sum = sum_of_warp(sum) + to_float(((const T*)p.bias)[choice]);
-        if (lane == k)
-            score = rounded<T>(sum);
+#pragma unroll
+        for (int k = 0; k < AT_ONCE; k++) {
+            float sum = sum_of_warp(sums[k]);
+            if (lane == start + k && lane < p.n_choices)
+                score = rounded<T>(sum + to_float(((const T*)p.bias)[first_choice + lane]));
+        }
     }
     return score;
 }

@@ -9,12 +9,9 @@ import torch
 from megastep.agents.networks.kernels.program import CORES, DTYPES
 from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
 
-MAX_LEAVES = 4
-MAX_CHOICES = 32
+MAX_LEAVES = CORES.constants["MAX_LEAVES"]
+MAX_CHOICES = CORES.constants["MAX_CHOICES"]
 _WORD = 16  # bytes that a thread reads at once
-_NO_LEAF = CORES.params.IntakeLeafParams(
-    values=0, mean=0, scale=0, n_features=0, group=1, is_half=0
-)
 
 
 def normalise(
@@ -50,12 +47,11 @@ def normalise(
         )
         for leaf, mean, scale in zip(leaves, means, scales, strict=True)
     ]
-    packed += [_NO_LEAF] * (MAX_LEAVES - len(packed))
     _launch(
         f"normalise_{DTYPES[dtype]}",
         features,
-        features.numel() // 4,
-        **{f"leaf{i}": leaf for i, leaf in enumerate(packed)},
+        n_columns // 4 * -(-n_steps * n_selected // CORES.constants["NORMALISED_ROWS"]),
+        leaves=b"".join(packed),
         lanes=lanes,
         features=features,
         n_steps=n_steps,

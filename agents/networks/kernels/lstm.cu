@@ -13,13 +13,13 @@ struct LstmStep {
     float input[N], forget[N], candidate[N], output[N], before[N], after[N], tanh_after[N];
 };
 
+// Computes a step whose cell `s.before` is set.
 template <class T, int N, class Params>
 DEVICE void activate(LstmStep<N>& s, const Params& p, const Place& place) {
     read<T>(s.input, p.gates, place.gate);
     read<T>(s.forget, p.gates, place.gate + p.width);
     read<T>(s.candidate, p.gates, place.gate + 2 * p.width);
     read<T>(s.output, p.gates, place.gate + 3 * p.width);
-    read<float>(s.before, p.cell, place.unit);
     for (int n = 0; n < N; n++) {
         s.input[n] = sigmoid(s.input[n]);
         s.forget[n] = sigmoid(s.forget[n]);
@@ -36,14 +36,40 @@ struct LstmStart {
     template <class T, int N>
     DEVICE void run(const LstmStartParams& p, const Place& place) {
         float hidden[N], cell[N];
+        bool resets = p.reset[place.lane];
         read<float>(hidden, p.last_output, place.unit);
-        read<float>(cell, p.last_cell, place.unit);
-        if (p.reset[place.lane]) {
+        if (resets)
             clear(hidden);
-            clear(cell);
-        }
         write<T>(p.hidden, place.unit, hidden);
+        if (!p.last_cell)
+            return;
+        read<float>(cell, p.last_cell, place.unit);
+        if (resets)
+            clear(cell);
         write<float>(p.cell, place.unit, cell);
+    }
+};
+
+// One step without a gradient.
+struct LstmAct {
+    static constexpr int N_GATES = 4;
+
+    template <class T, int N>
+    DEVICE void run(const LstmActParams& p, const Place& place) {
+        LstmStep<N> s;
+        read<float>(s.before, p.last_cell, place.unit);
+        if (p.reset[place.lane])
+            clear(s.before);
+        activate<T>(s, p, place);
+        T output[N];
+        float next_output[N];
+        for (int n = 0; n < N; n++) {
+            assign(output[n], s.output[n] * s.tanh_after[n]);
+            next_output[n] = to_float(output[n]);
+        }
+        write<T>(p.output, place.unit, next_output);
+        write<float>(p.next_output, place.unit, next_output);
+        write<float>(p.next_cell, place.unit, s.after);
     }
 };
 
@@ -54,6 +80,7 @@ struct LstmForward {
     DEVICE void run(const LstmForwardParams& p, const Place& place) {
         bool next_resets = p.next_reset && p.next_reset[place.lane];
         LstmStep<N> s;
+        read<float>(s.before, p.cell, place.unit);
         activate<T>(s, p, place);
         float output[N];
         for (int n = 0; n < N; n++)
@@ -84,6 +111,7 @@ struct LstmBackward {
             next_resets = p.next_reset[place.lane];
         }
         LstmStep<N> s;
+        read<float>(s.before, p.cell, place.unit);
         activate<T>(s, p, place);
         if (next_resets) {
             clear(d_hidden);
@@ -109,6 +137,8 @@ struct LstmBackward {
 
 KERNEL lstm_start_float32(LstmStartParams p) { run<LstmStart, float>(p); }
 KERNEL lstm_start_bfloat16(LstmStartParams p) { run<LstmStart, Bfloat16>(p); }
+KERNEL lstm_act_float32(LstmActParams p) { run<LstmAct, float>(p); }
+KERNEL lstm_act_bfloat16(LstmActParams p) { run<LstmAct, Bfloat16>(p); }
 KERNEL lstm_forward_float32(LstmForwardParams p) { run<LstmForward, float>(p); }
 KERNEL lstm_forward_bfloat16(LstmForwardParams p) { run<LstmForward, Bfloat16>(p); }
 KERNEL lstm_backward_float32(LstmBackwardParams p) { run<LstmBackward, float>(p); }

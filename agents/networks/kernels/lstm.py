@@ -1,5 +1,5 @@
 """The LSTM on a GPU between its matrix products: one kernel before the first step, one per step,
-and one per backward step.
+and one per backward step; another one per step when acting.
 
 B lanes, W units. All tensors are contiguous; if W is a multiple of 4, they start at a multiple of
 four elements. Gates are before activation. Gates, outputs, hidden states and their gradients are in
@@ -15,19 +15,43 @@ def start(reset, last_output, last_cell, hidden, cell):
     Args:
         reset: (B,) bool, of the first step.
         last_output: (B, W) float32.
-        last_cell: (B, W) float32.
+        last_cell: (B, W) float32; None if the cell is not wanted.
         hidden: (B, W), written.
-        cell: (B, W), written.
+        cell: (B, W), written; None if it is not wanted.
     """
     run(
         "lstm_start",
         hidden.dtype,
-        cell,
+        hidden,
         reset=reset,
         last_output=last_output,
         last_cell=last_cell,
         hidden=hidden,
         cell=cell,
+    )
+
+
+def act(gates, reset, last_cell, output, next_output, next_cell):
+    """Computes one step without a gradient. The recurrent input was `start`'s, without a cell.
+
+    Args:
+        gates: (B, 4 W).
+        reset: (B,) bool.
+        last_cell: (B, W) float32, before the reset.
+        output: (B, W), written.
+        next_output: (B, W) float32, written: the same numbers.
+        next_cell: (B, W), written.
+    """
+    run(
+        "lstm_act",
+        gates.dtype,
+        last_cell,
+        gates=gates,
+        reset=reset,
+        last_cell=last_cell,
+        output=output,
+        next_output=next_output,
+        next_cell=next_cell,
     )
 
 

@@ -16,6 +16,7 @@ from megastep.kernels.build.program import Program
 PROGRAM = Program(Path(__file__).parent / "clusters", CUDA_FLAGS)
 WIDTH = 256
 MIN_STEPS = 2  # for one step, loading the weights takes longer than the products
+MAX_STEPS = PROGRAM.constants["MAX_STEPS"]
 _THREADS = PROGRAM.constants["SEQUENCE_THREADS"]
 _LANES = PROGRAM.constants["SEQUENCE_LANES"]
 _RANKS = WIDTH // PROGRAM.constants["BLOCK_UNITS"]  # blocks of a cluster
@@ -27,7 +28,7 @@ def is_supported(x: torch.Tensor) -> bool:
         x.is_cuda
         and x.dtype == torch.bfloat16
         and x.shape[-1] == WIDTH
-        and len(x) >= MIN_STEPS
+        and MIN_STEPS <= len(x) <= MAX_STEPS
         and torch.cuda.get_device_capability(x.device) >= (9, 0)
     )
 

@@ -10,9 +10,21 @@
 struct LstmStartParams {
     const unsigned char* reset;  // (B) at the first step
     const float* last_output;    // (B, W)
-    const float* last_cell;      // (B, W)
+    const float* last_cell;      // (B, W); null: `cell` is not wanted
     void* hidden;                // (B, W) compute
     float* cell;                 // (B, W)
+    int n_lanes;
+    int width;
+    int n_units;  // units per thread
+};
+
+struct LstmActParams {
+    const void* gates;           // (B, 4 W) compute
+    const unsigned char* reset;  // (B)
+    const float* last_cell;      // (B, W)
+    void* output;                // (B, W) compute
+    float* next_output;          // (B, W), the same numbers
+    float* next_cell;            // (B, W)
     int n_lanes;
     int width;
     int n_units;  // units per thread
@@ -89,10 +101,7 @@ struct IntakeLeafParams {
 };
 
 struct NormaliseParams {
-    IntakeLeafParams leaf0;
-    IntakeLeafParams leaf1;
-    IntakeLeafParams leaf2;
-    IntakeLeafParams leaf3;
+    IntakeLeafParams leaves[4];
     const long long* lanes;  // (P, M), the lanes to read; null: all, M = B
     void* features;          // (P, T, M, n_columns) compute
     int n_steps;

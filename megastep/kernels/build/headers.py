@@ -2,7 +2,8 @@
 
 Three kinds of declarations are recognised:
 
-* structs whose names end in ``Params``, one field per line: ``const float* positions;``
+* structs whose names end in ``Params``, one field per line: ``const float* positions;``, or an
+  array of such structs: ``LeafParams leaves[4];``
 * constants in files called ``constants.h``, one per line: ``constexpr int MAX_RES = 1024;``
 * operations: ``KERNEL render(RenderParams p)``
 """
@@ -21,7 +22,7 @@ OPERATION = re.compile(
     r"KERNEL\s+(?:BOUNDS\(\d+\)\s+)?(\w+)\((?:const\s+)?(\w+Params)\s*&?\s*\w+\)"
 )
 STRUCT = re.compile(r"^struct (\w+Params) \{(.*?)^\};", re.M | re.S)
-FIELD = re.compile(r"([\w ]+?)\s*(\*?)\s+(\w+)")
+FIELD = re.compile(r"([\w ]+?)\s*(\*?)\s+(\w+)(?:\[(\d+)\])?")
 
 Fields = list[tuple[str, str]]  # (name, format of the module struct)
 
@@ -45,10 +46,15 @@ def struct_fields(sources: Mapping[str, str]) -> dict[str, Fields]:
 def _field(line, formats, header):
     match = FIELD.fullmatch(line.strip())
     kind = match and match[1].replace("const", "").strip()
-    if not match or not (match[2] or kind in formats):
+    is_array = match and match[4]
+    if is_array and not match[2] and formats.get(kind, "").endswith("s"):
+        size = int(formats[kind][2:-1])
+        return match[3], f"0P{size * int(match[4])}s"
+    if not match or is_array or not (match[2] or kind in formats):
         raise ValueError(
             f"{header}: cannot pack the field '{' '.join(line.split())}'. A field is a pointer, "
-            f"an int, an unsigned int, a float or a struct ...Params declared above."
+            f"an int, an unsigned int, a float, or a struct ...Params declared above or an array "
+            f"of them."
         )
     return match[3], "P" if match[2] else formats[kind]
 
@@ -63,7 +69,8 @@ def packer(fields: Fields) -> struct.Struct:
 def builder(name: str, fields: Fields) -> Callable[..., bytes]:
     """Returns a function ``name`` of keyword arguments, one per field, that packs the struct.
 
-    All fields must be given: Python itself names one that is missing or misspelt.
+    All fields must be given: Python itself names one that is missing or misspelt. An array is the
+    joined bytes of its structs; those that are missing at its end are zeros.
     """
     names = ", ".join(field for field, _ in fields)
     function = eval(f"lambda *, {names}: pack({names})", {"pack": packer(fields).pack})

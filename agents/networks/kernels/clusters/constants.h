@@ -3,5 +3,6 @@
 constexpr int SEQUENCE_THREADS = 256;  // threads of a block
 constexpr int SEQUENCE_LANES = 32;     // lanes of a cluster
 constexpr int BLOCK_UNITS = 64;        // units of a block
-constexpr int FORWARD_MEMORY = 72192;  // bytes of shared memory of a block, for 256 units
-constexpr int BACKWARD_MEMORY = 108032;
+constexpr int MAX_STEPS = 512;
+constexpr int FORWARD_MEMORY = 108048;  // bytes of shared memory of a block, for 256 units
+constexpr int BACKWARD_MEMORY = 192016;

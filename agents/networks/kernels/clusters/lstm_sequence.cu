@@ -3,9 +3,10 @@
 //
 // A cluster of W / 64 blocks runs 32 lanes. A block computes the four gates of 64 units, with its
 // share of the weights as the left matrix of each product and the lanes as columns of the right
-// one. After a step the blocks of a cluster exchange, through each other's shared memory, the
-// outputs of their units (forward), or their parts of the sums over all gates (backward, added in
-// a fixed order).
+// one. After a step the blocks of a cluster send each other, from shared memory to shared memory,
+// the outputs of their units (forward), or their parts of the sums over all gates (backward, added
+// in a fixed order). A block sends what step t + 1 needs only after all have sent what step t needed,
+// so two buffers are enough.
 //
 // Of the 16 x 8 results of a product, a thread holds rows g and g + 8 and columns 2 q and 2 q + 1,
 // with g = lane / 4 and q = lane % 4 of the warp. Rows are laid out so that these are the four gates
@@ -38,18 +39,19 @@ DEVICE Thread this_thread() {
     return {i, i >> 5, lane, lane >> 2, lane & 3, 8 * (i >> 5) + (lane >> 2)};
 }
 
-// Adds the product of this warp's weights and the rows of `right`, one per lane, to `sums`.
-template <int K>
+// Adds the product of this warp's weights and of `right` to `sums`. `right` has a row of K numbers
+// per lane, in pieces of N numbers: first the first piece of each row.
+template <int K, int N>
 DEVICE void multiply(float (&sums)[2][COLUMNS][4], const unsigned int (&left)[2][K / 16][4],
                      const Bits* right, const Thread& me) {
-    const Bits* row = right + (8 * (me.warp_lane >> 4) + (me.warp_lane & 7)) * (K + PAD) +
+    const Bits* row = right + (8 * (me.warp_lane >> 4) + (me.warp_lane & 7)) * (N + PAD) +
                       8 * (me.warp_lane >> 3 & 1);
 #pragma unroll
     for (int k = 0; k < K / 16; k++)
 #pragma unroll
         for (int j = 0; j < COLUMNS; j += 2) {
             unsigned int b[4];
-            load_matrices(b, row + 8 * j * (K + PAD) + 16 * k);
+            load_matrices(b, row + 16 * k / N * LANES * (N + PAD) + 8 * j * (N + PAD) + 16 * k % N);
 #pragma unroll
             for (int tile = 0; tile < 2; tile++) {
                 multiply_add(sums[tile][j], left[tile][k], b[0], b[1]);
@@ -65,28 +67,62 @@ DEVICE long long saved_at(long long policy, int t, int n_steps, int cluster, int
     return block * n * THREADS + thread;
 }
 
+// One bit per lane of the cluster, for each step: whether the lane is reset before it.
+DEVICE void read_resets(unsigned int* words, const unsigned char* reset, int n_steps, int n_lanes,
+                        int first_lane, const Thread& me) {
+    int lane = min(first_lane + me.warp_lane, n_lanes - 1);
+    for (int t = me.warp; t < n_steps; t += THREADS / 32) {
+        unsigned int word = __ballot_sync(~0u, reset[(long long)t * n_lanes + lane]);
+        if (!me.warp_lane)
+            words[t] = word;
+    }
+}
+
 // ---- Forward ----
+
+constexpr int STAGES = 3;  // steps whose gates are in shared memory
 
 template <int W>
 struct ForwardMemory {
-    Bits hidden[2][LANES][W + PAD];
-    Bits gates[2][LANES][GATES + PAD];
-    Bits output[LANES][UNITS + PAD];
+    static constexpr int RANKS = W / UNITS;
+    Bits hidden[2][RANKS][LANES][UNITS + PAD];  // by the block that sends it
+    Bits next_hidden[2][LANES][UNITS + PAD];    // to send
+    Bits output[2][LANES][UNITS + PAD];
+    Bits gates[STAGES][LANES][GATES + PAD];
+    Arrivals arrivals[2];
+    unsigned int resets[MAX_STEPS];
 };
 
 template <int W>
 DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     constexpr int RANKS = W / UNITS;
+    constexpr int SENT = sizeof(ForwardMemory<W>::next_hidden) / 2;
     ForwardMemory<W>& memory = *(ForwardMemory<W>*)shared_memory;
     Thread me = this_thread();
     int rank = cluster_rank(), cluster = blockIdx.x / RANKS, first_lane = LANES * cluster;
-    int n_lanes = p.n_lanes, last_lane = n_lanes - 1;
+    int n_steps = p.n_steps, n_lanes = p.n_lanes, last_lane = n_lanes - 1;
     long long policy = blockIdx.y, lanes = policy * n_lanes;
     int unit = rank * UNITS + me.unit;
-    const Bits* gates = (const Bits*)p.gates + policy * p.n_steps * n_lanes * (4 * W);
-    const unsigned char* reset = p.reset + policy * p.n_steps * n_lanes;
-    Bits* outputs = (Bits*)p.outputs + policy * p.n_steps * n_lanes * W;
-    Bits* hiddens = (Bits*)p.hiddens + policy * p.n_steps * n_lanes * W;
+    const Bits* gates = (const Bits*)p.gates + policy * n_steps * n_lanes * (4 * W);
+    const unsigned char* reset = p.reset + policy * n_steps * n_lanes;
+    Bits* outputs = (Bits*)p.outputs + policy * n_steps * n_lanes * W;
+    Bits* hiddens = (Bits*)p.hiddens + policy * n_steps * n_lanes * W;
+
+    auto begin_gates = [&](int t) {
+        if (t < n_steps) {
+#pragma unroll
+            for (int n = 0; n < 4; n++) {
+                int i = me.index + n * THREADS, lane = i >> 5, gate = i >> 3 & 3;
+                int part = 8 * (i & 7);
+                long long row = (long long)t * n_lanes + min(first_lane + lane, last_lane);
+                begin_copy(&memory.gates[t % STAGES][lane][gate * UNITS + part],
+                           gates + row * (4 * W) + gate * W + rank * UNITS + part);
+            }
+        }
+        end_group();
+    };
+    begin_gates(0);
+    begin_gates(1);
 
     // Rows of tile 0: input gates, then forget gates; of tile 1: candidates, then output gates
     unsigned int weights[2][W / 16][4];
@@ -108,7 +144,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
         int from = min(first_lane + lane, last_lane);
         float2 pair = *(const float2*)(p.last_output + (lanes + from) * W + column);
         unsigned int bits = reset[from] ? 0u : pack_bfloat16(pair.x, pair.y);
-        *(unsigned int*)&memory.hidden[0][lane][column] = bits;
+        *(unsigned int*)&memory.hidden[0][column / UNITS][lane][column % UNITS] = bits;
         if (column / UNITS == rank && first_lane + lane < n_lanes)
             *(unsigned int*)(hiddens + (long long)from * W + column) = bits;
     }
@@ -120,34 +156,19 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
             int lane = min(first_lane + 8 * j + 2 * me.q + e, last_lane);
             cells[j][e] = reset[lane] ? 0.f : p.last_cell[(lanes + lane) * W + unit];
         }
-
-    auto begin_gates = [&](int t) {
-#pragma unroll
-        for (int n = 0; n < 4; n++) {
-            int i = me.index + n * THREADS, lane = i >> 5, gate = i >> 3 & 3, part = 8 * (i & 7);
-            long long row = (long long)t * n_lanes + min(first_lane + lane, last_lane);
-            begin_copy(&memory.gates[t & 1][lane][gate * UNITS + part],
-                       gates + row * (4 * W) + gate * W + rank * UNITS + part);
+    read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
+    if (!me.index) {
+        for (int i = 0; i < 2; i++) {
+            init(&memory.arrivals[i]);
+            expect(&memory.arrivals[i], RANKS * SENT);
         }
-    };
-    begin_gates(0);
-    wait_for_copies();
+    }
+    wait_for_copies<1>();
     cluster_barrier();
 
-    for (int t = 0; t < p.n_steps; t++) {
-        bool is_last = t + 1 == p.n_steps;
-        unsigned int next_resets = 0;  // bit 2 j + e: whether the lane is reset before step t + 1
-        if (!is_last) {
-            begin_gates(t + 1);
-#pragma unroll
-            for (int j = 0; j < COLUMNS; j++)
-#pragma unroll
-                for (int e = 0; e < 2; e++) {
-                    int lane = min(first_lane + 8 * j + 2 * me.q + e, last_lane);
-                    bool is_reset = reset[(long long)(t + 1) * n_lanes + lane];
-                    next_resets |= (unsigned int)is_reset << (2 * j + e);
-                }
-        }
+    for (int t = 0; t < n_steps; t++) {
+        bool is_last = t + 1 == n_steps;
+        begin_gates(t + 2);
         float sums[2][COLUMNS][4];
 #pragma unroll
         for (int tile = 0; tile < 2; tile++)
@@ -156,12 +177,18 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
 #pragma unroll
                 for (int part = 0; part < 4; part++) {
                     int gate = 2 * tile + (part >> 1), lane = 8 * j + 2 * me.q + (part & 1);
-                    Bits bits = memory.gates[t & 1][lane][gate * UNITS + me.unit];
+                    Bits bits = memory.gates[t % STAGES][lane][gate * UNITS + me.unit];
                     sums[tile][j][part] = __uint_as_float((unsigned int)bits << 16);
                 }
-        multiply<W>(sums, weights, &memory.hidden[t & 1][0][0], me);
+        if (t) {
+            wait_for(&memory.arrivals[t & 1], (t - 1) >> 1);
+            if (!me.index)
+                expect(&memory.arrivals[t & 1], RANKS * SENT);
+        }
+        multiply<W, UNITS>(sums, weights, &memory.hidden[t & 1][0][0][0], me);
 
         unsigned int rounded[2][COLUMNS][2];  // input | forget, candidate | output
+        unsigned int resets = is_last ? 0u : memory.resets[t + 1] >> (2 * me.q);
 #pragma unroll
         for (int j = 0; j < COLUMNS; j++)
 #pragma unroll
@@ -170,7 +197,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                 rounded[1][j][e] = pack_bfloat16(sums[1][j][e], sums[1][j][2 + e]);
             }
         if (p.saved_gates) {
-            uint4* saved = (uint4*)p.saved_gates + saved_at(policy, t, p.n_steps, cluster,
+            uint4* saved = (uint4*)p.saved_gates + saved_at(policy, t, n_steps, cluster,
                                                             p.n_clusters, RANKS, rank, 4, me.index);
 #pragma unroll
             for (int j = 0; j < COLUMNS; j++)
@@ -178,7 +205,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                                       rounded[1][j][1]};
             float4* saved_cells =
                 (float4*)p.saved_cells +
-                saved_at(policy, t, p.n_steps, cluster, p.n_clusters, RANKS, rank, 2, me.index);
+                saved_at(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank, 2, me.index);
             saved_cells[0] = {cells[0][0], cells[0][1], cells[1][0], cells[1][1]};
             saved_cells[THREADS] = {cells[2][0], cells[2][1], cells[3][0], cells[3][1]};
         }
@@ -191,30 +218,28 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                 float candidate = tanh_of(low_half(rounded[1][j][e]));
                 float output = sigmoid(high_half(rounded[1][j][e]));
                 float after = forget * cells[j][e] + input * candidate;
-                float value = output * tanh_of(after);
+                Bits value = (Bits)pack_bfloat16(output * tanh_of(after), 0.f);
+                bool is_reset = resets >> (8 * j + e) & 1;
                 int lane = 8 * j + 2 * me.q + e;
-                memory.output[lane][me.unit] = (Bits)pack_bfloat16(value, 0.f);
-                cells[j][e] = next_resets >> (2 * j + e) & 1 ? 0.f : after;
+                memory.output[t & 1][lane][me.unit] = value;
+                memory.next_hidden[t & 1][lane][me.unit] = is_reset ? (Bits)0 : value;
+                cells[j][e] = is_reset ? 0.f : after;
             }
+        publish_to_copies();
+        wait_for_copies<1>();
         __syncthreads();
+        if (!is_last && me.index < RANKS)
+            send(&memory.hidden[(t + 1) & 1][rank][0][0], &memory.next_hidden[t & 1][0][0], SENT,
+                 &memory.arrivals[(t + 1) & 1], me.index);
         int lane = me.index >> 3, part = 8 * (me.index & 7);
-        uint4 value = *(const uint4*)&memory.output[lane][part];
-        bool exists = first_lane + lane < n_lanes;
-        long long row = (long long)t * n_lanes + first_lane + lane, column = rank * UNITS + part;
-        if (exists)
-            *(uint4*)(outputs + row * W + column) = value;
-        if (!is_last) {
-            if (exists && reset[row + n_lanes])
-                value = {0, 0, 0, 0};
-            if (exists)
-                *(uint4*)(hiddens + (row + n_lanes) * W + column) = value;
-            const Bits* target = &memory.hidden[(t + 1) & 1][lane][column];
-#pragma unroll
-            for (int other = 0; other < RANKS; other++)
-                write_there(address_in(target, other), value);
+        if (first_lane + lane < n_lanes) {
+            long long row = (long long)t * n_lanes + first_lane + lane;
+            long long at = row * W + rank * UNITS + part;
+            *(uint4*)(outputs + at) = *(const uint4*)&memory.output[t & 1][lane][part];
+            if (!is_last)
+                *(uint4*)(hiddens + at + (long long)n_lanes * W) =
+                    *(const uint4*)&memory.next_hidden[t & 1][lane][part];
         }
-        wait_for_copies();
-        cluster_barrier();
     }
 #pragma unroll
     for (int j = 0; j < COLUMNS; j++)
@@ -224,32 +249,48 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
             if (lane < n_lanes)
                 p.cell[(lanes + lane) * W + unit] = cells[j][e];
         }
+    cluster_barrier();  // no block ends while another sends to it
 }
 
 // ---- Backward ----
 
+typedef float Parts[UNITS][LANES + PAD];  // of the sums for a block's units
+
 template <int W>
 struct BackwardMemory {
     static constexpr int RANKS = W / UNITS;
-    float parts[2][RANKS][UNITS][LANES + PAD];  // by the block that they come from
+    Parts parts[2][RANKS];  // by the block that sends them
+    Parts to_send[2][RANKS];
     Bits d_gates[LANES][GATES + PAD];
     Bits d_output[2][LANES][UNITS + PAD];
+    Arrivals arrivals[2];
+    unsigned int resets[MAX_STEPS];
 };
 
 template <int W>
 DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     constexpr int RANKS = W / UNITS;
-    constexpr int TILES = W / 128;  // of 16 units, per warp
-    static_assert(TILES == 2, "a warp multiplies two tiles");
+    static_assert(W == 256, "a warp multiplies two tiles of 16 units");
     BackwardMemory<W>& memory = *(BackwardMemory<W>*)shared_memory;
     Thread me = this_thread();
     int rank = cluster_rank(), cluster = blockIdx.x / RANKS, first_lane = LANES * cluster;
-    int n_lanes = p.n_lanes, last_lane = n_lanes - 1;
+    int n_steps = p.n_steps, n_lanes = p.n_lanes, last_lane = n_lanes - 1;
     long long policy = blockIdx.y, lanes = policy * n_lanes;
     int unit = rank * UNITS + me.unit;
-    const unsigned char* reset = p.reset + policy * p.n_steps * n_lanes;
-    const Bits* d_outputs = (const Bits*)p.d_outputs + policy * p.n_steps * n_lanes * W;
-    Bits* d_gates = (Bits*)p.d_gates + policy * p.n_steps * n_lanes * (4 * W);
+    const unsigned char* reset = p.reset + policy * n_steps * n_lanes;
+    const Bits* d_outputs = (const Bits*)p.d_outputs + policy * n_steps * n_lanes * W;
+    Bits* d_gates = (Bits*)p.d_gates + policy * n_steps * n_lanes * (4 * W);
+
+    auto begin_d_output = [&](int t) {
+        if (t >= 0) {
+            int lane = me.index >> 3, part = 8 * (me.index & 7);
+            long long row = (long long)t * n_lanes + min(first_lane + lane, last_lane);
+            begin_copy(&memory.d_output[t & 1][lane][part],
+                       d_outputs + row * W + rank * UNITS + part);
+        }
+        end_group();
+    };
+    begin_d_output(n_steps - 1);
 
     // Rows: the units whose outputs fed the gates, 32 per warp. Columns: this block's gates.
     unsigned int weights[2][GATES / 16][4];
@@ -262,9 +303,8 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
             for (int part = 0; part < 4; part++) {
                 int row = 32 * me.warp + 16 * tile + me.g + 8 * (part & 1);
                 int i = 16 * k + 2 * me.q + 8 * (part >> 1), gate = i / UNITS;
-                weights[tile][k][part] =
-                    *(const unsigned int*)(weight + row * (4 * W) + gate * W + rank * UNITS +
-                                           i % UNITS);
+                weights[tile][k][part] = *(const unsigned int*)(weight + row * (4 * W) + gate * W +
+                                                                rank * UNITS + i % UNITS);
             }
 
     float d_cells[COLUMNS][2], d_bias[4] = {0.f, 0.f, 0.f, 0.f};
@@ -275,19 +315,39 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
             d_cells[j][e] = lane < n_lanes ? p.d_cell[(lanes + lane) * W + unit] : 0.f;
         }
-
-    auto begin_d_output = [&](int t) {
-        int lane = me.index >> 3, part = 8 * (me.index & 7);
-        long long row = (long long)t * n_lanes + min(first_lane + lane, last_lane);
-        begin_copy(&memory.d_output[t & 1][lane][part], d_outputs + row * W + rank * UNITS + part);
+    uint4 gates[COLUMNS];  // of the next step to go back through
+    float4 cells[COLUMNS / 2];
+    auto load_saved = [&](int t) {
+        const uint4* saved = (const uint4*)p.saved_gates +
+                             saved_at(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank, 4,
+                                      me.index);
+        const float4* saved_cells =
+            (const float4*)p.saved_cells +
+            saved_at(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank, 2, me.index);
+#pragma unroll
+        for (int j = 0; j < COLUMNS; j++)
+            gates[j] = __ldcs(saved + j * THREADS);
+        cells[0] = __ldcs(saved_cells);
+        cells[1] = __ldcs(saved_cells + THREADS);
     };
-    begin_d_output(p.n_steps - 1);
-    wait_for_copies();
+    load_saved(n_steps - 1);
+    read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
+    if (!me.index) {
+        for (int i = 0; i < 2; i++) {
+            init(&memory.arrivals[i]);
+            expect(&memory.arrivals[i], RANKS * (int)sizeof(Parts));
+        }
+    }
+    wait_for_copies<0>();
     cluster_barrier();
 
-    // The gradient of each lane's recurrent input of the step after t
+    // The gradient of each lane's recurrent input of step t, added up in the order of the blocks
     float d_hiddens[COLUMNS][2];
-    auto add_parts = [&](int t) {
+    auto receive = [&](int t) {
+        Arrivals* arrivals = &memory.arrivals[t & 1];
+        wait_for(arrivals, (n_steps - 1 - t) >> 1);
+        if (!me.index)
+            expect(arrivals, RANKS * (int)sizeof(Parts));
 #pragma unroll
         for (int j = 0; j < COLUMNS; j++) {
             d_hiddens[j][0] = d_hiddens[j][1] = 0.f;
@@ -300,30 +360,13 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
             }
         }
     };
-    auto is_reset = [&](int t, int j, int e) {
-        int lane = min(first_lane + 8 * j + 2 * me.q + e, last_lane);
-        return reset[(long long)t * n_lanes + lane] != 0;
-    };
 
-    for (int t = p.n_steps - 1; t >= 0; t--) {
-        const uint4* saved = (const uint4*)p.saved_gates + saved_at(policy, t, p.n_steps, cluster,
-                                                                    p.n_clusters, RANKS, rank, 4,
-                                                                    me.index);
-        const float4* saved_cells =
-            (const float4*)p.saved_cells +
-            saved_at(policy, t, p.n_steps, cluster, p.n_clusters, RANKS, rank, 2, me.index);
-        uint4 gates[COLUMNS];
-        float4 cells[COLUMNS / 2];
-#pragma unroll
-        for (int j = 0; j < COLUMNS; j++)
-            gates[j] = saved[j * THREADS];
-        cells[0] = saved_cells[0];
-        cells[1] = saved_cells[THREADS];
-        if (t)
-            begin_d_output(t - 1);
-        bool has_next = t + 1 < p.n_steps;
+    for (int t = n_steps - 1; t >= 0; t--) {
+        begin_d_output(t - 1);
+        bool has_next = t + 1 < n_steps;
+        unsigned int resets = has_next ? memory.resets[t + 1] >> (2 * me.q) : 0u;
         if (has_next)
-            add_parts(t + 1);
+            receive(t + 1);
 #pragma unroll
         for (int j = 0; j < COLUMNS; j++)
 #pragma unroll
@@ -340,7 +383,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
                 float d_output = __uint_as_float((unsigned int)bits << 16);
                 float d_cell = d_cells[j][e];
                 if (has_next) {
-                    bool cut = is_reset(t + 1, j, e);
+                    bool cut = resets >> (8 * j + e) & 1;
                     d_output += cut ? 0.f : d_hiddens[j][e];
                     d_cell = cut ? 0.f : d_cell;
                 }
@@ -364,6 +407,9 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
                 row[2 * UNITS] = (Bits)d_second;
                 row[3 * UNITS] = (Bits)(d_second >> 16);
             }
+        if (t)
+            load_saved(t - 1);
+        wait_for_copies<0>();
         __syncthreads();
 #pragma unroll
         for (int n = 0; n < 4; n++) {
@@ -374,30 +420,32 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
                     *(const uint4*)&memory.d_gates[lane][gate * UNITS + part];
         }
         float sums[2][COLUMNS][4] = {};
-        multiply<GATES>(sums, weights, &memory.d_gates[0][0], me);
+        multiply<GATES, GATES>(sums, weights, &memory.d_gates[0][0], me);
 #pragma unroll
         for (int tile = 0; tile < 2; tile++)
 #pragma unroll
             for (int half = 0; half < 2; half++) {
                 int row = 32 * me.warp + 16 * tile + me.g + 8 * half;
-                unsigned int target = address_in(
-                    &memory.parts[t & 1][rank][row % UNITS][2 * me.q], row / UNITS);
+                float* target = &memory.to_send[t & 1][row / UNITS][row % UNITS][2 * me.q];
 #pragma unroll
                 for (int j = 0; j < COLUMNS; j++)
-                    write_there(target + 8 * j * (int)sizeof(float), sums[tile][j][2 * half],
-                                sums[tile][j][2 * half + 1]);
+                    *(float2*)(target + 8 * j) = {sums[tile][j][2 * half],
+                                                  sums[tile][j][2 * half + 1]};
             }
-        wait_for_copies();
-        cluster_barrier();
+        publish_to_copies();
+        __syncthreads();
+        if (me.index < RANKS)
+            send(&memory.parts[t & 1][rank], &memory.to_send[t & 1][me.index], sizeof(Parts),
+                 &memory.arrivals[t & 1], me.index);
     }
-    add_parts(0);
+    receive(0);
 #pragma unroll
     for (int j = 0; j < COLUMNS; j++)
 #pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
             if (lane < n_lanes) {
-                bool cut = is_reset(0, j, e);
+                bool cut = memory.resets[0] >> (8 * j + 2 * me.q + e) & 1;
                 p.d_last_output[(lanes + lane) * W + unit] = cut ? 0.f : d_hiddens[j][e];
                 p.d_last_cell[(lanes + lane) * W + unit] = cut ? 0.f : d_cells[j][e];
             }
@@ -410,6 +458,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         if (!me.q)
             p.d_bias[(policy * p.n_clusters + cluster) * (4 * W) + gate * W + unit] = sum;
     }
+    cluster_barrier();  // no block ends while another sends to it
 }
 
 static_assert(sizeof(ForwardMemory<256>) == FORWARD_MEMORY);

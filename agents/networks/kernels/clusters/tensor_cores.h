@@ -50,8 +50,13 @@ DEVICE void begin_copy(void* shared, const void* global) {
                  : "memory");
 }
 
+// Ends a group of copies.
+DEVICE void end_group() { asm volatile("cp.async.commit_group;" ::: "memory"); }
+
+// Waits until this thread's groups of copies but the latest n are done.
+template <int n>
 DEVICE void wait_for_copies() {
-    asm volatile("cp.async.commit_group;\ncp.async.wait_group 0;" ::: "memory");
+    asm volatile("cp.async.wait_group %0;" ::"n"(n) : "memory");
 }
 
 DEVICE unsigned int cluster_rank() {
@@ -67,20 +72,56 @@ DEVICE void cluster_barrier() {
                      : "memory");
 }
 
-// The address that this shared memory has in another block of the cluster.
-DEVICE unsigned int address_in(const void* shared, unsigned int rank) {
-    unsigned int address = (unsigned int)__cvta_generic_to_shared(shared), there;
-    asm("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(there) : "r"(address), "r"(rank));
-    return there;
+// A barrier in shared memory that counts bytes which other blocks send. Each phase ends when one
+// thread has announced the number of bytes and all have arrived.
+typedef unsigned long long Arrivals;
+
+DEVICE unsigned int shared_address(const void* shared) {
+    return (unsigned int)__cvta_generic_to_shared(shared);
 }
 
-DEVICE void write_there(unsigned int address, uint4 value) {
-    asm volatile("st.shared::cluster.v4.u32 [%0], {%1, %2, %3, %4};" ::"r"(address), "r"(value.x),
-                 "r"(value.y), "r"(value.z), "r"(value.w)
+DEVICE void init(Arrivals* arrivals) {
+    asm volatile("mbarrier.init.shared.b64 [%0], 1;\n"
+                 "fence.mbarrier_init.release.cluster;" ::"r"(shared_address(arrivals))
                  : "memory");
 }
 
-DEVICE void write_there(unsigned int address, float low, float high) {
-    asm volatile("st.shared::cluster.v2.f32 [%0], {%1, %2};" ::"r"(address), "f"(low), "f"(high)
+DEVICE void expect(Arrivals* arrivals, int n_bytes) {
+    asm volatile("mbarrier.arrive.expect_tx.shared.b64 _, [%0], %1;" ::"r"(
+                     shared_address(arrivals)),
+                 "r"(n_bytes)
+                 : "memory");
+}
+
+// Waits for the end of a phase: the first has number 0.
+DEVICE void wait_for(Arrivals* arrivals, int phase) {
+    unsigned int is_over;
+    do {
+        asm volatile("{\n.reg .pred p;\n"
+                     "mbarrier.try_wait.parity.shared.b64 p, [%1], %2;\n"
+                     "selp.u32 %0, 1, 0, p;\n}"
+                     : "=r"(is_over)
+                     : "r"(shared_address(arrivals)), "r"(phase & 1)
+                     : "memory");
+    } while (!is_over);
+}
+
+// Orders this thread's writes to shared memory before the copies that follow a barrier.
+DEVICE void publish_to_copies() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
+
+// Sends shared memory to the same kind of place in another block of the cluster, and tells its
+// `arrivals`. One thread calls this. The number of bytes is a multiple of 16.
+DEVICE void send(void* target, const void* source, int n_bytes, Arrivals* arrivals,
+                 unsigned int rank) {
+    unsigned int there, arrivals_there;
+    asm("mapa.shared::cluster.u32 %0, %1, %2;"
+        : "=r"(there)
+        : "r"(shared_address(target)), "r"(rank));
+    asm("mapa.shared::cluster.u32 %0, %1, %2;"
+        : "=r"(arrivals_there)
+        : "r"(shared_address(arrivals)), "r"(rank));
+    asm volatile("cp.async.bulk.shared::cluster.shared::cta.mbarrier::complete_tx::bytes "
+                 "[%0], [%1], %2, [%3];" ::"r"(there),
+                 "r"(shared_address(source)), "r"(n_bytes), "r"(arrivals_there)
                  : "memory");
 }
