@@ -21,16 +21,19 @@ KERNEL ppo_loss(PpoLossParams p) {
             // a NaN fails both comparisons and stays
             bool is_clipped = surrogate > clipped * advantage;
             float squared = error * error;
-            bool is_old = false;
+            bool is_limited = false;
             if (p.old_values) {
                 float limit = p.value_clip * scale, old = p.old_values[row];
-                float moved = fminf(fmaxf(p.values[row] - old, -limit), limit);
-                float other = (old + moved - p.targets[row]) / scale;
-                is_old = other * other > squared;
-                squared = is_old ? other * other : squared;
+                float moved = p.values[row] - old;
+                float clipped_error =
+                    (old + fminf(fmaxf(moved, -limit), limit) - p.targets[row]) / scale;
+                if (clipped_error * clipped_error > squared) {
+                    is_limited = fabsf(moved) > limit;
+                    squared = clipped_error * clipped_error;
+                }
             }
             d_logprob = is_clipped ? 0.f : -surrogate * share;
-            d_value = is_old ? 0.f : p.value_coef * 2.f * error / scale * share;
+            d_value = is_limited ? 0.f : p.value_coef * 2.f * error / scale * share;
             sums[0] = -(is_clipped ? clipped * advantage : surrogate);
             sums[1] = squared;
             sums[2] = p.entropies[row];

@@ -23,13 +23,16 @@
 constexpr int LANES = SEQUENCE_LANES, UNITS = BLOCK_UNITS, THREADS = SEQUENCE_THREADS;
 constexpr int GATES = 4 * UNITS;  // of a block
 constexpr int PAD = 8;            // elements after each row, so that rows start in other banks
-constexpr int COLUMNS = LANES / 8;
+// The lanes are run in two halves: while the blocks exchange one half's numbers, they compute the
+// other's.
+constexpr int HALF = LANES / 2;
+constexpr int COLUMNS = HALF / 8;  // of eight lanes, of a half
 
 typedef unsigned short Bits;  // of a bfloat16
 
 extern __shared__ __align__(16) unsigned char shared_memory[];
 
-// A thread's place: its unit in the block and its lanes 8 j + 2 q + {0, 1}, j = 0 to 3.
+// A thread's place: its unit in the block, and its lanes 8 j + 2 q + {0, 1} of each half.
 struct Thread {
     int index, warp, warp_lane, g, q, unit;
 };
@@ -40,31 +43,31 @@ DEVICE Thread this_thread() {
 }
 
 // Adds the product of this warp's weights and of `right` to `sums`. `right` has a row of K numbers
-// per lane, in pieces of N numbers: first the first piece of each row.
+// per lane, in pieces of N numbers; `piece` numbers lie between two pieces of a row.
 template <int K, int N>
 DEVICE void multiply(float (&sums)[2][COLUMNS][4], const unsigned int (&left)[2][K / 16][4],
-                     const Bits* right, const Thread& me) {
+                     const Bits* right, int piece, const Thread& me) {
     const Bits* row = right + (8 * (me.warp_lane >> 4) + (me.warp_lane & 7)) * (N + PAD) +
                       8 * (me.warp_lane >> 3 & 1);
+    unsigned int b[2][4];  // of this step of the product and of the next
+    load_matrices(b[0], row);
 #pragma unroll
-    for (int k = 0; k < K / 16; k++)
+    for (int k = 0; k < K / 16; k++) {
+        int next = 16 * (k + 1);
+        if (next < K)
+            load_matrices(b[(k + 1) & 1], row + next / N * piece + next % N);
 #pragma unroll
-        for (int j = 0; j < COLUMNS; j += 2) {
-            unsigned int b[4];
-            load_matrices(b, row + 16 * k / N * LANES * (N + PAD) + 8 * j * (N + PAD) + 16 * k % N);
-#pragma unroll
-            for (int tile = 0; tile < 2; tile++) {
-                multiply_add(sums[tile][j], left[tile][k], b[0], b[1]);
-                multiply_add(sums[tile][j + 1], left[tile][k], b[2], b[3]);
-            }
+        for (int tile = 0; tile < 2; tile++) {
+            multiply_add(sums[tile][0], left[tile][k], b[k & 1][0], b[k & 1][1]);
+            multiply_add(sums[tile][1], left[tile][k], b[k & 1][2], b[k & 1][3]);
         }
+    }
 }
 
-// Where a thread's saved numbers of step t begin, in units of `n` words of 16 bytes per thread.
-DEVICE long long saved_at(long long policy, int t, int n_steps, int cluster, int n_clusters,
-                          int n_ranks, int rank, int n, int thread) {
-    long long block = ((policy * n_steps + t) * n_clusters + cluster) * n_ranks + rank;
-    return block * n * THREADS + thread;
+// The number of the block whose saved numbers of step t these are.
+DEVICE long long saved_block(long long policy, int t, int n_steps, int cluster, int n_clusters,
+                             int n_ranks, int rank) {
+    return ((policy * n_steps + t) * n_clusters + cluster) * n_ranks + rank;
 }
 
 // One bit per lane of the cluster, for each step: whether the lane is reset before it.
@@ -89,14 +92,14 @@ struct ForwardMemory {
     Bits next_hidden[2][LANES][UNITS + PAD];    // to send
     Bits output[2][LANES][UNITS + PAD];
     Bits gates[STAGES][LANES][GATES + PAD];
-    Arrivals arrivals[2];
+    Arrivals arrivals[2][2];  // of even and odd steps, of both halves
     unsigned int resets[MAX_STEPS];
 };
 
 template <int W>
 DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     constexpr int RANKS = W / UNITS;
-    constexpr int SENT = sizeof(ForwardMemory<W>::next_hidden) / 2;
+    constexpr int SENT = HALF * (UNITS + PAD) * (int)sizeof(Bits);
     ForwardMemory<W>& memory = *(ForwardMemory<W>*)shared_memory;
     Thread me = this_thread();
     int rank = cluster_rank(), cluster = blockIdx.x / RANKS, first_lane = LANES * cluster;
@@ -148,9 +151,9 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
         if (column / UNITS == rank && first_lane + lane < n_lanes)
             *(unsigned int*)(hiddens + (long long)from * W + column) = bits;
     }
-    float cells[COLUMNS][2];
+    float cells[2 * COLUMNS][2];
 #pragma unroll
-    for (int j = 0; j < COLUMNS; j++)
+    for (int j = 0; j < 2 * COLUMNS; j++)
 #pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = min(first_lane + 8 * j + 2 * me.q + e, last_lane);
@@ -158,9 +161,9 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
         }
     read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
     if (!me.index) {
-        for (int i = 0; i < 2; i++) {
-            init(&memory.arrivals[i]);
-            expect(&memory.arrivals[i], RANKS * SENT);
+        for (int i = 0; i < 4; i++) {
+            init(&memory.arrivals[i / 2][i % 2]);
+            expect(&memory.arrivals[i / 2][i % 2], RANKS * SENT);
         }
     }
     wait_for_copies<1>();
@@ -169,80 +172,92 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     for (int t = 0; t < n_steps; t++) {
         bool is_last = t + 1 == n_steps;
         begin_gates(t + 2);
-        float sums[2][COLUMNS][4];
-#pragma unroll
-        for (int tile = 0; tile < 2; tile++)
-#pragma unroll
-            for (int j = 0; j < COLUMNS; j++)
-#pragma unroll
-                for (int part = 0; part < 4; part++) {
-                    int gate = 2 * tile + (part >> 1), lane = 8 * j + 2 * me.q + (part & 1);
-                    Bits bits = memory.gates[t % STAGES][lane][gate * UNITS + me.unit];
-                    sums[tile][j][part] = __uint_as_float((unsigned int)bits << 16);
-                }
-        if (t) {
-            wait_for(&memory.arrivals[t & 1], (t - 1) >> 1);
-            if (!me.index)
-                expect(&memory.arrivals[t & 1], RANKS * SENT);
-        }
-        multiply<W, UNITS>(sums, weights, &memory.hidden[t & 1][0][0][0], me);
-
-        unsigned int rounded[2][COLUMNS][2];  // input | forget, candidate | output
         unsigned int resets = is_last ? 0u : memory.resets[t + 1] >> (2 * me.q);
+        long long block = saved_block(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank);
 #pragma unroll
-        for (int j = 0; j < COLUMNS; j++)
+        for (int half = 0; half < 2; half++) {
+            int first = HALF * half;  // lane of this half
+            float sums[2][COLUMNS][4];
 #pragma unroll
-            for (int e = 0; e < 2; e++) {
-                rounded[0][j][e] = pack_bfloat16(sums[0][j][e], sums[0][j][2 + e]);
-                rounded[1][j][e] = pack_bfloat16(sums[1][j][e], sums[1][j][2 + e]);
+            for (int tile = 0; tile < 2; tile++)
+#pragma unroll
+                for (int j = 0; j < COLUMNS; j++)
+#pragma unroll
+                    for (int part = 0; part < 4; part++) {
+                        int gate = 2 * tile + (part >> 1);
+                        int lane = first + 8 * j + 2 * me.q + (part & 1);
+                        Bits bits = memory.gates[t % STAGES][lane][gate * UNITS + me.unit];
+                        sums[tile][j][part] = __uint_as_float((unsigned int)bits << 16);
+                    }
+            if (t) {
+                Arrivals* arrivals = &memory.arrivals[t & 1][half];
+                wait_for(arrivals, (t - 1) >> 1);
+                if (!me.index)
+                    expect(arrivals, RANKS * SENT);
             }
-        if (p.saved_gates) {
-            uint4* saved = (uint4*)p.saved_gates + saved_at(policy, t, n_steps, cluster,
-                                                            p.n_clusters, RANKS, rank, 4, me.index);
+            multiply<W, UNITS>(sums, weights, &memory.hidden[t & 1][0][first][0],
+                               LANES * (UNITS + PAD), me);
+
+            unsigned int rounded[2][COLUMNS][2];  // input | forget, candidate | output
 #pragma unroll
             for (int j = 0; j < COLUMNS; j++)
-                saved[j * THREADS] = {rounded[0][j][0], rounded[1][j][0], rounded[0][j][1],
-                                      rounded[1][j][1]};
-            float4* saved_cells =
-                (float4*)p.saved_cells +
-                saved_at(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank, 2, me.index);
-            saved_cells[0] = {cells[0][0], cells[0][1], cells[1][0], cells[1][1]};
-            saved_cells[THREADS] = {cells[2][0], cells[2][1], cells[3][0], cells[3][1]};
-        }
 #pragma unroll
-        for (int j = 0; j < COLUMNS; j++)
+                for (int e = 0; e < 2; e++) {
+                    rounded[0][j][e] = pack_bfloat16(sums[0][j][e], sums[0][j][2 + e]);
+                    rounded[1][j][e] = pack_bfloat16(sums[1][j][e], sums[1][j][2 + e]);
+                }
+            if (p.saved_gates) {
+                uint4* saved = (uint4*)p.saved_gates +
+                               (4 * block + COLUMNS * half) * THREADS + me.index;
 #pragma unroll
-            for (int e = 0; e < 2; e++) {
-                float input = sigmoid(low_half(rounded[0][j][e]));
-                float forget = sigmoid(high_half(rounded[0][j][e]));
-                float candidate = tanh_of(low_half(rounded[1][j][e]));
-                float output = sigmoid(high_half(rounded[1][j][e]));
-                float after = forget * cells[j][e] + input * candidate;
-                Bits value = (Bits)pack_bfloat16(output * tanh_of(after), 0.f);
-                bool is_reset = resets >> (8 * j + e) & 1;
-                int lane = 8 * j + 2 * me.q + e;
-                memory.output[t & 1][lane][me.unit] = value;
-                memory.next_hidden[t & 1][lane][me.unit] = is_reset ? (Bits)0 : value;
-                cells[j][e] = is_reset ? 0.f : after;
+                for (int j = 0; j < COLUMNS; j++)
+                    __stcs(saved + j * THREADS, uint4{rounded[0][j][0], rounded[1][j][0],
+                                                      rounded[0][j][1], rounded[1][j][1]});
+                float4* saved_cells =
+                    (float4*)p.saved_cells + (2 * block + half) * THREADS + me.index;
+                int j = COLUMNS * half;
+                __stcs(saved_cells,
+                       float4{cells[j][0], cells[j][1], cells[j + 1][0], cells[j + 1][1]});
             }
-        publish_to_copies();
-        wait_for_copies<1>();
-        __syncthreads();
-        if (!is_last && me.index < RANKS)
-            send(&memory.hidden[(t + 1) & 1][rank][0][0], &memory.next_hidden[t & 1][0][0], SENT,
-                 &memory.arrivals[(t + 1) & 1], me.index);
-        int lane = me.index >> 3, part = 8 * (me.index & 7);
-        if (first_lane + lane < n_lanes) {
-            long long row = (long long)t * n_lanes + first_lane + lane;
-            long long at = row * W + rank * UNITS + part;
-            *(uint4*)(outputs + at) = *(const uint4*)&memory.output[t & 1][lane][part];
-            if (!is_last)
-                *(uint4*)(hiddens + at + (long long)n_lanes * W) =
-                    *(const uint4*)&memory.next_hidden[t & 1][lane][part];
+#pragma unroll
+            for (int j = 0; j < COLUMNS; j++)
+#pragma unroll
+                for (int e = 0; e < 2; e++) {
+                    float& cell = cells[COLUMNS * half + j][e];
+                    float input = sigmoid(low_half(rounded[0][j][e]));
+                    float forget = sigmoid(high_half(rounded[0][j][e]));
+                    float candidate = tanh_of(low_half(rounded[1][j][e]));
+                    float output = sigmoid(high_half(rounded[1][j][e]));
+                    float after = forget * cell + input * candidate;
+                    Bits value = (Bits)pack_bfloat16(output * tanh_of(after), 0.f);
+                    bool is_reset = resets >> (first + 8 * j + e) & 1;
+                    int lane = first + 8 * j + 2 * me.q + e;
+                    memory.output[t & 1][lane][me.unit] = value;
+                    memory.next_hidden[t & 1][lane][me.unit] = is_reset ? (Bits)0 : value;
+                    cell = is_reset ? 0.f : after;
+                }
+            publish_to_copies();
+            if (half)
+                wait_for_copies<1>();
+            __syncthreads();
+            if (!is_last && me.index < RANKS)
+                send(&memory.hidden[(t + 1) & 1][rank][first][0],
+                     &memory.next_hidden[t & 1][first][0], SENT,
+                     &memory.arrivals[(t + 1) & 1][half], me.index);
+            // half of the threads write outputs, the others the next step's inputs
+            int lane = first + (me.index >> 3 & 15), part = 8 * (me.index & 7);
+            bool is_output = me.index < THREADS / 2;
+            if (first_lane + lane < n_lanes && (is_output || !is_last)) {
+                long long row = (long long)(t + !is_output) * n_lanes + first_lane + lane;
+                const Bits* source = is_output ? &memory.output[t & 1][lane][part]
+                                               : &memory.next_hidden[t & 1][lane][part];
+                Bits* target = is_output ? outputs : hiddens;
+                *(uint4*)(target + row * W + rank * UNITS + part) = *(const uint4*)source;
+            }
         }
     }
 #pragma unroll
-    for (int j = 0; j < COLUMNS; j++)
+    for (int j = 0; j < 2 * COLUMNS; j++)
 #pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
@@ -254,16 +269,16 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
 
 // ---- Backward ----
 
-typedef float Parts[UNITS][LANES + PAD];  // of the sums for a block's units
+typedef float Parts[UNITS][HALF + PAD];  // of the sums for a block's units and half of the lanes
 
 template <int W>
 struct BackwardMemory {
     static constexpr int RANKS = W / UNITS;
-    Parts parts[2][RANKS];  // by the block that sends them
-    Parts to_send[2][RANKS];
+    Parts parts[2][2][RANKS];    // of even and odd steps, of both halves, by the block that sends
+    Parts to_send[2][2][RANKS];  // by the block that receives
     Bits d_gates[LANES][GATES + PAD];
     Bits d_output[2][LANES][UNITS + PAD];
-    Arrivals arrivals[2];
+    Arrivals arrivals[2][2];
     unsigned int resets[MAX_STEPS];
 };
 
@@ -307,35 +322,35 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
                                                                 rank * UNITS + i % UNITS);
             }
 
-    float d_cells[COLUMNS][2], d_bias[4] = {0.f, 0.f, 0.f, 0.f};
+    float d_cells[2 * COLUMNS][2], d_bias[4] = {0.f, 0.f, 0.f, 0.f};
 #pragma unroll
-    for (int j = 0; j < COLUMNS; j++)
+    for (int j = 0; j < 2 * COLUMNS; j++)
 #pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
             d_cells[j][e] = lane < n_lanes ? p.d_cell[(lanes + lane) * W + unit] : 0.f;
         }
-    uint4 gates[COLUMNS];  // of the next step to go back through
-    float4 cells[COLUMNS / 2];
-    auto load_saved = [&](int t) {
-        const uint4* saved = (const uint4*)p.saved_gates +
-                             saved_at(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank, 4,
-                                      me.index);
-        const float4* saved_cells =
-            (const float4*)p.saved_cells +
-            saved_at(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank, 2, me.index);
+    uint4 gates[2][COLUMNS];  // of both halves, of the next step to go back through
+    float4 cells[2];
+    auto load_saved = [&](int t, int half) {
+        if (t < 0)
+            return;
+        long long block = saved_block(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank);
+        const uint4* saved =
+            (const uint4*)p.saved_gates + (4 * block + COLUMNS * half) * THREADS + me.index;
 #pragma unroll
         for (int j = 0; j < COLUMNS; j++)
-            gates[j] = __ldcs(saved + j * THREADS);
-        cells[0] = __ldcs(saved_cells);
-        cells[1] = __ldcs(saved_cells + THREADS);
+            gates[half][j] = __ldcs(saved + j * THREADS);
+        cells[half] =
+            __ldcs((const float4*)p.saved_cells + (2 * block + half) * THREADS + me.index);
     };
-    load_saved(n_steps - 1);
+    load_saved(n_steps - 1, 0);
+    load_saved(n_steps - 1, 1);
     read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
     if (!me.index) {
-        for (int i = 0; i < 2; i++) {
-            init(&memory.arrivals[i]);
-            expect(&memory.arrivals[i], RANKS * (int)sizeof(Parts));
+        for (int i = 0; i < 4; i++) {
+            init(&memory.arrivals[i / 2][i % 2]);
+            expect(&memory.arrivals[i / 2][i % 2], RANKS * (int)sizeof(Parts));
         }
     }
     wait_for_copies<0>();
@@ -343,8 +358,8 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
 
     // The gradient of each lane's recurrent input of step t, added up in the order of the blocks
     float d_hiddens[COLUMNS][2];
-    auto receive = [&](int t) {
-        Arrivals* arrivals = &memory.arrivals[t & 1];
+    auto receive = [&](int t, int half) {
+        Arrivals* arrivals = &memory.arrivals[t & 1][half];
         wait_for(arrivals, (n_steps - 1 - t) >> 1);
         if (!me.index)
             expect(arrivals, RANKS * (int)sizeof(Parts));
@@ -354,7 +369,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
 #pragma unroll
             for (int other = 0; other < RANKS; other++) {
                 float2 pair =
-                    *(const float2*)&memory.parts[t & 1][other][me.unit][8 * j + 2 * me.q];
+                    *(const float2*)&memory.parts[t & 1][half][other][me.unit][8 * j + 2 * me.q];
                 d_hiddens[j][0] += pair.x;
                 d_hiddens[j][1] += pair.y;
             }
@@ -365,91 +380,100 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         begin_d_output(t - 1);
         bool has_next = t + 1 < n_steps;
         unsigned int resets = has_next ? memory.resets[t + 1] >> (2 * me.q) : 0u;
-        if (has_next)
-            receive(t + 1);
+#pragma unroll
+        for (int half = 0; half < 2; half++) {
+            int first = HALF * half;  // lane of this half
+            if (has_next)
+                receive(t + 1, half);
+#pragma unroll
+            for (int j = 0; j < COLUMNS; j++)
+#pragma unroll
+                for (int e = 0; e < 2; e++) {
+                    int lane = first + 8 * j + 2 * me.q + e;
+                    unsigned int one = e ? gates[half][j].z : gates[half][j].x;
+                    unsigned int two = e ? gates[half][j].w : gates[half][j].y;
+                    float4 four = cells[half];
+                    float before = j ? (e ? four.w : four.z) : (e ? four.y : four.x);
+                    float input = sigmoid(low_half(one)), forget = sigmoid(high_half(one));
+                    float candidate = tanh_of(low_half(two)), output = sigmoid(high_half(two));
+                    float after = tanh_of(forget * before + input * candidate);
+                    Bits bits = memory.d_output[t & 1][lane][me.unit];
+                    float d_output = __uint_as_float((unsigned int)bits << 16);
+                    float d_cell = d_cells[COLUMNS * half + j][e];
+                    if (has_next) {
+                        bool cut = resets >> (first + 8 * j + e) & 1;
+                        d_output += cut ? 0.f : d_hiddens[j][e];
+                        d_cell = cut ? 0.f : d_cell;
+                    }
+                    d_cell += d_output * output * (1.f - after * after);
+                    unsigned int d_one =
+                        pack_bfloat16(d_cell * candidate * input * (1.f - input),
+                                      d_cell * before * forget * (1.f - forget));
+                    unsigned int d_two =
+                        pack_bfloat16(d_cell * input * (1.f - candidate * candidate),
+                                      d_output * after * output * (1.f - output));
+                    d_cells[COLUMNS * half + j][e] = d_cell * forget;
+                    if (first_lane + lane >= n_lanes)
+                        d_one = d_two = 0u;
+                    d_bias[0] += low_half(d_one);
+                    d_bias[1] += high_half(d_one);
+                    d_bias[2] += low_half(d_two);
+                    d_bias[3] += high_half(d_two);
+                    Bits* row = &memory.d_gates[lane][me.unit];
+                    row[0] = (Bits)d_one;
+                    row[UNITS] = (Bits)(d_one >> 16);
+                    row[2 * UNITS] = (Bits)d_two;
+                    row[3 * UNITS] = (Bits)(d_two >> 16);
+                }
+            load_saved(t - 1, half);
+            if (half)
+                wait_for_copies<0>();
+            __syncthreads();
+            float sums[2][COLUMNS][4] = {};
+            multiply<GATES, GATES>(sums, weights, &memory.d_gates[first][0], 0, me);
+#pragma unroll
+            for (int tile = 0; tile < 2; tile++)
+#pragma unroll
+                for (int upper = 0; upper < 2; upper++) {
+                    int row = 32 * me.warp + 16 * tile + me.g + 8 * upper;
+                    Parts& target = memory.to_send[t & 1][half][row / UNITS];
+#pragma unroll
+                    for (int j = 0; j < COLUMNS; j++)
+                        *(float2*)&target[row % UNITS][8 * j + 2 * me.q] = {
+                            sums[tile][j][2 * upper], sums[tile][j][2 * upper + 1]};
+                }
+            publish_to_copies();
+            __syncthreads();
+            if (me.index < RANKS)
+                send(&memory.parts[t & 1][half][rank], &memory.to_send[t & 1][half][me.index],
+                     sizeof(Parts), &memory.arrivals[t & 1][half], me.index);
+#pragma unroll
+            for (int n = 0; n < 2; n++) {
+                int i = me.index + n * THREADS, lane = first + (i >> 5), gate = i >> 3 & 3;
+                int part = 8 * (i & 7);
+                long long row = (long long)t * n_lanes + first_lane + lane;
+                if (first_lane + lane < n_lanes)
+                    *(uint4*)(d_gates + row * (4 * W) + gate * W + rank * UNITS + part) =
+                        *(const uint4*)&memory.d_gates[lane][gate * UNITS + part];
+            }
+        }
+    }
+#pragma unroll
+    for (int half = 0; half < 2; half++) {
+        receive(0, half);
 #pragma unroll
         for (int j = 0; j < COLUMNS; j++)
 #pragma unroll
             for (int e = 0; e < 2; e++) {
-                int lane = 8 * j + 2 * me.q + e;
-                unsigned int first = e ? gates[j].z : gates[j].x;
-                unsigned int second = e ? gates[j].w : gates[j].y;
-                float4 four = cells[j / 2];
-                float before = j & 1 ? (e ? four.w : four.z) : (e ? four.y : four.x);
-                float input = sigmoid(low_half(first)), forget = sigmoid(high_half(first));
-                float candidate = tanh_of(low_half(second)), output = sigmoid(high_half(second));
-                float after = tanh_of(forget * before + input * candidate);
-                Bits bits = memory.d_output[t & 1][lane][me.unit];
-                float d_output = __uint_as_float((unsigned int)bits << 16);
-                float d_cell = d_cells[j][e];
-                if (has_next) {
-                    bool cut = resets >> (8 * j + e) & 1;
-                    d_output += cut ? 0.f : d_hiddens[j][e];
-                    d_cell = cut ? 0.f : d_cell;
+                int lane = first_lane + HALF * half + 8 * j + 2 * me.q + e;
+                if (lane < n_lanes) {
+                    bool cut = memory.resets[0] >> (lane - first_lane) & 1;
+                    long long at = (lanes + lane) * W + unit;
+                    p.d_last_output[at] = cut ? 0.f : d_hiddens[j][e];
+                    p.d_last_cell[at] = cut ? 0.f : d_cells[COLUMNS * half + j][e];
                 }
-                d_cell += d_output * output * (1.f - after * after);
-                unsigned int d_first =
-                    pack_bfloat16(d_cell * candidate * input * (1.f - input),
-                                  d_cell * before * forget * (1.f - forget));
-                unsigned int d_second =
-                    pack_bfloat16(d_cell * input * (1.f - candidate * candidate),
-                                  d_output * after * output * (1.f - output));
-                d_cells[j][e] = d_cell * forget;
-                if (first_lane + lane >= n_lanes)
-                    d_first = d_second = 0u;
-                d_bias[0] += low_half(d_first);
-                d_bias[1] += high_half(d_first);
-                d_bias[2] += low_half(d_second);
-                d_bias[3] += high_half(d_second);
-                Bits* row = &memory.d_gates[lane][me.unit];
-                row[0] = (Bits)d_first;
-                row[UNITS] = (Bits)(d_first >> 16);
-                row[2 * UNITS] = (Bits)d_second;
-                row[3 * UNITS] = (Bits)(d_second >> 16);
             }
-        if (t)
-            load_saved(t - 1);
-        wait_for_copies<0>();
-        __syncthreads();
-#pragma unroll
-        for (int n = 0; n < 4; n++) {
-            int i = me.index + n * THREADS, lane = i >> 5, gate = i >> 3 & 3, part = 8 * (i & 7);
-            long long row = (long long)t * n_lanes + first_lane + lane;
-            if (first_lane + lane < n_lanes)
-                *(uint4*)(d_gates + row * (4 * W) + gate * W + rank * UNITS + part) =
-                    *(const uint4*)&memory.d_gates[lane][gate * UNITS + part];
-        }
-        float sums[2][COLUMNS][4] = {};
-        multiply<GATES, GATES>(sums, weights, &memory.d_gates[0][0], me);
-#pragma unroll
-        for (int tile = 0; tile < 2; tile++)
-#pragma unroll
-            for (int half = 0; half < 2; half++) {
-                int row = 32 * me.warp + 16 * tile + me.g + 8 * half;
-                float* target = &memory.to_send[t & 1][row / UNITS][row % UNITS][2 * me.q];
-#pragma unroll
-                for (int j = 0; j < COLUMNS; j++)
-                    *(float2*)(target + 8 * j) = {sums[tile][j][2 * half],
-                                                  sums[tile][j][2 * half + 1]};
-            }
-        publish_to_copies();
-        __syncthreads();
-        if (me.index < RANKS)
-            send(&memory.parts[t & 1][rank], &memory.to_send[t & 1][me.index], sizeof(Parts),
-                 &memory.arrivals[t & 1], me.index);
     }
-    receive(0);
-#pragma unroll
-    for (int j = 0; j < COLUMNS; j++)
-#pragma unroll
-        for (int e = 0; e < 2; e++) {
-            int lane = first_lane + 8 * j + 2 * me.q + e;
-            if (lane < n_lanes) {
-                bool cut = memory.resets[0] >> (8 * j + 2 * me.q + e) & 1;
-                p.d_last_output[(lanes + lane) * W + unit] = cut ? 0.f : d_hiddens[j][e];
-                p.d_last_cell[(lanes + lane) * W + unit] = cut ? 0.f : d_cells[j][e];
-            }
-        }
 #pragma unroll
     for (int gate = 0; gate < 4; gate++) {
         float sum = d_bias[gate];
