@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch.utils._pytree import tree_leaves_with_path
 
+from megastep.agents.algorithms.kernels import program
+
 #: The largest magnitude allowed in a rollout. Squares of returns made of such rewards, summed over
 #: millions of steps, still fit into float32 (3e38). A float16 that overflowed is inf, so larger.
 LIMIT = 1e12
@@ -122,6 +124,8 @@ class NonFiniteCheck:
         Returns:
             () bool on the device, whether all numbers are finite and within `LIMIT`.
         """
+        if _is_fused(floats):
+            return self._check_on_gpu(floats)
         count, first = self.record[:1], self.record[2:]
         count += 1
         sizes = _sizes(floats)
@@ -137,6 +141,52 @@ class NonFiniteCheck:
         latest[-MAX_NAMED:][: len(index)] = worst.nan_to_num(nan=-1.0)
         first.copy_(torch.where((n_bad == 0) | self.found, first, latest))
         return n_bad == 0
+
+    def _check_on_gpu(self, floats):
+        """Does the same as `__call__` in two kernels."""
+        tensors = list(floats.values())
+        n_steps, n_lanes = min(map(len, tensors)) + 1, tensors[0].shape[1]
+        n_rows, device = n_steps * len(tensors), tensors[0].device
+        sizes = torch.empty(n_rows, n_lanes, device=device)
+        first_rows = torch.full((n_lanes,), n_rows, dtype=torch.int32, device=device)
+        is_finite = torch.empty((), dtype=torch.bool, device=device)
+        packed = [
+            program.PROGRAM.params.SizesTensorParams(
+                values=tensor.data_ptr(),
+                n_steps=len(tensor),
+                n_features=math.prod(tensor.shape[2:]),
+                is_half=int(tensor.dtype == torch.float16),
+            )
+            for tensor in tensors
+        ]
+        program.run(
+            "sizes",
+            device,
+            program.PROGRAM.constants["SIZES_THREADS"] * n_steps * n_lanes,
+            len(tensors),
+            tensors=b"".join(packed),
+            sizes=sizes,
+            first_rows=first_rows,
+            n_tensors=len(tensors),
+            n_steps=n_steps,
+            n_lanes=n_lanes,
+            limit=LIMIT,
+        )
+        n_threads = program.PROGRAM.constants["RECORD_THREADS"]
+        program.run(
+            "record",
+            device,
+            n_threads,
+            block=n_threads,
+            sizes=sizes,
+            first_rows=first_rows,
+            record=self.record,
+            is_finite=is_finite,
+            n_rows=n_rows,
+            n_lanes=n_lanes,
+            n_named=MAX_NAMED,
+        )
+        return is_finite
 
     def state_dict(self) -> torch.Tensor:
         """Returns the rollouts checked and the updates skipped in a row.
@@ -171,6 +221,18 @@ class NonFiniteCheck:
             return None, int(n_skipped)
         others = tuple(values[1:])
         return dataclasses.replace(values[0], others=others, n_lanes=int(n_bad)), int(n_skipped)
+
+
+def _is_fused(floats):
+    """Returns whether kernels can check these tensors."""
+    tensors = list(floats.values())
+    return len(tensors) <= program.PROGRAM.constants["SIZES_TENSORS"] and all(
+        tensor.is_cuda
+        and tensor.dtype in (torch.float16, torch.float32)
+        and tensor.is_contiguous()
+        and len(tensor) - min(map(len, tensors)) <= 1
+        for tensor in tensors
+    )
 
 
 def _sizes(floats):

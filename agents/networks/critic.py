@@ -48,6 +48,6 @@ class Critic(nn.Module):
             lanes: (M,) int64, lanes to select from privileged observations (T, B, ...). None: all.
         """
         if self.is_asymmetric:
-            encoded = self.intake(privileged, lanes).to(features.dtype)
-            features = linear(torch.cat([features, encoded], -1), self.hidden, torch.relu)
+            encoded = self.intake(privileged, lanes)
+            features = linear((features, encoded), self.hidden, torch.relu)
         return self.output(features)

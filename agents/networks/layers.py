@@ -21,14 +21,25 @@ from megastep.agents.networks.running_norm import RunningNorm
 Activation = Callable[[torch.Tensor], torch.Tensor]
 
 
-def linear(x: torch.Tensor, layer: nn.Linear, activation: Activation | None = None) -> torch.Tensor:
-    """Applies a linear layer and an activation in the compute dtype: (..., in) -> (..., out)."""
+def linear(
+    x: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
+    layer: nn.Linear,
+    activation: Activation | None = None,
+) -> torch.Tensor:
+    """Applies a linear layer and an activation in the compute dtype: (..., in) -> (..., out).
+
+    Args:
+        x: the input, or two parts of it, as if concatenated.
+        layer: the layer.
+        activation: such as `torch.relu`.
+    """
     dtype = compute_dtype(layer.weight)
-    x = x.to(dtype)
-    is_known = activation in (None, torch.relu) and not layer.in_features % 8
-    if x.is_cuda and dtype == torch.bfloat16 and is_known and layer.bias is not None:
-        return _Linear.apply(x, layer.weight, layer.bias, activation is torch.relu)
-    y = layer(x)
+    parts = [part.to(dtype) for part in (x if isinstance(x, tuple) else (x,))]
+    is_known = activation in (None, torch.relu) and layer.bias is not None
+    is_aligned = not any(part.shape[-1] % 8 for part in parts)
+    if parts[0].is_cuda and dtype == torch.bfloat16 and is_known and is_aligned:
+        return _Linear.apply(layer.weight, layer.bias, activation is torch.relu, *parts)
+    y = layer(torch.cat(parts, -1) if len(parts) > 1 else parts[0])
     return y if activation is None else activation(y)
 
 
@@ -39,29 +50,40 @@ class _Linear(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, x, weight, bias, has_relu):
-        ctx.n_outputs, ctx.has_relu = len(weight), has_relu
-        weight, bias = (cast(leaf, x.dtype, multiple=8) for leaf in (weight, bias))
-        rows = x.flatten(0, -2)
-        if has_relu:
-            y = torch._addmm_activation(bias, rows, weight.T)
+    def forward(ctx, weight, bias, has_relu, *parts):
+        ctx.n_outputs, ctx.has_relu, lead = len(weight), has_relu, parts[0].shape[:-1]
+        dtype = parts[0].dtype
+        weight, bias = (cast(leaf, dtype, multiple=8) for leaf in (weight, bias))
+        parts = [part.flatten(0, -2) for part in parts]
+        weights = weight.split([part.shape[1] for part in parts], 1)
+        if has_relu and len(parts) == 1:
+            y = torch._addmm_activation(bias, parts[0], weight.T)
         else:
-            y = torch.addmm(bias, rows, weight.T)
-        ctx.save_for_backward(rows, weight, *[y] * has_relu)
-        return y[:, : ctx.n_outputs].unflatten(0, x.shape[:-1])
+            y = torch.addmm(bias, parts[0], weights[0].T)
+            for part, its_weight in zip(parts[1:], weights[1:], strict=True):
+                y.addmm_(part, its_weight.T)
+            y = y.relu_() if has_relu else y
+        ctx.save_for_backward(weight, *parts, *[y] * has_relu)
+        return y[:, : ctx.n_outputs].unflatten(0, lead)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d):
-        rows, weight, *activated = ctx.saved_tensors
+        weight, *saved = ctx.saved_tensors
+        parts, activated = (saved[:-1], saved[-1:]) if ctx.has_relu else (saved, [])
         lead, n_padding = d.shape[:-1], len(weight) - ctx.n_outputs
         d = nn.functional.pad(d.flatten(0, -2), (0, n_padding)) if n_padding else d.flatten(0, -2)
         d, d_bias = kernels.bias_gradient(d.contiguous(), *activated)
-        d_x = (d @ weight).unflatten(0, lead) if ctx.needs_input_grad[0] else None
-        d_weight = product(d.T, rows) if ctx.needs_input_grad[1] else None
+        d_weight, d_parts = None, [None] * len(parts)
+        if ctx.needs_input_grad[0]:
+            d_weights = [product(d.T, part) for part in parts]
+            d_weight = torch.cat(d_weights, 1) if len(parts) > 1 else d_weights[0]
+        for i, its_weight in enumerate(weight.split([part.shape[1] for part in parts], 1)):
+            if ctx.needs_input_grad[3 + i]:
+                d_parts[i] = (d @ its_weight).unflatten(0, lead)
         if n_padding:
             d_weight, d_bias = d_weight[: ctx.n_outputs], d_bias[: ctx.n_outputs]
-        return d_x, d_weight, d_bias, None
+        return d_weight, d_bias, None, *d_parts
 
 
 def normalised(
@@ -84,6 +106,7 @@ def normalised(
     """
     dtype = compute_dtype(leaves[0])
     possible = dtype == torch.bfloat16 and len(leaves) <= kernels.MAX_LEAVES
+    possible = possible and (lanes is None or len(leaves[0]) <= kernels.MAX_STEPS)
     for leaf in leaves:
         is_float = leaf.dtype in (torch.float16, torch.float32) and not leaf.requires_grad
         possible = possible and leaf.is_cuda and leaf.is_contiguous() and is_float

@@ -8,7 +8,7 @@
 #define __device__
 #define __global__
 #define __forceinline__ inline
-#define __launch_bounds__(threads)
+#define __launch_bounds__(n_threads)
 #define __expf expf
 
 struct uint2 {

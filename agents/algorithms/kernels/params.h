@@ -72,3 +72,31 @@ struct AdamParams {
     float beta2;
     float eps;
 };
+
+// A tensor (n_steps, B, n_features) of a rollout.
+struct SizesTensorParams {
+    const void* values;
+    int n_steps;
+    int n_features;
+    int is_half;  // float16, else float32
+};
+
+struct SizesParams {
+    SizesTensorParams tensors[16];
+    float* sizes;     // (T + 1, n_tensors, B), the largest magnitude of each row
+    int* first_rows;  // (B), the first row of `sizes` above the limit, n_rows if there is none
+    int n_tensors;
+    int n_steps;  // T + 1
+    int n_lanes;
+    float limit;
+};
+
+struct RecordParams {
+    const float* sizes;     // (n_rows, B)
+    const int* first_rows;  // (B)
+    double* record;         // see NonFiniteCheck
+    unsigned char* is_finite;  // ()
+    int n_rows;
+    int n_lanes;
+    int n_named;
+};

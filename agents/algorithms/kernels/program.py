@@ -5,21 +5,38 @@ from pathlib import Path
 import torch
 
 from megastep.agents.networks.kernels.program import CUDA_FLAGS
-from megastep.kernels.build.launch import BLOCK, launch
+from megastep.kernels.build.launch import BLOCK, launch_blocks
 from megastep.kernels.build.program import Program
 
 PROGRAM = Program(Path(__file__).parent, CUDA_FLAGS)
 N_SUMS = 6
 
 
-def run(operation: str, device: torch.device, n_threads: int, **fields) -> None:
-    """Launches an operation. A tensor stands for its address, None for null."""
+def run(
+    operation: str,
+    device: torch.device,
+    n_threads: int,
+    n_blocks_y: int = 1,
+    block: int = BLOCK,
+    **fields,
+) -> None:
+    """Launches an operation.
+
+    Args:
+        operation: its name.
+        device: where the tensors are.
+        n_threads: along x, rounded up to whole blocks.
+        n_blocks_y: blocks along y.
+        block: threads of a block.
+        fields: the fields of its struct. A tensor stands for its address, None for null.
+    """
     values = {
         name: field.data_ptr() if isinstance(field, torch.Tensor) else 0 if field is None else field
         for name, field in fields.items()
     }
     pack = getattr(PROGRAM.params, PROGRAM.cuda_operations[operation])
-    launch(PROGRAM, operation, pack(**values), device, n_threads)
+    shape = (-(-n_threads // block), n_blocks_y), block
+    launch_blocks(PROGRAM, operation, pack(**values), device, *shape)
 
 
 def n_blocks(n_threads: int) -> int:

@@ -1,53 +1,61 @@
 // The gradient of a layer before its activation (ReLU), and its sums over rows, which are the
-// gradient of the bias. A warp adds up a strip of rows, in a fixed order. The sums of strips are
-// added by the caller.
+// gradient of the bias. A block adds up a strip of rows in a fixed order; the caller adds the strips.
+// Blocks along y: words of columns, 32 at once.
+#include "constants.h"
 #include "lanes.h"
 #include "params.h"
 
 template <class T, int N>
 DEVICE void bias_gradient(const BiasGradientParams& p) {
-    int warp = (blockIdx.x * blockDim.x + threadIdx.x) / WARP, lane = threadIdx.x % WARP;
-    int n_words = p.n_columns / N;                   // of a row
-    int words = n_words < WARP ? n_words : WARP;     // that a warp handles
-    int n_blocks = (n_words + words - 1) / words;    // of columns
-    int n_groups = WARP / words;                     // rows that a warp handles at once
-    int strip = warp / n_blocks, group = lane / words;
-    int word = warp % n_blocks * words + lane % words;
-    if (strip >= p.n_strips)
-        return;
-    bool is_active = group < n_groups && word < n_words;
-    long long policy = blockIdx.y, first = policy * p.n_rows;
-    int end = min((strip + 1) * p.strip, p.n_rows);
+    constexpr int AT_ONCE = 4, WARPS = STRIP_THREADS / WARP;  // rows whose loads do not wait
+    __shared__ float of_warps[WARPS][N * WARP];
+    int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
+    int n_words = p.n_columns / N;                           // of a row
+    int words = min(n_words - WARP * (int)blockIdx.y, WARP);  // of this block
+    int groups = WARP / words, group = lane / words;         // rows that a warp handles at once
+    int word = WARP * blockIdx.y + lane % words;
+    long long policy = blockIdx.z, strip = blockIdx.x, first = policy * p.n_rows;
+    int end = min(((int)strip + 1) * STRIP, p.n_rows), step = WARPS * groups;
     float sums[N];
     clear(sums);
-    if (is_active) {
-#pragma unroll 4
-        for (int row = strip * p.strip + group; row < end; row += n_groups) {
-            long long at = (first + row) * p.n_columns + (long long)word * N;
-            float values[N];
-            read<T>(values, p.d, at);
-            if (p.activated) {
-                float activated[N];
-                read<T>(activated, p.activated, at);
-                for (int n = 0; n < N; n++)
-                    values[n] = activated[n] > 0.f ? values[n] : 0.f;
-                write<T>(p.d_masked, at, values);
+    if (group < groups)
+        for (int start = (int)strip * STRIP + warp * groups + group; start < end;
+             start += AT_ONCE * step) {
+            float values[AT_ONCE][N], activated[AT_ONCE][N];
+#pragma unroll
+            for (int i = 0; i < AT_ONCE; i++) {
+                int row = min(start + i * step, end - 1);
+                long long at = (first + row) * p.n_columns + word * N;
+                read<T>(values[i], p.d, at);
+                if (p.activated)
+                    read<T>(activated[i], p.activated, at);
             }
-            for (int n = 0; n < N; n++)
-                sums[n] += values[n];
+#pragma unroll
+            for (int i = 0; i < AT_ONCE; i++) {
+                int row = start + i * step;
+                if (row >= end)
+                    break;
+                if (p.activated) {
+                    for (int n = 0; n < N; n++)
+                        values[i][n] = activated[i][n] > 0.f ? values[i][n] : 0.f;
+                    write<T>(p.d_masked, (first + row) * p.n_columns + word * N, values[i]);
+                }
+                for (int n = 0; n < N; n++)
+                    sums[n] += values[i][n];
+            }
         }
-    }
-    float totals[N];
-    clear(totals);
-    for (int other = 0; other < n_groups; other++)
-        for (int n = 0; n < N; n++)
-            totals[n] += __shfl_sync(~0u, sums[n], other * words + lane % words);
-    if (is_active && !group) {
-        float* target = p.sums + (policy * p.n_strips + strip) * p.n_columns + word * N;
-        for (int n = 0; n < N; n++)
-            target[n] = totals[n];
+    for (int n = 0; n < N; n++)
+        of_warps[warp][N * lane + n] = sums[n];
+    __syncthreads();
+    float* target = p.sums + (policy * p.n_strips + strip) * p.n_columns + WARP * N * blockIdx.y;
+    for (int column = threadIdx.x; column < words * N; column += STRIP_THREADS) {
+        float total = 0.f;
+        for (int i = 0; i < WARPS; i++)
+            for (int other = 0; other < groups; other++)
+                total += of_warps[i][other * words * N + column];
+        target[column] = total;
     }
 }
 
-KERNEL bias_gradient_float32(BiasGradientParams p) { bias_gradient<float, 4>(p); }
-KERNEL bias_gradient_bfloat16(BiasGradientParams p) { bias_gradient<Bfloat16, 8>(p); }
+KERNEL BOUNDS(256) bias_gradient_float32(BiasGradientParams p) { bias_gradient<float, 4>(p); }
+KERNEL BOUNDS(256) bias_gradient_bfloat16(BiasGradientParams p) { bias_gradient<Bfloat16, 8>(p); }

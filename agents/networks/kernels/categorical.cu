@@ -1,15 +1,8 @@
-// Categorical actions: choosing them when acting, one warp per lane; log-probability and entropy when
+// Categorical actions: choosing them when acting, ACT_THREADS threads per lane; log-probability and entropy when
 // learning, and their gradients, one thread per row.
+#include "constants.h"
 #include "lanes.h"
 #include "params.h"
-
-constexpr unsigned int ALL_LANES = ~0u;
-
-DEVICE float sum_of_warp(float x) {
-    for (int mask = WARP / 2; mask; mask /= 2)
-        x += __shfl_xor_sync(ALL_LANES, x, mask);
-    return x;
-}
 
 template <class T>
 DEVICE float rounded(float x) {
@@ -18,82 +11,86 @@ DEVICE float rounded(float x) {
     return to_float(value);
 }
 
-// The score of each choice of an agent, that of choice k in lane k; others have -infinity.
+// The scores of an agent's choices, in each of the ACT_THREADS threads of a lane.
 template <class T>
-DEVICE float score_of(const CategoricalActParams& p, long long policy, long long row, int agent,
-                      int lane) {
-    constexpr int AT_ONCE = 8;  // choices, so that their loads do not wait for each other
-    float score = __int_as_float(0xff800000);
-    long long first_choice = (policy * p.n_agents + agent) * p.n_choices;
-    for (int start = 0; start < p.n_choices; start += AT_ONCE) {
-        float sums[AT_ONCE] = {};
-        for (int first = 4 * lane; first < p.width; first += 4 * WARP) {
-            float features[4];
-            read<T>(features, p.features, row * p.width + first);
+DEVICE void score(float (&scores)[MAX_CHOICES], const CategoricalActParams& p, int row,
+                  const T* weight, const T* bias, int part) {
+    for (int k = 0; k < MAX_CHOICES; k++)
+        scores[k] = 0.f;
+    const T* features = (const T*)p.features + (long long)row * p.width;
+    for (int first = 4 * part; first < p.width; first += 4 * ACT_THREADS) {
+        float of_lane[4];
+        read<T>(of_lane, features, first);
 #pragma unroll
-            for (int k = 0; k < AT_ONCE; k++) {
+        for (int k = 0; k < MAX_CHOICES; k++)
+            if (k < p.n_choices) {
                 float weights[4];
-                long long choice = first_choice + min(start + k, p.n_choices - 1);
-                read<T>(weights, p.weight, choice * p.width + first);
+                read<T>(weights, weight + k * p.width, first);
 #pragma unroll
                 for (int n = 0; n < 4; n++)
-                    sums[k] += features[n] * weights[n];
+                    scores[k] += of_lane[n] * weights[n];
             }
-        }
-#pragma unroll
-        for (int k = 0; k < AT_ONCE; k++) {
-            float sum = sum_of_warp(sums[k]);
-            if (lane == start + k && lane < p.n_choices)
-                score = rounded<T>(sum + to_float(((const T*)p.bias)[first_choice + lane]));
-        }
     }
-    return score;
+#pragma unroll
+    for (int k = 0; k < MAX_CHOICES; k++) {
+        for (int mask = ACT_THREADS / 2; mask; mask /= 2)
+            scores[k] += __shfl_xor_sync(~0u, scores[k], mask);
+        if (k < p.n_choices)
+            scores[k] = rounded<T>(scores[k] + to_float(bias[k]));
+    }
 }
 
 // Logits are log-softmax of the scores. Samples by the Gumbel-max trick.
 template <class T>
 DEVICE void act(const CategoricalActParams& p) {
-    int i = (blockIdx.x * blockDim.x + threadIdx.x) / WARP, lane = threadIdx.x % WARP;
-    if (i >= p.n_lanes)
-        return;
-    long long policy = blockIdx.y, row = policy * p.n_lanes + i;
+    int thread = blockIdx.x * blockDim.x + threadIdx.x, part = thread % ACT_THREADS;
+    int lane = min(thread / ACT_THREADS, p.n_lanes - 1);  // all threads of a warp shuffle
+    long long policy = blockIdx.y;
+    int row = (int)policy * p.n_lanes + lane;
     float logprob = 0.f;
     for (int agent = 0; agent < p.n_agents; agent++) {
-        float score = score_of<T>(p, policy, row, agent, lane), largest = score;
-        for (int mask = WARP / 2; mask; mask /= 2)
-            largest = fmaxf(largest, __shfl_xor_sync(ALL_LANES, largest, mask));
-        bool is_choice = lane < p.n_choices;
-        float total = sum_of_warp(is_choice ? expf(score - largest) : 0.f);
-        float logit = score - largest - logf(total), value = logit;
-        long long at = (row * p.n_agents + agent) * p.n_choices + lane;
-        if (is_choice) {
-            p.logits[at] = logit;
-            if (p.noise)
-                value -= logf(fmaxf(p.noise[at], 1e-20f));
-        }
-        int best = lane;
-        for (int mask = WARP / 2; mask; mask /= 2) {
-            float other = __shfl_xor_sync(ALL_LANES, value, mask);
-            int other_best = __shfl_xor_sync(ALL_LANES, best, mask);
-            if (other > value || (other == value && other_best < best)) {
-                value = other;
-                best = other_best;
+        long long choice = (policy * p.n_agents + agent) * p.n_choices;
+        float scores[MAX_CHOICES];
+        score<T>(scores, p, row, (const T*)p.weight + choice * p.width,
+                 (const T*)p.bias + choice, part);
+        float largest = scores[0], total = 0.f;
+#pragma unroll
+        for (int k = 1; k < MAX_CHOICES; k++)
+            if (k < p.n_choices)
+                largest = fmaxf(largest, scores[k]);
+#pragma unroll
+        for (int k = 0; k < MAX_CHOICES; k++)
+            if (k < p.n_choices)
+                total += expf(scores[k] - largest);
+        float log_total = logf(total), best_value = 0.f, best_logit = 0.f;
+        long long at = ((long long)row * p.n_agents + agent) * p.n_choices;
+        int best = 0;
+#pragma unroll
+        for (int k = 0; k < MAX_CHOICES; k++)
+            if (k < p.n_choices) {
+                float logit = scores[k] - largest - log_total, value = logit;
+                if (part == k)
+                    p.logits[at + k] = logit;
+                if (p.noise)
+                    value -= logf(fmaxf(p.noise[at + k], 1e-20f));
+                if (!k || value > best_value) {
+                    best = k;
+                    best_value = value;
+                    best_logit = logit;
+                }
             }
-        }
-        best = __shfl_sync(ALL_LANES, best, 0);
-        best = best < p.n_choices ? best : 0;  // if every score is NaN
-        logprob += __shfl_sync(ALL_LANES, logit, best);
-        if (!lane)
-            p.actions[row * p.n_agents + agent] = best;
+        logprob += best_logit;
+        if (!part)
+            p.actions[(long long)row * p.n_agents + agent] = best;
     }
-    if (!lane)
+    if (!part)
         p.logprobs[row] = logprob;
 }
 
-KERNEL categorical_act_float32(CategoricalActParams p) { act<float>(p); }
-KERNEL categorical_act_bfloat16(CategoricalActParams p) { act<Bfloat16>(p); }
+KERNEL BOUNDS(64) categorical_act_float32(CategoricalActParams p) { act<float>(p); }
+KERNEL BOUNDS(64) categorical_act_bfloat16(CategoricalActParams p) { act<Bfloat16>(p); }
 
-KERNEL categorical_terms(CategoricalTermsParams p) {
+KERNEL BOUNDS(64) categorical_terms(CategoricalTermsParams p) {
     int row = blockIdx.x * blockDim.x + threadIdx.x;
     if (row >= p.n_rows)
         return;
@@ -109,7 +106,7 @@ KERNEL categorical_terms(CategoricalTermsParams p) {
     p.entropies[row] = entropy;
 }
 
-KERNEL categorical_terms_backward(CategoricalTermsBackwardParams p) {
+KERNEL BOUNDS(64) categorical_terms_backward(CategoricalTermsBackwardParams p) {
     int row = blockIdx.x * blockDim.x + threadIdx.x;
     if (row >= p.n_rows)
         return;

@@ -11,7 +11,9 @@ from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
 
 MAX_LEAVES = CORES.constants["MAX_LEAVES"]
 MAX_CHOICES = CORES.constants["MAX_CHOICES"]
+MAX_STEPS = 65_535  # of `normalise`; blocks along y
 _WORD = 16  # bytes that a thread reads at once
+_STRIP, _STRIP_THREADS = CORES.constants["STRIP"], CORES.constants["STRIP_THREADS"]
 
 
 def normalise(
@@ -23,7 +25,7 @@ def normalise(
     lanes: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Returns (leaf - mean) / scale of some lanes, concatenated: (T, M, n_columns) in `dtype`.
-    Columns beyond the leaves' features are 0.
+    Columns beyond the leaves' features are 0. T is at most 65,535.
 
     Args:
         leaves: at most `MAX_LEAVES`, (T, B, F) float16 or float32 each.
@@ -50,7 +52,7 @@ def normalise(
     _launch(
         f"normalise_{DTYPES[dtype]}",
         features,
-        n_columns // 4 * -(-n_steps * n_selected // CORES.constants["NORMALISED_ROWS"]),
+        n_columns // 4 * -(-n_selected // CORES.constants["NORMALISED_ROWS"]),
         leaves=b"".join(packed),
         lanes=lanes,
         features=features,
@@ -58,6 +60,7 @@ def normalise(
         n_lanes=n_lanes,
         n_selected=n_selected,
         n_columns=n_columns,
+        n_blocks_y=n_steps,
     )
     return features
 
@@ -73,15 +76,15 @@ def bias_gradient(
     """
     n_rows, n_columns = d.shape
     n_words = n_columns * d.element_size() // _WORD
-    groups = max(1, WARP // n_words)  # rows that a warp reads at once
-    strip = 32 * groups
-    n_strips = -(-n_rows // strip)
+    n_strips = -(-n_rows // _STRIP)
     d_masked = d if activated is None else torch.empty_like(d)
     sums = d.new_empty(n_strips, n_columns, dtype=torch.float32)
     _launch(
         f"bias_gradient_{DTYPES[d.dtype]}",
         d,
-        WARP * n_strips * -(-n_words // min(n_words, WARP)),
+        _STRIP_THREADS * n_strips,
+        n_blocks_y=-(-n_words // WARP),
+        block=_STRIP_THREADS,
         d=d,
         activated=activated,
         d_masked=None if activated is None else d_masked,
@@ -89,7 +92,6 @@ def bias_gradient(
         n_rows=n_rows,
         n_columns=n_columns,
         n_strips=n_strips,
-        strip=strip,
     )
     return d_masked, sums.sum(0)
 
@@ -104,7 +106,7 @@ def act(
     """Chooses actions by the softmax of a linear layer.
 
     Args:
-        features: (B, W), W a multiple of 4.
+        features: (B, W), W a multiple of 32.
         weight: (A n, W) in the same dtype.
         bias: (A n,) in the same dtype.
         shape: (A, n), n at most `MAX_CHOICES`.
@@ -120,7 +122,7 @@ def act(
     _launch(
         f"categorical_act_{DTYPES[features.dtype]}",
         features,
-        WARP * n_lanes,
+        CORES.constants["ACT_THREADS"] * n_lanes,
         features=features,
         weight=weight,
         bias=bias,
@@ -182,13 +184,13 @@ def _rows(logits, actions):
     )
 
 
-def _launch(operation, tensor, n_threads, **fields):
+def _launch(operation, tensor, n_threads, n_blocks_y=1, block=BLOCK, **fields):
     """Launches an operation for one policy on a tensor's GPU."""
     values = {
         name: field.data_ptr() if isinstance(field, torch.Tensor) else 0 if field is None else field
         for name, field in fields.items()
     }
     pack = getattr(CORES.params, CORES.cuda_operations[operation])
-    if n_threads:
-        n_blocks = -(-n_threads // BLOCK), 1
-        launch_blocks(CORES, operation, pack(**values), tensor.device, n_blocks, BLOCK)
+    if n_threads and n_blocks_y:
+        n_blocks = -(-n_threads // block), n_blocks_y
+        launch_blocks(CORES, operation, pack(**values), tensor.device, n_blocks, block)

@@ -135,11 +135,11 @@ struct LstmBackward {
     }
 };
 
-KERNEL lstm_start_float32(LstmStartParams p) { run<LstmStart, float>(p); }
-KERNEL lstm_start_bfloat16(LstmStartParams p) { run<LstmStart, Bfloat16>(p); }
-KERNEL lstm_act_float32(LstmActParams p) { run<LstmAct, float>(p); }
-KERNEL lstm_act_bfloat16(LstmActParams p) { run<LstmAct, Bfloat16>(p); }
-KERNEL lstm_forward_float32(LstmForwardParams p) { run<LstmForward, float>(p); }
-KERNEL lstm_forward_bfloat16(LstmForwardParams p) { run<LstmForward, Bfloat16>(p); }
-KERNEL lstm_backward_float32(LstmBackwardParams p) { run<LstmBackward, float>(p); }
-KERNEL lstm_backward_bfloat16(LstmBackwardParams p) { run<LstmBackward, Bfloat16>(p); }
+KERNEL BOUNDS(64) lstm_start_float32(LstmStartParams p) { run<LstmStart, float>(p); }
+KERNEL BOUNDS(64) lstm_start_bfloat16(LstmStartParams p) { run<LstmStart, Bfloat16>(p); }
+KERNEL BOUNDS(64) lstm_act_float32(LstmActParams p) { run<LstmAct, float>(p); }
+KERNEL BOUNDS(64) lstm_act_bfloat16(LstmActParams p) { run<LstmAct, Bfloat16>(p); }
+KERNEL BOUNDS(64) lstm_forward_float32(LstmForwardParams p) { run<LstmForward, float>(p); }
+KERNEL BOUNDS(64) lstm_forward_bfloat16(LstmForwardParams p) { run<LstmForward, Bfloat16>(p); }
+KERNEL BOUNDS(64) lstm_backward_float32(LstmBackwardParams p) { run<LstmBackward, float>(p); }
+KERNEL BOUNDS(64) lstm_backward_bfloat16(LstmBackwardParams p) { run<LstmBackward, Bfloat16>(p); }

@@ -114,11 +114,10 @@ struct BiasGradientParams {
     const void* d;          // (P, n_rows, n_columns) compute
     const void* activated;  // of the same shape; null: no activation
     void* d_masked;         // d where `activated` is above 0, else 0; null without one
-    float* sums;            // (P, n_strips, n_columns), over the rows of a strip
-    int n_rows;
-    int n_columns;  // a multiple of 8
+    float* sums;            // (P, n_strips, n_columns), over STRIP rows each
+    int n_rows;             // at most 2^31 - STRIP
+    int n_columns;          // a multiple of 8
     int n_strips;
-    int strip;  // rows of a strip
 };
 
 struct CategoricalActParams {
@@ -130,9 +129,9 @@ struct CategoricalActParams {
     long long* actions;    // (P, B, A)
     float* logprobs;       // (P, B), of the joint actions
     int n_lanes;
-    int width;  // a multiple of 4
+    int width;  // a multiple of 32
     int n_agents;
-    int n_choices;  // at most 32
+    int n_choices;  // at most MAX_CHOICES
 };
 
 struct CategoricalTermsParams {

@@ -99,7 +99,7 @@ struct ForwardMemory {
 template <int W>
 DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     constexpr int RANKS = W / UNITS;
-    constexpr int SENT = HALF * (UNITS + PAD) * (int)sizeof(Bits);
+    constexpr int SENT = HALF * UNITS * (int)sizeof(Bits);
     ForwardMemory<W>& memory = *(ForwardMemory<W>*)shared_memory;
     Thread me = this_thread();
     int rank = cluster_rank(), cluster = blockIdx.x / RANKS, first_lane = LANES * cluster;
@@ -236,24 +236,25 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                     memory.next_hidden[t & 1][lane][me.unit] = is_reset ? (Bits)0 : value;
                     cell = is_reset ? 0.f : after;
                 }
-            publish_to_copies();
             if (half)
                 wait_for_copies<1>();
             __syncthreads();
-            if (!is_last && me.index < RANKS)
-                send(&memory.hidden[(t + 1) & 1][rank][first][0],
-                     &memory.next_hidden[t & 1][first][0], SENT,
-                     &memory.arrivals[(t + 1) & 1][half], me.index);
-            // half of the threads write outputs, the others the next step's inputs
+            // half of the threads send the next step's inputs, the others write outputs
             int lane = first + (me.index >> 3 & 15), part = 8 * (me.index & 7);
-            bool is_output = me.index < THREADS / 2;
-            if (first_lane + lane < n_lanes && (is_output || !is_last)) {
-                long long row = (long long)(t + !is_output) * n_lanes + first_lane + lane;
-                const Bits* source = is_output ? &memory.output[t & 1][lane][part]
-                                               : &memory.next_hidden[t & 1][lane][part];
-                Bits* target = is_output ? outputs : hiddens;
-                *(uint4*)(target + row * W + rank * UNITS + part) = *(const uint4*)source;
-            }
+            bool sends = me.index < THREADS / 2;
+            bool exists = first_lane + lane < n_lanes;
+            long long at = ((long long)t * n_lanes + first_lane + lane) * W + rank * UNITS + part;
+            if (sends && !is_last) {
+                uint4 value = *(const uint4*)&memory.next_hidden[t & 1][lane][part];
+                const Bits* target = &memory.hidden[(t + 1) & 1][rank][lane][part];
+                Arrivals* arrivals = &memory.arrivals[(t + 1) & 1][half];
+#pragma unroll
+                for (int other = 0; other < RANKS; other++)
+                    send(address_in(target, other), value, address_in(arrivals, other));
+                if (exists)
+                    *(uint4*)(hiddens + at + (long long)n_lanes * W) = value;
+            } else if (!sends && exists)
+                *(uint4*)(outputs + at) = *(const uint4*)&memory.output[t & 1][lane][part];
         }
     }
 #pragma unroll
@@ -274,8 +275,7 @@ typedef float Parts[UNITS][HALF + PAD];  // of the sums for a block's units and 
 template <int W>
 struct BackwardMemory {
     static constexpr int RANKS = W / UNITS;
-    Parts parts[2][2][RANKS];    // of even and odd steps, of both halves, by the block that sends
-    Parts to_send[2][2][RANKS];  // by the block that receives
+    Parts parts[2][2][RANKS];  // of even and odd steps, of both halves, by the block that sends
     Bits d_gates[LANES][GATES + PAD];
     Bits d_output[2][LANES][UNITS + PAD];
     Arrivals arrivals[2][2];
@@ -285,6 +285,7 @@ struct BackwardMemory {
 template <int W>
 DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     constexpr int RANKS = W / UNITS;
+    constexpr int SENT = UNITS * HALF * (int)sizeof(float);
     static_assert(W == 256, "a warp multiplies two tiles of 16 units");
     BackwardMemory<W>& memory = *(BackwardMemory<W>*)shared_memory;
     Thread me = this_thread();
@@ -350,7 +351,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     if (!me.index) {
         for (int i = 0; i < 4; i++) {
             init(&memory.arrivals[i / 2][i % 2]);
-            expect(&memory.arrivals[i / 2][i % 2], RANKS * (int)sizeof(Parts));
+            expect(&memory.arrivals[i / 2][i % 2], RANKS * SENT);
         }
     }
     wait_for_copies<0>();
@@ -362,7 +363,7 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
         Arrivals* arrivals = &memory.arrivals[t & 1][half];
         wait_for(arrivals, (n_steps - 1 - t) >> 1);
         if (!me.index)
-            expect(arrivals, RANKS * (int)sizeof(Parts));
+            expect(arrivals, RANKS * SENT);
 #pragma unroll
         for (int j = 0; j < COLUMNS; j++) {
             d_hiddens[j][0] = d_hiddens[j][1] = 0.f;
@@ -436,17 +437,16 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
 #pragma unroll
                 for (int upper = 0; upper < 2; upper++) {
                     int row = 32 * me.warp + 16 * tile + me.g + 8 * upper;
-                    Parts& target = memory.to_send[t & 1][half][row / UNITS];
+                    const float* target =
+                        &memory.parts[t & 1][half][rank][row % UNITS][2 * me.q];
+                    unsigned int there = address_in(target, row / UNITS);
+                    unsigned int arrivals =
+                        address_in(&memory.arrivals[t & 1][half], row / UNITS);
 #pragma unroll
                     for (int j = 0; j < COLUMNS; j++)
-                        *(float2*)&target[row % UNITS][8 * j + 2 * me.q] = {
-                            sums[tile][j][2 * upper], sums[tile][j][2 * upper + 1]};
+                        send(there + 8 * j * (int)sizeof(float), sums[tile][j][2 * upper],
+                             sums[tile][j][2 * upper + 1], arrivals);
                 }
-            publish_to_copies();
-            __syncthreads();
-            if (me.index < RANKS)
-                send(&memory.parts[t & 1][half][rank], &memory.to_send[t & 1][half][me.index],
-                     sizeof(Parts), &memory.arrivals[t & 1][half], me.index);
 #pragma unroll
             for (int n = 0; n < 2; n++) {
                 int i = me.index + n * THREADS, lane = first + (i >> 5), gate = i >> 3 & 3;

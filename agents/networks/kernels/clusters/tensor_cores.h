@@ -111,22 +111,26 @@ DEVICE void wait_for(Arrivals* arrivals, int phase) {
     } while (!is_over);
 }
 
-// Orders this thread's writes to shared memory before the copies that follow a barrier.
-DEVICE void publish_to_copies() { asm volatile("fence.proxy.async.shared::cta;" ::: "memory"); }
-
-// Sends shared memory to the same kind of place in another block of the cluster, and tells its
-// `arrivals`. One thread calls this. The number of bytes is a multiple of 16.
-DEVICE void send(void* target, const void* source, int n_bytes, Arrivals* arrivals,
-                 unsigned int rank) {
-    unsigned int there, arrivals_there;
+// Where a block of the cluster has its copy of this shared memory.
+DEVICE unsigned int address_in(const void* shared, unsigned int rank) {
+    unsigned int there;
     asm("mapa.shared::cluster.u32 %0, %1, %2;"
         : "=r"(there)
-        : "r"(shared_address(target)), "r"(rank));
-    asm("mapa.shared::cluster.u32 %0, %1, %2;"
-        : "=r"(arrivals_there)
-        : "r"(shared_address(arrivals)), "r"(rank));
-    asm volatile("cp.async.bulk.shared::cluster.shared::cta.mbarrier::complete_tx::bytes "
-                 "[%0], [%1], %2, [%3];" ::"r"(there),
-                 "r"(shared_address(source)), "r"(n_bytes), "r"(arrivals_there)
+        : "r"(shared_address(shared)), "r"(rank));
+    return there;
+}
+
+// Begins to write to another block's shared memory. Its `arrivals` count the bytes as they come.
+DEVICE void send(unsigned int target, uint4 value, unsigned int arrivals) {
+    asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v4.b32 "
+                 "[%0], {%1, %2, %3, %4}, [%5];" ::"r"(target),
+                 "r"(value.x), "r"(value.y), "r"(value.z), "r"(value.w), "r"(arrivals)
+                 : "memory");
+}
+
+DEVICE void send(unsigned int target, float one, float two, unsigned int arrivals) {
+    asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v2.f32 "
+                 "[%0], {%1, %2}, [%3];" ::"r"(target),
+                 "f"(one), "f"(two), "r"(arrivals)
                  : "memory");
 }
