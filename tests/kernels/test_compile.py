@@ -48,7 +48,9 @@ programs = pytest.mark.parametrize("kernels", [ENGINE, *GAMES.values()], ids=["e
 
 @programs
 def test_cpu_and_gpu_have_the_same_operations(kernels):
-    assert kernels.cpu_operations == kernels.cuda_operations != {}
+    operations = dict(kernels.cuda_operations)
+    operations.pop("render_split", None)  # `render` with another number of warps
+    assert kernels.cpu_operations == operations != {}
 
 
 @programs
