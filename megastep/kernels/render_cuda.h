@@ -84,15 +84,6 @@ DEVICE int agent_ray_of(const NearestLine* nearest, int res, int n_agent_lines, 
     return best == ~0u ? -1 : (int)(best & 0xffffu);
 }
 
-// Waits for the other warp of a block in which both share an agent.
-template <int is_split>
-DEVICE void sync_agent() {
-    if (is_split)
-        __syncthreads();
-    else
-        __syncwarp();
-}
-
 template <int full_res, int has_agents, int is_split>
 DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelSpan* spans,
                          NearestLine* nearest, int* newly_seen_by_warp) {
@@ -113,19 +104,22 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
         for (int i = rank; i < p.n_words; i += n_threads)
             seen[i] = 0u;
     Tiles tiles = {0, 0};
-    if (is_split)
+    if (is_split) {
         tiles = half_of_screen(p.res, warp);
+        __syncthreads();  // `seen` is clear
+    }
+    int reads_both = is_split && (p.centre_line || p.agent_ray);  // halves of `nearest`
     for (int c = 0; c < p.n_cameras; c++) {
         int view = agent * p.n_cameras + c;
         Pose camera = pose_at(x, y, angle + p.yaws[c]);
         View<is_split> v = {camera, screen, p.ray_lengths, spans, nearest, warp_lane, tiles, 0.f};
-        if (is_split)
-            __syncthreads();  // the other warp has read `nearest`
         clear(v);
         if (has_agents && s.n_agents > 1)
             raster_agents(v, s, scenery, a);
         raster_walls(v, s, scenery, p.half_width);
-        sync_agent<is_split>();
+        __syncwarp();
+        if (reads_both)
+            __syncthreads();
         if (p.centre_line && rank == 0)
             p.centre_line[view] = nearest[p.res / 2].line;
         if (p.agent_ray && rank == warp_lane) {
@@ -135,13 +129,16 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
             if (warp_lane == 0)
                 p.agent_ray[view] = ray;
         }
+        if (reads_both)
+            __syncthreads();
         shade<full_res, has_agents>(p, v, scenery, view, seen, newly_seen);
     }
     if (!p.newly_seen)
         return;
     newly_seen = __reduce_add_sync(FULL_WARP, newly_seen);
     if (is_split) {
-        newly_seen_by_warp[warp] = newly_seen;
+        if (warp_lane == 0)
+            newly_seen_by_warp[warp] = newly_seen;
         __syncthreads();
         newly_seen = newly_seen_by_warp[0] + newly_seen_by_warp[1];
     }
