@@ -74,7 +74,12 @@ def main(device):
             )
             engine.render(c.scenery, c.agents)
         out_of_range(c, spawn)
-    for env in (envs.Explorer(7, homes, device=device), envs.Minimal(7, homes, device=device)):
+    as_trained = dict(device=device, resample=True, privileged=True, patience=1)
+    for env in (
+        envs.Explorer(7, homes, device=device),
+        envs.Explorer(7, homes, **as_trained),
+        envs.Minimal(7, homes, device=device),
+    ):
         env.reset()
         for action in range(7):
             step(env, 7, action)

@@ -4,6 +4,7 @@ N environments, A agents per environment, C cameras per agent (the axis is dropp
 R rays per camera, P = R / subsample pixels.
 """
 
+import functools
 import math
 
 import torch
@@ -19,12 +20,16 @@ from megastep.engine.launch_params import (
 from megastep.engine.outputs import Observation, Render
 from megastep.engine.scenery import Scenery
 from megastep.engine.texels import texel_bits
-from megastep.kernels.build.launch import ENGINE, WARP, launch
+from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, launch
 
 __all__ = ["observe", "render", "update_agent_geometry"]
 
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
+
+#: Two warps share an agent where there are at most so many agents per multiprocessor of a GPU. One
+#: agent then takes less time, but more instructions.
+MAX_SPLIT = 32
 
 # RenderParams' optional outputs, and the inputs that only these need. 0 is null: not wanted.
 _OPTIONAL = dict.fromkeys(
@@ -173,6 +178,22 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
         **{**_OPTIONAL, **fields},
     )
     shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)
-    threads = WARP * scenery.n_envs * scenery.n_agents
-    launch(ENGINE, "render", packed, device, threads, shared)
+    n = scenery.n_envs * scenery.n_agents
+    if "indices" not in fields and _is_split(n, res, subsample, device):
+        launch(ENGINE, "render_split", packed, device, BLOCK * n, shared * WARP // BLOCK)
+    else:
+        launch(ENGINE, "render", packed, device, WARP * n, shared)
     check_on_cpu(agents)
+
+
+def _is_split(n, res, subsample, device):
+    """Returns whether two warps share each of ``n`` agents. They share whole tiles of the screen,
+    which must hold whole pixels.
+    """
+    fits = device.type == "cuda" and res > WARP and WARP % subsample == 0
+    return fits and n <= MAX_SPLIT * _n_multiprocessors(device)
+
+
+@functools.cache
+def _n_multiprocessors(device):
+    return torch.cuda.get_device_properties(device).multi_processor_count

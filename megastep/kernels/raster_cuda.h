@@ -1,7 +1,7 @@
-// A warp rasterises one camera's view into shared memory, 32 lines at a time. Each warp lane
-// projects one line of such a group. Then the warp visits each tile of 32 pixels that the group
-// covers: each warp lane takes one pixel and keeps, of the lines that cover it, the one with the
-// largest inverse depth, or the first of equals.
+// A warp rasterises one camera's view, or a part of it, into shared memory, 32 lines at a time.
+// Each warp lane projects one line of such a group. Then the warp visits each tile of 32 pixels
+// that the group covers: each warp lane takes one pixel and keeps, of the lines that cover it, the
+// one with the largest inverse depth, or the first of equals.
 #pragma once
 #include "constants.h"
 #include "raster.h"
@@ -10,9 +10,16 @@
 constexpr int TILE = WARP;  // pixels
 static_assert(MAX_RES == TILE * WARP, "warp lane k holds tile_min of tile k");
 
+// The tiles [first, end) of a screen.
+struct Tiles {
+    int first, end;
+};
+
 // One camera's view while it is rasterised. Warp lane k holds tile_min of tile k: the smallest
 // inverse depth among its pixels. `nearest` has whole tiles; pixels beyond the screen have infinite
-// inverse depth, so they are never the smallest.
+// inverse depth, so they are never the smallest. If `is_split`, this warp has only `tiles` of the
+// screen.
+template <int is_split>
 struct View {
     const Pose& camera;
     const Screen& screen;
@@ -20,22 +27,35 @@ struct View {
     PixelSpan* spans;      // (32) in shared memory: the group's
     NearestLine* nearest;  // (whole tiles) in shared memory
     int warp_lane;
+    Tiles tiles;
     float tile_min;
 };
 
 HD int whole_tiles(int res) { return (res + TILE - 1) & ~(TILE - 1); }
 
-DEVICE void clear(View& v) {
+// Half of a screen's tiles for each of two warps.
+HD Tiles half_of_screen(int res, int warp) {
+    int n_tiles = whole_tiles(res) / TILE, middle = (n_tiles + 1) / 2;
+    return {warp ? middle : 0, warp ? n_tiles : middle};
+}
+
+// Tiles of other warps look as if something at no distance hid all lines there.
+template <int is_split>
+DEVICE void clear(View<is_split>& v) {
     __syncwarp();
-    for (int r = v.warp_lane; r < whole_tiles(v.screen.res); r += WARP)
+    int first = is_split ? TILE * v.tiles.first : 0;
+    int end = is_split ? TILE * v.tiles.end : whole_tiles(v.screen.res);
+    for (int r = first + v.warp_lane; r < end; r += WARP)
         v.nearest[r] = {r < v.screen.res ? 0.f : INF_VALUE, -1};
-    v.tile_min = 0.f;
+    int is_own = !is_split || (v.warp_lane >= v.tiles.first && v.warp_lane < v.tiles.end);
+    v.tile_min = is_own ? 0.f : INF_VALUE;
 }
 
 // The nearest of a group's lines at pixel r: its inverse depth (0: none) and its slot in the group.
 // `slots` has a bit for each line that covers the tile. Near-clipped lines are invisible where they
 // are within the radius.
-DEVICE NearestLine nearest_of_group(const View& v, int r, unsigned int slots,
+template <int is_split>
+DEVICE NearestLine nearest_of_group(const View<is_split>& v, int r, unsigned int slots,
                                     unsigned int near_clipped) {
     float at = (float)r, max_inverse = 0.f;
     int slot = 0;
@@ -67,7 +87,8 @@ DEVICE NearestLine nearest_of_group(const View& v, int r, unsigned int slots,
 
 // Rasterises 32 lines, one per warp lane, `ends` being this lane's. Lanes that are not `active`
 // have none. `line` is the index, in its environment, of the first warp lane's line.
-DEVICE void raster_group(View& v, const Float4* ends, int line, int active) {
+template <int is_split>
+DEVICE void raster_group(View<is_split>& v, const Float4* ends, int line, int active) {
     Projection projection = {{0, 0, 0.f, 0.f}, 0};
     if (active) {
         Float4 e = LOAD(ends);
@@ -77,6 +98,10 @@ DEVICE void raster_group(View& v, const Float4* ends, int line, int active) {
     int visible = span.first < span.end;
     int first_tile = visible ? span.first >> 5 : 32;
     int last_tile = visible ? (span.end - 1) >> 5 : -1;
+    if (is_split) {
+        first_tile = maxi(first_tile, v.tiles.first);
+        last_tile = mini(last_tile, v.tiles.end - 1);
+    }
     float max_inverse = maxf(span.base + span.gain * (float)span.first,
                              span.base + span.gain * (float)(span.end - 1));
     unsigned int near_clipped = __ballot_sync(FULL_WARP, projection.near_clipped);
@@ -110,7 +135,8 @@ DEVICE void raster_group(View& v, const Float4* ends, int line, int active) {
 // Rasterises walls, in groups of 32 with a bounding box around each. Groups that are off-screen are
 // skipped. The others come nearest first, so that groups entirely behind earlier ones can be
 // skipped too.
-DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scenery,
+template <int is_split>
+DEVICE void raster_walls(View<is_split>& v, const SceneryParams& s, const EnvScenery& scenery,
                          float half_width) {
     for (int start = 0; BOX_WALLS * start < scenery.n_walls; start += WARP) {
         unsigned int key = ~0u;
@@ -118,7 +144,9 @@ DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scen
         if (BOX_WALLS * (start + v.warp_lane) < scenery.n_walls) {
             float4 box = ((const float4*)s.boxes)[scenery.first_box + start + v.warp_lane];
             bounds = bounds_of(v.camera, v.screen, half_width, box.x, box.y, box.z, box.w);
-            if (bounds.distance2 >= 0.f)
+            int is_own = !is_split ||
+                         (bounds.first < TILE * v.tiles.end && bounds.last >= TILE * v.tiles.first);
+            if (bounds.distance2 >= 0.f && is_own)
                 key = __float_as_uint(bounds.distance2);
         }
         int tiles = bounds.first / TILE | bounds.last / TILE << 16;
@@ -141,7 +169,9 @@ DEVICE void raster_walls(View& v, const SceneryParams& s, const EnvScenery& scen
 }
 
 // Rasterises the lines of all agents except agent a.
-DEVICE void raster_agents(View& v, const SceneryParams& s, const EnvScenery& scenery, int a) {
+template <int is_split>
+DEVICE void raster_agents(View<is_split>& v, const SceneryParams& s, const EnvScenery& scenery,
+                          int a) {
     for (int first = 0; first < scenery.n_agent_lines; first += WARP) {
         int l = first + v.warp_lane;
         int active = l < scenery.n_agent_lines && l / s.n_model != a;

@@ -1,129 +1,5 @@
-// One warp per agent, which handles the agent's cameras one after the other. The warp rasterises a
-// camera's view; then each warp lane shades its rays, and neighbouring lanes sum theirs into
-// pixels.
-#include "common/errors.h"
-#include "common/scenery.h"
-#include "raster_cuda.h"
-#include "render.h"
-
-// The sum over `n` warp lanes, in order: this one and those after it.
-DEVICE RaySample sum_of(const RaySample& ray, int n) {
-    RaySample sum = ray;
-    for (int j = 1; j < n; j++) {
-        sum.red += __shfl_down_sync(FULL_WARP, ray.red, j);
-        sum.green += __shfl_down_sync(FULL_WARP, ray.green, j);
-        sum.blue += __shfl_down_sync(FULL_WARP, ray.blue, j);
-        sum.depth += __shfl_down_sync(FULL_WARP, ray.depth, j);
-    }
-    return sum;
-}
-
-// The sum over four neighbouring warp lanes, in pairs. Each lane returns one component: the first
-// red, the next ones blue, green and depth.
-DEVICE float quarter_of_sum(const RaySample& ray, int warp_lane) {
-    int odd = warp_lane & 1, second = warp_lane & 2;
-    float one = odd ? ray.blue : ray.red;
-    float two = odd ? ray.depth : ray.green;
-    one += __shfl_xor_sync(FULL_WARP, odd ? ray.red : ray.blue, 1);
-    two += __shfl_xor_sync(FULL_WARP, odd ? ray.green : ray.depth, 1);
-    return (second ? two : one) + __shfl_xor_sync(FULL_WARP, second ? one : two, 2);
-}
-
-// Shades a camera's rays, one batch of warp lanes at a time, and sums them into pixels.
-template <int full_res, int has_agents>
-DEVICE void shade(const RenderParams& p, const View& v, const EnvScenery& scenery, int view,
-                  unsigned int* seen, int& newly_seen) {
-    int res = p.res, subsample = p.subsample, warp_lane = v.warp_lane;
-    int batch = subsample == 4 ? WARP : WARP / subsample * subsample;
-    int channel = (warp_lane & 1) << 1 | (warp_lane & 2) >> 1;  // of quarter_of_sum
-    unsigned short* plane = channel == 3 ? p.depth : p.rgb;
-    int wanted = plane != 0;
-    plane += (long long)(channel == 3 ? view : 3 * view + channel) * p.n_pixels;
-#pragma unroll 1
-    for (int start = 0; start < res; start += batch) {
-        int r = start + warp_lane, active = r < res && warp_lane < batch;
-        RaySample sample = {0.f, 0.f, 0.f, 0.f};
-        if (active) {
-            NearestLine nearest = v.nearest[r];
-            long long ray = (long long)view * res + r;
-            if (full_res)
-                p.indices[ray] = nearest.line;
-            if (nearest.line >= 0) {
-                Surface surface =
-                    surface_of<has_agents>(p.scenery, scenery, v.camera, nearest.line);
-                sample = shade_ray<full_res>(p, v.screen, scenery, surface, view, seen, r,
-                                             nearest.inverse, newly_seen);
-            } else if (full_res) {
-                write_miss(p, ray);
-            }
-        }
-        if (subsample == 4) {
-            float sum = quarter_of_sum(sample, warp_lane);
-            if (active && wanted)
-                plane[r >> 2] = HALF_BITS(sum * p.inv_subsample);
-        } else {
-            RaySample sum = sum_of(sample, subsample);
-            if (active && warp_lane % subsample == 0)
-                write_pixel(p, view, r / subsample, sum);
-        }
-    }
-}
-
-// The ray closest to the central one that hits another agent, or the first of equals; -1: none.
-DEVICE int agent_ray_of(const NearestLine* nearest, int res, int n_agent_lines, int warp_lane) {
-    unsigned int best = ~0u;
-    for (int r = warp_lane; r < res; r += WARP) {
-        int line = nearest[r].line;
-        if (line >= 0 && line < n_agent_lines)
-            best = min(best, (unsigned int)(abs(r - res / 2) << 16 | r));
-    }
-    best = __reduce_min_sync(FULL_WARP, best);
-    return best == ~0u ? -1 : (int)(best & 0xffffu);
-}
-
-template <int full_res, int has_agents>
-DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelSpan* spans,
-                         NearestLine* nearest) {
-    const SceneryParams& s = p.scenery;
-    int env = has_agents ? agent / s.n_agents : agent, a = has_agents ? agent % s.n_agents : 0;
-    int newly_seen = 0;
-    float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
-    Screen screen = screen_of(p);
-    EnvScenery scenery = env_scenery(s, env, layout_of(s, env, p.error_flag));
-    unsigned int* seen = p.seen ? p.seen + agent * (long long)p.n_words : 0;
-    if (warp_lane == 0)
-        flag_nonfinite(p.error_flag, env, x, y, angle);
-    if (p.imu && warp_lane < 3)
-        write_imu(p, agent, warp_lane);
-    if (seen && p.clear_mask && p.clear_mask[agent])
-        for (int i = warp_lane; i < p.n_words; i += WARP)
-            seen[i] = 0u;
-    for (int c = 0; c < p.n_cameras; c++) {
-        int view = agent * p.n_cameras + c;
-        Pose camera = pose_at(x, y, angle + p.yaws[c]);
-        View v = {camera, screen, p.ray_lengths, spans, nearest, warp_lane, 0.f};
-        clear(v);
-        if (has_agents && s.n_agents > 1)
-            raster_agents(v, s, scenery, a);
-        raster_walls(v, s, scenery, p.half_width);
-        __syncwarp();
-        if (p.centre_line && warp_lane == 0)
-            p.centre_line[view] = nearest[p.res / 2].line;
-        if (p.agent_ray) {
-            int ray = -1;
-            if (has_agents)
-                ray = agent_ray_of(nearest, p.res, scenery.n_agent_lines, warp_lane);
-            if (warp_lane == 0)
-                p.agent_ray[view] = ray;
-        }
-        shade<full_res, has_agents>(p, v, scenery, view, seen, newly_seen);
-    }
-    if (!p.newly_seen)
-        return;
-    newly_seen = __reduce_add_sync(FULL_WARP, newly_seen);
-    if (warp_lane == 0)
-        p.newly_seen[agent] = newly_seen;
-}
+// One warp per agent.
+#include "render_cuda.h"
 
 // Three variants: all outputs, several agents, one agent. The last needs the fewest registers.
 KERNEL BOUNDS(24) render(RenderParams p) {
@@ -136,9 +12,9 @@ KERNEL BOUNDS(24) render(RenderParams p) {
     PixelSpan* warp_spans = spans + WARP * warp;
     NearestLine* nearest = shared + whole_tiles(p.res) * warp;
     if (p.indices)
-        render_agent<1, 1>(p, agent, warp_lane, warp_spans, nearest);
+        render_agent<1, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
     else if (p.scenery.n_agents > 1)
-        render_agent<0, 1>(p, agent, warp_lane, warp_spans, nearest);
+        render_agent<0, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
     else
-        render_agent<0, 0>(p, agent, warp_lane, warp_spans, nearest);
+        render_agent<0, 0, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
 }

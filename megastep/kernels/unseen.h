@@ -1,28 +1,9 @@
 // Counts of the visible texels that an agent has not seen yet, in 16 sectors of bearing relative to
 // the agent's heading and 3 bands of distance.
 #pragma once
+#include "common/bins.h"
 #include "common/scenery.h"
-#include "constants.h"
 #include "params.h"
-
-constexpr int BINS = BANDS * SECTORS;
-constexpr float BAND_ENDS[] = {1.5f, 4.f};  // metres
-
-// Sector 0 is straight ahead, 4 to the left, 8 behind. Bearings are compared with the tangents of
-// odd multiples of 11.25 degrees, which needs no arc tangent.
-HD int sector_of(float ahead, float left) {
-    float along = ahead < 0.f ? -ahead : ahead, across = left < 0.f ? -left : left;
-    int sector = (across > 0.19891237f * along) + (across > 0.66817864f * along) +
-                 (across > 1.49660576f * along) + (across > 5.02733949f * along);
-    if (ahead < 0.f)
-        sector = SECTORS / 2 - sector;
-    return left < 0.f ? (SECTORS - sector) % SECTORS : sector;
-}
-
-HD int band_of(float ahead, float left) {
-    float squared = ahead * ahead + left * left;
-    return (squared > BAND_ENDS[0] * BAND_ENDS[0]) + (squared > BAND_ENDS[1] * BAND_ENDS[1]);
-}
 
 // Adds the unseen texels of a wall. `first_texel` is the first texel of the wall's layout. Texels
 // that share a word of bits, at most 1.6 m of a wall, are all counted at their midpoint.
@@ -38,9 +19,8 @@ HD void count_wall(const UnseenParams& p, const Pose& pose, const unsigned int* 
         if (!bits)
             continue;
         float middle = (0.5f * (float)(from + to) - (float)first) / (float)(end - first);
-        float dx = mix(line.x, line.z, middle) - pose.x, dy = mix(line.y, line.w, middle) - pose.y;
-        float ahead = pose.cosine * dx + pose.sine * dy, left = pose.cosine * dy - pose.sine * dx;
-        ADD(bins + SECTORS * band_of(ahead, left) + sector_of(ahead, left), COUNT_BITS(bits));
+        float x = mix(line.x, line.z, middle), y = mix(line.y, line.w, middle);
+        ADD(bins + bin_of(pose, x, y), COUNT_BITS(bits));
     }
 }
 

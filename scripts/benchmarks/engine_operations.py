@@ -8,6 +8,7 @@ from random_walks import random_actions, walk_four_agents, walk_in_homes
 from timing import graph_seconds_per_call, measurement, rate, seconds_per_call
 
 from megastep import core, engine, modules
+from megastep.envs.explorer.step import explorer_step
 
 N_AGENTS = {"cuda": (8192, 262_144), "cpu": (2048,)}
 N_ARENAS = {"cuda": 65_536, "cpu": 1024}  # homes of four agents each
@@ -32,6 +33,14 @@ def operations(n: int, device: torch.device) -> Iterator[tuple[str, Callable[[in
     )
     visible = modules.visible_texels(scenery, env.spawner.points)
     yield "`unseen`", lambda i: engine.unseen(scenery, agents, env.seen, visible)
+    newly_seen, episodes = torch.zeros_like(ended, dtype=torch.int32), env.lifecycle
+    yield (
+        "`explorer_step` with a privileged observation",
+        lambda i: explorer_step(
+            scenery, agents, newly_seen, env.seen, env.runs, episodes.ages, episodes.limits,
+            episodes.ended, coverage=True, privileged=True,
+        ),
+    )  # fmt: skip
     yield "`render`, 256 rays, all fields", lambda i: engine.render(scenery, agents)
     minimal, _ = walk_in_homes("minimal", n, device)
     yield (

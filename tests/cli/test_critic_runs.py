@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from megastep import envs
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.cli.program import ConfigErrors, UserError
 from megastep.agents.training import checkpoint
+from megastep.envs.explorer import env as explorer_env
 from tests.cli.test_train import configured
 
 EXPLORER = [
@@ -34,6 +34,18 @@ def trained(*overrides):
     return train.run(configured(*overrides, tiny=EXPLORER))
 
 
+def refuse_privileged(monkeypatch):
+    """Has Explorer raise a TypeError if it computes a privileged observation."""
+
+    def plain_step(*args, privileged, **settings):
+        if privileged:
+            raise TypeError("a privileged observation is computed")
+        return step(*args, **settings)
+
+    step = explorer_env.explorer_step
+    monkeypatch.setattr(explorer_env, "explorer_step", plain_step)
+
+
 def weights(run):
     return checkpoint.load_latest(run / "checkpoints").state["policy"]
 
@@ -52,7 +64,7 @@ def test_train_resume_evaluate_record_and_init(critic, monkeypatch):
     torch.testing.assert_close(weights(second)[first], weights(run)[first], rtol=0, atol=1e-6)
 
     # evaluating and recording compute no privileged observations
-    monkeypatch.setattr(envs.Explorer, "_privileged", None)
+    refuse_privileged(monkeypatch)
     assert evaluate.main([f"run={run}", "episodes=3", "baseline=false", "device=cpu"]) == 0
     pytest.importorskip("av")
     assert record.main([f"run={run}", "steps=1", "device=cpu"]) == 0
@@ -60,7 +72,7 @@ def test_train_resume_evaluate_record_and_init(critic, monkeypatch):
 
 @pytest.mark.usefixtures("folder")
 def test_plain_critic_does_not_compute_privileged(monkeypatch):
-    monkeypatch.setattr(envs.Explorer, "_privileged", None)
+    refuse_privileged(monkeypatch)
     trained("samples=1", "agent.critic=plain")
     with pytest.raises(TypeError):
         trained("samples=1", "agent.critic=asymmetric")

@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from megastep import core, engine, scene, toys
+from megastep.envs.explorer.step import explorer_step
+from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
 
@@ -85,6 +87,19 @@ def pointgoal(c):
     return result.reward.view(LAST + 1, -1)
 
 
+def explorer(c):
+    layouts, lanes, n = c.scenery.layouts, (LAST + 1, c.n_agents), (LAST + 1) * c.n_agents
+    words = -(-layouts.max_texels // 32)
+    visible = torch.full((len(layouts), words), -1, dtype=torch.int32, device=c.device)
+    seen = torch.zeros((*lanes, words), dtype=torch.int32, device=c.device)
+    ages, limits = (torch.ones(n, dtype=torch.int32, device=c.device) for _ in range(2))
+    result = explorer_step(
+        c.scenery, c.agents, torch.zeros(lanes, dtype=torch.int32, device=c.device), seen,
+        TexelRuns(c.scenery, visible), ages, limits, ages.bool(), coverage=True, privileged=True,
+    )  # fmt: skip
+    return result.unseen.view(LAST + 1, -1)
+
+
 def spawn(c):
     n, a, device = c.scenery.n_envs, c.n_agents, c.scenery.device
     mask = torch.ones((n, a), dtype=torch.bool, device=device)
@@ -97,7 +112,7 @@ def spawn(c):
 @pytest.mark.parametrize("layout", [2, -1, 2**31 - 1, -(2**31)])
 @pytest.mark.parametrize("n_agents", [1, 3])
 @pytest.mark.parametrize(
-    "operation", [physics, render, observe, geometry, unseen, coverage, pointgoal, spawn]
+    "operation", [physics, render, observe, geometry, unseen, coverage, explorer, pointgoal, spawn]
 )
 def test_bad_layout_is_named_and_other_environments_continue(operation, n_agents, layout, device):
     expected = operation(boxes(device, n_agents))
@@ -113,7 +128,7 @@ def test_bad_layout_is_named_and_other_environments_continue(operation, n_agents
     engine.check(c.agents)
 
 
-@pytest.mark.parametrize("operation", [physics, render, observe, unseen, pointgoal])
+@pytest.mark.parametrize("operation", [physics, render, observe, unseen, explorer, pointgoal])
 @pytest.mark.parametrize("field", ["positions", "angles"])
 def test_nonfinite_pose_is_named_by_every_operation(operation, field, device):
     expected = operation(boxes(device, 2))

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from megastep import cuda, engine, scene, toys
+from megastep.engine import rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns, visible_texels
 from tests.helpers.outputs import seen_of
@@ -72,12 +73,16 @@ SETTINGS = [
     dict(n_agents=2, res=160, subsample=5),
     dict(n_agents=1, res=96, subsample=32),
     dict(n_agents=1, res=63),
+    dict(n_agents=2, res=96, subsample=4, cameras=[0, 120]),  # a half has more tiles than the other
 ]
 
 
 @pytest.mark.cuda
+@pytest.mark.parametrize("max_split", [0, 32], ids=["one warp", "two warps"])
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_cpu_and_gpu_agree_on_every_bit(settings):
+def test_cpu_and_gpu_agree_on_every_bit(settings, max_split, monkeypatch):
+    """With one warp per agent, and with two where the settings allow it."""
+    monkeypatch.setattr(rendering, "MAX_SPLIT", max_split)
     assert not any(differing(trajectory("cpu", **settings), trajectory("cuda", **settings)))
 
 

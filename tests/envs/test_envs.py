@@ -310,9 +310,9 @@ class Launches(TorchDispatchMode):
     "name, max_launches",
     [
         ("minimal", 10),
-        ("explorer", 9),
-        ("explorer, privileged", 18),
-        ("explorer, cameras", 9),
+        ("explorer", 0),
+        ("explorer, privileged", 0),
+        ("explorer, cameras", 0),
         ("deathmatch", 1),
         ("deathmatch, privileged", 1),
         ("deathmatch, all rules", 4),  # three of them for search_reward
@@ -379,10 +379,9 @@ def test_explorer_counts_the_texels_of_its_bitmap():
     assert int(state.seen.sum()) == int(state.n_seen) == int(env.n_seen[3])
 
 
-def test_explorer_without_metrics_is_the_same_otherwise(monkeypatch):
+def test_explorer_without_metrics_is_the_same_otherwise():
     names = ("explorer", "explorer, privileged")
     expected = [contract.rollout(make(name), 10) for name in names]
-    monkeypatch.setattr(engine, "coverage", None)  # a call would fail
     for name, worlds in zip(names, expected):
         env = make(name, metrics=False)
         for world, plain in zip(worlds, contract.rollout(env, 10)):

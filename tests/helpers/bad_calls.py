@@ -20,6 +20,8 @@ import torch
 from megastep import core, cuda, engine, modules, scene, toys
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.envs.deathmatch.step import TALLY_ROWS, deathmatch_step
+from megastep.envs.explorer.step import explorer_step
+from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.envs.pointgoal.goal_fields import GoalFields
 from megastep.envs.pointgoal.step import PROGRESS_ROWS, pointgoal_step
 from megastep.envs.pong.step import GAME_FIELDS, PIXELS, pong_step
@@ -64,6 +66,7 @@ def fixture(device):
         tally=torch.zeros((TALLY_ROWS, N * A), device=device),
         ages=torch.zeros(N * A, dtype=torch.int32, device=device),
         ended=torch.zeros(N * A, dtype=torch.bool, device=device),
+        runs=TexelRuns(scenery, torch.zeros((D, words), dtype=torch.int32, device=device)),
     )
 
 
@@ -328,6 +331,22 @@ def operations(f):
         dict(counts=f.counts.view(-1), mask=f.mask.view(-1), seed=1, out=f.out),
         dict(counts=tensors, mask=tensors, seed=lambda g: [*integers(0)(g)][:6], out=tensors),
     )
+    yield (
+        explorer_step,
+        dict(
+            both, newly_seen=f.counts, seen=f.seen, runs=f.runs, ages=f.ages, limits=f.numbers,
+            ended=f.ended, coverage=True, privileged=True,
+        ),
+        dict(
+            OPERANDS,
+            runs=objects,
+            **dict.fromkeys(("newly_seen", "seen", "ages", "limits", "ended"), tensors),
+            patience=lambda good: integers(1, 2**31 - 1)(1),
+            coverage=flags,
+            privileged=flags,
+        ),
+    )  # fmt: skip
+    yield TexelRuns, dict(scenery=f.scenery, visible=f.visible), dict(visible=tensors)
     yield (
         pong_step,
         dict(games=f.games, actions=f.actions, error_flag=f.error_flag, seed=1, pixels=f.pixels),

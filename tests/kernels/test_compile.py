@@ -15,6 +15,7 @@ import torch
 
 from megastep.agents.networks.kernels.program import CORES
 from megastep.envs.deathmatch.step import PROGRAM as DEATHMATCH
+from megastep.envs.explorer.step import PROGRAM as EXPLORER
 from megastep.envs.pointgoal.step import PROGRAM as POINTGOAL
 from megastep.envs.pong.step import PROGRAM as PONG
 from megastep.kernels.build import compile, launch, program
@@ -41,13 +42,15 @@ def run(code, cache, **env):
     return process.returncode, process.stdout.strip(), process.stderr
 
 
-GAMES = dict(deathmatch=DEATHMATCH, pointgoal=POINTGOAL, pong=PONG)
+GAMES = dict(deathmatch=DEATHMATCH, explorer=EXPLORER, pointgoal=POINTGOAL, pong=PONG)
 programs = pytest.mark.parametrize("kernels", [ENGINE, *GAMES.values()], ids=["engine", *GAMES])
 
 
 @programs
 def test_cpu_and_gpu_have_the_same_operations(kernels):
-    assert kernels.cpu_operations == kernels.cuda_operations != {}
+    operations = dict(kernels.cuda_operations)
+    operations.pop("render_split", None)  # `render` with another number of warps
+    assert kernels.cpu_operations == operations != {}
 
 
 @programs

@@ -8,12 +8,14 @@ import pytest
 
 from megastep.agents.networks.kernels.program import CORES
 from megastep.envs.deathmatch.step import PROGRAM as DEATHMATCH
+from megastep.envs.explorer.step import PROGRAM as EXPLORER
 from megastep.envs.pointgoal.step import PROGRAM as POINTGOAL
 from megastep.envs.pong.step import PROGRAM as PONG
 from megastep.kernels.build import compile, headers
 from megastep.kernels.build.launch import ENGINE
 
-PROGRAMS = dict(engine=ENGINE, cores=CORES, pong=PONG, deathmatch=DEATHMATCH, pointgoal=POINTGOAL)
+GAMES = dict(deathmatch=DEATHMATCH, explorer=EXPLORER, pointgoal=POINTGOAL, pong=PONG)
+PROGRAMS = dict(engine=ENGINE, cores=CORES, **GAMES)
 programs = pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS)
 
 

@@ -12,6 +12,8 @@ from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.envs.common import SceneryEnv
+from megastep.envs.explorer.step import N_EPISODE, explorer_step
+from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
 
@@ -63,7 +65,7 @@ class Explorer(SceneryEnv):
         privileged: if True, worlds have ``privileged`` for a critic: ``episode`` (B, 1, 4), steps
             left and taken, texels seen and left; ``unseen`` (B, 1, 48), where around the agent the
             visible texels lie that it has not seen yet.
-        metrics: if False, worlds have no ``metrics``, which saves a kernel launch per step.
+        metrics: if False, worlds have no ``metrics``.
     """
 
     n_agents = 1
@@ -114,18 +116,20 @@ class Explorer(SceneryEnv):
         pixels = self.obs_space.d.H * self.obs_space.d.W
         engine.fit(n_envs, 4 * words + 8 * pixels + 64, self.device)
         self.seen = torch.zeros((n_envs, 1, words), dtype=torch.int32, device=self.device)
+        self.runs = None
         if metrics or privileged:
             self.visible = modules.visible_texels(self.core.scenery, self.spawner.points)
+            self.runs = TexelRuns(self.core.scenery, self.visible)
         if privileged:
-            self.units = torch.tensor([200.0, 1000.0, 1000.0, 1000.0], device=self.device)
             self.privileged_space = dotdict(
-                episode=spaces.MultiVector(1, 4),
+                episode=spaces.MultiVector(1, N_EPISODE),
                 unseen=spaces.MultiVector(1, engine.BANDS * engine.SECTORS),
             )
 
     def reset(self) -> arrdict:
         """Starts a new episode in every lane. Returns the first world."""
-        return self._world(self.lifecycle.start_all())
+        self.lifecycle.ended.fill_(True)
+        return self._world()
 
     def desync(self) -> None:
         """Gives every lane a random age, from the seed, so that episodes do not end together."""
@@ -134,45 +138,38 @@ class Explorer(SceneryEnv):
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step by ``decision["actions"]``. Returns a world."""
         self.movement(decision)
-        return self._world(self.lifecycle.start_ended())
+        return self._world()
 
-    def _world(self, reset):
-        self.spawner(reset)
-        clear_mask = modules.to_agents(reset, self.n_agents)
-        obs, newly_seen = self._observation(seen=self.seen, clear_mask=clear_mask)
-        self.lifecycle.limits.masked_fill_(reset, self.patience).add_(newly_seen)
-        reward = (newly_seen / modules.TEXELS_PER_POINT).masked_fill_(reset, 0.0)
-        flags = self.lifecycle(reset)
-        world = arrdict(obs=obs, reward=reward, **flags)
-        if self.has_metrics:
-            world["metrics"] = self._metrics(flags.truncated)
-        if self.privileged_space is not None:
-            world["privileged"] = self._privileged()
+    def _world(self):
+        """Respawns agents whose episode has ended, renders, and computes rewards and flags."""
+        ages, limits, ended = self.lifecycle.ages, self.lifecycle.limits, self.lifecycle.ended
+        self.spawner(ended)
+        obs, newly_seen = self._observation(seen=self.seen, clear_mask=ended[:, None])
+        step = explorer_step(
+            self.core.scenery,
+            self.core.agents,
+            newly_seen,
+            self.seen,
+            self.runs,
+            ages,
+            limits,
+            ended,
+            patience=self.patience,
+            coverage=self.has_metrics,
+            privileged=self.privileged_space is not None,
+        )
+        world = arrdict(
+            obs=obs,
+            reward=step.reward,
+            reset=step.reset,
+            terminal=step.terminal,
+            truncated=step.truncated,
+        )
+        if step.coverage is not None:
+            world["metrics"] = arrdict(coverage=step.coverage)
+        if step.unseen is not None:
+            world["privileged"] = arrdict(episode=step.episode, unseen=step.unseen)
         return world
-
-    def _metrics(self, ends):
-        """``coverage`` (B,), of the episodes that end here."""
-        ends = modules.to_agents(ends, self.n_agents)
-        coverage = engine.coverage(
-            self.core.scenery, self.core.agents, self.seen, self.visible, ends
-        )
-        return arrdict(coverage=modules.to_lanes(coverage))
-
-    def _privileged(self):
-        """Inputs of the critic, scaled to about 1.
-
-        ``episode`` (B, 1, 4): steps left and taken, texels seen and left. ``unseen`` (B, 1, 48):
-        square root of (unseen texels / 64) in each band and sector of ``engine.unseen``.
-        """
-        ages, limits = self.lifecycle.ages, self.lifecycle.limits
-        counts = engine.unseen(self.core.scenery, self.core.agents, self.seen, self.visible)
-        counts = counts.view(self.n_envs, 1, -1)
-        columns = limits - ages, ages, self.n_seen, counts.sum((1, 2), dtype=torch.int32)
-        return arrdict(
-            episode=torch.stack(columns, -1)[:, None] / self.units,
-            # in double precision: the float square roots of CPU and GPU differ in the last bit
-            unseen=(counts.double() / modules.TEXELS_PER_POINT).sqrt_().float(),
-        )
 
     @property
     def n_seen(self) -> torch.Tensor:
@@ -180,7 +177,7 @@ class Explorer(SceneryEnv):
         return self.lifecycle.limits - self.patience
 
     def _observation(self, **bitmaps):
-        """Returns the observation and the number of newly seen texels, (B,) int32.
+        """Returns the observation and the number of newly seen texels, (N, 1) int32.
 
         Without ``bitmaps`` (arguments ``seen`` and ``clear_mask`` of ``engine.observe``) the number
         is None.
@@ -194,7 +191,7 @@ class Explorer(SceneryEnv):
             d=view.depth.view(self.n_envs, *self.obs_space.d.shape),
             imu=view.imu,
         )
-        return obs, modules.to_lanes(view.newly_seen) if bitmaps else None
+        return obs, view.newly_seen
 
     def state(self, e: int = 0) -> arrdict:
         """Returns the tensors of environment ``e`` that :meth:`plot_state` draws."""

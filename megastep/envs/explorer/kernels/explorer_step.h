@@ -1,0 +1,82 @@
+// One step of Explorer: where episodes start and end, rewards, the fraction of the home that was
+// seen, and what a critic sees: counts of the visible texels that are still unseen, in the bins of
+// common/bins.h.
+#pragma once
+#include "common/bins.h"
+#include "common/errors.h"
+#include "common/scenery.h"
+#include "constants.h"
+#include "params.h"
+
+// Visible texels of one wall that share a word of bits, at most 1.6 m. They are all counted at the
+// run's midpoint.
+struct ALIGNED Run {
+    float x, y;
+    unsigned int word, bits;
+};
+
+// A layout's runs [first, end).
+struct Runs {
+    int first, end;
+};
+
+HD Runs runs_of(const ExplorerStepParams& p, int layout) {
+    return {p.run_starts[layout], p.run_starts[layout + 1]};
+}
+
+HD const unsigned int* seen_by(const ExplorerStepParams& p, int agent) {
+    return p.seen + agent * (long long)p.n_words;
+}
+
+HD Pose pose_of(const ExplorerStepParams& p, int agent, int env) {
+    float x = p.positions[2 * agent], y = p.positions[2 * agent + 1], angle = p.angles[agent];
+    flag_nonfinite(p.error_flag, env, x, y, angle);
+    return pose_at(x, y, angle);
+}
+
+// An agent's episode.
+struct Episode {
+    int reset, newly_seen, age, limit;
+};
+
+HD Episode read_episode(const ExplorerStepParams& p, int agent) {
+    return {p.ended[agent], p.newly_seen[agent], p.ages[agent], p.limits[agent]};
+}
+
+// The episode one step later. Each texel that is seen for the first time is worth another step.
+HD Episode next(const ExplorerStepParams& p, const Episode& before) {
+    Episode now = before;
+    now.age = before.reset ? 0 : before.age + 1;
+    now.limit = (before.reset ? p.patience : before.limit) + before.newly_seen;
+    return now;
+}
+
+HD int is_over(const Episode& episode) { return episode.age >= episode.limit; }
+
+HD void write_episode(const ExplorerStepParams& p, const Episode& episode, int agent) {
+    p.ages[agent] = episode.age;
+    p.limits[agent] = episode.limit;
+    p.ended[agent] = (unsigned char)is_over(episode);
+    p.reward[agent] = episode.reset ? 0.f : (float)episode.newly_seen / p.texels_per_point;
+    p.reset[agent] = (unsigned char)episode.reset;
+    p.terminal[agent] = 0;
+    p.truncated[agent] = (unsigned char)is_over(episode);
+}
+
+// The fraction of the visible texels that an agent has seen, if its episode is over.
+HD void write_coverage(const ExplorerStepParams& p, const Episode& episode, int agent, int layout,
+                       int n_left) {
+    int n = p.n_visible[layout];
+    p.coverage[agent] = is_over(episode) ? (float)(n - n_left) / (float)maxi(n, 1) : 0.f;
+}
+
+// Number k of what a critic sees of an episode, scaled to about 1.
+HD float episode_number(const ExplorerStepParams& p, const Episode& episode, int n_left, int k) {
+    if (k == 0)
+        return (float)(episode.limit - episode.age) / 200.f;
+    return (float)(k == 1 ? episode.age : k == 2 ? episode.limit - p.patience : n_left) / 1000.f;
+}
+
+HD float unseen_number(const ExplorerStepParams& p, int count) {
+    return SQRT((float)count / p.texels_per_point);
+}

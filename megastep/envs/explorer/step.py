@@ -1,0 +1,109 @@
+"""One step of Explorer as one operation. N environments, A agents each, B = N A lanes."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from megastep.engine import checks
+from megastep.engine.agents import Agents, check_on_cpu
+from megastep.engine.launch_params import (
+    error_flag_address,
+    lanes_of,
+    scenery_params,
+    state_params,
+)
+from megastep.engine.scenery import Scenery
+from megastep.engine.texels import BANDS, SECTORS, texel_bits
+from megastep.envs.explorer.texel_runs import TexelRuns
+from megastep.kernels.build.launch import WARP, launch
+from megastep.kernels.build.program import Program
+from megastep.modules.visibility import TEXELS_PER_POINT
+
+__all__ = ["N_EPISODE", "PROGRAM", "ExplorerStep", "explorer_step"]
+
+PROGRAM = Program(Path(__file__).parent / "kernels")
+N_EPISODE = PROGRAM.constants["N_EPISODE"]  # numbers that a critic sees of an episode
+
+
+class ExplorerStep(NamedTuple):
+    """The outcome of a step, one row per lane."""
+
+    reward: torch.Tensor  # (B,)
+    reset: torch.Tensor  # (B,) bool
+    terminal: torch.Tensor  # (B,) bool, always False
+    truncated: torch.Tensor  # (B,) bool
+    coverage: torch.Tensor | None  # (B,) 0 where no episode ends; None if not wanted, as the next
+    episode: torch.Tensor | None  # (B, 1, 4): steps left / 200; steps taken, texels seen and left,
+    # each / 1000
+    unseen: torch.Tensor | None  # (B, 1, 48): square root of (unseen texels / 64) in each band and
+    # sector of engine.unseen
+
+
+def explorer_step(
+    scenery: Scenery,
+    agents: Agents,
+    newly_seen: torch.Tensor,
+    seen: torch.Tensor,
+    runs: TexelRuns | None,
+    ages: torch.Tensor,
+    limits: torch.Tensor,
+    ended: torch.Tensor,
+    *,
+    patience: int = 200,
+    coverage: bool = False,
+    privileged: bool = False,
+) -> ExplorerStep:
+    """Rewards each agent for texels that it has seen for the first time, and ends episodes. See
+    :class:`~megastep.envs.Explorer`.
+
+    Args:
+        newly_seen: (N, A) int32, from :func:`~megastep.engine.observe`.
+        seen: (N, A, n_words) int32, the bitmap that it was given.
+        runs: the visible texels of the scenery's layouts. None if neither ``coverage`` nor
+            ``privileged``.
+        ages: (B,) int32, steps since the first observation, updated in place.
+        limits: (B,) int32, age at which the episode is truncated, updated in place.
+        ended: (B,) bool, updated in place. In: lanes that start an episode in this step. Out: lanes
+            whose episode ends in this step.
+        patience: an episode is truncated after this many steps plus the texels seen.
+        coverage: compute the fraction of the visible texels that was seen, where an episode ends.
+        privileged: compute the privileged observation.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+        EngineError: on the CPU, if a position is NaN or a layout does not exist.
+    """
+    n, a = lanes = lanes_of(scenery, agents)
+    device, n_lanes = scenery.device, n * a
+    flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
+    coverage_out = episode = unseen = None
+    if checks.flag("coverage", coverage):
+        coverage_out = torch.empty(n_lanes, device=device)
+    if checks.flag("privileged", privileged):
+        episode = torch.empty((n_lanes, 1, N_EPISODE), device=device)
+        unseen = torch.empty((n_lanes, 1, BANDS * SECTORS), device=device)
+    out = ExplorerStep(torch.empty(n_lanes, device=device), *flags, coverage_out, episode, unseen)
+    seen_at, n_words = texel_bits(scenery, "seen", seen, lanes)
+    tables = dict(runs=0, run_starts=0, n_visible=0)
+    if coverage or privileged:
+        tables = checks.instance("runs", runs, TexelRuns).addresses(scenery, n_words)
+    packed = PROGRAM.params.ExplorerStepParams(
+        scenery=scenery_params(scenery, agents.radius),
+        **state_params(scenery, agents, "positions", "angles"),
+        newly_seen=checks.address("newly_seen", newly_seen, lanes, torch.int32, device),
+        seen=seen_at,
+        **tables,
+        ages=checks.address("ages", ages, (n_lanes,), torch.int32, device),
+        limits=checks.address("limits", limits, (n_lanes,), torch.int32, device),
+        ended=checks.address("ended", ended, (n_lanes,), torch.bool, device),
+        error_flag=error_flag_address(scenery, agents),
+        **{k: 0 if v is None else v.data_ptr() for k, v in out._asdict().items()},
+        n_words=n_words,
+        patience=checks.integer("patience", patience, 1, 2**31 - 1),
+        texels_per_point=TEXELS_PER_POINT,
+    )
+    n_threads = n_lanes * WARP if privileged else n_lanes
+    launch(PROGRAM, "explorer_step", packed, device, threads=n_threads)
+    check_on_cpu(agents)
+    return out

@@ -1,0 +1,176 @@
+"""Explorer's step as one operation, against its twin in plain PyTorch."""
+
+import pytest
+import torch
+
+from megastep import contract, core, engine, envs, modules, scene, toys
+from megastep.arrdict import arrdict
+from megastep.envs.explorer.step import explorer_step
+from megastep.envs.explorer.texel_runs import TexelRuns
+from megastep.geometries import sample
+from tests.helpers import explorer_twin, random_scenery
+from tests.helpers.outputs import Poison, seen_of
+
+STATE = "ages", "limits", "ended"
+
+
+def packed(bits):
+    """Packs bits (..., 32 n_words) into words (..., n_words) int32, the first in the lowest bit."""
+    values = torch.tensor([2**i for i in range(31)] + [-(2**31)])
+    return (bits.unflatten(-1, (-1, 32)) * values).sum(-1).int()
+
+
+def random_state(c, seed, density):
+    """Returns a core's bitmaps ``seen`` and ``visible``, and the tensors of its episodes: some
+    start, some end, some go on.
+    """
+    random = torch.Generator().manual_seed(seed)
+    layouts, lanes = c.scenery.layouts, (c.n_envs, c.n_agents)
+    n_texels = layouts.texel_starts[layouts.wall_starts.long()].diff()
+    n_words = seen_of(c).shape[-1] + seed % 2
+    inside = torch.arange(32 * n_words) < n_texels.cpu()[:, None]
+    is_visible, is_seen = (
+        torch.rand((*axes, 32 * n_words), generator=random) < chance
+        for axes, chance in (((len(layouts),), density), (lanes, 0.5))
+    )
+    visible, seen = packed(is_visible & inside).to(c.device), packed(is_seen).to(c.device)
+    n = c.n_envs * c.n_agents
+
+    def integers(low, high):
+        return torch.randint(low, high, (n,), generator=random, dtype=torch.int32).to(c.device)
+
+    ended = (torch.rand(n, generator=random) < 0.3).to(c.device)
+    state = dict(ages=integers(0, 300), limits=integers(100, 400), ended=ended)
+    return seen, visible, integers(0, 90).view(lanes), state
+
+
+def check_step(c, seed, density, monkeypatch):
+    """Compares all outputs and the new state with the twin, bit by bit. Returns how many episodes
+    start and end.
+    """
+    seen, visible, newly_seen, state = random_state(c, seed, density)
+    expected = explorer_twin.explorer_step(
+        c.scenery, c.agents, newly_seen, seen, visible, **state, patience=7
+    )
+    runs, poison = TexelRuns(c.scenery, visible), Poison(torch.empty)
+    for wanted in ((True, True), (True, False), (False, True), (False, False)):
+        coverage, privileged = wanted
+        now = {name: tensor.clone() for name, tensor in state.items()}
+        with monkeypatch.context() as patch:
+            patch.setattr(torch, "empty", poison.allocate)
+            out = explorer_step(
+                c.scenery, c.agents, newly_seen, seen, runs if any(wanted) else None, **now,
+                patience=7, coverage=coverage, privileged=privileged,
+            )._asdict()  # fmt: skip
+        assert (out["coverage"] is None, out["unseen"] is None) == (not coverage, not privileged)
+        for name, tensor in (out | now).items():
+            if tensor is not None:
+                ours, theirs = tensor.cpu(), expected[name].cpu()
+                assert ours.dtype == theirs.dtype and torch.equal(ours, theirs), (name, wanted)
+    return int(expected["reset"].sum()), int(expected["truncated"].sum())
+
+
+@pytest.mark.parametrize("n_agents", [1, 3])
+@pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
+def test_step_matches_twin_on_every_bit(n_agents, degenerate, device, monkeypatch):
+    """Walls begin anywhere in a word, have hundreds of words or none. Environments share layouts,
+    and a layout has no environment. Densities 0 and 1 leave no run, and all.
+    """
+    n_starts = n_ends = 0
+    for seed, density in enumerate((0.0, 0.02, 0.5, 1.0)):
+        scenery = random_scenery.random_environments(
+            seed, n_agents=n_agents, degenerate=degenerate, origin=190.0 if seed % 2 else 1.0
+        )
+        arguments = scenery.scenery_arguments(device)
+        c = core.Core(engine.Scenery(**arguments), res=8)
+        c.agents.positions.copy_(scenery.positions)
+        c.agents.angles.copy_(scenery.angles)
+        c.scenery.layout.copy_(torch.tensor([1, 3, 0, 1]))
+        starts, ends = check_step(c, seed, density, monkeypatch)
+        n_starts, n_ends = n_starts + starts, n_ends + ends
+    assert n_starts and n_ends
+
+
+@pytest.mark.parametrize("n_envs", [1, 77])
+def test_step_matches_twin_in_homes(n_envs, device, monkeypatch):
+    """77 environments fill no whole number of warps or blocks."""
+    homes = sample("bench", 3)
+    c = core.Core(scene.scenery(homes, 1, n_envs, device=device), res=8)
+    modules.RandomSpawns(homes, c)(c.agent_full(True))
+    check_step(c, 1, 0.7, monkeypatch)
+
+
+@pytest.mark.parametrize("settings", [dict(), dict(resample=True, privileged=True)])
+def test_episodes_match_twin(settings, device):
+    """Every world of many short episodes is that of the twin, from the state before it."""
+    env = envs.Explorer(
+        9, sample("bench", 3), device=device, patience=1, res=1, subsample=1, **settings
+    )
+    life, generator, n_ends = env.lifecycle, torch.Generator().manual_seed(1), 0
+    world, before = env.reset(), None
+    for _ in range(80):
+        if before is not None:
+            newly_seen = (64 * world.reward).int()
+            # the reward of a first observation is 0, whatever it shows
+            newly_seen = torch.where(world.reset, life.limits - env.patience, newly_seen)
+            expected = explorer_twin.explorer_step(
+                env.core.scenery, env.core.agents, newly_seen, env.seen, env.visible, **before,
+                patience=env.patience,
+            )  # fmt: skip
+            values = dict(world, **world.metrics, **world.get("privileged", {}))
+            values |= {name: getattr(life, name) for name in STATE}
+            for name in expected.keys() & values.keys():
+                assert torch.equal(values[name], expected[name]), name
+            n_ends += int(world.truncated.sum())
+        before = {name: getattr(life, name).clone() for name in STATE}
+        world = env.step(arrdict(actions=contract.random_actions(env, generator)))
+    assert n_ends > 9
+
+
+@pytest.mark.cuda
+def test_cpu_and_gpu_compute_the_same_bits():
+    settings = dict(patience=1, res=4, subsample=1, resample=True, privileged=True)
+    rollouts = [
+        contract.rollout(envs.Explorer(70, sample("bench", 4), device=device, **settings), 60)
+        for device in ("cpu", "cuda")
+    ]
+    for ours, theirs in zip(*rollouts, strict=True):
+        for name in ("reward", "reset", "truncated", "metrics", "privileged"):
+            one, other = (arrdict(value=world[name]) for world in (ours, theirs))
+            assert contract.same(one.map(torch.Tensor.cpu), other.map(torch.Tensor.cpu)), name
+
+
+# ---- TexelRuns by hand ----
+
+
+def test_runs_of_a_box():
+    """Four walls of 1.6 m have one word of 32 texels each."""
+    scenery = scene.scenery([toys.box(1.6)], 1, device="cpu")
+    runs = TexelRuns(scenery, torch.tensor([[-1, 0b1101, 0, 1 << 31 - 31]], dtype=torch.int32))
+    middles = scenery.layouts.lines.vals.mean(1)
+    assert torch.equal(runs.table[:, :2], middles[[0, 1, 3]])
+    assert runs.table[:, 2:].contiguous().view(torch.int32).tolist() == [[0, -1], [1, 13], [3, 1]]
+    assert runs.starts.tolist() == [0, 3] and runs.n_visible.tolist() == [36]
+
+
+def test_a_run_never_crosses_a_wall_or_a_word():
+    """Walls of 2 m have 40 texels: a word and a quarter, a half and a half, ..."""
+    scenery = scene.scenery([toys.box(2)], 1, device="cpu")
+    runs = TexelRuns(scenery, torch.full((1, 5), -1, dtype=torch.int32))
+    words, bits = runs.table[:, 2:].contiguous().view(torch.int32).T.tolist()
+    counts = [bin(word & 0xFFFFFFFF).count("1") for word in bits]
+    assert words == [0, 1, 1, 2, 2, 3, 3, 4] and counts == [32, 8, 24, 16, 16, 24, 8, 32]
+    assert runs.n_visible.tolist() == [160]
+
+
+def test_runs_of_other_layouts_are_refused():
+    c, other = (
+        core.Core(scene.scenery([toys.box(size)], 1, device="cpu"), res=8) for size in (1.6, 5)
+    )
+    runs = TexelRuns(other.scenery, seen_of(other)[0])
+    lane = torch.zeros(1, dtype=torch.int32)
+    arguments = c.scenery, c.agents, lane[:, None], seen_of(c), runs, lane, lane, lane.bool()
+    with pytest.raises(ValueError, match="runs must be of the scenery's 1 layouts of 4 words"):
+        explorer_step(*arguments, coverage=True)
+    with pytest.raises(TypeError, match="runs must be a TexelRuns"):
+        explorer_step(*arguments[:4], None, *arguments[5:], privileged=True)
