@@ -24,6 +24,7 @@ from megastep.agents.algorithms.masked_stats import (
     pooled_normalise,
 )
 from megastep.agents.networks.policy import Policy
+from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
 from megastep.arrdict import arrdict
@@ -153,6 +154,7 @@ class PPO(GradientLearner):
         self.policy.update_stats(last.obs, last.get("privileged"), is_finite & rollout.learns[-1])
         return {**self.steps.end(), "explained_variance": explained}
 
+    @section("forward")
     def _losses(self, batch):
         """Returns the loss of a minibatch and its metrics, tensors ()."""
         obs, starts = without_last(batch.obs), without_last(batch.starts)

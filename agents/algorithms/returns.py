@@ -13,6 +13,7 @@ import torch
 
 from megastep import arrdict
 from megastep.agents.networks.scan import linear_scan
+from megastep.agents.sections import section
 
 
 def discounted_sum(terms: torch.Tensor, discounts: torch.Tensor) -> torch.Tensor:
@@ -56,6 +57,7 @@ def gae(
     return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=~reset)
 
 
+@section("returns")
 def vtrace(
     log_ratio: torch.Tensor,
     reward: torch.Tensor,
@@ -106,6 +108,7 @@ def vtrace(
     )
 
 
+@section("returns")
 def n_step_returns(
     reward: torch.Tensor,
     value: torch.Tensor,

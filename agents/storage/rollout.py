@@ -11,6 +11,7 @@ import torch
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
+from megastep.agents.sections import section
 from megastep.arrdict import arrdict, clone
 from megastep.dotdict import mapping
 from megastep.types import Env, Space, Tree, n_lanes, optional
@@ -189,6 +190,7 @@ class Rollout:
             truncated=self.truncated,
         )
 
+    @section("forward")
     def sequences(self, lanes: torch.Tensor) -> arrdict:
         """Returns whole sequences of some lanes, as a copy.
 
