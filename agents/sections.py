@@ -92,9 +92,9 @@ class Spans:
 
     def seconds(self) -> dict[str, float]:
         """Returns the GPU's seconds by section, of the last replay. Synchronises."""
-        torch.cuda.synchronize()
         seconds = {}
         for span in [span for span in self.spans if span.is_captured] or self.spans:
+            span.end.synchronize()
             elapsed = span.start.elapsed_time(span.end) / 1000
             _add(seconds, span.name, span.outer, elapsed)
         return seconds

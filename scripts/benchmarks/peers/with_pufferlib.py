@@ -58,6 +58,8 @@ def import_pufferl(device: torch.device) -> types.ModuleType:
     except ImportError:
         from torch.utils import cpp_extension
 
+        # where ninja is installed, which builds it
+        os.environ["PATH"] += f"{os.pathsep}{Path(sys.executable).parent}"
         sources = Path(pufferlib.__file__).parent / "extensions"
         files = [sources / "pufferlib.cpp"]
         files += [sources / "cuda" / "pufferlib.cu"] if device.type == "cuda" else []
