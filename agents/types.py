@@ -113,9 +113,9 @@ class Logger(Protocol):
     """Writes the metrics of a run."""
 
     def write(
-        self, step: int, metrics: Mapping[str, float | str], perf: Mapping[str, float]
+        self, step: int, metrics: Mapping[str, float | str] | None, perf: Mapping[str, float]
     ) -> None:
-        """Writes one report after ``step`` environment steps."""
+        """Writes one report after ``step`` environment steps. Without metrics, only ``perf``."""
 
     def sync(self) -> None:
         """Flushes to disk what resuming reads. Raises OSError if it cannot be written."""

@@ -32,7 +32,7 @@ ENGINE = (
     ("rendering",),
 )
 AGENTS = (
-    ("distributed", "generator", "types"),
+    ("distributed", "generator", "sections", "types"),
     ("networks",),
     ("storage",),
     ("algorithms",),

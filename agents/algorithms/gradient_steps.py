@@ -8,6 +8,7 @@ import torch
 from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 from megastep.agents.distributed.pooling import average_gradients, on_all_ranks
+from megastep.agents.sections import section
 
 
 class GradientSteps:
@@ -67,6 +68,7 @@ class GradientSteps:
         self._is_finite, self._rows = on_all_ranks(self.check(floats)), []
         return self._is_finite
 
+    @section("backward")
     def backward(
         self, loss: torch.Tensor, metrics: dict[str, torch.Tensor], n_valid: torch.Tensor
     ) -> dict[str, torch.Tensor]:
@@ -87,6 +89,7 @@ class GradientSteps:
         self._has_valid, self._metrics = n_valid > 0, dict(zip(metrics, means, strict=True))
         return self._metrics
 
+    @section("optimiser")
     def take(self, is_enabled: torch.Tensor | bool = True) -> torch.Tensor:
         """Takes one step down the gradient. Without a valid transition, it is not taken.
 

@@ -21,6 +21,7 @@ from megastep.agents.algorithms.learner import (
 from megastep.agents.algorithms.masked_stats import explained_variance, pooled_normalise
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
 from megastep.agents.networks.policy import Policy
+from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
 from megastep.arrdict import arrdict
@@ -151,6 +152,7 @@ class PPO(GradientLearner):
         self.policy.update_stats(last.obs, last.get("privileged"), is_finite & rollout.learns[-1])
         return {**self.steps.end(), "explained_variance": explained}
 
+    @section("forward")
     def _losses(self, rollout, lanes, batch):
         """Returns the loss of a minibatch and its metrics, tensors ().
 

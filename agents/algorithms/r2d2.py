@@ -14,6 +14,7 @@ from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLe
 from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
 from megastep.agents.networks.policy import Policy
 from megastep.agents.networks.running_norm import store_if
+from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings, defaults_from
@@ -183,6 +184,7 @@ class R2D2(GradientLearner):
             "priority_mean": (priorities.sum() / n_available).float(),
         }
 
+    @section("forward")
     def _losses(self, batch):
         """Returns the loss of a minibatch, its metrics, tensors (), the sequences' priorities (M,)
         and the valid steps (L - burn-in, M).

@@ -14,6 +14,7 @@ import torch
 from megastep import arrdict
 from megastep.agents.algorithms.kernels import program
 from megastep.agents.networks.scan import linear_scan
+from megastep.agents.sections import section
 
 
 def discounted_sum(terms: torch.Tensor, discounts: torch.Tensor) -> torch.Tensor:
@@ -84,6 +85,7 @@ def _gae_on_gpu(reward, value, last_value, reset, terminal, truncated, gamma, la
     return estimates
 
 
+@section("returns")
 def vtrace(
     log_ratio: torch.Tensor,
     reward: torch.Tensor,
@@ -134,6 +136,7 @@ def vtrace(
     )
 
 
+@section("returns")
 def n_step_returns(
     reward: torch.Tensor,
     value: torch.Tensor,

@@ -27,6 +27,7 @@ from megastep.agents.algorithms.masked_stats import (
     pooled_mean,
 )
 from megastep.agents.networks.policy import Policy
+from megastep.agents.sections import section
 from megastep.agents.storage import mixed_batches
 from megastep.agents.storage.async_collector import AsyncCollector
 from megastep.agents.storage.collector import Collector
@@ -200,6 +201,7 @@ class VTrace(GradientLearner):
         self.policy.update_stats(last.obs, last.get("privileged"), is_finite & rollout.learns[-1])
         return self.steps.end()
 
+    @section("forward")
     def _batch(self, rollout, lanes):
         batch = mixed_batches.from_rollout(rollout, lanes)
         if self.replay_buffer is None:
@@ -210,6 +212,7 @@ class VTrace(GradientLearner):
             batch, self.replay_buffer, self.policy, n_replayed, generator
         )
 
+    @section("forward")
     def _losses(self, batch, n_fresh):
         """Returns the loss of a minibatch, its metrics, tensors (), and V-trace's estimates.
 

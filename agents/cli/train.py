@@ -35,7 +35,7 @@ from megastep.agents.cli import (
     signals,
 )
 from megastep.agents.distributed import process_group
-from megastep.agents.distributed.agreement import from_rank_0, together
+from megastep.agents.distributed.agreement import any_rank, from_rank_0, together
 from megastep.agents.distributed.drift import DriftError
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
 from megastep.agents.training import (
@@ -289,6 +289,8 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                 contextlib.closing(running),
             ):
                 running.train(lambda: bool(numbers))
+                if not any_rank(bool(numbers)):
+                    measure_sections(running)
         except NonFiniteError as error:
             saved = f"What was saved before is in {folder}{running.nonfinite_guard.replay_hint}"
             raise program.NonFinite(f"{error}. {saved}") from error
@@ -306,6 +308,9 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             if is_first:
                 with process_group.unhurried():
                     curves.plot_curves(folder)
+        times = running.section_times
+        if is_first and times.n:
+            console.say(console.sections(times.milliseconds(), times.iteration))
         # a signal that one rank got stops all, and so does a checkpoint that one could not save
         ends = process_group.gather_objects((numbers[:1], running.saver.error))
         if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
@@ -331,6 +336,15 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
         if cfg.rerun and is_first:
             compare(folder, runs.folder_of(runs.find(cfg.rerun)))
     return folder
+
+
+def measure_sections(running: Trainer) -> None:
+    """Measures where an iteration's time goes; the training is done, and no failure may end it."""
+    try:
+        running.measure_sections()
+    except RuntimeError as error:
+        reason = str(error).partition("\n")[0]
+        console.warn(f"the sections of an iteration could not be measured: {reason}")
 
 
 def write_config(folder: Path, config: dict[str, Any]) -> None:

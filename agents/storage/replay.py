@@ -13,6 +13,7 @@ import torch
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
+from megastep.agents.sections import section
 from megastep.agents.storage.replay_columns import Column, stored_dtype
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout, copy_tree
@@ -109,6 +110,7 @@ class ReplayBuffer:
         return (self.n_available > 0) & (n_collected >= self.settings.start)
 
     @torch.no_grad()
+    @section("store")
     def add(self, rollout: Rollout, is_finite: torch.Tensor | bool = True) -> None:
         """Stores a rollout in place of the oldest.
 
@@ -154,6 +156,7 @@ class ReplayBuffer:
         self.n_available.copy_((self.tree.priorities > 0).sum())
 
     @torch.no_grad()
+    @section("forward")
     def sample(self, n: int, generator: torch.Generator | None = None) -> arrdict:
         """Draws M = n sequences. While none can be drawn, all numbers are finite but meaningless.
 
@@ -187,6 +190,7 @@ class ReplayBuffer:
         return batch
 
     @torch.no_grad()
+    @section("store")
     def set_priorities(self, index: torch.Tensor, values: torch.Tensor) -> None:
         """Sets the priorities of sequences of the last sample to values (M,) to the power alpha.
 

@@ -12,6 +12,7 @@ import torch
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
+from megastep.agents.sections import section
 from megastep.agents.storage.copies import copy_all
 from megastep.arrdict import arrdict, clone
 from megastep.dotdict import mapping
@@ -204,6 +205,7 @@ class Rollout:
             truncated=self.truncated,
         )
 
+    @section("forward")
     def sequences(self, lanes: torch.Tensor, names: Sequence[str] = SEQUENCES) -> arrdict:
         """Returns whole sequences of some lanes, as a copy.
 

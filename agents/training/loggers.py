@@ -180,17 +180,20 @@ class Loggers:
         except Exception as error:
             warnings.warn(_first_line(error), stacklevel=3)
 
-    def write(self, step: int, metrics: dict[str, float | str], perf: dict[str, float]) -> None:
+    def write(
+        self, step: int, metrics: dict[str, float | str] | None, perf: dict[str, float]
+    ) -> None:
         """Writes one report after `step` environment steps.
 
         Args:
-            metrics: name -> number or string, determined by the seed.
+            metrics: name -> number or string, determined by the seed. None: only `perf` is written.
             perf: name -> number, such as times and rates.
         """
-        self._call(self.metrics, "write", step, metrics)
+        if metrics is not None:
+            self._call(self.metrics, "write", step, metrics)
         self._call(self.perf, "write", step, perf)
         for logger in list(self.optional):
-            self._call(logger, "write", step, {**metrics, **perf})
+            self._call(logger, "write", step, {**(metrics or {}), **perf})
 
     def sync(self) -> None:
         """Flushes the metrics to disk. Raises OSError if they cannot be written."""
@@ -220,7 +223,9 @@ class Loggers:
 class NoLogger:
     """Writes nothing, as on ranks other than 0."""
 
-    def write(self, step: int, metrics: dict[str, float | str], perf: dict[str, float]) -> None:
+    def write(
+        self, step: int, metrics: dict[str, float | str] | None, perf: dict[str, float]
+    ) -> None:
         pass
 
     def sync(self) -> None:

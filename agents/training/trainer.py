@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from megastep.agents import sections
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.agreement import any_rank
 from megastep.agents.distributed.drift import check_drift
@@ -17,7 +18,7 @@ from megastep.agents.distributed.process_group import mean_over_ranks, n_ranks, 
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
-from megastep.agents.training.performance import PhaseTimer, device_memory
+from megastep.agents.training.performance import N_WARM_UPS, PhaseTimer, SectionTimes, device_memory
 from megastep.agents.training.run_state import RunState
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.types import Env, optional
@@ -58,6 +59,7 @@ class Trainer:
     Attributes:
         samples, updates: environment steps of all lanes of all ranks, and updates, so far.
         clock: counts the seconds of training.
+        section_times: where they go.
         lr: the current learning rate.
         score: the last mean return that was logged, or None before `MIN_EPISODES` have ended: that
             of few episodes is luck, and would mark the first checkpoint as the best.
@@ -116,6 +118,7 @@ class Trainer:
         self.run_state = RunState(env, policy, learner, self.collect, self.episode_stats, opponents)
         self.nonfinite_guard = NonFiniteGuard(env, learner, self.collect, opponents, replay_folder)
         self.clock, self.timer = Stopwatch(), PhaseTimer(env.device)
+        self.section_times = SectionTimes(env.device)
         self.samples = self.updates = 0
         self.lr = learner.lr
         self.score = self.samples_per_second = None
@@ -153,7 +156,6 @@ class Trainer:
                 self.nonfinite_guard.end_rollout(self.rollout)
                 self.timer.start("update")
                 losses = self.update(plan.lr_fraction)
-                self.timer.start("rest")
                 self.snapshot_saver(self)
                 if self.updates % self.log_every == 0:
                     self.samples_at_report = self.samples
@@ -223,6 +225,7 @@ class Trainer:
             self.lr = self.learner.lr * lr_fraction
             self.learner.set_lr(self.lr)
         losses = self.learner.update(rollout)
+        self.timer.start("rest")
         self.episode_stats.add(
             rollout.reward,
             rollout.reset,
@@ -241,6 +244,7 @@ class Trainer:
             self.seconds_at_checkpoint = self.clock.seconds
             self.samples_at_log, self.seconds_at_log = self.samples, self.clock.seconds
             self.timer.pop()
+            sections.pop()
         return losses
 
     def log(self, losses: dict[str, torch.Tensor]) -> None:
@@ -274,7 +278,11 @@ class Trainer:
             n_samples = self.samples - self.samples_at_log
             self.samples_per_second = n_samples / (seconds - self.seconds_at_log)
             perf["perf/rate"] = self.samples_per_second
-            perf |= {f"perf/{phase}": time for phase, time in self.timer.pop().items()}
+            phases = self.timer.pop()
+            perf |= {f"perf/{phase}": time for phase, time in phases.items()}
+            n_iterations = n_samples // (self.rollout.n_steps * self.rollout.n_lanes * n_ranks())
+            times = self.section_times.add(phases, n_iterations)
+            perf |= {f"section/{name}": time for name, time in times.items()}
         perf |= {f"perf/memory_{name}": n for name, n in device_memory(self.env.device).items()}
         self.samples_at_log, self.seconds_at_log = self.samples, seconds
         self.updates_at_log = self.updates
@@ -286,6 +294,26 @@ class Trainer:
         if stats.get("episode/window", 0) >= MIN_EPISODES:
             self.score = stats["episode/return"]
         self.on_log(self)
+
+    def measure_sections(self) -> None:
+        """Measures the sections of an iteration on a GPU, and logs them; a CPU knows them already.
+
+        Call it after `train`, on all ranks. Collects and learns a few times more, which nothing
+        saves, with CUDA graphs that are captured anew and hold events.
+        """
+        if torch.device(self.env.device).type != "cuda" or not self.section_times.n:
+            return
+        for _ in range(N_WARM_UPS):
+            self.rollout = self.collect()
+            self.learner.update(self.rollout)
+        collect = self.collect
+        if hasattr(collect, "recapture"):
+            collect = collect.recapture()
+        if hasattr(self.learner, "recapture"):
+            self.learner.recapture()
+        self.section_times.measure(collect, lambda: self.learner.update(self.rollout))
+        times = {f"section/{name}": n for name, n in self.section_times.milliseconds().items()}
+        self.logger.write(self.samples, None, {"perf/seconds": self.seconds_at_log, **times})
 
     def save_checkpoint(self, state: dict[str, Any] | None = None, is_last: bool = False) -> None:
         """Begins to save a checkpoint, unless the last one holds every update. All ranks call it.

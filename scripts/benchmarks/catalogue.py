@@ -9,6 +9,7 @@ from checkpoints import checkpoints
 from engine_operations import agents, cpu, kernels, observe
 from env_steps import deathmatch, memory, pong, step
 from nsight_counters import counters
+from peers import peers
 from published import published
 from replay_buffer import replay
 from scaling import ranks, scaling
@@ -38,6 +39,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "ablation": ablation,
     "learners": learners,
     "published": published,
+    "peers": peers,
     "scaling": scaling,
     "ranks": ranks,
 }

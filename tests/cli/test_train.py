@@ -83,6 +83,7 @@ def test_files_of_a_run(here, with_curves):
     assert not any("perf" in name for row in rows for name in row)
     perf = json_lines.read(folder / "perf.jsonl")[-1]
     assert {"perf/rate", "perf/collect", "perf/update", "perf/rest"} <= set(perf)
+    assert {"section/env", "section/backward", "section/log"} < set(perf)
     (start,) = json_lines.read(folder / "provenance.jsonl")
     assert start["samples"] == 0 and {"command", "device", "megastep", "torch"} <= set(start)
     loaded = checkpoint.load_latest(folder / "checkpoints")
@@ -450,7 +451,7 @@ def test_disk_that_fills_up(here, monkeypatch, capsys, with_curves):
         real(self, losses)
         if self.updates == 2:
             self.saver.wait()  # the first checkpoint is written
-            full.enter_context(faults.full_disk(5000))
+            full.enter_context(faults.full_disk(8000))
 
     with full, monkeypatch.context() as patch:
         patch.setattr(train.Trainer, "log", report)
