@@ -75,7 +75,7 @@ class MultiDiscreteOutput(Output):
         """Does the same as `Output.act`, on a GPU in one kernel."""
         dtype = compute_dtype(self.linear.weight)
         is_fused = x.is_cuda and dtype in kernels.DTYPES and not torch.is_grad_enabled()
-        if not is_fused or self.shape[1] > kernels.MAX_CHOICES or x.shape[-1] % 32:
+        if not is_fused or self.shape[1] > kernels.MAX_CHOICES or x.shape[-1] % 8:
             return super().act(x, sample, generator)
         noise = None
         if sample:

@@ -11,77 +11,76 @@ DEVICE float rounded(float x) {
     return to_float(value);
 }
 
-// The scores of an agent's choices, in each of the ACT_THREADS threads of a lane.
-template <class T>
-DEVICE void score(float (&scores)[MAX_CHOICES], const CategoricalActParams& p, int row,
-                  const T* weight, const T* bias, int part) {
-    for (int k = 0; k < MAX_CHOICES; k++)
-        scores[k] = 0.f;
-    const T* features = (const T*)p.features + (long long)row * p.width;
-    for (int first = 4 * part; first < p.width; first += 4 * ACT_THREADS) {
-        float of_lane[4];
-        read<T>(of_lane, features, first);
-#pragma unroll
-        for (int k = 0; k < MAX_CHOICES; k++)
-            if (k < p.n_choices) {
-                float weights[4];
-                read<T>(weights, weight + k * p.width, first);
-#pragma unroll
-                for (int n = 0; n < 4; n++)
-                    scores[k] += of_lane[n] * weights[n];
-            }
-    }
-#pragma unroll
-    for (int k = 0; k < MAX_CHOICES; k++) {
-        for (int mask = ACT_THREADS / 2; mask; mask /= 2)
-            scores[k] += __shfl_xor_sync(~0u, scores[k], mask);
-        if (k < p.n_choices)
-            scores[k] = rounded<T>(scores[k] + to_float(bias[k]));
-    }
+DEVICE float largest_of_lane(float x) {
+    for (int mask = ACT_THREADS / 2; mask; mask /= 2)
+        x = fmaxf(x, __shfl_xor_sync(~0u, x, mask));
+    return x;
 }
 
-// Logits are log-softmax of the scores. Samples by the Gumbel-max trick.
+DEVICE float sum_of_lane(float x) {
+    for (int mask = ACT_THREADS / 2; mask; mask /= 2)
+        x += __shfl_xor_sync(~0u, x, mask);
+    return x;
+}
+
+// The score of choice `part` of an agent, before the bias. The threads of a lane share its features.
+// Nothing branches on the number of choices, so that no load waits for another.
+template <class T>
+DEVICE float score_of(const CategoricalActParams& p, const T* features, const T* weight, int part) {
+    constexpr int N = 16 / sizeof(T);  // numbers that a thread reads at once
+    float sums[ACT_THREADS] = {};
+    for (int first = N * part; first < p.width; first += N * ACT_THREADS) {
+        float of_lane[N];
+        read<T>(of_lane, features, first);
+#pragma unroll
+        for (int k = 0; k < ACT_THREADS; k++) {
+            float weights[N];
+            read<T>(weights, weight, min(k, p.n_choices - 1) * p.width + first);
+#pragma unroll
+            for (int n = 0; n < N; n++)
+                sums[k] += of_lane[n] * weights[n];
+        }
+    }
+    float score = 0.f;
+#pragma unroll
+    for (int k = 0; k < ACT_THREADS; k++) {
+        float sum = sum_of_lane(sums[k]);
+        score = k == part ? sum : score;
+    }
+    return score;
+}
+
+// Thread k of a lane handles choice k of each agent. Logits are log-softmax of the scores; samples by
+// the Gumbel-max trick.
 template <class T>
 DEVICE void act(const CategoricalActParams& p) {
     int thread = blockIdx.x * blockDim.x + threadIdx.x, part = thread % ACT_THREADS;
     int lane = min(thread / ACT_THREADS, p.n_lanes - 1);  // all threads of a warp shuffle
-    long long policy = blockIdx.y;
-    int row = (int)policy * p.n_lanes + lane;
-    float logprob = 0.f;
+    long long policy = blockIdx.y, row = policy * p.n_lanes + lane;
+    bool is_choice = part < p.n_choices;
+    float infinity = __int_as_float(0x7f800000), logprob = 0.f;
     for (int agent = 0; agent < p.n_agents; agent++) {
         long long choice = (policy * p.n_agents + agent) * p.n_choices;
-        float scores[MAX_CHOICES];
-        score<T>(scores, p, row, (const T*)p.weight + choice * p.width,
-                 (const T*)p.bias + choice, part);
-        float largest = scores[0], total = 0.f;
-#pragma unroll
-        for (int k = 1; k < MAX_CHOICES; k++)
-            if (k < p.n_choices)
-                largest = fmaxf(largest, scores[k]);
-#pragma unroll
-        for (int k = 0; k < MAX_CHOICES; k++)
-            if (k < p.n_choices)
-                total += expf(scores[k] - largest);
-        float log_total = logf(total), best_value = 0.f, best_logit = 0.f;
-        long long at = ((long long)row * p.n_agents + agent) * p.n_choices;
-        int best = 0;
-#pragma unroll
-        for (int k = 0; k < MAX_CHOICES; k++)
-            if (k < p.n_choices) {
-                float logit = scores[k] - largest - log_total, value = logit;
-                if (part == k)
-                    p.logits[at + k] = logit;
-                if (p.noise)
-                    value -= logf(fmaxf(p.noise[at + k], 1e-20f));
-                if (!k || value > best_value) {
-                    best = k;
-                    best_value = value;
-                    best_logit = logit;
-                }
-            }
-        logprob += best_logit;
+        long long at = (row * p.n_agents + agent) * p.n_choices + part;
+        float noise = p.noise && is_choice ? p.noise[at] : 1.f;
+        float bias = to_float(((const T*)p.bias)[choice + min(part, p.n_choices - 1)]);
+        float score = score_of(p, (const T*)p.features + row * p.width,
+                               (const T*)p.weight + choice * p.width, part);
+        score = is_choice ? rounded<T>(score + bias) : -infinity;
+        float largest = largest_of_lane(score);
+        float total = sum_of_lane(is_choice ? expf(score - largest) : 0.f);
+        float logit = score - largest - logf(total);
+        float value = logit - logf(fmaxf(noise, 1e-20f));
+        if (is_choice)
+            p.logits[at] = logit;
+        // the largest value's choice, the first of equal ones; 0 if all are NaN
+        float best_value = largest_of_lane(is_choice ? value : -infinity);
+        unsigned int is_best = __ballot_sync(~0u, is_choice && value == best_value);
+        unsigned int of_lane = is_best >> (threadIdx.x % WARP - part) & ((1u << ACT_THREADS) - 1);
+        int best = of_lane ? __ffs(of_lane) - 1 : 0;
+        logprob += __shfl_sync(~0u, logit, best, ACT_THREADS);
         if (!part)
-            p.actions[(long long)row * p.n_agents + agent] = best;
+            p.actions[row * p.n_agents + agent] = best;
     }
     if (!part)
         p.logprobs[row] = logprob;

@@ -10,7 +10,7 @@ from megastep.agents.networks.kernels.program import CORES, DTYPES
 from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
 
 MAX_LEAVES = CORES.constants["MAX_LEAVES"]
-MAX_CHOICES = CORES.constants["MAX_CHOICES"]
+MAX_CHOICES = CORES.constants["ACT_THREADS"]
 MAX_STEPS = 65_535  # of `normalise`; blocks along y
 _WORD = 16  # bytes that a thread reads at once
 _STRIP, _STRIP_THREADS = CORES.constants["STRIP"], CORES.constants["STRIP_THREADS"]
@@ -106,7 +106,7 @@ def act(
     """Chooses actions by the softmax of a linear layer.
 
     Args:
-        features: (B, W), W a multiple of 32.
+        features: (B, W), W a multiple of 8.
         weight: (A n, W) in the same dtype.
         bias: (A n,) in the same dtype.
         shape: (A, n), n at most `MAX_CHOICES`.

@@ -4,45 +4,124 @@
 #include "lanes.h"
 #include "params.h"
 
-DEVICE float half_value(unsigned short bits) {
+DEVICE float half_value(unsigned int bits) {
     float x;
-    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(bits));
+    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"((unsigned short)bits));
     return x;
 }
 
-// One column of the result: which numbers it comes from, and their statistics.
-struct Column {
-    const char* values;  // null: there is no such feature
-    int stride, is_half;
-    float mean, inverse;  // of the scale
+DEVICE void unpack(float (&values)[4], uint2 word) {
+    values[0] = half_value(word.x & 0xffff);
+    values[1] = half_value(word.x >> 16);
+    values[2] = half_value(word.y & 0xffff);
+    values[3] = half_value(word.y >> 16);
+}
+
+DEVICE void unpack(float (&values)[4], uint4 word) {
+    values[0] = __uint_as_float(word.x);
+    values[1] = __uint_as_float(word.y);
+    values[2] = __uint_as_float(word.z);
+    values[3] = __uint_as_float(word.w);
+}
+
+// Where a feature is: its leaf, and its number in it. Features beyond the leaves have number -1.
+struct Feature {
+    const char* values;
+    const float *mean, *scale;
+    int n_features, group, is_half, number;
 };
 
-DEVICE bool find(Column& column, const IntakeLeafParams& leaf, long long policy, int& feature) {
-    if (feature >= leaf.n_features) {
-        feature -= leaf.n_features;
-        return false;
-    }
-    int size = leaf.is_half ? 2 : 4;
-    long long statistic = policy * (leaf.n_features / leaf.group) + feature / leaf.group;
-    column = {(const char*)leaf.values + feature * size, leaf.n_features * size, leaf.is_half,
-              leaf.mean[statistic], __fdiv_rn(1.f, leaf.scale[statistic])};
-    return true;
-}
-
-DEVICE Column column_at(const NormaliseParams& p, long long policy, int feature) {
-    Column column = {nullptr, 0, 0, 0.f, 1.f};
-    bool is_found = false;
+DEVICE Feature find(const NormaliseParams& p, int number) {
+    Feature feature = {(const char*)p.leaves[0].values, p.leaves[0].mean, p.leaves[0].scale,
+                       p.leaves[0].n_features,          p.leaves[0].group, p.leaves[0].is_half,
+                       -1};
 #pragma unroll
-    for (int i = 0; i < MAX_LEAVES; i++)
-        is_found = is_found || find(column, p.leaves[i], policy, feature);
-    return column;
+    for (int i = 0; i < MAX_LEAVES; i++) {
+        const IntakeLeafParams& leaf = p.leaves[i];
+        if (number >= 0 && number < leaf.n_features)
+            feature = {(const char*)leaf.values, leaf.mean, leaf.scale, leaf.n_features,
+                       leaf.group,               leaf.is_half, number};
+        number -= leaf.n_features;
+    }
+    return feature;
 }
 
-DEVICE float value_at(const Column& column, unsigned int row) {
-    if (!column.values)
-        return 0.f;
-    const char* address = column.values + (unsigned long long)row * column.stride;
-    return column.is_half ? half_value(*(const unsigned short*)address) : *(const float*)address;
+// The rows of the leaves that a thread reads.
+struct Rows {
+    unsigned int source[NORMALISED_ROWS], target[NORMALISED_ROWS];
+    bool exists[NORMALISED_ROWS];
+};
+
+template <class T>
+DEVICE void write_row(const NormaliseParams& p, const Rows& rows, int i, int column,
+                      const float (&values)[4]) {
+    if (rows.exists[i])
+        write<T>(p.features, (long long)rows.target[i] * p.n_columns + column, values);
+}
+
+// Four features of one leaf with one mean and scale, which a word holds.
+template <class T, class Word>
+DEVICE void normalise_word(const NormaliseParams& p, const Rows& rows, int column,
+                           const Feature& feature, long long policy) {
+    long long statistic = policy * (feature.n_features / feature.group);
+    float means[4], scales[4];
+#pragma unroll
+    for (int n = 0; n < 4; n++) {
+        long long at = statistic + (feature.number + n) / feature.group;
+        means[n] = feature.mean[at];
+        scales[n] = feature.scale[at];
+    }
+    Word words[NORMALISED_ROWS];
+    const Word* first = (const Word*)feature.values + feature.number / 4;
+#pragma unroll
+    for (int i = 0; i < NORMALISED_ROWS; i++)
+        words[i] = first[(long long)rows.source[i] * (feature.n_features / 4)];
+#pragma unroll
+    for (int n = 0; n < 4; n++)
+        scales[n] = __fdiv_rn(1.f, scales[n]);
+#pragma unroll
+    for (int i = 0; i < NORMALISED_ROWS; i++) {
+        float values[4];
+        unpack(values, words[i]);
+#pragma unroll
+        for (int n = 0; n < 4; n++)
+            values[n] = (values[n] - means[n]) * scales[n];
+        write_row<T>(p, rows, i, column, values);
+    }
+}
+
+// Any four features, one by one.
+template <class T>
+DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int column,
+                               long long policy) {
+    float values[NORMALISED_ROWS][4];
+#pragma unroll
+    for (int n = 0; n < 4; n++) {
+        Feature feature = find(p, column + n);
+        int number = max(feature.number, 0);
+        long long at = policy * (feature.n_features / feature.group) + number / feature.group;
+        float mean = feature.mean[at], scale = feature.scale[at];
+        const unsigned short* halves = (const unsigned short*)feature.values;
+        // a float as two halves, so that no load depends on a branch
+        unsigned int low[NORMALISED_ROWS], high[NORMALISED_ROWS];
+#pragma unroll
+        for (int i = 0; i < NORMALISED_ROWS; i++) {
+            long long first = (long long)rows.source[i] * feature.n_features + number;
+            first = feature.is_half ? first : 2 * first;
+            low[i] = halves[first];
+            high[i] = halves[feature.is_half ? first : first + 1];
+        }
+#pragma unroll
+        for (int i = 0; i < NORMALISED_ROWS; i++) {
+            float value = feature.is_half ? half_value(low[i])
+                                          : __uint_as_float(high[i] << 16 | low[i]);
+            value = (value - mean) * __fdiv_rn(1.f, scale);
+            values[i][n] = feature.number < 0 ? 0.f : value;
+        }
+    }
+#pragma unroll
+    for (int i = 0; i < NORMALISED_ROWS; i++)
+        write_row<T>(p, rows, i, column, values[i]);
 }
 
 // Blocks along y: steps of all policies.
@@ -51,46 +130,28 @@ DEVICE void normalise(const NormaliseParams& p) {
     unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x, n_words = p.n_columns / 4;
     unsigned int n_selected = p.n_selected;
     unsigned int step = (n_selected + NORMALISED_ROWS - 1) / NORMALISED_ROWS;  // between two rows
-    unsigned int first = thread / n_words, word = thread - first * n_words;
+    unsigned int first = thread / n_words, column = 4 * (thread - first * n_words);
     if (first >= step)
         return;
-    unsigned int policy = blockIdx.y / p.n_steps, row_of_step = blockIdx.y * p.n_lanes;
-    Column columns[4];
-#pragma unroll
-    for (int n = 0; n < 4; n++)
-        columns[n] = column_at(p, policy, 4 * word + n);
-    // four neighbours in 8 bytes
-    bool is_word = columns[0].is_half && columns[3].values == columns[0].values + 6 &&
-                   columns[0].stride == columns[3].stride && columns[0].stride % 8 == 0 &&
-                   (unsigned long long)columns[0].values % 8 == 0;
-    float values[NORMALISED_ROWS][4];
+    unsigned int policy = blockIdx.y / p.n_steps;
+    Rows rows;
 #pragma unroll
     for (int i = 0; i < NORMALISED_ROWS; i++) {
         unsigned int m = min(first + i * step, n_selected - 1);
-        unsigned int row = row_of_step + (p.lanes ? p.lanes[policy * n_selected + m] : m);
-        if (is_word) {
-            uint2 bits =
-                *(const uint2*)(columns[0].values + (unsigned long long)row * columns[0].stride);
-            values[i][0] = half_value(bits.x & 0xffff);
-            values[i][1] = half_value(bits.x >> 16);
-            values[i][2] = half_value(bits.y & 0xffff);
-            values[i][3] = half_value(bits.y >> 16);
-        } else
-#pragma unroll
-            for (int n = 0; n < 4; n++)
-                values[i][n] = value_at(columns[n], row);
+        unsigned int lane = p.lanes ? (unsigned int)p.lanes[policy * n_selected + m] : m;
+        rows.exists[i] = first + i * step < n_selected;
+        rows.source[i] = blockIdx.y * p.n_lanes + lane;
+        rows.target[i] = blockIdx.y * n_selected + m;
     }
-#pragma unroll
-    for (int i = 0; i < NORMALISED_ROWS; i++) {
-        unsigned int m = first + i * step;
-        if (m >= n_selected)
-            break;
-#pragma unroll
-        for (int n = 0; n < 4; n++)
-            values[i][n] = (values[i][n] - columns[n].mean) * columns[n].inverse;
-        long long row = (long long)blockIdx.y * n_selected + m;
-        write<T>(p.features, row * p.n_columns + 4 * word, values[i]);
-    }
+    Feature feature = find(p, column);
+    bool is_word = feature.number >= 0 && feature.number % 4 == 0 && feature.n_features % 4 == 0;
+    bool is_aligned = (unsigned long long)feature.values % (feature.is_half ? 8 : 16) == 0;
+    if (is_word && is_aligned && feature.is_half)
+        normalise_word<T, uint2>(p, rows, column, feature, policy);
+    else if (is_word && is_aligned)
+        normalise_word<T, uint4>(p, rows, column, feature, policy);
+    else
+        normalise_features<T>(p, rows, column, policy);
 }
 
 KERNEL BOUNDS(64) normalise_float32(NormaliseParams p) { normalise<float>(p); }

@@ -129,9 +129,9 @@ struct CategoricalActParams {
     long long* actions;    // (P, B, A)
     float* logprobs;       // (P, B), of the joint actions
     int n_lanes;
-    int width;  // a multiple of 32
+    int width;  // a multiple of 8
     int n_agents;
-    int n_choices;  // at most MAX_CHOICES
+    int n_choices;  // at most ACT_THREADS
 };
 
 struct CategoricalTermsParams {
