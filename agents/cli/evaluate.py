@@ -66,7 +66,8 @@ def run(cfg: settings.Evaluate) -> Path:
         for name, player, greedy in players:
             episodes = evaluation.first_episodes(env, player, seed, greedy)
             episodes = share.with_others(episodes)
-            summaries = evaluation.summaries(episodes, optional(env, "roles"))
+            sources = evaluation.sources_of(homes)
+            summaries = evaluation.summaries(episodes, optional(env, "roles"), sources)
             rows += [{"agent": name, **row} for row in summaries]
         if process_group.rank() > 0:
             return runs.folder_of(loaded.path)
@@ -101,7 +102,7 @@ def cells(row: dict) -> dict[str, str]:
         texts = [f"{value:.3g}" for value in metric.values() if value is not None] or 2 * ["none"]
         metrics |= {name: texts[0], f"{name}: {runs.INTERVAL}": " to ".join(texts[1:])}
     return {
-        "agent": f"{row['agent']}: {row['role']}" if "role" in row else row["agent"],
+        "agent": f"{row['agent']}{part_of(row)}",
         "return": f"{row['return']:.2f}",
         runs.INTERVAL: f"{row['lower']:.2f} to {row['upper']:.2f}",
         **metrics,
@@ -109,6 +110,12 @@ def cells(row: dict) -> dict[str, str]:
         "episodes": f"{row['lanes']}{cut}",
         "homes": str(row["homes"] or "none"),
     }
+
+
+def part_of(row: dict) -> str:
+    """Returns which of its agent's episodes a row has, `: hunter` or `, in maze`; empty for all."""
+    role, source = row.get("role"), row.get("source")
+    return f": {role}" if role else f", in {source}" if source else ""
 
 
 # ---- Duels and ratings ----
@@ -196,6 +203,7 @@ class Arena:
         slots = duels.rotating_slots(self.share.n_envs, n_agents, self.env.device)
         self.slots = slots[[*self.share.envs]]
         self.place = runs.place(env, geometry, homes, cfg.split)
+        self.sources = evaluation.sources_of(homes)
         warn_without_layout(self.env, homes)
 
     def play(self, player: Player, opponent: Player) -> Any:
@@ -212,7 +220,7 @@ class Arena:
         rows = [
             {"against": opponent.name, **row}
             for opponent in self.others
-            for row in duels.summaries(self.play(self.agent, opponent), roles)
+            for row in duels.summaries(self.play(self.agent, opponent), roles, self.sources)
         ]
         if process_group.rank() > 0:
             return runs.folder_of(self.run.path)
@@ -274,7 +282,7 @@ class Arena:
 
 
 def duel_cells(row: dict) -> dict[str, str]:
-    against = f"{row['against']}, as {row['role']}" if "role" in row else row["against"]
+    against = f"{row['against']}{part_of(row).replace(': ', ', as ')}"
     row = row | {"against": against, "homes": row["homes"] or "none"}
     return {key: form.format_map(row) for key, form in DUELS.items()}
 

@@ -130,14 +130,40 @@ def interval(
     return float(values.mean()), float(lower), float(upper)
 
 
-def summaries(episodes: Mapping, roles: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Returns table rows for the result of `first_episodes`: one overall, then one per role.
+def sources_of(geometries: Sequence[Mapping]) -> list[str] | None:
+    """Returns the `source` of each geometry, which `geometry=mixed` sets; None if one has none."""
+    sources = [g.get("source") if isinstance(g, Mapping) else None for g in geometries]
+    return None if None in sources else [*map(str, sources)] or None
+
+
+def lanes_by_source(
+    homes: np.ndarray | None, sources: Sequence[str] | None
+) -> dict[str, np.ndarray]:
+    """Returns {source: (B,) bool, the lanes that played in its homes}; empty if nothing is known.
+
+    Args:
+        homes: (B,) integers, the home of each lane.
+        sources: the source of each home.
+    """
+    if homes is None or sources is None:
+        return {}
+    source_of_lane = np.array(sources)[homes]
+    lanes = {source: source_of_lane == source for source in dict.fromkeys(sources)}
+    return {source: played for source, played in lanes.items() if played.any()}
+
+
+def summaries(
+    episodes: Mapping, roles: Sequence[str] | None = None, sources: Sequence[str] | None = None
+) -> list[dict[str, Any]]:
+    """Returns table rows for the result of `first_episodes`: one overall, then one per role and one
+    per source of homes.
 
     Only lanes that learn are counted, or all lanes if none learns. An episode whose metric is not
     finite is left out of that metric; a warning names the metric.
 
     Args:
         roles: the role of each agent slot, repeated over environments.
+        sources: the source of each home.
     """
     learns = episodes["learns"].cpu().numpy()
     learns = learns if learns.any() else ~learns
@@ -154,6 +180,10 @@ def summaries(episodes: Mapping, roles: Sequence[str] | None = None) -> list[dic
     for role in dict.fromkeys(roles or ()):
         if (lanes := learns & (role_of_lane == role)).any():
             rows.append({"role": role, **_summary(episodes, lanes)})
+    homes = episodes["homes"].cpu().numpy() if "homes" in episodes else None
+    for source, lanes in lanes_by_source(homes, sources).items():
+        if (lanes := learns & lanes).any():
+            rows.append({"source": source, **_summary(episodes, lanes)})
     return rows
 
 

@@ -4,23 +4,27 @@ Their arguments are the settings of a run's `geometry`.
 """
 
 import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from megastep.dotdict import dotdict
 from megastep.geometries import files as npz
 from megastep.geometries import mazes, toys
 from megastep.geometries.homes import database
-from megastep.settings import checked
+from megastep.imports import import_object
+from megastep.settings import checked, closest
 
-__all__ = ["bench", "box", "column", "files", "homes", "maze"]
+__all__ = ["bench", "box", "column", "files", "homes", "maze", "mixed"]
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 BENCH = Path(__file__).parent / "data" / "bench_homes.npz"
+MIX = {"homes": 1000, "bench": 512, "maze": 300}  # the parts of `mixed`
 
 
 def _split_range(count, split):
@@ -105,3 +109,71 @@ def maze(
     fit(len(unique), mazes.bytes_each(size, corridor, thickness), "cpu", what)
     generated = {i: mazes.generate(i, size, corridor, thickness, braid) for i in unique}
     return [generated[i] for i in indices]
+
+
+def _part(name: str, part: Any) -> tuple[Callable, dict[str, Any]]:
+    """Returns the source of a part of `mixed`, and its options with `n`.
+
+    Raises:
+        ValueError: if there is no such source, or it takes other options.
+    """
+    options = dict(part) if isinstance(part, dict) else {"n": part}
+    source = options.pop("source", name)
+    if not isinstance(source, str) or source not in __all__ and ":" not in source:
+        raise ValueError(
+            f"{source!r} is no source; {closest(source, [*__all__, 'module:function'])}"
+        )
+    function = import_object(source) if ":" in source else globals()[source]
+    arguments = inspect.signature(function).parameters
+    taken = [k for k in arguments if k not in ("split", "seed")]
+    if missing := [k for k in ("n", "split", "seed") if k not in arguments]:
+        raise ValueError(f"{name}: {source} is no source, for it takes no {missing[0]}")
+    if unknown := [k for k in options if k not in taken]:
+        raise ValueError(
+            f"{name}: {source} has no option {unknown[0]}; {closest(unknown[0], taken)}"
+        )
+    required = [k for k in taken if arguments[k].default is inspect.Parameter.empty]
+    if absent := [k for k in required if k not in options]:
+        raise ValueError(f"{name}: {absent[0]} is missing")
+    n = options.setdefault("n", arguments["n"].default)
+    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 0 <= n <= 1_000_000:
+        raise ValueError(f"{name}: {n!r} is no number of geometries, 0 to 1,000,000")
+    return function, options
+
+
+def _valid_parts(parts: dict[str, Any]) -> dict[str, Any]:
+    if not sum(_part(name, part)[1]["n"] for name, part in parts.items()):
+        raise ValueError("its counts sum to 0; give at least one geometry: {homes: 512}")
+    return parts
+
+
+@checked
+def mixed(
+    n: Count | None = None,
+    split: str = "training",
+    seed: Seed = 1,
+    parts: Annotated[dict[str, Any], AfterValidator(_valid_parts)] = MIX,
+) -> list[dotdict]:
+    """Returns geometries of several sources, one after the other, each with the key `source`, the
+    name of its part.
+
+    Args:
+        n: number of geometries, evenly spaced over the parts, or repeated; None: as many as the
+            parts have.
+        parts: name -> number of geometries from the source of that name; or {source, n, options}
+            with the name or import path of a source. Every part is of the same split and seed, and
+            has at most as many geometries as that split of its source.
+    """
+    geometries = []
+    for name, part in parts.items():
+        function, options = _part(name, part)
+        if options["n"]:
+            try:
+                drawn = checked(function)(split=split, seed=seed, **options)
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from error
+            unique = {id(g): dotdict(g, source=name) for g in drawn}
+            geometries += unique.values()
+    total = len(geometries)
+    n = n or total
+    return [geometries[i * total // n if n < total else i % total] for i in range(n)]

@@ -120,6 +120,20 @@ def test_rows_by_role():
     assert (hunter["won"], hunter["lower"], hunter["upper"]) == expected
 
 
+def test_rows_by_source():
+    """Both duels in home 2, a maze, are won, and none of those in homes 0 and 1 is."""
+    played = arrdict(
+        score=torch.tensor([0.0, 0.5, 1, 0, 0, 1]),
+        lengths=torch.tensor([1.0, 2, 3, 4, 5, 6]),
+        slots=torch.tensor([0, 0, 0, 1, 1, 1]),
+        homes=torch.tensor([0, 1, 2, 0, 1, 2]),
+    )
+    _, homes, maze = duels.summaries(played, sources=["homes", "homes", "maze", "never played"])
+    assert (homes["source"], maze["source"]) == ("homes", "maze")
+    assert (homes["won"], homes["duels"], homes["homes"]) == (0.125, 4, 2)
+    assert (maze["won"], maze["wins"], maze["length"]) == (1, 2, 4.5)
+
+
 def test_duels_are_reproducible():
     def scores(seed):
         return duels.play(Matrix(64), Always(2, 0.9), Always(0, 0.9), seed).score.tolist()

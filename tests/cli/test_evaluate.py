@@ -368,6 +368,37 @@ def test_evaluate_in_homes_from_a_file(trained, tmp_path):
     assert result["rows"][0]["homes"] == 3
 
 
+def test_metrics_of_each_part_of_a_mix(tmp_path, monkeypatch, capsys):
+    """Of six episodes in three homes each, those in homes 1 and 4 are in a maze."""
+    monkeypatch.chdir(tmp_path)
+    house = "{source: megastep.geometries.sources:bench, n: 1}"
+    words = ["geometry=mixed", f"geometry.parts={{homes: 1, maze: 1, house: {house}}}"]
+    words += ["env=explorer", "preset=cpu", "env.n_envs=4", "env.patience=1", "env.res=4"]
+    words += ["env.subsample=1", "agent.width=8", "learner.n_steps=8"]
+    words += ["learner.n_minibatches=2", "device=cpu", "samples=1"]
+    seen, first_episodes = [], evaluation.first_episodes
+
+    def spied(env, *args):
+        seen.append(first_episodes(env, *args))
+        return seen[-1]
+
+    monkeypatch.setattr(evaluation, "first_episodes", spied)
+    written = evaluate.run(configured(run=str(train.run(settings(*words))), episodes=6))
+    assert written.name.startswith("mixed-test-")
+    rows = json.loads(written.read_text())["rows"]
+    sources = [None, "homes", "maze", "house"]
+    assert [(row["agent"], row.get("source")) for row in rows] == [
+        (agent, source) for agent in ("trained", "random") for source in sources
+    ]
+    every, _, maze, house = rows[:4]
+    assert (every["lanes"], maze["lanes"], maze["homes"]) == (6, 2, 1)
+    for row, lanes in (maze, [1, 4]), (house, [2, 5]):
+        assert row["return"] == pytest.approx(seen[0].returns[lanes].mean().item())
+        for name, values in seen[0].metrics.items():
+            assert row["metrics"][name]["mean"] == pytest.approx(values[lanes].mean().item())
+    assert "trained, in maze" in capsys.readouterr().out
+
+
 def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):
     """Ten lanes in four homes: three, three, two and two."""
     monkeypatch.chdir(tmp_path)
