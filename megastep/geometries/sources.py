@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field
 from megastep.dotdict import dotdict
 from megastep.geometries import files as npz
 from megastep.geometries import mazes, toys
-from megastep.geometries.homes import database
+from megastep.geometries.homes import database, plan
 from megastep.imports import import_object
 from megastep.settings import checked, closest
 
@@ -71,13 +71,25 @@ def files(n: Count = 512, split: str = "training", seed: Seed = 1, *, path: str)
     return [database[i] for i in _draw_indices(len(database), n, split, seed)]
 
 
+@checked
 def homes(
-    n: Count = 512, split: str = "training", seed: Seed = 1, outer: bool = True
+    n: Count = 512,
+    split: str = "training",
+    seed: Seed = 1,
+    outer: bool = True,
+    density: Annotated[float, Field(ge=1, le=plan.DENSEST)] = 1.0,
 ) -> list[dotdict]:
     """Returns homes from the 5,000 of the package. With `outer=False` they lack the outer faces of
     outer walls, which cannot be seen from inside.
+
+    Of more `density`, up to 3, they are generated anew from as many seeds: with more rooms,
+    narrower doors and corridors, and furniture, they reach three times as many walls.
     """
-    return [database.home(i, outer) for i in _draw_indices(database.COUNT, n, split, seed)]
+    indices = _draw_indices(database.COUNT, n, split, seed)
+    if density == 1:
+        return [database.home(i, outer) for i in indices]
+    generated = database.generated(tuple(dict.fromkeys(indices)), density, outer)
+    return [generated[i] for i in indices]
 
 
 def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdict]:
