@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
-from megastep.agents.training.evaluation import CHECK_EVERY, interval, lanes_by_source
+from megastep.agents.training.evaluation import CHECK_EVERY, interval, lanes_by_source, worst_homes
 from megastep.arrdict import arrdict
 from megastep.types import Env, Policy, n_lanes, optional
 
@@ -143,6 +143,15 @@ def summaries(
     for source, in_source in lanes_by_source(arrays.get("homes"), sources).items():
         rows.append({"source": source, **_summary(_of(arrays, in_source))})
     return rows
+
+
+def worst_summary(played: Mapping) -> dict[str, Any]:
+    """Returns a table row of the worst homes, `evaluation.worst_homes`, from a result of `play`."""
+    arrays = {key: values.cpu().numpy() for key, values in played.items()}
+    numbers, means = worst_homes({"won": arrays["score"]}, arrays["homes"])
+    won = means["won"]
+    row = _summary(_of(arrays, np.isin(arrays["homes"], numbers)))
+    return row | {"won": won["mean"], "lower": won["lower"], "upper": won["upper"]}
 
 
 def _of(arrays, is_included):

@@ -19,12 +19,20 @@ from megastep.geometries.homes import database, plan
 from megastep.imports import import_object
 from megastep.settings import checked, closest
 
-__all__ = ["bench", "box", "column", "files", "homes", "maze", "mixed"]
+__all__ = ["bench", "box", "column", "files", "homes", "maze", "mixed", "suite"]
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 BENCH = Path(__file__).parent / "data" / "bench_homes.npz"
 MIX = {"homes": 1000, "bench": 512, "maze": 300}  # the parts of `mixed`
+SUITE = {  # the parts of `suite`
+    "generated": {"source": "homes", "n": 500},
+    "dense": {"source": "homes", "n": 500, "density": float(plan.DENSEST)},
+    "bench": {"source": "bench", "n": 512},
+    "perfect mazes": {"source": "maze", "n": 250},
+    "braided mazes": {"source": "maze", "n": 250, "braid": 1.0},
+    "box": {"source": "box", "n": 1},
+}
 
 
 def _split_range(count, split):
@@ -159,12 +167,12 @@ def _valid_parts(parts: dict[str, Any]) -> dict[str, Any]:
     return parts
 
 
+Parts = Annotated[dict[str, Any], AfterValidator(_valid_parts)]
+
+
 @checked
 def mixed(
-    n: Count | None = None,
-    split: str = "training",
-    seed: Seed = 1,
-    parts: Annotated[dict[str, Any], AfterValidator(_valid_parts)] = MIX,
+    n: Count | None = None, split: str = "training", seed: Seed = 1, parts: Parts = MIX
 ) -> list[dotdict]:
     """Returns geometries of several sources, one after the other, each with the key `source`, the
     name of its part.
@@ -189,3 +197,21 @@ def mixed(
     total = len(geometries)
     n = n or total
     return [geometries[i * total // n if n < total else i % total] for i in range(n)]
+
+
+@checked
+def suite(
+    n: Count | None = None,
+    split: str = "training",
+    seed: Seed = 1,
+    parts: Parts = SUITE,
+    plans: str | None = None,
+) -> list[dotdict]:
+    """Returns the homes of the fixed suite that agents are evaluated in, a `mixed` of all kinds.
+
+    Args:
+        plans: an `.npz` file of imported floor plans, which are a further part, `plans`.
+    """
+    if plans is not None:
+        parts = parts | {"plans": {"source": "files", "n": 512, "path": plans}}
+    return mixed(n, split, seed, parts)

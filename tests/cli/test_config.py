@@ -310,6 +310,9 @@ def test_parts_of_a_mix():
     assert text == "'hoems' is no source; did you mean homes?"
     text = errors("geometry=mixed", "geometry.parts={homes: 0}")["geometry.parts"]
     assert text.startswith("its counts sum to 0")
+    words = "run=x", "geometry=suite", "geometry.parts={}"
+    with pytest.raises(ConfigErrors, match="geometry.parts: its counts sum to 0"):
+        compose(*words, script="evaluate")
 
 
 def test_contradicting_settings():
