@@ -182,7 +182,8 @@ def worst_homes(
         homes: (B,) integers, the home of each episode.
 
     Returns:
-        The numbers of the homes, and {name: {mean, lower, upper}}.
+        The numbers of the homes, and {name: {mean, lower, upper}}, None for each if no episode in
+        them has a number.
     """
     numbers, homes = np.unique(np.asarray(homes), return_inverse=True)
     means = {name: _means_by_home(np.asarray(v, float), homes) for name, v in columns.items()}
@@ -193,11 +194,21 @@ def worst_homes(
     worst = order[np.sort(order.argsort()[resamples], 1)[:, :n_worst]]
     result = {}
     for name, by_home in means.items():
-        resampled = np.nanmean(by_home[worst], 1)
-        lower, upper = np.nanquantile(resampled, [(1 - level) / 2, (1 + level) / 2])
-        mean = np.nanmean(by_home[order[:n_worst]])
-        result[name] = {"mean": float(mean), "lower": float(lower), "upper": float(upper)}
+        mean, resampled = _finite_mean(by_home[order[:n_worst]]), _finite_mean(by_home[worst])
+        numbers_in_worst = [None] * 3
+        if np.isfinite(mean):
+            levels = [(1 - level) / 2, (1 + level) / 2]
+            numbers_in_worst = [float(mean), *np.nanquantile(resampled, levels).tolist()]
+        result[name] = dict(zip(("mean", "lower", "upper"), numbers_in_worst, strict=True))
     return numbers[order[:n_worst]], result
+
+
+def _finite_mean(values):
+    """Returns the mean over the last axis of what is finite, nan if there is none."""
+    is_finite = np.isfinite(values)
+    counts = is_finite.sum(-1)
+    means = np.where(is_finite, values, 0.0).sum(-1) / np.maximum(counts, 1)
+    return np.where(counts > 0, means, np.nan)
 
 
 def _means_by_home(values, homes):

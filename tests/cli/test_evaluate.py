@@ -425,7 +425,9 @@ def test_worst_homes_by_hand():
 
 
 def test_worst_homes_of_few_are_one():
-    worst, means = evaluation.worst_homes({"return": [3.0, 1, 2]}, [0, 1, 2])
+    columns = {"return": [3.0, 1, 2], "laps": [4, np.nan, np.inf]}
+    worst, means = evaluation.worst_homes(columns, [0, 1, 2])
+    assert means["laps"] == {"mean": None, "lower": None, "upper": None}
     assert worst.tolist() == [1]
     assert (means["return"]["mean"], means["return"]["lower"]) == (1, 1)
 
