@@ -23,6 +23,8 @@ from megastep.settings import arguments_of
 
 POLICY = "megastep.agents.networks.policy:Policy"
 FILES = "megastep.geometries.sources:files"
+MIXED = "megastep.geometries.sources:mixed"
+CHECK_PARTS = "megastep.geometries.sources:check_parts"
 SUITE = "megastep.geometries.sources:suite"
 OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
 #: How the arguments of a group's members become settings, as `arguments_of` takes it: `reserved`

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from megastep.dotdict import dotdict
 from megastep.geometries import files as npz
@@ -161,18 +161,19 @@ def _part(name: str, part: Any) -> tuple[Callable, dict[str, Any]]:
     return function, options
 
 
-def _valid_parts(parts: dict[str, Any]) -> dict[str, Any]:
+def check_parts(parts: dict[str, Any]) -> None:
+    """Checks the parts of `mixed` and `suite`.
+
+    Raises:
+        ValueError: if a source does not exist or takes other options, or no part has geometries.
+    """
     if not sum(_part(name, part)[1]["n"] for name, part in parts.items()):
         raise ValueError("its counts sum to 0; give at least one geometry: {homes: 512}")
-    return parts
-
-
-Parts = Annotated[dict[str, Any], AfterValidator(_valid_parts)]
 
 
 @checked
 def mixed(
-    n: Count | None = None, split: str = "training", seed: Seed = 1, parts: Parts = MIX
+    n: Count | None = None, split: str = "training", seed: Seed = 1, parts: dict[str, Any] = MIX
 ) -> list[dotdict]:
     """Returns geometries of several sources, one after the other, each with the key `source`, the
     name of its part.
@@ -184,6 +185,7 @@ def mixed(
             with the name or import path of a source. Every part is of the same split and seed, and
             has at most as many geometries as that split of its source.
     """
+    check_parts(parts)
     geometries = []
     for name, part in parts.items():
         function, options = _part(name, part)
@@ -204,7 +206,7 @@ def suite(
     n: Count | None = None,
     split: str = "training",
     seed: Seed = 1,
-    parts: Parts = SUITE,
+    parts: dict[str, Any] = SUITE,
     plans: str | None = None,
 ) -> list[dotdict]:
     """Returns the homes of the fixed suite that agents are evaluated in, a `mixed` of all kinds.
