@@ -8,7 +8,7 @@ FINE = 0.05  # metres per cell
 RADIUS = 0.15 / 2**0.5  # metres; of an agent
 GAP = 0.55  # metres; minimum width of a passage
 SPAWN = 0.15  # metres; each room has a point this far from all walls
-MAX_WALLS, MAX_EXTENT = 400, 40.0
+MAX_WALLS, MAX_EXTENT = 500, 40.0
 LIT = 0.05  # metres; minimum distance of a light from a wall
 MIN_CELLS = 4  # minimum cells of a room in the masks
 

@@ -88,7 +88,11 @@ OUTSIDE_USERS = {
     ),
     "hydra": ("agents/cli/*.py",),
     "hydra_plugins": ("agents/cli/*.py",),
-    "loky": ("megastep/recording.py", "megastep/vector_processes.py"),
+    "loky": (
+        "megastep/geometries/homes/database.py",
+        "megastep/recording.py",
+        "megastep/vector_processes.py",
+    ),
     "omegaconf": ("agents/cli/*.py",),
     "openskill": ("agents/selfplay/ratings.py",),
     "rich": ("agents/cli/*.py", "megastep/envs/pointgoal/goals.py"),

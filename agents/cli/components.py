@@ -23,6 +23,9 @@ from megastep.settings import arguments_of
 
 POLICY = "megastep.agents.networks.policy:Policy"
 FILES = "megastep.geometries.sources:files"
+MIXED = "megastep.geometries.sources:mixed"
+CHECK_PARTS = "megastep.geometries.sources:check_parts"
+SUITE = "megastep.geometries.sources:suite"
 OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
 #: How the arguments of a group's members become settings, as `arguments_of` takes it: `reserved`
 #: are passed by the program, `missing` are defaults, and the others are settings beside them.

@@ -143,7 +143,7 @@ class Composer:
             typed = [key for key in map(key_of, overrides) if not key.startswith("hydra")]
             tree = self.script.prepare(own(config, resolve=not secret), typed)
             groups = [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
-            errors += settings.missing_files(tree)
+            errors += settings.missing_sources(tree)
             chosen = check.check(self.script.kind, tree, groups + self.loader.list_groups(""))
         except OmegaConfBaseException as error:
             errors.append((error.full_key or "configuration", str(error).partition("\n")[0]))

@@ -9,7 +9,16 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from megastep.agents.cli import command, console, factory, program, runs, scripts, settings
+from megastep.agents.cli import (
+    command,
+    components,
+    console,
+    factory,
+    program,
+    runs,
+    scripts,
+    settings,
+)
 from megastep.agents.distributed import process_group
 from megastep.agents.distributed.share import Share
 from megastep.agents.generator import rank_seed
@@ -17,6 +26,8 @@ from megastep.agents.selfplay import duels, ratings
 from megastep.agents.training import checkpoint, evaluation
 from megastep.types import optional
 
+#: The source of a suite of which the worst homes have a row of their own.
+DENSE = "dense"
 #: Columns of a table of duels, and of one of ratings, as templates.
 DUELS = {
     "against": "{against}",
@@ -42,48 +53,123 @@ def run(cfg: settings.Evaluate) -> Path:
     Of several ranks, each plays its share. Rank 0 writes; the others return the run's folder.
 
     Writes .json and .md into the run's folder `evaluations`, one of each per source of geometries
-    (per environment where it has none), split and checkpoint. With `cfg.against` plays duels
-    instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
+    (per environment where it has none), split and checkpoint. Of `geometry=suite` plays as many
+    episodes in each source, and adds the worst source and the worst dense homes. With `cfg.against`
+    plays duels instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
     """
     start, device = time.monotonic(), factory.make_device(cfg.device)
     loaded = runs.load_checkpoint(runs.find(cfg.run), cfg.trust, device)
     trained = factory.config_of(loaded)
     env_settings, geometry = cfg.env or trained.env, cfg.geometry or trained.geometry
-    if cfg.ratings or cfg.against is not None:
-        arena = Arena(cfg, loaded, env_settings, geometry, device)
-        path = arena.rate() if cfg.ratings else arena.duel()
+    homes = factory.homes(env_settings, geometry, cfg.split)
+    if cfg.ratings:
+        path = Arena(cfg, loaded, env_settings, geometry, homes, device).rate()
+    elif cfg.against is not None:
+        path = duel(cfg, loaded, env_settings, geometry, homes, device)
     else:
-        homes = factory.homes(env_settings, geometry, cfg.split)
-        homes = factory.spread(homes, cfg.episodes)
-        share = Share.of_this_rank(cfg.episodes, len(homes))
-        seed = rank_seed(cfg.seed, process_group.rank())
-        env_settings = factory.changed(env_settings, n_envs=len(share.envs), resample=False)
-        where = dict(geometries=[homes[home] for home in share.homes], seed=seed, device=device)
-        env, rows = factory.construct(env_settings, **where), []
-        policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
-        players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
-        players += [("random", evaluation.RandomActions(env.action_space), False)] * cfg.baseline
-        for name, player, greedy in players:
-            episodes = evaluation.first_episodes(env, player, seed, greedy)
-            episodes = share.with_others(episodes)
-            summaries = evaluation.summaries(episodes, optional(env, "roles"))
-            rows += [{"agent": name, **row} for row in summaries]
+        rows = []
+        for source, part in parts_of(geometry, homes):
+            rows += of_source(source, play(cfg, loaded, env_settings, part, device, source))
         if process_group.rank() > 0:
             return runs.folder_of(loaded.path)
         place = runs.place(env_settings, geometry, homes, cfg.split)
-        n_episodes, n_homes = rows[0]["lanes"], rows[0]["homes"]
-        warn_without_layout(env, homes)
+        what, n_homes = f"{rows[0]['lanes']:,} episodes", count_homes(rows)
+        rows = with_worst_source(rows, "agent") if is_suite(geometry) else rows
         path = runs.write_table(
             cfg,
             loaded,
             [place.source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
-            f"{place.title(f'{n_episodes:,} episodes', n_homes)}, after {loaded.step:,} samples "
+            f"{place.title(what + each_source(geometry), n_homes)}, after {loaded.step:,} samples "
             f"({loaded.path.name}), seed {cfg.seed}",
             rows,
             [*map(cells, rows)],
         )
     console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
     return path
+
+
+def play(
+    cfg: settings.Evaluate,
+    loaded: checkpoint.Checkpoint,
+    env_settings: settings.Env,
+    homes: list,
+    device: Any,
+    source: str | None = None,
+) -> list[dict]:
+    """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the table rows."""
+    homes = factory.spread(homes, cfg.episodes)
+    share = Share.of_this_rank(cfg.episodes, len(homes))
+    seed, trained = rank_seed(cfg.seed, process_group.rank()), factory.config_of(loaded)
+    env_settings = factory.changed(env_settings, n_envs=len(share.envs), resample=False)
+    where = dict(geometries=[homes[home] for home in share.homes], seed=seed, device=device)
+    env, rows = factory.construct(env_settings, **where), []
+    policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+    players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
+    players += [("random", evaluation.RandomActions(env.action_space), False)] * cfg.baseline
+    sources = None if source else evaluation.sources_of(homes)
+    for name, player, greedy in players:
+        episodes = share.with_others(evaluation.first_episodes(env, player, seed, greedy))
+        summaries = evaluation.summaries(episodes, optional(env, "roles"), sources)
+        if source == DENSE and "homes" in episodes:
+            summaries.append({"tail": evaluation.TAIL, **evaluation.worst_summary(episodes)})
+        rows += [{"agent": name, **row} for row in summaries]
+    if process_group.rank() == 0:
+        warn_without_layout(env, homes)
+    return rows
+
+
+# ---- The suite, whose sources are evaluated one by one ----
+
+
+def is_suite(geometry: settings.Geometry) -> bool:
+    return geometry.name == components.SUITE
+
+
+def each_source(geometry: settings.Geometry) -> str:
+    return " in each source" if is_suite(geometry) else ""
+
+
+def parts_of(geometry: settings.Geometry, homes: list) -> list[tuple[str | None, list]]:
+    """Returns [(source, its homes)] of a suite, and [(None, homes)] of all other geometries.
+
+    Raises:
+        UserError: if the environment takes no homes, so that a suite has no sources.
+    """
+    if not is_suite(geometry):
+        return [(None, homes)]
+    if not homes:
+        raise program.UserError(
+            "This environment has no floor plans, so geometry=suite has no sources; leave it out"
+        )
+    parts = {}
+    for home in homes:
+        parts.setdefault(home["source"], []).append(home)
+    return [*parts.items()]
+
+
+def of_source(source: str | None, rows: list[dict]) -> list[dict]:
+    return [{**row, "source": source} for row in rows] if source else rows
+
+
+def count_homes(rows: list[dict]) -> int:
+    """Returns the number of homes of the first agent or opponent, over all sources."""
+    by_source = {}
+    for row in rows:
+        by_source.setdefault(row.get("source"), row["homes"] or 0)
+    return by_source.get(None) or sum(by_source.values())
+
+
+def with_worst_source(rows: list[dict], who: str) -> list[dict]:
+    """Returns the rows of each agent or opponent, row[who], together, with that of its worst source
+    once more at their end.
+    """
+    ordered = []
+    for name in dict.fromkeys(row[who] for row in rows):
+        of_one = [row for row in rows if row[who] == name]
+        whole = [row for row in of_one if not {"role", "tail"} & row.keys()]
+        worst = min(whole, key=evaluation.score_of)
+        ordered += [*of_one, {**worst, "is_worst": True}]
+    return ordered
 
 
 def warn_without_layout(env: Any, homes: list) -> None:
@@ -101,7 +187,7 @@ def cells(row: dict) -> dict[str, str]:
         texts = [f"{value:.3g}" for value in metric.values() if value is not None] or 2 * ["none"]
         metrics |= {name: texts[0], f"{name}: {runs.INTERVAL}": " to ".join(texts[1:])}
     return {
-        "agent": f"{row['agent']}: {row['role']}" if "role" in row else row["agent"],
+        "agent": f"{row['agent']}{part_of(row)}",
         "return": f"{row['return']:.2f}",
         runs.INTERVAL: f"{row['lower']:.2f} to {row['upper']:.2f}",
         **metrics,
@@ -109,6 +195,14 @@ def cells(row: dict) -> dict[str, str]:
         "episodes": f"{row['lanes']}{cut}",
         "homes": str(row["homes"] or "none"),
     }
+
+
+def part_of(row: dict) -> str:
+    """Returns which of its agent's episodes a row has, `: hunter` or `, in maze`; empty for all."""
+    worst = f", worst {row['tail']:.0%} of homes" if "tail" in row else ""
+    worst += ", the worst source" * row.get("is_worst", False)
+    role = f": {row['role']}" if "role" in row else ""
+    return role + (f", in {row['source']}{worst}" if "source" in row else "")
 
 
 # ---- Duels and ratings ----
@@ -176,10 +270,15 @@ class Arena:
     """
 
     def __init__(
-        self, cfg, run: checkpoint.Checkpoint, env: settings.Env, geometry: Any, device: Any
+        self,
+        cfg,
+        run: checkpoint.Checkpoint,
+        env: settings.Env,
+        geometry: Any,
+        homes: list,
+        device: Any,
     ):
         self.cfg, self.run, env = cfg, run, factory.changed(env, **FOR_TWO)
-        homes = factory.homes(env, geometry, cfg.split)
         where = dict(seed=cfg.seed, device=device)
         sample = factory.make_sample(env, homes, **where)
         self.others = [find_player(name, run, env, sample, cfg.trust) for name in cfg.against or ()]
@@ -195,7 +294,8 @@ class Arena:
         self.env, self.sample = factory.construct(env, **where), sample
         slots = duels.rotating_slots(self.share.n_envs, n_agents, self.env.device)
         self.slots = slots[[*self.share.envs]]
-        self.place = runs.place(env, geometry, homes, cfg.split)
+        self.place, self.env_settings = runs.place(env, geometry, homes, cfg.split), env
+        self.sources = evaluation.sources_of(homes)
         warn_without_layout(self.env, homes)
 
     def play(self, player: Player, opponent: Player) -> Any:
@@ -204,34 +304,18 @@ class Arena:
             played = duels.play(self.env, *policies, self.seed, self.cfg.greedy, slots=self.slots)
         return self.share.with_others(played)
 
-    def duel(self) -> Path:
-        """Plays the run's agent against each of `cfg.against`. Prints and writes a table, and
-        returns the path of its .json.
+    def duel(self, source: str | None = None) -> list[dict]:
+        """Plays the run's agent against each of `cfg.against`, in homes of a `source` or of
+        several. Returns the table rows.
         """
-        roles = optional(self.env, "roles")
-        rows = [
-            {"against": opponent.name, **row}
-            for opponent in self.others
-            for row in duels.summaries(self.play(self.agent, opponent), roles)
-        ]
-        if process_group.rank() > 0:
-            return runs.folder_of(self.run.path)
-        title = self.place.title(f"{rows[0]['duels']:,} duels", rows[0]["homes"])
-        return runs.write_table(
-            self.cfg,
-            self.run,
-            [
-                "duels",
-                self.place.source,
-                self.cfg.split,
-                str(self.run.step),
-                "against",
-                *self.cfg.against,
-            ],
-            f"{self.agent.name}, in {title}, seed {self.cfg.seed}",
-            rows,
-            [*map(duel_cells, rows)],
-        )
+        roles, rows = optional(self.env, "roles"), []
+        for opponent in self.others:
+            played = self.play(self.agent, opponent)
+            summaries = duels.summaries(played, roles, None if source else self.sources)
+            if source == DENSE and "homes" in played:
+                summaries.append({"tail": evaluation.TAIL, **duels.worst_summary(played)})
+            rows += [{"against": opponent.name, **row} for row in summaries]
+        return rows
 
     def rate(self) -> Path:
         """Rates the run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels
@@ -273,8 +357,38 @@ class Arena:
         return folder / "ratings.csv"
 
 
+def duel(
+    cfg: settings.Evaluate,
+    run: checkpoint.Checkpoint,
+    env: settings.Env,
+    geometry: settings.Geometry,
+    homes: list,
+    device: Any,
+) -> Path:
+    """Plays the run's agent against each of `cfg.against`, of a suite in each source. Prints and
+    writes a table, and returns the path of its .json.
+    """
+    rows = []
+    for source, part in parts_of(geometry, homes):
+        arena = Arena(cfg, run, env, geometry, part, device)
+        rows += of_source(source, arena.duel(source))
+    if process_group.rank() > 0:
+        return runs.folder_of(run.path)
+    place = runs.place(arena.env_settings, geometry, homes, cfg.split)
+    title = place.title(f"{rows[0]['duels']:,} duels{each_source(geometry)}", count_homes(rows))
+    rows = with_worst_source(rows, "against") if is_suite(geometry) else rows
+    return runs.write_table(
+        cfg,
+        run,
+        ["duels", place.source, cfg.split, str(run.step), "against", *cfg.against],
+        f"{arena.agent.name}, in {title}, seed {cfg.seed}",
+        rows,
+        [*map(duel_cells, rows)],
+    )
+
+
 def duel_cells(row: dict) -> dict[str, str]:
-    against = f"{row['against']}, as {row['role']}" if "role" in row else row["against"]
+    against = f"{row['against']}{part_of(row).replace(': ', ', as ')}"
     row = row | {"against": against, "homes": row["homes"] or "none"}
     return {key: form.format_map(row) for key, form in DUELS.items()}
 

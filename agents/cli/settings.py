@@ -136,11 +136,18 @@ Agent = kind_of("agent", components.POLICY)
 Opposition = kind_of("opponents", components.OPPONENTS)
 
 
-def missing_files(tree: dict[str, Any]) -> list[tuple[str, str]]:
-    """Returns [(key, sentence)] of files that are named in nested dicts and do not exist."""
+def missing_sources(tree: dict[str, Any]) -> list[tuple[str, str]]:
+    """Returns [(key, sentence)] of files and parts of a mix that are named in nested dicts and do
+    not exist.
+    """
     match tree.get("geometry"):
         case {"name": components.FILES, "path": str(path)} if not os.path.isfile(path):
             return [("geometry.path", f"there is no file {path!r}; give an .npz of geometries")]
+        case {"name": components.MIXED | components.SUITE, "parts": dict(parts)}:
+            try:
+                import_object(components.CHECK_PARTS)(parts)
+            except ValueError as error:
+                return [("geometry.parts", str(error))]
     return []
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
-from megastep.agents.training.evaluation import CHECK_EVERY, interval
+from megastep.agents.training.evaluation import CHECK_EVERY, interval, lanes_by_source, worst_homes
 from megastep.arrdict import arrdict
 from megastep.types import Env, Policy, n_lanes, optional
 
@@ -121,23 +121,41 @@ def play(
     return arrdict(score=score, lengths=lengths, slots=slots[:, 0], **homes)
 
 
-def summaries(played: Mapping, roles: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Returns table rows for the result of `play`: one overall, then one per role.
+def summaries(
+    played: Mapping, roles: Sequence[str] | None = None, sources: Sequence[str] | None = None
+) -> list[dict[str, Any]]:
+    """Returns table rows for the result of `play`: one overall, then one per role and one per
+    source of homes.
 
     `won` is the share of duels won, a draw counting half; `lower` and `upper` are its 95 % interval
     over homes, or over duels if there are no homes.
 
     Args:
         roles: the role of each agent slot. A role's row has the duels in which `policy` played it.
+        sources: the source of each home.
     """
     arrays = {key: values.cpu().numpy() for key, values in played.items()}
     rows, slots = [_summary(arrays)], arrays["slots"]
     for role in dict.fromkeys(roles or ()):
         has_role = np.array([name == role for name in roles])[slots]
         if has_role.any():
-            of_role = {key: values[has_role] for key, values in arrays.items()}
-            rows.append({"role": role, **_summary(of_role)})
+            rows.append({"role": role, **_summary(_of(arrays, has_role))})
+    for source, in_source in lanes_by_source(arrays.get("homes"), sources).items():
+        rows.append({"source": source, **_summary(_of(arrays, in_source))})
     return rows
+
+
+def worst_summary(played: Mapping) -> dict[str, Any]:
+    """Returns a table row of the worst homes, `evaluation.worst_homes`, from a result of `play`."""
+    arrays = {key: values.cpu().numpy() for key, values in played.items()}
+    numbers, means = worst_homes({"won": arrays["score"]}, arrays["homes"])
+    won = means["won"]
+    row = _summary(_of(arrays, np.isin(arrays["homes"], numbers)))
+    return row | {"won": won["mean"], "lower": won["lower"], "upper": won["upper"]}
+
+
+def _of(arrays, is_included):
+    return {key: values[is_included] for key, values in arrays.items()}
 
 
 def _summary(arrays):

@@ -60,7 +60,7 @@ def foreign_names(config: bytes) -> list[str]:
     while stack:  # not recursive: a planted file may be nested deeply
         value = stack.pop()
         if isinstance(value, (dict, list)):
-            stack += value.values() if isinstance(value, dict) else value
+            stack += [*value, *value.values()] if isinstance(value, dict) else value
         elif isinstance(value, str) and ":" in value and not OWN.fullmatch(value):
             names.append(value)
     return sorted({*names})

@@ -4,8 +4,10 @@ Their arguments are the settings of a run's `geometry`.
 """
 
 import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -13,14 +15,24 @@ from pydantic import Field
 from megastep.dotdict import dotdict
 from megastep.geometries import files as npz
 from megastep.geometries import mazes, toys
-from megastep.geometries.homes import database
-from megastep.settings import checked
+from megastep.geometries.homes import database, plan
+from megastep.imports import import_object
+from megastep.settings import checked, closest
 
-__all__ = ["bench", "box", "column", "files", "homes", "maze"]
+__all__ = ["bench", "box", "column", "files", "homes", "maze", "mixed", "suite"]
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 BENCH = Path(__file__).parent / "data" / "bench_homes.npz"
+MIX = {"homes": 1000, "bench": 512, "maze": 300}  # the parts of `mixed`
+SUITE = {  # the parts of `suite`
+    "generated": {"source": "homes", "n": 500},
+    "dense": {"source": "homes", "n": 500, "density": float(plan.DENSEST)},
+    "bench": {"source": "bench", "n": 512},
+    "perfect mazes": {"source": "maze", "n": 250},
+    "braided mazes": {"source": "maze", "n": 250, "braid": 1.0},
+    "box": {"source": "box", "n": 1},
+}
 
 
 def _split_range(count, split):
@@ -67,13 +79,25 @@ def files(n: Count = 512, split: str = "training", seed: Seed = 1, *, path: str)
     return [database[i] for i in _draw_indices(len(database), n, split, seed)]
 
 
+@checked
 def homes(
-    n: Count = 512, split: str = "training", seed: Seed = 1, outer: bool = True
+    n: Count = 512,
+    split: str = "training",
+    seed: Seed = 1,
+    outer: bool = True,
+    density: Annotated[float, Field(ge=1, le=plan.DENSEST)] = 1.0,
 ) -> list[dotdict]:
     """Returns homes from the 5,000 of the package. With `outer=False` they lack the outer faces of
     outer walls, which cannot be seen from inside.
+
+    Of more `density`, up to 3, they are generated anew from as many seeds: with more rooms,
+    narrower doors and corridors, and furniture, they reach three times as many walls.
     """
-    return [database.home(i, outer) for i in _draw_indices(database.COUNT, n, split, seed)]
+    indices = _draw_indices(database.COUNT, n, split, seed)
+    if density == 1:
+        return [database.home(i, outer) for i in indices]
+    generated = database.generated(tuple(dict.fromkeys(indices)), density, outer)
+    return [generated[i] for i in indices]
 
 
 def bench(n: Count = 512, split: str = "training", seed: Seed = 1) -> list[dotdict]:
@@ -105,3 +129,91 @@ def maze(
     fit(len(unique), mazes.bytes_each(size, corridor, thickness), "cpu", what)
     generated = {i: mazes.generate(i, size, corridor, thickness, braid) for i in unique}
     return [generated[i] for i in indices]
+
+
+def _part(name: str, part: Any) -> tuple[Callable, dict[str, Any]]:
+    """Returns the source of a part of `mixed`, and its options with `n`.
+
+    Raises:
+        ValueError: if there is no such source, or it takes other options.
+    """
+    options = dict(part) if isinstance(part, dict) else {"n": part}
+    source = options.pop("source", name)
+    if not isinstance(source, str) or source not in __all__ and ":" not in source:
+        raise ValueError(
+            f"{source!r} is no source; {closest(source, [*__all__, 'module:function'])}"
+        )
+    function = import_object(source) if ":" in source else globals()[source]
+    arguments = inspect.signature(function).parameters
+    taken = [k for k in arguments if k not in ("split", "seed")]
+    if missing := [k for k in ("n", "split", "seed") if k not in arguments]:
+        raise ValueError(f"{name}: {source} is no source, for it takes no {missing[0]}")
+    if unknown := [k for k in options if k not in taken]:
+        raise ValueError(
+            f"{name}: {source} has no option {unknown[0]}; {closest(unknown[0], taken)}"
+        )
+    required = [k for k in taken if arguments[k].default is inspect.Parameter.empty]
+    if absent := [k for k in required if k not in options]:
+        raise ValueError(f"{name}: {absent[0]} is missing")
+    n = options.setdefault("n", arguments["n"].default)
+    if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 0 <= n <= 1_000_000:
+        raise ValueError(f"{name}: {n!r} is no number of geometries, 0 to 1,000,000")
+    return function, options
+
+
+def check_parts(parts: dict[str, Any]) -> None:
+    """Checks the parts of `mixed` and `suite`.
+
+    Raises:
+        ValueError: if a source does not exist or takes other options, or no part has geometries.
+    """
+    if not sum(_part(name, part)[1]["n"] for name, part in parts.items()):
+        raise ValueError("its counts sum to 0; give at least one geometry: {homes: 512}")
+
+
+@checked
+def mixed(
+    n: Count | None = None, split: str = "training", seed: Seed = 1, parts: dict[str, Any] = MIX
+) -> list[dotdict]:
+    """Returns geometries of several sources, one after the other, each with the key `source`, the
+    name of its part.
+
+    Args:
+        n: number of geometries, evenly spaced over the parts, or repeated; None: as many as the
+            parts have.
+        parts: name -> number of geometries from the source of that name; or {source, n, options}
+            with the name or import path of a source. Every part is of the same split and seed, and
+            has at most as many geometries as that split of its source.
+    """
+    check_parts(parts)
+    geometries = []
+    for name, part in parts.items():
+        function, options = _part(name, part)
+        if options["n"]:
+            try:
+                drawn = checked(function)(split=split, seed=seed, **options)
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from error
+            unique = {id(g): dotdict(g, source=name) for g in drawn}
+            geometries += unique.values()
+    total = len(geometries)
+    n = n or total
+    return [geometries[i * total // n if n < total else i % total] for i in range(n)]
+
+
+@checked
+def suite(
+    n: Count | None = None,
+    split: str = "training",
+    seed: Seed = 1,
+    parts: dict[str, Any] = SUITE,
+    plans: str | None = None,
+) -> list[dotdict]:
+    """Returns the homes of the fixed suite that agents are evaluated in, a `mixed` of all kinds.
+
+    Args:
+        plans: an `.npz` file of imported floor plans, which are a further part, `plans`.
+    """
+    if plans is not None:
+        parts = parts | {"plans": {"source": "files", "n": 512, "path": plans}}
+    return mixed(n, split, seed, parts)

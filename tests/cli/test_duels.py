@@ -120,6 +120,20 @@ def test_rows_by_role():
     assert (hunter["won"], hunter["lower"], hunter["upper"]) == expected
 
 
+def test_rows_by_source():
+    """Both duels in home 2, a maze, are won, and none of those in homes 0 and 1 is."""
+    played = arrdict(
+        score=torch.tensor([0.0, 0.5, 1, 0, 0, 1]),
+        lengths=torch.tensor([1.0, 2, 3, 4, 5, 6]),
+        slots=torch.tensor([0, 0, 0, 1, 1, 1]),
+        homes=torch.tensor([0, 1, 2, 0, 1, 2]),
+    )
+    _, homes, maze = duels.summaries(played, sources=["homes", "homes", "maze", "never played"])
+    assert (homes["source"], maze["source"]) == ("homes", "maze")
+    assert (homes["won"], homes["duels"], homes["homes"]) == (0.125, 4, 2)
+    assert (maze["won"], maze["wins"], maze["length"]) == (1, 2, 4.5)
+
+
 def test_duels_are_reproducible():
     def scores(seed):
         return duels.play(Matrix(64), Always(2, 0.9), Always(0, 0.9), seed).score.tolist()
@@ -403,6 +417,37 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
     table = json.loads(path.read_text())
     assert table["rows"][0]["homes"] == 7
     assert "matrix: 28 duels in 7 homes, geometry=homes, split=test, seed 1" in table["title"]
+
+
+def test_duels_in_each_source_of_a_suite(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["env=tests.helpers.games:Matrix", "env.n_agents=2", "env.n_envs=4", "geometry=box"]
+    options = ["samples=1", "folder=run", *PONG[4:]]
+    train.run(configured(*words, *options, tiny=["preset=cpu", "agent.width=8"]))
+    parts = "geometry.parts={dense: {source: homes, n: 3, density: 1.5}, maze: {n: 2, size: 3}}"
+    words = ["run=run", "geometry=suite", parts, "episodes=12", "device=cpu"]
+    assert evaluate.main([*words, "against=[tests.helpers.games:High,random]"]) == 0
+    (path,) = (tmp_path / "run" / "evaluations").glob("duels-suite-test-*.json")
+    table = json.loads(path.read_text())
+    assert "matrix: 12 duels in each source in 5 homes, geometry=suite" in table["title"]
+    rows = [row for row in table["rows"] if row["against"].endswith("High")]
+    assert rows == table["rows"][:4] and len(table["rows"]) == 8
+    dense, tail, maze, worst = rows
+    assert [row["source"] for row in rows[:3]] == ["dense", "dense", "maze"]
+    assert [row["duels"] for row in rows[:3]] == [12, 4, 12]
+    assert tail["tail"] == 0.05 and tail["homes"] == 1 and tail["won"] <= dense["won"]
+    assert worst["is_worst"] and worst["won"] == min(dense["won"], maze["won"])
+
+
+def test_worst_homes_of_duels():
+    """Of 20 homes, in home 7 both duels are lost."""
+    homes = torch.arange(20).repeat(2)
+    score = torch.where(homes == 7, 0.0, 1.0)
+    score[3] = 0
+    played = arrdict(score=score, lengths=score + 5, slots=torch.zeros(40), homes=homes)
+    row = duels.worst_summary(played)
+    assert (row["won"], row["losses"], row["duels"], row["homes"]) == (0, 2, 2, 1)
+    assert row["length"] == 5 and row["lower"] == 0 < row["upper"]
 
 
 @pytest.mark.parametrize(

@@ -368,6 +368,133 @@ def test_evaluate_in_homes_from_a_file(trained, tmp_path):
     assert result["rows"][0]["homes"] == 3
 
 
+def test_metrics_of_each_part_of_a_mix(tmp_path, monkeypatch, capsys):
+    """Of six episodes in three homes each, those in homes 1 and 4 are in a maze."""
+    monkeypatch.chdir(tmp_path)
+    house = "{source: megastep.geometries.sources:bench, n: 1}"
+    words = ["geometry=mixed", f"geometry.parts={{homes: 1, maze: 1, house: {house}}}"]
+    words += ["env=explorer", "preset=cpu", "env.n_envs=4", "env.patience=1", "env.res=4"]
+    words += ["env.subsample=1", "agent.width=8", "learner.n_steps=8"]
+    words += ["learner.n_minibatches=2", "device=cpu", "samples=1"]
+    seen, first_episodes = [], evaluation.first_episodes
+
+    def spied(env, *args):
+        seen.append(first_episodes(env, *args))
+        return seen[-1]
+
+    monkeypatch.setattr(evaluation, "first_episodes", spied)
+    written = evaluate.run(configured(run=str(train.run(settings(*words))), episodes=6))
+    assert written.name.startswith("mixed-test-")
+    rows = json.loads(written.read_text())["rows"]
+    sources = [None, "homes", "maze", "house"]
+    assert [(row["agent"], row.get("source")) for row in rows] == [
+        (agent, source) for agent in ("trained", "random") for source in sources
+    ]
+    every, _, maze, house = rows[:4]
+    assert (every["lanes"], maze["lanes"], maze["homes"]) == (6, 2, 1)
+    for row, lanes in (maze, [1, 4]), (house, [2, 5]):
+        assert row["return"] == pytest.approx(seen[0].returns[lanes].mean().item())
+        for name, values in seen[0].metrics.items():
+            assert row["metrics"][name]["mean"] == pytest.approx(values[lanes].mean().item())
+    assert "trained, in maze" in capsys.readouterr().out
+
+
+# ---- The suite ----
+
+
+def test_worst_homes_by_hand():
+    """Of forty homes with two episodes each, the two worst by success, and then by return."""
+    homes = np.repeat(np.arange(40), 2)
+    success = np.ones(80)
+    success[[6, 7, 20, 30]] = 0  # home 3 fails twice, homes 10 and 15 once
+    returns = np.arange(80.0)
+    returns[30:32] = -5
+    falls = np.full(80, np.nan)
+    falls[[7, 31]] = 4, 2
+    columns = {"return": returns, "success": success, "falls": falls}
+    worst, means = evaluation.worst_homes(columns, homes)
+    assert worst.tolist() == [3, 15]
+    assert means["success"]["mean"] == 0.25 and means["return"]["mean"] == (6.5 - 5) / 2
+    assert means["falls"]["mean"] == 3
+    assert 0 <= means["success"]["lower"] <= 0.25 < means["success"]["upper"] <= 1
+    # numbers of homes may be any, and their order changes nothing
+    order = np.random.default_rng(0).permutation(80)
+    shuffled = {name: values[order] for name, values in columns.items()}
+    again, other_means = evaluation.worst_homes(shuffled, 7 * homes[order] + 3)
+    assert again.tolist() == [24, 108] and other_means["return"] == means["return"]
+
+
+def test_worst_homes_of_few_are_one():
+    columns = {"return": [3.0, 1, 2], "laps": [4, np.nan, np.inf]}
+    worst, means = evaluation.worst_homes(columns, [0, 1, 2])
+    assert means["laps"] == {"mean": None, "lower": None, "upper": None}
+    assert worst.tolist() == [1]
+    assert (means["return"]["mean"], means["return"]["lower"]) == (1, 1)
+
+
+def test_a_row_is_scored_by_what_compares_between_homes():
+    row = {"return": 9.0, "metrics": {"coverage": {"mean": 0.5}, "laps": {"mean": 3}}}
+    assert evaluation.score_of(row) == 0.5
+    assert evaluation.score_of({"return": 9.0, "metrics": {"success": {"mean": None}}}) == 9
+    assert evaluation.score_of({"won": 0.25}) == 0.25
+
+
+@pytest.fixture
+def explorer(tmp_path, monkeypatch):
+    """A run of an explorer."""
+    monkeypatch.chdir(tmp_path)
+    words = ["env=explorer", "preset=cpu", "geometry=box", "env.n_envs=4", "env.patience=1"]
+    words += ["env.res=4", "env.subsample=1", "agent.width=8", "learner.n_steps=8"]
+    words += ["learner.n_minibatches=2", "device=cpu", "samples=1"]
+    return train.run(settings(*words))
+
+
+def test_suite_evaluates_each_source_by_itself(explorer, capsys):
+    parts = "{dense: {source: homes, n: 3, density: 1.5}, maze: {n: 2, size: 3}, box: 1}"
+    words = ["run=x", "geometry=suite", f"geometry.parts={parts}"]
+    suite = settings(*words, script="evaluate").geometry
+    written = evaluate.run(configured(run=str(explorer), geometry=suite, episodes=6))
+    assert written.name.startswith("suite-test-")
+    result = json.loads(written.read_text())
+    assert "explorer: 6 episodes in each source in 6 homes, geometry=suite" in result["title"]
+    rows = [row for row in result["rows"] if row["agent"] == "trained"]
+    assert rows == result["rows"][:5] and len(result["rows"]) == 10
+    names = ["dense", "dense", "maze", "box"]
+    assert [row["source"] for row in rows[:4]] == names
+    assert [(row["lanes"], row["homes"]) for row in rows[:4]] == [(6, 3), (2, 1), (6, 2), (6, 1)]
+    dense, tail, *others, worst = rows
+    assert tail["tail"] == 0.05
+    assert tail["metrics"]["coverage"]["mean"] <= dense["metrics"]["coverage"]["mean"]
+    least = min((dense, *others), key=lambda row: row["metrics"]["coverage"]["mean"])
+    assert worst == {**least, "is_worst": True}
+    text = capsys.readouterr().out
+    assert "trained, in dense, worst 5% of homes" in text
+    assert f"random, in {result['rows'][-1]['source']}, the worst source" in text
+    alone = settings("run=x", "geometry=maze", "geometry.n=2", "geometry.size=3", script="evaluate")
+    alone = evaluate.run(configured(run=str(explorer), geometry=alone.geometry, episodes=6))
+    alone = json.loads(alone.read_text())["rows"][0]
+    assert alone.items() <= rows[2].items(), "as in an evaluation of that source alone"
+
+
+def test_suite_of_imported_plans(explorer, tmp_path):
+    files.save(tmp_path / "plans.npz", sample("homes", 20))
+    words = ["run=x", "geometry=suite", "geometry.parts={box: 1}"]
+    words.append(f"geometry.plans={tmp_path / 'plans.npz'}")
+    suite = settings(*words, script="evaluate").geometry
+    written = evaluate.run(configured(run=str(explorer), geometry=suite, baseline=False))
+    rows = json.loads(written.read_text())["rows"]
+    assert [(row["source"], row["homes"]) for row in rows[:-1]] == [("box", 1), ("plans", 2)]
+
+
+def test_suite_without_sources(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pong = ["env=pong", "preset=cpu", "env.n_envs=4", "learner.n_steps=8", "agent.width=8"]
+    run = train.run(settings(*pong, "learner.n_minibatches=2", "device=cpu", "samples=1"))
+    suite = settings("run=x", "geometry=suite", script="evaluate").geometry
+    with pytest.raises(UserError, match="no floor plans, so geometry=suite has no sources"):
+        evaluate.run(configured(run=str(run), geometry=suite))
+
+
 def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):
     """Ten lanes in four homes: three, three, two and two."""
     monkeypatch.chdir(tmp_path)

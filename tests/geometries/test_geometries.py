@@ -1,6 +1,7 @@
 """Sources of geometries: toys, splits, files, and files that are broken or malicious."""
 
 import io
+import re
 import subprocess
 import sys
 import zipfile
@@ -66,6 +67,59 @@ def test_the_test_split_is_a_tenth(name, total, test):
 
 def test_the_test_split_of_homes_is_the_last_seeds():
     assert sorted(g.id for g in geometries.sample("homes", 500, "test")) == list(range(4500, 5000))
+
+
+def rooms(n=4, split="training", seed=1, longest=9.0):
+    """A source of one's own: n rooms, 5 m to `longest` wide."""
+    widths = np.random.default_rng([seed, split == "test"]).uniform(5, longest, n)
+    return [toys.box(width) for width in widths]
+
+
+def test_a_mix_splits_each_part_with_one_seed():
+    braided = {"source": "maze", "n": 3, "size": 4, "braid": 1}
+    own = {"source": f"{__name__}:rooms", "n": 6, "longest": 6.0}
+    parts = {"homes": 7, "bench": 60, "maze": 0, "braided": braided, "own": own}
+    for split, n_bench in ("training", 60), ("test", 51), ("all", 60):
+        n = 7 + n_bench + 3 + 6
+        mix = geometries.sample("mixed", n, split, seed=5, parts=parts)
+        assert [g.source for g in mix] == 7 * ["homes"] + n_bench * ["bench"] + 3 * [
+            "braided"
+        ] + 6 * ["own"]
+        homes = geometries.sample("homes", 7, split, 5)
+        bench = geometries.sample("bench", n_bench, split, 5)
+        mazes = geometries.sample("maze", 3, split, 5, size=4, braid=1)
+        for g, alone in zip(mix, [*homes, *bench, *mazes, *rooms(6, split, 5, 6.0)], strict=True):
+            assert g.walls.tobytes() == alone.walls.tobytes() and "source" not in alone
+
+
+def test_fewer_of_a_mix_are_spread_over_its_parts_and_more_are_repeated():
+    parts = {"homes": 6, "bench": 2}
+    mix = geometries.sample("mixed", 8, parts=parts)
+    four, twenty = (geometries.sample("mixed", n, parts=parts) for n in (4, 20))
+    assert [g.id for g in four] == [mix[i].id for i in (0, 2, 4, 6)]
+    assert [g.id for g in twenty] == [mix[i % 8].id for i in range(20)]
+    assert twenty[8] is twenty[0], "the same objects, so that no home gets two layouts"
+
+
+@pytest.mark.parametrize(
+    "parts, message",
+    [
+        ({"hoems": 3}, "'hoems' is no source; did you mean homes?"),
+        ({"a": {"source": "nowhere:rooms", "n": 3}}, "nowhere:rooms cannot be imported"),
+        ({"a": {"source": "megastep.toys:box", "n": 3}}, "a: megastep.toys:box is no source"),
+        ({"homes": 0, "maze": 0}, "its counts sum to 0"),
+        ({}, "its counts sum to 0"),
+        ({"homes": -1}, "homes: -1 is no number of geometries"),
+        ({"homes": True}, "homes: True is no number of geometries"),
+        ({"a": {"source": "mixed"}}, "a: None is no number of geometries"),
+        ({"a": {"source": "homes", "outr": True}}, "a: homes has no option outr; did you mean out"),
+        ({"files": 3}, "files: path is missing"),
+        ({"maze": {"n": 3, "braid": 4}}, "maze: braid: 4 is out of range: allowed is from 0 to 1"),
+    ],
+)
+def test_a_mix_of_wrong_parts_is_refused(parts, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        geometries.sample("mixed", 4, parts=parts)
 
 
 def test_options_reach_the_source():

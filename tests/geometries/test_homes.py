@@ -9,11 +9,12 @@ import matplotlib
 import numpy as np
 import pytest
 
-from megastep import geometry
+from megastep import geometries, geometry
 from megastep.dotdict import dotdict
 from megastep.geometries import homes
 from megastep.geometries.homes import (
     database,
+    furniture,
     openings,
     partition,
     plan,
@@ -22,7 +23,7 @@ from megastep.geometries.homes import (
     walls,
 )
 from megastep.geometries.homes.portable_generator import PortableGenerator
-from scripts import check_homes, make_homes, show_homes
+from scripts import check_homes, compare_homes, make_homes, show_homes
 
 matplotlib.use("Agg")
 
@@ -34,6 +35,12 @@ L_SHAPE = [(0, 0, 400, 600), (400, 0, 700, 250)]  # centimetres
 def generated():
     """Sixty generated homes."""
     return [homes.generate(seed) for seed in range(60)]
+
+
+@pytest.fixture(scope="module")
+def dense():
+    """Sixty homes of the highest density."""
+    return [homes.generate(seed, density=plan.DENSEST) for seed in range(60)]
 
 
 @pytest.fixture(scope="module")
@@ -162,6 +169,122 @@ def test_bytes_of_homes_are_unchanged(generated):
     assert digest.hexdigest() == "e5d40bf46ffaf368ed89de69fd7c6b18c8665457b7d8df80dcca074e81a5a926"
 
 
+# ---- Dense homes ----
+
+
+def test_bytes_of_dense_homes_are_unchanged(dense):
+    digest = hashlib.sha256()
+    for g in dense[:20]:
+        for values, dtype in (g.walls, "<f4"), (g.lights, "<f4"), (g.masks, "<i2"):
+            digest.update(values.astype(dtype).tobytes())
+    assert digest.hexdigest() == "702b83482aedb501976e66d1af282af846654cff1bb2f27958df2669bb097ee9"
+
+
+def test_dense_homes_pass_the_checks(dense):
+    assert [(g.id, error) for g in dense for error in check_homes.errors(g)] == []
+
+
+def test_density_widens_homes_up_to_those_of_the_benchmarks(generated, dense):
+    """Median walls: 66 of real homes, 204 of `bench`."""
+    half = [homes.generate(seed, density=2) for seed in range(30)]
+    medians = [np.median([len(g.walls) for g in plans]) for plans in (generated, half, dense)]
+    assert 55 < medians[0] < 90 < medians[1] < 180 < medians[2] < 240
+    widths, narrow = (np.mean([w for g in plans for w in g.doors]) for plans in (generated, dense))
+    assert min(w for g in dense for w in g.doors) == 0.6 and narrow < widths - 0.03
+    n_open, n_dense = (np.mean([len(g.openings) for g in plans]) for plans in (generated, dense))
+    assert n_dense < 0.6 * n_open
+
+
+def test_no_room_has_cells_inside_furniture(dense):
+    for g in dense:
+        distance = check_homes.clearance(g)
+        labels, _ = check_homes.components(distance > check_homes.FINE / 2)
+        fine = np.maximum(g.masks, 0).repeat(4, 0).repeat(4, 1)
+        assert len(np.unique(labels[(fine > 0) & (labels > 0)])) == 1, g.id
+        assert (labels[fine > 0] > 0).mean() > 0.99, "a cell that no wall touches is free"
+
+
+def test_a_room_less_its_walls():
+    """Walls along all sides, and the end of one that meets the left wall from outside."""
+    sides = [(-5, 0, 5, 300), (395, 0, 405, 300), (-5, -5, 405, 5), (-5, 290, 405, 300)]
+    assert furniture.clear((0, 0, 400, 300), [*sides, (-200, 145, 5, 155)]) == (5, 5, 395, 290)
+
+
+def test_sides_of_an_l_shape_with_a_wall_all_along():
+    assert furniture.walled(L_SHAPE, (0, 0, 400, 600)) == [True, True, False, True]
+    assert furniture.walled(L_SHAPE, (400, 0, 700, 250)) == [False, True, True, True]
+
+
+def test_furniture_leaves_a_passage_around_itself_and_in_front_of_doors():
+    """In a room of 8 m x 6 m with a door in the middle of its lower wall."""
+    room, door, passage = (0, 0, 800, 600), (360, -65, 440, 65), furniture.PASSAGE
+    n_pieces = n_shapes = 0
+    for seed in range(100):
+        boxes = furniture.furnish([room], [], [door], 0.6, PortableGenerator(seed))
+        n_pieces += len(boxes)
+        for i, a in enumerate(boxes):
+            assert min(a[:2]) >= 0 and a[2] <= 800 and a[3] <= 600
+            assert not furniture.overlap(a, door)
+            near = [b for b in boxes[:i] if furniture.overlap(a, b, passage)]
+            assert len(near) <= 1, "the other half of an L-shape"
+            n_shapes += len(near)
+            assert not any(furniture.overlap(a, b) for b in near)
+    assert n_pieces > 1000 and 0.2 < n_shapes / (n_pieces - n_shapes) < 0.5
+
+
+def test_an_l_shape_never_walls_in_a_corner():
+    """Free cells of 5 cm of furnished rooms are connected."""
+    for seed in range(200):
+        boxes = furniture.furnish([(0, 0, 300, 250)], [], [], 2.0, PortableGenerator(seed))
+        free = np.ones((50, 60), bool)
+        for x0, y0, x1, y1 in boxes:
+            free[y0 // 5 : y1 // 5, x0 // 5 : x1 // 5] = False
+        assert check_homes.components(free)[1] == 1
+
+
+def test_dense_homes_of_the_source_are_generated_ones(monkeypatch, tmp_path):
+    """In two processes, in one, and from the cache."""
+    monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(database, "SEEDS_EACH", 2)
+    drawn = []
+    for each in 2, 100:
+        monkeypatch.setattr(database, "SEEDS_EACH", each)
+        for _ in range(2):
+            database.generated.cache_clear()
+            drawn.append(geometries.sample("homes", 5, "test", density=1.5))
+        shutil.rmtree(tmp_path / "cache")
+    database.generated.cache_clear()
+    for plans in drawn:
+        assert [g.id for g in plans] == [g.id for g in geometries.sample("homes", 5, "test")]
+        for g in plans:
+            expected = homes.generate(g.id, density=1.5)
+            assert all(np.array_equal(g[key], expected[key]) for key in g)
+
+
+def test_dense_homes_come_from_the_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path / "cache"))
+    first = database.generated((3, 4), 2.0)
+    database.generated.cache_clear()
+    monkeypatch.setattr(database, "_generate", None)
+    again, inner = (database.generated((3, 4), 2.0, outer) for outer in (True, False))
+    assert all((again[seed].walls == first[seed].walls).all() for seed in (3, 4))
+    assert (inner[4].walls == first[4].walls[: -first[4].n_outer]).all()
+    database.generated.cache_clear()
+
+
+@pytest.mark.parametrize("density", [0.9, 3.1, float("nan"), "dense"])
+def test_a_density_that_is_none_is_refused(density):
+    with pytest.raises(ValueError, match="density"):
+        geometries.sample("homes", 2, density=density)
+
+
+@pytest.mark.slow
+def test_a_thousand_dense_homes_pass_the_checks():
+    plans = [homes.generate(seed, density=plan.DENSEST) for seed in range(10_000, 11_000)]
+    assert [(g.id, error) for g in plans for error in check_homes.errors(g)] == []
+    assert 190 < np.median([len(g.walls) for g in plans]) < 215
+
+
 def test_packaged_homes_equal_generated_ones(generated):
     for g in [*generated[::6], homes.generate(4999)]:
         stored = database.home(g.id)
@@ -233,7 +356,7 @@ def test_checks_find_narrow_passages():
         (
             "it is too large",
             lambda g: g.update(
-                walls=np.concatenate([g.walls + np.float32(i / 999) for i in range(101)])
+                walls=np.concatenate([g.walls + np.float32(i / 999) for i in range(126)])
             ),
         ),
         ("a room has too few cells", lambda g: g.masks.__setitem__(g.masks == 1, 2)),
@@ -405,3 +528,20 @@ def test_show_homes_draws_every_home():
     assert [ax.get_title()[:7] for ax in figure.axes] == ["home 0:", "home 1:", "home 2:", "", ""]
     assert len(figure.axes[1].collections[0].get_segments()) == len(homes.generate(1).walls)
     matplotlib.pyplot.close(figure)
+
+
+def test_gaps_are_doors(generated):
+    """Some recesses of walls look like doors too."""
+    for g in generated[:10]:
+        widths = np.round(compare_homes.gaps(g), 2).tolist()
+        for width in np.round(g.doors, 2):
+            widths.remove(width)
+        assert len(widths) <= 3
+
+
+def test_compare_homes_prints_a_table(capsys):
+    compare_homes.main(["--count", "3", "homes", "maze,size=3,corridor=1.5", "box,width=4"])
+    head, _, walls, rooms, area, *_ = capsys.readouterr().out.splitlines()
+    assert head.endswith("| `homes` | `maze,size=3,corridor=1.5` | `box,width=4` |")
+    assert walls.endswith("| 4 / 4 / 4 / 4 / 4 |") and rooms.endswith("| 1 / 1 / 1 / 1 / 1 |")
+    assert area.endswith("| 16 / 16 / 16 / 16 / 16 |")

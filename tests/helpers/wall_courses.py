@@ -101,8 +101,8 @@ def remote(random):
     ]
 
 
-def homes(source, n):
-    return [enclosed(g.walls) for g in sample(source, n)]
+def homes(source, n, **options):
+    return [enclosed(g.walls) for g in sample(source, n, **options)]
 
 
 COURSES = {  # name: (function of a random generator that returns layouts, agents per environment)
@@ -149,6 +149,7 @@ COURSES = {  # name: (function of a random generator that returns layouts, agent
     "remote": (remote, 1),
     "homes": (lambda random: homes("homes", 16), 1),
     "bench": (lambda random: homes("bench", 16), 2),
+    "dense homes": (lambda random: homes("homes", 16, density=3.0), 2),
 }
 
 

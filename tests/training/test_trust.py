@@ -33,7 +33,7 @@ def test_own_classes_need_no_signature(home):
     + ["megastep.agents.cli.signals:stop", "my-module:A", ":", "megastep.envs.pong:Pong\n"],
 )
 def test_names_outside_megastep_are_found_at_any_depth(name):
-    for text in (config(name), config("own", deep={"in": [0, [name]]})):
+    for text in (config(name), config("own", deep={"in": [0, [name]]}), config("own", **{name: 3})):
         assert trust.untrusted_names(text, None) == [name]
 
 

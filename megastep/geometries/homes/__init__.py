@@ -10,7 +10,7 @@ import numpy as np
 
 from megastep import geometry
 from megastep.dotdict import dotdict
-from megastep.geometries.homes import openings, partition, plan, walls
+from megastep.geometries.homes import furniture, openings, partition, plan, walls
 from megastep.geometries.homes.portable_generator import PortableGenerator
 
 ATTEMPTS = 60  # plans tried before a home gets one room less
@@ -21,14 +21,14 @@ SLANTED = 0.08  # fraction of homes with a corner cut off at 45 degrees
 START = 100  # cm; the minimum coordinate of a home
 
 
-def _attempt(count, generator):
+def _attempt(count, generator, style):
     """Tries to plan `count` rooms. Returns [(cost, footprint, rooms, contacts, depth, gaps)], or []
     if it fails.
     """
     rooms = plan.programme(count, generator)
     footprint = plan.footprint(sum(size for _, size in rooms), generator)
     try:
-        rooms, sides = partition.partition(footprint, rooms, generator)
+        rooms, sides = partition.partition(footprint, rooms, generator, style)
     except partition.Failure:
         return []
     depth = walls.depths(sides, THIN[generator.below(len(THIN))])
@@ -39,23 +39,23 @@ def _attempt(count, generator):
         return []
     cost, connections = result
     gaps = [
-        openings.opening(c, spans[c], (rooms[c.a].kind, rooms[c.b].kind), generator)
+        openings.opening(c, spans[c], (rooms[c.a].kind, rooms[c.b].kind), generator, style)
         for c in connections
     ]
     return [(cost, footprint, rooms, meetings, depth, gaps)]
 
 
-def _best_plan(generator):
+def _best_plan(generator, style):
     """Returns the best of a few plans: (cost, footprint, rooms, contacts, depth, gaps).
 
     The number of rooms is drawn once. Plans of few rooms succeed more often, so drawing it again
     after each failure would make homes too small.
     """
-    count = plan.room_count(generator)
+    count = plan.room_count(generator, style)
     while True:
         plans = []
         for _ in range(ATTEMPTS):
-            plans += _attempt(count, generator)
+            plans += _attempt(count, generator, style)
             if len(plans) >= (ENOUGH if count <= FEW else 1):
                 break
         if plans:
@@ -63,11 +63,32 @@ def _best_plan(generator):
         count -= 1
 
 
-def generate(seed: int, outer: bool = True) -> dotdict:
+def _furnish(rooms, solids, gaps, depth, lights, triangle, rate, generator):
+    """Returns the furniture of a home: rectangles, none in a room with a slanted corner."""
+    doorways = []
+    for g in gaps:
+        doorway, axis = [*walls.gap(g, depth)], g.contact.axis
+        doorway[axis] -= furniture.PASSAGE
+        doorway[axis + 2] += furniture.PASSAGE
+        doorways.append(tuple(doorway))
+    reach = furniture.BESIDE_LIGHT
+    lit = [(x - reach, y - reach, x + reach, y + reach) for x, y in lights]
+    return [
+        piece
+        for room in rooms
+        if not walls.holds(room.region, triangle)
+        for piece in furniture.furnish(room.region, solids, doorways + lit, rate, generator)
+    ]
+
+
+def generate(seed: int, outer: bool = True, density: float = 1) -> dotdict:
     """Returns the home of a seed.
 
     Args:
         seed: any integer.
+        density: from 1 to 3, at which a home has about three times as many walls: more
+            rooms, narrower doors and corridors, fewer openings without a door, furniture, and
+            lights off the middle of their rooms.
         outer: if False, leave out the envelope's outer face, which cannot be seen from indoors.
 
     Returns:
@@ -76,12 +97,12 @@ def generate(seed: int, outer: bool = True) -> dotdict:
         the gaps with and without a door; `n_outer`, the number of walls, the last ones, that are
         the envelope's outer face.
     """
-    generator = PortableGenerator(seed)
-    _, footprint, rooms, meetings, depth, gaps = _best_plan(generator)
+    generator, style = PortableGenerator(seed), plan.style(density)
+    _, footprint, rooms, meetings, depth, gaps = _best_plan(generator, style)
     thickness = THICK[generator.below(len(THICK))]
-    grid = walls.paint(
-        footprint, walls.solids(meetings, depth), [walls.gap(g, depth) for g in gaps], thickness
-    )
+    solids = walls.solids(meetings, depth)
+    layers = footprint, solids, [walls.gap(g, depth) for g in gaps], thickness
+    grid = walls.paint(*layers)
     inside, outside = walls.segments(*grid, walls.INDOORS), walls.segments(*grid, walls.OUTDOORS)
     lights = [walls.light(room.region, inside) for room in rooms]
     rings = [
@@ -92,12 +113,28 @@ def generate(seed: int, outer: bool = True) -> dotdict:
         inside, outside, triangle = walls.slanted(inside, outside, *grid, thickness, generator)
         for room, ring in zip(rooms, rings):
             ring += [triangle] if walls.holds(room.region, triangle) else []
+    else:
+        triangle = []
+    if style.furniture:
+        lights = [
+            light
+            if walls.holds(room.region, triangle) or not generator.chance(style.off_centre)
+            else furniture.place_light(room.region, solids, generator)
+            for light, room in zip(lights, rooms)
+        ]
+        pieces = _furnish(rooms, solids, gaps, depth, lights, triangle, style.furniture, generator)
+        grid = walls.paint(*layers, pieces)
+        inside = walls.segments(*grid, walls.INDOORS)
+        inside = walls.cut_off(inside, triangle) if triangle else inside
 
     shift = START - outside.min((0, 1))
     lines = (np.concatenate([inside, outside]) + shift) / 100
     masks = geometry.masks(
         lines, [[(np.array(ring) + shift) / 100 for ring in room] for room in rings]
     )
+    if style.furniture:  # no line marks the cells that are wholly inside it
+        y, x = ((np.arange(n) + 0.5) * geometry.RES * 100 for n in masks.shape)
+        masks[(masks > 0) & ~walls.are_indoors(grid, x - shift[0], y[::-1] - shift[1])] = 0
     doors = [[(g.high - g.low) / 100 for g in gaps if g.door is kind] for kind in (True, False)]
     return dotdict(
         id=seed,

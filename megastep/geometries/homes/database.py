@@ -3,20 +3,29 @@
 `scripts/make_homes.py` writes them. The arrays of all homes lie end to end: `walls` (M, 2, 2) and
 `lights` (K, 2), int16 centimetres, and `masks` (cells,) int8. `widths` (homes, 5) has, per home,
 the number of walls, of walls in the outer face, of lights, and the height and width of the masks.
+
+Homes of other densities are generated when they are first asked for, on all cores, and cached on
+disk in the same format.
 """
 
 import functools
 import hashlib
 import io
+import os
+import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from megastep import geometry
+from megastep import cache, geometry, workers
 from megastep.dotdict import dotdict
+from megastep.geometries import homes
 
 COUNT = 5_000
 PATH = Path(__file__).parents[1] / "data" / "homes.npz"
+PREFIX, MAX_FILES = "homes-", 16  # of files in the cache: of their names, and their number
+SEEDS_EACH = 50  # homes per process at least; to start one takes as long as about ten homes
 REMEDY = "install megastep again, or run scripts/make_homes.py"
 
 
@@ -35,6 +44,31 @@ def _arrays(path):
         ) from error
     if hashlib.sha256(content).hexdigest() != expected:
         raise ValueError(f"The homes in {str(path)!r} are damaged (wrong sha256); {REMEDY}.")
+    return _unpack(content)
+
+
+def pack(plans: Sequence[dotdict]) -> bytes:
+    """Returns the bytes of a database of homes from `homes.generate`."""
+    arrays = {
+        "walls": np.concatenate([np.rint(g.walls * 100) for g in plans]).astype("<i2"),
+        "lights": np.concatenate([np.rint(g.lights * 100) for g in plans]).astype("<i2"),
+        "masks": np.concatenate([g.masks.ravel() for g in plans]).astype("i1"),
+        "widths": np.array(
+            [(len(g.walls), g.n_outer, len(g.lights), *g.masks.shape) for g in plans], "<i4"
+        ),
+    }
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, values in arrays.items():
+            entry = zipfile.ZipInfo(f"{name}.npy")  # dated 1980: equal homes give equal bytes
+            entry.compress_type = zipfile.ZIP_LZMA
+            with archive.open(entry, "w") as file:
+                np.lib.format.write_array(file, values, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _unpack(content):
+    """Returns the arrays of a database and the index at which each home's begin."""
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     widths = arrays["widths"]
@@ -45,17 +79,53 @@ def _arrays(path):
 @functools.lru_cache(maxsize=COUNT)
 def home(index: int, outer: bool = True, path: Path = PATH) -> dotdict:
     """Returns the home of seed `index`, a geometry with `n_outer`. `outer` is as in `generate`."""
-    arrays, starts = _arrays(path)
+    return _home(*_arrays(path), index, index, outer)
+
+
+def _home(arrays, starts, index, seed, outer):
     _, n_outer, _, height, width = arrays["widths"][index]
     walls, lights, cells = (
         arrays[key][a:b]
         for key, a, b in zip(("walls", "lights", "masks"), starts[index], starts[index + 1])
     )
     return dotdict(
-        id=index,
+        id=seed,
         walls=(walls[: len(walls) if outer else len(walls) - n_outer] / 100).astype(np.float32),
         lights=(lights / 100).astype(np.float32),
         masks=cells.reshape(height, width).astype(np.int16),
         res=geometry.RES,
         n_outer=int(n_outer) if outer else 0,
     )
+
+
+@functools.lru_cache(maxsize=4)
+def generated(seeds: tuple[int, ...], density: float, outer: bool = True) -> dict[int, dotdict]:
+    """Returns {seed: home} of a density, from the cache on disk if they were generated before."""
+    key = hashlib.sha256(repr((seeds, float(density))).encode())
+    for source in *sorted(Path(__file__).parent.glob("*.py")), Path(geometry.__file__):
+        key.update(source.read_bytes())
+    name = f"{PREFIX}{key.hexdigest()[:20]}"
+    content, _ = cache.fetch(name, lambda: _generate(seeds, density))
+    cache.prune(PREFIX, MAX_FILES)
+    database = _unpack(content)
+    return {seed: _home(*database, index, seed, outer) for index, seed in enumerate(seeds)}
+
+
+def _generate(seeds, density):
+    """Returns the bytes of a database of generated homes."""
+    import loky
+
+    make = functools.partial(homes.generate, density=density)
+    n_workers = min(loky.cpu_count(), len(seeds) // SEEDS_EACH)
+    if n_workers < 2:
+        return pack([make(seed) for seed in seeds])
+    with (
+        workers.terminal_signals_blocked(),
+        loky.ProcessPoolExecutor(
+            n_workers,
+            initializer=workers.end_with_parent,
+            initargs=(os.getpid(),),
+            env=workers.WORKER_ENV,
+        ) as pool,
+    ):
+        return pack(list(pool.map(make, seeds, chunksize=10)))

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 from typing import Any, NamedTuple
 
+from megastep.geometries.homes.plan import NORMAL, Style
 from megastep.geometries.homes.portable_generator import PortableGenerator
 
 # Probability of each width of a door.
@@ -153,13 +154,17 @@ def connections(
 
 
 def opening(
-    contact: Contact, span: tuple[int, int], kinds: tuple[str, str], generator: PortableGenerator
+    contact: Contact,
+    span: tuple[int, int],
+    kinds: tuple[str, str],
+    generator: PortableGenerator,
+    style: Style = NORMAL,
 ) -> Opening:
     """Returns a random Opening within the clear span (low, high) of a contact between rooms of two
     kinds.
     """
     low, high = span
-    open_plan = generator.chance(OPEN.get(frozenset(kinds), 0.0))
+    open_plan = generator.chance(OPEN.get(frozenset(kinds), 0.0) * style.open_plan)
     if open_plan:
         if generator.chance(FULL):
             return Opening(contact, low, high, False)
@@ -168,7 +173,8 @@ def opening(
         widths = list(DOORS)
         if any(kind in SMALL for kind in kinds):
             widths = [width for width in widths if width <= MAX_SMALL]
-        width = widths[generator.pick([DOORS[width] for width in widths])]
+        weights = [DOORS[width] * (1 + style.narrow * (90 - width) ** 2 / 100) for width in widths]
+        width = widths[generator.pick(weights)]
     spare = high - low - width - 2 * STUB
     if spare < 0:
         return Opening(contact, low, high, False)

@@ -7,7 +7,7 @@ from itertools import accumulate
 from typing import NamedTuple
 
 from megastep.geometries.homes import regions
-from megastep.geometries.homes.plan import ALLOWANCE, KINDS
+from megastep.geometries.homes.plan import ALLOWANCE, KINDS, NORMAL, Style
 from megastep.geometries.homes.portable_generator import PortableGenerator, exp
 
 PORTAL = 120  # cm; the minimum neck between the parts of a region that is still to be cut
@@ -17,7 +17,6 @@ SNAP = 45  # cm within which a cut moves to a corner of the outline
 TEMPERATURE = 0.35  # of the random choice among cuts by their worst aspect
 BRANCHES = 4  # cuts tried for one region
 STEPS = 40  # cuts tried for a whole partition
-CORRIDOR = (110, 150)  # cm of clear width
 MAX_CORRIDOR = 850  # cm of length
 CORRIDORS = 8.0  # relative probability of a corridor against a simple cut of its aspect
 
@@ -58,7 +57,10 @@ class Failure(Exception):
 
 
 def partition(
-    region: regions.Region, rooms: Sequence[tuple[str, int]], generator: PortableGenerator
+    region: regions.Region,
+    rooms: Sequence[tuple[str, int]],
+    generator: PortableGenerator,
+    style: Style = NORMAL,
 ) -> tuple[list[Room], dict]:
     """Lays out rooms, a list of (kind, area in cm2), in a region.
 
@@ -71,19 +73,19 @@ def partition(
     """
     keyed = [(ORDER[kind] + generator.normal(0.0, 0.8), i) for i, (kind, _) in enumerate(rooms)]
     ordered = [rooms[i] for _, i in sorted(keyed)]
-    result = _divide(region, ordered, generator, steps_left=[STEPS])
+    result = _divide(region, ordered, generator, style.corridor, steps_left=[STEPS])
     if result is None:
         raise Failure
     return result
 
 
-def _divide(region, rooms, generator, steps_left):
+def _divide(region, rooms, generator, corridor, steps_left):
     """Returns the result of `partition` for rooms in this order, or None if it fails. `steps_left`
     counts down over the whole recursion.
     """
     if len(rooms) == 1:
         return [Room(rooms[0][0], region)], {}
-    cuts = _cuts(region, rooms, generator)
+    cuts = _cuts(region, rooms, generator, corridor)
     for _ in range(min(BRANCHES, len(cuts))):
         steps_left[0] -= 1
         if steps_left[0] < 0:
@@ -93,7 +95,7 @@ def _divide(region, rooms, generator, steps_left):
         )
         placed, sides = [], {(axis, at): side for axis, at, side in cut.lines}
         for part, rooms_inside in cut.parts:
-            result = _divide(part, rooms_inside, generator, steps_left)
+            result = _divide(part, rooms_inside, generator, corridor, steps_left)
             if result is None:
                 break
             placed += result[0]
@@ -103,7 +105,7 @@ def _divide(region, rooms, generator, steps_left):
     return None
 
 
-def _cuts(region, rooms, generator):
+def _cuts(region, rooms, generator, corridor):
     """Returns all cuts of a region in two that suit its rooms, and cuts with a corridor."""
     widths = [KINDS[kind].width + ALLOWANCE for kind, _ in rooms]
     firsts, lasts = list(accumulate(widths, max)), list(accumulate(widths[::-1], max))[::-1]
@@ -127,11 +129,11 @@ def _cuts(region, rooms, generator):
                 lower, upper = (upper, lower) if flipped else (lower, upper)
                 pairs = [(lower, rooms[:k]), (upper, rooms[k:])]
                 cuts.append(_suitable_cut(pairs, [(axis, at, side)]))
-        cuts.append(_corridor(region, rooms, axis, slices, generator))
+        cuts.append(_corridor(region, rooms, axis, slices, generator, corridor))
     return [cut for cut in cuts if cut]
 
 
-def _corridor(region, rooms, axis, slices, generator):
+def _corridor(region, rooms, axis, slices, generator, widths):
     """Returns a cut of a region into two rows of rooms with the entry as a corridor between, or
     None.
     """
@@ -140,7 +142,7 @@ def _corridor(region, rooms, axis, slices, generator):
     if not entries or len(in_rows) < 4:
         return None
     low, high = slices[0][0], slices[-1][1]
-    width = generator.between(*CORRIDOR) // regions.LATTICE * regions.LATTICE + ALLOWANCE // 2 * 2
+    width = generator.between(*widths) // regions.LATTICE * regions.LATTICE + ALLOWANCE // 2 * 2
     k = generator.between(2, len(in_rows) - 2)
     below, total = (sum(size for _, size in part) for part in (in_rows[:k], in_rows))
     at = (

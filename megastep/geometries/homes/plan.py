@@ -22,6 +22,42 @@ class Kind(NamedTuple):
     aspect: float = 2.6  # maximum of long side / short side
 
 
+DENSEST = 3  # density at which homes have about three times as many walls as at 1
+
+
+class Style(NamedTuple):
+    """How homes of a density differ from those of density 1."""
+
+    rooms: float = 1.0  # factor of the median number of rooms
+    sigma: float = 1.0  # factor of the standard deviation of its logarithm
+    max_rooms: int = 18
+    corridor: tuple[int, int] = (110, 150)  # cm of clear width
+    narrow: float = 0.0  # how far small widths of doors are preferred, up to 1
+    open_plan: float = 1.0  # factor of the probability that a connection has no door
+    furniture: float = 0.0  # pieces tried per m2
+    off_centre: float = 0.0  # fraction of lights that are anywhere in their room
+
+
+NORMAL = Style()
+
+
+def style(density: float) -> Style:
+    """Returns the style of homes of a density from 1, as real homes have, to `DENSEST`."""
+    if not 1 <= density <= DENSEST:
+        raise ValueError(f"density={density!r}: homes have a density from 1 to {DENSEST}")
+    t = (density - 1) / (DENSEST - 1)
+    return Style(
+        rooms=1 + 0.55 * t,
+        sigma=1 - 0.3 * t,
+        max_rooms=18 + int(2 * t),
+        corridor=(110 - int(20 * t), 150 - int(40 * t)),
+        narrow=t,
+        open_plan=1 - 0.7 * t,
+        furniture=0.8 * t,
+        off_centre=0.7 * t,
+    )
+
+
 KINDS = {
     "living": Kind(17.0, 0.30, 280),
     "bath": Kind(3.1, 0.28, 115, 0.55),
@@ -37,7 +73,7 @@ KINDS = {
 # The first five rooms of every home.
 CORE = ("living", "bath", "entry", "bedroom", "kitchen")
 
-MEDIAN_ROOMS, SIGMA_ROOMS, MIN_ROOMS, MAX_ROOMS = 8.3, 0.40, 3, 18
+MEDIAN_ROOMS, SIGMA_ROOMS, MIN_ROOMS = 8.3, 0.40, 3
 MEDIAN_ASPECT, SIGMA_ASPECT, MAX_ASPECT = 1.42, 0.24, 2.4
 # Factor of all areas. Rooms that are too narrow are rejected, which favours large ones.
 SCALE = 0.78
@@ -51,10 +87,10 @@ MIN_NECK = 220  # cm between two notches, or a notch and the side across
 STEP = 10  # cm; the lattice of outlines
 
 
-def room_count(generator: PortableGenerator) -> int:
+def room_count(generator: PortableGenerator, style: Style = NORMAL) -> int:
     """Draws the number of rooms of a home."""
-    count = int(generator.lognormal(MEDIAN_ROOMS, SIGMA_ROOMS) + 0.5)
-    return min(max(count, MIN_ROOMS), MAX_ROOMS)
+    count = int(generator.lognormal(MEDIAN_ROOMS * style.rooms, SIGMA_ROOMS * style.sigma) + 0.5)
+    return min(max(count, MIN_ROOMS), style.max_rooms)
 
 
 def programme(count: int, generator: PortableGenerator) -> list[tuple[str, int]]:

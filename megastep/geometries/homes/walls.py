@@ -65,10 +65,14 @@ def gap(opening: Opening, depth: Callable) -> tuple[int, int, int, int]:
 
 
 def paint(
-    floor: regions.Region, walls: regions.Region, gaps: regions.Region, envelope: int
+    floor: regions.Region,
+    walls: regions.Region,
+    gaps: regions.Region,
+    envelope: int,
+    furniture: regions.Region = (),
 ) -> Grid:
-    """Paints the grid of a home from rectangles of floor, inner walls and gaps, with an envelope of
-    so many cm.
+    """Paints the grid of a home from rectangles of floor, inner walls, gaps and furniture, which is
+    wall too, with an envelope of so many cm.
 
     Returns the coordinates of the lines, xs and ys, and the states of the cells,
     (len(ys) - 1, len(xs) - 1) with row 0 at the bottom.
@@ -80,6 +84,7 @@ def paint(
     layers += (
         [(r, INDOORS) for r in floor] + [(r, WALL) for r in walls] + [(r, INDOORS) for r in gaps]
     )
+    layers += [(r, WALL) for r in furniture]
     xs = sorted({x for r, _ in layers for x in r[::2]})
     ys = sorted({y for r, _ in layers for y in r[1::2]})
     column, row = ({line: k for k, line in enumerate(lines)} for lines in (xs, ys))
@@ -114,6 +119,16 @@ def segments(xs: np.ndarray, ys: np.ndarray, cells: np.ndarray, beside: int) -> 
     level = _faces(ys, xs, cells, beside)
     upright = _faces(xs, ys, cells.T, beside)[..., ::-1]
     return np.concatenate([level, upright])
+
+
+def are_indoors(grid: Grid, xs: np.ndarray, ys: np.ndarray) -> np.ndarray:
+    """Returns whether each point of a lattice, xs (W,) and ys (H,), is indoors: (H, W) bool."""
+    lines_x, lines_y, cells = grid
+    columns, rows = (
+        np.searchsorted(lines, points, "right") - 1
+        for lines, points in ((lines_x, xs), (lines_y, ys))
+    )
+    return np.pad(cells, ((0, 1), (0, 1)))[rows[:, None], columns] == INDOORS
 
 
 def areas(grid: Grid, parts: Sequence[regions.Region]) -> list[float]:
@@ -188,6 +203,12 @@ def slanted(
 def _reach(lines, corner):
     """Returns the lengths along x and y of the segments that end in a corner."""
     return np.abs(lines[(lines == corner).all(-1).any(-1)] - corner).max((0, 1))
+
+
+def cut_off(lines: np.ndarray, triangle: list) -> np.ndarray:
+    """Cuts the triangle of a slanted corner off the segments (n, 2, 2) indoors."""
+    corner, (x, _), (_, y) = triangle
+    return _chamfered(lines, corner, x - corner[0], y - corner[1])
 
 
 def _chamfered(lines, corner, dx, dy):

@@ -1,0 +1,135 @@
+"""Furniture of dense homes: boxes and L-shapes, as solid as walls. Integer centimetres.
+
+Furniture never cuts a room in two: around each piece, grown up to the walls that it stands by, is a
+free strip `PASSAGE` wide, in which whatever is at most as wide can go round it.
+"""
+
+from collections.abc import Sequence
+
+from megastep.geometries.homes import regions
+from megastep.geometries.homes.portable_generator import PortableGenerator
+from megastep.geometries.homes.walls import CLEAR
+
+Rectangle = tuple[int, int, int, int]
+
+PASSAGE = 65  # cm; 5 more than the narrowest door
+SLIT = 20  # cm; nearer than this to a wall, a piece stands at it
+SIZES = (30, 110)  # cm per side
+AT_WALL = 0.55  # probability, along each axis, of standing at a wall
+L_SHAPED = 0.35  # fraction of pieces without one of their corners
+NOTCH = 15  # cm per side; the least that an L-shape lacks, and of which it consists
+BESIDE_LIGHT = 25  # cm; so that no piece touches a light's cell of the masks
+TRIES = 6  # places tried for a piece
+
+
+def overlap(a: Rectangle, b: Rectangle, apart: int = 0) -> bool:
+    """Returns True if two rectangles overlap, or are less than `apart` cm apart in x and in y."""
+    return min(a[2], b[2]) + apart > max(a[0], b[0]) and min(a[3], b[3]) + apart > max(a[1], b[1])
+
+
+def clear(rectangle: Rectangle, solids: regions.Region) -> Rectangle:
+    """Returns a room's rectangle less the walls at its sides."""
+    sides = [*rectangle]
+    for solid in solids:
+        part = [*map(max, rectangle[:2], solid[:2]), *map(min, rectangle[2:], solid[2:])]
+        if part[0] < part[2] and part[1] < part[3]:
+            touched = [side for side in range(4) if part[side] == rectangle[side]]
+            side = min(touched, key=lambda side: part[side % 2 + 2] - part[side % 2])
+            sides[side] = (max if side < 2 else min)(sides[side], part[(side + 2) % 4])
+    return tuple(sides)
+
+
+def place_light(
+    region: regions.Region, solids: regions.Region, generator: PortableGenerator
+) -> tuple[int, int]:
+    """Draws a place for a room's light, anywhere in its widest rectangle that is clear of walls."""
+    x0, y0, x1, y1 = clear(regions.widest(region), solids)
+    return generator.between(x0 + CLEAR, x1 - CLEAR), generator.between(y0 + CLEAR, y1 - CLEAR)
+
+
+def walled(region: regions.Region, rectangle: Rectangle) -> list[bool]:
+    """Returns for each side of a rectangle in a region, in its order, whether the region ends
+    there all along.
+    """
+    closed = []
+    for side in range(4):
+        beyond, axis, at = [*rectangle], side % 2, rectangle[side]
+        beyond[axis], beyond[axis + 2] = (at - 1, at) if side < 2 else (at, at + 1)
+        closed.append(not any(overlap(tuple(beyond), other) for other in region))
+    return closed
+
+
+def _place(low, high, size, is_walled, generator):
+    """Places a piece along an axis of a room, from `low` to `high`.
+
+    Returns (low, high) of the piece and of what it fills with the walls that it stands by, or None
+    if it blocks the room or a side without a wall.
+    """
+    spare = high - low - size
+    if spare < 0:
+        return None
+    if generator.chance(AT_WALL):
+        before = generator.below(2) * spare
+    else:
+        before = generator.between(0, spare // 5) * 5
+    before = 0 if before < SLIT else spare if spare - before < SLIT else before
+    fills = before < PASSAGE, spare - before < PASSAGE
+    if all(fills) or any(fill and not wall for fill, wall in zip(fills, is_walled)):
+        return None
+    at = low + before
+    return (at, at + size), (low if fills[0] else at, high if fills[1] else at + size)
+
+
+def furnish(
+    region: regions.Region,
+    solids: regions.Region,
+    keep_clear: Sequence[Rectangle],
+    rate: float,
+    generator: PortableGenerator,
+) -> regions.Region:
+    """Draws the furniture of a room: disjoint rectangles, of which an L-shape has two.
+
+    Args:
+        solids: the walls of the home.
+        keep_clear: where nothing may stand, such as in front of doors.
+        rate: pieces per m2 of the room's widest rectangle. Those that find no place are left out.
+    """
+    widest = regions.widest(region)
+    is_walled, (x0, y0, x1, y1) = walled(region, widest), clear(widest, solids)
+    count = int(rate * (x1 - x0) * (y1 - y0) / 10_000 + generator.uniform())
+    filled, pieces = [], []
+    for _ in range(count):
+        for _ in range(TRIES):
+            width, height = (generator.between(SIZES[0] // 5, SIZES[1] // 5) * 5 for _ in "xy")
+            across = _place(x0, x1, width, is_walled[0::2], generator)
+            down = _place(y0, y1, height, is_walled[1::2], generator)
+            if not (across and down):
+                continue
+            (a, c), (fill_a, fill_c) = across
+            (b, d), (fill_b, fill_d) = down
+            fills = fill_a, fill_b, fill_c, fill_d
+            if any(overlap(fills, other, PASSAGE) for other in filled):
+                continue
+            if any(overlap(fills, other) for other in keep_clear):
+                continue
+            filled.append(fills)
+            # the corner that an L-shape lacks is away from walls, or it would be walled in
+            right = 1 if fill_a == x0 else 0 if fill_c == x1 else generator.below(2)
+            up = 1 if fill_b == y0 else 0 if fill_d == y1 else generator.below(2)
+            pieces += _shape((a, b, c, d), right, up, generator)
+            break
+    return pieces
+
+
+def _shape(box, right, up, generator):
+    """Returns the rectangles of a piece with this bounding box: all of it, or an L-shape that lacks
+    the corner on these sides.
+    """
+    a, b, c, d = box
+    if min(c - a, d - b) < 3 * NOTCH or not generator.chance(L_SHAPED):
+        return [box]
+    wide, high = (generator.between(NOTCH // 5, (side - NOTCH) // 5) * 5 for side in (c - a, d - b))
+    x = c - wide if right else a + wide
+    low, top = (b, d - high) if up else (b + high, d)
+    left, end = (a, x) if right else (x, c)
+    return [(a, low, c, top), (left, top, end, d) if up else (left, b, end, low)]
