@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from megastep.agents.networks.kernels import lstm as kernels
 from megastep.agents.networks.kernels.program import aligned, check_shapes
+from megastep.agents.networks.lstm_cpu import CpuSequence, fits
 from megastep.agents.networks.precision import compute_dtype
 from megastep.arrdict import arrdict
 
@@ -185,7 +186,8 @@ class LSTM(nn.Module):
         weights = self.input.weight, self.input.bias, self.recurrent.weight
         # autocast would choose its own dtypes inside
         with torch.autocast(x.device.type, enabled=False):
-            outputs, cell = _Sequence.apply(
+            sequence = CpuSequence if fits(x) else _Sequence
+            outputs, cell = sequence.apply(
                 x.to(dtype),
                 *(weight.to(dtype) for weight in weights),
                 reset.bool(),

@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 
 from megastep.arrdict import arrdict
+from megastep.kernels.build import program
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import launch
 from megastep.kernels.build.program import Program
@@ -12,7 +13,8 @@ from megastep.kernels.build.program import Program
 DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
 # Unlike in the engine, no bits have to agree: fused multiply-adds, and subnormals flushed to zero.
 CUDA_FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info")
-CORES = Program(Path(__file__).parent, CUDA_FLAGS)
+CPU_FLAGS = tuple(flag.replace("contract=off", "contract=fast") for flag in program.CPU_FLAGS)
+CORES = Program(Path(__file__).parent, CUDA_FLAGS, CPU_FLAGS)
 
 
 def run(operation: str, dtype: torch.dtype, state: torch.Tensor, **fields) -> None:
