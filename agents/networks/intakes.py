@@ -10,6 +10,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.distributed.pooling import Moments
+from megastep.agents.networks import intake_cpu
 from megastep.agents.networks.encoders import make_encoder
 from megastep.agents.networks.precision import compute_dtype
 from megastep.agents.networks.running_norm import RunningNorm
@@ -70,22 +71,22 @@ class ConcatIntake(nn.Module):
                 block.normal_(std=math.sqrt(2 / (len(sizes) * size)))
 
     def forward(self, obs: Tree) -> torch.Tensor:
-        features = self._encode_leaves(obs)
-        if self.n_padding:
-            features.append(features[0].new_zeros((*features[0].shape[:-1], self.n_padding)))
-        return self.activation(self.project(torch.cat(features, dim=-1)))
+        return self.activation(self.project(self.encode(obs, self.n_padding)))
 
-    def encode(self, obs: Tree) -> torch.Tensor:
-        """Returns all leaves, normalised, encoded and concatenated: (..., n_features)."""
-        return torch.cat(self._encode_leaves(obs), dim=-1)
-
-    def _encode_leaves(self, obs):
-        dtype = compute_dtype(self.project.weight)
-        leaves = self._leaves(obs)
-        return [
+    def encode(self, obs: Tree, n_padding: int = 0) -> torch.Tensor:
+        """Returns all leaves, normalised, encoded and concatenated, then zeros: (..., n_features +
+        n_padding).
+        """
+        leaves, dtype = self._leaves(obs), compute_dtype(self.project.weight)
+        if dtype == torch.float32 and intake_cpu.fits(leaves, self.norms, self.encoders):
+            return intake_cpu.normalised(leaves, self.norms, n_padding)
+        features = [
             encoder(norm(leaf)).to(dtype)
             for leaf, norm, encoder in zip(leaves, self.norms, self.encoders, strict=True)
         ]
+        if n_padding:
+            features.append(features[0].new_zeros((*features[0].shape[:-1], n_padding)))
+        return torch.cat(features, dim=-1)
 
     def moments(
         self, obs: Tree, is_counted: torch.Tensor | bool = True

@@ -3,29 +3,17 @@
 T time, B lanes, W width. `megastep.agents.networks.lstm` has the same as PyTorch operations.
 """
 
-import functools
-
 import torch
 from torch.autograd.function import once_differentiable
 
-from megastep.agents.networks.kernels.program import CORES
-from megastep.kernels.build.compile import EngineError, cpu
-from megastep.kernels.build.launch import launch
+from megastep.agents.networks.kernels.program import is_built_for_cpu, run_on_cpu
 
 MULTIPLE = 16  # of which the width must be one
 
 
 def fits(x: torch.Tensor) -> bool:
     """Returns whether the kernels can take inputs (T, B, W), which needs a C++ compiler."""
-    return x.device.type == "cpu" and x.shape[-1] % MULTIPLE == 0 and _is_built()
-
-
-@functools.cache
-def _is_built():
-    try:
-        return bool(cpu(CORES))
-    except EngineError:
-        return False
+    return x.device.type == "cpu" and x.shape[-1] % MULTIPLE == 0 and is_built_for_cpu()
 
 
 class CpuSequence(torch.autograd.Function):
@@ -38,9 +26,10 @@ class CpuSequence(torch.autograd.Function):
         gates = x.new_empty((*x.shape[:2], 4 * x.shape[2]))
         hiddens, cells, outputs = (torch.empty_like(x) for _ in range(3))
         last_cell = torch.empty_like(cell)
-        _run(
+        n_steps, n_lanes, width = x.shape
+        run_on_cpu(
             "lstm_sequence_forward",
-            x,
+            x=x,
             input_weight=input_weight,
             bias=bias,
             weight=weight,
@@ -52,7 +41,9 @@ class CpuSequence(torch.autograd.Function):
             cells=cells,
             outputs=outputs,
             last_cell=last_cell,
-            x=x,
+            n_steps=n_steps,
+            n_lanes=n_lanes,
+            width=width,
         )
         ctx.save_for_backward(x, input_weight, weight, reset, gates, hiddens, cells)
         return outputs, last_cell
@@ -63,9 +54,9 @@ class CpuSequence(torch.autograd.Function):
         x, input_weight, weight, reset, gates, hiddens, cells = ctx.saved_tensors
         d_gates, d_x = torch.empty_like(gates), torch.empty_like(x)
         d_output, d_cell = torch.empty_like(d_last_cell), torch.empty_like(d_last_cell)
-        _run(
+        n_steps, n_lanes, width = x.shape
+        run_on_cpu(
             "lstm_sequence_backward",
-            x,
             input_weight=input_weight,
             weight=weight,
             reset=reset,
@@ -77,20 +68,10 @@ class CpuSequence(torch.autograd.Function):
             d_x=d_x,
             d_output=d_output,
             d_cell=d_cell,
+            n_steps=n_steps,
+            n_lanes=n_lanes,
+            width=width,
         )
         flat = d_gates.flatten(0, 1)
         d_input_weight, d_weight = flat.T @ x.flatten(0, 1), flat.T @ hiddens.flatten(0, 1)
         return d_x, d_input_weight, flat.sum(0), d_weight, None, d_output, d_cell
-
-
-def _run(operation, like, **tensors):
-    """Runs an operation on tensors, for sequences of the shape of `like`."""
-    n_steps, n_lanes, width = like.shape
-    packed = getattr(CORES.params, CORES.cpu_operations[operation])(
-        **{name: tensor.data_ptr() for name, tensor in tensors.items()},
-        n_steps=n_steps,
-        n_lanes=n_lanes,
-        width=width,
-        n_threads=torch.get_num_threads(),
-    )
-    launch(CORES, operation, packed, like.device, 0)
