@@ -12,6 +12,9 @@
 typedef float Four __attribute__((vector_size(16)));
 typedef float AnyFour __attribute__((vector_size(16), aligned(4), may_alias));
 
+// Loops over rays are in blocks of so many, since compilers then need no code for the last few.
+constexpr int BLOCK_RAYS = 16;
+
 // The rays of a view, one array per field, so that compilers vectorise loops over them.
 struct Rays {
     // the nearest line
@@ -23,17 +26,19 @@ struct Rays {
     std::vector<Four> samples;
 
     explicit Rays(int res) : samples(res) {
+        int size = (res + BLOCK_RAYS - 1) / BLOCK_RAYS * BLOCK_RAYS;
         for (auto* field :
              {&inverse, &ax, &ay, &vx, &vy, &location, &facing, &weight, &distance, &depth})
-            field->resize(res);
+            field->resize(size);
         for (auto* field : {&index, &first_texel, &width, &texel, &left, &right})
-            field->resize(res);
+            field->resize(size);
     }
 };
 
 // One thread's buffers: the projections of its lines, and one view.
 struct Scratch {
     std::vector<Projection> projections;
+    std::vector<int> visible;
     std::vector<float> sums;
     std::vector<unsigned short> halves;
     Rays rays;
@@ -51,12 +56,14 @@ static void raster_near(Projection line, const RenderParams& p, int index, Rays&
 }
 
 static void raster_span(PixelSpan span, int index, float* inverse, int* indices) {
+    for (int block = span.first / BLOCK_RAYS * BLOCK_RAYS; block < span.end; block += BLOCK_RAYS) {
 #pragma omp simd
-    for (int r = span.first; r < span.end; r++) {
-        float here = span.base + span.gain * (float)r;
-        int nearer = here > inverse[r];
-        inverse[r] = nearer ? here : inverse[r];
-        indices[r] = nearer ? index : indices[r];
+        for (int r = block; r < block + BLOCK_RAYS; r++) {
+            float here = span.base + span.gain * (float)r;
+            int nearer = (here > inverse[r]) & (r >= span.first) & (r < span.end);
+            inverse[r] = nearer ? here : inverse[r];
+            indices[r] = nearer ? index : indices[r];
+        }
     }
 }
 
@@ -65,30 +72,37 @@ static void raster_span(PixelSpan span, int index, float* inverse, int* indices)
 static void raster_lines(const Pose& camera, const Screen& screen, const RenderParams& p,
                          const float* lines, int n, int offset, int skip_first, int skip_end,
                          Scratch& scratch) {
-    if ((int)scratch.projections.size() < n)
+    if ((int)scratch.projections.size() < n) {
         scratch.projections.resize(n);
+        scratch.visible.resize(n);
+    }
     Projection* projections = scratch.projections.data();
 #pragma omp simd
     for (int l = 0; l < n; l++) {
         projections[l] = project(camera, screen, lines[4 * l], lines[4 * l + 1], lines[4 * l + 2],
                                  lines[4 * l + 3]);
     }
+    int n_visible = 0;
     for (int l = 0; l < n; l++) {
-        Projection line = projections[l];
-        if (line.span.first >= line.span.end || (l >= skip_first && l < skip_end))
+        scratch.visible[n_visible] = l;
+        n_visible += projections[l].span.first < projections[l].span.end;
+    }
+    for (int i = 0; i < n_visible; i++) {
+        int l = scratch.visible[i];
+        if (l >= skip_first && l < skip_end)
             continue;
-        if (line.near_clipped)
-            raster_near(line, p, offset + l, scratch.rays);
+        if (projections[l].near_clipped)
+            raster_near(projections[l], p, offset + l, scratch.rays);
         else
-            raster_span(line.span, offset + l, scratch.rays.inverse.data(),
+            raster_span(projections[l].span, offset + l, scratch.rays.inverse.data(),
                         scratch.rays.index.data());
     }
 }
 
 // Calls f(line, first, end) for each run of neighbouring rays that hit the same line.
 template <class F>
-static void for_runs(const std::vector<int>& index, F f) {
-    int res = (int)index.size(), end;
+static void for_runs(const std::vector<int>& index, int res, F f) {
+    int end;
     for (int first = 0; first < res; first = end) {
         for (end = first + 1; end < res && index[end] == index[first]; end++)
             ;
@@ -98,18 +112,17 @@ static void for_runs(const std::vector<int>& index, F f) {
 
 static void find_surfaces(const RenderParams& p, const EnvScenery& scenery, const Pose& camera,
                           Rays& rays) {
-    for_runs(rays.index, [&](int line, int first, int end) {
+    for_runs(rays.index, p.res, [&](int line, int first, int end) {
         Surface surface = {0.f, 0.f, 0.f, 0.f, 0, 1, 0};
         if (line >= 0)
             surface = surface_of<1>(p.scenery, scenery, camera, line);
-        for (int r = first; r < end; r++) {
-            rays.ax[r] = surface.ax;
-            rays.ay[r] = surface.ay;
-            rays.vx[r] = surface.vx;
-            rays.vy[r] = surface.vy;
-            rays.first_texel[r] = surface.first_texel;
-            rays.width[r] = surface.width;
-        }
+        int n = end - first;
+        std::fill_n(&rays.ax[first], n, surface.ax);
+        std::fill_n(&rays.ay[first], n, surface.ay);
+        std::fill_n(&rays.vx[first], n, surface.vx);
+        std::fill_n(&rays.vy[first], n, surface.vy);
+        std::fill_n(&rays.first_texel[first], n, surface.first_texel);
+        std::fill_n(&rays.width[first], n, surface.width);
     });
 }
 
@@ -143,34 +156,44 @@ static void find_hits(const RenderParams& p, const Screen& screen, Rays& rays) {
 }
 
 // As wall_colour, with a vector of all components.
-static Four wall_sample(const SceneryParams& s, const Rays& rays, int r) {
+static void wall_samples(const SceneryParams& s, Rays& rays, int first, int end) {
     const AnyFour* texels = (const AnyFour*)s.texels;
-    Four left = texels[rays.left[r]], right = texels[rays.right[r]];
-    Four texel = left + rays.weight[r] * (right - left);
-    Four sample = texel * (texel[3] * rays.facing[r]);
-    sample[3] = rays.depth[r];
-    return sample;
+    const int *left = rays.left.data(), *right = rays.right.data();
+    const float *weight = rays.weight.data(), *facing = rays.facing.data();
+    const float* depth = rays.depth.data();
+    Four* samples = rays.samples.data();
+    for (int r = first; r < end; r++) {
+        Four texel = texels[left[r]];
+        texel += weight[r] * (texels[right[r]] - texel);
+        Four sample = texel * (texel[3] * facing[r]);
+        sample[3] = depth[r];
+        samples[r] = sample;
+    }
 }
 
-static Four agent_sample(const EnvScenery& scenery, const Rays& rays, int r) {
-    Colour colour = blend(agent_texel(scenery, rays.left[r]), agent_texel(scenery, rays.right[r]),
-                          rays.weight[r], rays.facing[r]);
-    return Four{colour.red, colour.green, colour.blue, rays.depth[r]};
+static void agent_samples(const EnvScenery& scenery, Rays& rays, int first, int end) {
+    for (int r = first; r < end; r++) {
+        Colour colour = blend(agent_texel(scenery, rays.left[r]),
+                              agent_texel(scenery, rays.right[r]), rays.weight[r], rays.facing[r]);
+        rays.samples[r] = Four{colour.red, colour.green, colour.blue, rays.depth[r]};
+    }
 }
 
 static void find_samples(const RenderParams& p, const EnvScenery& scenery, Rays& rays) {
-    for_runs(rays.index, [&](int line, int first, int end) {
-        for (int r = first; r < end; r++)
-            rays.samples[r] = line < 0                       ? Four{}
-                              : line < scenery.n_agent_lines ? agent_sample(scenery, rays, r)
-                                                             : wall_sample(p.scenery, rays, r);
+    for_runs(rays.index, p.res, [&](int line, int first, int end) {
+        if (line < 0)
+            std::fill_n(&rays.samples[first], end - first, Four{});
+        else if (line < scenery.n_agent_lines)
+            agent_samples(scenery, rays, first, end);
+        else
+            wall_samples(p.scenery, rays, first, end);
     });
 }
 
 // Returns the number of newly seen texels.
-static int mark_all_seen(const EnvScenery& scenery, const Rays& rays, unsigned int* seen) {
+static int mark_all_seen(const EnvScenery& scenery, const Rays& rays, int res, unsigned int* seen) {
     int newly_seen = 0, last = -1;
-    for (size_t r = 0; r < rays.index.size(); r++) {
+    for (int r = 0; r < res; r++) {
         if (rays.index[r] < scenery.n_agent_lines || rays.texel[r] == last)
             continue;
         last = rays.texel[r];
@@ -231,8 +254,8 @@ static void write_pixels(const RenderParams& p, int view, const std::vector<Four
 }
 
 // The ray closest to the central one that hits another agent, or the first of equals; -1: none.
-static int agent_ray_of(const std::vector<int>& index, int n_agent_lines) {
-    int res = (int)index.size(), best = -1, least = res;
+static int agent_ray_of(const std::vector<int>& index, int res, int n_agent_lines) {
+    int best = -1, least = res;
     for (int r = 0; r < res; r++) {
         int off = r < res / 2 ? res / 2 - r : r - res / 2;
         if (index[r] >= 0 && index[r] < n_agent_lines && off < least) {
@@ -249,8 +272,8 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery, const P
     const SceneryParams& s = p.scenery;
     Screen screen = screen_of(p);
     Rays& rays = scratch.rays;
-    rays.inverse.assign(p.res, 0.f);
-    rays.index.assign(p.res, -1);
+    std::fill(rays.inverse.begin(), rays.inverse.end(), 0.f);
+    std::fill(rays.index.begin(), rays.index.end(), -1);
     if (s.n_agents > 1)
         raster_lines(camera, screen, p, scenery.agent_lines, scenery.n_agent_lines, 0,
                      a * s.n_model, (a + 1) * s.n_model, scratch);
@@ -259,7 +282,7 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery, const P
     if (p.centre_line)
         p.centre_line[view] = rays.index[p.res / 2];
     if (p.agent_ray)
-        p.agent_ray[view] = agent_ray_of(rays.index, scenery.n_agent_lines);
+        p.agent_ray[view] = agent_ray_of(rays.index, p.res, scenery.n_agent_lines);
     find_surfaces(p, scenery, camera, rays);
     find_hits(p, screen, rays);
     if (p.rgb || p.screen || p.depth)
@@ -268,7 +291,7 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery, const P
         write_rays(p, screen, view, rays);
     if (p.rgb || p.depth)
         write_pixels(p, view, rays.samples, scratch);
-    return seen ? mark_all_seen(scenery, rays, seen) : 0;
+    return seen ? mark_all_seen(scenery, rays, p.res, seen) : 0;
 }
 
 static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
@@ -296,7 +319,7 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
 KERNEL render(const RenderParams& p) {
 #pragma omp parallel num_threads(p.scenery.n_threads)
     {
-        Scratch scratch = {{}, {}, {}, Rays(p.res)};
+        Scratch scratch = {{}, {}, {}, {}, Rays(p.res)};
 #pragma omp for schedule(static)
         for (int agent = 0; agent < p.scenery.n_envs * p.scenery.n_agents; agent++)
             render_agent(p, agent, scratch);
