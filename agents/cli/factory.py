@@ -140,7 +140,7 @@ def share_threads(width: int) -> None:
     """
     n_threads = engine.threads()
     engine.set_threads(n_threads)
-    torch.set_num_threads(max(1, min(n_threads, width // 32)))
+    torch.set_num_threads(max(1, min(n_threads, width // 128)))
 
 
 def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:

@@ -6,8 +6,9 @@ PyTorch. Matrix products run in the compute dtype (autocast's) on a GPU and in f
 cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell would round small
 additions away.
 
-The part between two matrix products is written here for the CPU. On a GPU it is a kernel with the
-same arguments (`megastep.agents.networks.kernels.lstm`).
+The part between two matrix products is written here as PyTorch operations. On a GPU it is a kernel
+with the same arguments (`megastep.agents.networks.kernels.lstm`). On a CPU a kernel does the whole
+sequence if W is a multiple of 16 (`megastep.agents.networks.lstm_cpu`).
 """
 
 from types import SimpleNamespace

@@ -4,14 +4,22 @@
 #include <memory>
 
 #include "common/math.h"
-#include "lstm_sequence.h"
+#include "params.h"
 #include "vector.h"
+
+// Returns the number of threads for a sequence. Waking a sleeping thread takes 50 us; 2^22
+// multiples of a lane's W^2 at a step take a thread 500 us.
+template <class Params>
+static int threads_of(const Params& p) {
+    long long size = (long long)p.n_steps * p.n_lanes * p.width * p.width;
+    return size < 1 << 22 ? 1 : p.n_threads;
+}
 
 // Calls f with the lanes [first, end) of each thread.
 template <class F>
 static void on_threads(int n_lanes, int n_threads, F f) {
     int n_tiles = (n_lanes + ROWS - 1) / ROWS;
-#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
+#pragma omp parallel for schedule(static) num_threads(n_threads)
     for (int i = 0; i < n_threads; i++) {
         int first = ROWS * (int)((long long)n_tiles * i / n_threads);
         f(first, mini(ROWS * (int)((long long)n_tiles * (i + 1) / n_threads), n_lanes));
@@ -116,13 +124,13 @@ static void forward_lanes(const LstmSequenceForwardParams& p, const float* packe
 }
 
 KERNEL lstm_sequence_forward(const LstmSequenceForwardParams& p) {
-    int w = p.width;
+    int w = p.width, n_threads = threads_of(p);
     std::unique_ptr<Vector[]> vectors(new Vector[8LL * w * w / SIZE]);  // aligned, unlike floats
     float* packed = (float*)vectors.get();
-#pragma omp parallel for schedule(static) num_threads(p.n_threads) if (p.n_threads > 1)
+#pragma omp parallel for schedule(static) num_threads(n_threads)
     for (int unit = 0; unit < w; unit += SIZE)
         pack(p, unit, packed + 8LL * w * unit);
-    on_threads(p.n_lanes, p.n_threads,
+    on_threads(p.n_lanes, n_threads,
                [&](int first, int end) { forward_lanes(p, packed, first, end); });
 }
 
@@ -215,5 +223,6 @@ static void backward_lanes(const LstmSequenceBackwardParams& p, int first, int e
 }
 
 KERNEL lstm_sequence_backward(const LstmSequenceBackwardParams& p) {
-    on_threads(p.n_lanes, p.n_threads, [&](int first, int end) { backward_lanes(p, first, end); });
+    on_threads(p.n_lanes, threads_of(p),
+               [&](int first, int end) { backward_lanes(p, first, end); });
 }

@@ -1,7 +1,10 @@
 // Normalises a leaf of an observation into its columns of the network's input: (obs - mean) /
 // scale. The bits are those of PyTorch's operations.
 #include "common/backend.h"
-#include "normalise.h"
+#include "params.h"
+
+constexpr long long MIN_PARALLEL = 1
+                                   << 20;  // numbers; fewer take little longer than waking a thread
 
 static inline float value_of(float x) { return x; }
 
@@ -26,7 +29,8 @@ static void normalise_row(const NormaliseParams& p, const T* obs, float* out) {
 template <class T>
 static void normalise_all(const NormaliseParams& p) {
     long long size = (long long)p.n_channels * p.n_pixels;
-#pragma omp parallel for schedule(static) num_threads(p.n_threads) if (p.n_threads > 1)
+    bool is_small = p.n_rows * size < MIN_PARALLEL;
+#pragma omp parallel for schedule(static) num_threads(is_small ? 1 : p.n_threads)
     for (int row = 0; row < p.n_rows; row++)
         normalise_row(p, (const T*)p.obs + row * size, p.out + (long long)row * p.row_stride);
 }

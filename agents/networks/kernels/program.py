@@ -1,10 +1,11 @@
-"""The recurrent cores' kernels for the GPU as one program, and their launch."""
+"""The networks' kernels as one program for the CPU and the GPU, and their launch."""
 
 import functools
 from pathlib import Path
 
 import torch
 
+from megastep import engine
 from megastep.arrdict import arrdict
 from megastep.kernels.build import program
 from megastep.kernels.build.compile import EngineError, cpu
@@ -55,7 +56,7 @@ def is_built_for_cpu() -> bool:
 
 
 def run_on_cpu(operation: str, **fields) -> None:
-    """Runs an operation of a `.cpp` file with as many threads as PyTorch has.
+    """Runs an operation of a `.cpp` file with as many threads as the engine has.
 
     Args:
         operation: its name.
@@ -63,7 +64,7 @@ def run_on_cpu(operation: str, **fields) -> None:
     """
     pack = getattr(CORES.params, CORES.cpu_operations[operation])
     values = {name: _value(field) for name, field in fields.items()}
-    packed = pack(**values, n_threads=torch.get_num_threads())
+    packed = pack(**values, n_threads=engine.threads())
     launch(CORES, operation, packed, CPU, 0)
 
 
