@@ -291,7 +291,7 @@ def test_statistics_are_saved_with_weights():
 @pytest.mark.parametrize("lead", [(), (6,), (3, 6)])
 def test_normalisation_on_cpu_has_the_bits_of_pytorch(monkeypatch, lead, dtype):
     torch.manual_seed(0)
-    space = {"rgb": IMAGE, "imu": VECTOR}
+    space = arrdict(rgb=IMAGE, imu=VECTOR)
     intake, obs = heads.intake(space, WIDTH), random_obs(space, *lead, dtype=dtype)
     for norm in intake.norms:
         norm.mean.normal_()
