@@ -10,6 +10,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.distributed.pooling import Moments
+from megastep.agents.networks import intake_cpu
 from megastep.agents.networks.encoders import Flat, make_encoder
 from megastep.agents.networks.layers import linear, normalised
 from megastep.agents.networks.precision import compute_dtype
@@ -94,6 +95,8 @@ class ConcatIntake(nn.Module):
         if lanes is not None:
             leaves = [leaf.index_select(1, lanes) for leaf in leaves]
         dtype = compute_dtype(self.project.weight)
+        if dtype == torch.float32 and intake_cpu.fits(leaves, self.norms, self.encoders):
+            return intake_cpu.normalised(leaves, self.norms, self.n_padding)
         features = [
             encoder(norm(leaf)).to(dtype)
             for leaf, norm, encoder in zip(leaves, self.norms, self.encoders, strict=True)

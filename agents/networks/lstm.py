@@ -6,9 +6,10 @@ PyTorch. Matrix products run in the compute dtype (autocast's) on a GPU and in f
 cell and its gates are float32 on both: over hundreds of steps a bfloat16 cell would round small
 additions away.
 
-The part between two matrix products is written here for the CPU. On a GPU it is a kernel with the
-same arguments (`megastep.agents.networks.kernels.lstm`). GPUs with clusters of blocks run a whole
-sequence, products included, in one kernel (`megastep.agents.networks.kernels.lstm_sequence`).
+The part between two matrix products is written here in PyTorch. On a GPU it is a kernel with the
+same arguments (`megastep.agents.networks.kernels.lstm`). GPUs with clusters of blocks run a
+whole sequence, products included, in one kernel (`megastep.agents.networks.kernels.lstm_sequence`),
+and so does a CPU if W is a multiple of 16 (`megastep.agents.networks.lstm_cpu`).
 """
 
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ from torch.nn import functional as F
 from megastep.agents.networks.kernels import lstm as kernels
 from megastep.agents.networks.kernels import lstm_sequence
 from megastep.agents.networks.kernels.program import aligned, check_shapes
+from megastep.agents.networks.lstm_cpu import CpuSequence, fits
 from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.arrdict import arrdict
 
@@ -228,7 +230,8 @@ class LSTM(nn.Module):
         dtype = compute_dtype(self.recurrent.weight) if x.is_cuda else torch.float32
         # autocast would choose its own dtypes inside
         with torch.autocast(x.device.type, enabled=False):
-            outputs, cell = _Sequence.apply(
+            sequence = CpuSequence if fits(x) else _Sequence
+            outputs, cell = sequence.apply(
                 x.to(dtype),
                 *(self.input.weight, self.input.bias, self.recurrent.weight),
                 reset.bool(),

@@ -1,37 +1,69 @@
 // A loop over agents. Each line of a view is compared with the nearest so far at the pixels it
-// covers. Then rays are shaded, in runs of neighbours that hit the same line.
+// covers. Then all rays are shaded together: their surfaces, hits and samples, loop after loop.
+#include <algorithm>
 #include <vector>
 
 #include "common/errors.h"
 #include "common/scenery.h"
 #include "render.h"
 
+// Four floats in one register, as a texel (red, green, blue, light) or a ray's sample (red, green,
+// blue, depth).
+typedef float Four __attribute__((vector_size(16)));
+typedef float AnyFour __attribute__((vector_size(16), aligned(4), may_alias));
+
+// Loops over rays are in blocks of so many, since compilers then need no code for the last few.
+constexpr int BLOCK_RAYS = 16;
+
+// The rays of a view, one array per field, so that compilers vectorise loops over them.
+struct Rays {
+    // the nearest line
+    std::vector<float> inverse, ax, ay, vx, vy;
+    std::vector<int> index, first_texel, width;
+    // where they hit it: `texel` as seen, and `left`, `right` and `weight` of the filter
+    std::vector<float> location, facing, weight, distance, depth;
+    std::vector<int> texel, left, right;
+    std::vector<Four> samples;
+
+    explicit Rays(int res) : samples(res) {
+        int size = (res + BLOCK_RAYS - 1) / BLOCK_RAYS * BLOCK_RAYS;
+        for (auto* field :
+             {&inverse, &ax, &ay, &vx, &vy, &location, &facing, &weight, &distance, &depth})
+            field->resize(size);
+        for (auto* field : {&index, &first_texel, &width, &texel, &left, &right})
+            field->resize(size);
+    }
+};
+
 // One thread's buffers: the projections of its lines, and one view.
 struct Scratch {
     std::vector<Projection> projections;
-    std::vector<float> inverse;
-    std::vector<int> index;
-    std::vector<RaySample> samples;
+    std::vector<int> visible;
+    std::vector<float> sums;
+    std::vector<unsigned short> halves;
+    Rays rays;
 };
 
 // Rasterises a near-clipped line, which is invisible where it is within the radius.
-static void raster_near(Projection line, const RenderParams& p, int index, Scratch& scratch) {
+static void raster_near(Projection line, const RenderParams& p, int index, Rays& rays) {
     for (int r = line.span.first; r < line.span.end; r++) {
         float inverse = line.span.base + line.span.gain * (float)r;
-        if (inverse > scratch.inverse[r] && inverse * p.scenery.radius < p.ray_lengths[r]) {
-            scratch.inverse[r] = inverse;
-            scratch.index[r] = index;
+        if (inverse > rays.inverse[r] && inverse * p.scenery.radius < p.ray_lengths[r]) {
+            rays.inverse[r] = inverse;
+            rays.index[r] = index;
         }
     }
 }
 
 static void raster_span(PixelSpan span, int index, float* inverse, int* indices) {
+    for (int block = span.first / BLOCK_RAYS * BLOCK_RAYS; block < span.end; block += BLOCK_RAYS) {
 #pragma omp simd
-    for (int r = span.first; r < span.end; r++) {
-        float here = span.base + span.gain * (float)r;
-        int nearer = here > inverse[r];
-        inverse[r] = nearer ? here : inverse[r];
-        indices[r] = nearer ? index : indices[r];
+        for (int r = block; r < block + BLOCK_RAYS; r++) {
+            float here = span.base + span.gain * (float)r;
+            int nearer = (here > inverse[r]) & (r >= span.first) & (r < span.end);
+            inverse[r] = nearer ? here : inverse[r];
+            indices[r] = nearer ? index : indices[r];
+        }
     }
 }
 
@@ -40,74 +72,190 @@ static void raster_span(PixelSpan span, int index, float* inverse, int* indices)
 static void raster_lines(const Pose& camera, const Screen& screen, const RenderParams& p,
                          const float* lines, int n, int offset, int skip_first, int skip_end,
                          Scratch& scratch) {
-    if ((int)scratch.projections.size() < n)
+    if ((int)scratch.projections.size() < n) {
         scratch.projections.resize(n);
+        scratch.visible.resize(n);
+    }
     Projection* projections = scratch.projections.data();
 #pragma omp simd
     for (int l = 0; l < n; l++) {
         projections[l] = project(camera, screen, lines[4 * l], lines[4 * l + 1], lines[4 * l + 2],
                                  lines[4 * l + 3]);
     }
+    int n_visible = 0;
     for (int l = 0; l < n; l++) {
-        Projection line = projections[l];
-        if (line.span.first >= line.span.end || (l >= skip_first && l < skip_end))
+        scratch.visible[n_visible] = l;
+        n_visible += projections[l].span.first < projections[l].span.end;
+    }
+    for (int i = 0; i < n_visible; i++) {
+        int l = scratch.visible[i];
+        if (l >= skip_first && l < skip_end)
             continue;
-        if (line.near_clipped)
-            raster_near(line, p, offset + l, scratch);
+        if (projections[l].near_clipped)
+            raster_near(projections[l], p, offset + l, scratch.rays);
         else
-            raster_span(line.span, offset + l, scratch.inverse.data(), scratch.index.data());
+            raster_span(projections[l].span, offset + l, scratch.rays.inverse.data(),
+                        scratch.rays.index.data());
     }
 }
 
-static void shade_run(const RenderParams& p, const Screen& screen, const EnvScenery& scenery,
-                      const Pose& camera, int view, unsigned int* seen, int first, int end,
-                      Scratch& scratch, int& newly_seen) {
-    Surface surface = surface_of<1>(p.scenery, scenery, camera, scratch.index[first]);
-    for (int r = first; r < end; r++)
-        scratch.samples[r] = shade_ray<1>(p, screen, scenery, surface, view, seen, r,
-                                          scratch.inverse[r], newly_seen);
+// Calls f(line, first, end) for each run of neighbouring rays that hit the same line.
+template <class F>
+static void for_runs(const std::vector<int>& index, int res, F f) {
+    int end;
+    for (int first = 0; first < res; first = end) {
+        for (end = first + 1; end < res && index[end] == index[first]; end++)
+            ;
+        f(index[first], first, end);
+    }
 }
 
-static void shade(const RenderParams& p, const Screen& screen, const EnvScenery& scenery,
-                  const Pose& camera, int view, unsigned int* seen, Scratch& scratch,
-                  int& newly_seen) {
-    long long first_ray = (long long)view * p.res;
-    int end;
-    for (int first = 0; first < p.res; first = end) {
-        int line = scratch.index[first];
-        for (end = first + 1; end < p.res && scratch.index[end] == line; end++)
-            ;
+static void find_surfaces(const RenderParams& p, const EnvScenery& scenery, const Pose& camera,
+                          Rays& rays) {
+    for_runs(rays.index, p.res, [&](int line, int first, int end) {
+        Surface surface = {0.f, 0.f, 0.f, 0.f, 0, 1, 0};
+        if (line >= 0)
+            surface = surface_of<1>(p.scenery, scenery, camera, line);
+        int n = end - first;
+        std::fill_n(&rays.ax[first], n, surface.ax);
+        std::fill_n(&rays.ay[first], n, surface.ay);
+        std::fill_n(&rays.vx[first], n, surface.vx);
+        std::fill_n(&rays.vy[first], n, surface.vy);
+        std::fill_n(&rays.first_texel[first], n, surface.first_texel);
+        std::fill_n(&rays.width[first], n, surface.width);
+    });
+}
+
+// What a ray without a line gets here is never read. GCC 12 vectorises the loop only with addresses
+// in variables, and not with "omp simd", which keeps structs in memory.
+static void find_hits(const RenderParams& p, const Screen& screen, Rays& rays) {
+    const float *ax = rays.ax.data(), *ay = rays.ay.data(), *vx = rays.vx.data(),
+                *vy = rays.vy.data(), *inverse = rays.inverse.data(), *lengths = p.ray_lengths;
+    const int *firsts = rays.first_texel.data(), *widths = rays.width.data();
+    float *location = rays.location.data(), *facing = rays.facing.data(),
+          *weight = rays.weight.data(), *distance = rays.distance.data(),
+          *depth = rays.depth.data(), inv_max_depth = p.inv_max_depth;
+    int *texel = rays.texel.data(), *left = rays.left.data(), *right = rays.right.data();
+    int res = p.res;
+    Screen lens = screen;
+#pragma GCC ivdep
+    for (int r = 0; r < res; r++) {
+        float y = ray_slope(lens, r), length = lengths[r];
+        int first = firsts[r], width = widths[r];
+        Hit hit = hit_of({ax[r], ay[r], vx[r], vy[r], first, width, 0}, y, length);
+        Filter filter = filter_at(hit.location, width);
+        location[r] = hit.location;
+        facing[r] = hit.facing;
+        texel[r] = first + texel_at(hit.location, width);
+        left[r] = first + filter.left;
+        right[r] = first + filter.right;
+        weight[r] = filter.weight;
+        distance[r] = length * RECIPROCAL(inverse[r]);
+        depth[r] = depth_reading(distance[r], lens.radius, inv_max_depth);
+    }
+}
+
+// As wall_colour, with a vector of all components.
+static void wall_samples(const SceneryParams& s, Rays& rays, int first, int end) {
+    const AnyFour* texels = (const AnyFour*)s.texels;
+    const int *left = rays.left.data(), *right = rays.right.data();
+    const float *weight = rays.weight.data(), *facing = rays.facing.data();
+    const float* depth = rays.depth.data();
+    Four* samples = rays.samples.data();
+    for (int r = first; r < end; r++) {
+        Four texel = texels[left[r]];
+        texel += weight[r] * (texels[right[r]] - texel);
+        Four sample = texel * (texel[3] * facing[r]);
+        sample[3] = depth[r];
+        samples[r] = sample;
+    }
+}
+
+static void agent_samples(const EnvScenery& scenery, Rays& rays, int first, int end) {
+    for (int r = first; r < end; r++) {
+        Colour colour = blend(agent_texel(scenery, rays.left[r]),
+                              agent_texel(scenery, rays.right[r]), rays.weight[r], rays.facing[r]);
+        rays.samples[r] = Four{colour.red, colour.green, colour.blue, rays.depth[r]};
+    }
+}
+
+static void find_samples(const RenderParams& p, const EnvScenery& scenery, Rays& rays) {
+    for_runs(rays.index, p.res, [&](int line, int first, int end) {
+        if (line < 0)
+            std::fill_n(&rays.samples[first], end - first, Four{});
+        else if (line < scenery.n_agent_lines)
+            agent_samples(scenery, rays, first, end);
+        else
+            wall_samples(p.scenery, rays, first, end);
+    });
+}
+
+// Returns the number of newly seen texels.
+static int mark_all_seen(const EnvScenery& scenery, const Rays& rays, int res, unsigned int* seen) {
+    int newly_seen = 0, last = -1;
+    for (int r = 0; r < res; r++) {
+        if (rays.index[r] < scenery.n_agent_lines || rays.texel[r] == last)
+            continue;
+        last = rays.texel[r];
+        newly_seen += mark_seen(seen, last - scenery.first_texel);
+    }
+    return newly_seen;
+}
+
+static void write_rays(const RenderParams& p, const Screen& screen, int view, const Rays& rays) {
+    for (int r = 0; r < p.res; r++) {
+        long long ray = (long long)view * p.res + r;
         if (p.indices)
-            for (int r = first; r < end; r++)
-                p.indices[first_ray + r] = line;
-        if (line >= 0) {
-            shade_run(p, screen, scenery, camera, view, seen, first, end, scratch, newly_seen);
+            p.indices[ray] = rays.index[r];
+        if (rays.index[r] < 0) {
+            write_miss(p, ray);
             continue;
         }
-        for (int r = first; r < end; r++) {
-            scratch.samples[r] = {0.f, 0.f, 0.f, 0.f};
-            write_miss(p, first_ray + r);
-        }
+        if (p.screen)
+            for (int k = 0; k < 3; k++)
+                p.screen[3 * ray + k] = rays.samples[r][k];
+        if (p.locations)
+            p.locations[ray] = rays.location[r];
+        if (p.dots)
+            p.dots[ray] = cosine_of({0.f, 0.f, rays.vx[r], rays.vy[r], 0, 0, 0},
+                                    ray_slope(screen, r), p.ray_lengths[r]);
+        if (p.distances)
+            p.distances[ray] = rays.distance[r];
     }
 }
 
-static void write_pixels(const RenderParams& p, int view, const RaySample* samples) {
-    for (int pixel = 0; pixel < p.n_pixels; pixel++) {
-        const RaySample* rays = samples + pixel * p.subsample;
-        RaySample sum = rays[0];
+// As write_pixel.
+static void write_pixels(const RenderParams& p, int view, const std::vector<Four>& samples,
+                         Scratch& scratch) {
+    int n = p.n_pixels;
+    scratch.sums.resize(4 * n);
+    scratch.halves.resize(4 * n);
+    for (int pixel = 0; pixel < n; pixel++) {
+        const Four* rays = samples.data() + pixel * p.subsample;
+        Four sum = rays[0];
         if (p.subsample == 4) {
-            sum = plus(plus(rays[0], rays[1]), plus(rays[2], rays[3]));
+            sum = (rays[0] + rays[1]) + (rays[2] + rays[3]);
         } else {
             for (int k = 1; k < p.subsample; k++)
-                sum = plus(sum, rays[k]);
+                sum += rays[k];
         }
-        write_pixel(p, view, pixel, sum);
+        for (int k = 0; k < 4; k++)
+            scratch.sums[k * n + pixel] = sum[k];
     }
+    const float* sums = scratch.sums.data();
+    unsigned short* halves = scratch.halves.data();
+#pragma omp simd
+    for (int i = 0; i < 4 * n; i++)
+        halves[i] = HALF_BITS(sums[i] * p.inv_subsample);
+    if (p.rgb)
+        std::copy(halves, halves + 3 * n, p.rgb + (long long)view * (3 * n));
+    if (p.depth)
+        std::copy(halves + 3 * n, halves + 4 * n, p.depth + (long long)view * n);
 }
 
 // The ray closest to the central one that hits another agent, or the first of equals; -1: none.
-static int agent_ray_of(const std::vector<int>& index, int n_agent_lines) {
-    int res = (int)index.size(), best = -1, least = res;
+static int agent_ray_of(const std::vector<int>& index, int res, int n_agent_lines) {
+    int best = -1, least = res;
     for (int r = 0; r < res; r++) {
         int off = r < res / 2 ? res / 2 - r : r - res / 2;
         if (index[r] >= 0 && index[r] < n_agent_lines && off < least) {
@@ -118,23 +266,32 @@ static int agent_ray_of(const std::vector<int>& index, int n_agent_lines) {
     return best;
 }
 
-static void render_view(const RenderParams& p, const EnvScenery& scenery, const Pose& camera,
-                        int view, int a, unsigned int* seen, Scratch& scratch, int& newly_seen) {
+// Returns the number of newly seen texels.
+static int render_view(const RenderParams& p, const EnvScenery& scenery, const Pose& camera,
+                       int view, int a, unsigned int* seen, Scratch& scratch) {
     const SceneryParams& s = p.scenery;
     Screen screen = screen_of(p);
-    scratch.inverse.assign(p.res, 0.f);
-    scratch.index.assign(p.res, -1);
+    Rays& rays = scratch.rays;
+    std::fill(rays.inverse.begin(), rays.inverse.end(), 0.f);
+    std::fill(rays.index.begin(), rays.index.end(), -1);
     if (s.n_agents > 1)
         raster_lines(camera, screen, p, scenery.agent_lines, scenery.n_agent_lines, 0,
                      a * s.n_model, (a + 1) * s.n_model, scratch);
     raster_lines(camera, screen, p, s.walls + 4 * (long long)scenery.first_wall, scenery.n_walls,
                  scenery.n_agent_lines, 0, 0, scratch);
     if (p.centre_line)
-        p.centre_line[view] = scratch.index[p.res / 2];
+        p.centre_line[view] = rays.index[p.res / 2];
     if (p.agent_ray)
-        p.agent_ray[view] = agent_ray_of(scratch.index, scenery.n_agent_lines);
-    shade(p, screen, scenery, camera, view, seen, scratch, newly_seen);
-    write_pixels(p, view, scratch.samples.data());
+        p.agent_ray[view] = agent_ray_of(rays.index, p.res, scenery.n_agent_lines);
+    find_surfaces(p, scenery, camera, rays);
+    find_hits(p, screen, rays);
+    if (p.rgb || p.screen || p.depth)
+        find_samples(p, scenery, rays);
+    if (p.indices || p.screen || p.locations || p.dots || p.distances)
+        write_rays(p, screen, view, rays);
+    if (p.rgb || p.depth)
+        write_pixels(p, view, rays.samples, scratch);
+    return seen ? mark_all_seen(scenery, rays, p.res, seen) : 0;
 }
 
 static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
@@ -153,7 +310,7 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
             seen[i] = 0u;
     for (int c = 0; c < p.n_cameras; c++) {
         Pose camera = pose_at(x, y, angle + p.yaws[c]);
-        render_view(p, scenery, camera, agent * p.n_cameras + c, a, seen, scratch, newly_seen);
+        newly_seen += render_view(p, scenery, camera, agent * p.n_cameras + c, a, seen, scratch);
     }
     if (p.newly_seen)
         p.newly_seen[agent] = newly_seen;
@@ -162,8 +319,7 @@ static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {
 KERNEL render(const RenderParams& p) {
 #pragma omp parallel num_threads(p.scenery.n_threads)
     {
-        Scratch scratch;
-        scratch.samples.resize(p.res);
+        Scratch scratch = {{}, {}, {}, {}, Rays(p.res)};
 #pragma omp for schedule(static)
         for (int agent = 0; agent < p.scenery.n_envs * p.scenery.n_agents; agent++)
             render_agent(p, agent, scratch);

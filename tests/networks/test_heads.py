@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.networks import encoders, heads, running_norm
+from megastep.agents.networks import encoders, heads, intake_cpu, running_norm
 from megastep.arrdict import arrdict
 
 IMAGE, DEPTH, VECTOR = (
@@ -285,3 +285,21 @@ def test_statistics_are_saved_with_weights():
     update(intake, obs)
     other.load_state_dict(intake.state_dict())
     assert torch.equal(other(obs), intake(obs))
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32], ids=str)
+@pytest.mark.parametrize("lead", [(), (6,), (3, 6)])
+def test_normalisation_on_cpu_has_the_bits_of_pytorch(monkeypatch, lead, dtype):
+    torch.manual_seed(0)
+    space = arrdict(rgb=IMAGE, imu=VECTOR)
+    intake, obs = heads.intake(space, WIDTH), random_obs(space, *lead, dtype=dtype)
+    for norm in intake.norms:
+        norm.mean.normal_()
+        norm.scale.uniform_(0.1, 2)
+    fits = intake_cpu.fits
+    assert fits([obs.rgb, obs.imu], intake.norms, intake.encoders)
+    encoded = intake.encode(obs)
+    monkeypatch.setattr(intake_cpu, "fits", lambda *arguments: False)
+    assert torch.equal(encoded, intake.encode(obs))
+    obs.imu.requires_grad_()
+    assert not fits([obs.rgb, obs.imu], intake.norms, intake.encoders)

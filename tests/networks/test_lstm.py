@@ -7,7 +7,9 @@ import pytest
 import torch
 from torch import nn
 
+from megastep import engine
 from megastep.agents.networks import lstm as lstm_module
+from megastep.agents.networks import lstm_cpu
 from megastep.agents.networks.kernels import lstm as kernels
 from megastep.agents.networks.kernels import program
 from megastep.agents.networks.lstm import LSTM
@@ -354,3 +356,61 @@ def test_sequence_on_chip_cuts_nan_at_resets():
     )
     assert outputs[: n_steps // 2].isnan().any() and outputs[n_steps // 2 :].isfinite().all()
     assert cell.isfinite().all() and d_x[n_steps // 2 :].isfinite().all()
+
+
+# ---- The kernels of a whole sequence on the CPU ----
+
+# float32 sums in another order, exponentials with an error of 2e-7, up to 32 steps deep
+CPU_SLACK = 2e-5
+
+
+def on_cpu(kind, n_steps, n_lanes, width):
+    """Returns outputs, last cell and all gradients by `lstm._Sequence` or `CpuSequence`."""
+    torch.manual_seed(0)
+    inputs = [
+        torch.randn(width, n_steps, n_lanes).permute(1, 2, 0),  # not contiguous
+        torch.randn(4 * width, width) / width**0.5,
+        torch.randn(4 * width),
+        torch.randn(4 * width, width) / width**0.5,
+        torch.randn(n_lanes, width),
+        torch.randn(n_lanes, width),
+    ]
+    inputs = [leaf.requires_grad_() for leaf in inputs]
+    reset = (torch.rand(n_lanes, n_steps) < 0.3).T
+    d_results = torch.randn(n_steps, n_lanes, width), torch.randn(n_lanes, width)
+    results = kind.apply(*inputs[:4], reset, *inputs[4:])
+    return [*results, *torch.autograd.grad(results, inputs, d_results)]
+
+
+@pytest.mark.parametrize(
+    "shape", [(9, 5, 16), (1, 3, 48), (32, 64, 64), (3, 7, 256), (70, 1, 80)], ids=str
+)
+def test_cpu_sequence_matches_pytorch(shape):
+    expected = on_cpu(lstm_module._Sequence, *shape)
+    assert_close(NAMES, on_cpu(lstm_cpu.CpuSequence, *shape), expected, CPU_SLACK)
+
+
+def test_cpu_sequence_has_the_same_bits_with_any_number_of_threads():
+    results = []
+    for n_threads in (1, 2, 3):
+        engine.set_threads(n_threads)
+        results.append(on_cpu(lstm_cpu.CpuSequence, 32, 65, 64))
+    engine.set_threads(None)
+    for other in results[1:]:
+        assert all(map(torch.equal, results[0], other))
+
+
+def test_large_gates_saturate_on_cpu():
+    # without weights, gates are their biases: input, forget and output 1, candidate 1
+    x, zeros = torch.zeros(1, 1, W), torch.zeros(1, W)
+    weights = torch.zeros(4 * W, W), torch.full((4 * W,), 1e4), torch.zeros(4 * W, W)
+    reset = torch.zeros(1, 1, dtype=torch.bool)
+    outputs, cell = lstm_cpu.CpuSequence.apply(x, *weights, reset, zeros, zeros + 2)
+    torch.testing.assert_close(cell, torch.full((1, W), 3.0), **CLOSE)
+    torch.testing.assert_close(outputs[0], torch.full((1, W), 3.0).tanh(), **CLOSE)
+
+
+def test_widths_that_kernels_do_not_take_use_pytorch():
+    assert lstm_cpu.fits(torch.zeros(1, 1, 16)) and not lstm_cpu.fits(torch.zeros(1, 1, 17))
+    output, _ = LSTM(17).step(torch.zeros(1, 17), torch.zeros(1, dtype=bool), LSTM(17).initial(1))
+    assert output.isfinite().all()

@@ -1,5 +1,5 @@
-// Adam with decoupled weight decay for many parameters in one launch, and the norm of their gradients.
-// A block handles part of one parameter.
+// Adam with decoupled weight decay for many parameters in one launch, and the norm of their
+// gradients. A block handles part of one parameter.
 #include "common/constants.h"
 #include "constants.h"
 #include "params.h"

@@ -92,9 +92,9 @@ struct SizesParams {
 };
 
 struct RecordParams {
-    const float* sizes;     // (n_rows, B)
-    const int* first_rows;  // (B)
-    double* record;         // see NonFiniteCheck
+    const float* sizes;        // (n_rows, B)
+    const int* first_rows;     // (B)
+    double* record;            // see NonFiniteCheck
     unsigned char* is_finite;  // ()
     int n_rows;
     int n_lanes;

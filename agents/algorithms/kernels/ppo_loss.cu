@@ -1,5 +1,5 @@
-// PPO's loss, with its gradients and metrics. One thread per row; a block adds up its rows in a fixed
-// order, the caller the blocks.
+// PPO's loss, with its gradients and metrics. One thread per row; a block adds up its rows in a
+// fixed order, the caller the blocks.
 #include "common/constants.h"
 #include "params.h"
 

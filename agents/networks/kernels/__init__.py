@@ -1,1 +1,1 @@
-"""The recurrent cores' kernels for the GPU, and a module per core that launches them."""
+"""The networks' kernels, and a module per core that launches those for the GPU."""

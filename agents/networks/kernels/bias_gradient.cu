@@ -1,6 +1,6 @@
 // The gradient of a layer before its activation (ReLU), and its sums over rows, which are the
-// gradient of the bias. A block adds up a strip of rows in a fixed order; the caller adds the strips.
-// Blocks along y: words of columns, 32 at once.
+// gradient of the bias. A block adds up a strip of rows in a fixed order; the caller adds the
+// strips. Blocks along y: words of columns, 32 at once.
 #include "constants.h"
 #include "lanes.h"
 #include "params.h"
@@ -10,9 +10,9 @@ DEVICE void bias_gradient(const BiasGradientParams& p) {
     constexpr int AT_ONCE = 4, WARPS = STRIP_THREADS / WARP;  // rows whose loads do not wait
     __shared__ float of_warps[WARPS][N * WARP];
     int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
-    int n_words = p.n_columns / N;                           // of a row
+    int n_words = p.n_columns / N;                            // of a row
     int words = min(n_words - WARP * (int)blockIdx.y, WARP);  // of this block
-    int groups = WARP / words, group = lane / words;         // rows that a warp handles at once
+    int groups = WARP / words, group = lane / words;          // rows that a warp handles at once
     int word = WARP * blockIdx.y + lane % words;
     long long policy = blockIdx.z, strip = blockIdx.x, first = policy * p.n_rows;
     int end = min(((int)strip + 1) * STRIP, p.n_rows), step = WARPS * groups;

@@ -1,4 +1,4 @@
-// The parameters of each launch, passed by value; see megastep/kernels/params.h.
+// The parameters of each launch; see megastep/kernels/params.h.
 //
 // T steps, B lanes, W units. "compute" is the dtype of matrix products, float32 or bfloat16.
 #pragma once
@@ -153,4 +153,58 @@ struct CategoricalTermsBackwardParams {
     int n_rows;
     int n_agents;
     int n_choices;
+};
+
+// The LSTM over a whole sequence, on the CPU. Everything is float32, W is a multiple of 16.
+
+struct LstmSequenceForwardParams {
+    const float* x;              // (T, B, W)
+    const float* input_weight;   // (4 W, W)
+    const float* bias;           // (4 W)
+    const float* weight;         // (4 W, W) of the recurrent product
+    const unsigned char* reset;  // (T, B) clears a lane's output and cell before the step
+    const float* first_output;   // (B, W) before the sequence
+    const float* first_cell;     // (B, W)
+    float* gates;                // (T, B, 4 W) out: after activation
+    float* hiddens;              // (T, B, W) out: the last step's output as a step sees it
+    float* cells;                // (T, B, W) out: the last step's cell as a step sees it
+    float* outputs;              // (T, B, W) out
+    float* last_cell;            // (B, W) out
+    int n_steps;
+    int n_lanes;
+    int width;
+    int n_threads;
+};
+
+struct LstmSequenceBackwardParams {
+    const float* input_weight;   // (4 W, W)
+    const float* weight;         // (4 W, W)
+    const unsigned char* reset;  // (T, B)
+    const float* gates;          // (T, B, 4 W) after activation
+    const float* cells;          // (T, B, W)
+    const float* d_outputs;      // (T, B, W)
+    const float* d_last_cell;    // (B, W)
+    float* d_gates;              // (T, B, 4 W) out: before activation
+    float* d_x;                  // (T, B, W) out
+    float* d_output;             // (B, W) out: of the output before the sequence
+    float* d_cell;               // (B, W) out
+    int n_steps;
+    int n_lanes;
+    int width;
+    int n_threads;
+};
+
+// The normalisation of a leaf of an observation, on the CPU: N rows, C channels of P pixels.
+
+struct NormaliseLeafParams {
+    const void* obs;     // (N, C, P) fp16 if is_half, else float32
+    const float* mean;   // (C)
+    const float* scale;  // (C)
+    float* out;          // rows of C P numbers, row_stride apart
+    int row_stride;
+    int n_rows;      // N
+    int n_channels;  // C
+    int n_pixels;    // P: those of a channel share mean and scale
+    int is_half;
+    int n_threads;
 };

@@ -1,18 +1,23 @@
-"""The recurrent cores' kernels for the GPU as one program, and their launch."""
+"""The networks' kernels as one program for the CPU and the GPU, and their launch."""
 
+import functools
 from pathlib import Path
 
 import torch
 
+from megastep import engine
 from megastep.arrdict import arrdict
-from megastep.kernels.build.compile import EngineError
+from megastep.kernels.build import program
+from megastep.kernels.build.compile import EngineError, cpu
 from megastep.kernels.build.launch import launch
 from megastep.kernels.build.program import Program
 
 DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
 # Unlike in the engine, no bits have to agree: fused multiply-adds, and subnormals flushed to zero.
 CUDA_FLAGS = ("--std=c++17", "--ftz=true", "--generate-line-info")
-CORES = Program(Path(__file__).parent, CUDA_FLAGS)
+CPU_FLAGS = tuple(flag.replace("contract=off", "contract=fast") for flag in program.CPU_FLAGS)
+CPU = torch.device("cpu")
+CORES = Program(Path(__file__).parent, CUDA_FLAGS, CPU_FLAGS)
 
 
 def run(operation: str, dtype: torch.dtype, state: torch.Tensor, **fields) -> None:
@@ -39,6 +44,28 @@ def run(operation: str, dtype: torch.dtype, state: torch.Tensor, **fields) -> No
     values = {name: _value(field) for name, field in fields.items()}
     packed = pack(**values, n_lanes=n_lanes, width=width, n_units=n_units)
     launch(CORES, kernel, packed, state.device, n_lanes * width // n_units)
+
+
+@functools.cache
+def is_built_for_cpu() -> bool:
+    """Returns whether the CPU's operations can be used, which takes a C++ compiler."""
+    try:
+        return bool(cpu(CORES))
+    except EngineError:
+        return False
+
+
+def run_on_cpu(operation: str, **fields) -> None:
+    """Runs an operation of a `.cpp` file with as many threads as the engine has.
+
+    Args:
+        operation: its name.
+        fields: the fields of its struct but `n_threads`. A tensor stands for its address.
+    """
+    pack = getattr(CORES.params, CORES.cpu_operations[operation])
+    values = {name: _value(field) for name, field in fields.items()}
+    packed = pack(**values, n_threads=engine.threads())
+    launch(CORES, operation, packed, CPU, 0)
 
 
 def _value(field):

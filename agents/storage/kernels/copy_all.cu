@@ -1,4 +1,5 @@
-// Copies many pieces of memory in one launch: blocks along x share a piece, blocks along y the pieces.
+// Copies many pieces of memory in one launch: blocks along x share a piece, blocks along y the
+// pieces.
 #include "common/constants.h"
 #include "constants.h"
 #include "params.h"

@@ -27,19 +27,6 @@ from megastep.kernels.build.program import KERNELS, Program
 
 __all__ = ["EngineError", "bindings", "check_status", "compiler", "cpu", "cuda"]
 
-CPU_FLAGS = (
-    "-std=c++17",
-    "-O3",
-    "-march=native",
-    "-ffp-contract=off",
-    "-fno-tree-slp-vectorize",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-fopenmp",
-    "-shared",
-    "-fPIC",
-)
-
 
 class EngineError(RuntimeError):
     """The engine cannot go on, for example without a compiler, GPU or enough memory, or with a NaN
@@ -61,7 +48,7 @@ def cpu(program: Program) -> dict[str, Callable[[bytes], None]]:
         return {}
     command, version = compiler()
     files = program.sources(".h", ".cpp")
-    key = _key(*files, *files.values(), *CPU_FLAGS, command, version, _processor())
+    key = _key(*files, *files.values(), *program.cpu_flags, command, version, _processor())
     name = f"cpu-{key}.so"
     library = _load(name, *cache.fetch(name, lambda: _build_cpu(program, command)))
     end_threads_at_forks(library)
@@ -122,7 +109,7 @@ def _build_cpu(program, command):
         with tempfile.TemporaryDirectory(prefix="megastep-") as folder:
             out = Path(folder) / "kernels.so"
             process = _run(
-                [command, *CPU_FLAGS, f"-I{KERNELS}", *files, "-o", str(out)], TMPDIR=folder
+                [command, *program.cpu_flags, f"-I{KERNELS}", *files, "-o", str(out)], TMPDIR=folder
             )
             if not process.returncode:
                 return out.read_bytes()

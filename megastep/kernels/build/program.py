@@ -6,10 +6,23 @@ from types import SimpleNamespace
 
 from megastep.kernels.build import headers
 
-__all__ = ["CUDA_FLAGS", "KERNELS", "Program"]
+__all__ = ["CPU_FLAGS", "CUDA_FLAGS", "KERNELS", "Program"]
 
 #: The folder of the engine's kernels. Its headers in ``common/`` are for all programs.
 KERNELS = Path(__file__).parents[1]
+#: The C++ compiler's flags. No fused multiply-adds, as below.
+CPU_FLAGS = (
+    "-std=c++17",
+    "-O3",
+    "-march=native",
+    "-ffp-contract=off",
+    "-fno-tree-slp-vectorize",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fopenmp",
+    "-shared",
+    "-fPIC",
+)
 #: NVRTC's flags, without the architecture. No fused multiply-adds and IEEE division, so that the
 #: GPU computes the same bits as the CPU.
 CUDA_FLAGS = (
@@ -34,6 +47,7 @@ class Program:
     Args:
         folder: where the sources are.
         cuda_flags: NVRTC's flags, without the architecture.
+        cpu_flags: the C++ compiler's flags.
 
     Attributes:
         params: a function for each struct; ``params.RenderParams(res=64, ...)`` packs one. All
@@ -44,8 +58,13 @@ class Program:
         cuda_operations: {operation: struct} of the ``.cu`` files.
     """
 
-    def __init__(self, folder: Path | str, cuda_flags: tuple[str, ...] = CUDA_FLAGS):
-        self.folder, self.cuda_flags = Path(folder), cuda_flags
+    def __init__(
+        self,
+        folder: Path | str,
+        cuda_flags: tuple[str, ...] = CUDA_FLAGS,
+        cpu_flags: tuple[str, ...] = CPU_FLAGS,
+    ):
+        self.folder, self.cuda_flags, self.cpu_flags = Path(folder), cuda_flags, cpu_flags
         structs = headers.struct_fields(self.sources(".h"))
         self.params = SimpleNamespace(
             **{name: headers.builder(name, fields) for name, fields in structs.items()}

@@ -44,21 +44,21 @@ static inline unsigned int float_bits(float value) {
     return same.bits;
 }
 
-// Rounds to fp16, to nearest even, with integer instructions that every processor has.
+// Rounds to fp16, to nearest even, with integer instructions that every processor has. All cases
+// are computed, so that compilers vectorise loops over it.
 static inline unsigned short half_bits(float value) {
     unsigned int bits = float_bits(value);
     unsigned int sign = (bits >> 16) & 0x8000u;
     unsigned int magnitude = bits & 0x7fffffffu;
-    if (magnitude > 0x7f800000u)  // NaN: a GPU turns all of them into this one
-        return 0x7fff;
-    if (magnitude >= 0x477ff000u)  // rounds to more than 65504, the largest fp16 value
-        return (unsigned short)(sign | 0x7c00u);
-    if (magnitude < 0x38800000u) {  // subnormal in fp16: adding 0.5 shifts and rounds it
-        float shifted = __builtin_fabsf(value) + 0.5f;
-        return (unsigned short)(sign | (float_bits(shifted) - 0x3f000000u));
-    }
     unsigned int to_even = 0xfffu + ((magnitude >> 13) & 1u);
-    return (unsigned short)(sign | ((magnitude - 0x38000000u + to_even) >> 13));
+    unsigned int half = (magnitude - 0x38000000u + to_even) >> 13;
+    // subnormal in fp16: adding 0.5 shifts and rounds it
+    unsigned int subnormal = float_bits(__builtin_fabsf(value) + 0.5f) - 0x3f000000u;
+    half = magnitude < 0x38800000u ? subnormal : half;
+    half = magnitude >= 0x477ff000u ? 0x7c00u : half;  // more than 65504, the largest fp16 value
+    half |= sign;
+    // NaN: a GPU turns all of them into this one
+    return (unsigned short)(magnitude > 0x7f800000u ? 0x7fffu : half);
 }
 
 static inline float half_value(unsigned short bits) {

@@ -5,13 +5,13 @@
 // share of the weights as the left matrix of each product and the lanes as columns of the right
 // one. After a step the blocks of a cluster send each other, from shared memory to shared memory,
 // the outputs of their units (forward), or their parts of the sums over all gates (backward, added
-// in a fixed order). A block sends what step t + 1 needs only after all have sent what step t needed,
-// so two buffers are enough.
+// in a fixed order). A block sends what step t + 1 needs only after all have sent what step t
+// needed, so two buffers are enough.
 //
 // Of the 16 x 8 results of a product, a thread holds rows g and g + 8 and columns 2 q and 2 q + 1,
-// with g = lane / 4 and q = lane % 4 of the warp. Rows are laid out so that these are the four gates
-// of one unit. So gates and cells never leave their thread, and what the backward pass needs is
-// saved in the order of the threads.
+// with g = lane / 4 and q = lane % 4 of the warp. Rows are laid out so that these are the four
+// gates of one unit. So gates and cells never leave their thread, and what the backward pass needs
+// is saved in the order of the threads.
 #include "constants.h"
 #include "params.h"
 #include "tensor_cores.h"
@@ -207,8 +207,8 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                     rounded[1][j][e] = pack_bfloat16(sums[1][j][e], sums[1][j][2 + e]);
                 }
             if (p.saved_gates) {
-                uint4* saved = (uint4*)p.saved_gates +
-                               (4 * block + COLUMNS * half) * THREADS + me.index;
+                uint4* saved =
+                    (uint4*)p.saved_gates + (4 * block + COLUMNS * half) * THREADS + me.index;
 #pragma unroll
                 for (int j = 0; j < COLUMNS; j++)
                     __stcs(saved + j * THREADS, uint4{rounded[0][j][0], rounded[1][j][0],
@@ -407,9 +407,8 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
                         d_cell = cut ? 0.f : d_cell;
                     }
                     d_cell += d_output * output * (1.f - after * after);
-                    unsigned int d_one =
-                        pack_bfloat16(d_cell * candidate * input * (1.f - input),
-                                      d_cell * before * forget * (1.f - forget));
+                    unsigned int d_one = pack_bfloat16(d_cell * candidate * input * (1.f - input),
+                                                       d_cell * before * forget * (1.f - forget));
                     unsigned int d_two =
                         pack_bfloat16(d_cell * input * (1.f - candidate * candidate),
                                       d_output * after * output * (1.f - output));
@@ -437,11 +436,9 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
 #pragma unroll
                 for (int upper = 0; upper < 2; upper++) {
                     int row = 32 * me.warp + 16 * tile + me.g + 8 * upper;
-                    const float* target =
-                        &memory.parts[t & 1][half][rank][row % UNITS][2 * me.q];
+                    const float* target = &memory.parts[t & 1][half][rank][row % UNITS][2 * me.q];
                     unsigned int there = address_in(target, row / UNITS);
-                    unsigned int arrivals =
-                        address_in(&memory.arrivals[t & 1][half], row / UNITS);
+                    unsigned int arrivals = address_in(&memory.arrivals[t & 1][half], row / UNITS);
 #pragma unroll
                     for (int j = 0; j < COLUMNS; j++)
                         send(there + 8 * j * (int)sizeof(float), sums[tile][j][2 * upper],
@@ -488,9 +485,5 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
 static_assert(sizeof(ForwardMemory<256>) == FORWARD_MEMORY);
 static_assert(sizeof(BackwardMemory<256>) == BACKWARD_MEMORY);
 
-KERNEL BOUNDS(4) lstm_sequence_forward_256(LstmSequenceForwardParams p) {
-    lstm_forward<256>(p);
-}
-KERNEL BOUNDS(4) lstm_sequence_backward_256(LstmSequenceBackwardParams p) {
-    lstm_backward<256>(p);
-}
+KERNEL BOUNDS(4) lstm_sequence_forward_256(LstmSequenceForwardParams p) { lstm_forward<256>(p); }
+KERNEL BOUNDS(4) lstm_sequence_backward_256(LstmSequenceBackwardParams p) { lstm_backward<256>(p); }

@@ -1,8 +1,8 @@
 // The parameters of each launch, passed by value; see megastep/kernels/params.h.
 //
 // P policies, each with its own weights and its own B lanes, T steps, W units. Every array starts
-// with the axis P. Arrays are bfloat16 unless their type says otherwise. C is the number of clusters
-// per policy, S = W / 64 that of blocks per cluster.
+// with the axis P. Arrays are bfloat16 unless their type says otherwise. C is the number of
+// clusters per policy, S = W / 64 that of blocks per cluster.
 #pragma once
 
 struct LstmSequenceForwardParams {

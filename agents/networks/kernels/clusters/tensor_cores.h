@@ -28,7 +28,8 @@ DEVICE float sigmoid(float x) { return 0.5f * tanh_of(0.5f * x) + 0.5f; }
 
 // ---- Tensor cores ----
 
-// Loads four matrices of 8 x 8 bfloat16. Lanes 8 i to 8 i + 7 of the warp give the rows of matrix i.
+// Loads four matrices of 8 x 8 bfloat16. Lanes 8 i to 8 i + 7 of the warp give the rows of matrix
+// i.
 DEVICE void load_matrices(unsigned int (&parts)[4], const void* row) {
     unsigned int address = (unsigned int)__cvta_generic_to_shared(row);
     asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
@@ -40,10 +41,11 @@ DEVICE void load_matrices(unsigned int (&parts)[4], const void* row) {
 // sum (16 x 8) += a (16 x 16) b (16 x 8), a and b in bfloat16.
 DEVICE void multiply_add(float (&sum)[4], const unsigned int (&a)[4], unsigned int b0,
                          unsigned int b1) {
-    asm volatile("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0, %1, %2, %3}, "
-                 "{%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
-                 : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3])
-                 : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+    asm volatile(
+        "mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0, %1, %2, %3}, "
+        "{%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
+        : "+f"(sum[0]), "+f"(sum[1]), "+f"(sum[2]), "+f"(sum[3])
+        : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
 }
 
 // ---- Copies and clusters ----
@@ -72,9 +74,10 @@ DEVICE unsigned int cluster_rank() {
 
 // Waits until every thread of the cluster is here. What they wrote before is then visible to all.
 DEVICE void cluster_barrier() {
-    asm volatile("barrier.cluster.arrive.release.aligned;\n"
-                 "barrier.cluster.wait.acquire.aligned;" ::
-                     : "memory");
+    asm volatile(
+        "barrier.cluster.arrive.release.aligned;\n"
+        "barrier.cluster.wait.acquire.aligned;" ::
+            : "memory");
 }
 
 // A barrier in shared memory that counts bytes which other blocks send. Each phase ends when one
@@ -86,28 +89,30 @@ DEVICE unsigned int shared_address(const void* shared) {
 }
 
 DEVICE void init(Arrivals* arrivals) {
-    asm volatile("mbarrier.init.shared.b64 [%0], 1;\n"
-                 "fence.mbarrier_init.release.cluster;" ::"r"(shared_address(arrivals))
-                 : "memory");
+    asm volatile(
+        "mbarrier.init.shared.b64 [%0], 1;\n"
+        "fence.mbarrier_init.release.cluster;" ::"r"(shared_address(arrivals))
+        : "memory");
 }
 
 DEVICE void expect(Arrivals* arrivals, int n_bytes) {
-    asm volatile("mbarrier.arrive.expect_tx.shared.b64 _, [%0], %1;" ::"r"(
-                     shared_address(arrivals)),
-                 "r"(n_bytes)
-                 : "memory");
+    asm volatile(
+        "mbarrier.arrive.expect_tx.shared.b64 _, [%0], %1;" ::"r"(shared_address(arrivals)),
+        "r"(n_bytes)
+        : "memory");
 }
 
 // Waits for the end of a phase: the first has number 0.
 DEVICE void wait_for(Arrivals* arrivals, int phase) {
     unsigned int is_over;
     do {
-        asm volatile("{\n.reg .pred p;\n"
-                     "mbarrier.try_wait.parity.shared.b64 p, [%1], %2;\n"
-                     "selp.u32 %0, 1, 0, p;\n}"
-                     : "=r"(is_over)
-                     : "r"(shared_address(arrivals)), "r"(phase & 1)
-                     : "memory");
+        asm volatile(
+            "{\n.reg .pred p;\n"
+            "mbarrier.try_wait.parity.shared.b64 p, [%1], %2;\n"
+            "selp.u32 %0, 1, 0, p;\n}"
+            : "=r"(is_over)
+            : "r"(shared_address(arrivals)), "r"(phase & 1)
+            : "memory");
     } while (!is_over);
 }
 
@@ -122,15 +127,17 @@ DEVICE unsigned int address_in(const void* shared, unsigned int rank) {
 
 // Begins to write to another block's shared memory. Its `arrivals` count the bytes as they come.
 DEVICE void send(unsigned int target, uint4 value, unsigned int arrivals) {
-    asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v4.b32 "
-                 "[%0], {%1, %2, %3, %4}, [%5];" ::"r"(target),
-                 "r"(value.x), "r"(value.y), "r"(value.z), "r"(value.w), "r"(arrivals)
-                 : "memory");
+    asm volatile(
+        "st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v4.b32 "
+        "[%0], {%1, %2, %3, %4}, [%5];" ::"r"(target),
+        "r"(value.x), "r"(value.y), "r"(value.z), "r"(value.w), "r"(arrivals)
+        : "memory");
 }
 
 DEVICE void send(unsigned int target, float one, float two, unsigned int arrivals) {
-    asm volatile("st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v2.f32 "
-                 "[%0], {%1, %2}, [%3];" ::"r"(target),
-                 "f"(one), "f"(two), "r"(arrivals)
-                 : "memory");
+    asm volatile(
+        "st.async.weak.shared::cluster.mbarrier::complete_tx::bytes.v2.f32 "
+        "[%0], {%1, %2}, [%3];" ::"r"(target),
+        "f"(one), "f"(two), "r"(arrivals)
+        : "memory");
 }

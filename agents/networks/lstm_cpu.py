@@ -1,0 +1,77 @@
+"""The LSTM's recurrence on a CPU: one kernel for a whole sequence, and one for its gradient.
+
+T time, B lanes, W width. `megastep.agents.networks.lstm` has the same as PyTorch operations.
+"""
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from megastep.agents.networks.kernels.program import is_built_for_cpu, run_on_cpu
+
+MULTIPLE = 16  # of which the width must be one
+
+
+def fits(x: torch.Tensor) -> bool:
+    """Returns whether the kernels can take inputs (T, B, W), which needs a C++ compiler."""
+    return x.device.type == "cpu" and x.shape[-1] % MULTIPLE == 0 and is_built_for_cpu()
+
+
+class CpuSequence(torch.autograd.Function):
+    """`lstm._Sequence` in float32: the same arguments, results and gradients."""
+
+    @staticmethod
+    def forward(ctx, x, input_weight, bias, weight, reset, output, cell):
+        inputs = x, input_weight, bias, weight, reset, output, cell
+        x, input_weight, bias, weight, reset, output, cell = (one.contiguous() for one in inputs)
+        gates = x.new_empty((*x.shape[:2], 4 * x.shape[2]))
+        hiddens, cells, outputs = (torch.empty_like(x) for _ in range(3))
+        last_cell = torch.empty_like(cell)
+        n_steps, n_lanes, width = x.shape
+        run_on_cpu(
+            "lstm_sequence_forward",
+            x=x,
+            input_weight=input_weight,
+            bias=bias,
+            weight=weight,
+            reset=reset,
+            first_output=output,
+            first_cell=cell,
+            gates=gates,
+            hiddens=hiddens,
+            cells=cells,
+            outputs=outputs,
+            last_cell=last_cell,
+            n_steps=n_steps,
+            n_lanes=n_lanes,
+            width=width,
+        )
+        ctx.save_for_backward(x, input_weight, weight, reset, gates, hiddens, cells)
+        return outputs, last_cell
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_outputs, d_last_cell):
+        x, input_weight, weight, reset, gates, hiddens, cells = ctx.saved_tensors
+        d_gates, d_x = torch.empty_like(gates), torch.empty_like(x)
+        d_output, d_cell = torch.empty_like(d_last_cell), torch.empty_like(d_last_cell)
+        n_steps, n_lanes, width = x.shape
+        run_on_cpu(
+            "lstm_sequence_backward",
+            input_weight=input_weight,
+            weight=weight,
+            reset=reset,
+            gates=gates,
+            cells=cells,
+            d_outputs=d_outputs.contiguous(),
+            d_last_cell=d_last_cell.contiguous(),
+            d_gates=d_gates,
+            d_x=d_x,
+            d_output=d_output,
+            d_cell=d_cell,
+            n_steps=n_steps,
+            n_lanes=n_lanes,
+            width=width,
+        )
+        flat = d_gates.flatten(0, 1)
+        d_input_weight, d_weight = flat.T @ x.flatten(0, 1), flat.T @ hiddens.flatten(0, 1)
+        return d_x, d_input_weight, flat.sum(0), d_weight, None, d_output, d_cell
