@@ -13,7 +13,10 @@ from megastep.agents.networks.kernels.program import CUDA_FLAGS
 from megastep.kernels.build.launch import launch_blocks
 from megastep.kernels.build.program import Program
 
-PROGRAM = Program(Path(__file__).parent / "clusters", CUDA_FLAGS)
+# Lambdas with type parameters are device code only if everything is.
+PROGRAM = Program(
+    Path(__file__).parent / "clusters", (*CUDA_FLAGS, "--device-as-default-execution-space")
+)
 WIDTH = 256
 MIN_STEPS = 2  # for one step, loading the weights takes longer than the products
 MAX_STEPS = PROGRAM.constants["MAX_STEPS"]
@@ -56,8 +59,8 @@ def forward(gates, weight, reset, output, cell, needs_backward):
     if needs_backward:
         lead = n_steps, n_clusters, _RANKS
         saved = (
-            gates.new_empty(*lead, 4, _THREADS, 8),
-            cell.new_empty(*lead, 2, _THREADS, 4),
+            gates.new_empty(*lead, _LANES // 8, _THREADS, 8),
+            cell.new_empty(*lead, _LANES // 8, _THREADS, 2),
         )
     _launch(
         "forward",

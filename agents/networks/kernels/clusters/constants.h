@@ -1,8 +1,10 @@
 #pragma once
 
 constexpr int SEQUENCE_THREADS = 256;  // threads of a block
-constexpr int SEQUENCE_LANES = 32;     // lanes of a cluster
 constexpr int BLOCK_UNITS = 64;        // units of a block
-constexpr int MAX_STEPS = 512;
-constexpr int FORWARD_MEMORY = 108064;  // bytes of shared memory of a block, for 256 units
-constexpr int BACKWARD_MEMORY = 126496;
+// Lanes of a cluster. An H200 runs 30 clusters of four blocks at once: with 40 lanes they hold the
+// 1,024 lanes of the default minibatch.
+constexpr int SEQUENCE_LANES = 40;
+constexpr int MAX_STEPS = 512;          // of a sequence
+constexpr int FORWARD_MEMORY = 136608;  // bytes of shared memory of a block, for 256 units
+constexpr int BACKWARD_MEMORY = 135072;

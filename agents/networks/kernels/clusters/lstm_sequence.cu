@@ -1,7 +1,7 @@
 // The LSTM over a whole sequence, forward and backward, in one kernel each. The recurrent weights
 // stay in registers from the first step to the last.
 //
-// A cluster of W / 64 blocks runs 32 lanes. A block computes the four gates of 64 units, with its
+// A cluster of W / 64 blocks runs 40 lanes. A block computes the four gates of 64 units, with its
 // share of the weights as the left matrix of each product and the lanes as columns of the right
 // one. After a step the blocks of a cluster send each other, from shared memory to shared memory,
 // the outputs of their units (forward), or their parts of the sums over all gates (backward, added
@@ -21,18 +21,24 @@
 #define BOUNDS(n_blocks) __cluster_dims__(n_blocks, 1, 1) __launch_bounds__(THREADS, 1)
 
 constexpr int LANES = SEQUENCE_LANES, UNITS = BLOCK_UNITS, THREADS = SEQUENCE_THREADS;
-constexpr int GATES = 4 * UNITS;  // of a block
-constexpr int PAD = 8;            // elements after each row, so that rows start in other banks
-// The lanes are run in two halves: while the blocks exchange one half's numbers, they compute the
+constexpr int GATES = 4 * UNITS;    // of a block
+constexpr int PAD = 8;              // elements after each row, so that rows start in other banks
+constexpr int COLUMNS = LANES / 8;  // of eight lanes
+
+// The lanes are run in two groups: while the blocks exchange one group's numbers, they compute the
 // other's.
-constexpr int HALF = LANES / 2;
-constexpr int COLUMNS = HALF / 8;  // of eight lanes, of a half
+template <int group>
+struct Group {
+    static constexpr int NUMBER = group, COLUMNS = group ? 2 : 3, FIRST_COLUMN = group ? 3 : 0;
+    static constexpr int LANES = 8 * COLUMNS, FIRST_LANE = 8 * FIRST_COLUMN;
+};
+static_assert(Group<0>::COLUMNS + Group<1>::COLUMNS == COLUMNS);
 
 typedef unsigned short Bits;  // of a bfloat16
 
 extern __shared__ __align__(16) unsigned char shared_memory[];
 
-// A thread's place: its unit in the block, and its lanes 8 j + 2 q + {0, 1} of each half.
+// A thread's place: its unit in the block, and its lanes 8 j + 2 q + {0, 1} of column j.
 struct Thread {
     int index, warp, warp_lane, g, q, unit;
 };
@@ -42,25 +48,36 @@ DEVICE Thread this_thread() {
     return {i, i >> 5, lane, lane >> 2, lane & 3, 8 * (i >> 5) + (lane >> 2)};
 }
 
+// Loads the right matrix of one step of a product, 16 numbers of each lane: for each column of
+// lanes two parts. `row` is this thread's row of the first two columns.
+template <int C>
+DEVICE void load_columns(unsigned int (&parts)[C][2], const Bits* row, int lanes_apart) {
+#pragma unroll
+    for (int j = 0; j + 1 < C; j += 2)
+        load_matrices(parts[j], parts[j + 1], row + j * lanes_apart);
+    if (C % 2)
+        load_matrices(parts[C - 1], row + (C - 1) * lanes_apart);
+}
+
 // Adds the product of this warp's weights and of `right` to `sums`. `right` has a row of K numbers
 // per lane, in pieces of N numbers; `piece` numbers lie between two pieces of a row.
-template <int K, int N>
-DEVICE void multiply(float (&sums)[2][COLUMNS][4], const unsigned int (&left)[2][K / 16][4],
+template <int K, int N, int C>
+DEVICE void multiply(float (&sums)[2][C][4], const unsigned int (&left)[2][K / 16][4],
                      const Bits* right, int piece, const Thread& me) {
     const Bits* row = right + (8 * (me.warp_lane >> 4) + (me.warp_lane & 7)) * (N + PAD) +
                       8 * (me.warp_lane >> 3 & 1);
-    unsigned int b[2][4];  // of this step of the product and of the next
-    load_matrices(b[0], row);
+    unsigned int parts[2][C][2];  // of this step of the product and of the next
+    load_columns(parts[0], row, 8 * (N + PAD));
 #pragma unroll
     for (int k = 0; k < K / 16; k++) {
         int next = 16 * (k + 1);
         if (next < K)
-            load_matrices(b[(k + 1) & 1], row + next / N * piece + next % N);
+            load_columns(parts[(k + 1) & 1], row + next / N * piece + next % N, 8 * (N + PAD));
 #pragma unroll
-        for (int tile = 0; tile < 2; tile++) {
-            multiply_add(sums[tile][0], left[tile][k], b[k & 1][0], b[k & 1][1]);
-            multiply_add(sums[tile][1], left[tile][k], b[k & 1][2], b[k & 1][3]);
-        }
+        for (int tile = 0; tile < 2; tile++)
+#pragma unroll
+            for (int j = 0; j < C; j++)
+                multiply_add(sums[tile][j], left[tile][k], parts[k & 1][j][0], parts[k & 1][j][1]);
     }
 }
 
@@ -71,11 +88,17 @@ DEVICE long long saved_block(long long policy, int t, int n_steps, int cluster, 
 }
 
 // One bit per lane of the cluster, for each step: whether the lane is reset before it.
-DEVICE void read_resets(unsigned int* words, const unsigned char* reset, int n_steps, int n_lanes,
+typedef unsigned long long Resets;
+
+DEVICE void read_resets(Resets* words, const unsigned char* reset, int n_steps, int n_lanes,
                         int first_lane, const Thread& me) {
-    int lane = min(first_lane + me.warp_lane, n_lanes - 1);
     for (int t = me.warp; t < n_steps; t += THREADS / 32) {
-        unsigned int word = __ballot_sync(~0u, reset[(long long)t * n_lanes + lane]);
+        Resets word = 0;
+#pragma unroll
+        for (int first = 0; first < LANES; first += 32) {
+            int lane = min(first_lane + first + me.warp_lane, n_lanes - 1);
+            word |= (Resets)__ballot_sync(~0u, reset[(long long)t * n_lanes + lane]) << first;
+        }
         if (!me.warp_lane)
             words[t] = word;
     }
@@ -92,14 +115,14 @@ struct ForwardMemory {
     Bits next_hidden[2][LANES][UNITS + PAD];    // to send
     Bits output[2][LANES][UNITS + PAD];
     Bits gates[STAGES][LANES][GATES + PAD];
-    Arrivals arrivals[2][2];  // of even and odd steps, of both halves
-    unsigned int resets[MAX_STEPS];
+    Arrivals arrivals[2][2];  // of even and odd steps, of both groups
+    Resets resets[MAX_STEPS];
 };
 
 template <int W>
 DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     constexpr int RANKS = W / UNITS;
-    constexpr int SENT = HALF * UNITS * (int)sizeof(Bits);
+    constexpr int SENT = UNITS * (int)sizeof(Bits);  // by a block, per lane
     ForwardMemory<W>& memory = *(ForwardMemory<W>*)shared_memory;
     Thread me = this_thread();
     int rank = cluster_rank(), cluster = blockIdx.x / RANKS, first_lane = LANES * cluster;
@@ -114,7 +137,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     auto begin_gates = [&](int t) {
         if (t < n_steps) {
 #pragma unroll
-            for (int n = 0; n < 4; n++) {
+            for (int n = 0; n < LANES * GATES / 8 / THREADS; n++) {
                 int i = me.index + n * THREADS, lane = i >> 5, gate = i >> 3 & 3;
                 int part = 8 * (i & 7);
                 long long row = (long long)t * n_lanes + min(first_lane + lane, last_lane);
@@ -151,9 +174,9 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
         if (column / UNITS == rank && first_lane + lane < n_lanes)
             *(unsigned int*)(hiddens + (long long)from * W + column) = bits;
     }
-    float cells[2 * COLUMNS][2];
+    float cells[COLUMNS][2];
 #pragma unroll
-    for (int j = 0; j < 2 * COLUMNS; j++)
+    for (int j = 0; j < COLUMNS; j++)
 #pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = min(first_lane + 8 * j + 2 * me.q + e, last_lane);
@@ -161,93 +184,95 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
         }
     read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
     if (!me.index) {
-        for (int i = 0; i < 4; i++) {
-            init(&memory.arrivals[i / 2][i % 2]);
-            expect(&memory.arrivals[i / 2][i % 2], RANKS * SENT);
+        for (int i = 0; i < 2; i++) {
+            init(&memory.arrivals[i][0]);
+            expect(&memory.arrivals[i][0], RANKS * SENT * Group<0>::LANES);
+            init(&memory.arrivals[i][1]);
+            expect(&memory.arrivals[i][1], RANKS * SENT * Group<1>::LANES);
         }
     }
     wait_for_copies<1>();
     cluster_barrier();
 
-    for (int t = 0; t < n_steps; t++) {
+    auto run = [&](int t, auto group) {
+        typedef decltype(group) G;
+        constexpr int C = G::COLUMNS;
         bool is_last = t + 1 == n_steps;
-        begin_gates(t + 2);
-        unsigned int resets = is_last ? 0u : memory.resets[t + 1] >> (2 * me.q);
-        long long block = saved_block(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank);
+        Resets resets = is_last ? 0 : memory.resets[t + 1] >> (2 * me.q);
+        float sums[2][C][4];
 #pragma unroll
-        for (int half = 0; half < 2; half++) {
-            int first = HALF * half;  // lane of this half
-            float sums[2][COLUMNS][4];
+        for (int tile = 0; tile < 2; tile++)
 #pragma unroll
-            for (int tile = 0; tile < 2; tile++)
+            for (int j = 0; j < C; j++)
 #pragma unroll
-                for (int j = 0; j < COLUMNS; j++)
-#pragma unroll
-                    for (int part = 0; part < 4; part++) {
-                        int gate = 2 * tile + (part >> 1);
-                        int lane = first + 8 * j + 2 * me.q + (part & 1);
-                        Bits bits = memory.gates[t % STAGES][lane][gate * UNITS + me.unit];
-                        sums[tile][j][part] = __uint_as_float((unsigned int)bits << 16);
-                    }
-            if (t) {
-                Arrivals* arrivals = &memory.arrivals[t & 1][half];
-                wait_for(arrivals, (t - 1) >> 1);
-                if (!me.index)
-                    expect(arrivals, RANKS * SENT);
-            }
-            multiply<W, UNITS>(sums, weights, &memory.hidden[t & 1][0][first][0],
-                               LANES * (UNITS + PAD), me);
+                for (int part = 0; part < 4; part++) {
+                    int gate = 2 * tile + (part >> 1);
+                    int lane = G::FIRST_LANE + 8 * j + 2 * me.q + (part & 1);
+                    Bits bits = memory.gates[t % STAGES][lane][gate * UNITS + me.unit];
+                    sums[tile][j][part] = __uint_as_float((unsigned int)bits << 16);
+                }
+        if (t) {
+            Arrivals* arrivals = &memory.arrivals[t & 1][G::NUMBER];
+            wait_for(arrivals, (t - 1) >> 1);
+            if (!me.index)
+                expect(arrivals, RANKS * SENT * G::LANES);
+        }
+        multiply<W, UNITS>(sums, weights, &memory.hidden[t & 1][0][G::FIRST_LANE][0],
+                           LANES * (UNITS + PAD), me);
 
-            unsigned int rounded[2][COLUMNS][2];  // input | forget, candidate | output
+        unsigned int rounded[2][C][2];  // input | forget, candidate | output
 #pragma unroll
-            for (int j = 0; j < COLUMNS; j++)
+        for (int j = 0; j < C; j++)
 #pragma unroll
-                for (int e = 0; e < 2; e++) {
-                    rounded[0][j][e] = pack_bfloat16(sums[0][j][e], sums[0][j][2 + e]);
-                    rounded[1][j][e] = pack_bfloat16(sums[1][j][e], sums[1][j][2 + e]);
-                }
-            if (p.saved_gates) {
-                uint4* saved =
-                    (uint4*)p.saved_gates + (4 * block + COLUMNS * half) * THREADS + me.index;
-#pragma unroll
-                for (int j = 0; j < COLUMNS; j++)
-                    __stcs(saved + j * THREADS, uint4{rounded[0][j][0], rounded[1][j][0],
-                                                      rounded[0][j][1], rounded[1][j][1]});
-                float4* saved_cells =
-                    (float4*)p.saved_cells + (2 * block + half) * THREADS + me.index;
-                int j = COLUMNS * half;
-                __stcs(saved_cells,
-                       float4{cells[j][0], cells[j][1], cells[j + 1][0], cells[j + 1][1]});
+            for (int e = 0; e < 2; e++) {
+                rounded[0][j][e] = pack_bfloat16(sums[0][j][e], sums[0][j][2 + e]);
+                rounded[1][j][e] = pack_bfloat16(sums[1][j][e], sums[1][j][2 + e]);
             }
+        if (p.saved_gates) {
+            long long first =
+                COLUMNS * saved_block(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank) +
+                G::FIRST_COLUMN;
 #pragma unroll
-            for (int j = 0; j < COLUMNS; j++)
+            for (int j = 0; j < C; j++) {
+                long long at = (first + j) * THREADS + me.index;
+                const float (&cell)[2] = cells[G::FIRST_COLUMN + j];
+                __stcs((uint4*)p.saved_gates + at, uint4{rounded[0][j][0], rounded[1][j][0],
+                                                         rounded[0][j][1], rounded[1][j][1]});
+                __stcs((float2*)p.saved_cells + at, float2{cell[0], cell[1]});
+            }
+        }
 #pragma unroll
-                for (int e = 0; e < 2; e++) {
-                    float& cell = cells[COLUMNS * half + j][e];
-                    float input = sigmoid(low_half(rounded[0][j][e]));
-                    float forget = sigmoid(high_half(rounded[0][j][e]));
-                    float candidate = tanh_of(low_half(rounded[1][j][e]));
-                    float output = sigmoid(high_half(rounded[1][j][e]));
-                    float after = forget * cell + input * candidate;
-                    Bits value = (Bits)pack_bfloat16(output * tanh_of(after), 0.f);
-                    bool is_reset = resets >> (first + 8 * j + e) & 1;
-                    int lane = first + 8 * j + 2 * me.q + e;
-                    memory.output[t & 1][lane][me.unit] = value;
-                    memory.next_hidden[t & 1][lane][me.unit] = is_reset ? (Bits)0 : value;
-                    cell = is_reset ? 0.f : after;
-                }
-            if (half)
-                wait_for_copies<1>();
-            __syncthreads();
-            // half of the threads send the next step's inputs, the others write outputs
-            int lane = first + (me.index >> 3 & 15), part = 8 * (me.index & 7);
-            bool sends = me.index < THREADS / 2;
+        for (int j = 0; j < C; j++)
+#pragma unroll
+            for (int e = 0; e < 2; e++) {
+                float& cell = cells[G::FIRST_COLUMN + j][e];
+                float input = sigmoid(low_half(rounded[0][j][e]));
+                float forget = sigmoid(high_half(rounded[0][j][e]));
+                float candidate = tanh_of(low_half(rounded[1][j][e]));
+                float output = sigmoid(high_half(rounded[1][j][e]));
+                float after = forget * cell + input * candidate;
+                Bits value = (Bits)pack_bfloat16(output * tanh_of(after), 0.f);
+                bool is_reset = resets >> (G::FIRST_LANE + 8 * j + e) & 1;
+                int lane = G::FIRST_LANE + 8 * j + 2 * me.q + e;
+                memory.output[t & 1][lane][me.unit] = value;
+                memory.next_hidden[t & 1][lane][me.unit] = is_reset ? (Bits)0 : value;
+                cell = is_reset ? 0.f : after;
+            }
+        if (G::NUMBER)
+            wait_for_copies<1>();
+        __syncthreads();
+        // the first threads send the next step's inputs, the others write outputs
+        constexpr int WORDS = G::LANES * UNITS / 8;
+        for (int i = me.index; i < 2 * WORDS; i += THREADS) {
+            bool sends = i < WORDS;
+            int word = sends ? i : i - WORDS, lane = G::FIRST_LANE + (word >> 3);
+            int part = 8 * (word & 7);
             bool exists = first_lane + lane < n_lanes;
             long long at = ((long long)t * n_lanes + first_lane + lane) * W + rank * UNITS + part;
             if (sends && !is_last) {
                 uint4 value = *(const uint4*)&memory.next_hidden[t & 1][lane][part];
                 const Bits* target = &memory.hidden[(t + 1) & 1][rank][lane][part];
-                Arrivals* arrivals = &memory.arrivals[(t + 1) & 1][half];
+                Arrivals* arrivals = &memory.arrivals[(t + 1) & 1][G::NUMBER];
 #pragma unroll
                 for (int other = 0; other < RANKS; other++)
                     send(address_in(target, other), value, address_in(arrivals, other));
@@ -256,9 +281,14 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
             } else if (!sends && exists)
                 *(uint4*)(outputs + at) = *(const uint4*)&memory.output[t & 1][lane][part];
         }
+    };
+    for (int t = 0; t < n_steps; t++) {
+        begin_gates(t + 2);
+        run(t, Group<0>());
+        run(t, Group<1>());
     }
 #pragma unroll
-    for (int j = 0; j < 2 * COLUMNS; j++)
+    for (int j = 0; j < COLUMNS; j++)
 #pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
@@ -270,22 +300,25 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
 
 // ---- Backward ----
 
-typedef float Parts[UNITS][HALF + PAD];  // of the sums for a block's units and half of the lanes
+// The sums for a block's units and a group's lanes. Rows are 24 numbers apart for both groups, so
+// that the threads of half a warp write to different banks.
+typedef float Parts[UNITS][Group<0>::LANES];
+static_assert(Group<0>::LANES == 24);
 
 template <int W>
 struct BackwardMemory {
     static constexpr int RANKS = W / UNITS;
-    Parts parts[2][2][RANKS];  // of even and odd steps, of both halves, by the block that sends
+    Parts parts[2][2][RANKS];  // of even and odd steps, of both groups, by the block that sends
     Bits d_gates[LANES][GATES + PAD];
     Bits d_output[2][LANES][UNITS + PAD];
     Arrivals arrivals[2][2];
-    unsigned int resets[MAX_STEPS];
+    Resets resets[MAX_STEPS];
 };
 
 template <int W>
 DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     constexpr int RANKS = W / UNITS;
-    constexpr int SENT = UNITS * HALF * (int)sizeof(float);
+    constexpr int SENT = UNITS * (int)sizeof(float);  // by a block, per lane
     static_assert(W == 256, "a warp multiplies two tiles of 16 units");
     BackwardMemory<W>& memory = *(BackwardMemory<W>*)shared_memory;
     Thread me = this_thread();
@@ -298,12 +331,13 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
     Bits* d_gates = (Bits*)p.d_gates + policy * n_steps * n_lanes * (4 * W);
 
     auto begin_d_output = [&](int t) {
-        if (t >= 0) {
-            int lane = me.index >> 3, part = 8 * (me.index & 7);
-            long long row = (long long)t * n_lanes + min(first_lane + lane, last_lane);
-            begin_copy(&memory.d_output[t & 1][lane][part],
-                       d_outputs + row * W + rank * UNITS + part);
-        }
+        if (t >= 0)
+            for (int i = me.index; i < LANES * UNITS / 8; i += THREADS) {
+                int lane = i >> 3, part = 8 * (i & 7);
+                long long row = (long long)t * n_lanes + min(first_lane + lane, last_lane);
+                begin_copy(&memory.d_output[t & 1][lane][part],
+                           d_outputs + row * W + rank * UNITS + part);
+            }
         end_group();
     };
     begin_d_output(n_steps - 1);
@@ -323,154 +357,165 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
                                                                 rank * UNITS + i % UNITS);
             }
 
-    float d_cells[2 * COLUMNS][2], d_bias[4] = {0.f, 0.f, 0.f, 0.f};
+    float d_cells[COLUMNS][2], d_bias[4] = {0.f, 0.f, 0.f, 0.f};
 #pragma unroll
-    for (int j = 0; j < 2 * COLUMNS; j++)
+    for (int j = 0; j < COLUMNS; j++)
 #pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
             d_cells[j][e] = lane < n_lanes ? p.d_cell[(lanes + lane) * W + unit] : 0.f;
         }
-    uint4 gates[2][COLUMNS];  // of both halves, of the next step to go back through
-    float4 cells[2];
-    auto load_saved = [&](int t, int half) {
+    // What was saved of the next step to go back through
+    uint4 gates[COLUMNS];
+    float2 cells[COLUMNS];
+    auto load_saved = [&](int t, auto group) {
+        typedef decltype(group) G;
         if (t < 0)
             return;
-        long long block = saved_block(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank);
-        const uint4* saved =
-            (const uint4*)p.saved_gates + (4 * block + COLUMNS * half) * THREADS + me.index;
+        long long first =
+            COLUMNS * saved_block(policy, t, n_steps, cluster, p.n_clusters, RANKS, rank);
 #pragma unroll
-        for (int j = 0; j < COLUMNS; j++)
-            gates[half][j] = __ldcs(saved + j * THREADS);
-        cells[half] =
-            __ldcs((const float4*)p.saved_cells + (2 * block + half) * THREADS + me.index);
+        for (int j = G::FIRST_COLUMN; j < G::FIRST_COLUMN + G::COLUMNS; j++) {
+            long long at = (first + j) * THREADS + me.index;
+            gates[j] = __ldcs((const uint4*)p.saved_gates + at);
+            cells[j] = __ldcs((const float2*)p.saved_cells + at);
+        }
     };
-    load_saved(n_steps - 1, 0);
-    load_saved(n_steps - 1, 1);
+    load_saved(n_steps - 1, Group<0>());
+    load_saved(n_steps - 1, Group<1>());
     read_resets(memory.resets, reset, n_steps, n_lanes, first_lane, me);
     if (!me.index) {
-        for (int i = 0; i < 4; i++) {
-            init(&memory.arrivals[i / 2][i % 2]);
-            expect(&memory.arrivals[i / 2][i % 2], RANKS * SENT);
+        for (int i = 0; i < 2; i++) {
+            init(&memory.arrivals[i][0]);
+            expect(&memory.arrivals[i][0], RANKS * SENT * Group<0>::LANES);
+            init(&memory.arrivals[i][1]);
+            expect(&memory.arrivals[i][1], RANKS * SENT * Group<1>::LANES);
         }
     }
     wait_for_copies<0>();
     cluster_barrier();
 
     // The gradient of each lane's recurrent input of step t, added up in the order of the blocks
-    float d_hiddens[COLUMNS][2];
-    auto receive = [&](int t, int half) {
-        Arrivals* arrivals = &memory.arrivals[t & 1][half];
+    auto receive = [&](float (&d_hiddens)[COLUMNS][2], int t, auto group) {
+        typedef decltype(group) G;
+        Arrivals* arrivals = &memory.arrivals[t & 1][G::NUMBER];
         wait_for(arrivals, (n_steps - 1 - t) >> 1);
         if (!me.index)
-            expect(arrivals, RANKS * SENT);
+            expect(arrivals, RANKS * SENT * G::LANES);
 #pragma unroll
-        for (int j = 0; j < COLUMNS; j++) {
-            d_hiddens[j][0] = d_hiddens[j][1] = 0.f;
+        for (int j = 0; j < G::COLUMNS; j++) {
+            float2 sum = {0.f, 0.f};
 #pragma unroll
             for (int other = 0; other < RANKS; other++) {
-                float2 pair =
-                    *(const float2*)&memory.parts[t & 1][half][other][me.unit][8 * j + 2 * me.q];
-                d_hiddens[j][0] += pair.x;
-                d_hiddens[j][1] += pair.y;
+                const Parts& parts = memory.parts[t & 1][G::NUMBER][other];
+                float2 pair = *(const float2*)&parts[me.unit][8 * j + 2 * me.q];
+                sum.x += pair.x;
+                sum.y += pair.y;
             }
+            d_hiddens[j][0] = sum.x;
+            d_hiddens[j][1] = sum.y;
         }
     };
 
-    for (int t = n_steps - 1; t >= 0; t--) {
-        begin_d_output(t - 1);
+    auto run = [&](int t, auto group) {
+        typedef decltype(group) G;
+        constexpr int C = G::COLUMNS;
         bool has_next = t + 1 < n_steps;
-        unsigned int resets = has_next ? memory.resets[t + 1] >> (2 * me.q) : 0u;
+        Resets resets = has_next ? memory.resets[t + 1] >> (2 * me.q) : 0;
+        float d_hiddens[COLUMNS][2];
+        if (has_next)
+            receive(d_hiddens, t + 1, group);
 #pragma unroll
-        for (int half = 0; half < 2; half++) {
-            int first = HALF * half;  // lane of this half
-            if (has_next)
-                receive(t + 1, half);
-#pragma unroll
-            for (int j = 0; j < COLUMNS; j++)
-#pragma unroll
-                for (int e = 0; e < 2; e++) {
-                    int lane = first + 8 * j + 2 * me.q + e;
-                    unsigned int one = e ? gates[half][j].z : gates[half][j].x;
-                    unsigned int two = e ? gates[half][j].w : gates[half][j].y;
-                    float4 four = cells[half];
-                    float before = j ? (e ? four.w : four.z) : (e ? four.y : four.x);
-                    float input = sigmoid(low_half(one)), forget = sigmoid(high_half(one));
-                    float candidate = tanh_of(low_half(two)), output = sigmoid(high_half(two));
-                    float after = tanh_of(forget * before + input * candidate);
-                    Bits bits = memory.d_output[t & 1][lane][me.unit];
-                    float d_output = __uint_as_float((unsigned int)bits << 16);
-                    float d_cell = d_cells[COLUMNS * half + j][e];
-                    if (has_next) {
-                        bool cut = resets >> (first + 8 * j + e) & 1;
-                        d_output += cut ? 0.f : d_hiddens[j][e];
-                        d_cell = cut ? 0.f : d_cell;
-                    }
-                    d_cell += d_output * output * (1.f - after * after);
-                    unsigned int d_one = pack_bfloat16(d_cell * candidate * input * (1.f - input),
-                                                       d_cell * before * forget * (1.f - forget));
-                    unsigned int d_two =
-                        pack_bfloat16(d_cell * input * (1.f - candidate * candidate),
-                                      d_output * after * output * (1.f - output));
-                    d_cells[COLUMNS * half + j][e] = d_cell * forget;
-                    if (first_lane + lane >= n_lanes)
-                        d_one = d_two = 0u;
-                    d_bias[0] += low_half(d_one);
-                    d_bias[1] += high_half(d_one);
-                    d_bias[2] += low_half(d_two);
-                    d_bias[3] += high_half(d_two);
-                    Bits* row = &memory.d_gates[lane][me.unit];
-                    row[0] = (Bits)d_one;
-                    row[UNITS] = (Bits)(d_one >> 16);
-                    row[2 * UNITS] = (Bits)d_two;
-                    row[3 * UNITS] = (Bits)(d_two >> 16);
-                }
-            load_saved(t - 1, half);
-            if (half)
-                wait_for_copies<0>();
-            __syncthreads();
-            float sums[2][COLUMNS][4] = {};
-            multiply<GATES, GATES>(sums, weights, &memory.d_gates[first][0], 0, me);
-#pragma unroll
-            for (int tile = 0; tile < 2; tile++)
-#pragma unroll
-                for (int upper = 0; upper < 2; upper++) {
-                    int row = 32 * me.warp + 16 * tile + me.g + 8 * upper;
-                    const float* target = &memory.parts[t & 1][half][rank][row % UNITS][2 * me.q];
-                    unsigned int there = address_in(target, row / UNITS);
-                    unsigned int arrivals = address_in(&memory.arrivals[t & 1][half], row / UNITS);
-#pragma unroll
-                    for (int j = 0; j < COLUMNS; j++)
-                        send(there + 8 * j * (int)sizeof(float), sums[tile][j][2 * upper],
-                             sums[tile][j][2 * upper + 1], arrivals);
-                }
-#pragma unroll
-            for (int n = 0; n < 2; n++) {
-                int i = me.index + n * THREADS, lane = first + (i >> 5), gate = i >> 3 & 3;
-                int part = 8 * (i & 7);
-                long long row = (long long)t * n_lanes + first_lane + lane;
-                if (first_lane + lane < n_lanes)
-                    *(uint4*)(d_gates + row * (4 * W) + gate * W + rank * UNITS + part) =
-                        *(const uint4*)&memory.d_gates[lane][gate * UNITS + part];
-            }
-        }
-    }
-#pragma unroll
-    for (int half = 0; half < 2; half++) {
-        receive(0, half);
-#pragma unroll
-        for (int j = 0; j < COLUMNS; j++)
+        for (int j = 0; j < C; j++)
 #pragma unroll
             for (int e = 0; e < 2; e++) {
-                int lane = first_lane + HALF * half + 8 * j + 2 * me.q + e;
-                if (lane < n_lanes) {
-                    bool cut = memory.resets[0] >> (lane - first_lane) & 1;
-                    long long at = (lanes + lane) * W + unit;
+                constexpr int FIRST = G::FIRST_COLUMN;
+                int lane = G::FIRST_LANE + 8 * j + 2 * me.q + e;
+                unsigned int one = e ? gates[FIRST + j].z : gates[FIRST + j].x;
+                unsigned int two = e ? gates[FIRST + j].w : gates[FIRST + j].y;
+                float before = e ? cells[FIRST + j].y : cells[FIRST + j].x;
+                float input = sigmoid(low_half(one)), forget = sigmoid(high_half(one));
+                float candidate = tanh_of(low_half(two)), output = sigmoid(high_half(two));
+                float after = tanh_of(forget * before + input * candidate);
+                Bits bits = memory.d_output[t & 1][lane][me.unit];
+                float d_output = __uint_as_float((unsigned int)bits << 16);
+                float d_cell = d_cells[FIRST + j][e];
+                if (has_next) {
+                    bool cut = resets >> (G::FIRST_LANE + 8 * j + e) & 1;
+                    d_output += cut ? 0.f : d_hiddens[j][e];
+                    d_cell = cut ? 0.f : d_cell;
+                }
+                d_cell += d_output * output * (1.f - after * after);
+                unsigned int d_one = pack_bfloat16(d_cell * candidate * input * (1.f - input),
+                                                   d_cell * before * forget * (1.f - forget));
+                unsigned int d_two = pack_bfloat16(d_cell * input * (1.f - candidate * candidate),
+                                                   d_output * after * output * (1.f - output));
+                d_cells[FIRST + j][e] = d_cell * forget;
+                if (first_lane + lane >= n_lanes)
+                    d_one = d_two = 0u;
+                d_bias[0] += low_half(d_one);
+                d_bias[1] += high_half(d_one);
+                d_bias[2] += low_half(d_two);
+                d_bias[3] += high_half(d_two);
+                Bits* row = &memory.d_gates[lane][me.unit];
+                row[0] = (Bits)d_one;
+                row[UNITS] = (Bits)(d_one >> 16);
+                row[2 * UNITS] = (Bits)d_two;
+                row[3 * UNITS] = (Bits)(d_two >> 16);
+            }
+        load_saved(t - 1, group);
+        if (G::NUMBER)
+            wait_for_copies<0>();
+        __syncthreads();
+        float sums[2][C][4] = {};
+        multiply<GATES, GATES>(sums, weights, &memory.d_gates[G::FIRST_LANE][0], 0, me);
+#pragma unroll
+        for (int tile = 0; tile < 2; tile++)
+#pragma unroll
+            for (int upper = 0; upper < 2; upper++) {
+                int row = 32 * me.warp + 16 * tile + me.g + 8 * upper;
+                const float* target = &memory.parts[t & 1][G::NUMBER][rank][row % UNITS][2 * me.q];
+                unsigned int there = address_in(target, row / UNITS);
+                unsigned int arrivals = address_in(&memory.arrivals[t & 1][G::NUMBER], row / UNITS);
+#pragma unroll
+                for (int j = 0; j < C; j++)
+                    send(there + 8 * j * (int)sizeof(float), sums[tile][j][2 * upper],
+                         sums[tile][j][2 * upper + 1], arrivals);
+            }
+#pragma unroll
+        for (int n = 0; n < G::LANES * GATES / 8 / THREADS; n++) {
+            int i = me.index + n * THREADS, lane = G::FIRST_LANE + (i >> 5), gate = i >> 3 & 3;
+            int part = 8 * (i & 7);
+            long long row = (long long)t * n_lanes + first_lane + lane;
+            if (first_lane + lane < n_lanes)
+                *(uint4*)(d_gates + row * (4 * W) + gate * W + rank * UNITS + part) =
+                    *(const uint4*)&memory.d_gates[lane][gate * UNITS + part];
+        }
+    };
+    for (int t = n_steps - 1; t >= 0; t--) {
+        begin_d_output(t - 1);
+        run(t, Group<0>());
+        run(t, Group<1>());
+    }
+    auto end = [&](auto group) {
+        typedef decltype(group) G;
+        float d_hiddens[COLUMNS][2];
+        receive(d_hiddens, 0, group);
+#pragma unroll
+        for (int j = 0; j < G::COLUMNS; j++)
+#pragma unroll
+            for (int e = 0; e < 2; e++) {
+                int lane = G::FIRST_LANE + 8 * j + 2 * me.q + e;
+                if (first_lane + lane < n_lanes) {
+                    bool cut = memory.resets[0] >> lane & 1;
+                    long long at = (lanes + first_lane + lane) * W + unit;
                     p.d_last_output[at] = cut ? 0.f : d_hiddens[j][e];
-                    p.d_last_cell[at] = cut ? 0.f : d_cells[COLUMNS * half + j][e];
+                    p.d_last_cell[at] = cut ? 0.f : d_cells[G::FIRST_COLUMN + j][e];
                 }
             }
-    }
+    };
+    end(Group<0>());
+    end(Group<1>());
 #pragma unroll
     for (int gate = 0; gate < 4; gate++) {
         float sum = d_bias[gate];

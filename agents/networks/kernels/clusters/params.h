@@ -14,8 +14,8 @@ struct LstmSequenceForwardParams {
     void* outputs;               // (P, T, B, W)
     void* hiddens;               // (P, T, B, W), each step's recurrent input
     float* cell;                 // (P, B, W), after the sequence
-    void* saved_gates;           // (P, T, C, S, 4, 256, 8), before activation; null: not saved
-    float* saved_cells;          // (P, T, C, S, 2, 256, 4), each step's input
+    void* saved_gates;           // (P, T, C, S, 5, 256, 8), before activation; null: not saved
+    float* saved_cells;          // (P, T, C, S, 5, 256, 2), each step's input
     int n_policies;
     int n_steps;
     int n_lanes;

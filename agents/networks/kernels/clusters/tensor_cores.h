@@ -28,12 +28,20 @@ DEVICE float sigmoid(float x) { return 0.5f * tanh_of(0.5f * x) + 0.5f; }
 
 // ---- Tensor cores ----
 
-// Loads four matrices of 8 x 8 bfloat16. Lanes 8 i to 8 i + 7 of the warp give the rows of matrix
-// i.
-DEVICE void load_matrices(unsigned int (&parts)[4], const void* row) {
+// Loads two matrices of 8 x 8 bfloat16. Lanes 8 i to 8 i + 7 of the warp give the rows of matrix i.
+DEVICE void load_matrices(unsigned int (&parts)[2], const void* row) {
+    unsigned int address = (unsigned int)__cvta_generic_to_shared(row);
+    asm volatile("ldmatrix.sync.aligned.m8n8.x2.shared.b16 {%0, %1}, [%2];"
+                 : "=r"(parts[0]), "=r"(parts[1])
+                 : "r"(address)
+                 : "memory");
+}
+
+// Loads four such matrices.
+DEVICE void load_matrices(unsigned int (&first)[2], unsigned int (&second)[2], const void* row) {
     unsigned int address = (unsigned int)__cvta_generic_to_shared(row);
     asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
-                 : "=r"(parts[0]), "=r"(parts[1]), "=r"(parts[2]), "=r"(parts[3])
+                 : "=r"(first[0]), "=r"(first[1]), "=r"(second[0]), "=r"(second[1])
                  : "r"(address)
                  : "memory");
 }
