@@ -23,6 +23,7 @@ from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
+from megastep.agents.storage.copies import select_lanes
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
 from megastep.arrdict import arrdict
 from megastep.settings import MAX_ENVS, checked
@@ -138,7 +139,7 @@ class PPO(GradientLearner):
             generator = self.generator.on(self.device)
             order = torch.rand(rollout.n_lanes, generator=generator, device=self.device).argsort()
             for lanes in order.tensor_split(self.n_minibatches):
-                selected = estimates.map(torch.index_select, 1, lanes)
+                selected = dict(zip(estimates, select_lanes([*estimates.values()], lanes)))
                 batch = arrdict({**rollout.sequences(lanes, _PARTS), **selected})
                 if self.normalise_advantage == "minibatch":
                     batch["advantages"] = pooled_normalise(batch.advantages, batch.valid)

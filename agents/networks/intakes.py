@@ -9,7 +9,6 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.distributed.pooling import Moments
 from megastep.agents.networks import intake_cpu
 from megastep.agents.networks.encoders import Flat, make_encoder
 from megastep.agents.networks.layers import linear, normalised
@@ -105,21 +104,10 @@ class ConcatIntake(nn.Module):
             features.append(features[0].new_zeros((*features[0].shape[:-1], self.n_padding)))
         return torch.cat(features, dim=-1)
 
-    def moments(
-        self, obs: Tree, is_counted: torch.Tensor | bool = True
-    ) -> list[tuple[RunningNorm, Moments]]:
-        """Returns each normalisation with the moments of its observations, for `update_norms`.
-
-        Args:
-            obs: (B, ...) per leaf.
-            is_counted: () or (B,) bool, lanes to count.
-        """
-        pairs = zip(self._leaves(obs), self.norms, strict=True)
-        return [
-            (norm, norm.moments(leaf, is_counted))
-            for leaf, norm in pairs
-            if isinstance(norm, RunningNorm)
-        ]
+    def normalised_leaves(self, obs: Tree) -> list[tuple[RunningNorm, torch.Tensor]]:
+        """Returns each normalisation with its leaf, for `update_norms`."""
+        pairs = zip(self.norms, self._leaves(obs), strict=True)
+        return [(norm, leaf) for norm, leaf in pairs if isinstance(norm, RunningNorm)]
 
     def _leaves(self, obs):
         values = spaces.leaves(obs)

@@ -220,7 +220,10 @@ class Policy(nn.Module):
         only once.
         """
         return ComputeDtype(
-            self.device.type, torch.bfloat16, enabled=self.bf16 and self.device.type == "cuda"
+            self.device.type,
+            torch.bfloat16,
+            enabled=self.bf16 and self.device.type == "cuda",
+            weights=self.parameters,
         )
 
     def actor(self) -> "Policy":
@@ -245,7 +248,7 @@ class Policy(nn.Module):
             privileged: (B, ...) per leaf, for an asymmetric critic.
             is_counted: () or (B,) bool, lanes to count.
         """
-        pairs = self.intake.moments(obs, is_counted)
+        pairs = self.intake.normalised_leaves(obs)
         if self.privileged_space:
-            pairs += self.critic.intake.moments(privileged, is_counted)
-        update_norms(pairs)
+            pairs += self.critic.intake.normalised_leaves(privileged)
+        update_norms(pairs, is_counted)

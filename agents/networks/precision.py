@@ -1,6 +1,8 @@
 """The dtype that layers compute in."""
 
+import math
 import threading
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -13,17 +15,32 @@ class _Casts(threading.local):
 
     def __init__(self):
         self.by_weight: dict[tuple, tuple[torch.Tensor, torch.Tensor]] = {}
+        self.weights: Callable[[], Iterable[torch.Tensor]] = tuple
 
 
 _CASTS = _Casts()
+_MULTIPLE = 8  # rows that tensor cores want; the only padding of weights that are cast together
 
 
 class ComputeDtype(torch.autocast):
     """Autocast that also remembers what `cast` returned: until the outermost context ends, each
     weight is cast only once. Weights must not change inside it.
+
+    Args:
+        args: autocast's arguments.
+        weights: returns weights that are cast together, on a GPU, once one of them is needed.
+        options: autocast's arguments.
     """
 
+    def __init__(
+        self, *args: Any, weights: Callable[[], Iterable[torch.Tensor]] = tuple, **options: Any
+    ):
+        super().__init__(*args, **options)
+        self._weights = weights
+
     def __enter__(self) -> Any:
+        if not _CASTS.depth:
+            _CASTS.weights = self._weights
         _CASTS.depth += 1
         return super().__enter__()
 
@@ -46,6 +63,8 @@ def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.T
     if weight.dtype == dtype and not n_padding:
         return weight
     key = id(weight), dtype, multiple
+    if key not in _CASTS.by_weight and _CASTS.depth and weight.is_cuda:
+        _cast_together(weight, dtype)
     if key in _CASTS.by_weight:
         return _CASTS.by_weight[key][1]
     result = weight.detach().to(dtype)
@@ -55,6 +74,25 @@ def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.T
         # the weight is kept, so that no other gets its id
         _CASTS.by_weight[key] = weight, result
     return result
+
+
+@torch.no_grad()
+def _cast_together(weight, dtype):
+    """Casts all weights of the context, if this is one of them: two kernels instead of one or two
+    for each.
+    """
+    weights = [w for w in _CASTS.weights() if w.dim() and w.dtype == weight.dtype and w.is_cuda]
+    if not any(w is weight for w in weights):
+        return
+    shapes = [(len(w) + -len(w) % _MULTIPLE, *w.shape[1:]) for w in weights]
+    sizes = [math.prod(shape) for shape in shapes]
+    padded = torch.zeros(sum(sizes), dtype=dtype, device=weight.device).split(sizes)
+    padded = [part.view(shape) for part, shape in zip(padded, shapes, strict=True)]
+    plain = [part[: len(w)] for part, w in zip(padded, weights, strict=True)]
+    torch._foreach_copy_(plain, weights)
+    for w, part, whole in zip(weights, plain, padded, strict=True):
+        _CASTS.by_weight[id(w), dtype, 1] = w, part
+        _CASTS.by_weight[id(w), dtype, _MULTIPLE] = w, whole
 
 
 def compute_dtype(weight: torch.Tensor) -> torch.dtype:

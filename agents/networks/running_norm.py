@@ -10,6 +10,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.distributed.pooling import Moments, pool_moments
+from megastep.agents.networks.kernels import layers as kernels
 from megastep.types import Space
 
 
@@ -67,11 +68,60 @@ class RunningNorm(nn.Module):
         store_if(is_stored, [(self.mean, mean), (self.scale, scale), (self.count, count)])
 
 
-def update_norms(pairs: Sequence[tuple[RunningNorm, Moments]]) -> None:
-    """Adds to each norm's statistics its moments, pooled over the ranks in one operation."""
-    pooled = pool_moments(*(moments for _, moments in pairs))
-    for (norm, _), moments in zip(pairs, pooled, strict=True):
+@torch.no_grad()
+def update_norms(
+    pairs: Sequence[tuple[RunningNorm, torch.Tensor]], is_counted: torch.Tensor | bool = True
+) -> None:
+    """Adds observations to the statistics of their norms, those of all ranks together in one
+    operation. On a GPU in two kernels.
+
+    Args:
+        pairs: norms, with the observations (B, ...) of each.
+        is_counted: () or (B,) bool, lanes to count.
+    """
+    if not pairs:
+        return
+    is_fused = all(_is_fused(norm, obs) for norm, obs in pairs)
+    if is_fused:
+        all_moments = _moments_on_gpu(pairs, is_counted)
+    else:
+        all_moments = [norm.moments(obs, is_counted) for norm, obs in pairs]
+    pooled = pool_moments(*all_moments)
+    norms = [norm for norm, _ in pairs]
+    if is_fused:
+        _add_on_gpu(norms, pooled)
+        return
+    for norm, moments in zip(norms, pooled, strict=True):
         norm.add(*moments)
+
+
+def _is_fused(norm, obs):
+    is_float = obs.dtype in (torch.float16, torch.float32)
+    return obs.is_cuda and is_float and obs.is_contiguous() and norm.mean.dtype == torch.float32
+
+
+def _moments_on_gpu(pairs, is_counted):
+    """Returns `RunningNorm.moments` of each pair, in one kernel for up to `MAX_LEAVES`."""
+    moments = []
+    for start in range(0, len(pairs), kernels.MAX_LEAVES):
+        some = pairs[start : start + kernels.MAX_LEAVES]
+        n_lanes, means, variances = kernels.moments(
+            [obs.flatten(1) for _, obs in some],
+            [norm.mean.numel() for norm, _ in some],
+            torch.as_tensor(is_counted, device=some[0][1].device).expand(len(some[0][1])),
+        )
+        moments += [
+            (n_lanes, mean.view_as(norm.mean), variance.view_as(norm.mean))
+            for (norm, _), mean, variance in zip(some, means, variances, strict=True)
+        ]
+    return moments
+
+
+def _add_on_gpu(norms, all_moments):
+    """Does `RunningNorm.add` for each norm, in one kernel for up to `MAX_LEAVES`."""
+    for start in range(0, len(norms), kernels.MAX_LEAVES):
+        some = slice(start, start + kernels.MAX_LEAVES)
+        kernels.add_moments(norms[some], all_moments[some])
 
 
 def mix_moments(

@@ -1,6 +1,7 @@
-"""Copies of many tensors at once."""
+"""Copies and selections of many tensors at once."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import torch
@@ -11,6 +12,7 @@ from megastep.kernels.build.program import Program
 PROGRAM = Program(Path(__file__).parent / "kernels")
 _MAX_COPIES = PROGRAM.constants["MAX_COPIES"]
 _BLOCK_BYTES = 16 * BLOCK * PROGRAM.constants["COPY_WORDS"]
+_MAX_SELECTED = PROGRAM.constants["MAX_SELECTED"]
 _MAX_BYTES = 2**31
 
 
@@ -52,3 +54,52 @@ def _is_plain_copy(target, source):
         and target.is_contiguous()
         and target.numel() * target.element_size() < _MAX_BYTES
     )
+
+
+def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[torch.Tensor]:
+    """Returns `tensor.index_select(1, lanes)` of each tensor, on a GPU in one kernel.
+
+    Args:
+        tensors: (T, B, ...) each, T may differ.
+        lanes: (M,) int64.
+    """
+    results = {}
+    fused = [i for i, tensor in enumerate(tensors) if tensor.is_cuda and _can_select(tensor)]
+    for start in range(0, len(fused), _MAX_SELECTED):
+        chosen = fused[start : start + _MAX_SELECTED]
+        rows, largest = [], 0
+        for i in chosen:
+            tensor = tensors[i]
+            n_steps, _, *rest = tensor.shape
+            results[i] = tensor.new_empty(n_steps, len(lanes), *rest)
+            n_bytes = math.prod(rest) * tensor.element_size()
+            addresses = n_bytes | tensor.data_ptr() | results[i].data_ptr()
+            word_size = next(size for size in (16, 8, 4, 1) if not addresses % size)
+            rows.append(
+                PROGRAM.params.SelectParams(
+                    target=results[i].data_ptr(),
+                    source=tensor.data_ptr(),
+                    n_steps=n_steps,
+                    n_words=n_bytes // word_size,
+                    word_size=word_size,
+                )
+            )
+            largest = max(largest, n_steps * len(lanes) * (n_bytes // word_size))
+        struct = PROGRAM.params.SelectLanesParams(
+            tensors=b"".join(rows),
+            lanes=lanes.data_ptr(),
+            n_lanes=tensors[chosen[0]].shape[1],
+            n_selected=len(lanes),
+        )
+        n_blocks = -(-largest // BLOCK), len(rows)
+        if largest:
+            launch_blocks(PROGRAM, "select_lanes", struct, lanes.device, n_blocks, BLOCK)
+    return [
+        results[i] if i in results else tensor.index_select(1, lanes)
+        for i, tensor in enumerate(tensors)
+    ]
+
+
+def _can_select(tensor):
+    n_bytes = tensor.numel() * tensor.element_size()
+    return tensor.is_contiguous() and 0 < n_bytes < _MAX_BYTES

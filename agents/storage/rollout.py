@@ -9,11 +9,12 @@ import math
 from collections.abc import Sequence
 
 import torch
+from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
-from megastep.agents.storage.copies import copy_all
+from megastep.agents.storage.copies import copy_all, select_lanes
 from megastep.arrdict import arrdict, clone
 from megastep.dotdict import mapping
 from megastep.types import Env, Space, Tree, n_lanes, optional
@@ -218,10 +219,13 @@ class Rollout:
             logprobs, reward, terminal and truncated, each (T, M, ...); and state (M, ...), the
             hidden state before row 0.
         """
-        select = mapping(lambda leaf: leaf.index_select(1, lanes))
-        parts = {name: getattr(self, name) for name in names}
-        batch = arrdict({name: select(part) for name, part in parts.items() if part is not None})
-        batch["state"] = _select(self.state, lanes)
+        parts = arrdict({name: getattr(self, name) for name in names})
+        parts = arrdict({name: part for name, part in parts.items() if part is not None})
+        # the hidden state as one step
+        parts["state"] = mapping(lambda leaf: leaf[None])(self.state)
+        leaves, spec = tree_flatten(parts)
+        batch = tree_unflatten(select_lanes(leaves, lanes), spec)
+        batch["state"] = mapping(lambda leaf: leaf[0])(batch["state"])
         return batch
 
 

@@ -10,7 +10,8 @@ from megastep.agents.networks.running_norm import RunningNorm, update_norms
 
 
 def update(norm, *observations):
-    update_norms([(norm, norm.moments(*observations))])
+    obs, *is_counted = observations
+    update_norms([(norm, obs)], *is_counted)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
@@ -45,3 +46,27 @@ def test_batches_have_equal_weight():
         update(norm, batch)
     torch.testing.assert_close(norm.mean, batches.mean((0, 1)))
     torch.testing.assert_close(norm.scale, batches.std((0, 1), correction=0))
+
+
+@pytest.mark.cuda
+def test_gpu_adds_the_same_moments_as_the_cpu():
+    """Images, vectors, a NaN in a lane that does not count, and another in a leaf of its own."""
+    space = [spaces.MultiImage(1, 3, 2, 8), spaces.MultiVector(1, 5), spaces.MultiVector(2, 3)]
+    norms = [RunningNorm(leaf) for leaf in space]
+    on_gpu = [RunningNorm(leaf).cuda() for leaf in space]
+    for seed in range(3):
+        torch.manual_seed(seed)
+        obs = [torch.randn(1000, *leaf.shape) * 3 + 1 for leaf in space]
+        obs[0] = obs[0].half()
+        is_counted = torch.rand(1000) < 0.7
+        obs[1][~is_counted] = torch.nan
+        if seed == 1:
+            obs[2][int(is_counted.nonzero()[0])] = torch.nan
+        update_norms(list(zip(norms, obs)), is_counted)
+        update_norms([(norm, leaf.cuda()) for norm, leaf in zip(on_gpu, obs)], is_counted.cuda())
+    update_norms([(norm, leaf.cuda()) for norm, leaf in zip(on_gpu, obs)], False)
+    assert [norm.count.item() for norm in on_gpu] == [3, 3, 2]
+    for norm, other in zip(norms, on_gpu, strict=True):
+        for name in ("mean", "scale", "count"):
+            one, two = getattr(norm, name), getattr(other, name).cpu()
+            torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-5)

@@ -22,8 +22,14 @@ static __device__ __forceinline__ float larger(float size, float value) {
 // first row of its sizes is 0.
 KERNEL sizes(SizesParams p) {
     const SizesTensorParams& tensor = p.tensors[blockIdx.y];
-    unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x, part = thread % SIZES_THREADS;
-    unsigned int n_rows = p.n_steps * p.n_lanes, at = min(thread / SIZES_THREADS, n_rows - 1);
+    bool is_shared = tensor.n_features >= SIZES_THREADS;  // a row, by several threads
+    unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x, n_rows = p.n_steps * p.n_lanes;
+    unsigned int part = is_shared ? thread % SIZES_THREADS : 0;
+    unsigned int at = is_shared ? thread / SIZES_THREADS : thread;
+    if (!is_shared && at >= n_rows)
+        return;
+    bool exists = at < n_rows;
+    at = min(at, n_rows - 1);
     int t = at / p.n_lanes, lane = at % p.n_lanes, source_t = t - (p.n_steps - tensor.n_steps);
     float size = 0.f;
     if (source_t >= 0) {
@@ -41,12 +47,13 @@ KERNEL sizes(SizesParams p) {
                 }
             }
         else
-            for (int i = part; i < tensor.n_features; i += SIZES_THREADS)
+            for (int i = part; i < tensor.n_features; i += is_shared ? SIZES_THREADS : 1)
                 size = larger(size, tensor.is_half ? half_value(halves[i]) : floats[i]);
     }
-    for (int mask = SIZES_THREADS / 2; mask; mask /= 2)
-        size = larger(size, __shfl_xor_sync(~0u, size, mask));
-    if (part)
+    if (is_shared)
+        for (int mask = SIZES_THREADS / 2; mask; mask /= 2)
+            size = larger(size, __shfl_xor_sync(~0u, size, mask));
+    if (part || !exists)
         return;
     int row = t * p.n_tensors + blockIdx.y;
     p.sizes[(long long)row * p.n_lanes + lane] = size;

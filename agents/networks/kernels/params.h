@@ -101,13 +101,39 @@ struct IntakeLeafParams {
 };
 
 struct NormaliseParams {
-    IntakeLeafParams leaves[4];
+    IntakeLeafParams leaves[8];
     const long long* lanes;  // (P, M), the lanes to read; null: all, M = B
     void* features;          // (P, T, M, n_columns) compute
     int n_steps;
     int n_lanes;     // B
     int n_selected;  // M
     int n_columns;   // a multiple of 4; those after the leaves' features are 0
+};
+
+// Statistics of one policy.
+struct MomentsParams {
+    IntakeLeafParams leaves[8];       // without mean and scale
+    const unsigned char* is_counted;  // (B)
+    float* moments;                   // (2, n_statistics), means and variances of all leaves
+    long long* n_counted;             // ()
+    int n_lanes;
+    int n_statistics;
+};
+
+// A leaf's running statistics, and the moments to add to them.
+struct RunningNormParams {
+    float* mean;   // (n)
+    float* scale;  // (n)
+    float* count;  // ()
+    const float* new_mean;
+    const float* new_variance;
+    const long long* n_counted;  // ()
+    int n;
+    float min_scale;
+};
+
+struct AddMomentsParams {
+    RunningNormParams norms[8];
 };
 
 struct BiasGradientParams {

@@ -12,3 +12,18 @@ struct CopyAllParams {
     CopyParams copies[24];
     int n_copies;
 };
+
+struct SelectParams {
+    void* target;        // (T, M, words)
+    const void* source;  // (T, B, words)
+    unsigned int n_steps;
+    unsigned int n_words;  // per step and lane
+    int word_size;         // 1, 4, 8 or 16 bytes
+};
+
+struct SelectLanesParams {
+    SelectParams tensors[16];
+    const long long* lanes;  // (M)
+    unsigned int n_lanes;    // B
+    unsigned int n_selected;  // M
+};
