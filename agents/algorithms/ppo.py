@@ -167,8 +167,6 @@ class PPO(GradientLearner):
         with policy.compute_dtype():  # one, so that weights are cast once
             now = policy.unroll(without_last(rollout.obs), starts, batch.state, lanes)
             logprobs, entropies = policy.output.terms(now.logits, batch.actions)
-            values, errors = policy.value(now.features, privileged, lanes), None
-            if policy.privileged_space:
-                errors = policy.prediction_error(now.features, privileged, lanes)
+            values, errors = policy.value_and_error(now.features, privileged, lanes)
         scale = policy.critic.output.scale
         return ppo_loss(logprobs, entropies, values, errors, batch, scale, self.coefficients)

@@ -47,7 +47,18 @@ class Critic(nn.Module):
             privileged: (..., *shape) or a dict of them; unused by a plain critic.
             lanes: (M,) int64, lanes to select from privileged observations (T, B, ...). None: all.
         """
+        encoded = self.encode(privileged, lanes) if self.is_asymmetric else None
+        return self.from_encoded(features, encoded)
+
+    def encode(self, privileged: Tree, lanes: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns the privileged observations, normalised and encoded, of an asymmetric critic."""
+        return self.intake.encode(privileged, lanes)
+
+    def from_encoded(
+        self, features: torch.Tensor, encoded: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Returns the value from features (..., width) and what `encode` returned."""
         if self.is_asymmetric:
-            encoded = self.intake(privileged, lanes)
-            features = linear((features, encoded), self.hidden, torch.relu)
+            joined = features, self.intake.projected(encoded)
+            features = linear(joined, self.hidden, torch.relu)
         return self.output(features)

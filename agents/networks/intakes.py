@@ -79,7 +79,11 @@ class ConcatIntake(nn.Module):
             obs: (..., *shape) per leaf.
             lanes: (M,) int64, lanes to select from leaves (T, B, ...). None: all.
         """
-        return linear(self.encode(obs, lanes), self.project, self.activation)
+        return self.projected(self.encode(obs, lanes))
+
+    def projected(self, encoded: torch.Tensor) -> torch.Tensor:
+        """Returns the features (..., width) of what `encode` returned."""
+        return linear(encoded, self.project, self.activation)
 
     def encode(self, obs: Tree, lanes: torch.Tensor | None = None) -> torch.Tensor:
         """Returns all leaves, normalised, encoded and concatenated, with columns of zeros at the

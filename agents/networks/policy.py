@@ -208,11 +208,29 @@ class Policy(nn.Module):
             privileged: the world's privileged observations.
             lanes: as for `value`.
         """
-        intake = self.critic.intake
         with self.compute_dtype():
-            with torch.no_grad():
-                target = intake.encode(privileged, lanes)[..., : intake.n_features]
-            predicted = linear(features, self.prediction).float()
+            encoded = self.critic.encode(privileged, lanes)
+            return self._prediction_error(features, encoded)
+
+    def value_and_error(
+        self,
+        features: torch.Tensor,
+        privileged: Tree | None = None,
+        lanes: torch.Tensor | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Returns `value` and `prediction_error`, None without a `privileged_space`, which need the
+        privileged observations encoded once.
+        """
+        with self.compute_dtype():
+            if not self.privileged_space:
+                return self.critic(features), None
+            encoded = self.critic.encode(privileged, lanes)
+            value = self.critic.from_encoded(features, encoded)
+            return value, self._prediction_error(features, encoded)
+
+    def _prediction_error(self, features, encoded):
+        target = encoded[..., : self.critic.intake.n_features].detach()
+        predicted = linear(features, self.prediction).float()
         return (predicted - target).square().mean(-1)
 
     def compute_dtype(self) -> ComputeDtype:

@@ -59,3 +59,24 @@ DEVICE void bias_gradient(const BiasGradientParams& p) {
 
 KERNEL BOUNDS(256) bias_gradient_float32(BiasGradientParams p) { bias_gradient<float, 4>(p); }
 KERNEL BOUNDS(256) bias_gradient_bfloat16(BiasGradientParams p) { bias_gradient<Bfloat16, 8>(p); }
+
+// Adds up rows in a fixed order. A warp handles 32 columns of every eighth row.
+KERNEL BOUNDS(256) sum_rows(SumRowsParams p) {
+    constexpr int WARPS = STRIP_THREADS / WARP;
+    __shared__ float of_warps[WARPS][WARP];
+    int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP, column = WARP * blockIdx.x + lane;
+    const float* rows = p.rows + (long long)blockIdx.y * p.n_rows * p.n_columns;
+    float sum = 0.f;
+    if (column < p.n_columns)
+#pragma unroll 8
+        for (int row = warp; row < p.n_rows; row += WARPS)
+            sum += rows[(long long)row * p.n_columns + column];
+    of_warps[warp][lane] = sum;
+    __syncthreads();
+    if (warp || column >= p.n_columns)
+        return;
+    float total = 0.f;
+    for (int i = 0; i < WARPS; i++)
+        total += of_warps[i][lane];
+    p.sums[blockIdx.y * p.n_columns + column] = total;
+}

@@ -1,8 +1,8 @@
 #pragma once
 
-constexpr int MAX_LEAVES = 8;       // of an observation, that a launch handles
-constexpr int NORMALISED_ROWS = 4;  // rows that a thread normalises
-constexpr int STRIP = 128;          // rows that a block adds up
-constexpr int STRIP_THREADS = 256;  // of such a block
-constexpr int ACT_THREADS = 8;      // that choose one lane's actions, one per choice
+constexpr int MAX_LEAVES = 8;          // of an observation, that a launch handles
+constexpr int NORMALISED_ROWS = 4;     // rows that a thread normalises
+constexpr int STRIP = 128;             // rows that a block adds up
+constexpr int STRIP_THREADS = 256;     // of such a block
+constexpr int ACT_THREADS = 8;         // that choose one lane's actions, one per choice
 constexpr int MOMENTS_THREADS = 1024;  // of a block, for one statistic

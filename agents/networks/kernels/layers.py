@@ -162,7 +162,24 @@ def bias_gradient(
         n_columns=n_columns,
         n_strips=n_strips,
     )
-    return d_masked, sums.sum(0)
+    return d_masked, sum_rows(sums)
+
+
+def sum_rows(rows: torch.Tensor) -> torch.Tensor:
+    """Returns the sums (columns,) of rows (n, columns) float32, always in the same order."""
+    sums = rows.new_empty(rows.shape[1])
+    n_threads = _STRIP_THREADS * -(-rows.shape[1] // WARP)
+    _launch(
+        "sum_rows",
+        rows,
+        n_threads,
+        block=_STRIP_THREADS,
+        rows=rows,
+        sums=sums,
+        n_rows=rows.shape[0],
+        n_columns=rows.shape[1],
+    )
+    return sums
 
 
 def act(

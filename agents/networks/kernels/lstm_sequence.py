@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from megastep.agents.networks.kernels.layers import sum_rows
 from megastep.agents.networks.kernels.program import CUDA_FLAGS
 from megastep.kernels.build.launch import launch_blocks
 from megastep.kernels.build.program import Program
@@ -117,7 +118,7 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
         n_steps=n_steps,
         n_lanes=n_lanes,
     )
-    return d_gates, d_bias.sum(0), d_last_output, d_last_cell
+    return d_gates, sum_rows(d_bias), d_last_output, d_last_cell
 
 
 def _launch(direction, n_clusters, **fields):

@@ -1,15 +1,14 @@
-// Means and variances of observations over lanes, one block per statistic; and adding them to running
-// statistics, one block per leaf.
+// Means and variances of observations over lanes, one block per statistic; and adding them to
+// running statistics, one block per leaf.
 #include "constants.h"
+#include "half.h"
 #include "lanes.h"
 #include "params.h"
 
 DEVICE float number_at(const IntakeLeafParams& leaf, long long at) {
     if (!leaf.is_half)
         return ((const float*)leaf.values)[at];
-    float x;
-    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(((const unsigned short*)leaf.values)[at]));
-    return x;
+    return half_value(((const unsigned short*)leaf.values)[at]);
 }
 
 // The sum over a block in a fixed order, in every thread.
@@ -27,18 +26,36 @@ DEVICE float sum_of_block(float x) {
     return x;
 }
 
-// The sum of the numbers of a statistic, or of the squares of their distance from `mean`. A lane that
-// does not count may hold anything.
+DEVICE void add(float& sum, float x, float mean, bool is_square) {
+    sum += is_square ? (x - mean) * (x - mean) : x;
+}
+
+// The sum of the numbers of a statistic, or of the squares of their distance from `mean`. A lane
+// that does not count may hold anything.
 template <bool is_square>
 DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int first, float mean) {
     float sum = 0.f;
-    int n = p.n_lanes * leaf.group;
-#pragma unroll 8
-    for (int i = threadIdx.x; i < n; i += MOMENTS_THREADS) {
-        int lane = i / leaf.group;
-        float x = number_at(leaf, (long long)lane * leaf.n_features + first + i % leaf.group);
-        x = is_square ? (x - mean) * (x - mean) : x;
-        sum += p.is_counted[lane] ? x : 0.f;
+    bool in_words =
+        leaf.is_half && leaf.group % 8 == 0 && (unsigned long long)leaf.values % 16 == 0;
+    for (int lane = threadIdx.x; lane < p.n_lanes; lane += MOMENTS_THREADS) {
+        if (!p.is_counted[lane])
+            continue;
+        long long at = (long long)lane * leaf.n_features + first;
+        if (in_words) {
+            const uint4* words = (const uint4*)((const unsigned short*)leaf.values + at);
+#pragma unroll 4
+            for (int i = 0; i < leaf.group / 8; i++) {
+                uint4 word = words[i];
+                const unsigned int pairs[4] = {word.x, word.y, word.z, word.w};
+#pragma unroll
+                for (int n = 0; n < 4; n++) {
+                    add(sum, half_value(pairs[n] & 0xffff), mean, is_square);
+                    add(sum, half_value(pairs[n] >> 16), mean, is_square);
+                }
+            }
+        } else
+            for (int i = 0; i < leaf.group; i++)
+                add(sum, number_at(leaf, at + i), mean, is_square);
     }
     return sum_of_block(sum);
 }

@@ -1,14 +1,9 @@
 // The intake of observations: normalises all leaves, selects lanes, concatenates, rounds. A thread
 // handles four columns of several rows, so that it reads their statistics once.
 #include "constants.h"
+#include "half.h"
 #include "lanes.h"
 #include "params.h"
-
-DEVICE float half_value(unsigned int bits) {
-    float x;
-    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"((unsigned short)bits));
-    return x;
-}
 
 DEVICE void unpack(float (&values)[4], uint2 word) {
     values[0] = half_value(word.x & 0xffff);

@@ -146,6 +146,13 @@ struct BiasGradientParams {
     int n_strips;
 };
 
+struct SumRowsParams {
+    const float* rows;  // (P, n_rows, n_columns)
+    float* sums;        // (P, n_columns)
+    int n_rows;
+    int n_columns;
+};
+
 struct CategoricalActParams {
     const void* features;  // (P, B, W) compute
     const void* weight;    // (P, A n, W) compute
