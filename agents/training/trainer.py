@@ -299,21 +299,27 @@ class Trainer:
         """Measures the sections of an iteration on a GPU, and logs them; a CPU knows them already.
 
         Call it after `train`, on all ranks. Collects and learns a few times more, which nothing
-        saves, with CUDA graphs that are captured anew and hold events.
+        saves, with CUDA graphs that are captured anew, hold events and are dropped afterwards.
         """
-        if torch.device(self.env.device).type != "cuda" or not self.section_times.n:
+        is_gpu = torch.device(self.env.device).type == "cuda"
+        if not is_gpu or not self.section_times.n or self.nonfinite_guard.value is not None:
             return
         for _ in range(N_WARM_UPS):
             self.rollout = self.collect()
             self.learner.update(self.rollout)
-        collect = self.collect
-        if hasattr(collect, "recapture"):
-            collect = collect.recapture()
-        if hasattr(self.learner, "recapture"):
-            self.learner.recapture()
-        self.section_times.measure(collect, lambda: self.learner.update(self.rollout))
+        collect = self._recapture()
+        try:
+            self.section_times.measure(collect, lambda: self.learner.update(self.rollout))
+        finally:
+            self._recapture()  # replayed again, graphs would write to events that are gone
         times = {f"section/{name}": n for name, n in self.section_times.milliseconds().items()}
         self.logger.write(self.samples, None, {"perf/seconds": self.seconds_at_log, **times})
+
+    def _recapture(self):
+        """Drops the collector's and the learner's graphs. Returns what collects in the foreground."""
+        if hasattr(self.learner, "recapture"):
+            self.learner.recapture()
+        return self.collect.recapture() if hasattr(self.collect, "recapture") else self.collect
 
     def save_checkpoint(self, state: dict[str, Any] | None = None, is_last: bool = False) -> None:
         """Begins to save a checkpoint, unless the last one holds every update. All ranks call it.
