@@ -77,11 +77,11 @@ def _steps(x):
     return kernels if x.is_cuda else _CPU_STEPS
 
 
-def _unroll(x, input_weight, bias, weight, reset, output, cell, needs_backward):
+def _unroll(x, input_weight, bias, weight, reset, output, cell, needs_backward, is_residual):
     """Unrolls the recurrence step by step.
 
-    Returns outputs (T, B, W), each step's recurrent input (T, B, W), the last cell (B, W), and what
-    `_unroll_backward` needs.
+    Returns outputs (T, B, W), each step's recurrent input (T, B, W), the last output and cell
+    (B, W), and what `_unroll_backward` needs.
     """
     steps = _steps(x)
     gates = F.linear(x, input_weight, bias)
@@ -94,7 +94,9 @@ def _unroll(x, input_weight, bias, weight, reset, output, cell, needs_backward):
         gates[t].addmm_(hiddens[t], weight.T)
         cells.append(torch.empty_like(cells[t]))
         steps.forward(gates[t], cells[t], next_reset, outputs[t], next_hidden, cells[t + 1])
-    return outputs, hiddens, cells[-1], (gates, *cells[:-1])
+    last = outputs[-1].float()
+    outputs = outputs + x if is_residual else outputs
+    return outputs, hiddens, last, cells[-1], (gates, *cells[:-1])
 
 
 def _unroll_backward(weight, reset, saved, d_outputs, d_cell, needs_state):
@@ -120,10 +122,12 @@ def _unroll_backward(weight, reset, saved, d_outputs, d_cell, needs_state):
     return d_gates, d_bias, d_output, d_cell.masked_fill_(reset[0, :, None], 0.0)
 
 
-def _unroll_on_chip(x, input_weight, bias, weight, reset, output, cell, needs_backward):
+def _unroll_on_chip(
+    x, input_weight, bias, weight, reset, output, cell, needs_backward, is_residual
+):
     """`_unroll` in one kernel after the inputs' product."""
-    gates = F.linear(x, input_weight, bias)
-    return lstm_sequence.forward(gates, weight, reset, output, cell, needs_backward)
+    gates, residual = F.linear(x, input_weight, bias), x if is_residual else None
+    return lstm_sequence.forward(gates, weight, reset, output, cell, needs_backward, residual)
 
 
 def _unroll_on_chip_backward(weight, reset, saved, d_outputs, d_cell, needs_state):
@@ -139,7 +143,7 @@ class _Sequence(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, x, input_weight, bias, weight, reset, output, cell):
+    def forward(ctx, x, input_weight, bias, weight, reset, output, cell, is_residual=False):
         """Unrolls the recurrence.
 
         Args:
@@ -150,39 +154,55 @@ class _Sequence(torch.autograd.Function):
             reset: (T, B) bool.
             output: (B, W) float32, last output before the sequence.
             cell: (B, W) float32, last cell before the sequence.
+            is_residual: adds x to the outputs.
 
         Returns:
-            outputs (T, B, W) in the compute dtype, and the last cell (B, W).
+            outputs (T, B, W) in the compute dtype, the last cell (B, W), and the last output (B, W)
+            float32 without x.
         """
-        ctx.on_chip = lstm_sequence.is_supported(x)
+        ctx.set_materialize_grads(False)
+        ctx.on_chip, ctx.is_residual = lstm_sequence.is_supported(x), is_residual
         unroll = _unroll_on_chip if ctx.on_chip else _unroll
         x, reset = aligned(x), reset.contiguous()
         input_weight, bias, weight = (cast(w, x.dtype) for w in (input_weight, bias, weight))
-        outputs, hiddens, last_cell, saved = unroll(
+        outputs, hiddens, last_output, last_cell, saved = unroll(
             *(x, input_weight, bias, weight, reset, aligned(output), aligned(cell)),
             any(ctx.needs_input_grad),
+            is_residual,
         )
         ctx.save_for_backward(x, input_weight, weight, reset, hiddens, *saved)
-        return outputs, last_cell
+        return outputs, last_cell, last_output
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, d_outputs, d_cell):
+    def backward(ctx, d_outputs, d_cell, d_last_output):
         x, input_weight, weight, reset, hiddens, *saved = ctx.saved_tensors
+        d_sum = torch.zeros_like(x) if d_outputs is None else aligned(d_outputs)
+        d_outputs = d_sum
+        if d_last_output is not None:
+            d_outputs = d_sum.clone()
+            d_outputs[-1] += d_last_output
+        if d_cell is None:
+            d_cell = torch.zeros(x.shape[1:], device=x.device)
         backward = _unroll_on_chip_backward if ctx.on_chip else _unroll_backward
         needs_state = any(ctx.needs_input_grad[-2:])
         d_gates, d_bias, d_output, d_cell = backward(
-            weight, reset, saved, aligned(d_outputs), aligned(d_cell), needs_state
+            weight, reset, saved, d_outputs, aligned(d_cell), needs_state
         )
         flat = d_gates.flatten(0, 1)
+        if ctx.is_residual:
+            d_x = torch.addmm(d_sum.flatten(0, 1), flat, input_weight).view_as(x)
+        else:
+            d_x = d_gates @ input_weight
         return (
-            d_gates @ input_weight,
+            d_x,
             product(flat.T, x.flatten(0, 1)),
             d_bias.float(),
             product(flat.T, hiddens.flatten(0, 1)),
             None,
             d_output,
             d_cell,
+            None,
         )
 
 
@@ -208,7 +228,11 @@ class LSTM(nn.Module):
         )
 
     def forward(
-        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+        self,
+        x: torch.Tensor,
+        reset: torch.Tensor,
+        state: arrdict,
+        is_residual: bool = False,
     ) -> tuple[torch.Tensor, arrdict]:
         """Unrolls over a sequence.
 
@@ -216,6 +240,7 @@ class LSTM(nn.Module):
             x: (T, B, W).
             reset: (T, B) bool; clears a lane's hidden state before the step.
             state: hidden state before the sequence.
+            is_residual: adds x to the outputs.
 
         Returns:
             outputs (T, B, W), in the compute dtype on a GPU and float32 on a CPU, and the hidden
@@ -226,33 +251,35 @@ class LSTM(nn.Module):
         """
         check_shapes(x, reset, state, ("output", "cell"))
         if len(x) == 1 and x.is_cuda and not torch.is_grad_enabled():
-            return self._act(x, reset, state)
+            return self._act(x, reset, state, is_residual)
         dtype = compute_dtype(self.recurrent.weight) if x.is_cuda else torch.float32
+        x, states = x.to(dtype), (state["output"].float(), state["cell"].float())
+        weights = self.input.weight, self.input.bias, self.recurrent.weight
         # autocast would choose its own dtypes inside
         with torch.autocast(x.device.type, enabled=False):
-            sequence = CpuSequence if fits(x) else _Sequence
-            outputs, cell = sequence.apply(
-                x.to(dtype),
-                *(self.input.weight, self.input.bias, self.recurrent.weight),
-                reset.bool(),
-                *(state["output"].float(), state["cell"].float()),
-            )
-        return outputs, arrdict(output=outputs[-1].float(), cell=cell)
+            if fits(x):
+                outputs, cell = CpuSequence.apply(x, *weights, reset.bool(), *states)
+                last_output, outputs = outputs[-1], outputs + x if is_residual else outputs
+            else:
+                sequence = x, *weights, reset.bool(), *states, is_residual
+                outputs, cell, last_output = _Sequence.apply(*sequence)
+        return outputs, arrdict(output=last_output, cell=cell)
 
-    def _act(self, x, reset, state):
+    def _act(self, x, reset, state, is_residual):
         """Does the same as `forward` for one step on a GPU, without a gradient."""
         dtype = compute_dtype(self.recurrent.weight)
         parameters = self.input.weight, self.input.bias, self.recurrent.weight
         input_weight, bias, weight = (cast(leaf, dtype) for leaf in parameters)
         last_output, last_cell = (aligned(state[key].float()) for key in ("output", "cell"))
-        reset = reset[0].contiguous().bool()
+        x, reset = aligned(x[0].to(dtype)), reset[0].contiguous().bool()
         output = torch.empty_like(last_output, dtype=dtype)
         hidden, after = torch.empty_like(output), map(torch.empty_like, (last_output, last_cell))
         after = arrdict(zip(("output", "cell"), after))
         kernels.start(reset, last_output, None, hidden, None)
         with torch.autocast(x.device.type, enabled=False):
-            gates = F.linear(x[0].to(dtype), input_weight, bias).addmm_(hidden, weight.T)
-        kernels.act(gates, reset, last_cell, output, after.output, after.cell)
+            gates = F.linear(x, input_weight, bias).addmm_(hidden, weight.T)
+        residual = x if is_residual else None
+        kernels.act(gates, reset, last_cell, residual, output, after.output, after.cell)
         return output[None], after
 
     def step(

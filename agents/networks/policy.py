@@ -17,6 +17,7 @@ from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, encoders, heads
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.layers import linear
+from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.precision import ComputeDtype
 from megastep.agents.networks.running_norm import update_norms
 from megastep.arrdict import arrdict
@@ -175,8 +176,11 @@ class Policy(nn.Module):
 
     def _features(self, obs, reset, state, lanes=None):
         encoded = self.intake(obs, lanes)
+        # a residual connection around the recurrent core
+        if isinstance(self.core, LSTM):
+            return self.core(encoded, reset, state, is_residual=True)
         outputs, state = self.core(encoded, reset, state)
-        return encoded + outputs, state  # a residual connection around the recurrent core
+        return encoded + outputs, state
 
     def value(
         self,

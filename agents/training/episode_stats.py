@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from megastep.agents.algorithms.kernels import program
 from megastep.agents.algorithms.nonfinite import LIMIT
 from megastep.agents.distributed.process_group import sum_over_ranks
 from megastep.types import Env, optional
@@ -79,6 +80,9 @@ class EpisodeStats:
             metrics: name -> (T, B), read where `done`. An episode whose metric is not finite or
                 beyond the limit is left out of that metric's mean.
         """
+        if self._is_fused(reward, learns, metrics):
+            self._add_on_gpu(reward, reset, done, learns, metrics)
+            return
         reward = _without_nonfinite(reward)
         # cumulative sums over all T rows, minus the sum at the last episode end before each row
         returns = self.returns + reward.double().cumsum(0)
@@ -101,6 +105,42 @@ class EpisodeStats:
         self.returns = _sum_since(returns, last_end, slice(-1, None))[0]
         self.lengths = _sum_since(lengths, last_end, slice(-1, None))[0]
         self.is_whole |= done.any(0)
+
+    def _is_fused(self, reward, learns, metrics):
+        values = [metrics[name] for name in self.metrics]
+        return (
+            reward.is_cuda
+            and isinstance(learns, torch.Tensor)
+            and len(values) <= program.PROGRAM.constants["EPISODE_METRICS"]
+            and all(value.dtype == torch.float32 for value in (reward, *values))
+        )
+
+    def _add_on_gpu(self, reward, reset, done, learns, metrics):
+        """Does the same as `add` in one kernel."""
+        n_steps, n_lanes = reward.shape
+        values = [metrics[name].contiguous() for name in self.metrics]
+        pack = program.PROGRAM.params.EpisodeMetricParams
+        sums = self.sums.new_empty(len(self.sums), n_lanes)
+        program.run(
+            "episodes",
+            reward.device,
+            n_lanes,
+            metrics=b"".join(pack(values=value.data_ptr()) for value in values),
+            reward=reward.contiguous(),
+            reset=reset.contiguous(),
+            done=done.contiguous(),
+            learns=learns.contiguous(),
+            returns=self.returns,
+            lengths=self.lengths,
+            is_whole=self.is_whole,
+            sums=sums,
+            bad_lanes=self.bad_lanes,
+            n_metrics=len(values),
+            n_steps=n_steps,
+            n_lanes=n_lanes,
+            limit=LIMIT,
+        )
+        self.sums += sums @ self.members
 
     def _sum_metrics(self, counts, metrics):
         """Returns the sums of the metrics and the number of episodes left out of each, (M, B)."""

@@ -178,7 +178,8 @@ def sequence(device, dtype, x, reset, state, weights, d_outputs, d_cell):
     """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU."""
     to = [leaf.detach().to(device, dtype).requires_grad_() for leaf in (x, *weights)]
     states = [leaf.detach().to(device).requires_grad_() for leaf in state]
-    outputs, cell = lstm_module._Sequence.apply(*to, reset.to(device), *states)
+    outputs, cell, last = lstm_module._Sequence.apply(*to, reset.to(device), *states)
+    assert torch.equal(last, outputs[-1].float())
     assert outputs.dtype == dtype and cell.dtype == torch.float32
     grads = torch.autograd.grad(
         [outputs, cell], [*to, *states], [d_outputs.to(device, dtype), d_cell.to(device)]
@@ -378,7 +379,7 @@ def on_cpu(kind, n_steps, n_lanes, width):
     inputs = [leaf.requires_grad_() for leaf in inputs]
     reset = (torch.rand(n_lanes, n_steps) < 0.3).T
     d_results = torch.randn(n_steps, n_lanes, width), torch.randn(n_lanes, width)
-    results = kind.apply(*inputs[:4], reset, *inputs[4:])
+    results = kind.apply(*inputs[:4], reset, *inputs[4:])[:2]
     return [*results, *torch.autograd.grad(results, inputs, d_results)]
 
 
@@ -414,3 +415,34 @@ def test_widths_that_kernels_do_not_take_use_pytorch():
     assert lstm_cpu.fits(torch.zeros(1, 1, 16)) and not lstm_cpu.fits(torch.zeros(1, 1, 17))
     output, _ = LSTM(17).step(torch.zeros(1, 17), torch.zeros(1, dtype=bool), LSTM(17).initial(1))
     assert output.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "device, width",
+    [
+        ("cpu", 16),
+        ("cpu", 7),
+        *[pytest.param("cuda", w, marks=pytest.mark.cuda) for w in (256, 16)],
+    ],
+)
+def test_residual_is_added_to_outputs_only(device, width):
+    """Outputs, the state and the gradients of both, also when acting."""
+    torch.manual_seed(0)
+    lstm = LSTM(width).to(device)
+    x = torch.randn(5, 33, width, device=device, requires_grad=True)
+    reset = torch.rand(5, 33, device=device) < 0.3
+    state = arrdict({key: torch.randn(33, width, device=device) for key in ("output", "cell")})
+    results = []
+    for is_residual in (True, False):
+        with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
+            outputs, after = lstm(x, reset, state, is_residual)
+            outputs = outputs if is_residual else x.to(outputs.dtype) + outputs
+            loss = outputs.float().square().sum() + after.output.sum() + after.cell.sum()
+            grads = torch.autograd.grad(loss, [x, *lstm.parameters()])
+            with torch.no_grad():
+                acted, acted_after = lstm(x[:1], reset[:1], state, is_residual)
+            acted = acted if is_residual else x[:1].to(acted.dtype) + acted
+        leaves = [outputs, after.output, after.cell, *grads]
+        leaves += [acted, acted_after.output, acted_after.cell]
+        results.append([leaf.detach().float().cpu() for leaf in leaves])
+    assert_close(range(len(results[0])), *results, 2e-2 if device == "cuda" else 1e-5)

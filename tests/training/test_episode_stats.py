@@ -249,3 +249,30 @@ def test_sums_are_restored_only_for_the_same_metrics():
     resumed.load_state_dict(rest.state_dict())
     assert resumed.pop() == rest.pop() and resumed.windows == rest.windows
     assert resumed.windows[0][0] == [1, 1, 1, 1]
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n_metrics", [0, 2])
+def test_gpu_counts_as_the_cpu_does(n_metrics):
+    """Over several rollouts, with groups, NaN rewards and metrics, and lanes that do not learn."""
+    n_steps, n_lanes, names = 32, 300, [f"metric{i}" for i in range(n_metrics)]
+    group = torch.rand(n_lanes, generator=torch.Generator().manual_seed(0)) < 0.3
+    stats = [
+        EpisodeStats(n_lanes, device, names, {"some": group.to(device)}, skip_first=True)
+        for device in ("cpu", "cuda")
+    ]
+    for seed in range(3):
+        torch.manual_seed(seed)
+        reward = torch.randn(n_steps, n_lanes)
+        reward[torch.rand(n_steps, n_lanes) < 0.01] = torch.nan
+        flags = [torch.rand(n_steps, n_lanes) < p for p in (0.1, 0.1, 0.9)]
+        metrics = {name: torch.randn(n_steps, n_lanes) for name in names}
+        for values in metrics.values():
+            values[torch.rand(n_steps, n_lanes) < 0.01] = torch.inf
+        for one, device in zip(stats, ("cpu", "cuda"), strict=True):
+            rows = {name: values.to(device) for name, values in metrics.items()}
+            one.add(reward.to(device), *(flag.to(device) for flag in flags), rows)
+    plain, fused = stats
+    for name in ("returns", "lengths", "is_whole", "sums", "bad_lanes"):
+        torch.testing.assert_close(getattr(fused, name).cpu(), getattr(plain, name))
+    assert fused.pop() == pytest.approx(plain.pop())

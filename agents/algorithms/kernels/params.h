@@ -100,3 +100,24 @@ struct RecordParams {
     int n_lanes;
     int n_named;
 };
+
+struct EpisodeMetricParams {
+    const float* values;  // (T, B)
+};
+
+struct EpisodesParams {
+    EpisodeMetricParams metrics[8];
+    const float* reward;          // (T, B)
+    const unsigned char* reset;   // (T, B)
+    const unsigned char* done;    // (T, B)
+    const unsigned char* learns;  // (T, B); null: all
+    double* returns;              // (B), of the episodes in progress, updated
+    double* lengths;              // (B), updated
+    unsigned char* is_whole;      // (B), updated
+    double* sums;                 // (4 + 2 n_metrics, B)
+    long long* bad_lanes;         // (n_metrics), updated
+    int n_metrics;
+    int n_steps;
+    int n_lanes;
+    float limit;
+};

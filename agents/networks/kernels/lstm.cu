@@ -67,8 +67,14 @@ struct LstmAct {
             assign(output[n], s.output[n] * s.tanh_after[n]);
             next_output[n] = to_float(output[n]);
         }
-        write<T>(p.output, place.unit, next_output);
         write<float>(p.next_output, place.unit, next_output);
+        if (p.residual) {
+            float residual[N];
+            read<T>(residual, p.residual, place.unit);
+            for (int n = 0; n < N; n++)
+                next_output[n] += residual[n];
+        }
+        write<T>(p.output, place.unit, next_output);
         write<float>(p.next_cell, place.unit, s.after);
     }
 };

@@ -31,15 +31,16 @@ def start(reset, last_output, last_cell, hidden, cell):
     )
 
 
-def act(gates, reset, last_cell, output, next_output, next_cell):
+def act(gates, reset, last_cell, residual, output, next_output, next_cell):
     """Computes one step without a gradient. The recurrent input was `start`'s, without a cell.
 
     Args:
         gates: (B, 4 W).
         reset: (B,) bool.
         last_cell: (B, W) float32, before the reset.
+        residual: (B, W), added to `output`, or None.
         output: (B, W), written.
-        next_output: (B, W) float32, written: the same numbers.
+        next_output: (B, W) float32, written: the same numbers without the residual.
         next_cell: (B, W), written.
     """
     run(
@@ -49,6 +50,7 @@ def act(gates, reset, last_cell, output, next_output, next_cell):
         gates=gates,
         reset=reset,
         last_cell=last_cell,
+        residual=residual,
         output=output,
         next_output=next_output,
         next_cell=next_cell,

@@ -37,7 +37,7 @@ def is_supported(x: torch.Tensor) -> bool:
     )
 
 
-def forward(gates, weight, reset, output, cell, needs_backward):
+def forward(gates, weight, reset, output, cell, needs_backward, residual=None):
     """Unrolls the recurrence.
 
     Args:
@@ -47,15 +47,18 @@ def forward(gates, weight, reset, output, cell, needs_backward):
         output: (B, W) float32, before the sequence.
         cell: (B, W) float32, before the sequence.
         needs_backward: whether to save what `backward` needs.
+        residual: (T, B, W), added to the outputs, or None.
 
     Returns:
-        outputs (T, B, W), the recurrent input of each step (T, B, W), the last cell (B, W) float32,
-        and what to pass on to `backward`, two tensors or two times None.
+        outputs (T, B, W), the recurrent input of each step (T, B, W), the last output, without the
+        residual, and the last cell (B, W) float32, and what to pass on to `backward`, two tensors
+        or two times None.
     """
     n_steps, n_lanes, _ = gates.shape
     n_clusters = -(-n_lanes // _LANES)
     outputs = gates.new_empty(n_steps, n_lanes, WIDTH)
-    hiddens, last_cell = torch.empty_like(outputs), torch.empty_like(cell)
+    hiddens = torch.empty_like(outputs)
+    after, last_cell = torch.empty_like(output), torch.empty_like(cell)
     saved = None, None
     if needs_backward:
         lead = n_steps, n_clusters, _RANKS
@@ -71,15 +74,17 @@ def forward(gates, weight, reset, output, cell, needs_backward):
         reset=reset,
         last_output=output,
         last_cell=cell,
+        residual=residual,
         outputs=outputs,
         hiddens=hiddens,
+        output=after,
         cell=last_cell,
         saved_gates=saved[0],
         saved_cells=saved[1],
         n_steps=n_steps,
         n_lanes=n_lanes,
     )
-    return outputs, hiddens, last_cell, saved
+    return outputs, hiddens, after, last_cell, saved
 
 
 def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):

@@ -22,8 +22,9 @@ struct LstmActParams {
     const void* gates;           // (B, 4 W) compute
     const unsigned char* reset;  // (B)
     const float* last_cell;      // (B, W)
+    const void* residual;        // (B, W) compute, added to `output`; null: nothing is
     void* output;                // (B, W) compute
-    float* next_output;          // (B, W), the same numbers
+    float* next_output;          // (B, W), the same numbers without the residual
     float* next_cell;            // (B, W)
     int n_lanes;
     int width;

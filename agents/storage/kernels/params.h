@@ -23,7 +23,7 @@ struct SelectParams {
 
 struct SelectLanesParams {
     SelectParams tensors[16];
-    const long long* lanes;  // (M)
-    unsigned int n_lanes;    // B
+    const long long* lanes;   // (M)
+    unsigned int n_lanes;     // B
     unsigned int n_selected;  // M
 };

@@ -104,6 +104,22 @@ DEVICE void read_resets(Resets* words, const unsigned char* reset, int n_steps, 
     }
 }
 
+DEVICE unsigned int add(unsigned int a, unsigned int b) {
+    return pack_bfloat16(low_half(a) + low_half(b), high_half(a) + high_half(b));
+}
+
+// Adds eight pairs of numbers.
+DEVICE uint4 add(uint4 a, uint4 b) {
+    return {add(a.x, b.x), add(a.y, b.y), add(a.z, b.z), add(a.w, b.w)};
+}
+
+DEVICE void write_floats(float* target, uint4 bits) {
+    ((float4*)target)[0] = {low_half(bits.x), high_half(bits.x), low_half(bits.y),
+                            high_half(bits.y)};
+    ((float4*)target)[1] = {low_half(bits.z), high_half(bits.z), low_half(bits.w),
+                            high_half(bits.w)};
+}
+
 // ---- Forward ----
 
 constexpr int STAGES = 3;  // steps whose gates are in shared memory
@@ -115,6 +131,7 @@ struct ForwardMemory {
     Bits next_hidden[2][LANES][UNITS + PAD];    // to send
     Bits output[2][LANES][UNITS + PAD];
     Bits gates[STAGES][LANES][GATES + PAD];
+    Bits residual[STAGES][LANES][UNITS + PAD];
     Arrivals arrivals[2][2];  // of even and odd steps, of both groups
     Resets resets[MAX_STEPS];
 };
@@ -131,6 +148,8 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
     int unit = rank * UNITS + me.unit;
     const Bits* gates = (const Bits*)p.gates + policy * n_steps * n_lanes * (4 * W);
     const unsigned char* reset = p.reset + policy * n_steps * n_lanes;
+    const Bits* residual =
+        p.residual ? (const Bits*)p.residual + policy * n_steps * n_lanes * W : nullptr;
     Bits* outputs = (Bits*)p.outputs + policy * n_steps * n_lanes * W;
     Bits* hiddens = (Bits*)p.hiddens + policy * n_steps * n_lanes * W;
 
@@ -144,6 +163,13 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                 begin_copy(&memory.gates[t % STAGES][lane][gate * UNITS + part],
                            gates + row * (4 * W) + gate * W + rank * UNITS + part);
             }
+            if (residual)
+                for (int i = me.index; i < LANES * UNITS / 8; i += THREADS) {
+                    int lane = i >> 3, part = 8 * (i & 7);
+                    long long row = (long long)t * n_lanes + min(first_lane + lane, last_lane);
+                    begin_copy(&memory.residual[t % STAGES][lane][part],
+                               residual + row * W + rank * UNITS + part);
+                }
         }
         end_group();
     };
@@ -278,8 +304,15 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                     send(address_in(target, other), value, address_in(arrivals, other));
                 if (exists)
                     *(uint4*)(hiddens + at + (long long)n_lanes * W) = value;
-            } else if (!sends && exists)
-                *(uint4*)(outputs + at) = *(const uint4*)&memory.output[t & 1][lane][part];
+            } else if (!sends && exists) {
+                uint4 value = *(const uint4*)&memory.output[t & 1][lane][part];
+                if (is_last)
+                    write_floats(p.output + (lanes + first_lane + lane) * W + rank * UNITS + part,
+                                 value);
+                if (residual)
+                    value = add(value, *(const uint4*)&memory.residual[t % STAGES][lane][part]);
+                *(uint4*)(outputs + at) = value;
+            }
         }
     };
     for (int t = 0; t < n_steps; t++) {

@@ -11,8 +11,10 @@ struct LstmSequenceForwardParams {
     const unsigned char* reset;  // (P, T, B)
     const float* last_output;    // (P, B, W), before the sequence
     const float* last_cell;      // (P, B, W)
+    const void* residual;        // (P, T, B, W), added to the outputs; null: nothing is
     void* outputs;               // (P, T, B, W)
     void* hiddens;               // (P, T, B, W), each step's recurrent input
+    float* output;               // (P, B, W), after the sequence, without the residual
     float* cell;                 // (P, B, W), after the sequence
     void* saved_gates;           // (P, T, C, S, 5, 256, 8), before activation; null: not saved
     float* saved_cells;          // (P, T, C, S, 5, 256, 2), each step's input

@@ -1,0 +1,57 @@
+// Sums over the episodes that end in a rollout, one thread per lane.
+#include "common/constants.h"
+#include "constants.h"
+#include "params.h"
+
+#define KERNEL extern "C" __global__ void
+
+KERNEL episodes(EpisodesParams p) {
+    int lane = blockIdx.x * blockDim.x + threadIdx.x;
+    if (lane >= p.n_lanes)
+        return;
+    double n = 0., sum = 0., square = 0., steps = 0.;
+    double totals[EPISODE_METRICS] = {}, left_out[EPISODE_METRICS] = {};
+    double episode_return = p.returns[lane], length = p.lengths[lane];
+    bool is_whole = p.is_whole[lane];
+#pragma unroll 8
+    for (int t = 0; t < p.n_steps; t++) {
+        long long at = (long long)t * p.n_lanes + lane;
+        float reward = p.reward[at];
+        episode_return += fabsf(reward) <= p.limit ? reward : 0.f;
+        length += p.reset[at] ? 0. : 1.;
+        if (!p.done[at])
+            continue;
+        if (is_whole && (!p.learns || p.learns[at])) {
+            n += 1.;
+            sum += episode_return;
+            square += episode_return * episode_return;
+            steps += length;
+#pragma unroll
+            for (int i = 0; i < EPISODE_METRICS; i++)
+                if (i < p.n_metrics) {
+                    float value = p.metrics[i].values[at];
+                    bool is_good = fabsf(value) <= p.limit;
+                    totals[i] += is_good ? value : 0.f;
+                    left_out[i] += is_good ? 0. : 1.;
+                }
+        }
+        episode_return = length = 0.;
+        is_whole = true;
+    }
+    p.returns[lane] = episode_return;
+    p.lengths[lane] = length;
+    p.is_whole[lane] = is_whole;
+    double* sums = p.sums + lane;
+    sums[0] = n;
+    sums[p.n_lanes] = sum;
+    sums[2ll * p.n_lanes] = square;
+    sums[3ll * p.n_lanes] = steps;
+#pragma unroll
+    for (int i = 0; i < EPISODE_METRICS; i++)
+        if (i < p.n_metrics) {
+            sums[(4ll + i) * p.n_lanes] = totals[i];
+            sums[(4ll + p.n_metrics + i) * p.n_lanes] = left_out[i];
+            if (left_out[i] > 0.)
+                atomicMin(p.bad_lanes + i, (long long)lane);  // the same whatever the order
+        }
+}
