@@ -12,14 +12,16 @@ static __device__ __forceinline__ float half_value(unsigned int bits) {
     return x;
 }
 
+static_assert(sizeof(SizesParams::tensors) == SIZES_TENSORS * sizeof(SizesTensorParams));
+
 // The larger magnitude; NaN if one is NaN.
 static __device__ __forceinline__ float larger(float size, float value) {
     value = fabsf(value);
     return size > value || isnan(size) ? size : value;
 }
 
-// Blocks along y: tensors. A tensor's rows begin at its last step: if it has one step less, the first
-// row of its sizes is 0.
+// Blocks along y: tensors. A tensor's rows begin at its last step: if it has one step less, the
+// first row of its sizes is 0.
 KERNEL sizes(SizesParams p) {
     const SizesTensorParams& tensor = p.tensors[blockIdx.y];
     unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x, part = thread % SIZES_THREADS;
@@ -112,8 +114,9 @@ KERNEL BOUNDS(1024) record(RecordParams p) {
         if (!threadIdx.x) {
             float size = index < none ? p.sizes[index] : 0.f;
             p.record[4 + i] = (double)index;
-            p.record[4 + p.n_named + i] =
-                isnan(size) ? -1. : isinf(size) ? 1.7976931348623157e308 : (double)size;
+            p.record[4 + p.n_named + i] = isnan(size)   ? -1.
+                                          : isinf(size) ? 1.7976931348623157e308
+                                                        : (double)size;
         }
         if (index == none)
             break;

@@ -4,6 +4,8 @@
 #include "lanes.h"
 #include "params.h"
 
+static_assert(sizeof(NormaliseParams::leaves) == MAX_LEAVES * sizeof(IntakeLeafParams));
+
 DEVICE float half_value(unsigned int bits) {
     float x;
     asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"((unsigned short)bits));
@@ -32,15 +34,24 @@ struct Feature {
 };
 
 DEVICE Feature find(const NormaliseParams& p, int number) {
-    Feature feature = {(const char*)p.leaves[0].values, p.leaves[0].mean, p.leaves[0].scale,
-                       p.leaves[0].n_features,          p.leaves[0].group, p.leaves[0].is_half,
+    Feature feature = {(const char*)p.leaves[0].values,
+                       p.leaves[0].mean,
+                       p.leaves[0].scale,
+                       p.leaves[0].n_features,
+                       p.leaves[0].group,
+                       p.leaves[0].is_half,
                        -1};
 #pragma unroll
     for (int i = 0; i < MAX_LEAVES; i++) {
         const IntakeLeafParams& leaf = p.leaves[i];
         if (number >= 0 && number < leaf.n_features)
-            feature = {(const char*)leaf.values, leaf.mean, leaf.scale, leaf.n_features,
-                       leaf.group,               leaf.is_half, number};
+            feature = {(const char*)leaf.values,
+                       leaf.mean,
+                       leaf.scale,
+                       leaf.n_features,
+                       leaf.group,
+                       leaf.is_half,
+                       number};
         number -= leaf.n_features;
     }
     return feature;
@@ -113,8 +124,8 @@ DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int c
         }
 #pragma unroll
         for (int i = 0; i < NORMALISED_ROWS; i++) {
-            float value = feature.is_half ? half_value(low[i])
-                                          : __uint_as_float(high[i] << 16 | low[i]);
+            float value =
+                feature.is_half ? half_value(low[i]) : __uint_as_float(high[i] << 16 | low[i]);
             value = (value - mean) * __fdiv_rn(1.f, scale);
             values[i][n] = feature.number < 0 ? 0.f : value;
         }

@@ -1,9 +1,12 @@
-// Copies many pieces of memory in one launch: blocks along x share a piece, blocks along y the pieces.
+// Copies many pieces of memory in one launch: blocks along x share a piece, blocks along y the
+// pieces.
 #include "common/constants.h"
 #include "constants.h"
 #include "params.h"
 
 #define KERNEL extern "C" __global__ void
+
+static_assert(sizeof(CopyAllParams::copies) == MAX_COPIES * sizeof(CopyParams));
 
 KERNEL copy_all(CopyAllParams p) {
     const CopyParams& copy = p.copies[blockIdx.y];
