@@ -1,5 +1,5 @@
-// Categorical actions: choosing them when acting, ACT_THREADS threads per lane; log-probability and entropy when
-// learning, and their gradients, one thread per row.
+// Categorical actions: choosing them when acting, ACT_THREADS threads per lane; log-probability and
+// entropy when learning, and their gradients, one thread per row.
 #include "constants.h"
 #include "lanes.h"
 #include "params.h"
@@ -23,8 +23,8 @@ DEVICE float sum_of_lane(float x) {
     return x;
 }
 
-// The score of choice `part` of an agent, before the bias. The threads of a lane share its features.
-// Nothing branches on the number of choices, so that no load waits for another.
+// The score of choice `part` of an agent, before the bias. The threads of a lane share its
+// features. Nothing branches on the number of choices, so that no load waits for another.
 template <class T>
 DEVICE float score_of(const CategoricalActParams& p, const T* features, const T* weight, int part) {
     constexpr int N = 16 / sizeof(T);  // numbers that a thread reads at once
@@ -50,8 +50,8 @@ DEVICE float score_of(const CategoricalActParams& p, const T* features, const T*
     return score;
 }
 
-// Thread k of a lane handles choice k of each agent. Logits are log-softmax of the scores; samples by
-// the Gumbel-max trick.
+// Thread k of a lane handles choice k of each agent. Logits are log-softmax of the scores; samples
+// by the Gumbel-max trick.
 template <class T>
 DEVICE void act(const CategoricalActParams& p) {
     int thread = blockIdx.x * blockDim.x + threadIdx.x, part = thread % ACT_THREADS;

@@ -94,6 +94,10 @@ struct MingruBackward {
 };
 
 KERNEL BOUNDS(64) mingru_forward_float32(MingruForwardParams p) { run<MingruForward, float>(p); }
-KERNEL BOUNDS(64) mingru_forward_bfloat16(MingruForwardParams p) { run<MingruForward, Bfloat16>(p); }
+KERNEL BOUNDS(64) mingru_forward_bfloat16(MingruForwardParams p) {
+    run<MingruForward, Bfloat16>(p);
+}
 KERNEL BOUNDS(64) mingru_backward_float32(MingruBackwardParams p) { run<MingruBackward, float>(p); }
-KERNEL BOUNDS(64) mingru_backward_bfloat16(MingruBackwardParams p) { run<MingruBackward, Bfloat16>(p); }
+KERNEL BOUNDS(64) mingru_backward_bfloat16(MingruBackwardParams p) {
+    run<MingruBackward, Bfloat16>(p);
+}
