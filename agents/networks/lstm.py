@@ -137,7 +137,7 @@ class _Sequence(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, x, input_weight, bias, weight, reset, output, cell):
+    def forward(ctx, x, input_weight, bias, weight, reset, output, cell, has_grad):
         """Unrolls the recurrence.
 
         Args:
@@ -148,6 +148,7 @@ class _Sequence(torch.autograd.Function):
             reset: (T, B) bool.
             output: (B, W) float32, last output before the sequence.
             cell: (B, W) float32, last cell before the sequence.
+            has_grad: whether autograd is on; it never is in here.
 
         Returns:
             outputs (T, B, W) in the compute dtype, and the last cell (B, W).
@@ -158,7 +159,7 @@ class _Sequence(torch.autograd.Function):
         input_weight, bias, weight = (cast(w, x.dtype) for w in (input_weight, bias, weight))
         outputs, hiddens, last_cell, saved = unroll(
             *(x, input_weight, bias, weight, reset, aligned(output), aligned(cell)),
-            any(ctx.needs_input_grad),
+            has_grad and any(ctx.needs_input_grad),
         )
         ctx.save_for_backward(x, input_weight, weight, reset, hiddens, *saved)
         return outputs, last_cell
@@ -168,7 +169,7 @@ class _Sequence(torch.autograd.Function):
     def backward(ctx, d_outputs, d_cell):
         x, input_weight, weight, reset, hiddens, *saved = ctx.saved_tensors
         backward = _unroll_on_chip_backward if ctx.on_chip else _unroll_backward
-        needs_state = any(ctx.needs_input_grad[-2:])
+        needs_state = any(ctx.needs_input_grad[5:7])
         d_gates, d_bias, d_output, d_cell = backward(
             weight, reset, saved, aligned(d_outputs), aligned(d_cell), needs_state
         )
@@ -181,6 +182,7 @@ class _Sequence(torch.autograd.Function):
             None,
             d_output,
             d_cell,
+            None,
         )
 
 
@@ -233,6 +235,7 @@ class LSTM(nn.Module):
                 *(self.input.weight, self.input.bias, self.recurrent.weight),
                 reset.bool(),
                 *(state["output"].float(), state["cell"].float()),
+                torch.is_grad_enabled(),
             )
         return outputs, arrdict(output=outputs[-1].float(), cell=cell)
 
