@@ -178,7 +178,7 @@ def sequence(device, dtype, x, reset, state, weights, d_outputs, d_cell):
     """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU."""
     to = [leaf.detach().to(device, dtype).requires_grad_() for leaf in (x, *weights)]
     states = [leaf.detach().to(device).requires_grad_() for leaf in state]
-    outputs, cell = lstm_module._Sequence.apply(*to, reset.to(device), *states)
+    outputs, cell = lstm_module._Sequence.apply(*to, reset.to(device), *states, True)
     assert outputs.dtype == dtype and cell.dtype == torch.float32
     grads = torch.autograd.grad(
         [outputs, cell], [*to, *states], [d_outputs.to(device, dtype), d_cell.to(device)]
