@@ -71,7 +71,10 @@ OWN_USERS = {
         "megastep/envs/pointgoal/path_graph.py",
         "megastep/kernels/build/*.py",
         "megastep/modules/visibility.py",  # its cache depends on the kernels' sources
+        "agents/algorithms/adam.py",
+        "agents/algorithms/kernels/*.py",
         "agents/networks/kernels/*.py",
+        "agents/storage/copies.py",
     ),
 }
 # The files that may import these packages, directly or through importlib, as glob patterns.

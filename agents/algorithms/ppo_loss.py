@@ -97,7 +97,7 @@ class _FusedLoss(torch.autograd.Function):
     def forward(ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients):
         clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
         inputs = [None if x is None else x.contiguous() for x in (entropies, values, errors)]
-        gradients = [torch.empty_like(logprobs) for _ in range(3 + (errors is not None))]
+        gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
         n_rows, n_valid = logprobs.numel(), batch.valid.sum()
         sums = logprobs.new_empty(program.n_blocks(n_rows), program.N_SUMS)
         names = "d_logprobs", "d_entropies", "d_values", "d_errors"

@@ -49,7 +49,7 @@ def gae(
         arrdict(advantages, targets, valid), each (T, B). Targets are the lambda returns A + V,
         which the value should fit. A is 0 where the action was not valid.
     """
-    if value.is_cuda:
+    if value.is_cuda and value.dtype == reward.dtype == torch.float32:
         return _gae_on_gpu(reward, value, last_value, reset, terminal, truncated, gamma, lambda_)
     delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.0) - value
     delta = delta.masked_fill(reset, 0.0)
@@ -62,10 +62,8 @@ def gae(
 
 def _gae_on_gpu(reward, value, last_value, reset, terminal, truncated, gamma, lambda_):
     """Computes `gae` in one kernel, lane by lane."""
-    estimates = arrdict.arrdict(
-        advantages=torch.empty_like(reward), targets=torch.empty_like(reward), valid=~reset
-    )
     n_steps, n_lanes = reward.shape
+    advantages, targets = reward.new_empty(2, n_steps, n_lanes)
     program.run(
         "gae",
         value.device,
@@ -75,14 +73,14 @@ def _gae_on_gpu(reward, value, last_value, reset, terminal, truncated, gamma, la
         reset=reset.contiguous(),
         terminal=terminal.contiguous(),
         truncated=truncated.contiguous(),
-        advantages=estimates.advantages,
-        targets=estimates.targets,
+        advantages=advantages,
+        targets=targets,
         n_steps=n_steps,
         n_lanes=n_lanes,
         gamma=gamma,
         lambda_=lambda_,
     )
-    return estimates
+    return arrdict.arrdict(advantages=advantages, targets=targets, valid=~reset)
 
 
 @section("returns")

@@ -15,6 +15,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.networks.kernels import layers as kernels
+from megastep.agents.networks.kernels.program import aligned
 from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.networks.running_norm import RunningNorm
 
@@ -73,17 +74,16 @@ class _Linear(torch.autograd.Function):
         parts, activated = (saved[:-1], saved[-1:]) if ctx.has_relu else (saved, [])
         lead, n_padding = d.shape[:-1], len(weight) - ctx.n_outputs
         d = nn.functional.pad(d.flatten(0, -2), (0, n_padding)) if n_padding else d.flatten(0, -2)
-        d, d_bias = kernels.bias_gradient(d.contiguous(), *activated)
+        d, d_bias = kernels.bias_gradient(aligned(d), *activated)
         d_weight, d_parts = None, [None] * len(parts)
         if ctx.needs_input_grad[0]:
             d_weights = [product(d.T, part) for part in parts]
             d_weight = torch.cat(d_weights, 1) if len(parts) > 1 else d_weights[0]
+            d_weight = d_weight[: ctx.n_outputs]
         for i, its_weight in enumerate(weight.split([part.shape[1] for part in parts], 1)):
             if ctx.needs_input_grad[3 + i]:
                 d_parts[i] = (d @ its_weight).unflatten(0, lead)
-        if n_padding:
-            d_weight, d_bias = d_weight[: ctx.n_outputs], d_bias[: ctx.n_outputs]
-        return d_weight, d_bias, None, *d_parts
+        return d_weight, d_bias[: ctx.n_outputs], None, *d_parts
 
 
 def normalised(
@@ -129,7 +129,8 @@ class CategoricalTerms(torch.autograd.Function):
     @staticmethod
     def forward(ctx, logits, actions):
         lead = logits.shape[:-2]
-        logits, actions = logits.flatten(0, -3).contiguous(), actions.flatten(0, -2).contiguous()
+        logits = logits.flatten(0, -3).contiguous()
+        actions = actions.flatten(0, -2).long().contiguous()
         ctx.save_for_backward(logits, actions)
         return tuple(each.view(lead) for each in kernels.terms(logits, actions))
 

@@ -143,7 +143,9 @@ class _Sequence(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, x, input_weight, bias, weight, reset, output, cell, is_residual=False):
+    def forward(
+        ctx, x, input_weight, bias, weight, reset, output, cell, is_residual=False, has_grad=True
+    ):
         """Unrolls the recurrence.
 
         Args:
@@ -155,6 +157,7 @@ class _Sequence(torch.autograd.Function):
             output: (B, W) float32, last output before the sequence.
             cell: (B, W) float32, last cell before the sequence.
             is_residual: adds x to the outputs.
+            has_grad: whether autograd is on; it never is in here.
 
         Returns:
             outputs (T, B, W) in the compute dtype, the last cell (B, W), and the last output (B, W)
@@ -167,7 +170,7 @@ class _Sequence(torch.autograd.Function):
         input_weight, bias, weight = (cast(w, x.dtype) for w in (input_weight, bias, weight))
         outputs, hiddens, last_output, last_cell, saved = unroll(
             *(x, input_weight, bias, weight, reset, aligned(output), aligned(cell)),
-            any(ctx.needs_input_grad),
+            has_grad and any(ctx.needs_input_grad),
             is_residual,
         )
         ctx.save_for_backward(x, input_weight, weight, reset, hiddens, *saved)
@@ -185,7 +188,7 @@ class _Sequence(torch.autograd.Function):
         if d_cell is None:
             d_cell = torch.zeros(x.shape[1:], device=x.device)
         backward = _unroll_on_chip_backward if ctx.on_chip else _unroll_backward
-        needs_state = any(ctx.needs_input_grad[-2:])
+        needs_state = any(ctx.needs_input_grad[5:7])
         d_gates, d_bias, d_output, d_cell = backward(
             weight, reset, saved, d_outputs, aligned(d_cell), needs_state
         )
@@ -202,6 +205,7 @@ class _Sequence(torch.autograd.Function):
             None,
             d_output,
             d_cell,
+            None,
             None,
         )
 
@@ -261,7 +265,7 @@ class LSTM(nn.Module):
                 outputs, cell = CpuSequence.apply(x, *weights, reset.bool(), *states)
                 last_output, outputs = outputs[-1], outputs + x if is_residual else outputs
             else:
-                sequence = x, *weights, reset.bool(), *states, is_residual
+                sequence = x, *weights, reset.bool(), *states, is_residual, torch.is_grad_enabled()
                 outputs, cell, last_output = _Sequence.apply(*sequence)
         return outputs, arrdict(output=last_output, cell=cell)
 

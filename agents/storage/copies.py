@@ -20,8 +20,13 @@ def copy_all(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> None:
     """Copies the second tensor of each pair into the first, as `Tensor.copy_` does.
 
     On a GPU contiguous tensors of equal dtype and shape are copied by one kernel: a copy of a few
-    kilobytes takes no time, but its launch takes a microsecond.
+    kilobytes takes no time, but its launch takes a microsecond. They are copied in no order, so no
+    target may share memory with another tensor of the pairs.
+
+    Args:
+        pairs: targets and sources, all on one device but for sources on the host.
     """
+    pairs = list(pairs)  # a source that nobody else holds lives until the launch
     packed, largest, device = [], 0, None
     for target, source in pairs:
         if not (target.is_cuda and _is_plain_copy(target, source)):

@@ -5,6 +5,7 @@ from collections import OrderedDict
 import pytest
 import torch
 
+from megastep.agents.algorithms import nonfinite
 from megastep.agents.algorithms.nonfinite import (
     LIMIT,
     NonFiniteCheck,
@@ -118,6 +119,90 @@ def test_nonfinite_leaf_returns_path():
     assert nonfinite_leaf({**tree, "n": [1, torch.tensor(torch.inf)]}) == "n.1"
     tree["policy"]["a.b"][1] = torch.nan
     assert nonfinite_leaf(tree) == "policy.a.b"
+
+
+def bad_rollout(seed, n_lanes, n_bad, value, extra_row):
+    """Returns floats on a GPU. Some numbers of some lanes are bad, others large but allowed.
+
+    Args:
+        n_bad: bad numbers per tensor, at random places.
+        value: the bad number, which may overflow in float16.
+        extra_row: whether observations have T + 1 rows.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    n_rows = T + extra_row
+    shapes = dict(
+        rgb=((n_rows, n_lanes, 1, 3, 1, 8), torch.float16),  # read in words of eight
+        imu=((n_rows, n_lanes, 1, 3), torch.float16),
+        unseen=((n_rows, n_lanes, 1, 48), torch.float32),
+        reward=((T, n_lanes), torch.float32),
+        short=((T, n_lanes), torch.float16),
+        value=((n_rows, n_lanes), torch.float32),
+    )
+    floats = {}
+    for name, (shape, dtype) in shapes.items():
+        leaf = torch.rand(shape, generator=generator).to(dtype)
+        leaf.view(-1)[::7] = 0.99 * LIMIT if dtype == torch.float32 else 65_504.0
+        places = torch.randint(leaf.numel(), (n_bad,), generator=generator)
+        leaf.view(-1)[places] = torch.tensor(value).to(dtype)
+        floats[name] = leaf.cuda()
+    return floats
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1.01 * LIMIT, -1e30])
+@pytest.mark.parametrize("n_lanes, n_bad", [(1, 1), (3, 2), (40, 2), (1100, 700)])
+@pytest.mark.parametrize("extra_row", [False, True])
+def test_kernels_find_what_the_plain_form_finds(monkeypatch, value, n_lanes, n_bad, extra_row):
+    """Among many rollouts: the first bad one is kept until it is read, with up to eight lanes."""
+    good, first, second = (
+        bad_rollout(seed, n_lanes, n, value, extra_row)
+        for seed, n in enumerate((0, n_bad, 2 * n_bad))
+    )
+    assert nonfinite._is_fused(good)
+    results = []
+    for is_fused in (True, False):
+        if not is_fused:
+            monkeypatch.setattr(nonfinite, "_is_fused", lambda floats: False)
+        check, texts = NonFiniteCheck(torch.device("cuda")), []
+        for rollout in (good, first, second, good, None, second, good, None, first, None):
+            if rollout is None:
+                bad, _ = check.read(good)
+                texts.append(repr(bad))
+            else:
+                texts.append(bool(check(rollout)))
+            texts.append(bool(check.found))
+        results.append((texts, check.state_dict().tolist()))
+    assert results[0] == results[1]
+    texts = results[0][0]
+    assert texts[:4] == [True, False, False, True] and "rollout=2" in texts[8]
+
+
+@pytest.mark.cuda
+def test_kernels_tell_infinities_of_both_signs_from_nan():
+    """The plain form adds a row's float16 numbers up, which makes NaN of them."""
+    rollout = bad_rollout(0, 3, 0, 0.0, True)
+    rollout["rgb"][2, 1].view(-1)[:2] = torch.tensor([torch.inf, -torch.inf])
+    check = NonFiniteCheck(torch.device("cuda"))
+    assert not check(rollout)
+    assert check.read(rollout)[0] == NonFiniteValue("rgb", 1, 2, torch.inf)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("change", ["dtype", "layout", "number"])
+def test_what_kernels_cannot_check_is_checked_all_the_same(change):
+    rollout = bad_rollout(0, 3, 0, 0.0, True)
+    if change == "dtype":
+        rollout["value"] = rollout["value"].bfloat16().clamp(max=1.0)
+    elif change == "layout":
+        rollout["value"] = rollout["value"].T.contiguous().T
+    else:
+        rollout |= {f"more{i}": rollout["reward"] for i in range(16)}
+    assert not nonfinite._is_fused(rollout)
+    check = NonFiniteCheck(torch.device("cuda"))
+    assert check(rollout)
+    rollout["value"][3, 2] = torch.nan
+    assert not check(rollout) and check.read(rollout)[0].name == "value"
 
 
 @pytest.mark.cuda

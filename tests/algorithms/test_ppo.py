@@ -11,7 +11,7 @@ from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.rollout import Rollout
 from megastep.arrdict import arrdict
-from tests.helpers.made_up import MOVES, OBS, PRIVILEGED, WIDTH, B, T, made_up, weights
+from tests.helpers.made_up import MOVES, OBS, PRIVILEGED, WIDTH, B, Numbers, T, made_up, weights
 
 
 def test_first_pass_has_zero_kl():
@@ -344,6 +344,40 @@ def test_captured_update_matches_eager(options):
         ends.append((weights(policy), metrics["loss/value"]))
     # bfloat16 products; the captured graph may use other kernels
     torch.testing.assert_close(ends[1], ends[0], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("graph", [False, True])
+@pytest.mark.parametrize("width", [WIDTH, 256])  # the LSTM of 256 units runs on chip
+def test_same_seed_gives_the_same_bits_on_a_gpu(graph, width):
+    ends = []
+    for _ in range(2):
+        policy, rollout = made_up(device="cuda", privileged=PRIVILEGED, width=width)
+        learner = PPO(policy, n_epochs=2, n_minibatches=3, lr=1e-3, graph=graph, **OPTIONS)
+        before = weights(policy)
+        for _ in range(4):
+            metrics = learner.update(rollout)
+        assert not metrics["loss/skipped_steps"] and not torch.equal(weights(policy), before)
+        state = {**policy.state_dict(), **metrics}
+        ends.append({name: leaf.clone() for name, leaf in state.items()})
+    for name, leaf in ends[0].items():
+        assert torch.equal(leaf, ends[1][name]), name
+
+
+@pytest.mark.cuda
+def test_same_seed_collects_and_learns_the_same_bits_on_a_gpu():
+    ends = []
+    for _ in range(2):
+        env = Numbers("cuda")
+        policy = Policy(env.obs_space, env.action_space, width=256).cuda()
+        learner = PPO(policy, n_steps=T, n_minibatches=2, lr=1e-2, graph=True)
+        collect = learner.collector(env)
+        for _ in range(5):
+            rollout = collect()
+            learner.update(rollout)
+        ends.append((weights(policy), rollout.logprobs.clone(), rollout.actions.clone()))
+    for one, other in zip(*ends, strict=True):
+        assert torch.equal(one, other)
 
 
 @pytest.mark.cuda

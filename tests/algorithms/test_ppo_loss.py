@@ -67,3 +67,36 @@ def test_gae_on_a_gpu_matches_the_cpu(n_steps, n_lanes):
     fused = returns.gae(*(leaf.cuda() for leaf in inputs), gamma=0.9, lambda_=0.8)
     for name, leaf in plain.items():
         torch.testing.assert_close(fused[name].cpu(), leaf, rtol=1e-5, atol=1e-5)
+
+
+def transposed(leaf):
+    """Returns an equal tensor with another memory layout."""
+    return leaf.T.contiguous().T
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("change", [transposed, torch.Tensor.double])
+def test_gae_on_a_gpu_takes_other_layouts_and_float64(change):
+    torch.manual_seed(0)
+    value, reward = torch.randn(2, 7, 5)
+    last_value, flags = torch.randn(5), [torch.rand(7, 5) < 0.2 for _ in range(3)]
+    plain = returns.gae(reward, value, last_value, *flags, gamma=0.9, lambda_=0.8)
+    inputs = [change(reward.cuda()), change(value.cuda()), last_value.cuda(), *flags]
+    inputs[3:] = [transposed(flag.cuda()) for flag in flags]
+    other = returns.gae(*inputs, gamma=0.9, lambda_=0.8)
+    for name, leaf in plain.items():
+        torch.testing.assert_close(
+            other[name].cpu().to(leaf.dtype), leaf, rtol=1e-5, atol=1e-5, check_stride=False
+        )
+
+
+@pytest.mark.cuda
+def test_fused_loss_takes_other_layouts():
+    leaves, batch, scale, settings = case("cuda", 0.3, True)
+    results = []
+    for change in (torch.Tensor.contiguous, transposed):
+        inputs = [change(leaf.detach()).requires_grad_() for leaf in leaves]
+        loss, _ = ppo_loss(*inputs, batch.map(change), scale, settings)
+        results.append([loss.detach(), *torch.autograd.grad(loss, inputs)])
+    for one, other in zip(*results, strict=True):
+        assert torch.equal(one, other)

@@ -81,7 +81,8 @@ def trainers(monkeypatch):
 
 def is_captured(trainer):
     """Returns True if collecting and updating replayed CUDA graphs."""
-    return trainer.was_captured
+    graphs = trainer.collect.graph, trainer.learner.cuda_graph.graph
+    return getattr(trainer, "was_captured", isinstance(graphs[0], capture.Graph) and graphs[1])
 
 
 def test_interrupted_run_is_saved(stopped):

@@ -51,9 +51,9 @@ class Numbers:
         return arrdict(obs=self.obs, reward=reward, metrics=metrics, **flags)
 
 
-def made_up(seed=0, device="cpu", privileged=None, values=True):
+def made_up(seed=0, device="cpu", privileged=None, values=True, width=WIDTH):
     """Returns a policy and a random rollout with its actions. Lanes 1 and 4 have a reset each."""
-    policy = Policy(OBS, MOVES, privileged, width=WIDTH, seed=seed).to(device)
+    policy = Policy(OBS, MOVES, privileged, width=width, seed=seed).to(device)
     with torch.no_grad():
         # a policy far from uniform, so that gradients differ by action
         policy.output.linear.weight.mul_(100)

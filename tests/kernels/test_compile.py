@@ -234,3 +234,44 @@ def test_a_thread_without_a_context_gets_the_gpus_and_launches_again(monkeypatch
         launch.launch(ENGINE, "uniform", b"params", torch.device("cuda", 1), threads=100)
     assert current == ["context of device 1"] and len(calls) == 3
     assert calls[0] == calls[1] and calls[0][:4] == ("function", 2, 1, 1)
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_a_gpu_launch_of_an_unknown_operation_is_named(monkeypatch, blocks):
+    monkeypatch.setattr(launch, "cuda", lambda program, index: {"uniform": "function"})
+    device, message = torch.device("cuda", 0), r"No \.cu file in .* defines the operation unifrom: "
+    with pytest.raises(compile.EngineError, match=message + r".*or run on a CPU \(device=cpu\)"):
+        if blocks:
+            launch.launch_blocks(ENGINE, "unifrom", b"params", device, (1, 1), 64)
+        else:
+            launch.launch(ENGINE, "unifrom", b"params", device, threads=100)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize(
+    "shape, action",
+    [
+        (((1, 1), 2048), "Launching uniform"),
+        (((0, 1), 64), "Launching uniform"),
+        (((1, 2**16), 64), "Launching uniform"),
+        (((1, 1), 64, 2**30), "Reserving shared memory"),
+    ],
+)
+def test_a_launch_that_the_gpu_refuses_is_named(shape, action):
+    """The next one works again."""
+    counts = torch.zeros(1, dtype=torch.int32, device="cuda")
+    mask = torch.ones(1, dtype=torch.bool, device="cuda")
+    out = torch.full((1, 4), -1.0, device="cuda")
+    packed = ENGINE.params.UniformParams(
+        counts=counts.data_ptr(),
+        mask=mask.data_ptr(),
+        out=out.data_ptr(),
+        key0=1,
+        key1=2,
+        n_lanes=1,
+        n_threads=1,
+    )
+    with pytest.raises(compile.EngineError, match=f"{action} failed with CUDA_ERROR_INVALID_VALUE"):
+        launch.launch_blocks(ENGINE, "uniform", packed, out.device, *shape)
+    launch.launch_blocks(ENGINE, "uniform", packed, out.device, (1, 1), 64)
+    assert ((0 <= out) & (out < 1)).all()

@@ -6,7 +6,10 @@ import subprocess
 
 import pytest
 
+from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
+from megastep.agents.networks.kernels.lstm_sequence import PROGRAM as SEQUENCES
 from megastep.agents.networks.kernels.program import CORES
+from megastep.agents.storage.copies import PROGRAM as COPIES
 from megastep.envs.deathmatch.step import PROGRAM as DEATHMATCH
 from megastep.envs.explorer.step import PROGRAM as EXPLORER
 from megastep.envs.pointgoal.step import PROGRAM as POINTGOAL
@@ -15,7 +18,8 @@ from megastep.kernels.build import compile, headers
 from megastep.kernels.build.launch import ENGINE
 
 GAMES = dict(deathmatch=DEATHMATCH, explorer=EXPLORER, pointgoal=POINTGOAL, pong=PONG)
-PROGRAMS = dict(engine=ENGINE, cores=CORES, **GAMES)
+LEARNER = dict(cores=CORES, sequences=SEQUENCES, algorithms=ALGORITHMS, copies=COPIES)
+PROGRAMS = dict(engine=ENGINE, **LEARNER, **GAMES)
 programs = pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS)
 
 
@@ -47,6 +51,66 @@ def test_packed_structs_have_the_compilers_layout(program, tmp_path):
     checks = compiled(tmp_path, program, code)
     for name, data in packed.items():
         assert len(data) == program.sizes[name]
+        assert getattr(checks, f"check_{name}")(data, len(data)), name
+
+
+NESTED = """
+struct NumbersParams {
+    int count;
+    float size;
+    unsigned int mask;
+};
+struct PointerParams {
+    int count;
+    const float* values;
+    float size;
+};
+struct ArraysParams {
+    int first;
+    NumbersParams numbers[3];
+    int second;
+    PointerParams pointers[2];
+    int third;
+};
+struct OneParams {
+    int first;
+    NumbersParams one;
+};
+"""
+
+
+def test_arrays_of_structs_have_the_compilers_layout(tmp_path):
+    """Structs without a pointer have other sizes and places than those with one."""
+    structs = headers.struct_fields({"params.h": NESTED})
+    pack = {name: headers.builder(name, fields) for name, fields in structs.items()}
+    numbers = [pack["NumbersParams"](count=i, size=i + 0.5, mask=2**31 + i) for i in range(2)]
+    pointers = [pack["PointerParams"](count=5 + i, values=2**40 + i, size=-i) for i in range(2)]
+    packed = dict(
+        ArraysParams=pack["ArraysParams"](
+            first=-1, numbers=b"".join(numbers), second=-2, pointers=b"".join(pointers), third=-3
+        ),
+        OneParams=pack["OneParams"](first=-1, one=numbers[1]),
+    )
+    code = (
+        NESTED
+        + """
+    extern "C" int check_ArraysParams(const ArraysParams* p, int size) {
+        int fits = size == sizeof(*p) && p->first == -1 && p->second == -2 && p->third == -3;
+        for (int i = 0; i < 2; i++) {
+            fits &= p->numbers[i].count == i && p->numbers[i].size == i + 0.5f;
+            fits &= p->numbers[i].mask == (1u << 31) + i && p->pointers[i].size == -i;
+            fits &= p->pointers[i].count == 5 + i;
+            fits &= (long long)p->pointers[i].values == (1ll << 40) + i;
+        }
+        return fits && !p->numbers[2].count && !p->numbers[2].size && !p->numbers[2].mask;
+    }
+    extern "C" int check_OneParams(const OneParams* p, int size) {
+        return size == sizeof(*p) && p->first == -1 && p->one.count == 1 && p->one.size == 1.5f;
+    }
+    """
+    )
+    checks = compiled(tmp_path, ENGINE, code)
+    for name, data in packed.items():
         assert getattr(checks, f"check_{name}")(data, len(data)), name
 
 

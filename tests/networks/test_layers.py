@@ -67,6 +67,49 @@ def test_linear_matches_float32(activation, n_rows, n_in, n_out):
 
 
 @pytest.mark.cuda
+@pytest.mark.parametrize("n_out", [7, 16])
+@pytest.mark.parametrize("frozen", ["weight", "bias", "both", "input"])
+def test_frozen_layers_pass_gradients(n_out, frozen):
+    torch.manual_seed(0)
+    layer = nn.Linear(16, n_out).cuda()
+    x = torch.randn(5, 16, device="cuda", requires_grad=frozen != "input")
+    layer.weight.requires_grad_(frozen not in ("weight", "both"))
+    layer.bias.requires_grad_(frozen not in ("bias", "both"))
+    leaves = [leaf for leaf in (x, *layer.parameters()) if leaf.requires_grad]
+    gradients = []
+    for is_fused in (True, False):
+        with torch.autocast("cuda", torch.bfloat16, enabled=is_fused):
+            y = layers.linear(x, layer)
+        gradients.append(torch.autograd.grad(y.float().square().sum(), leaves))
+    for fused, plain in zip(*gradients, strict=True):
+        assert_close(fused, plain)
+
+
+@pytest.mark.cuda
+def test_gradient_of_one_row_may_begin_anywhere():
+    """One row of a wider tensor counts as contiguous, wherever it begins."""
+    layer = nn.Linear(8, 8).cuda()
+    x = torch.randn(1, 8, device="cuda")
+    gradients = []
+    for is_fused in (True, False):
+        with torch.autocast("cuda", torch.bfloat16, enabled=is_fused):
+            y = layers.linear(x, layer)
+            joined = torch.cat([y.new_zeros(1, 3), y], 1)
+        d = torch.arange(11.0, device="cuda", dtype=joined.dtype)[None]
+        gradients.append(torch.autograd.grad(joined, layer.bias, d)[0])
+    assert torch.equal(gradients[0], gradients[1])
+
+
+@pytest.mark.cuda
+def test_nan_passes_the_gradient_of_a_relu():
+    d = torch.randn(3, 8, device="cuda").bfloat16()
+    y = torch.tensor([torch.nan, 1.0, 0.0], device="cuda").bfloat16()[:, None].expand(3, 8)
+    masked, _ = layers.kernels.bias_gradient(d, y.contiguous())
+    assert torch.equal(masked, torch.ops.aten.threshold_backward(d, y, 0))
+    assert torch.equal(masked[0], d[0]) and not masked[2].any()
+
+
+@pytest.mark.cuda
 @pytest.mark.parametrize("n_rows", [1, 31, 4096, 100_001])
 @pytest.mark.parametrize("n_columns", [8, 56, 256, 264, 1024])
 def test_bias_gradient_is_the_sum_of_rows_and_repeatable(n_rows, n_columns):

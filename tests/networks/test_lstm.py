@@ -3,6 +3,8 @@
 Kernels run on a GPU, and compiled for the CPU from the same source (`cuda_on_cpu.h`).
 """
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torch import nn
@@ -446,3 +448,36 @@ def test_residual_is_added_to_outputs_only(device, width):
         leaves += [acted, acted_after.output, acted_after.cell]
         results.append([leaf.detach().float().cpu() for leaf in leaves])
     assert_close(range(len(results[0])), *results, 2e-2 if device == "cuda" else 1e-5)
+
+
+@pytest.mark.cuda
+def test_sequence_saves_nothing_without_autograd(monkeypatch):
+    lstm, saved = LSTM(256).cuda(), []
+    on_chip = lstm_module.lstm_sequence.forward
+    monkeypatch.setattr(
+        lstm_module.lstm_sequence, "forward", lambda *args: saved.append(args[5]) or on_chip(*args)
+    )
+    x, reset = torch.randn(3, 5, 256, device="cuda"), torch.zeros(3, 5, device="cuda").bool()
+    with torch.autocast("cuda", torch.bfloat16):
+        outputs, _ = lstm(x, reset, lstm.initial(5, "cuda"))
+        with torch.no_grad():
+            again, _ = lstm(x, reset, lstm.initial(5, "cuda"))
+    assert saved == [True, False] and torch.equal(outputs, again)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("major, shared_memory", [(12, 101_376), (8, 166_912)])
+def test_gpus_without_clusters_or_memory_take_step_by_step(monkeypatch, major, shared_memory):
+    x = torch.zeros(2, 3, 256, dtype=torch.bfloat16, device="cuda")
+    gpu = SimpleNamespace(major=major, shared_memory_per_block_optin=shared_memory)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
+    assert not lstm_module.lstm_sequence.is_supported(x)
+
+
+@pytest.mark.cuda
+def test_sequence_of_no_lanes():
+    lstm = LSTM(256).cuda()
+    x, reset = torch.zeros(2, 0, 256, device="cuda"), torch.zeros(2, 0, device="cuda").bool()
+    with torch.autocast("cuda", torch.bfloat16), torch.no_grad():
+        outputs, state = lstm(x, reset, lstm.initial(0, "cuda"))
+    assert outputs.shape == (2, 0, 256) and state.cell.shape == (0, 256)

@@ -1,5 +1,6 @@
 """The policy: steps match an unroll over the sequence, and a seed determines everything."""
 
+import copy
 import io
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 
 from megastep import spaces
 from megastep.agents.generator import SeededGenerator, stream_seed
+from megastep.agents.networks import layers as layers_module
 from megastep.agents.networks.cores import CORES
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, stack
@@ -14,6 +16,7 @@ from megastep.dotdict import leaves
 
 T, B = 7, 5
 OBS = arrdict(rgb=spaces.MultiImage(1, 3, 1, 16), imu=spaces.MultiVector(1, 3))
+PRIVILEGED = spaces.MultiVector(1, 12)
 MOVES = arrdict(movement=spaces.MultiDiscrete(1, 7), fire=spaces.MultiDiscrete(1, 2))
 
 
@@ -194,6 +197,69 @@ def test_gpu_never_synchronises_and_bf16_is_close():
             torch.cuda.set_sync_debug_mode("default")
     # logits of an untrained policy differ by some .01, bfloat16 by 1 %
     torch.testing.assert_close(*results, rtol=0, atol=5e-3)
+
+
+def learnt(policy, world, privileged, lanes, weights):
+    """Returns what learning computes from a sequence of some lanes, and the gradients of a random
+    sum of it, each on the CPU by name.
+    """
+    starts, state = world.reset[:, lanes], policy.initial(len(lanes))
+    with policy.compute_dtype():
+        now = policy.unroll(world.obs, starts, state, lanes)
+        # the same actions whatever the logits are
+        actions = now.logits.map(lambda leaf: (weights[0] > 0).long()[..., None])
+        logprobs, entropies = policy.output.terms(now.logits, actions)
+        values = policy.value(now.features, privileged, lanes)
+        errors = policy.prediction_error(now.features, privileged, lanes)
+    outputs = dict(logprobs=logprobs, entropies=entropies, values=values, errors=errors)
+    assert all(output.dtype == torch.float32 for output in outputs.values())
+    sum((w * output).sum() for w, output in zip(weights, outputs.values())).backward()
+    gradients = {name: p.grad for name, p in policy.named_parameters()}
+    results = {**outputs, "features": now.features, **gradients}
+    return {name: leaf.detach().float().cpu() for name, leaf in results.items()}
+
+
+def relative_error(one, other):
+    return ((one - other).norm() / other.norm()).item()
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("layers", [1, 3])
+@pytest.mark.parametrize("core", CORES)
+def test_bf16_policy_on_a_gpu_matches_the_plain_forms_in_float32(core, layers, monkeypatch):
+    """What learning computes, for some lanes. The LSTM of 256 units runs on chip."""
+    n_steps, n_lanes = 9, 45
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(space):
+        return torch.rand(n_steps, n_lanes, *space.shape, generator=generator).half()
+
+    world = arrdict(
+        obs=OBS.map(draw), reset=torch.rand(n_steps, n_lanes, generator=generator) < 0.2
+    )
+    privileged = draw(PRIVILEGED).float()
+    lanes = torch.randperm(n_lanes, generator=generator)[:37]
+    weights = torch.randn(4, n_steps, len(lanes), generator=generator)
+    plain = Policy(OBS, MOVES, PRIVILEGED, core=core, layers=layers)
+    with torch.no_grad():
+        for output in plain.output.outputs.values():
+            output.linear.weight.mul_(100)  # far from uniform
+    plain.update_stats(world[0].obs, privileged[0])
+    fused, launches = copy.deepcopy(plain).cuda(), []
+    expected = learnt(plain, world, privileged, lanes, weights)
+    kernel = layers_module.kernels.bias_gradient
+    monkeypatch.setattr(
+        layers_module.kernels, "bias_gradient", lambda *d: launches.append(d) or kernel(*d)
+    )
+    on_gpu = (leaf.cuda() for leaf in (world, privileged, lanes, weights))
+    for name, leaf in learnt(fused, *on_gpu).items():
+        assert leaf.shape == expected[name].shape
+        # a number in bfloat16 is off by up to 0.2 %, and each layer and step adds to that; a ReLU
+        # whose input is near 0 may pass a gradient in one of both forms only
+        limit = 0.2 if name in dict(plain.named_parameters()) else 0.03
+        assert relative_error(leaf, expected[name]) < limit, name
+    # intakes of actor and critic, the critic's hidden layer and output, prediction, two heads
+    assert len(launches) >= 7
 
 
 def test_wrong_numbers_of_lanes_are_named():

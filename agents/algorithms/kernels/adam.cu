@@ -1,5 +1,5 @@
 // Adam with decoupled weight decay for many parameters in one launch, and the norm of their
-// gradients. A block handles part of one parameter.
+// gradients. A block handles part of one parameter; blocks along y are policies.
 #include "common/constants.h"
 #include "constants.h"
 #include "params.h"
@@ -16,13 +16,17 @@ static __device__ __forceinline__ int row_of_block(const AdamRowParams* rows, in
     return first;
 }
 
+static_assert(sizeof(AdamParams::rows) == ADAM_ROWS * sizeof(AdamRowParams));
+static_assert(sizeof(SquaredNormParams::rows) == ADAM_ROWS * sizeof(AdamRowParams));
+
 KERNEL squared_norm(SquaredNormParams p) {
     const AdamRowParams& row = p.rows[row_of_block(p.rows, p.n_rows)];
     unsigned int first = (blockIdx.x - row.first_block) * (BLOCK * ADAM_NUMBERS) + threadIdx.x;
+    const float* gradient = row.gradient + blockIdx.y * (long long)row.n;
     float values[ADAM_NUMBERS], sum = 0.f;
 #pragma unroll
     for (int i = 0; i < ADAM_NUMBERS; i++)
-        values[i] = first + i * BLOCK < row.n ? row.gradient[first + i * BLOCK] : 0.f;
+        values[i] = first + i * BLOCK < row.n ? gradient[first + i * BLOCK] : 0.f;
 #pragma unroll
     for (int i = 0; i < ADAM_NUMBERS; i++)
         sum += values[i] * values[i];
@@ -36,24 +40,25 @@ KERNEL squared_norm(SquaredNormParams p) {
         float total = 0.f;
         for (int warp = 0; warp < BLOCK / WARP; warp++)
             total += of_warps[warp];
-        p.sums[blockIdx.x] = total;
+        p.sums[blockIdx.y * gridDim.x + blockIdx.x] = total;
     }
 }
 
 KERNEL adam(AdamParams p) {
-    if (!*p.is_taken)
+    unsigned int policy = blockIdx.y;
+    if (!p.is_taken[policy])
         return;
     const AdamRowParams& row = p.rows[row_of_block(p.rows, p.n_rows)];
     unsigned int first = (blockIdx.x - row.first_block) * (BLOCK * ADAM_NUMBERS) + threadIdx.x;
-    float clip = p.grad_norm ? fminf(p.max_norm / (*p.grad_norm + 1e-6f), 1.f) : 1.f;
-    float lr = *p.lr * row.lr_factor, n_steps = *p.n_steps;
+    float clip = p.grad_norm ? fminf(p.max_norm / (p.grad_norm[policy] + 1e-6f), 1.f) : 1.f;
+    float lr = p.lr[policy] * row.lr_factor, n_steps = p.n_steps[policy];
     float step = lr / (1.f - powf(p.beta1, n_steps));
     float scale = 1.f / sqrtf(1.f - powf(p.beta2, n_steps));
 #pragma unroll
     for (int i = 0; i < ADAM_NUMBERS; i++) {
-        unsigned int at = first + i * BLOCK;
-        if (at >= row.n)
+        if (first + i * BLOCK >= row.n)
             break;
+        long long at = policy * (long long)row.n + first + i * BLOCK;
         float gradient = row.gradient[at] * clip, mean = row.mean[at];
         mean += (1.f - p.beta1) * (gradient - mean);
         float square = p.beta2 * row.square[at] + (1.f - p.beta2) * gradient * gradient;

@@ -12,6 +12,8 @@ static __device__ __forceinline__ float half_value(unsigned int bits) {
     return x;
 }
 
+static_assert(sizeof(SizesParams::tensors) == SIZES_TENSORS * sizeof(SizesTensorParams));
+
 // The larger magnitude; NaN if one is NaN.
 static __device__ __forceinline__ float larger(float size, float value) {
     value = fabsf(value);

@@ -1,6 +1,7 @@
 // The parameters of each launch, passed by value; see megastep/kernels/params.h.
 //
-// T steps, B lanes.
+// T steps, B lanes, P policies. Arrays that belong to weights or to a policy's statistics start
+// with the axis P; whatever is per lane has those of all policies.
 #pragma once
 
 struct GaeParams {
@@ -18,22 +19,22 @@ struct GaeParams {
 };
 
 struct PpoLossParams {
-    const float* logprobs;       // (n_rows), of the actions
-    const float* entropies;      // (n_rows)
-    const float* values;         // (n_rows)
-    const float* errors;         // (n_rows), of the prediction; null: there is none
-    const float* old_logprobs;   // (n_rows), when acting
-    const float* old_values;     // (n_rows), when acting; null: values are not clipped
-    const float* advantages;     // (n_rows)
-    const float* targets;        // (n_rows)
-    const unsigned char* valid;  // (n_rows)
-    const long long* n_valid;    // ()
-    const float* value_scale;    // ()
-    float* d_logprobs;           // (n_rows), gradients of the loss
-    float* d_entropies;          // (n_rows)
-    float* d_values;             // (n_rows)
-    float* d_errors;             // (n_rows)
-    float* sums;  // (n_blocks, 6): policy, value, entropy, kl, clip_fraction, auxiliary
+    const float* logprobs;       // (P, n_rows), of the actions
+    const float* entropies;      // (P, n_rows)
+    const float* values;         // (P, n_rows)
+    const float* errors;         // (P, n_rows), of the prediction; null: there is none
+    const float* old_logprobs;   // (P, n_rows), when acting
+    const float* old_values;     // (P, n_rows), when acting; null: values are not clipped
+    const float* advantages;     // (P, n_rows)
+    const float* targets;        // (P, n_rows)
+    const unsigned char* valid;  // (P, n_rows)
+    const long long* n_valid;    // (P)
+    const float* value_scale;    // (P)
+    float* d_logprobs;           // (P, n_rows), gradients of the loss
+    float* d_entropies;          // (P, n_rows)
+    float* d_values;             // (P, n_rows)
+    float* d_errors;             // (P, n_rows)
+    float* sums;  // (P, n_blocks, 6): policy, value, entropy, kl, clip_fraction, auxiliary
     int n_rows;
     float clip;
     float value_clip;
@@ -42,7 +43,7 @@ struct PpoLossParams {
     float auxiliary_coef;
 };
 
-// A parameter with its gradient and Adam's running means.
+// A parameter (P, n) with its gradient and Adam's running means.
 struct AdamRowParams {
     float* parameter;
     const float* gradient;
@@ -56,16 +57,16 @@ struct AdamRowParams {
 
 struct SquaredNormParams {
     AdamRowParams rows[48];
-    float* sums;  // (n_blocks)
+    float* sums;  // (P, n_blocks)
     int n_rows;
 };
 
 struct AdamParams {
     AdamRowParams rows[48];
-    const float* lr;                // ()
-    const float* n_steps;           // (), this one included
-    const float* grad_norm;         // (); null: gradients are not clipped
-    const unsigned char* is_taken;  // (), false: nothing changes
+    const float* lr;                // (P)
+    const float* n_steps;           // (P), this one included
+    const float* grad_norm;         // (P); null: gradients are not clipped
+    const unsigned char* is_taken;  // (P), false: nothing changes
     int n_rows;
     float max_norm;
     float beta1;

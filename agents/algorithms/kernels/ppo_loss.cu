@@ -1,5 +1,5 @@
 // PPO's loss, with its gradients and metrics. One thread per row; a block adds up its rows in a
-// fixed order, the caller the blocks.
+// fixed order, the caller the blocks. Blocks along y are policies.
 #include "common/constants.h"
 #include "params.h"
 
@@ -8,16 +8,17 @@
 constexpr int N_SUMS = 6;
 
 KERNEL ppo_loss(PpoLossParams p) {
-    int row = blockIdx.x * blockDim.x + threadIdx.x;
+    int of_policy = blockIdx.x * blockDim.x + threadIdx.x;
+    long long policy = blockIdx.y, row = policy * p.n_rows + of_policy;
     float sums[N_SUMS] = {};
-    if (row < p.n_rows) {
-        float share = p.valid[row] ? 1.f / (float)max(*p.n_valid, 1ll) : 0.f;
+    if (of_policy < p.n_rows) {
+        float share = p.valid[row] ? 1.f / (float)max(p.n_valid[policy], 1ll) : 0.f;
         float d_logprob = 0.f, d_value = 0.f;
         if (p.valid[row]) {
             float log_ratio = p.logprobs[row] - p.old_logprobs[row], ratio = expf(log_ratio);
             float clipped = fminf(fmaxf(ratio, 1.f - p.clip), 1.f + p.clip);
             float advantage = p.advantages[row], surrogate = ratio * advantage;
-            float scale = *p.value_scale, error = (p.values[row] - p.targets[row]) / scale;
+            float scale = p.value_scale[policy], error = (p.values[row] - p.targets[row]) / scale;
             // a NaN fails both comparisons and stays
             bool is_clipped = surrogate > clipped * advantage;
             float squared = error * error;
@@ -59,6 +60,6 @@ KERNEL ppo_loss(PpoLossParams p) {
         float total = 0.f;
         for (int warp = 0; warp < BLOCK / WARP; warp++)
             total += of_warps[warp][threadIdx.x];
-        p.sums[blockIdx.x * N_SUMS + threadIdx.x] = total;
+        p.sums[(policy * gridDim.x + blockIdx.x) * N_SUMS + threadIdx.x] = total;
     }
 }

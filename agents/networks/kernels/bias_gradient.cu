@@ -1,6 +1,6 @@
 // The gradient of a layer before its activation (ReLU), and its sums over rows, which are the
 // gradient of the bias. A block adds up a strip of rows in a fixed order; the caller adds the
-// strips. Blocks along y: words of columns, 32 at once.
+// strips. Blocks along y: words of columns, 32 at once, of all policies.
 #include "constants.h"
 #include "lanes.h"
 #include "params.h"
@@ -10,11 +10,12 @@ DEVICE void bias_gradient(const BiasGradientParams& p) {
     constexpr int AT_ONCE = 4, WARPS = STRIP_THREADS / WARP;  // rows whose loads do not wait
     __shared__ float of_warps[WARPS][N * WARP];
     int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
-    int n_words = p.n_columns / N;                            // of a row
-    int words = min(n_words - WARP * (int)blockIdx.y, WARP);  // of this block
-    int groups = WARP / words, group = lane / words;          // rows that a warp handles at once
-    int word = WARP * blockIdx.y + lane % words;
-    long long policy = blockIdx.z, strip = blockIdx.x, first = policy * p.n_rows;
+    int n_words = p.n_columns / N, n_parts = (n_words + WARP - 1) / WARP;  // of a row
+    int first_word = WARP * (blockIdx.y % n_parts);
+    int words = min(n_words - first_word, WARP);      // of this block
+    int groups = WARP / words, group = lane / words;  // rows that a warp handles at once
+    int word = first_word + lane % words;
+    long long policy = blockIdx.y / n_parts, strip = blockIdx.x, first = policy * p.n_rows;
     int end = min(((int)strip + 1) * STRIP, p.n_rows), step = WARPS * groups;
     float sums[N];
     clear(sums);
@@ -37,7 +38,7 @@ DEVICE void bias_gradient(const BiasGradientParams& p) {
                     break;
                 if (p.activated) {
                     for (int n = 0; n < N; n++)
-                        values[i][n] = activated[i][n] > 0.f ? values[i][n] : 0.f;
+                        values[i][n] = activated[i][n] <= 0.f ? 0.f : values[i][n];
                     write<T>(p.d_masked, (first + row) * p.n_columns + word * N, values[i]);
                 }
                 for (int n = 0; n < N; n++)
@@ -47,7 +48,7 @@ DEVICE void bias_gradient(const BiasGradientParams& p) {
     for (int n = 0; n < N; n++)
         of_warps[warp][N * lane + n] = sums[n];
     __syncthreads();
-    float* target = p.sums + (policy * p.n_strips + strip) * p.n_columns + WARP * N * blockIdx.y;
+    float* target = p.sums + (policy * p.n_strips + strip) * p.n_columns + N * first_word;
     for (int column = threadIdx.x; column < words * N; column += STRIP_THREADS) {
         float total = 0.f;
         for (int i = 0; i < WARPS; i++)

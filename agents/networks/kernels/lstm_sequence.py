@@ -24,17 +24,22 @@ MAX_STEPS = PROGRAM.constants["MAX_STEPS"]
 _THREADS = PROGRAM.constants["SEQUENCE_THREADS"]
 _LANES = PROGRAM.constants["SEQUENCE_LANES"]
 _RANKS = WIDTH // PROGRAM.constants["BLOCK_UNITS"]  # blocks of a cluster
+_MEMORY = max(PROGRAM.constants[f"{name}_MEMORY"] for name in ("FORWARD", "BACKWARD"))
 
 
 def is_supported(x: torch.Tensor) -> bool:
     """Returns whether the kernels run a sequence x (T, B, W) of this dtype on its device."""
-    return (
+    if not (
         x.is_cuda
         and x.dtype == torch.bfloat16
         and x.shape[-1] == WIDTH
         and MIN_STEPS <= len(x) <= MAX_STEPS
-        and torch.cuda.get_device_capability(x.device) >= (9, 0)
-    )
+        and x.numel()
+    ):
+        return False
+    # consumer GPUs of the same generations have clusters too, but less shared memory
+    gpu = torch.cuda.get_device_properties(x.device)
+    return gpu.major >= 9 and gpu.shared_memory_per_block_optin >= _MEMORY
 
 
 def forward(gates, weight, reset, output, cell, needs_backward, residual=None):

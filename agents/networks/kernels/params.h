@@ -140,10 +140,10 @@ struct AddMomentsParams {
 struct BiasGradientParams {
     const void* d;          // (P, n_rows, n_columns) compute
     const void* activated;  // of the same shape; null: no activation
-    void* d_masked;         // d where `activated` is above 0, else 0; null without one
-    float* sums;            // (P, n_strips, n_columns), over STRIP rows each
-    int n_rows;             // at most 2^31 - STRIP
-    int n_columns;          // a multiple of 8
+    void* d_masked;  // d, 0 where `activated` is not above 0 (NaN counts as above); null without
+    float* sums;     // (P, n_strips, n_columns), over STRIP rows each
+    int n_rows;      // at most 2^31 - STRIP
+    int n_columns;   // a multiple of 8
     int n_strips;
 };
 

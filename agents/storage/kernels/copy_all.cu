@@ -6,6 +6,8 @@
 
 #define KERNEL extern "C" __global__ void
 
+static_assert(sizeof(CopyAllParams::copies) == MAX_COPIES * sizeof(CopyParams));
+
 KERNEL copy_all(CopyAllParams p) {
     const CopyParams& copy = p.copies[blockIdx.y];
     unsigned int n_words = copy.is_aligned ? copy.n_bytes / 16 : 0;

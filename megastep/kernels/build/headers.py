@@ -39,7 +39,8 @@ def struct_fields(sources: Mapping[str, str]) -> dict[str, Fields]:
     for header, text in sources.items():
         for name, body in STRUCT.findall(_without_comments(text)):
             structs[name] = [_field(line, formats, header) for line in body.split(";")[:-1]]
-            formats[name] = f"0P{packer(structs[name]).size}s"
+            aligned = "0P" if _holds_pointer(structs[name]) else "0i"
+            formats[name] = f"{aligned}{packer(structs[name]).size}s"
     return structs
 
 
@@ -49,7 +50,7 @@ def _field(line, formats, header):
     is_array = match and match[4]
     if is_array and not match[2] and formats.get(kind, "").endswith("s"):
         size = int(formats[kind][2:-1])
-        return match[3], f"0P{size * int(match[4])}s"
+        return match[3], f"{formats[kind][:2]}{size * int(match[4])}s"
     if not match or is_array or not (match[2] or kind in formats):
         raise ValueError(
             f"{header}: cannot pack the field '{' '.join(line.split())}'. A field is a pointer, "
@@ -62,8 +63,12 @@ def _field(line, formats, header):
 def packer(fields: Fields) -> struct.Struct:
     """Returns the packer of a struct, with the memory layout that a C++ compiler gives it."""
     # "0P" at the end pads to a pointer's alignment, as a compiler does if the struct holds one.
-    end = "0P" if any(kind[-1] in "Ps" for _, kind in fields) else ""
+    end = "0P" if _holds_pointer(fields) else ""
     return struct.Struct("".join(kind for _, kind in fields) + end)
+
+
+def _holds_pointer(fields):
+    return any("P" in kind for _, kind in fields)
 
 
 def builder(name: str, fields: Fields) -> Callable[..., bytes]:

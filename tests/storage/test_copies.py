@@ -1,0 +1,90 @@
+"""Copies of many tensors at once, against `Tensor.copy_`."""
+
+import pytest
+import torch
+
+from megastep.agents.storage import copies
+from megastep.agents.storage.copies import copy_all
+
+DTYPES = torch.bool, torch.uint8, torch.int32, torch.int64, torch.float16, torch.float32
+SIZES = 0, 1, 3, 16, 1000, 70_001  # the last takes several blocks
+
+
+def numbers(shape, dtype, device, seed):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 100, shape, generator=generator).to(dtype).to(device)
+
+
+def cases(device):
+    """Returns pairs (buffer, its part to write, source): plain copies, then others."""
+    cases = []
+
+    def add(buffer, part, source):
+        cases.append((buffer, part(buffer), source))
+
+    for i, dtype in enumerate(DTYPES):
+        for n in SIZES:
+            # what lies around the target must stay
+            buffer = numbers((n + 64,), dtype, device, seed=i)
+            source = numbers((n + 1,), dtype, device, seed=i + n)
+            add(buffer, lambda buffer, n=n: buffer[16 : 16 + n], source[:n])
+            add(buffer.clone(), lambda buffer, n=n: buffer[15 : 15 + n], source[1:])
+            add(buffer.clone(), lambda buffer, n=n: buffer[16 : 16 + n], source[1:])
+    n_plain = len(cases)
+    matrix = numbers((9, 8), torch.float32, device, seed=99)
+    add(torch.zeros(9, 16, device=device), lambda buffer: buffer[:, ::2], matrix)
+    add(torch.zeros(8, 9, device=device), lambda buffer: buffer, matrix.T)
+    add(torch.zeros(9, 8, device=device), lambda buffer: buffer, matrix[0].expand(9, 8))
+    add(torch.zeros(9, 8, device=device), lambda buffer: buffer, matrix[0])
+    add(torch.zeros(9, 8, dtype=torch.float16, device=device), lambda buffer: buffer, matrix)
+    add(torch.zeros(9, 8, dtype=torch.bool, device=device), lambda buffer: buffer, matrix)
+    add(torch.zeros(9, 8, device=device), lambda buffer: buffer, matrix.cpu())
+    return cases, n_plain
+
+
+def test_copies_what_copy_does(device, monkeypatch):
+    launches, launch_blocks = [], copies.launch_blocks
+    monkeypatch.setattr(
+        copies, "launch_blocks", lambda *args: launches.append(args) or launch_blocks(*args)
+    )
+    (ours, n_plain), (theirs, _) = cases(device), cases(device)
+    copy_all([(target, source) for _, target, source in ours])
+    for _, target, source in theirs:
+        target.copy_(source)
+    for i, ((buffer, _, _), (expected, _, _)) in enumerate(zip(ours, theirs, strict=True)):
+        assert torch.equal(buffer, expected), i
+    n_launches = -(-n_plain // copies._MAX_COPIES) if device == "cuda" else 0
+    assert n_plain > 2 * copies._MAX_COPIES and len(launches) == n_launches
+
+
+def test_sources_that_nobody_else_holds_are_copied(device):
+    """Conversions between them would take the memory of a source that is freed too early."""
+    source = torch.arange(10_000.0, device=device)
+    plain = [torch.zeros(10_000, device=device) for _ in range(8)]
+    half = [torch.zeros(10_000, dtype=torch.float16, device=device) for _ in range(8)]
+
+    def pairs():
+        for i in range(8):
+            yield plain[i], source + i
+            yield half[i], source * 0 + i
+
+    copy_all(pairs())
+    for i in range(8):
+        assert torch.equal(plain[i], source + i) and (half[i] == i).all()
+
+
+def test_nothing_to_copy():
+    copy_all([])
+
+
+@pytest.mark.cuda
+def test_copies_are_captured():
+    source, target = torch.zeros(2, 1000, device="cuda")
+    copy_all([(target, source)])  # builds the kernel
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        copy_all([(target, source)])
+    source.fill_(3.0)
+    assert not target.any()
+    graph.replay()
+    assert (target == 3).all()
