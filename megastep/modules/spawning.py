@@ -123,6 +123,8 @@ class RandomSpawns:
     Attributes:
         points: (D, A * (n_spawns // A), 2) float32, those of agent 0 first.
         point_index: (N, A) int32, index into ``points`` of each agent's last spawn point.
+        cumulative: (D,) int32, cumulative weights by which layouts are drawn, see ``engine.spawn``;
+            None: every layout is as likely.
     """
 
     def __init__(
@@ -154,6 +156,7 @@ class RandomSpawns:
             torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
             for _ in range(2)
         )
+        self.cumulative: torch.Tensor | None = None
 
     def __call__(self, reset: torch.Tensor) -> None:
         """Respawns the agents where ``reset``, (N, A) or (B,) bool, is True."""
@@ -168,7 +171,22 @@ class RandomSpawns:
             self.resample,
             self.hidden,
             self.point_index,
+            self.cumulative,
         )
+
+    def weigh_layouts(self) -> torch.Tensor:
+        """Has layouts be drawn by weights from now on, first by equal ones. Returns ``cumulative``,
+        to be changed in place.
+
+        Raises:
+            ValueError: if environments keep their layouts.
+        """
+        if not self.resample:
+            raise ValueError("environments keep their homes: use resample=True to draw them anew")
+        if self.cumulative is None:
+            n = len(self.core.scenery.layouts)
+            self.cumulative = torch.arange(1, n + 1, dtype=torch.int32, device=self.core.device)
+        return self.cumulative
 
 
 def _all_points(geometries, n, n_agents, radius, seed):
