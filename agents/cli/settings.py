@@ -60,9 +60,9 @@ class WandbLogger:
 
 @frozen
 class NoCurriculum:
-    """The environment draws every home alike."""
+    """Every home is drawn alike."""
 
-    name: str = "none"
+    name: str
 
 
 LOGGERS = {"none": LocalLogger, "wandb": WandbLogger}
@@ -199,7 +199,7 @@ class Train(Common):
     geometry: Geometry
     agent: Agent = Agent()
     learner: Learner
-    curriculum: Curriculum = NoCurriculum()
+    curriculum: Curriculum = NoCurriculum(name="none")
     opponents: Opposition = Opposition()
     logger: Logger
     finish: Finish

@@ -108,13 +108,11 @@ class Rollout:
         self.layouts = torch.zeros_like(self.reward, dtype=torch.int32)
 
     def store_layouts(self, t: int, layout: torch.Tensor) -> None:
-        """Stores the layouts of the world that followed time t, where they are wanted.
+        """Stores the layouts of the world that followed time t, if they were allocated.
 
         Args:
-            layout: (N,) int32, by environment.
+            layout: (N,) integers, by environment.
         """
-        if self.layouts is None:
-            return
         n_env_lanes = self.n_lanes if self.learners is None else len(self.learners)
         by_lane = layout[:, None].expand(-1, n_env_lanes // len(layout)).flatten()
         self.layouts[t] = self.select_lanes(by_lane)

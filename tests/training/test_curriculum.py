@@ -271,6 +271,7 @@ def test_run_logs_outcomes_by_source(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = [*SMALL, "env=pointgoal", "env.limit=5", "log_every=1", "curriculum=sfl"]
     words[2:4] = ["geometry=mixed", "geometry.parts={bench: 3, maze: 1}"]
+    words.append("samples=320")
     assert train.main([*words, "folder=run"]) == 0
     row = json_lines.read("run/metrics.jsonl")[-1]
     shares = [row[f"curriculum/drawn/{source}"] for source in ("bench", "maze")]
