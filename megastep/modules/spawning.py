@@ -123,8 +123,6 @@ class RandomSpawns:
     Attributes:
         points: (D, A * (n_spawns // A), 2) float32, those of agent 0 first.
         point_index: (N, A) int32, index into ``points`` of each agent's last spawn point.
-        cumulative: (D,) int32, cumulative weights by which layouts are drawn, see ``engine.spawn``;
-            None: every layout is as likely.
     """
 
     def __init__(
@@ -143,6 +141,7 @@ class RandomSpawns:
                 f"n_spawns={n_spawns} is less than one point for each of the {core.n_agents} agents"
             )
         self.core = core
+        self._n_layouts = len(core.scenery.layouts)
         self.resample = checks.flag("resample", resample)
         self.hidden = checks.flag("hidden", hidden)
         self.seed = core.seed if seed is None else checks.integer("seed", seed, 0)
@@ -156,7 +155,7 @@ class RandomSpawns:
             torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
             for _ in range(2)
         )
-        self.cumulative: torch.Tensor | None = None
+        self._weights: torch.Tensor | None = None
 
     def __call__(self, reset: torch.Tensor) -> None:
         """Respawns the agents where ``reset``, (N, A) or (B,) bool, is True."""
@@ -183,10 +182,20 @@ class RandomSpawns:
         """
         if not self.resample:
             raise ValueError("environments keep their homes: use resample=True to draw them anew")
-        if self.cumulative is None:
-            n = len(self.core.scenery.layouts)
-            self.cumulative = torch.arange(1, n + 1, dtype=torch.int32, device=self.core.device)
+        if self._weights is None:
+            n, n_envs, n_agents = self._n_layouts, self.core.n_envs, self.core.n_agents
+            # of another length than a tensor with a row per environment or lane, which recordings
+            # of NaN would take it for
+            length = next(k for k in range(n, n + 3) if k not in (n_envs, n_envs * n_agents))
+            self._weights = torch.arange(1, length + 1, dtype=torch.int32, device=self.core.device)
         return self.cumulative
+
+    @property
+    def cumulative(self) -> torch.Tensor | None:
+        """(D,) int32, cumulative weights by which layouts are drawn, see ``engine.spawn``; None
+        before `weigh_layouts`: every layout is as likely.
+        """
+        return None if self._weights is None else self._weights[: self._n_layouts]
 
 
 def _all_points(geometries, n, n_agents, radius, seed):
