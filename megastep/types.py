@@ -55,6 +55,9 @@ class Env(Protocol):
         check(): raises the errors that were flagged on the device. Synchronises host and device.
         layout: (N,) integers, the floor plan that each environment shows now. Confidence intervals
             of an evaluation are over layouts. Default: None, intervals are over environments.
+        weigh_layouts(): has new episodes take place in layouts drawn by weights from now on.
+            Returns the cumulative weights, (D,) int32 on the device, which a curriculum changes in
+            place. Default: none, there are no layouts to draw.
         bot: class of a scripted policy for this environment, whose arguments are settings of the
             environment. It plays as ``opponents.bot`` and ``against=bot``. Default: none.
         roles: a name per agent, such as ``("leader", "follower")``. Metrics are reported by role.
@@ -87,6 +90,7 @@ DEFAULTS: dict[str, Any] = {
     "close": lambda: None,
     "check": lambda: None,
     "layout": None,
+    "weigh_layouts": None,
     "bot": None,
     "roles": None,
     "privileged_space": None,

@@ -40,6 +40,7 @@ ARGUMENTS = {
         # what lr falls to 0 over; auto: samples if given, else seconds if given
         anneal=(Literal["auto", "never", "samples", "seconds"], "auto"),
     ),
+    "curriculum": dict(reserved=("env", "learner", "rollout", "sources"), name=str),
     "agent": dict(reserved=("obs_space", "action_space", "privileged_space", "seed")),
     "opponents": dict(
         reserved=("env", "policy", "scripted", "seed"),

@@ -12,6 +12,7 @@ from megastep.agents.algorithms.learner import LearnerError, check_learner
 from megastep.agents.cli import check, program
 from megastep.agents.cli.settings import (
     Agent,
+    Curriculum,
     Env,
     Geometry,
     Learner,
@@ -152,6 +153,21 @@ def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
         except TypeError as error:
             raise LearnerError(error) from error
     return learner
+
+
+def make_curriculum(settings: Curriculum, geometries: list[dict]) -> Callable | None:
+    """Returns a function of (env, learner, rollout) that makes the curriculum, None if there is to
+    be none.
+    """
+    if settings.name == "none":
+        return None
+    sources = [home.get("source") for home in geometries]
+    sources = sources if all(sources) else None
+
+    def make(env, learner, rollout):
+        return construct(settings, env=env, learner=learner, rollout=rollout, sources=sources)
+
+    return make
 
 
 def make_opponents(

@@ -81,6 +81,8 @@ def run(path: Path, device: str | None = None, trust: bool = False) -> NonFinite
         device=device,
         privileged=cfg.agent.critic == "asymmetric",
     )
+    if cfg.curriculum.name != "none":
+        env.weigh_layouts()  # the file has the weights
     with errors(kinds=(ReplayError,)):
         value = recording.replay(env)
     if value and (value.name, value.lane, value.step) == recording.place:

@@ -51,6 +51,8 @@ The most common words:
                                in environments with several agents: shares of environments against
                                past selves and a scripted policy; snapshots=8 keeps what ratings
                                compare
+  curriculum=sfl               draw homes that are won half of the time more often; plr: where
+                               values err most
   resume=RUN                   continue a run (its folder, or latest) under its own configuration;
                                more_seconds=60 more_samples=1e6 add to what it has had
   ranks=2                      two processes that train together, on a GPU each; all: every GPU;

@@ -58,6 +58,13 @@ class WandbLogger:
     group: str | None = None
 
 
+@frozen
+class NoCurriculum:
+    """Every home is drawn alike."""
+
+    name: str
+
+
 LOGGERS = {"none": LocalLogger, "wandb": WandbLogger}
 #: Groups of configs/ whose member has `name`, the import path of a class or function, and decides
 #: which settings there are: its arguments. Those it must have, with what each means.
@@ -65,6 +72,7 @@ IMPORTED = {
     "env": {"n_envs": "the number of environments"},
     "geometry": {"n": "the number of geometries", "split": "its split", "seed": "an integer"},
     "learner": {"policy": "the policy to improve"},
+    "curriculum": {"env": "the environment", "rollout": "the rollout"},
 }
 GROUPS = (*IMPORTED, "logger")
 
@@ -80,6 +88,8 @@ def kind_of(group: str, name: str) -> type:
         if name not in LOGGERS:
             raise ValueError(f"{name!r} is unknown; {closest(name, LOGGERS)}")
         return LOGGERS[name]
+    if (group, name) == ("curriculum", "none"):
+        return NoCurriculum
     if (group, name) in components.built_in():
         return settings_class(*components.built_in()[group, name])
     constructor, spec = import_object(name), components.ARGUMENTS[group]
@@ -131,7 +141,7 @@ def env_name(env: Any) -> str:
     return getattr(env, "id", None) or label(env.name)
 
 
-Env, Geometry, Learner, Logger = map(_group, GROUPS)
+Env, Geometry, Learner, Curriculum, Logger = map(_group, GROUPS)
 Agent = kind_of("agent", components.POLICY)
 Opposition = kind_of("opponents", components.OPPONENTS)
 
@@ -189,6 +199,7 @@ class Train(Common):
     geometry: Geometry
     agent: Agent = Agent()
     learner: Learner
+    curriculum: Curriculum = NoCurriculum(name="none")
     opponents: Opposition = Opposition()
     logger: Logger
     finish: Finish
@@ -213,8 +224,21 @@ class Train(Common):
 
     def errors(self):
         n_minibatches, over = getattr(self.learner, "n_minibatches", 1), self.learner.anneal
-        is_async = getattr(self.learner, "lag", 0) and (self.opponents.past or self.opponents.bot)
+        lag, env = getattr(self.learner, "lag", 0), self.env
+        has_curriculum = self.curriculum.name != "none"
+        is_async = lag and (self.opponents.past or self.opponents.bot)
+        # classes of users are asked when they are made
+        draws = getattr(env, "resample", not env.name.startswith("megastep."))
+        cure = "use env.resample=true" if hasattr(env, "resample") else "use curriculum=none"
         return {
+            "curriculum": has_curriculum
+            and (lag or not draws)
+            and (
+                "the homes to draw change with every update, so nothing can be collected ahead of "
+                "it; use learner.lag=0"
+                if lag
+                else f"env={env_name(env)} draws no home for each episode; {cure}"
+            ),
             "learner.n_minibatches": n_minibatches > self.env.n_envs
             and f"{n_minibatches} is more than env.n_envs={self.env.n_envs}",
             "learner.lag": is_async

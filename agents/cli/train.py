@@ -123,6 +123,7 @@ def make_trainer(
             checkpoint_seconds=cfg.checkpoint_seconds,
             desync=cfg.desync,
             opponents=opponents,
+            make_curriculum=factory.make_curriculum(cfg.curriculum, where["geometries"]),
             replay_folder=folder if cfg.nonfinite_replay else None,
             **writers,
         )

@@ -54,6 +54,8 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
                 world = env.step(arrdict(actions=rollout.scatter_actions(decision["actions"])))
                 world = rollout.select_lanes(world)
             seen = rollout.store_step(t, decision, world)
+            if rollout.layouts is not None:
+                rollout.store_layouts(t, env.layout)
 
         if rollout.values is not None:
             with section("act"):

@@ -54,6 +54,8 @@ class Rollout:
         terminal: (T, B) bool.
         truncated: (T, B) bool.
         metrics: (T, B) float32 by name, read where an episode ends.
+        layouts: (T, B) int32, the floor plan that the action led through, for a curriculum; None
+            without `allocate_layouts`.
         state: (B, ...), the policy's hidden state before row 0.
 
     Raises:
@@ -92,7 +94,7 @@ class Rollout:
         self.values = torch.zeros(rows_and_last, device=device) if values else None
         self.logprobs = torch.zeros(rows, device=device)
         self.reward = torch.zeros(rows, device=device)
-        self.metrics = arrdict()
+        self.metrics, self.layouts = arrdict(), None
         self.state = clone(state)
 
     # ---- Writing ----
@@ -101,6 +103,20 @@ class Rollout:
         """Allocates the metrics of worlds like this one. Call once, before the first step."""
         for name in world.get("metrics", {}):
             self.metrics[name] = torch.zeros_like(self.reward)
+
+    def allocate_layouts(self) -> None:
+        """Has the layouts of the environment be stored. Call once, before the first step."""
+        self.layouts = torch.zeros_like(self.reward, dtype=torch.int32)
+
+    def store_layouts(self, t: int, layout: torch.Tensor) -> None:
+        """Stores the layouts of the world that followed time t, if they were allocated.
+
+        Args:
+            layout: (N,) integers, by environment.
+        """
+        n_env_lanes = self.n_lanes if self.learners is None else len(self.learners)
+        by_lane = layout[:, None].expand(-1, n_env_lanes // len(layout)).flatten()
+        self.layouts[t] = self.select_lanes(by_lane)
 
     def store_world(self, t: int, world: arrdict) -> arrdict:
         """Stores the world at time t. Returns it as it was stored, for the policy to act on."""
@@ -143,7 +159,7 @@ class Rollout:
 
     def state_dict(self) -> dict[str, Tree]:
         """Returns every tensor: trees by name."""
-        names = *SEQUENCES, "values", "metrics", "state"
+        names = *SEQUENCES, "values", "metrics", "layouts", "state"
         parts = {name: getattr(self, name) for name in names}
         return {name: part for name, part in parts.items() if part is not None}
 
@@ -153,8 +169,8 @@ class Rollout:
 
     # ---- Lanes of the environment and lanes of the rollout ----
 
-    def select_lanes(self, world: arrdict) -> arrdict:
-        """Returns the stored lanes of an environment's world."""
+    def select_lanes(self, world: Tree) -> Tree:
+        """Returns the stored lanes of an environment's world, or of a tensor (B, ...)."""
         return world if self.lane_indices is None else _select(world, self.lane_indices)
 
     def scatter_actions(self, actions: Tree) -> Tree:

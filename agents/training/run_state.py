@@ -12,6 +12,7 @@ from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
+    from megastep.agents.training.curriculum import Curriculum
     from megastep.agents.training.episode_stats import EpisodeStats
     from megastep.agents.types import Collector, Learner, OpponentPool
 
@@ -26,6 +27,7 @@ class RunState:
         collect: the learner's collector.
         episode_stats: statistics of the episodes.
         opponents: `env`, if it is an `Opponents`.
+        curriculum: what draws the homes of episodes, if anything does.
     """
 
     def __init__(
@@ -36,9 +38,11 @@ class RunState:
         collect: Collector,
         episode_stats: EpisodeStats,
         opponents: OpponentPool | None = None,
+        curriculum: Curriculum | None = None,
     ):
         self.policy, self.learner, self.collect = policy, learner, collect
         self.episode_stats, self.opponents = episode_stats, opponents
+        self.curriculum = curriculum
         if opponents is None:
             self.env_state = EnvState(env)
         else:
@@ -68,6 +72,8 @@ class RunState:
             parts["collector"] = getattr(self.collect, "state_dict", dict)()
         if self.opponents is not None:
             parts["opponents"] = self.opponents.state_dict()
+        if self.curriculum is not None:
+            parts["curriculum"] = self.curriculum.state_dict()
         if self.replay_buffer is not None:
             parts["replay"] = self.replay_buffer.state_dict()
         return parts
@@ -90,6 +96,9 @@ class RunState:
             of_episodes = {"lanes"} if lost else set()
             parts = state["opponents"].items()
             self.opponents.load_state_dict({k: v for k, v in parts if k not in of_episodes})
+        if self.curriculum is not None:
+            parts = state["curriculum"]
+            self.curriculum.load_state_dict(parts if not lost else parts | {"lanes": None})
         if self.replay_buffer is not None:
             if "replay" in state:
                 self.replay_buffer.load_state_dict(state["replay"])

@@ -26,7 +26,8 @@ from megastep.types import Env, optional
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.training.annealing import AnnealingRecord
-    from megastep.agents.types import Learner, Logger, OpponentPool, Saver
+    from megastep.agents.training.curriculum import Curriculum
+    from megastep.agents.types import Learner, Logger, OpponentPool, Rollout, Saver
 
 
 class Trainer:
@@ -55,6 +56,8 @@ class Trainer:
             environment, see `nonfinite_recorder`; None for no file.
         annealing_record: such as `annealing.AnnealingRecord`: gets the factor of the learning rate
             in each update, and is flushed before each report.
+        make_curriculum: returns what draws the homes of new episodes, such as `curriculum.SFL`, for
+            the environment, the learner and the rollout; None leaves that to the environment.
 
     Attributes:
         samples, updates: environment steps of all lanes of all ranks, and updates, so far.
@@ -72,7 +75,8 @@ class Trainer:
             resumed run has all reports up to it, and writes the later ones.
 
     Raises:
-        ValueError: the budget anneals the learning rate of a learner without `set_lr`.
+        ValueError: the budget anneals the learning rate of a learner without `set_lr`; the
+            curriculum has no use for the environment or the learner.
     """
 
     def __init__(
@@ -92,6 +96,7 @@ class Trainer:
         snapshot_saver: Callable[[Trainer], None] = lambda trainer: None,
         replay_folder: Path | None = None,
         annealing_record: AnnealingRecord | None = None,
+        make_curriculum: Callable[[Env, Learner, Rollout], Curriculum] | None = None,
     ):
         self.env, self.policy, self.learner = env, policy, learner
         self.logger, self.saver, self.budget = logger, saver, budget
@@ -105,6 +110,7 @@ class Trainer:
             )
         self.collect = learner.collector(env)
         self.rollout = self.collect.rollout
+        self.curriculum = make_curriculum and make_curriculum(env, learner, self.rollout)
         desync = desync and optional(env, "desync") is not None
         if desync:
             env.desync()  # the collector has reset the environment, and has not stepped it yet
@@ -115,7 +121,9 @@ class Trainer:
             lane_groups(env, self.rollout.learners),
             skip_first=desync,
         )
-        self.run_state = RunState(env, policy, learner, self.collect, self.episode_stats, opponents)
+        self.run_state = RunState(
+            env, policy, learner, self.collect, self.episode_stats, opponents, self.curriculum
+        )
         self.nonfinite_guard = NonFiniteGuard(env, learner, self.collect, opponents, replay_folder)
         self.clock, self.timer = Stopwatch(), PhaseTimer(env.device)
         self.section_times = SectionTimes(env.device)
@@ -233,6 +241,8 @@ class Trainer:
             rollout.learns[:-1],
             rollout.metrics,
         )
+        if self.curriculum is not None:
+            self.curriculum.update(rollout)
         self.samples += rollout.n_steps * rollout.n_lanes * n_ranks()
         self.updates += 1
         if self.opponents is not None:
@@ -264,6 +274,8 @@ class Trainer:
         stats = self.episode_stats.pop()
         if self.opponents is not None:
             stats |= self.opponents.pop_win_rates()
+        if self.curriculum is not None:
+            stats |= mean_over_ranks(self.curriculum.stats())
         self.latest_stats.update(stats)
         metrics = {
             **stats,

@@ -20,9 +20,11 @@ from pathlib import Path
 
 KEY_BYTES = 32
 #: Groups of settings that may hold import paths.
-GROUPS = ("env", "geometry", "agent", "learner", "opponents")
+GROUPS = ("env", "geometry", "agent", "learner", "opponents", "curriculum")
 #: Import paths of megastep's own components.
-OWN = re.compile(r"megastep\.(envs|geometries|agents\.(algorithms|networks|selfplay))(\.\w+)*:\w+")
+OWN = re.compile(
+    r"megastep\.(envs|geometries|agents\.(algorithms|networks|selfplay|training))(\.\w+)*:\w+"
+)
 
 
 def sign(config: bytes) -> str | None:

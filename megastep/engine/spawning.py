@@ -32,6 +32,7 @@ def spawn(
     resample: bool = False,
     hidden: bool = False,
     point_index: torch.Tensor | None = None,
+    cumulative: torch.Tensor | None = None,
 ) -> None:
     """Puts agents at random points of their environment's layout, at rest, with random headings.
 
@@ -45,6 +46,9 @@ def spawn(
             narrower than an agent's radius. If there is none, choose the point that is furthest
             from its nearest agent. Agents respawn one after the other and avoid those before them.
         point_index: (N, A) int32, receives the index of each respawned agent's point.
+        cumulative: (D,) int32, cumulative weights of the layouts, by which `resample` draws them:
+            whole numbers from 0 whose sum, the last entry, is from 1 to 2**31 - 1. Default: every
+            layout is as likely.
 
     Raises:
         TypeError, ValueError: naming the argument that does not fit.
@@ -59,6 +63,9 @@ def spawn(
     point_index_at = 0
     if point_index is not None:
         point_index_at = checks.address("point_index", point_index, lanes, torch.int32, device)
+    cumulative_at = 0
+    if cumulative is not None:
+        cumulative_at = checks.address("cumulative", cumulative, (n_layouts,), torch.int32, device)
     packed = ENGINE.params.SpawnParams(
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
@@ -66,6 +73,7 @@ def spawn(
         points=checks.address("points", points, (n_layouts, n_points, 2), torch.float32, device),
         counts=checks.address("counts", counts, lanes, torch.int32, device),
         point_index=point_index_at,
+        cumulative=cumulative_at,
         error_flag=error_flag_address(scenery, agents),
         **seed_params(seed),
         n_points=n_points,

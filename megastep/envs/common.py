@@ -8,6 +8,7 @@ import torch
 from megastep import engine
 from megastep.arrdict import arrdict, numpyify
 from megastep.core import Core
+from megastep.modules import RandomSpawns
 
 __all__ = ["DisplayedEnv", "SceneryEnv"]
 
@@ -27,6 +28,7 @@ class SceneryEnv(DisplayedEnv):
     """An environment built around a :class:`~megastep.core.Core`, its attribute ``core``."""
 
     core: Core
+    spawner: RandomSpawns
 
     def check(self) -> None:
         """Raises EngineError if the engine flagged an error on the device since the last check.
@@ -39,3 +41,12 @@ class SceneryEnv(DisplayedEnv):
     def layout(self) -> torch.Tensor:
         """(N,) int32: the layout that each environment shows now, an index into ``geometries``."""
         return self.core.scenery.layout
+
+    def weigh_layouts(self) -> torch.Tensor:
+        """Has the layouts of new episodes be drawn by weights from now on, first by equal ones.
+        Returns the cumulative weights, (D,) int32, to be changed in place.
+
+        Raises:
+            ValueError: if environments keep their layouts.
+        """
+        return self.spawner.weigh_layouts()

@@ -96,6 +96,7 @@ struct SpawnParams {
     const float* points;        // (D, n_points, 2) spawn points
     int* counts;                // (N, A) in and out: numbers drawn so far, the generator's counter
     int* point_index;           // (N, A) out where mask: the layout's point
+    const int* cumulative;      // (D) cumulative weights of the layouts; null: all are as likely
     int* error_flag;            // (1) out: see common/errors.h
     unsigned int key0;          // the seed
     unsigned int key1;

@@ -37,6 +37,24 @@ HD int hidden_point(const SpawnParams& p, const Group& group, int env, int a, in
     return furthest;
 }
 
+// A layout drawn by a random number. With weights, a fraction bits / 2^32 of their sum lies in the
+// interval of one layout: the first whose cumulative weight is above it.
+HD int drawn_layout(const SpawnParams& p, unsigned int bits) {
+    int n_layouts = p.scenery.n_layouts, low = 0, high = n_layouts - 1;
+    if (!p.cumulative)
+        return (int)(unit_float(bits) * (float)n_layouts);
+    unsigned long long total = (unsigned int)p.cumulative[high];
+    int at = (int)(bits * total >> 32);
+    while (low < high) {
+        int middle = (low + high) / 2;
+        if (p.cumulative[middle] > at)
+            high = middle;
+        else
+            low = middle + 1;
+    }
+    return low;
+}
+
 HD void place(const SpawnParams& p, int i, const float* at, float angle) {
     p.counts[i] = (int)((unsigned int)p.counts[i] + 1u);  // wraps, as Philox's counter does
     p.positions[2 * i] = at[0];
@@ -69,7 +87,7 @@ HD void spawn_env(const SpawnParams& p, const Group& group, int env) {
             continue;
         Philox bits = philox((unsigned int)i, (unsigned int)p.counts[i], p.key0, p.key1);
         if (a == 0 && moves)
-            layout = (int)(unit_float(bits.c) * (float)s.n_layouts);
+            layout = drawn_layout(p, bits.c);
         int point = (int)(unit_float(bits.a) * (float)n_per_agent);
         if (hidden)
             point = hidden_point(p, group, env, a, layout, point);

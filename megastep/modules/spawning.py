@@ -141,6 +141,7 @@ class RandomSpawns:
                 f"n_spawns={n_spawns} is less than one point for each of the {core.n_agents} agents"
             )
         self.core = core
+        self._n_layouts = len(core.scenery.layouts)
         self.resample = checks.flag("resample", resample)
         self.hidden = checks.flag("hidden", hidden)
         self.seed = core.seed if seed is None else checks.integer("seed", seed, 0)
@@ -154,6 +155,7 @@ class RandomSpawns:
             torch.zeros((core.n_envs, core.n_agents), dtype=torch.int32, device=core.device)
             for _ in range(2)
         )
+        self._weights: torch.Tensor | None = None
 
     def __call__(self, reset: torch.Tensor) -> None:
         """Respawns the agents where ``reset``, (N, A) or (B,) bool, is True."""
@@ -168,7 +170,32 @@ class RandomSpawns:
             self.resample,
             self.hidden,
             self.point_index,
+            self.cumulative,
         )
+
+    def weigh_layouts(self) -> torch.Tensor:
+        """Has layouts be drawn by weights from now on, first by equal ones. Returns ``cumulative``,
+        to be changed in place.
+
+        Raises:
+            ValueError: if environments keep their layouts.
+        """
+        if not self.resample:
+            raise ValueError("environments keep their homes: use resample=True to draw them anew")
+        if self._weights is None:
+            n, n_envs, n_agents = self._n_layouts, self.core.n_envs, self.core.n_agents
+            # of another length than a tensor with a row per environment or lane, which recordings
+            # of NaN would take it for
+            length = next(k for k in range(n, n + 3) if k not in (n_envs, n_envs * n_agents))
+            self._weights = torch.arange(1, length + 1, dtype=torch.int32, device=self.core.device)
+        return self.cumulative
+
+    @property
+    def cumulative(self) -> torch.Tensor | None:
+        """(D,) int32, cumulative weights by which layouts are drawn, see ``engine.spawn``; None
+        before `weigh_layouts`: every layout is as likely.
+        """
+        return None if self._weights is None else self._weights[: self._n_layouts]
 
 
 def _all_points(geometries, n, n_agents, radius, seed):

@@ -32,7 +32,8 @@ MORE = {"geometry=files": [f"geometry.path={sources.BENCH}"]}
 @pytest.mark.slow
 def test_every_group_member_composes():
     groups = Composer(scripts.TRAIN).groups()
-    assert set(groups) == {"env", "geometry", "agent", "learner", "logger", "preset", "experiment"}
+    parts = {"env", "geometry", "agent", "learner", "curriculum", "logger"}
+    assert set(groups) == parts | {"preset", "experiment"}
     assert set(groups["env"]) == set(envs.ENVS)
     assert set(groups["geometry"]) == set(geometries.SOURCES)
     for choice in [f"{group}={member}" for group in groups for member in groups[group]]:
@@ -130,7 +131,7 @@ def test_settings_round_trip():
     assert check(Train, as_tree(cfg)) == cfg
 
 
-@pytest.mark.parametrize("group", ["env", "geometry", "learner", "agent"])
+@pytest.mark.parametrize("group", ["env", "geometry", "learner", "curriculum", "agent"])
 def test_config_files_hold_no_constructor_defaults(group):
     for path in (CONFIGS / group).glob("*.yaml"):
         dotted = values(f"{group}/{path.stem}", "train")

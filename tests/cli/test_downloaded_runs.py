@@ -15,7 +15,7 @@ from megastep.agents.cli.settings import Train, kind_of
 from megastep.agents.training import checkpoint, nonfinite_replay, trust
 from tests.helpers.tiny import TINY, changed, settings
 
-KEYS = ("env.name", "geometry.name", "learner.name", "opponents.bot_class")
+KEYS = ("env.name", "geometry.name", "learner.name", "curriculum.name", "opponents.bot_class")
 KEYS += ("agent.core", "agent.encoder")
 IMPORTED = pathlib.Path("imported")  # written by the planted module
 

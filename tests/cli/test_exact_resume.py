@@ -24,6 +24,7 @@ FIGHT = [
     *("env=deathmatch", "env.n_agents=2", "env.res=8", *SMALL),
     *("learner.n_minibatches=2", "preset=cpu"),
 ]
+DRAWN = [*SMALL[1:], "geometry=bench", "geometry.n=4", "env.res=8", "learner.n_minibatches=2"]
 PONG = ["env=pong", "env.n_envs=8", "agent.width=8", "learner.n_steps=8", "device=cpu"]
 DATA = pathlib.Path(__file__).parents[1] / "data"
 EVERY_UPDATE = ["checkpoint_seconds=1e-9", "keep_checkpoints=99"]
@@ -48,6 +49,12 @@ CASES = {
     "explorer": ["env=explorer", "env.res=8", *SMALL, "learner.n_minibatches=2"],
     "pointgoal": ["env=pointgoal", "env.res=8", *SMALL, "learner.n_minibatches=2"],
     "deathmatch": FIGHT,
+    "plr": [*DRAWN, "env=pointgoal", "env.limit=12", "curriculum=plr", "curriculum.every=3"],
+    "sfl": [*DRAWN, "env=explorer", "env.patience=3", "curriculum=sfl"],
+    "rounds": [
+        *(*FIGHT, "geometry=bench", "geometry.n=4", "env.resample=true", "env.limit=12"),
+        *(*SELF_PLAY, "curriculum=sfl"),
+    ],
     "opponents": [*FIGHT, *SELF_PLAY, "opponents.bot=0.25"],
     "pong": [*PONG, "learner.n_minibatches=2"],
     "continuous": [
@@ -63,7 +70,7 @@ CASES = {
     ],
     "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[1:]],
 }
-FAST = "explorer", "lag", "priorities", "r2d2", "opponents", "stranger", "beta"
+FAST = "explorer", "lag", "priorities", "r2d2", "opponents", "stranger", "beta", "plr"
 
 
 class Drifting:

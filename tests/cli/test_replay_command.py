@@ -63,6 +63,29 @@ def test_the_command_of_the_last_sentence_shows_the_number_again(
     assert "There is no checkpoint in run" in sentence
 
 
+def test_a_run_with_a_curriculum_is_replayed_in_the_homes_that_it_drew(
+    tmp_path, monkeypatch, capsys
+):
+    """There are as many homes as environments; the bad episode begins in the recorded rollout."""
+    monkeypatch.chdir(tmp_path)
+    real = envs.PointGoal.step
+
+    def step(self, decision):
+        world = real(self, decision)
+        is_bad = (self.spawner.counts[:, 0] >= 12) & (torch.arange(4) == 2) & (self.ages >= 2)
+        reward = 1e13 * (self.layout + 1) + 1e12 * self.core.agents.positions[:, 0, 0]
+        return type(world)(world, reward=torch.where(is_bad, reward, world.reward))
+
+    monkeypatch.setattr(envs.PointGoal, "step", step)
+    words = [*tiny.TINY, "env=pointgoal", "env.limit=3", "geometry=bench", "geometry.n=4"]
+    words += ["curriculum=plr", "curriculum.temperature=0.2", f"samples={20 * tiny.UPDATE}"]
+    assert train.main([*words, "folder=run", "log_every=1"]) == 1
+    sentence, command = capsys.readouterr().err.splitlines()[-1].split(". To see it again: ")
+    assert call(monkeypatch, *shlex.split(command)[3:]) == 0
+    number = sentence.partition("train.py: ")[2].partition(". All else")[0]
+    assert capsys.readouterr().out.strip().endswith(f": {number}")
+
+
 @pytest.mark.parametrize("words", [["nothing.npz"], ["config.yaml"], []])
 def test_what_cannot_be_replayed(tmp_path, monkeypatch, capsys, words):
     monkeypatch.chdir(tmp_path)

@@ -185,6 +185,25 @@ def test_spawn_changes_masked_agents_only(device):
     assert scenery.layout[1::2].unique().tolist() == [0, 1], "the others move"
 
 
+def test_spawn_draws_layouts_by_cumulative_weights(device):
+    """The third of the four numbers that the generator draws says where in the weights."""
+    weights, n = torch.tensor([0, 5, 1, 0, 7, 3, 0]), 4096
+    cumulative = weights.cumsum(0)  # up to 16
+    scenery = scene.scenery(len(weights) * [toys.box()], 1, n, device=device)
+    core = cuda.Core(scenery)
+    points = torch.full((len(weights), 4, 2), 2.5, device=device)
+    mask, counts = core.agent_full(True), torch.full((n, 1), 3, dtype=torch.int32, device=device)
+    numbers = torch.full((n, 4), torch.nan, device=device)
+    engine.uniform(counts.flatten().clone(), mask.flatten(), 5, out=numbers)
+    expected = np.searchsorted(cumulative.numpy(), 16 * numbers[:, 2].cpu().numpy(), side="right")
+    table = cumulative.to(device, torch.int32)
+    engine.spawn(
+        scenery, core.agents, mask, points, counts, seed=5, resample=True, cumulative=table
+    )
+    assert np.array_equal(scenery.layout.cpu().numpy(), expected)
+    assert set(expected) == {1, 2, 4, 5}
+
+
 def test_spawn_with_one_point_per_agent(device):
     core = cuda.Core(scene.scenery([toys.box()], 2, 1, device=device))
     points = torch.tensor([[[2.0, 2.0], [4.0, 4.0]]], device=device)

@@ -46,6 +46,7 @@ def fixture(device):
         lanes=torch.ones((N, A), dtype=torch.int64, device=device),
         mask=torch.ones((N, A), dtype=torch.bool, device=device),
         counts=torch.zeros((N, A), dtype=torch.int32, device=device),
+        cumulative=torch.arange(1, D + 1, dtype=torch.int32, device=device),
         seen=torch.zeros((N, A, words), dtype=torch.int32, device=device),
         moves=torch.zeros((7, 3), device=device),
         weights=torch.zeros((N, A, 7), device=device),
@@ -282,6 +283,7 @@ def operations(f):
             seed=1,
             resample=True,
             point_index=f.counts,
+            cumulative=f.cumulative,
         ),
         dict(
             OPERANDS,
@@ -292,6 +294,7 @@ def operations(f):
             resample=flags,
             hidden=flags,
             point_index=optional_tensors,
+            cumulative=optional_tensors,
         ),
     )
     yield (

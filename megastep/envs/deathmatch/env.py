@@ -88,6 +88,9 @@ class Deathmatch(SceneryEnv):
         subsample: rays per pixel.
         fov: field of view in degrees.
         fps: steps per second.
+        resample: play in rounds of ``limit`` steps. At their end every episode in the environment
+            is truncated, and the next round is in a randomly drawn home. Otherwise an environment
+            keeps its own.
         privileged: worlds hold ``privileged`` for a critic: every agent's health and pose.
     """
 
@@ -117,17 +120,22 @@ class Deathmatch(SceneryEnv):
         subsample: Annotated[int, Field(ge=1, le=32)] = 4,
         fov: Annotated[float, Field(gt=0, lt=180)] = 70.0,
         fps: Annotated[float, Field(ge=1, le=1000)] = 10.0,
+        resample: bool = False,
         privileged: bool = False,
     ):
         if geometries is None:
             geometries = sources.sample("homes", min(n_envs, 512), seed=seed)
-        geometries = spread(geometries, n_envs)
+        geometries = geometries if resample else spread(geometries, n_envs)
         homes = scenery(geometries, n_agents, n_envs=n_envs, seed=seed, device=device)
         self.core = Core(homes, res, fov, fps, seed=seed)
         self.n_envs, self.n_agents = n_envs, n_agents
         self.device, self.fps, self.subsample = self.core.device, self.core.fps, subsample
         self.spawner = modules.RandomSpawns(
-            geometries, self.core, max(MIN_SPAWNS, SPAWNS_PER_AGENT * n_agents), hidden=True
+            geometries,
+            self.core,
+            max(MIN_SPAWNS, SPAWNS_PER_AGENT * n_agents),
+            resample=resample,
+            hidden=True,
         )
         self.movement = modules.MomentumMovement(self.core)
         pixels, n_privileged = res // subsample, privileged_size(n_agents)
@@ -163,16 +171,22 @@ class Deathmatch(SceneryEnv):
         self.tally = torch.zeros((TALLY_ROWS, n_lanes), **on)
         self.ages = torch.zeros(n_lanes, dtype=torch.int32, **on)
         self.ended = torch.zeros(n_lanes, dtype=torch.bool, **on)
+        # steps of the round, -1 if the next begins one
+        self.round_ages = torch.zeros(n_envs, dtype=torch.int32, **on) if resample else None
 
     def reset(self) -> arrdict:
         """Starts a new episode for every agent. Returns a world."""
         self.ended.fill_(True)
+        if self.round_ages is not None:
+            self.round_ages.fill_(-1)
         return self._world()
 
     def desync(self) -> None:
         """Gives every lane a random age, from the seed, so that episodes do not end together."""
         limits = torch.full_like(self.ages, self.rules["limit"])
         self.ages.copy_(modules.random_ages(limits, self.core.seed))
+        if self.round_ages is not None:
+            self.round_ages.copy_(self.ages.view(self.n_envs, -1).amax(1))
 
     def step(self, decision: Mapping) -> arrdict:
         """Takes one step with ``decision.actions`` (B, 1). Returns a world."""
@@ -201,17 +215,36 @@ class Deathmatch(SceneryEnv):
         if self.seen is not None:
             search = view.newly_seen.flatten() * (self.search_reward / modules.TEXELS_PER_POINT)
             reward = reward + search.masked_fill_(step.reset, 0.0)
+        truncated, metrics = step.truncated, step.metrics
+        if self.round_ages is not None:
+            truncated, metrics = self._end_rounds(step)
         world = arrdict(
             obs=arrdict(self._images(view), health=step.health_obs),
             reward=reward,
             reset=step.reset,
             terminal=step.terminal,
-            truncated=step.truncated,
-            metrics=arrdict(zip(METRICS, step.metrics.unbind())),
+            truncated=truncated,
+            metrics=arrdict(zip(METRICS, metrics.unbind())),
         )
         if step.privileged is not None:
             world["privileged"] = step.privileged
         return world
+
+    def _end_rounds(self, step):
+        """Ends every episode of the environments whose round is over, but not while one begins.
+
+        Returns `truncated` and the metrics with those episodes in them.
+        """
+        shape = self.n_envs, self.n_agents
+        over = self.round_ages.add_(1) >= self.rules["limit"]
+        over &= ~step.reset.view(shape).any(1)
+        self.round_ages.masked_fill_(over, -1)
+        over = over[:, None].expand(shape).flatten()
+        kills, damage, hits = self.tally
+        so_far = torch.stack([kills, torch.zeros_like(kills), damage, hits / self.ages])
+        metrics = torch.where(over & ~self.ended, so_far, step.metrics)
+        self.ended |= over
+        return step.truncated | (over & ~step.terminal), metrics
 
     def _search_arguments(self):
         """The arguments of observe that count newly seen texels, if search_reward is not 0."""

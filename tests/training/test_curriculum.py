@@ -1,0 +1,321 @@
+"""Curricula: scores by hand, draws that follow them, and what a run logs and keeps of them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from megastep import envs, spaces, toys
+from megastep.agents.algorithms.returns import gae
+from megastep.agents.cli import train
+from megastep.agents.storage.rollout import Rollout
+from megastep.agents.training import json_lines
+from megastep.agents.training.curriculum import PLR, SFL
+from megastep.arrdict import arrdict
+from megastep.geometries import sample
+
+LEARNER = SimpleNamespace(gamma=0.9, lambda_=0.8)
+SMALL = [
+    *("device=cpu", "preset=cpu", "geometry=bench", "geometry.n=4", "env.n_envs=4", "env.res=8"),
+    *("agent.width=8", "learner.n_steps=8", "learner.n_minibatches=2", "samples=64"),
+]
+
+
+class Homes:
+    """Stands for an environment of D homes."""
+
+    def __init__(self, n, device="cpu"):
+        self.layout = torch.zeros(4, dtype=torch.int32, device=device)
+        self.cumulative = torch.arange(1, n + 1, dtype=torch.int32, device=device)
+
+    def weigh_layouts(self):
+        return self.cumulative
+
+
+def empty_rollout(n_steps, n_lanes, device="cpu", metrics=("success",)):
+    space, action_space = spaces.MultiVector(1, 1), spaces.MultiDiscrete(1, 2)
+    rollout = Rollout(n_steps, n_lanes, space, action_space, arrdict(), device)
+    rollout.metrics = arrdict({name: torch.zeros_like(rollout.reward) for name in metrics})
+    return rollout
+
+
+def play(curriculum, rollout, homes, outcomes, name="success"):
+    """One step in which each lane ends an episode."""
+    rollout.terminal.fill_(True)
+    rollout.layouts.copy_(torch.as_tensor(homes)[None])
+    rollout.metrics[name].copy_(torch.as_tensor(outcomes)[None])
+    curriculum.update(rollout)
+
+
+def drawn(curriculum):
+    """Returns the probability of each home in the environment's table."""
+    weights = np.diff(curriculum.cumulative.cpu().numpy().astype(float), prepend=0)
+    return weights / weights.sum()
+
+
+def random_rollout(rollout, seed):
+    """Fills a rollout with random numbers and episodes of a few steps."""
+    random = torch.Generator().manual_seed(seed)
+    shape = rollout.reward.shape
+
+    def numbers(*shape):
+        return torch.rand(*shape, generator=random)
+
+    ends, kind = numbers(*shape) < 0.3, numbers(*shape) < 0.5
+    rollout.terminal.copy_(ends & kind)
+    rollout.truncated.copy_(ends & ~kind)
+    rollout.values.copy_(numbers(*rollout.values.shape))
+    rollout.reward.copy_(numbers(*shape))
+    rollout.metrics.success.copy_((numbers(*shape) < 0.5).float())
+    rollout.learns.copy_(numbers(*rollout.learns.shape) < 0.9)
+    rollout.layouts.copy_((5 * numbers(*shape)).int())
+    # an episode starts in the row after its predecessor's last
+    rollout.starts.zero_()
+    rollout.starts[2:] = ends[:-1].to(rollout.starts.device)
+
+
+# ---- Sampling for learnability ----
+
+
+def test_homes_solved_half_of_the_time_are_drawn_most():
+    """Home 0 is always solved, home 1 never, home 2 every second time, home 3 nine times in ten."""
+    rollout = empty_rollout(1, 4)
+    sfl = SFL(Homes(4), LEARNER, rollout, uniform=0.2, lr=0.01)
+    assert drawn(sfl).tolist() == 4 * [0.25]
+    for n in range(1000):
+        play(sfl, rollout, [0, 1, 2, 3], [1.0, 0.0, n % 2, n % 10 > 0])
+    assert sfl.means.tolist() == pytest.approx([1, 0, 0.5, 0.9], abs=0.04)
+    scores = np.array([0, 0, 0.25, 0.09])
+    assert sfl.scores.tolist() == pytest.approx(scores.tolist(), abs=0.03)
+    assert drawn(sfl) == pytest.approx(0.05 + 0.8 * scores / scores.sum(), abs=0.05)
+    assert drawn(sfl)[:2] == pytest.approx([0.05, 0.05], abs=1e-6)
+
+
+def test_learnability_of_a_coverage_is_its_variance():
+    """Home 0 is always covered to 0.8; home 1 wholly in 80 % of its episodes, else not at all."""
+    rollout = empty_rollout(1, 2, metrics=["coverage"])
+    sfl = SFL(Homes(2), LEARNER, rollout, uniform=0.0, lr=0.01)
+    for n in range(1000):
+        play(sfl, rollout, [0, 1], [0.8, float(n % 5 > 0)], "coverage")
+    assert sfl.scores.tolist() == pytest.approx([0, 0.16], abs=0.02)
+    assert drawn(sfl) == pytest.approx([0, 1], abs=1e-3)
+
+
+def test_running_means_by_hand():
+    """The first outcomes are their mean; n later ones weigh 1 - (1 - lr)^n together."""
+    rollout = empty_rollout(1, 3)
+    sfl = SFL(Homes(2), LEARNER, rollout, lr=0.5)
+    play(sfl, rollout, [0, 0, 0], [1.0, 0.0, 0.0])
+    assert sfl.means.tolist() == pytest.approx([1 / 3, 0]) and sfl.scores[1] == 0.25
+    play(sfl, rollout, [0, 0, 1], [1.0, 1.0, 1.0])
+    assert sfl.means.tolist() == pytest.approx([1 / 3 + 0.75 * 2 / 3, 1])
+    assert sfl.n_episodes.tolist() == [5, 1] and sfl.staleness.tolist() == [0, 0]
+
+
+def test_duels_count_as_decided_by_kills_or_deaths():
+    rollout = empty_rollout(1, 3, metrics=["kills", "deaths"])
+    sfl = SFL(Homes(3), LEARNER, rollout)
+    rollout.metrics.deaths[0, 0] = 1.0
+    play(sfl, rollout, [0, 1, 2], [0.0, 2.0, 0.0], "kills")
+    assert sfl.means.tolist() == [1, 1, 0]
+
+
+def test_lanes_that_do_not_learn_and_outcomes_of_nan_count_for_nothing():
+    rollout = empty_rollout(1, 2)
+    sfl = SFL(Homes(2), LEARNER, rollout)
+    rollout.learns[0, 1] = False
+    play(sfl, rollout, [0, 1], [torch.nan, 1.0])
+    assert sfl.n_episodes.tolist() == [1, 0] and sfl.means.tolist() == [0, 0]
+
+
+def test_probabilities_change_every_so_many_updates():
+    rollout = empty_rollout(1, 2)
+    sfl = SFL(Homes(2), LEARNER, rollout, every=2)
+    play(sfl, rollout, [0, 0], [1.0, 1.0])
+    assert drawn(sfl).tolist() == [0.5, 0.5]
+    play(sfl, rollout, [0, 0], [1.0, 1.0])
+    assert drawn(sfl) == pytest.approx([0.25, 0.75])
+
+
+# ---- Prioritised level replay ----
+
+
+@pytest.mark.parametrize("score", ["absolute", "positive"])
+def test_score_is_the_mean_advantage_of_an_episode(score):
+    """Against a loop over lanes and steps; episodes reach across rollouts."""
+    rollout = empty_rollout(6, 8)
+    plr = PLR(Homes(5), LEARNER, rollout, score=score, lr=0.25)
+    running, n_seen = np.zeros(5), np.zeros(5, int)
+    so_far = [[] for _ in range(8)]
+    for seed in range(4):
+        random_rollout(rollout, seed)
+        plr.update(rollout)
+        a = gae(**rollout.transitions(), gamma=0.9, lambda_=0.8).advantages.numpy()
+        a = np.abs(a) if score == "absolute" else np.maximum(a, 0)
+        ended = [[] for _ in range(5)]
+        for t in range(6):
+            for b in range(8):
+                if not rollout.reset[t, b]:
+                    so_far[b].append(a[t, b])
+                if rollout.terminal[t, b] or rollout.truncated[t, b]:
+                    if rollout.learns[t, b]:
+                        ended[rollout.layouts[t, b]].append(sum(so_far[b]) / max(len(so_far[b]), 1))
+                    so_far[b] = []
+        for home, scores in enumerate(ended):
+            if scores:
+                rate = 1 - 0.75 ** len(scores) if n_seen[home] else 1
+                running[home] += rate * (np.mean(scores) - running[home])
+                n_seen[home] += len(scores)
+    assert plr.n_episodes.tolist() == n_seen.tolist() and n_seen.min() > 0
+    assert plr.scores.numpy() == pytest.approx(running, abs=1e-5)
+
+
+def test_draws_follow_ranks_and_staleness():
+    rollout = empty_rollout(1, 1)
+    plr = PLR(Homes(4), LEARNER, rollout, temperature=0.5, staleness=0.4)
+    plr.n_episodes.fill_(1)
+    plr.scores.copy_(torch.tensor([0.1, 0.4, 0.3, 0.2]))
+    plr.staleness.copy_(torch.tensor([0, 0, 1, 3]))
+    ranks = 1 / np.array([4, 1, 2, 3]) ** 2
+    expected = 0.6 * ranks / ranks.sum() + 0.4 * np.array([0, 0, 1, 3]) / 4
+    assert plr.probabilities().numpy() == pytest.approx(expected, abs=1e-6)
+    plr.n_episodes[0] = 0
+    assert plr.probabilities().argmax() == 0, "an unseen home ranks first"
+
+
+# ---- On both devices ----
+
+
+def scored(kind, device):
+    rollout = empty_rollout(6, 8, device)
+    curriculum = kind(Homes(5, device), LEARNER, rollout)
+    for seed in range(5):
+        random_rollout(rollout, seed)
+        curriculum.update(rollout)
+    return {k: torch.as_tensor(v).cpu() for k, v in curriculum.state_dict().items()}
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("kind", [SFL, PLR])
+def test_cpu_and_gpu_agree_and_a_gpu_repeats_its_bits(kind):
+    once, again, on_cpu = scored(kind, "cuda"), scored(kind, "cuda"), scored(kind, "cpu")
+    for name, value in once.items():
+        assert torch.equal(value, again[name]), name
+        torch.testing.assert_close(value.double(), on_cpu[name].double(), rtol=1e-4, atol=8)
+    assert torch.equal(once["n_episodes"], on_cpu["n_episodes"])
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("kind", [SFL, PLR])
+def test_an_update_does_not_synchronise(kind):
+    rollout = empty_rollout(6, 8, "cuda")
+    curriculum = kind(Homes(5, "cuda"), LEARNER, rollout)
+    curriculum.update(rollout)
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        curriculum.update(rollout)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+# ---- In environments ----
+
+
+@pytest.mark.parametrize("name", ["Explorer", "PointGoal", "Deathmatch"])
+def test_episodes_begin_in_the_homes_that_are_drawn(name, device):
+    homes = sample("bench", 3)
+    settings = dict(limit=4) if name != "Explorer" else dict(patience=1)
+    env = getattr(envs, name)(6, homes, device=device, res=16, resample=True, **settings)
+    cumulative = env.weigh_layouts()
+    assert cumulative.tolist() == [1, 2, 3] and env.layout.tolist() == [0, 1, 2, 0, 1, 2]
+    cumulative.copy_(torch.tensor([0, 7, 7]))
+    world = env.reset()
+    n_lanes = len(world.reset)
+    assert env.layout.tolist() == 6 * [1]
+    cumulative.copy_(torch.tensor([0, 0, 7]))
+    still = arrdict(actions=torch.zeros(n_lanes, 1, dtype=torch.int64, device=device))
+    while not (world.terminal | world.truncated).any():
+        world = env.step(still)
+    env.step(still)
+    env.check()
+    assert 2 in env.layout.tolist()
+
+
+def test_a_round_of_deathmatch_ends_all_episodes_at_once():
+    """Agents that died in it are in a later episode. Their truncated ones have metrics."""
+    env = envs.Deathmatch(
+        64, 8 * [toys.box()], n_agents=2, device="cpu", res=16, limit=12, resample=True, damage=1.0
+    )
+    random, world, n_moves, n_deaths = torch.Generator().manual_seed(0), env.reset(), 0, 0
+    for _ in range(40):
+        before, last = env.layout.clone(), world
+        actions = torch.randint(7, (128, 1), generator=random)
+        world = env.step(arrdict(actions=actions))
+        moved = before != env.layout
+        ended = (last.terminal | last.truncated).view(64, 2)
+        assert ended[moved].all() and world.reset.view(64, 2)[moved].all()
+        assert not (last.terminal & last.truncated).any()
+        assert torch.equal(world.reset, last.terminal | last.truncated)
+        n_moves, n_deaths = n_moves + moved.sum(), n_deaths + world.terminal.sum()
+        assert not world.metrics.accuracy.isnan().any()
+    assert n_moves > 64 and n_deaths > 0
+    assert env.round_ages.max() <= 12 + 2
+
+
+# ---- Runs ----
+
+
+def test_run_logs_outcomes_by_source(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = [*SMALL, "env=pointgoal", "env.limit=5", "log_every=1", "curriculum=sfl"]
+    words[2:4] = ["geometry=mixed", "geometry.parts={bench: 3, maze: 1}"]
+    words.append("samples=320")
+    assert train.main([*words, "folder=run"]) == 0
+    row = json_lines.read("run/metrics.jsonl")[-1]
+    shares = [row[f"curriculum/drawn/{source}"] for source in ("bench", "maze")]
+    assert sum(shares) == pytest.approx(1) and row["curriculum/fewest_episodes"] >= 1
+    assert row["curriculum/unseen"] == 0 and 1 <= row["curriculum/effective_homes"] <= 4.001
+    assert 0 <= row["curriculum/worst"] <= row["curriculum/outcome"] <= 1
+
+
+def test_without_a_curriculum_nothing_is_stored_or_logged(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made, make_trainer = [], train.make_trainer
+    monkeypatch.setattr(
+        train, "make_trainer", lambda *args: made.append(make_trainer(*args)) or made[0]
+    )
+    assert train.main([*SMALL, "env=pointgoal", "env.limit=5", "folder=run"]) == 0
+    assert made[0].rollout.layouts is None and made[0].env.spawner.cumulative is None
+    (row,) = json_lines.read("run/metrics.jsonl")
+    assert not [key for key in row if key.startswith("curriculum")]
+
+
+@pytest.mark.parametrize(
+    "words, text",
+    [
+        (["env=pong"], "env=pong draws no home for each episode; use curriculum=none"),
+        (["env=minimal"], "env=minimal draws no home"),
+        (["env=pointgoal", "env.resample=false"], "use env.resample=true"),
+        (["env=deathmatch", "env.n_agents=2"], "use env.resample=true"),
+        (["env=pointgoal", "geometry=box"], "there is one home only"),
+        (["env=explorer", "env.metrics=false"], "none of the metrics that tell the outcome"),
+        (["env=explorer", "learner=vtrace", "learner.lag=1"], "use learner.lag=0"),
+        (["env=explorer", "learner=vtrace", "curriculum=plr"], "use curriculum=sfl"),
+        (["env=explorer", "curriculum.lr=0"], "curriculum.lr: 0 is out of range"),
+        (["env=explorer", "curriculum.staleness=0.1"], "curriculum=plr has it"),
+        (["env=explorer", "curriculum=slf"], "did you mean sfl?"),
+        (["env=tests.cli.test_exact_resume:Steered"], "Steered has no homes to draw"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else None,
+)
+def test_bad_input_is_one_sentence(tmp_path, monkeypatch, capsys, words, text):
+    monkeypatch.chdir(tmp_path)
+    small = [word for word in SMALL if not word.startswith(("geometry", "env.res"))]
+    homes = [] if "geometry=box" in words else SMALL[2:4]
+    chosen = [] if any(word.startswith("curriculum=") for word in words) else ["curriculum=sfl"]
+    assert train.main([*small, *homes, *words, *chosen, "folder=run"]) == 2
+    error = capsys.readouterr().err
+    assert text in error and "Traceback" not in error
+    assert not (tmp_path / "run").exists()
