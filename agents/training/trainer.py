@@ -328,7 +328,7 @@ class Trainer:
         self.logger.write(self.samples, None, {"perf/seconds": self.seconds_at_log, **times})
 
     def _recapture(self):
-        """Drops the collector's and the learner's graphs. Returns what collects in the foreground."""
+        """Drops the graphs of collecting and learning. Returns what collects in the foreground."""
         if hasattr(self.learner, "recapture"):
             self.learner.recapture()
         return self.collect.recapture() if hasattr(self.collect, "recapture") else self.collect
