@@ -41,6 +41,7 @@ AGENTS = (
     ("cli",),
 )
 # Modules of the simulator that every room of the learner may import: no environment, no engine.
+THREADS = "megastep.engine.devices"
 SHARED = {
     "megastep",
     "megastep.arrdict",
@@ -255,7 +256,9 @@ def learner_knows_trees_and_spaces_only(graph):
         is_cli = is_below(name, "megastep.agents.cli")
         launches = matches(name, OWN_USERS["megastep.kernels.build.launch"])
         allowed = is_agents(target) or target in (SHARED_WITH_CLI if is_cli else SHARED)
-        if not allowed and not (launches and is_below(target, "megastep.kernels.build")):
+        # the number of CPU threads is the engine's
+        of_launches = is_below(target, "megastep.kernels.build") or target == THREADS
+        if not allowed and not (launches and of_launches):
             yield f"{name} must not import {target}"
 
 

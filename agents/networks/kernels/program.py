@@ -5,8 +5,8 @@ from pathlib import Path
 
 import torch
 
-from megastep import engine
 from megastep.arrdict import arrdict
+from megastep.engine.devices import threads
 from megastep.kernels.build import program
 from megastep.kernels.build.compile import EngineError, cpu
 from megastep.kernels.build.launch import launch
@@ -64,7 +64,7 @@ def run_on_cpu(operation: str, **fields) -> None:
     """
     pack = getattr(CORES.params, CORES.cpu_operations[operation])
     values = {name: _value(field) for name, field in fields.items()}
-    packed = pack(**values, n_threads=engine.threads())
+    packed = pack(**values, n_threads=threads())
     launch(CORES, operation, packed, CPU, 0)
 
 
