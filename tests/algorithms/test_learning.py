@@ -211,8 +211,8 @@ CONTINUOUS = [name for name in LEARNERS if name != "r2d2"]
 class NeverResets(Policy):
     """A policy whose hidden state leaks from one episode into the next."""
 
-    def unroll(self, obs, reset, state):
-        return super().unroll(obs, torch.zeros_like(reset), state)
+    def _features(self, obs, reset, state, lanes=None):
+        return super()._features(obs, torch.zeros_like(reset), state, lanes)
 
 
 @pytest.mark.parametrize("name", LEARNERS)
