@@ -139,10 +139,9 @@ def _part(name: str, part: Any) -> tuple[Callable, dict[str, Any]]:
     """
     options = dict(part) if isinstance(part, dict) else {"n": part}
     source = options.pop("source", name)
-    if not isinstance(source, str) or source not in __all__ and ":" not in source:
-        raise ValueError(
-            f"{source!r} is no source; {closest(source, [*__all__, 'module:function'])}"
-        )
+    known = [name for name in __all__ if name not in ("mixed", "suite")]
+    if not isinstance(source, str) or source not in known and ":" not in source:
+        raise ValueError(f"{source!r} is no source; {closest(source, [*known, 'module:function'])}")
     function = import_object(source) if ":" in source else globals()[source]
     arguments = inspect.signature(function).parameters
     taken = [k for k in arguments if k not in ("split", "seed")]

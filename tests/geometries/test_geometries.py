@@ -111,7 +111,7 @@ def test_fewer_of_a_mix_are_spread_over_its_parts_and_more_are_repeated():
         ({}, "its counts sum to 0"),
         ({"homes": -1}, "homes: -1 is no number of geometries"),
         ({"homes": True}, "homes: True is no number of geometries"),
-        ({"a": {"source": "mixed"}}, "a: None is no number of geometries"),
+        ({"a": {"source": "mixed"}}, "'mixed' is no source; there are bench"),
         ({"a": {"source": "homes", "outr": True}}, "a: homes has no option outr; did you mean out"),
         ({"files": 3}, "files: path is missing"),
         ({"maze": {"n": 3, "braid": 4}}, "maze: braid: 4 is out of range: allowed is from 0 to 1"),
