@@ -48,12 +48,13 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
         for t in range(rollout.n_steps):
             with section("act"):
                 decision, state = policy(seen, state)
+            rollout.store_decision(t, decision)
             if rollout.values is not None:
                 features.append(decision["features"])
             with section("env"), torch.autocast(rollout.reward.device.type, enabled=False):
                 world = env.step(arrdict(actions=rollout.scatter_actions(decision["actions"])))
                 world = rollout.select_lanes(world)
-            seen = rollout.store_step(t, decision, world)
+            seen = rollout.store_outcome(t, world)
             if rollout.layouts is not None:
                 rollout.store_layouts(t, env.layout)
 

@@ -127,15 +127,20 @@ class Rollout:
         """Stores reward, end of episode and metrics of the world that followed time t."""
         copy_all(self._of_transition(t, world))
 
-    def store_step(self, t: int, decision: arrdict, world: arrdict) -> arrdict:
-        """Stores the actions of time t, their log-probabilities if the decision has any, and the
-        world that followed, at time t + 1. Returns that as it was stored.
+    def store_decision(self, t: int, decision: arrdict) -> None:
+        """Stores the actions of time t, and their log-probabilities if the decision has any. Call
+        it before the environment steps, which may change the actions in place.
         """
-        pairs = [*self._of_transition(t, world), *self._of_world(t + 1, world)]
-        pairs += _pairs(self.actions, t, decision["actions"])
+        pairs = _pairs(self.actions, t, decision["actions"])
         if "logprobs" in decision:
             pairs.append((self.logprobs[t], decision["logprobs"]))
         copy_all(pairs)
+
+    def store_outcome(self, t: int, world: arrdict) -> arrdict:
+        """Stores the world that followed time t: what happened, at t, and what it looks like, at
+        t + 1. Returns that as it was stored.
+        """
+        copy_all([*self._of_transition(t, world), *self._of_world(t + 1, world)])
         return self.world(t + 1)
 
     def _of_world(self, t, world):

@@ -119,6 +119,25 @@ def test_actor_state_is_updated_in_place():
     assert torch.equal(actor_state.world.obs.eye[:, 0, 0, 0, 0], env.label(2 * T))
 
 
+def test_actions_are_stored_as_they_were_chosen():
+    """An environment may change the actions that it is given, for example to clip them."""
+
+    class Changes(LabelledEnv):
+        def step(self, decision):
+            self.actions.append(decision.actions.clone())
+            world = super().step(decision)
+            self.actions.pop()
+            for leaf in leaves(decision.actions):
+                leaf.fill_(0)
+            return world
+
+    env, _, rollout, _ = collected(env=Changes())
+    assert rollout.actions.move.any()
+    for t, actions in enumerate(env.actions):
+        assert torch.equal(rollout.actions.move[t], actions.move)
+        assert torch.equal(rollout.actions.fire[t], actions.fire)
+
+
 def test_logprobs_and_values_match_unroll():
     _, policy, rollout, actor_state = collected(n_rollouts=2, dtype=torch.float16)
     out = policy.unroll(rollout.obs, rollout.starts, rollout.state)
