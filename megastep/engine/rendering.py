@@ -27,8 +27,8 @@ __all__ = ["observe", "render", "update_agent_geometry"]
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
 
-#: Two warps share an agent where there are at most so many agents per multiprocessor of a GPU. One
-#: agent then takes less time, but more instructions.
+#: Two warps share an agent where there are at most so many agents per multiprocessor of a GPU. It
+#: takes more instructions, and is meant to take less time.
 MAX_SPLIT = 32
 
 # RenderParams' optional outputs, and the inputs that only these need. 0 is null: not wanted.
