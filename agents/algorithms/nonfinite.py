@@ -146,44 +146,41 @@ class NonFiniteCheck:
         """Does the same as `__call__` in two kernels."""
         tensors = list(floats.values())
         n_steps, n_lanes = min(map(len, tensors)) + 1, tensors[0].shape[1]
-        n_rows, device = n_steps * len(tensors), tensors[0].device
-        sizes = torch.empty(n_rows, n_lanes, device=device)
-        first_rows = torch.full((n_lanes,), n_rows, dtype=torch.int32, device=device)
+        device, constants = tensors[0].device, program.PROGRAM.constants
+        first_rows = torch.full((n_lanes,), 2**31 - 1, dtype=torch.int32, device=device)
         is_finite = torch.empty((), dtype=torch.bool, device=device)
-        packed = [
-            program.PROGRAM.params.SizesTensorParams(
-                values=tensor.data_ptr(),
-                n_steps=len(tensor),
-                n_features=math.prod(tensor.shape[2:]),
-                is_half=int(tensor.dtype == torch.float16),
+        block_bytes = 16 * constants["CHECKED_THREADS"] * constants["CHECKED_WORDS"]
+        packed, n_blocks = [], 0
+        for tensor in tensors:
+            packed.append(
+                program.PROGRAM.params.CheckedTensorParams(
+                    values=tensor.data_ptr(),
+                    first_block=n_blocks,
+                    n_steps=len(tensor),
+                    n_features=math.prod(tensor.shape[2:]),
+                    is_half=int(tensor.dtype == torch.float16),
+                )
             )
-            for tensor in tensors
-        ]
-        program.run(
-            "sizes",
-            device,
-            program.PROGRAM.constants["SIZES_THREADS"] * n_steps * n_lanes,
-            len(tensors),
+            # at least one byte more, so that a block sees the numbers after the last whole word
+            n_blocks += tensor.numel() * tensor.element_size() // block_bytes + 1
+        shared = dict(
             tensors=b"".join(packed),
-            sizes=sizes,
             first_rows=first_rows,
             n_tensors=len(tensors),
             n_steps=n_steps,
             n_lanes=n_lanes,
-            limit=LIMIT,
         )
-        n_threads = program.PROGRAM.constants["RECORD_THREADS"]
+        n_threads = constants["CHECKED_THREADS"]
         program.run(
-            "record",
-            device,
-            n_threads,
+            "find_bad", device, n_blocks * n_threads, block=n_threads, **shared, limit=LIMIT
+        )
+        n_threads = constants["RECORD_THREADS"]
+        program.run(
+            *("record", device, n_threads),
             block=n_threads,
-            sizes=sizes,
-            first_rows=first_rows,
+            **shared,
             record=self.record,
             is_finite=is_finite,
-            n_rows=n_rows,
-            n_lanes=n_lanes,
             n_named=MAX_NAMED,
         )
         return is_finite
@@ -226,10 +223,11 @@ class NonFiniteCheck:
 def _is_fused(floats):
     """Returns whether kernels can check these tensors."""
     tensors = list(floats.values())
-    return len(tensors) <= program.PROGRAM.constants["SIZES_TENSORS"] and all(
+    return len(tensors) <= program.PROGRAM.constants["CHECKED_TENSORS"] and all(
         tensor.is_cuda
         and tensor.dtype in (torch.float16, torch.float32)
         and tensor.is_contiguous()
+        and tensor.data_ptr() % 16 == 0
         and len(tensor) - min(map(len, tensors)) <= 1
         for tensor in tensors
     )

@@ -191,13 +191,16 @@ def test_infinities_of_both_signs_are_found():
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("change", ["dtype", "layout", "number"])
+@pytest.mark.parametrize("change", ["dtype", "layout", "address", "number"])
 def test_what_kernels_cannot_check_is_checked_all_the_same(change):
     rollout = bad_rollout(0, 3, 0, 0.0, True)
     if change == "dtype":
         rollout["value"] = rollout["value"].bfloat16().clamp(max=1.0)
     elif change == "layout":
         rollout["value"] = rollout["value"].T.contiguous().T
+    elif change == "address":
+        values = rollout["value"]
+        rollout["value"] = torch.cat([values[0, :1], values.flatten()])[1:].view_as(values)
     else:
         rollout |= {f"more{i}": rollout["reward"] for i in range(16)}
     assert not nonfinite._is_fused(rollout)

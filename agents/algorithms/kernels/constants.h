@@ -1,8 +1,9 @@
 #pragma once
 
-constexpr int ADAM_ROWS = 48;      // parameters of a launch
-constexpr int ADAM_NUMBERS = 16;   // of a parameter, that a thread handles
-constexpr int SIZES_TENSORS = 16;  // of a rollout that is checked
-constexpr int SIZES_THREADS = 8;   // that read one row of a tensor
+constexpr int ADAM_ROWS = 48;         // parameters of a launch
+constexpr int ADAM_NUMBERS = 16;      // of a parameter, that a thread handles
+constexpr int CHECKED_TENSORS = 16;   // of a rollout
+constexpr int CHECKED_THREADS = 256;  // of a block
+constexpr int CHECKED_WORDS = 4;      // of 16 bytes, that a thread reads
 constexpr int RECORD_THREADS = 1024;
 constexpr int EPISODE_METRICS = 8;  // of a world

@@ -5,68 +5,84 @@
 
 #define KERNEL extern "C" __global__ void
 #define BOUNDS(n_threads) __launch_bounds__(n_threads)
+#define DEVICE static __device__ __forceinline__
 
-static __device__ __forceinline__ float half_value(unsigned int bits) {
+static_assert(sizeof(FindBadParams::tensors) == CHECKED_TENSORS * sizeof(CheckedTensorParams));
+static_assert(sizeof(RecordParams::tensors) == CHECKED_TENSORS * sizeof(CheckedTensorParams));
+
+DEVICE float value_at(const CheckedTensorParams& tensor, long long at) {
+    if (!tensor.is_half)
+        return ((const float*)tensor.values)[at];
     float x;
-    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"((unsigned short)bits));
+    asm("cvt.f32.f16 %0, %1;" : "=f"(x) : "h"(((const unsigned short*)tensor.values)[at]));
     return x;
 }
 
-static_assert(sizeof(SizesParams::tensors) == SIZES_TENSORS * sizeof(SizesTensorParams));
-
-// The larger magnitude; NaN if one is NaN.
-static __device__ __forceinline__ float larger(float size, float value) {
-    value = fabsf(value);
-    return size > value || isnan(size) ? size : value;
+// Whether a word has a bad number: two float16 or one float32. A float16 is bad if all bits of its
+// exponent are set, because its largest finite number is below any limit.
+DEVICE bool is_bad(unsigned int word, bool is_half, unsigned int limit) {
+    if (is_half)
+        return ((word & 0x7c007c00u) + 0x04000400u) & 0x80008000u;
+    return (word & 0x7fffffffu) > limit;  // NaN is above infinity
 }
 
-// A float16 beyond the limit is infinite and stays so, or becomes NaN, in a sum, which is faster
-// than a maximum.
-//
-// Blocks along y: tensors. A tensor's rows begin at its last step: if it has one step less, the
-// first row of its sizes is 0.
-KERNEL sizes(SizesParams p) {
-    const SizesTensorParams& tensor = p.tensors[blockIdx.y];
-    bool is_shared = tensor.n_features >= SIZES_THREADS;  // a row, by several threads
-    unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x, n_rows = p.n_steps * p.n_lanes;
-    unsigned int part = is_shared ? thread % SIZES_THREADS : 0;
-    unsigned int at = is_shared ? thread / SIZES_THREADS : thread;
-    if (!is_shared && at >= n_rows)
-        return;
-    bool exists = at < n_rows;
-    at = min(at, n_rows - 1);
-    int t = at / p.n_lanes, lane = at % p.n_lanes, source_t = t - (p.n_steps - tensor.n_steps);
-    float size = 0.f;
-    if (source_t >= 0) {
-        long long first = ((long long)source_t * p.n_lanes + lane) * tensor.n_features;
-        const unsigned short* halves = (const unsigned short*)tensor.values + first;
-        const float* floats = (const float*)tensor.values + first;
-        if (tensor.is_half && tensor.n_features % 8 == 0 && (long long)tensor.values % 16 == 0)
-            for (int i = 8 * part; i < tensor.n_features; i += 8 * SIZES_THREADS) {
-                uint4 words = *(const uint4*)(halves + i);
-                const unsigned int pairs[4] = {words.x, words.y, words.z, words.w};
+// Keeps the row of a number if it is its lane's first.
+DEVICE void keep(const FindBadParams& p, int of_tensor, long long at) {
+    const CheckedTensorParams& tensor = p.tensors[of_tensor];
+    long long source_row = at / tensor.n_features;
+    int lane = source_row % p.n_lanes, t = source_row / p.n_lanes + p.n_steps - tensor.n_steps;
+    atomicMin(p.first_rows + lane, t * p.n_tensors + of_tensor);  // the same whatever the order
+}
+
+// A thread reads CHECKED_WORDS words of 16 bytes, a block neighbouring ones of one tensor.
+KERNEL BOUNDS(256) find_bad(FindBadParams p) {
+    int i = 0;
+    while (i + 1 < p.n_tensors && p.tensors[i + 1].first_block <= blockIdx.x)
+        i++;
+    const CheckedTensorParams& tensor = p.tensors[i];
+    bool is_half = tensor.is_half;
+    int per_word = is_half ? 8 : 4;
+    unsigned int limit = __float_as_uint(p.limit);
+    long long first_word =
+        (long long)(blockIdx.x - tensor.first_block) * (CHECKED_THREADS * CHECKED_WORDS);
+    long long n_numbers = (long long)tensor.n_steps * p.n_lanes * tensor.n_features;
+    long long n_words = n_numbers / per_word;
+    uint4 words[CHECKED_WORDS];
 #pragma unroll
-                for (int n = 0; n < 4; n++)
-                    size += half_value(pairs[n] & 0xffff) + half_value(pairs[n] >> 16);
-            }
-        else
-            for (int i = part; i < tensor.n_features; i += is_shared ? SIZES_THREADS : 1)
-                size = larger(size, tensor.is_half ? half_value(halves[i]) : floats[i]);
+    for (int n = 0; n < CHECKED_WORDS; n++) {
+        long long at = first_word + n * CHECKED_THREADS + threadIdx.x;
+        words[n] = at < n_words ? ((const uint4*)tensor.values)[at] : make_uint4(0, 0, 0, 0);
     }
-    size = fabsf(size);
-    if (is_shared)
-        for (int mask = SIZES_THREADS / 2; mask; mask /= 2)
-            size = larger(size, __shfl_xor_sync(~0u, size, mask));
-    if (part || !exists)
-        return;
-    int row = t * p.n_tensors + blockIdx.y;
-    p.sizes[(long long)row * p.n_lanes + lane] = size;
-    if (!(size <= p.limit))
-        atomicMin(p.first_rows + lane, row);  // the same whatever the order
+#pragma unroll
+    for (int n = 0; n < CHECKED_WORDS; n++) {
+        bool found = is_bad(words[n].x, is_half, limit) || is_bad(words[n].y, is_half, limit) ||
+                     is_bad(words[n].z, is_half, limit) || is_bad(words[n].w, is_half, limit);
+        long long first = (first_word + n * CHECKED_THREADS + threadIdx.x) * per_word;
+        bool is_end = first == n_words * per_word;  // the numbers after the last whole word
+        if (!found && !is_end)
+            continue;
+        for (long long at = first; at < min(first + per_word, n_numbers); at++)
+            if (!(fabsf(value_at(tensor, at)) <= p.limit))
+                keep(p, i, at);
+    }
+}
+
+// The largest magnitude of a row of a tensor, or NaN; of float16, of which one is infinite or NaN,
+// that of their sum.
+DEVICE float size_of(const CheckedTensorParams& tensor, long long row) {
+    float size = 0.f;
+    for (int i = 0; i < tensor.n_features; i++) {
+        float value = value_at(tensor, row * tensor.n_features + i);
+        if (tensor.is_half)
+            size += value;
+        else
+            size = size > fabsf(value) || isnan(size) ? size : fabsf(value);
+    }
+    return fabsf(size);
 }
 
 // The sum of a number over a block, in every thread.
-static __device__ int sum_of_block(int x) {
+DEVICE int sum_of_block(int x) {
     __shared__ int of_warps[RECORD_THREADS / WARP];
     x = __reduce_add_sync(~0u, x);
     __syncthreads();
@@ -77,7 +93,7 @@ static __device__ int sum_of_block(int x) {
 }
 
 // The smallest number of a block, in every thread.
-static __device__ long long least_of_block(long long x) {
+DEVICE long long least_of_block(long long x) {
     __shared__ long long least;
     for (int mask = WARP / 2; mask; mask /= 2)
         x = min(x, __shfl_xor_sync(~0u, x, mask));
@@ -92,11 +108,11 @@ static __device__ long long least_of_block(long long x) {
 }
 
 // One block. Counts the rollout, and keeps the first numbers of up to n_named lanes, those of the
-// smallest index in `sizes`, unless an earlier rollout's are still there.
+// smallest row and lane, unless an earlier rollout's are still there.
 KERNEL BOUNDS(1024) record(RecordParams p) {
-    int n_bad = 0;
+    int n_rows = p.n_steps * p.n_tensors, n_bad = 0;
     for (int lane = threadIdx.x; lane < p.n_lanes; lane += RECORD_THREADS)
-        n_bad += p.first_rows[lane] < p.n_rows;
+        n_bad += p.first_rows[lane] < n_rows;
     n_bad = sum_of_block(n_bad);
     double count = p.record[0] + 1.;
     bool is_first = n_bad && !(p.record[2] > 0.);
@@ -111,17 +127,23 @@ KERNEL BOUNDS(1024) record(RecordParams p) {
     }
     if (!is_first)
         return;
-    long long last = -1, none = (long long)p.n_rows * p.n_lanes;
+    long long last = -1, none = (long long)n_rows * p.n_lanes;
     for (int i = 0; i < p.n_named; i++) {
         long long index = none;
         for (int lane = threadIdx.x; lane < p.n_lanes; lane += RECORD_THREADS) {
             long long candidate = (long long)p.first_rows[lane] * p.n_lanes + lane;
-            if (p.first_rows[lane] < p.n_rows && candidate > last)
+            if (p.first_rows[lane] < n_rows && candidate > last)
                 index = min(index, candidate);
         }
         index = last = least_of_block(index);
         if (!threadIdx.x) {
-            float size = index < none ? p.sizes[index] : 0.f;
+            float size = 0.f;
+            if (index < none) {
+                int row = index / p.n_lanes, lane = index % p.n_lanes;
+                const CheckedTensorParams& tensor = p.tensors[row % p.n_tensors];
+                long long t = row / p.n_tensors - (p.n_steps - tensor.n_steps);
+                size = size_of(tensor, t * p.n_lanes + lane);
+            }
             p.record[4 + i] = (double)index;
             p.record[4 + p.n_named + i] = isnan(size)   ? -1.
                                           : isinf(size) ? 1.7976931348623157e308

@@ -74,18 +74,20 @@ struct AdamParams {
     float eps;
 };
 
-// A tensor (n_steps, B, n_features) of a rollout.
-struct SizesTensorParams {
+// A tensor (n_steps, B, n_features) of a rollout, which begins at a multiple of 16 bytes.
+struct CheckedTensorParams {
     const void* values;
-    int n_steps;
+    unsigned int first_block;  // of the launch that handles it
+    int n_steps;               // T + 1, or T if it has no row of the first world
     int n_features;
     int is_half;  // float16, else float32
 };
 
-struct SizesParams {
-    SizesTensorParams tensors[16];
-    float* sizes;     // (T + 1, n_tensors, B), the largest magnitude of each row
-    int* first_rows;  // (B), the first row of `sizes` above the limit, n_rows if there is none
+// A row is a step of a tensor, in the order (T + 1, n_tensors).
+
+struct FindBadParams {
+    CheckedTensorParams tensors[16];
+    int* first_rows;  // (B), the first row with a number above the limit; larger if there is none
     int n_tensors;
     int n_steps;  // T + 1
     int n_lanes;
@@ -93,11 +95,12 @@ struct SizesParams {
 };
 
 struct RecordParams {
-    const float* sizes;        // (n_rows, B)
+    CheckedTensorParams tensors[16];
     const int* first_rows;     // (B)
     double* record;            // see NonFiniteCheck
     unsigned char* is_finite;  // ()
-    int n_rows;
+    int n_tensors;
+    int n_steps;  // T + 1
     int n_lanes;
     int n_named;
 };
