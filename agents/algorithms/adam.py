@@ -11,10 +11,10 @@ from typing import Any
 import torch
 
 from megastep.agents.algorithms.kernels import program
-from megastep.kernels.build.launch import BLOCK, launch_blocks
+from megastep.kernels.build.launch import launch_blocks
 
 _MAX_ROWS = program.PROGRAM.constants["ADAM_ROWS"]
-_BLOCK_NUMBERS = BLOCK * program.PROGRAM.constants["ADAM_NUMBERS"]
+_THREADS = program.PROGRAM.constants["ADAM_THREADS"]
 _NONE = MappingProxyType({})
 
 
@@ -54,20 +54,39 @@ class Adam:
             key = lr_factors.get(row[0], 1.0), weight_decays.get(row[0], 0.0)
             self._groups.setdefault(key, []).append(row)
 
+    @property
+    def is_fused(self) -> bool:
+        """True if kernels can handle the parameters and their present gradients."""
+        gradients = [p.grad for p in self.parameters if p.grad is not None]
+        tensors = [*self.parameters, *gradients]
+        return bool(gradients) and all(
+            x.is_cuda and x.dtype == torch.float32 and x.is_contiguous() for x in tensors
+        )
+
     @torch.no_grad()
     def grad_norm(self) -> torch.Tensor:
         """Returns the norm () of all gradients together."""
+        if self.is_fused:
+            return self.squared_norms().sum().sqrt()
         gradients = [p.grad for p in self.parameters if p.grad is not None]
-        if not self._is_fused(gradients):
-            return torch.nn.utils.get_total_norm(gradients)
-        sums = []
-        for rows, n_blocks in self._launches():
-            sums.append(self.n_steps.new_empty(n_blocks))
+        return torch.nn.utils.get_total_norm(gradients)
+
+    def squared_norms(self) -> torch.Tensor:
+        """Returns (n,) numbers that add up to the square of `grad_norm`, if it `is_fused`."""
+        launches = list(self._launches())
+        n_sums, first_sum = sum(n_blocks for _, n_blocks in launches), 0
+        sums = self.n_steps.new_empty(n_sums)
+        for rows, n_blocks in launches:
             struct = program.PROGRAM.params.SquaredNormParams(
-                rows=b"".join(rows), sums=sums[-1].data_ptr(), n_rows=len(rows)
+                rows=b"".join(rows),
+                sums=sums.data_ptr(),
+                n_rows=len(rows),
+                n_sums=n_sums,
+                first_sum=first_sum,
             )
             self._launch("squared_norm", struct, n_blocks)
-        return torch.cat(sums).sum().sqrt() if len(sums) > 1 else sums[0].sum().sqrt()
+            first_sum += n_blocks
+        return sums
 
     @torch.no_grad()
     def step(
@@ -84,9 +103,8 @@ class Adam:
             max_norm: longer gradients are scaled down to this norm.
         """
         self.n_steps += is_taken
-        gradients = [p.grad for p in self.parameters if p.grad is not None]
-        if self._is_fused(gradients):
-            self._step_on_gpu(is_taken, grad_norm, max_norm)
+        if self.is_fused:
+            self.step_on_gpu(is_taken, grad_norm, max_norm)
             return
         if grad_norm is not None:
             torch.nn.utils.clip_grads_with_norm_(self.parameters, max_norm, grad_norm)
@@ -108,13 +126,10 @@ class Adam:
                     found_inf=found_inf,
                 )
 
-    def _is_fused(self, gradients):
-        tensors = [*self.parameters, *gradients]
-        return bool(gradients) and all(
-            x.is_cuda and x.dtype == torch.float32 and x.is_contiguous() for x in tensors
-        )
-
-    def _step_on_gpu(self, is_taken, grad_norm, max_norm):
+    def step_on_gpu(
+        self, is_taken: torch.Tensor, grad_norm: torch.Tensor | None, max_norm: float
+    ) -> None:
+        """Takes a `step` that `n_steps` counts already, if it `is_fused`."""
         for rows, n_blocks in self._launches():
             struct = program.PROGRAM.params.AdamParams(
                 rows=b"".join(rows),
@@ -140,23 +155,23 @@ class Adam:
                 if len(rows) == _MAX_ROWS:
                     yield rows, n_blocks
                     rows, n_blocks = [], 0
+                addresses = [x.data_ptr() for x in (p, p.grad, mean, square)]
+                names = "parameter", "gradient", "mean", "square"
                 rows.append(
                     program.PROGRAM.params.AdamRowParams(
-                        parameter=p.data_ptr(),
-                        gradient=p.grad.data_ptr(),
-                        mean=mean.data_ptr(),
-                        square=square.data_ptr(),
+                        **dict(zip(names, addresses, strict=True)),
                         n=p.numel(),
                         first_block=n_blocks,
+                        is_aligned=int(not any(address % 16 for address in addresses)),
                         lr_factor=factor,
                         weight_decay=weight_decay,
                     )
                 )
-                n_blocks += max(1, -(-p.numel() // _BLOCK_NUMBERS))
+                n_blocks += max(1, -(-p.numel() // (4 * _THREADS)))
         yield rows, n_blocks
 
     def _launch(self, operation, struct, n_blocks):
-        launch_blocks(program.PROGRAM, operation, struct, self.lr.device, (n_blocks, 1), BLOCK)
+        launch_blocks(program.PROGRAM, operation, struct, self.lr.device, (n_blocks, 1), _THREADS)
 
     def zero_grad(self) -> None:
         """Frees the gradients."""

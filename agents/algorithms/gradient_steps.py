@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from megastep.agents.algorithms.adam import Adam
+from megastep.agents.algorithms.kernels import program
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 from megastep.agents.distributed.pooling import average_gradients, on_all_ranks
 from megastep.agents.sections import section
@@ -49,7 +50,8 @@ class GradientSteps:
         self._lr = torch.tensor(lr, device=device)
         self.optimizer = Adam(parameters, self._lr, **options)
         self.check = NonFiniteCheck(device)
-        self._is_finite, self._rows, self._metrics = None, [], {}  # of the update in progress
+        # of the update in progress; totals are those of metrics, then steps taken and skipped
+        self._is_finite, self._totals, self._metrics = None, None, {}
 
     def set_lr(self, lr: float) -> None:
         """Changes Adam's step size, also for a captured update."""
@@ -65,7 +67,7 @@ class GradientSteps:
             () bool, whether they are all finite, on every rank. If not, no step of this update is
             taken.
         """
-        self._is_finite, self._rows = on_all_ranks(self.check(floats)), []
+        self._is_finite, self._totals = on_all_ranks(self.check(floats)), None
         return self._is_finite
 
     @section("backward")
@@ -86,29 +88,72 @@ class GradientSteps:
         loss.backward()
         parameters = self.optimizer.parameters
         n_valid, means = average_gradients(parameters, n_valid, [*metrics.values()])
-        self._has_valid, self._metrics = n_valid > 0, dict(zip(metrics, means, strict=True))
+        self._n_valid, self._metrics = n_valid.long(), dict(zip(metrics, means, strict=True))
         return self._metrics
 
     @section("optimiser")
-    def take(self, is_enabled: torch.Tensor | bool = True) -> torch.Tensor:
+    def take(self, is_enabled: torch.Tensor | None = None) -> torch.Tensor:
         """Takes one step down the gradient. Without a valid transition, it is not taken.
 
         Args:
             is_enabled: () bool. A step that is not enabled is neither taken nor counted as skipped.
+                None: it is.
 
         Returns:
             () bool, whether the step was taken.
         """
+        max_metrics = program.PROGRAM.constants["JUDGED_METRICS"]
+        if self.optimizer.is_fused and len(self._metrics) <= max_metrics:
+            grad_norm, is_taken = self._judge_on_gpu(is_enabled)
+            self.optimizer.step_on_gpu(is_taken, grad_norm, self.max_grad_norm)
+        else:
+            grad_norm, is_taken = self._judge(is_enabled)
+            self.optimizer.step(is_taken, grad_norm, self.max_grad_norm)
+        self._metrics["grad_norm"] = grad_norm
+        return is_taken
+
+    def _judge(self, is_enabled):
+        """Returns the gradients' norm and whether the step is taken, () each, and adds up the
+        metrics of steps that are.
+        """
+        if is_enabled is None:
+            is_enabled = torch.ones_like(self._is_finite)
         grad_norm = self.optimizer.grad_norm()
         is_finite = grad_norm.isfinite() & self._is_finite
-        is_taken = is_finite & is_enabled & self._has_valid
-        self.optimizer.step(is_taken, grad_norm, self.max_grad_norm)
-        self._metrics["grad_norm"] = grad_norm
-        row = torch.stack([*self._metrics.values()])
-        row = row.masked_fill(~is_taken, 0.0)
+        is_taken = is_finite & is_enabled & (self._n_valid > 0)
+        row = torch.stack([*self._metrics.values(), grad_norm]).masked_fill(~is_taken, 0.0)
         is_skipped = ~is_finite & is_enabled
-        self._rows.append(torch.cat([row, torch.stack([is_taken, is_skipped]).float()]))
-        return is_taken
+        row = torch.cat([row, torch.stack([is_taken, is_skipped]).float()])
+        self._totals = row if self._totals is None else self._totals + row
+        return grad_norm, is_taken
+
+    def _judge_on_gpu(self, is_enabled):
+        """Does `_judge` in two kernels, and counts the step."""
+        sums, device = self.optimizer.squared_norms(), self._lr.device
+        metrics = [value.float() for value in self._metrics.values()]
+        pack = program.PROGRAM.params.MetricParams
+        is_first = self._totals is None
+        if is_first:
+            self._totals = sums.new_empty(len(metrics) + 3)
+        grad_norm, is_taken = sums.new_empty(()), torch.empty_like(self._is_finite)
+        n_threads = program.PROGRAM.constants["ADAM_THREADS"]
+        program.run(
+            *("judge", device, n_threads),
+            block=n_threads,
+            metrics=b"".join(pack(values=value.data_ptr()) for value in metrics),
+            sums=sums,
+            is_finite=self._is_finite,
+            is_enabled=is_enabled,
+            n_valid=self._n_valid,
+            n_steps=self.optimizer.n_steps,
+            grad_norm=grad_norm,
+            is_taken=is_taken,
+            totals=self._totals,
+            n_sums=len(sums),
+            n_metrics=len(metrics),
+            is_first=int(is_first),
+        )
+        return grad_norm, is_taken
 
     def end(self) -> dict[str, torch.Tensor]:
         """Ends the update. Returns the means of the metrics over the steps taken, and
@@ -116,10 +161,10 @@ class GradientSteps:
 
         Without a step, the means are NaN: a trainer leaves them out of its report.
         """
-        *sums, n_taken, n_skipped = sum(self._rows).unbind()
+        n_taken, n_skipped = self._totals[-2], self._totals[-1]
         self.check.count((n_taken == 0) & (n_skipped > 0))
-        means = {name: total / n_taken for name, total in zip(self._metrics, sums, strict=True)}
-        return {**means, "skipped_steps": n_skipped}
+        means = (self._totals[:-2] / n_taken).unbind()
+        return {**dict(zip(self._metrics, means, strict=True)), "skipped_steps": n_skipped}
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the optimizer's state, the step size and what `check` has counted."""

@@ -128,13 +128,13 @@ def test_adam():
     gradients = [randn(*shape) for shape in shapes]
     moments = [[randn(*shape).abs() for shape in shapes] for _ in range(2)]
     lr, max_norm = torch.tensor([0.1, 0.01, 0.3], device="cuda"), 0.7
-    n_steps = torch.tensor([3.0, 8.0, 1.0], device="cuda")
+    n_steps = torch.tensor([2.0, 7.0, 1.0], device="cuda")
     is_taken = torch.tensor([True, True, False], device="cuda")
     alone, norms = [], []
     for i in range(P):
         params = [torch.nn.Parameter(weight[i].clone()) for weight in weights]
         adam = Adam(params, lr[i].clone(), weight_decays={params[0]: 0.1})
-        adam.n_steps.fill_(n_steps[i] - is_taken[i].float())
+        adam.n_steps.fill_(n_steps[i])
         for kept, values in zip((adam.means, adam.squares), moments, strict=True):
             for target, value in zip(kept, values, strict=True):
                 target.copy_(value[i])
@@ -144,7 +144,7 @@ def test_adam():
         adam.step(is_taken[i].clone(), norms[-1], max_norm)
         alone.append([*(p.detach() for p in params), *adam.means, *adam.squares])
 
-    rows, n = [], 0
+    rows, n, n_threads = [], 0, ALGORITHMS.constants["ADAM_THREADS"]
     for at, row in enumerate(zip(weights, gradients, *moments, strict=True)):
         names = "parameter", "gradient", "mean", "square"
         rows.append(
@@ -152,17 +152,37 @@ def test_adam():
                 **{name: leaf.data_ptr() for name, leaf in zip(names, row, strict=True)},
                 n=row[0][0].numel(),
                 first_block=n,
+                is_aligned=1,
                 lr_factor=1.0,
                 weight_decay=0.0 if at else 0.1,
             )
         )
-        n += -(-row[0][0].numel() // (BLOCK * ALGORITHMS.constants["ADAM_NUMBERS"]))
+        n += -(-row[0][0].numel() // (4 * n_threads))
     packed, sums = dict(rows=b"".join(rows), n_rows=len(rows)), randn(n)
-    launch(ALGORITHMS, "squared_norm", (n, P), sums=sums, **packed)
-    grad_norm = sums.sum(1).sqrt()
-    torch.testing.assert_close(grad_norm, torch.stack(norms))
     launch(
-        *(ALGORITHMS, "adam", (n, P)),
+        *(ALGORITHMS, "squared_norm", (n, P), n_threads), **packed, sums=sums, n_sums=n, first_sum=0
+    )
+    judged = dict(grad_norm=randn(), is_taken=torch.empty_like(is_taken), totals=randn(4))
+    launch(
+        *(ALGORITHMS, "judge", (1, P), n_threads),
+        metrics=ALGORITHMS.params.MetricParams(values=lr.data_ptr()),
+        sums=sums,
+        is_finite=torch.tensor([True, True, False], device="cuda"),
+        is_enabled=torch.ones_like(is_taken),
+        n_valid=torch.tensor([4, 1, 4], device="cuda"),
+        n_steps=n_steps,
+        **judged,
+        n_sums=n,
+        n_metrics=1,
+        is_first=1,
+    )
+    torch.testing.assert_close(judged["grad_norm"], torch.stack(norms))
+    assert torch.equal(judged["is_taken"], is_taken) and n_steps.tolist() == [3, 8, 1]
+    expected = torch.stack([lr, torch.stack(norms), torch.ones_like(lr), torch.zeros_like(lr)], 1)
+    expected[2] = torch.tensor([0, 0, 0, 1])
+    torch.testing.assert_close(judged["totals"], expected)
+    launch(
+        *(ALGORITHMS, "adam", (n, P), n_threads),
         **packed,
         lr=lr,
         n_steps=n_steps,

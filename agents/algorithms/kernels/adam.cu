@@ -1,70 +1,140 @@
-// Adam with decoupled weight decay for many parameters in one launch, and the norm of their
-// gradients. A block handles part of one parameter; blocks along y are policies.
+// Adam with decoupled weight decay for many parameters in one launch, the norm of their gradients,
+// and whether a step is taken. A block handles neighbouring numbers of one parameter, a thread a
+// word of four; blocks along y are policies.
 #include "common/constants.h"
 #include "constants.h"
 #include "params.h"
 
 #define KERNEL extern "C" __global__ void
-
-// The row of this block: the last one that begins at or before it.
-static __device__ __forceinline__ int row_of_block(const AdamRowParams* rows, int n_rows) {
-    int first = 0, end = n_rows;
-    while (end - first > 1) {
-        int middle = (first + end) / 2;
-        (rows[middle].first_block <= blockIdx.x ? first : end) = middle;
-    }
-    return first;
-}
+#define BOUNDS(n_threads) __launch_bounds__(n_threads)
+#define DEVICE static __device__ __forceinline__
 
 static_assert(sizeof(AdamParams::rows) == ADAM_ROWS * sizeof(AdamRowParams));
 static_assert(sizeof(SquaredNormParams::rows) == ADAM_ROWS * sizeof(AdamRowParams));
+static_assert(sizeof(JudgeParams::metrics) == JUDGED_METRICS * sizeof(MetricParams));
 
-KERNEL squared_norm(SquaredNormParams p) {
-    const AdamRowParams& row = p.rows[row_of_block(p.rows, p.n_rows)];
-    unsigned int first = (blockIdx.x - row.first_block) * (BLOCK * ADAM_NUMBERS) + threadIdx.x;
-    const float* gradient = row.gradient + blockIdx.y * (long long)row.n;
-    float values[ADAM_NUMBERS], sum = 0.f;
-#pragma unroll
-    for (int i = 0; i < ADAM_NUMBERS; i++)
-        values[i] = first + i * BLOCK < row.n ? gradient[first + i * BLOCK] : 0.f;
-#pragma unroll
-    for (int i = 0; i < ADAM_NUMBERS; i++)
-        sum += values[i] * values[i];
-    for (int mask = WARP / 2; mask; mask /= 2)
-        sum += __shfl_xor_sync(~0u, sum, mask);
-    __shared__ float of_warps[BLOCK / WARP];
-    if (threadIdx.x % WARP == 0)
-        of_warps[threadIdx.x / WARP] = sum;
-    __syncthreads();
-    if (!threadIdx.x) {
-        float total = 0.f;
-        for (int warp = 0; warp < BLOCK / WARP; warp++)
-            total += of_warps[warp];
-        p.sums[blockIdx.y * gridDim.x + blockIdx.x] = total;
+// Where a thread's word is: in a row, from a number on, `n` of its four numbers exist.
+struct Place {
+    int row;
+    long long first;
+    int n;
+    bool is_word;  // one instruction moves it
+};
+
+DEVICE Place find_place(const AdamRowParams* rows, int n_rows) {
+    int row = 0, end = n_rows;  // the last row that begins at or before this block
+    while (end - row > 1) {
+        int middle = (row + end) / 2;
+        (rows[middle].first_block <= blockIdx.x ? row : end) = middle;
     }
+    const AdamRowParams& its = rows[row];
+    unsigned int at = 4 * ((blockIdx.x - its.first_block) * ADAM_THREADS + threadIdx.x);
+    long long of_policy = blockIdx.y * (long long)its.n;
+    int n = at < its.n ? (int)min(its.n - at, 4u) : 0;
+    return {row, of_policy + at, n, its.is_aligned && of_policy % 4 == 0 && n == 4};
 }
 
-KERNEL adam(AdamParams p) {
+DEVICE void read(float (&values)[4], const float* array, const Place& place) {
+    if (place.is_word) {
+        float4 word = *(const float4*)(array + place.first);
+        values[0] = word.x;
+        values[1] = word.y;
+        values[2] = word.z;
+        values[3] = word.w;
+        return;
+    }
+#pragma unroll
+    for (int i = 0; i < 4; i++)
+        values[i] = i < place.n ? array[place.first + i] : 0.f;
+}
+
+DEVICE void write(float* array, const Place& place, const float (&values)[4]) {
+    if (place.is_word) {
+        *(float4*)(array + place.first) = make_float4(values[0], values[1], values[2], values[3]);
+        return;
+    }
+#pragma unroll
+    for (int i = 0; i < 4; i++)
+        if (i < place.n)
+            array[place.first + i] = values[i];
+}
+
+// The sum over a block in a fixed order, for its first thread.
+DEVICE float sum_of_block(float x) {
+    for (int mask = WARP / 2; mask; mask /= 2)
+        x += __shfl_xor_sync(~0u, x, mask);
+    __shared__ float of_warps[ADAM_THREADS / WARP];
+    if (threadIdx.x % WARP == 0)
+        of_warps[threadIdx.x / WARP] = x;
+    __syncthreads();
+    float sum = 0.f;
+    for (int warp = 0; warp < ADAM_THREADS / WARP; warp++)
+        sum += of_warps[warp];
+    return sum;
+}
+
+KERNEL BOUNDS(256) squared_norm(SquaredNormParams p) {
+    Place place = find_place(p.rows, p.n_rows);
+    float values[4], sum = 0.f;
+    read(values, p.rows[place.row].gradient, place);
+    for (int i = 0; i < 4; i++)
+        sum += values[i] * values[i];
+    sum = sum_of_block(sum);
+    if (!threadIdx.x)
+        p.sums[blockIdx.y * p.n_sums + p.first_sum + blockIdx.x] = sum;
+}
+
+// One block. Decides whether a step is taken, and counts it and its metrics.
+KERNEL BOUNDS(256) judge(JudgeParams p) {
+    int policy = blockIdx.y, n_totals = p.n_metrics + 3;
+    float sum = 0.f;
+    for (int i = threadIdx.x; i < p.n_sums; i += ADAM_THREADS)
+        sum += p.sums[policy * p.n_sums + i];
+    float grad_norm = sqrtf(sum_of_block(sum));
+    bool is_finite = isfinite(grad_norm) && p.is_finite[policy];
+    bool is_enabled = !p.is_enabled || p.is_enabled[policy];
+    bool is_taken = is_finite && is_enabled && p.n_valid[policy] > 0;
+    for (int i = threadIdx.x; i < n_totals; i += ADAM_THREADS) {
+        float value = i < p.n_metrics ? p.metrics[i].values[policy] : grad_norm;
+        if (i == p.n_metrics + 1)
+            value = 1.f;
+        value = is_taken ? value : 0.f;
+        if (i == p.n_metrics + 2)
+            value = !is_finite && is_enabled ? 1.f : 0.f;
+        float* total = p.totals + policy * n_totals + i;
+        *total = p.is_first ? value : *total + value;
+    }
+    if (threadIdx.x)
+        return;
+    p.grad_norm[policy] = grad_norm;
+    p.is_taken[policy] = is_taken;
+    p.n_steps[policy] += is_taken ? 1.f : 0.f;
+}
+
+KERNEL BOUNDS(256) adam(AdamParams p) {
     unsigned int policy = blockIdx.y;
     if (!p.is_taken[policy])
         return;
-    const AdamRowParams& row = p.rows[row_of_block(p.rows, p.n_rows)];
-    unsigned int first = (blockIdx.x - row.first_block) * (BLOCK * ADAM_NUMBERS) + threadIdx.x;
+    Place place = find_place(p.rows, p.n_rows);
+    const AdamRowParams& row = p.rows[place.row];
+    float gradients[4], means[4], squares[4], parameters[4];
+    read(gradients, row.gradient, place);
+    read(means, row.mean, place);
+    read(squares, row.square, place);
+    read(parameters, row.parameter, place);
     float clip = p.grad_norm ? fminf(p.max_norm / (p.grad_norm[policy] + 1e-6f), 1.f) : 1.f;
     float lr = p.lr[policy] * row.lr_factor, n_steps = p.n_steps[policy];
     float step = lr / (1.f - powf(p.beta1, n_steps));
     float scale = 1.f / sqrtf(1.f - powf(p.beta2, n_steps));
 #pragma unroll
-    for (int i = 0; i < ADAM_NUMBERS; i++) {
-        if (first + i * BLOCK >= row.n)
-            break;
-        long long at = policy * (long long)row.n + first + i * BLOCK;
-        float gradient = row.gradient[at] * clip, mean = row.mean[at];
-        mean += (1.f - p.beta1) * (gradient - mean);
-        float square = p.beta2 * row.square[at] + (1.f - p.beta2) * gradient * gradient;
-        float parameter = row.parameter[at] * (1.f - lr * row.weight_decay);
-        row.mean[at] = mean;
-        row.square[at] = square;
-        row.parameter[at] = parameter - step * mean / (sqrtf(square) * scale + p.eps);
+    for (int i = 0; i < 4; i++) {
+        float gradient = gradients[i] * clip;
+        means[i] += (1.f - p.beta1) * (gradient - means[i]);
+        squares[i] = p.beta2 * squares[i] + (1.f - p.beta2) * gradient * gradient;
+        parameters[i] = parameters[i] * (1.f - lr * row.weight_decay) -
+                        step * means[i] / (sqrtf(squares[i]) * scale + p.eps);
     }
+    write(row.mean, place, means);
+    write(row.square, place, squares);
+    write(row.parameter, place, parameters);
 }

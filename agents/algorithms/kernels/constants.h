@@ -1,7 +1,8 @@
 #pragma once
 
 constexpr int ADAM_ROWS = 48;         // parameters of a launch
-constexpr int ADAM_NUMBERS = 16;      // of a parameter, that a thread handles
+constexpr int ADAM_THREADS = 256;     // of a block, each for four numbers of a parameter
+constexpr int JUDGED_METRICS = 32;    // of a gradient step
 constexpr int CHECKED_TENSORS = 16;   // of a rollout
 constexpr int CHECKED_THREADS = 256;  // of a block
 constexpr int CHECKED_WORDS = 4;      // of 16 bytes, that a thread reads

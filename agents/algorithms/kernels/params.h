@@ -51,14 +51,36 @@ struct AdamRowParams {
     float* square;
     unsigned int n;
     unsigned int first_block;  // of the launch that handles it
+    int is_aligned;            // all begin at a multiple of 16 bytes
     float lr_factor;
     float weight_decay;
 };
 
 struct SquaredNormParams {
     AdamRowParams rows[48];
-    float* sums;  // (P, n_blocks)
+    float* sums;  // (P, n_sums), of this launch's blocks from first_sum on
     int n_rows;
+    int n_sums;
+    int first_sum;
+};
+
+struct MetricParams {
+    const float* values;  // (P)
+};
+
+struct JudgeParams {
+    MetricParams metrics[32];
+    const float* sums;                // (P, n_sums), of squared gradients
+    const unsigned char* is_finite;   // (P), whether the transitions are
+    const unsigned char* is_enabled;  // (P); null: true
+    const long long* n_valid;         // (P), valid transitions
+    float* n_steps;                   // (P), updated
+    float* grad_norm;                 // (P)
+    unsigned char* is_taken;          // (P)
+    float* totals;  // (P, n_metrics + 3), updated: metrics, the norm and 1 of steps taken; skipped
+    int n_sums;
+    int n_metrics;
+    int is_first;  // `totals` begin here
 };
 
 struct AdamParams {
