@@ -5,7 +5,8 @@
 
 import torch
 
-from megastep.agents.distributed.pooling import masked_moments, pool_moments
+from megastep.agents.distributed.pooling import pool_moments
+from megastep.agents.networks.masked_moments import masked_moments, normalise_masked
 
 
 def masked_mean(x: torch.Tensor, valid: torch.Tensor, axis: int | None = None) -> torch.Tensor:
@@ -23,8 +24,8 @@ def pooled_normalise(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """Returns x minus its mean over all ranks, divided by its standard deviation there; 0 where
     invalid.
     """
-    ((_, mean, variance),) = pool_moments(masked_moments(x, valid))
-    return (x - mean).masked_fill(~valid, 0.0) / (variance.sqrt() + 1e-8)
+    (moments,) = pool_moments(*masked_moments(valid, x))
+    return normalise_masked(x, valid, moments)
 
 
 def explained_variance(

@@ -18,8 +18,10 @@ from megastep.agents.algorithms.learner import (
     Positive,
     check_minibatches,
 )
-from megastep.agents.algorithms.masked_stats import explained_variance, pooled_normalise
+from megastep.agents.algorithms.masked_stats import pooled_normalise
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
+from megastep.agents.distributed.pooling import pool_moments
+from megastep.agents.networks.masked_moments import masked_moments, normalise_masked
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
@@ -125,12 +127,16 @@ class PPO(GradientLearner):
     def _update(self, rollout):
         is_finite = self.steps.begin(rollout.floats())
         transitions = rollout.transitions()
-        estimates = returns.gae(**transitions, gamma=self.gamma, lambda_=self.lambda_)
-        estimates["valid"] = estimates.valid & rollout.learns[:-1]
-        self.policy.critic.output.update_stats(estimates.targets, estimates.valid & is_finite)
-        explained = explained_variance(transitions["value"], estimates.targets, estimates.valid)
+        traces = dict(gamma=self.gamma, lambda_=self.lambda_)
+        estimates = returns.gae(**transitions, learns=rollout.learns[:-1], **traces)
+        advantages, targets, valid = (estimates[key] for key in ("advantages", "targets", "valid"))
+        moments = masked_moments(valid, targets, advantages)
+        (_, _, variance), (_, _, error) = moments  # targets are values plus advantages
+        explained = 1 - error / variance.clamp(min=1e-8)
+        of_targets, of_advantages = pool_moments(*moments)
+        self.policy.critic.output.add(of_targets, is_finite)
         if self.normalise_advantage == "rollout":
-            estimates["advantages"] = pooled_normalise(estimates.advantages, estimates.valid)
+            estimates["advantages"] = normalise_masked(advantages, valid, of_advantages)
         if self.coefficients.value_clip is not None:
             estimates["old_value"] = transitions["value"]
 

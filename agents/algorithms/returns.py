@@ -36,6 +36,7 @@ def gae(
     reset: torch.Tensor,
     terminal: torch.Tensor,
     truncated: torch.Tensor,
+    learns: torch.Tensor | None = None,
     *,
     gamma: float,
     lambda_: float,
@@ -45,42 +46,48 @@ def gae(
         delta_t = r_{t+1} + gamma (1 - terminal_{t+1}) V_{t+1} - V_t
         A_t     = delta_t + gamma lambda (1 - done_{t+1}) A_{t+1},   done = terminal or truncated
 
+    Args:
+        learns: (T, B) bool, transitions to learn from; the others are not valid. None: all.
+
     Returns:
         arrdict(advantages, targets, valid), each (T, B). Targets are the lambda returns A + V,
-        which the value should fit. A is 0 where the action was not valid.
+        which the value should fit. A is 0 where the environment ignored the action.
     """
     if value.is_cuda and value.dtype == reward.dtype == torch.float32:
-        return _gae_on_gpu(reward, value, last_value, reset, terminal, truncated, gamma, lambda_)
+        flags = dict(reset=reset, terminal=terminal, truncated=truncated, learns=learns)
+        return _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_)
     delta = reward + gamma * _following(value, last_value).masked_fill(terminal, 0.0) - value
     delta = delta.masked_fill(reset, 0.0)
     discounts = torch.full_like(value, gamma * lambda_).masked_fill_(
         terminal | truncated | reset, 0.0
     )
     advantages = discounted_sum(delta, discounts)
-    return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=~reset)
+    valid = ~reset if learns is None else ~reset & learns
+    return arrdict.arrdict(advantages=advantages, targets=advantages + value, valid=valid)
 
 
-def _gae_on_gpu(reward, value, last_value, reset, terminal, truncated, gamma, lambda_):
+def _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_):
     """Computes `gae` in one kernel, lane by lane."""
     n_steps, n_lanes = reward.shape
     advantages, targets = reward.new_empty(2, n_steps, n_lanes)
+    valid = torch.empty_like(advantages, dtype=torch.bool)
     program.run(
         "gae",
         value.device,
         n_lanes,
         reward=reward.contiguous(),
-        values=torch.cat([value, last_value[None]]),
-        reset=reset.contiguous(),
-        terminal=terminal.contiguous(),
-        truncated=truncated.contiguous(),
+        values=value.contiguous(),
+        last_value=last_value.contiguous(),
+        **{name: flag if flag is None else flag.contiguous() for name, flag in flags.items()},
         advantages=advantages,
         targets=targets,
+        valid=valid,
         n_steps=n_steps,
         n_lanes=n_lanes,
         gamma=gamma,
         lambda_=lambda_,
     )
-    return arrdict.arrdict(advantages=advantages, targets=targets, valid=~reset)
+    return arrdict.arrdict(advantages=advantages, targets=targets, valid=valid)
 
 
 @section("returns")

@@ -44,19 +44,6 @@ def on_all_ranks(condition: torch.Tensor) -> torch.Tensor:
     return all_reduce((~condition).int()) == 0
 
 
-def masked_moments(x: torch.Tensor, valid: torch.Tensor) -> Moments:
-    """Returns the number of valid entries, and their mean and variance, 0 if none is valid.
-
-    Args:
-        x: may hold anything where invalid.
-        valid: bool of the same shape.
-    """
-    n_valid = valid.sum()
-    n = n_valid.clamp(min=1)
-    mean = x.masked_fill(~valid, 0.0).sum() / n
-    return n_valid, mean, (x - mean).square().masked_fill(~valid, 0.0).sum() / n
-
-
 def pool_moments(*moments: Moments) -> list[Moments]:
     """Returns the moments of the entries of all ranks together (Chan et al. 1979).
 

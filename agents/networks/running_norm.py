@@ -10,7 +10,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.distributed.pooling import Moments, pool_moments
-from megastep.agents.networks.kernels import layers as kernels
+from megastep.agents.networks.kernels import moments as kernels
 from megastep.types import Space
 
 

@@ -6,8 +6,10 @@
 import torch
 from torch import nn
 
-from megastep.agents.distributed.pooling import masked_moments, pool_moments
+from megastep.agents.distributed.pooling import Moments, pool_moments
+from megastep.agents.networks.kernels import moments as kernels
 from megastep.agents.networks.layers import linear
+from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.running_norm import mix_moments, store_if
 
 
@@ -36,26 +38,42 @@ class ValueOutput(nn.Module):
         normalised = linear(x, self.linear).float().squeeze(-1)
         return normalised * self.scale + self.mean
 
-    @torch.no_grad()
-    def update_stats(
-        self, targets: torch.Tensor, valid: torch.Tensor, min_rate: float = 0.05
-    ) -> None:
-        """Adds returns to the statistics, those of all ranks together, the n-th call with weight
-        max(min_rate, 1/n).
-
-        Changes nothing if none is valid, or if their mean or variance is not finite.
+    def update_stats(self, targets: torch.Tensor, valid: torch.Tensor) -> None:
+        """Adds returns to the statistics, those of all ranks together; see `add`.
 
         Args:
             targets: (...,), returns.
             valid: (...,) bool.
+        """
+        (moments,) = pool_moments(*masked_moments(valid, targets))
+        self.add(moments)
+
+    @torch.no_grad()
+    def add(
+        self, moments: Moments, is_counted: torch.Tensor | None = None, min_rate: float = 0.05
+    ) -> None:
+        """Adds moments of returns to the statistics, the n-th call with weight max(min_rate, 1/n).
+        On a GPU in one kernel.
+
+        Changes nothing if there is no return, or if mean or variance is not finite.
+
+        Args:
+            moments: number of returns, their mean and variance.
+            is_counted: () bool; if false, nothing changes. None: true.
             min_rate: smallest weight of a call.
         """
-        ((n_valid, mean, variance),) = pool_moments(masked_moments(targets, valid))
+        tensors = *self.linear.parameters(), self.mean
+        if all(x.is_cuda and x.dtype == torch.float32 and x.is_contiguous() for x in tensors):
+            kernels.add_returns(self, moments, is_counted, min_rate)
+            return
+        n_valid, mean, variance = moments
         count = self.count + 1
         rate = (1 / count).clamp(min=min_rate, max=1.0)
         mean, scale = mix_moments(self, mean, variance, rate)
         weight = self.linear.weight * (self.scale / scale)
         bias = (self.linear.bias * self.scale + (self.mean - mean)) / scale
         is_stored = (n_valid > 0) & (mean + scale).isfinite()
+        if is_counted is not None:
+            is_stored = is_stored & is_counted
         old = self.linear.weight, self.linear.bias, self.mean, self.scale, self.count
         store_if(is_stored, zip(old, (weight, bias, mean, scale, count), strict=True))

@@ -61,7 +61,7 @@ def test_without_valid_steps_nothing_is_learned():
 def test_gae_on_a_gpu_matches_the_cpu(n_steps, n_lanes):
     torch.manual_seed(0)
     value, reward = torch.randn(2, n_steps, n_lanes)
-    flags = [torch.rand(n_steps, n_lanes) < 0.2 for _ in range(3)]
+    flags = [torch.rand(n_steps, n_lanes) < 0.2 for _ in range(4)]  # the last: learns
     inputs = [reward, value, torch.randn(n_lanes), *flags]
     plain = returns.gae(*inputs, gamma=0.9, lambda_=0.8)
     fused = returns.gae(*(leaf.cuda() for leaf in inputs), gamma=0.9, lambda_=0.8)

@@ -68,6 +68,15 @@ def test_gae_matches_hand_calculation():
     assert r.valid.all()
 
 
+def test_gae_of_lanes_that_do_not_learn_is_not_valid():
+    case = lane(value=[1, 4, 2], last_value=8, reward=[1, 2, 4], reset=[0, 1, 0])
+    r = returns.gae(**case, learns=flags(True, True, False), gamma=0.5, lambda_=0.5)
+    assert r.valid[:, 0].tolist() == [True, False, False]
+    everyone = returns.gae(**case, gamma=0.5, lambda_=0.5)
+    assert torch.equal(r.advantages, everyone.advantages)
+    assert everyone.valid[:, 0].tolist() == [True, False, True]
+
+
 def test_gae_bootstraps_from_truncated_not_terminal():
     # the episode ends after row 1; row 2 is the reset
     case = dict(value=[1, 4, 100, 6], last_value=8, reward=[1, 2, 0, 3], reset=[0, 0, 1, 0])

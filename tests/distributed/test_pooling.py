@@ -9,6 +9,7 @@ from megastep.agents.algorithms.masked_stats import pooled_mean, pooled_normalis
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.distributed import pooling, process_group
+from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.storage.rollout import Rollout
 from tests.helpers import ranks
 from tests.helpers.made_up import MOVES, OBS, PRIVILEGED, T, made_up, weights
@@ -98,7 +99,7 @@ def test_one_process_pools_nothing():
     x, valid = torch.tensor([1.0, 3.0, torch.nan]), torch.tensor([True, True, False])
     assert pooled_mean(x, valid) == 2
     assert pooled_normalise(x, valid).tolist() == pytest.approx([-1, 1, 0])
-    ((n, mean, variance),) = pooling.pool_moments(pooling.masked_moments(x, valid))
+    ((n, mean, variance),) = pooling.pool_moments(*masked_moments(valid, x))
     assert (n, mean, variance) == (2, 2, 1)
     parameter = torch.nn.Parameter(torch.zeros(2))
     parameter.grad = torch.ones(2)

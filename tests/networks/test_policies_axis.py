@@ -7,10 +7,13 @@ from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels.program import N_SUMS, n_blocks
 from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
-from megastep.agents.networks.kernels import layers
+from megastep.agents.networks.kernels import layers, moments
 from megastep.agents.networks.kernels.program import CORES
+from megastep.agents.networks.running_norm import RunningNorm
+from megastep.agents.networks.value_output import ValueOutput
 from megastep.arrdict import arrdict
 from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
+from megastep.spaces import MultiVector
 
 pytestmark = pytest.mark.cuda
 P = 3
@@ -69,6 +72,145 @@ def test_intake():
         of_policy = ([leaf[i] for leaf in parts] for parts in (leaves, means, scales))
         alone = layers.normalise(*of_policy, n_columns, BF16, lanes[i])
         assert torch.equal(features[i], alone), i
+
+
+def test_statistics_of_observations():
+    """One policy counts no lane, and another's numbers of one leaf are not finite."""
+    n_lanes, sizes, threads = 50, (4, 5), CORES.constants["MOMENTS_THREADS"]
+    leaves = [randn(n_lanes, 16).half(), randn(n_lanes, 5)]
+    leaves[1][2, 7, 3] = torch.nan
+    is_counted = torch.rand(P, n_lanes, device="cuda") < 0.7
+    is_counted[1], is_counted[2, 7] = False, True
+    results = [randn(2, n).transpose(0, 1).contiguous() for n in sizes]  # (2, P, n)
+    results = torch.cat([result.flatten() for result in results])
+    n_counted = torch.empty(P, dtype=torch.int64, device="cuda")
+    packed = [
+        CORES.params.IntakeLeafParams(
+            values=leaf.data_ptr(),
+            mean=0,
+            scale=0,
+            n_features=leaf.shape[-1],
+            group=leaf.shape[-1] // n,
+            is_half=int(leaf.dtype == torch.float16),
+        )
+        for leaf, n in zip(leaves, sizes, strict=True)
+    ]
+    launch(
+        *(CORES, "moments", (sum(sizes), P), threads),
+        leaves=b"".join(packed),
+        is_counted=is_counted,
+        moments=results,
+        n_counted=n_counted,
+        n_lanes=n_lanes,
+    )
+    of_leaves = [
+        part.view(2, P, n) for part, n in zip(results.split([2 * P * n for n in sizes]), sizes)
+    ]
+    means, scales = [randn(n) for n in sizes], [randn(n).abs() + 0.1 for n in sizes]
+    counts = torch.tensor([[1.0, 2.0, 3.0]] * 2, device="cuda")
+    norms = [[RunningNorm(MultiVector(1, n)).cuda() for n in sizes] for _ in range(P)]
+    for i in range(P):
+        for norm, mean, scale, count in zip(norms[i], means, scales, counts, strict=True):
+            norm.mean.copy_(mean[i, None])
+            norm.scale.copy_(scale[i, None])
+            norm.count.copy_(count[i])
+    packed = [
+        CORES.params.RunningNormParams(
+            mean=mean.data_ptr(),
+            scale=scale.data_ptr(),
+            count=count.data_ptr(),
+            new_mean=new_mean.data_ptr(),
+            new_variance=new_variance.data_ptr(),
+            n_counted=n_counted.data_ptr(),
+            n=n,
+            min_scale=norms[0][0].min_scale,
+        )
+        for n, mean, scale, count, (new_mean, new_variance) in zip(
+            sizes, means, scales, counts, of_leaves, strict=True
+        )
+    ]
+    launch(*(CORES, "add_moments", (len(sizes), P), threads), norms=b"".join(packed))
+    assert counts.tolist() == [[2, 2, 4], [2, 2, 3]]
+    for i in range(P):
+        n, *alone = moments.moments([leaf[i] for leaf in leaves], list(sizes), is_counted[i])
+        assert n_counted[i] == n
+        for result, mean, variance in zip(of_leaves, *alone, strict=True):
+            for one, other in zip(result[:, i], (mean, variance), strict=True):
+                torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
+        moments.add_moments(norms[i], [(n, *pair) for pair in zip(*alone, strict=True)])
+        for norm, mean, scale, count in zip(norms[i], means, scales, counts, strict=True):
+            assert torch.equal(norm.mean[0], mean[i]) and torch.equal(norm.scale[0], scale[i])
+            assert norm.count == count[i]
+
+
+def test_statistics_of_returns():
+    """Policies have different valid returns; one does not count its own."""
+    n, width, threads = 5000, 40, CORES.constants["MASKED_THREADS"]
+    arrays = [randn(n), 3 * randn(n) + 1]
+    valid = torch.rand(P, n, device="cuda") < 0.6
+    n_parts = -(-n // (threads * CORES.constants["MASKED_NUMBERS"]))
+    parts, results = randn(len(arrays), n_parts, 3), randn(len(arrays), 2)
+    n_valid = torch.empty(P, dtype=torch.int64, device="cuda")
+    pack = CORES.params.MaskedArrayParams
+    shared = dict(parts=parts, n_arrays=len(arrays))
+    launch(
+        *(CORES, "masked_parts", (n_parts, P * len(arrays)), threads),
+        arrays=b"".join(pack(values=array.data_ptr()) for array in arrays),
+        valid=valid,
+        n=n,
+        **shared,
+    )
+    launch(
+        *(CORES, "masked_moments", (1, P * len(arrays)), threads),
+        **shared,
+        moments=results,
+        n_valid=n_valid,
+        n_parts=n_parts,
+    )
+    means, variances = (column.contiguous() for column in results[:, 1].unbind(1))
+    normalised = torch.empty_like(arrays[1])
+    launch(
+        *(CORES, "normalise_masked", (-(-n // BLOCK), P)),
+        values=arrays[1],
+        valid=valid,
+        mean=means,
+        variance=variances,
+        normalised=normalised,
+        n=n,
+    )
+    outputs = [ValueOutput(width).cuda() for _ in range(P)]
+    is_counted = torch.tensor([True, False, True], device="cuda")
+    names = "weight", "bias", "mean", "scale", "count"
+    of_all = {
+        name: torch.stack(
+            [
+                (output.state_dict() | dict(output.linear.named_parameters()))[name]
+                for output in outputs
+            ]
+        ).detach()
+        for name in names
+    }
+    launch(
+        *(CORES, "add_returns", (1, P), threads),
+        **of_all,
+        new_mean=means,
+        new_variance=variances,
+        n_valid=n_valid,
+        is_counted=is_counted,
+        width=width,
+        min_rate=0.05,
+        min_scale=outputs[0].min_scale,
+    )
+    for i in range(P):
+        count, alone = moments.masked_moments([array[i] for array in arrays], valid[i])
+        assert n_valid[i] == count and torch.equal(results[i], alone)
+        one = moments.normalise_masked(arrays[1][i], valid[i], *alone[1])
+        assert torch.equal(normalised[i], one)
+        outputs[i].add((count, *alone[1]), is_counted[i])
+        state = outputs[i].state_dict() | dict(outputs[i].linear.named_parameters())
+        for name, tensor in of_all.items():
+            assert torch.equal(tensor[i], state[name]), name
+    assert of_all["count"].tolist() == [1, 0, 1]
 
 
 @pytest.mark.parametrize("n_columns", [8, 264])  # 264: two blocks of columns

@@ -54,3 +54,30 @@ def test_nonfinite_returns_change_nothing(bad):
     # 1e30 is finite, its square is not
     value.update_stats(torch.tensor([1.0, 2.0, bad]), torch.tensor([True, True, True]))
     assert all(torch.equal(value.state_dict()[name], before[name]) for name in before)
+
+
+def test_moments_that_do_not_count_change_nothing():
+    value, moments = ValueOutput(WIDTH), tuple(map(torch.tensor, (4, 3.0, 4.0)))
+    value.add(moments, torch.tensor(False))
+    assert value.mean.item() == 0 and value.count.item() == 0
+    value.add(moments, torch.tensor(True))
+    assert value.mean.item() == 3 and value.scale.item() == 2 and value.count.item() == 1
+
+
+@pytest.mark.cuda
+def test_a_gpu_adds_the_same_moments():
+    """Also none, those that do not count, and those that are not finite."""
+    width, yes = 300, torch.tensor(True)
+    one, other = ValueOutput(width), ValueOutput(width).cuda()
+    other.load_state_dict(one.state_dict())
+    calls = [(5, 3.0, 4.0, None), (5, 30.0, 400.0, yes), (0, 1.0, 1.0, yes), (4, 8.0, 9.0, ~yes)]
+    calls += [(5, math.nan, 1.0, None), (5, 1.0, math.inf, None), (4, 9.0, 0.0, yes)]
+    for *moments, is_counted in calls:
+        moments = [torch.tensor(number) for number in moments]
+        one.add(moments, is_counted)
+        on_gpu = None if is_counted is None else is_counted.cuda()
+        other.add([number.cuda() for number in moments], on_gpu)
+        for name, tensor in one.state_dict().items():
+            close = dict(rtol=1e-5, atol=1e-6)
+            torch.testing.assert_close(other.state_dict()[name].cpu(), tensor, **close)
+    assert one.count == 3

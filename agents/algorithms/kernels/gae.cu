@@ -8,7 +8,7 @@ KERNEL gae(GaeParams p) {
     int lane = blockIdx.x * blockDim.x + threadIdx.x;
     if (lane >= p.n_lanes)
         return;
-    float advantage = 0.f, next_value = p.values[p.n_steps * (long long)p.n_lanes + lane];
+    float advantage = 0.f, next_value = p.last_value[lane];
 #pragma unroll 4
     for (int t = p.n_steps - 1; t >= 0; t--) {
         long long at = t * (long long)p.n_lanes + lane;
@@ -19,6 +19,7 @@ KERNEL gae(GaeParams p) {
         advantage = (reset ? 0.f : delta) + (ends ? 0.f : p.gamma * p.lambda_ * advantage);
         p.advantages[at] = advantage;
         p.targets[at] = advantage + value;
+        p.valid[at] = !reset && (!p.learns || p.learns[at]);
         next_value = value;
     }
 }

@@ -6,12 +6,15 @@
 
 struct GaeParams {
     const float* reward;             // (T, B)
-    const float* values;             // (T + 1, B)
+    const float* values;             // (T, B)
+    const float* last_value;         // (B)
     const unsigned char* reset;      // (T, B)
     const unsigned char* terminal;   // (T, B)
     const unsigned char* truncated;  // (T, B)
+    const unsigned char* learns;     // (T, B); null: all do
     float* advantages;               // (T, B)
     float* targets;                  // (T, B)
+    unsigned char* valid;            // (T, B)
     int n_steps;
     int n_lanes;
     float gamma;

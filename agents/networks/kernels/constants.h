@@ -6,3 +6,6 @@ constexpr int STRIP = 128;             // rows that a block adds up
 constexpr int STRIP_THREADS = 256;     // of such a block
 constexpr int ACT_THREADS = 8;         // that choose one lane's actions, one per choice
 constexpr int MOMENTS_THREADS = 1024;  // of a block, for one statistic
+constexpr int MASKED_ARRAYS = 4;       // whose moments a launch computes
+constexpr int MASKED_THREADS = 256;    // of a block
+constexpr int MASKED_NUMBERS = 8;      // of an array, that a thread reads

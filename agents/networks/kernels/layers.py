@@ -7,7 +7,8 @@ choices.
 import torch
 
 from megastep.agents.networks.kernels.program import CORES, DTYPES
-from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
+from megastep.agents.networks.kernels.program import launch_on_gpu as _launch
+from megastep.kernels.build.launch import WARP
 
 MAX_LEAVES = CORES.constants["MAX_LEAVES"]
 MAX_CHOICES = CORES.constants["ACT_THREADS"]
@@ -63,75 +64,6 @@ def normalise(
         n_blocks_y=n_steps,
     )
     return features
-
-
-def moments(
-    leaves: list[torch.Tensor], n_statistics: list[int], is_counted: torch.Tensor
-) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-    """Returns the number of lanes that count, () int64, and each leaf's means and variances.
-
-    Args:
-        leaves: at most `MAX_LEAVES`, (B, F) float16 or float32 each.
-        n_statistics: of each leaf, each of F / n neighbouring features.
-        is_counted: (B,) bool, lanes to count.
-    """
-    total, device = sum(n_statistics), leaves[0].device
-    results = torch.empty(2, total, device=device)
-    n_counted = torch.empty((), dtype=torch.int64, device=device)
-    threads = CORES.constants["MOMENTS_THREADS"]
-    packed = [
-        CORES.params.IntakeLeafParams(
-            values=leaf.data_ptr(),
-            mean=0,
-            scale=0,
-            n_features=leaf.shape[1],
-            group=leaf.shape[1] // n,
-            is_half=int(leaf.dtype == torch.float16),
-        )
-        for leaf, n in zip(leaves, n_statistics, strict=True)
-    ]
-    _launch(
-        "moments",
-        results,
-        total * threads,
-        block=threads,
-        leaves=b"".join(packed),
-        is_counted=is_counted.contiguous(),
-        moments=results,
-        n_counted=n_counted,
-        n_lanes=len(leaves[0]),
-        n_statistics=total,
-    )
-    means, variances = (row.split(n_statistics) for row in results)
-    return n_counted, list(means), list(variances)
-
-
-def add_moments(norms: list, all_moments: list) -> None:
-    """Adds moments to the statistics of norms, at most `MAX_LEAVES`.
-
-    Args:
-        norms: `RunningNorm`s.
-        all_moments: of each norm: the number of lanes () int64, means and variances.
-    """
-    packed, kept = [], []
-    for norm, (n_counted, mean, variance) in zip(norms, all_moments, strict=True):
-        mean, variance, n_counted = mean.contiguous(), variance.contiguous(), n_counted.long()
-        kept += [mean, variance, n_counted]  # until the launch
-        packed.append(
-            CORES.params.RunningNormParams(
-                mean=norm.mean.data_ptr(),
-                scale=norm.scale.data_ptr(),
-                count=norm.count.data_ptr(),
-                new_mean=mean.data_ptr(),
-                new_variance=variance.data_ptr(),
-                n_counted=n_counted.data_ptr(),
-                n=mean.numel(),
-                min_scale=norm.min_scale,
-            )
-        )
-    threads = CORES.constants["MOMENTS_THREADS"]
-    n_threads = threads * len(packed)
-    _launch("add_moments", norms[0].mean, n_threads, block=threads, norms=b"".join(packed))
 
 
 def bias_gradient(
@@ -268,15 +200,3 @@ def _rows(logits, actions):
     return dict(
         logits=logits, actions=actions, n_rows=n_rows, n_agents=n_agents, n_choices=n_choices
     )
-
-
-def _launch(operation, tensor, n_threads, n_blocks_y=1, block=BLOCK, **fields):
-    """Launches an operation for one policy on a tensor's GPU."""
-    values = {
-        name: field.data_ptr() if isinstance(field, torch.Tensor) else 0 if field is None else field
-        for name, field in fields.items()
-    }
-    pack = getattr(CORES.params, CORES.cuda_operations[operation])
-    if n_threads and n_blocks_y:
-        n_blocks = -(-n_threads // block), n_blocks_y
-        launch_blocks(CORES, operation, pack(**values), tensor.device, n_blocks, block)

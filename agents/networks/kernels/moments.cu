@@ -1,5 +1,6 @@
 // Means and variances of observations over lanes, one block per statistic; and adding them to
-// running statistics, one block per leaf.
+// running statistics, one block per leaf. Blocks along y are policies.
+#include "block_sum.h"
 #include "constants.h"
 #include "half.h"
 #include "lanes.h"
@@ -9,21 +10,6 @@ DEVICE float number_at(const IntakeLeafParams& leaf, long long at) {
     if (!leaf.is_half)
         return ((const float*)leaf.values)[at];
     return half_value(((const unsigned short*)leaf.values)[at]);
-}
-
-// The sum over a block in a fixed order, in every thread.
-DEVICE float sum_of_block(float x) {
-    __shared__ float of_warps[MOMENTS_THREADS / WARP];
-    for (int mask = WARP / 2; mask; mask /= 2)
-        x += __shfl_xor_sync(~0u, x, mask);
-    __syncthreads();
-    if (threadIdx.x % WARP == 0)
-        of_warps[threadIdx.x / WARP] = x;
-    __syncthreads();
-    x = of_warps[threadIdx.x % WARP];
-    for (int mask = WARP / 2; mask; mask /= 2)
-        x += __shfl_xor_sync(~0u, x, mask);
-    return x;
 }
 
 DEVICE void add(float& sum, float x, float mean, bool is_square) {
@@ -38,9 +24,10 @@ DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int fi
     bool in_words =
         leaf.is_half && leaf.group % 8 == 0 && (unsigned long long)leaf.values % 16 == 0;
     for (int lane = threadIdx.x; lane < p.n_lanes; lane += MOMENTS_THREADS) {
-        if (!p.is_counted[lane])
+        long long row = (long long)blockIdx.y * p.n_lanes + lane;
+        if (!p.is_counted[row])
             continue;
-        long long at = (long long)lane * leaf.n_features + first;
+        long long at = row * leaf.n_features + first;
         if (in_words) {
             const uint4* words = (const uint4*)((const unsigned short*)leaf.values + at);
 #pragma unroll 4
@@ -57,38 +44,44 @@ DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int fi
             for (int i = 0; i < leaf.group; i++)
                 add(sum, number_at(leaf, at + i), mean, is_square);
     }
-    return sum_of_block(sum);
+    return sum_of_block<MOMENTS_THREADS>(sum);
 }
 
 KERNEL BOUNDS(1024) moments(MomentsParams p) {
-    int statistic = blockIdx.x, leaf = 0;
-    for (; statistic >= p.leaves[leaf].n_features / p.leaves[leaf].group; leaf++)
-        statistic -= p.leaves[leaf].n_features / p.leaves[leaf].group;
+    int statistic = blockIdx.x, leaf = 0, policy = blockIdx.y, n_policies = gridDim.y;
+    float* results = p.moments;  // of the leaf
+    for (; statistic >= p.leaves[leaf].n_features / p.leaves[leaf].group; leaf++) {
+        int n_statistics = p.leaves[leaf].n_features / p.leaves[leaf].group;
+        statistic -= n_statistics;
+        results += 2 * n_policies * n_statistics;
+    }
     IntakeLeafParams chosen = p.leaves[leaf];
     float n_counted = 0.f;
     for (int lane = threadIdx.x; lane < p.n_lanes; lane += MOMENTS_THREADS)
-        n_counted += p.is_counted[lane] ? 1.f : 0.f;
-    n_counted = sum_of_block(n_counted);  // exact below 2^24
+        n_counted += p.is_counted[(long long)policy * p.n_lanes + lane] ? 1.f : 0.f;
+    n_counted = sum_of_block<MOMENTS_THREADS>(n_counted);  // exact below 2^24
     float n = fmaxf(n_counted, 1.f) * (float)chosen.group;
     int first = statistic * chosen.group;
     float mean = __fdiv_rn(sum_of<false>(p, chosen, first, 0.f), n);
     float variance = __fdiv_rn(sum_of<true>(p, chosen, first, mean), n);
     if (threadIdx.x)
         return;
-    p.moments[blockIdx.x] = mean;
-    p.moments[p.n_statistics + blockIdx.x] = variance;
+    int n_statistics = chosen.n_features / chosen.group, at = policy * n_statistics + statistic;
+    results[at] = mean;
+    results[n_policies * n_statistics + at] = variance;
     if (!blockIdx.x)
-        *p.n_counted = (long long)n_counted;
+        p.n_counted[policy] = (long long)n_counted;
 }
 
 // Changes nothing if no lane was counted, or if a number is not finite.
 KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
     const RunningNormParams& norm = p.norms[blockIdx.x];
-    float count = *norm.count + 1.f, rate = __fdiv_rn(1.f, count);
+    int policy = blockIdx.y, first = policy * norm.n;
+    float count = norm.count[policy] + 1.f, rate = __fdiv_rn(1.f, count);
     for (int pass = 0; pass < 2; pass++) {  // first only looks
         bool stores = pass == 1;
         bool is_finite = true;
-        for (int i = threadIdx.x; i < norm.n; i += MOMENTS_THREADS) {
+        for (int i = first + threadIdx.x; i < first + norm.n; i += MOMENTS_THREADS) {
             float old_mean = norm.mean[i], old_scale = norm.scale[i];
             float away = norm.new_mean[i] - old_mean, old_variance = old_scale * old_scale;
             float variance = old_variance + rate * (norm.new_variance[i] - old_variance) +
@@ -102,9 +95,9 @@ KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
                 norm.scale[i] = scale;
             }
         }
-        if (!__syncthreads_and(is_finite) || *norm.n_counted <= 0)
+        if (!__syncthreads_and(is_finite) || norm.n_counted[policy] <= 0)
             return;
     }
     if (!threadIdx.x)
-        *norm.count = count;
+        norm.count[policy] = count;
 }

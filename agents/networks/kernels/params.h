@@ -111,30 +111,74 @@ struct NormaliseParams {
     int n_columns;   // a multiple of 4; those after the leaves' features are 0
 };
 
-// Statistics of one policy.
 struct MomentsParams {
-    IntakeLeafParams leaves[8];       // without mean and scale
-    const unsigned char* is_counted;  // (B)
-    float* moments;                   // (2, n_statistics), means and variances of all leaves
-    long long* n_counted;             // ()
+    IntakeLeafParams leaves[8];       // (P, B, n_features), without mean and scale
+    const unsigned char* is_counted;  // (P, B)
+    float* moments;        // of each leaf (2, P, n_features / group): means, then variances
+    long long* n_counted;  // (P)
     int n_lanes;
-    int n_statistics;
 };
 
 // A leaf's running statistics, and the moments to add to them.
 struct RunningNormParams {
-    float* mean;   // (n)
-    float* scale;  // (n)
-    float* count;  // ()
-    const float* new_mean;
-    const float* new_variance;
-    const long long* n_counted;  // ()
+    float* mean;                 // (P, n)
+    float* scale;                // (P, n)
+    float* count;                // (P)
+    const float* new_mean;       // (P, n)
+    const float* new_variance;   // (P, n)
+    const long long* n_counted;  // (P)
     int n;
     float min_scale;
 };
 
 struct AddMomentsParams {
     RunningNormParams norms[8];
+};
+
+// Numbers of which some are valid; the others may be anything.
+struct MaskedArrayParams {
+    const float* values;  // (P, n)
+};
+
+struct MaskedPartsParams {
+    MaskedArrayParams arrays[4];
+    const unsigned char* valid;  // (P, n), of all arrays
+    float* parts;  // (P, n_arrays, n_blocks, 3): count, mean, sum of squared distances from it
+    int n;
+    int n_arrays;
+};
+
+struct MaskedMomentsParams {
+    const float* parts;  // (P, n_arrays, n_parts, 3)
+    float* moments;      // (P, n_arrays, 2), means and variances
+    long long* n_valid;  // (P)
+    int n_parts;
+    int n_arrays;
+};
+
+struct NormaliseMaskedParams {
+    const float* values;         // (P, n)
+    const unsigned char* valid;  // (P, n)
+    const float* mean;           // (P)
+    const float* variance;       // (P)
+    float* normalised;           // (P, n), 0 where invalid
+    int n;
+};
+
+// The critic's last layer, and the statistics of returns that it predicts in.
+struct AddReturnsParams {
+    float* weight;                    // (P, W)
+    float* bias;                      // (P)
+    float* mean;                      // (P)
+    float* scale;                     // (P)
+    float* count;                     // (P)
+    const float* new_mean;            // (P)
+    const float* new_variance;        // (P)
+    const long long* n_valid;         // (P)
+    const unsigned char* is_counted;  // (P), false: nothing changes; null: true
+    int width;
+    float min_rate;
+    float min_scale;
 };
 
 struct BiasGradientParams {

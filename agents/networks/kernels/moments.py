@@ -1,0 +1,166 @@
+"""Statistics on a GPU: of observations, and of numbers of which some are valid.
+
+All tensors are contiguous and on one GPU. B lanes.
+"""
+
+from collections.abc import Sequence
+
+import torch
+
+from megastep.agents.networks.kernels.program import CORES, launch_on_gpu
+
+MAX_LEAVES = CORES.constants["MAX_LEAVES"]
+MAX_ARRAYS = CORES.constants["MASKED_ARRAYS"]
+_THREADS = CORES.constants["MASKED_THREADS"]
+
+
+def moments(
+    leaves: list[torch.Tensor], n_statistics: list[int], is_counted: torch.Tensor
+) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
+    """Returns the number of lanes that count, () int64, and each leaf's means and variances.
+
+    Args:
+        leaves: at most `MAX_LEAVES`, (B, F) float16 or float32 each.
+        n_statistics: of each leaf, each of F / n neighbouring features.
+        is_counted: (B,) bool, lanes to count.
+    """
+    total, device = sum(n_statistics), leaves[0].device
+    results = torch.empty(2 * total, device=device)
+    n_counted = torch.empty((), dtype=torch.int64, device=device)
+    threads = CORES.constants["MOMENTS_THREADS"]
+    packed = [
+        CORES.params.IntakeLeafParams(
+            values=leaf.data_ptr(),
+            mean=0,
+            scale=0,
+            n_features=leaf.shape[1],
+            group=leaf.shape[1] // n,
+            is_half=int(leaf.dtype == torch.float16),
+        )
+        for leaf, n in zip(leaves, n_statistics, strict=True)
+    ]
+    launch_on_gpu(
+        "moments",
+        results,
+        total * threads,
+        block=threads,
+        leaves=b"".join(packed),
+        is_counted=is_counted.contiguous(),
+        moments=results,
+        n_counted=n_counted,
+        n_lanes=len(leaves[0]),
+    )
+    means, variances = zip(
+        *(part.chunk(2) for part in results.split([2 * n for n in n_statistics]))
+    )
+    return n_counted, list(means), list(variances)
+
+
+def add_moments(norms: list, all_moments: list) -> None:
+    """Adds moments to the statistics of norms, at most `MAX_LEAVES`.
+
+    Args:
+        norms: `RunningNorm`s.
+        all_moments: of each norm: the number of lanes () int64, means and variances.
+    """
+    packed, kept = [], []
+    for norm, (n_counted, mean, variance) in zip(norms, all_moments, strict=True):
+        mean, variance, n_counted = mean.contiguous(), variance.contiguous(), n_counted.long()
+        kept += [mean, variance, n_counted]  # until the launch
+        packed.append(
+            CORES.params.RunningNormParams(
+                mean=norm.mean.data_ptr(),
+                scale=norm.scale.data_ptr(),
+                count=norm.count.data_ptr(),
+                new_mean=mean.data_ptr(),
+                new_variance=variance.data_ptr(),
+                n_counted=n_counted.data_ptr(),
+                n=mean.numel(),
+                min_scale=norm.min_scale,
+            )
+        )
+    threads = CORES.constants["MOMENTS_THREADS"]
+    n_threads = threads * len(packed)
+    launch_on_gpu("add_moments", norms[0].mean, n_threads, block=threads, norms=b"".join(packed))
+
+
+def masked_moments(
+    arrays: Sequence[torch.Tensor], valid: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns the number of valid entries, () int64, and means and variances (n, 2).
+
+    Args:
+        arrays: n, at most `MAX_ARRAYS`, float32 each, of fewer than 2^31 numbers.
+        valid: bool, of the same shape.
+    """
+    n_numbers, tensor = arrays[0].numel(), arrays[0]
+    n_parts = max(1, -(-n_numbers // (_THREADS * CORES.constants["MASKED_NUMBERS"])))
+    parts = tensor.new_empty(len(arrays), n_parts, 3)
+    moments = tensor.new_empty(len(arrays), 2)
+    n_valid = torch.empty((), dtype=torch.int64, device=tensor.device)
+    pack, shape = CORES.params.MaskedArrayParams, dict(n_blocks_y=len(arrays), block=_THREADS)
+    launch_on_gpu(
+        *("masked_parts", tensor, n_parts * _THREADS),
+        **shape,
+        arrays=b"".join(pack(values=array.data_ptr()) for array in arrays),
+        valid=valid,
+        parts=parts,
+        n=n_numbers,
+        n_arrays=len(arrays),
+    )
+    launch_on_gpu(
+        *("masked_moments", tensor, _THREADS),
+        **shape,
+        parts=parts,
+        moments=moments,
+        n_valid=n_valid,
+        n_parts=n_parts,
+        n_arrays=len(arrays),
+    )
+    return n_valid, moments
+
+
+def normalise_masked(
+    x: torch.Tensor, valid: torch.Tensor, mean: torch.Tensor, variance: torch.Tensor
+) -> torch.Tensor:
+    """Returns (x - mean) / sqrt(variance), 0 where invalid.
+
+    Args:
+        x: float32, of fewer than 2^31 numbers.
+        valid: bool, of the same shape.
+        mean: () float32.
+        variance: () float32.
+    """
+    normalised = torch.empty_like(x)
+    statistics = dict(mean=mean, variance=variance)
+    fields = dict(values=x, valid=valid, **statistics, normalised=normalised, n=x.numel())
+    launch_on_gpu("normalise_masked", x, x.numel(), **fields)
+    return normalised
+
+
+def add_returns(output, moments: tuple, is_counted: torch.Tensor | None, min_rate: float) -> None:
+    """Adds moments to the statistics of a `ValueOutput`.
+
+    Args:
+        output: whose tensors are float32.
+        moments: the number of returns () int64, their mean and variance, () float32 each.
+        is_counted: () bool. None: true.
+        min_rate: smallest weight of the moments.
+    """
+    n_valid, mean, variance = moments
+    launch_on_gpu(
+        *("add_returns", output.mean, _THREADS),
+        block=_THREADS,
+        weight=output.linear.weight,
+        bias=output.linear.bias,
+        mean=output.mean,
+        scale=output.scale,
+        count=output.count,
+        new_mean=mean,
+        new_variance=variance,
+        n_valid=n_valid,
+        is_counted=is_counted,
+        width=output.linear.in_features,
+        min_rate=min_rate,
+        min_scale=output.min_scale,
+    )

@@ -1,0 +1,103 @@
+// Means and variances of the valid ones of many numbers, such as returns; normalisation by them;
+// and adding those of returns to the critic's (PopArt). Blocks along y: policies, with their
+// arrays.
+#include "block_sum.h"
+#include "constants.h"
+#include "lanes.h"
+#include "params.h"
+
+static_assert(sizeof(MaskedPartsParams::arrays) == MASKED_ARRAYS * sizeof(MaskedArrayParams));
+
+// A block has MASKED_NUMBERS neighbouring numbers of an array per thread.
+KERNEL BOUNDS(256) masked_parts(MaskedPartsParams p) {
+    int array = blockIdx.y % p.n_arrays;
+    long long policy = blockIdx.y / p.n_arrays;
+    const float* values = p.arrays[array].values + policy * p.n;
+    const unsigned char* valid = p.valid + policy * p.n;
+    int first = blockIdx.x * (MASKED_THREADS * MASKED_NUMBERS) + threadIdx.x;
+    float numbers[MASKED_NUMBERS], count = 0.f, sum = 0.f, squares = 0.f;
+    bool counts[MASKED_NUMBERS];
+#pragma unroll
+    for (int i = 0; i < MASKED_NUMBERS; i++) {
+        int at = first + i * MASKED_THREADS;
+        counts[i] = at < p.n && valid[at];
+        numbers[i] = at < p.n ? values[at] : 0.f;
+    }
+#pragma unroll
+    for (int i = 0; i < MASKED_NUMBERS; i++) {
+        count += counts[i] ? 1.f : 0.f;
+        sum += counts[i] ? numbers[i] : 0.f;
+    }
+    count = sum_of_block<MASKED_THREADS>(count);
+    float mean = __fdiv_rn(sum_of_block<MASKED_THREADS>(sum), fmaxf(count, 1.f));
+#pragma unroll
+    for (int i = 0; i < MASKED_NUMBERS; i++) {
+        float away = numbers[i] - mean;
+        squares += counts[i] ? away * away : 0.f;
+    }
+    squares = sum_of_block<MASKED_THREADS>(squares);
+    if (threadIdx.x)
+        return;
+    float* part = p.parts + 3ll * ((long long)blockIdx.y * gridDim.x + blockIdx.x);
+    part[0] = count;
+    part[1] = mean;
+    part[2] = squares;
+}
+
+// A block adds up the parts of an array (Chan et al. 1979).
+KERNEL BOUNDS(256) masked_moments(MaskedMomentsParams p) {
+    const float* parts = p.parts + 3ll * blockIdx.y * p.n_parts;
+    float count = 0.f, sum = 0.f, squares = 0.f;
+    for (int i = threadIdx.x; i < p.n_parts; i += MASKED_THREADS) {
+        count += parts[3 * i];
+        sum += parts[3 * i] * parts[3 * i + 1];
+    }
+    count = sum_of_block<MASKED_THREADS>(count);  // exact below 2^24
+    float n = fmaxf(count, 1.f), mean = __fdiv_rn(sum_of_block<MASKED_THREADS>(sum), n);
+    for (int i = threadIdx.x; i < p.n_parts; i += MASKED_THREADS) {
+        float away = parts[3 * i + 1] - mean;
+        squares += parts[3 * i + 2] + parts[3 * i] * away * away;
+    }
+    squares = sum_of_block<MASKED_THREADS>(squares);
+    if (threadIdx.x)
+        return;
+    p.moments[2 * blockIdx.y] = mean;
+    p.moments[2 * blockIdx.y + 1] = __fdiv_rn(squares, n);
+    if (blockIdx.y % p.n_arrays == 0)
+        p.n_valid[blockIdx.y / p.n_arrays] = (long long)count;
+}
+
+KERNEL normalise_masked(NormaliseMaskedParams p) {
+    int of_policy = blockIdx.x * blockDim.x + threadIdx.x, policy = blockIdx.y;
+    if (of_policy >= p.n)
+        return;
+    long long at = (long long)policy * p.n + of_policy;
+    float away = p.values[at] - p.mean[policy];
+    p.normalised[at] = p.valid[at] ? __fdiv_rn(away, sqrtf(p.variance[policy]) + 1e-8f) : 0.f;
+}
+
+// Changes nothing if no return is valid, or if a number is not finite.
+KERNEL BOUNDS(256) add_returns(AddReturnsParams p) {
+    int policy = blockIdx.y;
+    float old_mean = p.mean[policy], old_scale = p.scale[policy];
+    float count = p.count[policy] + 1.f;
+    float rate = fminf(fmaxf(__fdiv_rn(1.f, count), p.min_rate), 1.f);
+    float away = p.new_mean[policy] - old_mean, old_variance = old_scale * old_scale;
+    float variance = old_variance + rate * (p.new_variance[policy] - old_variance) +
+                     rate * (1.f - rate) * away * away;
+    float mean = old_mean + rate * away, scale = sqrtf(variance);
+    scale = scale < p.min_scale ? p.min_scale : scale;  // NaN stays
+    bool is_counted = !p.is_counted || p.is_counted[policy];
+    if (!is_counted || p.n_valid[policy] <= 0 || !isfinite(mean + scale))
+        return;
+    float* weight = p.weight + (long long)policy * p.width;
+    for (int i = threadIdx.x; i < p.width; i += MASKED_THREADS)
+        weight[i] *= __fdiv_rn(old_scale, scale);
+    __syncthreads();  // all have read the old statistics
+    if (threadIdx.x)
+        return;
+    p.bias[policy] = __fdiv_rn(p.bias[policy] * old_scale + (old_mean - mean), scale);
+    p.mean[policy] = mean;
+    p.scale[policy] = scale;
+    p.count[policy] = count;
+}
