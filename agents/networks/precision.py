@@ -1,11 +1,12 @@
 """The dtype that layers compute in."""
 
-import math
 import threading
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
+
+from megastep.agents.networks.kernels import casts as kernels
 
 
 class _Casts(threading.local):
@@ -63,8 +64,8 @@ def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.T
     if weight.dtype == dtype and not n_padding:
         return weight
     key = id(weight), dtype, multiple
-    if key not in _CASTS.by_weight and _CASTS.depth and weight.is_cuda:
-        _cast_together(weight, dtype)
+    if key not in _CASTS.by_weight and _CASTS.depth and dtype == torch.bfloat16:
+        _cast_together(weight)
     if key in _CASTS.by_weight:
         return _CASTS.by_weight[key][1]
     result = weight.detach().to(dtype)
@@ -77,22 +78,20 @@ def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.T
 
 
 @torch.no_grad()
-def _cast_together(weight, dtype):
-    """Casts all weights of the context, if this is one of them: two kernels instead of one or two
-    for each.
+def _cast_together(weight):
+    """Rounds all weights of the context to bfloat16, if this is one of them: in one kernel instead
+    of one or two for each.
     """
-    weights = [w for w in _CASTS.weights() if w.dim() and w.dtype == weight.dtype and w.is_cuda]
+    weights = [w for w in _CASTS.weights() if w.dim() and _is_float32_on_gpu(w)]
     if not any(w is weight for w in weights):
         return
-    shapes = [(len(w) + -len(w) % _MULTIPLE, *w.shape[1:]) for w in weights]
-    sizes = [math.prod(shape) for shape in shapes]
-    padded = torch.zeros(sum(sizes), dtype=dtype, device=weight.device).split(sizes)
-    padded = [part.view(shape) for part, shape in zip(padded, shapes, strict=True)]
-    plain = [part[: len(w)] for part, w in zip(padded, weights, strict=True)]
-    torch._foreach_copy_(plain, weights)
-    for w, part, whole in zip(weights, plain, padded, strict=True):
-        _CASTS.by_weight[id(w), dtype, 1] = w, part
-        _CASTS.by_weight[id(w), dtype, _MULTIPLE] = w, whole
+    for w, padded in zip(weights, kernels.cast(weights, _MULTIPLE), strict=True):
+        _CASTS.by_weight[id(w), torch.bfloat16, 1] = w, padded[: len(w)]
+        _CASTS.by_weight[id(w), torch.bfloat16, _MULTIPLE] = w, padded
+
+
+def _is_float32_on_gpu(weight):
+    return weight.is_cuda and weight.dtype == torch.float32 and weight.is_contiguous()
 
 
 def compute_dtype(weight: torch.Tensor) -> torch.dtype:

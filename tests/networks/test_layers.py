@@ -35,6 +35,32 @@ def test_weights_are_cast_once_per_context():
 
 
 @pytest.mark.cuda
+def test_weights_of_a_context_are_cast_together():
+    """More than fit into a launch, some misaligned or not contiguous, and one of no context."""
+    torch.manual_seed(0)
+    shapes = [*((n,) for n in range(1, 50)), (7, 3), (1, 256), (1024, 264), ()]
+    weights = [nn.Parameter(torch.randn(shape, device="cuda")) for shape in shapes]
+    weights.append(torch.randn(41, device="cuda")[1:].view(4, 10))
+    weights += [torch.randn(6, 4, device="cuda").T, torch.randn(5, device="cuda").double()]
+    weights[3].data[0] = torch.nan
+    other = torch.randn(9, 2, device="cuda")
+    for _ in range(2):
+        with ComputeDtype("cuda", torch.bfloat16, weights=lambda: weights):
+            for weight in (w for w in (*weights, other) if w.dim()):
+                rounded = cast(weight, torch.bfloat16)
+                expected = weight.detach().bfloat16()
+                torch.testing.assert_close(rounded, expected, rtol=0, atol=0, equal_nan=True)
+                assert cast(weight, torch.bfloat16) is rounded and not rounded.requires_grad
+                padded = cast(weight, torch.bfloat16, multiple=8)
+                assert len(padded) % 8 == 0 and not padded[len(weight) :].any()
+                torch.testing.assert_close(
+                    padded[: len(weight)], expected, rtol=0, atol=0, equal_nan=True
+                )
+        with torch.no_grad():
+            weights[10].add_(1.0)
+
+
+@pytest.mark.cuda
 @pytest.mark.parametrize("activation", [None, torch.relu])
 @pytest.mark.parametrize(
     "n_rows, n_in, n_out", [(1, 8, 1), (100, 64, 7), (999, 264, 256), (3, 8, 52)]

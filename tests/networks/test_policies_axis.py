@@ -236,6 +236,29 @@ def test_bias_gradient(n_columns):
         torch.testing.assert_close(sums[i].sum(0), total)
 
 
+def test_casts():
+    """Numbers after a weight are zeros, of each policy."""
+    weights, threads = [randn(3), randn(77, 5), randn(70_000)], CORES.constants["CAST_THREADS"]
+    sizes, rows, n = [8, 400, 70_000], [], 0
+    targets = [torch.full((P, size), torch.nan, dtype=BF16, device="cuda") for size in sizes]
+    for weight, target, size in zip(weights, targets, sizes, strict=True):
+        rows.append(
+            CORES.params.CastRowParams(
+                source=weight.data_ptr(),
+                target=target.data_ptr(),
+                n=weight[0].numel(),
+                n_padded=size,
+                first_block=n,
+            )
+        )
+        n += -(-size // (8 * threads))
+    launch(*(CORES, "cast", (n, P), threads), rows=b"".join(rows), n_rows=len(rows))
+    for weight, target in zip(weights, targets, strict=True):
+        rounded = weight.flatten(1).to(BF16)
+        assert torch.equal(target[:, : rounded.shape[1]], rounded)
+        assert not target[:, rounded.shape[1] :].any()
+
+
 def test_categorical_actions():
     n_lanes, width, shape = 37, 64, (2, 5)
     features, noise = randn(n_lanes, width).to(BF16), randn(n_lanes, *shape).abs()

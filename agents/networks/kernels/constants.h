@@ -9,3 +9,5 @@ constexpr int MOMENTS_THREADS = 1024;  // of a block, for one statistic
 constexpr int MASKED_ARRAYS = 4;       // whose moments a launch computes
 constexpr int MASKED_THREADS = 256;    // of a block
 constexpr int MASKED_NUMBERS = 8;      // of an array, that a thread reads
+constexpr int CAST_ROWS = 48;          // weights of a launch
+constexpr int CAST_THREADS = 256;      // of a block

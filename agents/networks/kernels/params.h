@@ -135,6 +135,20 @@ struct AddMomentsParams {
     RunningNormParams norms[8];
 };
 
+// A weight, and where it is rounded to.
+struct CastRowParams {
+    const float* source;  // (P, n)
+    void* target;         // (P, n_padded) bfloat16, at a multiple of 16 bytes
+    unsigned int n;
+    unsigned int n_padded;     // a multiple of 8
+    unsigned int first_block;  // of the launch that handles it
+};
+
+struct CastParams {
+    CastRowParams rows[48];
+    int n_rows;
+};
+
 // Numbers of which some are valid; the others may be anything.
 struct MaskedArrayParams {
     const float* values;  // (P, n)

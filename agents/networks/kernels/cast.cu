@@ -1,0 +1,32 @@
+// Rounds weights to bfloat16, many in one launch, with zeros after each. A thread writes a word of
+// eight numbers; blocks along y are policies.
+#include "constants.h"
+#include "lanes.h"
+#include "params.h"
+
+static_assert(sizeof(CastParams::rows) == CAST_ROWS * sizeof(CastRowParams));
+
+KERNEL BOUNDS(256) cast(CastParams p) {
+    int row = 0, end = p.n_rows;  // the last row that begins at or before this block
+    while (end - row > 1) {
+        int middle = (row + end) / 2;
+        (p.rows[middle].first_block <= blockIdx.x ? row : end) = middle;
+    }
+    const CastRowParams& its = p.rows[row];
+    unsigned int at = 8 * ((blockIdx.x - its.first_block) * CAST_THREADS + threadIdx.x);
+    if (at >= its.n_padded)
+        return;
+    const float* source = its.source + blockIdx.y * (long long)its.n + at;
+    float values[8];
+    if (at + 8 <= its.n && (unsigned long long)source % 16 == 0) {
+        uint4 low = *(const uint4*)source, high = *(const uint4*)(source + 4);
+        const unsigned int words[8] = {low.x, low.y, low.z, low.w, high.x, high.y, high.z, high.w};
+#pragma unroll
+        for (int i = 0; i < 8; i++)
+            values[i] = __uint_as_float(words[i]);
+    } else
+#pragma unroll
+        for (int i = 0; i < 8; i++)
+            values[i] = at + i < its.n ? source[i] : 0.f;
+    write<Bfloat16>(its.target, blockIdx.y * (long long)its.n_padded + at, values);
+}

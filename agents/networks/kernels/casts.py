@@ -1,0 +1,40 @@
+"""Rounding weights to bfloat16 on a GPU."""
+
+import torch
+
+from megastep.agents.networks.kernels.program import CORES, launch_on_gpu
+
+_MAX_ROWS, _THREADS = CORES.constants["CAST_ROWS"], CORES.constants["CAST_THREADS"]
+
+
+def cast(weights: list[torch.Tensor], multiple: int) -> list[torch.Tensor]:
+    """Returns weights in bfloat16, in one launch for up to `CAST_ROWS`.
+
+    Args:
+        weights: (N, ...) float32 each, contiguous.
+        multiple: of 8. Rows of zeros are added until there are a multiple of this.
+    """
+    shapes = [(len(weight) + -len(weight) % multiple, *weight.shape[1:]) for weight in weights]
+    sizes = [torch.Size(shape).numel() for shape in shapes]
+    memory = torch.empty(sum(sizes), dtype=torch.bfloat16, device=weights[0].device)
+    targets = memory.split(sizes)
+    for start in range(0, len(weights), _MAX_ROWS):
+        some, rows, n_blocks = slice(start, start + _MAX_ROWS), [], 0
+        for weight, target in zip(weights[some], targets[some], strict=True):
+            rows.append(
+                CORES.params.CastRowParams(
+                    source=weight.data_ptr(),
+                    target=target.data_ptr(),
+                    n=weight.numel(),
+                    n_padded=target.numel(),
+                    first_block=n_blocks,
+                )
+            )
+            n_blocks += max(1, -(-target.numel() // (8 * _THREADS)))
+        launch_on_gpu(
+            *("cast", memory, n_blocks * _THREADS),
+            block=_THREADS,
+            rows=b"".join(rows),
+            n_rows=len(rows),
+        )
+    return [target.view(shape) for target, shape in zip(targets, shapes, strict=True)]
