@@ -25,9 +25,7 @@ from megastep.agents.networks.masked_moments import masked_moments, normalise_ma
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
-from megastep.agents.storage.copies import select_lanes
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
-from megastep.arrdict import arrdict
 from megastep.settings import MAX_ENVS, checked
 from megastep.types import Env, optional
 
@@ -145,12 +143,12 @@ class PPO(GradientLearner):
             generator = self.generator.on(self.device)
             order = torch.rand(rollout.n_lanes, generator=generator, device=self.device).argsort()
             for lanes in order.tensor_split(self.n_minibatches):
-                selected = dict(zip(estimates, select_lanes([*estimates.values()], lanes)))
-                batch = arrdict({**rollout.sequences(lanes, _PARTS), **selected})
+                batch = rollout.sequences(lanes, _PARTS, estimates)
+                n_valid = batch.valid.sum()
                 if self.normalise_advantage == "minibatch":
                     batch["advantages"] = pooled_normalise(batch.advantages, batch.valid)
-                loss, metrics = self._losses(rollout, lanes, batch)
-                kl = self.steps.backward(loss, metrics, batch.valid.sum())["kl"]
+                loss, metrics = self._losses(rollout, lanes, batch, n_valid)
+                kl = self.steps.backward(loss, metrics, n_valid)["kl"]
                 if self.target_kl is not None:
                     is_enabled = is_enabled & ~(kl > self.target_kl)
                 self.steps.take(is_enabled)
@@ -161,13 +159,14 @@ class PPO(GradientLearner):
         return {**self.steps.end(), "explained_variance": explained}
 
     @section("forward")
-    def _losses(self, rollout, lanes, batch):
+    def _losses(self, rollout, lanes, batch, n_valid):
         """Returns the loss of a minibatch and its metrics, tensors ().
 
         Args:
             rollout: the rollout, whose observations are selected as they are normalised.
             lanes: (M,), lanes of the minibatch.
             batch: the other parts of its steps, (T, M) each.
+            n_valid: (), number of valid steps.
         """
         policy, privileged = self.policy, without_last(rollout.privileged)
         starts = without_last(batch.starts)
@@ -176,4 +175,5 @@ class PPO(GradientLearner):
             logprobs, entropies = policy.output.terms(now.logits, batch.actions)
             values, errors = policy.value_and_error(now.features, privileged, lanes)
         scale = policy.critic.output.scale
-        return ppo_loss(logprobs, entropies, values, errors, batch, scale, self.coefficients)
+        inputs = logprobs, entropies, values, errors
+        return ppo_loss(*inputs, batch, n_valid, scale, self.coefficients)

@@ -10,7 +10,6 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.algorithms.kernels import program
-from megastep.agents.algorithms.masked_stats import masked_mean
 from megastep.arrdict import arrdict
 
 METRICS = "policy", "value", "entropy", "kl", "clip_fraction", "auxiliary"
@@ -32,12 +31,13 @@ def ppo_loss(
     values: torch.Tensor,
     errors: torch.Tensor | None,
     batch: arrdict,
+    n_valid: torch.Tensor,
     value_scale: torch.Tensor,
     coefficients: Coefficients,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Returns the loss, a mean over the valid steps, and its metrics, tensors ().
 
-    On a GPU one kernel computes both, and the gradients.
+    On a GPU two kernels compute both, and the gradients.
 
     Args:
         logprobs: (T, M) float32, of the actions.
@@ -46,26 +46,29 @@ def ppo_loss(
         errors: (T, M), of the auxiliary prediction, or None.
         batch: has `logprobs`, `advantages`, `targets` and `valid`, (T, M) each; with a
             `value_clip` also `old_value`.
+        n_valid: () int64, the number of valid steps.
         value_scale: (), the value's own scale.
         coefficients: the settings.
     """
+    inputs = logprobs, entropies, values, errors, batch, n_valid, value_scale, coefficients
     if logprobs.is_cuda:
-        inputs = logprobs, entropies, values, errors
-        loss, metrics = _FusedLoss.apply(*inputs, batch, value_scale, coefficients)
+        loss, metrics = _FusedLoss.apply(*inputs)
         metrics = dict(zip(METRICS, metrics.unbind(), strict=True))
     else:
-        loss, metrics = plain_loss(
-            logprobs, entropies, values, errors, batch, value_scale, coefficients
-        )
+        loss, metrics = plain_loss(*inputs)
     if errors is None:
         metrics.pop("auxiliary", None)
     return loss, metrics
 
 
-def plain_loss(logprobs, entropies, values, errors, batch, value_scale, coefficients):
+def plain_loss(logprobs, entropies, values, errors, batch, n_valid, value_scale, coefficients):
     """Does the same in PyTorch."""
     clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
-    valid = batch.valid
+    valid, n = batch.valid, n_valid.clamp(min=1)
+
+    def mean(x):
+        return x.masked_fill(~valid, 0.0).sum() / n
+
     log_ratio = logprobs - batch.logprobs
     log_ratio = log_ratio.masked_fill(~valid, 0.0)  # its exp may overflow, and 0 * inf is NaN
     ratio = log_ratio.exp()
@@ -76,30 +79,38 @@ def plain_loss(logprobs, entropies, values, errors, batch, value_scale, coeffici
         limit = value_clip * value_scale
         moved = batch.old_value + (values - batch.old_value).clamp(-limit, limit)
         squared = torch.maximum(squared, ((moved - batch.targets) / value_scale).square())
-    policy = -masked_mean(surrogate, valid)
-    value, entropy = masked_mean(squared, valid), masked_mean(entropies, valid)
+    policy = -mean(surrogate)
+    value, entropy = mean(squared), mean(entropies)
     with torch.no_grad():
         # this estimate of the KL divergence is never negative, unlike the mean log ratio
-        kl = masked_mean(ratio - 1 - log_ratio, valid)
-        clip_fraction = masked_mean((ratio != clipped).float(), valid)
+        kl = mean(ratio - 1 - log_ratio)
+        clip_fraction = mean((ratio != clipped).float())
     loss = policy + value_coef * value - entropy_coef * entropy
     metrics = dict(policy=policy, value=value, entropy=entropy, kl=kl, clip_fraction=clip_fraction)
     if errors is not None:
-        metrics["auxiliary"] = masked_mean(errors, valid)
+        metrics["auxiliary"] = mean(errors)
         loss = loss + auxiliary_coef * metrics["auxiliary"]
     return loss, metrics
 
 
 class _FusedLoss(torch.autograd.Function):
-    """`plain_loss` in one kernel, which leaves the gradients for the backward pass."""
+    """`plain_loss` in two kernels, which leave the gradients for the backward pass."""
 
     @staticmethod
-    def forward(ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients):
+    def forward(
+        ctx, logprobs, entropies, values, errors, batch, n_valid, value_scale, coefficients
+    ):
         clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
         inputs = [None if x is None else x.contiguous() for x in (entropies, values, errors)]
         gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
-        n_rows, n_valid = logprobs.numel(), batch.valid.sum()
-        sums = logprobs.new_empty(program.n_blocks(n_rows), program.N_SUMS)
+        n_rows, constants = logprobs.numel(), program.PROGRAM.constants
+        n_sums = constants["N_SUMS"]
+        sums = logprobs.new_empty(program.n_blocks(n_rows), n_sums)
+        weights = dict(
+            value_coef=value_coef,
+            entropy_coef=entropy_coef,
+            auxiliary_coef=0.0 if errors is None else auxiliary_coef,
+        )
         names = "d_logprobs", "d_entropies", "d_values", "d_errors"
         program.run(
             "ppo_loss",
@@ -119,14 +130,21 @@ class _FusedLoss(torch.autograd.Function):
             n_rows=n_rows,
             clip=clip,
             value_clip=value_clip or 0.0,
-            value_coef=value_coef,
-            entropy_coef=entropy_coef,
-            auxiliary_coef=auxiliary_coef,
+            **weights,
         )
         ctx.save_for_backward(*gradients)
-        metrics = sums.sum(0) / n_valid.clamp(min=1)
-        weights = [1.0, value_coef, -entropy_coef, 0.0, 0.0, auxiliary_coef]
-        loss = sum(metrics[i] * weight for i, weight in enumerate(weights) if weight)
+        metrics, loss = sums.new_empty(n_sums), sums.new_empty(())
+        n_threads = constants["WARP"] * n_sums
+        program.run(
+            *("ppo_metrics", logprobs.device, n_threads),
+            block=n_threads,
+            sums=sums,
+            n_valid=n_valid,
+            metrics=metrics,
+            loss=loss,
+            n_parts=len(sums),
+            **weights,
+        )
         ctx.mark_non_differentiable(metrics)
         return loss, metrics
 
@@ -135,4 +153,4 @@ class _FusedLoss(torch.autograd.Function):
     def backward(ctx, d_loss, d_metrics):
         # Learners differentiate the loss itself, so that d_loss is 1; others may scale it
         gradients = torch._foreach_mul(list(ctx.saved_tensors), d_loss)
-        return *gradients, *[None] * (7 - len(gradients))
+        return *gradients, *[None] * (8 - len(gradients))

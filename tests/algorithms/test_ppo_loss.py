@@ -37,7 +37,7 @@ def test_fused_loss_matches_plain(value_clip, auxiliary):
     results = []
     for device, function in (("cuda", ppo_loss), ("cpu", plain_loss)):
         leaves, batch, scale, settings = case(device, value_clip, auxiliary)
-        loss, metrics = function(*leaves, batch, scale, settings)
+        loss, metrics = function(*leaves, batch, batch.valid.sum(), scale, settings)
         inputs = [leaf for leaf in leaves if leaf is not None]
         gradients = torch.autograd.grad(3 * loss, inputs)
         results.append([loss, *metrics.values(), *gradients])
@@ -51,7 +51,7 @@ def test_fused_loss_matches_plain(value_clip, auxiliary):
 def test_without_valid_steps_nothing_is_learned():
     leaves, batch, scale, settings = case("cuda", None, True)
     batch["valid"] = torch.zeros_like(batch.valid)
-    loss, metrics = ppo_loss(*leaves, batch, scale, settings)
+    loss, metrics = ppo_loss(*leaves, batch, batch.valid.sum(), scale, settings)
     assert not loss and not any(metrics.values())
     assert not any(gradient.any() for gradient in torch.autograd.grad(loss, leaves))
 
@@ -96,7 +96,7 @@ def test_fused_loss_takes_other_layouts():
     results = []
     for change in (torch.Tensor.contiguous, transposed):
         inputs = [change(leaf.detach()).requires_grad_() for leaf in leaves]
-        loss, _ = ppo_loss(*inputs, batch.map(change), scale, settings)
+        loss, _ = ppo_loss(*inputs, batch.map(change), batch.valid.sum(), scale, settings)
         results.append([loss.detach(), *torch.autograd.grad(loss, inputs)])
     for one, other in zip(*results, strict=True):
         assert torch.equal(one, other)

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from megastep.agents.algorithms.adam import Adam
-from megastep.agents.algorithms.kernels.program import N_SUMS, n_blocks
 from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
+from megastep.agents.algorithms.kernels.program import n_blocks
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
 from megastep.agents.networks.kernels import layers, moments
 from megastep.agents.networks.kernels.program import CORES
@@ -377,7 +377,8 @@ def test_ppo_loss():
     )
     value_scale = randn().abs() + 0.5
     gradients = {f"d_{name}": randn(n_steps, n_lanes) for name in names}
-    sums = randn(n_blocks(n_rows), N_SUMS)
+    n_sums = ALGORITHMS.constants["N_SUMS"]
+    sums, metrics_of_all, losses = randn(n_blocks(n_rows), n_sums), randn(n_sums), randn()
     n_valid = batch.valid.sum((1, 2))
     launch(
         *(ALGORITHMS, "ppo_loss", (n_blocks(n_rows), P)),
@@ -394,11 +395,21 @@ def test_ppo_loss():
         n_rows=n_rows,
         **settings._asdict(),
     )
+    names_of_weights = "value_coef", "entropy_coef", "auxiliary_coef"
+    launch(
+        *(ALGORITHMS, "ppo_metrics", (1, P), WARP * n_sums),
+        sums=sums,
+        n_valid=n_valid,
+        metrics=metrics_of_all,
+        loss=losses,
+        n_parts=n_blocks(n_rows),
+        **{name: settings._asdict()[name] for name in names_of_weights},
+    )
     for i in range(P):
         leaves = [inputs[name][i].clone().requires_grad_() for name in names]
-        loss, metrics = ppo_loss(*leaves, batch[i], value_scale[i], settings)
+        loss, metrics = ppo_loss(*leaves, batch[i], n_valid[i], value_scale[i], settings)
         alone = torch.autograd.grad(loss, leaves)
         for one, other in zip(gradients.values(), alone, strict=True):
             assert torch.equal(one[i], other), i
-        means = torch.stack([*metrics.values()])
-        torch.testing.assert_close(sums[i].sum(0) / n_valid[i], means)
+        assert torch.equal(metrics_of_all[i], torch.stack([*metrics.values()]))
+        assert torch.equal(losses[i], loss)

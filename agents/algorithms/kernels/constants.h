@@ -8,3 +8,4 @@ constexpr int CHECKED_THREADS = 256;  // of a block
 constexpr int CHECKED_WORDS = 4;      // of 16 bytes, that a thread reads
 constexpr int RECORD_THREADS = 1024;
 constexpr int EPISODE_METRICS = 8;  // of a world
+constexpr int N_SUMS = 6;           // of PPO's loss: see PpoLossParams

@@ -9,7 +9,6 @@ from megastep.kernels.build.launch import BLOCK, launch_blocks
 from megastep.kernels.build.program import Program
 
 PROGRAM = Program(Path(__file__).parent, CUDA_FLAGS)
-N_SUMS = 6
 
 
 def run(
