@@ -6,6 +6,7 @@ import torch
 
 from megastep.agents.distributed.segments import SegmentedGraph
 from megastep.agents.generator import SeededGenerator
+from megastep.agents.storage.copies import copy_all
 from megastep.agents.types import Rollout
 
 # Updates that run eagerly before the capture, since libraries initialise themselves in the first.
@@ -69,7 +70,7 @@ class CudaGraphUpdate:
                 self.graph = SegmentedGraph(lambda: self.update(rollout), self.stream, generators)
                 self._rollout = rollout
             self.graph.replay()
-            return {name: value.clone() for name, value in self.graph.output.items()}
+            return _copies(self.graph.output)
 
     def _warm_up(self, rollout):
         # PyTorch would warn of gradients accumulated on another stream, which this one waits for
@@ -79,3 +80,9 @@ class CudaGraphUpdate:
             metrics = self.update(rollout)
         torch.cuda.current_stream().wait_stream(self.stream)
         return metrics
+
+
+def _copies(metrics):
+    copies = {name: torch.empty_like(value) for name, value in metrics.items()}
+    copy_all((copies[name], value) for name, value in metrics.items())
+    return copies
