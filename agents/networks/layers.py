@@ -92,8 +92,8 @@ def normalised(
     n_columns: int,
     lanes: torch.Tensor | None = None,
 ) -> torch.Tensor | None:
-    """Returns leaves normalised, flattened and concatenated in one kernel, in the compute dtype;
-    None where that is not possible.
+    """Returns leaves normalised, flattened and concatenated in one kernel, if the compute dtype is
+    bfloat16; None where that is not possible.
 
     Args:
         leaves: (..., *shape) of each norm; (T, B, *shape) if there are lanes.
@@ -104,8 +104,7 @@ def normalised(
     Returns:
         (..., n_columns), or (T, M, n_columns).
     """
-    dtype = compute_dtype(leaves[0])
-    possible = dtype == torch.bfloat16 and len(leaves) <= kernels.MAX_LEAVES
+    possible = compute_dtype(leaves[0]) == torch.bfloat16 and len(leaves) <= kernels.MAX_LEAVES
     possible = possible and (lanes is None or len(leaves[0]) <= kernels.MAX_STEPS)
     for leaf in leaves:
         is_float = leaf.dtype in (torch.float16, torch.float32) and not leaf.requires_grad
@@ -117,7 +116,7 @@ def normalised(
     if lanes is None:
         flat = [leaf.reshape(1, -1, leaf.shape[-1]) for leaf in flat]
     means, scales = [norm.mean for norm in norms], [norm.scale for norm in norms]
-    features = kernels.normalise(flat, means, scales, n_columns, dtype, lanes)
+    features = kernels.normalise(flat, means, scales, n_columns, lanes)
     return features.view(*lead, n_columns) if lanes is None else features
 
 

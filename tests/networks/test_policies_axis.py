@@ -59,7 +59,7 @@ def test_intake():
     ]
     n_threads = n_columns // 4 * -(-7 // CORES.constants["NORMALISED_ROWS"])
     launch(
-        *(CORES, "normalise_bfloat16", (-(-n_threads // BLOCK), P * n_steps)),
+        *(CORES, "normalise", (-(-n_threads // BLOCK), P * n_steps)),
         leaves=b"".join(packed),
         lanes=lanes,
         features=features,
@@ -70,7 +70,7 @@ def test_intake():
     )
     for i in range(P):
         of_policy = ([leaf[i] for leaf in parts] for parts in (leaves, means, scales))
-        alone = layers.normalise(*of_policy, n_columns, BF16, lanes[i])
+        alone = layers.normalise(*of_policy, n_columns, lanes[i])
         assert torch.equal(features[i], alone), i
 
 
@@ -220,7 +220,7 @@ def test_bias_gradient(n_columns):
     d, activated = randn(n_rows, n_columns).to(BF16), randn(n_rows, n_columns).to(BF16).relu()
     d_masked, sums = torch.empty_like(d), randn(n_strips, n_columns)
     launch(
-        *(CORES, "bias_gradient_bfloat16", (n_strips, P * -(-n_columns // (8 * WARP)))),
+        *(CORES, "bias_gradient", (n_strips, P * -(-n_columns // (8 * WARP)))),
         CORES.constants["STRIP_THREADS"],
         d=d,
         activated=activated,

@@ -5,8 +5,8 @@
 #include "lanes.h"
 #include "params.h"
 
-template <class T, int N>
-DEVICE void bias_gradient(const BiasGradientParams& p) {
+KERNEL BOUNDS(256) bias_gradient(BiasGradientParams p) {
+    constexpr int N = 8;                                      // columns that a thread handles
     constexpr int AT_ONCE = 4, WARPS = STRIP_THREADS / WARP;  // rows whose loads do not wait
     __shared__ float of_warps[WARPS][N * WARP];
     int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
@@ -27,9 +27,9 @@ DEVICE void bias_gradient(const BiasGradientParams& p) {
             for (int i = 0; i < AT_ONCE; i++) {
                 int row = min(start + i * step, end - 1);
                 long long at = (first + row) * p.n_columns + word * N;
-                read<T>(values[i], p.d, at);
+                read<Bfloat16>(values[i], p.d, at);
                 if (p.activated)
-                    read<T>(activated[i], p.activated, at);
+                    read<Bfloat16>(activated[i], p.activated, at);
             }
 #pragma unroll
             for (int i = 0; i < AT_ONCE; i++) {
@@ -39,7 +39,7 @@ DEVICE void bias_gradient(const BiasGradientParams& p) {
                 if (p.activated) {
                     for (int n = 0; n < N; n++)
                         values[i][n] = activated[i][n] <= 0.f ? 0.f : values[i][n];
-                    write<T>(p.d_masked, (first + row) * p.n_columns + word * N, values[i]);
+                    write<Bfloat16>(p.d_masked, (first + row) * p.n_columns + word * N, values[i]);
                 }
                 for (int n = 0; n < N; n++)
                     sums[n] += values[i][n];
@@ -57,9 +57,6 @@ DEVICE void bias_gradient(const BiasGradientParams& p) {
         target[column] = total;
     }
 }
-
-KERNEL BOUNDS(256) bias_gradient_float32(BiasGradientParams p) { bias_gradient<float, 4>(p); }
-KERNEL BOUNDS(256) bias_gradient_bfloat16(BiasGradientParams p) { bias_gradient<Bfloat16, 8>(p); }
 
 // Adds up rows in a fixed order. A warp handles 32 columns of every eighth row.
 KERNEL BOUNDS(256) sum_rows(SumRowsParams p) {

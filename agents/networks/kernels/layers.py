@@ -22,10 +22,9 @@ def normalise(
     means: list[torch.Tensor],
     scales: list[torch.Tensor],
     n_columns: int,
-    dtype: torch.dtype,
     lanes: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Returns (leaf - mean) / scale of some lanes, concatenated: (T, M, n_columns) in `dtype`.
+    """Returns (leaf - mean) / scale of some lanes, concatenated: (T, M, n_columns) bfloat16.
     Columns beyond the leaves' features are 0. T is at most 65,535.
 
     Args:
@@ -33,12 +32,11 @@ def normalise(
         means: float32, one per leaf, each a number for F / len(mean) neighbouring features.
         scales: float32, of the same shapes.
         n_columns: at least the features of all leaves, a multiple of 4.
-        dtype: float32 or bfloat16.
         lanes: (M,) int64. None: all, M = B.
     """
     n_steps, n_lanes = leaves[0].shape[:2]
     n_selected = n_lanes if lanes is None else len(lanes)
-    features = leaves[0].new_empty(n_steps, n_selected, n_columns, dtype=dtype)
+    features = leaves[0].new_empty(n_steps, n_selected, n_columns, dtype=torch.bfloat16)
     packed = [
         CORES.params.IntakeLeafParams(
             values=leaf.data_ptr(),
@@ -51,7 +49,7 @@ def normalise(
         for leaf, mean, scale in zip(leaves, means, scales, strict=True)
     ]
     _launch(
-        f"normalise_{DTYPES[dtype]}",
+        "normalise",
         features,
         n_columns // 4 * -(-n_selected // CORES.constants["NORMALISED_ROWS"]),
         leaves=b"".join(packed),
@@ -72,7 +70,7 @@ def bias_gradient(
     """Returns the gradient before a ReLU, and its sum over rows, float32.
 
     Args:
-        d: (rows, columns), columns a multiple of 8; the gradient after the ReLU.
+        d: (rows, columns) bfloat16, columns a multiple of 8; the gradient after the ReLU.
         activated: the ReLU's outputs. None: there is no ReLU, and `d` is returned.
     """
     n_rows, n_columns = d.shape
@@ -81,7 +79,7 @@ def bias_gradient(
     d_masked = d if activated is None else torch.empty_like(d)
     sums = d.new_empty(n_strips, n_columns, dtype=torch.float32)
     _launch(
-        f"bias_gradient_{DTYPES[d.dtype]}",
+        "bias_gradient",
         d,
         _STRIP_THREADS * n_strips,
         n_blocks_y=-(-n_words // WARP),

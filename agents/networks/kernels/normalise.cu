@@ -58,15 +58,14 @@ struct Rows {
     bool exists[NORMALISED_ROWS];
 };
 
-template <class T>
 DEVICE void write_row(const NormaliseParams& p, const Rows& rows, int i, int column,
                       const float (&values)[4]) {
     if (rows.exists[i])
-        write<T>(p.features, (long long)rows.target[i] * p.n_columns + column, values);
+        write<Bfloat16>(p.features, (long long)rows.target[i] * p.n_columns + column, values);
 }
 
 // Four features of one leaf with one mean and scale, which a word holds.
-template <class T, class Word>
+template <class Word>
 DEVICE void normalise_word(const NormaliseParams& p, const Rows& rows, int column,
                            const Feature& feature, long long policy) {
     long long statistic = policy * (feature.n_features / feature.group);
@@ -92,12 +91,11 @@ DEVICE void normalise_word(const NormaliseParams& p, const Rows& rows, int colum
 #pragma unroll
         for (int n = 0; n < 4; n++)
             values[n] = (values[n] - means[n]) * scales[n];
-        write_row<T>(p, rows, i, column, values);
+        write_row(p, rows, i, column, values);
     }
 }
 
 // Any four features, one by one.
-template <class T>
 DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int column,
                                long long policy) {
     float values[NORMALISED_ROWS][4];
@@ -127,12 +125,11 @@ DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int c
     }
 #pragma unroll
     for (int i = 0; i < NORMALISED_ROWS; i++)
-        write_row<T>(p, rows, i, column, values[i]);
+        write_row(p, rows, i, column, values[i]);
 }
 
 // Blocks along y: steps of all policies.
-template <class T>
-DEVICE void normalise(const NormaliseParams& p) {
+KERNEL BOUNDS(64) normalise(NormaliseParams p) {
     unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x, n_words = p.n_columns / 4;
     unsigned int n_selected = p.n_selected;
     unsigned int step = (n_selected + NORMALISED_ROWS - 1) / NORMALISED_ROWS;  // between two rows
@@ -153,12 +150,9 @@ DEVICE void normalise(const NormaliseParams& p) {
     bool is_word = feature.number >= 0 && feature.number % 4 == 0 && feature.n_features % 4 == 0;
     bool is_aligned = (unsigned long long)feature.values % (feature.is_half ? 8 : 16) == 0;
     if (is_word && is_aligned && feature.is_half)
-        normalise_word<T, uint2>(p, rows, column, feature, policy);
+        normalise_word<uint2>(p, rows, column, feature, policy);
     else if (is_word && is_aligned)
-        normalise_word<T, uint4>(p, rows, column, feature, policy);
+        normalise_word<uint4>(p, rows, column, feature, policy);
     else
-        normalise_features<T>(p, rows, column, policy);
+        normalise_features(p, rows, column, policy);
 }
-
-KERNEL BOUNDS(64) normalise_float32(NormaliseParams p) { normalise<float>(p); }
-KERNEL BOUNDS(64) normalise_bfloat16(NormaliseParams p) { normalise<Bfloat16>(p); }

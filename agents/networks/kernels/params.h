@@ -104,7 +104,7 @@ struct IntakeLeafParams {
 struct NormaliseParams {
     IntakeLeafParams leaves[8];
     const long long* lanes;  // (P, M), the lanes to read; null: all, M = B
-    void* features;          // (P, T, M, n_columns) compute
+    void* features;          // (P, T, M, n_columns) bfloat16
     int n_steps;
     int n_lanes;     // B
     int n_selected;  // M
@@ -196,7 +196,7 @@ struct AddReturnsParams {
 };
 
 struct BiasGradientParams {
-    const void* d;          // (P, n_rows, n_columns) compute
+    const void* d;          // (P, n_rows, n_columns) bfloat16
     const void* activated;  // of the same shape; null: no activation
     void* d_masked;  // d, 0 where `activated` is not above 0 (NaN counts as above); null without
     float* sums;     // (P, n_strips, n_columns), over STRIP rows each
