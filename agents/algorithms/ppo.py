@@ -19,6 +19,7 @@ from megastep.agents.algorithms.learner import (
     check_minibatches,
 )
 from megastep.agents.algorithms.masked_stats import pooled_normalise
+from megastep.agents.algorithms.order import random_order
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
 from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.masked_moments import masked_moments, normalise_masked
@@ -141,7 +142,7 @@ class PPO(GradientLearner):
         is_enabled = None if self.target_kl is None else torch.ones_like(is_finite)
         for _ in range(self.n_epochs):
             generator = self.generator.on(self.device)
-            order = torch.rand(rollout.n_lanes, generator=generator, device=self.device).argsort()
+            order = random_order(rollout.n_lanes, generator, self.device)
             for lanes in order.tensor_split(self.n_minibatches):
                 batch = rollout.sequences(lanes, _PARTS, estimates)
                 n_valid = batch.valid.sum()

@@ -21,6 +21,12 @@ struct GaeParams {
     float lambda_;
 };
 
+struct OrderParams {
+    const float* keys;  // (n), no NaN
+    long long* order;   // (n), indices of the keys from the smallest on
+    int n;
+};
+
 struct PpoLossParams {
     const float* logprobs;       // (P, n_rows), of the actions
     const float* entropies;      // (P, n_rows)
@@ -160,4 +166,11 @@ struct EpisodesParams {
     int n_steps;
     int n_lanes;
     float limit;
+};
+
+struct EpisodeGroupsParams {
+    const double* of_lanes;  // (n_sums, B)
+    const double* members;   // (B, G), 1 for the lanes of a group, else 0
+    double* sums;            // (n_sums, G), updated
+    int n_lanes;
 };
