@@ -116,11 +116,11 @@ class EpisodeStats:
         )
 
     def _add_on_gpu(self, reward, reset, done, learns, metrics):
-        """Does the same as `add` in one kernel."""
+        """Does the same as `add` in two kernels."""
         n_steps, n_lanes = reward.shape
         values = [metrics[name].contiguous() for name in self.metrics]
         pack = program.PROGRAM.params.EpisodeMetricParams
-        sums = self.sums.new_empty(len(self.sums), n_lanes)
+        of_lanes = self.sums.new_empty(len(self.sums), n_lanes)
         program.run(
             "episodes",
             reward.device,
@@ -133,14 +133,22 @@ class EpisodeStats:
             returns=self.returns,
             lengths=self.lengths,
             is_whole=self.is_whole,
-            sums=sums,
+            sums=of_lanes,
             bad_lanes=self.bad_lanes,
             n_metrics=len(values),
             n_steps=n_steps,
             n_lanes=n_lanes,
             limit=LIMIT,
         )
-        self.sums += sums @ self.members
+        n_threads = program.PROGRAM.constants["GROUPS_THREADS"]
+        n_sums, n_groups = self.sums.shape
+        program.run(
+            *("episode_groups", reward.device, n_groups * n_threads, n_sums, n_threads),
+            of_lanes=of_lanes,
+            members=self.members,
+            sums=self.sums,
+            n_lanes=n_lanes,
+        )
 
     def _sum_metrics(self, counts, metrics):
         """Returns the sums of the metrics and the number of episodes left out of each, (M, B)."""

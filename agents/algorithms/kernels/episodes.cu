@@ -1,9 +1,10 @@
-// Sums over the episodes that end in a rollout, one thread per lane.
+// Sums over the episodes that end in a rollout, one thread per lane; and over the lanes of groups.
 #include "common/constants.h"
 #include "constants.h"
 #include "params.h"
 
 #define KERNEL extern "C" __global__ void
+#define BOUNDS(n_threads) __launch_bounds__(n_threads)
 
 KERNEL episodes(EpisodesParams p) {
     int lane = blockIdx.x * blockDim.x + threadIdx.x;
@@ -54,4 +55,25 @@ KERNEL episodes(EpisodesParams p) {
             if (left_out[i] > 0.)
                 atomicMin(p.bad_lanes + i, (long long)lane);  // the same whatever the order
         }
+}
+
+// Adds a sum over the lanes of a group, in a fixed order. Blocks along x: groups; along y: sums.
+KERNEL BOUNDS(256) episode_groups(EpisodeGroupsParams p) {
+    const double* of_lanes = p.of_lanes + (long long)blockIdx.y * p.n_lanes;
+    double sum = 0.;
+#pragma unroll 4
+    for (int lane = threadIdx.x; lane < p.n_lanes; lane += GROUPS_THREADS)
+        sum += of_lanes[lane] * p.members[(long long)lane * gridDim.x + blockIdx.x];
+    for (int mask = WARP / 2; mask; mask /= 2)
+        sum += __shfl_xor_sync(~0u, sum, mask);
+    __shared__ double of_warps[GROUPS_THREADS / WARP];
+    if (threadIdx.x % WARP == 0)
+        of_warps[threadIdx.x / WARP] = sum;
+    __syncthreads();
+    if (threadIdx.x)
+        return;
+    sum = 0.;
+    for (int warp = 0; warp < GROUPS_THREADS / WARP; warp++)
+        sum += of_warps[warp];
+    p.sums[blockIdx.y * gridDim.x + blockIdx.x] += sum;
 }
