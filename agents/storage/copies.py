@@ -16,7 +16,9 @@ _MAX_SELECTED = PROGRAM.constants["MAX_SELECTED"]
 _MAX_BYTES = 2**31
 
 
-def copy_all(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> None:
+def copy_all(
+    pairs: Iterable[tuple[torch.Tensor, torch.Tensor]], unless: torch.Tensor | None = None
+) -> None:
     """Copies the second tensor of each pair into the first, as `Tensor.copy_` does.
 
     On a GPU contiguous tensors of equal dtype and shape are copied by one kernel: a copy of a few
@@ -25,29 +27,40 @@ def copy_all(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> None:
 
     Args:
         pairs: targets and sources, all on one device but for sources on the host.
+        unless: () bool on the device; if true, nothing is copied. None: false.
     """
     pairs = list(pairs)  # a source that nobody else holds lives until the launch
-    packed, largest, device = [], 0, None
+    fused = []
     for target, source in pairs:
-        if not (target.is_cuda and _is_plain_copy(target, source)):
+        if target.is_cuda and _is_plain_copy(target, source):
+            fused.append((target, source))
+        else:
+            if unless is not None:
+                source = torch.where(unless, target, source.to(target.device))
             target.copy_(source)
-            continue
-        n_bytes = target.numel() * target.element_size()
-        is_aligned = not (target.data_ptr() | source.data_ptr()) % 16
-        packed.append(
-            PROGRAM.params.CopyParams(
-                target=target.data_ptr(),
-                source=source.data_ptr(),
-                n_bytes=n_bytes,
-                is_aligned=int(is_aligned),
+    for start in range(0, len(fused), _MAX_COPIES):
+        rows, n_blocks = [], 0
+        for target, source in fused[start : start + _MAX_COPIES]:
+            n_bytes = target.numel() * target.element_size()
+            is_aligned = not (target.data_ptr() | source.data_ptr()) % 16
+            rows.append(
+                PROGRAM.params.CopyParams(
+                    target=target.data_ptr(),
+                    source=source.data_ptr(),
+                    n_bytes=n_bytes,
+                    first_block=n_blocks,
+                    is_aligned=int(is_aligned),
+                )
             )
+            n_blocks += -(-n_bytes // _BLOCK_BYTES)
+        struct = PROGRAM.params.CopyAllParams(
+            copies=b"".join(rows),
+            unless=0 if unless is None else unless.data_ptr(),
+            n_copies=len(rows),
         )
-        largest, device = max(largest, n_bytes), target.device
-    for i in range(0, len(packed), _MAX_COPIES):
-        rows = packed[i : i + _MAX_COPIES]
-        struct = PROGRAM.params.CopyAllParams(copies=b"".join(rows), n_copies=len(rows))
-        n_blocks = max(1, -(-largest // _BLOCK_BYTES)), len(rows)
-        launch_blocks(PROGRAM, "copy_all", struct, device, n_blocks, BLOCK)
+        if n_blocks:
+            device = fused[0][0].device
+            launch_blocks(PROGRAM, "copy_all", struct, device, (n_blocks, 1), BLOCK)
 
 
 def _is_plain_copy(target, source):

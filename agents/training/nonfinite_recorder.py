@@ -19,6 +19,7 @@ import torch
 from megastep import spaces
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck, NonFiniteValue
 from megastep.agents.storage.collector import Collector
+from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.rollout import Rollout
 from megastep.agents.training.atomic_files import write_atomically
 from megastep.agents.training.nonfinite_replay import FORMAT, env_axis, rows_of
@@ -66,23 +67,22 @@ class RolloutRecorder:
         self.n_rollouts += 1
         self.n_played = 0
         host = self.on_host[self.n_rollouts] = {}
-        found, device = self.check.found, self.check.record.device
+        device, kept = self.check.record.device, {}
         for path, leaf in state_tree(self.env).items():
             if isinstance(leaf, torch.Generator):
                 host[path] = leaf.get_state()
             elif self._axis(leaf) is not None or leaf.nbytes <= MAX_SHARED_BYTES:
                 if leaf.device == device:
-                    _keep(self.state, path, leaf, found)
+                    kept[path] = leaf
                 else:
                     host[path] = leaf.clone()
+        _keep(self.state, kept, self.check.found)
 
     @torch.no_grad()
     def end(self, rollout: Rollout) -> None:
         """Copies the actions. Call after each rollout, before it is checked."""
         actions = self.played or spaces.leaves(rollout.actions, "actions")
-        found = self.check.found
-        for path, leaf in actions.items():
-            _keep(self.actions, path, leaf, found)
+        _keep(self.actions, actions, self.check.found)
 
     def watch(self, opponents: Any, n_steps: int) -> None:
         """Has opponents report the actions of all lanes, as rollouts of T steps store some only."""
@@ -161,13 +161,16 @@ class RolloutRecorder:
         return rows_of(envs, size // self.env.n_envs)
 
 
-def _keep(copies, path, leaf, found):
-    """Copies a tensor, unless a non-finite number was found: then the last copy stays."""
-    copy = copies.get(path)
-    if copy is None or (copy.shape, copy.dtype) != (leaf.shape, leaf.dtype):
-        copies[path] = leaf.clone()
-    else:
-        torch.where(found, copy, leaf, out=copy)
+def _keep(copies, tensors, found):
+    """Copies tensors by path, unless a non-finite number was found: then the last copies stay."""
+    pairs = []
+    for path, leaf in tensors.items():
+        copy = copies.get(path)
+        if copy is None or (copy.shape, copy.dtype) != (leaf.shape, leaf.dtype):
+            copies[path] = leaf.clone()
+        else:
+            pairs.append((copy, leaf))
+    copy_all(pairs, unless=found)
 
 
 def make_recorder(

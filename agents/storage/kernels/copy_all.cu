@@ -1,17 +1,27 @@
-// Copies many pieces of memory in one launch: blocks along x share a piece, blocks along y the
-// pieces.
+// Copies many pieces of memory in one launch. A block copies neighbouring words of one piece.
 #include "common/constants.h"
 #include "constants.h"
 #include "params.h"
 
 #define KERNEL extern "C" __global__ void
 
+constexpr unsigned int BLOCK_BYTES = 16 * BLOCK * COPY_WORDS;
+
 static_assert(sizeof(CopyAllParams::copies) == MAX_COPIES * sizeof(CopyParams));
 
 KERNEL copy_all(CopyAllParams p) {
-    const CopyParams& copy = p.copies[blockIdx.y];
+    if (p.unless && *p.unless)
+        return;
+    int piece = 0, end = p.n_copies;  // the last one that begins at or before this block
+    while (end - piece > 1) {
+        int middle = (piece + end) / 2;
+        (p.copies[middle].first_block <= blockIdx.x ? piece : end) = middle;
+    }
+    const CopyParams& copy = p.copies[piece];
+    unsigned int block = blockIdx.x - copy.first_block;
+    unsigned int n_blocks = (copy.n_bytes + BLOCK_BYTES - 1) / BLOCK_BYTES;
     unsigned int n_words = copy.is_aligned ? copy.n_bytes / 16 : 0;
-    unsigned int first = blockIdx.x * (BLOCK * COPY_WORDS) + threadIdx.x;
+    unsigned int first = block * (BLOCK * COPY_WORDS) + threadIdx.x;
     const uint4* source = (const uint4*)copy.source;
     uint4 words[COPY_WORDS];
 #pragma unroll
@@ -23,7 +33,7 @@ KERNEL copy_all(CopyAllParams p) {
         if (first + i * BLOCK < n_words)
             ((uint4*)copy.target)[first + i * BLOCK] = words[i];
     // the rest, byte by byte
-    for (unsigned int at = 16 * n_words + blockIdx.x * BLOCK + threadIdx.x; at < copy.n_bytes;
-         at += gridDim.x * BLOCK)
+    for (unsigned int at = 16 * n_words + block * BLOCK + threadIdx.x; at < copy.n_bytes;
+         at += n_blocks * BLOCK)
         ((unsigned char*)copy.target)[at] = ((const unsigned char*)copy.source)[at];
 }

@@ -4,12 +4,14 @@
 struct CopyParams {
     void* target;
     const void* source;
-    unsigned int n_bytes;
-    int is_aligned;  // both begin at a multiple of 16 bytes
+    unsigned int n_bytes;      // less than 2^31
+    unsigned int first_block;  // of the launch that copies it
+    int is_aligned;            // both begin at a multiple of 16 bytes
 };
 
 struct CopyAllParams {
     CopyParams copies[24];
+    const unsigned char* unless;  // (), true: nothing is copied; null: false
     int n_copies;
 };
 
