@@ -164,9 +164,11 @@ class PPO(GradientLearner):
         """
         policy, privileged = self.policy, without_last(rollout.privileged)
         starts = without_last(batch.starts)
-        with policy.compute_dtype():  # one, so that weights are cast once
-            now = policy.unroll(without_last(rollout.obs), starts, batch.state, lanes)
-            logprobs, entropies = policy.output.terms(now.logits, batch.actions)
-            values, errors = policy.value_and_error(now.features, privileged, lanes)
-        scale = policy.critic.output.scale
-        return ppo_loss(logprobs, entropies, values, errors, batch, scale, self.coefficients)
+        sequence = without_last(rollout.obs), starts, batch.state, batch.actions
+        terms = policy.terms(*sequence, privileged, lanes)
+        return ppo_loss(
+            **terms,
+            batch=batch,
+            value_scale=policy.critic.output.scale,
+            coefficients=self.coefficients,
+        )

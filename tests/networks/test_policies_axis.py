@@ -7,7 +7,7 @@ from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels.program import N_SUMS, n_blocks
 from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
-from megastep.agents.networks.kernels import layers
+from megastep.agents.networks.kernels import heads, layers
 from megastep.agents.networks.kernels.program import CORES
 from megastep.arrdict import arrdict
 from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
@@ -119,6 +119,46 @@ def test_categorical_actions():
         alone = layers.act(features[i], weight[i], bias[i], shape, noise[i])
         for one, other in zip((logits[i], actions[i], logprobs[i]), alone, strict=True):
             assert torch.equal(one, other), i
+
+
+def test_heads():
+    n_rows, sizes, strip = 300, heads.Sizes(11, 2, 5, 264), CORES.constants["STRIP"]
+    first_score, _, n_columns = sizes.starts
+    columns, target = randn(n_rows, n_columns).to(BF16), randn(n_rows, first_score).to(BF16)
+    actions = torch.randint(5, (P, n_rows, 2), device="cuda")
+    values = heads.Value(randn(1, 264), randn(1), randn(), randn())
+    results, gradients = torch.randn(2, 4, P, n_rows, device="cuda")
+    names, n_strips = ("logprobs", "entropies", "errors", "values"), -(-n_rows // strip)
+    inputs = dict(product=columns, target=target, actions=actions)
+    weights = {f"value_{name}": leaf for name, leaf in values._asdict().items()}
+    launch(
+        *(CORES, "heads_forward", (n_strips, P), CORES.constants["STRIP_THREADS"]),
+        **inputs,
+        **weights,
+        **dict(zip(names, results)),
+        n_rows=n_rows,
+        **sizes._asdict(),
+    )
+    d_columns, sums = torch.empty_like(columns), randn(n_strips, n_columns + 264 + 8)
+    launch(
+        *(CORES, "heads_backward", (n_strips, 3 * P), CORES.constants["STRIP_THREADS"]),
+        **inputs,
+        value_weight=values.weight,
+        value_scale=values.scale,
+        **{f"d_{name}": d for name, d in zip(names, gradients)},
+        d_product=d_columns,
+        sums=sums,
+        n_rows=n_rows,
+        **sizes._asdict(),
+    )
+    for i in range(P):
+        of_policy = columns[i], target[i], actions[i], heads.Value(*(leaf[i] for leaf in values))
+        for name, one, other in zip(names, results, heads.forward(*of_policy, sizes)):
+            assert torch.equal(one[i], other), name
+        alone = heads.backward(*of_policy, sizes, tuple(gradients[:, i].contiguous()))
+        assert torch.equal(d_columns[i], alone[0]), i
+        expected = torch.cat([leaf.flatten() for leaf in alone[1:]])
+        torch.testing.assert_close(sums[i].sum(0)[: len(expected)], expected)
 
 
 def test_adam():

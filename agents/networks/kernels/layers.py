@@ -49,7 +49,7 @@ def normalise(
         )
         for leaf, mean, scale in zip(leaves, means, scales, strict=True)
     ]
-    _launch(
+    launch_for_policy(
         f"normalise_{DTYPES[dtype]}",
         features,
         n_columns // 4 * -(-n_selected // CORES.constants["NORMALISED_ROWS"]),
@@ -90,7 +90,7 @@ def moments(
         )
         for leaf, n in zip(leaves, n_statistics, strict=True)
     ]
-    _launch(
+    launch_for_policy(
         "moments",
         results,
         total * threads,
@@ -131,7 +131,9 @@ def add_moments(norms: list, all_moments: list) -> None:
         )
     threads = CORES.constants["MOMENTS_THREADS"]
     n_threads = threads * len(packed)
-    _launch("add_moments", norms[0].mean, n_threads, block=threads, norms=b"".join(packed))
+    launch_for_policy(
+        "add_moments", norms[0].mean, n_threads, block=threads, norms=b"".join(packed)
+    )
 
 
 def bias_gradient(
@@ -148,7 +150,7 @@ def bias_gradient(
     n_strips = -(-n_rows // _STRIP)
     d_masked = d if activated is None else torch.empty_like(d)
     sums = d.new_empty(n_strips, n_columns, dtype=torch.float32)
-    _launch(
+    launch_for_policy(
         f"bias_gradient_{DTYPES[d.dtype]}",
         d,
         _STRIP_THREADS * n_strips,
@@ -169,7 +171,7 @@ def sum_rows(rows: torch.Tensor) -> torch.Tensor:
     """Returns the sums (columns,) of rows (n, columns) float32, always in the same order."""
     sums = rows.new_empty(rows.shape[1])
     n_threads = _STRIP_THREADS * -(-rows.shape[1] // WARP)
-    _launch(
+    launch_for_policy(
         "sum_rows",
         rows,
         n_threads,
@@ -205,7 +207,7 @@ def act(
     logits = features.new_empty(n_lanes, *shape, dtype=torch.float32)
     actions = torch.empty(n_lanes, shape[0], dtype=torch.int64, device=features.device)
     logprobs = torch.empty_like(logits[:, 0, 0])
-    _launch(
+    launch_for_policy(
         f"categorical_act_{DTYPES[features.dtype]}",
         features,
         CORES.constants["ACT_THREADS"] * n_lanes,
@@ -232,7 +234,7 @@ def terms(logits: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, to
         actions: (rows, A) int64.
     """
     logprobs, entropies = logits.new_empty(2, len(logits))
-    _launch(
+    launch_for_policy(
         "categorical_terms",
         logits,
         len(logits),
@@ -251,7 +253,7 @@ def terms_backward(
 ) -> torch.Tensor:
     """Returns the gradient of `terms`' logits."""
     d_logits = torch.empty_like(logits)
-    _launch(
+    launch_for_policy(
         "categorical_terms_backward",
         logits,
         len(logits),
@@ -270,7 +272,7 @@ def _rows(logits, actions):
     )
 
 
-def _launch(operation, tensor, n_threads, n_blocks_y=1, block=BLOCK, **fields):
+def launch_for_policy(operation, tensor, n_threads, n_blocks_y=1, block=BLOCK, **fields):
     """Launches an operation for one policy on a tensor's GPU."""
     values = {
         name: field.data_ptr() if isinstance(field, torch.Tensor) else 0 if field is None else field
