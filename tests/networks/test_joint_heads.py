@@ -78,7 +78,7 @@ def test_nan_of_a_row_stays_in_it():
     columns = torch.randn(40, n_columns, device="cuda").to(BF16)
     target = torch.randn(40, first_score, device="cuda").to(BF16)
     actions = torch.zeros(40, 1, dtype=torch.int64, device="cuda")
-    value = kernels.Value(*(torch.ones(*shape, device="cuda") for shape in ((1, 64), (1,), (), ())))
+    value = kernels.Value(*(torch.ones(shape, device="cuda") for shape in ((1, 64), (1,), (), ())))
     clean = kernels.forward(columns, target, actions, value, sizes)
     columns[5] = torch.nan
     for one, other in zip(kernels.forward(columns, target, actions, value, sizes), clean):
