@@ -10,9 +10,19 @@
 struct LstmStartParams {
     const unsigned char* reset;  // (B) at the first step
     const float* last_output;    // (B, W)
-    const float* last_cell;      // (B, W); null: `cell` is not wanted
+    const float* last_cell;      // (B, W)
     void* hidden;                // (B, W) compute
     float* cell;                 // (B, W)
+    int n_lanes;
+    int width;
+    int n_units;  // units per thread
+};
+
+struct LstmJoinParams {
+    const unsigned char* reset;  // (B)
+    const void* x;               // (B, W) compute
+    const float* last_output;    // (B, W)
+    void* joined;                // (B, 2 W) compute: x, then the last output
     int n_lanes;
     int width;
     int n_units;  // units per thread
