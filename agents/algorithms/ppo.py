@@ -23,9 +23,7 @@ from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
-from megastep.agents.storage.copies import select_lanes
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
-from megastep.arrdict import arrdict
 from megastep.settings import MAX_ENVS, checked
 from megastep.types import Env, optional
 
@@ -95,7 +93,7 @@ class PPO(GradientLearner):
         self.coefficients = Coefficients(clip, value_clip, value_coef, entropy_coef, auxiliary_coef)
         self.normalise_advantage = normalise_advantage
         self.n_epochs, self.n_minibatches = n_epochs, n_minibatches
-        self.target_kl = float("inf") if target_kl is None else target_kl
+        self.target_kl = target_kl
 
     def collector(self, env: Env) -> Collector:
         """Returns a collector of rollouts of `n_steps` steps."""
@@ -134,19 +132,20 @@ class PPO(GradientLearner):
         if self.coefficients.value_clip is not None:
             estimates["old_value"] = transitions["value"]
 
-        is_stopped = torch.zeros((), dtype=torch.bool, device=self.device)
+        is_enabled = True
         for _ in range(self.n_epochs):
             generator = self.generator.on(self.device)
             order = torch.rand(rollout.n_lanes, generator=generator, device=self.device).argsort()
             for lanes in order.tensor_split(self.n_minibatches):
-                selected = dict(zip(estimates, select_lanes([*estimates.values()], lanes)))
-                batch = arrdict({**rollout.sequences(lanes, _PARTS), **selected})
+                batch = rollout.sequences(lanes, _PARTS, estimates)
+                batch["n_valid"] = batch.valid.sum()
                 if self.normalise_advantage == "minibatch":
                     batch["advantages"] = pooled_normalise(batch.advantages, batch.valid)
                 loss, metrics = self._losses(rollout, lanes, batch)
-                kl = self.steps.backward(loss, metrics, batch.valid.sum())["kl"]
-                is_stopped = is_stopped | (kl > self.target_kl)
-                self.steps.take(~is_stopped)
+                kl = self.steps.backward(loss, metrics, batch.n_valid)["kl"]
+                if self.target_kl is not None:
+                    is_enabled = is_enabled & ~(kl > self.target_kl)
+                self.steps.take(is_enabled)
         # Observation statistics change only now, so the whole update saw the normalisation that
         # acted. One row is enough: every rollout brings another B observations.
         last = rollout.world(-1)

@@ -44,8 +44,8 @@ def ppo_loss(
         entropies: (T, M), of the policy.
         values: (T, M), in units of reward.
         errors: (T, M), of the auxiliary prediction, or None.
-        batch: has `logprobs`, `advantages`, `targets` and `valid`, (T, M) each; with a
-            `value_clip` also `old_value`.
+        batch: has `logprobs`, `advantages`, `targets` and `valid`, (T, M) each, and `n_valid` (),
+            the number of valid steps; with a `value_clip` also `old_value` (T, M).
         value_scale: (), the value's own scale.
         coefficients: the settings.
     """
@@ -98,7 +98,7 @@ class _FusedLoss(torch.autograd.Function):
         clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
         inputs = [None if x is None else x.contiguous() for x in (entropies, values, errors)]
         gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
-        n_rows, n_valid = logprobs.numel(), batch.valid.sum()
+        n_rows = logprobs.numel()
         sums = logprobs.new_empty(program.n_blocks(n_rows), program.N_SUMS)
         names = "d_logprobs", "d_entropies", "d_values", "d_errors"
         program.run(
@@ -112,7 +112,7 @@ class _FusedLoss(torch.autograd.Function):
             advantages=batch.advantages.contiguous(),
             targets=batch.targets.contiguous(),
             valid=batch.valid.contiguous(),
-            n_valid=n_valid,
+            n_valid=batch.n_valid,
             value_scale=value_scale,
             **{**dict.fromkeys(names), **dict(zip(names, gradients))},
             sums=sums,
@@ -124,9 +124,8 @@ class _FusedLoss(torch.autograd.Function):
             auxiliary_coef=auxiliary_coef,
         )
         ctx.save_for_backward(*gradients)
-        metrics = sums.sum(0) / n_valid.clamp(min=1)
-        weights = [1.0, value_coef, -entropy_coef, 0.0, 0.0, auxiliary_coef]
-        loss = sum(metrics[i] * weight for i, weight in enumerate(weights) if weight)
+        means = sums.sum(0)
+        metrics, loss = means[:-1], means[-1]
         ctx.mark_non_differentiable(metrics)
         return loss, metrics
 

@@ -6,7 +6,7 @@ t+1. So row t is a valid transition unless its `reset` is set.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch.utils._pytree import tree_flatten, tree_unflatten
@@ -228,20 +228,26 @@ class Rollout:
         )
 
     @section("forward")
-    def sequences(self, lanes: torch.Tensor, names: Sequence[str] = SEQUENCES) -> arrdict:
+    def sequences(
+        self,
+        lanes: torch.Tensor,
+        names: Sequence[str] = SEQUENCES,
+        others: Mapping[str, torch.Tensor] = arrdict(),
+    ) -> arrdict:
         """Returns whole sequences of some lanes, as a copy.
 
         Args:
             lanes: (M,) int64.
             names: which of the parts to return, besides `state`.
+            others: further tensors (T, B, ...) to return, by name.
 
         Returns:
             arrdict of obs, starts, learns and privileged (if stored), each (T+1, M, ...); actions,
-            logprobs, reward, terminal and truncated, each (T, M, ...); and state (M, ...), the
-            hidden state before row 0.
+            logprobs, reward, terminal and truncated, each (T, M, ...); `others`; and state
+            (M, ...), the hidden state before row 0.
         """
         parts = arrdict({name: getattr(self, name) for name in names})
-        parts = arrdict({name: part for name, part in parts.items() if part is not None})
+        parts = arrdict({name: part for name, part in parts.items() if part is not None}, **others)
         # the hidden state as one step
         parts["state"] = mapping(lambda leaf: leaf[None])(self.state)
         leaves, spec = tree_flatten(parts)

@@ -23,6 +23,7 @@ def case(device, value_clip, auxiliary):
         old_value=draw(3.0),
         valid=draw() > -1,
     )
+    batch["n_valid"] = batch.valid.sum()
     leaves = [draw(0.3) - 1, draw() + 2, draw(3.0), draw() if auxiliary else None]
     leaves[0][~batch.valid] = torch.nan  # whatever is invalid does not count
     leaves = [None if leaf is None else leaf.requires_grad_() for leaf in leaves]
@@ -51,6 +52,7 @@ def test_fused_loss_matches_plain(value_clip, auxiliary):
 def test_without_valid_steps_nothing_is_learned():
     leaves, batch, scale, settings = case("cuda", None, True)
     batch["valid"] = torch.zeros_like(batch.valid)
+    batch["n_valid"] = batch.valid.sum()
     loss, metrics = ppo_loss(*leaves, batch, scale, settings)
     assert not loss and not any(metrics.values())
     assert not any(gradient.any() for gradient in torch.autograd.grad(loss, leaves))
@@ -71,7 +73,7 @@ def test_gae_on_a_gpu_matches_the_cpu(n_steps, n_lanes):
 
 def transposed(leaf):
     """Returns an equal tensor with another memory layout."""
-    return leaf.T.contiguous().T
+    return leaf.T.contiguous().T if leaf.dim() else leaf
 
 
 @pytest.mark.cuda

@@ -233,7 +233,7 @@ def test_ppo_loss():
     value_scale = randn().abs() + 0.5
     gradients = {f"d_{name}": randn(n_steps, n_lanes) for name in names}
     sums = randn(n_blocks(n_rows), N_SUMS)
-    n_valid = batch.valid.sum((1, 2))
+    batch["n_valid"] = batch.valid.sum((1, 2))
     launch(
         *(ALGORITHMS, "ppo_loss", (n_blocks(n_rows), P)),
         **inputs,
@@ -242,7 +242,7 @@ def test_ppo_loss():
         advantages=batch.advantages,
         targets=batch.targets,
         valid=batch.valid,
-        n_valid=n_valid,
+        n_valid=batch.n_valid,
         value_scale=value_scale,
         **gradients,
         sums=sums,
@@ -255,5 +255,5 @@ def test_ppo_loss():
         alone = torch.autograd.grad(loss, leaves)
         for one, other in zip(gradients.values(), alone, strict=True):
             assert torch.equal(one[i], other), i
-        means = torch.stack([*metrics.values()])
-        torch.testing.assert_close(sums[i].sum(0) / n_valid[i], means)
+        means = torch.stack([*metrics.values(), loss.detach()])
+        torch.testing.assert_close(sums[i].sum(0), means)

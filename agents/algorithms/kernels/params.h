@@ -34,7 +34,8 @@ struct PpoLossParams {
     float* d_entropies;          // (P, n_rows)
     float* d_values;             // (P, n_rows)
     float* d_errors;             // (P, n_rows)
-    float* sums;  // (P, n_blocks, 6): policy, value, entropy, kl, clip_fraction, auxiliary
+    // (P, n_blocks, 7), shares of means: policy, value, entropy, kl, clip_fraction, auxiliary, loss
+    float* sums;
     int n_rows;
     float clip;
     float value_clip;

@@ -1,11 +1,11 @@
-// PPO's loss, with its gradients and metrics. One thread per row; a block adds up its rows in a
-// fixed order, the caller the blocks. Blocks along y are policies.
+// PPO's loss, with its gradients and metrics, all means over valid rows. One thread per row; a
+// block adds up its rows in a fixed order, the caller the blocks. Blocks along y are policies.
 #include "common/constants.h"
 #include "params.h"
 
 #define KERNEL extern "C" __global__ void
 
-constexpr int N_SUMS = 6;
+constexpr int N_SUMS = 7;
 
 KERNEL ppo_loss(PpoLossParams p) {
     int of_policy = blockIdx.x * blockDim.x + threadIdx.x;
@@ -41,6 +41,10 @@ KERNEL ppo_loss(PpoLossParams p) {
             sums[3] = ratio - 1.f - log_ratio;
             sums[4] = ratio != clipped ? 1.f : 0.f;
             sums[5] = p.errors ? p.errors[row] : 0.f;
+            sums[6] = sums[0] + p.value_coef * sums[1] - p.entropy_coef * sums[2] +
+                      p.auxiliary_coef * sums[5];
+            for (int i = 0; i < N_SUMS; i++)
+                sums[i] *= share;
         }
         p.d_logprobs[row] = d_logprob;
         p.d_values[row] = d_value;

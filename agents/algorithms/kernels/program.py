@@ -9,7 +9,7 @@ from megastep.kernels.build.launch import BLOCK, launch_blocks
 from megastep.kernels.build.program import Program
 
 PROGRAM = Program(Path(__file__).parent, CUDA_FLAGS)
-N_SUMS = 6
+N_SUMS = 7  # of PPO's loss
 
 
 def run(
