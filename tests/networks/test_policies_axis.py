@@ -141,7 +141,7 @@ def test_heads():
     )
     d_columns, sums = torch.empty_like(columns), randn(n_strips, n_columns + 264 + 8)
     launch(
-        *(CORES, "heads_backward", (n_strips, 3 * P), CORES.constants["STRIP_THREADS"]),
+        *(CORES, "heads_backward", (3 * n_strips, P), CORES.constants["STRIP_THREADS"]),
         **inputs,
         value_weight=values.weight,
         value_scale=values.scale,

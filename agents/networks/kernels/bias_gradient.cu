@@ -10,7 +10,7 @@ template <class T, int N>
 DEVICE void bias_gradient(const BiasGradientParams& p) {
     int n_words = p.n_columns / N, n_parts = (n_words + WARP - 1) / WARP;  // of a row
     int first_word = WARP * (blockIdx.y % n_parts);
-    Strip strip = find_strip(min(n_words - first_word, WARP), p.n_rows);
+    Strip strip = find_strip(blockIdx.x, min(n_words - first_word, WARP), p.n_rows);
     int word = first_word + strip.word;
     long long policy = blockIdx.y / n_parts, first = policy * p.n_rows;
     float sums[N];

@@ -115,13 +115,14 @@ KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
 // Where a thread reads and writes.
 struct HeadsPlace {
     long long policy, first;  // row of the policy
+    int strip;
     int first_score, first_hidden, n_columns;
     float* sums;  // of this block's strip
 };
 
 // The gradient of the scores, one thread per row. The entropy's is -p (logit + entropy).
 DEVICE void scores_backward(const HeadsBackwardParams& p, const HeadsPlace& place) {
-    int row = (int)blockIdx.x * STRIP + (int)threadIdx.x;
+    int row = place.strip * STRIP + (int)threadIdx.x;
     if (threadIdx.x >= STRIP || row >= p.n_rows)
         return;
     long long at = (place.first + row) * place.n_columns + place.first_score;
@@ -149,7 +150,7 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsPlace& place
     __syncthreads();
     int n_words = place.first_hidden / WORD;
     for (int first_word = 0; first_word < n_words; first_word += WARP) {
-        Strip strip = find_strip(min(n_words - first_word, WARP), p.n_rows);
+        Strip strip = find_strip(place.strip, min(n_words - first_word, WARP), p.n_rows);
         int column = WORD * (first_word + strip.word);
         bool is_score = column >= place.first_score;
         float sums[WORD];
@@ -191,7 +192,7 @@ DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsPlace& place
 // The gradients of 32 words of the critic's hidden layer and of the value's weights.
 DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsPlace& place, int part) {
     int first_word = WARP * part;
-    Strip strip = find_strip(min(p.width / WORD - first_word, WARP), p.n_rows);
+    Strip strip = find_strip(place.strip, min(p.width / WORD - first_word, WARP), p.n_rows);
     int column = WORD * (first_word + strip.word);
     float weight[WORD], sums[WORD], weight_sums[WORD], bias_sum[1];
     read_word(weight, p.value_weight + place.policy * p.width + column);
@@ -232,17 +233,18 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsPlace& plac
         add_up(bias_sum, strip, place.sums + place.n_columns + p.width, 1);
 }
 
-// Blocks along y: one for prediction and scores, the others for the hidden layer, of each policy.
+// Neighbouring blocks have one strip: one has prediction and scores, the others the hidden layer.
 KERNEL BOUNDS(256) heads_backward(HeadsBackwardParams p) {
-    int n_parts = 1 + (p.width / WORD + WARP - 1) / WARP, part = blockIdx.y % n_parts;
+    int n_parts = 1 + (p.width / WORD + WARP - 1) / WARP, part = blockIdx.x % n_parts;
     HeadsPlace place;
-    place.policy = blockIdx.y / n_parts;
+    place.policy = blockIdx.y;
     place.first = place.policy * p.n_rows;
+    place.strip = blockIdx.x / n_parts;
     place.first_score = padded(p.n_predicted);
     place.first_hidden = place.first_score + padded(p.n_agents * p.n_choices);
     place.n_columns = place.first_hidden + p.width;
-    place.sums =
-        p.sums + (place.policy * gridDim.x + blockIdx.x) * (place.n_columns + p.width + WORD);
+    long long n_strips = gridDim.x / n_parts, n_sums = place.n_columns + p.width + WORD;
+    place.sums = p.sums + (place.policy * n_strips + place.strip) * n_sums;
     if (part)
         critic_backward(p, place, part - 1);
     else

@@ -110,8 +110,7 @@ def backward(
     launch_for_policy(
         "heads_backward",
         product,
-        _STRIP_THREADS * n_strips,
-        n_blocks_y=n_parts,
+        _STRIP_THREADS * n_strips * n_parts,
         block=_STRIP_THREADS,
         product=product,
         target=target,

@@ -15,10 +15,10 @@ struct Strip {
     int start, end, step;  // rows of the thread: start, start + step, ... up to end, exclusive
 };
 
-// The place of this thread in strip `blockIdx.x` of n_rows.
-DEVICE Strip find_strip(int words, int n_rows) {
+// The place of this thread in a strip of n_rows.
+DEVICE Strip find_strip(int strip, int words, int n_rows) {
     int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
-    int groups = WARP / words, group = lane / words, first = (int)blockIdx.x * STRIP;
+    int groups = WARP / words, group = lane / words, first = strip * STRIP;
     int end = min(first + STRIP, n_rows);
     // the last threads of a warp may be in no group
     int start = group < groups ? first + warp * groups + group : end;
