@@ -24,6 +24,13 @@ def pooled_normalise(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     invalid.
     """
     ((_, mean, variance),) = pool_moments(masked_moments(x, valid))
+    return normalise(x, valid, mean, variance)
+
+
+def normalise(
+    x: torch.Tensor, valid: torch.Tensor, mean: torch.Tensor, variance: torch.Tensor
+) -> torch.Tensor:
+    """Returns x minus its mean, divided by its standard deviation; 0 where invalid."""
     return (x - mean).masked_fill(~valid, 0.0) / (variance.sqrt() + 1e-8)
 
 

@@ -18,8 +18,9 @@ from megastep.agents.algorithms.learner import (
     Positive,
     check_minibatches,
 )
-from megastep.agents.algorithms.masked_stats import explained_variance, pooled_normalise
+from megastep.agents.algorithms.masked_stats import normalise, pooled_normalise
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
+from megastep.agents.distributed.pooling import masked_moments, pool_moments
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
@@ -125,10 +126,14 @@ class PPO(GradientLearner):
         transitions = rollout.transitions()
         estimates = returns.gae(**transitions, gamma=self.gamma, lambda_=self.lambda_)
         estimates["valid"] = estimates.valid & rollout.learns[:-1]
-        self.policy.critic.output.update_stats(estimates.targets, estimates.valid & is_finite)
-        explained = explained_variance(transitions["value"], estimates.targets, estimates.valid)
+        advantages, valid = estimates.advantages, estimates.valid
+        both = torch.stack([estimates.targets, advantages])
+        ((n_valid, means, variances),) = pool_moments(masked_moments(both, valid))
+        self.policy.critic.output.add(n_valid * is_finite, means[0], variances[0])
+        # an advantage is the error of the value
+        explained = 1 - variances[1] / variances[0].clamp(min=1e-8)
         if self.normalise_advantage == "rollout":
-            estimates["advantages"] = pooled_normalise(estimates.advantages, estimates.valid)
+            estimates["advantages"] = normalise(advantages, valid, means[1], variances[1])
         if self.coefficients.value_clip is not None:
             estimates["old_value"] = transitions["value"]
 

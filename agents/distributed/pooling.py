@@ -45,16 +45,18 @@ def on_all_ranks(condition: torch.Tensor) -> torch.Tensor:
 
 
 def masked_moments(x: torch.Tensor, valid: torch.Tensor) -> Moments:
-    """Returns the number of valid entries, and their mean and variance, 0 if none is valid.
+    """Returns the number of valid entries, and their mean and variance (...,), 0 if none is valid.
 
     Args:
-        x: may hold anything where invalid.
-        valid: bool of the same shape.
+        x: (..., *shape), quantities of each entry; may hold anything where invalid.
+        valid: (*shape) bool.
     """
+    axes, is_invalid = tuple(range(-valid.dim(), 0)), ~valid
     n_valid = valid.sum()
     n = n_valid.clamp(min=1)
-    mean = x.masked_fill(~valid, 0.0).sum() / n
-    return n_valid, mean, (x - mean).square().masked_fill(~valid, 0.0).sum() / n
+    mean = x.masked_fill(is_invalid, 0.0).sum(axes, keepdim=True) / n
+    variance = (x - mean).square().masked_fill(is_invalid, 0.0).sum(axes) / n
+    return n_valid, mean.view_as(variance), variance
 
 
 def pool_moments(*moments: Moments) -> list[Moments]:

@@ -71,7 +71,25 @@ class ValueOutput(nn.Module):
             valid: (...,) bool.
             min_rate: smallest weight of a call.
         """
-        ((n_valid, mean, variance),) = pool_moments(masked_moments(targets, valid))
+        (moments,) = pool_moments(masked_moments(targets, valid))
+        self.add(*moments, min_rate)
+
+    @torch.no_grad()
+    def add(
+        self,
+        n_valid: torch.Tensor,
+        mean: torch.Tensor,
+        variance: torch.Tensor,
+        min_rate: float = 0.05,
+    ) -> None:
+        """Does the same as `update_stats` with the returns' moments.
+
+        Args:
+            n_valid: () number of returns.
+            mean: ().
+            variance: ().
+            min_rate: smallest weight of a call.
+        """
         count = self.count + 1
         rate = (1 / count).clamp(min=min_rate, max=1.0)
         mean, scale = mix_moments(self, mean, variance, rate)

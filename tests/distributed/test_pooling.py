@@ -100,6 +100,8 @@ def test_one_process_pools_nothing():
     assert pooled_normalise(x, valid).tolist() == pytest.approx([-1, 1, 0])
     ((n, mean, variance),) = pooling.pool_moments(pooling.masked_moments(x, valid))
     assert (n, mean, variance) == (2, 2, 1)
+    n, means, variances = pooling.masked_moments(torch.stack([x, 3 * x]), valid)
+    assert n == 2 and means.tolist() == [2, 6] and variances.tolist() == [1, 9]
     parameter = torch.nn.Parameter(torch.zeros(2))
     parameter.grad = torch.ones(2)
     n, means = pooling.average_gradients([parameter], valid.sum(), [x[0]])
