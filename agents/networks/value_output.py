@@ -8,6 +8,7 @@ from torch import nn
 
 from megastep.agents.distributed.pooling import masked_moments, pool_moments
 from megastep.agents.networks.kernels import heads as kernels
+from megastep.agents.networks.kernels import layers
 from megastep.agents.networks.kernels.program import aligned
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.precision import compute_dtype
@@ -82,7 +83,7 @@ class ValueOutput(nn.Module):
         variance: torch.Tensor,
         min_rate: float = 0.05,
     ) -> None:
-        """Does the same as `update_stats` with the returns' moments.
+        """Does the same as `update_stats` with the returns' moments. On a GPU in one kernel.
 
         Args:
             n_valid: () number of returns.
@@ -90,10 +91,14 @@ class ValueOutput(nn.Module):
             variance: ().
             min_rate: smallest weight of a call.
         """
+        weight = self.linear.weight
+        if weight.is_cuda and weight.dtype == torch.float32 and weight.is_contiguous():
+            layers.add_returns(self, n_valid, mean, variance, min_rate)
+            return
         count = self.count + 1
         rate = (1 / count).clamp(min=min_rate, max=1.0)
         mean, scale = mix_moments(self, mean, variance, rate)
-        weight = self.linear.weight * (self.scale / scale)
+        weight = weight * (self.scale / scale)
         bias = (self.linear.bias * self.scale + (self.mean - mean)) / scale
         is_stored = (n_valid > 0) & (mean + scale).isfinite()
         old = self.linear.weight, self.linear.bias, self.mean, self.scale, self.count

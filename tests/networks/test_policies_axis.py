@@ -121,6 +121,25 @@ def test_categorical_actions():
             assert torch.equal(one, other), i
 
 
+def test_statistics_of_returns():
+    names = "weight", "bias", "mean", "scale", "count", "new_mean", "new_variance"
+    width = 40
+    leaves = {name: randn(width) if name == "weight" else randn().abs() for name in names}
+    counts = torch.tensor([3, 0, 7], device="cuda")  # one policy has no returns
+    alone = {name: leaf.clone() for name, leaf in leaves.items()}
+    options = dict(width=width, min_rate=0.05, min_scale=1e-3)
+    threads = CORES.constants["MOMENTS_THREADS"]
+    launch(CORES, "add_returns", (P, 1), threads, **leaves, n_returns=counts, **options)
+    for i in range(P):
+        row = {name: leaf[i : i + 1] for name, leaf in alone.items()}
+        before = {name: leaf.clone() for name, leaf in row.items()}
+        launch(CORES, "add_returns", (1, 1), threads, **row, n_returns=counts[i : i + 1], **options)
+        for name, leaf in row.items():
+            assert torch.equal(leaves[name][i], leaf[0]), name
+            if name in ("weight", "bias", "mean", "count"):
+                assert torch.equal(leaf, before[name]) == (i == 1), name
+
+
 def test_heads():
     n_rows, sizes, strip = 300, heads.Sizes(11, 2, 5, 264), CORES.constants["STRIP"]
     first_score, _, n_columns = sizes.starts

@@ -136,6 +136,43 @@ def add_moments(norms: list, all_moments: list) -> None:
     )
 
 
+def add_returns(
+    output: torch.nn.Module,
+    n_returns: torch.Tensor,
+    mean: torch.Tensor,
+    variance: torch.Tensor,
+    min_rate: float,
+) -> None:
+    """Adds moments of returns to a critic's output layer, in place.
+
+    Args:
+        output: a `ValueOutput` whose parameters and statistics are float32.
+        n_returns: () number of returns.
+        mean: ().
+        variance: ().
+        min_rate: smallest weight of the moments.
+    """
+    n_returns, mean, variance = n_returns.long(), mean.float(), variance.float()
+    layer, threads = output.linear, CORES.constants["MOMENTS_THREADS"]
+    launch_for_policy(
+        "add_returns",
+        mean,
+        threads,
+        block=threads,
+        weight=layer.weight,
+        bias=layer.bias,
+        mean=output.mean,
+        scale=output.scale,
+        count=output.count,
+        new_mean=mean,
+        new_variance=variance,
+        n_returns=n_returns,
+        width=layer.in_features,
+        min_rate=min_rate,
+        min_scale=output.min_scale,
+    )
+
+
 def bias_gradient(
     d: torch.Tensor, activated: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:

@@ -108,3 +108,31 @@ KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
     if (!threadIdx.x)
         *norm.count = count;
 }
+
+// Adds moments of returns to a value's statistics, and changes its layer so that no prediction
+// changes (PopArt). One block per policy. Changes nothing if there were no returns, or if a number
+// is not finite.
+KERNEL BOUNDS(1024) add_returns(AddReturnsParams p) {
+    int policy = blockIdx.x;
+    float count = p.count[policy] + 1.f;
+    float rate = fminf(fmaxf(__fdiv_rn(1.f, count), p.min_rate), 1.f);
+    float old_mean = p.mean[policy], old_scale = p.scale[policy], bias = p.bias[policy];
+    float away = p.new_mean[policy] - old_mean, old_variance = old_scale * old_scale;
+    float variance = old_variance + rate * (p.new_variance[policy] - old_variance) +
+                     rate * (1.f - rate) * away * away;
+    float mean = old_mean + rate * away, scale = sqrtf(variance);
+    scale = scale < p.min_scale ? p.min_scale : scale;  // NaN stays
+    __syncthreads();                                    // all have read
+    if (p.n_returns[policy] <= 0 || !isfinite(mean + scale))
+        return;
+    float* weight = p.weight + (long long)policy * p.width;
+    float ratio = __fdiv_rn(old_scale, scale);
+    for (int i = threadIdx.x; i < p.width; i += MOMENTS_THREADS)
+        weight[i] *= ratio;
+    if (threadIdx.x)
+        return;
+    p.bias[policy] = __fdiv_rn(bias * old_scale + (old_mean - mean), scale);
+    p.mean[policy] = mean;
+    p.scale[policy] = scale;
+    p.count[policy] = count;
+}

@@ -147,6 +147,21 @@ struct AddMomentsParams {
     RunningNormParams norms[8];
 };
 
+// The last layer of a critic, its statistics of returns, and the moments to add to them.
+struct AddReturnsParams {
+    float* weight;               // (P, W)
+    float* bias;                 // (P)
+    float* mean;                 // (P)
+    float* scale;                // (P)
+    float* count;                // (P)
+    const float* new_mean;       // (P)
+    const float* new_variance;   // (P)
+    const long long* n_returns;  // (P)
+    int width;
+    float min_rate;
+    float min_scale;
+};
+
 struct BiasGradientParams {
     const void* d;          // (P, n_rows, n_columns) compute
     const void* activated;  // of the same shape; null: no activation
