@@ -92,12 +92,11 @@ class GradientSteps:
         return self._metrics
 
     @section("optimiser")
-    def take(self, is_enabled: torch.Tensor | None = None) -> torch.Tensor:
+    def take(self, is_enabled: torch.Tensor | bool = True) -> torch.Tensor:
         """Takes one step down the gradient. Without a valid transition, it is not taken.
 
         Args:
             is_enabled: () bool. A step that is not enabled is neither taken nor counted as skipped.
-                None: it is.
 
         Returns:
             () bool, whether the step was taken.
@@ -116,8 +115,6 @@ class GradientSteps:
         """Returns the gradients' norm and whether the step is taken, () each, and adds up the
         metrics of steps that are.
         """
-        if is_enabled is None:
-            is_enabled = torch.ones_like(self._is_finite)
         grad_norm = self.optimizer.grad_norm()
         is_finite = grad_norm.isfinite() & self._is_finite
         is_taken = is_finite & is_enabled & (self._n_valid > 0)
@@ -143,7 +140,7 @@ class GradientSteps:
             metrics=b"".join(pack(values=value.data_ptr()) for value in metrics),
             sums=sums,
             is_finite=self._is_finite,
-            is_enabled=is_enabled,
+            is_enabled=None if is_enabled is True else torch.as_tensor(is_enabled, device=device),
             n_valid=self._n_valid,
             n_steps=self.optimizer.n_steps,
             grad_norm=grad_norm,

@@ -130,7 +130,7 @@ class PPO(GradientLearner):
         estimates = returns.gae(**transitions, learns=rollout.learns[:-1], **traces)
         advantages, targets, valid = (estimates[key] for key in ("advantages", "targets", "valid"))
         moments = masked_moments(valid, targets, advantages)
-        (_, _, variance), (_, _, error) = moments  # targets are values plus advantages
+        (_, _, variance), (_, _, error) = moments  # an advantage is the error of the value
         explained = 1 - error / variance.clamp(min=1e-8)
         of_targets, of_advantages = pool_moments(*moments)
         self.policy.critic.output.add(of_targets, is_finite)
@@ -139,17 +139,17 @@ class PPO(GradientLearner):
         if self.coefficients.value_clip is not None:
             estimates["old_value"] = transitions["value"]
 
-        is_enabled = None if self.target_kl is None else torch.ones_like(is_finite)
+        is_enabled = True
         for _ in range(self.n_epochs):
             generator = self.generator.on(self.device)
             order = random_order(rollout.n_lanes, generator, self.device)
             for lanes in order.tensor_split(self.n_minibatches):
                 batch = rollout.sequences(lanes, _PARTS, estimates)
-                n_valid = batch.valid.sum()
+                batch["n_valid"] = batch.valid.sum()
                 if self.normalise_advantage == "minibatch":
                     batch["advantages"] = pooled_normalise(batch.advantages, batch.valid)
-                loss, metrics = self._losses(rollout, lanes, batch, n_valid)
-                kl = self.steps.backward(loss, metrics, n_valid)["kl"]
+                loss, metrics = self._losses(rollout, lanes, batch)
+                kl = self.steps.backward(loss, metrics, batch.n_valid)["kl"]
                 if self.target_kl is not None:
                     is_enabled = is_enabled & ~(kl > self.target_kl)
                 self.steps.take(is_enabled)
@@ -160,21 +160,21 @@ class PPO(GradientLearner):
         return {**self.steps.end(), "explained_variance": explained}
 
     @section("forward")
-    def _losses(self, rollout, lanes, batch, n_valid):
+    def _losses(self, rollout, lanes, batch):
         """Returns the loss of a minibatch and its metrics, tensors ().
 
         Args:
             rollout: the rollout, whose observations are selected as they are normalised.
             lanes: (M,), lanes of the minibatch.
             batch: the other parts of its steps, (T, M) each.
-            n_valid: (), number of valid steps.
         """
         policy, privileged = self.policy, without_last(rollout.privileged)
         starts = without_last(batch.starts)
-        with policy.compute_dtype():  # one, so that weights are cast once
-            now = policy.unroll(without_last(rollout.obs), starts, batch.state, lanes)
-            logprobs, entropies = policy.output.terms(now.logits, batch.actions)
-            values, errors = policy.value_and_error(now.features, privileged, lanes)
-        scale = policy.critic.output.scale
-        inputs = logprobs, entropies, values, errors
-        return ppo_loss(*inputs, batch, n_valid, scale, self.coefficients)
+        sequence = without_last(rollout.obs), starts, batch.state, batch.actions
+        terms = policy.terms(*sequence, privileged, lanes)
+        return ppo_loss(
+            **terms,
+            batch=batch,
+            value_scale=policy.critic.output.scale,
+            coefficients=self.coefficients,
+        )

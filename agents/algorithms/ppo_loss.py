@@ -10,6 +10,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.algorithms.kernels import program
+from megastep.agents.algorithms.masked_stats import masked_mean
 from megastep.arrdict import arrdict
 
 METRICS = "policy", "value", "entropy", "kl", "clip_fraction", "auxiliary"
@@ -31,44 +32,40 @@ def ppo_loss(
     values: torch.Tensor,
     errors: torch.Tensor | None,
     batch: arrdict,
-    n_valid: torch.Tensor,
     value_scale: torch.Tensor,
     coefficients: Coefficients,
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """Returns the loss, a mean over the valid steps, and its metrics, tensors ().
 
-    On a GPU two kernels compute both, and the gradients.
+    On a GPU one kernel computes both, and the gradients.
 
     Args:
         logprobs: (T, M) float32, of the actions.
         entropies: (T, M), of the policy.
         values: (T, M), in units of reward.
         errors: (T, M), of the auxiliary prediction, or None.
-        batch: has `logprobs`, `advantages`, `targets` and `valid`, (T, M) each; with a
-            `value_clip` also `old_value`.
-        n_valid: () int64, the number of valid steps.
+        batch: has `logprobs`, `advantages`, `targets` and `valid`, (T, M) each, and `n_valid` (),
+            the number of valid steps; with a `value_clip` also `old_value` (T, M).
         value_scale: (), the value's own scale.
         coefficients: the settings.
     """
-    inputs = logprobs, entropies, values, errors, batch, n_valid, value_scale, coefficients
     if logprobs.is_cuda:
-        loss, metrics = _FusedLoss.apply(*inputs)
+        inputs = logprobs, entropies, values, errors
+        loss, metrics = _FusedLoss.apply(*inputs, batch, value_scale, coefficients)
         metrics = dict(zip(METRICS, metrics.unbind(), strict=True))
     else:
-        loss, metrics = plain_loss(*inputs)
+        loss, metrics = plain_loss(
+            logprobs, entropies, values, errors, batch, value_scale, coefficients
+        )
     if errors is None:
         metrics.pop("auxiliary", None)
     return loss, metrics
 
 
-def plain_loss(logprobs, entropies, values, errors, batch, n_valid, value_scale, coefficients):
+def plain_loss(logprobs, entropies, values, errors, batch, value_scale, coefficients):
     """Does the same in PyTorch."""
     clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
-    valid, n = batch.valid, n_valid.clamp(min=1)
-
-    def mean(x):
-        return x.masked_fill(~valid, 0.0).sum() / n
-
+    valid = batch.valid
     log_ratio = logprobs - batch.logprobs
     log_ratio = log_ratio.masked_fill(~valid, 0.0)  # its exp may overflow, and 0 * inf is NaN
     ratio = log_ratio.exp()
@@ -79,38 +76,30 @@ def plain_loss(logprobs, entropies, values, errors, batch, n_valid, value_scale,
         limit = value_clip * value_scale
         moved = batch.old_value + (values - batch.old_value).clamp(-limit, limit)
         squared = torch.maximum(squared, ((moved - batch.targets) / value_scale).square())
-    policy = -mean(surrogate)
-    value, entropy = mean(squared), mean(entropies)
+    policy = -masked_mean(surrogate, valid)
+    value, entropy = masked_mean(squared, valid), masked_mean(entropies, valid)
     with torch.no_grad():
         # this estimate of the KL divergence is never negative, unlike the mean log ratio
-        kl = mean(ratio - 1 - log_ratio)
-        clip_fraction = mean((ratio != clipped).float())
+        kl = masked_mean(ratio - 1 - log_ratio, valid)
+        clip_fraction = masked_mean((ratio != clipped).float(), valid)
     loss = policy + value_coef * value - entropy_coef * entropy
     metrics = dict(policy=policy, value=value, entropy=entropy, kl=kl, clip_fraction=clip_fraction)
     if errors is not None:
-        metrics["auxiliary"] = mean(errors)
+        metrics["auxiliary"] = masked_mean(errors, valid)
         loss = loss + auxiliary_coef * metrics["auxiliary"]
     return loss, metrics
 
 
 class _FusedLoss(torch.autograd.Function):
-    """`plain_loss` in two kernels, which leave the gradients for the backward pass."""
+    """`plain_loss` in one kernel, which leaves the gradients for the backward pass."""
 
     @staticmethod
-    def forward(
-        ctx, logprobs, entropies, values, errors, batch, n_valid, value_scale, coefficients
-    ):
+    def forward(ctx, logprobs, entropies, values, errors, batch, value_scale, coefficients):
         clip, value_clip, value_coef, entropy_coef, auxiliary_coef = coefficients
         inputs = [None if x is None else x.contiguous() for x in (entropies, values, errors)]
         gradients = [logprobs.new_empty(logprobs.shape) for _ in range(3 + (errors is not None))]
-        n_rows, constants = logprobs.numel(), program.PROGRAM.constants
-        n_sums = constants["N_SUMS"]
-        sums = logprobs.new_empty(program.n_blocks(n_rows), n_sums)
-        weights = dict(
-            value_coef=value_coef,
-            entropy_coef=entropy_coef,
-            auxiliary_coef=0.0 if errors is None else auxiliary_coef,
-        )
+        n_rows = logprobs.numel()
+        sums = logprobs.new_empty(program.n_blocks(n_rows), program.PROGRAM.constants["N_SUMS"])
         names = "d_logprobs", "d_entropies", "d_values", "d_errors"
         program.run(
             "ppo_loss",
@@ -123,28 +112,20 @@ class _FusedLoss(torch.autograd.Function):
             advantages=batch.advantages.contiguous(),
             targets=batch.targets.contiguous(),
             valid=batch.valid.contiguous(),
-            n_valid=n_valid,
+            n_valid=batch.n_valid,
             value_scale=value_scale,
             **{**dict.fromkeys(names), **dict(zip(names, gradients))},
             sums=sums,
             n_rows=n_rows,
             clip=clip,
             value_clip=value_clip or 0.0,
-            **weights,
+            value_coef=value_coef,
+            entropy_coef=entropy_coef,
+            auxiliary_coef=auxiliary_coef,
         )
         ctx.save_for_backward(*gradients)
-        metrics, loss = sums.new_empty(n_sums), sums.new_empty(())
-        n_threads = constants["WARP"] * n_sums
-        program.run(
-            *("ppo_metrics", logprobs.device, n_threads),
-            block=n_threads,
-            sums=sums,
-            n_valid=n_valid,
-            metrics=metrics,
-            loss=loss,
-            n_parts=len(sums),
-            **weights,
-        )
+        means = sums.sum(0)
+        metrics, loss = means[:-1], means[-1]
         ctx.mark_non_differentiable(metrics)
         return loss, metrics
 
@@ -153,4 +134,4 @@ class _FusedLoss(torch.autograd.Function):
     def backward(ctx, d_loss, d_metrics):
         # Learners differentiate the loss itself, so that d_loss is 1; others may scale it
         gradients = torch._foreach_mul(list(ctx.saved_tensors), d_loss)
-        return *gradients, *[None] * (8 - len(gradients))
+        return *gradients, *[None] * (7 - len(gradients))

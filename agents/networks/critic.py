@@ -58,7 +58,9 @@ class Critic(nn.Module):
         self, features: torch.Tensor, encoded: torch.Tensor | None = None
     ) -> torch.Tensor:
         """Returns the value from features (..., width) and what `encode` returned."""
-        if self.is_asymmetric:
-            joined = features, self.intake.projected(encoded)
-            features = linear(joined, self.hidden, torch.relu)
-        return self.output(features)
+        if not self.is_asymmetric:
+            return self.output(features)
+        joined = features, self.intake.projected(encoded)
+        if self.output.is_fused(features):
+            return self.output.of_hidden(linear(joined, self.hidden))
+        return self.output(linear(joined, self.hidden, torch.relu))

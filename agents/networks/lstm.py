@@ -23,7 +23,7 @@ from megastep.agents.networks.kernels import lstm as kernels
 from megastep.agents.networks.kernels import lstm_sequence
 from megastep.agents.networks.kernels.program import aligned, check_shapes
 from megastep.agents.networks.lstm_cpu import CpuSequence, fits
-from megastep.agents.networks.precision import cast, compute_dtype, product
+from megastep.agents.networks.precision import cast, cast_joined, compute_dtype, product
 from megastep.arrdict import arrdict
 
 _sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input  # (d, y): d y (1 - y)
@@ -270,18 +270,20 @@ class LSTM(nn.Module):
         return outputs, arrdict(output=last_output, cell=cell)
 
     def _act(self, x, reset, state, is_residual):
-        """Does the same as `forward` for one step on a GPU, without a gradient."""
+        """Does the same as `forward` for one step on a GPU, without a gradient: with one product of
+        inputs and last outputs.
+        """
         dtype = compute_dtype(self.recurrent.weight)
-        parameters = self.input.weight, self.input.bias, self.recurrent.weight
-        input_weight, bias, weight = (cast(leaf, dtype) for leaf in parameters)
+        weight = cast_joined((self.input.weight, self.recurrent.weight), dtype)
+        bias = cast(self.input.bias, dtype)
         last_output, last_cell = (aligned(state[key].float()) for key in ("output", "cell"))
         x, reset = aligned(x[0].to(dtype)), reset[0].contiguous().bool()
-        output = torch.empty_like(last_output, dtype=dtype)
-        hidden, after = torch.empty_like(output), map(torch.empty_like, (last_output, last_cell))
+        output, joined = torch.empty_like(x), x.new_empty(len(x), 2 * self.width)
+        after = map(torch.empty_like, (last_output, last_cell))
         after = arrdict(zip(("output", "cell"), after))
-        kernels.start(reset, last_output, None, hidden, None)
+        kernels.join(reset, x, last_output, joined)
         with torch.autocast(x.device.type, enabled=False):
-            gates = F.linear(x, input_weight, bias).addmm_(hidden, weight.T)
+            gates = F.linear(joined, weight, bias)
         residual = x if is_residual else None
         kernels.act(gates, reset, last_cell, residual, output, after.output, after.cell)
         return output[None], after

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field
 from torch import nn
 
 from megastep.agents.generator import SeededGenerator, stream_seed
-from megastep.agents.networks import cores, encoders, heads
+from megastep.agents.networks import cores, encoders, heads, joint_heads
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.lstm import LSTM
@@ -216,21 +216,38 @@ class Policy(nn.Module):
             encoded = self.critic.encode(privileged, lanes)
             return self._prediction_error(features, encoded)
 
-    def value_and_error(
+    def terms(
         self,
-        features: torch.Tensor,
+        obs: Tree,
+        reset: torch.Tensor,
+        state: arrdict,
+        actions: Tree,
         privileged: Tree | None = None,
         lanes: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Returns `value` and `prediction_error`, None without a `privileged_space`, which need the
-        privileged observations encoded once.
+    ) -> arrdict:
+        """Returns what a loss needs of a sequence, (T, B) float32 each: `logprobs` of the actions,
+        `entropies` of the policy, `values`, and without a `privileged_space` None, with one the
+        `errors` of `prediction_error`. On a GPU the heads are computed together, if they can.
+
+        Args:
+            obs: as for `unroll`, as `reset`, `state` and `lanes`.
+            actions: (T, B, ...); (T, M, ...) with `lanes`.
+            privileged: as for `value`.
         """
+        names = "logprobs", "entropies", "errors", "values"
         with self.compute_dtype():
-            if not self.privileged_space:
-                return self.critic(features), None
-            encoded = self.critic.encode(privileged, lanes)
-            value = self.critic.from_encoded(features, encoded)
-            return value, self._prediction_error(features, encoded)
+            features, _ = self._features(obs, reset, state, lanes)
+            encoded = errors = None
+            if self.privileged_space:
+                encoded = self.critic.encode(privileged, lanes)
+                if joint_heads.fit(self.output, self.critic, features, encoded):
+                    heads_of = self.output, self.critic, self.prediction
+                    terms = joint_heads.joint_terms(*heads_of, features, encoded, actions)
+                    return arrdict(zip(names, terms, strict=True))
+                errors = self._prediction_error(features, encoded)
+            logprobs, entropies = self.output.terms(self.output(features), actions)
+            values = self.critic.from_encoded(features, encoded)
+        return arrdict(zip(names, (logprobs, entropies, errors, values), strict=True))
 
     def _prediction_error(self, features, encoded):
         target = encoded[..., : self.critic.intake.n_features].detach()

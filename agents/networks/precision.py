@@ -15,7 +15,8 @@ class _Casts(threading.local):
     depth = 0
 
     def __init__(self):
-        self.by_weight: dict[tuple, tuple[torch.Tensor, torch.Tensor]] = {}
+        # with the weights themselves, so that no other gets their id
+        self.by_weight: dict[tuple, tuple[Any, torch.Tensor]] = {}
         self.weights: Callable[[], Iterable[torch.Tensor]] = tuple
 
 
@@ -72,9 +73,19 @@ def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.T
     if n_padding:
         result = torch.cat([result, result.new_zeros(n_padding, *weight.shape[1:])])
     if _CASTS.depth:
-        # the weight is kept, so that no other gets its id
         _CASTS.by_weight[key] = weight, result
     return result
+
+
+def cast_joined(weights: tuple[torch.Tensor, ...], dtype: torch.dtype) -> torch.Tensor:
+    """Returns weights (N, n) each, cast as by `cast` and joined along columns: (N, sum of n)."""
+    key = tuple(id(weight) for weight in weights), dtype
+    if key not in _CASTS.by_weight:
+        result = torch.cat([cast(weight, dtype).detach() for weight in weights], 1)
+        if not _CASTS.depth:
+            return result
+        _CASTS.by_weight[key] = weights, result
+    return _CASTS.by_weight[key][1]
 
 
 @torch.no_grad()

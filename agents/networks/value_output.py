@@ -7,9 +7,12 @@ import torch
 from torch import nn
 
 from megastep.agents.distributed.pooling import Moments, pool_moments
-from megastep.agents.networks.kernels import moments as kernels
+from megastep.agents.networks.kernels import heads as kernels
+from megastep.agents.networks.kernels import moments as statistics
+from megastep.agents.networks.kernels.program import aligned
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.masked_moments import masked_moments
+from megastep.agents.networks.precision import compute_dtype
 from megastep.agents.networks.running_norm import mix_moments, store_if
 
 
@@ -38,6 +41,24 @@ class ValueOutput(nn.Module):
         normalised = linear(x, self.linear).float().squeeze(-1)
         return normalised * self.scale + self.mean
 
+    def is_fused(self, x: torch.Tensor) -> bool:
+        """Returns whether `of_hidden` takes features like x (..., width)."""
+        is_bf16 = compute_dtype(self.linear.weight) == torch.bfloat16
+        is_bf16 = is_bf16 and self.linear.weight.dtype == torch.float32
+        n_rows = x.numel() // max(x.shape[-1], 1)
+        is_sized = n_rows <= kernels.MAX_ROWS and not x.shape[-1] % kernels.MULTIPLE
+        return x.is_cuda and is_bf16 and is_sized and not torch.is_grad_enabled()
+
+    def of_hidden(self, hidden: torch.Tensor) -> torch.Tensor:
+        """Returns `self(hidden.relu())` (...,) in one kernel of a GPU, of (..., width) bfloat16."""
+        rows = aligned(hidden.flatten(0, -2))
+        return kernels.values(rows, self.fused_value()).view(hidden.shape[:-1])
+
+    def fused_value(self) -> kernels.Value:
+        """Returns weight, bias and statistics as kernels take them."""
+        weight, bias = (leaf.detach() for leaf in self.linear.parameters())
+        return kernels.Value(aligned(weight), bias, self.scale, self.mean)
+
     def update_stats(self, targets: torch.Tensor, valid: torch.Tensor) -> None:
         """Adds returns to the statistics, those of all ranks together; see `add`.
 
@@ -64,7 +85,7 @@ class ValueOutput(nn.Module):
         """
         tensors = *self.linear.parameters(), self.mean
         if all(x.is_cuda and x.dtype == torch.float32 and x.is_contiguous() for x in tensors):
-            kernels.add_returns(self, moments, is_counted, min_rate)
+            statistics.add_returns(self, moments, is_counted, min_rate)
             return
         n_valid, mean, variance = moments
         count = self.count + 1

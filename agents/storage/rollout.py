@@ -7,7 +7,6 @@ t+1. So row t is a valid transition unless its `reset` is set.
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 
 import torch
 from torch.utils._pytree import tree_flatten, tree_unflatten
@@ -233,23 +232,22 @@ class Rollout:
         self,
         lanes: torch.Tensor,
         names: Sequence[str] = SEQUENCES,
-        others: Mapping[str, torch.Tensor] = MappingProxyType({}),
+        others: Mapping[str, torch.Tensor] = arrdict(),
     ) -> arrdict:
         """Returns whole sequences of some lanes, as a copy.
 
         Args:
             lanes: (M,) int64.
             names: which of the parts to return, besides `state`.
-            others: tensors (T, B, ...) by name, to return as well.
+            others: further tensors (T, B, ...) to return, by name.
 
         Returns:
             arrdict of obs, starts, learns and privileged (if stored), each (T+1, M, ...); actions,
-            logprobs, reward, terminal and truncated, each (T, M, ...); and state (M, ...), the
-            hidden state before row 0; and the others, (T, M, ...).
+            logprobs, reward, terminal and truncated, each (T, M, ...); `others`; and state
+            (M, ...), the hidden state before row 0.
         """
-        parts = {name: getattr(self, name) for name in names}
-        parts = {name: part for name, part in parts.items() if part is not None}
-        parts = arrdict({**parts, **others})
+        parts = arrdict({name: getattr(self, name) for name in names})
+        parts = arrdict({name: part for name, part in parts.items() if part is not None}, **others)
         # the hidden state as one step
         parts["state"] = mapping(lambda leaf: leaf[None])(self.state)
         leaves, spec = tree_flatten(parts)

@@ -22,7 +22,7 @@ def updates(device):
         for k in range(4):
             factors = torch.randn(len(sizes), generator=generator).to(device)
             loss = sum(p.square().sum() * factor for p, factor in zip(params, factors))
-            n_valid, is_enabled = torch.tensor(3, device=device), None
+            n_valid, is_enabled = torch.tensor(3, device=device), True
             if (update, k) == (0, 1):
                 n_valid -= 3
             if (update, k) == (1, 2):

@@ -23,6 +23,7 @@ def case(device, value_clip, auxiliary):
         old_value=draw(3.0),
         valid=draw() > -1,
     )
+    batch["n_valid"] = batch.valid.sum()
     leaves = [draw(0.3) - 1, draw() + 2, draw(3.0), draw() if auxiliary else None]
     leaves[0][~batch.valid] = torch.nan  # whatever is invalid does not count
     leaves = [None if leaf is None else leaf.requires_grad_() for leaf in leaves]
@@ -37,7 +38,7 @@ def test_fused_loss_matches_plain(value_clip, auxiliary):
     results = []
     for device, function in (("cuda", ppo_loss), ("cpu", plain_loss)):
         leaves, batch, scale, settings = case(device, value_clip, auxiliary)
-        loss, metrics = function(*leaves, batch, batch.valid.sum(), scale, settings)
+        loss, metrics = function(*leaves, batch, scale, settings)
         inputs = [leaf for leaf in leaves if leaf is not None]
         gradients = torch.autograd.grad(3 * loss, inputs)
         results.append([loss, *metrics.values(), *gradients])
@@ -51,7 +52,8 @@ def test_fused_loss_matches_plain(value_clip, auxiliary):
 def test_without_valid_steps_nothing_is_learned():
     leaves, batch, scale, settings = case("cuda", None, True)
     batch["valid"] = torch.zeros_like(batch.valid)
-    loss, metrics = ppo_loss(*leaves, batch, batch.valid.sum(), scale, settings)
+    batch["n_valid"] = batch.valid.sum()
+    loss, metrics = ppo_loss(*leaves, batch, scale, settings)
     assert not loss and not any(metrics.values())
     assert not any(gradient.any() for gradient in torch.autograd.grad(loss, leaves))
 
@@ -71,7 +73,7 @@ def test_gae_on_a_gpu_matches_the_cpu(n_steps, n_lanes):
 
 def transposed(leaf):
     """Returns an equal tensor with another memory layout."""
-    return leaf.T.contiguous().T
+    return leaf.T.contiguous().T if leaf.dim() else leaf
 
 
 @pytest.mark.cuda
@@ -96,7 +98,7 @@ def test_fused_loss_takes_other_layouts():
     results = []
     for change in (torch.Tensor.contiguous, transposed):
         inputs = [change(leaf.detach()).requires_grad_() for leaf in leaves]
-        loss, _ = ppo_loss(*inputs, batch.map(change), batch.valid.sum(), scale, settings)
+        loss, _ = ppo_loss(*inputs, batch.map(change), scale, settings)
         results.append([loss.detach(), *torch.autograd.grad(loss, inputs)])
     for one, other in zip(*results, strict=True):
         assert torch.equal(one, other)

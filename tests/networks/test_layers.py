@@ -6,7 +6,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks import heads, layers
-from megastep.agents.networks.precision import ComputeDtype, cast
+from megastep.agents.networks.precision import ComputeDtype, cast, cast_joined
 from megastep.arrdict import arrdict
 
 BF16 = dict(rtol=0, atol=2e-2)  # times the largest number: 8 bits, and sums of them
@@ -32,6 +32,16 @@ def test_weights_are_cast_once_per_context():
         assert torch.equal(cast(weight, torch.bfloat16), weight.bfloat16())
         padded = cast(weight, torch.bfloat16, multiple=8)
     assert padded.shape == (8, 3) and not padded[7].any()
+
+
+def test_weights_are_joined_once_per_context():
+    weights = nn.Parameter(torch.randn(7, 3)), nn.Parameter(torch.randn(7, 2))
+    expected = torch.cat(weights, 1).detach()
+    assert torch.equal(cast_joined(weights, torch.float32), expected)
+    with ComputeDtype("cpu", torch.bfloat16):
+        joined = cast_joined(weights, torch.bfloat16)
+        assert cast_joined(weights, torch.bfloat16) is joined
+    assert torch.equal(joined, expected.bfloat16()) and not joined.requires_grad
 
 
 @pytest.mark.cuda

@@ -263,6 +263,33 @@ def test_kernels_clear_even_nan_at_reset(where, dtype, width):
     assert d_x[:4].isfinite().all() and d_x[4:].isnan().all()
 
 
+@pytest.mark.parametrize("dtype", SLACK, ids=str)
+@pytest.mark.parametrize("is_residual", [False, True])
+@pytest.mark.parametrize("n_lanes, width", [(5, 16), (3, 7), (40, 256)])
+@torch.no_grad()
+def test_acting_matches_a_sequence_of_one_step(where, dtype, is_residual, n_lanes, width):
+    torch.manual_seed(0)
+    lstm, x = LSTM(width), torch.randn(1, n_lanes, width).bfloat16().float()
+    reset = torch.arange(n_lanes)[None] % 3 == 1
+    state = arrdict({key: torch.randn(n_lanes, width) for key in ("output", "cell")})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lstm_module, "fits", lambda x: False)
+        patch.setattr(lstm_module, "_steps", lambda x: lstm_module._CPU_STEPS)
+        expected, expected_after = lstm(x, reset, state, is_residual)
+    state.output[1] = torch.nan  # cleared by the reset
+    state.cell[1] = torch.nan
+    with torch.autocast(where, torch.bfloat16, enabled=dtype == torch.bfloat16):
+        result, after = lstm.to(where)._act(
+            x.to(where), reset.to(where), state.to(where), is_residual
+        )
+    assert result.dtype == dtype and after.output.dtype == after.cell.dtype == torch.float32
+    results = [leaf.float().cpu() for leaf in (result, after.output, after.cell)]
+    expected = expected, expected_after.output, expected_after.cell
+    assert_close(("outputs", "output", "cell"), results, expected, SLACK[dtype])
+    if not is_residual:
+        assert torch.equal(results[0][0], results[1])
+
+
 @pytest.mark.parametrize("width", [4, 3])
 def test_gates_saturate_and_nan_propagates(where, width):
     """All gates of a lane have the same value before their activation."""

@@ -7,7 +7,7 @@ from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
 from megastep.agents.algorithms.kernels.program import n_blocks
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
-from megastep.agents.networks.kernels import layers, moments
+from megastep.agents.networks.kernels import heads, layers, moments
 from megastep.agents.networks.kernels.program import CORES
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.networks.value_output import ValueOutput
@@ -286,6 +286,46 @@ def test_categorical_actions():
             assert torch.equal(one, other), i
 
 
+def test_heads():
+    n_rows, sizes, strip = 300, heads.Sizes(11, 2, 5, 264), CORES.constants["STRIP"]
+    first_score, _, n_columns = sizes.starts
+    columns, target = randn(n_rows, n_columns).to(BF16), randn(n_rows, first_score).to(BF16)
+    actions = torch.randint(5, (P, n_rows, 2), device="cuda")
+    values = heads.Value(randn(1, 264), randn(1), randn(), randn())
+    results, gradients = torch.randn(2, 4, P, n_rows, device="cuda")
+    names, n_strips = ("logprobs", "entropies", "errors", "values"), -(-n_rows // strip)
+    inputs = dict(product=columns, target=target, actions=actions)
+    weights = {f"value_{name}": leaf for name, leaf in values._asdict().items()}
+    launch(
+        *(CORES, "heads_forward", (n_strips, P), CORES.constants["STRIP_THREADS"]),
+        **inputs,
+        **weights,
+        **dict(zip(names, results)),
+        n_rows=n_rows,
+        **sizes._asdict(),
+    )
+    d_columns, sums = torch.empty_like(columns), randn(n_strips, n_columns + 264 + 8)
+    launch(
+        *(CORES, "heads_backward", (3 * n_strips, P), CORES.constants["STRIP_THREADS"]),
+        **inputs,
+        value_weight=values.weight,
+        value_scale=values.scale,
+        **{f"d_{name}": d for name, d in zip(names, gradients)},
+        d_product=d_columns,
+        sums=sums,
+        n_rows=n_rows,
+        **sizes._asdict(),
+    )
+    for i in range(P):
+        of_policy = columns[i], target[i], actions[i], heads.Value(*(leaf[i] for leaf in values))
+        for name, one, other in zip(names, results, heads.forward(*of_policy, sizes)):
+            assert torch.equal(one[i], other), name
+        alone = heads.backward(*of_policy, sizes, tuple(gradients[:, i].contiguous()))
+        assert torch.equal(d_columns[i], alone[0]), i
+        expected = torch.cat([leaf.flatten() for leaf in alone[1:]])
+        torch.testing.assert_close(sums[i].sum(0)[: len(expected)], expected)
+
+
 def test_adam():
     """Each policy has its own step size, count of steps and norm; one takes no step."""
     shapes = (5, 3), (70_000,), (1,)
@@ -377,9 +417,8 @@ def test_ppo_loss():
     )
     value_scale = randn().abs() + 0.5
     gradients = {f"d_{name}": randn(n_steps, n_lanes) for name in names}
-    n_sums = ALGORITHMS.constants["N_SUMS"]
-    sums, metrics_of_all, losses = randn(n_blocks(n_rows), n_sums), randn(n_sums), randn()
-    n_valid = batch.valid.sum((1, 2))
+    sums = randn(n_blocks(n_rows), ALGORITHMS.constants["N_SUMS"])
+    batch["n_valid"] = batch.valid.sum((1, 2))
     launch(
         *(ALGORITHMS, "ppo_loss", (n_blocks(n_rows), P)),
         **inputs,
@@ -388,28 +427,18 @@ def test_ppo_loss():
         advantages=batch.advantages,
         targets=batch.targets,
         valid=batch.valid,
-        n_valid=n_valid,
+        n_valid=batch.n_valid,
         value_scale=value_scale,
         **gradients,
         sums=sums,
         n_rows=n_rows,
         **settings._asdict(),
     )
-    names_of_weights = "value_coef", "entropy_coef", "auxiliary_coef"
-    launch(
-        *(ALGORITHMS, "ppo_metrics", (1, P), WARP * n_sums),
-        sums=sums,
-        n_valid=n_valid,
-        metrics=metrics_of_all,
-        loss=losses,
-        n_parts=n_blocks(n_rows),
-        **{name: settings._asdict()[name] for name in names_of_weights},
-    )
     for i in range(P):
         leaves = [inputs[name][i].clone().requires_grad_() for name in names]
-        loss, metrics = ppo_loss(*leaves, batch[i], n_valid[i], value_scale[i], settings)
+        loss, metrics = ppo_loss(*leaves, batch[i], value_scale[i], settings)
         alone = torch.autograd.grad(loss, leaves)
         for one, other in zip(gradients.values(), alone, strict=True):
             assert torch.equal(one[i], other), i
-        assert torch.equal(metrics_of_all[i], torch.stack([*metrics.values()]))
-        assert torch.equal(losses[i], loss)
+        means = torch.stack([*metrics.values(), loss.detach()])
+        torch.testing.assert_close(sums[i].sum(0), means)

@@ -8,11 +8,12 @@ import torch
 
 from megastep import spaces
 from megastep.agents.generator import SeededGenerator, stream_seed
+from megastep.agents.networks import joint_heads
 from megastep.agents.networks import layers as layers_module
 from megastep.agents.networks.cores import CORES
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, stack
-from megastep.dotdict import leaves
+from megastep.dotdict import leaves, mapping
 
 T, B = 7, 5
 OBS = arrdict(rgb=spaces.MultiImage(1, 3, 1, 16), imu=spaces.MultiVector(1, 3))
@@ -204,14 +205,10 @@ def learnt(policy, world, privileged, lanes, weights):
     sum of it, each on the CPU by name.
     """
     starts, state = world.reset[:, lanes], policy.initial(len(lanes))
-    with policy.compute_dtype():
-        now = policy.unroll(world.obs, starts, state, lanes)
-        # the same actions whatever the logits are
-        actions = now.logits.map(lambda leaf: (weights[0] > 0).long()[..., None])
-        logprobs, entropies = policy.output.terms(now.logits, actions)
-        values = policy.value(now.features, privileged, lanes)
-        errors = policy.prediction_error(now.features, privileged, lanes)
-    outputs = dict(logprobs=logprobs, entropies=entropies, values=values, errors=errors)
+    now = policy.unroll(world.obs, starts, state, lanes)
+    # the same actions whatever the logits are
+    actions = mapping(lambda leaf: (weights[0] > 0).long()[..., None])(now.logits)
+    outputs = policy.terms(world.obs, starts, state, actions, privileged, lanes)
     assert all(output.dtype == torch.float32 for output in outputs.values())
     sum((w * output).sum() for w, output in zip(weights, outputs.values())).backward()
     gradients = {name: p.grad for name, p in policy.named_parameters()}
@@ -219,15 +216,38 @@ def learnt(policy, world, privileged, lanes, weights):
     return {name: leaf.detach().float().cpu() for name, leaf in results.items()}
 
 
+def test_terms_are_those_of_an_unroll():
+    policy, world = Policy(OBS, MOVES, PRIVILEGED, width=32), worlds()
+    state, generator = policy.initial(B), torch.Generator().manual_seed(1)
+    privileged = torch.randn(T, B, *PRIVILEGED.shape, generator=generator)
+    now = policy.unroll(world.obs, world.reset, state)
+    actions = policy.output.sample(now.logits, generator)
+    terms = policy.terms(world.obs, world.reset, state, actions, privileged)
+    expected = dict(
+        logprobs=policy.output.logprob(now.logits, actions),
+        entropies=policy.output.entropy(now.logits),
+        errors=policy.prediction_error(now.features, privileged),
+        values=policy.value(now.features, privileged),
+    )
+    assert terms.keys() == expected.keys()
+    for name, leaf in expected.items():
+        torch.testing.assert_close(terms[name], leaf, msg=name)
+    plain = Policy(OBS, MOVES, width=32)
+    assert plain.terms(world.obs, world.reset, state, actions).errors is None
+
+
 def relative_error(one, other):
     return ((one - other).norm() / other.norm()).item()
 
 
 @pytest.mark.cuda
+@pytest.mark.parametrize("moves", [MOVES, spaces.MultiDiscrete(1, 7)])
 @pytest.mark.parametrize("layers", [1, 3])
 @pytest.mark.parametrize("core", CORES)
-def test_bf16_policy_on_a_gpu_matches_the_plain_forms_in_float32(core, layers, monkeypatch):
-    """What learning computes, for some lanes. The LSTM of 256 units runs on chip."""
+def test_bf16_policy_on_a_gpu_matches_the_plain_forms_in_float32(core, layers, moves, monkeypatch):
+    """What learning computes, for some lanes. The LSTM of 256 units runs on chip; with actions of
+    one kind, the heads are computed together.
+    """
     n_steps, n_lanes = 9, 45
     generator = torch.Generator().manual_seed(0)
 
@@ -240,17 +260,20 @@ def test_bf16_policy_on_a_gpu_matches_the_plain_forms_in_float32(core, layers, m
     privileged = draw(PRIVILEGED).float()
     lanes = torch.randperm(n_lanes, generator=generator)[:37]
     weights = torch.randn(4, n_steps, len(lanes), generator=generator)
-    plain = Policy(OBS, MOVES, PRIVILEGED, core=core, layers=layers)
+    plain = Policy(OBS, moves, PRIVILEGED, core=core, layers=layers)
+    outputs = plain.output.outputs.values() if moves is MOVES else [plain.output]
     with torch.no_grad():
-        for output in plain.output.outputs.values():
+        for output in outputs:
             output.linear.weight.mul_(100)  # far from uniform
     plain.update_stats(world[0].obs, privileged[0])
     fused, launches = copy.deepcopy(plain).cuda(), []
     expected = learnt(plain, world, privileged, lanes, weights)
-    kernel = layers_module.kernels.bias_gradient
-    monkeypatch.setattr(
-        layers_module.kernels, "bias_gradient", lambda *d: launches.append(d) or kernel(*d)
-    )
+    for module, name in (
+        (layers_module.kernels, "bias_gradient"),
+        (joint_heads.kernels, "backward"),
+    ):
+        kernel = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *d, k=kernel, n=name: launches.append(n) or k(*d))
     on_gpu = (leaf.cuda() for leaf in (world, privileged, lanes, weights))
     for name, leaf in learnt(fused, *on_gpu).items():
         assert leaf.shape == expected[name].shape
@@ -258,8 +281,9 @@ def test_bf16_policy_on_a_gpu_matches_the_plain_forms_in_float32(core, layers, m
         # whose input is near 0 may pass a gradient in one of both forms only
         limit = 0.2 if name in dict(plain.named_parameters()) else 0.03
         assert relative_error(leaf, expected[name]) < limit, name
-    # intakes of actor and critic, the critic's hidden layer and output, prediction, two heads
-    assert len(launches) >= 7
+    # intakes of actor and critic, the critic's hidden layer and output, prediction, two outputs
+    assert launches.count("bias_gradient") >= (7 if moves is MOVES else 2)
+    assert launches.count("backward") == (moves is not MOVES)
 
 
 def test_wrong_numbers_of_lanes_are_named():

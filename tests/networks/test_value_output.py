@@ -1,5 +1,6 @@
 """PopArt: updating the statistics of returns keeps the predictions."""
 
+import copy
 import math
 
 import pytest
@@ -81,3 +82,20 @@ def test_a_gpu_adds_the_same_moments():
             close = dict(rtol=1e-5, atol=1e-6)
             torch.testing.assert_close(other.state_dict()[name].cpu(), tensor, **close)
     assert one.count == 3
+
+
+@pytest.mark.cuda
+def test_statistics_on_a_gpu_match_the_cpu():
+    torch.manual_seed(0)
+    plain = ValueOutput(WIDTH)
+    fused = copy.deepcopy(plain).cuda()
+    calls = [(torch.randn(64) * scale + 3 * scale, VALID) for scale in (2.0, 40.0, 0.0, 1e-9)]
+    calls += [(torch.full((64,), torch.nan), VALID), (torch.ones(64), ~VALID)] + 30 * calls[:1]
+    for targets, valid in calls:
+        before = [leaf.clone() for leaf in fused.state_dict().values()]
+        plain.update_stats(targets, valid)
+        fused.update_stats(targets.cuda(), valid.cuda())
+        for (name, leaf), other in zip(plain.state_dict().items(), fused.state_dict().values()):
+            torch.testing.assert_close(other.cpu(), leaf, rtol=1e-4, atol=1e-5, msg=name)
+        if not (targets.isfinite() & valid).any():
+            assert all(map(torch.equal, before, fused.state_dict().values()))

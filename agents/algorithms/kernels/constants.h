@@ -9,4 +9,4 @@ constexpr int CHECKED_WORDS = 4;      // of 16 bytes, that a thread reads
 constexpr int RECORD_THREADS = 1024;
 constexpr int EPISODE_METRICS = 8;   // of a world
 constexpr int GROUPS_THREADS = 256;  // of a block, for one sum over episodes
-constexpr int N_SUMS = 6;            // of PPO's loss: see PpoLossParams
+constexpr int N_SUMS = 7;            // of PPO's loss: see PpoLossParams

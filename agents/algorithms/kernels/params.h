@@ -43,21 +43,12 @@ struct PpoLossParams {
     float* d_entropies;          // (P, n_rows)
     float* d_values;             // (P, n_rows)
     float* d_errors;             // (P, n_rows)
-    float* sums;  // (P, n_parts, N_SUMS): policy, value, entropy, kl, clip_fraction, auxiliary
+    // (P, n_blocks, N_SUMS), shares of means: policy, value, entropy, kl, clip_fraction, auxiliary,
+    // loss
+    float* sums;
     int n_rows;
     float clip;
     float value_clip;
-    float value_coef;
-    float entropy_coef;
-    float auxiliary_coef;
-};
-
-struct PpoMetricsParams {
-    const float* sums;         // (P, n_parts, N_SUMS)
-    const long long* n_valid;  // (P)
-    float* metrics;            // (P, N_SUMS), means over the valid rows
-    float* loss;               // (P)
-    int n_parts;
     float value_coef;
     float entropy_coef;
     float auxiliary_coef;

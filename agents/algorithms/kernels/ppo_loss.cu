@@ -1,11 +1,10 @@
-// PPO's loss, with its gradients and metrics. One thread per row; a block adds up its rows in a
-// fixed order, and another kernel the blocks. Blocks along y are policies.
+// PPO's loss, with its gradients and metrics, all means over valid rows. One thread per row; a
+// block adds up its rows in a fixed order, the caller the blocks. Blocks along y are policies.
 #include "common/constants.h"
 #include "constants.h"
 #include "params.h"
 
 #define KERNEL extern "C" __global__ void
-#define BOUNDS(n_threads) __launch_bounds__(n_threads)
 
 KERNEL ppo_loss(PpoLossParams p) {
     int of_policy = blockIdx.x * blockDim.x + threadIdx.x;
@@ -41,6 +40,10 @@ KERNEL ppo_loss(PpoLossParams p) {
             sums[3] = ratio - 1.f - log_ratio;
             sums[4] = ratio != clipped ? 1.f : 0.f;
             sums[5] = p.errors ? p.errors[row] : 0.f;
+            sums[6] = sums[0] + p.value_coef * sums[1] - p.entropy_coef * sums[2] +
+                      p.auxiliary_coef * sums[5];
+            for (int i = 0; i < N_SUMS; i++)
+                sums[i] *= share;
         }
         p.d_logprobs[row] = d_logprob;
         p.d_values[row] = d_value;
@@ -62,27 +65,4 @@ KERNEL ppo_loss(PpoLossParams p) {
             total += of_warps[warp][threadIdx.x];
         p.sums[(policy * gridDim.x + blockIdx.x) * N_SUMS + threadIdx.x] = total;
     }
-}
-
-static_assert(N_SUMS * WARP == 192);
-
-// One block of N_SUMS warps, each of which adds up one sum of all blocks.
-KERNEL BOUNDS(192) ppo_metrics(PpoMetricsParams p) {
-    __shared__ float metrics[N_SUMS];
-    int policy = blockIdx.y, i = threadIdx.x / WARP;
-    const float* sums = p.sums + (long long)policy * p.n_parts * N_SUMS + i;
-    float sum = 0.f;
-#pragma unroll 8
-    for (int block = threadIdx.x % WARP; block < p.n_parts; block += WARP)
-        sum += sums[block * N_SUMS];
-    for (int mask = WARP / 2; mask; mask /= 2)
-        sum += __shfl_xor_sync(~0u, sum, mask);
-    if (threadIdx.x % WARP == 0) {
-        metrics[i] = sum / (float)max(p.n_valid[policy], 1ll);
-        p.metrics[policy * N_SUMS + i] = metrics[i];
-    }
-    __syncthreads();
-    if (!threadIdx.x)
-        p.loss[policy] = metrics[0] + p.value_coef * metrics[1] - p.entropy_coef * metrics[2] +
-                         p.auxiliary_coef * metrics[5];
 }

@@ -4,58 +4,43 @@
 #include "constants.h"
 #include "lanes.h"
 #include "params.h"
+#include "strips.h"
 
 KERNEL BOUNDS(256) bias_gradient(BiasGradientParams p) {
-    constexpr int N = 8;                                      // columns that a thread handles
-    constexpr int AT_ONCE = 4, WARPS = STRIP_THREADS / WARP;  // rows whose loads do not wait
-    __shared__ float of_warps[WARPS][N * WARP];
-    int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
+    constexpr int N = 8;  // columns that a thread handles
     int n_words = p.n_columns / N, n_parts = (n_words + WARP - 1) / WARP;  // of a row
     int first_word = WARP * (blockIdx.y % n_parts);
-    int words = min(n_words - first_word, WARP);      // of this block
-    int groups = WARP / words, group = lane / words;  // rows that a warp handles at once
-    int word = first_word + lane % words;
-    long long policy = blockIdx.y / n_parts, strip = blockIdx.x, first = policy * p.n_rows;
-    int end = min(((int)strip + 1) * STRIP, p.n_rows), step = WARPS * groups;
+    Strip strip = find_strip(blockIdx.x, min(n_words - first_word, WARP), p.n_rows);
+    int word = first_word + strip.word;
+    long long policy = blockIdx.y / n_parts, first = policy * p.n_rows;
     float sums[N];
     clear(sums);
-    if (group < groups)
-        for (int start = (int)strip * STRIP + warp * groups + group; start < end;
-             start += AT_ONCE * step) {
-            float values[AT_ONCE][N], activated[AT_ONCE][N];
+    for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
+        float values[AT_ONCE][N], activated[AT_ONCE][N];
 #pragma unroll
-            for (int i = 0; i < AT_ONCE; i++) {
-                int row = min(start + i * step, end - 1);
-                long long at = (first + row) * p.n_columns + word * N;
-                read<Bfloat16>(values[i], p.d, at);
-                if (p.activated)
-                    read<Bfloat16>(activated[i], p.activated, at);
-            }
-#pragma unroll
-            for (int i = 0; i < AT_ONCE; i++) {
-                int row = start + i * step;
-                if (row >= end)
-                    break;
-                if (p.activated) {
-                    for (int n = 0; n < N; n++)
-                        values[i][n] = activated[i][n] <= 0.f ? 0.f : values[i][n];
-                    write<Bfloat16>(p.d_masked, (first + row) * p.n_columns + word * N, values[i]);
-                }
-                for (int n = 0; n < N; n++)
-                    sums[n] += values[i][n];
-            }
+        for (int i = 0; i < AT_ONCE; i++) {
+            int row = min(start + i * strip.step, strip.end - 1);
+            long long at = (first + row) * p.n_columns + word * N;
+            read<Bfloat16>(values[i], p.d, at);
+            if (p.activated)
+                read<Bfloat16>(activated[i], p.activated, at);
         }
-    for (int n = 0; n < N; n++)
-        of_warps[warp][N * lane + n] = sums[n];
-    __syncthreads();
-    float* target = p.sums + (policy * p.n_strips + strip) * p.n_columns + N * first_word;
-    for (int column = threadIdx.x; column < words * N; column += STRIP_THREADS) {
-        float total = 0.f;
-        for (int i = 0; i < WARPS; i++)
-            for (int other = 0; other < groups; other++)
-                total += of_warps[i][other * words * N + column];
-        target[column] = total;
+#pragma unroll
+        for (int i = 0; i < AT_ONCE; i++) {
+            int row = start + i * strip.step;
+            if (row >= strip.end)
+                break;
+            if (p.activated) {
+                for (int n = 0; n < N; n++)
+                    values[i][n] = activated[i][n] <= 0.f ? 0.f : values[i][n];
+                write<Bfloat16>(p.d_masked, (first + row) * p.n_columns + word * N, values[i]);
+            }
+            for (int n = 0; n < N; n++)
+                sums[n] += values[i][n];
+        }
     }
+    float* target = p.sums + (policy * p.n_strips + blockIdx.x) * p.n_columns + N * first_word;
+    add_up(sums, strip, target, strip.words * N);
 }
 
 // Adds up rows in a fixed order. A warp handles 32 columns of every eighth row.

@@ -2,7 +2,8 @@
 
 import torch
 
-from megastep.agents.networks.kernels.program import CORES, launch_on_gpu
+from megastep.agents.networks.kernels.layers import launch_for_policy
+from megastep.agents.networks.kernels.program import CORES
 
 _MAX_ROWS, _THREADS = CORES.constants["CAST_ROWS"], CORES.constants["CAST_THREADS"]
 
@@ -31,7 +32,7 @@ def cast(weights: list[torch.Tensor], multiple: int) -> list[torch.Tensor]:
                 )
             )
             n_blocks += max(1, -(-target.numel() // (8 * _THREADS)))
-        launch_on_gpu(
+        launch_for_policy(
             *("cast", memory, n_blocks * _THREADS),
             block=_THREADS,
             rows=b"".join(rows),

@@ -7,8 +7,7 @@ choices.
 import torch
 
 from megastep.agents.networks.kernels.program import CORES, DTYPES
-from megastep.agents.networks.kernels.program import launch_on_gpu as _launch
-from megastep.kernels.build.launch import WARP
+from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
 
 MAX_LEAVES = CORES.constants["MAX_LEAVES"]
 MAX_CHOICES = CORES.constants["ACT_THREADS"]
@@ -48,7 +47,7 @@ def normalise(
         )
         for leaf, mean, scale in zip(leaves, means, scales, strict=True)
     ]
-    _launch(
+    launch_for_policy(
         "normalise",
         features,
         n_columns // 4 * -(-n_selected // CORES.constants["NORMALISED_ROWS"]),
@@ -78,7 +77,7 @@ def bias_gradient(
     n_strips = -(-n_rows // _STRIP)
     d_masked = d if activated is None else torch.empty_like(d)
     sums = d.new_empty(n_strips, n_columns, dtype=torch.float32)
-    _launch(
+    launch_for_policy(
         "bias_gradient",
         d,
         _STRIP_THREADS * n_strips,
@@ -99,7 +98,7 @@ def sum_rows(rows: torch.Tensor) -> torch.Tensor:
     """Returns the sums (columns,) of rows (n, columns) float32, always in the same order."""
     sums = rows.new_empty(rows.shape[1])
     n_threads = _STRIP_THREADS * -(-rows.shape[1] // WARP)
-    _launch(
+    launch_for_policy(
         "sum_rows",
         rows,
         n_threads,
@@ -135,7 +134,7 @@ def act(
     logits = features.new_empty(n_lanes, *shape, dtype=torch.float32)
     actions = torch.empty(n_lanes, shape[0], dtype=torch.int64, device=features.device)
     logprobs = torch.empty_like(logits[:, 0, 0])
-    _launch(
+    launch_for_policy(
         f"categorical_act_{DTYPES[features.dtype]}",
         features,
         CORES.constants["ACT_THREADS"] * n_lanes,
@@ -162,7 +161,7 @@ def terms(logits: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, to
         actions: (rows, A) int64.
     """
     logprobs, entropies = logits.new_empty(2, len(logits))
-    _launch(
+    launch_for_policy(
         "categorical_terms",
         logits,
         len(logits),
@@ -181,7 +180,7 @@ def terms_backward(
 ) -> torch.Tensor:
     """Returns the gradient of `terms`' logits."""
     d_logits = torch.empty_like(logits)
-    _launch(
+    launch_for_policy(
         "categorical_terms_backward",
         logits,
         len(logits),
@@ -198,3 +197,15 @@ def _rows(logits, actions):
     return dict(
         logits=logits, actions=actions, n_rows=n_rows, n_agents=n_agents, n_choices=n_choices
     )
+
+
+def launch_for_policy(operation, tensor, n_threads, n_blocks_y=1, block=BLOCK, **fields):
+    """Launches an operation for one policy on a tensor's GPU."""
+    values = {
+        name: field.data_ptr() if isinstance(field, torch.Tensor) else 0 if field is None else field
+        for name, field in fields.items()
+    }
+    pack = getattr(CORES.params, CORES.cuda_operations[operation])
+    if n_threads and n_blocks_y:
+        n_blocks = -(-n_threads // block), n_blocks_y
+        launch_blocks(CORES, operation, pack(**values), tensor.device, n_blocks, block)

@@ -41,12 +41,26 @@ struct LstmStart {
         if (resets)
             clear(hidden);
         write<T>(p.hidden, place.unit, hidden);
-        if (!p.last_cell)
-            return;
         read<float>(cell, p.last_cell, place.unit);
         if (resets)
             clear(cell);
         write<float>(p.cell, place.unit, cell);
+    }
+};
+
+// What a step multiplies by its weights: a row has the inputs, then the last outputs.
+struct LstmJoin {
+    static constexpr int N_GATES = 2;
+
+    template <class T, int N>
+    DEVICE void run(const LstmJoinParams& p, const Place& place) {
+        float x[N], hidden[N];
+        read<T>(x, p.x, place.unit);
+        read<float>(hidden, p.last_output, place.unit);
+        if (p.reset[place.lane])
+            clear(hidden);
+        write<T>(p.joined, place.gate, x);
+        write<T>(p.joined, place.gate + p.width, hidden);
     }
 };
 
@@ -143,6 +157,8 @@ struct LstmBackward {
 
 KERNEL BOUNDS(64) lstm_start_float32(LstmStartParams p) { run<LstmStart, float>(p); }
 KERNEL BOUNDS(64) lstm_start_bfloat16(LstmStartParams p) { run<LstmStart, Bfloat16>(p); }
+KERNEL BOUNDS(64) lstm_join_float32(LstmJoinParams p) { run<LstmJoin, float>(p); }
+KERNEL BOUNDS(64) lstm_join_bfloat16(LstmJoinParams p) { run<LstmJoin, Bfloat16>(p); }
 KERNEL BOUNDS(64) lstm_act_float32(LstmActParams p) { run<LstmAct, float>(p); }
 KERNEL BOUNDS(64) lstm_act_bfloat16(LstmActParams p) { run<LstmAct, Bfloat16>(p); }
 KERNEL BOUNDS(64) lstm_forward_float32(LstmForwardParams p) { run<LstmForward, float>(p); }

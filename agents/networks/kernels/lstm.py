@@ -1,5 +1,5 @@
 """The LSTM on a GPU between its matrix products: one kernel before the first step, one per step,
-and one per backward step; another one per step when acting.
+and one per backward step; two others per step when acting.
 
 B lanes, W units. All tensors are contiguous; if W is a multiple of 4, they start at a multiple of
 four elements. Gates are before activation. Gates, outputs, hidden states and their gradients are in
@@ -15,9 +15,9 @@ def start(reset, last_output, last_cell, hidden, cell):
     Args:
         reset: (B,) bool, of the first step.
         last_output: (B, W) float32.
-        last_cell: (B, W) float32; None if the cell is not wanted.
+        last_cell: (B, W) float32.
         hidden: (B, W), written.
-        cell: (B, W), written; None if it is not wanted.
+        cell: (B, W), written.
     """
     run(
         "lstm_start",
@@ -31,8 +31,28 @@ def start(reset, last_output, last_cell, hidden, cell):
     )
 
 
+def join(reset, x, last_output, joined):
+    """Joins what the gates are computed from: x and the last output, zeroed where `reset`.
+
+    Args:
+        reset: (B,) bool.
+        x: (B, W).
+        last_output: (B, W) float32.
+        joined: (B, 2 W), written.
+    """
+    run(
+        "lstm_join",
+        x.dtype,
+        last_output,
+        reset=reset,
+        x=x,
+        last_output=last_output,
+        joined=joined,
+    )
+
+
 def act(gates, reset, last_cell, residual, output, next_output, next_cell):
-    """Computes one step without a gradient. The recurrent input was `start`'s, without a cell.
+    """Computes one step without a gradient, from gates of what `join` joined.
 
     Args:
         gates: (B, 4 W).

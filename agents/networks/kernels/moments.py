@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import torch
 
-from megastep.agents.networks.kernels.program import CORES, launch_on_gpu
+from megastep.agents.networks.kernels.layers import launch_for_policy
+from megastep.agents.networks.kernels.program import CORES
 
 MAX_LEAVES = CORES.constants["MAX_LEAVES"]
 MAX_ARRAYS = CORES.constants["MASKED_ARRAYS"]
@@ -39,7 +40,7 @@ def moments(
         )
         for leaf, n in zip(leaves, n_statistics, strict=True)
     ]
-    launch_on_gpu(
+    launch_for_policy(
         "moments",
         results,
         total * threads,
@@ -81,7 +82,9 @@ def add_moments(norms: list, all_moments: list) -> None:
         )
     threads = CORES.constants["MOMENTS_THREADS"]
     n_threads = threads * len(packed)
-    launch_on_gpu("add_moments", norms[0].mean, n_threads, block=threads, norms=b"".join(packed))
+    launch_for_policy(
+        "add_moments", norms[0].mean, n_threads, block=threads, norms=b"".join(packed)
+    )
 
 
 def masked_moments(
@@ -99,7 +102,7 @@ def masked_moments(
     moments = tensor.new_empty(len(arrays), 2)
     n_valid = torch.empty((), dtype=torch.int64, device=tensor.device)
     pack, shape = CORES.params.MaskedArrayParams, dict(n_blocks_y=len(arrays), block=_THREADS)
-    launch_on_gpu(
+    launch_for_policy(
         *("masked_parts", tensor, n_parts * _THREADS),
         **shape,
         arrays=b"".join(pack(values=array.data_ptr()) for array in arrays),
@@ -108,7 +111,7 @@ def masked_moments(
         n=n_numbers,
         n_arrays=len(arrays),
     )
-    launch_on_gpu(
+    launch_for_policy(
         *("masked_moments", tensor, _THREADS),
         **shape,
         parts=parts,
@@ -134,7 +137,7 @@ def normalise_masked(
     normalised = torch.empty_like(x)
     statistics = dict(mean=mean, variance=variance)
     fields = dict(values=x, valid=valid, **statistics, normalised=normalised, n=x.numel())
-    launch_on_gpu("normalise_masked", x, x.numel(), **fields)
+    launch_for_policy("normalise_masked", x, x.numel(), **fields)
     return normalised
 
 
@@ -148,7 +151,7 @@ def add_returns(output, moments: tuple, is_counted: torch.Tensor | None, min_rat
         min_rate: smallest weight of the moments.
     """
     n_valid, mean, variance = moments
-    launch_on_gpu(
+    launch_for_policy(
         *("add_returns", output.mean, _THREADS),
         block=_THREADS,
         weight=output.linear.weight,

@@ -10,9 +10,19 @@
 struct LstmStartParams {
     const unsigned char* reset;  // (B) at the first step
     const float* last_output;    // (B, W)
-    const float* last_cell;      // (B, W); null: `cell` is not wanted
+    const float* last_cell;      // (B, W)
     void* hidden;                // (B, W) compute
     float* cell;                 // (B, W)
+    int n_lanes;
+    int width;
+    int n_units;  // units per thread
+};
+
+struct LstmJoinParams {
+    const unsigned char* reset;  // (B)
+    const void* x;               // (B, W) compute
+    const float* last_output;    // (B, W)
+    void* joined;                // (B, 2 W) compute: x, then the last output
     int n_lanes;
     int width;
     int n_units;  // units per thread
@@ -245,6 +255,47 @@ struct CategoricalTermsBackwardParams {
     int n_rows;
     int n_agents;
     int n_choices;
+};
+
+// The heads of an update. A row of their product has the prediction, the actions' scores, and the
+// critic's hidden layer of W units before its ReLU, each padded to a multiple of 8.
+struct HeadsForwardParams {
+    const void* product;        // (P, n_rows, n_columns) bfloat16
+    const void* target;         // (P, n_rows, n_predicted, padded) bfloat16, of the prediction
+    const long long* actions;   // (P, n_rows, A)
+    const float* value_weight;  // (P, W)
+    const float* value_bias;    // (P)
+    const float* value_scale;   // (P)
+    const float* value_mean;    // (P)
+    float* logprobs;            // (P, n_rows), of the joint actions; null: not wanted
+    float* entropies;           // (P, n_rows)
+    float* errors;              // (P, n_rows), of the prediction; null: not wanted
+    float* values;              // (P, n_rows)
+    int n_rows;                 // at most 2^31 - STRIP
+    int n_predicted;
+    int n_agents;
+    int n_choices;
+    int width;  // a multiple of 8
+};
+
+struct HeadsBackwardParams {
+    const void* product;
+    const void* target;
+    const long long* actions;
+    const float* value_weight;
+    const float* value_scale;
+    const float* d_logprobs;   // (P, n_rows)
+    const float* d_entropies;  // (P, n_rows)
+    const float* d_errors;     // (P, n_rows)
+    const float* d_values;     // (P, n_rows)
+    void* d_product;           // (P, n_rows, n_columns) bfloat16
+    float* sums;               // (P, n_strips, n_columns + W + 8), of d_product, and the gradients
+                               // of the value's weight and bias, over STRIP rows each
+    int n_rows;
+    int n_predicted;
+    int n_agents;
+    int n_choices;
+    int width;
 };
 
 // The LSTM over a whole sequence, on the CPU. Everything is float32, W is a multiple of 16.

@@ -9,7 +9,7 @@ from megastep.arrdict import arrdict
 from megastep.engine.devices import threads
 from megastep.kernels.build import program
 from megastep.kernels.build.compile import EngineError, cpu
-from megastep.kernels.build.launch import BLOCK, launch, launch_blocks
+from megastep.kernels.build.launch import launch
 from megastep.kernels.build.program import Program
 
 DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
@@ -66,31 +66,6 @@ def run_on_cpu(operation: str, **fields) -> None:
     values = {name: _value(field) for name, field in fields.items()}
     packed = pack(**values, n_threads=threads())
     launch(CORES, operation, packed, CPU, 0)
-
-
-def launch_on_gpu(
-    operation: str,
-    tensor: torch.Tensor,
-    n_threads: int,
-    n_blocks_y: int = 1,
-    block: int = BLOCK,
-    **fields,
-) -> None:
-    """Launches an operation for one policy on a tensor's GPU.
-
-    Args:
-        operation: its name.
-        tensor: any tensor there.
-        n_threads: along x, rounded up to whole blocks.
-        n_blocks_y: blocks along y.
-        block: threads of a block.
-        fields: the fields of its struct. A tensor stands for its address, None for null.
-    """
-    values = {name: _value(field) for name, field in fields.items()}
-    pack = getattr(CORES.params, CORES.cuda_operations[operation])
-    if n_threads and n_blocks_y:
-        n_blocks = -(-n_threads // block), n_blocks_y
-        launch_blocks(CORES, operation, pack(**values), tensor.device, n_blocks, block)
 
 
 def _value(field):

@@ -1,0 +1,252 @@
+// The heads of an update, from one product of the features with the weights of all of them: the
+// log-probability of the actions and the entropy, the value, the error of the auxiliary prediction,
+// and the gradient of that product. A row of the product has the prediction, the scores of the
+// actions, and the critic's hidden layer before its ReLU, each padded to a multiple of 8. Blocks
+// along x are strips of rows; along y, policies.
+#include "constants.h"
+#include "lanes.h"
+#include "params.h"
+#include "strips.h"
+
+constexpr int WORD = 8;  // bfloat16 numbers that a thread reads at once
+
+DEVICE int padded(int n) { return (n + WORD - 1) / WORD * WORD; }
+
+DEVICE void read_word(float (&values)[WORD], const float* from) {
+    float first[4], last[4];
+    read<float>(first, from, 0);
+    read<float>(last, from, 4);
+    for (int n = 0; n < 4; n++) {
+        values[n] = first[n];
+        values[4 + n] = last[n];
+    }
+}
+
+struct Softmax {
+    float largest, log_total, entropy;
+};
+
+DEVICE float logit_of(Bfloat16 score, const Softmax& softmax) {
+    return to_float(score) - softmax.largest - softmax.log_total;
+}
+
+// Of the n scores of one agent.
+DEVICE Softmax softmax_of(const Bfloat16* scores, int n) {
+    Softmax softmax = {to_float(scores[0]), 0.f, 0.f};
+    for (int k = 1; k < n; k++)
+        softmax.largest = fmaxf(softmax.largest, to_float(scores[k]));
+    float total = 0.f;
+    for (int k = 0; k < n; k++)
+        total += expf(to_float(scores[k]) - softmax.largest);
+    softmax.log_total = logf(total);
+    for (int k = 0; k < n; k++) {
+        float logit = logit_of(scores[k], softmax);
+        softmax.entropy -= expf(logit) * logit;
+    }
+    return softmax;
+}
+
+DEVICE float sum_of_eight(float x) {
+    for (int mask = 4; mask; mask /= 2)
+        x += __shfl_xor_sync(~0u, x, mask);
+    return x;
+}
+
+// One thread per row for the actions; eight threads per row for the rest.
+KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
+    long long policy = blockIdx.y, first = policy * p.n_rows;
+    int start = (int)blockIdx.x * STRIP;
+    int first_score = padded(p.n_predicted);
+    int first_hidden = first_score + padded(p.n_agents * p.n_choices);
+    int n_columns = first_hidden + p.width;
+    const Bfloat16* product = (const Bfloat16*)p.product + first * n_columns;
+
+    int row = start + (int)threadIdx.x;
+    if (p.logprobs && threadIdx.x < STRIP && row < p.n_rows) {
+        float logprob = 0.f, entropy = 0.f;
+        const Bfloat16* scores = product + (long long)row * n_columns + first_score;
+        for (int agent = 0; agent < p.n_agents; agent++, scores += p.n_choices) {
+            Softmax softmax = softmax_of(scores, p.n_choices);
+            long long action = p.actions[(first + row) * p.n_agents + agent];
+            logprob += logit_of(scores[action], softmax);
+            entropy += softmax.entropy;
+        }
+        p.logprobs[first + row] = logprob;
+        p.entropies[first + row] = entropy;
+    }
+
+    int part = threadIdx.x % 8;
+    const float* value_weight = p.value_weight + policy * p.width;
+    const Bfloat16* target = (const Bfloat16*)p.target + first * first_score;
+    for (int i = threadIdx.x / 8; i < STRIP; i += STRIP_THREADS / 8) {
+        row = min(start + i, p.n_rows - 1);  // all threads of a warp shuffle
+        const Bfloat16* columns = product + (long long)row * n_columns;
+        float value = 0.f, error = 0.f;
+#pragma unroll 4
+        for (int column = WORD * part; column < p.width; column += 8 * WORD) {
+            float hidden[WORD], weight[WORD];
+            read<Bfloat16>(hidden, columns, first_hidden + column);
+            read_word(weight, value_weight + column);
+            for (int n = 0; n < WORD; n++)
+                value += hidden[n] <= 0.f ? 0.f : hidden[n] * weight[n];
+        }
+        for (int column = WORD * part; column < p.n_predicted; column += 8 * WORD) {
+            float predicted[WORD], expected[WORD];
+            read<Bfloat16>(predicted, columns, column);
+            read<Bfloat16>(expected, target, (long long)row * first_score + column);
+            for (int n = 0; n < WORD; n++) {
+                float difference = predicted[n] - expected[n];
+                error += column + n < p.n_predicted ? difference * difference : 0.f;
+            }
+        }
+        value = sum_of_eight(value);
+        error = sum_of_eight(error);
+        if (part || start + i >= p.n_rows)
+            continue;
+        p.values[first + row] =
+            (value + p.value_bias[policy]) * p.value_scale[policy] + p.value_mean[policy];
+        if (p.errors)
+            p.errors[first + row] = error / (float)p.n_predicted;
+    }
+}
+
+// ---- Backward ----
+
+// Where a thread reads and writes.
+struct HeadsPlace {
+    long long policy, first;  // row of the policy
+    int strip;
+    int first_score, first_hidden, n_columns;
+    float* sums;  // of this block's strip
+};
+
+// The gradient of the scores, one thread per row. The entropy's is -p (logit + entropy).
+DEVICE void scores_backward(const HeadsBackwardParams& p, const HeadsPlace& place) {
+    int row = place.strip * STRIP + (int)threadIdx.x;
+    if (threadIdx.x >= STRIP || row >= p.n_rows)
+        return;
+    long long at = (place.first + row) * place.n_columns + place.first_score;
+    const Bfloat16* scores = (const Bfloat16*)p.product + at;
+    Bfloat16* d_scores = (Bfloat16*)p.d_product + at;
+    float d_logprob = p.d_logprobs[place.first + row], d_entropy = p.d_entropies[place.first + row];
+    int n = p.n_choices, n_scores = p.n_agents * n;
+    for (int agent = 0; agent < p.n_agents; agent++) {
+        Softmax softmax = softmax_of(scores + agent * n, n);
+        long long action = p.actions[(place.first + row) * p.n_agents + agent];
+        for (int k = 0; k < n; k++) {
+            float logit = logit_of(scores[agent * n + k], softmax), probability = expf(logit);
+            float d = d_logprob * ((action == k ? 1.f : 0.f) - probability) -
+                      d_entropy * probability * (logit + softmax.entropy);
+            assign(d_scores[agent * n + k], d);
+        }
+    }
+    for (int k = n_scores; k < padded(n_scores); k++)
+        assign(d_scores[k], 0.f);
+}
+
+// The gradients of the prediction and of the scores, and their sums.
+DEVICE void actor_backward(const HeadsBackwardParams& p, const HeadsPlace& place) {
+    scores_backward(p, place);
+    __syncthreads();
+    int n_words = place.first_hidden / WORD;
+    for (int first_word = 0; first_word < n_words; first_word += WARP) {
+        Strip strip = find_strip(place.strip, min(n_words - first_word, WARP), p.n_rows);
+        int column = WORD * (first_word + strip.word);
+        bool is_score = column >= place.first_score;
+        float sums[WORD];
+        clear(sums);
+        for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
+            float values[AT_ONCE][WORD], expected[AT_ONCE][WORD], d_errors[AT_ONCE];
+#pragma unroll
+            for (int i = 0; i < AT_ONCE; i++) {
+                long long row = place.first + min(start + i * strip.step, strip.end - 1);
+                long long at = row * place.n_columns + column;
+                read<Bfloat16>(values[i], is_score ? p.d_product : p.product, at);
+                // a score has no target: reads whatever is in the first columns
+                int target = is_score ? 0 : column;
+                if (place.first_score)
+                    read<Bfloat16>(expected[i], p.target, row * place.first_score + target);
+                d_errors[i] = p.d_errors[row] * 2.f / (float)p.n_predicted;
+            }
+#pragma unroll
+            for (int i = 0; i < AT_ONCE; i++) {
+                int row = start + i * strip.step;
+                if (row >= strip.end)
+                    break;
+                if (!is_score) {
+                    for (int n = 0; n < WORD; n++) {
+                        float d = d_errors[i] * (values[i][n] - expected[i][n]);
+                        values[i][n] = column + n < p.n_predicted ? d : 0.f;
+                    }
+                    write<Bfloat16>(p.d_product, (place.first + row) * place.n_columns + column,
+                                    values[i]);
+                }
+                for (int n = 0; n < WORD; n++)
+                    sums[n] += values[i][n];
+            }
+        }
+        add_up(sums, strip, place.sums + WORD * first_word, WORD * strip.words);
+    }
+}
+
+// The gradients of 32 words of the critic's hidden layer and of the value's weights.
+DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsPlace& place, int part) {
+    int first_word = WARP * part;
+    Strip strip = find_strip(place.strip, min(p.width / WORD - first_word, WARP), p.n_rows);
+    int column = WORD * (first_word + strip.word);
+    float weight[WORD], sums[WORD], weight_sums[WORD], bias_sum[1];
+    read_word(weight, p.value_weight + place.policy * p.width + column);
+    clear(sums);
+    clear(weight_sums);
+    clear(bias_sum);
+    float scale = p.value_scale[place.policy];
+    for (int start = strip.start; start < strip.end; start += AT_ONCE * strip.step) {
+        float hidden[AT_ONCE][WORD], d_values[AT_ONCE];
+#pragma unroll
+        for (int i = 0; i < AT_ONCE; i++) {
+            long long row = place.first + min(start + i * strip.step, strip.end - 1);
+            read<Bfloat16>(hidden[i], p.product,
+                           row * place.n_columns + place.first_hidden + column);
+            d_values[i] = p.d_values[row] * scale;
+        }
+#pragma unroll
+        for (int i = 0; i < AT_ONCE; i++) {
+            int row = start + i * strip.step;
+            if (row >= strip.end)
+                break;
+            bias_sum[0] += d_values[i];
+            for (int n = 0; n < WORD; n++) {
+                bool is_off = hidden[i][n] <= 0.f;
+                weight_sums[n] += is_off ? 0.f : d_values[i] * hidden[i][n];
+                hidden[i][n] = is_off ? 0.f : d_values[i] * weight[n];
+                sums[n] += hidden[i][n];
+            }
+            write<Bfloat16>(p.d_product,
+                            (place.first + row) * place.n_columns + place.first_hidden + column,
+                            hidden[i]);
+        }
+    }
+    float* target = place.sums + WORD * first_word;
+    add_up(sums, strip, target + place.first_hidden, WORD * strip.words);
+    add_up(weight_sums, strip, target + place.n_columns, WORD * strip.words);
+    if (!part)
+        add_up(bias_sum, strip, place.sums + place.n_columns + p.width, 1);
+}
+
+// Neighbouring blocks have one strip: one has prediction and scores, the others the hidden layer.
+KERNEL BOUNDS(256) heads_backward(HeadsBackwardParams p) {
+    int n_parts = 1 + (p.width / WORD + WARP - 1) / WARP, part = blockIdx.x % n_parts;
+    HeadsPlace place;
+    place.policy = blockIdx.y;
+    place.first = place.policy * p.n_rows;
+    place.strip = blockIdx.x / n_parts;
+    place.first_score = padded(p.n_predicted);
+    place.first_hidden = place.first_score + padded(p.n_agents * p.n_choices);
+    place.n_columns = place.first_hidden + p.width;
+    long long n_strips = gridDim.x / n_parts, n_sums = place.n_columns + p.width + WORD;
+    place.sums = p.sums + (place.policy * n_strips + place.strip) * n_sums;
+    if (part)
+        critic_backward(p, place, part - 1);
+    else
+        actor_backward(p, place);
+}
