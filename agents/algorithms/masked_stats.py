@@ -3,9 +3,15 @@
 `valid` is a bool tensor of the shape of the numbers.
 """
 
+from collections.abc import Sequence
+
 import torch
 
-from megastep.agents.distributed.pooling import masked_moments, pool_moments
+from megastep.agents.algorithms.kernels import program
+from megastep.agents.distributed.pooling import Moments, masked_moments, pool_moments
+
+_MAX_QUANTITIES = program.PROGRAM.constants["MOMENTS_QUANTITIES"]
+_MAX_SIZE = 2**31
 
 
 def masked_mean(x: torch.Tensor, valid: torch.Tensor, axis: int | None = None) -> torch.Tensor:
@@ -19,11 +25,58 @@ def pooled_mean(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     return pool_moments((valid.sum(), mean, torch.zeros_like(mean)))[0][1]
 
 
+def pooled_moments(tensors: Sequence[torch.Tensor], valid: torch.Tensor) -> Moments:
+    """Returns the number of valid entries () of all ranks, and the mean and the variance of each of
+    K tensors, (K,). On a GPU in two kernels.
+    """
+    is_fused = valid.is_cuda and len(tensors) <= _MAX_QUANTITIES and 0 < valid.numel() < _MAX_SIZE
+    if is_fused and all(x.dtype == torch.float32 for x in tensors):
+        moments = _moments_on_gpu(tensors, valid)
+    else:
+        moments = masked_moments(torch.stack([*tensors]), valid)
+    return pool_moments(moments)[0]
+
+
+def _moments_on_gpu(tensors, valid):
+    """Returns `masked_moments` of tensors."""
+    tensors, valid = [x.contiguous() for x in tensors], valid.contiguous()
+    threads, n_numbers = (program.PROGRAM.constants[f"MOMENTS_{x}"] for x in ("THREADS", "NUMBERS"))
+    n_quantities, n_blocks = len(tensors), -(-valid.numel() // (threads * n_numbers))
+    parts = tensors[0].new_empty(n_quantities, n_blocks, 3)
+    means, variances = tensors[0].new_empty(2, n_quantities)
+    n_valid = torch.empty((), dtype=torch.int64, device=valid.device)
+    quantity = program.PROGRAM.params.QuantityParams
+    program.run(
+        "block_moments",
+        valid.device,
+        n_blocks * threads,
+        n_blocks_y=n_quantities,
+        block=threads,
+        quantities=b"".join(quantity(values=x.data_ptr()) for x in tensors),
+        valid=valid,
+        parts=parts,
+        n_entries=valid.numel(),
+    )
+    program.run(
+        "join_moments",
+        valid.device,
+        threads,
+        n_blocks_y=n_quantities,
+        block=threads,
+        parts=parts,
+        means=means,
+        variances=variances,
+        n_valid=n_valid,
+        n_blocks=n_blocks,
+    )
+    return n_valid, means, variances
+
+
 def pooled_normalise(x: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """Returns x minus its mean over all ranks, divided by its standard deviation there; 0 where
     invalid.
     """
-    ((_, mean, variance),) = pool_moments(masked_moments(x, valid))
+    _, (mean,), (variance,) = pooled_moments([x], valid)
     return normalise(x, valid, mean, variance)
 
 

@@ -18,9 +18,8 @@ from megastep.agents.algorithms.learner import (
     Positive,
     check_minibatches,
 )
-from megastep.agents.algorithms.masked_stats import normalise, pooled_normalise
+from megastep.agents.algorithms.masked_stats import normalise, pooled_moments, pooled_normalise
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
-from megastep.agents.distributed.pooling import masked_moments, pool_moments
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
@@ -127,8 +126,7 @@ class PPO(GradientLearner):
         estimates = returns.gae(**transitions, gamma=self.gamma, lambda_=self.lambda_)
         estimates["valid"] = estimates.valid & rollout.learns[:-1]
         advantages, valid = estimates.advantages, estimates.valid
-        both = torch.stack([estimates.targets, advantages])
-        ((n_valid, means, variances),) = pool_moments(masked_moments(both, valid))
+        n_valid, means, variances = pooled_moments([estimates.targets, advantages], valid)
         self.policy.critic.output.add(n_valid * is_finite, means[0], variances[0])
         # an advantage is the error of the value
         explained = 1 - variances[1] / variances[0].clamp(min=1e-8)

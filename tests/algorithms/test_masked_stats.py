@@ -43,3 +43,28 @@ def test_effective_sample_size():
 def test_mean_along_axis():
     x, valid = torch.tensor([[1.0, 5.0], [3.0, torch.nan]]), torch.tensor([[True, False]] * 2)
     assert masked_stats.masked_mean(x, valid, 0).tolist() == [2, 0]
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("shape", [(1, 1), (7, 133), (32, 1000)])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.8, 1.0])
+def test_moments_are_those_of_the_valid_entries(device, shape, share):
+    torch.manual_seed(0)
+    tensors = [torch.randn(shape) * 3 + 1000, torch.randn(shape)]
+    valid = torch.rand(shape) < share
+    expected = [x[valid].double() for x in tensors]
+    tensors = [x.masked_fill(~valid, torch.nan).to(device) for x in tensors]
+    results = [masked_stats.pooled_moments(tensors, valid.to(device)) for _ in range(2)]
+    assert all(map(torch.equal, *results))
+    n_valid, means, variances = results[0]
+    assert n_valid == valid.sum() and n_valid.dtype == torch.int64
+    for i, x in enumerate(expected):
+        mean = x.mean() if len(x) else 0.0
+        # float32 near 1,000
+        assert means[i].item() == pytest.approx(float(mean), rel=1e-6, abs=1e-6)
+        variance = (x - mean).square().mean() if len(x) else 0.0
+        assert variances[i].item() == pytest.approx(float(variance), rel=1e-4, abs=1e-6)
+    if len(expected[0]):
+        tensors[0][valid] = torch.nan
+        _, means, _ = masked_stats.pooled_moments(tensors, valid.to(device))
+        assert means[0].isnan() and means[1].isfinite()

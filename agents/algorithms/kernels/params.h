@@ -75,6 +75,25 @@ struct AdamParams {
     float eps;
 };
 
+struct QuantityParams {
+    const float* values;  // (n_entries)
+};
+
+struct BlockMomentsParams {
+    QuantityParams quantities[4];
+    const unsigned char* valid;  // (n_entries)
+    float* parts;  // (n_quantities, n_blocks, 3): number, mean, sum of squared distances to it
+    int n_entries;
+};
+
+struct JoinMomentsParams {
+    const float* parts;
+    float* means;        // (n_quantities)
+    float* variances;    // (n_quantities)
+    long long* n_valid;  // ()
+    int n_blocks;
+};
+
 // A tensor (n_steps, B, n_features) of a rollout.
 struct SizesTensorParams {
     const void* values;
