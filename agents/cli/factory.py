@@ -167,13 +167,24 @@ def make_curriculum(settings: Curriculum, geometries: list[dict]) -> Callable | 
     """
     if settings.name == "none":
         return None
-    sources = [home.get("source") for home in geometries]
-    sources = sources if all(sources) else None
+    sources = evaluation.sources_of(geometries)
 
     def make(env, learner, rollout):
         return construct(settings, env=env, learner=learner, rollout=rollout, sources=sources)
 
     return make
+
+
+def layout_sources(env: Env, geometries: list[dict]) -> list[str] | None:
+    """Returns the name of the source of each layout of an environment in training; None if floor
+    plans have no sources, or it is unknown which of them the layouts are.
+    """
+    sources = evaluation.sources_of(geometries)
+    if sources is None or getattr(env, "resample", False):
+        return sources
+    if env.n_envs < len(sources) and not env.name.startswith("megastep."):
+        return None
+    return scene.spread(sources, env.n_envs)
 
 
 def make_opponents(

@@ -127,6 +127,7 @@ def make_trainer(
             desync=cfg.desync,
             opponents=opponents,
             make_curriculum=factory.make_curriculum(cfg.curriculum, where["geometries"]),
+            layout_sources=factory.layout_sources(cfg.env, where["geometries"]),
             replay_folder=folder if cfg.nonfinite_replay else None,
             **writers,
         )
