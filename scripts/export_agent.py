@@ -1,6 +1,7 @@
 """Turns a run into an agent of the package: a file with its acting weights, and a card.
 
     python scripts/export_agent.py runs/NAME pointgoal_anywhere
+    python scripts/export_agent.py --cards                       # only writes all cards again
 
 Writes pointgoal_anywhere.safetensors and pointgoal_anywhere.md into agents/pretrained/, from the
 run's newest checkpoint. Evaluate the run first, for the card's tables: `python evaluate.py
@@ -113,7 +114,7 @@ def tables_of(folder: Path, step: int) -> list[dict]:
         words += [f"{key}={how[key]}" for key in ("split", "episodes", "seed")]
         words += ["greedy=true"] * how["greedy"]
         words += [f"against={','.join(how['against'])}"] if how.get("against") else []
-        title = table["title"].replace(folder.name, "the agent")
+        title = re.sub(f"^{re.escape(folder.name)}(?=, )", "the agent", table["title"])
         tables.append({"title": title, "command": " ".join(words), "rows": table["rows"]})
     return tables
 
@@ -275,13 +276,20 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", help="a run's folder, or one of its checkpoints")
-    parser.add_argument("name", help="of the agent, such as pointgoal_anywhere")
-    parser.add_argument("--folder", type=Path, help="default: agents/pretrained")
+    parser.add_argument("run", nargs="?", help="a run's folder, or one of its checkpoints")
+    parser.add_argument("name", nargs="?", help="of the agent, such as pointgoal_anywhere")
+    parser.add_argument("--folder", type=Path, default=program.PRETRAINED)
     parser.add_argument("--max-error", type=float, default=MAX_ERROR, help="of the logits")
+    parser.add_argument("--cards", action="store_true", help="only write all cards again")
     options = parser.parse_args(words)
+    if options.cards == (options.name is not None):
+        parser.error("give a run and a name, or --cards")
     try:
-        for path in export(options.run, options.name, options.folder, options.max_error):
+        if options.cards:
+            paths = map(write_card, sorted(options.folder.glob(f"*{agent_file.SUFFIX}")))
+        else:
+            paths = export(options.run, options.name, options.folder, options.max_error)
+        for path in paths:
             console.say(f"Wrote {path}")
     except program.UserError as error:
         console.say(f"export_agent.py: {error}", sys.stderr)
