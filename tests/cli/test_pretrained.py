@@ -381,6 +381,12 @@ def test_agent_of_the_package(path):
     assert decision.logits.isfinite().all() and world.reward.isfinite().all()
 
 
+@pytest.mark.skipif(not FILES, reason="the package has no agents yet")
+def test_page_names_every_agent():
+    page = Path(__file__).parents[2] / "docs/pretrained.md"
+    assert set(re.findall(r"^\| `(\w+)` \|", page.read_text(), re.M)) == {p.stem for p in FILES}
+
+
 def test_every_card_has_its_agent():
     cards = {path.stem for path in program.PRETRAINED.glob("*.md")}
     assert cards == {path.stem for path in FILES}
