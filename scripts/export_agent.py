@@ -28,7 +28,7 @@ from megastep.types import n_lanes
 
 MAX_BYTES = 2_000_000
 #: Bound of `rounding_error`. Float16 changes a weight by at most 1 part in 2,048.
-MAX_ERROR = 0.02
+MAX_ERROR = 0.005
 #: Environments and steps in which it is measured.
 N_ENVS, N_STEPS = 64, 256
 #: Settings of a run that are of no use to others, or name files of the machine that trained it.

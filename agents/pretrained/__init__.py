@@ -43,7 +43,8 @@ def load(name: str, device: str = "auto") -> Policy:
     Raises:
         UserError: there is none; or it names modules outside megastep and another user made it.
     """
-    loaded = runs.load_checkpoint(runs.find(name), False, factory.make_device(device))
+    device = factory.make_device(device)
+    loaded = runs.load_checkpoint(runs.find(name), False, device)
     trained = factory.config_of(loaded)
     box = settings.kind_of("geometry", _BOX)(name=_BOX)
     homes = factory.homes(trained.env, box, "test")
