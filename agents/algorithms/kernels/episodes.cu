@@ -1,4 +1,5 @@
-// Sums over the episodes that end in a rollout, one thread per lane.
+// Sums over the episodes that end in a rollout, one thread per lane. Sums by source are in global
+// memory, where each thread has a column of its own: a lane ends an episode in few of its steps.
 #include "common/constants.h"
 #include "constants.h"
 #include "params.h"
@@ -13,6 +14,10 @@ KERNEL episodes(EpisodesParams p) {
     double totals[EPISODE_METRICS] = {}, left_out[EPISODE_METRICS] = {};
     double episode_return = p.returns[lane], length = p.lengths[lane];
     bool is_whole = p.is_whole[lane];
+    long long row = (long long)p.n_sources * p.n_lanes;  // of source_sums
+    if (p.layouts)
+        for (long long i = lane; i < (4 + 2 * p.n_metrics) * row; i += p.n_lanes)
+            p.source_sums[i] = 0.;
 #pragma unroll 8
     for (int t = 0; t < p.n_steps; t++) {
         long long at = (long long)t * p.n_lanes + lane;
@@ -26,6 +31,15 @@ KERNEL episodes(EpisodesParams p) {
             sum += episode_return;
             square += episode_return * episode_return;
             steps += length;
+            double* own = nullptr;
+            int layout = p.layouts ? p.layouts[at] : -1;
+            if (layout >= 0 && layout < p.n_layouts) {
+                own = p.source_sums + (long long)p.source_of_layout[layout] * p.n_lanes + lane;
+                own[0] += 1.;
+                own[row] += episode_return;
+                own[2 * row] += episode_return * episode_return;
+                own[3 * row] += length;
+            }
 #pragma unroll
             for (int i = 0; i < EPISODE_METRICS; i++)
                 if (i < p.n_metrics) {
@@ -33,6 +47,10 @@ KERNEL episodes(EpisodesParams p) {
                     bool is_good = fabsf(value) <= p.limit;
                     totals[i] += is_good ? value : 0.f;
                     left_out[i] += is_good ? 0. : 1.;
+                    if (own) {
+                        own[(4 + i) * row] += is_good ? value : 0.f;
+                        own[(4 + p.n_metrics + i) * row] += is_good ? 0. : 1.;
+                    }
                 }
         }
         episode_return = length = 0.;

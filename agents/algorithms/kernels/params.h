@@ -132,12 +132,17 @@ struct EpisodesParams {
     const unsigned char* reset;   // (T, B)
     const unsigned char* done;    // (T, B)
     const unsigned char* learns;  // (T, B); null: all
+    const int* layouts;           // (T, B); null: no sums by source
+    const int* source_of_layout;  // (D)
     double* returns;              // (B), of the episodes in progress, updated
     double* lengths;              // (B), updated
     unsigned char* is_whole;      // (B), updated
     double* sums;                 // (4 + 2 n_metrics, B)
+    double* source_sums;          // (4 + 2 n_metrics, S, B)
     long long* bad_lanes;         // (n_metrics), updated
     int n_metrics;
+    int n_sources;  // S
+    int n_layouts;  // D
     int n_steps;
     int n_lanes;
     float limit;
