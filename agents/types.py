@@ -61,7 +61,9 @@ class Collector(Protocol):
 
     A collector that runs in the background also has `wait()`, which blocks until nothing acts in
     the environment. One with `state_dict()` and `load_state_dict(state)`, of all that it carries
-    from rollout to rollout, lets a run be resumed bit for bit.
+    from rollout to rollout, lets a run be resumed bit for bit. One with `allocate_layouts()` has
+    the environment's layouts in its rollouts from then on, `rollout.layouts`, (T, B) int32, and
+    reports have statistics of episodes by the source of their floor plan.
     """
 
     rollout: Rollout  # what the last call returned; allocated and empty before the first call

@@ -39,6 +39,7 @@ AGENTS = (
     ("training",),
     ("selfplay",),
     ("cli",),
+    ("pretrained",),
 )
 # Modules of the simulator that every room of the learner may import: no environment, no engine.
 THREADS = "megastep.engine.devices"

@@ -232,9 +232,7 @@ def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpo
             f"{settings.label(own.env.name)}; choose a run in the same environment"
         )
     policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
-    return Player(
-        f"{runs.folder_of(loaded.path).name}, {loaded.step:,} samples", policy, loaded.step
-    )
+    return Player(f"{runs.name_of(loaded.path)}, {loaded.step:,} samples", policy, loaded.step)
 
 
 def find_player(
@@ -243,8 +241,9 @@ def find_player(
     """Returns who is to meet the agent of `run` in `env`.
 
     Args:
-        name: a run's folder or checkpoint; or what needs no weights: an import path, `random`, or
-            `bot`, which is the run's `opponents.bot_class`, or else the environment's own bot.
+        name: a run's folder or checkpoint, or a pretrained agent; or what needs no weights: an
+            import path, `random`, or `bot`, which is the run's `opponents.bot_class`, or else the
+            environment's own bot.
         trust: import what a run that another user made names.
 
     Raises:
@@ -323,9 +322,11 @@ class Arena:
         folder, and returns the path of the first.
         """
         folder, players = runs.folder_of(self.run.path), []
-        for path in checkpoint.list_checkpoints(
-            folder / "snapshots"
-        ) or checkpoint.list_checkpoints(folder / "checkpoints"):
+        for path in (
+            checkpoint.list_checkpoints(folder / "snapshots")
+            or checkpoint.list_checkpoints(folder / "checkpoints")
+            or [self.run.path]  # the file of an agent
+        ):
             player = find_player(str(path), self.run, None, self.sample, self.cfg.trust)
             players.append(player._replace(name=f"{player.step:,} samples"))
         players += self.others
@@ -352,6 +353,7 @@ class Arena:
         )
         console.say(f"{title}\n{table}")
         with program.errors(f"{folder} cannot be written: "):
+            folder.mkdir(parents=True, exist_ok=True)
             ratings.write(folder, rows, title)
         console.say(f"Plot: {folder / 'ratings.svg'}")
         return folder / "ratings.csv"

@@ -21,9 +21,15 @@ from megastep.agents.cli.settings import (
     takes_geometries,
 )
 from megastep.agents.distributed import process_group
-from megastep.agents.networks.policy import Policy
+from megastep.agents.networks.policy import TRAINING_ONLY, Policy
 from megastep.agents.selfplay.opponents import Opponents
-from megastep.agents.training import checkpoint, checkpoint_format, evaluation, loggers
+from megastep.agents.training import (
+    agent_file,
+    checkpoint,
+    checkpoint_format,
+    evaluation,
+    loggers,
+)
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.capture import state_tree
 from megastep.imports import import_object
@@ -161,13 +167,24 @@ def make_curriculum(settings: Curriculum, geometries: list[dict]) -> Callable | 
     """
     if settings.name == "none":
         return None
-    sources = [home.get("source") for home in geometries]
-    sources = sources if all(sources) else None
+    sources = evaluation.sources_of(geometries)
 
     def make(env, learner, rollout):
         return construct(settings, env=env, learner=learner, rollout=rollout, sources=sources)
 
     return make
+
+
+def layout_sources(env: Env, geometries: list[dict]) -> list[str] | None:
+    """Returns the name of the source of each layout of an environment in training; None if floor
+    plans have no sources, or it is unknown which of them the layouts are.
+    """
+    sources = evaluation.sources_of(geometries)
+    if sources is None or getattr(env, "resample", False):
+        return sources
+    if env.n_envs < len(sources) and not env.name.startswith("megastep."):
+        return None
+    return scene.spread(sources, env.n_envs)
 
 
 def make_opponents(
@@ -243,7 +260,8 @@ def spaces_of(env: Any) -> dict[str, str]:
 
 
 def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Policy:
-    """Returns a policy made for `env` with a checkpoint's weights, the critic's too if it has one.
+    """Returns a policy made for `env` with a checkpoint's weights, the critic's too if both have
+    one. With the file of an agent, which only acts, the critic keeps the weights that it has.
 
     Raises:
         UserError: naming what differs, if they do not fit.
@@ -257,9 +275,11 @@ def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Pol
             f"{loaded.path} was trained in another environment{names}: {'; '.join(changes)}. "
             "Choose the env it was trained in"
         )
-    weights = loaded.state["policy"]
-    if policy.critic is None:  # what only training needs
-        weights = {k: v for k, v in weights.items() if not k.startswith(("critic.", "prediction."))}
+    weights, own = loaded.state["policy"], policy.state_dict()
+    if policy.critic is None:
+        weights = {k: v for k, v in weights.items() if not k.startswith(TRAINING_ONLY)}
+    elif agent_file.is_agent_file(loaded.path):
+        weights = weights | {k: v for k, v in own.items() if k.startswith(TRAINING_ONLY)}
     agent = " ".join(f"agent.{k}={v}" for k, v in loaded.config["train"]["agent"].items())
     with program.errors(f"{loaded.path} needs an agent with {agent}: ", (RuntimeError,)):
         policy.load_state_dict(weights)

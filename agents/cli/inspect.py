@@ -1,17 +1,17 @@
-"""megastep inspect RUN: what is in a run's checkpoints, every byte of them verified."""
+"""megastep inspect RUN: what is in a run's checkpoints, or an agent's file, every byte verified."""
 
 import datetime
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from megastep.agents.cli import console, program, runs
-from megastep.agents.training import checkpoint, checkpoint_format
+from megastep.agents.training import agent_file, checkpoint, checkpoint_format
 
 HELP = """Verifies a run's checkpoints and prints what is in them.
 
-  megastep inspect RUN     a run folder, one of its checkpoints, or latest"""
+  megastep inspect RUN     a run folder, one of its checkpoints, latest, or a pretrained agent"""
 
 
 def run(words: list[str]) -> int:
@@ -21,14 +21,22 @@ def run(words: list[str]) -> int:
     if len(words) != 1 or words[0] in ("-h", "--help"):
         console.say(HELP)
         return 0 if words in (["-h"], ["--help"]) else 2
-    path = runs.checkpoints_of(runs.find(words[0]))
+    path = runs.find(words[0])
+    if agent_file.is_agent_file(path):
+        return _inspect([path], _lines_of_agent)
+    path = runs.checkpoints_of(path)
     paths = [path] if (path / "manifest.json").exists() else checkpoint.list_checkpoints(path)
     if not paths:
         raise program.UserError(f"There is no checkpoint in {path}; has the run saved one yet?")
+    return _inspect(paths, _lines)
+
+
+def _inspect(paths: list[Path], lines_of: Callable[[Path], Iterable[str]]) -> int:
+    """Prints the lines about each path. Returns 1 if one is damaged, else 0."""
     is_damaged = False
     for path in paths:
         try:
-            console.say("\n".join(_lines(path)))
+            console.say("\n".join(lines_of(path)))
         except checkpoint.CheckpointError as error:
             is_damaged = True
             console.say(str(error))
@@ -51,6 +59,18 @@ def _lines(path: Path) -> Iterator[str]:
     head = ["part", "tensors", "numbers", "bytes", "largest"]
     rows = [_row(name, part) for name, part in loaded.state.items() if isinstance(part, dict)]
     yield from (f"  {line}" for line in console.table(head, rows).splitlines())
+
+
+def _lines_of_agent(path: Path) -> Iterator[str]:
+    """Yields the text about the file of an agent."""
+    loaded, about = agent_file.read(path, "cpu"), agent_file.read_metadata(path)
+    yield f"{path}: intact, {console.number(path.stat().st_size)} bytes"
+    yield from (f"  {name}: {value}" for name, value in about["facts"].items())
+    head = ["part", "tensors", "numbers", "bytes", "largest"]
+    rows = [_row(name, part) for name, part in loaded.state.items()]
+    yield from (f"  {line}" for line in console.table(head, rows).splitlines())
+    for table in about["tables"]:
+        yield f"  {table['title']}: {len(table['rows'])} rows"
 
 
 def _row(name: str, part: dict[str, Any]) -> list[str]:

@@ -12,6 +12,8 @@ DISTRIBUTION = "megastep-flatland"
 ROOT = Path(__file__).resolve().parents[2]
 #: configs/ of the repository, which the package carries as data.
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+#: The trained agents that the package carries as data.
+PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
 
 
 def name(script: str, python: str = "") -> str:

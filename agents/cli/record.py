@@ -72,6 +72,7 @@ def run(cfg: settings.Record) -> Path:
 def take_free_name(path: Path) -> Path:
     """Creates an empty file, `video.mp4` or else `video-2.mp4` and so on, and returns its path."""
     with program.errors(f"The video {path} could not be made: "):
+        path.parent.mkdir(parents=True, exist_ok=True)
         for number in itertools.count(1):
             name = path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
             with contextlib.suppress(FileExistsError):

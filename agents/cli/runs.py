@@ -26,7 +26,7 @@ from megastep.agents.cli.settings import (
     takes_geometries,
 )
 from megastep.agents.distributed import environment
-from megastep.agents.training import checkpoint, json_lines
+from megastep.agents.training import agent_file, checkpoint, json_lines
 from megastep.agents.training.atomic_files import write_atomically
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
@@ -146,30 +146,51 @@ def known() -> list[Path]:
     return sorted(folders, key=lambda path: (order.get(path, -1), str(path)))
 
 
+def pretrained() -> dict[str, Path]:
+    """Returns the files of the agents that come with megastep, by name."""
+    files = sorted(program.PRETRAINED.glob(f"*{agent_file.SUFFIX}"))
+    return {path.stem: path for path in files}
+
+
 def find(name: str) -> Path:
-    """Returns an existing run's folder, or one of its checkpoints, from a path or `latest`.
+    """Returns an existing run's folder, one of its checkpoints, or the file of an agent.
+
+    Args:
+        name: a path, `latest`, or the name of a pretrained agent; what is at a path of that name
+            comes first.
 
     Raises:
-        UserError: naming the nearest run.
+        UserError: naming the nearest run and the nearest pretrained agent.
     """
-    path, folders = Path(name), known()
+    path, folders, agents = Path(name), known(), pretrained()
     if name == "latest" and folders:
         return folders[-1]
     if any(os.path.exists(path / entry) for entry in ("manifest.json", "checkpoints")):
         return path
+    if agent_file.is_agent_file(path) and os.path.isfile(path):
+        return path
+    if os.path.exists(path):
+        problem = "is no run, with a folder checkpoints"
+        if name in agents:
+            raise UserError(f"{name} {problem}; rename it to use the pretrained agent {name}")
+    elif name in agents:
+        return agents[name]
+    else:
+        problem = "is neither a run folder nor a pretrained agent"
     near = difflib.get_close_matches(name, map(str, folders), n=1, cutoff=0.4)
-    problem = "is no run, with a folder checkpoints" if os.path.exists(path) else "does not exist"
+    near += difflib.get_close_matches(name, agents, n=1, cutoff=0.6)
+    makes = "train.py makes runs"
+    names = f"{makes}, and pretrained agents are {', '.join(agents)}" if agents else makes
     raise UserError(
-        f"{shortened(name)} {problem}; "
-        + (f"did you mean {near[0]}?" if near else "train.py makes runs")
+        f"{shortened(name)} {problem}; " + (f"did you mean {' or '.join(near)}?" if near else names)
     )
 
 
 def load_checkpoint(
     path: Path, trust: bool, device: Any = None, is_whole: bool = False, rank: int = 0
 ) -> checkpoint.Checkpoint:
-    """Returns the checkpoint of a run found with `find`, on a device; without one, all but its
-    state, and PyTorch is not imported. Warns of damaged ones it skips.
+    """Returns the checkpoint of a run or an agent found with `find`, on a device; without one, all
+    but its state, and PyTorch is not imported. Warns of damaged ones it skips.
 
     Args:
         trust: whether a run that another user made may name modules to import.
@@ -180,7 +201,10 @@ def load_checkpoint(
         UserError: there is none; or, without `trust`, it names modules and another user made it.
     """
     with program.errors(kinds=(OSError, ValueError, checkpoint.CheckpointError)):
-        loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
+        if agent_file.is_agent_file(path):
+            loaded = agent_file.read(path, device)
+        else:
+            loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
     if loaded.untrusted and not trust:
         raise UserError(
             f"{loaded.path} was not made by this user here, and would import "
@@ -203,8 +227,17 @@ def checkpoints_of(path: Path) -> Path:
 
 
 def folder_of(path: Path) -> Path:
-    """The folder of the run that a path belongs to."""
+    """The folder of the run that a path belongs to. The results of an agent's file, which may be
+    where nobody writes, go to a folder of their own, which need not exist.
+    """
+    if agent_file.is_agent_file(path):
+        return RUNS / f"pretrained-{path.stem}"
     return path.parent.parent if checkpoints_of(path) == path else path
+
+
+def name_of(path: Path) -> str:
+    """What tables call the agent at a path: the name of its run's folder, or of its file."""
+    return path.stem if agent_file.is_agent_file(path) else folder_of(path).name
 
 
 # ---- Results ----
@@ -267,7 +300,7 @@ def write_table(
     )
     console.say(f"{title}\n{console.table(head, lines)}")
     with program.errors(f"{folder} cannot be written: "):
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         write_atomically(
             folder / f"{name[:200]}.md",
             f"{title}\n\n{console.table(head, lines, is_markdown=True)}\n".encode(),

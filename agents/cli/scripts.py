@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from megastep.agents.cli import launch, program, runs, settings
 from megastep.agents.distributed import environment
+from megastep.agents.training import agent_file
 
 Tree = dict[str, Any]
 
@@ -60,7 +61,8 @@ The most common words:
                                prints what would run
   rerun=RUN                    repeat a run, with the learning rates that its clock chose, and
                                compare its metrics.jsonl
-  init=RUN                     start a new run from its weights, in its environment and homes
+  init=RUN                     start a new run from its weights, in its environment and homes; also
+                               the name of a pretrained agent
   env=my_package.rover:Rover   a class of your own; also for geometry, learner, agent.core
   logger=wandb logger.mode=offline"""
 #: What may change when a run is resumed: where it runs, when it stops, what it leaves behind; never
@@ -128,6 +130,11 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     if refused := [key for key in typed if not {key, key.split(".")[0]} & {*allowed}]:
         raise program.ConfigErrors((key, CURES[how]) for key in refused)
     path = runs.find(tree[how])
+    if how != "init" and agent_file.is_agent_file(path):
+        raise program.UserError(
+            f"{tree[how]} is a pretrained agent, which has the weights only. init={tree[how]} "
+            f"starts a new run from it; {how}= takes the run's folder"
+        )
     # a run in use is refused before its checkpoints are read, which come and go
     locked = runs.locked(runs.folder_of(path)) if how == "resume" else contextlib.nullcontext()
     with locked:
@@ -204,7 +211,7 @@ EVALUATE_HELP = """Measures what a run's agent earns in the first episode of eac
 interval over homes. Prints a table and writes it to the run's folder: evaluations/*.md.
 
 The most common words:
-  run=RUN              a run folder, one of its checkpoints, or latest
+  run=RUN              a run folder, one of its checkpoints, latest, or a pretrained agent
   split=training       the homes it was trained in, instead of unseen ones
   geometry=bench       other homes
   env=pong             another environment with the same spaces: after self-play, the tracker
@@ -217,7 +224,7 @@ The most common words:
 RECORD_HELP = """Films a run's agent in one home: the plan with what it has seen, and its view.
 
 The most common words:
-  run=RUN          a run folder, one of its checkpoints, or latest
+  run=RUN          a run folder, one of its checkpoints, latest, or a pretrained agent
   env=explorer     random actions in an environment, without a run
   steps=400        frames
   against=RUN      its duel with another run's agent, `bot`, or an import path, in one home

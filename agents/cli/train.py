@@ -39,6 +39,7 @@ from megastep.agents.distributed.agreement import any_rank, from_rank_0, togethe
 from megastep.agents.distributed.drift import DriftError
 from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
 from megastep.agents.training import (
+    agent_file,
     annealing,
     budget,
     checkpoint,
@@ -90,6 +91,8 @@ def make_trainer(
         path = runs.find(cfg.resume or cfg.init)
         loaded = runs.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
         factory.load_weights(policy, env, loaded)
+        if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
+            console.say(f"{runs.name_of(path)} has no critic, so this run begins with a new one")
     opponents = factory.make_opponents(cfg, env, sample, policy, seed)
     for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
         checkpoint.set_aside_after(folder / name, loaded.step)
@@ -124,6 +127,7 @@ def make_trainer(
             desync=cfg.desync,
             opponents=opponents,
             make_curriculum=factory.make_curriculum(cfg.curriculum, where["geometries"]),
+            layout_sources=factory.layout_sources(cfg.env, where["geometries"]),
             replay_folder=folder if cfg.nonfinite_replay else None,
             **writers,
         )

@@ -101,10 +101,11 @@ def _unroll(x, input_weight, bias, weight, reset, output, cell, needs_backward, 
 
 def _unroll_backward(weight, reset, saved, d_outputs, d_cell, needs_state):
     """Returns the gradients of the gates (T, B, 4 W), of the bias and, if needed, of the output and
-    the cell before the sequence.
+    the cell before the sequence. `d_cell` None: the last cell has no gradient.
     """
     gates, *cells = saved
     steps, d_gates = _steps(gates), torch.empty_like(gates)
+    d_cell = torch.zeros_like(cells[0]) if d_cell is None else d_cell
     next_reset = d_hidden = None
     for t in reversed(range(len(reset))):
         d_next_cell, d_cell = d_cell, torch.empty_like(d_cell)
@@ -185,12 +186,11 @@ class _Sequence(torch.autograd.Function):
         if d_last_output is not None:
             d_outputs = d_sum.clone()
             d_outputs[-1] += d_last_output
-        if d_cell is None:
-            d_cell = torch.zeros(x.shape[1:], device=x.device)
+        d_cell = None if d_cell is None else aligned(d_cell)
         backward = _unroll_on_chip_backward if ctx.on_chip else _unroll_backward
         needs_state = any(ctx.needs_input_grad[5:7])
         d_gates, d_bias, d_output, d_cell = backward(
-            weight, reset, saved, d_outputs, aligned(d_cell), needs_state
+            weight, reset, saved, d_outputs, d_cell, needs_state
         )
         flat = d_gates.flatten(0, 1)
         if ctx.is_residual:

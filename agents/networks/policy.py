@@ -26,6 +26,9 @@ from megastep.imports import known_name
 from megastep.settings import checked
 from megastep.types import Space, Tree
 
+#: Prefixes of the weights that acting does not need, in a policy's `state_dict`.
+TRAINING_ONLY = ("critic.", "prediction.")
+
 
 def _name_in(table: Mapping[str, Any]) -> AfterValidator:
     """Returns a validator of names: a name in the table, or an import path."""
@@ -60,7 +63,7 @@ class Policy(nn.Module):
     Attributes:
         generator: the `SeededGenerator` of the actions. A learner saves its state.
 
-    Weights used in training only are under "critic." and "prediction." in `state_dict()`.
+    Weights used in training only are under `TRAINING_ONLY` in `state_dict()`.
 
     Raises:
         ValueError: if an argument is out of range, or a space is of an unknown kind.

@@ -89,6 +89,11 @@ class AsyncCollector:
         self._launch(slot)
         return self.rollout
 
+    def allocate_layouts(self) -> None:
+        """Has rollouts hold the environment's layouts. Call before the first rollout."""
+        for rollout in (self.rollout, *(slot.rollout for slot in self.slots)):
+            rollout.allocate_layouts()
+
     def _launch(self, slot):
         """Starts collecting a rollout with the policy's current weights."""
         slot.copy_weights()

@@ -54,9 +54,8 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
             with section("env"), torch.autocast(rollout.reward.device.type, enabled=False):
                 world = env.step(arrdict(actions=rollout.scatter_actions(decision["actions"])))
                 world = rollout.select_lanes(world)
-            seen = rollout.store_outcome(t, world)
-            if rollout.layouts is not None:
-                rollout.store_layouts(t, env.layout)
+            layout = None if rollout.layouts is None else env.layout
+            seen = rollout.store_outcome(t, world, layout)
 
         if rollout.values is not None:
             with section("act"):
@@ -111,6 +110,10 @@ class Collector:
         else:
             self.graph()
         return self.rollout
+
+    def allocate_layouts(self) -> None:
+        """Has rollouts hold the environment's layouts. Call before the first rollout."""
+        self.rollout.allocate_layouts()
 
     def recapture(self) -> "Collector":
         """Discards the graph, if there is one. The next call captures again. Returns itself."""

@@ -54,8 +54,8 @@ class Rollout:
         terminal: (T, B) bool.
         truncated: (T, B) bool.
         metrics: (T, B) float32 by name, read where an episode ends.
-        layouts: (T, B) int32, the floor plan that the action led through, for a curriculum; None
-            without `allocate_layouts`.
+        layouts: (T, B) int32, the floor plan that the action led through, for a curriculum and for
+            statistics by source; None without `allocate_layouts`.
         state: (B, ...), the policy's hidden state before row 0.
 
     Raises:
@@ -105,18 +105,9 @@ class Rollout:
             self.metrics[name] = torch.zeros_like(self.reward)
 
     def allocate_layouts(self) -> None:
-        """Has the layouts of the environment be stored. Call once, before the first step."""
-        self.layouts = torch.zeros_like(self.reward, dtype=torch.int32)
-
-    def store_layouts(self, t: int, layout: torch.Tensor) -> None:
-        """Stores the layouts of the world that followed time t, if they were allocated.
-
-        Args:
-            layout: (N,) integers, by environment.
-        """
-        n_env_lanes = self.n_lanes if self.learners is None else len(self.learners)
-        by_lane = layout[:, None].expand(-1, n_env_lanes // len(layout)).flatten()
-        self.layouts[t] = self.select_lanes(by_lane)
+        """Has the layouts of the environment be stored. Call before the first step."""
+        if self.layouts is None:
+            self.layouts = torch.zeros_like(self.reward, dtype=torch.int32)
 
     def store_world(self, t: int, world: arrdict) -> arrdict:
         """Stores the world at time t. Returns it as it was stored, for the policy to act on."""
@@ -136,11 +127,19 @@ class Rollout:
             pairs.append((self.logprobs[t], decision["logprobs"]))
         copy_all(pairs)
 
-    def store_outcome(self, t: int, world: arrdict) -> arrdict:
+    def store_outcome(self, t: int, world: arrdict, layout: torch.Tensor | None = None) -> arrdict:
         """Stores the world that followed time t: what happened, at t, and what it looks like, at
         t + 1. Returns that as it was stored.
+
+        Args:
+            layout: (N,) integers, the environments' layouts in that world, if they are stored.
         """
-        copy_all([*self._of_transition(t, world), *self._of_world(t + 1, world)])
+        pairs = [*self._of_transition(t, world), *self._of_world(t + 1, world)]
+        if layout is not None:
+            n_env_lanes = self.n_lanes if self.learners is None else len(self.learners)
+            by_lane = layout[:, None].expand(-1, n_env_lanes // len(layout)).flatten()
+            pairs.append((self.layouts[t], self.select_lanes(by_lane)))
+        copy_all(pairs)
         return self.world(t + 1)
 
     def _of_world(self, t, world):

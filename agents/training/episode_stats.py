@@ -1,6 +1,6 @@
 """Statistics of finished episodes, accumulated on the device.
 
-Axes: T time, B lanes, G groups of lanes.
+Axes: T time, B lanes, G groups of lanes, D layouts, S sources of layouts.
 """
 
 import math
@@ -28,18 +28,20 @@ class EpisodeStats:
         device: where the transitions are.
         metrics: names of the metrics that worlds carry.
         groups: group name -> (B,) bool. Each group's means are reported beside the overall ones.
+        sources: the name of the source of each layout, (D,), or None. The means of the episodes in
+            each source's layouts are reported, too, unless a group has its name.
         skip_first: leaves out each lane's first episode, for lanes that started in the middle of
             one (`desync`).
 
     Attributes:
         returns, lengths: (B,) float64, of the episode that each lane is in.
         is_whole: (B,) bool, whether that episode is to be counted.
-        sums: (4 + 2 M, 1 + G) float64 for M metrics, over the episodes that ended since the last
-            `pop`: count, return, squared return, length, each metric, and for each metric the
-            number of episodes left out of it; for all lanes and for each group.
+        sums: (4 + 2 M, 1 + G + S) float64 for M metrics, over the episodes that ended since the
+            last `pop`: count, return, squared return, length, each metric, and for each metric the
+            number of episodes left out of it; for all lanes, for each group and for each source.
         bad_lanes: (M,) int64, the first lane with a metric that was left out; `n_lanes` if none.
-        windows: for all lanes and for each group, the sums of the last reports, of all ranks, on
-            the host. The oldest report is dropped once the others hold `MIN_EPISODES`.
+        windows: for all lanes, each group and each source, the sums of the last reports, of all
+            ranks, on the host. The oldest report is dropped once the others hold `MIN_EPISODES`.
     """
 
     def __init__(
@@ -49,18 +51,24 @@ class EpisodeStats:
         metrics: Sequence[str] = (),
         groups: Mapping[str, torch.Tensor] | None = None,
         skip_first: bool = False,
+        sources: Sequence[str] | None = None,
     ):
         self.metrics, self.groups = tuple(metrics), tuple(groups or ())
+        self.sources = tuple(dict.fromkeys(sources or ()))
+        self.source_of_layout = torch.tensor(
+            [self.sources.index(name) for name in sources or ()], dtype=torch.int32, device=device
+        )
         all_lanes = torch.ones(n_lanes, dtype=torch.bool, device=device)
         self.members = torch.stack([all_lanes, *(groups or {}).values()], 1).double()  # (B, 1 + G)
         self.returns = torch.zeros(n_lanes, dtype=torch.float64, device=device)
         self.lengths = torch.zeros(n_lanes, dtype=torch.float64, device=device)
         self.is_whole = torch.full((n_lanes,), not skip_first, device=device)
-        shape = 4 + 2 * len(self.metrics), 1 + len(self.groups)
+        n_columns = 1 + len(self.groups) + len(self.sources)
+        shape = 4 + 2 * len(self.metrics), n_columns
         self.sums = torch.zeros(shape, dtype=torch.float64, device=device)
         self.bad_lanes = torch.full((len(self.metrics),), n_lanes, device=device)
         self.named = set()
-        self.windows = [deque() for _ in range(1 + len(self.groups))]
+        self.windows = [deque() for _ in range(n_columns)]
 
     def add(
         self,
@@ -69,6 +77,7 @@ class EpisodeStats:
         done: torch.Tensor,
         learns: torch.Tensor | bool = True,
         metrics: Mapping[str, torch.Tensor] | None = None,
+        layouts: torch.Tensor | None = None,
     ) -> None:
         """Adds T transitions of B lanes.
 
@@ -79,9 +88,10 @@ class EpisodeStats:
             learns: (T, B) bool. An episode counts if this was true when its last action was chosen.
             metrics: name -> (T, B), read where `done`. An episode whose metric is not finite or
                 beyond the limit is left out of that metric's mean.
+            layouts: (T, B) int32, the layout of each episode, read where `done`. For sources.
         """
         if self._is_fused(reward, learns, metrics):
-            self._add_on_gpu(reward, reset, done, learns, metrics)
+            self._add_on_gpu(reward, reset, done, learns, metrics, layouts)
             return
         reward = _without_nonfinite(reward)
         # cumulative sums over all T rows, minus the sum at the last episode end before each row
@@ -98,10 +108,12 @@ class EpisodeStats:
             episode_returns**2,
             _sum_since(lengths, previous_end),
         ]
-        sums = torch.stack([torch.where(counts, value, 0.0).sum(0) for value in values])
-        if self.metrics:
-            sums = torch.cat([sums, *self._sum_metrics(counts, metrics)])
-        self.sums += sums @ self.members
+        by_source = None
+        if self.sources:
+            source_of_row = self._sources_of(layouts)
+            rows = [counts & (source_of_row == source) for source in range(len(self.sources))]
+            by_source = torch.stack([self._sum(one, values, metrics) for one in rows], 1)
+        self._add_sums(self._sum(counts, values, metrics), by_source)
         self.returns = _sum_since(returns, last_end, slice(-1, None))[0]
         self.lengths = _sum_since(lengths, last_end, slice(-1, None))[0]
         self.is_whole |= done.any(0)
@@ -115,12 +127,16 @@ class EpisodeStats:
             and all(value.dtype == torch.float32 for value in (reward, *values))
         )
 
-    def _add_on_gpu(self, reward, reset, done, learns, metrics):
+    def _add_on_gpu(self, reward, reset, done, learns, metrics, layouts):
         """Does the same as `add` in two kernels."""
         n_steps, n_lanes = reward.shape
         values = [metrics[name].contiguous() for name in self.metrics]
         pack = program.PROGRAM.params.EpisodeMetricParams
         of_lanes = self.sums.new_empty(len(self.sums), n_lanes)
+        source_sums = None
+        if self.sources:
+            source_sums = self.sums.new_empty(len(self.sums), len(self.sources), n_lanes)
+            layouts = layouts.contiguous()
         program.run(
             "episodes",
             reward.device,
@@ -130,25 +146,48 @@ class EpisodeStats:
             reset=reset.contiguous(),
             done=done.contiguous(),
             learns=learns.contiguous(),
+            layouts=layouts if self.sources else None,
+            source_of_layout=self.source_of_layout if self.sources else None,
             returns=self.returns,
             lengths=self.lengths,
             is_whole=self.is_whole,
             sums=of_lanes,
+            source_sums=source_sums,
             bad_lanes=self.bad_lanes,
             n_metrics=len(values),
+            n_sources=len(self.sources),
+            n_layouts=len(self.source_of_layout),
             n_steps=n_steps,
             n_lanes=n_lanes,
             limit=LIMIT,
         )
-        n_threads = program.PROGRAM.constants["GROUPS_THREADS"]
-        n_sums, n_groups = self.sums.shape
+        n_threads = program.PROGRAM.constants["COLUMNS_THREADS"]
+        n_sums, n_columns = self.sums.shape
         program.run(
-            *("episode_groups", reward.device, n_groups * n_threads, n_sums, n_threads),
+            *("episode_columns", reward.device, n_columns * n_threads, n_sums, n_threads),
             of_lanes=of_lanes,
             members=self.members,
+            source_sums=source_sums,
             sums=self.sums,
+            n_groups=self.members.shape[1],
             n_lanes=n_lanes,
         )
+
+    def _add_sums(self, sums, source_sums):
+        """Adds sums (4 + 2 M, B), and those by source (4 + 2 M, S, B) if there are sources."""
+        columns = sums @ self.members
+        self.sums += columns if source_sums is None else torch.cat([columns, source_sums.sum(2)], 1)
+
+    def _sources_of(self, layouts):
+        """Returns the number of each layout's source, -1 for one that is out of range."""
+        last = len(self.source_of_layout) - 1
+        sources = self.source_of_layout[layouts.clamp(0, last).long()]
+        return torch.where((layouts >= 0) & (layouts <= last), sources, -1)
+
+    def _sum(self, counts, values, metrics):
+        """Returns the sums over time of the episodes that count, (4 + 2 M, B)."""
+        sums = torch.stack([torch.where(counts, value, 0.0).sum(0) for value in values])
+        return torch.cat([sums, *self._sum_metrics(counts, metrics)]) if self.metrics else sums
 
     def _sum_metrics(self, counts, metrics):
         """Returns the sums of the metrics and the number of episodes left out of each, (M, B)."""
@@ -182,7 +221,8 @@ class EpisodeStats:
         - `episode/return`, `episode/length` and `episode/NAME` for each metric: the means; a metric
           is absent if every episode was left out of it
         - `episode/return_std`: standard deviation of the return
-        - all but the last for each group, such as `episode/return/leader`
+        - all but the last for each group and each source, such as `episode/return/leader` and
+          `episode/success/maze`
         """
         reports = sum_over_ranks(self.sums.T).tolist()
         self.sums.zero_()
@@ -195,9 +235,10 @@ class EpisodeStats:
         if n:
             variance = squared_returns / n - stats["episode/return"] ** 2
             stats["episode/return_std"] = math.sqrt(max(variance, 0.0))
-        for group, report, total in zip(self.groups, reports[1:], totals[1:], strict=True):
-            by_name = self._means(report, total)
-            stats |= {f"{name}/{group}": value for name, value in by_name.items()}
+        names = *self.groups, *self.sources
+        for group, report, total in zip(names, reports[1:], totals[1:], strict=True):
+            by_name = {f"{name}/{group}": n for name, n in self._means(report, total).items()}
+            stats |= {name: n for name, n in by_name.items() if name not in stats}
         return stats
 
     def _means(self, report, totals):

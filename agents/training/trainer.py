@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +58,8 @@ class Trainer:
             in each update, and is flushed before each report.
         make_curriculum: returns what draws the homes of new episodes, such as `curriculum.SFL`, for
             the environment, the learner and the rollout; None leaves that to the environment.
+        layout_sources: the name of the source of each of the environment's layouts, whose episodes
+            have statistics of their own; None for none.
 
     Attributes:
         samples, updates: environment steps of all lanes of all ranks, and updates, so far.
@@ -97,6 +99,7 @@ class Trainer:
         replay_folder: Path | None = None,
         annealing_record: AnnealingRecord | None = None,
         make_curriculum: Callable[[Env, Learner, Rollout], Curriculum] | None = None,
+        layout_sources: Sequence[str] | None = None,
     ):
         self.env, self.policy, self.learner = env, policy, learner
         self.logger, self.saver, self.budget = logger, saver, budget
@@ -111,6 +114,10 @@ class Trainer:
         self.collect = learner.collector(env)
         self.rollout = self.collect.rollout
         self.curriculum = make_curriculum and make_curriculum(env, learner, self.rollout)
+        if optional(env, "layout") is None or not hasattr(self.collect, "allocate_layouts"):
+            layout_sources = None
+        if layout_sources:
+            self.collect.allocate_layouts()
         desync = desync and optional(env, "desync") is not None
         if desync:
             env.desync()  # the collector has reset the environment, and has not stepped it yet
@@ -120,6 +127,7 @@ class Trainer:
             tuple(self.rollout.metrics),
             lane_groups(env, self.rollout.learners),
             skip_first=desync,
+            sources=layout_sources,
         )
         self.run_state = RunState(
             env, policy, learner, self.collect, self.episode_stats, opponents, self.curriculum
@@ -240,6 +248,7 @@ class Trainer:
             rollout.terminal | rollout.truncated,
             rollout.learns[:-1],
             rollout.metrics,
+            rollout.layouts if self.episode_stats.sources else None,
         )
         if self.curriculum is not None:
             self.curriculum.update(rollout)

@@ -340,7 +340,7 @@ def test_record_against(here, capsys, monkeypatch):
         ("tests.helpers.games:Hihg", "tests.helpers.games has no Hihg; did you mean High"),
         ("tests.helpers.games:Matrix", "tests.helpers.games:Matrix cannot play in Pong"),
         ("test_duels:Elsewhere", "cannot play in Pong.*its actions are not those of MultiDiscrete"),
-        ("nowhere", "nowhere does not exist"),
+        ("nowhere", "nowhere is neither a run folder nor a pretrained agent"),
     ],
 )
 def test_opponent_errors(here, capsys, name, sentence, script):

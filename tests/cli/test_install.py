@@ -24,7 +24,7 @@ ENVIRONMENT = {key: value for key, value in os.environ.items() if key != "PYTHON
 #: Source folders with files that the wheel must contain, and where it has them.
 PACKAGE_DATA = {
     "configs": ("megastep/agents/configs", {".yaml"}),
-    "agents": ("megastep/agents", {".py", ".h", ".cu", ".cpp"}),
+    "agents": ("megastep/agents", {".py", ".h", ".cu", ".cpp", ".safetensors", ".md"}),
     "megastep": ("megastep", {".py", ".h", ".cu", ".cpp", ".npz", ".json", ".sha256"}),
 }
 
@@ -51,6 +51,8 @@ def source(tmp_path_factory):
         if os.path.lexists(ROOT / name):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name, follow_symlinks=False)
+    for suffix in ("safetensors", "md"):  # an agent, also where none was committed yet
+        (folder / f"agents/pretrained/test_agent.{suffix}").write_text("not read")
     return folder
 
 

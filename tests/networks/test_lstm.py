@@ -388,6 +388,21 @@ def test_sequence_on_chip_cuts_nan_at_resets():
     assert cell.isfinite().all() and d_x[n_steps // 2 :].isfinite().all()
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_no_gradient_of_the_last_cell_is_one_of_zeros(device):
+    torch.manual_seed(0)
+    dtype = torch.bfloat16 if device == "cuda" else torch.float32
+    options = dict(dtype=dtype, device=device, requires_grad=True)
+    x, weight = torch.randn(3, 50, 256, **options), torch.randn(1024, 256, **options)
+    bias, states = torch.zeros(1024, **options), torch.zeros(2, 50, 256, device=device).unbind()
+    reset = torch.zeros(3, 50, dtype=torch.bool, device=device)
+    outputs, cell, _ = lstm_module._Sequence.apply(x, weight, bias, weight, reset, *states)
+    d, leaves = torch.randn_like(outputs), (x, weight, bias)
+    alone = torch.autograd.grad(outputs, leaves, d, retain_graph=True)
+    both = torch.autograd.grad([outputs, cell], leaves, [d, torch.zeros_like(cell)])
+    assert all(map(torch.equal, alone, both))
+
+
 # ---- The kernels of a whole sequence on the CPU ----
 
 # float32 sums in another order, exponentials with an error of 2e-7, up to 32 steps deep

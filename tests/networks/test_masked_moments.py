@@ -16,25 +16,34 @@ def test_only_valid_numbers_count():
     assert (n, mean, variance) == (0, 0, 0)
 
 
-@pytest.mark.cuda
-@pytest.mark.parametrize("shape", [(1,), (3, 5), (2048,), (32, 4096), (7, 70_001)])
-def test_a_gpu_finds_the_same_moments(shape):
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("shape", [(1,), (3, 5), (2048,), (32, 1000), (7, 70_001)])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.8, 1.0])
+def test_moments_and_normalised_numbers_are_those_of_the_valid_entries(device, shape, share):
     """Far from 0, where the square of the mean would swallow the variance."""
     torch.manual_seed(0)
-    valid = torch.rand(shape) < 0.7
+    valid = torch.rand(shape) < share
     arrays = [torch.randn(shape) * 3 + 1000, torch.randn(shape), torch.rand(shape)]
-    for x in arrays:
-        x[~valid] = torch.nan
-    plain = masked_moments(valid, *(x.double() for x in arrays))
-    fused = masked_moments(valid.cuda(), *(x.cuda() for x in arrays))
-    for x, one, other in zip(arrays, fused, plain, strict=True):
-        assert one[0].item() == other[0].item()
-        for number, expected in zip(one[1:], other[1:], strict=True):
-            torch.testing.assert_close(number.cpu().double(), expected, rtol=1e-4, atol=1e-5)
-        result = normalise_masked(x.cuda(), valid.cuda(), one).cpu()
-        expected = normalise_masked(x.double(), valid, other)
-        # the mean of numbers near 1000 has an error of 1e-4
-        torch.testing.assert_close(result.double(), expected, rtol=1e-3, atol=1e-3)
+    expected = [x[valid].double() for x in arrays]
+    valid = valid.to(device)
+    arrays = [x.to(device).masked_fill(~valid, torch.nan) for x in arrays]
+    results = masked_moments(valid, *arrays)
+    for x, entries, moments in zip(arrays, expected, results, strict=True):
+        n_valid, mean, variance = moments
+        assert n_valid == len(entries) and n_valid.dtype == torch.int64
+        normalised = normalise_masked(x, valid, moments)
+        assert not normalised[~valid].any()
+        if not len(entries):
+            assert mean == variance == 0
+            continue
+        assert mean.item() == pytest.approx(entries.mean().item(), rel=1e-6, abs=1e-6)
+        spread = entries.std(correction=0)
+        assert variance.item() == pytest.approx(spread.square().item(), rel=1e-4, abs=1e-6)
+        if len(entries) > 1:
+            # float32 near 1,000
+            close = dict(rtol=1e-3, atol=1e-3)
+            exact = (entries - entries.mean()) / spread
+            torch.testing.assert_close(normalised[valid].cpu().double(), exact, **close)
 
 
 @pytest.mark.cuda

@@ -280,6 +280,46 @@ def test_run_logs_outcomes_by_source(tmp_path, monkeypatch):
     assert 0 <= row["curriculum/worst"] <= row["curriculum/outcome"] <= 1
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["env=pointgoal", "env.limit=5"],
+        ["env=pointgoal", "env.limit=5", "learner=vtrace", "learner.lag=1"],
+        ["env=pointgoal", "env.limit=5", "env.resample=false", "env.n_envs=2"],
+        ["env=deathmatch", "env.n_agents=2", "env.limit=5", "opponents.bot=0.5"],
+    ],
+    ids=["ppo", "lag", "fewer environments than homes", "opponents"],
+)
+def test_run_in_a_mix_logs_episodes_by_source(words, tmp_path, monkeypatch):
+    """Also without a curriculum. Every episode is one of its source's."""
+    monkeypatch.chdir(tmp_path)
+    common = [*SMALL[:2], "geometry=mixed", "geometry.parts={bench: 2, maze: 2}", *SMALL[4:-1]]
+    common += ["log_every=4", "desync=false"]
+    assert train.main([*common, *words, "samples=640", "folder=run"]) == 0
+    row = json_lines.read("run/metrics.jsonl")[-1]
+    names = [f"episode/{{}}/{source}" for source in ("bench", "maze")]
+    counts = [row[name.format("count")] for name in names]
+    assert sum(counts) == row["episode/count"] and min(counts) > 0
+    metric = "success" if "env=pointgoal" in words else "kills"
+    for key in ("return", "length", metric):
+        windows = [row[name.format("window")] for name in names]
+        mean = np.average([row[name.format(key)] for name in names], weights=windows)
+        if sum(windows) == row["episode/window"]:
+            assert mean == pytest.approx(row[f"episode/{key}"])
+
+
+def test_statistics_by_source_are_exact_under_resume(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = [*SMALL[:2], "geometry=mixed", "geometry.parts={bench: 2, maze: 2}", *SMALL[4:-1]]
+    words += ["env=pointgoal", "env.limit=5", "log_every=3"]
+    words += ["learner.anneal=never"]
+    assert train.main([*words, "samples=640", "folder=whole"]) == 0
+    assert train.main([*words, "samples=256", "folder=cut"]) == 0
+    assert train.main(["resume=cut", "samples=640"]) == 0
+    whole, cut = (json_lines.read(f"{name}/metrics.jsonl") for name in ("whole", "cut"))
+    assert cut == whole and "episode/spl/maze" in cut[-1]
+
+
 def test_without_a_curriculum_nothing_is_stored_or_logged(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made, make_trainer = [], train.make_trainer

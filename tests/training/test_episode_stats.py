@@ -123,6 +123,28 @@ def test_metrics_are_read_at_episode_ends_and_split_by_role():
     assert stats["episode/count/follower"] == 0 and stats["episode/return/follower"] == 10
 
 
+def test_sources_are_those_of_the_layouts_where_episodes_end():
+    """Lane 0 ends an episode in layout 2, a maze, and then one in layout 0; lane 1 in layout 7,
+    which does not exist.
+    """
+    sources = ["homes", "homes", "maze", "all"]
+    groups = {"all": torch.tensor([True, True])}
+    episodes = EpisodeStats(2, "cpu", ["laps"], groups, sources=sources)
+    layouts = torch.tensor([[2, 7], [0, 7]], dtype=torch.int32)
+    done = torch.tensor([[True, False], [True, True]])
+    reward = torch.tensor([[1.0, 10.0], [5.0, 20.0]])
+    metrics = dict(laps=torch.tensor([[2.0, 0], [torch.nan, 8]]))
+    episodes.add(reward, torch.zeros_like(done), done, True, metrics, layouts)
+    stats = episodes.pop()
+    assert (stats["episode/count"], stats["episode/return"]) == (3, (1 + 5 + 30) / 3)
+    assert (stats["episode/count/maze"], stats["episode/return/maze"]) == (1, 1)
+    assert (stats["episode/laps/maze"], stats["episode/length/maze"]) == (2, 1)
+    assert (stats["episode/count/homes"], stats["episode/return/homes"]) == (1, 5)
+    assert "episode/laps/homes" not in stats and "episode/return_std/maze" not in stats
+    assert stats["episode/count/all"] == 3, "a group of the same name stays the group"
+    assert episodes.pop()["episode/return/maze"] == 1, "a window of its own"
+
+
 def test_lane_groups_by_role_and_matchup():
     past = torch.tensor([False, False, True, True])
     env = SimpleNamespace(n_envs=2, device="cpu", roles=("left", "right"), matchups={"past": past})
@@ -253,12 +275,16 @@ def test_sums_are_restored_only_for_the_same_metrics():
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("n_metrics", [0, 2])
-def test_gpu_counts_as_the_cpu_does(n_metrics):
-    """Over several rollouts, with groups, NaN rewards and metrics, and lanes that do not learn."""
+@pytest.mark.parametrize("sources", [None, ["homes", "maze", "maze", "bench"]])
+def test_gpu_counts_as_the_cpu_does(n_metrics, sources):
+    """Over several rollouts, with groups, NaN rewards and metrics, lanes that do not learn, sources
+    and layouts out of range.
+    """
     n_steps, n_lanes, names = 32, 300, [f"metric{i}" for i in range(n_metrics)]
     group = torch.rand(n_lanes, generator=torch.Generator().manual_seed(0)) < 0.3
+    options = dict(skip_first=True, sources=sources)
     stats = [
-        EpisodeStats(n_lanes, device, names, {"some": group.to(device)}, skip_first=True)
+        EpisodeStats(n_lanes, device, names, {"some": group.to(device)}, **options)
         for device in ("cpu", "cuda")
     ]
     for seed in range(3):
@@ -269,10 +295,13 @@ def test_gpu_counts_as_the_cpu_does(n_metrics):
         metrics = {name: torch.randn(n_steps, n_lanes) for name in names}
         for values in metrics.values():
             values[torch.rand(n_steps, n_lanes) < 0.01] = torch.inf
+        layouts = torch.randint(-1, 6, (n_steps, n_lanes), dtype=torch.int32)
         for one, device in zip(stats, ("cpu", "cuda"), strict=True):
             rows = {name: values.to(device) for name, values in metrics.items()}
-            one.add(reward.to(device), *(flag.to(device) for flag in flags), rows)
+            where = layouts.to(device)
+            one.add(reward.to(device), *(flag.to(device) for flag in flags), rows, where)
     plain, fused = stats
+    assert plain.sums[0].min() > 100
     for name in ("returns", "lengths", "is_whole", "sums", "bad_lanes"):
         torch.testing.assert_close(getattr(fused, name).cpu(), getattr(plain, name))
     assert fused.pop() == pytest.approx(plain.pop())

@@ -4,10 +4,10 @@
 #include "number.h"
 
 // In a fixed order, in every thread of a block of THREADS: 32, 64, 128, ... 1024.
-template <int THREADS>
-DEVICE float sum_of_block(float x) {
+template <int THREADS, class T>
+DEVICE T sum_of_block(T x) {
     constexpr int WARPS = THREADS / WARP;
-    __shared__ float of_warps[WARPS];
+    __shared__ T of_warps[WARPS];
     for (int mask = WARP / 2; mask; mask /= 2)
         x += __shfl_xor_sync(~0u, x, mask);
     __syncthreads();  // the last sum was read

@@ -101,7 +101,7 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
         saved_gates: of `forward`.
         saved_cells: of `forward`.
         d_outputs: (T, B, W).
-        d_cell: (B, W) float32, gradient of the last cell.
+        d_cell: (B, W) float32, gradient of the last cell. None: 0.
 
     Returns:
         The gradients of the gates (T, B, 4 W), of a bias (4 W,) float32, which is their sum, and of
@@ -110,8 +110,8 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
     n_steps, n_lanes, _ = d_outputs.shape
     n_clusters = -(-n_lanes // _LANES)
     d_gates = d_outputs.new_empty(n_steps, n_lanes, 4 * WIDTH)
-    d_bias = d_cell.new_empty(n_clusters, 4 * WIDTH)
-    d_last_output, d_last_cell = torch.empty_like(d_cell), torch.empty_like(d_cell)
+    d_bias = saved_cells.new_empty(n_clusters, 4 * WIDTH)
+    d_last_output, d_last_cell = (saved_cells.new_empty(n_lanes, WIDTH) for _ in range(2))
     _launch(
         "backward",
         n_clusters,

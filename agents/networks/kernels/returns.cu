@@ -47,22 +47,22 @@ KERNEL BOUNDS(256) masked_parts(MaskedPartsParams p) {
 // A block adds up the parts of an array (Chan et al. 1979).
 KERNEL BOUNDS(256) masked_moments(MaskedMomentsParams p) {
     const float* parts = p.parts + 3ll * blockIdx.y * p.n_parts;
-    float count = 0.f, sum = 0.f, squares = 0.f;
+    double count = 0., sum = 0., squares = 0.;
     for (int i = threadIdx.x; i < p.n_parts; i += MASKED_THREADS) {
         count += parts[3 * i];
-        sum += parts[3 * i] * parts[3 * i + 1];
+        sum += (double)parts[3 * i] * parts[3 * i + 1];
     }
-    count = sum_of_block<MASKED_THREADS>(count);  // exact below 2^24
-    float n = fmaxf(count, 1.f), mean = __fdiv_rn(sum_of_block<MASKED_THREADS>(sum), n);
+    count = sum_of_block<MASKED_THREADS>(count);
+    double n = count < 1. ? 1. : count, mean = sum_of_block<MASKED_THREADS>(sum) / n;
     for (int i = threadIdx.x; i < p.n_parts; i += MASKED_THREADS) {
-        float away = parts[3 * i + 1] - mean;
+        double away = parts[3 * i + 1] - mean;
         squares += parts[3 * i + 2] + parts[3 * i] * away * away;
     }
     squares = sum_of_block<MASKED_THREADS>(squares);
     if (threadIdx.x)
         return;
-    p.moments[2 * blockIdx.y] = mean;
-    p.moments[2 * blockIdx.y + 1] = __fdiv_rn(squares, n);
+    p.moments[2 * blockIdx.y] = (float)mean;
+    p.moments[2 * blockIdx.y + 1] = (float)(squares / n);
     if (blockIdx.y % p.n_arrays == 0)
         p.n_valid[blockIdx.y / p.n_arrays] = (long long)count;
 }

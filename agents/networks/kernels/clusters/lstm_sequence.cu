@@ -396,7 +396,8 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
 #pragma unroll
         for (int e = 0; e < 2; e++) {
             int lane = first_lane + 8 * j + 2 * me.q + e;
-            d_cells[j][e] = lane < n_lanes ? p.d_cell[(lanes + lane) * W + unit] : 0.f;
+            bool exists = p.d_cell && lane < n_lanes;
+            d_cells[j][e] = exists ? p.d_cell[(lanes + lane) * W + unit] : 0.f;
         }
     // What was saved of the next step to go back through
     uint4 gates[COLUMNS];

@@ -30,7 +30,7 @@ struct LstmSequenceBackwardParams {
     const void* saved_gates;     // of the forward pass
     const float* saved_cells;
     const void* d_outputs;  // (P, T, B, W)
-    const float* d_cell;    // (P, B, W)
+    const float* d_cell;    // (P, B, W); null: 0
     void* d_gates;          // (P, T, B, 4 W)
     float* d_bias;          // (P, C, 4 W), sums over each cluster's lanes
     float* d_last_output;   // (P, B, W)

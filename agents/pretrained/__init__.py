@@ -1,0 +1,86 @@
+"""Trained agents that come with megastep, and how to load them from Python.
+
+    from megastep import geometries
+    from megastep.agents import pretrained
+
+    env = pretrained.make_env("pointgoal_anywhere", geometries.sample("maze", 16), n_envs=16)
+    policy = pretrained.load("pointgoal_anywhere")
+    world, state = env.reset(), policy.initial(16)
+    for _ in range(500):
+        decision, state = policy(world, state)
+        world = env.step(decision)
+
+Each agent is a file NAME.safetensors in this folder, with a card NAME.md beside it. On the command
+line its name stands for a run: `evaluate.py run=NAME`.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from megastep.agents.cli import factory, program, runs, settings
+from megastep.agents.networks.policy import Policy
+
+#: Where an agent's spaces are read from, which no floor plan changes.
+_BOX = "megastep.geometries.sources:box"
+
+
+def names() -> list[str]:
+    """Returns the names of the agents that come with megastep."""
+    return [*runs.pretrained()]
+
+
+def load(name: str, device: str = "auto") -> Policy:
+    """Returns a trained policy, ready to act: `decision, state = policy(world, state)`.
+
+    It acts only: it has no critic, and its weights need no gradient. On a CPU this sets the number
+    of threads that PyTorch uses, as training does.
+
+    Args:
+        name: one of `names()`; or the path of such a file, a run's folder or a checkpoint, or
+            `latest`. A path comes first.
+        device: `auto`, `cpu`, `cuda` or `cuda:1`; `auto` is a GPU if there is one.
+
+    Raises:
+        UserError: there is none; or it names modules outside megastep and another user made it.
+    """
+    device = factory.make_device(device)
+    loaded = runs.load_checkpoint(runs.find(name), False, device)
+    trained = factory.config_of(loaded)
+    box = settings.kind_of("geometry", _BOX)(name=_BOX)
+    homes = factory.homes(trained.env, box, "test")
+    env = factory.make_sample(trained.env, homes, seed=trained.seed, device=device)
+    policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+    return policy.requires_grad_(False)
+
+
+def make_env(
+    name: str,
+    geometries: Sequence[dict] = (),
+    n_envs: int = 128,
+    seed: int = 1,
+    device: str = "auto",
+    **changes: Any,
+) -> Any:
+    """Returns an environment with the settings that an agent was trained with.
+
+    Args:
+        name: as for `load`.
+        geometries: floor plans, such as `geometries.sample("homes", 64, "test")`, of an environment
+            that takes any.
+        n_envs: number of environments.
+        seed: of the environment.
+        device: as for `load`.
+        changes: other settings of the environment, such as `resample=False`.
+
+    Raises:
+        UserError: as `load`; or the environment has no such setting, or refuses its value.
+    """
+    device = factory.make_device(device)
+    trained = factory.config_of(runs.load_checkpoint(runs.find(name), False)).env
+    if unknown := [key for key in changes if not hasattr(trained, key)]:
+        raise program.UserError(
+            f"{settings.env_name(trained)} has no setting {unknown[0]}; it has "
+            f"{', '.join(key for key in vars(trained) if key != 'name')}"
+        )
+    env = factory.changed(trained, n_envs=n_envs, **changes)
+    return factory.construct(env, geometries=[*geometries], seed=seed, device=device)

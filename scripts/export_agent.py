@@ -1,0 +1,301 @@
+"""Turns a run into an agent of the package: a file with its acting weights, and a card.
+
+    python scripts/export_agent.py runs/NAME pointgoal_anywhere
+    python scripts/export_agent.py --cards                       # only writes all cards again
+
+Writes pointgoal_anywhere.safetensors and pointgoal_anywhere.md into agents/pretrained/, from the
+run's newest checkpoint. Evaluate the run first, for the card's tables: `python evaluate.py
+run=runs/NAME geometry=suite episodes=8000`, and with against=bot for duels. What follows "What it
+is for" in a card is written by hand, and kept when the agent is exported again.
+"""
+
+import argparse
+import json
+import re
+import sys
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from megastep.agents.cli import components, console, evaluate, factory, program, runs, settings
+from megastep.agents.networks.policy import Policy
+from megastep.agents.training import agent_file, checkpoint, json_lines, provenance, trust
+from megastep.agents.training.atomic_files import write_atomically
+from megastep.dotdict import leaves
+from megastep.types import n_lanes
+
+MAX_BYTES = 2_000_000
+#: Bound of `rounding_error`. Float16 changes a weight by at most 1 part in 2,048.
+MAX_ERROR = 0.005
+#: Environments and steps in which it is measured.
+N_ENVS, N_STEPS = 64, 256
+#: Settings of a run that are of no use to others, or name files of the machine that trained it.
+PRIVATE = dict(
+    folder=None, resume=None, rerun=None, init=None, more_samples=None, more_seconds=None
+)
+BY_HAND = "## What it is for"
+
+
+# ---- The file ----
+
+
+def rounded(policy: Policy) -> dict[str, torch.Tensor]:
+    """Returns a policy's state with weights as float16; statistics keep their dtype.
+
+    Raises:
+        UserError: a weight is too large for float16.
+    """
+    weights = dict(policy.named_parameters())
+    state = {k: v.half() if k in weights else v for k, v in policy.state_dict().items()}
+    for name, tensor in state.items():
+        if not tensor.isfinite().all():
+            raise program.UserError(f"{name} has numbers beyond 65,504, the largest of float16")
+    return {name: tensor.detach().cpu() for name, tensor in state.items()}
+
+
+@torch.no_grad()
+def rounding_error(exported: Policy, original: Policy, env, n_steps: int = N_STEPS) -> float:
+    """Returns how far the logits of two policies are apart, as a fraction of their size: of root
+    mean squares over all lanes and steps. Both see what the original's actions lead to.
+    """
+    world = env.reset()
+    states = [policy.initial(n_lanes(env), env.device) for policy in (exported, original)]
+    generator = torch.Generator(env.device).manual_seed(1)
+    difference = size = 0.0
+    for _ in range(n_steps):
+        mine, states[0] = exported(world, states[0], sample=False)
+        theirs, states[1] = original(world, states[1], generator=generator)
+        for one, other in zip(leaves(mine["logits"]), leaves(theirs["logits"]), strict=True):
+            difference += (one.double() - other.double()).square().sum().item()
+            size += other.double().square().sum().item()
+        world = env.step(theirs)
+    return (difference / max(size, 1e-300)) ** 0.5
+
+
+def facts_of(folder: Path, loaded: checkpoint.Checkpoint) -> dict:
+    """Returns what made the agent, from what its run recorded."""
+    lines = json_lines.read(folder / provenance.FILE)
+    lines = [line for line in lines if line["samples"] < loaded.step]
+    commits = dict.fromkeys(line.get("commit", "unknown") for line in lines)
+    return {
+        "environment": loaded.config["train"]["env"]["name"],
+        "commands": [command_of(line["command"]) for line in lines],
+        "commit": ", ".join(commits) or "unknown",
+        "samples": loaded.step,
+        "seconds": round(loaded.numbers["seconds"], 1),
+        "device": loaded.made_with.get("device", "unknown").removeprefix("cuda "),
+        "torch": loaded.made_with.get("torch", "unknown"),
+        "ranks": loaded.made_with.get("ranks", 1),
+    }
+
+
+def command_of(words: str) -> str:
+    """Returns a command without where Python and the script are on the machine."""
+    return re.sub(r"^.*?(\S*/)?((train\.py|megastep train)\b.*)$", r"python \2", words).replace(
+        "python megastep", "megastep"
+    )
+
+
+def tables_of(folder: Path, step: int) -> list[dict]:
+    """Returns the evaluations of a run in geometry=suite after so many samples, oldest first:
+    titles, commands without their run, and rows.
+    """
+    tables = []
+    files = sorted((folder / "evaluations").glob("*.json"), key=lambda path: path.stat().st_mtime)
+    for path in files:
+        table = json.loads(path.read_text())
+        how = table.get("evaluation", {})
+        geometry = how.get("geometry") or {}
+        if table.get("step") != step or geometry.get("name") != components.SUITE:
+            continue
+        words = ["geometry=suite", *options_of(geometry)]
+        words += [f"{key}={how[key]}" for key in ("split", "episodes", "seed")]
+        words += ["greedy=true"] * how["greedy"]
+        words += [f"against={','.join(how['against'])}"] if how.get("against") else []
+        title = re.sub(f"^{re.escape(folder.name)}(?=, )", "the agent", table["title"])
+        tables.append({"title": title, "command": " ".join(words), "rows": table["rows"]})
+    return tables
+
+
+def options_of(geometry: dict) -> list[str]:
+    """Returns the words of a command line for those options of a suite that are not its own."""
+    own = vars(settings.kind_of("geometry", components.SUITE)(name=components.SUITE))
+    return [
+        "'geometry.{}={}'".format(key, json.dumps(value).replace('"', ""))
+        for key, value in geometry.items()
+        if value != own[key]
+    ]
+
+
+def export(
+    run: str, name: str, folder: Path | None = None, max_error: float = MAX_ERROR
+) -> tuple[Path, Path]:
+    """Writes an agent's file and its card. Returns their paths.
+
+    Args:
+        run: a run's folder, or one of its checkpoints.
+        name: of the agent.
+        folder: where; default: the package's.
+        max_error: bound of `rounding_error`.
+
+    Raises:
+        UserError: the run has no suite evaluation, needs modules outside megastep, is too large, or
+            acts otherwise once it is rounded. Nothing was written then.
+    """
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise program.UserError(f"{name!r} is no name of an agent; use small letters, digits and _")
+    folder, path = folder or program.PRETRAINED, runs.find(run)
+    loaded = runs.load_checkpoint(path, False, factory.make_device("cpu"))
+    if not loaded.numbers:
+        raise program.UserError(f"{loaded.path} has weights only; export a run or its checkpoint")
+    config = {**loaded.config, "train": loaded.config["train"] | PRIVATE}
+    if names := trust.foreign_names(json.dumps(config).encode()):
+        raise program.UserError(
+            f"{loaded.path} needs {', '.join(names)}, and agents of the package need megastep only"
+        )
+    if not (tables := tables_of(runs.folder_of(loaded.path), loaded.step)):
+        raise program.UserError(
+            f"{runs.folder_of(loaded.path)} has no evaluation of {loaded.path.name} in the suite; "
+            f"first run python evaluate.py run={loaded.path} geometry=suite episodes=8000"
+        )
+    trained = factory.config_of(loaded)
+    homes = factory.spread(factory.homes(trained.env, trained.geometry, "test"), N_ENVS)
+    env = factory.construct(
+        factory.changed(trained.env, n_envs=N_ENVS), geometries=homes, seed=1, device="cpu"
+    )
+    original = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+    state, exported = rounded(original), factory.make_policy(trained.agent, env)
+    exported.load_state_dict(state)
+    error = rounding_error(exported, original, env)
+    if not error <= max_error:
+        raise program.UserError(
+            f"{loaded.path} acts otherwise with weights in float16: its logits differ by "
+            f"{error:.1%}, and may by {max_error:.1%}"
+        )
+    facts = facts_of(runs.folder_of(loaded.path), loaded)
+    facts |= {"parameters": sum(v.numel() for v in state.values()), "rounding": error}
+    file = folder / f"{name}{agent_file.SUFFIX}"
+    temporary = file.with_name(f"{name}-new{agent_file.SUFFIX}")
+    with program.errors(f"{folder} cannot be written: "):
+        folder.mkdir(parents=True, exist_ok=True)
+        agent_file.write(temporary, state, config, facts, tables)
+    try:
+        check_file(temporary, state)
+        temporary.replace(file)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return file, write_card(file)
+
+
+def check_file(path: Path, state: dict[str, torch.Tensor]) -> None:
+    """Raises UserError if a file of an agent is too large or does not hold this state."""
+    if (size := path.stat().st_size) > MAX_BYTES:
+        raise program.UserError(f"The agent has {size:,} bytes, and may have {MAX_BYTES:,}")
+    read = runs.load_checkpoint(path, False, "cpu").state["policy"]
+    is_same = read.keys() == state.keys() and all(torch.equal(read[k], v) for k, v in state.items())
+    if not is_same:
+        raise program.UserError(f"{path} was not written as it should be")
+
+
+# ---- The card ----
+
+
+def write_card(file: Path) -> Path:
+    """Writes the card beside an agent's file. Keeps what its authors wrote. Returns its path."""
+    about = agent_file.read_metadata(file)
+    path = file.with_suffix(".md")
+    text = path.read_text() if path.exists() else ""
+    start = text.find(BY_HAND)
+    by_hand = text[start:] if start >= 0 else default_words(about)
+    write_atomically(path, f"{card(file)}\n{by_hand}".encode())
+    return path
+
+
+def card(file: Path) -> str:
+    """Returns the part of a card that follows from the agent's file."""
+    about = agent_file.read_metadata(file)
+    facts, name = about["facts"], file.stem
+    commands = "; then ".join(f"`{command}`" for command in facts["commands"]) or "unknown"
+    gpus = f"{facts['ranks']} × {facts['device']}" if facts["ranks"] > 1 else facts["device"]
+    lines = {
+        "command": commands,
+        "commit": facts["commit"],
+        "samples": f"{facts['samples']:,}",
+        "seconds of training": f"{facts['seconds']:,}",
+        "device": f"{gpus}, PyTorch {facts['torch']}",
+        "size": f"{file.stat().st_size / 1e6:.2f} MB, {facts['parameters']:,} numbers: weights in "
+        "float16, statistics of observations in float32, no critic",
+        "error of rounding": f"{100 * facts['rounding']:.2g} % of its logits' root mean square",
+    }
+    parts = [
+        f"# {name}",
+        "```\n"
+        f"python evaluate.py run={name} geometry=suite\n"
+        f"python record.py run={name} geometry=maze\n"
+        f"python train.py init={name} seconds=60\n"
+        "```",
+        "## Training",
+        "\n".join(f"- {key}: {text}" for key, text in lines.items()),
+        "## Skill",
+    ]
+    for table in about["tables"]:
+        are_duels = "won" in table["rows"][0]
+        cells = [*map(evaluate.duel_cells if are_duels else evaluate.cells, table["rows"])]
+        lines = [[*row.values()] for row in cells]
+        parts += [
+            f"`python evaluate.py run={name} {table['command']}`, measured before the weights were "
+            f"rounded. {table['title']}:",
+            console.table([*cells[0]], lines, is_markdown=True),
+        ]
+    return "\n\n".join(parts) + "\n"
+
+
+def default_words(about: dict) -> str:
+    """Returns what a new card says where people write."""
+    train, spaces = about["config"]["train"], about["config"]["spaces"]
+    spaces = "; ".join(f"`{name}` {space}" for name, space in spaces.items())
+    environment = settings.label(train["env"]["name"])
+    homes = settings.label(train["geometry"]["name"])
+    return "\n\n".join(
+        [
+            BY_HAND,
+            f"It acts in `env={environment}`: as a baseline, as an opponent, and as a start for "
+            "training with `init=`.",
+            "## Limits",
+            f"It was trained in `geometry={homes}` and measured where the tables say. Its "
+            f"observations and actions must be {spaces}. It has no critic.",
+            "## Licence",
+            "MIT, as megastep.\n",
+        ]
+    )
+
+
+def main(words: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", nargs="?", help="a run's folder, or one of its checkpoints")
+    parser.add_argument("name", nargs="?", help="of the agent, such as pointgoal_anywhere")
+    parser.add_argument("--folder", type=Path, default=program.PRETRAINED)
+    parser.add_argument("--max-error", type=float, default=MAX_ERROR, help="of the logits")
+    parser.add_argument("--cards", action="store_true", help="only write all cards again")
+    options = parser.parse_args(words)
+    if options.cards == (options.name is not None):
+        parser.error("give a run and a name, or --cards")
+    try:
+        if options.cards:
+            paths = map(write_card, sorted(options.folder.glob(f"*{agent_file.SUFFIX}")))
+        else:
+            paths = export(options.run, options.name, options.folder, options.max_error)
+        for path in paths:
+            console.say(f"Wrote {path}")
+    except program.UserError as error:
+        console.say(f"export_agent.py: {error}", sys.stderr)
+        return error.code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,392 @@
+"""Agents in one file: exported from a run, and then used by their names. Those of the package."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import export_agent
+import pytest
+import torch
+
+from megastep import geometries
+from megastep.agents import pretrained
+from megastep.agents.cli import evaluate, factory, inspect, program, record, runs, train
+from megastep.agents.cli.program import UserError
+from megastep.agents.networks.policy import TRAINING_ONLY
+from megastep.agents.networks.running_norm import RunningNorm
+from megastep.agents.training import agent_file, checkpoint
+from megastep.agents.training.checkpoint_format import CheckpointError, DamagedCheckpoint
+from megastep.types import n_lanes
+
+NAME = "tiny_agent"
+PARTS = "geometry.parts={bench: 2, braided: {source: maze, n: 2, braid: 1}}"
+TINY = [
+    *("env=deathmatch", "env.n_agents=2", "env.res=16", "env.n_envs=4", "env.limit=20"),
+    *("geometry=mixed", PARTS, "preset=cpu", "device=cpu", "agent.width=8", "seed=1"),
+    *("learner.n_steps=8", "learner.n_minibatches=2", "log_every=4"),
+]
+SUITE = ["geometry=suite", PARTS, "episodes=8", "device=cpu"]
+#: The agents of the package.
+FILES = sorted(program.PRETRAINED.glob(f"*{agent_file.SUFFIX}"))
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A folder with a run, `run`, evaluated in the suite, and its agent in `agents`."""
+    folder = tmp_path_factory.mktemp("exported")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert train.main([*TINY, "samples=512", "snapshots=2", "folder=run"]) == 0
+        for words in ([], ["against=bot"]):
+            assert evaluate.main(["run=run", *SUITE, *words]) == 0
+        assert export_agent.main(["run", NAME, "--folder", "agents"]) == 0
+    return folder
+
+
+@pytest.fixture
+def folder(exported, tmp_path, monkeypatch):
+    """Changes to a folder of its own, with the exported agent as the only one of the package."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(exported / "agents", "package")
+    monkeypatch.setattr(program, "PRETRAINED", tmp_path / "package")
+    return tmp_path
+
+
+@pytest.fixture
+def file(folder):
+    return folder / "package" / f"{NAME}.safetensors"
+
+
+def original_of(exported, env):
+    """The run's own policy."""
+    loaded = checkpoint.load_latest(exported / "run/checkpoints")
+    return factory.load_weights(
+        factory.make_policy(factory.config_of(loaded).agent, env), env, loaded
+    )
+
+
+# ---- Exporting ----
+
+
+def test_weights_are_float16_and_statistics_float32(file):
+    read, policy = agent_file.read(file, "cpu"), pretrained.load(NAME, "cpu")
+    norms = [name for name, part in policy.named_modules() if isinstance(part, RunningNorm)]
+    state = read.state["policy"]
+    assert norms and not [name for name in state if name.startswith(TRAINING_ONLY)]
+    for name, tensor in state.items():
+        is_statistic = name.rpartition(".")[0] in norms
+        assert tensor.dtype == (torch.float32 if is_statistic else torch.float16), name
+    assert (read.step, read.numbers, read.untrusted) == (512, {}, ())
+    train = read.config["train"]
+    assert (train["folder"], train["resume"], train["init"]) == (None, None, None)
+
+
+def test_card_has_what_the_file_says_and_keeps_what_people_wrote(file, exported):
+    card = file.with_suffix(".md")
+    text = card.read_text()
+    assert text.startswith(export_agent.card(file))
+    assert "- samples: 512\n" in text and "MB, " in text and "## Licence" in text
+    written = json.loads(next((exported / "run/evaluations").glob("suite-*.json")).read_text())
+    row = written["rows"][0]
+    numbers = f"| {row['return']:.2f} | {row['lower']:.2f} to {row['upper']:.2f} |"
+    assert numbers in re.sub(" +", " ", text)
+    assert "| bot, in braided" in text and "the agent, 512 samples, in deathmatch: 8 duels" in text
+    assert f"run={NAME} geometry=suite '{PARTS}' split=test episodes=8 seed=1`" in text
+    card.write_text(text.replace("It acts in", "We think that it acts in").replace("512", "513"))
+    assert export_agent.main(["--cards", "--folder", str(file.parent)]) == 0
+    assert card.read_text() == text.replace("It acts in", "We think that it acts in")
+
+
+@pytest.mark.parametrize(
+    "words, command",
+    [
+        ("/x/.venv/bin/python /y/train.py env=pong seed=2", "python train.py env=pong seed=2"),
+        ("python train.py 'a={b: 1}' folder=x/y", "python train.py 'a={b: 1}' folder=x/y"),
+        ("/x/bin/python /x/bin/megastep train seed=1", "megastep train seed=1"),
+        ("python -m megastep train seed=1", "megastep train seed=1"),
+    ],
+)
+def test_commands_are_without_places_of_the_machine(words, command):
+    assert export_agent.command_of(words) == command
+
+
+@pytest.mark.parametrize(
+    "words, text",
+    [
+        (["run", "Tiny"], "no name of an agent"),
+        (["run/snapshots/step_512", NAME], "has weights only"),
+        (["run", NAME, "--max-error", "1e-9"], "acts otherwise with weights in float16"),
+        (["nowhere", NAME], "nowhere is neither a run folder nor a pretrained agent"),
+    ],
+)
+def test_export_refuses(words, text, exported, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(exported)
+    assert export_agent.main([*words, "--folder", str(tmp_path / "new")]) == 2
+    assert text in capsys.readouterr().err and not (tmp_path / "new").exists()
+
+
+def test_export_refuses_large_agents_and_those_without_the_suite(exported, tmp_path, monkeypatch):
+    monkeypatch.chdir(exported)
+    monkeypatch.setattr(export_agent, "MAX_BYTES", 1000)
+    with pytest.raises(UserError, match="bytes, and may have 1,000"):
+        export_agent.export("run", NAME, tmp_path)
+    assert not [*tmp_path.iterdir()]
+    shutil.copytree("run/checkpoints", tmp_path / "other/checkpoints")
+    with pytest.raises(UserError, match="no evaluation .* geometry=suite episodes=8000"):
+        export_agent.export(str(tmp_path / "other"), NAME, tmp_path)
+
+
+def test_export_refuses_modules_of_others(exported, tmp_path, monkeypatch):
+    loaded = checkpoint.load_latest(exported / "run/checkpoints")
+    loaded.config["train"]["agent"]["core"] = "mine:Core"
+    monkeypatch.setattr(runs, "load_checkpoint", lambda *args: loaded)
+    with pytest.raises(UserError, match="needs mine:Core, and agents of the package"):
+        export_agent.export(str(exported / "run"), NAME, tmp_path)
+
+
+def test_weights_beyond_float16_are_refused(file):
+    policy = pretrained.load(NAME, "cpu")
+    next(policy.parameters()).view(-1)[0] = 1e5
+    with pytest.raises(UserError, match="beyond 65,504"):
+        export_agent.rounded(policy)
+
+
+# ---- Using an agent by its name ----
+
+
+def test_evaluates_into_a_folder_of_its_own(folder, capsys):
+    assert evaluate.main([f"run={NAME}", *SUITE, "baseline=false"]) == 0
+    table = json.loads(Path(f"runs/pretrained-{NAME}/evaluations/suite-test-512.json").read_text())
+    assert {row["source"] for row in table["rows"]} == {"bench", "braided"}
+    assert sorted(path.name for path in (folder / "package").iterdir()) == [
+        f"{NAME}.md",
+        f"{NAME}.safetensors",
+    ]
+    assert runs.known() == [], "its folder is no run"
+
+
+def test_meets_others_in_duels(exported, capsys):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(exported)
+        patch.setattr(program, "PRETRAINED", exported / "agents")
+        words = ["geometry=box", "episodes=4", "device=cpu"]
+        assert evaluate.main(["run=run", f"against={NAME},bot", *words]) == 0
+        assert f"{NAME}, 512 samples" in capsys.readouterr().out
+        assert evaluate.main([f"run={NAME}", "against=run", *words]) == 0
+        assert f"{NAME}, 512 samples, in deathmatch" in capsys.readouterr().out
+        assert evaluate.main([f"run={NAME}", "against=bot", "ratings=true", *words]) == 0
+        assert Path(f"runs/pretrained-{NAME}/ratings.csv").exists()
+        assert evaluate.main([f"run={NAME}", "ratings=true", *words]) == 2
+        assert "nothing to compare it with" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("drawn_in_this_process")
+def test_is_recorded_into_its_folder(folder):
+    pytest.importorskip("av")
+    words = [f"run={NAME}", "geometry=box", "steps=1", "device=cpu"]
+    assert record.main(words) == record.main([*words, f"against={NAME}"]) == 0
+    names = sorted(path.name for path in Path(f"runs/pretrained-{NAME}").iterdir())
+    assert names == ["video-2.mp4", "video.mp4"]
+
+
+def test_starts_a_run_with_a_new_critic(file, capsys):
+    words = [f"init={NAME}", "device=cpu", "preset=cpu", "learner.n_minibatches=2"]
+    assert train.main([*words, "learner.lr=1e-12", "samples=1", "folder=second"]) == 0
+    assert "tiny_agent has no critic, so this run begins with a new one" in capsys.readouterr().out
+    loaded = checkpoint.load_latest("second/checkpoints")
+    weights = agent_file.read(file, "cpu").state["policy"]
+    for name in ("intake.project.weight", "core.input.weight", "output.head.weight"):
+        if name in weights:
+            torch.testing.assert_close(
+                loaded.state["policy"][name], weights[name].float(), rtol=0, atol=1e-6
+            )
+    assert any(name.startswith("critic.") for name in loaded.state["policy"])
+    assert loaded.config["train"]["env"]["res"] == 16, "its environment"
+    assert train.main(["resume=second", "more_samples=1"]) == 0
+
+
+@torch.no_grad()
+def test_loads_in_python_and_acts_as_the_run(folder, exported):
+    env = pretrained.make_env(NAME, geometries.sample("maze", 2), n_envs=3, device="cpu")
+    assert (env.n_envs, n_lanes(env), pretrained.names()) == (3, 6, [NAME])
+    policy, original = pretrained.load(NAME, "cpu"), original_of(exported, env)
+    assert policy.critic is None and not any(p.requires_grad for p in policy.parameters())
+    assert 0 < export_agent.rounding_error(policy, original, env, 30) < 0.005
+    assert pretrained.load(f"package/{NAME}.safetensors", "cpu").width == 8
+    with pytest.raises(UserError, match="deathmatch has no setting cameras; it has n_envs, "):
+        pretrained.make_env(NAME, geometries.sample("maze", 2), cameras=3)
+
+
+def test_rounding_error_sees_other_weights(folder, exported):
+    env = pretrained.make_env(NAME, geometries.sample("maze", 2), n_envs=3, device="cpu")
+    policy, original = pretrained.load(NAME, "cpu"), original_of(exported, env)
+    policy.load_state_dict({k: 1.1 * v for k, v in policy.state_dict().items()})
+    assert export_agent.rounding_error(policy, original, env, 30) > 0.02
+
+
+def test_inspect_prints_what_is_in_a_file(file, capsys):
+    assert inspect.run([NAME]) == 0
+    out = capsys.readouterr().out
+    assert f"{NAME}.safetensors: intact" in out and "samples: 512" in out and "policy" in out
+    file.write_bytes(file.read_bytes()[:-1])
+    assert inspect.run([NAME]) == 1
+    assert "SHA-256" in capsys.readouterr().out
+
+
+# ---- Names and files that cannot be used ----
+
+
+@pytest.mark.parametrize(
+    "main, words, text",
+    [
+        (evaluate.main, ["run=tiny_agnet"], "did you mean tiny_agent?"),
+        (record.main, ["run=tiny_agnet"], "did you mean tiny_agent?"),
+        (train.main, ["init=tiny_agnet"], "did you mean tiny_agent?"),
+        (evaluate.main, ["run=zzz"], "train.py makes runs, and pretrained agents are tiny_agent"),
+        (evaluate.main, [f"run={NAME}", "against=zzz"], "zzz is neither a run folder nor"),
+        (train.main, [f"resume={NAME}"], f"has the weights only. init={NAME} starts"),
+        (train.main, [f"rerun={NAME}"], "rerun= takes the run's folder"),
+        (evaluate.main, [f"run={NAME}", "env=pong"], "was trained in another environment"),
+    ],
+)
+def test_wrong_names_are_one_sentence(main, words, text, folder, capsys):
+    assert main(words) == 2
+    err = capsys.readouterr().err
+    assert text in err and err.count("\n") == 1 and not Path("runs").exists()
+
+
+def test_a_folder_of_the_name_comes_first(folder, exported, capsys):
+    shutil.copytree(exported / "run", NAME)
+    assert runs.find(NAME) == Path(NAME)
+    shutil.rmtree(f"{NAME}/checkpoints")
+    assert evaluate.main([f"run={NAME}"]) == 2
+    assert f"rename it to use the pretrained agent {NAME}" in capsys.readouterr().err
+
+
+def test_both_lists_have_a_near_name(folder, exported):
+    shutil.copytree(exported / "run", "runs/tiny_agent_2")
+    with pytest.raises(UserError, match="did you mean runs/tiny_agent_2 or tiny_agent?"):
+        runs.find("runs/tiny_agent")
+
+
+def changed(content, **texts):
+    """Returns the bytes of a file of an agent with other texts in its header."""
+    n = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + n])
+    header["__metadata__"] |= texts
+    text = json.dumps(header).encode()
+    return len(text).to_bytes(8, "little") + text + content[8 + n :]
+
+
+DAMAGES = {
+    "empty": (lambda content: b"", "no header"),
+    "cut off": (lambda content: content[:-7], "do not match their SHA-256"),
+    "a bit": (lambda content: content[:-3] + b"!" + content[-2:], "do not match their SHA-256"),
+    "header": (lambda content: content[:30] + b"!" + content[31:], "no agent of megastep"),
+    "long header": (lambda content: b"\xff" * 8 + content, "no header"),
+    "of others": (lambda content: b"\x02" + b"\0" * 7 + b"{}", "not an agent's"),
+    "no samples": (lambda content: changed(content, facts='{"samples": null}'), "samples"),
+    "no config": (lambda content: changed(content, config="{}"), "not whole"),
+    "deep": (lambda content: changed(content, tables="[" * 100_000), "not an agent's"),
+    "newer": (lambda content: changed(content, format="99"), "Update megastep"),
+}
+
+
+@pytest.mark.parametrize("damage, text", DAMAGES.values(), ids=DAMAGES)
+def test_damaged_files_are_one_sentence(damage, text, file, capsys):
+    file.write_bytes(damage(file.read_bytes()))
+    with pytest.raises(CheckpointError, match=text):
+        agent_file.read(file, None)
+    assert evaluate.main([f"run={NAME}"]) == 2
+    assert text in (err := capsys.readouterr().err) and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"dtype": "F16", "shape": [3], "data_offsets": [0, 4]},
+        {"dtype": "F16", "shape": [2], "data_offsets": [4, 8]},
+        {"dtype": "F16", "shape": [-2], "data_offsets": [0, 4]},
+        {"dtype": "F8", "shape": [2], "data_offsets": [0, 4]},
+        {"dtype": "F16", "shape": [2]},
+    ],
+)
+def test_tensors_that_do_not_fill_the_file_are_refused(entry, tmp_path):
+    path, config = tmp_path / "a.safetensors", {"train": {}, "spaces": {}}
+    agent_file.write(path, {"w": torch.ones(2).half()}, config, {"samples": 1})
+    content = path.read_bytes()
+    n = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + n]) | {"w": entry}
+    text = json.dumps(header).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + content[8 + n :])
+    with pytest.raises(DamagedCheckpoint, match="a.safetensors is damaged, or no agent"):
+        agent_file.read(path, "cpu")
+
+
+def test_modules_of_others_need_trust(file, capsys):
+    content = file.read_bytes()
+    config = agent_file.read_metadata(file)["config"]
+    config["train"]["agent"]["core"] = "planted:Core"
+    file.write_bytes(changed(content, config=json.dumps(config)))
+    assert evaluate.main([f"run={NAME}"]) == 2
+    assert "planted:Core" in (err := capsys.readouterr().err) and "trust=true" in err
+    assert evaluate.main([f"run={NAME}", "trust=true"]) == 2
+    assert "planted" in (err := capsys.readouterr().err) and "trust=true" not in err
+
+
+# ---- The format ----
+
+
+def test_format_is_that_of_safetensors(tmp_path):
+    """The same tensors as written by the package safetensors, 0.7, without its texts."""
+    path = tmp_path / "a.safetensors"
+    tensors = {"b": torch.tensor([[1.0, 2.0]]).half(), "a": torch.tensor(3.5)}
+    agent_file.write(path, tensors, {"train": {}, "spaces": {}}, {"samples": 7})
+    content = path.read_bytes()
+    n = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + n])
+    assert all(type(text) is str for text in header.pop("__metadata__").values())
+    assert json.dumps(header, separators=(",", ":")) == (
+        '{"a":{"dtype":"F32","shape":[],"data_offsets":[0,4]},'
+        '"b":{"dtype":"F16","shape":[1,2],"data_offsets":[4,8]}}'
+    )
+    assert content[8 + n :] == b"\x00\x00`@\x00<\x00@" and n % 8 == 0
+    read = agent_file.read(path, "cpu").state["policy"]
+    assert all(torch.equal(read[name], tensors[name]) for name in ("a", "b"))
+    with pytest.raises(ValueError, match="w is bool"):
+        agent_file.write(path, {"w": torch.ones(1).bool()}, {}, {})
+
+
+# ---- The agents of the package ----
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+@torch.no_grad()
+def test_agent_of_the_package(path):
+    """It loads, acts, is small, and has a card whose numbers are those of the file."""
+    assert path.stat().st_size <= export_agent.MAX_BYTES
+    assert agent_file.read(path, None).untrusted == ()
+    assert agent_file.read_metadata(path)["tables"], "evaluated in the suite"
+    card = path.with_suffix(".md").read_text()
+    assert card.startswith(export_agent.card(path)), "scripts/export_agent.py --cards writes it"
+    for title in (export_agent.BY_HAND, "## Limits", "## Licence"):
+        assert title in card
+    env = pretrained.make_env(path.stem, geometries.sample("box", 1), n_envs=2, device="cpu")
+    policy = pretrained.load(path.stem, "cpu")
+    world, state = env.reset(), policy.initial(n_lanes(env))
+    for _ in range(10):
+        decision, state = policy(world, state)
+        world = env.step(decision)
+    assert decision.logits.isfinite().all() and world.reward.isfinite().all()
+
+
+@pytest.mark.skipif(not FILES, reason="the package has no agents yet")
+def test_page_names_every_agent():
+    page = Path(__file__).parents[2] / "docs/pretrained.md"
+    assert set(re.findall(r"^\| `(\w+)` \|", page.read_text(), re.M)) == {p.stem for p in FILES}
+
+
+def test_every_card_has_its_agent():
+    cards = {path.stem for path in program.PRETRAINED.glob("*.md")}
+    assert cards == {path.stem for path in FILES}
