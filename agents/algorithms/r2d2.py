@@ -13,9 +13,9 @@ from megastep.agents.algorithms import returns
 from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
 from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
 from megastep.agents.networks.policy import Policy
-from megastep.agents.networks.running_norm import store_if
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
+from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings, defaults_from
 from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
@@ -167,7 +167,7 @@ class R2D2(GradientLearner):
         ratio = self.replay_settings.ratio
         n_sequences = round(ratio * rollout.n_lanes / self.gradient_steps)
         for _ in range(self.gradient_steps):
-            store_if(self.n_taken % self.target_period == 0, self._target_copies)
+            copy_all(self._target_copies, self.n_taken % self.target_period == 0)
             batch = self.replay_buffer.sample(n_sequences, generator)
             loss, metrics, priorities, valid = self._losses(batch)
             # A non-finite rollout counts as skipped even while the replay buffer is not ready.
@@ -189,18 +189,19 @@ class R2D2(GradientLearner):
         """Returns the loss of a minibatch, its metrics, tensors (), the sequences' priorities (M,)
         and the valid steps (L - burn-in, M).
         """
-        burn_in = self.replay_settings.burn_in
-        state, target_state = self._burn_in(batch, burn_in)
-        rest = mapping(lambda leaf: leaf[burn_in:])
-        obs, starts, actions = rest(batch.obs), rest(batch.starts), rest(batch.actions)
+        burn_in, output = self.replay_settings.burn_in, self.policy.output
+        sequence = batch.obs, batch.starts, batch.state
+        starts, actions = (
+            batch.starts[burn_in:],
+            mapping(lambda leaf: leaf[burn_in:])(batch.actions),
+        )
         ends = {name: batch[name][burn_in:] for name in ("reward", "terminal", "truncated")}
         reset = starts[1:]
         valid = ~reset & batch.learns[burn_in:-1]
 
-        output = self.policy.output
-        q = self.policy.unroll(obs, starts, state).logits
+        q = self.policy.unroll(*sequence, burn_in=burn_in).logits
         with torch.no_grad():
-            target_q = self.target.unroll(obs, starts, target_state).logits
+            target_q = self.target.unroll(*sequence, burn_in=burn_in).logits
             value = returns.inverse_rescale(output.action_value(target_q, output.greedy(q)))
             targets = returns.n_step_returns(
                 **ends,
@@ -225,16 +226,6 @@ class R2D2(GradientLearner):
                 effective_samples=effective_sample_size(batch.weight, all_sequences),
             )
         return loss, metrics, priorities, valid
-
-    @torch.no_grad()
-    def _burn_in(self, batch, n_steps):
-        """Returns the hidden states of both networks after the first steps of the sequences."""
-        if not n_steps:
-            return batch.state, batch.state
-        first = mapping(lambda leaf: leaf[:n_steps])
-        obs, starts = first(batch.obs), first(batch.starts)
-        networks = self.policy, self.target
-        return [network.unroll(obs, starts, batch.state).state for network in networks]
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the base's state, the target network and the number of gradient steps taken."""

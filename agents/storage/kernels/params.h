@@ -10,6 +10,7 @@ struct CopyParams {
 
 struct CopyAllParams {
     CopyParams copies[24];
+    const unsigned char* condition;  // (), false: nothing changes; null: true
     int n_copies;
 };
 
