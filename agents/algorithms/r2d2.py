@@ -41,11 +41,8 @@ class EpsilonGreedy:
         self.initial, self.compute_dtype = policy.initial, policy.compute_dtype
 
     def __call__(self, world: arrdict, state: arrdict) -> tuple[arrdict, arrdict]:
-        policy = self.policy
-        decision, state = policy(world, state, sample=False)
-        generator = policy.generator.on(policy.device)
-        actions = policy.output.sample(decision.logits, generator, epsilon=self.epsilon)
-        return arrdict(actions=actions), state
+        decision, state = self.policy(world, state, epsilon=self.epsilon)
+        return arrdict(actions=decision.actions), state
 
 
 def epsilons(n_lanes: int, epsilon: float, spread: float) -> torch.Tensor:

@@ -120,6 +120,7 @@ class Policy(nn.Module):
         state: arrdict,
         sample: bool = True,
         generator: torch.Generator | None = None,
+        **options: torch.Tensor,
     ) -> tuple[arrdict, arrdict]:
         """Acts for one step.
 
@@ -128,6 +129,7 @@ class Policy(nn.Module):
             state: hidden state.
             sample: samples actions; if false, takes the most likely or best ones.
             generator: generator of the actions. Default: the policy's.
+            options: further arguments of the output's `sample`, such as epsilon.
 
         Returns:
             arrdict(actions, logits, logprobs (B,), features (B, width)) and the next hidden state.
@@ -147,7 +149,7 @@ class Policy(nn.Module):
             generator = self.generator.on(self.device)
         with self.compute_dtype():
             features, state = self._features(obs, reset, state)
-            logits, actions, logprobs = self.output.act(features[0], sample, generator)
+            logits, actions, logprobs = self.output.act(features[0], sample, generator, **options)
         decision = arrdict(actions=actions, logits=logits, logprobs=logprobs, features=features[0])
         return decision, state
 
