@@ -9,16 +9,15 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 
-from megastep.agents.algorithms import returns
 from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
-from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
+from megastep.agents.algorithms.td_loss import Settings, td_loss
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings, defaults_from
-from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
+from megastep.agents.storage.rollout import bytes_per_step, make_rollout
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.settings import MAX_ENVS, checked
@@ -26,6 +25,8 @@ from megastep.types import Env, optional
 
 #: R2D2's default replay settings. A configuration that sets some of them keeps the others.
 REPLAY = ReplaySettings(capacity=8_000_000, burn_in=32, ratio=4.0, alpha=0.9)
+#: Parts of a minibatch with a time axis that the loss needs.
+_STEPS = "actions", "reward", "terminal", "truncated", "starts", "learns"
 
 
 class EpsilonGreedy:
@@ -106,8 +107,8 @@ class R2D2(GradientLearner):
         if policy.output_kind != "duelling":
             raise ValueError("R2D2 needs a policy of action values: use agent.output=duelling")
         super().__init__(policy, lr, max_grad_norm, graph, seed, weight_decay=weight_decay)
-        self.n_steps, self.gamma, self.return_steps = n_steps, gamma, return_steps
-        self.target_period, self.eta = target_period, eta
+        self.n_steps, self.target_period = n_steps, target_period
+        self.loss_settings = Settings(gamma, return_steps, eta)
         self.epsilon, self.epsilon_spread = epsilon, epsilon_spread
         self.gradient_steps, self.replay_settings = gradient_steps, replay
         self.length = replay.sequence_steps(n_steps)
@@ -159,18 +160,18 @@ class R2D2(GradientLearner):
     def _update(self, rollout):
         is_finite = self.steps.begin(rollout.floats())
         self.replay_buffer.add(rollout, is_finite)
-        is_ready = self.replay_buffer.is_ready
+        # A non-finite rollout counts as skipped even while the replay buffer is not ready.
+        is_enabled = self.replay_buffer.is_ready | ~is_finite
         generator = self.generator.on(self.device)
         ratio = self.replay_settings.ratio
         n_sequences = round(ratio * rollout.n_lanes / self.gradient_steps)
         for _ in range(self.gradient_steps):
             copy_all(self._target_copies, self.n_taken % self.target_period == 0)
             batch = self.replay_buffer.sample(n_sequences, generator)
-            loss, metrics, priorities, valid = self._losses(batch)
-            # A non-finite rollout counts as skipped even while the replay buffer is not ready.
-            self.steps.backward(loss, metrics, valid.sum())
-            self.n_taken += self.steps.take(is_ready | ~is_finite)
-            self.replay_buffer.set_priorities(batch.index, priorities)
+            result = self._losses(batch)
+            self.steps.backward(result.loss, result.metrics, result.n_valid)
+            self.n_taken += self.steps.take(is_enabled)
+            self.replay_buffer.set_priorities(batch.index, result.priorities)
         last = rollout.world(-1)
         self.policy.update_stats(last.obs, is_counted=is_finite & rollout.learns[-1])
         priorities = self.replay_buffer.tree.priorities
@@ -183,46 +184,16 @@ class R2D2(GradientLearner):
 
     @section("forward")
     def _losses(self, batch):
-        """Returns the loss of a minibatch, its metrics, tensors (), the sequences' priorities (M,)
-        and the valid steps (L - burn-in, M).
-        """
-        burn_in, output = self.replay_settings.burn_in, self.policy.output
+        """Returns the `td_loss.Result` of a minibatch."""
+        burn_in = self.replay_settings.burn_in
         sequence = batch.obs, batch.starts, batch.state
-        starts, actions = (
-            batch.starts[burn_in:],
-            mapping(lambda leaf: leaf[burn_in:])(batch.actions),
-        )
-        ends = {name: batch[name][burn_in:] for name in ("reward", "terminal", "truncated")}
-        reset = starts[1:]
-        valid = ~reset & batch.learns[burn_in:-1]
-
         q = self.policy.unroll(*sequence, burn_in=burn_in).logits
         with torch.no_grad():
             target_q = self.target.unroll(*sequence, burn_in=burn_in).logits
-            value = returns.inverse_rescale(output.action_value(target_q, output.greedy(q)))
-            targets = returns.n_step_returns(
-                **ends,
-                value=value[:-1],
-                last_value=value[-1],
-                reset=reset,
-                gamma=self.gamma,
-                n=self.return_steps,
-            )
-        q_taken = output.action_value(without_last(q), actions)
-        error = (returns.rescale(targets) - q_taken).masked_fill(~valid, 0.0)
-        loss = masked_mean(batch.weight * error.square(), valid)
-        with torch.no_grad():
-            size = error.abs()
-            priorities = self.eta * size.amax(0) + (1 - self.eta) * masked_mean(size, valid, 0)
-            all_sequences = torch.ones_like(batch.weight, dtype=torch.bool)
-            metrics = dict(
-                td=loss,
-                td_error=masked_mean(size, valid),
-                q=masked_mean(returns.inverse_rescale(q_taken), valid),
-                staleness=batch.age.float().mean(),
-                effective_samples=effective_sample_size(batch.weight, all_sequences),
-            )
-        return loss, metrics, priorities, valid
+        steps = arrdict({name: batch[name] for name in _STEPS})
+        steps = mapping(lambda leaf: leaf[burn_in:])(steps)
+        learned = arrdict({**steps, "weight": batch.weight, "age": batch.age})
+        return td_loss(q, target_q, learned, self.policy.output, self.loss_settings)
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the base's state, the target network and the number of gradient steps taken."""

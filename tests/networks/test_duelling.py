@@ -8,7 +8,7 @@ from megastep.agents.networks import heads
 from megastep.agents.networks.kernels import duelling as kernels
 
 pytestmark = pytest.mark.cuda
-# rows, features, agents, choices; 264 and 520: more than one word per thread, 7 rows: part of a warp
+# rows, features, agents, choices; from 264 features on, a thread reads several words
 CASES = [(7, 8, 1, 8), (300, 256, 1, 7), (129, 264, 2, 3), (257, 64, 8, 1), (130, 520, 2, 4)]
 
 

@@ -43,6 +43,39 @@ struct PpoLossParams {
     float auxiliary_coef;
 };
 
+// M sequences of T steps after the burn-in, A agents per lane, n choices.
+struct TdLossParams {
+    const float* q;                  // (P, T + 1, M, A, n), of the online network
+    const float* target_q;           // (P, T + 1, M, A, n)
+    const long long* actions;        // (P, T, M, A)
+    const float* reward;             // (P, T, M)
+    const unsigned char* terminal;   // (P, T, M)
+    const unsigned char* truncated;  // (P, T, M)
+    const unsigned char* starts;     // (P, T + 1, M)
+    const unsigned char* learns;     // (P, T + 1, M)
+    const float* weight;             // (P, M)
+    const long long* age;            // (P, M)
+    float* values;                   // (P, T + 1, M), written
+    float* d_q;                      // (P, T + 1, M, A, n), of the sum over valid steps
+    float* priorities;               // (P, M)
+    float* sums;  // (P, n_blocks, 7): loss, |error|, q, valid steps; age, weight, weight^2
+    int n_steps;
+    int n_sequences;
+    int n_agents;
+    int n_choices;
+    int n_return_steps;
+    float gamma;
+    float eta;
+    float eps;  // of `returns.rescale`
+};
+
+struct TdMetricsParams {
+    const float* sums;  // (P, n_blocks, 7)
+    float* metrics;     // (P, 7): those of `td_loss.METRICS`, valid steps, 1 / max(valid steps, 1)
+    int n_blocks;
+    int n_sequences;
+};
+
 // A parameter (P, n) with its gradient and Adam's running means.
 struct AdamRowParams {
     float* parameter;
