@@ -64,6 +64,7 @@ def test_intake():
         n_lanes=n_lanes,
         n_selected=7,
         n_columns=n_columns,
+        n_plain_words=4,
     )
     for i in range(P):
         of_policy = ([leaf[i] for leaf in parts] for parts in (leaves, means, scales))

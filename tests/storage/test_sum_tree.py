@@ -135,7 +135,7 @@ def test_kernels_match_pytorch(n):
         tree.set(torch.arange(n, device=device), values.to(device))
         tree.set(index.to(device), values.flip(0)[index // 2].to(device))
     for ours, theirs in zip(fused.levels, plain.levels, strict=True):
-        testing.assert_close(ours.cpu(), theirs, rtol=1e-14, atol=0)
+        testing.assert_close(ours.cpu(), theirs, rtol=1e-12, atol=0)
     drawn, probability = fused.draw(2000, torch.Generator("cuda").manual_seed(2))
     testing.assert_close(probability, fused.probability(drawn), rtol=1e-12, atol=0)
     generator = torch.Generator("cuda").manual_seed(2)

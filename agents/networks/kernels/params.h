@@ -106,9 +106,11 @@ struct NormaliseParams {
     const long long* lanes;  // (P, M), the lanes to read; null: all, M = B
     void* features;          // (P, T, M, n_columns) compute
     int n_steps;
-    int n_lanes;     // B
-    int n_selected;  // M
-    int n_columns;   // a multiple of 4; those after the leaves' features are 0
+    int n_lanes;        // B
+    int n_selected;     // M
+    int n_columns;      // a multiple of 4; those after the leaves' features are 0
+    int n_plain_words;  // of four columns, before the first leaf whose features are no multiple of
+                        // 4
 };
 
 // Statistics of one policy.
