@@ -18,6 +18,23 @@ struct GaeParams {
     float lambda_;
 };
 
+struct VtraceParams {
+    const float* log_ratio;          // (T, B)
+    const float* reward;             // (T, B)
+    const float* values;             // (T + 1, B)
+    const unsigned char* reset;      // (T, B)
+    const unsigned char* terminal;   // (T, B)
+    const unsigned char* truncated;  // (T, B)
+    float* advantages;               // (T, B)
+    float* targets;                  // (T, B)
+    int n_steps;
+    int n_lanes;
+    float gamma;
+    float lambda_;
+    float rho_clip;
+    float c_clip;
+};
+
 struct PpoLossParams {
     const float* logprobs;       // (P, n_rows), of the actions
     const float* entropies;      // (P, n_rows)
