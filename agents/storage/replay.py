@@ -231,7 +231,7 @@ class ReplayBuffer:
             )
         if self.settings.alpha == 0:
             return
-        if self.tree.is_fused:
+        if self.tree.is_fused and len(index) <= kernels.MAX_SET:
             kernels.set_priorities(
                 self.tree.levels,
                 index.contiguous(),

@@ -13,6 +13,7 @@ from megastep.agents.storage.copies import PROGRAM
 from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
 
 MAX_LEVELS = PROGRAM.constants["MAX_LEVELS"]
+MAX_SET = PROGRAM.constants["MAX_SET"]  # indices of `set_tree` and `set_priorities`
 FAN_OUT = WARP  # children of a node
 _MAX_TENSORS = PROGRAM.constants["MAX_SELECTED"]
 _SET_THREADS, _READ_THREADS = (PROGRAM.constants[f"{name}_THREADS"] for name in ("SET", "READ"))
@@ -151,7 +152,7 @@ def read_sequences(
         weights (M,) float32 and ages (M,) int64.
     """
     n_sequences, device, packed = len(index), index.device, []
-    results, largest = [], (n_steps + 1) * n_sequences
+    results, n_blocks = [], 1 + -(-(n_steps + 1) * n_sequences // _READ_THREADS)
     for rows, dtype, n_rows in tensors:
         result = torch.empty(n_rows, n_sequences, *rows.shape[2:], dtype=dtype, device=device)
         n_words, kind = math.prod(rows.shape[2:]), _CONVERSIONS.get((rows.dtype, dtype))
@@ -167,11 +168,12 @@ def read_sequences(
                 n_rows=n_rows,
                 n_words=n_words,
                 rows_per_rollout=len(rows) // n_rollouts,
+                first_block=n_blocks,
                 kind=kind,
             )
         )
         results.append(result)
-        largest = max(largest, n_rows * n_sequences * n_words)
+        n_blocks += -(-n_rows * n_sequences * n_words // _READ_THREADS)
     lengths = n_steps + 1, n_steps + 1, n_steps, n_steps
     bools = [torch.empty(n, n_sequences, dtype=torch.bool, device=device) for n in lengths]
     weights, age = torch.empty_like(probability), torch.empty_like(index)
@@ -195,8 +197,7 @@ def read_sequences(
         rows_per_rollout=len(flags) // n_rollouts,
         beta=beta,
     )
-    n_blocks = -(-largest // _READ_THREADS), len(tensors) + 2
-    launch_blocks(PROGRAM, "read_sequences", struct, device, n_blocks, _READ_THREADS)
+    launch_blocks(PROGRAM, "read_sequences", struct, device, (n_blocks, 1), _READ_THREADS)
     return results, bools, weight, age
 
 

@@ -76,7 +76,7 @@ class SumTree:
                 f"values is {tuple(values.shape)}"
             )
         values = values.to(torch.float64)
-        if self.is_fused:
+        if self.is_fused and len(index) <= kernels.MAX_SET:
             if len(index):
                 kernels.set_tree(self.levels, index.contiguous(), values.contiguous())
             return

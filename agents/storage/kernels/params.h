@@ -76,6 +76,7 @@ struct ReadTensorParams {
     unsigned int n_rows;
     unsigned int n_words;           // per entry
     unsigned int rows_per_rollout;  // T, or 1 for hidden states
+    unsigned int first_block;       // of the launch that reads it
     int kind;
 };
 

@@ -1,5 +1,5 @@
-// Reads sequences from the replay buffer: blocks along y are tensors, then the flags, then the
-// importance weights. One thread per word.
+// Reads sequences from the replay buffer, one thread per word. The first block computes the
+// importance weights, the next ones read the flags, then those of each tensor follow.
 #include "common/backend.h"
 #include "constants.h"
 #include "params.h"
@@ -109,11 +109,18 @@ DEVICE void read_weights(const ReadSequencesParams& p) {
 }
 
 KERNEL read_sequences(ReadSequencesParams p) {
-    unsigned int at = blockIdx.x * blockDim.x + threadIdx.x;
-    if (blockIdx.y < p.n_tensors)
-        read_word(p, p.tensors[blockIdx.y], at);
-    else if (blockIdx.y == p.n_tensors)
-        read_flags(p, at);
-    else if (!blockIdx.x)
+    unsigned int block = blockIdx.x;
+    if (!block) {
         read_weights(p);
+        return;
+    }
+    int number = (int)p.n_tensors - 1;
+    while (number >= 0 && block < p.tensors[number].first_block)
+        number--;
+    unsigned int first = number < 0 ? 1 : p.tensors[number].first_block;
+    unsigned int at = (block - first) * blockDim.x + threadIdx.x;
+    if (number < 0)
+        read_flags(p, at);
+    else
+        read_word(p, p.tensors[number], at);
 }
