@@ -289,6 +289,61 @@ def test_captured_update_matches_eager():
     testing.assert_close(ends[1], ends[0], rtol=1e-2, atol=1e-3)  # bfloat16 products
 
 
+@pytest.mark.cuda
+@pytest.mark.parametrize("width", [32, 256])
+def test_same_seed_gives_same_bits(width):
+    ends = []
+    for _ in range(2):
+        learner, collect = make("cuda", graph=True, width=width, target_period=3)
+        losses = update(learner, collect, 6)
+        ends.append([weights(learner.policy), weights(learner.target), *losses.values()])
+    for one, other in zip(*ends, strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("core", ["lstm", "gru"])
+def test_fused_update_matches_the_cpus(core):
+    """The same minibatch has the same loss, priorities and gradients, but for bfloat16."""
+    torch.manual_seed(0)
+    results = []
+    for device in ("cpu", "cuda"):
+        env = Noise(device)
+        policy = Policy(env.obs_space, env.action_space, width=64, core=core, output="duelling")
+        learner = r2d2.R2D2(policy.to(device), **SETTINGS, replay=ReplaySettings(burn_in=3))
+        batch = drawn_batch(learner.length, 40, policy)
+        batch = batch.map(lambda leaf, device=device: leaf.to(device))
+        result = learner._losses(batch)
+        gradients = torch.autograd.grad(result.loss, list(policy.parameters()))
+        results.append([result.loss, result.priorities, *gradients])
+        assert result.n_valid == (~batch.starts[4:] & batch.learns[3:-1]).sum()
+    for i, (plain, fused) in enumerate(zip(*results, strict=True)):
+        error = (fused.cpu() - plain).abs().max() / plain.abs().max()
+        assert error < 0.1, (i, error)  # 8 bits, over the steps of a sequence
+
+
+def drawn_batch(length, n_sequences, policy):
+    """Returns random sequences like those of a replay buffer."""
+    generator = torch.Generator().manual_seed(0)
+    rows, with_last = (length, n_sequences), (length + 1, n_sequences)
+
+    def flags(shape):
+        return torch.rand(shape, generator=generator) < 0.1
+
+    return arrdict(
+        obs=torch.randn(*with_last, 1, 4, generator=generator).half(),
+        starts=flags(with_last),
+        learns=~flags(with_last),
+        actions=torch.randint(3, (*rows, 1), generator=generator),
+        reward=torch.randn(rows, generator=generator),
+        terminal=flags(rows),
+        truncated=torch.zeros(rows, dtype=torch.bool),
+        state=policy.initial(n_sequences, "cpu"),
+        weight=torch.rand(n_sequences, generator=generator),
+        age=torch.arange(n_sequences),
+    )
+
+
 TINY_R2D2 = [word.replace("n_minibatches", "gradient_steps") for word in TINY]
 RUN = [*TINY_R2D2, "learner=r2d2", "learner.replay.burn_in=2", "learner.replay.capacity=320"]
 
