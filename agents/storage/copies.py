@@ -16,7 +16,9 @@ _MAX_SELECTED = PROGRAM.constants["MAX_SELECTED"]
 _MAX_BYTES = 2**31
 
 
-def copy_all(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> None:
+def copy_all(
+    pairs: Iterable[tuple[torch.Tensor, torch.Tensor]], condition: torch.Tensor | None = None
+) -> None:
     """Copies the second tensor of each pair into the first, as `Tensor.copy_` does.
 
     On a GPU contiguous tensors of equal dtype and shape are copied by one kernel: a copy of a few
@@ -25,12 +27,14 @@ def copy_all(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> None:
 
     Args:
         pairs: targets and sources, all on one device but for sources on the host.
+        condition: () bool on the device. If false, no bit changes. None: copies always.
     """
     pairs = list(pairs)  # a source that nobody else holds lives until the launch
     packed, largest, device = [], 0, None
     for target, source in pairs:
         if not (target.is_cuda and _is_plain_copy(target, source)):
-            target.copy_(source)
+            is_always = condition is None
+            target.copy_(source if is_always else torch.where(condition, source, target))
             continue
         n_bytes = target.numel() * target.element_size()
         is_aligned = not (target.data_ptr() | source.data_ptr()) % 16
@@ -45,7 +49,11 @@ def copy_all(pairs: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> None:
         largest, device = max(largest, n_bytes), target.device
     for i in range(0, len(packed), _MAX_COPIES):
         rows = packed[i : i + _MAX_COPIES]
-        struct = PROGRAM.params.CopyAllParams(copies=b"".join(rows), n_copies=len(rows))
+        struct = PROGRAM.params.CopyAllParams(
+            copies=b"".join(rows),
+            condition=0 if condition is None else condition.data_ptr(),
+            n_copies=len(rows),
+        )
         n_blocks = max(1, -(-largest // _BLOCK_BYTES)), len(rows)
         launch_blocks(PROGRAM, "copy_all", struct, device, n_blocks, BLOCK)
 

@@ -73,6 +73,18 @@ def test_sources_that_nobody_else_holds_are_copied(device):
         assert torch.equal(plain[i], source + i) and (half[i] == i).all()
 
 
+def test_false_condition_changes_no_bit(device):
+    for condition in (False, True):
+        some, _ = cases(device)
+        pairs = [(target, source) for _, target, source in some]
+        pairs = [(target, source.to(target.device)) for target, source in pairs]
+        before = [target.clone() for target, _ in pairs]
+        copy_all(pairs, torch.tensor(condition, device=device))
+        for old, (target, source) in zip(before, pairs, strict=True):
+            expected = source.to(target.dtype).expand_as(target) if condition else old
+            assert torch.equal(target, expected)
+
+
 def test_nothing_to_copy():
     copy_all([])
 

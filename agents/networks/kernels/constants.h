@@ -6,3 +6,6 @@ constexpr int STRIP = 128;             // rows that a block adds up
 constexpr int STRIP_THREADS = 256;     // of such a block
 constexpr int ACT_THREADS = 8;         // that choose one lane's actions, one per choice
 constexpr int MOMENTS_THREADS = 1024;  // of a block, for one statistic
+constexpr int DUELLING_OUTPUTS = 8;    // action values of a lane, at most
+constexpr int DUELLING_STRIP = 128;    // rows that a block of their gradients adds up
+constexpr int DUELLING_THREADS = 256;  // of such a block, two columns each

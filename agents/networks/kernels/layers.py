@@ -4,6 +4,8 @@ All tensors are contiguous and on one GPU. T steps, B lanes, M selected lanes, A
 choices.
 """
 
+import itertools
+
 import torch
 
 from megastep.agents.networks.kernels.program import CORES, DTYPES
@@ -38,6 +40,7 @@ def normalise(
     n_steps, n_lanes = leaves[0].shape[:2]
     n_selected = n_lanes if lanes is None else len(lanes)
     features = leaves[0].new_empty(n_steps, n_selected, n_columns, dtype=dtype)
+    plain = itertools.takewhile(lambda leaf: leaf.shape[-1] % 4 == 0, leaves)
     packed = [
         CORES.params.IntakeLeafParams(
             values=leaf.data_ptr(),
@@ -60,6 +63,7 @@ def normalise(
         n_lanes=n_lanes,
         n_selected=n_selected,
         n_columns=n_columns,
+        n_plain_words=sum(leaf.shape[-1] // 4 for leaf in plain),
         n_blocks_y=n_steps,
     )
     return features

@@ -9,6 +9,8 @@
 static_assert(sizeof(CopyAllParams::copies) == MAX_COPIES * sizeof(CopyParams));
 
 KERNEL copy_all(CopyAllParams p) {
+    if (p.condition && !*p.condition)
+        return;
     const CopyParams& copy = p.copies[blockIdx.y];
     unsigned int n_words = copy.is_aligned ? copy.n_bytes / 16 : 0;
     unsigned int first = blockIdx.x * (BLOCK * COPY_WORDS) + threadIdx.x;
