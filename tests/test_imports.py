@@ -77,6 +77,7 @@ OWN_USERS = {
         "agents/algorithms/kernels/*.py",
         "agents/networks/kernels/*.py",
         "agents/storage/copies.py",
+        "agents/storage/replay_kernels.py",
     ),
 }
 # The files that may import these packages, directly or through importlib, as glob patterns.

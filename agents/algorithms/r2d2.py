@@ -9,16 +9,15 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 
-from megastep.agents.algorithms import returns
 from megastep.agents.algorithms.learner import Coefficient, Fraction, GradientLearner, Positive
-from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
+from megastep.agents.algorithms.td_loss import Settings, td_loss
 from megastep.agents.networks.policy import Policy
-from megastep.agents.networks.running_norm import store_if
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
+from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings, defaults_from
-from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
+from megastep.agents.storage.rollout import bytes_per_step, make_rollout
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.settings import MAX_ENVS, checked
@@ -26,6 +25,8 @@ from megastep.types import Env, optional
 
 #: R2D2's default replay settings. A configuration that sets some of them keeps the others.
 REPLAY = ReplaySettings(capacity=8_000_000, burn_in=32, ratio=4.0, alpha=0.9)
+#: Parts of a minibatch with a time axis that the loss needs.
+_STEPS = "actions", "reward", "terminal", "truncated", "starts", "learns"
 
 
 class EpsilonGreedy:
@@ -41,11 +42,8 @@ class EpsilonGreedy:
         self.initial, self.compute_dtype = policy.initial, policy.compute_dtype
 
     def __call__(self, world: arrdict, state: arrdict) -> tuple[arrdict, arrdict]:
-        policy = self.policy
-        decision, state = policy(world, state, sample=False)
-        generator = policy.generator.on(policy.device)
-        actions = policy.output.sample(decision.logits, generator, epsilon=self.epsilon)
-        return arrdict(actions=actions), state
+        decision, state = self.policy(world, state, epsilon=self.epsilon)
+        return arrdict(actions=decision.actions), state
 
 
 def epsilons(n_lanes: int, epsilon: float, spread: float) -> torch.Tensor:
@@ -109,8 +107,8 @@ class R2D2(GradientLearner):
         if policy.output_kind != "duelling":
             raise ValueError("R2D2 needs a policy of action values: use agent.output=duelling")
         super().__init__(policy, lr, max_grad_norm, graph, seed, weight_decay=weight_decay)
-        self.n_steps, self.gamma, self.return_steps = n_steps, gamma, return_steps
-        self.target_period, self.eta = target_period, eta
+        self.n_steps, self.target_period = n_steps, target_period
+        self.loss_settings = Settings(gamma, return_steps, eta)
         self.epsilon, self.epsilon_spread = epsilon, epsilon_spread
         self.gradient_steps, self.replay_settings = gradient_steps, replay
         self.length = replay.sequence_steps(n_steps)
@@ -121,6 +119,9 @@ class R2D2(GradientLearner):
             (target, weights[name]) for name, target in self.target.state_dict().items()
         ]
         self.n_taken = torch.zeros((), dtype=torch.int64, device=self.device)  # gradient steps
+        # Both networks' LSTMs leave a fifth of a GPU idle, where the other's products can run.
+        on_gpu = self.device.type == "cuda"
+        self._beside = torch.cuda.Stream(self.device) if on_gpu else None
 
     def collector(self, env: Env) -> Collector:
         """Returns an epsilon-greedy collector of rollouts of `n_steps` steps, and allocates the
@@ -162,18 +163,18 @@ class R2D2(GradientLearner):
     def _update(self, rollout):
         is_finite = self.steps.begin(rollout.floats())
         self.replay_buffer.add(rollout, is_finite)
-        is_ready = self.replay_buffer.is_ready
+        # A non-finite rollout counts as skipped even while the replay buffer is not ready.
+        is_enabled = self.replay_buffer.is_ready | ~is_finite
         generator = self.generator.on(self.device)
         ratio = self.replay_settings.ratio
         n_sequences = round(ratio * rollout.n_lanes / self.gradient_steps)
         for _ in range(self.gradient_steps):
-            store_if(self.n_taken % self.target_period == 0, self._target_copies)
+            copy_all(self._target_copies, self.n_taken % self.target_period == 0)
             batch = self.replay_buffer.sample(n_sequences, generator)
-            loss, metrics, priorities, valid = self._losses(batch)
-            # A non-finite rollout counts as skipped even while the replay buffer is not ready.
-            self.steps.backward(loss, metrics, valid.sum())
-            self.n_taken += self.steps.take(is_ready | ~is_finite)
-            self.replay_buffer.set_priorities(batch.index, priorities)
+            result = self._losses(batch)
+            self.steps.backward(result.loss, result.metrics, result.n_valid)
+            self.n_taken += self.steps.take(is_enabled)
+            self.replay_buffer.set_priorities(batch.index, result.priorities)
         last = rollout.world(-1)
         self.policy.update_stats(last.obs, is_counted=is_finite & rollout.learns[-1])
         priorities = self.replay_buffer.tree.priorities
@@ -186,55 +187,20 @@ class R2D2(GradientLearner):
 
     @section("forward")
     def _losses(self, batch):
-        """Returns the loss of a minibatch, its metrics, tensors (), the sequences' priorities (M,)
-        and the valid steps (L - burn-in, M).
-        """
+        """Returns the `td_loss.Result` of a minibatch."""
         burn_in = self.replay_settings.burn_in
-        state, target_state = self._burn_in(batch, burn_in)
-        rest = mapping(lambda leaf: leaf[burn_in:])
-        obs, starts, actions = rest(batch.obs), rest(batch.starts), rest(batch.actions)
-        ends = {name: batch[name][burn_in:] for name in ("reward", "terminal", "truncated")}
-        reset = starts[1:]
-        valid = ~reset & batch.learns[burn_in:-1]
-
-        output = self.policy.output
-        q = self.policy.unroll(obs, starts, state).logits
-        with torch.no_grad():
-            target_q = self.target.unroll(obs, starts, target_state).logits
-            value = returns.inverse_rescale(output.action_value(target_q, output.greedy(q)))
-            targets = returns.n_step_returns(
-                **ends,
-                value=value[:-1],
-                last_value=value[-1],
-                reset=reset,
-                gamma=self.gamma,
-                n=self.return_steps,
-            )
-        q_taken = output.action_value(without_last(q), actions)
-        error = (returns.rescale(targets) - q_taken).masked_fill(~valid, 0.0)
-        loss = masked_mean(batch.weight * error.square(), valid)
-        with torch.no_grad():
-            size = error.abs()
-            priorities = self.eta * size.amax(0) + (1 - self.eta) * masked_mean(size, valid, 0)
-            all_sequences = torch.ones_like(batch.weight, dtype=torch.bool)
-            metrics = dict(
-                td=loss,
-                td_error=masked_mean(size, valid),
-                q=masked_mean(returns.inverse_rescale(q_taken), valid),
-                staleness=batch.age.float().mean(),
-                effective_samples=effective_sample_size(batch.weight, all_sequences),
-            )
-        return loss, metrics, priorities, valid
-
-    @torch.no_grad()
-    def _burn_in(self, batch, n_steps):
-        """Returns the hidden states of both networks after the first steps of the sequences."""
-        if not n_steps:
-            return batch.state, batch.state
-        first = mapping(lambda leaf: leaf[:n_steps])
-        obs, starts = first(batch.obs), first(batch.starts)
-        networks = self.policy, self.target
-        return [network.unroll(obs, starts, batch.state).state for network in networks]
+        sequence = batch.obs, batch.starts, batch.state
+        if self._beside is not None:
+            self._beside.wait_stream(torch.cuda.current_stream(self.device))
+        with torch.no_grad(), torch.cuda.stream(self._beside):
+            target_q = self.target.unroll(*sequence, burn_in=burn_in).logits
+        q = self.policy.unroll(*sequence, burn_in=burn_in).logits
+        if self._beside is not None:
+            torch.cuda.current_stream(self.device).wait_stream(self._beside)
+        steps = arrdict({name: batch[name] for name in _STEPS})
+        steps = mapping(lambda leaf: leaf[burn_in:])(steps)
+        learned = arrdict({**steps, "weight": batch.weight, "age": batch.age})
+        return td_loss(q, target_q, learned, self.policy.output, self.loss_settings)
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the base's state, the target network and the number of gradient steps taken."""

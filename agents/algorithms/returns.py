@@ -122,6 +122,11 @@ def vtrace(
         arrdict(advantages, targets, valid), each (T, B). The value should fit the targets v; the
         policy's gradient is weighted by A. Where the action was not valid, v = V and A = 0.
     """
+    if value.is_cuda and value.dtype == reward.dtype == log_ratio.dtype == torch.float32:
+        steps = dict(log_ratio=log_ratio, reward=reward, reset=reset)
+        steps |= dict(terminal=terminal, truncated=truncated)
+        settings = dict(gamma=gamma, lambda_=lambda_, rho_clip=rho_clip, c_clip=c_clip)
+        return _vtrace_on_gpu(steps, value, last_value, settings)
     following = _following(value, last_value)
     ratio = log_ratio.exp()
     rho = ratio.clamp(max=rho_clip)
@@ -139,6 +144,25 @@ def vtrace(
     return arrdict.arrdict(
         advantages=advantages.masked_fill(reset, 0.0), targets=targets, valid=~reset
     )
+
+
+def _vtrace_on_gpu(steps, value, last_value, settings):
+    """Computes `vtrace` in one kernel, lane by lane."""
+    n_steps, n_lanes = value.shape
+    advantages, targets = value.new_empty(2, n_steps, n_lanes)
+    program.run(
+        "vtrace",
+        value.device,
+        n_lanes,
+        **{name: leaf.contiguous() for name, leaf in steps.items()},
+        values=torch.cat([value, last_value[None]]),
+        advantages=advantages,
+        targets=targets,
+        n_steps=n_steps,
+        n_lanes=n_lanes,
+        **settings,
+    )
+    return arrdict.arrdict(advantages=advantages, targets=targets, valid=~steps["reset"])
 
 
 @section("returns")

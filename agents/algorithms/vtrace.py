@@ -219,11 +219,14 @@ class VTrace(GradientLearner):
         Args:
             n_fresh: number of lanes from the rollout; the others are replayed.
         """
-        output, privileged = self.policy.output, batch.get("privileged")
-        now = self.policy.unroll(batch.obs, batch.starts, batch.state)
-        value = self.policy.value(now.features, privileged)
-        features, logits = without_last(now.features), without_last(now.logits)
-        logprobs = output.logprob(logits, batch.actions)
+        policy, privileged, errors = self.policy, batch.get("privileged"), None
+        with policy.compute_dtype():  # one, so that weights are cast once
+            now = policy.unroll(batch.obs, batch.starts, batch.state)
+            logprobs, entropies = policy.output.terms(without_last(now.logits), batch.actions)
+            value = policy.value(now.features, privileged)
+            if policy.privileged_space:
+                features = without_last(now.features)
+                errors = policy.prediction_error(features, without_last(privileged))
         reset, weight = batch.starts[1:], batch.weight
         valid = ~reset & batch.learns[:-1]
         # traces pass through invalid steps as if the current policy had acted there
@@ -236,7 +239,7 @@ class VTrace(GradientLearner):
             **self.traces,
         )
         estimates["valid"] = valid
-        scale = self.policy.critic.output.scale
+        scale = policy.critic.output.scale
         error = (value[:-1] - estimates.targets) / scale
         advantages = estimates.advantages / scale  # in standard deviations of the return
         size = pooled_mean(advantages.square(), valid).sqrt()
@@ -244,7 +247,7 @@ class VTrace(GradientLearner):
         metrics = dict(
             policy=-masked_mean(weight * logprobs * advantages, valid),
             value=masked_mean(weight * error.square(), valid),
-            entropy=masked_mean(output.entropy(logits), valid),
+            entropy=masked_mean(entropies, valid),
             advantage=size,
             **self._ratio_metrics(log_ratio[:, :n_fresh], valid[:, :n_fresh]),
             explained_variance=explained_variance(value[:-1].detach(), estimates.targets, valid),
@@ -254,9 +257,8 @@ class VTrace(GradientLearner):
             + self.value_coef * metrics["value"]
             - self.entropy_coef * metrics["entropy"]
         )
-        if self.policy.privileged_space:
-            prediction_error = self.policy.prediction_error(features, without_last(privileged))
-            metrics["auxiliary"] = masked_mean(prediction_error, valid)
+        if errors is not None:
+            metrics["auxiliary"] = masked_mean(errors, valid)
             loss = loss + self.auxiliary_coef * metrics["auxiliary"]
         if self.replay_buffer is not None:
             replayed = self._ratio_metrics(log_ratio[:, n_fresh:], valid[:, n_fresh:])

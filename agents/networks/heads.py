@@ -14,8 +14,9 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks.continuous_outputs import CONTINUOUS_OUTPUTS
+from megastep.agents.networks.duelling_output import DuellingOutput
 from megastep.agents.networks.intakes import ConcatIntake
-from megastep.agents.networks.outputs import DictOutput, DuellingOutput, MultiDiscreteOutput
+from megastep.agents.networks.outputs import DictOutput, MultiDiscreteOutput
 from megastep.types import Space
 
 #: Outputs of integers by name: "softmax" samples by probability, "duelling" by action value.

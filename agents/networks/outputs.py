@@ -27,7 +27,11 @@ class Output(nn.Module):
     """
 
     def act(
-        self, x: torch.Tensor, sample: bool = True, generator: torch.Generator | None = None
+        self,
+        x: torch.Tensor,
+        sample: bool = True,
+        generator: torch.Generator | None = None,
+        **options: torch.Tensor,
     ) -> tuple[Tree, Tree, torch.Tensor]:
         """Returns logits, actions and the actions' log-probability (B,).
 
@@ -35,9 +39,10 @@ class Output(nn.Module):
             x: features (B, width).
             sample: samples; if false, takes the most likely or best actions.
             generator: generator of the samples.
+            options: further arguments of `sample`.
         """
         logits = self(x)
-        actions = self.sample(logits, generator) if sample else self.greedy(logits)
+        actions = self.sample(logits, generator, **options) if sample else self.greedy(logits)
         return logits, actions, self.logprob(logits, actions)
 
     def terms(self, logits: Tree, actions: Tree) -> tuple[torch.Tensor, torch.Tensor]:
@@ -105,76 +110,11 @@ class MultiDiscreteOutput(Output):
 
     def logprob(self, logits: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Returns the log-probability (...,) of actions."""
-        return _gather(logits, actions)
+        return gather(logits, actions)
 
     def entropy(self, logits: torch.Tensor) -> torch.Tensor:
         """Returns the entropy (...,) in nats."""
         return -(logits.exp() * logits).sum((-1, -2))
-
-
-class DuellingOutput(Output):
-    """Action values (..., A, n) of a duelling network (Wang et al. 2016): the lane's value plus
-    advantages minus their mean, each behind a hidden layer, in whatever scale a learner fits.
-
-    The action values take the place of `logits`. `sample` is epsilon-greedy: a policy that is
-    always greedy can stand before a wall forever. `action_value` (...,) belongs to the lane's joint
-    action, the sum over its agents (VDN, Sunehag et al. 2018).
-
-    Args:
-        space: action space.
-        width: number of features.
-    """
-
-    epsilon = 0.05
-
-    def __init__(self, space: spaces.MultiDiscrete, width: int):
-        super().__init__()
-        self.shape = (space.n_agents, space.n_actions)
-        self.hidden = nn.Linear(width, 2 * width)
-        self.value = nn.Linear(width, space.n_agents)
-        self.advantage = nn.Linear(width, math.prod(self.shape))
-        # The bias keeps its random initialisation: with zeros, features of 0 would put every ReLU
-        # exactly at its kink.
-        nn.init.orthogonal_(self.hidden.weight, gain=2**0.5)
-        for layer in self.value, self.advantage:
-            nn.init.orthogonal_(layer.weight, gain=0.1)
-            nn.init.zeros_(layer.bias)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        hidden = linear(x, self.hidden, torch.relu)
-        # bfloat16 would round large values by more than actions differ
-        with torch.autocast(x.device.type, enabled=False):
-            value, advantage = hidden.float().chunk(2, -1)
-            value = self.value(value)[..., None]
-            advantage = self.advantage(advantage).unflatten(-1, self.shape)
-        return value + advantage - advantage.mean(-1, keepdim=True)
-
-    def sample(
-        self,
-        logits: torch.Tensor,
-        generator: torch.Generator | None = None,
-        epsilon: torch.Tensor | None = None,
-    ) -> torch.Tensor:
-        """Returns the best actions, or random ones with probability epsilon (...,) per lane."""
-        epsilon = self.epsilon if epsilon is None else epsilon[..., None]
-        best = self.greedy(logits)
-        options = dict(generator=generator, device=logits.device)
-        random = torch.randint(logits.shape[-1], best.shape, **options)
-        is_random = torch.rand(best.shape, **options) < epsilon
-        return torch.where(is_random, random, best)
-
-    def greedy(self, logits: torch.Tensor) -> torch.Tensor:
-        """Returns the best actions."""
-        return logits.argmax(-1)
-
-    def logprob(self, logits: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Returns the log-probability (...,) of actions under `sample` with the default epsilon."""
-        n, is_best = logits.shape[-1], actions == self.greedy(logits)
-        return ((1 - self.epsilon) * is_best + self.epsilon / n).log().sum(-1)
-
-    def action_value(self, logits: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Returns the value (...,) of actions."""
-        return _gather(logits, actions)
 
 
 class DictOutput(Output):
@@ -202,10 +142,16 @@ class DictOutput(Output):
         return arrdict({key: output(x) for key, output in self.outputs.items()})
 
     def act(
-        self, x: torch.Tensor, sample: bool = True, generator: torch.Generator | None = None
+        self,
+        x: torch.Tensor,
+        sample: bool = True,
+        generator: torch.Generator | None = None,
+        **options: torch.Tensor,
     ) -> tuple[arrdict, arrdict, torch.Tensor]:
         """Acts key by key."""
-        parts = {key: output.act(x, sample, generator) for key, output in self.outputs.items()}
+        parts = {
+            key: output.act(x, sample, generator, **options) for key, output in self.outputs.items()
+        }
         logits, actions, logprobs = zip(*parts.values())
         return arrdict(zip(parts, logits)), arrdict(zip(parts, actions)), sum(logprobs)
 
@@ -246,6 +192,6 @@ class DictOutput(Output):
         )
 
 
-def _gather(values, actions):
+def gather(values: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
     """Returns the entries (..., A, n) of the actions (..., A), summed over agents."""
     return values.gather(-1, actions.long()[..., None]).squeeze(-1).sum(-1)

@@ -123,6 +123,7 @@ class Policy(nn.Module):
         state: arrdict,
         sample: bool = True,
         generator: torch.Generator | None = None,
+        **options: torch.Tensor,
     ) -> tuple[arrdict, arrdict]:
         """Acts for one step.
 
@@ -131,6 +132,7 @@ class Policy(nn.Module):
             state: hidden state.
             sample: samples actions; if false, takes the most likely or best ones.
             generator: generator of the actions. Default: the policy's.
+            options: further arguments of the output's `sample`, such as epsilon.
 
         Returns:
             arrdict(actions, logits, logprobs (B,), features (B, width)) and the next hidden state.
@@ -150,7 +152,7 @@ class Policy(nn.Module):
             generator = self.generator.on(self.device)
         with self.compute_dtype():
             features, state = self._features(obs, reset, state)
-            logits, actions, logprobs = self.output.act(features[0], sample, generator)
+            logits, actions, logprobs = self.output.act(features[0], sample, generator, **options)
         decision = arrdict(actions=actions, logits=logits, logprobs=logprobs, features=features[0])
         return decision, state
 
@@ -160,6 +162,7 @@ class Policy(nn.Module):
         reset: torch.Tensor,
         state: arrdict,
         lanes: torch.Tensor | None = None,
+        burn_in: int = 0,
     ) -> arrdict:
         """Runs over a sequence without acting.
 
@@ -168,14 +171,37 @@ class Policy(nn.Module):
             reset: (T, B) bool; clears a lane's hidden state before the step. (T, M) with `lanes`.
             state: hidden state before the sequence, of M lanes with `lanes`.
             lanes: (M,) int64, the lanes of `obs` to run over. None: all.
+            burn_in: steps at the start, fewer than T, that only warm up the hidden state. They have
+                no gradients, and the result leaves them out.
 
         Returns:
             arrdict(logits (T, B, ...), features (T, B, width) that they were computed from, state
             after the sequence).
         """
         with self.compute_dtype():
+            n_apart = burn_in if torch.is_grad_enabled() else 0  # without gradients, one pass does
+            if n_apart:
+                first = mapping(lambda leaf: leaf[:n_apart])(obs)
+                state = self.warm_up(first, reset[:n_apart], state, lanes)
+                obs, reset = mapping(lambda leaf: leaf[n_apart:])(obs), reset[n_apart:]
             features, state = self._features(obs, reset, state, lanes)
+            features = features[burn_in - n_apart :]
             return arrdict(logits=self.output(features), features=features, state=state)
+
+    @torch.no_grad()
+    def warm_up(
+        self,
+        obs: Tree,
+        reset: torch.Tensor,
+        state: arrdict,
+        lanes: torch.Tensor | None = None,
+    ) -> arrdict:
+        """Returns the hidden state after a sequence, without gradients; see `unroll`."""
+        with self.compute_dtype():
+            _, state = self._features(obs, reset, state, lanes)
+        # autocast would give these casts of the weights, which have no gradients, to later steps
+        torch.clear_autocast_cache()
+        return state
 
     def _features(self, obs, reset, state, lanes=None):
         encoded = self.intake(obs, lanes)

@@ -17,7 +17,7 @@ _MAX_BYTES = 2**31
 
 
 def copy_all(
-    pairs: Iterable[tuple[torch.Tensor, torch.Tensor]], unless: torch.Tensor | None = None
+    pairs: Iterable[tuple[torch.Tensor, torch.Tensor]], condition: torch.Tensor | None = None
 ) -> None:
     """Copies the second tensor of each pair into the first, as `Tensor.copy_` does.
 
@@ -27,7 +27,7 @@ def copy_all(
 
     Args:
         pairs: targets and sources, all on one device but for sources on the host.
-        unless: () bool on the device; if true, nothing is copied. None: false.
+        condition: () bool on the device. If false, no bit changes. None: copies always.
     """
     pairs = list(pairs)  # a source that nobody else holds lives until the launch
     fused = []
@@ -35,8 +35,8 @@ def copy_all(
         if target.is_cuda and _is_plain_copy(target, source):
             fused.append((target, source))
         else:
-            if unless is not None:
-                source = torch.where(unless, target, source.to(target.device))
+            if condition is not None:
+                source = torch.where(condition, source.to(target.device), target)
             target.copy_(source)
     for start in range(0, len(fused), _MAX_COPIES):
         rows, n_blocks = [], 0
@@ -55,7 +55,7 @@ def copy_all(
             n_blocks += -(-n_bytes // _BLOCK_BYTES)
         struct = PROGRAM.params.CopyAllParams(
             copies=b"".join(rows),
-            unless=0 if unless is None else unless.data_ptr(),
+            condition=0 if condition is None else condition.data_ptr(),
             n_copies=len(rows),
         )
         if n_blocks:

@@ -40,12 +40,11 @@ def add_replayed(
     return arrdict(joined, index=replayed.index)
 
 
-@torch.no_grad()
 def _burn_in(batch, policy, n_steps):
     """Returns a batch without its first steps, with the hidden state after them."""
     if not n_steps:
         return batch
     first, rest = mapping(lambda leaf: leaf[:n_steps]), mapping(lambda leaf: leaf[n_steps:])
-    state = policy.unroll(first(batch.obs), first(batch.starts), batch.state).state
+    state = policy.warm_up(first(batch.obs), first(batch.starts), batch.state)
     parts = {key: rest(part) if key in _IN_TIME else part for key, part in batch.items()}
     return arrdict(parts, state=state)

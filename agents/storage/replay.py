@@ -10,10 +10,12 @@ row arrives until its first row is overwritten.
 """
 
 import torch
+from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
+from megastep.agents.storage import replay_kernels as kernels
 from megastep.agents.storage.replay_columns import Column, stored_dtype
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout, copy_tree
@@ -169,8 +171,14 @@ class ReplayBuffer:
             weight: float32 importance weight for the loss, at most 1 (Schaul et al. 2016, sec. 3.4)
             age: int64, number of rollouts added since the one that it starts in
         """
-        index = self.tree.sample(n, generator)
-        probability = self.tree.probability(index)
+        index, probability = self.tree.draw(n, generator)
+        batch = self._read_on_gpu(index, probability)
+        batch = self._read(index, probability) if batch is None else batch
+        batch["index"], batch["probability"] = index, probability
+        return batch
+
+    def _read(self, index, probability):
+        """Returns the sequences with their weights and ages."""
         slot, lane = index // self.n_lanes, index % self.n_lanes
         window = torch.arange(self.length + 1, device=index.device)[:, None]
         rows = (slot * self.n_steps + window) % (self.n_rollouts * self.n_steps)
@@ -184,10 +192,29 @@ class ReplayBuffer:
             batch[name] = flag if name in _WITH_LAST else flag[:-1]
         batch["state"] = mapping(Column.read)(self.state, index)
         weight = (self.n_available * probability).clamp(min=1e-30) ** -self.settings.beta
-        batch["index"], batch["probability"] = index, probability
         batch["weight"] = (weight / weight.amax()).float()
         batch["age"] = (self.n_added - 1 - slot) % self.n_rollouts
         return batch
+
+    def _read_on_gpu(self, index, probability):
+        """Does the same in one kernel; None where that is not possible."""
+        tree = arrdict(self.columns, state=self.state)
+        columns, spec = tree_flatten(tree)
+        n_rows = {name: self.length + (name in _WITH_LAST) for name in self.columns}
+        n_rows["state"] = 1
+        n_rows = [n_rows[name] for name, part in tree.items() for _ in tree_flatten(part)[0]]
+        tensors = [(column.rows, column.dtype) for column in columns]
+        if not kernels.can_read(tensors, (self.length + 1) * len(index)):
+            return None
+        results, flags, weight, age = kernels.read_sequences(
+            [(*tensor, n) for tensor, n in zip(tensors, n_rows, strict=True)],
+            self.flags.rows,
+            *(index, probability, (self.n_added, self.n_available)),
+            *(self.length, self.n_rollouts, self.settings.beta),
+        )
+        batch = arrdict(tree_unflatten(results, spec), weight=weight, age=age)
+        batch["state"] = mapping(lambda leaf: leaf[0])(batch.state)
+        return arrdict(batch, **dict(zip(_FLAGS, flags, strict=True)))
 
     @torch.no_grad()
     @section("store")
@@ -203,6 +230,18 @@ class ReplayBuffer:
                 f"it is {tuple(values.shape)}"
             )
         if self.settings.alpha == 0:
+            return
+        if self.tree.is_fused and len(index) <= kernels.MAX_SET:
+            kernels.set_priorities(
+                self.tree.levels,
+                index.contiguous(),
+                values.float().contiguous(),
+                (self.n_added, self.n_available),
+                self.new_priority,
+                first_rollouts=-(-self.settings.start // (self.n_steps * self.n_lanes)),
+                smallest=_MIN_PRIORITY,
+                alpha=self.settings.alpha,
+            )
             return
         old = self.tree.priorities.index_select(0, index)
         new = values.double().clamp(min=_MIN_PRIORITY) ** self.settings.alpha

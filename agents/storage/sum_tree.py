@@ -10,6 +10,8 @@ import itertools
 
 import torch
 
+from megastep.agents.storage import replay_kernels as kernels
+
 
 class SumTree:
     """N priorities, initially 0. Nothing synchronises and shapes are fixed, so everything can be
@@ -47,6 +49,13 @@ class SumTree:
         return self.levels[-1].sum()
 
     @property
+    def is_fused(self) -> bool:
+        """Whether kernels draw and set."""
+        top = self.levels[-1]
+        is_known = self.fan_out == kernels.FAN_OUT and len(self.levels) <= kernels.MAX_LEVELS
+        return top.is_cuda and is_known
+
+    @property
     def bytes(self) -> int:
         """Bytes allocated."""
         return sum(level.nbytes for level in self.levels)
@@ -67,6 +76,10 @@ class SumTree:
                 f"values is {tuple(values.shape)}"
             )
         values = values.to(torch.float64)
+        if self.is_fused and len(index) <= kernels.MAX_SET:
+            if len(index):
+                kernels.set_tree(self.levels, index.contiguous(), values.contiguous())
+            return
         self.priorities.scatter_reduce_(0, index, values, "amax", include_self=False)
         for lower, upper in itertools.pairwise(self.levels):
             sums = upper.view(-1)
@@ -76,16 +89,24 @@ class SumTree:
             else:
                 sums[: len(lower)] = lower.sum(-1)
 
+    def draw(
+        self, n: int, generator: torch.Generator | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns `sample`'s indices and their `probability`, on a GPU in one kernel."""
+        if self.is_fused:
+            return kernels.draw(self.levels, self._shares(n, generator))
+        index = self.sample(n, generator)
+        return index, self.probability(index)
+
     def sample(self, n: int, generator: torch.Generator | None = None) -> torch.Tensor:
         """Draws n indices in proportion to their priorities, (n,) int64 in ascending order.
 
         Sampling is stratified: one index from each of n equal parts of the total. An index of
         priority 0 is never drawn; only if all are 0, the result is index 0.
         """
-        if n < 1:
-            raise ValueError(f"n must be at least 1 index to draw, but {n} was given")
-        top = self.levels[-1]
-        share = torch.rand(n, generator=generator, dtype=torch.float64, device=top.device)
+        if self.is_fused:
+            return self.draw(n, generator)[0]
+        top, share = self.levels[-1], self._shares(n, generator)
         rest = (share + torch.arange(n, device=top.device)) / n * self.total
         children = torch.arange(self.fan_out, device=top.device)
         index = torch.zeros(n, dtype=torch.int64, device=top.device)
@@ -106,3 +127,10 @@ class SumTree:
         """Returns the probability (M,) float64 of each index; 0 while all priorities are 0."""
         tiny = torch.finfo(torch.float64).tiny
         return self.priorities.index_select(0, index) / self.total.clamp(min=tiny)
+
+    def _shares(self, n, generator):
+        """Returns where in its part of the total each sample is, (n,) float64 from 0 to 1."""
+        if n < 1:
+            raise ValueError(f"n must be at least 1 index to draw, but {n} was given")
+        device = self.levels[-1].device
+        return torch.rand(n, generator=generator, dtype=torch.float64, device=device)

@@ -170,7 +170,7 @@ def _keep(copies, tensors, found):
             copies[path] = leaf.clone()
         else:
             pairs.append((copy, leaf))
-    copy_all(pairs, unless=found)
+    copy_all(pairs, condition=~found)
 
 
 def make_recorder(

@@ -159,11 +159,11 @@ def test_errors_and_priorities_match_hand_calculation(burn_in):
     batch = learner.replay_buffer.sample(5, torch.Generator().manual_seed(0))
     assert not batch.learns[burn_in:-1].all()
     with torch.no_grad():
-        loss, metrics, priorities, valid = learner._losses(batch)
+        loss, metrics, priorities, n_valid = learner._losses(batch)
         expected = [by_hand(learner, batch, m, 0.9, 3, 0.7) for m in range(5)]
     squares, sizes = [], []
+    assert n_valid == sum(sum(is_valid) for _, is_valid, _ in expected)
     for m, (errors, is_valid, priority) in enumerate(expected):
-        assert valid[:, m].tolist() == is_valid
         testing.assert_close(priorities[m], priority, rtol=1e-4, atol=1e-5)
         for error, counts in zip(errors, is_valid, strict=True):
             if counts:
@@ -287,6 +287,61 @@ def test_captured_update_matches_eager():
         ends.append((weights(learner.policy), losses["loss/q"], losses["loss/priority_mean"]))
     assert learner.cuda_graph.graph is not None
     testing.assert_close(ends[1], ends[0], rtol=1e-2, atol=1e-3)  # bfloat16 products
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("width", [32, 256])
+def test_same_seed_gives_same_bits(width):
+    ends = []
+    for _ in range(2):
+        learner, collect = make("cuda", graph=True, width=width, target_period=3)
+        losses = update(learner, collect, 6)
+        ends.append([weights(learner.policy), weights(learner.target), *losses.values()])
+    for one, other in zip(*ends, strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("core", ["lstm", "gru"])
+def test_fused_update_matches_the_cpus(core):
+    """The same minibatch has the same loss, priorities and gradients, but for bfloat16."""
+    torch.manual_seed(0)
+    results = []
+    for device in ("cpu", "cuda"):
+        env = Noise(device)
+        policy = Policy(env.obs_space, env.action_space, width=64, core=core, output="duelling")
+        learner = r2d2.R2D2(policy.to(device), **SETTINGS, replay=ReplaySettings(burn_in=3))
+        batch = drawn_batch(learner.length, 40, policy)
+        batch = batch.map(lambda leaf, device=device: leaf.to(device))
+        result = learner._losses(batch)
+        gradients = torch.autograd.grad(result.loss, list(policy.parameters()))
+        results.append([result.loss, result.priorities, *gradients])
+        assert result.n_valid == (~batch.starts[4:] & batch.learns[3:-1]).sum()
+    for i, (plain, fused) in enumerate(zip(*results, strict=True)):
+        error = (fused.cpu() - plain).abs().max() / plain.abs().max()
+        assert error < 0.1, (i, error)  # 8 bits, over the steps of a sequence
+
+
+def drawn_batch(length, n_sequences, policy):
+    """Returns random sequences like those of a replay buffer."""
+    generator = torch.Generator().manual_seed(0)
+    rows, with_last = (length, n_sequences), (length + 1, n_sequences)
+
+    def flags(shape):
+        return torch.rand(shape, generator=generator) < 0.1
+
+    return arrdict(
+        obs=torch.randn(*with_last, 1, 4, generator=generator).half(),
+        starts=flags(with_last),
+        learns=~flags(with_last),
+        actions=torch.randint(3, (*rows, 1), generator=generator),
+        reward=torch.randn(rows, generator=generator),
+        terminal=flags(rows),
+        truncated=torch.zeros(rows, dtype=torch.bool),
+        state=policy.initial(n_sequences, "cpu"),
+        weight=torch.rand(n_sequences, generator=generator),
+        age=torch.arange(n_sequences),
+    )
 
 
 TINY_R2D2 = [word.replace("n_minibatches", "gradient_steps") for word in TINY]

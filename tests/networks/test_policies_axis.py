@@ -7,7 +7,7 @@ from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
 from megastep.agents.algorithms.kernels.program import n_blocks
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
-from megastep.agents.networks.kernels import heads, layers, moments
+from megastep.agents.networks.kernels import duelling, heads, layers, moments
 from megastep.agents.networks.kernels.program import CORES
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.networks.value_output import ValueOutput
@@ -67,6 +67,7 @@ def test_intake():
         n_lanes=n_lanes,
         n_selected=7,
         n_columns=n_columns,
+        n_plain_words=4,
     )
     for i in range(P):
         of_policy = ([leaf[i] for leaf in parts] for parts in (leaves, means, scales))
@@ -442,3 +443,37 @@ def test_ppo_loss():
             assert torch.equal(one[i], other), i
         means = torch.stack([*metrics.values(), loss.detach()])
         torch.testing.assert_close(sums[i].sum(0), means)
+
+
+def test_duelling():
+    n_rows, width, shape = 21, 16, (2, 3)
+    hidden = randn(n_rows, 2 * width).relu().to(BF16)
+    weights = randn(2, width), randn(2), randn(6, width), randn(6)
+    names = "value_weight", "value_bias", "advantage_weight", "advantage_bias"
+    noise = torch.rand(2, P, n_rows, 2, device="cuda")
+    epsilon = torch.rand(P, n_rows, device="cuda")
+    values, logprobs = randn(n_rows, *shape), randn(n_rows)
+    actions = torch.empty(P, n_rows, 2, dtype=torch.int64, device="cuda")
+    launch(
+        *(CORES, "duelling_act", (-(-n_rows // 8), P)),
+        **dict(zip(names, weights, strict=True)),
+        **dict(hidden=hidden, noise=noise, epsilon=epsilon, values=values),
+        **dict(actions=actions, logprobs=logprobs, n_rows=n_rows, width=width),
+        **dict(n_agents=2, n_choices=3, usual_epsilon=0.05),
+    )
+    d_values, d_hidden = randn(n_rows, *shape), torch.empty_like(hidden)
+    sums = randn(1, (2 + 2 + 6) * width + 8)
+    launch(
+        *(CORES, "duelling_backward", (1, P), CORES.constants["DUELLING_THREADS"]),
+        **dict(hidden=hidden, value_weight=weights[0], advantage_weight=weights[2]),
+        **dict(d_values=d_values, d_hidden=d_hidden, sums=sums, n_rows=n_rows, width=width),
+        **dict(n_agents=2, n_choices=3, n_parts=1, n_sums=sums.shape[-1]),
+    )
+    for i in range(P):
+        own = [weight[i] for weight in weights]
+        alone = duelling.act(hidden[i], own, shape, noise[:, i].contiguous(), epsilon[i], 0.05)
+        for one, other in zip((values, actions, logprobs), alone, strict=True):
+            assert torch.equal(one[i], other), i
+        gradients = duelling.backward(hidden[i], own[0], own[2], d_values[i])
+        assert torch.equal(d_hidden[i], gradients[0]), i
+        assert torch.equal(sums[i, 0, : 2 * width], gradients[1][0]), i

@@ -62,6 +62,33 @@ def test_steps_match_unroll_for_every_core(core, layers):
         torch.testing.assert_close(leaf, expected, **close)
 
 
+@pytest.mark.parametrize("core", CORES)
+def test_burn_in_only_warms_up_the_hidden_state(core, device):
+    policy, world = Policy(OBS, MOVES, width=16, core=core).to(device), worlds()
+    world = world.map(lambda leaf: leaf.to(device))
+    sequence = world.obs, world.reset, policy.initial(B)
+    whole, rest = policy.unroll(*sequence), policy.unroll(*sequence, burn_in=3)
+    with torch.no_grad():
+        in_one_pass = policy.unroll(*sequence, burn_in=3)
+    close = dict(rtol=1e-5, atol=1e-5) if device == "cpu" else dict(rtol=2e-2, atol=2e-2)
+    for part in rest, in_one_pass:
+        torch.testing.assert_close(part.features, whole.features[3:], **close)
+        torch.testing.assert_close(
+            part.logits.movement, whole.logits.movement[3:], check_dtype=False, **close
+        )
+        for leaf, expected in zip(leaves(part.state), leaves(whole.state), strict=True):
+            torch.testing.assert_close(leaf, expected, **close)
+    # weights that the burn-in used still have gradients, those of the other steps
+    state = policy.warm_up(*(leaf[:3] for leaf in (world.obs, world.reset)), policy.initial(B))
+    alone = policy.unroll(*(leaf[3:] for leaf in (world.obs, world.reset)), state)
+    weights = [p for name, p in policy.named_parameters() if name.startswith(("intake", "core"))]
+    gradients = (
+        torch.autograd.grad(part.features.square().sum(), weights) for part in (rest, alone)
+    )
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other, **close)
+
+
 def test_activation_bytes_count_layers():
     # 24 float32 per unit, 8 for each further layer
     sizes = [Policy(OBS, MOVES, width=32, layers=n).activation_bytes for n in (1, 2, 4)]

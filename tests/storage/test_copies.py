@@ -57,18 +57,6 @@ def test_copies_what_copy_does(device, monkeypatch):
     assert n_plain > 2 * copies._MAX_COPIES and len(launches) == n_launches
 
 
-def test_nothing_is_copied_if_a_flag_says_so(device):
-    (cases_, _), flag = cases(device), torch.tensor(True, device=device)
-    before = [buffer.clone() for buffer, _, _ in cases_]
-    pairs = [(target, source) for _, target, source in cases_]
-    copy_all(pairs, unless=flag)
-    for (buffer, _, _), kept in zip(cases_, before, strict=True):
-        assert torch.equal(buffer, kept)
-    copy_all(pairs, unless=~flag)
-    for _, target, source in cases_:
-        assert torch.equal(target, source.to(target).expand_as(target))
-
-
 def test_sources_that_nobody_else_holds_are_copied(device):
     """Conversions between them would take the memory of a source that is freed too early."""
     source = torch.arange(10_000.0, device=device)
@@ -83,6 +71,18 @@ def test_sources_that_nobody_else_holds_are_copied(device):
     copy_all(pairs())
     for i in range(8):
         assert torch.equal(plain[i], source + i) and (half[i] == i).all()
+
+
+def test_false_condition_changes_no_bit(device):
+    for condition in (False, True):
+        some, _ = cases(device)
+        pairs = [(target, source) for _, target, source in some]
+        pairs = [(target, source.to(target.device)) for target, source in pairs]
+        before = [target.clone() for target, _ in pairs]
+        copy_all(pairs, torch.tensor(condition, device=device))
+        for old, (target, source) in zip(before, pairs, strict=True):
+            expected = source.to(target.dtype).expand_as(target) if condition else old
+            assert torch.equal(target, expected)
 
 
 def test_nothing_to_copy():

@@ -198,16 +198,19 @@ def test_unwritten_rows_are_never_drawn(length):
         compare(replay, lists)
 
 
-def test_priorities_and_importance_weights():
-    world = World(4)
+def test_priorities_and_importance_weights(device):
+    world = World(4, device)
     replay = buffer_of(world, 3, length=4, alpha=0.5, beta=1.0)
     for _ in range(3):
         replay.add(world.next())
     assert replay.tree.priorities.tolist() == [1] * 6 + [0] * 3
-    replay.set_priorities(torch.arange(6), torch.tensor([0.0, 1, 4, 9, 16, torch.nan]))
+    errors = torch.tensor([0.0, 1, 4, 9, 16, torch.nan], device=device)
+    replay.set_priorities(torch.arange(6, device=device), errors)
     expected = torch.tensor([1e-3, 1, 2, 3, 4, 1, 0, 0, 0], dtype=torch.float64)
-    testing.assert_close(replay.tree.priorities, expected)  # square roots; NaN changes nothing
-    batch = replay.sample(1400, torch.Generator().manual_seed(0))
+    testing.assert_close(
+        replay.tree.priorities.cpu(), expected
+    )  # square roots; NaN changes nothing
+    batch = replay.sample(1400, torch.Generator(device).manual_seed(0)).map(torch.Tensor.cpu)
     testing.assert_close(batch.probability, (expected / expected.sum())[batch.index])
     counts = torch.bincount(batch.index, minlength=9)
     assert (counts - 1400 * expected / expected.sum()).abs().max() <= 2  # stratified: one per part
@@ -252,8 +255,8 @@ def test_alpha_zero_ignores_priorities():
     assert torch.equal(batch.weight, torch.ones(900))
 
 
-def test_uint8_images_round_and_clip():
-    world = World(4)
+def test_uint8_images_round_and_clip(device):
+    world = World(4, device)
     replay = buffer_of(world, 2, length=4, images="uint8")
     assert replay.columns.obs.eye.rows.dtype == torch.uint8
     rollout = world.next()
@@ -262,7 +265,7 @@ def test_uint8_images_round_and_clip():
     raw = rollout.obs.raw[:4].clone()
     replay.add(rollout)
     replay.add(world.next())
-    batch = replay.sample(B)  # each lane once
+    batch = replay.sample(B, torch.Generator(device).manual_seed(0))  # each lane once
     assert batch.obs.eye.dtype == torch.float16
     # half a step of 1/255, and float16's rounding
     testing.assert_close(batch.obs.eye[:4], expected, rtol=0, atol=0.5 / 255 + 5e-4)

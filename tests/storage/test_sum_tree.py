@@ -35,9 +35,10 @@ def test_sample_matches_search_in_cumulative_sum(n, fan_out):
     np.testing.assert_allclose(chance, (priorities / priorities.sum())[drawn], rtol=1e-12)
 
 
-def test_sample_frequencies_match_priorities(device):
+@pytest.mark.parametrize("fan_out", [4, 32])
+def test_sample_frequencies_match_priorities(fan_out, device):
     priorities = np.array([0.0, 1, 2, 3, 0, 4, 30, 0] * 9)
-    tree = filled(priorities, device, fan_out=4)
+    tree = filled(priorities, device, fan_out=fan_out)
     # one sample per call, so that samples are independent
     generator = torch.Generator(device).manual_seed(1)
     drawn = torch.cat([tree.sample(1, generator) for _ in range(4000)])
@@ -120,6 +121,31 @@ def test_million_priorities():
 def test_bad_arguments_raise(n, fan_out):
     with pytest.raises(ValueError, match="fan_out >= 2"):
         SumTree(n, fan_out=fan_out)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n", [1, 40, 70_000])
+def test_kernels_match_pytorch(n):
+    values = 10 ** (9 * torch.rand(n, generator=torch.Generator().manual_seed(0)).double())
+    values[1::3] = 0
+    plain, fused = SumTree(n), SumTree(n, "cuda")
+    index = torch.randint(n, (900,), generator=torch.Generator().manual_seed(1))
+    for tree in plain, fused:
+        device = tree.levels[0].device
+        tree.set(torch.arange(n, device=device), values.to(device))
+        tree.set(index.to(device), values.flip(0)[index // 2].to(device))
+    for ours, theirs in zip(fused.levels, plain.levels, strict=True):
+        testing.assert_close(ours.cpu(), theirs, rtol=1e-12, atol=0)
+    drawn, probability = fused.draw(2000, torch.Generator("cuda").manual_seed(2))
+    testing.assert_close(probability, fused.probability(drawn), rtol=1e-12, atol=0)
+    generator = torch.Generator("cuda").manual_seed(2)
+    share = torch.rand(2000, generator=generator, dtype=torch.float64, device="cuda")
+    sums = plain.priorities.cumsum(0)
+    rest = (share.cpu() + torch.arange(2000)) / 2000 * sums[-1]
+    expected = torch.searchsorted(sums, rest, right=True)
+    # sums in another order may select a neighbour
+    assert (drawn.cpu() != expected).float().mean() < 0.01
+    assert (plain.priorities[drawn.cpu()] > 0).all()
 
 
 @pytest.mark.cuda

@@ -27,6 +27,23 @@ struct OrderParams {
     int n;
 };
 
+struct VtraceParams {
+    const float* log_ratio;          // (T, B)
+    const float* reward;             // (T, B)
+    const float* values;             // (T + 1, B)
+    const unsigned char* reset;      // (T, B)
+    const unsigned char* terminal;   // (T, B)
+    const unsigned char* truncated;  // (T, B)
+    float* advantages;               // (T, B)
+    float* targets;                  // (T, B)
+    int n_steps;
+    int n_lanes;
+    float gamma;
+    float lambda_;
+    float rho_clip;
+    float c_clip;
+};
+
 struct PpoLossParams {
     const float* logprobs;       // (P, n_rows), of the actions
     const float* entropies;      // (P, n_rows)
@@ -52,6 +69,39 @@ struct PpoLossParams {
     float value_coef;
     float entropy_coef;
     float auxiliary_coef;
+};
+
+// M sequences of T steps after the burn-in, A agents per lane, n choices.
+struct TdLossParams {
+    const float* q;                  // (P, T + 1, M, A, n), of the online network
+    const float* target_q;           // (P, T + 1, M, A, n)
+    const long long* actions;        // (P, T, M, A)
+    const float* reward;             // (P, T, M)
+    const unsigned char* terminal;   // (P, T, M)
+    const unsigned char* truncated;  // (P, T, M)
+    const unsigned char* starts;     // (P, T + 1, M)
+    const unsigned char* learns;     // (P, T + 1, M)
+    const float* weight;             // (P, M)
+    const long long* age;            // (P, M)
+    float* values;                   // (P, T + 1, M), written
+    float* d_q;                      // (P, T + 1, M, A, n), of the sum over valid steps
+    float* priorities;               // (P, M)
+    float* sums;  // (P, n_blocks, 7): loss, |error|, q, valid steps; age, weight, weight^2
+    int n_steps;
+    int n_sequences;
+    int n_agents;
+    int n_choices;
+    int n_return_steps;
+    float gamma;
+    float eta;
+    float eps;  // of `returns.rescale`
+};
+
+struct TdMetricsParams {
+    const float* sums;  // (P, n_blocks, 7)
+    float* metrics;     // (P, 7): those of `td_loss.METRICS`, valid steps, 1 / max(valid steps, 1)
+    int n_blocks;
+    int n_sequences;
 };
 
 // A parameter (P, n) with its gradient and Adam's running means.

@@ -11,3 +11,6 @@ constexpr int MASKED_THREADS = 256;    // of a block
 constexpr int MASKED_NUMBERS = 8;      // of an array, that a thread reads
 constexpr int CAST_ROWS = 48;          // weights of a launch
 constexpr int CAST_THREADS = 256;      // of a block
+constexpr int DUELLING_OUTPUTS = 8;    // action values of a lane, at most
+constexpr int DUELLING_STRIP = 128;    // rows that a block of their gradients adds up
+constexpr int DUELLING_THREADS = 256;  // of such a block, two columns each

@@ -4,6 +4,8 @@ All tensors are contiguous and on one GPU. T steps, B lanes, M selected lanes, A
 choices.
 """
 
+import itertools
+
 import torch
 
 from megastep.agents.networks.kernels.program import CORES, DTYPES
@@ -36,6 +38,7 @@ def normalise(
     n_steps, n_lanes = leaves[0].shape[:2]
     n_selected = n_lanes if lanes is None else len(lanes)
     features = leaves[0].new_empty(n_steps, n_selected, n_columns, dtype=torch.bfloat16)
+    plain = itertools.takewhile(lambda leaf: leaf.shape[-1] % 4 == 0, leaves)
     packed = [
         CORES.params.IntakeLeafParams(
             values=leaf.data_ptr(),
@@ -58,6 +61,7 @@ def normalise(
         n_lanes=n_lanes,
         n_selected=n_selected,
         n_columns=n_columns,
+        n_plain_words=sum(leaf.shape[-1] // 4 for leaf in plain),
         n_blocks_y=n_steps,
     )
     return features

@@ -131,9 +131,16 @@ DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int c
 // Blocks along y: steps of all policies.
 KERNEL BOUNDS(64) normalise(NormaliseParams p) {
     unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x, n_words = p.n_columns / 4;
-    unsigned int n_selected = p.n_selected;
+    unsigned int n_selected = p.n_selected, n_plain = p.n_plain_words;
     unsigned int step = (n_selected + NORMALISED_ROWS - 1) / NORMALISED_ROWS;  // between two rows
-    unsigned int first = thread / n_words, column = 4 * (thread - first * n_words);
+    // Other words take several times as long, so they have warps of their own.
+    bool is_plain = thread < step * n_plain;
+    unsigned int number = is_plain ? thread : thread - step * n_plain;
+    unsigned int words = is_plain ? n_plain : n_words - n_plain;
+    if (!words)
+        return;
+    unsigned int first = number / words, word = number - first * words + (is_plain ? 0 : n_plain);
+    unsigned int column = 4 * word;
     if (first >= step)
         return;
     unsigned int policy = blockIdx.y / p.n_steps;

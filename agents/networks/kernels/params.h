@@ -116,9 +116,11 @@ struct NormaliseParams {
     const long long* lanes;  // (P, M), the lanes to read; null: all, M = B
     void* features;          // (P, T, M, n_columns) bfloat16
     int n_steps;
-    int n_lanes;     // B
-    int n_selected;  // M
-    int n_columns;   // a multiple of 4; those after the leaves' features are 0
+    int n_lanes;        // B
+    int n_selected;     // M
+    int n_columns;      // a multiple of 4; those after the leaves' features are 0
+    int n_plain_words;  // of four columns, before the first leaf whose features are no multiple of
+                        // 4
 };
 
 struct MomentsParams {
@@ -296,6 +298,39 @@ struct HeadsBackwardParams {
     int n_agents;
     int n_choices;
     int width;
+};
+
+struct DuellingParams {
+    const void* hidden;             // (P, n_rows, 2 W) bfloat16
+    const float* value_weight;      // (P, A, W)
+    const float* value_bias;        // (P, A)
+    const float* advantage_weight;  // (P, A n, W)
+    const float* advantage_bias;    // (P, A n)
+    const float* noise;             // (2, P, n_rows, A) from 0 to 1; null: no random actions
+    const float* epsilon;           // (P, n_rows); null: `usual_epsilon`
+    float* values;                  // (P, n_rows, A, n)
+    long long* actions;             // (P, n_rows, A); null unless acting, like `logprobs`
+    float* logprobs;                // (P, n_rows), of the joint actions with `usual_epsilon`
+    int n_rows;
+    int width;      // a multiple of 8
+    int n_agents;   // A
+    int n_choices;  // A n is at most DUELLING_OUTPUTS
+    float usual_epsilon;
+};
+
+struct DuellingBackwardParams {
+    const void* hidden;             // (P, n_rows, 2 W) bfloat16, after the ReLU
+    const float* value_weight;      // (P, A, W)
+    const float* advantage_weight;  // (P, A n, W)
+    const float* d_values;          // (P, n_rows, A, n)
+    void* d_hidden;                 // (P, n_rows, 2 W) bfloat16, before the ReLU
+    float* sums;                    // (P, n_strips, n_sums); see the kernel
+    int n_rows;
+    int width;
+    int n_agents;
+    int n_choices;
+    int n_parts;  // blocks for the columns of a row
+    int n_sums;   // (2 + A + A n) W + A + A n
 };
 
 // The LSTM over a whole sequence, on the CPU. Everything is float32, W is a multiple of 16.

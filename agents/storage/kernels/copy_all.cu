@@ -10,7 +10,7 @@ constexpr unsigned int BLOCK_BYTES = 16 * BLOCK * COPY_WORDS;
 static_assert(sizeof(CopyAllParams::copies) == MAX_COPIES * sizeof(CopyParams));
 
 KERNEL copy_all(CopyAllParams p) {
-    if (p.unless && *p.unless)
+    if (p.condition && !*p.condition)
         return;
     int piece = 0, end = p.n_copies;  // the last one that begins at or before this block
     while (end - piece > 1) {

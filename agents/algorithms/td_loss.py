@@ -1,0 +1,159 @@
+"""R2D2's loss: the error of action values from n-step returns of a target network (Kapturowski et
+al. 2019, section 2.3), with the priorities that follow from it.
+
+T steps after the burn-in, M sequences, A agents per lane, n choices.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from megastep.agents.algorithms import returns
+from megastep.agents.algorithms.kernels import program
+from megastep.agents.algorithms.masked_stats import effective_sample_size, masked_mean
+from megastep.agents.networks.outputs import Output
+from megastep.agents.storage.rollout import without_last
+from megastep.arrdict import arrdict
+from megastep.types import Tree
+
+METRICS = "td", "td_error", "q", "staleness", "effective_samples"
+_ENDS = "reward", "terminal", "truncated"
+_EPS = 1e-3  # of `returns.rescale`
+_THREADS = program.PROGRAM.constants["TD_THREADS"]
+_SEQUENCES = program.PROGRAM.constants["TD_SEQUENCES"]
+_N_SUMS, _N_METRICS = (program.PROGRAM.constants[f"N_TD_{name}"] for name in ("SUMS", "METRICS"))
+
+
+class Settings(NamedTuple):
+    """The settings of the loss; see `R2D2`."""
+
+    gamma: float
+    return_steps: int
+    eta: float
+
+
+class Result(NamedTuple):
+    """What a minibatch gives.
+
+    Attributes:
+        loss: (), the mean of the weighted squared errors over the valid steps.
+        metrics: tensors () by name.
+        priorities: (M,).
+        n_valid: (), the number of valid steps.
+    """
+
+    loss: torch.Tensor
+    metrics: dict[str, torch.Tensor]
+    priorities: torch.Tensor
+    n_valid: torch.Tensor
+
+
+def td_loss(q: Tree, target_q: Tree, batch: arrdict, output: Output, settings: Settings) -> Result:
+    """Computes loss, metrics and priorities. On a GPU two kernels do, and leave the gradient.
+
+    Args:
+        q: (T+1, M, A, n) of the online network, or a tree of these.
+        target_q: those of the target network, without a gradient.
+        batch: has `actions`, `reward`, `terminal` and `truncated`, (T, M, ...) each, `starts` and
+            `learns` (T+1, M), `weight` and `age` (M,).
+        output: the policy's output.
+        settings: the settings.
+    """
+    if not (isinstance(q, torch.Tensor) and q.is_cuda and q.dtype == torch.float32):
+        return plain_loss(q, target_q, batch, output, settings)
+    loss, metrics, priorities = _FusedLoss.apply(q, target_q, batch, settings)
+    *values, n_valid, _ = metrics.unbind()
+    return Result(loss, dict(zip(METRICS, values, strict=True)), priorities, n_valid)
+
+
+def plain_loss(
+    q: Tree, target_q: Tree, batch: arrdict, output: Output, settings: Settings
+) -> Result:
+    """Does the same in PyTorch."""
+    reset = batch.starts[1:]
+    valid = ~reset & batch.learns[:-1]
+    with torch.no_grad():
+        value = returns.inverse_rescale(output.action_value(target_q, output.greedy(q)), _EPS)
+        targets = returns.n_step_returns(
+            **{name: batch[name] for name in _ENDS},
+            value=value[:-1],
+            last_value=value[-1],
+            reset=reset,
+            gamma=settings.gamma,
+            n=settings.return_steps,
+        )
+    q_taken = output.action_value(without_last(q), batch.actions)
+    error = (returns.rescale(targets, _EPS) - q_taken).masked_fill(~valid, 0.0)
+    loss = masked_mean(batch.weight * error.square(), valid)
+    with torch.no_grad():
+        size, eta = error.abs(), settings.eta
+        priorities = eta * size.amax(0) + (1 - eta) * masked_mean(size, valid, 0)
+        all_sequences = torch.ones_like(batch.weight, dtype=torch.bool)
+        metrics = dict(
+            td=loss,
+            td_error=masked_mean(size, valid),
+            q=masked_mean(returns.inverse_rescale(q_taken, _EPS), valid),
+            staleness=batch.age.float().mean(),
+            effective_samples=effective_sample_size(batch.weight, all_sequences),
+        )
+    return Result(loss, metrics, priorities, valid.sum())
+
+
+class _FusedLoss(torch.autograd.Function):
+    """`plain_loss` in two kernels. The gradient of the sum over valid steps is left for the
+    backward pass.
+    """
+
+    @staticmethod
+    def forward(ctx, q, target_q, batch, settings):
+        n_rows, n_sequences, n_agents, n_choices = q.shape
+        n_blocks = -(-n_sequences // _SEQUENCES)
+        d_q, values = (
+            torch.empty_like(q, memory_format=torch.contiguous_format),
+            q.new_empty(n_rows, n_sequences),
+        )
+        priorities = q.new_empty(n_sequences)
+        sums, metrics = q.new_empty(n_blocks, _N_SUMS), q.new_empty(_N_METRICS)
+        names = *_ENDS, "actions", "starts", "learns", "weight", "age"
+        tensors = {name: batch[name].contiguous() for name in names}
+        program.run(
+            "td_loss",
+            q.device,
+            n_blocks * _THREADS,
+            block=_THREADS,
+            q=q.contiguous(),
+            target_q=target_q.contiguous(),
+            **tensors,
+            values=values,
+            d_q=d_q,
+            priorities=priorities,
+            sums=sums,
+            n_steps=n_rows - 1,
+            n_sequences=n_sequences,
+            n_agents=n_agents,
+            n_choices=n_choices,
+            n_return_steps=settings.return_steps,
+            gamma=settings.gamma,
+            eta=settings.eta,
+            eps=_EPS,
+        )
+        program.run(
+            "td_metrics",
+            q.device,
+            _THREADS,
+            block=_THREADS,
+            sums=sums,
+            metrics=metrics,
+            n_blocks=n_blocks,
+            n_sequences=n_sequences,
+        )
+        ctx.save_for_backward(d_q, metrics)
+        ctx.mark_non_differentiable(metrics, priorities)
+        return metrics[0].clone(), metrics, priorities
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_loss, d_metrics, d_priorities):
+        d_q, metrics = ctx.saved_tensors
+        return d_q * (d_loss * metrics[-1]), None, None, None

@@ -1,0 +1,132 @@
+"""The output of a duelling network on a GPU: action values, gradients, epsilon-greedy actions.
+
+All tensors are contiguous and on one GPU, weights and features begin at a multiple of 16 bytes.
+B lanes, A agents per lane, n choices, W features, a multiple of 8. A n is at most `MAX_OUTPUTS`.
+"""
+
+from collections.abc import Sequence
+
+import torch
+
+from megastep.agents.networks.kernels.layers import sum_rows
+from megastep.agents.networks.kernels.program import CORES
+from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
+
+MAX_OUTPUTS = CORES.constants["DUELLING_OUTPUTS"]
+_STRIP, _THREADS = CORES.constants["DUELLING_STRIP"], CORES.constants["DUELLING_THREADS"]
+_BLOCK_ROWS = BLOCK // WARP * (WARP // MAX_OUTPUTS)
+
+
+def values(
+    hidden: torch.Tensor, parameters: Sequence[torch.Tensor], shape: tuple[int, int]
+) -> torch.Tensor:
+    """Returns action values (rows, A, n) float32.
+
+    Args:
+        hidden: (rows, 2 W) bfloat16, the features of the value, then those of the advantages.
+        parameters: weight (A, W) and bias (A,) of the value, weight (A n, W) and bias (A n,) of the
+            advantages, float32.
+        shape: (A, n).
+    """
+    return _launch("values", hidden, parameters, shape)
+
+
+def act(
+    hidden: torch.Tensor,
+    parameters: Sequence[torch.Tensor],
+    shape: tuple[int, int],
+    noise: torch.Tensor | None,
+    epsilon: torch.Tensor | None,
+    usual_epsilon: float,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Computes action values and takes the best actions, or random ones.
+
+    Args:
+        hidden: (B, 2 W), as for `values`.
+        parameters: as for `values`.
+        shape: (A, n).
+        noise: (2, B, A) uniform from 0 to 1: which random action, and whether to take it where it
+            is below epsilon. None: takes the best actions.
+        epsilon: (B,) float32. None: `usual_epsilon`.
+        usual_epsilon: of the log-probabilities.
+
+    Returns:
+        action values (B, A, n), actions (B, A) int64, and their log-probability (B,).
+    """
+    n_lanes, device = len(hidden), hidden.device
+    actions = torch.empty(n_lanes, shape[0], dtype=torch.int64, device=device)
+    logprobs = torch.empty(n_lanes, device=device)
+    results = dict(actions=actions, logprobs=logprobs)
+    options = dict(noise=noise, epsilon=epsilon, usual_epsilon=usual_epsilon)
+    return _launch("act", hidden, parameters, shape, **results, **options), actions, logprobs
+
+
+def _launch(operation, hidden, parameters, shape, usual_epsilon=1.0, **tensors):
+    n_rows, n_features = hidden.shape
+    values = torch.empty(n_rows, *shape, device=hidden.device)
+    names = "value_weight", "value_bias", "advantage_weight", "advantage_bias"
+    tensors |= dict(zip(names, parameters, strict=True), hidden=hidden, values=values)
+    names = *names, "hidden", "values", "noise", "epsilon", "actions", "logprobs"
+    addresses = {name: _address(tensors.get(name)) for name in names}
+    packed = CORES.params.DuellingParams(
+        **addresses,
+        n_rows=n_rows,
+        width=n_features // 2,
+        n_agents=shape[0],
+        n_choices=shape[1],
+        usual_epsilon=usual_epsilon,
+    )
+    if n_rows:
+        n_blocks = -(-n_rows // _BLOCK_ROWS), 1
+        launch_blocks(CORES, f"duelling_{operation}", packed, hidden.device, n_blocks, BLOCK)
+    return values
+
+
+def backward(
+    hidden: torch.Tensor,
+    value_weight: torch.Tensor,
+    advantage_weight: torch.Tensor,
+    d_values: torch.Tensor,
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Computes the gradients of `values`, and of the hidden layer before its ReLU.
+
+    Args:
+        hidden: (rows, 2 W), after the ReLU.
+        value_weight: (A, W).
+        advantage_weight: (A n, W).
+        d_values: (rows, A, n) float32.
+
+    Returns:
+        The gradient (rows, 2 W) before the ReLU, bfloat16. Its sum over the rows (2 W,), and the
+        gradients of weight and bias of the value and of the advantages, float32.
+    """
+    n_rows, n_agents, n_choices = d_values.shape
+    width, n_outputs = value_weight.shape[1], n_agents * n_choices
+    sizes = [2 * width, n_agents * width, n_outputs * width, n_agents, n_outputs]
+    n_strips, n_parts = -(-n_rows // _STRIP), -(-width // _THREADS)
+    d_hidden = torch.empty_like(hidden)
+    sums = d_values.new_empty(n_strips, sum(sizes))
+    packed = CORES.params.DuellingBackwardParams(
+        hidden=hidden.data_ptr(),
+        value_weight=value_weight.data_ptr(),
+        advantage_weight=advantage_weight.data_ptr(),
+        d_values=d_values.data_ptr(),
+        d_hidden=d_hidden.data_ptr(),
+        sums=sums.data_ptr(),
+        n_rows=n_rows,
+        width=width,
+        n_agents=n_agents,
+        n_choices=n_choices,
+        n_parts=n_parts,
+        n_sums=sum(sizes),
+    )
+    if n_rows:
+        n_blocks = n_strips, n_parts
+        launch_blocks(CORES, "duelling_backward", packed, hidden.device, n_blocks, _THREADS)
+    d_bias, d_value, d_advantage, d_value_bias, d_advantage_bias = sum_rows(sums).split(sizes)
+    d_weights = d_value.view_as(value_weight), d_advantage.view_as(advantage_weight)
+    return d_hidden, [d_bias, d_weights[0], d_value_bias, d_weights[1], d_advantage_bias]
+
+
+def _address(tensor):
+    return 0 if tensor is None else tensor.data_ptr()

@@ -1,0 +1,52 @@
+// The sum tree on a GPU: a block of 32 children is what a warp reads at once.
+#pragma once
+#include "common/constants.h"
+#include "constants.h"
+#include "params.h"
+
+// The number of the child of a block whose part of the total holds `rest`, from which the children
+// before it are subtracted. Of the whole warp, each thread with its child's sum.
+static __device__ __forceinline__ int find_child(double sum, double& rest) {
+    int lane = threadIdx.x % WARP;
+    double sums = sum;  // up to this child
+    for (int step = 1; step < WARP; step *= 2) {
+        double before = __shfl_up_sync(~0u, sums, step);
+        sums += lane < step ? 0. : before;
+    }
+    unsigned int positive = __ballot_sync(~0u, sum > 0.);
+    unsigned int beyond = __ballot_sync(~0u, sum > 0. && sums > rest);
+    // if rounding left a rest beyond the total, the last child that can be drawn
+    int child = beyond ? __ffs(beyond) - 1 : positive ? 31 - __clz(positive) : 0;
+    rest -= __shfl_sync(~0u, sums - sum, child);
+    return child;
+}
+
+// Replaces priorities at index (n). Of several values for one index, the largest stays. For one
+// block of threads; values (n) were written by these threads, each those that it handles here.
+static __device__ __forceinline__ void set_values(const SumTreeParams& tree, const long long* index,
+                                                  const double* values, int n) {
+    double* priorities = tree.levels[0].sums;
+    for (int i = threadIdx.x; i < n; i += blockDim.x)
+        priorities[index[i]] = 0.;
+    __syncthreads();
+    for (int i = threadIdx.x; i < n; i += blockDim.x)  // positive numbers compare as integers
+        atomicMax((long long*)priorities + index[i], __double_as_longlong(values[i]));
+    __syncthreads();
+    for (int level = 1, shift = 5; level < tree.n_levels; level++, shift += 5) {
+        const double* lower = tree.levels[level - 1].sums;
+        double* upper = tree.levels[level].sums;
+        for (int i = threadIdx.x; i < n; i += blockDim.x) {
+            long long block = index[i] >> shift;
+            const double2* children = (const double2*)(lower + block * WARP);
+            double sum = 0.;
+#pragma unroll
+            for (int k = 0; k < WARP / 2; k++) {
+                double2 pair = __ldcg(children + k);  // from where the atomics are
+                sum += pair.x;
+                sum += pair.y;
+            }
+            upper[block] = sum;  // those of one block write the same number
+        }
+        __syncthreads();
+    }
+}

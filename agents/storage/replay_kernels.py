@@ -1,0 +1,206 @@
+"""The replay buffer on a GPU: a kernel each draws indices, reads sequences and sets priorities.
+
+All tensors are contiguous, on one GPU. M indices or sequences, L steps of a sequence, B lanes, T
+steps and K rollouts of the buffer.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from megastep.agents.storage.copies import PROGRAM
+from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
+
+MAX_LEVELS = PROGRAM.constants["MAX_LEVELS"]
+MAX_SET = PROGRAM.constants["MAX_SET"]  # indices of `set_tree` and `set_priorities`
+FAN_OUT = WARP  # children of a node
+_MAX_TENSORS = PROGRAM.constants["MAX_SELECTED"]
+_SET_THREADS, _READ_THREADS = (PROGRAM.constants[f"{name}_THREADS"] for name in ("SET", "READ"))
+_MAX_ENTRIES = 2**31  # kernels count lanes, rows and words in 32 bits
+_COPIES = {size: PROGRAM.constants[f"COPY_{size}"] for size in (16, 8, 4, 2, 1)}
+#: How a stored dtype is read as another.
+_CONVERSIONS = {
+    (torch.uint8, torch.int64): PROGRAM.constants["BYTE_TO_LONG"],
+    (torch.int16, torch.int64): PROGRAM.constants["SHORT_TO_LONG"],
+    (torch.int32, torch.int64): PROGRAM.constants["INT_TO_LONG"],
+    (torch.uint8, torch.float16): PROGRAM.constants["BYTE_TO_HALF"],
+    (torch.uint8, torch.float32): PROGRAM.constants["BYTE_TO_FLOAT"],
+    (torch.float16, torch.float32): PROGRAM.constants["HALF_TO_FLOAT"],
+}
+
+
+def draw(levels: Sequence[torch.Tensor], shares: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Draws an index from each of M equal parts of a sum tree's total.
+
+    Args:
+        levels: of the tree, (blocks, FAN_OUT) float64 each.
+        shares: (M,) float64 from 0 to 1, where in its part.
+
+    Returns:
+        indices (M,) int64 and their probabilities (M,) float64.
+    """
+    index = torch.empty_like(shares, dtype=torch.int64)
+    probability = torch.empty_like(shares)
+    packed = PROGRAM.params.SampleTreeParams(
+        tree=_packed(levels),
+        shares=shares.data_ptr(),
+        index=index.data_ptr(),
+        probability=probability.data_ptr(),
+        n_samples=len(shares),
+    )
+    n_blocks = -(-len(shares) * WARP // BLOCK), 1
+    launch_blocks(PROGRAM, "sample_tree", packed, shares.device, n_blocks, BLOCK)
+    return index, probability
+
+
+def set_tree(levels: Sequence[torch.Tensor], index: torch.Tensor, values: torch.Tensor) -> None:
+    """Does `SumTree.set`.
+
+    Args:
+        levels: as for `draw`.
+        index: (n,) int64.
+        values: (n,) float64.
+    """
+    packed = PROGRAM.params.SetTreeParams(
+        tree=_packed(levels), index=index.data_ptr(), values=values.data_ptr(), n=len(index)
+    )
+    launch_blocks(PROGRAM, "set_tree", packed, index.device, (1, 1), _SET_THREADS)
+
+
+def set_priorities(
+    levels: Sequence[torch.Tensor],
+    index: torch.Tensor,
+    errors: torch.Tensor,
+    counts: tuple[torch.Tensor, torch.Tensor],
+    new_priority: torch.Tensor,
+    first_rollouts: int,
+    smallest: float,
+    alpha: float,
+) -> None:
+    """Does `ReplayBuffer.set_priorities`.
+
+    Args:
+        levels: as for `draw`.
+        index: (n,) int64.
+        errors: (n,) float32.
+        counts: (), the rollouts added in total and the sequences that can be drawn, int64.
+        new_priority: () float64, updated.
+        first_rollouts: without that many rollouts nothing changes.
+        smallest: smallest error.
+        alpha: exponent.
+    """
+    values = torch.empty_like(errors, dtype=torch.float64)
+    packed = PROGRAM.params.SetPrioritiesParams(
+        tree=_packed(levels),
+        index=index.data_ptr(),
+        errors=errors.data_ptr(),
+        values=values.data_ptr(),
+        n_added=counts[0].data_ptr(),
+        n_available=counts[1].data_ptr(),
+        new_priority=new_priority.data_ptr(),
+        n=len(index),
+        first_rollouts=min(first_rollouts, _MAX_ENTRIES - 1),
+        smallest=smallest,
+        alpha=alpha,
+    )
+    launch_blocks(PROGRAM, "set_priorities", packed, index.device, (1, 1), _SET_THREADS)
+
+
+def can_read(tensors: Sequence[tuple[torch.Tensor, torch.dtype]], n_words: int) -> bool:
+    """Returns whether `read_sequences` reads these tensors.
+
+    Args:
+        tensors: rows (R, B, ...) of the ring, and the dtype to return.
+        n_words: entries of a sequence's tensors times the words of the largest entry, at most.
+    """
+    return len(tensors) <= _MAX_TENSORS and all(
+        rows.is_cuda
+        and rows.is_contiguous()
+        and (rows.dtype == dtype or (rows.dtype, dtype) in _CONVERSIONS)
+        and rows.shape[0] * rows.shape[1] < _MAX_ENTRIES
+        and n_words * math.prod(rows.shape[2:]) * rows.element_size() < _MAX_ENTRIES
+        for rows, dtype in tensors
+    )
+
+
+def read_sequences(
+    tensors: Sequence[tuple[torch.Tensor, torch.dtype, int]],
+    flags: torch.Tensor,
+    index: torch.Tensor,
+    probability: torch.Tensor,
+    counts: tuple[torch.Tensor, torch.Tensor],
+    n_steps: int,
+    n_rollouts: int,
+    beta: float,
+) -> tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor, torch.Tensor]:
+    """Reads sequences, with their importance weights and ages.
+
+    Args:
+        tensors: rows (R, B, ...) of the ring, the dtype to return, and how many rows to return. R
+            is K T, or K for hidden states.
+        flags: (K T, B) uint8, four bits.
+        index: (M,) int64, slot x B + lane.
+        probability: (M,) float64.
+        counts: (), the rollouts added in total and the sequences that can be drawn, int64.
+        n_steps: L.
+        n_rollouts: K.
+        beta: exponent of the weights.
+
+    Returns:
+        the tensors (rows, M, ...), the four flags, (L + 1, M), (L + 1, M), (L, M) and (L, M) bool,
+        weights (M,) float32 and ages (M,) int64.
+    """
+    n_sequences, device, packed = len(index), index.device, []
+    results, n_blocks = [], 1 + -(-(n_steps + 1) * n_sequences // _READ_THREADS)
+    for rows, dtype, n_rows in tensors:
+        result = torch.empty(n_rows, n_sequences, *rows.shape[2:], dtype=dtype, device=device)
+        n_words, kind = math.prod(rows.shape[2:]), _CONVERSIONS.get((rows.dtype, dtype))
+        if rows.dtype == dtype:
+            n_bytes = n_words * rows.element_size()
+            addresses = n_bytes | rows.data_ptr() | result.data_ptr()
+            word_size = next(size for size in _COPIES if not addresses % size)
+            n_words, kind = n_bytes // word_size, _COPIES[word_size]
+        packed.append(
+            PROGRAM.params.ReadTensorParams(
+                target=result.data_ptr(),
+                source=rows.data_ptr(),
+                n_rows=n_rows,
+                n_words=n_words,
+                rows_per_rollout=len(rows) // n_rollouts,
+                first_block=n_blocks,
+                kind=kind,
+            )
+        )
+        results.append(result)
+        n_blocks += -(-n_rows * n_sequences * n_words // _READ_THREADS)
+    lengths = n_steps + 1, n_steps + 1, n_steps, n_steps
+    bools = [torch.empty(n, n_sequences, dtype=torch.bool, device=device) for n in lengths]
+    weights, age = torch.empty_like(probability), torch.empty_like(index)
+    weight = torch.empty_like(probability, dtype=torch.float32)
+    struct = PROGRAM.params.ReadSequencesParams(
+        tensors=b"".join(packed),
+        flags=flags.data_ptr(),
+        **dict(zip(("starts", "learns", "terminal", "truncated"), (b.data_ptr() for b in bools))),
+        index=index.data_ptr(),
+        probability=probability.data_ptr(),
+        weights=weights.data_ptr(),
+        weight=weight.data_ptr(),
+        age=age.data_ptr(),
+        n_added=counts[0].data_ptr(),
+        n_available=counts[1].data_ptr(),
+        n_tensors=len(tensors),
+        n_sequences=n_sequences,
+        n_steps=n_steps,
+        n_lanes=flags.shape[1],
+        n_rollouts=n_rollouts,
+        rows_per_rollout=len(flags) // n_rollouts,
+        beta=beta,
+    )
+    launch_blocks(PROGRAM, "read_sequences", struct, device, (n_blocks, 1), _READ_THREADS)
+    return results, bools, weight, age
+
+
+def _packed(levels):
+    addresses = [PROGRAM.params.TreeLevelParams(sums=level.data_ptr()) for level in levels]
+    return PROGRAM.params.SumTreeParams(levels=b"".join(addresses), n_levels=len(levels))
