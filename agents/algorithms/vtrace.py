@@ -26,6 +26,7 @@ from megastep.agents.algorithms.masked_stats import (
     masked_mean,
     pooled_mean,
 )
+from megastep.agents.algorithms.order import random_order
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage import mixed_batches
@@ -184,7 +185,7 @@ class VTrace(GradientLearner):
         all_estimates = []
         for _ in range(self.n_epochs):
             generator = self.generator.on(self.device)
-            order = torch.rand(rollout.n_lanes, generator=generator, device=self.device).argsort()
+            order = random_order(rollout.n_lanes, generator, self.device)
             for lanes in order.tensor_split(self.n_minibatches):
                 loss, metrics, estimates = self._losses(self._batch(rollout, lanes), len(lanes))
                 self.steps.backward(loss, metrics, estimates.valid.sum())
