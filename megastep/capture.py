@@ -111,7 +111,8 @@ class Graph:
     """A function recorded as a CUDA graph. Arguments are those of :func:`capture`.
 
     A call copies the tensors of its arguments in, replays the graph, and returns the outputs. They
-    are valid until the next call.
+    are valid until the next call. The tensors of ``roots`` live as long as the graph, which reads
+    and writes them, even if the objects themselves are gone.
     """
 
     IS_STATELESS = True  # its tensors are copies, see :func:`megastep.engine.state_tree.walk`
@@ -138,6 +139,8 @@ class Graph:
                 raise
             finally:
                 restore(roots, saved)
+        # not the objects: those that hold their graph would be freed late, by garbage collection
+        self._tensors = [leaf for _, _, leaf in walk(roots, (torch.Tensor,)).values()]
 
     def _record(self, function, inputs, roots, saved, warmup):
         self._graph = torch.cuda.CUDAGraph()

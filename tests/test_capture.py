@@ -4,6 +4,8 @@ themselves need a GPU; most tests replace them and run anywhere.
 
 import contextlib
 import copy
+import gc
+import weakref
 from operator import attrgetter
 
 import pydantic
@@ -11,6 +13,7 @@ import pytest
 import torch
 
 from megastep import arrdict, capture, envs, spaces
+from megastep.read_only import ReadOnlyTensor
 
 GPU = torch.cuda.is_available()
 
@@ -252,6 +255,17 @@ def test_a_tensor_created_by_the_function_is_kept(fake_cuda):
     assert lazy.total.tolist() == [0, 0], "other state is restored"
 
 
+def test_a_graph_keeps_the_tensors_it_uses(fake_cuda):
+    lazy = Lazy()
+    lazy.constant = ReadOnlyTensor(torch.ones(2), "constant")
+    graph = capture.Graph(lazy, (), (lazy,))
+    tensors = [weakref.ref(leaf) for leaf in (lazy.total, lazy.hidden["h"], lazy.constant)]
+    del lazy
+    assert all(tensor() is not None for tensor in tensors)
+    del graph
+    assert all(tensor() is None for tensor in tensors)
+
+
 def test_a_failed_recording_restores_the_state(fake_cuda):
     lazy = Lazy()
 
@@ -367,6 +381,20 @@ class TestOnTheGPU:
         captured = capture.Captured(env)
         captured.step(arrdict.arrdict(actions=torch.zeros((8, 1), dtype=torch.long, device="cuda")))
         assert torch.equal(env.spawner.counts, counts) and torch.equal(env.lifecycle.ages, ages + 1)
+
+    def test_an_environment_may_be_dropped(self):
+        decision = arrdict.arrdict(actions=torch.full((64, 1), 3, device="cuda"))
+        eager, env = (envs.Explorer(64, device="cuda") for _ in range(2))
+        for one in (eager, env):
+            one.reset()
+        graph = capture.capture(env.step, (decision,), (env,))
+        del env, one
+        gc.collect()
+        torch.full((2**28,), torch.nan, device="cuda")  # takes the memory that is free
+        for _ in range(5):
+            expected, world = eager.step(decision), graph(decision)
+        assert torch.equal(world.obs.rgb, expected.obs.rgb)
+        assert torch.equal(world.reward, expected.reward)
 
     def test_a_captured_step_allocates_nothing(self):
         env = capture.Captured(envs.Explorer(64, device="cuda"))

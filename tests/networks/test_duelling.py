@@ -72,8 +72,9 @@ def test_output_matches_float32():
         inputs = [x, *output.parameters()]
         results.append([values, *torch.autograd.grad(values.square().sum(), inputs)])
     for i, (one, other) in enumerate(zip(*results, strict=True)):
-        error = (one - other).abs().max() / one.abs().max()
-        assert other.shape == one.shape and error < 0.03, (i, error)  # 8 bits
+        # 8 bits; a ReLU's input near 0 may change its sign
+        error = (one - other).norm() / one.norm()
+        assert other.shape == one.shape and error < 0.1, (i, error)
 
 
 def test_output_draws_the_same_actions_fused_or_not():

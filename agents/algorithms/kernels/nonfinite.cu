@@ -128,7 +128,7 @@ KERNEL BOUNDS(1024) record(RecordParams p) {
     if (!is_first)
         return;
     long long last = -1, none = (long long)n_rows * p.n_lanes;
-    for (int i = 0; i < p.n_named; i++) {
+    for (int i = 0; i < min(p.n_named, p.n_lanes); i++) {
         long long index = none;
         for (int lane = threadIdx.x; lane < p.n_lanes; lane += RECORD_THREADS) {
             long long candidate = (long long)p.first_rows[lane] * p.n_lanes + lane;
