@@ -140,7 +140,8 @@ class Graph:
             finally:
                 restore(roots, saved)
         # not the objects: those that hold their graph would be freed late, by garbage collection
-        self._tensors = [leaf for _, _, leaf in walk(roots, (torch.Tensor,)).values()]
+        leaves = walk(roots, (torch.Tensor,), only_state=False).values()
+        self._tensors = [leaf for _, _, leaf in leaves]
 
     def _record(self, function, inputs, roots, saved, warmup):
         self._graph = torch.cuda.CUDAGraph()

@@ -256,11 +256,18 @@ def test_a_tensor_created_by_the_function_is_kept(fake_cuda):
 
 
 def test_a_graph_keeps_the_tensors_it_uses(fake_cuda):
+    class Tables:
+        IS_STATELESS = True
+
+        def __init__(self):
+            self.rows = torch.zeros(3)
+
     lazy = Lazy()
-    lazy.constant = ReadOnlyTensor(torch.ones(2), "constant")
+    lazy.constant, lazy.tables = ReadOnlyTensor(torch.ones(2), "constant"), Tables()
     graph = capture.Graph(lazy, (), (lazy,))
-    tensors = [weakref.ref(leaf) for leaf in (lazy.total, lazy.hidden["h"], lazy.constant)]
-    del lazy
+    used = lazy.total, lazy.hidden["h"], lazy.constant, lazy.tables.rows
+    tensors = [weakref.ref(leaf) for leaf in used]
+    del lazy, used
     assert all(tensor() is not None for tensor in tensors)
     del graph
     assert all(tensor() is None for tensor in tensors)
@@ -384,7 +391,8 @@ class TestOnTheGPU:
 
     def test_an_environment_may_be_dropped(self):
         decision = arrdict.arrdict(actions=torch.full((64, 1), 3, device="cuda"))
-        eager, env = (envs.Explorer(64, device="cuda") for _ in range(2))
+        settings = dict(resample=True, privileged=True, device="cuda")
+        eager, env = (envs.Explorer(64, **settings) for _ in range(2))
         for one in (eager, env):
             one.reset()
         graph = capture.capture(env.step, (decision,), (env,))

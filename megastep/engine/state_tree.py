@@ -31,12 +31,12 @@ OPAQUE = (  # types whose attributes hold no state of an environment
 )
 
 
-def children(node):
+def children(node, only_state=True):
     """Returns [(step of the path, child)] of a node.
 
-    An object of a class with an attribute ``IS_STATELESS`` has none.
+    With ``only_state``, an object of a class with an attribute ``IS_STATELESS`` has none.
     """
-    if getattr(type(node), "IS_STATELESS", False):
+    if only_state and getattr(type(node), "IS_STATELESS", False):
         return []
     if isinstance(node, dict):
         return [(f"[{key!r}]", child) for key, child in dict.items(node)]
@@ -51,12 +51,19 @@ def children(node):
     return []
 
 
-def walk(root: Any, types: tuple[type, ...]) -> dict[str, tuple[Any, str, Any]]:
+def walk(
+    root: Any, types: tuple[type, ...], only_state: bool = True
+) -> dict[str, tuple[Any, str, Any]]:
     """Returns {path: (parent, step, leaf)} of the leaves reachable from ``root`` that are of one of
     these types.
 
     Paths read like attributes, ``.core.agents.positions``; ``step`` is a path's last part. An
     object with children is visited once, by its first path.
+
+    Args:
+        root: where paths begin.
+        types: the types of leaves.
+        only_state: see :func:`children`.
     """
     leaves, visited, stack = {}, set(), [("", None, "", root)]
     while stack:
@@ -65,9 +72,8 @@ def walk(root: Any, types: tuple[type, ...]) -> dict[str, tuple[Any, str, Any]]:
             leaves[path] = (parent, step, node)
         elif not isinstance(node, (*OPAQUE, *SCALARS, *_LEAVES)) and id(node) not in visited:
             visited.add(id(node))
-            stack += [
-                (path + below, node, below, child) for below, child in reversed(children(node))
-            ]
+            below_node = reversed(children(node, only_state))
+            stack += [(path + below, node, below, child) for below, child in below_node]
     return leaves
 
 
