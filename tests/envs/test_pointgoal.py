@@ -54,6 +54,18 @@ def test_reward_is_progress_minus_cost():
     assert (away.reward.abs() < 0.03).all()
 
 
+def test_walking_has_a_cost_per_metre():
+    free, paid = make_env(), make_env(walk_cost=0.4)
+    for env in (free, paid):
+        env.reset()
+    for _ in range(5):
+        before = free.progress[5].clone()
+        without, costly = (env.step(decision(env, FORWARD)).reward for env in (free, paid))
+    walked = free.progress[5] - before
+    assert (walked > 0).any()
+    torch.testing.assert_close(without - costly, 0.4 * walked)
+
+
 def test_success_ends_the_episode_with_a_bonus(device):
     env = make_env(device, bonus=7.0, cost=0.5)
     env.reset()

@@ -325,6 +325,7 @@ def operations(f):
             reach=numbers(),
             bonus=numbers(),
             cost=numbers(),
+            walk_cost=numbers(),
             limit=lambda good: integers(1, 2**31 - 1)(1),
             privileged=flags,
         ),

@@ -46,8 +46,8 @@ class PointGoal(SceneryEnv):
         left. 1 does what the action forward, left or turn left does; numbers beyond are clipped.
 
     Reward:
-        Metres by which the shortest path to the goal became shorter, minus ``cost``, plus ``bonus``
-        at success.
+        Metres by which the shortest path to the goal became shorter, minus ``cost``, minus
+        ``walk_cost`` per metre walked, plus ``bonus`` at success.
 
     Episode end:
         Terminal within 0.2 m of the goal (success). Truncated after ``limit`` steps.
@@ -68,6 +68,7 @@ class PointGoal(SceneryEnv):
         limit: steps after which an episode is truncated.
         bonus: reward for success.
         cost: subtracted from the reward of every step.
+        walk_cost: subtracted from the reward per metre walked. SPL counts metres, ``cost`` steps.
         res: rays of the camera.
         subsample: rays per pixel.
         fov: field of view in degrees.
@@ -94,6 +95,7 @@ class PointGoal(SceneryEnv):
         limit: Annotated[int, Field(ge=1, le=10**6)] = 500,
         bonus: Annotated[float, Field(ge=0, le=1000)] = 5.0,
         cost: Annotated[float, Field(ge=0, le=1000)] = 0.02,
+        walk_cost: Annotated[float, Field(ge=0, le=1000)] = 0.0,
         res: Annotated[int, Field(ge=1, le=1024)] = 256,
         subsample: Annotated[int, Field(ge=1, le=32)] = 4,
         fov: Annotated[float, Field(gt=0, lt=180)] = 130.0,
@@ -114,7 +116,7 @@ class PointGoal(SceneryEnv):
         )
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, self.seed = subsample, seed + (2 << 32)  # not the spawns' seed
-        self.rules = dict(bonus=bonus, cost=cost, limit=limit, reach=REACH)
+        self.rules = dict(bonus=bonus, cost=cost, walk_cost=walk_cost, limit=limit, reach=REACH)
         self.goals = goal_fields(geometries, self.core, nearest, furthest)
         self.spawner = modules.RandomSpawns(
             geometries, self.core, resample=resample, points=self.goals.spawns

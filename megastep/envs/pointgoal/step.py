@@ -53,6 +53,7 @@ def pointgoal_step(
     reach: float = 0.2,
     bonus: float = 5.0,
     cost: float = 0.02,
+    walk_cost: float = 0.0,
     limit: int = 500,
     privileged: bool = False,
 ) -> PointGoalStep:
@@ -76,6 +77,7 @@ def pointgoal_step(
         reach: metres; an agent this close to its goal succeeds.
         bonus: reward for success.
         cost: subtracted from the reward of every step.
+        walk_cost: subtracted from the reward per metre walked.
         limit: steps after which an episode is truncated.
         privileged: compute the privileged observation: tens of metres to go, the slope of that
             distance ahead and to the left, and the fraction of the steps that is left.
@@ -92,7 +94,8 @@ def pointgoal_step(
             f"goals must be for the {len(scenery.layouts)} layouts of the scenery, on {device}, "
             f"but they are for {goals.n_layouts} on {goals.device}"
         )
-    for name, value in dict(reach=reach, bonus=bonus, cost=cost).items():
+    rewards = dict(bonus=bonus, cost=cost, walk_cost=walk_cost)
+    for name, value in dict(rewards, reach=reach).items():
         checks.number(name, value, -math.inf, math.inf)
     flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
     privileged_out = None
@@ -123,8 +126,7 @@ def pointgoal_step(
         **seed_params(seed),
         per_cell=1 / goals.cell,
         reach=reach,
-        bonus=bonus,
-        cost=cost,
+        **rewards,
         limit=checks.integer("limit", limit, 1, 2**31 - 1),
         n_goals=goals.n_goals,
         n_spawns=goals.n_spawns,
