@@ -49,12 +49,23 @@ union Pack {
     T values[N];
 };
 
+// Loads numbers without converting them, which would wait for the load.
+template <class T, int N>
+DEVICE void load(Pack<T, N>& pack, const void* base, long long index) {
+    pack.word = ((const Pack<T, N>*)((const T*)base + index))->word;
+}
+
+template <class T, int N>
+DEVICE void unpack(float (&values)[N], const Pack<T, N>& pack) {
+    for (int n = 0; n < N; n++)
+        values[n] = to_float(pack.values[n]);
+}
+
 template <class T, int N>
 DEVICE void read(float (&values)[N], const void* base, long long index) {
     Pack<T, N> pack;
-    pack.word = ((const Pack<T, N>*)((const T*)base + index))->word;
-    for (int n = 0; n < N; n++)
-        values[n] = to_float(pack.values[n]);
+    load(pack, base, index);
+    unpack(values, pack);
 }
 
 template <class T, int N>
