@@ -98,7 +98,11 @@ class _Sequence(torch.autograd.Function):
         ctx.is_residual = is_residual
         x, reset, start = aligned(x), reset.contiguous(), aligned(start)
         weight, bias = cast(weight, x.dtype), cast(bias, x.dtype)
-        gates, outputs, last = F.linear(x, weight, bias), torch.empty_like(x), torch.empty_like(start)
+        gates, outputs, last = (
+            F.linear(x, weight, bias),
+            torch.empty_like(x),
+            torch.empty_like(start),
+        )
         keeps_apart = is_residual and has_grad and any(ctx.needs_input_grad)
         states = torch.empty_like(x) if keeps_apart else None
         residual = x if is_residual else None
