@@ -48,7 +48,7 @@ def _forward(gates, reset, start, residual, states, outputs, last):
         states.copy_(exact)
 
 
-def _backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start):
+def _backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual):
     (z, candidate), reset = _split(gates), reset[..., None]
     factors, before = 1 - z, torch.cat([start[None], states[:-1]]).masked_fill(reset, 0.0)
     terms = d_outputs
@@ -61,6 +61,8 @@ def _backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start):
     d_candidate.copy_(d * z)
     if d_start is not None:
         d_start.copy_((d[0] * factors[0]).masked_fill(reset[0], 0.0))
+    if d_residual is not None:
+        d_residual.copy_(d_outputs)
     return d_gates.flatten(0, 1).sum(0).float()
 
 
@@ -98,11 +100,8 @@ class _Sequence(torch.autograd.Function):
         ctx.is_residual = is_residual
         x, reset, start = aligned(x), reset.contiguous(), aligned(start)
         weight, bias = cast(weight, x.dtype), cast(bias, x.dtype)
-        gates, outputs, last = (
-            F.linear(x, weight, bias),
-            torch.empty_like(x),
-            torch.empty_like(start),
-        )
+        gates = F.linear(x, weight, bias)
+        outputs, last = torch.empty_like(x), torch.empty_like(start)
         keeps_apart = is_residual and has_grad and any(ctx.needs_input_grad)
         states = torch.empty_like(x) if keeps_apart else None
         residual = x if is_residual else None
@@ -119,18 +118,21 @@ class _Sequence(torch.autograd.Function):
         d_last = None if d_last is None else aligned(d_last)
         d_gates = torch.empty_like(gates)
         d_start = torch.empty_like(start) if ctx.needs_input_grad[4] else None
+        # torch.addmm would copy d_outputs, and a gradient must not change in place
+        d_residual = torch.empty_like(x) if ctx.is_residual else None
         d_bias = _recurrence(x).backward(
-            gates, reset, start, states, d_outputs, d_last, d_gates, d_start
+            *(gates, reset, start, states, d_outputs, d_last),
+            *(d_gates, d_start, d_residual),
         )
         flat = d_gates.flatten(0, 1)
-        if not ctx.is_residual:
-            d_x = flat @ weight
+        if d_residual is None:
+            d_x = (flat @ weight).view_as(x)
         elif x.is_cuda:
-            d_x = torch.addmm(d_outputs.flatten(0, 1), flat, weight)
-        else:  # a CPU would round sums of products in between
-            d_x = (flat @ weight).add_(d_outputs.flatten(0, 1))
-        d_weight = product(flat.T, x.flatten(0, 1))
-        return d_x.view_as(x), d_weight, d_bias, None, d_start, None, None
+            d_residual.view(flat.shape[0], -1).addmm_(flat, weight)
+            d_x = d_residual
+        else:  # in one operation, a CPU would add up the product's sums in another order
+            d_x = d_residual.add_((flat @ weight).view_as(x))
+        return d_x, product(flat.T, x.flatten(0, 1)), d_bias, None, d_start, None, None
 
 
 class MinGRU(nn.Module):

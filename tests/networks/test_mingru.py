@@ -40,7 +40,11 @@ def recurrence(gates, reset, start, d_outputs, d_last=None, residual=None):
             torch.testing.assert_close(result, expected, rtol=0, atol=0, equal_nan=True)
     states = outputs if states is None else states
     d_gates, d_start = torch.full_like(gates, nan), torch.full_like(start, nan)
-    d_bias = functions.backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start)
+    d_residual = None if residual is None else torch.full_like(outputs, nan)
+    d_bias = functions.backward(
+        *(gates, reset, start, states, d_outputs, d_last), *(d_gates, d_start, d_residual)
+    )
+    assert residual is None or torch.equal(d_residual, d_outputs)
     return outputs, last, d_gates, d_start, d_bias
 
 

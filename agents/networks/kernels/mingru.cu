@@ -43,8 +43,8 @@ DEVICE void load(MingruForwardInput<T, N>& input, const MingruForwardParams& p, 
         load(input.residual, p.residual, unit_at(p, place, t));
 }
 
-// IS_STEP: the sequence is one step. That takes fewer than 33 registers, so that a multiprocessor runs
-// as many threads as it can.
+// IS_STEP: the sequence is one step. That takes fewer than 33 registers, so that a multiprocessor
+// runs as many threads as it can.
 template <bool IS_STEP>
 struct MingruForward {
     static constexpr int N_GATES = 2, AHEAD = IS_STEP ? 1 : STEPS_AHEAD;
@@ -151,7 +151,7 @@ struct MingruBackward {
                 else
                     for (int n = 0; n < N; n++)
                         before[n] = start[n];
-                step(p, place.gate + 2ll * t * p.n_lanes * p.width, input, before, d);
+                step(p, place, t, input, before, d);
             }
         }
         write<float>(p.d_biases, place.gate, d.update_sum);
@@ -161,7 +161,7 @@ struct MingruBackward {
     }
 
     template <class T, int N>
-    DEVICE void step(const MingruBackwardParams& p, long long gate,
+    DEVICE void step(const MingruBackwardParams& p, const Place& place, int t,
                      const MingruBackwardInput<T, N>& input, float (&before)[N],
                      MingruGradients<N>& d) {
         float update[N], candidate[N], d_output[N], d_update[N], d_candidate[N];
@@ -180,14 +180,15 @@ struct MingruBackward {
         }
         if (input.gates.reset)
             clear(d.state);
+        if (p.d_residual)
+            write<T>(p.d_residual, unit_at(p, place, t), d_output);
+        long long gate = place.gate + 2ll * t * p.n_lanes * p.width;
         write<T>(p.d_gates, gate, d_update);
         write<T>(p.d_gates, gate + p.width, d_candidate);
     }
 };
 
-KERNEL BOUNDS(64) mingru_step_float32(MingruForwardParams p) {
-    run<MingruForward<true>, float>(p);
-}
+KERNEL BOUNDS(64) mingru_step_float32(MingruForwardParams p) { run<MingruForward<true>, float>(p); }
 KERNEL BOUNDS(64) mingru_step_bfloat16(MingruForwardParams p) {
     run<MingruForward<true>, Bfloat16>(p);
 }

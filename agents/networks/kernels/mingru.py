@@ -31,12 +31,13 @@ def forward(gates, reset, start, residual, states, outputs, last):
     )
 
 
-def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start):
+def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual):
     """Computes the gradients of `forward`'s gates and first state from those of its outputs.
 
     Args:
         d_last: None: zeros.
         d_start: None: not wanted.
+        d_residual: (T, B, W), a copy of `d_outputs`. None: not wanted.
 
     Returns:
         the gates' gradient summed over steps and lanes, (2 W,) float32.
@@ -54,6 +55,7 @@ def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start):
         d_last=d_last,
         d_gates=d_gates,
         d_start=d_start,
+        d_residual=d_residual,
         d_biases=d_biases,
         n_steps=len(gates),
     )

@@ -94,6 +94,7 @@ struct MingruBackwardParams {
     const float* d_last;         // (B, W); null: zeros
     void* d_gates;               // (T, B, 2 W) compute
     float* d_start;              // (B, W); null: not wanted
+    void* d_residual;            // (T, B, W) compute, a copy of d_outputs; null: not wanted
     float* d_biases;             // (B, 2 W), sums of d_gates over steps
     int n_steps;
     int n_lanes;
