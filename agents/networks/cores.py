@@ -109,7 +109,8 @@ class Stack(nn.ModuleList):
     ) -> tuple[torch.Tensor, arrdict]:
         """Unrolls over a sequence, as the head of this file says."""
         total, after = None, arrdict()
-        if is_residual and x.is_cuda:  # each core's kernel adds its input
+        # On a GPU each core's kernel adds its input. A CPU keeps its order of sums, and so its bits.
+        if is_residual and x.is_cuda:
             for i, core in enumerate(self):
                 x, after[str(i)] = with_residual(core, x, reset, state[str(i)])
             return x, after

@@ -3,7 +3,9 @@
 // number is read once.
 //
 // The inputs of a step are loaded STEPS_AHEAD steps before it and converted only when it comes, so
-// that steps do not wait for GPU memory.
+// that steps do not wait for GPU memory. Loads have no conditions and come last in a step:
+// otherwise the compiler would copy what they load, and so wait for it. The last steps' loads are
+// not used.
 #include "lanes.h"
 #include "params.h"
 
@@ -15,18 +17,23 @@ struct MingruGates {
     unsigned char reset;
 };
 
+// Where a thread's units are in step t of an array (T, B, W), and in that of gates (T, B, 2 W).
+template <class Params>
+DEVICE long long unit_at(const Params& p, const Place& place, int t) {
+    return place.unit + t * ((long long)p.n_lanes * p.width);
+}
+
+template <class Params>
+DEVICE long long gate_at(const Params& p, const Place& place, int t) {
+    return place.gate + t * (2ll * p.n_lanes * p.width);
+}
+
 template <class T, int N, class Params>
 DEVICE void load(MingruGates<T, N>& gates, const Params& p, const Place& place, int t) {
-    long long gate = place.gate + 2ll * t * p.n_lanes * p.width;
+    long long gate = gate_at(p, place, t);
     load(gates.update, p.gates, gate);
     load(gates.candidate, p.gates, gate + p.width);
     gates.reset = p.reset[(long long)t * p.n_lanes + place.lane];
-}
-
-// Where a thread's units are in step t of an array (T, B, W).
-template <class Params>
-DEVICE long long unit_at(const Params& p, const Place& place, int t) {
-    return place.unit + (long long)t * p.n_lanes * p.width;
 }
 
 template <class T, int N>
@@ -56,8 +63,7 @@ struct MingruForward {
         MingruForwardInput<T, N> inputs[AHEAD];
 #pragma unroll
         for (int i = 0; i < AHEAD; i++)
-            if (i < n_steps)
-                load(inputs[i], p, place, i);
+            load(inputs[i], p, place, min(i, n_steps - 1));
         read<float>(state, p.start, place.unit);
         for (int first = 0; first < n_steps; first += AHEAD) {
 #pragma unroll
@@ -65,10 +71,9 @@ struct MingruForward {
                 int t = first + i;
                 if (t >= n_steps)
                     break;
-                MingruForwardInput<T, N> input = inputs[i];
-                if (t + AHEAD < n_steps)
-                    load(inputs[i], p, place, t + AHEAD);
-                step(p, unit_at(p, place, t), input, state);
+                step(p, unit_at(p, place, t), inputs[i], state);
+                if (!IS_STEP)
+                    load(inputs[i], p, place, min(t + AHEAD, n_steps - 1));
             }
         }
         write<float>(p.last, place.unit, state);
@@ -102,14 +107,13 @@ struct MingruBackwardInput {
     Pack<T, N> before, d_output;
 };
 
-// At the first step, `before` is not loaded.
+// At the first step, `before` is not used.
 template <class T, int N>
 DEVICE void load(MingruBackwardInput<T, N>& input, const MingruBackwardParams& p,
                  const Place& place, int t) {
     load(input.gates, p, place, t);
     load(input.d_output, p.d_outputs, unit_at(p, place, t));
-    if (t)
-        load(input.before, p.states, unit_at(p, place, t - 1));
+    load(input.before, p.states, unit_at(p, place, max(t - 1, 0)));
 }
 
 // Gradients of a thread's units: of the state, and of the gates summed over steps.
@@ -126,8 +130,7 @@ struct MingruBackward {
         MingruBackwardInput<T, N> inputs[STEPS_AHEAD];
 #pragma unroll
         for (int i = 0; i < STEPS_AHEAD; i++)
-            if (i < p.n_steps)
-                load(inputs[i], p, place, p.n_steps - 1 - i);
+            load(inputs[i], p, place, max(p.n_steps - 1 - i, 0));
         float start[N];
         MingruGradients<N> d;
         read<float>(start, p.start, place.unit);
@@ -142,16 +145,12 @@ struct MingruBackward {
                 int t = last - i;
                 if (t < 0)
                     break;
-                MingruBackwardInput<T, N> input = inputs[i];
-                if (t >= STEPS_AHEAD)
-                    load(inputs[i], p, place, t - STEPS_AHEAD);
                 float before[N];
-                if (t)
-                    unpack(before, input.before);
-                else
-                    for (int n = 0; n < N; n++)
-                        before[n] = start[n];
-                step(p, place, t, input, before, d);
+                unpack(before, inputs[i].before);
+                for (int n = 0; n < N; n++)
+                    before[n] = t ? before[n] : start[n];
+                step(p, place, t, inputs[i], before, d);
+                load(inputs[i], p, place, max(t - STEPS_AHEAD, 0));
             }
         }
         write<float>(p.d_biases, place.gate, d.update_sum);
@@ -182,7 +181,7 @@ struct MingruBackward {
             clear(d.state);
         if (p.d_residual)
             write<T>(p.d_residual, unit_at(p, place, t), d_output);
-        long long gate = place.gate + 2ll * t * p.n_lanes * p.width;
+        long long gate = gate_at(p, place, t);
         write<T>(p.d_gates, gate, d_update);
         write<T>(p.d_gates, gate + p.width, d_candidate);
     }
