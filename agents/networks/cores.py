@@ -109,7 +109,7 @@ class Stack(nn.ModuleList):
     ) -> tuple[torch.Tensor, arrdict]:
         """Unrolls over a sequence, as the head of this file says."""
         total, after = None, arrdict()
-        # On a GPU each core's kernel adds its input. A CPU keeps its order of sums, and so its bits.
+        # On a GPU each core's kernel adds its input. On a CPU sums keep their order and bits.
         if is_residual and x.is_cuda:
             for i, core in enumerate(self):
                 x, after[str(i)] = with_residual(core, x, reset, state[str(i)])
