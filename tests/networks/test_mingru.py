@@ -273,6 +273,22 @@ def test_gates_saturate_and_nan_propagates(where, width):
         torch.testing.assert_close(result.cpu(), expected, rtol=0, atol=2e-6, equal_nan=True)
 
 
+def test_outputs_round_to_nearest_bfloat16(where):
+    """Ties to even, as PyTorch rounds. A closed update gate leaves the state as it was."""
+    upper = torch.arange(2**16, dtype=torch.int64)[:, None] << 16
+    lower = torch.tensor([0, 1, 0x7FFF, 0x8000, 0x8001, 0xFFFF])
+    numbers = (upper | lower).flatten().to(torch.int32).view(torch.float32)
+    numbers = numbers[numbers.isfinite() & (numbers.abs() >= torch.finfo(torch.float32).tiny)]
+    start = numbers[: len(numbers) // 4 * 4].view(-1, 4).to(where)
+    gates = torch.zeros(1, len(start), 8, dtype=torch.bfloat16, device=where)
+    gates[..., :4] = -torch.inf
+    reset = torch.zeros(1, len(start), dtype=torch.bool, device=where)
+    outputs, last = gates.new_full((1, *start.shape), torch.nan), torch.full_like(start, torch.nan)
+    kernels.forward(gates, reset, start, None, None, outputs, last)
+    assert torch.equal(last, start)
+    assert torch.equal(outputs[0].cpu(), start.cpu().bfloat16())
+
+
 def test_unsupported_dtype_raises(where):
     _, reset, start = (tensor.to(where) for tensor in case())
     core, x = MinGRU(W).to(where).half(), torch.randn(T, B, W, device=where).half()
