@@ -92,8 +92,8 @@ CORES = {"lstm": LSTM, "gru": GRU, "mingru": MinGRU, "none": Feedforward}
 class Stack(nn.ModuleList):
     """Several cores with residual connections (He et al. 2016), which together are a core.
 
-    The input of each is x plus the outputs of those below. The output is the sum of all outputs.
-    The hidden state holds theirs under "0", "1", ...
+    The input of each is x plus the outputs of those below. The output is the sum of all outputs,
+    with `is_residual` x plus that sum. The hidden state holds theirs under "0", "1", ...
     """
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
@@ -101,15 +101,34 @@ class Stack(nn.ModuleList):
         return arrdict({str(i): core.initial(n_lanes, device) for i, core in enumerate(self)})
 
     def forward(
-        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+        self,
+        x: torch.Tensor,
+        reset: torch.Tensor,
+        state: arrdict,
+        is_residual: bool = False,
     ) -> tuple[torch.Tensor, arrdict]:
         """Unrolls over a sequence, as the head of this file says."""
         total, after = None, arrdict()
+        # On a GPU each core's kernel adds its input. On a CPU sums keep their order and bits.
+        if is_residual and x.is_cuda:
+            for i, core in enumerate(self):
+                x, after[str(i)] = with_residual(core, x, reset, state[str(i)])
+            return x, after
         for i, core in enumerate(self):
             core_input = x if total is None else x + total
             outputs, after[str(i)] = core(core_input, reset, state[str(i)])
             total = outputs if total is None else total + outputs
-        return total, after
+        return x + total if is_residual else total, after
+
+
+def with_residual(
+    core: nn.Module, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+) -> tuple[torch.Tensor, arrdict]:
+    """Returns x plus the outputs of a core, and its state after the last step."""
+    if isinstance(core, (LSTM, MinGRU, Stack)):
+        return core(x, reset, state, is_residual=True)
+    outputs, state = core(x, reset, state)
+    return x + outputs, state
 
 
 def make_core(name: str, width: int, layers: int = 1, activation: str = "relu") -> nn.Module:

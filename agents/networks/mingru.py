@@ -23,10 +23,11 @@ from types import SimpleNamespace
 import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
 
 from megastep.agents.networks.kernels import mingru as kernels
 from megastep.agents.networks.kernels.program import aligned, check_shapes
-from megastep.agents.networks.layers import linear
+from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.networks.scan import linear_scan
 from megastep.arrdict import arrdict
 
@@ -36,71 +37,102 @@ def _split(gates):
     return update.sigmoid(), candidate
 
 
-def _forward(gates, reset, start, outputs, last):
+def _forward(gates, reset, start, residual, states, outputs, last):
     (z, candidate), reset = _split(gates), reset[..., None]
     terms, factors = z * candidate, 1 - z
     terms[0].addcmul_(factors[0], start.masked_fill(reset[0], 0.0))
-    states = linear_scan(terms, factors, reset)
-    outputs.copy_(states)
-    last.copy_(states[-1])
+    exact = linear_scan(terms, factors, reset)
+    outputs.copy_(exact if residual is None else exact + residual)
+    last.copy_(exact[-1])
+    if states is not None:
+        states.copy_(exact)
 
 
-def _backward(gates, reset, start, outputs, d_outputs, d_last, d_gates, d_start):
+def _backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual):
     (z, candidate), reset = _split(gates), reset[..., None]
-    factors, before = 1 - z, torch.cat([start[None], outputs[:-1]]).masked_fill(reset, 0.0)
-    terms = torch.cat([d_outputs[:-1], (d_outputs[-1] + d_last)[None]])
+    factors, before = 1 - z, torch.cat([start[None], states[:-1]]).masked_fill(reset, 0.0)
+    terms = d_outputs
+    if d_last is not None:
+        terms = torch.cat([d_outputs[:-1], (d_outputs[-1] + d_last)[None]])
     # Row t needs the factor and reset of step t + 1. The last row is not used.
     d = linear_scan(terms, factors.roll(-1, 0), reset.roll(-1, 0), reverse=True)
     d_update, d_candidate = d_gates.chunk(2, -1)
     d_update.copy_(d * (candidate - before) * z * factors)
     d_candidate.copy_(d * z)
-    d_start.copy_((d[0] * factors[0]).masked_fill(reset[0], 0.0))
+    if d_start is not None:
+        d_start.copy_((d[0] * factors[0]).masked_fill(reset[0], 0.0))
+    if d_residual is not None:
+        d_residual.copy_(d_outputs)
+    return d_gates.flatten(0, 1).sum(0).float()
 
 
 _CPU_RECURRENCE = SimpleNamespace(forward=_forward, backward=_backward)
 
 
-def _recurrence(gates):
-    return kernels if gates.is_cuda else _CPU_RECURRENCE
+def _recurrence(x):
+    return kernels if x.is_cuda else _CPU_RECURRENCE
 
 
 class _Sequence(torch.autograd.Function):
-    """The recurrence over time with an explicit gradient.
+    """The product of all steps and the recurrence over time, with an explicit gradient.
 
-    Saves only its inputs and outputs. If outputs are bfloat16, the gradient sees states rounded to
-    bfloat16.
+    Saves only its input, the gates and the states. If they are bfloat16, the gradient sees states
+    rounded to bfloat16.
     """
 
     @staticmethod
-    def forward(ctx, gates, reset, start):
+    def forward(ctx, x, weight, bias, reset, start, is_residual, has_grad):
         """Unrolls the recurrence.
 
         Args:
-            gates: (T, B, 2 W) in the compute dtype.
+            x: (T, B, W) in the compute dtype.
+            weight: (2 W, W).
+            bias: (2 W,).
             reset: (T, B) bool.
             start: (B, W) float32, state before the sequence.
+            is_residual: adds x to the outputs.
+            has_grad: whether autograd is on; it never is in here.
 
         Returns:
             outputs (T, B, W) in the compute dtype, and the last state (B, W) float32.
         """
-        gates, reset, start = aligned(gates), reset.contiguous(), aligned(start)
-        outputs = gates.new_empty((*gates.shape[:2], start.shape[1]))
-        last = torch.empty_like(start)
-        _recurrence(gates).forward(gates, reset, start, outputs, last)
-        ctx.save_for_backward(gates, reset, start, outputs)
+        ctx.set_materialize_grads(False)
+        ctx.is_residual = is_residual
+        x, reset, start = aligned(x), reset.contiguous(), aligned(start)
+        weight, bias = cast(weight, x.dtype), cast(bias, x.dtype)
+        gates = F.linear(x, weight, bias)
+        outputs, last = torch.empty_like(x), torch.empty_like(start)
+        keeps_apart = is_residual and has_grad and any(ctx.needs_input_grad)
+        states = torch.empty_like(x) if keeps_apart else None
+        residual = x if is_residual else None
+        _recurrence(x).forward(gates, reset, start, residual, states, outputs, last)
+        states = outputs if states is None else states
+        ctx.save_for_backward(x, weight, gates, reset, start, states)
         return outputs, last
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_outputs, d_last):
-        gates, reset, start, outputs = ctx.saved_tensors
-        d_gates, d_start = torch.empty_like(gates), torch.empty_like(start)
-        _recurrence(gates).backward(
-            *(gates, reset, start, outputs),
-            *(aligned(d_outputs), aligned(d_last)),
-            *(d_gates, d_start),
+        x, weight, gates, reset, start, states = ctx.saved_tensors
+        d_outputs = torch.zeros_like(x) if d_outputs is None else aligned(d_outputs)
+        d_last = None if d_last is None else aligned(d_last)
+        d_gates = torch.empty_like(gates)
+        d_start = torch.empty_like(start) if ctx.needs_input_grad[4] else None
+        # torch.addmm would copy d_outputs, and a gradient must not change in place
+        d_residual = torch.empty_like(x) if ctx.is_residual else None
+        d_bias = _recurrence(x).backward(
+            *(gates, reset, start, states, d_outputs, d_last),
+            *(d_gates, d_start, d_residual),
         )
-        return d_gates, None, d_start
+        flat = d_gates.flatten(0, 1)
+        if d_residual is None:
+            d_x = (flat @ weight).view_as(x)
+        elif x.is_cuda:
+            d_residual.view(flat.shape[0], -1).addmm_(flat, weight)
+            d_x = d_residual
+        else:  # in one operation, a CPU would add up the product's sums in another order
+            d_x = d_residual.add_((flat @ weight).view_as(x))
+        return d_x, product(flat.T, x.flatten(0, 1)), d_bias, None, d_start, None, None
 
 
 class MinGRU(nn.Module):
@@ -123,7 +155,11 @@ class MinGRU(nn.Module):
         return arrdict(output=torch.zeros(n_lanes, self.width, device=device))
 
     def forward(
-        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
+        self,
+        x: torch.Tensor,
+        reset: torch.Tensor,
+        state: arrdict,
+        is_residual: bool = False,
     ) -> tuple[torch.Tensor, arrdict]:
         """Unrolls over a sequence.
 
@@ -131,6 +167,7 @@ class MinGRU(nn.Module):
             x: (T, B, W).
             reset: (T, B) bool; clears a lane's hidden state before the step.
             state: hidden state before the sequence.
+            is_residual: adds x to the outputs.
 
         Returns:
             outputs (T, B, W) in the compute dtype, and the hidden state after the sequence.
@@ -139,7 +176,9 @@ class MinGRU(nn.Module):
             ValueError: if shapes or devices do not fit.
         """
         check_shapes(x, reset, state, ("output",))
-        outputs, last = _Sequence.apply(
-            linear(x, self.input), reset.bool(), state["output"].float()
-        )
+        x, start = x.to(compute_dtype(self.input.weight)), state["output"].float()
+        sequence = x, self.input.weight, self.input.bias, reset.bool(), start, is_residual
+        # autocast would choose its own dtypes inside
+        with torch.autocast(x.device.type, enabled=False):
+            outputs, last = _Sequence.apply(*sequence, torch.is_grad_enabled())
         return outputs, arrdict(output=last)

@@ -17,7 +17,6 @@ from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, encoders, heads, joint_heads
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.layers import linear
-from megastep.agents.networks.lstm import LSTM
 from megastep.agents.networks.precision import ComputeDtype
 from megastep.agents.networks.running_norm import update_norms
 from megastep.arrdict import arrdict
@@ -204,12 +203,7 @@ class Policy(nn.Module):
         return state
 
     def _features(self, obs, reset, state, lanes=None):
-        encoded = self.intake(obs, lanes)
-        # a residual connection around the recurrent core
-        if isinstance(self.core, LSTM):
-            return self.core(encoded, reset, state, is_residual=True)
-        outputs, state = self.core(encoded, reset, state)
-        return encoded + outputs, state
+        return cores.with_residual(self.core, self.intake(obs, lanes), reset, state)
 
     def value(
         self,

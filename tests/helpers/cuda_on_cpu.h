@@ -1,5 +1,6 @@
 // Lets a CUDA kernel of independent threads compile for a CPU, where its threads run one after
 // another.
+#include <algorithm>
 #include <cmath>
 #include <cstring>
 
@@ -10,6 +11,9 @@
 #define __forceinline__ inline
 #define __launch_bounds__(n_threads)
 #define __expf expf
+
+using std::max;
+using std::min;
 
 struct uint2 {
     unsigned int x, y;

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import nn
 
-from megastep.agents.networks.cores import CORES, GRU, Stack, make_core
+from megastep.agents.networks.cores import CORES, GRU, Stack, make_core, with_residual
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves
+from tests.helpers.recurrent import assert_close as assert_close_by_size
 
 T, B, W = 9, 5, 8
 # CPU: float32 sums of 8 products in another order, nine steps deep. GPU: bfloat16's rounding, which
@@ -143,6 +144,32 @@ def test_stack_has_residual_connections(name):
     outputs, state = core(x, reset, state)
     torch.testing.assert_close(x + outputs, features, **CLOSE["cpu"])
     assert_close(state["2"], after, "cpu")
+
+
+@each_depth
+@each_core
+def test_residual_connection_around_core(name, layers, device):
+    """Also its gradients, and in steps without them."""
+    core, x, reset, state = case(name, layers, device)
+    x.requires_grad_()
+    inputs, weights = [x, *core.parameters()], torch.randn_like(x)
+    results = []
+    for is_fused in (True, False):
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=x.is_cuda):
+            if is_fused:
+                outputs, after = with_residual(core, x, reset, state)
+            else:
+                outputs, after = core(x, reset, state)
+                outputs = x + outputs
+        gradients = torch.autograd.grad((outputs.float() * weights).sum(), inputs)
+        results.append([outputs.detach().float(), *leaves(after), *gradients])
+    names = [str(i) for i in range(len(results[0]))]
+    slack = {"cpu": 1e-5, "cuda": 3e-2}[x.device.type]
+    assert_close_by_size(names, *results, slack)
+    with torch.no_grad(), torch.autocast(x.device.type, torch.bfloat16, enabled=x.is_cuda):
+        for t in range(T):
+            output, state = with_residual(core, x[t : t + 1], reset[t : t + 1], state)
+            assert_close(output[0].float(), results[0][0][t], device)
 
 
 @each_core

@@ -25,6 +25,29 @@ def case(n_steps=T, p_reset=0.3):
     return gates, torch.rand(n_steps, B) < p_reset, torch.randn(B, W, requires_grad=True)
 
 
+def recurrence(gates, reset, start, d_outputs, d_last=None, residual=None):
+    """Returns outputs, the last state, and gradients of the gates, of the first state and of the
+    biases. All but the last are written to tensors that are NaN before.
+    """
+    functions, nan = mingru_module._recurrence(gates), torch.nan
+    outputs, last = torch.full_like(d_outputs, nan), torch.full_like(start, nan)
+    states = None if residual is None else torch.full_like(outputs, nan)
+    functions.forward(gates, reset, start, residual, states, outputs, last)
+    if residual is not None:  # as when acting: without states
+        alone = torch.full_like(outputs, nan), torch.full_like(last, nan)
+        functions.forward(gates, reset, start, residual, None, *alone)
+        for result, expected in zip(alone, (outputs, last), strict=True):
+            torch.testing.assert_close(result, expected, rtol=0, atol=0, equal_nan=True)
+    states = outputs if states is None else states
+    d_gates, d_start = torch.full_like(gates, nan), torch.full_like(start, nan)
+    d_residual = None if residual is None else torch.full_like(outputs, nan)
+    d_bias = functions.backward(
+        *(gates, reset, start, states, d_outputs, d_last), *(d_gates, d_start, d_residual)
+    )
+    assert residual is None or torch.equal(d_residual, d_outputs)
+    return outputs, last, d_gates, d_start, d_bias
+
+
 def by_hand(gates, reset, start):
     """Runs lane by lane and step by step, from zeros where an episode starts."""
     lanes, lasts = [], []
@@ -44,15 +67,15 @@ def by_hand(gates, reset, start):
 @pytest.mark.parametrize("n_steps, p_reset", [(1, 0.3), (9, 0.0), (9, 0.3), (9, 1.0), (32, 0.1)])
 def test_outputs_and_gradients_match_equations(n_steps, p_reset):
     gates, reset, start = case(n_steps, p_reset)
-    results = mingru_module._Sequence.apply(gates, reset, start)
     expected = by_hand(gates, reset, start)
     weights = torch.randn(n_steps, B, W), torch.randn(B, W)
-    grads, expected_grads = (
-        torch.autograd.grad(tensors, (gates, start), weights, materialize_grads=True)
-        for tensors in (results, expected)
+    d_gates, d_start = torch.autograd.grad(
+        expected, (gates, start), weights, materialize_grads=True
     )
-    tensors, expected_tensors = (*results, *grads), (*expected, *expected_grads)
-    for name, tensor, expected_tensor in zip(NAMES, tensors, expected_tensors, strict=True):
+    expected = *expected, d_gates, d_start, d_gates.sum((0, 1))
+    with torch.no_grad():
+        results = recurrence(gates, reset, start, *weights)
+    for name, tensor, expected_tensor in zip(NAMES, results, expected, strict=True):
         torch.testing.assert_close(
             *(tensor, expected_tensor), **CLOSE, msg=lambda text, name=name: f"{name}: {text}"
         )
@@ -109,11 +132,46 @@ def test_wrong_shapes_raise():
         core(x[:0], reset[:0], state)
 
 
-def test_gradient_can_be_computed_twice():
-    gates, reset, start = case()
-    loss = mingru_module._Sequence.apply(gates, reset, start)[0].square().sum()
-    first, second = (torch.autograd.grad(loss, gates, retain_graph=True)[0] for _ in range(2))
-    assert torch.equal(first, second)
+@pytest.mark.parametrize("is_residual", [False, True])
+def test_gradient_can_be_computed_twice(is_residual):
+    core, reset, start = MinGRU(W), *case()[1:]
+    x = torch.randn(T, B, W, requires_grad=True)
+    loss = core(x, reset, arrdict(output=start), is_residual)[0].square().sum()
+    inputs = x, start, *core.parameters()
+    first, second = (torch.autograd.grad(loss, inputs, retain_graph=True) for _ in range(2))
+    assert all(map(torch.equal, first, second))
+
+
+@pytest.mark.parametrize("uses", ["outputs", "last", "both"])
+@pytest.mark.parametrize("is_residual", [False, True])
+def test_gradients_match_finite_differences(uses, is_residual):
+    """In float32, along one direction of all inputs and weights together."""
+    torch.manual_seed(1)
+    core, reset, start = MinGRU(W), *case()[1:]
+    x = torch.randn(T, B, W, requires_grad=True)
+    inputs = x, start, *core.parameters()
+    directions = [torch.randn_like(tensor) for tensor in inputs]
+    weights = torch.randn(T, B, W), torch.randn(B, W)
+
+    def loss(step):
+        names = "input.weight", "input.bias"
+        x, start, *parameters = (
+            tensor + step * d for tensor, d in zip(inputs, directions, strict=True)
+        )
+        outputs, after = torch.func.functional_call(
+            core,
+            dict(zip(names, parameters, strict=True)),
+            (x, reset, arrdict(output=start), is_residual),
+        )
+        terms = [(w * y).sum() for w, y in zip(weights, (outputs, after.output), strict=True)]
+        return {"outputs": terms[0], "last": terms[1], "both": sum(terms)}[uses]
+
+    gradients = torch.autograd.grad(loss(0.0), inputs)
+    slope = sum((g * d).sum() for g, d in zip(gradients, directions, strict=True))
+    with torch.no_grad():
+        measured = (loss(1e-3) - loss(-1e-3)) / 2e-3
+    # float32 sums of some 700 terms, and the step's square
+    torch.testing.assert_close(slope, measured, rtol=1e-2, atol=0.1)
 
 
 # ---- The kernels ----
@@ -129,41 +187,43 @@ def where(request, monkeypatch):
     return "cpu"
 
 
-def sequence(device, dtype, gates, reset, start, d_outputs, d_last):
-    """Returns outputs, last state and gradients of the recurrence, as float32 on the CPU."""
-    gates = gates.to(device, dtype).requires_grad_()
-    start = start.to(device).requires_grad_()
-    outputs, last = mingru_module._Sequence.apply(gates, reset.to(device), start)
-    assert outputs.dtype == dtype and last.dtype == torch.float32
-    grads = torch.autograd.grad(
-        [outputs, last], [gates, start], [d_outputs.to(device, dtype), d_last.to(device)]
-    )
-    return [leaf.detach().float().cpu() for leaf in (outputs, last, *grads)]
+def sequence(device, dtype, gates, reset, start, d_outputs, d_last, residual=None):
+    """Returns what `recurrence` does, as float32 on the CPU."""
+    gates, d_outputs = (leaf.to(device, dtype).contiguous() for leaf in (gates, d_outputs))
+    residual = None if residual is None else residual.to(device, dtype).contiguous()
+    reset, start = (leaf.to(device).contiguous() for leaf in (reset, start))
+    d_last = None if d_last is None else d_last.to(device).contiguous()
+    results = recurrence(gates, reset, start, d_outputs, d_last, residual)
+    assert results[1].dtype == results[-1].dtype == torch.float32
+    return [leaf.float().cpu() for leaf in results]
 
 
-NAMES = ("outputs", "last", "d gates", "d start")
+NAMES = ("outputs", "last", "d gates", "d start", "d bias")
 # Tolerance as a fraction of a tensor's largest magnitude. float32: approximate exponentials.
 # bfloat16: 8 bits.
 SLACK = {torch.float32: 1e-5, torch.bfloat16: 1e-2}
 
 
 @pytest.mark.parametrize("dtype", SLACK, ids=str)
+@pytest.mark.parametrize("is_residual", [False, True])
 @pytest.mark.parametrize(
-    "n_steps, n_lanes, width", [(9, 5, 16), (9, 5, 7), (1, 3, 16), (9, 1, 1), (3, 40, 256)]
+    "n_steps, n_lanes, width",
+    [(9, 5, 16), (9, 5, 7), (1, 3, 16), (2, 3, 5), (4, 3, 8), (9, 1, 1), (3, 40, 256)],
 )
-def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width):
+def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width, is_residual):
     torch.manual_seed(0)
 
     def rounded(*shape):
-        """Returns numbers rounded to bfloat16, so that both start with the same; not contiguous."""
-        return torch.randn(*reversed(shape)).movedim((0, 1, 2), (2, 1, 0)).bfloat16().float()
+        """Returns numbers rounded to bfloat16, so that both start with the same."""
+        return torch.randn(*shape).bfloat16().float()
 
     inputs = dict(
         gates=rounded(n_steps, n_lanes, 2 * width),
-        reset=(torch.rand(n_lanes, n_steps) < 0.3).T,
-        start=torch.randn(width, n_lanes).T,
+        reset=torch.rand(n_steps, n_lanes) < 0.3,
+        start=torch.randn(n_lanes, width),
         d_outputs=rounded(n_steps, n_lanes, width),
-        d_last=torch.randn(width, n_lanes).T,
+        d_last=None if is_residual else torch.randn(n_lanes, width),
+        residual=rounded(n_steps, n_lanes, width) if is_residual else None,
     )
     results = sequence(where, dtype, **inputs)
     with pytest.MonkeyPatch.context() as patch:
@@ -187,7 +247,7 @@ def test_kernels_clear_even_nan_at_reset(where, dtype, width):
     clean = sequence(where, dtype, **inputs)
     broken = dict(inputs, gates=inputs["gates"].clone(), start=torch.full((B, width), torch.nan))
     broken["gates"][:4] = torch.nan
-    outputs, last, d_gates, d_start = sequence(where, dtype, **broken)
+    outputs, last, d_gates, d_start, _ = sequence(where, dtype, **broken)
     assert torch.equal(outputs[4:], clean[0][4:]) and outputs[:4].isnan().all()
     assert torch.equal(last, clean[1]) and torch.equal(d_gates[4:], clean[2][4:])
     assert not d_start.any()  # cut by the reset
@@ -207,16 +267,68 @@ def test_gates_saturate_and_nan_propagates(where, width):
     start, reset = torch.full((len(values), width), 5.0), torch.zeros(1, len(values)).bool()
     gates, start, reset = (tensor.to(where) for tensor in (gates, start, reset))
     outputs, last = torch.full_like(gates[..., :width], 7.0).contiguous(), torch.empty_like(start)
-    kernels.forward(gates, reset, start, outputs, last)
+    kernels.forward(gates, reset, start, None, None, outputs, last)
     expected = (5.0 - 2.0 * values.double().sigmoid()).float()[:, None].expand(-1, width)
     for result in (outputs[0], last):
         torch.testing.assert_close(result.cpu(), expected, rtol=0, atol=2e-6, equal_nan=True)
 
 
+def test_outputs_round_to_nearest_bfloat16(where):
+    """Ties to even, as PyTorch rounds. A closed update gate leaves the state as it was."""
+    upper = torch.arange(2**16, dtype=torch.int64)[:, None] << 16
+    lower = torch.tensor([0, 1, 0x7FFF, 0x8000, 0x8001, 0xFFFF])
+    numbers = (upper | lower).flatten().to(torch.int32).view(torch.float32)
+    numbers = numbers[numbers.isfinite() & (numbers.abs() >= torch.finfo(torch.float32).tiny)]
+    start = numbers[: len(numbers) // 4 * 4].view(-1, 4).to(where)
+    gates = torch.zeros(1, len(start), 8, dtype=torch.bfloat16, device=where)
+    gates[..., :4] = -torch.inf
+    reset = torch.zeros(1, len(start), dtype=torch.bool, device=where)
+    outputs, last = gates.new_full((1, *start.shape), torch.nan), torch.full_like(start, torch.nan)
+    kernels.forward(gates, reset, start, None, None, outputs, last)
+    assert torch.equal(last, start)
+    assert torch.equal(outputs[0].cpu(), start.cpu().bfloat16())
+
+
 def test_unsupported_dtype_raises(where):
-    gates, reset, start = (tensor.to(where) for tensor in case())
+    _, reset, start = (tensor.to(where) for tensor in case())
+    core, x = MinGRU(W).to(where).half(), torch.randn(T, B, W, device=where).half()
     with pytest.raises(EngineError, match="float32 or bfloat16.*float16"):
-        mingru_module._Sequence.apply(gates.half(), reset, start)
+        core(x, reset, arrdict(output=start))
+
+
+@pytest.mark.parametrize("is_residual", [False, True])
+@pytest.mark.parametrize("is_transposed", [False, True])
+def test_module_with_kernels_matches_cpu(where, is_residual, is_transposed):
+    """Whatever the strides of the inputs and of the outputs' gradient."""
+    torch.manual_seed(0)
+    core = MinGRU(W)
+    x, reset, start = torch.randn(T, B, W), torch.rand(T, B) < 0.3, torch.randn(B, W)
+    weights = torch.randn(T, B, W)
+    if is_transposed:
+        x, weights = (leaf.transpose(0, 2).contiguous().transpose(0, 2) for leaf in (x, weights))
+        reset, start = (leaf.T.contiguous().T for leaf in (reset, start))
+
+    def run(device):
+        own = MinGRU(W).to(device)
+        own.load_state_dict(core.state_dict())
+        inputs = [leaf.detach().to(device).requires_grad_() for leaf in (x, start)]
+        state = arrdict(output=inputs[1])
+        outputs, after = own(inputs[0], reset.to(device), state, is_residual)
+        loss = (outputs * weights.to(device)).sum() + after.output.sum()
+        gradients = torch.autograd.grad(loss, [*inputs, *own.parameters()])
+        results = [leaf.detach().cpu() for leaf in (outputs, after.output, *gradients)]
+        with torch.no_grad():
+            acted, _ = own(inputs[0], reset.to(device), state, is_residual)
+        assert torch.equal(acted.cpu(), results[0])
+        return results
+
+    results = run(where)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mingru_module, "_recurrence", lambda x: mingru_module._CPU_RECURRENCE)
+        expected = run("cpu")
+    names = "outputs", "last", "d x", "d start", "d weight", "d bias"
+    # TF32 rounds products to 11 bits
+    assert_close(names, results, expected, 5e-3 if where == "cuda" else 1e-5)
 
 
 @pytest.mark.cuda

@@ -1,101 +1,201 @@
 // The minGRU's recurrence over all steps, forward and backward, in float32. One thread per lane and
 // n_units neighbouring units, whose states stay in registers: lanes and units fill a GPU, and every
 // number is read once.
+//
+// The inputs of a step are loaded STEPS_AHEAD steps before it and converted only when it comes, so
+// that steps do not wait for GPU memory. Loads have no conditions and come last in a step:
+// otherwise the compiler would copy what they load, and so wait for it. The last steps' loads are
+// not used.
 #include "lanes.h"
 #include "params.h"
 
-// The inputs of a step. They are loaded one step ahead, so that no step waits for GPU memory.
-template <int N>
-struct MingruInput {
-    float update[N], candidate[N];
-    bool reset;
+constexpr int STEPS_AHEAD = 4;
+
+template <class T, int N>
+struct MingruGates {
+    Pack<T, N> update, candidate;
+    unsigned char reset;
 };
 
-template <class T, int N, class Params>
-DEVICE void load(MingruInput<N>& input, const Params& p, const Place& place, int t) {
-    long long gate = place.gate + 2ll * t * p.n_lanes * p.width;
-    read<T>(input.update, p.gates, gate);
-    read<T>(input.candidate, p.gates, gate + p.width);
-    input.reset = p.reset[(long long)t * p.n_lanes + place.lane];
+// Where a thread's units are in step t of an array (T, B, W), and in that of gates (T, B, 2 W).
+template <class Params>
+DEVICE long long unit_at(const Params& p, const Place& place, int t) {
+    return place.unit + t * ((long long)p.n_lanes * p.width);
 }
 
+template <class Params>
+DEVICE long long gate_at(const Params& p, const Place& place, int t) {
+    return place.gate + t * (2ll * p.n_lanes * p.width);
+}
+
+template <class T, int N, class Params>
+DEVICE void load(MingruGates<T, N>& gates, const Params& p, const Place& place, int t) {
+    long long gate = gate_at(p, place, t);
+    load(gates.update, p.gates, gate);
+    load(gates.candidate, p.gates, gate + p.width);
+    gates.reset = p.reset[(long long)t * p.n_lanes + place.lane];
+}
+
+template <class T, int N>
+struct MingruForwardInput {
+    MingruGates<T, N> gates;
+    Pack<T, N> residual;
+};
+
+template <class T, int N>
+DEVICE void load(MingruForwardInput<T, N>& input, const MingruForwardParams& p, const Place& place,
+                 int t) {
+    load(input.gates, p, place, t);
+    if (p.residual)
+        load(input.residual, p.residual, unit_at(p, place, t));
+}
+
+// IS_STEP: the sequence is one step. That takes fewer than 33 registers, so that a multiprocessor
+// runs as many threads as it can.
+template <bool IS_STEP>
 struct MingruForward {
-    static constexpr int N_GATES = 2;
+    static constexpr int N_GATES = 2, AHEAD = IS_STEP ? 1 : STEPS_AHEAD;
 
     template <class T, int N>
     DEVICE void run(const MingruForwardParams& p, const Place& place) {
+        int n_steps = IS_STEP ? 1 : p.n_steps;
         float state[N];
+        MingruForwardInput<T, N> inputs[AHEAD];
+#pragma unroll
+        for (int i = 0; i < AHEAD; i++)
+            load(inputs[i], p, place, min(i, n_steps - 1));
         read<float>(state, p.start, place.unit);
-        MingruInput<N> input, next;
-        load<T>(next, p, place, 0);
-        for (int t = 0; t < p.n_steps; t++) {
-            input = next;
-            if (t + 1 < p.n_steps)
-                load<T>(next, p, place, t + 1);
-            if (input.reset)
-                clear(state);
-            for (int n = 0; n < N; n++)
-                state[n] += sigmoid(input.update[n]) * (input.candidate[n] - state[n]);
-            write<T>(p.outputs, place.unit + (long long)t * p.n_lanes * p.width, state);
+        for (int first = 0; first < n_steps; first += AHEAD) {
+#pragma unroll
+            for (int i = 0; i < AHEAD; i++) {
+                int t = first + i;
+                if (t >= n_steps)
+                    break;
+                step(p, unit_at(p, place, t), inputs[i], state);
+                if (!IS_STEP)
+                    load(inputs[i], p, place, min(t + AHEAD, n_steps - 1));
+            }
         }
         write<float>(p.last, place.unit, state);
+    }
+
+    template <class T, int N>
+    DEVICE void step(const MingruForwardParams& p, long long unit,
+                     const MingruForwardInput<T, N>& input, float (&state)[N]) {
+        float update[N], candidate[N], output[N];
+        unpack(update, input.gates.update);
+        unpack(candidate, input.gates.candidate);
+        if (input.gates.reset)
+            clear(state);
+        clear(output);
+        if (p.residual)
+            unpack(output, input.residual);
+        for (int n = 0; n < N; n++) {
+            state[n] += sigmoid(update[n]) * (candidate[n] - state[n]);
+            output[n] += state[n];
+        }
+        write<T>(p.outputs, unit, output);
+        if (p.states)
+            write<T>(p.states, unit, state);
     }
 };
 
 // The inputs of a backward step: also the state before it, and the gradient of its output.
-template <int N>
+template <class T, int N>
 struct MingruBackwardInput {
-    MingruInput<N> forward;
-    float before[N], d_output[N];
+    MingruGates<T, N> gates;
+    Pack<T, N> before, d_output;
 };
 
+// At the first step, `before` is not used.
 template <class T, int N>
-DEVICE void load_back(MingruBackwardInput<N>& input, const MingruBackwardParams& p,
-                      const Place& place, int t) {
-    long long rows = (long long)p.n_lanes * p.width, unit = place.unit + t * rows;
-    load<T>(input.forward, p, place, t);
-    read<T>(input.d_output, p.d_outputs, unit);
-    if (t)
-        read<T>(input.before, p.outputs, unit - rows);
-    else
-        read<float>(input.before, p.start, place.unit);
+DEVICE void load(MingruBackwardInput<T, N>& input, const MingruBackwardParams& p,
+                 const Place& place, int t) {
+    load(input.gates, p, place, t);
+    load(input.d_output, p.d_outputs, unit_at(p, place, t));
+    load(input.before, p.states, unit_at(p, place, max(t - 1, 0)));
 }
+
+// Gradients of a thread's units: of the state, and of the gates summed over steps.
+template <int N>
+struct MingruGradients {
+    float state[N], update_sum[N], candidate_sum[N];
+};
 
 struct MingruBackward {
     static constexpr int N_GATES = 2;
 
     template <class T, int N>
     DEVICE void run(const MingruBackwardParams& p, const Place& place) {
-        float d_state[N], d_update[N], d_candidate[N];
-        read<float>(d_state, p.d_last, place.unit);
-        MingruBackwardInput<N> input, next;
-        load_back<T>(next, p, place, p.n_steps - 1);
-        for (int t = p.n_steps - 1; t >= 0; t--) {
-            input = next;
-            if (t)
-                load_back<T>(next, p, place, t - 1);
-            if (input.forward.reset)
-                clear(input.before);
-            for (int n = 0; n < N; n++) {
-                float z = sigmoid(input.forward.update[n]), d = d_state[n] + input.d_output[n];
-                d_candidate[n] = d * z;
-                d_update[n] =
-                    d_candidate[n] * (1.f - z) * (input.forward.candidate[n] - input.before[n]);
-                d_state[n] = d * (1.f - z);
+        MingruBackwardInput<T, N> inputs[STEPS_AHEAD];
+#pragma unroll
+        for (int i = 0; i < STEPS_AHEAD; i++)
+            load(inputs[i], p, place, max(p.n_steps - 1 - i, 0));
+        float start[N];
+        MingruGradients<N> d;
+        read<float>(start, p.start, place.unit);
+        clear(d.state);
+        if (p.d_last)
+            read<float>(d.state, p.d_last, place.unit);
+        clear(d.update_sum);
+        clear(d.candidate_sum);
+        for (int last = p.n_steps - 1; last >= 0; last -= STEPS_AHEAD) {
+#pragma unroll
+            for (int i = 0; i < STEPS_AHEAD; i++) {
+                int t = last - i;
+                if (t < 0)
+                    break;
+                float before[N];
+                unpack(before, inputs[i].before);
+                for (int n = 0; n < N; n++)
+                    before[n] = t ? before[n] : start[n];
+                step(p, place, t, inputs[i], before, d);
+                load(inputs[i], p, place, max(t - STEPS_AHEAD, 0));
             }
-            if (input.forward.reset)
-                clear(d_state);
-            long long gate = place.gate + 2ll * t * p.n_lanes * p.width;
-            write<T>(p.d_gates, gate, d_update);
-            write<T>(p.d_gates, gate + p.width, d_candidate);
         }
-        write<float>(p.d_start, place.unit, d_state);
+        write<float>(p.d_biases, place.gate, d.update_sum);
+        write<float>(p.d_biases, place.gate + p.width, d.candidate_sum);
+        if (p.d_start)
+            write<float>(p.d_start, place.unit, d.state);
+    }
+
+    template <class T, int N>
+    DEVICE void step(const MingruBackwardParams& p, const Place& place, int t,
+                     const MingruBackwardInput<T, N>& input, float (&before)[N],
+                     MingruGradients<N>& d) {
+        float update[N], candidate[N], d_output[N], d_update[N], d_candidate[N];
+        unpack(update, input.gates.update);
+        unpack(candidate, input.gates.candidate);
+        unpack(d_output, input.d_output);
+        if (input.gates.reset)
+            clear(before);
+        for (int n = 0; n < N; n++) {
+            float z = sigmoid(update[n]), d_state = d.state[n] + d_output[n];
+            d_candidate[n] = d_state * z;
+            d_update[n] = d_candidate[n] * (1.f - z) * (candidate[n] - before[n]);
+            d.state[n] = d_state * (1.f - z);
+            d.update_sum[n] += d_update[n];
+            d.candidate_sum[n] += d_candidate[n];
+        }
+        if (input.gates.reset)
+            clear(d.state);
+        if (p.d_residual)
+            write<T>(p.d_residual, unit_at(p, place, t), d_output);
+        long long gate = gate_at(p, place, t);
+        write<T>(p.d_gates, gate, d_update);
+        write<T>(p.d_gates, gate + p.width, d_candidate);
     }
 };
 
-KERNEL BOUNDS(64) mingru_forward_float32(MingruForwardParams p) { run<MingruForward, float>(p); }
+KERNEL BOUNDS(64) mingru_step_float32(MingruForwardParams p) { run<MingruForward<true>, float>(p); }
+KERNEL BOUNDS(64) mingru_step_bfloat16(MingruForwardParams p) {
+    run<MingruForward<true>, Bfloat16>(p);
+}
+KERNEL BOUNDS(64) mingru_forward_float32(MingruForwardParams p) {
+    run<MingruForward<false>, float>(p);
+}
 KERNEL BOUNDS(64) mingru_forward_bfloat16(MingruForwardParams p) {
-    run<MingruForward, Bfloat16>(p);
+    run<MingruForward<false>, Bfloat16>(p);
 }
 KERNEL BOUNDS(64) mingru_backward_float32(MingruBackwardParams p) { run<MingruBackward, float>(p); }
 KERNEL BOUNDS(64) mingru_backward_bfloat16(MingruBackwardParams p) {

@@ -1,31 +1,48 @@
 """The minGRU on a GPU after its matrix product: one kernel for all steps, one for all steps back.
 
 T steps, B lanes, W units. All tensors are contiguous; if W is a multiple of 4, they start at a
-multiple of four elements. Gates (T, B, 2 W), before activation, outputs (T, B, W) and their
-gradients are in the compute dtype, states (B, W) are float32, resets (T, B) are bool. Each function
-writes to its last arguments.
+multiple of four elements. Gates (T, B, 2 W), before activation, states and outputs (T, B, W) and
+their gradients are in the compute dtype, `start` and `last` (B, W) are float32, resets (T, B) are
+bool.
 """
 
 from megastep.agents.networks.kernels.program import run
 
 
-def forward(gates, reset, start, outputs, last):
-    """Computes the outputs and the last state from the gates and the first state."""
+def forward(gates, reset, start, residual, states, outputs, last):
+    """Computes the last three from the gates and the first state.
+
+    Args:
+        residual: (T, B, W), added to the outputs. None: nothing is.
+        states: the outputs without the residual. None: not wanted.
+    """
     run(
-        "mingru_forward",
+        "mingru_step" if len(gates) == 1 else "mingru_forward",
         gates.dtype,
         start,
         gates=gates,
         reset=reset,
         start=start,
+        residual=residual,
+        states=states,
         outputs=outputs,
         last=last,
         n_steps=len(gates),
     )
 
 
-def backward(gates, reset, start, outputs, d_outputs, d_last, d_gates, d_start):
-    """Computes the gradients of `forward`'s gates and first state from those of its outputs."""
+def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d_residual):
+    """Computes the gradients of `forward`'s gates and first state from those of its outputs.
+
+    Args:
+        d_last: None: zeros.
+        d_start: None: not wanted.
+        d_residual: (T, B, W), a copy of `d_outputs`. None: not wanted.
+
+    Returns:
+        the gates' gradient summed over steps and lanes, (2 W,) float32.
+    """
+    d_biases = start.new_empty(len(start), gates.shape[-1])
     run(
         "mingru_backward",
         gates.dtype,
@@ -33,10 +50,13 @@ def backward(gates, reset, start, outputs, d_outputs, d_last, d_gates, d_start):
         gates=gates,
         reset=reset,
         start=start,
-        outputs=outputs,
+        states=states,
         d_outputs=d_outputs,
         d_last=d_last,
         d_gates=d_gates,
         d_start=d_start,
+        d_residual=d_residual,
+        d_biases=d_biases,
         n_steps=len(gates),
     )
+    return d_biases.sum(0)

@@ -15,12 +15,18 @@ DEVICE float to_float(Bfloat16 x) { return __uint_as_float((unsigned int)x.bits 
 DEVICE void assign(float& target, float x) { target = x; }
 
 // Rounds to nearest, ties to even. NaN is kept apart: rounding up could turn it into infinity.
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+DEVICE void assign(Bfloat16& target, float x) {
+    asm("cvt.rn.bf16.f32 %0, %1;" : "=h"(target.bits) : "f"(x));
+}
+#else
 DEVICE void assign(Bfloat16& target, float x) {
     unsigned int bits = __float_as_uint(x);
     bool is_nan = (bits & 0x7fffffffu) > 0x7f800000u;
     unsigned int rounded = bits + 0x7fffu + (bits >> 16 & 1u);
     target.bits = (unsigned short)((is_nan ? bits | 0x400000u : rounded) >> 16);
 }
+#endif
 
 // The type of a word of BYTES bytes, which one instruction moves.
 template <int BYTES>
@@ -49,12 +55,23 @@ union Pack {
     T values[N];
 };
 
+// Loads numbers without converting them, which would wait for the load.
+template <class T, int N>
+DEVICE void load(Pack<T, N>& pack, const void* base, long long index) {
+    pack.word = ((const Pack<T, N>*)((const T*)base + index))->word;
+}
+
+template <class T, int N>
+DEVICE void unpack(float (&values)[N], const Pack<T, N>& pack) {
+    for (int n = 0; n < N; n++)
+        values[n] = to_float(pack.values[n]);
+}
+
 template <class T, int N>
 DEVICE void read(float (&values)[N], const void* base, long long index) {
     Pack<T, N> pack;
-    pack.word = ((const Pack<T, N>*)((const T*)base + index))->word;
-    for (int n = 0; n < N; n++)
-        values[n] = to_float(pack.values[n]);
+    load(pack, base, index);
+    unpack(values, pack);
 }
 
 template <class T, int N>

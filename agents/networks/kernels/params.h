@@ -74,6 +74,9 @@ struct MingruForwardParams {
     const void* gates;           // (T, B, 2 W) compute
     const unsigned char* reset;  // (T, B)
     const float* start;          // (B, W)
+    const void* residual;        // (T, B, W) compute, added to `outputs`; null: nothing is
+    void* states;                // (T, B, W) compute, the outputs without the residual; null: not
+                                 // wanted
     void* outputs;               // (T, B, W) compute
     float* last;                 // (B, W)
     int n_steps;
@@ -86,11 +89,13 @@ struct MingruBackwardParams {
     const void* gates;           // (T, B, 2 W) compute
     const unsigned char* reset;  // (T, B)
     const float* start;          // (B, W)
-    const void* outputs;         // (T, B, W) compute
+    const void* states;          // (T, B, W) compute
     const void* d_outputs;       // (T, B, W) compute
-    const float* d_last;         // (B, W)
+    const float* d_last;         // (B, W); null: zeros
     void* d_gates;               // (T, B, 2 W) compute
-    float* d_start;              // (B, W)
+    float* d_start;              // (B, W); null: not wanted
+    void* d_residual;            // (T, B, W) compute, a copy of d_outputs; null: not wanted
+    float* d_biases;             // (B, 2 W), sums of d_gates over steps
     int n_steps;
     int n_lanes;
     int width;
