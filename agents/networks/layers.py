@@ -34,13 +34,23 @@ def linear(
         layer: the layer.
         activation: such as `torch.relu`.
     """
-    dtype = compute_dtype(layer.weight)
+    return affine(x, layer.weight, layer.bias, activation)
+
+
+def affine(
+    x: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
+    weight: torch.Tensor,
+    bias: torch.Tensor | None,
+    activation: Activation | None = None,
+) -> torch.Tensor:
+    """Does what `linear` does, for a weight (out, in) and a bias (out,)."""
+    dtype = compute_dtype(weight)
     parts = [part.to(dtype) for part in (x if isinstance(x, tuple) else (x,))]
-    is_known = activation in (None, torch.relu) and layer.bias is not None
+    is_known = activation in (None, torch.relu) and bias is not None
     is_aligned = not any(part.shape[-1] % 8 for part in parts)
     if parts[0].is_cuda and dtype == torch.bfloat16 and is_known and is_aligned:
-        return _Linear.apply(layer.weight, layer.bias, activation is torch.relu, *parts)
-    y = layer(torch.cat(parts, -1) if len(parts) > 1 else parts[0])
+        return _Linear.apply(weight, bias, activation is torch.relu, *parts)
+    y = nn.functional.linear(torch.cat(parts, -1) if len(parts) > 1 else parts[0], weight, bias)
     return y if activation is None else activation(y)
 
 

@@ -8,8 +8,8 @@ from contextlib import nullcontext
 
 import torch
 
+from megastep.agents.storage.copies import select_tree
 from megastep.arrdict import arrdict, cat
-from megastep.dotdict import mapping
 from megastep.types import Policy, Tree, World
 
 
@@ -57,11 +57,11 @@ class MixedPolicy:
     ) -> tuple[arrdict, arrdict]:
         """Acts in all lanes of an environment. Returns (arrdict(actions), next state)."""
         actions, state = self.act(self.select_lanes(world), state, sample, generator)
-        return arrdict(actions=_select(actions, self.order)), state
+        return arrdict(actions=select_tree(actions, self.order)), state
 
     def select_lanes(self, world: World) -> arrdict:
         """Returns a copy of `obs` and `reset` in the lanes of the policies, in their order."""
-        return arrdict({key: _select(world[key], self.lanes) for key in ("obs", "reset")})
+        return select_tree(arrdict(obs=world["obs"], reset=world["reset"]), self.lanes)
 
     def act(
         self,
@@ -85,7 +85,3 @@ class MixedPolicy:
         for stream in self.streams:
             main.wait_stream(stream)
         return cat(actions), next_state
-
-
-def _select(tree, lanes):
-    return mapping(lambda leaf: leaf.index_select(0, lanes))(tree)
