@@ -133,6 +133,34 @@ def test_beats_random_actions():
 
 
 @pytest.mark.cuda
+def test_gpu_acts_as_the_cpu_does():
+    """In homes, from every state. Ties may go either way, such as halves of equal mean depth."""
+    env = envs.Deathmatch(64, sample("homes", 8), n_agents=4, device="cuda", res=508)
+    generator, world = torch.Generator().manual_seed(0), env.reset()
+    for _ in range(30):
+        ranges = dict(lost=30, side=2, around=4, pushed=2)
+        state = {
+            name: torch.randint(high, (256,), generator=generator) for name, high in ranges.items()
+        }
+        state["side"] = 2 * state["side"] - 1
+        state["pushed"] = state["pushed"].bool()
+        (expected, after), (ours, next_state) = (
+            Bot()(
+                arrdict.arrdict(obs=world.obs.map(place), reset=place(world.reset)),
+                {name: place(leaf) for name, leaf in state.items()},
+            )
+            for place in (torch.Tensor.cpu, torch.Tensor.cuda)
+        )
+        is_same = (ours.actions.cpu() == expected.actions).all(1)
+        assert ours.actions.dtype == torch.int64 and ours.actions.shape == (256, 1)
+        for name, leaf in next_state.items():
+            assert leaf.dtype == after[name].dtype
+            is_same &= leaf.cpu() == after[name]
+        assert is_same.float().mean() > 0.99
+        world = env.step(ours)
+
+
+@pytest.mark.cuda
 def test_never_synchronises_and_can_be_captured():
     env = envs.Deathmatch(8, [toys.box()], device="cuda")
     bot, world = Bot(), env.reset()

@@ -1,24 +1,20 @@
 """A scripted policy for Deathmatch that acts on observations alone. B lanes, R pixels."""
 
+import math
 from collections.abc import Mapping
 
 import torch
 
 from megastep.arrdict import arrdict
+from megastep.envs.deathmatch.step import PROGRAM
+from megastep.kernels.build.launch import WARP, launch
 
 #: Actions with momentum.
-NOTHING, FORWARD, LEFT, RIGHT = 0, 3, 5, 6
-TURN = 18.0  # degrees per second added by an action
-RETAINED = 0.875  # fraction of a velocity left after a step
-STEP = 0.1  # seconds
-SATURATED = 0.12  # fraction of a pixel's light in its weakest channel: agents have less, walls more
-DARK = 0.01  # darker pixels are ignored
-LOOK = 25  # steps it turns after it lost an agent: all round
-AROUND = 10  # steps it turns away from what stopped it
-SLOW = 0.05  # maximum speed at which it approaches, in tens of metres per second
-MIDDLE = 8  # pixels left and right of the centre that must be free to walk
-CLOSE = 0.7  # depth at 3 m, near enough to an agent
-NEAR = 0.9  # depth at 1 m, too near to a wall
+NOTHING, FORWARD, LEFT, RIGHT = map(PROGRAM.constants.get, ("NOTHING", "FORWARD", "LEFT", "RIGHT"))
+TURN, RETAINED, STEP = map(PROGRAM.constants.get, ("TURN", "RETAINED", "STEP"))
+SATURATED, DARK = map(PROGRAM.constants.get, ("SATURATED", "DARK"))
+LOOK, AROUND, SLOW = map(PROGRAM.constants.get, ("LOOK", "AROUND", "SLOW"))
+MIDDLE, CLOSE, NEAR = map(PROGRAM.constants.get, ("MIDDLE", "CLOSE", "NEAR"))
 
 
 class Bot:
@@ -69,8 +65,11 @@ class Bot:
         obs = world["obs"]
         if not isinstance(obs, Mapping) or not {"rgb", "d", "imu"} <= obs.keys():
             raise ValueError("the bot needs observations rgb, d and imu, as Deathmatch has them")
+        if _is_fused(**obs):
+            return self._act_on_gpu(obs["rgb"], obs["d"], obs["imu"], world["reset"], state)
         rgb, depth = obs["rgb"][:, 0, :, 0].float(), obs["d"][:, 0, 0, 0].float()
-        spin, ahead = 360 * obs["imu"][:, 0, 0].float(), obs["imu"][:, 0, 1]
+        spin, ahead = (obs["imu"][:, 0, i].float() for i in range(2))
+        spin = 360 * spin
         is_seen, pixel = self._nearest_agent(rgb)
         target = self._bearing(pixel, depth.shape[1])
         half = depth.shape[1] // 2
@@ -88,6 +87,25 @@ class Bot:
         actions = torch.where(is_seen, fights, searches)
         state = arrdict(lost=lost, side=side, around=around, pushed=actions == FORWARD)
         return arrdict(actions=actions[:, None]), state
+
+    def _act_on_gpu(self, rgb, depth, imu, reset, state):
+        """Does the same in one kernel."""
+        n_lanes, n_pixels = len(reset), rgb.shape[-1]
+        rgb, depth, imu, reset = (leaf.contiguous() for leaf in (rgb, depth, imu, reset.bool()))
+        state = {name: leaf.contiguous() for name, leaf in state.items()}
+        after = arrdict({name: torch.empty_like(leaf) for name, leaf in state.items()})
+        actions = torch.empty(n_lanes, 1, dtype=torch.int64, device=rgb.device)
+        observed = dict(rgb=rgb, depth=depth, imu=imu, reset=reset)
+        next_state = {f"next_{name}": leaf for name, leaf in after.items()}
+        tensors = dict(**observed, **state, actions=actions, **next_state)
+        packed = PROGRAM.params.BotParams(
+            **{name: leaf.data_ptr() for name, leaf in tensors.items()},
+            slope=math.tan(math.radians(self.fov / 2)),
+            n_lanes=n_lanes,
+            n_pixels=n_pixels,
+        )
+        launch(PROGRAM, "bot", packed, rgb.device, threads=WARP * n_lanes)
+        return arrdict(actions=actions), after
 
     def _nearest_agent(self, rgb):
         """Returns (B,) bool, true if an agent is in view, and (B,) the agent's pixel closest to the
@@ -119,3 +137,12 @@ class Bot:
         soon, later = (self._turn(target, spin, seconds) for seconds in (STEP, 3 * STEP))
         action = torch.where(target.abs() > 3, later, soon)
         return torch.where((action == NOTHING) & approaches, FORWARD, action)
+
+
+def _is_fused(rgb, d, imu, **_):
+    n_pixels = rgb.shape[-1]
+    shapes = {(1, 3, 1, n_pixels): rgb, (1, 1, 1, n_pixels): d, (1, 3): imu}
+    return all(
+        leaf.is_cuda and leaf.dtype == torch.float16 and leaf.shape[1:] == shape
+        for shape, leaf in shapes.items()
+    )
