@@ -15,7 +15,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.networks.kernels import layers as kernels
-from megastep.agents.networks.kernels.program import aligned
+from megastep.agents.networks.kernels.program import aligned_rows
 from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.networks.running_norm import RunningNorm
 
@@ -84,7 +84,7 @@ class _Linear(torch.autograd.Function):
         parts, activated = (saved[:-1], saved[-1:]) if ctx.has_relu else (saved, [])
         lead, n_padding = d.shape[:-1], len(weight) - ctx.n_outputs
         d = nn.functional.pad(d.flatten(0, -2), (0, n_padding)) if n_padding else d.flatten(0, -2)
-        d, d_bias = kernels.bias_gradient(aligned(d), *activated)
+        d, d_bias = kernels.bias_gradient(aligned_rows(d), *activated)
         d_weight, d_parts = None, [None] * len(parts)
         if ctx.needs_input_grad[0]:
             d_weights = [product(d.T, part) for part in parts]

@@ -6,6 +6,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks import encoders, heads, intakes, layers
+from megastep.agents.networks.kernels.program import aligned_rows
 from megastep.agents.networks.precision import ComputeDtype, cast, cast_joined, once
 from megastep.arrdict import arrdict
 
@@ -151,6 +152,17 @@ def test_frozen_layers_pass_gradients(n_out, frozen):
         assert_close(fused, plain)
 
 
+def test_rows_are_copied_only_if_they_are_misaligned():
+    matrix = torch.arange(320.0).view(10, 32)
+    for part in (matrix, matrix[:, 4:12], matrix[2:, 8:9]):
+        assert aligned_rows(part) is part
+    odd = torch.arange(70.0).view(10, 7)
+    parts = matrix[:, 3:11], matrix.T, odd[:, :4], matrix[:1, 4:].expand(3, -1), odd[1:2]
+    for part in parts:
+        copied = aligned_rows(part)
+        assert torch.equal(copied, part) and copied.is_contiguous() and not copied.data_ptr() % 16
+
+
 @pytest.mark.cuda
 def test_gradient_of_one_row_may_begin_anywhere():
     """One row of a wider tensor counts as contiguous, wherever it begins."""
@@ -187,6 +199,10 @@ def test_bias_gradient_is_the_sum_of_rows_and_repeatable(n_rows, n_columns):
     expected = masked.double().sum(0).float()
     torch.testing.assert_close(sums, expected, rtol=1e-4, atol=1e-5 * n_rows**0.5 + 1e-3)
     assert torch.equal(layers.kernels.bias_gradient(d, y)[1], sums)
+    wide = torch.randn(n_rows, n_columns + 16, device="cuda").bfloat16()
+    wide[:, 8:-8] = d
+    ours = layers.kernels.bias_gradient(aligned_rows(wide[:, 8:-8]), y)
+    assert torch.equal(ours[0], masked) and torch.equal(ours[1], sums)
     same, sums = layers.kernels.bias_gradient(d)
     assert same is d
     expected = d.double().sum(0).float()
