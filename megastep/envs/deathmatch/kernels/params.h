@@ -53,5 +53,6 @@ struct BotParams {
     unsigned char* next_pushed;
     float slope;  // tangent of half the field of view
     int n_lanes;
-    int n_pixels;  // R
+    int n_pixels;   // R
+    int n_threads;  // CPU threads
 };
