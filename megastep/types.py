@@ -98,6 +98,7 @@ DEFAULTS: dict[str, Any] = {
     # of environments with opponents
     "learners": None,  # (B,) bool, lanes whose transitions are stored; None: all
     "matchups": {},  # (B,) bool by name, groups of lanes that are reported apart
+    "begin_step": lambda: None,  # starts what a step can do before its actions are known
 }
 
 

@@ -70,6 +70,7 @@ OWN_USERS = {
     "megastep.kernels.build.launch": (
         "megastep/engine/*.py",
         "megastep/envs/*/step.py",
+        "megastep/envs/deathmatch/bot.py",
         "megastep/envs/pointgoal/path_graph.py",
         "megastep/kernels/build/*.py",
         "megastep/modules/visibility.py",  # its cache depends on the kernels' sources

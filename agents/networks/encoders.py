@@ -8,10 +8,10 @@ import math
 
 import torch
 from torch import nn
-from torch.nn import functional as F
 
 from megastep import spaces
-from megastep.agents.networks.precision import compute_dtype
+from megastep.agents.networks.layers import Activation, affine
+from megastep.agents.networks.precision import compute_dtype, once
 from megastep.imports import resolve
 from megastep.types import Space
 
@@ -81,15 +81,26 @@ class BandedConv1d(nn.Conv1d):
         spread = spread.view(*self.weight.shape[:2], *self.band.shape[1:])
         return spread.transpose(1, 2).flatten(2).flatten(0, 1)
 
-    def forward(self, rows: torch.Tensor) -> torch.Tensor:
-        if rows.is_cuda and self.band.shape[-1] <= self.MAX_BANDED:
-            return self.as_product(rows)
-        return super().forward(rows)
+    def column_bias(self) -> torch.Tensor:
+        """Returns (C' W',), the bias of each row of `matrix`."""
+        return self.bias[:, None].expand(-1, self.n_outputs).flatten()
 
-    def as_product(self, rows: torch.Tensor) -> torch.Tensor:
-        """Computes the convolution with the banded matrix."""
-        bias = self.bias[:, None].expand(-1, self.n_outputs).flatten()
-        return F.linear(rows.flatten(1), self.matrix(), bias).unflatten(1, (-1, self.n_outputs))
+    def forward(self, rows: torch.Tensor, activation: Activation | None = None) -> torch.Tensor:
+        """Returns the convolution of rows (N, C, W), with an activation: (N, C', W')."""
+        if rows.is_cuda and self.band.shape[-1] <= self.MAX_BANDED:
+            return self.as_product(rows, activation)
+        outputs = super().forward(rows)
+        return outputs if activation is None else activation(outputs)
+
+    def as_product(self, rows: torch.Tensor, activation: Activation | None = None) -> torch.Tensor:
+        """Does what `forward` does with the banded matrix."""
+        if torch.is_grad_enabled():
+            matrix, bias = self.matrix(), self.column_bias()
+        else:
+            matrix = once((self.weight,), "matrix", self.matrix)
+            bias = once((self.bias,), "column_bias", self.column_bias)
+        outputs = affine(rows.flatten(1), matrix, bias, activation)
+        return outputs.unflatten(1, (-1, self.n_outputs))
 
 
 class Conv(nn.Module):
@@ -111,7 +122,8 @@ class Conv(nn.Module):
         rows = obs.reshape(-1, obs.shape[-3] * obs.shape[-2], obs.shape[-1]).to(
             compute_dtype(self.first.weight)
         )
-        return F.relu(self.second(F.relu(self.first(rows)))).reshape(*lead, self.n_features)
+        features = self.second(self.first(rows, torch.relu), torch.relu)
+        return features.reshape(*lead, self.n_features)
 
 
 class Cnn(nn.Module):

@@ -3,6 +3,7 @@
 `...` any leading axes, such as (B,) lanes or (T, B) time and lanes.
 """
 
+import itertools
 import math
 
 import torch
@@ -10,7 +11,7 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks import intake_cpu
-from megastep.agents.networks.encoders import Flat, make_encoder
+from megastep.agents.networks.encoders import Cnn, Conv, Flat, make_encoder
 from megastep.agents.networks.layers import linear, normalised
 from megastep.agents.networks.precision import compute_dtype
 from megastep.agents.networks.running_norm import RunningNorm
@@ -58,8 +59,8 @@ class ConcatIntake(nn.Module):
             nn.Identity() if isinstance(leaf, spaces.MultiDiscrete) else RunningNorm(leaf)
             for leaf in leaves.values()
         )
-        #: whether every leaf is a normalised vector
-        self.is_flat = all(isinstance(encoder, Flat) for encoder in self.encoders)
+        #: whether every leaf is normalised, and encoded by what takes a part of wider rows
+        self.is_fused = all(type(encoder) in (Flat, Conv, Cnn) for encoder in self.encoders)
         sizes = [encoder.n_features for encoder in self.encoders]
         self.n_features = sum(sizes)
         # GPUs multiply matrices whose columns are a multiple of 8 several times faster
@@ -71,6 +72,32 @@ class ConcatIntake(nn.Module):
             blocks[-1].zero_()
             for block, size in zip(blocks, sizes):
                 block.normal_(std=math.sqrt(2 / (len(sizes) * size)))
+        self._lay_out(list(leaves.values()))
+
+    def _lay_out(self, leaves):
+        """Decides how `normalised` puts leaves side by side: images first, so that their rows
+        start at multiples of 16 bytes. After the leaves come at least `n_padding` zeros.
+
+        Sets `order` of leaves, `n_columns`, and `runs` of columns in the order of the features:
+        (encoder, shape, start, end). Flat neighbours are one run, the padding too, with None.
+        """
+        is_flat = [isinstance(encoder, Flat) for encoder in self.encoders]
+        n_leaves, sizes = len(leaves), [math.prod(leaf.shape) for leaf in leaves]
+        self.order = sorted(range(n_leaves), key=is_flat.__getitem__)
+        starts = dict(
+            zip(self.order, itertools.accumulate((sizes[i] for i in self.order), initial=0))
+        )
+        starts[n_leaves] = sum(sizes)
+        self.runs = []
+        for i, size in enumerate([*sizes, self.n_padding]):
+            end = starts[i] + size
+            if i < n_leaves and not is_flat[i]:
+                self.runs.append((i, leaves[i].shape, starts[i], end))
+            elif self.runs and self.runs[-1][0] is None:
+                self.runs[-1] = (None, None, self.runs[-1][2], end)
+            elif size:
+                self.runs.append((None, None, starts[i], end))
+        self.n_columns = -8 * (-(sum(sizes) + self.n_padding) // 8)
 
     def forward(self, obs: Tree, lanes: torch.Tensor | None = None) -> torch.Tensor:
         """Returns the projected features (..., width).
@@ -90,11 +117,11 @@ class ConcatIntake(nn.Module):
         end: (..., n_features + n_padding).
         """
         leaves = self._leaves(obs)
-        if self.is_flat:
-            n_columns = self.n_features + self.n_padding
-            features = normalised(leaves, self.norms, n_columns, lanes)
-            if features is not None:
-                return features
+        if self.is_fused:
+            ordered = [(leaves[i], self.norms[i]) for i in self.order]
+            columns = normalised(*zip(*ordered, strict=True), self.n_columns, lanes)
+            if columns is not None:
+                return self._encode_columns(columns)
         if lanes is not None:
             leaves = [leaf.index_select(1, lanes) for leaf in leaves]
         dtype = compute_dtype(self.project.weight)
@@ -107,6 +134,20 @@ class ConcatIntake(nn.Module):
         if self.n_padding:
             features.append(features[0].new_zeros((*features[0].shape[:-1], self.n_padding)))
         return torch.cat(features, dim=-1)
+
+    def _encode_columns(self, columns):
+        """Returns `encode` of normalised leaves side by side, (..., n_columns)."""
+        if all(i is None for i, *_ in self.runs):  # one run, of all columns
+            return columns
+        parts = []
+        for i, shape, start, end in self.runs:
+            part = columns[..., start:end]
+            # a few columns; `cat` is several times faster if all its inputs are contiguous
+            encoded = (
+                part.contiguous() if i is None else self.encoders[i](part.unflatten(-1, shape))
+            )
+            parts.append(encoded)
+        return torch.cat(parts, -1)
 
     def normalised_leaves(self, obs: Tree) -> list[tuple[RunningNorm, torch.Tensor]]:
         """Returns each normalisation with its leaf, for `update_norms`."""

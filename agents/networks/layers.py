@@ -15,7 +15,7 @@ from torch import nn
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.networks.kernels import layers as kernels
-from megastep.agents.networks.kernels.program import aligned
+from megastep.agents.networks.kernels.program import aligned_rows
 from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.networks.running_norm import RunningNorm
 
@@ -34,13 +34,23 @@ def linear(
         layer: the layer.
         activation: such as `torch.relu`.
     """
-    dtype = compute_dtype(layer.weight)
+    return affine(x, layer.weight, layer.bias, activation)
+
+
+def affine(
+    x: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
+    weight: torch.Tensor,
+    bias: torch.Tensor | None,
+    activation: Activation | None = None,
+) -> torch.Tensor:
+    """Does what `linear` does, for a weight (out, in) and a bias (out,)."""
+    dtype = compute_dtype(weight)
     parts = [part.to(dtype) for part in (x if isinstance(x, tuple) else (x,))]
-    is_known = activation in (None, torch.relu) and layer.bias is not None
+    is_known = activation in (None, torch.relu) and bias is not None
     is_aligned = not any(part.shape[-1] % 8 for part in parts)
     if parts[0].is_cuda and dtype == torch.bfloat16 and is_known and is_aligned:
-        return _Linear.apply(layer.weight, layer.bias, activation is torch.relu, *parts)
-    y = layer(torch.cat(parts, -1) if len(parts) > 1 else parts[0])
+        return _Linear.apply(weight, bias, activation is torch.relu, *parts)
+    y = nn.functional.linear(torch.cat(parts, -1) if len(parts) > 1 else parts[0], weight, bias)
     return y if activation is None else activation(y)
 
 
@@ -74,7 +84,7 @@ class _Linear(torch.autograd.Function):
         parts, activated = (saved[:-1], saved[-1:]) if ctx.has_relu else (saved, [])
         lead, n_padding = d.shape[:-1], len(weight) - ctx.n_outputs
         d = nn.functional.pad(d.flatten(0, -2), (0, n_padding)) if n_padding else d.flatten(0, -2)
-        d, d_bias = kernels.bias_gradient(aligned(d), *activated)
+        d, d_bias = kernels.bias_gradient(aligned_rows(d), *activated)
         d_weight, d_parts = None, [None] * len(parts)
         if ctx.needs_input_grad[0]:
             d_weights = [product(d.T, part) for part in parts]

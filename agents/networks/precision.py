@@ -1,7 +1,7 @@
 """The dtype that layers compute in."""
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from typing import Any
 
 import torch
@@ -25,12 +25,13 @@ _MULTIPLE = 8  # rows that tensor cores want; the only padding of weights that a
 
 
 class ComputeDtype(torch.autocast):
-    """Autocast that also remembers what `cast` returned: until the outermost context ends, each
-    weight is cast only once. Weights must not change inside it.
+    """Autocast that also remembers what `cast` and `once` returned: until the outermost context
+    ends, each weight is cast only once. Weights must not change inside it.
 
     Args:
         args: autocast's arguments.
-        weights: returns weights that are cast together, on a GPU, once one of them is needed.
+        weights: returns weights that are cast together, on a GPU, once one of them is needed. In
+            contexts inside each other, those of the innermost.
         options: autocast's arguments.
     """
 
@@ -41,12 +42,12 @@ class ComputeDtype(torch.autocast):
         self._weights = weights
 
     def __enter__(self) -> Any:
-        if not _CASTS.depth:
-            _CASTS.weights = self._weights
+        self._outer_weights, _CASTS.weights = _CASTS.weights, self._weights
         _CASTS.depth += 1
         return super().__enter__()
 
     def __exit__(self, *args: Any) -> Any:
+        _CASTS.weights = self._outer_weights
         _CASTS.depth -= 1
         if not _CASTS.depth:
             _CASTS.by_weight.clear()
@@ -79,9 +80,26 @@ def cast(weight: torch.Tensor, dtype: torch.dtype, multiple: int = 1) -> torch.T
 
 def cast_joined(weights: tuple[torch.Tensor, ...], dtype: torch.dtype) -> torch.Tensor:
     """Returns weights (N, n) each, cast as by `cast` and joined along columns: (N, sum of n)."""
-    key = tuple(id(weight) for weight in weights), dtype
+
+    def join():
+        return torch.cat([cast(weight, dtype).detach() for weight in weights], 1)
+
+    return once(weights, dtype, join)
+
+
+def once(
+    weights: tuple[torch.Tensor, ...], name: Hashable, make: Callable[[], torch.Tensor]
+) -> torch.Tensor:
+    """Returns `make()`, which follows from weights and has no gradient: once per context.
+
+    Args:
+        weights: what `make` reads.
+        name: tells apart what is made of the same weights.
+        make: makes the tensor.
+    """
+    key = tuple(id(weight) for weight in weights), name
     if key not in _CASTS.by_weight:
-        result = torch.cat([cast(weight, dtype).detach() for weight in weights], 1)
+        result = make()
         if not _CASTS.depth:
             return result
         _CASTS.by_weight[key] = weights, result

@@ -8,16 +8,16 @@ from contextlib import nullcontext
 
 import torch
 
+from megastep.agents.storage.copies import select_tree
 from megastep.arrdict import arrdict, cat
-from megastep.dotdict import mapping
 from megastep.types import Policy, Tree, World
 
 
 class MixedPolicy:
     """A policy made of several policies, each with a fixed set of lanes.
 
-    Call it like any policy if it has all lanes of the environment. Use `act` if other policies act
-    in the remaining lanes.
+    Call it like any policy if it has all lanes of the environment. Use `start` and `finish` if
+    other policies act in the remaining lanes.
 
     On a GPU each policy runs on a separate CUDA stream, also inside a CUDA graph, because one small
     network does not fill the GPU.
@@ -37,7 +37,7 @@ class MixedPolicy:
         self.lanes = torch.cat(list(lanes))
         self.order = self.lanes.argsort()
         is_cuda = self.lanes.is_cuda
-        self.streams = [torch.cuda.Stream(self.lanes.device) for _ in policies[1:] if is_cuda]
+        self.streams = [torch.cuda.Stream(self.lanes.device) for _ in policies if is_cuda]
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> arrdict:
         """Returns the initial hidden state of each policy, by its index as a string."""
@@ -56,36 +56,38 @@ class MixedPolicy:
         generator: torch.Generator | None = None,
     ) -> tuple[arrdict, arrdict]:
         """Acts in all lanes of an environment. Returns (arrdict(actions), next state)."""
-        actions, state = self.act(self.select_lanes(world), state, sample, generator)
-        return arrdict(actions=_select(actions, self.order)), state
+        started = self.start(self.select_lanes(world), state, sample, generator)
+        actions, state = self.finish(started)
+        return arrdict(actions=select_tree(actions, self.order)), state
 
     def select_lanes(self, world: World) -> arrdict:
         """Returns a copy of `obs` and `reset` in the lanes of the policies, in their order."""
-        return arrdict({key: _select(world[key], self.lanes) for key in ("obs", "reset")})
+        return select_tree(arrdict(obs=world["obs"], reset=world["reset"]), self.lanes)
 
-    def act(
+    def start(
         self,
         world: Mapping,
         state: arrdict,
         sample: bool = True,
         generator: torch.Generator | None = None,
-    ) -> tuple[Tree, arrdict]:
-        """Acts on the result of `select_lanes`. Returns actions (M, ...) and the next state."""
+    ) -> list[tuple[Mapping, arrdict]]:
+        """Acts on the result of `select_lanes`. Returns what `finish` takes.
+
+        Until then nothing may use the results, and `world` and `state` must not change.
+        """
         main = torch.cuda.current_stream(self.lanes.device) if self.streams else None
         for stream in self.streams:
             stream.wait_stream(main)
-        actions, next_state, start = [], arrdict(), 0
+        started, start = [], 0
         for i, (policy, size) in enumerate(zip(self.policies, self.sizes, strict=True)):
             policy_world, start = world[start : start + size], start + size
-            with torch.cuda.stream(self.streams[i - 1]) if self.streams and i else nullcontext():
-                decision, next_state[str(i)] = policy(
-                    policy_world, state[str(i)], sample, generator
-                )
-            actions.append(decision["actions"])
+            with torch.cuda.stream(self.streams[i]) if self.streams else nullcontext():
+                started.append(policy(policy_world, state[str(i)], sample, generator))
+        return started
+
+    def finish(self, started: Sequence[tuple[Mapping, arrdict]]) -> tuple[Tree, arrdict]:
+        """Returns the actions (M, ...) and the next state of what `start` began."""
         for stream in self.streams:
-            main.wait_stream(stream)
-        return cat(actions), next_state
-
-
-def _select(tree, lanes):
-    return mapping(lambda leaf: leaf.index_select(0, lanes))(tree)
+            torch.cuda.current_stream(self.lanes.device).wait_stream(stream)
+        actions = cat([decision["actions"] for decision, _ in started])
+        return actions, arrdict({str(i): state for i, (_, state) in enumerate(started)})

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, SkipValidation
 
+from megastep.agents.algorithms.kernels.program import run
 from megastep.agents.distributed.process_group import sum_over_ranks
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
@@ -115,8 +116,19 @@ class Opponents:
     def reset(self) -> World:
         """Starts every episode and returns the first world."""
         self.hidden_state = self.mixed_policy.initial(len(self.learners), self.env.device)
+        self.acting = None
         self.returns.zero_()
         return self._observed(self.env.reset())
+
+    @torch.no_grad()
+    def begin_step(self) -> None:
+        """Has the opponents choose the actions of the next step; on a GPU beside whatever comes
+        until then. If it is not called, `step` does it.
+        """
+        generator = self.generator.on(self.learners.device)
+        self.acting = self.mixed_policy.start(
+            self.opponent_world, self.hidden_state, generator=generator
+        )
 
     @torch.no_grad()
     def step(self, decision: arrdict) -> World:
@@ -124,10 +136,10 @@ class Opponents:
 
         Uses `decision.actions`, (B, ...), in the lanes that learn; the opponents act in the others.
         """
-        generator = self.generator.on(self.learners.device)
-        opponent_actions, self.hidden_state = self.mixed_policy.act(
-            self.opponent_world, self.hidden_state, generator=generator
-        )
+        if self.acting is None:
+            self.begin_step()
+        opponent_actions, self.hidden_state = self.mixed_policy.finish(self.acting)
+        self.acting = None
         lanes = self.mixed_policy.lanes
         replace = mapping(lambda leaf, theirs: leaf.index_copy(0, lanes, theirs.to(leaf)))
         actions = replace(decision["actions"], opponent_actions)
@@ -144,11 +156,19 @@ class Opponents:
         return arrdict(world, learns=learns)
 
     def _count_pairs(self, world):
-        """Adds the pairs that this step decided to `pairs`."""
+        """Adds the pairs that this step decided to `pairs`. On a GPU in one kernel."""
         reward, terminal, truncated = (
-            world[key].view(-1, self.env.n_agents)[-self.n_opposed :]
+            world[key].contiguous().view(-1, self.env.n_agents)[-self.n_opposed :]
             for key in ("reward", "terminal", "truncated")
         )
+        if reward.is_cuda and reward.dtype == torch.float32:
+            run(
+                *("count_pairs", reward.device, self.n_opposed),
+                **dict(reward=reward, terminal=terminal, truncated=truncated, slots=self.slots),
+                **dict(returns=self.returns, pairs=self.pairs),
+                **dict(n_envs=self.n_opposed, n_agents=self.env.n_agents),
+            )
+            return
         self.returns += reward
         self.pairs += torch.stack(duels.score_pairs(terminal, self.returns, self.slots))
         self.returns.masked_fill_(terminal | truncated, 0.0)

@@ -46,6 +46,8 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
     with policy.compute_dtype():
         seen = rollout.store_world(0, world)
         for t in range(rollout.n_steps):
+            with section("env"), torch.autocast(rollout.reward.device.type, enabled=False):
+                optional(env, "begin_step")()
             with section("act"):
                 decision, state = policy(seen, state)
             rollout.store_decision(t, decision)

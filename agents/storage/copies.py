@@ -5,9 +5,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import torch
+from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from megastep.kernels.build.launch import BLOCK, launch_blocks
 from megastep.kernels.build.program import Program
+from megastep.types import Tree
 
 PROGRAM = Program(Path(__file__).parent / "kernels")
 _MAX_COPIES = PROGRAM.constants["MAX_COPIES"]
@@ -116,6 +118,15 @@ def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[t
         results[i] if i in results else tensor.index_select(1, lanes)
         for i, tensor in enumerate(tensors)
     ]
+
+
+def select_tree(tree: Tree, lanes: torch.Tensor) -> Tree:
+    """Returns `leaf.index_select(0, lanes)` of each leaf (B, ...) of a tree, on a GPU in one
+    kernel.
+    """
+    leaves, spec = tree_flatten(tree)
+    selected = select_lanes([leaf[None] for leaf in leaves], lanes)
+    return tree_unflatten([leaf[0] for leaf in selected], spec)
 
 
 def _can_select(tensor):

@@ -14,7 +14,7 @@ from torch.utils._pytree import tree_flatten, tree_unflatten
 from megastep import spaces
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
-from megastep.agents.storage.copies import copy_all, select_lanes
+from megastep.agents.storage.copies import copy_all, select_lanes, select_tree
 from megastep.arrdict import arrdict, clone
 from megastep.dotdict import mapping
 from megastep.types import Env, Space, Tree, n_lanes, optional
@@ -175,7 +175,7 @@ class Rollout:
 
     def select_lanes(self, world: Tree) -> Tree:
         """Returns the stored lanes of an environment's world, or of a tensor (B, ...)."""
-        return world if self.lane_indices is None else _select(world, self.lane_indices)
+        return world if self.lane_indices is None else select_tree(world, self.lane_indices)
 
     def scatter_actions(self, actions: Tree) -> Tree:
         """Returns actions for every lane of the environment: 0 for lanes that are not stored."""
@@ -324,7 +324,3 @@ def _bytes(space, default_itemsize):
         dtype = getattr(leaf, "dtype", None)
         n_bytes += math.prod(leaf.shape) * (dtype.itemsize if dtype else default_itemsize)
     return n_bytes
-
-
-def _select(tree, lanes):
-    return mapping(lambda leaf: leaf.index_select(0, lanes))(tree)

@@ -7,8 +7,10 @@ import torch
 
 from megastep import arrdict, capture, envs, toys
 from megastep.agents.training.evaluation import RandomActions
-from megastep.envs.deathmatch.bot import FORWARD, LEFT, NOTHING, RIGHT, Bot
+from megastep.envs.deathmatch.bot import Bot
 from megastep.geometries import sample
+from tests.helpers import bot_twin
+from tests.helpers.bot_twin import FORWARD, LEFT, NOTHING, RIGHT
 
 AHEAD = (2.0, 3.5, 0.0)
 
@@ -130,6 +132,45 @@ def test_beats_random_actions():
         won += ((dead.any(1) & ~ours) & ~over).float()
         over |= dead.any(1)
     assert won.mean() > 0.9
+
+
+@pytest.mark.parametrize("res, fov", [(512, 70), (508, 130), (96, 20)])
+def test_acts_as_its_twin_does(res, fov, device):
+    """In homes, from many states. Ties may go either way, such as halves of equal mean depth."""
+    env = envs.Deathmatch(64, sample("homes", 8), n_agents=4, device=device, res=res, fov=fov)
+    generator, world, bot = torch.Generator().manual_seed(0), env.reset(), Bot(fov)
+    for step in range(40):
+        if step % 8 == 0:
+            ranges = dict(lost=30, side=2, around=4, pushed=2)
+            state = {
+                name: torch.randint(high, (256,), generator=generator).to(env.device)
+                for name, high in ranges.items()
+            }
+            state["side"] = 2 * state["side"] - 1
+            state["pushed"] = state["pushed"].bool()
+        expected, after = bot_twin.act(world, state, fov)
+        decision, state = bot(world, state)
+        is_same = (decision.actions == expected.actions).all(1)
+        for name, leaf in state.items():
+            assert leaf.dtype == after[name].dtype
+            is_same &= leaf == after[name]
+        assert is_same.float().mean() > 0.99
+        world = env.step(decision)
+
+
+@pytest.mark.cuda
+def test_gpu_acts_as_the_cpu_does():
+    env = envs.Deathmatch(64, sample("homes", 8), n_agents=4, device="cuda")
+    bot, world = Bot(), env.reset()
+    state, on_cpu = bot.initial(256, "cuda"), bot.initial(256, "cpu")
+    for _ in range(60):
+        seen = arrdict.arrdict(obs=world.obs.map(torch.Tensor.cpu), reset=world.reset.cpu())
+        decision, state = bot(world, state)
+        expected, on_cpu = bot(seen, on_cpu)
+        assert torch.equal(decision.actions.cpu(), expected.actions)
+        for name, leaf in state.items():
+            assert torch.equal(leaf.cpu(), on_cpu[name]), name
+        world = env.step(decision)
 
 
 @pytest.mark.cuda

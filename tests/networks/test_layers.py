@@ -5,8 +5,9 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.networks import heads, layers
-from megastep.agents.networks.precision import ComputeDtype, cast, cast_joined
+from megastep.agents.networks import encoders, heads, intakes, layers
+from megastep.agents.networks.kernels.program import aligned_rows
+from megastep.agents.networks.precision import ComputeDtype, cast, cast_joined, once
 from megastep.arrdict import arrdict
 
 BF16 = dict(rtol=0, atol=2e-2)  # times the largest number: 8 bits, and sums of them
@@ -42,6 +43,36 @@ def test_weights_are_joined_once_per_context():
         joined = cast_joined(weights, torch.bfloat16)
         assert cast_joined(weights, torch.bfloat16) is joined
     assert torch.equal(joined, expected.bfloat16()) and not joined.requires_grad
+
+
+def test_what_follows_from_weights_is_made_once_per_context():
+    conv = encoders.BandedConv1d(3, 16, 2, kernel_size=4, stride=2, padding=1)
+    rows = torch.randn(5, 3, 16)
+    with ComputeDtype("cpu", torch.bfloat16, enabled=False), torch.no_grad():
+        with ComputeDtype("cpu", torch.bfloat16, enabled=False):
+            torch.testing.assert_close(conv.as_product(rows), conv(rows))
+        matrix = once((conv.weight,), "matrix", conv.matrix)
+        assert once((conv.weight,), "matrix", conv.matrix) is matrix
+        with torch.enable_grad():
+            gradient = torch.autograd.grad(conv.as_product(rows).sum(), conv.weight)[0]
+    assert gradient.any()
+    with torch.no_grad():
+        conv.weight.mul_(2.0)
+        with ComputeDtype("cpu", torch.bfloat16, enabled=False):
+            torch.testing.assert_close(conv.as_product(rows), conv(rows))
+
+
+@pytest.mark.cuda
+def test_weights_of_inner_contexts_are_cast_together():
+    weights = [torch.randn(3, 8, device="cuda") for _ in range(4)]
+    halves = weights[:2], weights[2:]
+    with ComputeDtype("cuda", torch.bfloat16, weights=lambda: halves[0]):
+        for half in (*halves, *halves):
+            with ComputeDtype("cuda", torch.bfloat16, weights=lambda half=half: half):
+                first, second = (cast(weight, torch.bfloat16) for weight in half)
+                assert second.data_ptr() - first.data_ptr() == 128  # neighbours, padded to 8 rows
+        outer = cast(weights[0], torch.bfloat16)
+        assert torch.equal(outer, weights[0].bfloat16())
 
 
 @pytest.mark.cuda
@@ -121,6 +152,17 @@ def test_frozen_layers_pass_gradients(n_out, frozen):
         assert_close(fused, plain)
 
 
+def test_rows_are_copied_only_if_they_are_misaligned():
+    matrix = torch.arange(320.0).view(10, 32)
+    for part in (matrix, matrix[:, 4:12], matrix[2:, 8:9]):
+        assert aligned_rows(part) is part
+    odd = torch.arange(70.0).view(10, 7)
+    parts = matrix[:, 3:11], matrix.T, odd[:, :4], matrix[:1, 4:].expand(3, -1), odd[1:2]
+    for part in parts:
+        copied = aligned_rows(part)
+        assert torch.equal(copied, part) and copied.is_contiguous() and not copied.data_ptr() % 16
+
+
 @pytest.mark.cuda
 def test_gradient_of_one_row_may_begin_anywhere():
     """One row of a wider tensor counts as contiguous, wherever it begins."""
@@ -157,6 +199,10 @@ def test_bias_gradient_is_the_sum_of_rows_and_repeatable(n_rows, n_columns):
     expected = masked.double().sum(0).float()
     torch.testing.assert_close(sums, expected, rtol=1e-4, atol=1e-5 * n_rows**0.5 + 1e-3)
     assert torch.equal(layers.kernels.bias_gradient(d, y)[1], sums)
+    wide = torch.randn(n_rows, n_columns + 16, device="cuda").bfloat16()
+    wide[:, 8:-8] = d
+    ours = layers.kernels.bias_gradient(aligned_rows(wide[:, 8:-8]), y)
+    assert torch.equal(ours[0], masked) and torch.equal(ours[1], sums)
     same, sums = layers.kernels.bias_gradient(d)
     assert same is d
     expected = d.double().sum(0).float()
@@ -185,12 +231,71 @@ def test_intake_matches_the_plain_form(cameras, lead):
     lanes = torch.tensor([3, 0, 3], device="cuda") if len(lead) == 2 else None
     with torch.autocast("cuda", torch.bfloat16):
         fused = intake.encode(obs, lanes)
-        intake.is_flat = False
+        intake.is_fused = False
         plain = intake.encode(obs, lanes)
     assert fused.dtype == torch.bfloat16
     # a product with 1 / scale may differ in the last bit of float32, and so of bfloat16
     torch.testing.assert_close(fused, plain, rtol=2**-7, atol=1e-6)
     assert (fused == plain).float().mean() > 0.999
+
+
+IMAGE, VECTOR = spaces.MultiImage(1, 3, 1, 16), spaces.MultiVector(1, 3)
+MIXED_SPACES = [
+    dict(rgb=IMAGE, d=spaces.MultiImage(1, 1, 1, 16), imu=VECTOR, health=VECTOR),
+    dict(imu=VECTOR, rgb=spaces.MultiImage(2, 3, 1, 16), health=VECTOR, far=IMAGE),
+    dict(rgb=IMAGE),
+    dict(imu=VECTOR, near=spaces.MultiVector(2, 4)),
+]
+
+
+def mixed_intake(space, lead, device, encoder="conv"):
+    """Returns an intake with statistics, and observations."""
+    torch.manual_seed(0)
+    intake = heads.intake(arrdict(space), 32, encoder)
+    for norm in intake.norms:
+        norm.mean.normal_()
+        norm.scale.uniform_(0.5, 2.0)
+    obs = arrdict({key: torch.randn(*lead, *leaf.shape).half() for key, leaf in space.items()})
+    return intake.to(device), obs.map(lambda leaf: leaf.to(device))
+
+
+@pytest.mark.parametrize("encoder", ["linear", "conv", "cnn"])
+@pytest.mark.parametrize("space", MIXED_SPACES)
+def test_encoders_read_parts_of_wider_rows(space, encoder, monkeypatch):
+    intake, obs = mixed_intake(space, (3, 5), "cpu", encoder)
+    plain = intake.encode(obs)
+
+    def side_by_side(leaves, norms, n_columns, lanes):
+        parts = [norm(leaf).flatten(2) for leaf, norm in zip(leaves, norms, strict=True)]
+        n_zeros = n_columns - sum(part.shape[-1] for part in parts)
+        assert n_columns % 8 == 0 and n_zeros >= intake.n_padding
+        return torch.cat([*parts, torch.zeros(3, 5, n_zeros)], -1)
+
+    monkeypatch.setattr(intakes, "normalised", side_by_side)
+    torch.testing.assert_close(intake.encode(obs), plain)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("space", MIXED_SPACES)
+@pytest.mark.parametrize("lead", [(5,), (3, 40)])
+def test_convolutions_of_an_intake_match_the_plain_form(space, lead):
+    intake, obs = mixed_intake(space, lead, "cuda")
+    lanes = torch.tensor([3, 0, 3], device="cuda") if len(lead) == 2 else None
+    results = []
+    for is_fused in (True, False):
+        intake.is_fused = is_fused
+        with ComputeDtype("cuda", torch.bfloat16):
+            features = intake(obs, lanes)
+            with torch.no_grad():
+                for _ in range(2):  # the second time with what the context remembers
+                    assert_close(intake(obs, lanes), features.detach())
+        weights = torch.randn(features.shape, generator=torch.Generator().manual_seed(1))
+        loss = (features.float() * weights.cuda()).sum()
+        results.append([features.detach(), *torch.autograd.grad(loss, [*intake.parameters()])])
+    for fused, plain in zip(*results, strict=True):
+        assert fused.dtype == plain.dtype
+        error = (fused.float() - plain.float()).norm() / plain.float().norm()
+        assert error < 0.1, error  # 8 bits, and ReLUs near their kink
 
 
 @pytest.mark.cuda

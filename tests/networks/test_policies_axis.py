@@ -229,6 +229,7 @@ def test_bias_gradient(n_columns):
         sums=sums,
         n_rows=n_rows,
         n_columns=n_columns,
+        d_stride=n_columns,
         n_strips=n_strips,
     )
     for i in range(P):

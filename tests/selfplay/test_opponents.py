@@ -42,6 +42,23 @@ def copied(module):
 # ---- Lanes and actions ----
 
 
+@pytest.mark.parametrize("begins", [False, True])
+def test_opponents_act_once_per_step(begins):
+    """The same, whether they start before the actions are known or in the step."""
+    env, other = make_opponents(), make_opponents()
+    for one in (env, other):
+        one.reset()
+    actions = []
+    env.on_actions = other.on_actions = actions.append
+    for _ in range(5):
+        if begins:
+            env.begin_step()
+        for one in (env, other):
+            one.step(arrdict(actions=torch.zeros(32, 1, dtype=torch.int64)))
+        assert torch.equal(*actions[-2:])
+    assert same(env.hidden_state["0"], other.hidden_state["0"]) and env.acting is None
+
+
 def test_fractions_of_environments_and_learning_slots():
     env = make_opponents(n_envs=16, n_agents=2)
     assert {name: int(lanes.sum()) // 2 for name, lanes in env.matchups.items()} == dict(
@@ -367,6 +384,26 @@ def test_pairs_are_won_by_survival_and_else_by_return(n_agents):
     slots = torch.randint(n_agents, (500, 1))
     won, decided = duels.score_pairs(terminal, returns, slots)
     assert (won.tolist(), decided.tolist()) == slow_score_pairs(terminal, returns, slots)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n_agents", [2, 5])
+def test_pairs_of_a_gpu_are_those_of_the_cpu(n_agents):
+    torch.manual_seed(1)
+    envs = [make_opponents(600, n_agents, past=0.0, bot=0.9) for _ in range(2)]
+    for name in ("returns", "pairs", "slots"):
+        setattr(envs[1], name, getattr(envs[1], name).cuda())
+    for _ in range(5):
+        terminal = torch.rand(600 * n_agents) < 0.3
+        truncated = ~terminal & (torch.rand(600 * n_agents) < 0.2)
+        reward = torch.randint(-2, 3, (600 * n_agents,)).float()
+        for env in envs:
+            parts = dict(reward=reward, terminal=terminal, truncated=truncated)
+            env._count_pairs({key: leaf.to(env.pairs.device) for key, leaf in parts.items()})
+    on_cpu, on_gpu = envs
+    assert on_cpu.pairs.any()
+    torch.testing.assert_close(on_gpu.pairs.cpu(), on_cpu.pairs)
+    assert torch.equal(on_gpu.returns.cpu(), on_cpu.returns)
 
 
 @pytest.mark.parametrize("mortal", [False, True])

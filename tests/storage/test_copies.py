@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from megastep.agents.storage import copies
-from megastep.agents.storage.copies import copy_all
+from megastep.agents.storage.copies import copy_all, select_tree
+from megastep.arrdict import arrdict
 
 DTYPES = torch.bool, torch.uint8, torch.int32, torch.int64, torch.float16, torch.float32
 SIZES = 0, 1, 3, 16, 1000, 70_001  # the last takes several blocks
@@ -83,6 +84,19 @@ def test_false_condition_changes_no_bit(device):
         for old, (target, source) in zip(before, pairs, strict=True):
             expected = source.to(target.dtype).expand_as(target) if condition else old
             assert torch.equal(target, expected)
+
+
+def test_selects_lanes_of_a_tree(device):
+    n_lanes, lanes = 70, torch.tensor([3, 69, 0, 3], device=device)
+    leaves = [numbers((n_lanes, 1, 3), dtype, device, seed=i) for i, dtype in enumerate(DTYPES)]
+    leaves += [numbers((4, n_lanes), torch.float32, device, seed=9)[1]]
+    leaves += [numbers((n_lanes, 2), torch.float32, device, seed=9)[:, 1]]
+    tree = arrdict(some=arrdict({str(i): leaf for i, leaf in enumerate(leaves)}), one=leaves[0])
+    selected = select_tree(tree, lanes)
+    assert type(selected) is type(selected.some) is arrdict
+    assert torch.equal(selected.one, leaves[0][lanes])
+    for i, leaf in enumerate(leaves):
+        assert torch.equal(selected.some[str(i)], leaf[lanes]), i
 
 
 def test_nothing_to_copy():

@@ -21,7 +21,7 @@ KERNEL BOUNDS(256) bias_gradient(BiasGradientParams p) {
         for (int i = 0; i < AT_ONCE; i++) {
             int row = min(start + i * strip.step, strip.end - 1);
             long long at = (first + row) * p.n_columns + word * N;
-            read<Bfloat16>(values[i], p.d, at);
+            read<Bfloat16>(values[i], p.d, (first + row) * p.d_stride + word * N);
             if (p.activated)
                 read<Bfloat16>(activated[i], p.activated, at);
         }

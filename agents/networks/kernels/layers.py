@@ -73,13 +73,14 @@ def bias_gradient(
     """Returns the gradient before a ReLU, and its sum over rows, float32.
 
     Args:
-        d: (rows, columns) bfloat16, columns a multiple of 8; the gradient after the ReLU.
+        d: (rows, columns) bfloat16, columns a multiple of 8; the gradient after the ReLU. May be
+            some columns of a wider tensor, as `aligned_rows` returns them.
         activated: the ReLU's outputs. None: there is no ReLU, and `d` is returned.
     """
     n_rows, n_columns = d.shape
     n_words = n_columns * d.element_size() // _WORD
     n_strips = -(-n_rows // _STRIP)
-    d_masked = d if activated is None else torch.empty_like(d)
+    d_masked = d if activated is None else torch.empty_like(activated)
     sums = d.new_empty(n_strips, n_columns, dtype=torch.float32)
     launch_for_policy(
         "bias_gradient",
@@ -93,6 +94,7 @@ def bias_gradient(
         sums=sums,
         n_rows=n_rows,
         n_columns=n_columns,
+        d_stride=d.stride(0),
         n_strips=n_strips,
     )
     return d_masked, sum_rows(sums)

@@ -213,12 +213,13 @@ struct AddReturnsParams {
 };
 
 struct BiasGradientParams {
-    const void* d;          // (P, n_rows, n_columns) bfloat16
-    const void* activated;  // of the same shape; null: no activation
+    const void* d;          // (P, n_rows, n_columns) bfloat16, a row every d_stride numbers
+    const void* activated;  // (P, n_rows, n_columns), as d_masked; null: no activation
     void* d_masked;  // d, 0 where `activated` is not above 0 (NaN counts as above); null without
     float* sums;     // (P, n_strips, n_columns), over STRIP rows each
     int n_rows;      // at most 2^31 - STRIP
     int n_columns;   // a multiple of 8
+    int d_stride;    // a multiple of 8
     int n_strips;
 };
 

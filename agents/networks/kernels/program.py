@@ -81,6 +81,18 @@ def aligned(tensor: torch.Tensor) -> torch.Tensor:
     return tensor.contiguous()
 
 
+def aligned_rows(matrix: torch.Tensor) -> torch.Tensor:
+    """Returns the matrix, or `aligned` of it if a row does not start at a multiple of 16 bytes, or
+    is not contiguous.
+    """
+    n_rows, n_columns = matrix.shape
+    n_bytes = matrix.stride(0) * matrix.element_size()
+    is_apart = n_rows > 1 and matrix.stride(0) >= n_columns and not n_bytes % 16
+    if is_apart and matrix.stride(1) == 1 and not matrix.data_ptr() % 16:
+        return matrix
+    return aligned(matrix)
+
+
 def check_shapes(
     x: torch.Tensor, reset: torch.Tensor, state: arrdict, leaves: tuple[str, ...]
 ) -> None:

@@ -35,3 +35,24 @@ struct DeathmatchStepParams {
     int n_model;       // M
     int n_threads;     // CPU threads
 };
+
+// B lanes, R pixels.
+struct BotParams {
+    const unsigned short* rgb;    // (B, 3, R) fp16
+    const unsigned short* depth;  // (B, R) fp16
+    const unsigned short* imu;    // (B, 3) fp16
+    const unsigned char* reset;   // (B,)
+    const long long* lost;        // (B,) the state; see Bot.initial
+    const long long* side;
+    const long long* around;
+    const unsigned char* pushed;
+    long long* actions;  // (B,) out, as the rest
+    long long* next_lost;
+    long long* next_side;
+    long long* next_around;
+    unsigned char* next_pushed;
+    float slope;  // tangent of half the field of view
+    int n_lanes;
+    int n_pixels;   // R
+    int n_threads;  // CPU threads
+};
