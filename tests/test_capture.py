@@ -262,10 +262,17 @@ def test_a_graph_keeps_the_tensors_it_uses(fake_cuda):
         def __init__(self):
             self.rows = torch.zeros(3)
 
+    class Fields:
+        __slots__ = ("cells",)
+
+        def __init__(self):
+            self.cells = torch.zeros(3)
+
     lazy = Lazy()
-    lazy.constant, lazy.tables = ReadOnlyTensor(torch.ones(2), "constant"), Tables()
+    lazy.constant = ReadOnlyTensor(torch.ones(2), "constant")
+    lazy.tables, lazy.fields = Tables(), Fields()
     graph = capture.Graph(lazy, (), (lazy,))
-    used = lazy.total, lazy.hidden["h"], lazy.constant, lazy.tables.rows
+    used = lazy.total, lazy.hidden["h"], lazy.constant, lazy.tables.rows, lazy.fields.cells
     tensors = [weakref.ref(leaf) for leaf in used]
     del lazy, used
     assert all(tensor() is not None for tensor in tensors)

@@ -34,7 +34,8 @@ OPAQUE = (  # types whose attributes hold no state of an environment
 def children(node, only_state=True):
     """Returns [(step of the path, child)] of a node.
 
-    With ``only_state``, an object of a class with an attribute ``IS_STATELESS`` has none.
+    With ``only_state``, an object with ``__slots__`` in place of a ``__dict__``, or of a class with
+    an attribute ``IS_STATELESS``, has none.
     """
     if only_state and getattr(type(node), "IS_STATELESS", False):
         return []
@@ -48,7 +49,10 @@ def children(node, only_state=True):
         return [(f".{key}", child) for group in (*groups, plain) for key, child in group.items()]
     if hasattr(node, "__dict__"):
         return [(f".{key}", child) for key, child in vars(node).items()]
-    return []
+    if only_state:
+        return []
+    slots = [slot for kind in type(node).__mro__ for slot in getattr(kind, "__slots__", ())]
+    return [(f".{slot}", getattr(node, slot)) for slot in slots if hasattr(node, slot)]
 
 
 def walk(
