@@ -30,8 +30,8 @@ def lengths(homes: list) -> np.ndarray:
     for i, home in enumerate(homes):
         generators = [np.random.default_rng(i)]
         graph = PathGraph([home], engine.AGENT_RADIUS, device)
-        points = geodesics._points(graph, 3 * N_POINTS, generators)
-        goals, spawns = geodesics._largest_part(graph, points, N_POINTS, N_POINTS)
+        points = geodesics.draw_points(graph, 3 * N_POINTS, generators)
+        goals, spawns = geodesics.largest_part(graph, points, N_POINTS, N_POINTS)
         graphs = [graph]
         graphs += [PathGraph([home], engine.AGENT_RADIUS + wider, device) for wider in WIDER]
         columns.append(np.stack([g.lengths(goals, spawns).numpy().ravel() for g in graphs]))

@@ -20,7 +20,7 @@ from megastep.engine.devices import threads
 from megastep.envs.pointgoal.path_graph import CELL, MAX_GOALS, PathGraph
 from megastep.modules.spawning import CLEARANCE, candidates
 
-__all__ = ["CELL", "Geodesics", "geodesics", "n_cells"]
+__all__ = ["CELL", "Geodesics", "draw_points", "geodesics", "largest_part", "n_cells"]
 
 SPARE = 1.5  # times as many points are drawn as needed, as some may be in rooms without a door
 #: Cells of the homes that are searched at once, per thread on a CPU, where signals are handled
@@ -70,8 +70,8 @@ def geodesics(
     n_threads = threads() if device.type == "cpu" else 1
     for chunk in _chunks(geometries, n_threads * CELLS_AT_ONCE[device.type]):
         graph = PathGraph(geometries[chunk], radius, device)
-        points = _points(graph, int(SPARE * (n_spawns + n_goals)), generators[chunk])
-        goals, spawns = _largest_part(graph, points, n_goals, n_spawns)
+        points = draw_points(graph, int(SPARE * (n_spawns + n_goals)), generators[chunk])
+        goals, spawns = largest_part(graph, points, n_goals, n_spawns)
         lengths = graph.lengths(goals, spawns).cpu().numpy()
         fields = graph.fields(goals)
         for d, origin in enumerate(graph.origins):
@@ -110,7 +110,7 @@ def _chunks(geometries, most):
     yield slice(first, len(geometries))
 
 
-def _points(graph, n, generators):
+def draw_points(graph: PathGraph, n: int, generators: Sequence[np.random.Generator]) -> np.ndarray:
     """Returns random points (D, n, 2) float32 in the rooms of a graph's homes, 5 cm clear of the
     walls. If fewer fit, they are repeated.
     """
@@ -138,7 +138,9 @@ def _points(graph, n, generators):
     return np.stack([np.resize(points, (n, 2)) for points in found])
 
 
-def _largest_part(graph, points, n_goals, n_spawns):
+def largest_part(
+    graph: PathGraph, points: np.ndarray, n_goals: int, n_spawns: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns goals (D, n_goals, 2) and spawn points (D, n_spawns, 2): the first of points (D, K,
     2) in the connected part of each home that holds most of them.
     """
