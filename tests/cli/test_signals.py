@@ -123,7 +123,10 @@ def test_signal_while_training(here, monkeypatch, capsys, moment, number):
         train.main([*TINY, "samples=1e9", "folder=run", "checkpoint_seconds=1e-9"]) == 128 + number
     )
     step = checkpoint.load_latest(here / "run" / "checkpoints").step
-    assert step == 2 * UPDATE or (moment is saving and step == 3 * UPDATE)
+    if moment is saving:  # while the second checkpoint is written, any number of updates go by
+        assert step >= 2 * UPDATE and step % UPDATE == 0
+    else:
+        assert step == 2 * UPDATE
     expected = f"train.py: Stopped after {step} samples. To continue: python train.py resume=run\n"
     assert capsys.readouterr().err == expected
     assert not list((here / "run" / "checkpoints").glob("*tmp*"))
