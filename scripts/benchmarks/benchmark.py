@@ -91,7 +91,10 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--envs", nargs="+", choices=COMPARED, help="for worlds and learners")
     parser.add_argument(
-        "--samples", type=int, metavar="N", help="samples per run, for duels, ablation, published"
+        "--samples",
+        type=int,
+        metavar="N",
+        help="samples per run, for duels, ablation, curricula, published",
     )
     parser.add_argument("--tasks", nargs="+", choices=TASKS, metavar="TASK", help="for published")
     parser.add_argument("--seconds", type=int, metavar="S", help="limit of a run, for published")

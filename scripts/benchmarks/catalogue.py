@@ -15,7 +15,7 @@ from replay_buffer import replay
 from scaling import ranks, scaling
 from shortest_paths import paths
 from startup_times import compile_kernels, first_step, startup
-from training_benchmarks import ablation, duels, learners, train, worlds
+from training_benchmarks import ablation, curricula, duels, learners, train, worlds
 
 BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "step": step,
@@ -38,6 +38,7 @@ BENCHMARKS: dict[str, Callable[..., Iterator[dict]]] = {
     "duels": duels,
     "ablation": ablation,
     "learners": learners,
+    "curricula": curricula,
     "published": published,
     "peers": peers,
     "scaling": scaling,

@@ -1,13 +1,15 @@
-"""Benchmarks that train: `train`, `worlds`, `duels`, `ablation`, `learners`.
+"""Benchmarks that train: `train`, `worlds`, `duels`, `ablation`, `learners`, `curricula`.
 
 The titles of what is trained are part of the records' names, which join old and new measurements.
 """
 
 import itertools
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
+from timing import measurement
 from training_runs import (
     evaluate,
     learning_curve,
@@ -15,6 +17,7 @@ from training_runs import (
     newest_evaluation,
     rating,
     ratings,
+    reports,
     share_of_duels_won,
     trained,
     training_rate,
@@ -97,6 +100,15 @@ COMPARED = {
     "Pong": ("env=pong agent.core=none learner.gamma=0.99", "points_won", 12),
     "PointGoal": ("env=pointgoal geometry=homes geometry.n=2000 learner.gamma=0.99", "spl", 30),
 }
+
+# ---- curricula: a comparison ----
+
+CURRICULA = "none", "plr", "sfl"
+CURRICULUM_RECIPE = "experiment=pointgoal_anywhere", "seconds=null", *NO_FINISH
+EVALUATED_IN = "geometry=suite", "episodes=1024", "baseline=false"
+LEARNABILITY = "env=pointgoal", "geometry.n=4096", "curriculum=sfl", "log_every=4", *NO_FINISH
+LEARNABILITY_SECONDS = 10
+N_EPISODES = 10  # in each home: the standard error of a success rate is at most 0.16
 
 
 def curve_metric(title: str) -> str:
@@ -202,3 +214,50 @@ def learners(
                     yield training_rate(what, curve)
                 place = "in unseen homes" if row["homes"] else "in first episodes"
                 yield metric_mean(f"{what}: {metric} {place}", row, metric)
+
+
+def curricula(
+    device: torch.device, seeds: Sequence[int] = SEEDS, samples: int = 1_000_000_000
+) -> Iterator[dict]:
+    """PointGoal in floor plans of several makes, with each curriculum and equally many samples, all
+    side by side on all GPUs: success and SPL in each source of the suite, in the worst and in the
+    worst dense homes, a sample per seed. Then how soon 10 episodes have ended in each of 4,096
+    homes, so that their learnability is known.
+    """
+    pairs = [(curriculum, seed) for curriculum in CURRICULA for seed in seeds]
+    devices = [*itertools.islice(itertools.cycle(_devices(device)), len(pairs))]
+    runs = [
+        (*CURRICULUM_RECIPE, f"curriculum={name}", f"seed={seed}", f"samples={samples}", word)
+        for (name, seed), word in zip(pairs, [f"device={one}" for one in devices])
+    ]
+    found = {}
+    with trained(device, *runs) as folders, ThreadPoolExecutor(len(runs)) as pool:
+        tables = pool.map(lambda run, one: evaluate(run, one, *EVALUATED_IN), folders, devices)
+        for (name, _), rows in zip(pairs, tables):
+            for row, metric in itertools.product(rows, ("success", "spl")):
+                key = f"{name}, {_part(row)}: {metric}"
+                found.setdefault(key, []).append(row["metrics"][metric]["mean"])
+    for key, values in found.items():
+        yield measurement(f"pointgoal, {samples / 1e6:.0f} M samples, curriculum {key}", "", values)
+    with trained(device, (*LEARNABILITY, f"seconds={LEARNABILITY_SECONDS}")) as (run,):
+        known = [
+            row["perf/seconds"]
+            for row in reports(run)
+            if row.get("curriculum/fewest_episodes", 0) >= N_EPISODES
+        ]
+    if known:
+        what = f"seconds of training until {N_EPISODES} episodes have ended in each of 4,096 homes"
+        yield measurement(what, "s", known[:1])
+
+
+def _devices(device):
+    """Returns all GPUs, or the CPU."""
+    if device.type == "cpu":
+        return [device]
+    return [torch.device("cuda", i) for i in range(torch.cuda.device_count())]
+
+
+def _part(row):
+    if row.get("is_worst"):
+        return "worst source"
+    return f"{row['source']}, worst 5 % of homes" if "tail" in row else row["source"]

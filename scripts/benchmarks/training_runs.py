@@ -80,16 +80,21 @@ def ratings(run: Path, device: torch.device, n_duels: int) -> list[dict[str, str
     return list(csv.DictReader((run / "ratings.csv").read_text().splitlines()))
 
 
-def learning_curve(run: Path, metric: str = "return") -> list[CurvePoint]:
-    """Returns a metric of the episodes that ended during training, a point per logged update."""
+def reports(run: Path) -> list[dict]:
+    """Returns the reports of training, each with those of `perf.jsonl` at the same samples."""
     metrics, perf = (
         {row["samples"]: row for row in map(json.loads, (run / name).read_text().splitlines())}
         for name in ("metrics.jsonl", "perf.jsonl")
     )
+    return [row | perf[samples] for samples, row in metrics.items() if samples in perf]
+
+
+def learning_curve(run: Path, metric: str = "return") -> list[CurvePoint]:
+    """Returns a metric of the episodes that ended during training, a point per logged update."""
     return [
-        (perf[samples]["perf/seconds"], samples, row[f"episode/{metric}"])
-        for samples, row in metrics.items()
-        if samples in perf and f"episode/{metric}" in row
+        (row["perf/seconds"], row["samples"], row[f"episode/{metric}"])
+        for row in reports(run)
+        if f"episode/{metric}" in row
     ]
 
 

@@ -106,3 +106,28 @@ def test_learners_are_compared_and_drawn(monkeypatch, tmp_path):
     figures.plot_learners([row | fields for row in rows], tmp_path / "learners.svg")
     figure = (tmp_path / "learners.svg").read_text()
     assert "PPO" in figure and "R2D2" in figure
+
+
+@pytest.mark.slow
+def test_curricula_are_compared_by_source_and_worst_homes(monkeypatch):
+    small = "env=pointgoal", "preset=cpu", "env.n_envs=32", "env.res=16", "env.subsample=1"
+    homes = "geometry=mixed", "geometry.parts={homes:8,mazes:{source:maze,n:4}}", "log_every=1"
+    recipe = *small, *homes, *training_benchmarks.NO_FINISH
+    places = "generated:{source:homes,n:4},dense:{source:homes,n:20,density:2}"
+    monkeypatch.setattr(training_benchmarks, "CURRICULUM_RECIPE", recipe)
+    monkeypatch.setattr(
+        training_benchmarks,
+        "EVALUATED_IN",
+        ("geometry=suite", f"geometry.parts={{{places}}}", "episodes=20", "baseline=false"),
+    )
+    monkeypatch.setattr(training_benchmarks, "CURRICULA", ("none", "plr"))
+    learnability = *training_benchmarks.LEARNABILITY, *small, "geometry.n=4", "env.limit=8"
+    monkeypatch.setattr(training_benchmarks, "LEARNABILITY", learnability)
+    monkeypatch.setattr(training_benchmarks, "LEARNABILITY_SECONDS", 3)
+    *rows, seconds = training_benchmarks.curricula(CPU, seeds=(1, 2), samples=4096)
+    # generated, dense, its worst homes and the worst source; success and SPL
+    assert len(rows) == 2 * 4 * 2
+    assert {row["n"] for row in rows} == {2} and all(0 <= row["value"] <= 1 for row in rows)
+    assert rows[0]["what"] == "pointgoal, 0 M samples, curriculum none, generated: success"
+    assert any(row["what"].endswith("plr, dense, worst 5 % of homes: spl") for row in rows)
+    assert 0 < seconds["value"] <= training_benchmarks.LEARNABILITY_SECONDS
