@@ -5,13 +5,13 @@ The titles of what is trained are part of the records' names, which join old and
 
 import itertools
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
 from timing import measurement
 from training_runs import (
     evaluate,
+    evaluate_all,
     learning_curve,
     metric_mean,
     newest_evaluation,
@@ -30,33 +30,27 @@ EXPLORER = "geometry=bench", "finish.evaluate=true"  # overrides of `train`
 
 # ---- worlds: a recipe per environment ----
 
-PLACES = {
-    "homes": "geometry=homes",
-    "mazes": "geometry=maze geometry.braid=0.3",
-    "a box": "geometry=box",
-}
-#: Where agents trained in those are evaluated as well: homes of another make.
-OTHER_PLACES = {"dense homes": "geometry=bench"}
+#: Overrides of an evaluation in floor plans of several makes.
+SUITE = "geometry=suite episodes=1024"
+TRAINED_IN = {"homes": "geometry=homes", "mazes": "geometry=maze geometry.braid=0.3"}
 AGENTS = {"Explorer": "env=explorer", "PointGoal": "experiment=pointgoal"}
-#: Title: (overrides of training, {place: overrides of its evaluation}).
+#: Title: (overrides of training, overrides of the evaluation). Those that take equally long are
+#: neighbours, as several GPUs train several at a time.
 RECIPES = {
+    "Pong from features": ("experiment=pong", ""),
+    "Pong, self-play": ("experiment=pong env.self_play=true seconds=25", "env=pong"),
+    "Pong from pictures": ("experiment=pong_pixels", ""),
     "PointGoal, continuous actions, trained in homes": (
         "experiment=pointgoal env.control=continuous seconds=60",
-        {"homes": "geometry=homes"},
-    ),
-    "Pong from features": ("experiment=pong", {"": ""}),
-    "Pong from pictures": ("experiment=pong_pixels", {"": ""}),
-    "Pong, self-play": (
-        "experiment=pong env.self_play=true seconds=25",
-        {"court of the tracker": "env=pong"},
+        SUITE,
     ),
     **{
         f"{name}, trained in {place}": (
-            f"{overrides} {PLACES[place]} geometry.n=2000 seconds=60",
-            PLACES | OTHER_PLACES,
+            f"{overrides} {homes} geometry.n=2000 seconds=60",
+            SUITE,
         )
         for name, overrides in AGENTS.items()
-        for place in ("homes", "mazes")
+        for place, homes in TRAINED_IN.items()
     },
 }
 #: The metric that learning curves show.
@@ -133,21 +127,29 @@ def train(
 
 
 def worlds(device: torch.device, envs: Sequence[str] = tuple(COMPARED)) -> Iterator[dict]:
-    """Each environment's recipe, one seed: metrics of first episodes in unseen places, of the
-    trained agent and of random actions.
+    """Each environment's recipe, one seed, each on a GPU of its own: metrics of first episodes, of
+    the trained agent and of random actions; where there are homes, in each source of the suite.
     """
     chosen = {title: recipe for title, recipe in RECIPES.items() if title.startswith(tuple(envs))}
-    for title, (recipe, places) in chosen.items():
-        with trained(device, (*recipe.split(), *NO_FINISH)) as (run,):
-            curve = learning_curve(run, curve_metric(title))
-            seconds, samples, _ = curve[-1]
-            yield training_rate(title, curve)
-            for place, overrides in places.items():
+    titles, devices = [*chosen], _devices(device)
+    for first in range(0, len(titles), len(devices)):
+        batch = titles[first : first + len(devices)]
+        runs = [
+            (*chosen[title][0].split(), *NO_FINISH, f"device={one}")
+            for title, one in zip(batch, devices)
+        ]
+        with trained(device, *runs) as folders:
+            tables = evaluate_all(folders, devices, *(chosen[title][1].split() for title in batch))
+            for title, folder, rows in zip(batch, folders, tables):
+                curve = learning_curve(folder, curve_metric(title))
+                seconds, samples, _ = curve[-1]
+                yield training_rate(title, curve)
                 what = f"{title}, {seconds:.0f} s, {samples / 1e6:.0f} M samples"
-                what += f", in {place}" if place else ""
-                for row in evaluate(run, device, *overrides.split()):
+                for row in rows:
+                    place = f", in {_part(row)}" if "source" in row else ""
                     for metric in ("return", *row["metrics"]):
-                        yield metric_mean(f"{what}: {metric}, {row['agent']}", row, metric)
+                        name = f"{what}{place}: {metric}, {row['agent']}"
+                        yield metric_mean(name, row, metric)
 
 
 def duels(
@@ -231,8 +233,8 @@ def curricula(
         for (name, seed), word in zip(pairs, [f"device={one}" for one in devices])
     ]
     found = {}
-    with trained(device, *runs) as folders, ThreadPoolExecutor(len(runs)) as pool:
-        tables = pool.map(lambda run, one: evaluate(run, one, *EVALUATED_IN), folders, devices)
+    with trained(device, *runs) as folders:
+        tables = evaluate_all(folders, devices, *[EVALUATED_IN] * len(runs))
         for (name, _), rows in zip(pairs, tables):
             for row, metric in itertools.product(rows, ("success", "spl")):
                 key = f"{name}, {_part(row)}: {metric}"

@@ -7,7 +7,8 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
@@ -63,6 +64,20 @@ def evaluate(run: Path, device: torch.device, *overrides: str) -> list[dict]:
     command = [sys.executable, "evaluate.py", f"run={run}", f"device={device}", *overrides]
     subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=True)
     return newest_evaluation(run)
+
+
+def evaluate_all(
+    runs: Sequence[Path], devices: Sequence[torch.device], *overrides: Sequence[str]
+) -> list[list[dict]]:
+    """Evaluates runs at the same time, each on its device and with its overrides. Returns the rows
+    of each table.
+    """
+    with ThreadPoolExecutor(len(runs)) as pool:
+        return [
+            *pool.map(
+                lambda run, device, words: evaluate(run, device, *words), runs, devices, overrides
+            )
+        ]
 
 
 def newest_evaluation(run: Path) -> list[dict]:

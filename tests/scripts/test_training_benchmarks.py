@@ -43,19 +43,29 @@ def test_failing_run_raises():
 
 
 @pytest.mark.slow
-def test_recipes_are_trained_and_evaluated_in_each_place(monkeypatch):
-    recipe = (
-        "env=pong preset=cpu samples=8192 env.n_envs=32 log_every=1",
-        {"": "", "games": "episodes=7"},
+def test_recipes_are_trained_and_evaluated_by_source(monkeypatch):
+    pong = "env=pong preset=cpu samples=8192 env.n_envs=32 log_every=1"
+    pointgoal = (
+        "env=pointgoal preset=cpu samples=4096 env.n_envs=32 env.limit=16 env.res=64 log_every=1"
     )
-    monkeypatch.setattr(training_benchmarks, "RECIPES", {"Pong": recipe})
-    rate, *rows = training_benchmarks.worlds(CPU)
+    parts = "geometry.parts={dense:{source:homes,n:20},box:{n:1}}"
+    recipes = {
+        "Pong": (pong, "episodes=7"),
+        "PointGoal": (pointgoal, f"geometry=suite {parts} episodes=20"),
+    }
+    monkeypatch.setattr(training_benchmarks, "RECIPES", recipes)
+    rows = list(training_benchmarks.worlds(CPU))
+    by_title = {title: [row for row in rows if row["what"].startswith(title)] for title in recipes}
+    rate, *pong = by_title["Pong"]
     assert rate["unit"] == "M/s" and all(0 <= won <= 1 for _, _, won in rate["curve"])
-    # two places, two agents, two metrics
-    assert len(rows) == 2 * 2 * 2 and {row["n"] for row in rows} == {1024, 7}
-    assert all(row["what"].startswith("Pong, ") for row in rows)
-    assert sum(": points_won, " in row["what"] for row in rows) == 4
-    assert sum(row["what"].endswith(", random") for row in rows) == 4
+    # two agents, two metrics
+    assert len(pong) == 2 * 2 and {row["n"] for row in pong} == {7}
+    assert sum(": points_won, " in row["what"] for row in pong) == 2
+    assert sum(row["what"].endswith(", random") for row in pong) == 2
+    rate, *pointgoal = by_title["PointGoal"]
+    # two agents; two sources, the worst and the worst dense homes; four metrics and the return
+    assert len(pointgoal) == 2 * 4 * 5 and rate["unit"] == "M/s"
+    assert any(", in dense, worst 5 % of homes: spl, " in row["what"] for row in pointgoal)
 
 
 @pytest.mark.slow
