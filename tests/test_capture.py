@@ -268,11 +268,15 @@ def test_a_graph_keeps_the_tensors_it_uses(fake_cuda):
         def __init__(self):
             self.cells = torch.zeros(3)
 
+    class NamedFields(Fields):
+        """Has a ``__dict__`` beside the slots of its base."""
+
     lazy = Lazy()
     lazy.constant = ReadOnlyTensor(torch.ones(2), "constant")
-    lazy.tables, lazy.fields = Tables(), Fields()
+    lazy.tables, lazy.fields, lazy.named = Tables(), Fields(), NamedFields()
     graph = capture.Graph(lazy, (), (lazy,))
     used = lazy.total, lazy.hidden["h"], lazy.constant, lazy.tables.rows, lazy.fields.cells
+    used += (lazy.named.cells,)
     tensors = [weakref.ref(leaf) for leaf in used]
     del lazy, used
     assert all(tensor() is not None for tensor in tensors)

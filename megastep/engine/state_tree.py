@@ -47,12 +47,12 @@ def children(node, only_state=True):
         groups = [getattr(node, group) for group in ("_parameters", "_buffers", "_modules")]
         plain = {key: child for key, child in vars(node).items() if not key.startswith("_")}
         return [(f".{key}", child) for group in (*groups, plain) for key, child in group.items()]
-    if hasattr(node, "__dict__"):
-        return [(f".{key}", child) for key, child in vars(node).items()]
+    below = [(f".{key}", child) for key, child in getattr(node, "__dict__", {}).items()]
     if only_state:
-        return []
+        return below
+    # a class without slots may have a base that has some
     slots = [slot for kind in type(node).__mro__ for slot in getattr(kind, "__slots__", ())]
-    return [(f".{slot}", getattr(node, slot)) for slot in slots if hasattr(node, slot)]
+    return below + [(f".{slot}", getattr(node, slot)) for slot in slots if hasattr(node, slot)]
 
 
 def walk(

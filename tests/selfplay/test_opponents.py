@@ -6,8 +6,9 @@ import copy
 
 import pytest
 import torch
+from torch.utils._pytree import tree_leaves
 
-from megastep import contract
+from megastep import contract, envs, toys
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay import duels
@@ -57,6 +58,42 @@ def test_opponents_act_once_per_step(begins):
             one.step(arrdict(actions=torch.zeros(32, 1, dtype=torch.int64)))
         assert torch.equal(*actions[-2:])
     assert same(env.hidden_state["0"], other.hidden_state["0"]) and env.acting is None
+
+
+def collected(device, has_streams, is_captured=False):
+    """Returns the tensors of four rollouts against past selves and a bot, with new weights and a
+    new snapshot after each.
+    """
+    env = envs.Deathmatch(
+        37, [toys.box()], n_agents=3, device=device, limit=20, res=128, privileged=True
+    )
+    policy = policy_of(env, width=64, privileged_space=env.privileged_space, encoder="conv")
+    policy = policy.to(device)
+    opponents = Opponents(env, policy, env.bot(), past=0.5, bot=0.25, snapshots=3, every=1, seed=2)
+    if not has_streams:
+        opponents.mixed_policy.streams = []
+    collector = PPO(policy, n_steps=8, n_minibatches=2).collector(opponents)
+    collector.can_capture = is_captured
+    tensors = []
+    for n_updates in range(1, 5):
+        rollout = collector()
+        tensors += [leaf.clone() for leaf in tree_leaves(rollout.state_dict())]
+        with torch.no_grad():
+            for weight in policy.parameters():
+                weight.mul_(1.5)
+        opponents.refresh_snapshots(policy, n_updates)
+    assert (collector.graph is not None) == is_captured
+    return tensors
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("is_captured", [False, True])
+def test_streams_of_opponents_change_no_bit(is_captured):
+    """They act beside the policy, or one after the other: three times, as a race may go well."""
+    expected = collected("cuda", False, is_captured)
+    for _ in range(3):
+        for tensor, other in zip(collected("cuda", True, is_captured), expected, strict=True):
+            assert torch.equal(tensor, other)
 
 
 def test_fractions_of_environments_and_learning_slots():
