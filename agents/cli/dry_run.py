@@ -1,7 +1,8 @@
 """Prints what a training run would do: the sizes of a rank, and of all."""
 
 from megastep.agents.cli import console, factory, launch, settings
-from megastep.types import n_lanes
+from megastep.agents.selfplay.opponents import count_environments
+from megastep.types import n_lanes, optional
 
 
 def show(cfg: settings.Train) -> None:
@@ -26,8 +27,24 @@ def sizes(cfg: settings.Train, device) -> dict[str, int]:
     n_steps = getattr(cfg.learner, "n_steps", None)
     n_minibatches = getattr(cfg.learner, "n_minibatches", None)
     numbers = {"environments": cfg.env.n_envs, "lanes": lanes}
+    n_opponents = count_opponents(cfg, sample)
+    if n_opponents:
+        lanes -= n_opponents
+        numbers["lanes that learn"] = lanes
     if n_steps:
         numbers["samples of an update"] = lanes * n_steps
     if n_steps and n_minibatches:
         numbers["samples of a minibatch"] = lanes * n_steps // n_minibatches
     return numbers
+
+
+def count_opponents(cfg: settings.Train, sample) -> int:
+    """Returns the number of lanes that opponents play. UserError if they do not fit."""
+    opponents = cfg.opponents
+    if not (opponents.past or opponents.bot):
+        return 0
+    shares = opponents.past, opponents.bot, opponents.snapshots
+    with factory.errors():
+        n_per_snapshot, n_bot = count_environments(sample, cfg.env.n_envs, *shares)
+    n_past = n_per_snapshot * opponents.snapshots if opponents.past else 0
+    return (n_past + n_bot) * (optional(sample, "n_agents") - 1)

@@ -74,7 +74,7 @@ class Opponents:
     ):
         self.env, self.every, device = env, every, env.device
         self.on_actions, self.scripted = None, scripted if bot else None
-        n_per_snapshot, n_bot = count_environments(env, past, bot, snapshots)
+        n_per_snapshot, n_bot = count_environments(env, env.n_envs, past, bot, snapshots)
         if bot and scripted is None:
             raise ValueError(
                 f"opponents.bot={bot} needs a bot that plays: pass scripted=, a policy, or bot=0"
@@ -237,8 +237,10 @@ class Opponents:
         return {name: getattr(self, name) for name in names}
 
 
-def count_environments(env: Env, past: float, bot: float, snapshots: int) -> tuple[int, int]:
-    """Returns the number of environments per snapshot, and against the bot.
+def count_environments(
+    env: Env, n_envs: int, past: float, bot: float, snapshots: int
+) -> tuple[int, int]:
+    """Returns the number of environments per snapshot, and against the bot, of `n_envs` like `env`.
 
     Raises:
         ValueError: as for `Opponents`.
@@ -257,16 +259,16 @@ def count_environments(env: Env, past: float, bot: float, snapshots: int) -> tup
             f"opponents.past={past} and opponents.bot={bot} are fractions of the environments, so "
             "their sum must be at most 1"
         )
-    n_past, n_bot = round(past * env.n_envs), round(bot * env.n_envs)
+    n_past, n_bot = round(past * n_envs), round(bot * n_envs)
     if past and n_past < snapshots:
         raise ValueError(
-            f"opponents.past={past} of {env.n_envs:,} environments is {n_past:,} environments, too "
+            f"opponents.past={past} of {n_envs:,} environments is {n_past:,} environments, too "
             f"few for opponents.snapshots={snapshots:,}: reduce opponents.snapshots or raise "
             "env.n_envs"
         )
     if bot and not n_bot:
         raise ValueError(
-            f"opponents.bot={bot} of {env.n_envs:,} environments is none: raise opponents.bot or "
+            f"opponents.bot={bot} of {n_envs:,} environments is none: raise opponents.bot or "
             "env.n_envs"
         )
     return n_past // snapshots, n_bot

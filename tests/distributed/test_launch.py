@@ -98,6 +98,19 @@ def test_dry_run(here, capsys):
         assert {str(number), str(3 * number)} <= set(line.split())
 
 
+def test_dry_run_counts_lanes_that_learn(here, capsys):
+    duels = "env=deathmatch", "geometry=box", "preset=cpu", "device=cpu", "dry_run=true"
+    sizes = "env.n_envs=10", "env.n_agents=3", "opponents.past=0.4", "opponents.snapshots=2"
+    assert train.main([*duels, *sizes, "opponents.bot=0.2", "learner.n_steps=8"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    (learn,) = (line for line in lines if "learn" in line)
+    (update,) = (line for line in lines if "update" in line)
+    # six environments have opponents, two each
+    assert str(30 - 6 * 2) in learn and str(8 * (30 - 6 * 2)) in update
+    assert train.main([*duels, *sizes, "opponents.past=0.9", "opponents.bot=0.2"]) == 2
+    assert "their sum must be at most 1" in capsys.readouterr().err
+
+
 # ---- What the ranks' endings mean for the process that launched them ----
 
 
