@@ -1,0 +1,97 @@
+"""Linear layers on a CPU: matrix products by a kernel, in float32.
+
+PyTorch's own products of these sizes are half as fast on some processors, and its threads cost more
+than they gain; see `docs/lab/speed-cpu.md`.
+"""
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from megastep.agents.networks.kernels.program import is_built_for_cpu, run_on_cpu
+
+
+def fits(*tensors: torch.Tensor) -> bool:
+    """Returns whether the kernel can take these tensors, which needs a C++ compiler."""
+    is_float = all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+    return is_float and is_built_for_cpu()
+
+
+def matmul(
+    a: torch.Tensor,
+    b: torch.Tensor,
+    out: torch.Tensor | None = None,
+    bias: torch.Tensor | None = None,
+    adds: bool = False,
+    has_relu: bool = False,
+) -> torch.Tensor:
+    """Returns the product of (rows, depth) and (depth, columns), of any strides, without a
+    gradient.
+
+    Args:
+        a, b: the matrices, that `fit`.
+        out: where to write it, (rows, columns) with contiguous rows. None: a new tensor.
+        bias: (columns,) to add.
+        adds: adds to what `out` holds.
+        has_relu: applies a ReLU at the end.
+    """
+    if out is None:
+        out = torch.empty(len(a), b.shape[1])
+    run_on_cpu(
+        "matmul",
+        a=a,
+        b=b,
+        bias=None if bias is None else bias.contiguous(),
+        out=out,
+        a_row=a.stride(0),
+        a_column=a.stride(1),
+        b_row=b.stride(0),
+        b_column=b.stride(1),
+        out_row=out.stride(0),
+        n_rows=len(a),
+        n_columns=b.shape[1],
+        depth=len(b),
+        adds=adds,
+        has_relu=has_relu,
+    )
+    return out
+
+
+class CpuLinear(torch.autograd.Function):
+    """A linear layer, with a ReLU: parts (..., in) that count as concatenated -> (..., out)."""
+
+    @staticmethod
+    def forward(ctx, weight, bias, has_relu, *parts):
+        lead, flat = parts[0].shape[:-1], [part.flatten(0, -2) for part in parts]
+        weights = weight.split([part.shape[-1] for part in parts], 1)
+        out = torch.empty(len(flat[0]), len(weight))
+        for i, (part, its_weight) in enumerate(zip(flat, weights, strict=True)):
+            is_first, is_last = i == 0, i == len(parts) - 1
+            matmul(
+                part,
+                its_weight.T,
+                out,
+                bias if is_first else None,
+                adds=not is_first,
+                has_relu=has_relu and is_last,
+            )
+        ctx.has_relu = has_relu
+        ctx.save_for_backward(weight, *flat, *[out] * has_relu)
+        return out.unflatten(0, lead)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d):
+        weight, *saved = ctx.saved_tensors
+        parts, activated = (saved[:-1], saved[-1:]) if ctx.has_relu else (saved, [])
+        lead, d = d.shape[:-1], d.flatten(0, -2)
+        if ctx.has_relu:
+            d = torch.ops.aten.threshold_backward(d, *activated, 0)
+        sizes = [part.shape[1] for part in parts]
+        d_weight = torch.empty_like(weight)
+        d_parts = [None] * len(parts)
+        rows = zip(parts, weight.split(sizes, 1), d_weight.split(sizes, 1), strict=True)
+        for i, (part, its_weight, its_gradient) in enumerate(rows):
+            matmul(d.T, part, its_gradient)
+            if ctx.needs_input_grad[3 + i]:
+                d_parts[i] = matmul(d, its_weight).unflatten(0, lead)
+        return d_weight, d.sum(0), None, *d_parts
