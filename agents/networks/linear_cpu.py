@@ -1,7 +1,5 @@
-"""Linear layers on a CPU: matrix products by a kernel, in float32.
-
-PyTorch's own products of these sizes are half as fast on some processors, and its threads cost more
-than they gain; see `docs/lab/speed-cpu.md`.
+"""Linear layers on a CPU: float32 matrix products by a kernel, which divides large ones among the
+engine's threads. `torch.nn.functional.linear` is the same in PyTorch.
 """
 
 import torch
@@ -61,37 +59,29 @@ class CpuLinear(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, weight, bias, has_relu, *parts):
-        lead, flat = parts[0].shape[:-1], [part.flatten(0, -2) for part in parts]
-        weights = weight.split([part.shape[-1] for part in parts], 1)
-        out = torch.empty(len(flat[0]), len(weight))
-        for i, (part, its_weight) in enumerate(zip(flat, weights, strict=True)):
-            is_first, is_last = i == 0, i == len(parts) - 1
-            matmul(
-                part,
-                its_weight.T,
-                out,
-                bias if is_first else None,
-                adds=not is_first,
-                has_relu=has_relu and is_last,
-            )
-        ctx.has_relu = has_relu
-        ctx.save_for_backward(weight, *flat, *[out] * has_relu)
-        return out.unflatten(0, lead)
+        ctx.has_relu, lead, last = has_relu, parts[0].shape[:-1], len(parts) - 1
+        parts = [part.reshape(-1, part.shape[-1]) for part in parts]
+        weights = weight.split([part.shape[1] for part in parts], 1)
+        out = torch.empty(len(parts[0]), len(weight))
+        for i, (part, its_weight) in enumerate(zip(parts, weights, strict=True)):
+            its_bias = bias if i == 0 else None
+            matmul(part, its_weight.T, out, its_bias, adds=i > 0, has_relu=has_relu and i == last)
+        ctx.save_for_backward(weight, *parts, *[out] * has_relu)
+        return out.view(*lead, len(weight))
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d):
         weight, *saved = ctx.saved_tensors
         parts, activated = (saved[:-1], saved[-1:]) if ctx.has_relu else (saved, [])
-        lead, d = d.shape[:-1], d.flatten(0, -2)
+        lead, d = d.shape[:-1], d.reshape(-1, len(weight))
         if ctx.has_relu:
             d = torch.ops.aten.threshold_backward(d, *activated, 0)
+        d_weight, d_parts = torch.empty_like(weight), [None] * len(parts)
         sizes = [part.shape[1] for part in parts]
-        d_weight = torch.empty_like(weight)
-        d_parts = [None] * len(parts)
         rows = zip(parts, weight.split(sizes, 1), d_weight.split(sizes, 1), strict=True)
         for i, (part, its_weight, its_gradient) in enumerate(rows):
             matmul(d.T, part, its_gradient)
             if ctx.needs_input_grad[3 + i]:
-                d_parts[i] = matmul(d, its_weight).unflatten(0, lead)
+                d_parts[i] = matmul(d, its_weight).view(*lead, sizes[i])
         return d_weight, d.sum(0), None, *d_parts
