@@ -218,8 +218,8 @@ static void find_samples(const RenderParams& p, const EnvScenery& scenery, Rays&
     }
 }
 
-// Returns the number of newly seen texels. Nearly all were seen before, so blocks of rays are tested
-// for others first.
+// Returns the number of newly seen texels. Nearly all were seen before, so blocks of rays are
+// tested for others first.
 static int mark_all_seen(const EnvScenery& scenery, Rays& rays, unsigned int* seen) {
     int newly_seen = 0, n_agent_lines = scenery.n_agent_lines, first_texel = scenery.first_texel;
     const int *index = rays.index.data(), *texel = rays.texel.data();

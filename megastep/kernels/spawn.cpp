@@ -5,7 +5,7 @@ constexpr int MIN_PARALLEL = 1 << 14;  // agents, few of which respawn
 
 KERNEL spawn(const SpawnParams& p) {
     const SceneryParams& s = p.scenery;
-#pragma omp parallel for num_threads(threads_for(s, s.n_envs * s.n_agents, MIN_PARALLEL))
+#pragma omp parallel for num_threads(threads_for(s, s.n_envs* s.n_agents, MIN_PARALLEL))
     for (int env = 0; env < s.n_envs; env++)
         spawn_env<0>(p, SingleThread{0}, env);
 }

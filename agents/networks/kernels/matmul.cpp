@@ -8,9 +8,11 @@
 #include "params.h"
 #include "vector.h"
 
-constexpr int WIDE = 4;             // vectors of a tile
-constexpr int PANEL = WIDE * SIZE;  // columns of a block of b
-constexpr int DEPTH = 2048 / SIZE;  // rows of such a block, at most: 32 kB
+// A tile of sums, and what they are added to, fit 32 registers with AVX-512 and 16 without.
+constexpr int WIDE = SIZE == 16 ? 4 : 2;       // vectors of a tile
+constexpr int TILE_ROWS = SIZE == 16 ? 4 : 6;  // rows of a tile
+constexpr int PANEL = WIDE * SIZE;             // columns of a block of b
+constexpr int DEPTH = 8192 / PANEL;            // rows of such a block, at most: 32 kB
 
 // Waking a sleeping thread takes 50 us; 2^25 multiples take a thread 300 us.
 static int threads_of(const MatmulParams& p) {
@@ -60,7 +62,7 @@ static void tile(const MatmulParams& p, const float* packed, int first, int end,
             b[m] = load(packed + m * SIZE);
             IN_REGISTER(b[m]);
         }
-#pragma GCC unroll 4
+#pragma GCC unroll 8
         for (int i = 0; i < N; i++)
 #pragma GCC unroll 4
             for (int m = 0; m < M; m++)
@@ -73,7 +75,7 @@ static void tile(const MatmulParams& p, const float* packed, int first, int end,
     for (int m = 0; m < M; m++) {
         int n_left = n - m * SIZE;
         Vector offset = bias ? load_some(bias + m * SIZE, n_left) : Vector{};
-#pragma GCC unroll 4
+#pragma GCC unroll 8
         for (int i = 0; i < N; i++) {
             float* target = out + (long long)i * p.out_row + m * SIZE;
             Vector sum = sums[i][m] + offset;
@@ -89,8 +91,8 @@ static void tile(const MatmulParams& p, const float* packed, int first, int end,
 template <int M>
 static void tiles(const MatmulParams& p, const float* packed, int first, int end, int column, int n,
                   int row, int last_row) {
-    for (; row + ROWS <= last_row; row += ROWS)
-        tile<ROWS, M>(p, packed, first, end, row, column, n);
+    for (; row + TILE_ROWS <= last_row; row += TILE_ROWS)
+        tile<TILE_ROWS, M>(p, packed, first, end, row, column, n);
     for (; row < last_row; row++)
         tile<1, M>(p, packed, first, end, row, column, n);
 }
@@ -113,12 +115,12 @@ static void multiply(const MatmulParams& p, int row, int last_row, float* packed
 }
 
 KERNEL matmul(const MatmulParams& p) {
-    int n_tiles = (p.n_rows + ROWS - 1) / ROWS, n_threads = threads_of(p);
+    int n_tiles = (p.n_rows + TILE_ROWS - 1) / TILE_ROWS, n_threads = threads_of(p);
 #pragma omp parallel for schedule(static) num_threads(n_threads)
     for (int i = 0; i < n_threads; i++) {
         std::unique_ptr<Vector[]> packed(new Vector[DEPTH * WIDE]);
-        int first = ROWS * (int)((long long)n_tiles * i / n_threads);
-        int end = mini(ROWS * (int)((long long)n_tiles * (i + 1) / n_threads), p.n_rows);
+        int first = TILE_ROWS * (int)((long long)n_tiles * i / n_threads);
+        int end = mini(TILE_ROWS * (int)((long long)n_tiles * (i + 1) / n_threads), p.n_rows);
         multiply(p, first, end, (float*)packed.get());
     }
 }
