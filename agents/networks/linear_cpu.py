@@ -8,10 +8,16 @@ from torch.autograd.function import once_differentiable
 from megastep.agents.networks.kernels.program import is_built_for_cpu, run_on_cpu
 
 
-def fits(*tensors: torch.Tensor) -> bool:
-    """Returns whether the kernel can take these tensors, which needs a C++ compiler."""
+MIN_OUTPUTS = 16  # of a layer; PyTorch takes less time for fewer, such as actions and values
+
+
+def fits(weight: torch.Tensor, *others: torch.Tensor) -> bool:
+    """Returns whether the kernel can take a layer's tensors, which needs a C++ compiler, and takes
+    less time than PyTorch.
+    """
+    tensors = weight, *others
     is_float = all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
-    return is_float and is_built_for_cpu()
+    return is_float and len(weight) >= MIN_OUTPUTS and is_built_for_cpu()
 
 
 def matmul(
@@ -26,7 +32,7 @@ def matmul(
     gradient.
 
     Args:
-        a, b: the matrices, that `fit`.
+        a, b: the matrices, float32 on the CPU.
         out: where to write it, (rows, columns) with contiguous rows. None: a new tensor.
         bias: (columns,) to add.
         adds: adds to what `out` holds.

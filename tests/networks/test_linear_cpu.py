@@ -78,9 +78,13 @@ def test_nan_passes_through_a_relu():
     assert out[0].isnan() and out[1] == 0
 
 
-def test_other_dtypes_and_activations_use_pytorch():
-    layer = nn.Linear(8, 8).double()
-    x = torch.randn(3, 8, dtype=torch.float64)
-    assert torch.equal(layers.linear(x, layer, torch.relu), layer(x).relu())
-    layer, x = layer.float(), x.float()
+def test_narrow_layers_and_other_dtypes_and_activations_use_pytorch():
+    layer, narrow = nn.Linear(8, 16), nn.Linear(8, 15)
+    x = torch.randn(3, 8)
+    assert linear_cpu.fits(layer.weight, layer.bias, x)
+    assert not linear_cpu.fits(narrow.weight, narrow.bias, x)
+    assert not linear_cpu.fits(layer.weight, layer.bias, x.double())
+    assert torch.equal(layers.linear(x, narrow, torch.relu), narrow(x).relu())
     assert torch.equal(layers.linear(x, layer, torch.tanh), layer(x).tanh())
+    layer, x = layer.double(), x.double()
+    assert torch.equal(layers.linear(x, layer, torch.relu), layer(x).relu())
