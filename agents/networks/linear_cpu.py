@@ -7,7 +7,6 @@ from torch.autograd.function import once_differentiable
 
 from megastep.agents.networks.kernels.program import is_built_for_cpu, run_on_cpu
 
-
 MIN_OUTPUTS = 16  # of a layer; PyTorch takes less time for fewer, such as actions and values
 
 
