@@ -14,6 +14,7 @@ import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
+from megastep.agents.networks import linear_cpu
 from megastep.agents.networks.kernels import layers as kernels
 from megastep.agents.networks.kernels.program import aligned_rows
 from megastep.agents.networks.precision import cast, compute_dtype, product
@@ -50,6 +51,8 @@ def affine(
     is_aligned = not any(part.shape[-1] % 8 for part in parts)
     if parts[0].is_cuda and dtype == torch.bfloat16 and is_known and is_aligned:
         return _Linear.apply(weight, bias, activation is torch.relu, *parts)
+    if is_known and linear_cpu.fits(weight, bias, *parts):
+        return linear_cpu.CpuLinear.apply(weight, bias, activation is torch.relu, *parts)
     y = nn.functional.linear(torch.cat(parts, -1) if len(parts) > 1 else parts[0], weight, bias)
     return y if activation is None else activation(y)
 

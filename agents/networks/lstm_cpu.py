@@ -7,6 +7,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from megastep.agents.networks.kernels.program import is_built_for_cpu, run_on_cpu
+from megastep.agents.networks.linear_cpu import matmul
 
 MULTIPLE = 16  # of which the width must be one
 
@@ -73,5 +74,5 @@ class CpuSequence(torch.autograd.Function):
             width=width,
         )
         flat = d_gates.flatten(0, 1)
-        d_input_weight, d_weight = flat.T @ x.flatten(0, 1), flat.T @ hiddens.flatten(0, 1)
+        d_input_weight, d_weight = (matmul(flat.T, rows.flatten(0, 1)) for rows in (x, hiddens))
         return d_x, d_input_weight, flat.sum(0), d_weight, None, d_output, d_cell

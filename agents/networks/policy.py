@@ -103,7 +103,7 @@ class Policy(nn.Module):
     @property
     def device(self) -> torch.device:
         """Device of the weights."""
-        return next(self.parameters()).device
+        return self.intake.project.weight.device  # `parameters` walks through all modules
 
     @property
     def activation_bytes(self) -> int:

@@ -4,6 +4,8 @@
 
 #include "physics.h"
 
+constexpr int MIN_PARALLEL = 1024;  // agents
+
 static float sweep_walls(const float* walls, int n, unsigned char* meets, float px, float py,
                          float dx, float dy, float rho) {
     if (dx == 0.f && dy == 0.f)
@@ -57,11 +59,13 @@ static void step(const PhysicsParams& p, int env, std::vector<unsigned char>& me
 }
 
 KERNEL physics(const PhysicsParams& p) {
-#pragma omp parallel num_threads(p.scenery.n_threads)
+    const SceneryParams& s = p.scenery;
+    int n_threads = threads_for(s, s.n_envs * s.n_agents, MIN_PARALLEL);
+#pragma omp parallel num_threads(n_threads)
     {
         std::vector<unsigned char> meets;
 #pragma omp for schedule(static)
-        for (int env = 0; env < p.scenery.n_envs; env++)
+        for (int env = 0; env < s.n_envs; env++)
             step(p, env, meets);
     }
 }

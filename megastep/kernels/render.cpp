@@ -15,6 +15,11 @@ typedef float AnyFour __attribute__((vector_size(16), aligned(4), may_alias));
 // Loops over rays are in blocks of so many, since compilers then need no code for the last few.
 constexpr int BLOCK_RAYS = 16;
 
+// Neighbouring rays [first, end) that hit the same line; -1: none.
+struct Run {
+    int line, first, end;
+};
+
 // The rays of a view, one array per field, so that compilers vectorise loops over them.
 struct Rays {
     // the nearest line
@@ -24,6 +29,7 @@ struct Rays {
     std::vector<float> location, facing, weight, distance, depth;
     std::vector<int> texel, left, right;
     std::vector<Four> samples;
+    std::vector<Run> runs;
 
     explicit Rays(int res) : samples(res) {
         int size = (res + BLOCK_RAYS - 1) / BLOCK_RAYS * BLOCK_RAYS;
@@ -35,9 +41,22 @@ struct Rays {
     }
 };
 
+// The projections of lines, one array per field.
+struct Projections {
+    std::vector<int> first, end, near_clipped;
+    std::vector<float> base, gain;
+
+    void resize(int n) {
+        for (auto* field : {&first, &end, &near_clipped})
+            field->resize(n);
+        for (auto* field : {&base, &gain})
+            field->resize(n);
+    }
+};
+
 // One thread's buffers: the projections of its lines, and one view.
 struct Scratch {
-    std::vector<Projection> projections;
+    Projections projections;
     std::vector<int> visible;
     std::vector<float> sums;
     std::vector<unsigned short> halves;
@@ -45,9 +64,9 @@ struct Scratch {
 };
 
 // Rasterises a near-clipped line, which is invisible where it is within the radius.
-static void raster_near(Projection line, const RenderParams& p, int index, Rays& rays) {
-    for (int r = line.span.first; r < line.span.end; r++) {
-        float inverse = line.span.base + line.span.gain * (float)r;
+static void raster_near(PixelSpan span, const RenderParams& p, int index, Rays& rays) {
+    for (int r = span.first; r < span.end; r++) {
+        float inverse = span.base + span.gain * (float)r;
         if (inverse > rays.inverse[r] && inverse * p.scenery.radius < p.ray_lengths[r]) {
             rays.inverse[r] = inverse;
             rays.index[r] = index;
@@ -58,7 +77,8 @@ static void raster_near(Projection line, const RenderParams& p, int index, Rays&
 static void raster_span(PixelSpan span, int index, float* inverse, int* indices) {
     for (int block = span.first / BLOCK_RAYS * BLOCK_RAYS; block < span.end; block += BLOCK_RAYS) {
 #pragma omp simd
-        for (int r = block; r < block + BLOCK_RAYS; r++) {
+        for (int i = 0; i < BLOCK_RAYS; i++) {
+            int r = block + i;
             float here = span.base + span.gain * (float)r;
             int nearer = (here > inverse[r]) & (r >= span.first) & (r < span.end);
             inverse[r] = nearer ? here : inverse[r];
@@ -72,47 +92,55 @@ static void raster_span(PixelSpan span, int index, float* inverse, int* indices)
 static void raster_lines(const Pose& camera, const Screen& screen, const RenderParams& p,
                          const float* lines, int n, int offset, int skip_first, int skip_end,
                          Scratch& scratch) {
-    if ((int)scratch.projections.size() < n) {
-        scratch.projections.resize(n);
+    Projections& spans = scratch.projections;
+    if ((int)scratch.visible.size() < n) {
+        spans.resize(n);
         scratch.visible.resize(n);
     }
-    Projection* projections = scratch.projections.data();
-#pragma omp simd
+    int *firsts = spans.first.data(), *ends = spans.end.data(), *nears = spans.near_clipped.data();
+    float *bases = spans.base.data(), *gains = spans.gain.data();
+    Pose pose = camera;
+    Screen lens = screen;
+#pragma GCC ivdep
     for (int l = 0; l < n; l++) {
-        projections[l] = project(camera, screen, lines[4 * l], lines[4 * l + 1], lines[4 * l + 2],
-                                 lines[4 * l + 3]);
+        Projection line =
+            project(pose, lens, lines[4 * l], lines[4 * l + 1], lines[4 * l + 2], lines[4 * l + 3]);
+        firsts[l] = line.span.first;
+        ends[l] = line.span.end;
+        bases[l] = line.span.base;
+        gains[l] = line.span.gain;
+        nears[l] = line.near_clipped;
     }
     int n_visible = 0;
     for (int l = 0; l < n; l++) {
         scratch.visible[n_visible] = l;
-        n_visible += projections[l].span.first < projections[l].span.end;
+        n_visible += firsts[l] < ends[l];
     }
     for (int i = 0; i < n_visible; i++) {
         int l = scratch.visible[i];
         if (l >= skip_first && l < skip_end)
             continue;
-        if (projections[l].near_clipped)
-            raster_near(projections[l], p, offset + l, scratch.rays);
+        PixelSpan span = {firsts[l], ends[l], bases[l], gains[l]};
+        if (nears[l])
+            raster_near(span, p, offset + l, scratch.rays);
         else
-            raster_span(projections[l].span, offset + l, scratch.rays.inverse.data(),
-                        scratch.rays.index.data());
+            raster_span(span, offset + l, scratch.rays.inverse.data(), scratch.rays.index.data());
     }
 }
 
-// Calls f(line, first, end) for each run of neighbouring rays that hit the same line.
-template <class F>
-static void for_runs(const std::vector<int>& index, int res, F f) {
+static void find_runs(const std::vector<int>& index, int res, std::vector<Run>& runs) {
+    runs.clear();
     int end;
     for (int first = 0; first < res; first = end) {
         for (end = first + 1; end < res && index[end] == index[first]; end++)
             ;
-        f(index[first], first, end);
+        runs.push_back({index[first], first, end});
     }
 }
 
 static void find_surfaces(const RenderParams& p, const EnvScenery& scenery, const Pose& camera,
                           Rays& rays) {
-    for_runs(rays.index, p.res, [&](int line, int first, int end) {
+    for (auto [line, first, end] : rays.runs) {
         Surface surface = {0.f, 0.f, 0.f, 0.f, 0, 1, 0};
         if (line >= 0)
             surface = surface_of<1>(p.scenery, scenery, camera, line);
@@ -123,7 +151,7 @@ static void find_surfaces(const RenderParams& p, const EnvScenery& scenery, cons
         std::fill_n(&rays.vy[first], n, surface.vy);
         std::fill_n(&rays.first_texel[first], n, surface.first_texel);
         std::fill_n(&rays.width[first], n, surface.width);
-    });
+    }
 }
 
 // What a ray without a line gets here is never read. GCC 12 vectorises the loop only with addresses
@@ -180,24 +208,32 @@ static void agent_samples(const EnvScenery& scenery, Rays& rays, int first, int 
 }
 
 static void find_samples(const RenderParams& p, const EnvScenery& scenery, Rays& rays) {
-    for_runs(rays.index, p.res, [&](int line, int first, int end) {
+    for (auto [line, first, end] : rays.runs) {
         if (line < 0)
             std::fill_n(&rays.samples[first], end - first, Four{});
         else if (line < scenery.n_agent_lines)
             agent_samples(scenery, rays, first, end);
         else
             wall_samples(p.scenery, rays, first, end);
-    });
+    }
 }
 
-// Returns the number of newly seen texels.
-static int mark_all_seen(const EnvScenery& scenery, const Rays& rays, int res, unsigned int* seen) {
-    int newly_seen = 0, last = -1;
-    for (int r = 0; r < res; r++) {
-        if (rays.index[r] < scenery.n_agent_lines || rays.texel[r] == last)
-            continue;
-        last = rays.texel[r];
-        newly_seen += mark_seen(seen, last - scenery.first_texel);
+// Returns the number of newly seen texels. Nearly all were seen before, so blocks of rays are
+// tested for others first.
+static int mark_all_seen(const EnvScenery& scenery, Rays& rays, unsigned int* seen) {
+    int newly_seen = 0, n_agent_lines = scenery.n_agent_lines, first_texel = scenery.first_texel;
+    const int *index = rays.index.data(), *texel = rays.texel.data();
+    for (int block = 0; block < (int)rays.index.size(); block += BLOCK_RAYS) {
+        unsigned int unseen = 0;
+#pragma omp simd reduction(| : unseen)
+        for (int i = 0; i < BLOCK_RAYS; i++) {
+            int r = block + i, at = texel[r] - first_texel;
+            if (index[r] >= n_agent_lines)
+                unseen |= ~seen[at >> 5] & 1u << (at & 31);
+        }
+        for (int r = block; unseen && r < block + BLOCK_RAYS; r++)
+            if (index[r] >= n_agent_lines)
+                newly_seen += mark_seen(seen, texel[r] - first_texel);
     }
     return newly_seen;
 }
@@ -283,6 +319,7 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery, const P
         p.centre_line[view] = rays.index[p.res / 2];
     if (p.agent_ray)
         p.agent_ray[view] = agent_ray_of(rays.index, p.res, scenery.n_agent_lines);
+    find_runs(rays.index, p.res, rays.runs);
     find_surfaces(p, scenery, camera, rays);
     find_hits(p, screen, rays);
     if (p.rgb || p.screen || p.depth)
@@ -291,7 +328,7 @@ static int render_view(const RenderParams& p, const EnvScenery& scenery, const P
         write_rays(p, screen, view, rays);
     if (p.rgb || p.depth)
         write_pixels(p, view, rays.samples, scratch);
-    return seen ? mark_all_seen(scenery, rays, p.res, seen) : 0;
+    return seen ? mark_all_seen(scenery, rays, seen) : 0;
 }
 
 static void render_agent(const RenderParams& p, int agent, Scratch& scratch) {

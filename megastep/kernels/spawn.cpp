@@ -1,8 +1,12 @@
 // A loop over environments.
 #include "spawn.h"
 
+constexpr int MIN_PARALLEL = 1 << 14;  // agents, few of which respawn
+
 KERNEL spawn(const SpawnParams& p) {
-#pragma omp parallel for schedule(static) num_threads(p.scenery.n_threads)
-    for (int env = 0; env < p.scenery.n_envs; env++)
+    const SceneryParams& s = p.scenery;
+    int n_threads = threads_for(s, s.n_envs * s.n_agents, MIN_PARALLEL);
+#pragma omp parallel for schedule(static) num_threads(n_threads)
+    for (int env = 0; env < s.n_envs; env++)
         spawn_env<0>(p, SingleThread{0}, env);
 }

@@ -392,3 +392,23 @@ struct NormaliseLeafParams {
     int is_half;
     int n_threads;
 };
+
+// A matrix product on the CPU: out = a b. Rows and columns of a and b are so many floats apart.
+
+struct MatmulParams {
+    const float* a;     // (rows, depth)
+    const float* b;     // (depth, columns)
+    const float* bias;  // (columns), or null
+    float* out;         // (rows, columns), whose columns are 1 apart
+    int a_row;
+    int a_column;
+    int b_row;
+    int b_column;
+    int out_row;
+    int n_rows;
+    int n_columns;
+    int depth;
+    int adds;      // to what `out` holds
+    int has_relu;  // at the end
+    int n_threads;
+};

@@ -41,6 +41,10 @@ HD int layout_of(const SceneryParams& s, int env, int* error_flag) {
     return 0;
 }
 
+// CPU threads for n agents. Fewer than `min` take one thread less time than another takes to wake,
+// 50 us.
+HD int threads_for(const SceneryParams& s, int n, int min) { return n < min ? 1 : s.n_threads; }
+
 // A layout's walls [first_wall, end_wall) and bounding boxes [first_box, end_box).
 struct Walls {
     int first_wall, end_wall, first_box, end_box;
