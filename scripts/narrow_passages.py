@@ -17,6 +17,7 @@ from megastep.envs.pointgoal.path_graph import PathGraph
 SOURCES = {
     "generated homes": ("homes", {}),
     "the same, geometry.density=3": ("homes", dict(density=3.0)),
+    "the same, geometry.clutter=1": ("homes", dict(density=3.0, clutter=1.0)),
     "bench homes": ("bench", {}),
 }
 WIDER = 0.01, 0.02, 0.05, 0.1  # metres on each side

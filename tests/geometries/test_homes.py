@@ -266,7 +266,7 @@ def test_dense_homes_come_from_the_cache(monkeypatch, tmp_path):
     first = database.generated((3, 4), 2.0)
     database.generated.cache_clear()
     monkeypatch.setattr(database, "_generate", None)
-    again, inner = (database.generated((3, 4), 2.0, outer) for outer in (True, False))
+    again, inner = (database.generated((3, 4), 2.0, outer=outer) for outer in (True, False))
     assert all((again[seed].walls == first[seed].walls).all() for seed in (3, 4))
     assert (inner[4].walls == first[4].walls[: -first[4].n_outer]).all()
     database.generated.cache_clear()
