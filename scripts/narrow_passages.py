@@ -21,7 +21,7 @@ SOURCES = {
     "bench homes": ("bench", {}),
 }
 WIDER = 0.01, 0.02, 0.05, 0.1  # metres on each side
-N_HOMES, N_POINTS = 40, 24
+N_HOMES, N_POINTS = 100, 24
 NEAREST, FURTHEST = 1, 15  # metres
 
 
@@ -45,7 +45,7 @@ def main() -> None:
     print("| homes | " + " | ".join(f"{100 * wider:g} cm wider" for wider in WIDER) + " |")
     print("| --- |" + " --- |" * len(WIDER))
     for title, (source, options) in SOURCES.items():
-        homes = geometries.sample(source, N_HOMES, split="test", seed=1, **options)
+        homes = geometries.sample(source, N_HOMES, split="all", seed=1, **options)
         shortest, *others = lengths(homes)
         cells = []
         for other in others:

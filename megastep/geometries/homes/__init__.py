@@ -63,14 +63,14 @@ def _best_plan(generator, style):
         count -= 1
 
 
-def _doorways(gaps, depth, clutter, generator):
+def _doorways(gaps, depth, half_blocked, generator):
     """Returns the rectangles in front of doors and openings that stay clear, and the parts of
-    their gaps that clutter blocks.
+    their gaps that clutter blocks, in the fraction `half_blocked` of them.
     """
     clear, blocked = [], []
     for g in gaps:
         low, high, reach = g.low, g.high, furniture.PASSAGE
-        if clutter and generator.chance(clutter):
+        if half_blocked and generator.chance(half_blocked):
             reach = furniture.tight(generator)
             low, high = (low, low + reach) if generator.below(2) else (high - reach, high)
             rest = (high, g.high) if low == g.low else (g.low, low)
@@ -84,7 +84,7 @@ def _doorways(gaps, depth, clutter, generator):
 
 def _furnish(rooms, solids, gaps, depth, lights, triangle, style, generator):
     """Returns the furniture of a home: rectangles, none in a room with a slanted corner."""
-    clear, blocked = _doorways(gaps, depth, style.clutter, generator)
+    clear, blocked = _doorways(gaps, depth, style.half_blocked, generator)
     reach = furniture.BESIDE_LIGHT
     clear += [(x - reach, y - reach, x + reach, y + reach) for x, y in lights]
     return [

@@ -23,7 +23,8 @@ NOTCH = 15  # cm per side; the least that an L-shape lacks, and of which it cons
 BESIDE_LIGHT = 25  # cm; so that no piece touches a light's cell of the masks
 TRIES = 6  # places tried for a piece
 TIGHT = (24, 46)  # cm; widths of the gaps that clutter leaves. An agent is 21.2 cm wide
-DEEP, LONG = (30, 90), (30, 200)  # cm; sides of a piece of clutter
+DEEP, LONG = (30, 90), (30, 130)  # cm; sides of a piece of clutter
+OFF_WALL = 0.5  # fraction of clutter that leaves a gap behind it
 
 
 def overlap(a: Rectangle, b: Rectangle, apart: int = 0) -> bool:
@@ -68,8 +69,9 @@ def tight(generator: PortableGenerator) -> int:
     return max(generator.between(*TIGHT), generator.between(*TIGHT))
 
 
-def _place(low, high, size, is_walled, generator, passage=PASSAGE):
-    """Places a piece along an axis of a room, from `low` to `high`.
+def _place(low, high, size, is_walled, generator, passage=PASSAGE, off_wall=0.0):
+    """Places a piece along an axis of a room, from `low` to `high`. With the probability `off_wall`
+    no wall is nearer than a passage.
 
     Returns (low, high) of the piece and of what it fills with the walls that it stands by, or None
     if it blocks the room or a side without a wall.
@@ -82,6 +84,8 @@ def _place(low, high, size, is_walled, generator, passage=PASSAGE):
     else:
         before = generator.between(0, spare // 5) * 5
     before = 0 if before < SLIT else spare if spare - before < SLIT else before
+    if off_wall and spare >= 2 * passage and generator.chance(off_wall):
+        before = min(max(before, passage), spare - passage)
     fills = before < passage, spare - before < passage
     if all(fills) or any(fill and not wall for fill, wall in zip(fills, is_walled)):
         return None
@@ -147,7 +151,7 @@ def _in_row(floor, is_walled, filled, keep_clear, doorway, gap, generator):
             return None
     else:
         at = generator.between(x0, x1)
-        down = _place(y0, y1, size, is_walled[1::2], generator, gap)
+        down = _place(y0, y1, size, is_walled[1::2], generator, gap, OFF_WALL)
         if not down:
             return None
         (b, _), fills = down

@@ -23,10 +23,9 @@ class Kind(NamedTuple):
 
 
 DENSEST = 3  # density at which homes have about three times as many walls as at 1
-FURNITURE = 0.4, 0.8  # pieces tried per m2: in cluttered homes of density 1, in the densest homes
-# Fraction of furniture and doorways that leave narrow gaps at a clutter of 1. In dense homes it is
-# also the fraction of furniture left out then: less is refused, so about as many pieces remain.
-CLUTTERED = 0.4
+# Pieces tried per m2: in homes of density 1 with a clutter of 1, in the densest homes without
+# clutter, and in the densest with a clutter of 1, where fewer are refused.
+SPARSE, FULL, CLUTTERED = 0.4, 0.8, 0.38
 
 
 class Style(NamedTuple):
@@ -40,7 +39,8 @@ class Style(NamedTuple):
     open_plan: float = 1.0  # factor of the probability that a connection has no door
     furniture: float = 0.0  # pieces tried per m2
     off_centre: float = 0.0  # fraction of lights that are anywhere in their room
-    clutter: float = 0.0  # fraction of furniture and doorways that leave narrow gaps
+    clutter: float = 0.0  # fraction of furniture that leaves narrow gaps
+    half_blocked: float = 0.0  # fraction of doorways with a narrow way in
 
 
 NORMAL = Style()
@@ -62,9 +62,10 @@ def style(density: float, clutter: float = 0.0) -> Style:
         corridor=(110 - int(20 * t), 150 - int(40 * t)),
         narrow=t,
         open_plan=1 - 0.7 * t,
-        furniture=FURNITURE[0] * clutter * (1 - t) + FURNITURE[1] * t * (1 - CLUTTERED * clutter),
+        furniture=SPARSE * clutter * (1 - t) + (FULL + (CLUTTERED - FULL) * clutter) * t,
         off_centre=0.7 * t,
-        clutter=CLUTTERED * clutter,
+        clutter=0.8 * clutter,
+        half_blocked=0.3 * clutter,
     )
 
 
