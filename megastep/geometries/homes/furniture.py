@@ -169,7 +169,8 @@ def _in_row(floor, is_walled, filled, keep_clear, doorway, gap, generator):
                     return None
     length = generator.between(LONG[0] // 5, LONG[1] // 5) * 5
     if c - a - length >= gap:
-        a, c = (a, a + length) if before else (c - length, c)
+        at_low = at - a < c - at if doorway else before
+        a, c = (a, a + length) if at_low else (c - length, c)
     if c - a < LONG[0]:
         return None
     return (a, b, c, b + size), (a, fills[0], c, fills[1])

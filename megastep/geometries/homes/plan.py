@@ -65,7 +65,7 @@ def style(density: float, clutter: float = 0.0) -> Style:
         furniture=SPARSE * clutter * (1 - t) + (FULL + (CLUTTERED - FULL) * clutter) * t,
         off_centre=0.7 * t,
         clutter=0.8 * clutter,
-        half_blocked=0.3 * clutter,
+        half_blocked=0.25 * clutter,
     )
 
 
