@@ -1,10 +1,13 @@
-"""Checks of a home, from its walls and masks, on a raster of 5 cm. `make_homes.py` uses them."""
+"""Checks of a home, from its walls and masks, on a raster of 5 cm, or 2 cm of cluttered homes.
+`make_homes.py` uses them.
+"""
 
 import numpy as np
 
 from megastep import geometry
 
 FINE = 0.05  # metres per cell
+FINEST = 0.02  # of cluttered homes: a body 21 cm wide has so much to spare in a gap of 24 cm
 RADIUS = 0.15 / 2**0.5  # metres; of an agent
 GAP = 0.55  # metres; minimum width of a passage
 SPAWN = 0.15  # metres; each room has a point this far from all walls
@@ -40,14 +43,14 @@ def components(free):
     return result, labels.max(initial=-1) + 1
 
 
-def clearance(g, limit=0.3):
-    """Returns the metres, at most `limit`, from each cell's centre on the fine raster to the
-    nearest wall.
+def clearance(g, limit=0.3, cell=FINE):
+    """Returns the metres, at most `limit`, from each cell's centre on a fine raster to the nearest
+    wall.
     """
-    ratio = round(g.res / FINE)
+    ratio = round(g.res / cell)
     height, width = g.masks.shape[0] * ratio, g.masks.shape[1] * ratio
     distance = np.full((height, width), limit)
-    x, y = (np.arange(width) + 0.5) * FINE, (height - np.arange(height) - 0.5) * FINE
+    x, y = (np.arange(width) + 0.5) * cell, (height - np.arange(height) - 0.5) * cell
     for (ax, ay), (bx, by) in g.walls.astype(float):
         columns = slice(*np.searchsorted(x, (min(ax, bx) - limit, max(ax, bx) + limit)))
         rows = slice(*np.searchsorted(-y, (-max(ay, by) - limit, -min(ay, by) + limit)))
@@ -68,9 +71,11 @@ def _reaches(labels, rooms):
     return any(all(label in labels_inside for labels_inside in by_room) for label in by_room[0])
 
 
-def errors(g):
-    """Returns a sentence for each error in a home."""
-    messages = []
+def errors(g, is_cluttered=False):
+    """Returns a sentence for each error in a home. In a cluttered one gaps may be as narrow as an
+    agent.
+    """
+    messages, cell = [], FINEST if is_cluttered else FINE
     walls = g.walls.reshape(-1, 4)
     canonical = np.where(
         (walls[:, :2] > walls[:, 2:]).any(-1)[:, None] & (walls[:, 0] >= walls[:, 2])[:, None],
@@ -93,17 +98,21 @@ def errors(g):
     if (g.masks[labels == labels[0, 0]] > 0).any():
         messages.append("the envelope is open")
 
-    distance = clearance(g)
-    ratio = round(g.res / FINE)
+    distance = clearance(g, cell=cell)
+    ratio = round(g.res / cell)
     fine = np.maximum(g.masks, 0).repeat(ratio, 0).repeat(ratio, 1)
-    for radius, disc in (RADIUS, "an agent"), (GAP / 2, "a disc as wide as the narrowest gap"):
+    discs = [(RADIUS, "an agent"), (GAP / 2, "a disc as wide as the narrowest gap")]
+    for radius, disc in discs[: 1 if is_cluttered else 2]:
         if not _reaches(components(distance > radius - 1e-3)[0], fine):
             messages.append(f"{disc} cannot reach every room")
+    labels, _ = components(distance > RADIUS - 1e-3)
+    if len(np.unique(labels[(fine > 0) & (distance >= SPAWN)])) > 1:
+        messages.append("an agent cannot reach every point to spawn at")
     if any(not (distance[fine == room] >= SPAWN).any() for room in range(1, rooms + 1)):
         messages.append("a room has no point to spawn at")
     light_cells = tuple(geometry.indices(g.lights, g.masks.shape, g.res).T)
     if not np.array_equal(g.masks[light_cells], np.arange(1, rooms + 1)):
         messages.append("a light is not in its room")
-    if (distance[tuple(geometry.indices(g.lights, distance.shape, FINE).T)] < LIT).any():
+    if (distance[tuple(geometry.indices(g.lights, distance.shape, cell).T)] < LIT).any():
         messages.append("a light is in a wall")
     return messages

@@ -17,10 +17,11 @@ from megastep.envs.pointgoal.path_graph import PathGraph
 SOURCES = {
     "generated homes": ("homes", {}),
     "the same, geometry.density=3": ("homes", dict(density=3.0)),
+    "the same, geometry.clutter=1": ("homes", dict(density=3.0, clutter=1.0)),
     "bench homes": ("bench", {}),
 }
 WIDER = 0.01, 0.02, 0.05, 0.1  # metres on each side
-N_HOMES, N_POINTS = 40, 24
+N_HOMES, N_POINTS = 100, 24
 NEAREST, FURTHEST = 1, 15  # metres
 
 
@@ -44,7 +45,7 @@ def main() -> None:
     print("| homes | " + " | ".join(f"{100 * wider:g} cm wider" for wider in WIDER) + " |")
     print("| --- |" + " --- |" * len(WIDER))
     for title, (source, options) in SOURCES.items():
-        homes = geometries.sample(source, N_HOMES, split="test", seed=1, **options)
+        homes = geometries.sample(source, N_HOMES, split="all", seed=1, **options)
         shortest, *others = lengths(homes)
         cells = []
         for other in others:

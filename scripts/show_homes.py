@@ -1,6 +1,6 @@
 """Draws a sheet of homes at one scale, as an image.
 
-python scripts/show_homes.py homes.png --first 0 --count 20 --density 1
+python scripts/show_homes.py homes.png --first 0 --count 20 --density 1 --clutter 0
 """
 
 import argparse
@@ -33,9 +33,9 @@ LABELS = {
 }
 
 
-def sheet(seeds, density=1):
+def sheet(seeds, density=1, clutter=0):
     """Returns a figure with the floor plans of the homes of these seeds and the names of rooms."""
-    plans = [homes.generate(seed, density=density) for seed in seeds]
+    plans = [homes.generate(seed, density=density, clutter=clutter) for seed in seeds]
     rows = -(-len(plans) // COLUMNS)
     figure, axes = plt.subplots(
         rows, COLUMNS, figsize=(4 * COLUMNS, 4 * rows), squeeze=False, layout="constrained"
@@ -61,11 +61,13 @@ def main():
     parser.add_argument("--first", type=int, default=0, help="seed of the first home")
     parser.add_argument("--count", type=int, default=20, help="number of homes")
     parser.add_argument("--density", type=float, default=1, help="of the homes, 1 to 3")
+    parser.add_argument("--clutter", type=float, default=0, help="of the homes, 0 to 1")
     args = parser.parse_args()
     if args.count < 1:
         raise SystemExit(f"--count {args.count}: take at least 1.")
     try:
-        figure = sheet(range(args.first, args.first + args.count), args.density)
+        seeds = range(args.first, args.first + args.count)
+        figure = sheet(seeds, args.density, args.clutter)
     except ValueError as error:
         raise SystemExit(str(error)) from None
     figure.savefig(args.path, dpi=70)

@@ -145,6 +145,7 @@ class Composer:
             groups = [f"hydra/{name}" for name in self.loader.list_groups("hydra")]
             errors += settings.missing_sources(tree)
             chosen = check.check(self.script.kind, tree, groups + self.loader.list_groups(""))
+            errors += settings.ignored_geometry(chosen.env, typed)
         except OmegaConfBaseException as error:
             errors.append((error.full_key or "configuration", str(error).partition("\n")[0]))
         except ConfigErrors as error:

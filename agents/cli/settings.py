@@ -129,6 +129,16 @@ def takes_geometries(env: Any) -> bool:
     return "geometries" in inspect.signature(import_object(env.name)).parameters
 
 
+def ignored_geometry(env: Any, typed: list[str]) -> list[tuple[str, str]]:
+    """Returns [(key, sentence)] of the first typed key that chooses a geometry, if the environment
+    takes none. `env` may be None, that of a run.
+    """
+    keys = [key for key in typed if key.split(".")[0] == "geometry"]
+    if not keys or env is None or takes_geometries(env):
+        return []
+    return [(keys[0], f"env={env_name(env)} takes no floor plans; leave geometry out")]
+
+
 def label(name: str) -> str:
     """`explorer` for megastep.envs.explorer:Explorer."""
     return name.rpartition(":")[2].rpartition(".")[2].lower()

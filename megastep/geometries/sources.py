@@ -86,17 +86,19 @@ def homes(
     seed: Seed = 1,
     outer: bool = True,
     density: Annotated[float, Field(ge=1, le=plan.DENSEST)] = 1.0,
+    clutter: Annotated[float, Field(ge=0, le=1)] = 0.0,
 ) -> list[dotdict]:
     """Returns homes from the 5,000 of the package. With `outer=False` they lack the outer faces of
     outer walls, which cannot be seen from inside.
 
     Of more `density`, up to 3, they are generated anew from as many seeds: with more rooms,
-    narrower doors and corridors, and furniture, they reach three times as many walls.
+    narrower doors and corridors, and furniture, they reach three times as many walls. With
+    `clutter`, up to 1, furniture leaves narrow gaps to walls, to other furniture and in doorways.
     """
     indices = _draw_indices(database.COUNT, n, split, seed)
-    if density == 1:
+    if density == 1 and clutter == 0:
         return [database.home(i, outer) for i in indices]
-    generated = database.generated(tuple(dict.fromkeys(indices)), density, outer)
+    generated = database.generated(tuple(dict.fromkeys(indices)), density, clutter, outer)
     return [generated[i] for i in indices]
 
 

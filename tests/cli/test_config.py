@@ -462,6 +462,12 @@ def test_search_is_checked_at_bounds():
         jobs("learner.lr=interval(1e-4,1e-2)")
 
 
+@pytest.mark.parametrize("key, value", [("geometry", "maze"), ("geometry.n", "3")])
+def test_a_geometry_that_the_environment_does_not_take_is_refused(key, value):
+    message = "env=pong takes no floor plans; leave geometry out"
+    assert errors("env=pong", f"{key}={value}") == {key: message}
+
+
 @pytest.mark.parametrize("word", ["env=glob(zz*)", "seed=range(3,3)"])
 def test_empty_sweep(word):
     with pytest.raises(ConfigErrors, match="has no value"):

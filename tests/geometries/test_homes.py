@@ -23,7 +23,7 @@ from megastep.geometries.homes import (
     walls,
 )
 from megastep.geometries.homes.portable_generator import PortableGenerator
-from scripts import check_homes, compare_homes, make_homes, show_homes
+from scripts import check_homes, compare_homes, make_homes, narrow_passages, show_homes
 
 matplotlib.use("Agg")
 
@@ -41,6 +41,12 @@ def generated():
 def dense():
     """Sixty homes of the highest density."""
     return [homes.generate(seed, density=plan.DENSEST) for seed in range(60)]
+
+
+@pytest.fixture(scope="module")
+def cluttered():
+    """Thirty homes of the highest density and clutter."""
+    return [homes.generate(seed, density=plan.DENSEST, clutter=1) for seed in range(30)]
 
 
 @pytest.fixture(scope="module")
@@ -251,13 +257,13 @@ def test_dense_homes_of_the_source_are_generated_ones(monkeypatch, tmp_path):
         monkeypatch.setattr(database, "SEEDS_EACH", each)
         for _ in range(2):
             database.generated.cache_clear()
-            drawn.append(geometries.sample("homes", 5, "test", density=1.5))
+            drawn.append(geometries.sample("homes", 5, "test", density=1.5, clutter=0.5))
         shutil.rmtree(tmp_path / "cache")
     database.generated.cache_clear()
     for plans in drawn:
         assert [g.id for g in plans] == [g.id for g in geometries.sample("homes", 5, "test")]
         for g in plans:
-            expected = homes.generate(g.id, density=1.5)
+            expected = homes.generate(g.id, density=1.5, clutter=0.5)
             assert all(np.array_equal(g[key], expected[key]) for key in g)
 
 
@@ -266,7 +272,7 @@ def test_dense_homes_come_from_the_cache(monkeypatch, tmp_path):
     first = database.generated((3, 4), 2.0)
     database.generated.cache_clear()
     monkeypatch.setattr(database, "_generate", None)
-    again, inner = (database.generated((3, 4), 2.0, outer) for outer in (True, False))
+    again, inner = (database.generated((3, 4), 2.0, outer=outer) for outer in (True, False))
     assert all((again[seed].walls == first[seed].walls).all() for seed in (3, 4))
     assert (inner[4].walls == first[4].walls[: -first[4].n_outer]).all()
     database.generated.cache_clear()
@@ -283,6 +289,66 @@ def test_a_thousand_dense_homes_pass_the_checks():
     plans = [homes.generate(seed, density=plan.DENSEST) for seed in range(10_000, 11_000)]
     assert [(g.id, error) for g in plans for error in check_homes.errors(g)] == []
     assert 190 < np.median([len(g.walls) for g in plans]) < 215
+
+
+# ---- Cluttered homes ----
+
+
+def test_bytes_of_cluttered_homes_are_unchanged(cluttered):
+    digest = hashlib.sha256()
+    for g in cluttered[:20]:
+        for values, dtype in (g.walls, "<f4"), (g.lights, "<f4"), (g.masks, "<i2"):
+            digest.update(values.astype(dtype).tobytes())
+    assert digest.hexdigest() == "d186e485986bc0aff14e7f688611170e9c5adef9fb3d69b6f58bfd1d49a2a2fa"
+
+
+def test_cluttered_homes_pass_the_checks(cluttered):
+    """An agent reaches every point to spawn at."""
+    some = [*cluttered, *(homes.generate(seed, clutter=1) for seed in range(10))]
+    assert [(g.id, error) for g in some for error in check_homes.errors(g, True)] == []
+
+
+@pytest.mark.slow
+def test_a_thousand_cluttered_homes_pass_the_checks():
+    plans = [homes.generate(seed, density=3, clutter=1) for seed in range(10_000, 11_000)]
+    assert [(g.id, error) for g in plans for error in check_homes.errors(g, True)] == []
+    assert 195 < np.median([len(g.walls) for g in plans]) < 215
+
+
+def test_clutter_changes_furniture_alone(dense, cluttered):
+    for g, other in zip(dense, cluttered):
+        assert g.rooms == other.rooms and g.doors == other.doors and g.openings == other.openings
+        assert (g.lights == other.lights).all() and not np.array_equal(g.walls, other.walls)
+
+
+def test_a_third_of_the_ways_in_cluttered_homes_are_narrow(dense, cluttered):
+    """Of those of an agent, a body 41 cm wide finds none of a third, and one 23 cm wide all."""
+    for plans, (least, most) in ((dense[:30], (0, 0.1)), (cluttered, (0.2, 0.45))):
+        _, one, _, _, ten = narrow_passages.lengths(plans)
+        assert np.isinf(one).mean() < 0.01 and least <= np.isinf(ten).mean() < most
+
+
+def test_clutter_leaves_gaps_for_an_agent_and_half_of_a_doorway():
+    """In a room of 4 m x 3 m with a door of 80 cm in its lower wall, of which 30 cm are left."""
+    kept, rest = (160, -30, 190, 30), (190, -10, 240, 0)
+    n_blocked = 0
+    for seed in range(100):
+        generator = PortableGenerator(seed)
+        boxes = furniture.furnish([(0, 0, 400, 300)], [], [kept], 0.6, generator, 1.0, [rest])
+        n_blocked += any(a[1] == 0 and a[0] == 190 for a in boxes)
+        for i, a in enumerate(boxes):
+            assert min(a[:2]) >= 0 and a[2] <= 400 and a[3] <= 300
+            assert not furniture.overlap(a, kept)
+            near = [b for b in boxes[:i] if furniture.overlap(a, b, furniture.TIGHT[0])]
+            assert len(near) <= 1, "the other half of an L-shape"
+            assert not any(furniture.overlap(a, b) for b in near)
+    assert n_blocked > 60
+
+
+@pytest.mark.parametrize("clutter", [-0.1, 1.1, float("nan"), "much"])
+def test_a_clutter_that_is_none_is_refused(clutter):
+    with pytest.raises(ValueError, match="clutter"):
+        geometries.sample("homes", 2, clutter=clutter)
 
 
 def test_packaged_homes_equal_generated_ones(generated):
@@ -364,6 +430,10 @@ def test_checks_find_narrow_passages():
         (
             "a room has no point to spawn at",
             lambda g: g.update(walls=np.concatenate([g.walls, COMB])),
+        ),
+        (
+            "an agent cannot reach every point",
+            lambda g: g.update(walls=np.concatenate([g.walls, bottleneck(0.1)])),
         ),
         ("a light is not in its room", lambda g: g.update(lights=g.lights[::-1])),
         ("a light is in a wall", lambda g: g.lights.__setitem__((0, 0), 1.04)),

@@ -63,25 +63,41 @@ def _best_plan(generator, style):
         count -= 1
 
 
-def _furnish(rooms, solids, gaps, depth, lights, triangle, rate, generator):
-    """Returns the furniture of a home: rectangles, none in a room with a slanted corner."""
-    doorways = []
+def _doorways(gaps, depth, half_blocked, generator):
+    """Returns the rectangles in front of doors and openings that stay clear, and the parts of
+    their gaps that clutter blocks, in the fraction `half_blocked` of them.
+    """
+    clear, blocked = [], []
     for g in gaps:
-        doorway, axis = [*walls.gap(g, depth)], g.contact.axis
-        doorway[axis] -= furniture.PASSAGE
-        doorway[axis + 2] += furniture.PASSAGE
-        doorways.append(tuple(doorway))
+        low, high, reach = g.low, g.high, furniture.PASSAGE
+        if half_blocked and generator.chance(half_blocked):
+            reach = furniture.tight(generator)
+            low, high = (low, low + reach) if generator.below(2) else (high - reach, high)
+            rest = (high, g.high) if low == g.low else (g.low, low)
+            blocked.append(walls.gap(g._replace(low=rest[0], high=rest[1]), depth))
+        doorway, axis = [*walls.gap(g._replace(low=low, high=high), depth)], g.contact.axis
+        doorway[axis] -= reach
+        doorway[axis + 2] += reach
+        clear.append(tuple(doorway))
+    return clear, blocked
+
+
+def _furnish(rooms, solids, gaps, depth, lights, triangle, style, generator):
+    """Returns the furniture of a home: rectangles, none in a room with a slanted corner."""
+    clear, blocked = _doorways(gaps, depth, style.half_blocked, generator)
     reach = furniture.BESIDE_LIGHT
-    lit = [(x - reach, y - reach, x + reach, y + reach) for x, y in lights]
+    clear += [(x - reach, y - reach, x + reach, y + reach) for x, y in lights]
     return [
         piece
         for room in rooms
         if not walls.holds(room.region, triangle)
-        for piece in furniture.furnish(room.region, solids, doorways + lit, rate, generator)
+        for piece in furniture.furnish(
+            room.region, solids, clear, style.furniture, generator, style.clutter, blocked
+        )
     ]
 
 
-def generate(seed: int, outer: bool = True, density: float = 1) -> dotdict:
+def generate(seed: int, outer: bool = True, density: float = 1, clutter: float = 0) -> dotdict:
     """Returns the home of a seed.
 
     Args:
@@ -89,6 +105,8 @@ def generate(seed: int, outer: bool = True, density: float = 1) -> dotdict:
         density: from 1 to 3, at which a home has about three times as many walls: more
             rooms, narrower doors and corridors, fewer openings without a door, furniture, and
             lights off the middle of their rooms.
+        clutter: from 0 to 1, at which many pieces of furniture leave narrow gaps, 24 to 46 cm wide:
+            to walls, to other furniture, and in doorways, which they half block.
         outer: if False, leave out the envelope's outer face, which cannot be seen from indoors.
 
     Returns:
@@ -97,7 +115,7 @@ def generate(seed: int, outer: bool = True, density: float = 1) -> dotdict:
         the gaps with and without a door; `n_outer`, the number of walls, the last ones, that are
         the envelope's outer face.
     """
-    generator, style = PortableGenerator(seed), plan.style(density)
+    generator, style = PortableGenerator(seed), plan.style(density, clutter)
     _, footprint, rooms, meetings, depth, gaps = _best_plan(generator, style)
     thickness = THICK[generator.below(len(THICK))]
     solids = walls.solids(meetings, depth)
@@ -122,7 +140,7 @@ def generate(seed: int, outer: bool = True, density: float = 1) -> dotdict:
             else furniture.place_light(room.region, solids, generator)
             for light, room in zip(lights, rooms)
         ]
-        pieces = _furnish(rooms, solids, gaps, depth, lights, triangle, style.furniture, generator)
+        pieces = _furnish(rooms, solids, gaps, depth, lights, triangle, style, generator)
         grid = walls.paint(*layers, pieces)
         inside = walls.segments(*grid, walls.INDOORS)
         inside = walls.cut_off(inside, triangle) if triangle else inside

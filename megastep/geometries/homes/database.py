@@ -4,7 +4,7 @@
 `lights` (K, 2), int16 centimetres, and `masks` (cells,) int8. `widths` (homes, 5) has, per home,
 the number of walls, of walls in the outer face, of lights, and the height and width of the masks.
 
-Homes of other densities are generated when they are first asked for, on all cores, and cached on
+Denser and cluttered homes are generated when they are first asked for, on all cores, and cached on
 disk in the same format.
 """
 
@@ -99,23 +99,25 @@ def _home(arrays, starts, index, seed, outer):
 
 
 @functools.lru_cache(maxsize=4)
-def generated(seeds: tuple[int, ...], density: float, outer: bool = True) -> dict[int, dotdict]:
-    """Returns {seed: home} of a density, from the cache on disk if they were generated before."""
-    key = hashlib.sha256(repr((seeds, float(density))).encode())
+def generated(
+    seeds: tuple[int, ...], density: float, clutter: float = 0.0, outer: bool = True
+) -> dict[int, dotdict]:
+    """Returns {seed: home} of a density and a clutter, from the cache on disk if possible."""
+    key = hashlib.sha256(repr((seeds, float(density), float(clutter))).encode())
     for source in *sorted(Path(__file__).parent.glob("*.py")), Path(geometry.__file__):
         key.update(source.read_bytes())
     name = f"{PREFIX}{key.hexdigest()[:20]}"
-    content, _ = cache.fetch(name, lambda: _generate(seeds, density))
+    content, _ = cache.fetch(name, lambda: _generate(seeds, density, clutter))
     cache.prune(PREFIX, MAX_FILES)
     database = _unpack(content)
     return {seed: _home(*database, index, seed, outer) for index, seed in enumerate(seeds)}
 
 
-def _generate(seeds, density):
+def _generate(seeds, density, clutter):
     """Returns the bytes of a database of generated homes."""
     import loky
 
-    make = functools.partial(homes.generate, density=density)
+    make = functools.partial(homes.generate, density=density, clutter=clutter)
     n_workers = min(loky.cpu_count(), len(seeds) // SEEDS_EACH)
     if n_workers < 2:
         return pack([make(seed) for seed in seeds])

@@ -1,7 +1,9 @@
-"""Furniture of dense homes: boxes and L-shapes, as solid as walls. Integer centimetres.
+"""Furniture of dense and cluttered homes: boxes and L-shapes, as solid as walls. Integer
+centimetres.
 
 Furniture never cuts a room in two: around each piece, grown up to the walls that it stands by, is a
-free strip `PASSAGE` wide, in which whatever is at most as wide can go round it.
+free strip, in which whatever is at most as wide can go round it. The strip is `PASSAGE` wide, and
+around clutter `TIGHT[0]`.
 """
 
 from collections.abc import Sequence
@@ -20,6 +22,9 @@ L_SHAPED = 0.35  # fraction of pieces without one of their corners
 NOTCH = 15  # cm per side; the least that an L-shape lacks, and of which it consists
 BESIDE_LIGHT = 25  # cm; so that no piece touches a light's cell of the masks
 TRIES = 6  # places tried for a piece
+TIGHT = (24, 46)  # cm; widths of the gaps that clutter leaves. An agent is 21.2 cm wide
+DEEP, LONG = (30, 90), (30, 130)  # cm; sides of a piece of clutter
+OFF_WALL = 0.5  # fraction of clutter that leaves a gap behind it
 
 
 def overlap(a: Rectangle, b: Rectangle, apart: int = 0) -> bool:
@@ -59,8 +64,14 @@ def walled(region: regions.Region, rectangle: Rectangle) -> list[bool]:
     return closed
 
 
-def _place(low, high, size, is_walled, generator):
-    """Places a piece along an axis of a room, from `low` to `high`.
+def tight(generator: PortableGenerator) -> int:
+    """Draws the width in cm of a gap that clutter leaves. The narrowest are rare."""
+    return max(generator.between(*TIGHT), generator.between(*TIGHT))
+
+
+def _place(low, high, size, is_walled, generator, passage=PASSAGE, off_wall=0.0):
+    """Places a piece along an axis of a room, from `low` to `high`. With the probability `off_wall`
+    no wall is nearer than a passage.
 
     Returns (low, high) of the piece and of what it fills with the walls that it stands by, or None
     if it blocks the room or a side without a wall.
@@ -73,11 +84,96 @@ def _place(low, high, size, is_walled, generator):
     else:
         before = generator.between(0, spare // 5) * 5
     before = 0 if before < SLIT else spare if spare - before < SLIT else before
-    fills = before < PASSAGE, spare - before < PASSAGE
+    if off_wall and spare >= 2 * passage and generator.chance(off_wall):
+        before = min(max(before, passage), spare - passage)
+    fills = before < passage, spare - before < passage
     if all(fills) or any(fill and not wall for fill, wall in zip(fills, is_walled)):
         return None
     at = low + before
     return (at, at + size), (low if fills[0] else at, high if fills[1] else at + size)
+
+
+def _roomy(floor, is_walled, generator):
+    """Places a piece with a passage around it on a rectangle of floor.
+
+    Returns the rectangles of the piece and of what it fills with the walls that it stands by, or
+    None if it blocks the room.
+    """
+    x0, y0, x1, y1 = floor
+    width, height = (generator.between(SIZES[0] // 5, SIZES[1] // 5) * 5 for _ in "xy")
+    across = _place(x0, x1, width, is_walled[0::2], generator)
+    down = _place(y0, y1, height, is_walled[1::2], generator)
+    if not (across and down):
+        return None
+    ((a, c), (fill_a, fill_c)), ((b, d), (fill_b, fill_d)) = across, down
+    return (a, b, c, d), (fill_a, fill_b, fill_c, fill_d)
+
+
+def _turned(sides):
+    """Exchanges x and y of a rectangle, or of something else in the order of its sides."""
+    return sides[1], sides[0], sides[3], sides[2]
+
+
+def _cluttered(floor, is_walled, filled, keep_clear, doorway, gap, generator):
+    """Places a piece that leaves narrow gaps. Returns the same as `_roomy`.
+
+    It stands in front of `doorway`, the part of one that clutter blocks, if given.
+    """
+    if doorway:
+        turns = doorway[2] - doorway[0] < doorway[3] - doorway[1]
+    else:
+        turns = generator.below(2)
+    if not turns:
+        return _in_row(floor, is_walled, filled, keep_clear, doorway, gap, generator)
+    rectangles = _in_row(
+        _turned(floor),
+        _turned(is_walled),
+        [*map(_turned, filled)],
+        [*map(_turned, keep_clear)],
+        doorway and _turned(doorway),
+        gap,
+        generator,
+    )
+    return rectangles and tuple(map(_turned, rectangles))
+
+
+def _in_row(floor, is_walled, filled, keep_clear, doorway, gap, generator):
+    """Places a piece so that along x it takes a free interval between walls, other pieces and what
+    is kept clear, less narrow gaps. At a wall at one of its ends may be none.
+    """
+    x0, y0, x1, y1 = floor
+    size = generator.between(DEEP[0] // 5, DEEP[1] // 5) * 5
+    if doorway:
+        at, above = (doorway[0] + doorway[2]) // 2, doorway[1] >= y0
+        b = y1 - size if above else y0
+        fills = b, b + size
+        if y1 - y0 - size < gap or not is_walled[3 if above else 1]:
+            return None
+    else:
+        at = generator.between(x0, x1)
+        down = _place(y0, y1, size, is_walled[1::2], generator, gap, OFF_WALL)
+        if not down:
+            return None
+        (b, _), fills = down
+    before = generator.below(2)
+    a = x0 if is_walled[0] and not before else x0 + gap
+    c = x1 if is_walled[2] and before else x1 - gap
+    for others, strip, apart in (keep_clear, 0, 0), (filled, gap, gap):
+        for x_low, y_low, x_high, y_high in others:
+            if min(fills[1], y_high) + strip > max(fills[0], y_low):
+                if x_low > at:
+                    c = min(c, x_low - apart, x1 - TIGHT[0])
+                elif x_high < at:
+                    a = max(a, x_high + apart, x0 + TIGHT[0])
+                else:
+                    return None
+    length = generator.between(LONG[0] // 5, LONG[1] // 5) * 5
+    if c - a - length >= gap:
+        at_low = at - a < c - at if doorway else before
+        a, c = (a, a + length) if at_low else (c - length, c)
+    if c - a < LONG[0]:
+        return None
+    return (a, b, c, b + size), (a, fills[0], c, fills[1])
 
 
 def furnish(
@@ -86,6 +182,8 @@ def furnish(
     keep_clear: Sequence[Rectangle],
     rate: float,
     generator: PortableGenerator,
+    clutter: float = 0.0,
+    doorways: Sequence[Rectangle] = (),
 ) -> regions.Region:
     """Draws the furniture of a room: disjoint rectangles, of which an L-shape has two.
 
@@ -93,30 +191,38 @@ def furnish(
         solids: the walls of the home.
         keep_clear: where nothing may stand, such as in front of doors.
         rate: pieces per m2 of the room's widest rectangle. Those that find no place are left out.
+        clutter: fraction of the pieces that leave narrow gaps.
+        doorways: parts of the home's doorways, outside of rooms, that clutter blocks.
     """
     widest = regions.widest(region)
-    is_walled, (x0, y0, x1, y1) = walled(region, widest), clear(widest, solids)
+    is_walled, floor = walled(region, widest), clear(widest, solids)
+    x0, y0, x1, y1 = floor
     count = int(rate * (x1 - x0) * (y1 - y0) / 10_000 + generator.uniform())
+    doorways = [doorway for doorway in doorways if overlap(doorway, floor, 1)]
     filled, pieces = [], []
     for _ in range(count):
+        is_clutter = clutter > 0 and generator.chance(clutter)
+        doorway = doorways.pop() if is_clutter and doorways else None
         for _ in range(TRIES):
-            width, height = (generator.between(SIZES[0] // 5, SIZES[1] // 5) * 5 for _ in "xy")
-            across = _place(x0, x1, width, is_walled[0::2], generator)
-            down = _place(y0, y1, height, is_walled[1::2], generator)
-            if not (across and down):
+            if is_clutter:
+                passage = tight(generator)
+                rectangles = _cluttered(
+                    floor, is_walled, filled, keep_clear, doorway, passage, generator
+                )
+            else:
+                passage, rectangles = PASSAGE, _roomy(floor, is_walled, generator)
+            if not rectangles:
                 continue
-            (a, c), (fill_a, fill_c) = across
-            (b, d), (fill_b, fill_d) = down
-            fills = fill_a, fill_b, fill_c, fill_d
-            if any(overlap(fills, other, PASSAGE) for other in filled):
+            box, fills = rectangles
+            if any(overlap(fills, other, passage) for other in filled):
                 continue
             if any(overlap(fills, other) for other in keep_clear):
                 continue
             filled.append(fills)
             # the corner that an L-shape lacks is away from walls, or it would be walled in
-            right = 1 if fill_a == x0 else 0 if fill_c == x1 else generator.below(2)
-            up = 1 if fill_b == y0 else 0 if fill_d == y1 else generator.below(2)
-            pieces += _shape((a, b, c, d), right, up, generator)
+            right = 1 if fills[0] == x0 else 0 if fills[2] == x1 else generator.below(2)
+            up = 1 if fills[1] == y0 else 0 if fills[3] == y1 else generator.below(2)
+            pieces += _shape(box, right, up, generator)
             break
     return pieces
 

@@ -23,6 +23,9 @@ class Kind(NamedTuple):
 
 
 DENSEST = 3  # density at which homes have about three times as many walls as at 1
+# Pieces tried per m2: in homes of density 1 with a clutter of 1, in the densest homes without
+# clutter, and in the densest with a clutter of 1, where fewer are refused.
+SPARSE, FULL, CLUTTERED = 0.4, 0.8, 0.38
 
 
 class Style(NamedTuple):
@@ -36,15 +39,21 @@ class Style(NamedTuple):
     open_plan: float = 1.0  # factor of the probability that a connection has no door
     furniture: float = 0.0  # pieces tried per m2
     off_centre: float = 0.0  # fraction of lights that are anywhere in their room
+    clutter: float = 0.0  # fraction of furniture that leaves narrow gaps
+    half_blocked: float = 0.0  # fraction of doorways with a narrow way in
 
 
 NORMAL = Style()
 
 
-def style(density: float) -> Style:
-    """Returns the style of homes of a density from 1, as real homes have, to `DENSEST`."""
+def style(density: float, clutter: float = 0.0) -> Style:
+    """Returns the style of homes of a density from 1, as real homes have, to `DENSEST`, and a
+    clutter from 0 to 1.
+    """
     if not 1 <= density <= DENSEST:
         raise ValueError(f"density={density!r}: homes have a density from 1 to {DENSEST}")
+    if not 0 <= clutter <= 1:
+        raise ValueError(f"clutter={clutter!r}: homes have a clutter from 0 to 1")
     t = (density - 1) / (DENSEST - 1)
     return Style(
         rooms=1 + 0.55 * t,
@@ -53,8 +62,10 @@ def style(density: float) -> Style:
         corridor=(110 - int(20 * t), 150 - int(40 * t)),
         narrow=t,
         open_plan=1 - 0.7 * t,
-        furniture=0.8 * t,
+        furniture=SPARSE * clutter * (1 - t) + (FULL + (CLUTTERED - FULL) * clutter) * t,
         off_centre=0.7 * t,
+        clutter=0.8 * clutter,
+        half_blocked=0.25 * clutter,
     )
 
 
