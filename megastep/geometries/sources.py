@@ -146,7 +146,7 @@ def _part(name: str, part: Any) -> tuple[Callable, dict[str, Any]]:
         raise ValueError(f"{source!r} is no source; {closest(source, [*known, 'module:function'])}")
     function = import_object(source) if ":" in source else globals()[source]
     arguments = inspect.signature(function).parameters
-    taken = [k for k in arguments if k not in ("split", "seed")]
+    taken = [k for k in arguments if k != "split"]
     if missing := [k for k in ("n", "split", "seed") if k not in arguments]:
         raise ValueError(f"{name}: {source} is no source, for it takes no {missing[0]}")
     if unknown := [k for k in options if k not in taken]:
@@ -183,8 +183,9 @@ def mixed(
         n: number of geometries, evenly spaced over the parts, or repeated; None: as many as the
             parts have.
         parts: name -> number of geometries from the source of that name; or {source, n, options}
-            with the name or import path of a source. Every part is of the same split and seed, and
-            has at most as many geometries as that split of its source.
+            with the name or import path of a source. Every part is of the same split, and of the
+            same seed unless its options have one; it has at most as many geometries as that split
+            of its source.
     """
     check_parts(parts)
     geometries = []
@@ -192,7 +193,7 @@ def mixed(
         function, options = _part(name, part)
         if options["n"]:
             try:
-                drawn = checked(function)(split=split, seed=seed, **options)
+                drawn = checked(function)(**{"split": split, "seed": seed, **options})
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from error
             unique = {id(g): dotdict(g, source=name) for g in drawn}

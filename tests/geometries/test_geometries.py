@@ -92,6 +92,16 @@ def test_a_mix_splits_each_part_with_one_seed():
             assert g.walls.tobytes() == alone.walls.tobytes() and "source" not in alone
 
 
+def test_a_part_may_have_a_seed_of_its_own():
+    parts = {"homes": 5, "others": {"source": "homes", "n": 5, "seed": 2}}
+    mix = geometries.sample("mixed", 10, "test", seed=1, parts=parts)
+    drawn = [g.id for seed in (1, 2) for g in geometries.sample("homes", 5, "test", seed)]
+    assert [g.id for g in mix] == drawn and len(set(drawn)) > 5
+    parts["others"]["seed"] = -1
+    with pytest.raises(ValueError, match="others: seed: -1 is out of range"):
+        geometries.sample("mixed", 10, parts=parts)
+
+
 def test_fewer_of_a_mix_are_spread_over_its_parts_and_more_are_repeated():
     parts = {"homes": 6, "bench": 2}
     mix = geometries.sample("mixed", 8, parts=parts)
