@@ -30,7 +30,7 @@ EXPLORER = "geometry=bench", "finish.evaluate=true"  # overrides of `train`
 
 # ---- worlds: a recipe per environment ----
 
-#: Overrides of an evaluation in floor plans of several makes.
+#: Overrides of an evaluation in several kinds of floor plans.
 SUITE = "geometry=suite episodes=1024"
 TRAINED_IN = {"homes": "geometry=homes", "mazes": "geometry=maze geometry.braid=0.3"}
 AGENTS = {"Explorer": "env=explorer", "PointGoal": "experiment=pointgoal"}
@@ -221,7 +221,7 @@ def learners(
 def curricula(
     device: torch.device, seeds: Sequence[int] = SEEDS, samples: int = 1_000_000_000
 ) -> Iterator[dict]:
-    """PointGoal in floor plans of several makes, with each curriculum and equally many samples, all
+    """PointGoal in several kinds of floor plans, with each curriculum and equally many samples, all
     side by side on all GPUs: success and SPL in each source of the suite, in the worst and in the
     worst dense homes, a sample per seed. Then how soon 10 episodes have ended in each of 4,096
     homes, so that their learnability is known.
