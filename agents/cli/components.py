@@ -7,6 +7,7 @@ hash of the sources.
 
 import functools
 import hashlib
+import inspect
 import pickle
 import sys
 from pathlib import Path
@@ -51,25 +52,47 @@ ARGUMENTS = {
 VERSIONS = 8
 
 
-@functools.cache
 def built_in() -> dict[tuple[str, str], tuple[str, dict[str, tuple]]]:
     """Returns what `arguments_of` returns of each component, by (group, import path)."""
+    return cached()[0]
+
+
+def takes_geometries(env: str) -> bool:
+    """Returns whether the environment of an import path takes floor plans."""
+    built_in, takers = cached()
+    return env in takers if ("env", env) in built_in else _takes_geometries(env)
+
+
+@functools.cache
+def cached() -> tuple[dict[tuple[str, str], tuple[str, dict[str, tuple]]], set[str]]:
+    """Returns what `read` does, from the cache on disk if no source has changed."""
     content, _ = cache.fetch(f"arguments-{_sources()}", lambda: pickle.dumps(read()))
     cache.prune("arguments-", VERSIONS)
     return pickle.loads(content)
 
 
-def read() -> dict[tuple[str, str], tuple[str, dict[str, tuple]]]:
-    """Imports every component of megastep, for `built_in`."""
+def read() -> tuple[dict[tuple[str, str], tuple[str, dict[str, tuple]]], set[str]]:
+    """Imports every component of megastep. Returns what `built_in` does, and the import paths of
+    the environments that take floor plans.
+    """
     names = [("agent", POLICY), ("opponents", OPPONENTS)]
     for path in program.CONFIGS.glob("*/*.yaml"):
         tree = yaml.safe_load(path.read_text()) or {}
         names.append((path.parent.name, str(tree.get("name"))))
-    return {
-        (group, name): arguments_of(import_object(name), **ARGUMENTS[group])
+    names = [
+        (group, name)
         for group, name in names
         if group in ARGUMENTS and name.startswith("megastep.")
+    ]
+    arguments = {
+        (group, name): arguments_of(import_object(name), **ARGUMENTS[group])
+        for group, name in names
     }
+    return arguments, {name for group, name in names if group == "env" and _takes_geometries(name)}
+
+
+def _takes_geometries(env):
+    return "geometries" in inspect.signature(import_object(env)).parameters
 
 
 def _sources():

@@ -60,7 +60,8 @@ def run(cfg: settings.Evaluate) -> Path:
     start, device = time.monotonic(), factory.make_device(cfg.device)
     loaded = runs.load_checkpoint(runs.find(cfg.run), cfg.trust, device)
     trained = factory.config_of(loaded)
-    env_settings, geometry = cfg.env or trained.env, cfg.geometry or trained.geometry
+    env_settings = cfg.env or trained.env
+    geometry = factory.typed_or(trained.geometry, cfg.geometry, env_settings)
     homes = factory.homes(env_settings, geometry, cfg.split)
     if cfg.ratings:
         path = Arena(cfg, loaded, env_settings, geometry, homes, device).rate()
@@ -130,17 +131,9 @@ def each_source(geometry: settings.Geometry) -> str:
 
 
 def parts_of(geometry: settings.Geometry, homes: list) -> list[tuple[str | None, list]]:
-    """Returns [(source, its homes)] of a suite, and [(None, homes)] of all other geometries.
-
-    Raises:
-        UserError: if the environment takes no homes, so that a suite has no sources.
-    """
+    """Returns [(source, its homes)] of a suite, and [(None, homes)] of all other geometries."""
     if not is_suite(geometry):
         return [(None, homes)]
-    if not homes:
-        raise program.UserError(
-            "This environment has no floor plans, so geometry=suite has no sources; leave it out"
-        )
     parts = {}
     for home in homes:
         parts.setdefault(home["source"], []).append(home)

@@ -18,6 +18,8 @@ from megastep.agents.cli.settings import (
     Learner,
     Train,
     changed,
+    env_name,
+    label,
     takes_geometries,
 )
 from megastep.agents.distributed import process_group
@@ -85,6 +87,18 @@ def homes(env: Env, geometry: Geometry, split: str) -> list[dict]:
     if not takes_geometries(env):
         return []
     return [*{id(home): home for home in construct(geometry, split=split)}.values()]
+
+
+def typed_or(geometry: Geometry, typed: Geometry | None, env: Env) -> Geometry:
+    """Returns the geometry that was typed, else the other. UserError if `env` takes none."""
+    if typed is None:
+        return geometry
+    if not takes_geometries(env):
+        raise program.UserError(
+            f"{env_name(env)} takes no floor plans, so it cannot be played in "
+            f"geometry={label(typed.name)}; leave geometry out"
+        )
+    return typed
 
 
 def spread(homes: list[dict], n_envs: int) -> list[dict]:

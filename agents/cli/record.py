@@ -41,7 +41,8 @@ def run(cfg: settings.Record) -> Path:
     if cfg.run is not None:
         loaded = runs.load_checkpoint(runs.find(cfg.run), cfg.trust, device)
         trained = factory.config_of(loaded)
-        env_settings, geometry = trained.env, geometry or trained.geometry
+        env_settings = trained.env
+        geometry = factory.typed_or(trained.geometry, geometry, env_settings)
         folder = runs.folder_of(loaded.path)
     if cfg.against is not None:
         env_settings = factory.changed(env_settings, **evaluate.FOR_TWO)

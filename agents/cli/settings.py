@@ -126,7 +126,7 @@ def changed(settings: Any, **changes: Any) -> Any:
 
 def takes_geometries(env: Any) -> bool:
     """Returns True if the class of an environment's settings takes floor plans."""
-    return "geometries" in inspect.signature(import_object(env.name)).parameters
+    return components.takes_geometries(env.name)
 
 
 def ignored_geometry(env: Any, typed: list[str]) -> list[tuple[str, str]]:

@@ -22,7 +22,8 @@ from tests.helpers import tiny
 ROOT = pathlib.Path(__file__).parents[2]
 #: The most files that adding one takes, its test among them.
 FILES = {"environment": 3, "geometry": 3, "learner": 3, "core": 2, "encoder": 2}
-SMALL = [word for word in tiny.TINY if not word.startswith(("env=", "env.res"))]
+SMALL = [word for word in tiny.TINY if not word.startswith(("env=", "env.res", "geometry"))]
+MINIMAL = ["env=minimal", "env.res=8", "geometry=box"]
 RUN = [*SMALL, "samples=64", "log_every=1"]
 
 COUNTER = '''
@@ -169,7 +170,7 @@ def test_custom_geometry(outside):
             return [toys.box(width + i) for i in range(n)]
         """
     add(outside, "geometry", {"plans.py": source})
-    words = ["env=minimal", "env.res=8", *SMALL, "samples=64", "log_every=1"]
+    words = [*MINIMAL, *SMALL, "samples=64", "log_every=1"]
     assert train.main([*words, "geometry=plans:rooms", "geometry.width=6"]) == 0
     expected = {"name": "plans:rooms", "n": 3, "seed": 1, "width": 6.0}
     assert saved().config["train"]["geometry"] == expected
@@ -280,7 +281,7 @@ MEAN = '''
 
 def test_custom_recurrent_core(outside):
     add(outside, "core", {"mean.py": MEAN})
-    words = ["env=minimal", "env.res=8", *SMALL, "samples=64", "agent.core=mean:Mean"]
+    words = [*MINIMAL, *SMALL, "samples=64", "agent.core=mean:Mean"]
     assert train.main(words) == 0
     assert saved().config["train"]["agent"]["core"] == "mean:Mean"
     assert "core.layer.weight" in saved().state["policy"]
@@ -304,7 +305,7 @@ def test_custom_encoder(outside):
                 return obs.mean(-1).flatten(-3)
         '''
     add(outside, "encoder", {"rows.py": encoder})
-    words = ["env=minimal", "env.res=8", *SMALL, "samples=64", "agent.encoder=rows:Rows"]
+    words = [*MINIMAL, *SMALL, "samples=64", "agent.encoder=rows:Rows"]
     assert train.main(words) == 0
     assert saved().state["policy"]["intake.project.weight"].shape[0] == 8
     assert evaluate.main(["run=latest", "episodes=4"]) == 0
@@ -409,7 +410,7 @@ def test_environment_contract_error_names_the_clause(outside, capsys, change, cl
 def test_core_contract_error_names_the_clause(outside, capsys, change, clause):
     assert change[0] in MEAN
     outside({"mean.py": MEAN.replace(*change)})
-    error = refused(capsys, "env=minimal", *SMALL, "agent.core=mean:Mean")
+    error = refused(capsys, *MINIMAL, *SMALL, "agent.core=mean:Mean")
     assert "mean:Mean" in error and clause in error, error
 
 
@@ -423,14 +424,14 @@ def test_core_contract_error_names_the_clause(outside, capsys, change, clause):
     ],
 )
 def test_core_or_encoder_of_another_kind(outside, capsys, key, name, reason):
-    error = refused(capsys, "env=minimal", "env.res=8", *SMALL, f"{key}={name}")
+    error = refused(capsys, *MINIMAL, *SMALL, f"{key}={name}")
     assert f"{name} {reason}" in error and "Traceback" not in error
 
 
 def test_encoder_contract_error(outside, capsys):
     text = "from torch import nn\n\n\nclass Half(nn.Flatten):\n    n_features = 3\n\n"
     outside({"half.py": text + "    def __init__(self, space):\n        super().__init__(-4)\n"})
-    error = refused(capsys, "env=minimal", "env.res=8", *SMALL, "agent.encoder=half:Half")
+    error = refused(capsys, *MINIMAL, *SMALL, "agent.encoder=half:Half")
     assert "half:Half breaks the contract of encoders" in error and "(3, 3), not (3, 24)" in error
 
 
@@ -456,22 +457,20 @@ def test_missing_class_of_a_checkpoint(outside, capsys):
 
 
 def test_init_takes_environment_geometry_and_agent_unless_typed(outside):
-    outside({"counter.py": COUNTER})
-    own = ["env=counter:Counter", "env.limit=7", "agent.core=gru", "agent.critic=plain"]
-    assert train.main([*RUN, *own, "geometry.width=6", "folder=first"]) == 0
-    common = [w for w in RUN if not w.startswith(("agent.", "env.", "geometry"))]
+    limit = "    def __init__(self, n_envs, geometries, seed=1, device=None, limit: int = 6):\n"
+    roomy = f"\n\nclass Roomy(Counter):\n{limit}"
+    roomy += "        super().__init__(n_envs, seed=seed, device=device, limit=limit)\n"
+    outside({"counter.py": COUNTER + roomy})
+    own = ["env=counter:Roomy", "env.limit=7", "agent.core=gru", "agent.critic=plain"]
+    assert train.main([*RUN, *own, "geometry=box", "geometry.width=6", "folder=first"]) == 0
+    common = [w for w in RUN if not w.startswith(("agent.", "env."))]
     assert train.main([*common, "init=first", "env.n_envs=8", "folder=second"]) == 0
     config = checkpoint.load_latest("second/checkpoints").config["train"]
-    assert config["env"] == {
-        "name": "counter:Counter",
-        "n_envs": 8,
-        "limit": 7,
-        "sizes": [1, 2],
-    }
+    assert config["env"] == {"name": "counter:Roomy", "n_envs": 8, "limit": 7}
     assert config["agent"]["core"] == "gru" and config["agent"]["width"] == 8
     box = {"name": "megastep.geometries.sources:box", "n": 1, "seed": 1, "width": 6.0}
     assert config["geometry"] == box
-    words = ["init=first", "env=counter:Counter", "env.n_envs=4", "geometry=column"]
+    words = ["init=first", "env=counter:Roomy", "env.n_envs=4", "geometry=column"]
     assert train.main([*common, *words, "folder=third"]) == 0
     config = checkpoint.load_latest("third/checkpoints").config["train"]
     assert config["env"]["limit"] == 6 and config["geometry"]["name"].endswith(":column")

@@ -1,5 +1,6 @@
 """What is told before PyTorch is imported: help, errors, and what a stopped run has had."""
 
+import inspect
 import json
 import os
 import pathlib
@@ -66,6 +67,15 @@ def test_cached_arguments_have_the_same_errors():
     assert n_sentences > 1000
 
 
+def test_environments_that_take_geometries_are_cached():
+    for group, name in components.built_in():
+        if group == "env":
+            taken = inspect.signature(import_object(name)).parameters
+            assert components.takes_geometries(name) == ("geometries" in taken), name
+    assert components.takes_geometries("megastep.envs.explorer:Explorer")
+    assert not components.takes_geometries("tests.cli.test_exact_resume:Steered")
+
+
 def test_arguments_are_read_again_after_a_change(tmp_path, monkeypatch):
     monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
     read = []
@@ -75,7 +85,7 @@ def test_arguments_are_read_again_after_a_change(tmp_path, monkeypatch):
     source.parent.mkdir()
     for text, n_reads in (("x = 1", 1), ("x = 1", 1), ("x = 2", 2), ("x = 1", 2)):
         source.write_text(text)
-        assert components.built_in.__wrapped__() == {} and len(read) == n_reads
+        assert components.cached.__wrapped__() == {} and len(read) == n_reads
 
 
 HEAVY = ("torch", "numpy", "scipy", "matplotlib", "rich", "tensorboard", "loky")
@@ -103,6 +113,7 @@ def test_errors_need_no_pytorch(stopped):
         ("train", 2, wrong),
         ("train", 2, ["learner=r2d2", "learner.replay.capacity=0"]),
         ("train", 2, ["geometry=files", "geometry.path=nope"]),
+        ("train", 2, ["env=pong", "geometry=box"]),
         ("train", 2, ["-m", "seed=1,2", "learner.lr=-1"]),
         ("train", 2, ["hydra.searchpath=ppo", "--info", "searchpath"]),
         ("train", 2, ["resume=run"]),

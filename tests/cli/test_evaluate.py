@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from megastep import envs, scene, spaces
-from megastep.agents.cli import evaluate, runs, train
+from megastep.agents.cli import evaluate, record, runs, train
 from megastep.agents.cli.program import UserError
 from megastep.agents.training import evaluation
 from megastep.arrdict import arrdict
@@ -486,13 +486,19 @@ def test_suite_of_imported_plans(explorer, tmp_path):
     assert [(row["source"], row["homes"]) for row in rows[:-1]] == [("box", 1), ("plans", 2)]
 
 
-def test_suite_without_sources(tmp_path, monkeypatch):
+@pytest.mark.parametrize("geometry", ["suite", "maze"])
+def test_a_geometry_that_the_environment_does_not_take_is_refused(tmp_path, monkeypatch, geometry):
     monkeypatch.chdir(tmp_path)
     pong = ["env=pong", "preset=cpu", "env.n_envs=4", "learner.n_steps=8", "agent.width=8"]
     run = train.run(settings(*pong, "learner.n_minibatches=2", "device=cpu", "samples=1"))
-    suite = settings("run=x", "geometry=suite", script="evaluate").geometry
-    with pytest.raises(UserError, match="no floor plans, so geometry=suite has no sources"):
-        evaluate.run(configured(run=str(run), geometry=suite))
+    typed = settings("run=x", f"geometry={geometry}", script="evaluate").geometry
+    message = f"pong takes no floor plans, so it cannot be played in geometry={geometry}"
+    with pytest.raises(UserError, match=message):
+        evaluate.run(configured(run=str(run), geometry=typed))
+    with pytest.raises(UserError, match=message):
+        words = f"run={run}", f"geometry={geometry}", "steps=2", "device=cpu"
+        record.run(settings(*words, script="record"))
+    assert not (run / "evaluations").exists() and not (run / "video.mp4").exists()
 
 
 def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):

@@ -58,17 +58,17 @@ CASES = {
     "opponents": [*FIGHT, *SELF_PLAY, "opponents.bot=0.25"],
     "pong": [*PONG, "learner.n_minibatches=2"],
     "continuous": [
-        *("env=tests.cli.test_exact_resume:Steered", *tiny.TINY[1:], "learner=vtrace"),
+        *("env=tests.cli.test_exact_resume:Steered", *tiny.TINY[2:], "learner=vtrace"),
         *("learner.buffer=replay", *REPLAY),
     ],
     "beta": [
-        *("env=tests.cli.test_exact_resume:Steered", *tiny.TINY[1:], "agent.continuous=beta"),
+        *("env=tests.cli.test_exact_resume:Steered", *tiny.TINY[2:], "agent.continuous=beta"),
     ],
     "gymnasium": [
         *("env=gymnasium", "env.id=CartPole-v1", *SMALL[1:]),
         *("learner.n_minibatches=2", "preset=cpu"),
     ],
-    "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[1:]],
+    "stranger": ["env=tests.cli.test_exact_resume:Drifting", *tiny.TINY[2:]],
 }
 FAST = "explorer", "lag", "priorities", "r2d2", "opponents", "stranger", "beta", "plr"
 
