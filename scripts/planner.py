@@ -30,6 +30,7 @@ from megastep.envs.pointgoal.path_graph import PathGraph
 SOURCES = {
     "generated homes": ("homes", {}),
     "the same, geometry.density=3": ("homes", dict(density=3.0)),
+    "geometry.density=3 geometry.clutter=1": ("homes", dict(density=3.0, clutter=1.0)),
     "bench homes": ("bench", {}),
     "perfect mazes": ("maze", {}),
     "braided mazes": ("maze", dict(braid=1.0)),
