@@ -43,6 +43,6 @@ def test_code_of_the_page_runs(folder):
 
 
 def test_commands_of_the_page_work(folder, monkeypatch, capsys):
-    assert pages.type_all(TEXT, folder, monkeypatch) == list(pages.MAINS)
+    assert pages.type_all(TEXT, folder, monkeypatch) == ["train.py", *pages.MAINS]
     assert "in 64 homes, geometry=my_rooms:sample, split=test" in capsys.readouterr().out
     assert (folder / "rooms.png").exists()
