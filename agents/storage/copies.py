@@ -13,7 +13,8 @@ from megastep.types import Tree
 
 PROGRAM = Program(Path(__file__).parent / "kernels")
 _MAX_COPIES = PROGRAM.constants["MAX_COPIES"]
-_BLOCK_BYTES = 16 * BLOCK * PROGRAM.constants["COPY_WORDS"]
+_BLOCK_WORDS = BLOCK * PROGRAM.constants["COPY_WORDS"]
+_BLOCK_BYTES = 16 * _BLOCK_WORDS
 _MAX_SELECTED = PROGRAM.constants["MAX_SELECTED"]
 _MAX_BYTES = 2**31
 
@@ -87,7 +88,7 @@ def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[t
     fused = [i for i, tensor in enumerate(tensors) if tensor.is_cuda and _can_select(tensor)]
     for start in range(0, len(fused), _MAX_SELECTED):
         chosen = fused[start : start + _MAX_SELECTED]
-        rows, largest = [], 0
+        rows, n_blocks = [], 0
         for i in chosen:
             tensor = tensors[i]
             n_steps, _, *rest = tensor.shape
@@ -101,19 +102,21 @@ def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[t
                     source=tensor.data_ptr(),
                     n_steps=n_steps,
                     n_words=n_bytes // word_size,
+                    first_block=n_blocks,
                     word_size=word_size,
                 )
             )
-            largest = max(largest, n_steps * len(lanes) * (n_bytes // word_size))
+            n_blocks += -(-n_steps * len(lanes) * (n_bytes // word_size) // _BLOCK_WORDS)
         struct = PROGRAM.params.SelectLanesParams(
             tensors=b"".join(rows),
             lanes=lanes.data_ptr(),
             n_lanes=tensors[chosen[0]].shape[1],
             n_selected=len(lanes),
+            n_tensors=len(rows),
         )
-        n_blocks = -(-largest // BLOCK), len(rows)
-        if largest:
-            launch_blocks(PROGRAM, "select_lanes", struct, lanes.device, n_blocks, BLOCK)
+        if n_blocks:
+            device = lanes.device
+            launch_blocks(PROGRAM, "select_lanes", struct, device, (n_blocks, 1), BLOCK)
     return [
         results[i] if i in results else tensor.index_select(1, lanes)
         for i, tensor in enumerate(tensors)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from megastep.agents.storage import copies
-from megastep.agents.storage.copies import copy_all, select_tree
+from megastep.agents.storage.copies import copy_all, select_lanes, select_tree
 from megastep.arrdict import arrdict
 
 DTYPES = torch.bool, torch.uint8, torch.int32, torch.int64, torch.float16, torch.float32
@@ -97,6 +97,24 @@ def test_selects_lanes_of_a_tree(device):
     assert torch.equal(selected.one, leaves[0][lanes])
     for i, leaf in enumerate(leaves):
         assert torch.equal(selected.some[str(i)], leaf[lanes]), i
+
+
+@pytest.mark.parametrize("n_selected", [0, 1, 1500])
+def test_selects_lanes_in_every_step(device, n_selected):
+    """Words of every size, numbers of steps that differ, and tensors of many blocks and of one."""
+    n_lanes = 2000
+    lanes = torch.randperm(n_lanes, generator=torch.Generator().manual_seed(1))[:n_selected]
+    lanes = lanes.to(device)
+    shapes = (3, 16), (1, 1), (5, 6), (2, 50), (1, 4), (4, 3, 2)
+    tensors = [
+        numbers((n_steps, n_lanes, *rest), dtype, device, seed=i)
+        for n_steps, *rest in shapes
+        for i, dtype in enumerate(DTYPES)
+    ]
+    assert len(tensors) > 2 * copies._MAX_SELECTED
+    selected = select_lanes(tensors, lanes)
+    for i, (tensor, ours) in enumerate(zip(tensors, selected, strict=True)):
+        assert torch.equal(ours, tensor[:, lanes]), i
 
 
 def test_nothing_to_copy():

@@ -19,8 +19,9 @@ struct SelectParams {
     void* target;        // (T, M, words)
     const void* source;  // (T, B, words)
     unsigned int n_steps;
-    unsigned int n_words;  // per step and lane
-    int word_size;         // 1, 4, 8 or 16 bytes
+    unsigned int n_words;      // per step and lane; less than 2^31 in all
+    unsigned int first_block;  // of the launch that selects from it
+    int word_size;             // 1, 4, 8 or 16 bytes
 };
 
 struct SelectLanesParams {
@@ -28,6 +29,7 @@ struct SelectLanesParams {
     const long long* lanes;   // (M)
     unsigned int n_lanes;     // B
     unsigned int n_selected;  // M
+    int n_tensors;
 };
 
 // ---- Replay buffer ----

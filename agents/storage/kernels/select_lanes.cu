@@ -1,24 +1,48 @@
-// Selects lanes of many tensors in one launch, one thread per word. Blocks along y: tensors.
+// Selects lanes of many tensors in one launch. A block copies neighbouring words of one tensor, a
+// thread several of them, whose loads do not wait for each other.
 #include "common/constants.h"
 #include "constants.h"
 #include "params.h"
 
 #define KERNEL extern "C" __global__ void
 
+static_assert(sizeof(SelectLanesParams::tensors) == MAX_SELECTED * sizeof(SelectParams));
+
+template <class Word>
+__device__ void copy_words(const SelectLanesParams& p, const SelectParams& tensor,
+                           unsigned int first) {
+    const Word* source = (const Word*)tensor.source;
+    unsigned int n = tensor.n_steps * p.n_selected * tensor.n_words;
+    Word words[COPY_WORDS];
+#pragma unroll
+    for (int i = 0; i < COPY_WORDS; i++) {
+        unsigned int at = first + i * BLOCK;
+        if (at >= n)
+            continue;
+        unsigned int row = at / tensor.n_words, word = at - row * tensor.n_words;
+        unsigned int t = row / p.n_selected, m = row - t * p.n_selected;
+        words[i] = source[((long long)t * p.n_lanes + p.lanes[m]) * tensor.n_words + word];
+    }
+#pragma unroll
+    for (int i = 0; i < COPY_WORDS; i++)
+        if (first + i * BLOCK < n)
+            ((Word*)tensor.target)[first + i * BLOCK] = words[i];
+}
+
 KERNEL select_lanes(SelectLanesParams p) {
-    const SelectParams& tensor = p.tensors[blockIdx.y];
-    unsigned int at = blockIdx.x * blockDim.x + threadIdx.x;
-    unsigned int row = at / tensor.n_words, word = at % tensor.n_words;
-    unsigned int t = row / p.n_selected, m = row % p.n_selected;
-    if (t >= tensor.n_steps)
-        return;
-    long long from = ((long long)t * p.n_lanes + p.lanes[m]) * tensor.n_words + word;
+    int chosen = 0, end = p.n_tensors;  // the last one that begins at or before this block
+    while (end - chosen > 1) {
+        int middle = (chosen + end) / 2;
+        (p.tensors[middle].first_block <= blockIdx.x ? chosen : end) = middle;
+    }
+    const SelectParams& tensor = p.tensors[chosen];
+    unsigned int first = (blockIdx.x - tensor.first_block) * (BLOCK * COPY_WORDS) + threadIdx.x;
     if (tensor.word_size == 16)
-        ((uint4*)tensor.target)[at] = ((const uint4*)tensor.source)[from];
+        copy_words<uint4>(p, tensor, first);
     else if (tensor.word_size == 8)
-        ((uint2*)tensor.target)[at] = ((const uint2*)tensor.source)[from];
+        copy_words<uint2>(p, tensor, first);
     else if (tensor.word_size == 4)
-        ((unsigned int*)tensor.target)[at] = ((const unsigned int*)tensor.source)[from];
+        copy_words<unsigned int>(p, tensor, first);
     else
-        ((unsigned char*)tensor.target)[at] = ((const unsigned char*)tensor.source)[from];
+        copy_words<unsigned char>(p, tensor, first);
 }
