@@ -223,10 +223,17 @@ class _Encode(torch.autograd.Function):
 
 
 def _parameter_gradients(encoder, d_features, features, rows):
-    """Returns the gradients of `parameters_in_order`, float32, through the banded matrices."""
+    """Returns the gradients of `parameters_in_order`, float32, through the banded matrices. None
+    for parameters that need none.
+    """
+    parameters = encoder.parameters_in_order()
+    wanted = [leaf for leaf in parameters if leaf.requires_grad]
+    if not wanted:
+        return [None] * len(parameters)
     with torch.enable_grad(), torch.autocast(rows.device.type, rows.dtype):
         convolved = encoder.convolved(rows)
-    return torch.autograd.grad(convolved, encoder.parameters_in_order(), d_features)
+    gradients = iter(torch.autograd.grad(convolved, wanted, d_features))
+    return [next(gradients) if leaf.requires_grad else None for leaf in parameters]
 
 
 class Cnn(nn.Module):
