@@ -112,6 +112,7 @@ class Conv(nn.Module):
     """Two convolutions along the rows of an image: (..., A, C, H, W) -> (..., n_features).
 
     The H rows count as channels, since images are one or a few pixels high. Agents share weights.
+    In bfloat16 on GPUs with clusters (Hopper and later), one kernel does both (`encode`).
     """
 
     def __init__(self, space: spaces.MultiImage, channels: int = 32):
@@ -172,7 +173,7 @@ class Part(NamedTuple):
 
 def can_encode(columns: torch.Tensor, parts: Sequence[Part]) -> bool:
     """Returns whether `encode` takes these observations: bfloat16, on GPUs with its kernel."""
-    if columns.requires_grad:
+    if columns.requires_grad or parts[-1].target.stop % kernels.ALIGNMENT:
         return False
     return all(part.encoder is None or part.is_supported(columns) for part in parts)
 

@@ -132,7 +132,9 @@ def test_observations_that_need_gradients_and_odd_columns_are_left_to_other_form
         return encoders.Part(encoder, slice(0, 48), slice(target, target + 96))
 
     assert encoders.can_encode(columns, [part(encoder, 0), part(None, 96)])
-    assert not encoders.can_encode(columns, [part(None, 0), part(encoder, 3)])
+    last = encoders.Part(None, slice(0, 5), slice(99, 104))
+    assert not encoders.can_encode(columns, [part(encoder, 3), last])
+    assert not encoders.can_encode(columns, [part(encoder, 0), last._replace(target=slice(96, 99))])
     assert not encoders.can_encode(columns, [part(encoders.Conv(IMAGE, channels=16), 0)])
     wide = encoders.Conv(spaces.MultiImage(1, 1, 1, 2 * encoders.BandedConv1d.MAX_BANDED))
     assert not encoders.can_encode(columns, [part(wide, 0)])
