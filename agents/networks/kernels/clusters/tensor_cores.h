@@ -16,6 +16,13 @@ DEVICE unsigned int pack_bfloat16(float low, float high) {
     return pair;
 }
 
+// Rounds the positive parts of two floats. NaN stays NaN.
+DEVICE unsigned int pack_relu(float low, float high) {
+    unsigned int pair;
+    asm("cvt.rn.relu.bf16x2.f32 %0, %1, %2;" : "=r"(pair) : "f"(high), "f"(low));
+    return pair;
+}
+
 // The hardware's approximation: its relative error, 2^-11, is below the rounding of the argument to
 // bfloat16. NaN stays NaN.
 DEVICE float tanh_of(float x) {
