@@ -1,8 +1,8 @@
 // One warp per agent: moves its model to its pose and, if `lit`, lights its texels, one per warp
 // lane. For each bounding box of 32 walls, the warp takes each light that some texel may still see.
 // With one wall per warp lane, it rules out the walls that cannot occlude the light from any part
-// of the agent. The remaining walls, rarely more than one, are tested against each texel until all
-// texels are in shadow.
+// of the agent. The remaining walls, often none, are tested against each texel until all texels are
+// in shadow.
 #include "common/scenery.h"
 #include "corridor.h"
 #include "update_agent_geometry.h"
