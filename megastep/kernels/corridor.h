@@ -1,47 +1,67 @@
 // Which walls could occlude a light from some part of an agent. Conservative: a wall is ruled out
-// only if it lies entirely to one side of the path from the light to the agent's centre, by more
-// than the agent's reach, or entirely behind the light, or entirely behind the agent.
+// only if, by a margin for rounding, all of it lies to one side of the path from the light to the
+// agent, or the light and the whole agent lie on the same side of it. All texels of an agent are
+// within `reach` of its centre.
 #pragma once
 #include "common/math.h"
 
-// The path (dx, dy) from a light at (x, y) to an agent. Walls matter up to `along` in its direction
-// and up to `aside` to either side; both are distances times the path's length.
+constexpr float MARGIN = 1e-3f;  // of distances in metres, and of areas in square metres
+
+// A vector's length, overestimated by up to an eighth.
+HD float length_at_most(float x, float y) {
+    float wide = ABS(x), tall = ABS(y);
+    return maxf(wide, tall) + 0.5f * minf(wide, tall);
+}
+
+// The path (dx, dy) from a light to an agent's centre. Walls matter up to half of `width` to either
+// side of it, which is a distance times the path's length.
 struct Corridor {
-    float x, y, dx, dy, along, aside;
+    float dx, dy, width;
 };
 
 HD Corridor corridor_of(float light_x, float light_y, const Pose& agent, float reach) {
     float dx = agent.x - light_x, dy = agent.y - light_y;
-    float length2 = dx * dx + dy * dy;
-    float wide = maxf(dx, -dx), tall = maxf(dy, -dy);
-    // The path's length, overestimated by up to an eighth, plus a slack for rounding.
-    float aside = reach * (maxf(wide, tall) + 0.5f * minf(wide, tall)) + 1e-3f;
-    return {light_x, light_y, dx, dy, length2 + aside, aside};
+    return {dx, dy, 2.f * (reach * length_at_most(dx, dy) + MARGIN)};
 }
 
-HD int may_occlude(const Corridor& c, float ax, float ay, float bx, float by) {
-    float side_a = cross(c.dx, c.dy, ax - c.x, ay - c.y);
-    float side_b = cross(c.dx, c.dy, bx - c.x, by - c.y);
-    float along_a = c.dx * (ax - c.x) + c.dy * (ay - c.y);
-    float along_b = c.dx * (bx - c.x) + c.dy * (by - c.y);
-    return !((minf(side_a, side_b) > c.aside) | (maxf(side_a, side_b) < -c.aside) |
-             (maxf(along_a, along_b) < -c.aside) | (minf(along_a, along_b) > c.along));
+// A box around a light and all of an agent's texels: min x, min y, max x, max y.
+HD Float4 bounds_of(float light_x, float light_y, const Pose& agent, float reach) {
+    float aside = reach + MARGIN;
+    return {minf(light_x, agent.x) - aside, minf(light_y, agent.y) - aside,
+            maxf(light_x, agent.x) + aside, maxf(light_y, agent.y) + aside};
 }
 
-// The same for the walls in a bounding box: 0 only if none of them can occlude the light.
-HD int box_may_occlude(const Corridor& c, float min_x, float min_y, float max_x, float max_y) {
-    float min_side = 1e9f, max_side = -1e9f;
-    float min_along = 1e9f, max_along = -1e9f;
-    for (int corner = 0; corner < 4; corner++) {
-        float x = (corner & 1 ? max_x : min_x) - c.x;
-        float y = (corner & 2 ? max_y : min_y) - c.y;
-        float side = cross(c.dx, c.dy, x, y);
-        float along = c.dx * x + c.dy * y;
-        min_side = minf(min_side, side);
-        max_side = maxf(max_side, side);
-        min_along = minf(min_along, along);
-        max_along = maxf(max_along, along);
-    }
-    return !((min_side > c.aside) | (max_side < -c.aside) | (max_along < -c.aside) |
-             (min_along > c.along));
+HD int overlap(const Float4& box, const Float4& other) {
+    return (box.x <= other.z) & (box.y <= other.w) & (box.z >= other.x) & (box.w >= other.y);
+}
+
+// A wall's ends a and b relative to an agent's centre, in the order in which a x b is not negative.
+// It cannot occlude a light from the agent if side_b - side_a of may_occlude exceeds `limit`.
+struct FacingWall {
+    float ax, ay, bx, by, limit;
+};
+
+HD FacingWall no_wall() { return {0.f, 0.f, 0.f, 0.f, -INF_VALUE}; }
+
+// The area w x v of a wall v that begins at w from a point tells on which side of the wall the
+// point is. From an agent to a light, it changes by side_b - side_a. There is no limit if the
+// wall's line may cut the agent.
+HD FacingWall facing_wall(const Float4& wall, const Pose& agent, float reach) {
+    float ax = wall.x - agent.x, ay = wall.y - agent.y;
+    float bx = wall.z - agent.x, by = wall.w - agent.y;
+    float vx = wall.z - wall.x, vy = wall.w - wall.y;
+    float signed_area = cross(ax, ay, vx, vy);
+    float area = ABS(signed_area);
+    float limit = area > reach * length_at_most(vx, vy) + MARGIN ? MARGIN - area : INF_VALUE;
+    if (signed_area < 0.f)
+        return {bx, by, ax, ay, limit};
+    return {ax, ay, bx, by, limit};
+}
+
+// Returns 0 only if the wall cannot occlude the light from any part of the agent.
+HD int may_occlude(const Corridor& corridor, const FacingWall& wall) {
+    float side_a = cross(corridor.dx, corridor.dy, wall.ax, wall.ay);
+    float side_b = cross(corridor.dx, corridor.dy, wall.bx, wall.by);
+    float turn = side_b - side_a;
+    return (turn <= wall.limit) & (ABS(side_a + side_b) <= ABS(turn) + corridor.width);
 }

@@ -118,29 +118,48 @@ def test_arrays_of_structs_have_the_compilers_layout(tmp_path):
 CORRIDOR = """
 #include "corridor.h"
 #include "light.h"
-extern "C" int ruled_out(float y, int box) {
-    Corridor corridor = corridor_of(3.f, 2.f, pose_at(7.f, 2.f, 0.f), 0.1f);
-    if (box == 1)
-        return !box_may_occlude(corridor, 6.995f, 2.f + y, 8.f, 3.f);
-    return box ? !may_occlude(corridor, 8.f, 3.f, 6.995f, 2.f + y)
-               : !may_occlude(corridor, 6.995f, 2.f + y, 8.f, 3.f);
+extern "C" int is_wall_ruled_out(float ax, float ay, float bx, float by) {
+    Pose agent = pose_at(7.f, 2.f, 0.f);
+    FacingWall wall = facing_wall({ax, ay, bx, by}, agent, 0.1f);
+    return !may_occlude(corridor_of(3.f, 2.f, agent, 0.1f), wall);
 }
-extern "C" int occluded(float y) {
-    return occludes(occluder_of(3.f, 2.f, 6.995f, 2.f + y, 8.f, 3.f), 4.f, 0.1f);
+extern "C" int is_box_ruled_out(float min_x, float min_y, float max_x, float max_y) {
+    Float4 bounds = bounds_of(3.f, 2.f, pose_at(7.f, 2.f, 0.f), 0.1f);
+    return !overlap({min_x, min_y, max_x, max_y}, bounds);
+}
+extern "C" int occluded(float ax, float ay, float bx, float by, float x, float y) {
+    return occludes(occluder_of(3.f, 2.f, ax, ay, bx, by), x - 3.f, y - 2.f);
 }
 """
 
 
 def test_no_wall_that_occludes_a_light_is_ruled_out(tmp_path):
-    """The light is 4 m from an agent whose outermost texel is 0.1 m aside. Walls across the path
-    begin at y, just in front of that texel.
+    """The light is 4 m from an agent whose outermost texels are 0.1 m from its centre. Walls are
+    moved just far enough not to occlude the light from any texel, then a bit further.
     """
     library = compiled(tmp_path, ENGINE, CORRIDOR)
-    for name in ("occluded", "ruled_out"):
-        getattr(library, name).argtypes = [ctypes.c_float, ctypes.c_int][: 1 + (name[0] == "r")]
-    assert library.occluded(0.0998) and not library.occluded(0.0999)
-    for is_box in (0, 1):
-        assert not library.ruled_out(0.0998, is_box) and library.ruled_out(0.11, is_box)
+    library.occluded.argtypes = [ctypes.c_float] * 6
+    library.is_wall_ruled_out.argtypes = library.is_box_ruled_out.argtypes = [ctypes.c_float] * 4
+
+    def aside(y):  # begins just in front of a texel
+        return 6.995, 2 + y, 8, 3
+
+    def across(x):
+        return x, 1, x, 3
+
+    def is_ruled_out(ax, ay, bx, by):
+        either = {library.is_wall_ruled_out(ax, ay, bx, by)}
+        either.add(library.is_wall_ruled_out(bx, by, ax, ay))
+        assert len(either) == 1  # whichever end comes first
+        return either.pop()
+
+    assert library.occluded(*aside(0.0998), 7, 2.1) and not library.occluded(*aside(0.0999), 7, 2.1)
+    assert not is_ruled_out(*aside(0.0998)) and is_ruled_out(*aside(0.11))
+    assert not library.is_box_ruled_out(*aside(0.0998)) and library.is_box_ruled_out(*aside(0.11))
+    assert library.occluded(*across(7.09), 7.1, 2) and not library.occluded(*across(7.1), 7.1, 2)
+    assert not is_ruled_out(*across(7.09)) and is_ruled_out(*across(7.11))  # behind the agent
+    assert library.occluded(*across(3.01), 7.1, 2) and not library.occluded(*across(2.99), 7.1, 2)
+    assert not is_ruled_out(*across(3.01)) and is_ruled_out(*across(2.99))  # behind the light
 
 
 @programs

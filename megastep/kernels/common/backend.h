@@ -7,6 +7,7 @@
 //   HALF_BITS, HALF_VALUE          between float and fp16
 //   NAN_VALUE, INF_VALUE
 //   SQRT, CEIL, FLOOR, RINT        of a float, correctly rounded
+//   ABS            magnitude of a float
 //   TO_INT         a float cut to an int; NaN is 0, and what is too large the nearest int
 //   RECIPROCAL     correctly rounded if argument and result are normal floats, else undefined
 //

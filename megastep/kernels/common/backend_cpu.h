@@ -9,6 +9,7 @@
 #define CEIL(x) __builtin_ceilf(x)
 #define FLOOR(x) __builtin_floorf(x)
 #define RINT(x) __builtin_rintf(x)
+#define ABS(x) __builtin_fabsf(x)
 #define TO_INT(x) to_int(x)
 #define RECIPROCAL(x) (1.f / (x))
 #define LOAD(address) (*(address))

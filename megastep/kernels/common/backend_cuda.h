@@ -13,6 +13,7 @@
 #define CEIL(x) ceilf(x)
 #define FLOOR(x) floorf(x)
 #define RINT(x) rintf(x)
+#define ABS(x) fabsf(x)
 #define TO_INT(x) ((int)(x))
 #define RECIPROCAL(x) reciprocal(x)
 #define LOAD(address) load(address)
