@@ -1,0 +1,428 @@
+// The gradients of the weights and biases of the encoder `Conv`, in one kernel. Hidden activations
+// are computed again, and they and their gradients never leave the registers of their thread.
+//
+// A block handles a tile of 16 rows at a time. In the gradient of a weight, the 16 rows are the
+// inner axis of the products, at one column after the other, so that no product is padded. Hidden
+// column h reads columns 4 h - 4 to 4 h + 3 of the rows, and columns (h + 2) / 2 and h / 2 of the
+// features read it. So step r loads column r + 1 of the gradients, and handles hidden columns 2 r
+// and 2 r + 1, whose gradients depend on columns r and r + 1.
+//
+// A warp handles half of the hidden channels, and half of the steps. Of a 16 x 8 result, a thread
+// holds rows g and g + 8 and columns 2 q and 2 q + 1, with g = lane / 4 and q = lane % 4 of the
+// warp. Results have hidden channels as rows and the tile's rows as columns: two results, rounded,
+// are the left matrix of the next product.
+#include "constants.h"
+#include "params.h"
+#include "tensor_cores.h"
+
+#define KERNEL extern "C" __global__ void
+// Blocks of a multiprocessor, which leave a thread 255 registers.
+#define BOUNDS(n_blocks) __launch_bounds__(THREADS, n_blocks)
+
+constexpr int THREADS = CONV_THREADS, WARPS = THREADS / 32, ROWS = CONV_ROWS;
+constexpr int HALVES = CONV_CHANNELS / 16;  // of the hidden channels
+constexpr int SLICES = WARPS / HALVES;      // of the steps
+constexpr int TILES = CONV_CHANNELS / 8;    // of eight features
+constexpr int PARTS = CONV_CHANNELS / 16;   // of a product over features
+constexpr int TAPS = 4;                     // of the second convolution
+constexpr int WORD = 8;                     // numbers in 16 bytes
+constexpr unsigned int ONES = 0x3f803f80;   // a pair of them
+static_assert(ROWS == 16 && HALVES == 2 && SLICES == 2 && CONV_CHANNELS == 32);
+
+typedef unsigned short Bits;  // of a bfloat16
+
+extern __shared__ __align__(16) unsigned char shared_memory[];
+
+struct Thread {
+    int warp, lane, g, q;
+    int half;   // of the hidden channels
+    int slice;  // of the steps
+};
+
+DEVICE Thread this_thread() {
+    int warp = threadIdx.x >> 5, lane = threadIdx.x & 31;
+    return {warp, lane, lane >> 2, lane & 3, warp % HALVES, warp / HALVES};
+}
+
+// What a thread adds up. R: pairs of input channels.
+template <int R>
+struct Sums {
+    float second[TAPS][TILES][4];  // hidden channels x features
+    float first[2][R][4];          // hidden channels x four columns of two inputs, by their side
+    float first_bias[4];           // hidden channels x any column
+    float second_bias[2][4];       // any row x features
+};
+
+// Calls f(sum, index) for each of them.
+template <int R, typename F>
+DEVICE void for_each(Sums<R>& sums, F f) {
+    int n = 0;
+#pragma unroll
+    for (int e = 0; e < 4; e++) {
+#pragma unroll
+        for (int t = 0; t < TAPS; t++)
+#pragma unroll
+            for (int j = 0; j < TILES; j++)
+                f(sums.second[t][j][e], n++);
+#pragma unroll
+        for (int side = 0; side < 2; side++)
+#pragma unroll
+            for (int i = 0; i < R; i++)
+                f(sums.first[side][i][e], n++);
+        f(sums.first_bias[e], n++);
+        f(sums.second_bias[0][e], n++);
+        f(sums.second_bias[1][e], n++);
+    }
+}
+
+// ---- Weights ----
+
+// What a thread holds of them, as left matrices. Rows are its half of the hidden channels.
+template <int R>
+struct Weights {
+    unsigned int first[R][4];             // by 16 numbers of a window of the rows
+    unsigned int second[TAPS][PARTS][4];  // by 16 features
+    float first_bias[2];
+};
+
+template <int R>
+DEVICE void load(Weights<R>& weights, const ConvBackwardParams& p, const Thread& me) {
+    long long policy = blockIdx.y;
+    const Bits* first = (const Bits*)p.first_weight + policy * CONV_CHANNELS * p.n_channels * 8;
+    const Bits* second = (const Bits*)p.second_weight + policy * CONV_CHANNELS * CONV_CHANNELS * 4;
+    const Bits* first_bias = (const Bits*)p.first_bias + policy * CONV_CHANNELS;
+#pragma unroll
+    for (int part = 0; part < 4; part++) {
+        int hidden = 16 * me.half + me.g + 8 * (part & 1);
+#pragma unroll
+        for (int i = 0; i < R; i++) {
+            int word = 2 * i + (part >> 1), number = WORD * (word % R) + 2 * me.q;
+            int channel = number >> 2, tap = 4 * (word / R) + (number & 3);
+            weights.first[i][part] = 0u;
+            if (channel < p.n_channels)
+                weights.first[i][part] =
+                    *(const unsigned int*)(first + (hidden * p.n_channels + channel) * 8 + tap);
+        }
+#pragma unroll
+        for (int i = 0; i < PARTS; i++) {
+            int feature = 16 * i + 8 * (part >> 1) + 2 * me.q;
+            const Bits* at = second + (feature * CONV_CHANNELS + hidden) * TAPS;
+            uint2 taps = *(const uint2*)at, next = *(const uint2*)(at + CONV_CHANNELS * TAPS);
+            weights.second[0][i][part] = __byte_perm(taps.x, next.x, 0x5410);
+            weights.second[1][i][part] = __byte_perm(taps.x, next.x, 0x7632);
+            weights.second[2][i][part] = __byte_perm(taps.y, next.y, 0x5410);
+            weights.second[3][i][part] = __byte_perm(taps.y, next.y, 0x7632);
+        }
+    }
+#pragma unroll
+    for (int e = 0; e < 2; e++)
+        weights.first_bias[e] = low_half(first_bias[16 * me.half + me.g + 8 * e]);
+}
+
+// ---- Tiles ----
+
+// Where a tile is in shared memory.
+struct Tile {
+    Bits* d_features;  // as they are in global memory
+    Bits* features;
+    Bits* gradients;  // of the second convolution's results, a pair of words of 16 rows per feature
+    Bits* images;     // of this tile, then of the next one
+};
+
+// Where a row's columns 4 b to 4 b + 3 of a channel are in shared memory: block b + 1 has 2 R
+// channels. The first block, and what is left of the last, is 0.
+template <int R>
+DEVICE int image_at(int block, int channel) {
+    return 2 * R * 4 * block + 4 * channel;
+}
+
+// Begins to copy a tile. Rows that do not exist are 0.
+template <int R>
+DEVICE void begin_tile(const Tile& tile, Bits* images, int first_row, int n_words,
+                       const ConvBackwardParams& p, const Thread& me) {
+    long long first = (long long)blockIdx.y * p.n_rows;
+    const Bits* rows = (const Bits*)p.rows + first * p.row_stride;
+    bool is_aligned = !((unsigned long long)rows % 8) && !(p.row_stride % 4) && !(p.n_columns % 4);
+    for (int row = me.warp; row < ROWS; row += WARPS) {
+        bool exists = first_row + row < p.n_rows;
+        long long from = min(first_row + row, p.n_rows - 1);
+        const Bits* d = (const Bits*)p.d_features + (first + from) * p.d_stride;
+        const Bits* features = (const Bits*)p.features + (first + from) * p.feature_stride;
+        for (int i = me.lane; i < n_words; i += 32) {
+            int at = row * p.staged_size + WORD * i;
+            begin_copy_or_clear<16>(tile.d_features + at, d + WORD * i, exists);
+            begin_copy_or_clear<16>(tile.features + at, features + WORD * i, exists);
+        }
+        const Bits* source = rows + from * p.row_stride;
+        Bits* target = images + row * p.image_size;
+        for (int channel = 0; channel < p.n_channels; channel++) {
+            if (is_aligned)
+                for (int i = me.lane; i < p.n_columns / 4; i += 32)
+                    begin_copy_or_clear<8>(target + image_at<R>(i + 1, channel), source + 4 * i,
+                                           exists);
+            else
+                for (int i = me.lane; i < p.n_columns; i += 32)
+                    target[image_at<R>(i / 4 + 1, channel) + i % 4] = exists ? source[i] : (Bits)0;
+            source += p.n_columns;
+        }
+    }
+    end_group();
+}
+
+// Where a word of eight rows' gradients of a feature is. No two words that a warp reads or writes
+// at once are in the same banks, with most numbers of columns.
+DEVICE int gradient_at(int feature, int word) {
+    int at = feature + (feature >> 3);
+    return ROWS * at + WORD * (word ^ (at >> 2 & 1));
+}
+
+constexpr int GRADIENTS_SIZE = ROWS * (CONV_CHANNELS + CONV_CHANNELS / 8);  // of a column
+
+// Clears the gradients where the features are not above 0, and transposes them. A thread handles
+// eight features of two rows.
+DEVICE void transpose(const Tile& tile, int n_outputs, const ConvBackwardParams& p,
+                      const Thread& me) {
+    int row = 2 * me.g;
+    for (int i = 4 * me.warp + me.q; i < CONV_CHANNELS * n_outputs / WORD; i += 4 * WARPS) {
+        unsigned int pairs[2][4];
+#pragma unroll
+        for (int e = 0; e < 2; e++) {
+            int at = (row + e) * p.staged_size + WORD * i;
+            uint4 d = *(const uint4*)(tile.d_features + at);
+            uint4 features = *(const uint4*)(tile.features + at);
+            pairs[e][0] = where_active(features.x, d.x);
+            pairs[e][1] = where_active(features.y, d.y);
+            pairs[e][2] = where_active(features.z, d.z);
+            pairs[e][3] = where_active(features.w, d.w);
+        }
+#pragma unroll
+        for (int n = 0; n < WORD; n++) {
+            unsigned int pair =
+                __byte_perm(pairs[0][n >> 1], pairs[1][n >> 1], n & 1 ? 0x7632 : 0x5410);
+            Bits* target = tile.gradients + gradient_at(WORD * i + n, row / WORD) + row % WORD;
+            *(unsigned int*)target = pair;
+        }
+    }
+}
+
+// One column of the gradients, as right matrices.
+struct Column {
+    unsigned int of_rows[TILES][2];         // rows x 8 features
+    unsigned int of_features[PARTS][2][2];  // 16 features x 8 rows
+};
+
+DEVICE void load_column(Column& column, const Bits* gradients, int i, int n_outputs,
+                        const Thread& me) {
+#pragma unroll
+    for (int part = 0; part < PARTS; part++) {
+        int channel = 16 * part + 8 * (me.lane >> 4) + (me.lane & 7);
+        const Bits* at = gradients + gradient_at(channel * n_outputs + i, me.lane >> 3 & 1);
+        load_matrices(column.of_rows[2 * part], column.of_rows[2 * part + 1], at);
+        unsigned int first[2], second[2];  // eight features each
+        load_transposed(first, second, at);
+#pragma unroll
+        for (int half = 0; half < 2; half++) {  // of the rows
+            column.of_features[part][half][0] = first[half];
+            column.of_features[part][half][1] = second[half];
+        }
+    }
+}
+
+// One block of the images, as right matrices.
+template <int R>
+struct Block {
+    unsigned int of_numbers[R][2];  // parts of 8 numbers x 8 rows, by eight numbers and half
+    unsigned int of_rows[R][2];     // rows x 8 numbers
+};
+
+template <int R>
+DEVICE void load_block(Block<R>& block, const Bits* images, int i, int image_size,
+                       const Thread& me) {
+    const Bits* at = images + (me.lane & 15) * image_size + image_at<R>(i, 2 * (me.lane >> 4));
+#pragma unroll
+    for (int n = 0; n + 1 < R; n += 2) {
+        load_matrices(block.of_numbers[n], block.of_numbers[n + 1], at + WORD * n);
+        load_transposed(block.of_rows[n], block.of_rows[n + 1], at + WORD * n);
+    }
+    if (R % 2) {
+        load_matrices(block.of_numbers[R - 1], at + WORD * (R - 1));
+        load_transposed(block.of_rows[R - 1], at + WORD * (R - 1));
+    }
+}
+
+// ---- Gradients ----
+
+// Handles one hidden column. `parity`: of its number.
+template <int R, int parity>
+DEVICE void add_hidden(Sums<R>& sums, const Weights<R>& weights, const Column& column,
+                       const Column& next_column, const Block<R>& left, const Block<R>& right) {
+    float d_sums[2][4] = {};  // by half of the rows
+#pragma unroll
+    for (int part = 0; part < PARTS; part++)
+#pragma unroll
+        for (int half = 0; half < 2; half++) {
+            const unsigned int (&now)[2] = column.of_features[part][half];
+            const unsigned int (&next)[2] = next_column.of_features[part][half];
+            multiply_add(d_sums[half], weights.second[parity + 2][part], now[0], now[1]);
+            multiply_add(d_sums[half], weights.second[parity][part], next[0], next[1]);
+        }
+
+    float hidden_sums[2][4];
+#pragma unroll
+    for (int half = 0; half < 2; half++) {
+#pragma unroll
+        for (int e = 0; e < 4; e++)
+            hidden_sums[half][e] = weights.first_bias[e >> 1];
+#pragma unroll
+        for (int i = 0; i < R; i++) {
+            unsigned int words[2];
+#pragma unroll
+            for (int e = 0; e < 2; e++) {
+                int word = 2 * i + e;
+                words[e] =
+                    word < R ? left.of_numbers[word % R][half] : right.of_numbers[word % R][half];
+            }
+            multiply_add(hidden_sums[half], weights.first[i], words[0], words[1]);
+        }
+    }
+
+    unsigned int hidden[4], d_hidden[4];
+#pragma unroll
+    for (int part = 0; part < 4; part++) {
+        int half = part >> 1, e = 2 * (part & 1);
+        hidden[part] = pack_relu(hidden_sums[half][e], hidden_sums[half][e + 1]);
+        d_hidden[part] =
+            where_active(hidden[part], pack_bfloat16(d_sums[half][e], d_sums[half][e + 1]));
+    }
+#pragma unroll
+    for (int j = 0; j < TILES; j++) {
+        multiply_add(sums.second[parity + 2][j], hidden, column.of_rows[j][0],
+                     column.of_rows[j][1]);
+        multiply_add(sums.second[parity][j], hidden, next_column.of_rows[j][0],
+                     next_column.of_rows[j][1]);
+    }
+#pragma unroll
+    for (int i = 0; i < R; i++) {
+        multiply_add(sums.first[0][i], d_hidden, left.of_rows[i][0], left.of_rows[i][1]);
+        multiply_add(sums.first[1][i], d_hidden, right.of_rows[i][0], right.of_rows[i][1]);
+    }
+    multiply_add(sums.first_bias, d_hidden, ONES, ONES);
+}
+
+// Adds a column of the gradients to the bias of this warp's half of the features.
+template <int R>
+DEVICE void add_bias(Sums<R>& sums, const Column& column, const Thread& me) {
+    const unsigned int ones[4] = {ONES, ONES, ONES, ONES};
+#pragma unroll
+    for (int j = 0; j < TILES / HALVES; j++) {
+        unsigned int first = me.half ? column.of_rows[TILES / 2 + j][0] : column.of_rows[j][0];
+        unsigned int second = me.half ? column.of_rows[TILES / 2 + j][1] : column.of_rows[j][1];
+        multiply_add(sums.second_bias[j], ones, first, second);
+    }
+}
+
+// Writes a block's sums, of which this thread has a part.
+template <int R>
+DEVICE void write(const Sums<R>& sums, float* target, int n_channels, const Thread& me) {
+    float* first_bias = target + CONV_CHANNELS * n_channels * 8;
+    float* second = first_bias + CONV_CHANNELS;
+    float* second_bias = second + CONV_CHANNELS * CONV_CHANNELS * TAPS;
+#pragma unroll
+    for (int e = 0; e < 4; e++) {
+        int hidden = 16 * me.half + me.g + 8 * (e >> 1), column = 2 * me.q + (e & 1);
+#pragma unroll
+        for (int side = 0; side < 2; side++)
+#pragma unroll
+            for (int i = 0; i < R; i++) {
+                int channel = 2 * i + column / 4, tap = 4 * side + column % 4;
+                if (channel < n_channels)
+                    target[(hidden * n_channels + channel) * 8 + tap] = sums.first[side][i][e];
+            }
+#pragma unroll
+        for (int j = 0; j < TILES; j++)
+            *(float4*)(second + ((8 * j + column) * CONV_CHANNELS + hidden) * TAPS) = {
+                sums.second[0][j][e], sums.second[1][j][e], sums.second[2][j][e],
+                sums.second[3][j][e]};
+        if (!me.q && !(e & 1))
+            first_bias[hidden] = sums.first_bias[e];
+        if (!me.g && e < 2)
+#pragma unroll
+            for (int j = 0; j < TILES / HALVES; j++)
+                second_bias[16 * me.half + 8 * j + column] = sums.second_bias[j][e];
+    }
+}
+
+template <int R>
+DEVICE void conv_backward(const ConvBackwardParams& p) {
+    Thread me = this_thread();
+    int n_hidden = p.n_columns / 4 + 1, n_outputs = n_hidden / 2 + 1;
+    int n_tiles = (p.n_rows + ROWS - 1) / ROWS, n_words = CONV_CHANNELS * n_outputs / WORD;
+    Tile tile;
+    tile.d_features = (Bits*)shared_memory;
+    tile.features = tile.d_features + ROWS * p.staged_size;
+    tile.gradients = tile.features + ROWS * p.staged_size;
+    tile.images = tile.gradients + GRADIENTS_SIZE * n_outputs;
+
+    for (int i = threadIdx.x; i < 2 * ROWS * p.image_size / WORD; i += THREADS)
+        ((uint4*)tile.images)[i] = {0u, 0u, 0u, 0u};
+    __syncthreads();
+    if (blockIdx.x < n_tiles)
+        begin_tile<R>(tile, tile.images, ROWS * blockIdx.x, n_words, p, me);
+    Weights<R> weights;
+    load(weights, p, me);
+    Sums<R> sums;
+    for_each(sums, [](float& sum, int) { sum = 0.f; });
+
+    // this warp's steps
+    int n_steps = (n_hidden + 1) / 2;
+    int first = n_steps * me.slice / SLICES, end = n_steps * (me.slice + 1) / SLICES;
+    for (int i = blockIdx.x, n = 0; i < n_tiles; i += gridDim.x, n++) {
+        wait_for_copies<0>();
+        __syncthreads();  // the tile is here, and no warp reads the last one's gradients
+        transpose(tile, n_outputs, p, me);
+        __syncthreads();
+        if (i + gridDim.x < n_tiles)
+            begin_tile<R>(tile, tile.images + (n + 1) % 2 * ROWS * p.image_size,
+                          ROWS * (i + gridDim.x), n_words, p, me);
+
+        const Bits* images = tile.images + n % 2 * ROWS * p.image_size;
+        Column column;
+        load_column(column, tile.gradients, first, n_outputs, me);
+        if (!me.slice)
+            add_bias(sums, column, me);
+        Block<R> left;
+        load_block(left, images, 2 * first, p.image_size, me);
+        for (int step = first; step < end; step++) {
+            Column next_column = {};
+            if (step + 1 < n_outputs)
+                load_column(next_column, tile.gradients, step + 1, n_outputs, me);
+            add_bias(sums, next_column, me);
+            Block<R> middle;
+            load_block(middle, images, 2 * step + 1, p.image_size, me);
+            add_hidden<R, 0>(sums, weights, column, next_column, left, middle);
+            if (2 * step + 1 < n_hidden) {
+                load_block(left, images, 2 * step + 2, p.image_size, me);
+                add_hidden<R, 1>(sums, weights, column, next_column, middle, left);
+            }
+            column = next_column;
+        }
+    }
+
+    // the sums over the first slice of the steps, and over the second
+    __syncthreads();
+    float* of_threads = (float*)shared_memory + 32 * me.half + me.lane;
+    if (me.slice)
+        for_each(sums, [&](float& sum, int n) { of_threads[32 * HALVES * n] = sum; });
+    __syncthreads();
+    if (me.slice)
+        return;
+    for_each(sums, [&](float& sum, int n) { sum += of_threads[32 * HALVES * n]; });
+    int n_sums = CONV_CHANNELS * (p.n_channels * 8 + 1 + CONV_CHANNELS * TAPS + 1);
+    long long block = (long long)blockIdx.y * gridDim.x + blockIdx.x;
+    write(sums, p.sums + block * n_sums, p.n_channels, me);
+}
+
+KERNEL BOUNDS(2) conv_backward_2(ConvBackwardParams p) { conv_backward<1>(p); }
+KERNEL BOUNDS(2) conv_backward_4(ConvBackwardParams p) { conv_backward<2>(p); }
+KERNEL BOUNDS(2) conv_backward_6(ConvBackwardParams p) { conv_backward<3>(p); }
+KERNEL BOUNDS(2) conv_backward_8(ConvBackwardParams p) { conv_backward<4>(p); }
