@@ -117,7 +117,6 @@ def _sizes(n_channels, n_columns):
     n_pairs = -(-n_channels // 2)
     staged_size = _FEATURES * n_outputs + 2 * _WORD
     image_size = _WORD * (n_pairs * (n_columns // 4 + 2) | 1)
-    gradients_size = (_FEATURES + _FEATURES // 8) * n_outputs  # per row
-    tile = 2 * _ROWS * (2 * staged_size + gradients_size + 2 * image_size)
+    tile = 2 * _ROWS * (2 * staged_size + _FEATURES * n_outputs + 2 * image_size)
     sums = 4 * 64 * (76 + 8 * n_pairs)  # float32, of two warps
     return staged_size, image_size, max(tile, sums)

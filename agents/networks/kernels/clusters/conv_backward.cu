@@ -125,7 +125,7 @@ DEVICE void load(Weights<R>& weights, const ConvBackwardParams& p, const Thread&
 struct Tile {
     Bits* d_features;  // as they are in global memory
     Bits* features;
-    Bits* gradients;  // of the second convolution's results, a pair of words of 16 rows per feature
+    Bits* gradients;  // before the second ReLU, 16 rows of each feature of each column
     Bits* images;     // of this tile, then of the next one
 };
 
@@ -169,17 +169,17 @@ DEVICE void begin_tile(const Tile& tile, Bits* images, int first_row, int n_word
     end_group();
 }
 
-// Where a word of eight rows' gradients of a feature is. No two words that a warp reads or writes
-// at once are in the same banks, with most numbers of columns.
-DEVICE int gradient_at(int feature, int word) {
-    int at = feature + (feature >> 3);
-    return ROWS * at + WORD * (word ^ (at >> 2 & 1));
+constexpr int COLUMN = ROWS * CONV_CHANNELS;  // numbers of a column of the gradients
+
+// Where a word of eight rows' gradients is. No two words that a warp loads at once are in the same
+// banks, and few that it writes.
+DEVICE int gradient_at(int column, int feature, int word) {
+    return COLUMN * column + ROWS * (feature ^ (column >> 3 & 3)) +
+           WORD * (word ^ (feature >> 2 & 1));
 }
 
-constexpr int GRADIENTS_SIZE = ROWS * (CONV_CHANNELS + CONV_CHANNELS / 8);  // of a column
-
 // Clears the gradients where the features are not above 0, and transposes them. A thread handles
-// eight features of two rows.
+// eight numbers of two rows.
 DEVICE void transpose(const Tile& tile, int n_outputs, const ConvBackwardParams& p,
                       const Thread& me) {
     int row = 2 * me.g;
@@ -195,12 +195,18 @@ DEVICE void transpose(const Tile& tile, int n_outputs, const ConvBackwardParams&
             pairs[e][2] = where_active(features.z, d.z);
             pairs[e][3] = where_active(features.w, d.w);
         }
+        int feature = WORD * i / n_outputs, column = WORD * i - feature * n_outputs;
 #pragma unroll
         for (int n = 0; n < WORD; n++) {
             unsigned int pair =
                 __byte_perm(pairs[0][n >> 1], pairs[1][n >> 1], n & 1 ? 0x7632 : 0x5410);
-            Bits* target = tile.gradients + gradient_at(WORD * i + n, row / WORD) + row % WORD;
+            Bits* target = tile.gradients + gradient_at(column, feature, row / WORD) + row % WORD;
             *(unsigned int*)target = pair;
+            column++;
+            if (column == n_outputs) {
+                column = 0;
+                feature++;
+            }
         }
     }
 }
@@ -211,12 +217,11 @@ struct Column {
     unsigned int of_features[PARTS][2][2];  // 16 features x 8 rows
 };
 
-DEVICE void load_column(Column& column, const Bits* gradients, int i, int n_outputs,
-                        const Thread& me) {
+DEVICE void load_column(Column& column, const Bits* gradients, int i, const Thread& me) {
 #pragma unroll
     for (int part = 0; part < PARTS; part++) {
-        int channel = 16 * part + 8 * (me.lane >> 4) + (me.lane & 7);
-        const Bits* at = gradients + gradient_at(channel * n_outputs + i, me.lane >> 3 & 1);
+        int feature = 16 * part + 8 * (me.lane >> 4) + (me.lane & 7);
+        const Bits* at = gradients + gradient_at(i, feature, me.lane >> 3 & 1);
         load_matrices(column.of_rows[2 * part], column.of_rows[2 * part + 1], at);
         unsigned int first[2], second[2];  // eight features each
         load_transposed(first, second, at);
@@ -361,7 +366,7 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
     tile.d_features = (Bits*)shared_memory;
     tile.features = tile.d_features + ROWS * p.staged_size;
     tile.gradients = tile.features + ROWS * p.staged_size;
-    tile.images = tile.gradients + GRADIENTS_SIZE * n_outputs;
+    tile.images = tile.gradients + COLUMN * n_outputs;
 
     for (int i = threadIdx.x; i < 2 * ROWS * p.image_size / WORD; i += THREADS)
         ((uint4*)tile.images)[i] = {0u, 0u, 0u, 0u};
@@ -387,7 +392,7 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
 
         const Bits* images = tile.images + n % 2 * ROWS * p.image_size;
         Column column;
-        load_column(column, tile.gradients, first, n_outputs, me);
+        load_column(column, tile.gradients, first, me);
         if (!me.slice)
             add_bias(sums, column, me);
         Block<R> left;
@@ -395,7 +400,7 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
         for (int step = first; step < end; step++) {
             Column next_column = {};
             if (step + 1 < n_outputs)
-                load_column(next_column, tile.gradients, step + 1, n_outputs, me);
+                load_column(next_column, tile.gradients, step + 1, me);
             add_bias(sums, next_column, me);
             Block<R> middle;
             load_block(middle, images, 2 * step + 1, p.image_size, me);
