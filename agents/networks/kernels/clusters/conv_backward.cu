@@ -20,13 +20,14 @@
 #define BOUNDS(n_blocks) __launch_bounds__(THREADS, n_blocks)
 
 constexpr int THREADS = CONV_THREADS, WARPS = THREADS / 32, ROWS = CONV_ROWS;
-constexpr int HALVES = CONV_CHANNELS / 16;  // of the hidden channels
-constexpr int SLICES = WARPS / HALVES;      // of the steps
-constexpr int TILES = CONV_CHANNELS / 8;    // of eight features
-constexpr int PARTS = CONV_CHANNELS / 16;   // of a product over features
-constexpr int TAPS = 4;                     // of the second convolution
-constexpr int WORD = 8;                     // numbers in 16 bytes
-constexpr unsigned int ONES = 0x3f803f80;   // a pair of them
+constexpr int HALVES = CONV_CHANNELS / 16;    // of the hidden channels
+constexpr int SLICES = WARPS / HALVES;        // of the steps
+constexpr int TILES = CONV_CHANNELS / 8;      // of eight features
+constexpr int PARTS = CONV_CHANNELS / 16;     // of a product over features
+constexpr int TAPS = 4;                       // of the second convolution
+constexpr int WORD = 8;                       // numbers in 16 bytes
+constexpr int COLUMN = ROWS * CONV_CHANNELS;  // numbers of a column of the gradients
+constexpr unsigned int ONES = 0x3f803f80;     // a pair of them
 static_assert(ROWS == 16 && HALVES == 2 && SLICES == 2 && CONV_CHANNELS == 32);
 
 typedef unsigned short Bits;  // of a bfloat16
@@ -37,11 +38,29 @@ struct Thread {
     int warp, lane, g, q;
     int half;   // of the hidden channels
     int slice;  // of the steps
+    // where the words are that it gives to the loads of matrices
+    int gradients_of_rows, gradients_of_features, image_numbers, image_rows;
 };
 
-DEVICE Thread this_thread() {
+// Where a word of eight rows' gradients is. No two words that a warp loads at once are in the same
+// banks, and few that it writes.
+DEVICE int gradient_at(int feature, int word) {
+    return ROWS * feature + WORD * (word ^ (feature >> 2 & 1));
+}
+
+DEVICE int column_at(int column, int gradient) {
+    return COLUMN * column + (gradient ^ ROWS * (column >> 3 & 3));
+}
+
+DEVICE Thread this_thread(int image_size) {
     int warp = threadIdx.x >> 5, lane = threadIdx.x & 31;
-    return {warp, lane, lane >> 2, lane & 3, warp % HALVES, warp / HALVES};
+    int row = lane & 7, odd = lane >> 3 & 1, upper = lane >> 4;  // of its matrix, of four
+    Thread me = {warp, lane, lane >> 2, lane & 3, warp % HALVES, warp / HALVES};
+    me.gradients_of_rows = gradient_at(row + 8 * upper, odd);
+    me.gradients_of_features = gradient_at(row + 8 * odd, upper);
+    me.image_numbers = (row + 8 * upper) * image_size + WORD * odd;
+    me.image_rows = (row + 8 * odd) * image_size + WORD * upper;
+    return me;
 }
 
 // What a thread adds up. R: pairs of input channels.
@@ -169,15 +188,6 @@ DEVICE void begin_tile(const Tile& tile, Bits* images, int first_row, int n_word
     end_group();
 }
 
-constexpr int COLUMN = ROWS * CONV_CHANNELS;  // numbers of a column of the gradients
-
-// Where a word of eight rows' gradients is. No two words that a warp loads at once are in the same
-// banks, and few that it writes.
-DEVICE int gradient_at(int column, int feature, int word) {
-    return COLUMN * column + ROWS * (feature ^ (column >> 3 & 3)) +
-           WORD * (word ^ (feature >> 2 & 1));
-}
-
 // Clears the gradients where the features are not above 0, and transposes them. A thread handles
 // eight numbers of two rows.
 DEVICE void transpose(const Tile& tile, int n_outputs, const ConvBackwardParams& p,
@@ -200,8 +210,8 @@ DEVICE void transpose(const Tile& tile, int n_outputs, const ConvBackwardParams&
         for (int n = 0; n < WORD; n++) {
             unsigned int pair =
                 __byte_perm(pairs[0][n >> 1], pairs[1][n >> 1], n & 1 ? 0x7632 : 0x5410);
-            Bits* target = tile.gradients + gradient_at(column, feature, row / WORD) + row % WORD;
-            *(unsigned int*)target = pair;
+            int at = column_at(column, gradient_at(feature, row / WORD));
+            *(unsigned int*)(tile.gradients + at + row % WORD) = pair;
             column++;
             if (column == n_outputs) {
                 column = 0;
@@ -218,40 +228,44 @@ struct Column {
 };
 
 DEVICE void load_column(Column& column, const Bits* gradients, int i, const Thread& me) {
+    const Bits* of_rows = gradients + column_at(i, me.gradients_of_rows);
+    const Bits* of_features = gradients + column_at(i, me.gradients_of_features);
 #pragma unroll
-    for (int part = 0; part < PARTS; part++) {
-        int feature = 16 * part + 8 * (me.lane >> 4) + (me.lane & 7);
-        const Bits* at = gradients + gradient_at(i, feature, me.lane >> 3 & 1);
-        load_matrices(column.of_rows[2 * part], column.of_rows[2 * part + 1], at);
-        unsigned int first[2], second[2];  // eight features each
-        load_transposed(first, second, at);
-#pragma unroll
-        for (int half = 0; half < 2; half++) {  // of the rows
-            column.of_features[part][half][0] = first[half];
-            column.of_features[part][half][1] = second[half];
-        }
+    for (int n = 0; n < PARTS; n++) {
+        load_matrices(column.of_rows[2 * n], column.of_rows[2 * n + 1], of_rows + 16 * ROWS * n);
+        load_transposed(column.of_features[n][0], column.of_features[n][1],
+                        of_features + 16 * ROWS * n);
     }
 }
 
 // One block of the images, as right matrices.
 template <int R>
 struct Block {
-    unsigned int of_numbers[R][2];  // parts of 8 numbers x 8 rows, by eight numbers and half
+    unsigned int of_numbers[2][R];  // parts of 8 numbers x 8 rows
     unsigned int of_rows[R][2];     // rows x 8 numbers
 };
 
 template <int R>
-DEVICE void load_block(Block<R>& block, const Bits* images, int i, int image_size,
-                       const Thread& me) {
-    const Bits* at = images + (me.lane & 15) * image_size + image_at<R>(i, 2 * (me.lane >> 4));
+DEVICE void load_block(Block<R>& block, const Bits* images, int i, const Thread& me) {
+    images += image_at<R>(i, 0);
 #pragma unroll
     for (int n = 0; n + 1 < R; n += 2) {
-        load_matrices(block.of_numbers[n], block.of_numbers[n + 1], at + WORD * n);
-        load_transposed(block.of_rows[n], block.of_rows[n + 1], at + WORD * n);
+        unsigned int first[2], second[2];  // of eight rows each
+        load_matrices(first, second, images + me.image_numbers + WORD * n);
+#pragma unroll
+        for (int e = 0; e < 2; e++) {
+            block.of_numbers[0][n + e] = first[e];
+            block.of_numbers[1][n + e] = second[e];
+        }
+        load_transposed(block.of_rows[n], block.of_rows[n + 1], images + me.image_rows + WORD * n);
     }
-    if (R % 2) {
-        load_matrices(block.of_numbers[R - 1], at + WORD * (R - 1));
-        load_transposed(block.of_rows[R - 1], at + WORD * (R - 1));
+    if (R % 2) {  // lanes 0 to 15 give the rows
+        unsigned int halves[2];
+        const Bits* last = images + me.image_rows + WORD * (R - 1);
+        load_matrices(halves, last);
+        block.of_numbers[0][R - 1] = halves[0];
+        block.of_numbers[1][R - 1] = halves[1];
+        load_transposed(block.of_rows[R - 1], last);
     }
 }
 
@@ -285,7 +299,7 @@ DEVICE void add_hidden(Sums<R>& sums, const Weights<R>& weights, const Column& c
             for (int e = 0; e < 2; e++) {
                 int word = 2 * i + e;
                 words[e] =
-                    word < R ? left.of_numbers[word % R][half] : right.of_numbers[word % R][half];
+                    word < R ? left.of_numbers[half][word % R] : right.of_numbers[half][word % R];
             }
             multiply_add(hidden_sums[half], weights.first[i], words[0], words[1]);
         }
@@ -359,7 +373,7 @@ DEVICE void write(const Sums<R>& sums, float* target, int n_channels, const Thre
 
 template <int R>
 DEVICE void conv_backward(const ConvBackwardParams& p) {
-    Thread me = this_thread();
+    Thread me = this_thread(p.image_size);
     int n_hidden = p.n_columns / 4 + 1, n_outputs = n_hidden / 2 + 1;
     int n_tiles = (p.n_rows + ROWS - 1) / ROWS, n_words = CONV_CHANNELS * n_outputs / WORD;
     Tile tile;
@@ -396,17 +410,17 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
         if (!me.slice)
             add_bias(sums, column, me);
         Block<R> left;
-        load_block(left, images, 2 * first, p.image_size, me);
+        load_block(left, images, 2 * first, me);
         for (int step = first; step < end; step++) {
             Column next_column = {};
             if (step + 1 < n_outputs)
                 load_column(next_column, tile.gradients, step + 1, me);
             add_bias(sums, next_column, me);
             Block<R> middle;
-            load_block(middle, images, 2 * step + 1, p.image_size, me);
+            load_block(middle, images, 2 * step + 1, me);
             add_hidden<R, 0>(sums, weights, column, next_column, left, middle);
             if (2 * step + 1 < n_hidden) {
-                load_block(left, images, 2 * step + 2, p.image_size, me);
+                load_block(left, images, 2 * step + 2, me);
                 add_hidden<R, 1>(sums, weights, column, next_column, middle, left);
             }
             column = next_column;
