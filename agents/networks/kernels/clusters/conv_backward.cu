@@ -271,8 +271,9 @@ DEVICE void load_block(Block<R>& block, const Bits* images, int i, const Thread&
 
 // ---- Gradients ----
 
-// Handles one hidden column. `parity`: of its number.
-template <int R, int parity>
+// Handles one hidden column. `parity`: of its number. The last column of the features is read by a
+// single hidden column more if their number is odd; then there is no next column.
+template <int R, int parity, bool is_last>
 DEVICE void add_hidden(Sums<R>& sums, const Weights<R>& weights, const Column& column,
                        const Column& next_column, const Block<R>& left, const Block<R>& right) {
     float d_sums[2][4] = {};  // by half of the rows
@@ -283,7 +284,8 @@ DEVICE void add_hidden(Sums<R>& sums, const Weights<R>& weights, const Column& c
             const unsigned int (&now)[2] = column.of_features[part][half];
             const unsigned int (&next)[2] = next_column.of_features[part][half];
             multiply_add(d_sums[half], weights.second[parity + 2][part], now[0], now[1]);
-            multiply_add(d_sums[half], weights.second[parity][part], next[0], next[1]);
+            if (!is_last)
+                multiply_add(d_sums[half], weights.second[parity][part], next[0], next[1]);
         }
 
     float hidden_sums[2][4];
@@ -317,8 +319,9 @@ DEVICE void add_hidden(Sums<R>& sums, const Weights<R>& weights, const Column& c
     for (int j = 0; j < TILES; j++) {
         multiply_add(sums.second[parity + 2][j], hidden, column.of_rows[j][0],
                      column.of_rows[j][1]);
-        multiply_add(sums.second[parity][j], hidden, next_column.of_rows[j][0],
-                     next_column.of_rows[j][1]);
+        if (!is_last)
+            multiply_add(sums.second[parity][j], hidden, next_column.of_rows[j][0],
+                         next_column.of_rows[j][1]);
     }
 #pragma unroll
     for (int i = 0; i < R; i++) {
@@ -393,7 +396,7 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
     for_each(sums, [](float& sum, int) { sum = 0.f; });
 
     // this warp's steps
-    int n_steps = (n_hidden + 1) / 2;
+    int n_steps = n_hidden / 2;
     int first = n_steps * me.slice / SLICES, end = n_steps * (me.slice + 1) / SLICES;
     for (int i = blockIdx.x, n = 0; i < n_tiles; i += gridDim.x, n++) {
         wait_for_copies<0>();
@@ -412,18 +415,21 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
         Block<R> left;
         load_block(left, images, 2 * first, me);
         for (int step = first; step < end; step++) {
-            Column next_column = {};
-            if (step + 1 < n_outputs)
-                load_column(next_column, tile.gradients, step + 1, me);
-            add_bias(sums, next_column, me);
-            Block<R> middle;
+            Column next_column;
+            Block<R> middle, right;
+            load_column(next_column, tile.gradients, step + 1, me);
             load_block(middle, images, 2 * step + 1, me);
-            add_hidden<R, 0>(sums, weights, column, next_column, left, middle);
-            if (2 * step + 1 < n_hidden) {
-                load_block(left, images, 2 * step + 2, me);
-                add_hidden<R, 1>(sums, weights, column, next_column, middle, left);
-            }
+            load_block(right, images, 2 * step + 2, me);
+            add_bias(sums, next_column, me);
+            add_hidden<R, 0, false>(sums, weights, column, next_column, left, middle);
+            add_hidden<R, 1, false>(sums, weights, column, next_column, middle, right);
             column = next_column;
+            left = right;
+        }
+        if (me.slice && n_hidden % 2) {
+            Block<R> right;
+            load_block(right, images, n_hidden, me);
+            add_hidden<R, 0, true>(sums, weights, column, column, left, right);
         }
     }
 
