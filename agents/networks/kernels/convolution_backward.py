@@ -118,5 +118,6 @@ def _sizes(n_channels, n_columns):
     staged_size = _FEATURES * n_outputs + 2 * _WORD
     image_size = _WORD * (n_pairs * (n_columns // 4 + 2) | 1)
     tile = 2 * _ROWS * (2 * staged_size + _FEATURES * n_outputs + 2 * image_size)
+    tile += 2 * _FEATURES * n_outputs
     sums = 4 * 64 * (76 + 8 * n_pairs)  # float32, of two warps
     return staged_size, image_size, max(tile, sums)

@@ -146,6 +146,7 @@ struct Tile {
     Bits* features;
     Bits* gradients;  // before the second ReLU, 16 rows of each feature of each column
     Bits* images;     // of this tile, then of the next one
+    Bits* places;     // where the gradients of a row's features are
 };
 
 // Where a row's columns 4 b to 4 b + 3 of a channel are in shared memory: block b + 1 has 2 R
@@ -205,18 +206,14 @@ DEVICE void transpose(const Tile& tile, int n_outputs, const ConvBackwardParams&
             pairs[e][2] = where_active(features.z, d.z);
             pairs[e][3] = where_active(features.w, d.w);
         }
-        int feature = WORD * i / n_outputs, column = WORD * i - feature * n_outputs;
+        uint4 places = *(const uint4*)(tile.places + WORD * i);
+        unsigned int of_pairs[4] = {places.x, places.y, places.z, places.w};
 #pragma unroll
         for (int n = 0; n < WORD; n++) {
-            unsigned int pair =
-                __byte_perm(pairs[0][n >> 1], pairs[1][n >> 1], n & 1 ? 0x7632 : 0x5410);
-            int at = column_at(column, gradient_at(feature, row / WORD));
-            *(unsigned int*)(tile.gradients + at + row % WORD) = pair;
-            column++;
-            if (column == n_outputs) {
-                column = 0;
-                feature++;
-            }
+            bool odd = n & 1;
+            unsigned int at = odd ? of_pairs[n >> 1] >> 16 : of_pairs[n >> 1] & 0xffff;
+            *(unsigned int*)(tile.gradients + (at ^ row)) =
+                __byte_perm(pairs[0][n >> 1], pairs[1][n >> 1], odd ? 0x7632 : 0x5410);
         }
     }
 }
@@ -383,10 +380,13 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
     tile.d_features = (Bits*)shared_memory;
     tile.features = tile.d_features + ROWS * p.staged_size;
     tile.gradients = tile.features + ROWS * p.staged_size;
-    tile.images = tile.gradients + COLUMN * n_outputs;
+    tile.places = tile.gradients + COLUMN * n_outputs;
+    tile.images = tile.places + CONV_CHANNELS * n_outputs;
 
     for (int i = threadIdx.x; i < 2 * ROWS * p.image_size / WORD; i += THREADS)
         ((uint4*)tile.images)[i] = {0u, 0u, 0u, 0u};
+    for (int i = threadIdx.x; i < CONV_CHANNELS * n_outputs; i += THREADS)
+        tile.places[i] = column_at(i % n_outputs, gradient_at(i / n_outputs, 0));
     __syncthreads();
     if (blockIdx.x < n_tiles)
         begin_tile<R>(tile, tile.images, ROWS * blockIdx.x, n_words, p, me);
