@@ -17,6 +17,7 @@ _FEATURES, _ROWS, _THREADS, _BLOCKS = (
     PROGRAM.constants[f"CONV_{name}"] for name in ("CHANNELS", "ROWS", "THREADS", "BLOCKS")
 )
 _RESERVED = 1024  # bytes of shared memory that each block needs besides its own
+_BARRIER = 16  # bytes of a barrier for copies
 _WORD = 8  # numbers in 16 bytes
 
 
@@ -120,4 +121,4 @@ def _sizes(n_channels, n_columns):
     tile = 2 * _ROWS * (2 * staged_size + _FEATURES * n_outputs + 2 * image_size)
     tile += 2 * _FEATURES * n_outputs
     sums = 4 * 64 * (76 + 8 * n_pairs)  # float32, of two warps
-    return staged_size, image_size, max(tile, sums)
+    return staged_size, image_size, _BARRIER + max(tile, sums)

@@ -142,7 +142,8 @@ DEVICE void load(Weights<R>& weights, const ConvBackwardParams& p, const Thread&
 
 // Where a tile is in shared memory.
 struct Tile {
-    Bits* d_features;  // as they are in global memory
+    Arrivals* arrivals;  // of d_features and features
+    Bits* d_features;    // as they are in global memory
     Bits* features;
     Bits* gradients;  // before the second ReLU, 16 rows of each feature of each column
     Bits* images;     // of this tile, then of the next one
@@ -158,43 +159,58 @@ DEVICE int image_at(int block, int channel) {
 
 // Begins to copy a tile. Rows that do not exist are 0.
 template <int R>
-DEVICE void begin_tile(const Tile& tile, Bits* images, int first_row, int n_words,
+DEVICE void begin_tile(const Tile& tile, Bits* images, int first_row, int n_features,
                        const ConvBackwardParams& p, const Thread& me) {
-    long long first = (long long)blockIdx.y * p.n_rows;
-    const Bits* rows = (const Bits*)p.rows + first * p.row_stride;
-    bool is_aligned = !((unsigned long long)rows % 8) && !(p.row_stride % 4) && !(p.n_columns % 4);
-    for (int row = me.warp; row < ROWS; row += WARPS) {
-        bool exists = first_row + row < p.n_rows;
-        long long from = min(first_row + row, p.n_rows - 1);
-        const Bits* d = (const Bits*)p.d_features + (first + from) * p.d_stride;
-        const Bits* features = (const Bits*)p.features + (first + from) * p.feature_stride;
-        for (int i = me.lane; i < n_words; i += 32) {
-            int at = row * p.staged_size + WORD * i;
-            begin_copy_or_clear<16>(tile.d_features + at, d + WORD * i, exists);
-            begin_copy_or_clear<16>(tile.features + at, features + WORD * i, exists);
-        }
-        const Bits* source = rows + from * p.row_stride;
-        Bits* target = images + row * p.image_size;
-        for (int channel = 0; channel < p.n_channels; channel++) {
-            if (is_aligned)
-                for (int i = me.lane; i < p.n_columns / 4; i += 32)
-                    begin_copy_or_clear<8>(target + image_at<R>(i + 1, channel), source + 4 * i,
-                                           exists);
-            else
-                for (int i = me.lane; i < p.n_columns; i += 32)
-                    target[image_at<R>(i / 4 + 1, channel) + i % 4] = exists ? source[i] : (Bits)0;
-            source += p.n_columns;
-        }
+    long long first = (long long)blockIdx.y * p.n_rows + first_row;
+    int n_rows = min(p.n_rows - first_row, ROWS), n_bytes = n_features * (int)sizeof(Bits);
+    if (!me.warp) {  // each lane copies a row of one of both arrays
+        if (!me.lane)
+            expect(tile.arrivals, 2 * n_rows * n_bytes);
+        __syncwarp();
+        int row = me.lane % ROWS;
+        bool is_d = me.lane < ROWS;
+        const Bits* source = is_d ? (const Bits*)p.d_features + (first + row) * p.d_stride
+                                  : (const Bits*)p.features + (first + row) * p.feature_stride;
+        Bits* target = (is_d ? tile.d_features : tile.features) + row * p.staged_size;
+        if (row < n_rows)
+            begin_copy(target, source, n_bytes, tile.arrivals);
+        else
+            for (int i = 0; i < n_features; i += WORD)
+                *(uint4*)(target + i) = {0u, 0u, 0u, 0u};
     }
+    const Bits* rows = (const Bits*)p.rows + (first + me.warp) * p.row_stride;
+    images += me.warp * p.image_size;
+    if ((unsigned long long)p.rows % 8 || p.row_stride % 4 || p.n_columns % 4)
+        for (int row = me.warp; row < ROWS; row += WARPS) {
+            for (int i = me.lane; i < p.n_channels * p.n_columns; i += 32) {
+                int channel = i / p.n_columns, column = i % p.n_columns;
+                images[image_at<R>(column / 4 + 1, channel) + column % 4] =
+                    row < n_rows ? rows[i] : (Bits)0;
+            }
+            rows += WARPS * p.row_stride;
+            images += WARPS * p.image_size;
+        }
+    else
+        for (int channel = 0; channel < p.n_channels; channel++)
+            for (int i = me.lane; i < p.n_columns / 4; i += 32) {
+                const Bits* source = rows + channel * p.n_columns + 4 * i;
+                Bits* target = images + image_at<R>(i + 1, channel);
+#pragma unroll
+                for (int n = 0; n < ROWS / WARPS; n++) {
+                    begin_copy_or_clear<8>(target, source, me.warp + WARPS * n < n_rows);
+                    source += WARPS * p.row_stride;
+                    target += WARPS * p.image_size;
+                }
+            }
     end_group();
 }
 
 // Clears the gradients where the features are not above 0, and transposes them. A thread handles
 // eight numbers of two rows.
-DEVICE void transpose(const Tile& tile, int n_outputs, const ConvBackwardParams& p,
+DEVICE void transpose(const Tile& tile, int n_features, const ConvBackwardParams& p,
                       const Thread& me) {
     int row = 2 * me.g;
-    for (int i = 4 * me.warp + me.q; i < CONV_CHANNELS * n_outputs / WORD; i += 4 * WARPS) {
+    for (int i = 4 * me.warp + me.q; i < n_features / WORD; i += 4 * WARPS) {
         unsigned int pairs[2][4];
 #pragma unroll
         for (int e = 0; e < 2; e++) {
@@ -375,21 +391,24 @@ template <int R>
 DEVICE void conv_backward(const ConvBackwardParams& p) {
     Thread me = this_thread(p.image_size);
     int n_hidden = p.n_columns / 4 + 1, n_outputs = n_hidden / 2 + 1;
-    int n_tiles = (p.n_rows + ROWS - 1) / ROWS, n_words = CONV_CHANNELS * n_outputs / WORD;
+    int n_tiles = (p.n_rows + ROWS - 1) / ROWS, n_features = CONV_CHANNELS * n_outputs;
     Tile tile;
-    tile.d_features = (Bits*)shared_memory;
+    tile.arrivals = (Arrivals*)shared_memory;
+    tile.d_features = (Bits*)shared_memory + WORD;
     tile.features = tile.d_features + ROWS * p.staged_size;
     tile.gradients = tile.features + ROWS * p.staged_size;
     tile.places = tile.gradients + COLUMN * n_outputs;
-    tile.images = tile.places + CONV_CHANNELS * n_outputs;
+    tile.images = tile.places + n_features;
 
     for (int i = threadIdx.x; i < 2 * ROWS * p.image_size / WORD; i += THREADS)
         ((uint4*)tile.images)[i] = {0u, 0u, 0u, 0u};
-    for (int i = threadIdx.x; i < CONV_CHANNELS * n_outputs; i += THREADS)
+    for (int i = threadIdx.x; i < n_features; i += THREADS)
         tile.places[i] = column_at(i % n_outputs, gradient_at(i / n_outputs, 0));
+    if (!threadIdx.x)
+        init(tile.arrivals);
     __syncthreads();
     if (blockIdx.x < n_tiles)
-        begin_tile<R>(tile, tile.images, ROWS * blockIdx.x, n_words, p, me);
+        begin_tile<R>(tile, tile.images, ROWS * blockIdx.x, n_features, p, me);
     Weights<R> weights;
     load(weights, p, me);
     Sums<R> sums;
@@ -400,12 +419,13 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
     int first = n_steps * me.slice / SLICES, end = n_steps * (me.slice + 1) / SLICES;
     for (int i = blockIdx.x, n = 0; i < n_tiles; i += gridDim.x, n++) {
         wait_for_copies<0>();
+        wait_for(tile.arrivals, n);
         __syncthreads();  // the tile is here, and no warp reads the last one's gradients
-        transpose(tile, n_outputs, p, me);
+        transpose(tile, n_features, p, me);
         __syncthreads();
         if (i + gridDim.x < n_tiles)
             begin_tile<R>(tile, tile.images + (n + 1) % 2 * ROWS * p.image_size,
-                          ROWS * (i + gridDim.x), n_words, p, me);
+                          ROWS * (i + gridDim.x), n_features, p, me);
 
         const Bits* images = tile.images + n % 2 * ROWS * p.image_size;
         Column column;
@@ -435,7 +455,7 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
 
     // the sums over the first slice of the steps, and over the second
     __syncthreads();
-    float* of_threads = (float*)shared_memory + 32 * me.half + me.lane;
+    float* of_threads = (float*)tile.d_features + 32 * me.half + me.lane;
     if (me.slice)
         for_each(sums, [&](float& sum, int n) { of_threads[32 * HALVES * n] = sum; });
     __syncthreads();

@@ -165,6 +165,16 @@ DEVICE void wait_for(Arrivals* arrivals, int phase) {
     } while (!is_over);
 }
 
+// Begins to copy from global to shared memory a multiple of 16 bytes, from and to a multiple of 16.
+// `arrivals` count the bytes as they come.
+DEVICE void begin_copy(void* shared, const void* global, int n_bytes, Arrivals* arrivals) {
+    asm volatile(
+        "cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1], %2, [%3];" ::
+            "r"(shared_address(shared)),
+        "l"(global), "r"(n_bytes), "r"(shared_address(arrivals))
+        : "memory");
+}
+
 // Where a block of the cluster has its copy of this shared memory.
 DEVICE unsigned int address_in(const void* shared, unsigned int rank) {
     unsigned int there;
