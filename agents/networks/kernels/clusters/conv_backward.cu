@@ -67,7 +67,7 @@ DEVICE Thread this_thread(int image_size) {
 template <int R>
 struct Sums {
     float second[TAPS][TILES][4];  // hidden channels x features
-    float first[2][R][4];          // hidden channels x four columns of two inputs, by their side
+    float first[2][R][4];          // hidden channels x four columns of two channels; left, right
     float first_bias[4];           // hidden channels x any column
     float second_bias[2][4];       // any row x features
 };
@@ -145,13 +145,14 @@ struct Tile {
     Arrivals* arrivals;  // of d_features and features
     Bits* d_features;    // as they are in global memory
     Bits* features;
-    Bits* gradients;  // before the second ReLU, 16 rows of each feature of each column
-    Bits* images;     // of this tile, then of the next one
-    Bits* places;     // where the gradients of a row's features are
+    Bits* gradients;  // before the second ReLU: 16 rows of each feature of each column
+    Bits* places;     // where the gradients of each of a row's features are
+    Bits* images;     // of two tiles, this one and the next
 };
 
-// Where a row's columns 4 b to 4 b + 3 of a channel are in shared memory: block b + 1 has 2 R
-// channels. The first block, and what is left of the last, is 0.
+// Where four columns of a channel are in a row in shared memory. Block b has columns 4 b - 4 to
+// 4 b - 1 of 2 R channels. What the rows do not have is 0. Hidden column h reads blocks h and h
+// + 1.
 template <int R>
 DEVICE int image_at(int block, int channel) {
     return 2 * R * 4 * block + 4 * channel;
@@ -284,8 +285,8 @@ DEVICE void load_block(Block<R>& block, const Bits* images, int i, const Thread&
 
 // ---- Gradients ----
 
-// Handles one hidden column. `parity`: of its number. The last column of the features is read by a
-// single hidden column more if their number is odd; then there is no next column.
+// Handles one hidden column, which two columns of the features read. `parity`: of its number.
+// `is_last`: only one of the two exists, as for the last of an odd number of hidden columns.
 template <int R, int parity, bool is_last>
 DEVICE void add_hidden(Sums<R>& sums, const Weights<R>& weights, const Column& column,
                        const Column& next_column, const Block<R>& left, const Block<R>& right) {
