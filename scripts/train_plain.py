@@ -78,6 +78,11 @@ def plain_heads() -> None:
     replace("fit", lambda *args: False, joint_heads)
 
 
+def plain_conv() -> None:
+    """The convolutions of `encoder=conv` are products of their own."""
+    replace("can_encode", lambda *args: False, encoders, intakes)
+
+
 def plain_layers() -> None:
     """Linear layers are PyTorch's, bias gradients and ReLU of their own."""
 
@@ -133,6 +138,7 @@ PARTS = {
     "streams": plain_streams,
     "lstm": plain_lstm,
     "heads": plain_heads,
+    "conv": plain_conv,
     "layers": plain_layers,
     "adam": plain_adam,
     "loss": plain_loss,

@@ -5,13 +5,17 @@ controls. An image leaf is (..., A, C, H, W).
 """
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import nn
+from torch.autograd.function import once_differentiable
 
 from megastep import spaces
+from megastep.agents.networks.kernels import conv as kernels
 from megastep.agents.networks.layers import Activation, affine
-from megastep.agents.networks.precision import compute_dtype, once
+from megastep.agents.networks.precision import cast, compute_dtype, once
 from megastep.imports import resolve
 from megastep.types import Space
 
@@ -68,6 +72,7 @@ class BandedConv1d(nn.Conv1d):
         padding: int,
     ):
         super().__init__(in_channels, out_channels, kernel_size, stride=stride, padding=padding)
+        self.n_columns = n_columns
         self.n_outputs = (n_columns + 2 * padding - kernel_size) // stride + 1
         offset = torch.arange(n_columns) - stride * torch.arange(self.n_outputs)[:, None] + padding
         # (K, W', W): 1 where kernel column k connects input column w to output column w'
@@ -107,23 +112,129 @@ class Conv(nn.Module):
     """Two convolutions along the rows of an image: (..., A, C, H, W) -> (..., n_features).
 
     The H rows count as channels, since images are one or a few pixels high. Agents share weights.
+    In bfloat16 on GPUs with clusters (Hopper and later), one kernel does both (`encode`).
     """
 
     def __init__(self, space: spaces.MultiImage, channels: int = 32):
         super().__init__()
-        shape = space.C * space.H, space.W
+        self.row_shape = shape = space.C * space.H, space.W
         self.first = BandedConv1d(*shape, channels, kernel_size=8, stride=4, padding=4)
         shape = channels, self.first.n_outputs
         self.second = BandedConv1d(*shape, channels, kernel_size=4, stride=2, padding=2)
-        self.n_features = space.n_agents * channels * self.second.n_outputs
+        self.n_row_features = channels * self.second.n_outputs  # of one agent
+        self.n_features = space.n_agents * self.n_row_features
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        lead = obs.shape[:-4]
-        rows = obs.reshape(-1, obs.shape[-3] * obs.shape[-2], obs.shape[-1]).to(
-            compute_dtype(self.first.weight)
+        rows = obs.reshape(-1, *self.row_shape).to(compute_dtype(self.first.weight))
+        part = Part(self, slice(0, math.prod(self.row_shape)), slice(0, self.n_row_features))
+        columns = rows.flatten(1)
+        if can_encode(columns, [part]):
+            features = encode(columns, [part])
+        else:
+            features = self.convolved(rows)
+        return features.reshape(*obs.shape[:-4], self.n_features)
+
+    def convolved(self, rows: torch.Tensor) -> torch.Tensor:
+        """Returns the features (N, n_row_features) of rows (N, C H, W), layer by layer."""
+        return self.second(self.first(rows, torch.relu), torch.relu).flatten(1)
+
+    def parameters_in_order(self) -> tuple[torch.Tensor, ...]:
+        """Returns weight and bias of the first, then of the second convolution."""
+        return self.first.weight, self.first.bias, self.second.weight, self.second.bias
+
+
+class Part(NamedTuple):
+    """Columns of normalised observations that become columns of features.
+
+    Attributes:
+        encoder: of one image. None: the columns are copied.
+        source: columns of the observations.
+        target: columns of the features.
+    """
+
+    encoder: Conv | None
+    source: slice
+    target: slice
+
+    def rows(self, columns: torch.Tensor) -> torch.Tensor:
+        """Returns the encoder's rows (N, C H, W), a view of (N, n_columns)."""
+        return columns[:, self.source].unflatten(1, self.encoder.row_shape)
+
+    def is_supported(self, columns: torch.Tensor) -> bool:
+        """Returns whether the kernel convolves the encoder's rows."""
+        first = self.encoder.first
+        is_size_right = (
+            first.out_channels == kernels.CHANNELS
+            and first.n_columns <= first.MAX_BANDED
+            and self.target.start % kernels.ALIGNMENT == 0
         )
-        features = self.second(self.first(rows, torch.relu), torch.relu)
-        return features.reshape(*lead, self.n_features)
+        return is_size_right and kernels.is_supported(self.rows(columns))
+
+
+def can_encode(columns: torch.Tensor, parts: Sequence[Part]) -> bool:
+    """Returns whether `encode` takes these observations: bfloat16, on GPUs with its kernel."""
+    if columns.requires_grad or parts[-1].target.stop % kernels.ALIGNMENT:
+        return False
+    return all(part.encoder is None or part.is_supported(columns) for part in parts)
+
+
+def encode(columns: torch.Tensor, parts: Sequence[Part]) -> torch.Tensor:
+    """Encodes parts of observations side by side, one kernel for each.
+
+    Args:
+        columns: (N, n_columns) bfloat16, each row contiguous. Gets no gradient.
+        parts: whose targets follow each other.
+
+    Returns:
+        features (N, n) bfloat16.
+    """
+    encoders = [part.encoder for part in parts if part.encoder]
+    parameters = [leaf for encoder in encoders for leaf in encoder.parameters_in_order()]
+    return _Encode.apply(columns, parts, *parameters)
+
+
+class _Encode(torch.autograd.Function):
+    """What `encode` does. Each part's encoder has four parameters, in the order of the parts."""
+
+    @staticmethod
+    def forward(ctx, columns, parts, *parameters):
+        features = columns.new_empty(len(columns), parts[-1].target.stop)
+        weights = iter([cast(leaf, columns.dtype) for leaf in parameters])
+        for part in parts:
+            target = features[:, part.target]
+            if part.encoder is None:
+                target.copy_(columns[:, part.source])
+            else:
+                of_part = [next(weights) for _ in range(4)]
+                kernels.conv_forward(part.rows(columns), *of_part, target)
+        ctx.parts = parts
+        ctx.save_for_backward(columns, features)
+        return features
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d):
+        columns, features = ctx.saved_tensors
+        gradients = []
+        for part in ctx.parts:
+            if part.encoder is not None:
+                of_part = d[:, part.target], features[:, part.target], part.rows(columns)
+                gradients += _parameter_gradients(part.encoder, *of_part)
+        return None, None, *gradients
+
+
+def _parameter_gradients(encoder, d_features, features, rows):
+    """Returns the gradients of `parameters_in_order`, float32, through the banded matrices. None
+    for parameters that need none.
+    """
+    parameters = encoder.parameters_in_order()
+    wanted = [leaf for leaf in parameters if leaf.requires_grad]
+    if not wanted:
+        return [None] * len(parameters)
+    with torch.enable_grad(), torch.autocast(rows.device.type, rows.dtype):
+        convolved = encoder.convolved(rows)
+    gradients = iter(torch.autograd.grad(convolved, wanted, d_features))
+    return [next(gradients) if leaf.requires_grad else None for leaf in parameters]
 
 
 class Cnn(nn.Module):

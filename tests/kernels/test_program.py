@@ -1,8 +1,11 @@
 """A folder of kernels outside of megastep is a program: it is built and launched on CPU and GPU."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
+from megastep.kernels.build import launch as launches
 from megastep.kernels.build.compile import EngineError
 from megastep.kernels.build.launch import launch
 from megastep.kernels.build.program import Program
@@ -112,3 +115,19 @@ def test_an_error_in_a_kernel_is_quoted(tmp_path):
     (tmp_path / "roll_dice.cpp").write_text("int broken = nonsense;\n" + FILES["roll_dice.cpp"])
     with pytest.raises(EngineError, match=rf"{tmp_path}.*nonsense"):
         roll(program, "cpu")
+
+
+def test_shared_memory_that_a_kernel_may_have_never_shrinks(monkeypatch):
+    """A launch with less comes between two with more."""
+    reserved = []
+    attribute = "CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES"
+    driver = SimpleNamespace(
+        CUfunction_attribute=SimpleNamespace(**{attribute: 8}),
+        cuFuncSetAttribute=lambda kernel, attribute, n_bytes: reserved.append(n_bytes) or (0,),
+    )
+    monkeypatch.setattr(launches, "bindings", lambda: (driver, None))
+    monkeypatch.setattr(launches, "make_current", lambda index: None)
+    monkeypatch.setattr(launches, "_ALLOWED_SHARED", {})
+    for n_bytes in (60_000, 50_000, 70_000, 60_000):
+        launches._allow_shared("kernel", n_bytes, 0)
+    assert reserved == [60_000, 70_000]

@@ -1,10 +1,21 @@
-"""Convolutions as banded matrices. test_heads.py tests encoders as part of intakes."""
+"""Convolutions as banded matrices and as one kernel. test_heads.py tests encoders as part of
+intakes.
+"""
 
 import pytest
 import torch
+from torch.nn import functional
 
 from megastep import spaces
-from megastep.agents.networks import encoders
+from megastep.agents.networks import encoders, heads
+from megastep.agents.networks.kernels import conv as kernels
+from megastep.agents.networks.precision import ComputeDtype
+from megastep.arrdict import arrdict
+
+BF16 = torch.bfloat16
+# Both round hidden activations and features to 8 bits. The order of float32 sums decides a few
+# roundings: of a feature by a unit of its last bit, of hidden activations by less than `atol`.
+ROUNDING = dict(rtol=2**-7, atol=1e-2)
 
 
 @pytest.mark.parametrize("shape", [(3, 128), (1, 64), (6, 37), (1, 5)])
@@ -47,3 +58,168 @@ def test_gpu_matches_cpu(n_columns):
     image = torch.rand(7, 1, 3, 1, n_columns, generator=torch.Generator().manual_seed(1))
     expected = conv(image)
     torch.testing.assert_close(conv.cuda()(image.cuda()).cpu(), expected, rtol=1e-3, atol=1e-3)
+
+
+def convolve(rows, first_weight, first_bias, second_weight, second_bias, features=None):
+    """The twin of `kernels.conv_forward`."""
+    for weight, bias in ((first_weight, first_bias), (second_weight, second_bias)):
+        stride = weight.shape[2] // 2  # which is the padding, too
+        sums = functional.conv1d(rows.float(), weight.float(), bias.float(), stride, stride)
+        rows = sums.relu().to(BF16)
+    return rows.flatten(1) if features is None else features.copy_(rows.flatten(1))
+
+
+IMAGE, VECTOR = spaces.MultiImage(1, 3, 1, 16), spaces.MultiVector(1, 3)
+
+
+@pytest.mark.parametrize(
+    "space, n_calls",
+    [
+        (dict(rgb=IMAGE, d=spaces.MultiImage(1, 1, 2, 37), imu=VECTOR, health=VECTOR), 2),
+        (dict(rgb=spaces.MultiImage(2, 3, 1, 16), imu=VECTOR, near=spaces.MultiVector(2, 4)), 2),
+        (dict(imu=spaces.MultiVector(1, 8), rgb=IMAGE), 1),
+    ],
+)
+def test_an_intake_writes_features_side_by_side(space, n_calls, monkeypatch):
+    """Also from columns in another order than that of the features, for two agents, and with
+    gradients.
+    """
+    torch.manual_seed(1)
+    intake = heads.intake(arrdict(space), 32, "conv")
+    columns = torch.randn(5, 2, intake.n_columns).to(BF16)
+    columns[..., intake.n_columns - 8 :] = 0
+    calls, results = [], []
+
+    def conv_forward(rows, *arguments):
+        calls.append(rows.shape)
+        return convolve(rows, *arguments)
+
+    monkeypatch.setattr(kernels, "conv_forward", conv_forward)
+    for is_supported in (True, False):
+        monkeypatch.setattr(kernels, "is_supported", lambda rows, value=is_supported: value)
+        with ComputeDtype("cpu", BF16):
+            features = intake._encode_columns(columns)
+        loss = features.float().square().sum()
+        results.append([features, *torch.autograd.grad(loss, [*intake.encoders.parameters()])])
+    assert len(calls) == n_calls
+    assert features.shape == (5, 2, intake.n_features + intake.n_padding)
+    for ours, plain in zip(*results, strict=True):
+        assert ours.dtype == plain.dtype
+        error = (ours.float() - plain.float()).norm() / plain.float().norm()
+        assert error < 0.02, error  # 8 bits
+
+
+def test_frozen_parameters_get_no_gradient(monkeypatch):
+    intake = heads.intake(arrdict(rgb=IMAGE, d=IMAGE, near=IMAGE), 32, "conv")
+    frozen = [*intake.encoders[0].parameters(), intake.encoders[1].first.weight]
+    for leaf in frozen:
+        leaf.requires_grad_(False)
+    monkeypatch.setattr(kernels, "conv_forward", convolve)
+    monkeypatch.setattr(kernels, "is_supported", lambda rows: True)
+    with ComputeDtype("cpu", BF16):
+        features = intake._encode_columns(torch.randn(5, intake.n_columns).to(BF16))
+    features.float().sum().backward()
+    for leaf in intake.encoders.parameters():
+        assert (leaf.grad is None) == any(leaf is other for other in frozen)
+
+
+def test_observations_that_need_gradients_and_odd_columns_are_left_to_other_forms(monkeypatch):
+    monkeypatch.setattr(kernels, "is_supported", lambda rows: True)
+    columns = torch.zeros(5, 48, dtype=BF16)
+    encoder = encoders.Conv(IMAGE)
+
+    def part(encoder, target):
+        return encoders.Part(encoder, slice(0, 48), slice(target, target + 96))
+
+    assert encoders.can_encode(columns, [part(encoder, 0), part(None, 96)])
+    last = encoders.Part(None, slice(0, 5), slice(99, 104))
+    assert not encoders.can_encode(columns, [part(encoder, 3), last])
+    assert not encoders.can_encode(columns, [part(encoder, 0), last._replace(target=slice(96, 99))])
+    assert not encoders.can_encode(columns, [part(encoders.Conv(IMAGE, channels=16), 0)])
+    wide = encoders.Conv(spaces.MultiImage(1, 1, 1, 2 * encoders.BandedConv1d.MAX_BANDED))
+    assert not encoders.can_encode(columns, [part(wide, 0)])
+    assert not encoders.can_encode(columns.requires_grad_(), [part(encoder, 0)])
+
+
+@pytest.mark.parametrize("n_columns", [1, 5, 16, 37, 128, 256])
+def test_features_have_the_columns_of_the_second_convolution(n_columns):
+    conv = encoders.Conv(spaces.MultiImage(1, 3, 1, n_columns))
+    assert kernels.n_outputs(n_columns) == conv.second.n_outputs
+
+
+def weights_of(conv):
+    """The weights, with biases that matter, in bfloat16 on the GPU."""
+    for layer in conv.first, conv.second:
+        layer.bias.data.normal_()
+    return [leaf.detach().to("cuda", BF16) for leaf in conv.parameters_in_order()]
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n_rows", [1, 37, 9_001])  # more tiles than blocks
+@pytest.mark.parametrize(
+    "shape", [(3, 128), (1, 128), (1, 64), (3, 16), (6, 37), (2, 7), (1, 5), (8, 256), (5, 250)]
+)
+def test_kernel_matches_convolutions(shape, n_rows):
+    torch.manual_seed(1)
+    conv = encoders.Conv(spaces.MultiImage(1, shape[0], 1, shape[1]))
+    weights = weights_of(conv)
+    rows = torch.randn(n_rows, *shape).to("cuda", BF16)
+    assert kernels.is_supported(rows)
+    features = torch.full((n_rows, conv.n_features + 16), torch.nan, dtype=BF16, device="cuda")
+    ours = kernels.conv_forward(rows, *weights, features[:, 8:-8])
+    expected = convolve(rows.cpu(), *(weight.cpu() for weight in weights))
+    torch.testing.assert_close(ours.cpu(), expected, **ROUNDING)
+    assert (ours.cpu() == expected).float().mean() > 0.9
+    assert features[:, :8].isnan().all() and features[:, -8:].isnan().all()
+    assert torch.equal(kernels.conv_forward(rows, *weights), ours)  # same bits twice
+    with torch.autocast("cuda", BF16), torch.no_grad():
+        banded = conv.cuda().convolved(rows)
+        assert torch.equal(conv(rows[:, None, :, None]), ours)
+    error = (ours.float() - banded.float()).norm() / banded.float().norm()
+    assert error < 0.02, error  # sums of the product may be rounded to 8 bits, too
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("start", [0, 3, 8])  # of the rows' columns; 3: not at 16 bytes
+@pytest.mark.parametrize("n_columns", [128, 37])
+def test_kernel_reads_parts_of_wider_rows(start, n_columns):
+    torch.manual_seed(1)
+    weights = weights_of(encoders.Conv(spaces.MultiImage(1, 3, 1, n_columns)))
+    wide = torch.full((1_000, 3 * n_columns + 16 + start), torch.nan, dtype=BF16, device="cuda")
+    part = wide[:, start : start + 3 * n_columns]
+    part.copy_(torch.randn(part.shape))
+    rows = part.unflatten(1, (3, n_columns))
+    alone = kernels.conv_forward(rows.contiguous(), *weights)
+    assert torch.equal(kernels.conv_forward(rows, *weights), alone)
+
+
+@pytest.mark.cuda
+def test_kernel_keeps_nan_to_the_columns_that_see_it():
+    torch.manual_seed(1)
+    weights = weights_of(encoders.Conv(spaces.MultiImage(1, 3, 1, 128)))
+    rows = torch.randn(40, 3, 128).to("cuda", BF16)
+    rows[7, 1, 64] = torch.nan  # hidden columns 16 and 17, columns 8 and 9 of the features
+    isnan = kernels.conv_forward(rows, *weights).unflatten(1, (32, -1)).isnan()
+    assert isnan[7, :, 8:10].all() and isnan.sum() == 2 * 32
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("shape", [(1, 3, 1, 128), (2, 1, 2, 64)])
+def test_gradients_through_the_kernel(shape, monkeypatch):
+    torch.manual_seed(1)
+    calls, conv_forward = [], kernels.conv_forward
+    monkeypatch.setattr(
+        kernels, "conv_forward", lambda *args: calls.append(args) or conv_forward(*args)
+    )
+    conv = encoders.Conv(spaces.MultiImage(*shape)).cuda()
+    images = torch.randn(300, *shape, device="cuda")
+    results = []
+    for is_enabled in (True, False):
+        with ComputeDtype("cuda", BF16, enabled=is_enabled):
+            features = conv(images)
+        loss = features.float().square().sum()
+        results.append([features, *torch.autograd.grad(loss, conv.parameters_in_order())])
+    assert len(calls) == 1
+    for ours, plain in zip(*results, strict=True):
+        error = (ours.float() - plain).norm() / plain.norm()
+        assert error < 0.05, error  # 8 bits, and ReLUs near their kink

@@ -7,7 +7,7 @@ from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
 from megastep.agents.algorithms.kernels.program import n_blocks
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
-from megastep.agents.networks.kernels import duelling, heads, layers, moments
+from megastep.agents.networks.kernels import conv, duelling, heads, layers, moments
 from megastep.agents.networks.kernels.program import CORES
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.networks.value_output import ValueOutput
@@ -20,7 +20,7 @@ P = 3
 BF16 = torch.bfloat16
 
 
-def launch(program, operation, n_blocks, n_threads=BLOCK, **fields):
+def launch(program, operation, n_blocks, n_threads=BLOCK, shared=0, **fields):
     """Launches an operation; a tensor stands for its address."""
     values = {
         name: field.data_ptr() if isinstance(field, torch.Tensor) else field
@@ -28,7 +28,7 @@ def launch(program, operation, n_blocks, n_threads=BLOCK, **fields):
     }
     pack = getattr(program.params, program.cuda_operations[operation])
     device = torch.device("cuda", torch.cuda.current_device())
-    launch_blocks(program, operation, pack(**values), device, n_blocks, n_threads)
+    launch_blocks(program, operation, pack(**values), device, n_blocks, n_threads, shared)
 
 
 @pytest.fixture(autouse=True)
@@ -72,6 +72,39 @@ def test_intake():
     for i in range(P):
         of_policy = ([leaf[i] for leaf in parts] for parts in (leaves, means, scales))
         alone = layers.normalise(*of_policy, n_columns, lanes[i])
+        assert torch.equal(features[i], alone), i
+
+
+@pytest.mark.parametrize("shape", [(3, 128), (5, 37)])
+def test_convolutions(shape):
+    n_rows, n_features = 100, conv.CHANNELS * conv.n_outputs(shape[1])
+    rows = randn(n_rows, *shape).to(BF16)
+    if not conv.is_supported(rows[0]):
+        pytest.skip("needs a GPU with clusters")
+    weights = dict(
+        first_weight=randn(32, shape[0], 8).to(BF16),
+        first_bias=randn(32).to(BF16),
+        second_weight=randn(32, 32, 4).to(BF16),
+        second_bias=randn(32).to(BF16),
+    )
+    features = torch.full((P, n_rows, n_features), torch.nan, dtype=BF16, device="cuda")
+    sizes = conv._shared_sizes(*shape)
+    launch(
+        *(conv.PROGRAM, f"conv_forward_{4 if shape[0] <= 4 else 8}", (2, P)),
+        conv.PROGRAM.constants["CONV_THREADS"],
+        conv._shared_bytes(**sizes),
+        rows=rows,
+        **weights,
+        features=features,
+        n_rows=n_rows,
+        n_channels=shape[0],
+        n_columns=shape[1],
+        row_stride=shape[0] * shape[1],
+        feature_stride=n_features,
+        **sizes,
+    )
+    for i in range(P):
+        alone = conv.conv_forward(rows[i], *(weight[i] for weight in weights.values()))
         assert torch.equal(features[i], alone), i
 
 

@@ -1,7 +1,6 @@
 """Launches a program's operation on the device where its tensors are."""
 
 import ctypes
-import functools
 from typing import Any
 
 import torch
@@ -18,6 +17,7 @@ WARP = ENGINE.constants["WARP"]
 INVALID_CONTEXT = 201  # CUDA_ERROR_INVALID_CONTEXT
 MAX_THREADS = 2**32 - BLOCK  # per launch: kernels count them in 32 bits
 USUAL_SHARED = 48 * 1024  # bytes of dynamic shared memory that any kernel may have
+_ALLOWED_SHARED: dict[tuple[Any, int], int] = {}  # {(kernel, GPU): bytes} of those that have more
 
 
 def launch(
@@ -94,13 +94,15 @@ def launch_blocks(
     check_status(status, f"Launching {operation}")
 
 
-@functools.cache
 def _allow_shared(function: Any, shared: int, index: int) -> None:
-    """Lets a kernel have more than the usual shared memory."""
+    """Lets a kernel have more than the usual shared memory. Never less than it had before."""
+    if shared <= _ALLOWED_SHARED.get((function, index), 0):
+        return
     driver, _ = bindings()
     make_current(index)
     attribute = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
     check_status(driver.cuFuncSetAttribute(function, attribute, shared), "Reserving shared memory")
+    _ALLOWED_SHARED[function, index] = shared
 
 
 def _operation(functions, name, program, suffix, other):

@@ -41,6 +41,25 @@ struct LstmSequenceBackwardParams {
     int n_clusters;
 };
 
+// The encoder `Conv`: N rows of C channels and W columns, with F = 32 features in each of W'
+// columns. Sizes count numbers.
+struct ConvForwardParams {
+    const void* rows;           // (P, N, C, W)
+    const void* first_weight;   // (P, F, C, 8)
+    const void* first_bias;     // (P, F)
+    const void* second_weight;  // (P, F, F, 4)
+    const void* second_bias;    // (P, F)
+    void* features;             // (P, N, F, W')
+    int n_rows;
+    int n_channels;
+    int n_columns;
+    int row_stride;      // between two rows, at least C W
+    int feature_stride;  // between two rows of features, at least F W'
+    int channel_size;    // of a channel in shared memory
+    int row_size;        // of a row in shared memory
+    int feature_size;    // of a row's features in shared memory
+};
+
 struct ConvBackwardParams {
     const void* d_features;     // (P, N, F, W')
     const void* features;       // (P, N, F, W')
