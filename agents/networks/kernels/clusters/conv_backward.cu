@@ -158,23 +158,28 @@ DEVICE int image_at(int block, int channel) {
     return 2 * R * 4 * block + 4 * channel;
 }
 
-// Begins to copy a tile. Rows that do not exist are 0.
+// Announces the bytes of a tile's features, before any thread copies them.
+DEVICE void expect_tile(const Tile& tile, int first_row, int n_features,
+                        const ConvBackwardParams& p) {
+    int n_rows = min(p.n_rows - first_row, ROWS);
+    if (!threadIdx.x)
+        expect(tile.arrivals, 2 * n_rows * n_features * (int)sizeof(Bits));
+}
+
+// Begins to copy a tile, a quarter of the rows per warp. Rows that do not exist are 0.
 template <int R>
 DEVICE void begin_tile(const Tile& tile, Bits* images, int first_row, int n_features,
                        const ConvBackwardParams& p, const Thread& me) {
     long long first = (long long)blockIdx.y * p.n_rows + first_row;
-    int n_rows = min(p.n_rows - first_row, ROWS), n_bytes = n_features * (int)sizeof(Bits);
-    if (!me.warp) {  // each lane copies a row of one of both arrays
-        if (!me.lane)
-            expect(tile.arrivals, 2 * n_rows * n_bytes);
-        __syncwarp();
-        int row = me.lane % ROWS;
-        bool is_d = me.lane < ROWS;
+    int n_rows = min(p.n_rows - first_row, ROWS);
+    if (me.lane < 2 * ROWS / WARPS) {  // a row of one of two arrays
+        int row = me.warp + WARPS * (me.lane >> 1);
+        bool is_d = me.lane & 1;
         const Bits* source = is_d ? (const Bits*)p.d_features + (first + row) * p.d_stride
                                   : (const Bits*)p.features + (first + row) * p.feature_stride;
         Bits* target = (is_d ? tile.d_features : tile.features) + row * p.staged_size;
         if (row < n_rows)
-            begin_copy(target, source, n_bytes, tile.arrivals);
+            begin_copy(target, source, n_features * (int)sizeof(Bits), tile.arrivals);
         else
             for (int i = 0; i < n_features; i += WORD)
                 *(uint4*)(target + i) = {0u, 0u, 0u, 0u};
@@ -405,10 +410,13 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
         ((uint4*)tile.images)[i] = {0u, 0u, 0u, 0u};
     for (int i = threadIdx.x; i < n_features; i += THREADS)
         tile.places[i] = column_at(i % n_outputs, gradient_at(i / n_outputs, 0));
+    bool has_tile = blockIdx.x < n_tiles;
     if (!threadIdx.x)
         init(tile.arrivals);
+    if (has_tile)
+        expect_tile(tile, ROWS * blockIdx.x, n_features, p);
     __syncthreads();
-    if (blockIdx.x < n_tiles)
+    if (has_tile)
         begin_tile<R>(tile, tile.images, ROWS * blockIdx.x, n_features, p, me);
     Weights<R> weights;
     load(weights, p, me);
@@ -423,10 +431,14 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
         wait_for(tile.arrivals, n);
         __syncthreads();  // the tile is here, and no warp reads the last one's gradients
         transpose(tile, n_features, p, me);
+        int next_row = ROWS * (i + gridDim.x);
+        bool has_next = i + gridDim.x < n_tiles;
+        if (has_next)
+            expect_tile(tile, next_row, n_features, p);
         __syncthreads();
-        if (i + gridDim.x < n_tiles)
-            begin_tile<R>(tile, tile.images + (n + 1) % 2 * ROWS * p.image_size,
-                          ROWS * (i + gridDim.x), n_features, p, me);
+        if (has_next)
+            begin_tile<R>(tile, tile.images + (n + 1) % 2 * ROWS * p.image_size, next_row,
+                          n_features, p, me);
 
         const Bits* images = tile.images + n % 2 * ROWS * p.image_size;
         Column column;
