@@ -23,6 +23,13 @@ DEVICE unsigned int pack_relu(float low, float high) {
     return pair;
 }
 
+// Clears the halves of `pair` where those of `activated` are not above 0. NaN counts as above.
+DEVICE unsigned int where_active(unsigned int activated, unsigned int pair) {
+    unsigned int mask;
+    asm("set.gtu.u32.bf16x2 %0, %1, %2;" : "=r"(mask) : "r"(activated), "r"(0u));
+    return pair & mask;
+}
+
 // The hardware's approximation: its relative error, 2^-11, is below the rounding of the argument to
 // bfloat16. NaN stays NaN.
 DEVICE float tanh_of(float x) {
@@ -53,6 +60,24 @@ DEVICE void load_matrices(unsigned int (&first)[2], unsigned int (&second)[2], c
                  : "memory");
 }
 
+// Loads two matrices of 8 x 8 bfloat16, transposed.
+DEVICE void load_transposed(unsigned int (&parts)[2], const void* row) {
+    unsigned int address = (unsigned int)__cvta_generic_to_shared(row);
+    asm volatile("ldmatrix.sync.aligned.m8n8.x2.trans.shared.b16 {%0, %1}, [%2];"
+                 : "=r"(parts[0]), "=r"(parts[1])
+                 : "r"(address)
+                 : "memory");
+}
+
+// Loads four such matrices.
+DEVICE void load_transposed(unsigned int (&first)[2], unsigned int (&second)[2], const void* row) {
+    unsigned int address = (unsigned int)__cvta_generic_to_shared(row);
+    asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
+                 : "=r"(first[0]), "=r"(first[1]), "=r"(second[0]), "=r"(second[1])
+                 : "r"(address)
+                 : "memory");
+}
+
 // sum (16 x 8) += a (16 x 16) b (16 x 8), a and b in bfloat16.
 DEVICE void multiply_add(float (&sum)[4], const unsigned int (&a)[4], unsigned int b0,
                          unsigned int b1) {
@@ -69,6 +94,15 @@ DEVICE void multiply_add(float (&sum)[4], const unsigned int (&a)[4], unsigned i
 DEVICE void begin_copy(void* shared, const void* global) {
     unsigned int address = (unsigned int)__cvta_generic_to_shared(shared);
     asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(address), "l"(global)
+                 : "memory");
+}
+
+// Begins to copy 4, 8 or 16 bytes, or to clear them if there is nothing to copy.
+template <int n_bytes>
+DEVICE void begin_copy_or_clear(void* shared, const void* global, bool exists) {
+    unsigned int address = (unsigned int)__cvta_generic_to_shared(shared);
+    asm volatile("cp.async.ca.shared.global [%0], [%1], %2, %3;" ::"r"(address), "l"(global),
+                 "n"(n_bytes), "r"(exists ? n_bytes : 0)
                  : "memory");
 }
 
@@ -129,6 +163,16 @@ DEVICE void wait_for(Arrivals* arrivals, int phase) {
             : "r"(shared_address(arrivals)), "r"(phase & 1)
             : "memory");
     } while (!is_over);
+}
+
+// Begins to copy from global to shared memory a multiple of 16 bytes, from and to a multiple of 16.
+// `arrivals` count the bytes as they come.
+DEVICE void begin_copy(void* shared, const void* global, int n_bytes, Arrivals* arrivals) {
+    asm volatile(
+        "cp.async.bulk.shared::cluster.global.mbarrier::complete_tx::bytes [%0], [%1], %2, [%3];" ::
+            "r"(shared_address(shared)),
+        "l"(global), "r"(n_bytes), "r"(shared_address(arrivals))
+        : "memory");
 }
 
 // Where a block of the cluster has its copy of this shared memory.
