@@ -161,7 +161,7 @@ class Part(NamedTuple):
         return columns[:, self.source].unflatten(1, self.encoder.row_shape)
 
     def is_supported(self, columns: torch.Tensor) -> bool:
-        """Returns whether the kernel convolves the encoder's rows."""
+        """Returns whether the kernels take the encoder's rows."""
         first = self.encoder.first
         is_size_right = (
             first.out_channels == kernels.CHANNELS
@@ -199,42 +199,35 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def forward(ctx, columns, parts, *parameters):
         features = columns.new_empty(len(columns), parts[-1].target.stop)
-        weights = iter([cast(leaf, columns.dtype) for leaf in parameters])
+        weights = [cast(leaf, columns.dtype) for leaf in parameters]
+        of_encoders = iter(weights)
         for part in parts:
             target = features[:, part.target]
             if part.encoder is None:
                 target.copy_(columns[:, part.source])
             else:
-                of_part = [next(weights) for _ in range(4)]
+                of_part = [next(of_encoders) for _ in range(4)]
                 kernels.conv_forward(part.rows(columns), *of_part, target)
         ctx.parts = parts
-        ctx.save_for_backward(columns, features)
+        ctx.save_for_backward(columns, features, *weights)
         return features
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d):
-        columns, features = ctx.saved_tensors
-        gradients = []
+        columns, features, *weights = ctx.saved_tensors
+        of_encoders, gradients = iter(weights), [None, None]
         for part in ctx.parts:
-            if part.encoder is not None:
-                of_part = d[:, part.target], features[:, part.target], part.rows(columns)
-                gradients += _parameter_gradients(part.encoder, *of_part)
-        return None, None, *gradients
-
-
-def _parameter_gradients(encoder, d_features, features, rows):
-    """Returns the gradients of `parameters_in_order`, float32, through the banded matrices. None
-    for parameters that need none.
-    """
-    parameters = encoder.parameters_in_order()
-    wanted = [leaf for leaf in parameters if leaf.requires_grad]
-    if not wanted:
-        return [None] * len(parameters)
-    with torch.enable_grad(), torch.autocast(rows.device.type, rows.dtype):
-        convolved = encoder.convolved(rows)
-    gradients = iter(torch.autograd.grad(convolved, wanted, d_features))
-    return [next(gradients) if leaf.requires_grad else None for leaf in parameters]
+            if part.encoder is None:
+                continue
+            *of_part, _ = (next(of_encoders) for _ in range(4))
+            is_needed = ctx.needs_input_grad[len(gradients) : len(gradients) + 4]
+            found = [None] * 4
+            if any(is_needed):
+                of_features = d[:, part.target], features[:, part.target]
+                found = kernels.conv_backward(*of_features, part.rows(columns), *of_part)
+            gradients += [one if needed else None for one, needed in zip(found, is_needed)]
+        return tuple(gradients)
 
 
 class Cnn(nn.Module):

@@ -1,13 +1,14 @@
 """The encoder `Conv` on a GPU with tensor cores for bfloat16 and much shared memory (Hopper and
-later): both convolutions and their ReLUs in one kernel.
+later): both convolutions and their ReLUs in one kernel, and all their gradients in another.
 
 N rows of C channels and W columns; W' columns of features. All tensors are bfloat16, on one GPU.
 """
 
 import torch
 
+from megastep.agents.networks.kernels.layers import sum_rows
 from megastep.agents.networks.kernels.lstm_sequence import PROGRAM
-from megastep.agents.networks.kernels.program import aligned
+from megastep.agents.networks.kernels.program import aligned, aligned_rows
 from megastep.kernels.build.launch import launch_blocks
 
 MAX_CHANNELS = PROGRAM.constants["CONV_INPUTS"]
@@ -16,6 +17,8 @@ _ROWS, _THREADS, _BLOCKS = (
     PROGRAM.constants[f"CONV_{name}"] for name in "ROWS THREADS BLOCKS".split()
 )
 ALIGNMENT = 8  # numbers in 16 bytes
+_BARRIER = 16  # bytes of shared memory that count copies
+_RESERVED = 1024  # bytes of shared memory that each block takes besides its own
 
 
 def n_outputs(n_columns: int) -> int:
@@ -25,12 +28,14 @@ def n_outputs(n_columns: int) -> int:
 
 
 def is_supported(rows: torch.Tensor) -> bool:
-    """Returns whether the kernel convolves rows (N, C, W) of this dtype on their device."""
+    """Returns whether the kernels take rows (N, C, W) of this dtype on their device. The backward
+    one needs more memory.
+    """
     _, n_channels, n_columns = rows.shape
     if not rows.is_cuda or rows.dtype != torch.bfloat16 or n_channels > MAX_CHANNELS:
         return False
     gpu = torch.cuda.get_device_properties(rows.device)
-    n_bytes = _shared_bytes(**_shared_sizes(n_channels, n_columns))
+    _, n_bytes = _backward_sizes(n_channels, n_columns)
     return gpu.major >= 9 and gpu.shared_memory_per_block_optin >= n_bytes
 
 
@@ -64,8 +69,8 @@ def conv_forward(
         rows = rows.contiguous()
     if features is None:
         features = rows.new_empty(n_rows, CHANNELS * n_outputs(n_columns))
-    sizes = _shared_sizes(n_channels, n_columns)
-    shared = _shared_bytes(**sizes)
+    sizes = _forward_sizes(n_channels, n_columns)
+    shared = _forward_bytes(**sizes)
     weights = dict(
         first_weight=first_weight,
         first_bias=first_bias,
@@ -92,7 +97,7 @@ def conv_forward(
     return features
 
 
-def _shared_sizes(n_channels, n_columns):
+def _forward_sizes(n_channels, n_columns):
     """Returns sizes in shared memory, in numbers.
 
     Threads of eight channels and rows read 16 bytes at once, from different banks: a channel takes
@@ -107,5 +112,101 @@ def _shared_sizes(n_channels, n_columns):
     return {name: ALIGNMENT * size for name, size in sizes.items()}
 
 
-def _shared_bytes(channel_size, row_size, feature_size):
+def _forward_bytes(channel_size, row_size, feature_size):
     return 2 * _ROWS * (2 * row_size + feature_size)
+
+
+def conv_backward(
+    d_features: torch.Tensor,
+    features: torch.Tensor,
+    rows: torch.Tensor,
+    first_weight: torch.Tensor,
+    first_bias: torch.Tensor,
+    second_weight: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Computes the gradients of `conv_forward`'s weights and biases.
+
+    Hidden activations are computed again, and rounded to bfloat16 like their gradients. Sums are
+    float32 and have a fixed order on a model of GPUs.
+
+    Args:
+        d_features: (N, 32 W').
+        features: (N, 32 W'), of `conv_forward`. The gradient passes where they are above 0 or NaN.
+            Both may be columns of a wider tensor, and are copied if their rows do not start at
+            multiples of 16 bytes.
+        rows: (N, C, W) for which `is_supported`; may be columns of a wider tensor. Faster if they
+            start at multiples of 8 bytes and W is a multiple of 4.
+        first_weight: (32, C, 8).
+        first_bias: (32,).
+        second_weight: (32, 32, 4).
+
+    Returns:
+        The gradients of the first weight and bias, then of the second, float32.
+    """
+    n_rows, n_channels, n_columns = rows.shape
+    if rows.stride()[1:] != (n_columns, 1):
+        rows = rows.contiguous()
+    d_features, features = aligned_rows(d_features), aligned_rows(features)
+    sizes = [first_weight.numel(), CHANNELS, second_weight.numel(), CHANNELS]
+    gpu = torch.cuda.get_device_properties(rows.device)
+    n_blocks = _backward_blocks(n_rows, n_channels, n_columns, gpu)
+    sums = rows.new_empty(n_blocks, sum(sizes), dtype=torch.float32)
+    launch_backward(
+        (n_blocks, 1),
+        d_features=d_features,
+        features=features,
+        rows=rows,
+        first_weight=aligned(first_weight),
+        first_bias=first_bias.contiguous(),
+        second_weight=aligned(second_weight),
+        sums=sums,
+        n_rows=n_rows,
+        n_channels=n_channels,
+        n_columns=n_columns,
+        d_stride=d_features.stride(0),
+        feature_stride=features.stride(0),
+        row_stride=rows.stride(0),
+    )
+    parts = sum_rows(sums).split(sizes)
+    return parts[0].view_as(first_weight), parts[1], parts[2].view_as(second_weight), parts[3]
+
+
+def launch_backward(n_blocks: tuple[int, int], **fields) -> None:
+    """Launches the kernel.
+
+    Args:
+        n_blocks: per policy, and policies.
+        fields: the fields of its struct but the sizes in shared memory. A tensor stands for its
+            address.
+    """
+    sizes, n_bytes = _backward_sizes(fields["n_channels"], fields["n_columns"])
+    kernel = f"conv_backward_{-(-fields['n_channels'] // 2) * 2}"
+    values = {
+        name: field.data_ptr() if isinstance(field, torch.Tensor) else field
+        for name, field in fields.items()
+    }
+    packed = PROGRAM.params.ConvBackwardParams(**values, **sizes)
+    launch_blocks(PROGRAM, kernel, packed, fields["sums"].device, n_blocks, _THREADS, n_bytes)
+
+
+def _backward_blocks(n_rows, n_channels, n_columns, gpu):
+    """Returns how many blocks run at once, at most one for each tile of rows."""
+    _, n_bytes = _backward_sizes(n_channels, n_columns)
+    n_at_once = min(_BLOCKS, gpu.shared_memory_per_multiprocessor // (n_bytes + _RESERVED))
+    return max(min(-(-n_rows // _ROWS), n_at_once * gpu.multi_processor_count), 1)
+
+
+def _backward_sizes(n_channels, n_columns):
+    """Returns sizes in shared memory, in numbers, and its bytes.
+
+    Rows start in other banks than those that a warp reads with them: those of features an odd
+    multiple of 32 bytes apart, those of images an odd multiple of 16.
+    """
+    n_features, n_pairs = CHANNELS * n_outputs(n_columns), -(-n_channels // 2)
+    staged_size = n_features + 2 * ALIGNMENT
+    image_size = ALIGNMENT * (n_pairs * (n_columns // 4 + 2) | 1)
+    # per row: two arrays of features, the gradients, and the images of two tiles
+    row = 2 * staged_size + n_features + 2 * image_size
+    tile = 2 * (_ROWS * row + n_features)
+    sums = 4 * 64 * (76 + 8 * n_pairs)  # of two warps, at the end
+    return dict(staged_size=staged_size, image_size=image_size), _BARRIER + max(tile, sums)

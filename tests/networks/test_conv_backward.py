@@ -4,9 +4,12 @@ import pytest
 import torch
 from torch.nn import functional
 
-from megastep.agents.networks.kernels import convolution_backward
-from megastep.agents.networks.kernels.conv import n_outputs
-from megastep.agents.networks.kernels.convolution_backward import conv_backward, is_supported
+from megastep.agents.networks.kernels.conv import (
+    conv_backward,
+    is_supported,
+    launch_backward,
+    n_outputs,
+)
 from megastep.agents.networks.kernels.layers import sum_rows
 
 DEVICE = "cuda"
@@ -161,7 +164,7 @@ def test_policies():
     )
     sizes = [F * n_channels * 8, F, F * F * 4, F]
     sums = torch.full((n_policies, n_blocks, sum(sizes)), torch.nan, device=DEVICE)
-    convolution_backward.launch(
+    launch_backward(
         (n_blocks, n_policies),
         d_features=d_features,
         features=features,
