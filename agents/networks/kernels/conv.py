@@ -4,13 +4,19 @@ later): both convolutions and their ReLUs in one kernel, and all their gradients
 N rows of C channels and W columns; W' columns of features. All tensors are bfloat16, on one GPU.
 """
 
+from pathlib import Path
+
 import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
-from megastep.agents.networks.kernels.lstm_sequence import PROGRAM
-from megastep.agents.networks.kernels.program import aligned, aligned_rows
+from megastep.agents.networks.kernels.program import CUDA_FLAGS, aligned, aligned_rows
 from megastep.kernels.build.launch import launch_blocks
+from megastep.kernels.build.program import Program
 
+# Lambdas with type parameters are device code only if everything is.
+PROGRAM = Program(
+    Path(__file__).parent / "convolutions", (*CUDA_FLAGS, "--device-as-default-execution-space")
+)
 MAX_CHANNELS = PROGRAM.constants["CONV_INPUTS"]
 CHANNELS = PROGRAM.constants["CONV_CHANNELS"]
 _ROWS, _THREADS, _BLOCKS = (

@@ -8,9 +8,3 @@ constexpr int SEQUENCE_LANES = 40;
 constexpr int MAX_STEPS = 512;          // of a sequence
 constexpr int FORWARD_MEMORY = 153888;  // bytes of shared memory of a block, for 256 units
 constexpr int BACKWARD_MEMORY = 135072;
-
-constexpr int CONV_CHANNELS = 32;  // of the hidden layer and of the features
-constexpr int CONV_INPUTS = 8;     // channels of the images, at most
-constexpr int CONV_ROWS = 16;      // of a tile, which a block convolves at once
-constexpr int CONV_THREADS = 128;  // of such a block
-constexpr int CONV_BLOCKS = 2;     // of a multiprocessor, at once

@@ -14,7 +14,7 @@
 // is saved in the order of the threads.
 #include "constants.h"
 #include "params.h"
-#include "tensor_cores.h"
+#include "common/tensor_cores.h"
 
 #define KERNEL extern "C" __global__ void
 // Blocks of a cluster. One block per multiprocessor, which leaves a thread 255 registers.

@@ -11,28 +11,14 @@
 // holds rows g and g + 8 and columns 2 q and 2 q + 1, with g = lane / 4 and q = lane % 4 of the
 // warp. Results have hidden channels as rows and the tile's rows as columns: two results, rounded,
 // are the left matrix of the next product.
-#include "constants.h"
-#include "params.h"
-#include "tensor_cores.h"
+#include "tiles.h"
 
-#define KERNEL extern "C" __global__ void
-// Blocks of a multiprocessor, which leave a thread 255 registers.
-#define BOUNDS(n_blocks) __launch_bounds__(THREADS, n_blocks)
-
-constexpr int THREADS = CONV_THREADS, WARPS = THREADS / 32, ROWS = CONV_ROWS;
 constexpr int HALVES = CONV_CHANNELS / 16;    // of the hidden channels
 constexpr int SLICES = WARPS / HALVES;        // of the steps
-constexpr int TILES = CONV_CHANNELS / 8;      // of eight features
-constexpr int PARTS = CONV_CHANNELS / 16;     // of a product over features
 constexpr int TAPS = 4;                       // of the second convolution
-constexpr int WORD = 8;                       // numbers in 16 bytes
 constexpr int COLUMN = ROWS * CONV_CHANNELS;  // numbers of a column of the gradients
 constexpr unsigned int ONES = 0x3f803f80;     // a pair of them
 static_assert(ROWS == 16 && HALVES == 2 && SLICES == 2 && CONV_CHANNELS == 32);
-
-typedef unsigned short Bits;  // of a bfloat16
-
-extern __shared__ __align__(16) unsigned char shared_memory[];
 
 struct Thread {
     int warp, lane, g, q;
@@ -94,18 +80,18 @@ DEVICE void for_each(Sums<R>& sums, F f) {
     }
 }
 
-// ---- Weights ----
+// ---- BackwardWeights ----
 
 // What a thread holds of them, as left matrices. Rows are its half of the hidden channels.
 template <int R>
-struct Weights {
+struct BackwardWeights {
     unsigned int first[R][4];             // by 16 numbers of a window of the rows
     unsigned int second[TAPS][PARTS][4];  // by 16 features
     float first_bias[2];
 };
 
 template <int R>
-DEVICE void load(Weights<R>& weights, const ConvBackwardParams& p, const Thread& me) {
+DEVICE void load(BackwardWeights<R>& weights, const ConvBackwardParams& p, const Thread& me) {
     long long policy = blockIdx.y;
     const Bits* first = (const Bits*)p.first_weight + policy * CONV_CHANNELS * p.n_channels * 8;
     const Bits* second = (const Bits*)p.second_weight + policy * CONV_CHANNELS * CONV_CHANNELS * 4;
@@ -293,7 +279,7 @@ DEVICE void load_block(Block<R>& block, const Bits* images, int i, const Thread&
 // Handles one hidden column, which two columns of the features read. `parity`: of its number.
 // `is_last`: only one of the two exists, as for the last of an odd number of hidden columns.
 template <int R, int parity, bool is_last>
-DEVICE void add_hidden(Sums<R>& sums, const Weights<R>& weights, const Column& column,
+DEVICE void add_hidden(Sums<R>& sums, const BackwardWeights<R>& weights, const Column& column,
                        const Column& next_column, const Block<R>& left, const Block<R>& right) {
     float d_sums[2][4] = {};  // by half of the rows
 #pragma unroll
@@ -418,7 +404,7 @@ DEVICE void conv_backward(const ConvBackwardParams& p) {
     __syncthreads();
     if (has_tile)
         begin_tile<R>(tile, tile.images, ROWS * blockIdx.x, n_features, p, me);
-    Weights<R> weights;
+    BackwardWeights<R> weights;
     load(weights, p, me);
     Sums<R> sums;
     for_each(sums, [](float& sum, int) { sum = 0.f; });

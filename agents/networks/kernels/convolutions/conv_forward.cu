@@ -13,22 +13,9 @@
 // columns of channel q: a thread reads the rows of its own channel only. Of a 16 x 8 result it
 // holds rows g and g + 8 and columns 2 q and 2 q + 1, so two results are a left matrix of the
 // second convolution.
-#include "constants.h"
-#include "params.h"
-#include "tensor_cores.h"
+#include "tiles.h"
 
-// Two blocks per multiprocessor leave a thread 255 registers.
-#define KERNEL extern "C" __global__ void __launch_bounds__(THREADS, CONV_BLOCKS)
-
-constexpr int THREADS = CONV_THREADS, WARPS = THREADS / 32, ROWS = CONV_ROWS;
 constexpr int ROW_THREADS = THREADS / ROWS;  // that copy a row
-constexpr int TILES = CONV_CHANNELS / 8;     // of eight features
-constexpr int PARTS = CONV_CHANNELS / 16;    // of a product of the second convolution, per tap
-constexpr int WORD = 8;                      // numbers in 16 bytes
-
-typedef unsigned short Bits;  // of a bfloat16
-
-extern __shared__ __align__(16) unsigned char shared_memory[];
 
 // Begins to copy a tile of rows. Rows that do not exist are the last one again.
 DEVICE void begin_rows(Bits* target, const Bits* rows, int first_row, bool is_aligned,
@@ -72,14 +59,14 @@ DEVICE void begin_sums(float (&sums)[TILES][4], const unsigned int (&bias)[TILES
 
 // What a thread holds of the weights. N channels of the rows: 4 or 8.
 template <int N>
-struct Weights {
+struct ForwardWeights {
     unsigned int first[N / 4][2][TILES][2];   // by the first or last four columns that they read
     unsigned int second[4][PARTS][TILES][2];  // by hidden column
     unsigned int first_bias[TILES], second_bias[TILES];
 };
 
 template <int N>
-DEVICE void load(Weights<N>& weights, const ConvForwardParams& p, int g, int q) {
+DEVICE void load(ForwardWeights<N>& weights, const ConvForwardParams& p, int g, int q) {
     long long policy = blockIdx.y;
     const Bits* first = (const Bits*)p.first_weight + policy * CONV_CHANNELS * p.n_channels * 8;
     const Bits* second = (const Bits*)p.second_weight + policy * CONV_CHANNELS * CONV_CHANNELS * 4;
@@ -126,7 +113,8 @@ typedef unsigned int Hidden[PARTS][4];
 
 template <int N>
 DEVICE void convolve_first(Hidden& hidden, const Columns (&left)[N / 4],
-                           const Columns (&right)[N / 4], bool exists, const Weights<N>& weights) {
+                           const Columns (&right)[N / 4], bool exists,
+                           const ForwardWeights<N>& weights) {
     float sums[TILES][4];
     begin_sums(sums, weights.first_bias);
 #pragma unroll
@@ -152,7 +140,7 @@ DEVICE void convolve_first(Hidden& hidden, const Columns (&left)[N / 4],
 // Adds two hidden columns' part of the features, from the first or last two of four.
 template <int N>
 DEVICE void convolve_second(float (&sums)[TILES][4], const Hidden (&hidden)[2], int first,
-                            const Weights<N>& weights) {
+                            const ForwardWeights<N>& weights) {
 #pragma unroll
     for (int h = 0; h < 2; h++)
 #pragma unroll
@@ -182,7 +170,7 @@ DEVICE void conv_forward(const ConvForwardParams& p) {
         for (int column = p.n_columns; column < p.channel_size; column++)
             channel[column] = 0;
     }
-    Weights<N> weights;
+    ForwardWeights<N> weights;
     load(weights, p, g, q);
 
     // this warp's columns of the features
@@ -257,5 +245,5 @@ DEVICE void conv_forward(const ConvForwardParams& p) {
     }
 }
 
-KERNEL conv_forward_4(ConvForwardParams p) { conv_forward<4>(p); }
-KERNEL conv_forward_8(ConvForwardParams p) { conv_forward<8>(p); }
+KERNEL BOUNDS(2) conv_forward_4(ConvForwardParams p) { conv_forward<4>(p); }
+KERNEL BOUNDS(2) conv_forward_8(ConvForwardParams p) { conv_forward<8>(p); }

@@ -1,0 +1,42 @@
+// The parameters of each launch, passed by value; see megastep/kernels/params.h.
+//
+// P policies, each with its own weights and its own N rows of C channels and W columns, with F = 32
+// features in each of W' columns. Every array starts with the axis P. Arrays are bfloat16 unless
+// their type says otherwise. Sizes count numbers.
+#pragma once
+
+struct ConvForwardParams {
+    const void* rows;           // (P, N, C, W)
+    const void* first_weight;   // (P, F, C, 8)
+    const void* first_bias;     // (P, F)
+    const void* second_weight;  // (P, F, F, 4)
+    const void* second_bias;    // (P, F)
+    void* features;             // (P, N, F, W')
+    int n_rows;
+    int n_channels;
+    int n_columns;
+    int row_stride;      // between two rows, at least C W
+    int feature_stride;  // between two rows of features, at least F W'
+    int channel_size;    // of a channel in shared memory
+    int row_size;        // of a row in shared memory
+    int feature_size;    // of a row's features in shared memory
+};
+
+struct ConvBackwardParams {
+    const void* d_features;     // (P, N, F, W')
+    const void* features;       // (P, N, F, W')
+    const void* rows;           // (P, N, C, W)
+    const void* first_weight;   // (P, F, C, 8)
+    const void* first_bias;     // (P, F)
+    const void* second_weight;  // (P, F, F, 4)
+    float* sums;  // (P, n_blocks, 8 F C + F + 4 F F + F): each block's gradients of the first
+                  // weight, the first bias, the second weight and the second bias
+    int n_rows;
+    int n_channels;
+    int n_columns;
+    int d_stride;        // between two rows of d_features, a multiple of 8
+    int feature_stride;  // between two rows of features, a multiple of 8
+    int row_stride;      // between two rows, at least C W
+    int staged_size;     // of a row's features in shared memory
+    int image_size;      // of a row in shared memory
+};
