@@ -20,7 +20,7 @@ P = 3
 BF16 = torch.bfloat16
 
 
-def launch(program, operation, n_blocks, n_threads=BLOCK, shared=0, **fields):
+def launch(program, operation, n_blocks, n_threads=BLOCK, **fields):
     """Launches an operation; a tensor stands for its address."""
     values = {
         name: field.data_ptr() if isinstance(field, torch.Tensor) else field
@@ -28,7 +28,7 @@ def launch(program, operation, n_blocks, n_threads=BLOCK, shared=0, **fields):
     }
     pack = getattr(program.params, program.cuda_operations[operation])
     device = torch.device("cuda", torch.cuda.current_device())
-    launch_blocks(program, operation, pack(**values), device, n_blocks, n_threads, shared)
+    launch_blocks(program, operation, pack(**values), device, n_blocks, n_threads)
 
 
 @pytest.fixture(autouse=True)
@@ -88,11 +88,8 @@ def test_convolutions(shape):
         second_bias=randn(32).to(BF16),
     )
     features = torch.full((P, n_rows, n_features), torch.nan, dtype=BF16, device="cuda")
-    sizes = conv._shared_sizes(*shape)
-    launch(
-        *(conv.PROGRAM, f"conv_forward_{4 if shape[0] <= 4 else 8}", (2, P)),
-        conv.PROGRAM.constants["CONV_THREADS"],
-        conv._shared_bytes(**sizes),
+    conv.launch_forward(
+        (2, P),
         rows=rows,
         **weights,
         features=features,
@@ -101,7 +98,6 @@ def test_convolutions(shape):
         n_columns=shape[1],
         row_stride=shape[0] * shape[1],
         feature_stride=n_features,
-        **sizes,
     )
     for i in range(P):
         alone = conv.conv_forward(rows[i], *(weight[i] for weight in weights.values()))

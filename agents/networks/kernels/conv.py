@@ -75,32 +75,40 @@ def conv_forward(
         rows = rows.contiguous()
     if features is None:
         features = rows.new_empty(n_rows, CHANNELS * n_outputs(n_columns))
-    sizes = _forward_sizes(n_channels, n_columns)
-    shared = _forward_bytes(**sizes)
     weights = dict(
         first_weight=first_weight,
         first_bias=first_bias,
         second_weight=second_weight,
         second_bias=second_bias,
     )
-    weights = {name: aligned(weight) for name, weight in weights.items()}
     gpu = torch.cuda.get_device_properties(rows.device)
     n_blocks = min(-(-n_rows // _ROWS), _BLOCKS * gpu.multi_processor_count)
     if n_rows:
-        packed = PROGRAM.params.ConvForwardParams(
-            rows=rows.data_ptr(),
-            **{name: weight.data_ptr() for name, weight in weights.items()},
-            features=features.data_ptr(),
+        launch_forward(
+            (n_blocks, 1),
+            rows=rows,
+            **{name: aligned(weight) for name, weight in weights.items()},
+            features=features,
             n_rows=n_rows,
             n_channels=n_channels,
             n_columns=n_columns,
             row_stride=rows.stride(0),
             feature_stride=features.stride(0),
-            **sizes,
         )
-        kernel = f"conv_forward_{4 if n_channels <= 4 else 8}"
-        launch_blocks(PROGRAM, kernel, packed, rows.device, (n_blocks, 1), _THREADS, shared)
     return features
+
+
+def launch_forward(n_blocks: tuple[int, int], **fields) -> None:
+    """Launches the kernel of `conv_forward`.
+
+    Args:
+        n_blocks: per policy, and policies.
+        fields: the fields of its struct but the sizes in shared memory. A tensor stands for its
+            address.
+    """
+    sizes = _forward_sizes(fields["n_channels"], fields["n_columns"])
+    kernel = f"conv_forward_{4 if fields['n_channels'] <= 4 else 8}"
+    _launch(kernel, "ConvForwardParams", n_blocks, _forward_bytes(**sizes), **fields, **sizes)
 
 
 def _forward_sizes(n_channels, n_columns):
@@ -178,21 +186,20 @@ def conv_backward(
 
 
 def launch_backward(n_blocks: tuple[int, int], **fields) -> None:
-    """Launches the kernel.
-
-    Args:
-        n_blocks: per policy, and policies.
-        fields: the fields of its struct but the sizes in shared memory. A tensor stands for its
-            address.
-    """
+    """Launches the kernel of `conv_backward`; see `launch_forward`."""
     sizes, n_bytes = _backward_sizes(fields["n_channels"], fields["n_columns"])
     kernel = f"conv_backward_{-(-fields['n_channels'] // 2) * 2}"
+    _launch(kernel, "ConvBackwardParams", n_blocks, n_bytes, **fields, **sizes)
+
+
+def _launch(kernel, struct, n_blocks, shared, **fields):
     values = {
         name: field.data_ptr() if isinstance(field, torch.Tensor) else field
         for name, field in fields.items()
     }
-    packed = PROGRAM.params.ConvBackwardParams(**values, **sizes)
-    launch_blocks(PROGRAM, kernel, packed, fields["sums"].device, n_blocks, _THREADS, n_bytes)
+    packed = getattr(PROGRAM.params, struct)(**values)
+    device = fields["rows"].device
+    launch_blocks(PROGRAM, kernel, packed, device, n_blocks, _THREADS, shared)
 
 
 def _backward_blocks(n_rows, n_channels, n_columns, gpu):
