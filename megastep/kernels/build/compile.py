@@ -153,10 +153,26 @@ def cuda(program: Program, index: int) -> dict[str, Any]:
     """Returns a program's operations on GPU ``index``: {name: CUfunction}."""
     if not program.cuda_operations:
         return {}
-    driver, nvrtc = bindings()
+    driver, _ = bindings()
     major, minor = torch.cuda.get_device_capability(index)
+    cubin = build_cuda(program, f"sm_{major}{minor}")
+    loading = "Loading the GPU's kernels"
+    with torch.cuda.device(index):
+        torch.cuda.current_stream().synchronize()  # makes the device's primary context current
+        module = check_status(driver.cuModuleLoadData(cubin), loading)
+        return {
+            operation: check_status(driver.cuModuleGetFunction(module, operation.encode()), loading)
+            for operation in program.cuda_operations
+        }
+
+
+def build_cuda(program: Program, architecture: str) -> bytes:
+    """Returns a program's kernels for GPUs of an architecture, such as ``sm_90``, from the cache if
+    they are there. Needs NVRTC, but no GPU.
+    """
+    _, nvrtc = bindings()
     files = program.sources(".h", ".cu")
-    flags = (*program.cuda_flags, f"--gpu-architecture=sm_{major}{minor}")
+    flags = (*program.cuda_flags, f"--gpu-architecture={architecture}")
     try:
         version = check_status(nvrtc.nvrtcVersion(), "NVRTC")
     except (RuntimeError, OSError) as error:
@@ -168,14 +184,7 @@ def cuda(program: Program, index: int) -> dict[str, Any]:
         f"cuda-{_key(*files, *files.values(), *flags, str(version))}.cubin",
         lambda: _build_cuda(files, flags),
     )
-    loading = "Loading the GPU's kernels"
-    with torch.cuda.device(index):
-        torch.cuda.current_stream().synchronize()  # makes the device's primary context current
-        module = check_status(driver.cuModuleLoadData(cubin), loading)
-        return {
-            operation: check_status(driver.cuModuleGetFunction(module, operation.encode()), loading)
-            for operation in program.cuda_operations
-        }
+    return cubin
 
 
 @functools.cache
