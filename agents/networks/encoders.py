@@ -112,7 +112,7 @@ class Conv(nn.Module):
     """Two convolutions along the rows of an image: (..., A, C, H, W) -> (..., n_features).
 
     The H rows count as channels, since images are one or a few pixels high. Agents share weights.
-    In bfloat16 on GPUs with clusters (Hopper and later), one kernel does both (`encode`).
+    In bfloat16 on GPUs from Hopper on, one kernel does both (`encode`).
     """
 
     def __init__(self, space: spaces.MultiImage, channels: int = 32):

@@ -85,7 +85,7 @@ def select_lanes(tensors: Sequence[torch.Tensor], lanes: torch.Tensor) -> list[t
         lanes: (M,) int64.
     """
     results = {}
-    fused = [i for i, tensor in enumerate(tensors) if tensor.is_cuda and _can_select(tensor)]
+    fused = [i for i, tensor in enumerate(tensors) if _can_select(tensor, len(lanes))]
     for start in range(0, len(fused), _MAX_SELECTED):
         chosen = fused[start : start + _MAX_SELECTED]
         rows, n_blocks = [], 0
@@ -132,6 +132,7 @@ def select_tree(tree: Tree, lanes: torch.Tensor) -> Tree:
     return tree_unflatten([leaf[0] for leaf in selected], spec)
 
 
-def _can_select(tensor):
-    n_bytes = tensor.numel() * tensor.element_size()
-    return tensor.is_contiguous() and 0 < n_bytes < _MAX_BYTES
+def _can_select(tensor, n_selected):
+    n_bytes = tensor[:, :1].numel() * tensor.element_size()  # of one lane
+    is_small = 0 < n_bytes * max(n_selected, tensor.shape[1]) < _MAX_BYTES
+    return tensor.is_cuda and tensor.is_contiguous() and is_small

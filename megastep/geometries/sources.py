@@ -133,14 +133,14 @@ def maze(
     return [generated[i] for i in indices]
 
 
-def _part(name: str, part: Any) -> tuple[Callable, dict[str, Any]]:
-    """Returns the source of a part of `mixed`, and its options with `n`.
+def _part(name: str, part: Any) -> tuple[Callable, dict[str, Any], int]:
+    """Returns the source of a part of `mixed`, its options with `n`, and its weight.
 
     Raises:
         ValueError: if there is no such source, or it takes other options.
     """
     options = dict(part) if isinstance(part, dict) else {"n": part}
-    source = options.pop("source", name)
+    source, weight = options.pop("source", name), options.pop("weight", 1)
     known = [name for name in __all__ if name not in ("mixed", "suite")]
     if not isinstance(source, str) or source not in known and ":" not in source:
         raise ValueError(f"{source!r} is no source; {closest(source, [*known, 'module:function'])}")
@@ -159,7 +159,9 @@ def _part(name: str, part: Any) -> tuple[Callable, dict[str, Any]]:
     n = options.setdefault("n", arguments["n"].default)
     if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or not 0 <= n <= 1_000_000:
         raise ValueError(f"{name}: {n!r} is no number of geometries, 0 to 1,000,000")
-    return function, options
+    if isinstance(weight, bool) or not isinstance(weight, int) or not 1 <= weight <= 1000:
+        raise ValueError(f"{name}: weight={weight!r} is no integer from 1 to 1,000")
+    return function, options, weight
 
 
 def check_parts(parts: dict[str, Any]) -> None:
@@ -185,19 +187,21 @@ def mixed(
         parts: name -> number of geometries from the source of that name; or {source, n, options}
             with the name or import path of a source. Every part is of the same split, and of the
             same seed unless its options have one; it has at most as many geometries as that split
-            of its source.
+            of its source. With {weight: 2} the training split has each of them twice.
     """
     check_parts(parts)
     geometries = []
     for name, part in parts.items():
-        function, options = _part(name, part)
+        function, options, weight = _part(name, part)
         if options["n"]:
             try:
                 drawn = checked(function)(**{"split": split, "seed": seed, **options})
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from error
-            unique = {id(g): dotdict(g, source=name) for g in drawn}
-            geometries += unique.values()
+            unique = {id(g): g for g in drawn}.values()
+            # each time another object, and so a layout of its own, as layouts are drawn evenly
+            for _ in range(weight if split == "training" else 1):
+                geometries += [dotdict(g, source=name) for g in unique]
     total = len(geometries)
     n = n or total
     return [geometries[i * total // n if n < total else i % total] for i in range(n)]

@@ -33,14 +33,14 @@ EXPLORER = "geometry=bench", "finish.evaluate=true"  # overrides of `train`
 #: Overrides of an evaluation in several kinds of floor plans.
 SUITE = "geometry=suite episodes=1024"
 TRAINED_IN = {"homes": "geometry=homes", "mazes": "geometry=maze geometry.braid=0.3"}
-AGENTS = {"Explorer": "env=explorer", "PointGoal": "experiment=pointgoal"}
+AGENTS = {"Explorer": "env=explorer", "PointGoal, metres charged": "experiment=pointgoal"}
 #: Title: (overrides of training, overrides of the evaluation). Those that take equally long are
 #: neighbours, as several GPUs train several at a time.
 RECIPES = {
     "Pong from features": ("experiment=pong", ""),
     "Pong, self-play": ("experiment=pong env.self_play=true seconds=25", "env=pong"),
     "Pong from pictures": ("experiment=pong_pixels", ""),
-    "PointGoal, continuous actions, trained in homes": (
+    "PointGoal, metres charged, continuous actions, trained in homes": (
         "experiment=pointgoal env.control=continuous seconds=60",
         SUITE,
     ),

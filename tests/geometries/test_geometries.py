@@ -11,7 +11,8 @@ import pytest
 
 from megastep import geometries, toys
 from megastep.dotdict import dotdict
-from megastep.geometries import files
+from megastep.geometries import files, sources
+from megastep.scene import scenery
 
 
 def test_box():
@@ -102,6 +103,19 @@ def test_a_part_may_have_a_seed_of_its_own():
         geometries.sample("mixed", 10, parts=parts)
 
 
+def test_training_draws_a_part_as_often_as_its_weight_says():
+    parts = {"homes": 3, "bench": {"n": 4, "weight": 2}}
+    plain = geometries.sample("mixed", 7, parts={"homes": 3, "bench": 4})
+    mix = geometries.sample("mixed", 11, parts=parts)
+    assert [(g.source, g.id) for g in mix] == [
+        (g.source, g.id) for g in [*plain[:3], *plain[3:], *plain[3:]]
+    ]
+    homes = scenery(mix, 1, n_envs=11)
+    assert homes.layouts.n_layouts == 11, "drawing layouts evenly draws them by weight"
+    for split in "test", "all":
+        assert len(sources.mixed(None, split, parts=parts)) == 7
+
+
 def test_fewer_of_a_mix_are_spread_over_its_parts_and_more_are_repeated():
     parts = {"homes": 6, "bench": 2}
     mix = geometries.sample("mixed", 8, parts=parts)
@@ -121,6 +135,8 @@ def test_fewer_of_a_mix_are_spread_over_its_parts_and_more_are_repeated():
         ({}, "its counts sum to 0"),
         ({"homes": -1}, "homes: -1 is no number of geometries"),
         ({"homes": True}, "homes: True is no number of geometries"),
+        ({"bench": {"weight": 0}}, "bench: weight=0 is no integer from 1 to 1,000"),
+        ({"bench": {"weight": 1.5}}, "bench: weight=1.5 is no integer from 1 to 1,000"),
         ({"a": {"source": "mixed"}}, "'mixed' is no source; there are bench"),
         ({"a": {"source": "homes", "outr": True}}, "a: homes has no option outr; did you mean out"),
         ({"files": 3}, "files: path is missing"),

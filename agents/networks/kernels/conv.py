@@ -1,4 +1,4 @@
-"""The encoder `Conv` on a GPU with tensor cores for bfloat16 and much shared memory (Hopper and
+"""The encoder `Conv` on a GPU whose tensor cores take bfloat16 and that copies in bulk (Hopper and
 later): both convolutions and their ReLUs in one kernel, and all their gradients in another.
 
 N rows of C channels and W columns; W' columns of features. All tensors are bfloat16, on one GPU.
