@@ -388,6 +388,12 @@ def test_acting_takes_the_step_and_learning_does_not(monkeypatch, is_residual):
     assert len(calls) == 2
 
 
+def test_each_width_has_a_kernel_that_fits():
+    names = {f"mingru_step_{width}" for width in mingru_step.WIDTHS}
+    assert mingru_step.PROGRAM.cuda_operations.keys() == names
+    assert max(map(mingru_step._shared, mingru_step.WIDTHS)) <= 227 * 1024  # of Hopper
+
+
 def step_inputs(n_lanes, width, is_exact=False):
     """Returns x (1, B, W), weight, bias, resets (1, B) and a state that is NaN where it is reset.
 
