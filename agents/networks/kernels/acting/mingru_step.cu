@@ -192,30 +192,40 @@ DEVICE void update(const Sums& sums, unsigned char* part, unsigned char* states,
                    int units, unsigned int resets, unsigned int residual_mask) {
     int g = threadIdx.x % 32 / 4, q = threadIdx.x % 4;
     states += (lanes + g) * STATE_BYTES + 4 * (units + 2 * q);
-    int output_at = word_at(lanes + g, units / (WORD / 2)) + 4 * q;
+    int first_output = word_at(lanes + g, units / (WORD / 2)) + 4 * q;
+    auto state_at = [&](int row, int j) {
+        return (float2*)(states + row * STATE_BYTES + 4 * 8 * j);
+    };
+    auto output_at = [&](int row, int j) {
+        return (unsigned int*)(part + (first_output ^ j * WORD) + row * ROW_BYTES);
+    };
 #pragma unroll
     for (int m = 0; m < LANE_TILES; m++)
 #pragma unroll
         for (int half = 0; half < 2; half++) {
             int row = 16 * m + 8 * half;  // and g
             bool is_reset = resets >> (row + g) & 1;
+            float2 before[UNIT_TILES];  // all are read before the first is written
+            unsigned int residuals[UNIT_TILES];
+#pragma unroll
+            for (int j = 0; j < UNIT_TILES; j++) {
+                before[j] = *state_at(row, j);
+                residuals[j] = *output_at(row, j) & residual_mask;
+            }
 #pragma unroll
             for (int j = 0; j < UNIT_TILES; j++) {
                 const float (&z)[4] = sums[m][0][j], (&c)[4] = sums[m][1][j];
                 // rounded, as the gates are when learning
                 unsigned int updates = pack_bfloat16(z[2 * half], z[2 * half + 1]);
                 unsigned int candidates = pack_bfloat16(c[2 * half], c[2 * half + 1]);
-                float2* at = (float2*)(states + row * STATE_BYTES + 4 * 8 * j);
-                auto* output = (unsigned int*)(part + (output_at ^ j * WORD) + row * ROW_BYTES);
-                float2 state = *at;
-                unsigned int residual = *output & residual_mask;
+                float2 state = before[j];
                 if (is_reset)
                     state = {0.f, 0.f};
                 state.x += activate(low_half(updates)) * (low_half(candidates) - state.x);
                 state.y += activate(high_half(updates)) * (high_half(candidates) - state.y);
-                *at = state;
-                *output =
-                    pack_bfloat16(low_half(residual) + state.x, high_half(residual) + state.y);
+                *state_at(row, j) = state;
+                *output_at(row, j) = pack_bfloat16(low_half(residuals[j]) + state.x,
+                                                   high_half(residuals[j]) + state.y);
             }
         }
 }
