@@ -25,6 +25,7 @@ from megastep.agents.networks import (
     joint_heads,
     layers,
     lstm,
+    mingru,
     outputs,
     policy,
     value_output,
@@ -71,6 +72,12 @@ def plain_lstm() -> None:
 
     replace("is_supported", lambda x: False, lstm.lstm_sequence)
     replace("_act", act, lstm.LSTM)
+
+
+def plain_mingru() -> None:
+    """A minGRU's product is one of its own, and a scan by doubling follows."""
+    replace("is_supported", lambda x: False, mingru.mingru_step)
+    replace("_recurrence", lambda x: mingru._CPU_RECURRENCE, mingru)
 
 
 def plain_heads() -> None:
@@ -137,6 +144,7 @@ def plain_order() -> None:
 PARTS = {
     "streams": plain_streams,
     "lstm": plain_lstm,
+    "mingru": plain_mingru,
     "heads": plain_heads,
     "conv": plain_conv,
     "layers": plain_layers,

@@ -15,7 +15,8 @@ Matrix products run in the compute dtype (autocast's). The recurrence is float32
 steps a bfloat16 state would round small additions away.
 
 The recurrence is written here for the CPU. On a GPU it is a kernel with the same arguments
-(`megastep.agents.networks.kernels.mingru`).
+(`megastep.agents.networks.kernels.mingru`). When acting, one kernel does product and recurrence
+(`megastep.agents.networks.kernels.mingru_step`).
 """
 
 from types import SimpleNamespace
@@ -26,6 +27,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from megastep.agents.networks.kernels import mingru as kernels
+from megastep.agents.networks.kernels import mingru_step
 from megastep.agents.networks.kernels.program import aligned, check_shapes
 from megastep.agents.networks.precision import cast, compute_dtype, product
 from megastep.agents.networks.scan import linear_scan
@@ -100,10 +102,12 @@ class _Sequence(torch.autograd.Function):
         ctx.is_residual = is_residual
         x, reset, start = aligned(x), reset.contiguous(), aligned(start)
         weight, bias = cast(weight, x.dtype), cast(bias, x.dtype)
+        needs_backward = has_grad and any(ctx.needs_input_grad)
+        if not needs_backward and mingru_step.is_supported(x):
+            return mingru_step.forward(x, weight, bias, reset, start, is_residual)
         gates = F.linear(x, weight, bias)
         outputs, last = torch.empty_like(x), torch.empty_like(start)
-        keeps_apart = is_residual and has_grad and any(ctx.needs_input_grad)
-        states = torch.empty_like(x) if keeps_apart else None
+        states = torch.empty_like(x) if is_residual and needs_backward else None
         residual = x if is_residual else None
         _recurrence(x).forward(gates, reset, start, residual, states, outputs, last)
         states = outputs if states is None else states

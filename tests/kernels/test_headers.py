@@ -8,6 +8,7 @@ import pytest
 
 from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
 from megastep.agents.networks.kernels.lstm_sequence import PROGRAM as SEQUENCES
+from megastep.agents.networks.kernels.mingru_step import PROGRAM as ACTING
 from megastep.agents.networks.kernels.program import CORES
 from megastep.agents.storage.copies import PROGRAM as COPIES
 from megastep.envs.deathmatch.step import PROGRAM as DEATHMATCH
@@ -18,7 +19,9 @@ from megastep.kernels.build import compile, headers
 from megastep.kernels.build.launch import ENGINE
 
 GAMES = dict(deathmatch=DEATHMATCH, explorer=EXPLORER, pointgoal=POINTGOAL, pong=PONG)
-LEARNER = dict(cores=CORES, sequences=SEQUENCES, algorithms=ALGORITHMS, copies=COPIES)
+LEARNER = dict(
+    cores=CORES, sequences=SEQUENCES, acting=ACTING, algorithms=ALGORITHMS, copies=COPIES
+)
 PROGRAMS = dict(engine=ENGINE, **LEARNER, **GAMES)
 programs = pytest.mark.parametrize("program", PROGRAMS.values(), ids=PROGRAMS)
 

@@ -5,10 +5,11 @@ Kernels run on a GPU, and compiled for the CPU from the same source (`cuda_on_cp
 
 import pytest
 import torch
+from torch.nn import functional
 
 from megastep.agents.networks import mingru as mingru_module
 from megastep.agents.networks.kernels import mingru as kernels
-from megastep.agents.networks.kernels import program
+from megastep.agents.networks.kernels import mingru_step, program
 from megastep.agents.networks.mingru import MinGRU
 from megastep.arrdict import arrdict
 from megastep.kernels.build.compile import EngineError
@@ -342,3 +343,160 @@ def test_captured_unroll_matches_steps(bf16):
 
     slack = 2e-2 if bf16 else 2e-3  # rounding of bfloat16 and of TF32 in sums of 256 products
     check_captured(core, "output", step, slack, bf16)
+
+
+# ---- A step in one kernel ----
+
+
+def plain_step(x, weight, bias, reset, start, is_residual):
+    """The twin of `mingru_step.forward`: float64, but for the roundings to bfloat16."""
+    inputs = (leaf.double() for leaf in (x[0], weight, bias))
+    gates = functional.linear(*inputs).bfloat16().double()
+    before = start.double().masked_fill(reset[0, :, None], 0.0)
+    last = before.lerp(gates[:, start.shape[1] :], gates[:, : start.shape[1]].sigmoid())
+    outputs = last + x[0].double() if is_residual else last
+    return outputs.to(x.dtype)[None], last.float()
+
+
+@pytest.mark.parametrize("is_residual", [False, True])
+def test_acting_takes_the_step_and_learning_does_not(monkeypatch, is_residual):
+    torch.manual_seed(0)
+    core, x, state = MinGRU(W), torch.randn(2, B, W), arrdict(output=torch.randn(B, W))
+    reset, calls = torch.rand(2, B) < 0.5, []
+
+    def step(*args):
+        calls.append(args)
+        return plain_step(*args)
+
+    monkeypatch.setattr(mingru_step, "is_supported", lambda x: len(x) == 1)
+    monkeypatch.setattr(mingru_step, "forward", step)
+    results = []
+    for grad in (True, False):
+        with torch.set_grad_enabled(grad):
+            outputs, after = core(x[:1], reset[:1], state, is_residual)
+        assert outputs.requires_grad is after.output.requires_grad is grad
+        results.append((outputs, after.output))
+    assert len(calls) == 1
+    for learnt, acted in zip(*results, strict=True):
+        # gates are rounded to 8 bits
+        torch.testing.assert_close(acted, learnt, rtol=0, atol=2e-2)
+    core.requires_grad_(False)
+    core(x[:1], reset[:1], state, is_residual)  # nothing needs a gradient
+    assert len(calls) == 2
+    with torch.no_grad():
+        core(x, reset, state, is_residual)  # two steps
+    assert len(calls) == 2
+
+
+def test_each_width_has_a_kernel_that_fits():
+    names = {f"mingru_step_{width}" for width in mingru_step.WIDTHS}
+    assert mingru_step.PROGRAM.cuda_operations.keys() == names
+    assert max(map(mingru_step._shared, mingru_step.WIDTHS)) <= 227 * 1024  # of Hopper
+
+
+def step_inputs(n_lanes, width, is_exact=False):
+    """Returns x (1, B, W), weight, bias, resets (1, B) and a state that is NaN where it is reset.
+
+    With `is_exact`, float32 sums of products and bias are exact: multiples of 1 / 512 below 256.
+    """
+    torch.manual_seed(0)
+    if is_exact:
+        x = torch.randint(-16, 17, (1, n_lanes, width)) / 8
+        weight, bias = torch.randint(-16, 17, (2 * width, width)) / 64, torch.randn(2 * width)
+        bias = (8 * bias).round() / 8
+    else:
+        x = torch.randn(1, n_lanes, width)
+        weight, bias = torch.randn(2 * width, width) / width**0.5, torch.randn(2 * width)
+    reset, start = torch.rand(1, n_lanes) < 0.3, torch.randn(n_lanes, width)
+    start[reset[0]] = torch.nan
+    inputs = (*(leaf.bfloat16() for leaf in (x, weight, bias)), reset, start)
+    return [leaf.cuda() for leaf in inputs]
+
+
+def two_kernels(gates, reset, start, residual):
+    """Returns outputs and state after the step from rounded gates (1, B, 2 W)."""
+    outputs, last = torch.full_like(gates[..., : start.shape[1]], torch.nan), start.clone()
+    outputs = outputs.contiguous()
+    kernels.forward(gates, reset, start, residual, None, outputs, last)
+    return outputs, last
+
+
+STEPS = pytest.mark.parametrize(
+    "n_lanes, width",
+    [(1, 256), (37, 256), (4096, 256), (5000, 256), (65_536, 64), (129, 64), (200, 128), (7, 192)],
+)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("is_residual", [False, True])
+@STEPS
+def test_step_has_the_bits_of_two_kernels(n_lanes, width, is_residual):
+    """Where sums are exact in any order."""
+    x, weight, bias, reset, start = inputs = step_inputs(n_lanes, width, is_exact=True)
+    assert mingru_step.is_supported(x)
+    gates = functional.linear(*(leaf.double() for leaf in (x, weight, bias))).bfloat16()
+    expected = two_kernels(gates, reset, start, x if is_residual else None)
+    results = mingru_step.forward(*inputs, is_residual)
+    for name, result, expected_tensor in zip(("outputs", "last"), results, expected, strict=True):
+        assert result.isfinite().all() and torch.equal(result, expected_tensor), name
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("is_residual", [False, True])
+@STEPS
+def test_step_matches_the_plain_form_and_is_repeatable(n_lanes, width, is_residual):
+    x, weight, bias, reset, start = inputs = step_inputs(n_lanes, width)
+    names, results = ("outputs", "last"), mingru_step.forward(*inputs, is_residual)
+    again = mingru_step.forward(*inputs, is_residual)
+    assert all(map(torch.equal, results, again))
+    slack = SLACK[torch.bfloat16]  # sums in another order round some gates to the next number
+    assert_close(names, results, plain_step(*inputs, is_residual), slack)
+    gates = functional.linear(x, weight, bias)
+    by_two = two_kernels(gates, reset, start, x if is_residual else None)
+    assert_close(names, results, by_two, slack)
+    for result, other in zip(results, by_two, strict=True):
+        # below the rounding of all gates to 8 bits
+        assert (result.float() - other.float()).norm() < 4e-3 * other.float().norm()
+
+
+@pytest.mark.cuda
+def test_step_keeps_nan_to_its_lane():
+    inputs = step_inputs(300, 256)
+    clean = mingru_step.forward(*inputs, True)
+    inputs[0][0, 140, 200] = inputs[4][20, 7] = torch.nan
+    inputs[3][0, 20] = False
+    lanes = torch.arange(300, device="cuda")
+    for result, expected in zip(mingru_step.forward(*inputs, True), clean, strict=True):
+        result, expected = result.view(300, 256), expected.view(300, 256)
+        assert result[140].isnan().all() and result[20, 7].isnan()
+        others = (lanes != 140) & (lanes != 20)
+        assert torch.equal(result[others], expected[others])
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("is_residual", [False, True])
+def test_captured_step_acts_like_the_two_kernels(monkeypatch, is_residual):
+    torch.manual_seed(0)
+    core, n_lanes = MinGRU(256).cuda(), 500
+    x, reset = torch.randn(1, n_lanes, 256, device="cuda"), torch.rand(1, n_lanes).cuda() < 0.3
+    state = arrdict(output=torch.randn(n_lanes, 256, device="cuda"))
+    forward, calls = mingru_step.forward, []
+    monkeypatch.setattr(mingru_step, "forward", lambda *args: calls.append(args) or forward(*args))
+
+    def act():
+        with torch.no_grad(), torch.autocast("cuda", torch.bfloat16):
+            outputs, after = core(x, reset, state, is_residual)
+        return outputs, after.output
+
+    act()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        captured = act()
+    x.normal_()
+    state.output.normal_()
+    reset.logical_not_()
+    graph.replay()
+    assert len(calls) == 2 and all(map(torch.equal, captured, act()))
+    monkeypatch.setattr(mingru_step, "is_supported", lambda x: False)
+    assert_close(("outputs", "last"), captured, act(), SLACK[torch.bfloat16])
+    assert len(calls) == 3

@@ -7,7 +7,14 @@ from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels.program import PROGRAM as ALGORITHMS
 from megastep.agents.algorithms.kernels.program import n_blocks
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
-from megastep.agents.networks.kernels import conv, duelling, heads, layers, moments
+from megastep.agents.networks.kernels import (
+    conv,
+    duelling,
+    heads,
+    layers,
+    mingru_step,
+    moments,
+)
 from megastep.agents.networks.kernels.program import CORES
 from megastep.agents.networks.running_norm import RunningNorm
 from megastep.agents.networks.value_output import ValueOutput
@@ -102,6 +109,28 @@ def test_convolutions(shape):
     for i in range(P):
         alone = conv.conv_forward(rows[i], *(weight[i] for weight in weights.values()))
         assert torch.equal(features[i], alone), i
+
+
+@pytest.mark.parametrize("n_lanes, width", [(37, 256), (300, 64)])
+def test_mingru_step(n_lanes, width):
+    x, start = randn(n_lanes, width).to(BF16), randn(n_lanes, width)
+    if not mingru_step.is_supported(x[:1]):
+        pytest.skip("needs a GPU with clusters")
+    inputs = dict(
+        x=x,
+        weight=(randn(2 * width, width) / width**0.5).to(BF16),
+        bias=randn(2 * width).to(BF16),
+        reset=randn(n_lanes) < 0,
+        start=start,
+    )
+    results = dict(outputs=torch.full_like(x, torch.nan), last=torch.full_like(start, torch.nan))
+    mingru_step.launch(P, **inputs, **results, n_lanes=n_lanes, is_residual=1)
+    for i in range(P):
+        of_policy = {name: leaf[i] for name, leaf in inputs.items()}
+        of_policy |= {name: of_policy[name][None] for name in ("x", "reset")}
+        outputs, last = mingru_step.forward(**of_policy, is_residual=True)
+        assert torch.equal(results["outputs"][i], outputs[0]), i
+        assert torch.equal(results["last"][i], last), i
 
 
 def test_statistics_of_observations():

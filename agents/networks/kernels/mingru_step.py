@@ -1,0 +1,95 @@
+"""One step of the minGRU on a GPU with tensor cores for bfloat16 and much shared memory (Hopper and
+later): the product of its gates and the recurrence in one kernel.
+
+B lanes, W units. All tensors are on one GPU.
+"""
+
+from pathlib import Path
+
+import torch
+
+from megastep.agents.networks.kernels.program import CUDA_FLAGS, aligned
+from megastep.kernels.build.launch import launch_blocks
+from megastep.kernels.build.program import Program
+
+PROGRAM = Program(Path(__file__).parent / "acting", CUDA_FLAGS)
+_LANES, _UNITS, _PARTS, _THREADS = (
+    PROGRAM.constants[f"STEP_{name}"] for name in "LANES UNITS PARTS THREADS".split()
+)
+WIDTHS = tuple(range(_UNITS, (_PARTS + 1) * _UNITS, _UNITS))
+
+
+def is_supported(x: torch.Tensor) -> bool:
+    """Returns whether the kernel takes inputs x (T, B, W) of this dtype on their device."""
+    n_steps, _, width = x.shape
+    if not x.is_cuda or x.dtype != torch.bfloat16 or n_steps != 1 or width not in WIDTHS:
+        return False
+    gpu = torch.cuda.get_device_properties(x.device)
+    return gpu.major >= 9 and gpu.shared_memory_per_block_optin >= _shared(width)
+
+
+def forward(
+    x: torch.Tensor,
+    weight: torch.Tensor,
+    bias: torch.Tensor,
+    reset: torch.Tensor,
+    start: torch.Tensor,
+    is_residual: bool,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Computes a step without what its gradient needs.
+
+    Gates are float32 sums, rounded to bfloat16 after the bias.
+
+    Args:
+        x: (1, B, W) bfloat16.
+        weight: (2 W, W) bfloat16.
+        bias: (2 W,) bfloat16.
+        reset: (1, B) bool; clears a lane's state before the step.
+        start: (B, W) float32, state before the step.
+        is_residual: adds x to the outputs.
+
+    Returns:
+        outputs (1, B, W) bfloat16, and the state after the step (B, W) float32.
+    """
+    x, start = aligned(x), aligned(start)
+    outputs, last = torch.empty_like(x), torch.empty_like(start)
+    launch(
+        1,
+        x=x,
+        weight=aligned(weight),
+        bias=aligned(bias),
+        reset=reset.contiguous(),
+        start=start,
+        outputs=outputs,
+        last=last,
+        n_lanes=len(start),
+        is_residual=int(is_residual),
+    )
+    return outputs, last
+
+
+def launch(n_policies: int, **fields) -> None:
+    """Launches the kernel.
+
+    Args:
+        n_policies: P.
+        fields: the fields of its struct. A tensor stands for its address.
+    """
+    x, n_lanes = fields["x"], fields["n_lanes"]
+    width = x.shape[-1]
+    values = {
+        name: field.data_ptr() if isinstance(field, torch.Tensor) else field
+        for name, field in fields.items()
+    }
+    packed = PROGRAM.params.MingruStepParams(**values)
+    n_blocks = -(-n_lanes // _LANES) * width // _UNITS, n_policies
+    if n_lanes:
+        shared = _shared(width)
+        launch_blocks(PROGRAM, f"mingru_step_{width}", packed, x.device, n_blocks, _THREADS, shared)
+
+
+def _shared(width):
+    """Returns the bytes of shared memory of a block."""
+    n_bytes = PROGRAM.constants
+    of_parts = width // _UNITS * n_bytes["PART_BYTES"]
+    return of_parts + _LANES * n_bytes["STATE_BYTES"] + n_bytes["BIAS_BYTES"]
