@@ -20,7 +20,7 @@ from megastep.engine.launch_params import (
 from megastep.engine.outputs import Observation, Render
 from megastep.engine.scenery import Scenery
 from megastep.engine.texels import texel_bits
-from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, launch
+from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, addresses, launch
 
 __all__ = ["observe", "render", "update_agent_geometry"]
 
@@ -150,11 +150,7 @@ def _seen_fields(scenery, seen, clear_mask):
 def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
     res, device = agents.res, scenery.device
     half_width = math.tan(math.radians(agents.fov / 2))
-    fields = {
-        name: value.data_ptr() if isinstance(value, torch.Tensor) else value
-        for name, value in outputs.items()
-        if value is not None
-    }
+    fields = addresses(outputs)
     packed = ENGINE.params.RenderParams(
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),

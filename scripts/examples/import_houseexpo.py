@@ -61,12 +61,16 @@ def main(argv: list[str] | None = None) -> int:
             break
         try:
             homes.append(home(len(homes), json.loads(path.read_text())))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             print(f"{path.name} is left out: {error!r}")
     if not homes:
         print(f"import_houseexpo.py: {args.folder} has no floor plan of HouseExpo", file=sys.stderr)
         return 2
-    files.save(args.file, homes)
+    try:
+        files.save(args.file, homes)
+    except OSError as error:
+        print(f"import_houseexpo.py: {args.file} cannot be written: {error}", file=sys.stderr)
+        return 2
     print(f"{len(homes)} homes are in {args.file}")
     return 0
 

@@ -53,6 +53,11 @@ def test_files_that_are_no_plans_are_named(folder, capsys):
     assert all(f"{name}.json is left out" in out for name in bad) and "1 homes" in out
 
 
+def test_file_that_cannot_be_written(folder, capsys):
+    assert import_houseexpo.main([str(folder), str(folder / "none" / "homes.npz")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
 def test_folder_without_plans(tmp_path, capsys):
     assert import_houseexpo.main([str(tmp_path), str(tmp_path / "homes.npz")]) == 2
     assert "has no floor plan" in capsys.readouterr().err and not [*tmp_path.iterdir()]

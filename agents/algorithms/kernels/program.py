@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from megastep.agents.networks.kernels.program import CUDA_FLAGS
-from megastep.kernels.build.launch import BLOCK, launch_blocks
+from megastep.kernels.build.launch import BLOCK, addresses, launch_blocks
 from megastep.kernels.build.program import Program
 
 PROGRAM = Program(Path(__file__).parent, CUDA_FLAGS)
@@ -29,10 +29,7 @@ def run(
         block: threads of a block.
         fields: the fields of its struct. A tensor stands for its address, None for null.
     """
-    values = {
-        name: field.data_ptr() if isinstance(field, torch.Tensor) else 0 if field is None else field
-        for name, field in fields.items()
-    }
+    values = addresses(fields)
     pack = getattr(PROGRAM.params, PROGRAM.cuda_operations[operation])
     shape = (-(-n_threads // block), n_blocks_y), block
     launch_blocks(PROGRAM, operation, pack(**values), device, *shape)

@@ -10,7 +10,7 @@ import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
 from megastep.agents.networks.kernels.program import CUDA_FLAGS, aligned, aligned_rows
-from megastep.kernels.build.launch import launch_blocks
+from megastep.kernels.build.launch import addresses, launch_blocks
 from megastep.kernels.build.program import Program
 
 # Lambdas with type parameters are device code only if everything is.
@@ -193,10 +193,7 @@ def launch_backward(n_blocks: tuple[int, int], **fields) -> None:
 
 
 def _launch(kernel, struct, n_blocks, shared, **fields):
-    values = {
-        name: field.data_ptr() if isinstance(field, torch.Tensor) else field
-        for name, field in fields.items()
-    }
+    values = addresses(fields)
     packed = getattr(PROGRAM.params, struct)(**values)
     device = fields["rows"].device
     launch_blocks(PROGRAM, kernel, packed, device, n_blocks, _THREADS, shared)

@@ -9,7 +9,7 @@ import itertools
 import torch
 
 from megastep.agents.networks.kernels.program import CORES, DTYPES
-from megastep.kernels.build.launch import BLOCK, WARP, launch_blocks
+from megastep.kernels.build.launch import BLOCK, WARP, addresses, launch_blocks
 
 MAX_LEAVES = CORES.constants["MAX_LEAVES"]
 MAX_CHOICES = CORES.constants["ACT_THREADS"]
@@ -207,10 +207,7 @@ def _rows(logits, actions):
 
 def launch_for_policy(operation, tensor, n_threads, n_blocks_y=1, block=BLOCK, **fields):
     """Launches an operation for one policy on a tensor's GPU."""
-    values = {
-        name: field.data_ptr() if isinstance(field, torch.Tensor) else 0 if field is None else field
-        for name, field in fields.items()
-    }
+    values = addresses(fields)
     pack = getattr(CORES.params, CORES.cuda_operations[operation])
     if n_threads and n_blocks_y:
         n_blocks = -(-n_threads // block), n_blocks_y

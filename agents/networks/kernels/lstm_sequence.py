@@ -11,7 +11,7 @@ import torch
 
 from megastep.agents.networks.kernels.layers import sum_rows
 from megastep.agents.networks.kernels.program import CUDA_FLAGS
-from megastep.kernels.build.launch import launch_blocks
+from megastep.kernels.build.launch import addresses, launch_blocks
 from megastep.kernels.build.program import Program
 
 # Lambdas with type parameters are device code only if everything is.
@@ -134,10 +134,7 @@ def backward(weight, reset, saved_gates, saved_cells, d_outputs, d_cell):
 def _launch(direction, n_clusters, **fields):
     kernel = f"lstm_sequence_{direction}_{WIDTH}"
     pack = getattr(PROGRAM.params, PROGRAM.cuda_operations[kernel])
-    values = {
-        name: field.data_ptr() if isinstance(field, torch.Tensor) else field or 0
-        for name, field in fields.items()
-    }
+    values = addresses(fields)
     launch_blocks(
         PROGRAM,
         kernel,

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from megastep.agents.networks.kernels.program import CUDA_FLAGS, aligned
-from megastep.kernels.build.launch import launch_blocks
+from megastep.kernels.build.launch import addresses, launch_blocks
 from megastep.kernels.build.program import Program
 
 PROGRAM = Program(Path(__file__).parent / "acting", CUDA_FLAGS)
@@ -77,10 +77,7 @@ def launch(n_policies: int, **fields) -> None:
     """
     x, n_lanes = fields["x"], fields["n_lanes"]
     width = x.shape[-1]
-    values = {
-        name: field.data_ptr() if isinstance(field, torch.Tensor) else field
-        for name, field in fields.items()
-    }
+    values = addresses(fields)
     packed = PROGRAM.params.MingruStepParams(**values)
     n_blocks = -(-n_lanes // _LANES) * width // _UNITS, n_policies
     if n_lanes:

@@ -9,7 +9,7 @@ from megastep.arrdict import arrdict
 from megastep.engine.devices import threads
 from megastep.kernels.build import program
 from megastep.kernels.build.compile import EngineError, cpu
-from megastep.kernels.build.launch import launch
+from megastep.kernels.build.launch import addresses, launch
 from megastep.kernels.build.program import Program
 
 DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
@@ -41,7 +41,7 @@ def run(operation: str, dtype: torch.dtype, state: torch.Tensor, **fields) -> No
     n_units = 1 if width % 4 else 4
     kernel = f"{operation}_{DTYPES[dtype]}"
     pack = getattr(CORES.params, CORES.cuda_operations[kernel])
-    values = {name: _value(field) for name, field in fields.items()}
+    values = addresses(fields)
     packed = pack(**values, n_lanes=n_lanes, width=width, n_units=n_units)
     launch(CORES, kernel, packed, state.device, n_lanes * width // n_units)
 
@@ -63,15 +63,9 @@ def run_on_cpu(operation: str, **fields) -> None:
         fields: the fields of its struct but `n_threads`. A tensor stands for its address.
     """
     pack = getattr(CORES.params, CORES.cpu_operations[operation])
-    values = {name: _value(field) for name, field in fields.items()}
+    values = addresses(fields)
     packed = pack(**values, n_threads=threads())
     launch(CORES, operation, packed, CPU, 0)
-
-
-def _value(field):
-    if isinstance(field, torch.Tensor):
-        return field.data_ptr()
-    return 0 if field is None else field
 
 
 def aligned(tensor: torch.Tensor) -> torch.Tensor:

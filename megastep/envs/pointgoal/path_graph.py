@@ -11,7 +11,7 @@ import torch
 
 from megastep.engine.devices import threads
 from megastep.envs.pointgoal.program import PROGRAM
-from megastep.kernels.build.launch import BLOCK, launch
+from megastep.kernels.build.launch import BLOCK, addresses, launch
 
 __all__ = ["CELL", "MAX_GOALS", "PathGraph"]
 
@@ -102,10 +102,7 @@ class PathGraph:
 
     def _launch(self, operation, params, n_threads, **values):
         """Launches an operation. Values that are tensors are passed by address."""
-        packed = {
-            name: value.data_ptr() if isinstance(value, torch.Tensor) else value
-            for name, value in values.items()
-        }
+        packed = addresses(values)
         struct = getattr(PROGRAM.params, params)(homes=self._params(), **packed)
         launch(PROGRAM, operation, struct, self.device, threads=n_threads)
 

@@ -1,6 +1,7 @@
 """Launches a program's operation on the device where its tensors are."""
 
 import ctypes
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -8,7 +9,7 @@ import torch
 from megastep.kernels.build.compile import EngineError, bindings, check_status, cpu, cuda
 from megastep.kernels.build.program import KERNELS, Program
 
-__all__ = ["ENGINE", "launch", "launch_blocks"]
+__all__ = ["ENGINE", "addresses", "launch", "launch_blocks"]
 
 #: The engine's operations.
 ENGINE = Program(KERNELS)
@@ -18,6 +19,15 @@ INVALID_CONTEXT = 201  # CUDA_ERROR_INVALID_CONTEXT
 MAX_THREADS = 2**32 - BLOCK  # per launch: kernels count them in 32 bits
 USUAL_SHARED = 48 * 1024  # bytes of dynamic shared memory that any kernel may have
 _ALLOWED_SHARED: dict[tuple[Any, int], int] = {}  # {(kernel, GPU): bytes} of those that have more
+
+
+def addresses(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns fields of a struct with the address of each tensor in its place, and 0 for None."""
+    values = {name: 0 if field is None else field for name, field in fields.items()}
+    return {
+        name: value.data_ptr() if isinstance(value, torch.Tensor) else value
+        for name, value in values.items()
+    }
 
 
 def launch(
