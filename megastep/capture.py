@@ -107,6 +107,16 @@ def _renew_generators(roots):
                 rebind(parent, step, renewed.setdefault(id(old), torch.Generator(old.device)))
 
 
+def end_failed_recording() -> None:
+    """Makes PyTorch's default generator of the current GPU usable again after a recording failed.
+
+    Every recording registers it, and one that fails leaves it marked as being captured, so that
+    drawing from it raises. The next recording that succeeds removes the mark; this makes one.
+    """
+    with torch.cuda.graph(torch.cuda.CUDAGraph(), stream=torch.cuda.Stream()):
+        torch.zeros((), device="cuda")  # PyTorch warns about empty graphs
+
+
 class Graph:
     """A function recorded as a CUDA graph. Arguments are those of :func:`capture`.
 
@@ -134,6 +144,7 @@ class Graph:
                 self._record(function, inputs, roots, saved, warmup)
             except BaseException as error:
                 if isinstance(error, RuntimeError):
+                    end_failed_recording()
                     _renew_generators(roots)
                 original.undo()
                 raise

@@ -246,6 +246,7 @@ def fake_cuda(monkeypatch):
         graph=lambda graph, stream: contextlib.nullcontext(),
     ).items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
+    monkeypatch.setattr(capture, "end_failed_recording", lambda: None)
 
 
 def test_a_tensor_created_by_the_function_is_kept(fake_cuda):
@@ -391,6 +392,7 @@ class TestOnTheGPU:
             env.step(actions("cuda"))
         assert not isinstance(env._step, capture.Graph)
         assert how == "grows" or env.step(actions("cuda")).obs.shape[0] == 4
+        torch.rand(1, device="cuda")  # the default generator is usable again
 
     def test_warming_up_does_not_advance_the_environment(self):
         env = envs.Explorer(8, device="cuda")

@@ -12,6 +12,8 @@ from typing import Any
 
 import torch
 
+from megastep.capture import end_failed_recording
+
 #: The graph that is being recorded.
 _recording: SegmentedGraph | None = None
 
@@ -63,6 +65,7 @@ class SegmentedGraph:
                 finally:  # ending a failed recording raises as well
                     self._end()
         except RuntimeError as error:
+            end_failed_recording()
             raise error.__context__ or error from None  # the first error is the informative one
         finally:
             _recording = None

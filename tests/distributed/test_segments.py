@@ -62,3 +62,4 @@ def test_an_error_while_recording_is_the_first_one():
     calls = []
     segments.between_graphs(lambda: calls.append(1))
     assert calls == [1]  # nothing is being recorded any more
+    torch.rand(1, device="cuda")  # the default generator is usable again
