@@ -53,9 +53,11 @@ SPEED, TURN_RATE = 2.5, 90.0  # m/s and degrees/s, to turn paths and bearings in
 REPLAN, CHASE = 3, 10  # steps between plans, and when following the other agent
 STILL = 20  # steps without moving, after which the way is taken for blocked
 PATIENCE = 10  # steps in addition to twice the time planned, after which a frontier is given up
+TOP = 4.0  # m/s, the speed that actions lead to
+
 HORIZON = 0.3  # seconds ahead to turn for
-SLACK, OFF = 10.0, 10.0  # degrees off that do not matter; degrees more that weigh as 1 m/s
-OPENED = 11  # cells, width of the square in which a frontier's unseen cells are counted
+SLACK, OFF = 10.0, 8.0  # degrees off that do not matter; degrees more that weigh as 1 m/s
+OPENED = 27  # cells, width of the square in which a frontier's unseen cells are counted
 
 
 class Home:
@@ -311,7 +313,7 @@ class Search:
         aim = points[np.arange(n), furthest]
         ends = np.stack([searcher.path[-2] for searcher in self.searchers])
         at_end = (np.abs(aim - ends) < 1e-9).all(-1)
-        return aim, np.where(at_end[:, None], gaze, aim)
+        return aim, np.where(at_end[:, None], gaze, gaze)
 
 
 def options(angle, velocity, spin):
@@ -331,7 +333,7 @@ def options(angle, velocity, spin):
 def towards(offset):
     """Returns the velocity (N, 2) at which to approach a point at an offset (N, 2) in metres."""
     away = np.hypot(*offset.T)[:, None]
-    return offset / np.maximum(away, 1e-9) * np.minimum(4 * away, 4.0)
+    return offset / np.maximum(away, 1e-9) * np.minimum(4 * away, TOP)
 
 
 def turn_cost(offset, angle, headings):
@@ -384,12 +386,12 @@ def play(env, homes, n_steps, player="search", opponent="bot", lasting=0, **opti
         events = dict(met=ray.any(1), saw=ray[:, 0], near=ray[:, 0] & (away < 10), pixel=pixel)
         for name, happens in events.items():
             found[name][playing & happens & np.isinf(found[name])] = step
-        if player != "duel" and step >= lasting:
-            playing &= np.isinf(np.maximum(found["near"], found["pixel"]))
         if search and step in STEPS:
             for e in np.flatnonzero(playing):
                 searcher = search.searchers[e]
                 found["seen"][e, STEPS.index(step)] = searcher.ever[searcher.floor].mean()
+        if player != "duel" and step >= lasting:
+            playing &= np.isinf(np.maximum(found["near"], found["pixel"]))
         if not playing.any() or step == n_steps:
             break
         decision, state = bot(world, state)
@@ -412,3 +414,92 @@ def play(env, homes, n_steps, player="search", opponent="bot", lasting=0, **opti
         found["won"][ends] = dies[ends, 1] & ~dies[ends, 0]
         playing &= ~ends
     return found | dict(metres=total)
+
+
+CASES = {
+    "two bots": dict(player="bot"),
+    "random actions": dict(player="random"),
+    "searcher": dict(lasting=LIMIT, n_steps=max(STEPS)),
+    "searcher, the bot stands still": dict(opponent="still"),
+    "searcher, the nearest frontier": dict(rule="nearest"),
+    "searcher, 110 degrees": dict(fov=110),
+    "searcher, 130 degrees": dict(fov=130),
+    "searcher, remembers 50 steps": dict(memory=50),
+    "searcher, sees walls 5 m away": dict(sight=5.0),
+    "searcher, sees walls 30 m away": dict(sight=30.0),
+    "walker who knows where the bot is": dict(knows_all=True),
+    "duel": dict(player="duel", damage=0.1),
+    "duel of two bots": dict(player="bot", damage=0.1, lasting=LIMIT),
+}
+"""Arguments of `play` and of the environment."""
+
+
+def results(job: tuple) -> dict:
+    """Returns what `play` does, and `homes` (N,). `job`: title of a source, case, homes, pairs."""
+    title, case, n_homes, n_pairs = job
+    torch.set_num_threads(1)
+    (source, options), case = SOURCES[title], dict(CASES[case])
+    plans = geometries.sample(source, n_homes, split="test", seed=1, **options)
+    homes = [Home(np.asarray(plan["walls"], float)) for plan in plans]
+    n_steps = case.pop("n_steps", LIMIT)
+    settings = dict(fov=case.pop("fov", 70.0), damage=case.pop("damage", 0.0))
+    env = Deathmatch(
+        n_homes * n_pairs, plans, n_agents=2, limit=n_steps + 1, seed=1, **settings
+    )
+    return play(env, homes, n_steps, **case) | dict(homes=env.layout.numpy().copy())
+
+
+def fraction(values, homes) -> str:
+    """Returns a mean and its 95 % interval over homes."""
+    mean, lower, upper = interval(values, homes)
+    return f"{mean:.2f} ({lower:.2f} to {upper:.2f})"
+
+
+def row(title: str, case: str, found: dict) -> str:
+    """Returns a row of the table in Markdown."""
+    homes, cells = found["homes"], [title, case]
+    steps = [n for n in STEPS if n <= CASES[case].get("n_steps", LIMIT)]
+    for n in STEPS:
+        cells.append(fraction(found["met"] <= n, homes) if n in steps else "")
+    for name in ("saw", "near", "pixel"):
+        cells.append(f"{(found[name] <= LIMIT).mean():.2f}")
+    seen = found["seen"][:, STEPS.index(LIMIT)]
+    cells.append("" if np.isnan(seen).all() else f"{np.nanmean(seen):.2f}")
+    is_decided = np.isfinite(found["decided"])
+    cells.append(f"{is_decided.mean():.2f}, {found['won'].sum() / max(1, is_decided.sum()):.2f}")
+    return " | ".join(["", *cells, ""]).strip()
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Prints a table in Markdown, then how often duels are decided by when the agents met."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--homes", type=int, default=40, help="homes per source")
+    parser.add_argument("--pairs", type=int, default=8, help="pairs of agents per home")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--sources", nargs="*", default=list(SOURCES), choices=list(SOURCES))
+    parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
+    arguments = parser.parse_args(argv)
+    met = [f"met by step {n}" for n in STEPS]
+    heads = ["homes", "who", *met, "player sees", "within 10 m", "as a pixel", "floor seen"]
+    heads.append("decided, of these won")
+    print(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}")
+    size, after = (arguments.homes, arguments.pairs), {}
+    jobs = [(title, case, *size) for title in arguments.sources for case in arguments.cases]
+    with futures.ProcessPoolExecutor(arguments.jobs) as pool:
+        for (title, case, *_), found in zip(jobs, pool.map(results, jobs)):
+            print(row(title, case, found), flush=True)
+            if case.startswith("duel"):
+                after.setdefault(case, []).append((found["met"], found["decided"]))
+    for case, pairs in after.items():
+        print(f"\n{case}: met in step, decided by step {LIMIT}")
+        when, decided = (np.concatenate(part) for part in zip(*pairs))
+        for first in range(0, LIMIT, 50):
+            among = np.isfinite(decided[(when >= first) & (when < first + 50)])
+            if len(among):
+                print(f"{first} to {first + 49}: {among.mean():.2f} of {len(among)}")
+
+
+if __name__ == "__main__":
+    main()
