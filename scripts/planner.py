@@ -67,7 +67,9 @@ class Grid:
         self.edges = [np.concatenate(parts) for parts in (starts, stops, lengths)]
 
     def cell(self, point: np.ndarray) -> int:
-        return np.ravel_multi_index(np.rint((point - self.origin) / self.size).astype(int), self.shape)
+        return np.ravel_multi_index(
+            np.rint((point - self.origin) / self.size).astype(int), self.shape
+        )
 
     def centre(self, cell: int) -> np.ndarray:
         return self.origin + self.size * np.array(np.unravel_index(cell, self.shape))

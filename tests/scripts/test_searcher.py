@@ -92,3 +92,27 @@ def test_a_walker_who_knows_where_the_other_is_meets_it():
     found = searcher.play(env, homes, 400, opponent="still", knows_all=True)
     assert (found["saw"] < 400).all() and (found["metres"] < 40).all()
     assert (found["met"] <= found["saw"]).all() and (found["saw"] <= found["near"]).all()
+
+
+def test_without_inertia_it_walks_at_the_speed_given():
+    env, homes, _ = rounds(geometries.sample("homes", 1, "test"))
+    env.reset()
+    search = searcher.Search(env, homes, knows_all=True)
+    start = env.core.agents.positions[0, 0].numpy().astype(float)
+    ahead = start + np.array([[0, 0], [0.08, 0], [0.16, 0], [0.4, 0], [0.48, 0]])
+    search.searchers[0].path = np.concatenate([ahead, ahead[-1:]])
+    search.glide(np.ones(1, bool), 3.0)
+    moved = env.core.agents.positions[0, 0].numpy() - start
+    assert moved == pytest.approx([0.3, 0.0], abs=1e-3)
+
+
+def test_every_case_has_a_row(monkeypatch):
+    cases = {"two bots": dict(player="bot"), "duel of two bots": searcher.CASES["duel of two bots"]}
+    monkeypatch.setattr(searcher, "CASES", cases)
+    monkeypatch.setattr(searcher, "SOURCES", {"generated": ("homes", {})})
+    rows = [
+        searcher.row("generated", case, searcher.results(("generated", case, 2, 2)))
+        for case in cases
+    ]
+    heads = [row.split(" | ")[:2] for row in rows]
+    assert heads == [["| generated", case] for case in cases]
