@@ -1,4 +1,4 @@
-"""How many pairs of Deathmatch agents can meet by a time: a searcher in homes that it does not know.
+"""How many pairs of Deathmatch agents can meet in time: a searcher in homes it does not know.
 
     python scripts/searcher.py --homes 40 --pairs 3
 
@@ -80,7 +80,7 @@ class Home:
         self.graph = sparse.csr_matrix((lengths, (starts, stops)), 2 * [flat.size])
 
     def paths(self, known: np.ndarray, start: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the length of paths over known cells (X Y,) from a start, and the cells before."""
+        """Returns the cost of paths over known cells (X Y,) from a start, and the cells before."""
         graph = self.graph.copy()
         graph.data = np.where(known[graph.indices], graph.data, np.inf)
         return csgraph.dijkstra(graph, indices=start, return_predecessors=True)
@@ -146,7 +146,7 @@ class Searcher:
             self.known = (self.fresh if self.memory else self.ever) & self.part
 
     def frontier(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the known cells that border on one not seen lately, (F,), and the latter, (F,)."""
+        """Returns the known cells that border on an unseen one, (F,), and the latter, (F,)."""
         shape = self.home.free.shape
         known, unseen = self.known.reshape(shape), ~self.fresh.reshape(shape)
         beyond = np.full(shape, -1)
