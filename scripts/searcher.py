@@ -11,7 +11,8 @@ source of homes, the fraction of pairs that have met by several steps, with 95 %
 homes. Needs SciPy, which `pip install megastep-flatland[sweep]` brings.
 
 What the searcher knows too well: of floor that it has seen, how far the next wall is, and whether
-it can be reached. What it does worse than it could: it spends most of its actions on turning.
+it can be reached. What it does worse than it could: it spends nearly half of its actions on
+turning.
 """
 
 import argparse
