@@ -48,12 +48,14 @@ MOVES = [(0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1)]
 
 
 class Grid:
-    """The cells of a home, and which of them an agent cannot stand in. Axes are x and y."""
+    """The cells of a home, `size` metres wide, and which of them an agent cannot stand in. Axes are
+    x and y.
+    """
 
-    def __init__(self, walls: np.ndarray):
-        ends = walls.reshape(-1, 2)
+    def __init__(self, walls: np.ndarray, size: float = CELL):
+        ends, self.size = walls.reshape(-1, 2), size
         self.origin = ends.min(0) - MARGIN
-        self.shape = tuple(np.ceil((ends.max(0) + MARGIN - self.origin) / CELL).astype(int) + 1)
+        self.shape = tuple(np.ceil((ends.max(0) + MARGIN - self.origin) / size).astype(int) + 1)
         numbers = np.arange(np.prod(self.shape)).reshape(self.shape)
         starts, stops, lengths = [], [], []
         for x, y in MOVES:
@@ -61,14 +63,16 @@ class Grid:
             to_cells = numbers[x:, max(0, y) : y if y < 0 else None]
             starts.append(from_cells.ravel())
             stops.append(to_cells.ravel())
-            lengths.append(np.full(from_cells.size, CELL * np.hypot(x, y)))
+            lengths.append(np.full(from_cells.size, size * np.hypot(x, y)))
         self.edges = [np.concatenate(parts) for parts in (starts, stops, lengths)]
 
     def cell(self, point: np.ndarray) -> int:
-        return np.ravel_multi_index(np.rint((point - self.origin) / CELL).astype(int), self.shape)
+        return np.ravel_multi_index(
+            np.rint((point - self.origin) / self.size).astype(int), self.shape
+        )
 
     def centre(self, cell: int) -> np.ndarray:
-        return self.origin + CELL * np.array(np.unravel_index(cell, self.shape))
+        return self.origin + self.size * np.array(np.unravel_index(cell, self.shape))
 
     def blocked(self, walls: np.ndarray) -> np.ndarray:
         """Returns which cells (X, Y) are within an agent's radius of walls (n, 2, 2)."""
@@ -77,10 +81,10 @@ class Grid:
             low = np.minimum(start, stop) - self.origin - engine.AGENT_RADIUS
             high = np.maximum(start, stop) - self.origin + engine.AGENT_RADIUS
             x, y = (
-                np.arange(max(0, int(a / CELL)), min(n, int(b / CELL) + 2))
+                np.arange(max(0, int(a / self.size)), min(n, int(b / self.size) + 2))
                 for a, b, n in zip(low, high, self.shape)
             )
-            centres = self.origin + CELL * np.stack(np.meshgrid(x, y, indexing="ij"), -1)
+            centres = self.origin + self.size * np.stack(np.meshgrid(x, y, indexing="ij"), -1)
             offsets = centres - nearest_on(start, stop - start, centres)
             blocked[np.ix_(x, y)] |= (offsets**2).sum(-1) < engine.AGENT_RADIUS**2
         return blocked
