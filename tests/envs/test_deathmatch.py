@@ -61,7 +61,7 @@ def fight(device, n_envs, n_agents, steps=30, **rules):
     c, n, lanes = core.Core(scenery, res=512, fov=70), n_envs * n_agents, (n_envs, n_agents)
     state = dict(
         health=torch.ones(n, device=device),
-        tally=torch.zeros((3, n), device=device),
+        tally=torch.zeros((4, n), device=device),
         ages=torch.zeros(n, dtype=torch.int32, device=device),
         ended=torch.ones(n, dtype=torch.bool, device=device),
     )
@@ -106,7 +106,7 @@ def test_step_matches_twin_on_every_bit(rules, n_agents, device):
 def test_optional_outputs_are_left_out():
     scenery = scene.scenery([toys.box()], 2, 1, device="cpu")
     agents = core.Core(scenery).agents
-    state = torch.ones(2), torch.zeros((3, 2)), torch.zeros(2, dtype=torch.int32)
+    state = torch.ones(2), torch.zeros((4, 2)), torch.zeros(2, dtype=torch.int32)
     view = engine.observe(scenery, agents, centre_line=True)
     out = deathmatch_step(scenery, agents, view, *state, torch.zeros(2, dtype=torch.bool))
     assert out.privileged is None and view.agent_ray is None
@@ -121,7 +121,7 @@ def test_step_takes_two_to_sixteen_agents(n_agents, message):
     scenery = scene.scenery([toys.box()], n_agents, 1, device="cpu")
     agents, n = core.Core(scenery).agents, n_agents
     view = engine.observe(scenery, agents, centre_line=True)
-    state = torch.ones(n), torch.zeros((3, n)), torch.zeros(n, dtype=torch.int32)
+    state = torch.ones(n), torch.zeros((4, n)), torch.zeros(n, dtype=torch.int32)
     with pytest.raises(ValueError, match=message):
         deathmatch_step(scenery, agents, view, *state, torch.zeros(n, dtype=torch.bool))
 
@@ -269,6 +269,14 @@ class Ring:
         return self.env.health.tolist()
 
 
+def turned(device, first, second, **settings):
+    """A Ring whose agents looked at nobody in the last step."""
+    ring = Ring(device, (2, 2, 180), (2, 5, 180), **settings)
+    ring.step()
+    ring.place(first, second)
+    return ring
+
+
 # The first agent looks at the second, which is two metres ahead and looks away.
 AMBUSH = (2.0, 3.5, 0.0), (4.0, 3.5, 0.0)
 
@@ -307,7 +315,7 @@ def test_ten_hits_kill_and_the_next_step_respawns(device):
     assert world.terminal.tolist() == [False, True] and not world.truncated.any()
     assert ring.health == [1, 0] and world.reward.tolist() == [1, -1], "as for any hit"
     assert [float(world.metrics[name][1]) for name in METRICS] == [0, 1, 0, 0]
-    assert ring.env.tally[:, 0].tolist() == pytest.approx([1, 1, 10])
+    assert ring.env.tally[:3, 0].tolist() == pytest.approx([1, 1, 10])
     world = ring.step()
     assert world.reset.tolist() == [False, True] and not world.reward.any()
     assert ring.health == [1, 1] and ring.env.ages.tolist() == [11, 0]
@@ -328,7 +336,7 @@ def test_kill_reward_is_shared(device):
     assert not ring.step().reward.any()
     world = ring.step()
     assert world.reward.tolist() == [4, -3, 4] and world.terminal.tolist() == [False, True, False]
-    assert ring.env.tally[:, [0, 2]].T.tolist() == 2 * [[0.5, 0.5, 2]]
+    assert ring.env.tally[:3, [0, 2]].T.tolist() == 2 * [[0.5, 0.5, 2]]
 
 
 def test_a_dying_agent_still_hits(device):
@@ -385,9 +393,8 @@ def test_health_per_hit(device):
 @pytest.mark.parametrize("ahead, left", [(2, 0.5), (2, -0.5), (3, 1.5), (1, 0)])
 def test_aim_reward_falls_from_centre_to_edge(ahead, left, device):
     """Aim is measured to the part of the other agent that is closest to the centre."""
-    ring = Ring(
-        device, (2, 3.5, 0), (2 + ahead, 3.5 + left, 0), aim_reward=1, hit_reward=0, wound_cost=0
-    )
+    settings = dict(aim_reward=1, hit_reward=0, wound_cost=0)
+    ring = turned(device, (2, 3.5, 0), (2 + ahead, 3.5 + left, 0), **settings)
     nearest = max(abs(left) - 0.075, 0) / (ahead + 0.0375 * np.sign(left * left))
     expected = max(1 - nearest / np.tan(np.radians(35)), 0)
     slack = 2 / 512 + 0.075 / ahead / 2  # a ray, and which of its corners is nearest
@@ -398,13 +405,34 @@ def test_aim_reward_falls_from_centre_to_edge(ahead, left, device):
 def test_aim_in_the_first_of_three_rays(device):
     """It points 25 degrees to the left, and is a third of the view's width from the centre."""
     settings = dict(res=3, subsample=1, hit_reward=0, wound_cost=0, aim_reward=3)
-    ring = Ring(device, (2, 3.5, 0), (4, 4.43, 0), **settings)
+    ring = turned(device, (2, 3.5, 0), (4, 4.43, 0), **settings)
     assert ring.step().reward.tolist() == pytest.approx([1, 0])
 
 
 def test_aim_reward_needs_an_agent_in_view(device):
-    ring = Ring(device, (2, 2, 180), (5, 5, 0), aim_reward=1)
+    ring = turned(device, (2, 2, 180), (5, 5, 0), aim_reward=1)
     assert ring.step().reward.tolist() == [0, 0]
+
+
+def test_watching_a_target_is_paid_once_and_taken_back(device):
+    settings = dict(aim_reward=1, hit_reward=0, wound_cost=0)
+    pose, other = (2, 3.5, 0), (4, 3.8, 0)
+    ring = turned(device, pose, other, **settings)
+    rewards = [ring.step().reward[0].item() for _ in range(4)]
+    assert 0.5 < rewards[0] < 0.9 and rewards[1:] == [0, 0, 0]
+    ring.place((2, 3.5, 180), other)
+    assert ring.step().reward[0].item() == -rewards[0]
+
+
+def test_first_observation_of_a_target_pays_nothing(device):
+    ring = Ring(device, *AMBUSH, aim_reward=1, damage=0, limit=2)
+    for _ in range(3):
+        ring.step(2)  # the episodes end
+        assert ring.env.ended.all()
+        ring.env.spawner = lambda ended: ring.place(*AMBUSH)
+        world = ring.step()
+        assert world.reset.all() and world.reward.tolist() == [0, 0]
+        assert ring.env.tally[3].tolist() == [1, 0]
 
 
 def test_search_reward_counts_newly_seen_texels(device):

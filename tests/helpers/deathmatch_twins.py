@@ -14,7 +14,7 @@ F = np.float32
 
 def hits_of(line, ray, health, tally, ages, ended, *, n_model, res, rules):
     """Steps one environment. ``line``, ``ray``, ``health``, ``ages``, ``ended`` are (A,); ``tally``
-    is (3, A): kills, damage, hits. Returns {name: values} of the outputs and the new state.
+    is (4, A): kills, damage, hits, aim. Returns {name: values} of the outputs and the new state.
     """
     n, rules = len(line), {name: F(value) for name, value in rules.items()}
     hits = {}  # attacker: target
@@ -46,7 +46,7 @@ def hits_of(line, ray, health, tally, ages, ended, *, n_model, res, rules):
             - rules["wound_cost"] * wounds
             + rules["kill_reward"] * kill
             - rules["death_cost"] * F(dies[a])
-            + rules["aim_reward"] * aim
+            + rules["aim_reward"] * (aim - tally[3, a])
         )
         age = 0 if starts else int(ages[a]) + 1
         ends = not starts and (dies[a] or age >= rules["limit"])
@@ -64,7 +64,7 @@ def hits_of(line, ray, health, tally, ages, ended, *, n_model, res, rules):
                 accuracy=sums[2] / F(age) if ends else F(0),
                 health_obs=np.array([after, hit, wounds], np.float16),
                 health=after,
-                tally=np.array(sums),
+                tally=np.array([*sums, aim]),
                 ages=age,
                 ended=ends,
             )

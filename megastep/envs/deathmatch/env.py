@@ -82,7 +82,10 @@ class Deathmatch(SceneryEnv):
         wound_cost: per hit received.
         kill_reward: per kill.
         death_cost: per death.
-        aim_reward: per step with another agent at the centre of the view, falling to 0 at the edge.
+        aim_reward: for bringing another agent from the edge of the view to its centre. What an agent
+            gains as its target nears the centre, it loses as it leaves, so that watching a target
+            without killing it pays nothing (Ng, Harada and Russell 1999, "Policy invariance under
+            reward transformations").
         search_reward: per 64 wall texels seen for the first time in the episode, as in Explorer.
         res: rays of an agent's camera.
         subsample: rays per pixel.
@@ -240,7 +243,7 @@ class Deathmatch(SceneryEnv):
         over &= ~step.reset.view(shape).any(1)
         self.round_ages.masked_fill_(over, -1)
         over = over[:, None].expand(shape).flatten()
-        kills, damage, hits = self.tally
+        kills, damage, hits, _ = self.tally
         so_far = torch.stack([kills, torch.zeros_like(kills), damage, hits / self.ages])
         metrics = torch.where(over & ~self.ended, so_far, step.metrics)
         self.ended |= over

@@ -72,7 +72,8 @@ def deathmatch_step(
         view: from :func:`~megastep.engine.observe` with one camera per agent and ``centre_line``;
             with ``agent_ray`` too if ``aim_reward`` is not 0.
         health: (B,) float32, from 0 to 1, updated in place.
-        tally: (3, B) float32, kills, damage and hits of the episode so far, updated in place.
+        tally: (4, B) float32, updated in place: kills, damage and hits of the episode so far, and
+            how well the agent aimed in the last step.
         ages: (B,) int32, steps since the first observation, updated in place.
         ended: (B,) bool, updated in place. In: lanes that start an episode in this step. Out: lanes
             whose episode ends in this step.
@@ -85,7 +86,8 @@ def deathmatch_step(
         wound_cost: per hit received.
         kill_reward: per kill, shared among the agents that hit the target in that step.
         death_cost: per death.
-        aim_reward: for another agent at the centre of the view, falling to 0 at the edge.
+        aim_reward: for bringing another agent from the edge of the view to its centre; taken back
+            as far as it leaves again.
         privileged: compute the privileged observation.
 
     Raises:

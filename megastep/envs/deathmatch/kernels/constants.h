@@ -2,7 +2,8 @@
 #pragma once
 
 constexpr int MAX_AGENTS = 16;              // per environment
-constexpr int TALLY_ROWS = 3;               // of an episode so far: kills, damage, hits
+constexpr int SUMS = 3;                     // of an episode so far: kills, damage, hits
+constexpr int TALLY_ROWS = 4;               // these, and how well the agent aimed last
 constexpr int PRIVILEGED_PER_OPPONENT = 5;  // numbers that a critic sees of each other agent
 
 // The bot.

@@ -58,12 +58,20 @@ HD float aim_of(const DeathmatchStepParams& p, int i) {
     return maxf(1.f - maxf(off, -off) / half, 0.f);
 }
 
-// Updates the tally of agent i's episode, and writes its metrics if the episode ends.
+// What agent i's aim gained since the last step, which it remembers for the next.
+HD float gain_of_aim(const DeathmatchStepParams& p, int i) {
+    float* last = p.tally + SUMS * (long long)p.n_envs * p.n_agents + i;
+    float aim = aim_of(p, i), gain = aim - *last;
+    *last = aim;
+    return gain;
+}
+
+// Updates the sums of agent i's episode, and writes its metrics if the episode ends.
 HD void update_tally(const DeathmatchStepParams& p, int i, float kills, float damage, float hit,
                      int ends, int dies) {
     long long n = (long long)p.n_envs * p.n_agents;
-    float values[TALLY_ROWS] = {kills, damage, hit};
-    for (int k = 0; k < TALLY_ROWS; k++) {
+    float values[SUMS] = {kills, damage, hit};
+    for (int k = 0; k < SUMS; k++) {
         float total = p.reset[i] ? 0.f : p.tally[k * n + i] + values[k];
         p.tally[k * n + i] = total;
         values[k] = ends ? total : 0.f;
@@ -88,7 +96,7 @@ HD void finish_step(const DeathmatchStepParams& p, int first, int a, const Hits&
     int ends = !reset && (dies || age >= p.limit);
     float wounds = (float)hits.wounds[a];
     float reward = p.hit_reward * hit - p.wound_cost * wounds + p.kill_reward * kill -
-                   p.death_cost * (float)dies + p.aim_reward * aim_of(p, i);
+                   p.death_cost * (float)dies + p.aim_reward * gain_of_aim(p, i);
     p.reward[i] = reset ? 0.f : reward;
     p.reset[i] = (unsigned char)reset;
     p.terminal[i] = (unsigned char)(ends && dies);

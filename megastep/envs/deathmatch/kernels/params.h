@@ -9,7 +9,7 @@ struct DeathmatchStepParams {
     const float* positions;  // (N, A, 2) for privileged
     const float* angles;     // (N, A) for privileged
     float* health;           // (N, A) in and out, as the next three: from 0 to 1
-    float* tally;            // (TALLY_ROWS, N, A) of the episode so far: kills, damage, hits
+    float* tally;            // (TALLY_ROWS, N, A): kills, damage, hits so far; aim in the last step
     int* ages;               // (N, A) steps since the first observation
     unsigned char* ended;    // (N, A) in: starts an episode in this step; out: ends it in this step
     float* reward;           // (N, A) out, as the next six
@@ -27,7 +27,7 @@ struct DeathmatchStepParams {
     float wound_cost;
     float kill_reward;
     float death_cost;
-    float aim_reward;  // for an agent at the centre of the view, falling to 0 at the edge
+    float aim_reward;  // for bringing an agent from the edge of the view to its centre
     int limit;         // steps per episode
     int res;           // rays per view
     int n_envs;        // N
