@@ -13,6 +13,7 @@ DEVICE int is_occluded(const SceneryParams& s, int layout, const float* light, f
 }
 
 KERNEL bake(BakeParams p) {
+    wait_for_previous();
     const SceneryParams& s = p.scenery;
     int texel = blockIdx.x * blockDim.x + threadIdx.x;
     if (texel >= p.n_texels)

@@ -3,6 +3,7 @@
 #include "coverage.h"
 
 KERNEL coverage(CoverageParams p) {
+    wait_for_previous();
     const SceneryParams& s = p.scenery;
     int thread = blockIdx.x * blockDim.x + threadIdx.x, warp_lane = threadIdx.x % WARP;
     int exists = thread < s.n_envs * s.n_agents;

@@ -3,6 +3,7 @@
 
 // Three variants: all outputs, several agents, one agent. The last needs the fewest registers.
 KERNEL BOUNDS(24) render(RenderParams p) {
+    wait_for_previous();
     extern __shared__ NearestLine shared[];
     __shared__ PixelSpan spans[BLOCK];
     int warp = threadIdx.x / WARP, warp_lane = threadIdx.x % WARP;

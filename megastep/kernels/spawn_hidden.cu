@@ -13,6 +13,7 @@ DEVICE unsigned int reduce_or(const WholeWarp&, unsigned int bits) {
 }
 
 KERNEL spawn_hidden(SpawnParams p) {
+    wait_for_previous();
     int env = (blockIdx.x * blockDim.x + threadIdx.x) / WARP;
     if (env < p.scenery.n_envs)
         spawn_env<1>(p, WholeWarp{(int)threadIdx.x % WARP}, env);

@@ -2,6 +2,7 @@
 #include "unseen.h"
 
 KERNEL BOUNDS(20) unseen(UnseenParams p) {
+    wait_for_previous();
     __shared__ int bins[BINS];
     int agent = blockIdx.x;
     for (int i = threadIdx.x; i < BINS; i += BLOCK)

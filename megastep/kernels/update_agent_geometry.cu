@@ -71,6 +71,7 @@ DEVICE unsigned int unoccluded(const SceneryParams& s, const Pose& pose, const W
 }
 
 KERNEL BOUNDS(20) update_agent_geometry(UpdateAgentGeometryParams p) {
+    wait_for_previous();
     const SceneryParams& s = p.scenery;
     int agent = (blockIdx.x * blockDim.x + threadIdx.x) / WARP, warp_lane = threadIdx.x % WARP;
     if (agent >= s.n_envs * s.n_agents)

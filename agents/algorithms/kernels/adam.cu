@@ -2,6 +2,7 @@
 // and whether a step is taken. A block handles neighbouring numbers of one parameter, a thread a
 // word of four; blocks along y are policies.
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 #include "constants.h"
 #include "params.h"
 
@@ -74,6 +75,7 @@ DEVICE float sum_of_block(float x) {
 }
 
 KERNEL BOUNDS(256) squared_norm(SquaredNormParams p) {
+    wait_for_previous();
     Place place = find_place(p.rows, p.n_rows);
     float values[4], sum = 0.f;
     read(values, p.rows[place.row].gradient, place);
@@ -86,6 +88,7 @@ KERNEL BOUNDS(256) squared_norm(SquaredNormParams p) {
 
 // One block. Decides whether a step is taken, and counts it and its metrics.
 KERNEL BOUNDS(256) judge(JudgeParams p) {
+    wait_for_previous();
     int policy = blockIdx.y, n_totals = p.n_metrics + 3;
     float sum = 0.f;
     for (int i = threadIdx.x; i < p.n_sums; i += ADAM_THREADS)
@@ -112,6 +115,7 @@ KERNEL BOUNDS(256) judge(JudgeParams p) {
 }
 
 KERNEL BOUNDS(256) adam(AdamParams p) {
+    wait_for_previous();
     unsigned int policy = blockIdx.y;
     if (!p.is_taken[policy])
         return;

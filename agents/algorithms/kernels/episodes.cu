@@ -2,6 +2,7 @@
 // are in global memory, where each thread has a column of its own: a lane ends an episode in few of
 // its steps.
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 #include "constants.h"
 #include "params.h"
 
@@ -9,6 +10,7 @@
 #define BOUNDS(n_threads) __launch_bounds__(n_threads)
 
 KERNEL episodes(EpisodesParams p) {
+    wait_for_previous();
     int lane = blockIdx.x * blockDim.x + threadIdx.x;
     if (lane >= p.n_lanes)
         return;
@@ -79,6 +81,7 @@ KERNEL episodes(EpisodesParams p) {
 // Adds a column up over lanes, in a fixed order. Blocks along x: columns, of groups, then of
 // sources; along y: sums.
 KERNEL BOUNDS(256) episode_columns(EpisodeColumnsParams p) {
+    wait_for_previous();
     int column = blockIdx.x, n_sources = gridDim.x - p.n_groups;
     bool is_source = column >= p.n_groups;
     long long row =

@@ -1,10 +1,12 @@
 // Generalised advantage estimates, one thread per lane, from the last step to the first.
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 #include "params.h"
 
 #define KERNEL extern "C" __global__ void
 
 KERNEL gae(GaeParams p) {
+    wait_for_previous();
     int lane = blockIdx.x * blockDim.x + threadIdx.x;
     if (lane >= p.n_lanes)
         return;

@@ -1,5 +1,6 @@
 // Looks for numbers of a rollout that are NaN, infinite or too large.
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 #include "constants.h"
 #include "params.h"
 
@@ -36,6 +37,7 @@ DEVICE void keep(const FindBadParams& p, int of_tensor, long long at) {
 
 // A thread reads CHECKED_WORDS words of 16 bytes, a block neighbouring ones of one tensor.
 KERNEL BOUNDS(256) find_bad(FindBadParams p) {
+    wait_for_previous();
     int i = 0;
     while (i + 1 < p.n_tensors && p.tensors[i + 1].first_block <= blockIdx.x)
         i++;
@@ -110,6 +112,7 @@ DEVICE long long least_of_block(long long x) {
 // One block. Counts the rollout, and keeps the first numbers of up to n_named lanes, those of the
 // smallest row and lane, unless an earlier rollout's are still there.
 KERNEL BOUNDS(1024) record(RecordParams p) {
+    wait_for_previous();
     int n_rows = p.n_steps * p.n_tensors, n_bad = 0;
     for (int lane = threadIdx.x; lane < p.n_lanes; lane += RECORD_THREADS)
         n_bad += p.first_rows[lane] < n_rows;

@@ -1,11 +1,13 @@
 // The order of random keys: a warp counts the keys before its own. Up to some thousand keys that
 // takes less time than a sort, which is several dependent kernels.
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 #include "params.h"
 
 #define KERNEL extern "C" __global__ void
 
 KERNEL order(OrderParams p) {
+    wait_for_previous();
     int at = (blockIdx.x * blockDim.x + threadIdx.x) / WARP, n_before = 0;
     if (at >= p.n)
         return;

@@ -1,12 +1,14 @@
 // PPO's loss, with its gradients and metrics, all means over valid rows. One thread per row; a
 // block adds up its rows in a fixed order, the caller the blocks. Blocks along y are policies.
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 #include "constants.h"
 #include "params.h"
 
 #define KERNEL extern "C" __global__ void
 
 KERNEL ppo_loss(PpoLossParams p) {
+    wait_for_previous();
     int of_policy = blockIdx.x * blockDim.x + threadIdx.x;
     long long policy = blockIdx.y, row = policy * p.n_rows + of_policy;
     float sums[N_SUMS] = {};

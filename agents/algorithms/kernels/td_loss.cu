@@ -1,6 +1,7 @@
 // R2D2's loss with its gradient, priorities and metrics. A block handles a few sequences, a thread
 // every N-th step of one of them; the block adds up in a fixed order. Blocks along y are policies.
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 #include "constants.h"
 #include "params.h"
 
@@ -78,6 +79,7 @@ DEVICE float n_step_return(const TdLossParams& p, const Tensors& tensors, int t,
 }
 
 KERNEL td_loss(TdLossParams p) {
+    wait_for_previous();
     __shared__ float largest[PHASES][TD_SEQUENCES], sizes[PHASES][TD_SEQUENCES];
     __shared__ float counts[PHASES][TD_SEQUENCES], of_warps[TD_WARPS][N_TD_SUMS];
     int phase = threadIdx.x / TD_SEQUENCES, of_block = threadIdx.x % TD_SEQUENCES;
@@ -154,6 +156,7 @@ KERNEL td_loss(TdLossParams p) {
 
 // Adds up the blocks of `td_loss`, one warp per sum.
 KERNEL td_metrics(TdMetricsParams p) {
+    wait_for_previous();
     __shared__ float totals[N_TD_SUMS];
     int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
     long long policy = blockIdx.y;

@@ -7,6 +7,7 @@
 #include "strips.h"
 
 KERNEL BOUNDS(256) bias_gradient(BiasGradientParams p) {
+    wait_for_previous();
     constexpr int N = 8;  // columns that a thread handles
     int n_words = p.n_columns / N, n_parts = (n_words + WARP - 1) / WARP;  // of a row
     int first_word = WARP * (blockIdx.y % n_parts);
@@ -45,6 +46,7 @@ KERNEL BOUNDS(256) bias_gradient(BiasGradientParams p) {
 
 // Adds up rows in a fixed order. A warp handles 32 columns of every eighth row.
 KERNEL BOUNDS(256) sum_rows(SumRowsParams p) {
+    wait_for_previous();
     constexpr int WARPS = STRIP_THREADS / WARP;
     __shared__ float of_warps[WARPS][WARP];
     int warp = threadIdx.x / WARP, lane = threadIdx.x % WARP, column = WARP * blockIdx.x + lane;

@@ -7,6 +7,7 @@
 static_assert(sizeof(CastParams::rows) == CAST_ROWS * sizeof(CastRowParams));
 
 KERNEL BOUNDS(256) cast(CastParams p) {
+    wait_for_previous();
     int row = 0, end = p.n_rows;  // the last row that begins at or before this block
     while (end - row > 1) {
         int middle = (row + end) / 2;

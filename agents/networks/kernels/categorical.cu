@@ -86,10 +86,17 @@ DEVICE void act(const CategoricalActParams& p) {
         p.logprobs[row] = logprob;
 }
 
-KERNEL BOUNDS(64) categorical_act_float32(CategoricalActParams p) { act<float>(p); }
-KERNEL BOUNDS(64) categorical_act_bfloat16(CategoricalActParams p) { act<Bfloat16>(p); }
+KERNEL BOUNDS(64) categorical_act_float32(CategoricalActParams p) {
+    wait_for_previous();
+    act<float>(p);
+}
+KERNEL BOUNDS(64) categorical_act_bfloat16(CategoricalActParams p) {
+    wait_for_previous();
+    act<Bfloat16>(p);
+}
 
 KERNEL BOUNDS(64) categorical_terms(CategoricalTermsParams p) {
+    wait_for_previous();
     int row = blockIdx.x * blockDim.x + threadIdx.x;
     if (row >= p.n_rows)
         return;
@@ -106,6 +113,7 @@ KERNEL BOUNDS(64) categorical_terms(CategoricalTermsParams p) {
 }
 
 KERNEL BOUNDS(64) categorical_terms_backward(CategoricalTermsBackwardParams p) {
+    wait_for_previous();
     int row = blockIdx.x * blockDim.x + threadIdx.x;
     if (row >= p.n_rows)
         return;

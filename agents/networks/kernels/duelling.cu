@@ -105,9 +105,13 @@ DEVICE float value_of(const DuellingParams& p, const Part& me) {
     return value;
 }
 
-KERNEL BOUNDS(64) duelling_values(DuellingParams p) { value_of(p, find_part(p)); }
+KERNEL BOUNDS(64) duelling_values(DuellingParams p) {
+    wait_for_previous();
+    value_of(p, find_part(p));
+}
 
 KERNEL BOUNDS(64) duelling_act(DuellingParams p) {
+    wait_for_previous();
     Part me = find_part(p);
     float value = value_of(p, me), best_value = 0.f, logprob = 0.f;
     int best = -1, n_outputs = p.n_agents * p.n_choices, agent = me.agent;
@@ -207,6 +211,7 @@ DEVICE void gradient_of_columns(const DuellingBackwardParams& p, const RowGradie
 // of the columns of all policies. A strip's sums are those of the hidden layer's bias, the weights
 // of value and advantages, and their biases, in this order.
 KERNEL BOUNDS(256) duelling_backward(DuellingBackwardParams p) {
+    wait_for_previous();
     __shared__ RowGradient gradients[STRIP_ROWS];
     int n_outputs = p.n_agents * p.n_choices, strip = blockIdx.x;
     int n_rows = min(STRIP_ROWS, p.n_rows - strip * STRIP_ROWS);

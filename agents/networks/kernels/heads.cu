@@ -54,6 +54,7 @@ DEVICE float sum_of_eight(float x) {
 
 // One thread per row for the actions; eight threads per row for the rest.
 KERNEL BOUNDS(256) heads_forward(HeadsForwardParams p) {
+    wait_for_previous();
     long long policy = blockIdx.y, first = policy * p.n_rows;
     int start = (int)blockIdx.x * STRIP;
     int first_score = padded(p.n_predicted);
@@ -235,6 +236,7 @@ DEVICE void critic_backward(const HeadsBackwardParams& p, const HeadsPlace& plac
 
 // Neighbouring blocks have one strip: one has prediction and scores, the others the hidden layer.
 KERNEL BOUNDS(256) heads_backward(HeadsBackwardParams p) {
+    wait_for_previous();
     int n_parts = 1 + (p.width / WORD + WARP - 1) / WARP, part = blockIdx.x % n_parts;
     HeadsPlace place;
     place.policy = blockIdx.y;

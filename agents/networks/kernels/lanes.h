@@ -2,6 +2,7 @@
 // neighbouring units.
 #pragma once
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 #include "number.h"
 
 #define KERNEL extern "C" __global__ void

@@ -155,13 +155,43 @@ struct LstmBackward {
     }
 };
 
-KERNEL BOUNDS(64) lstm_start_float32(LstmStartParams p) { run<LstmStart, float>(p); }
-KERNEL BOUNDS(64) lstm_start_bfloat16(LstmStartParams p) { run<LstmStart, Bfloat16>(p); }
-KERNEL BOUNDS(64) lstm_join_float32(LstmJoinParams p) { run<LstmJoin, float>(p); }
-KERNEL BOUNDS(64) lstm_join_bfloat16(LstmJoinParams p) { run<LstmJoin, Bfloat16>(p); }
-KERNEL BOUNDS(64) lstm_act_float32(LstmActParams p) { run<LstmAct, float>(p); }
-KERNEL BOUNDS(64) lstm_act_bfloat16(LstmActParams p) { run<LstmAct, Bfloat16>(p); }
-KERNEL BOUNDS(64) lstm_forward_float32(LstmForwardParams p) { run<LstmForward, float>(p); }
-KERNEL BOUNDS(64) lstm_forward_bfloat16(LstmForwardParams p) { run<LstmForward, Bfloat16>(p); }
-KERNEL BOUNDS(64) lstm_backward_float32(LstmBackwardParams p) { run<LstmBackward, float>(p); }
-KERNEL BOUNDS(64) lstm_backward_bfloat16(LstmBackwardParams p) { run<LstmBackward, Bfloat16>(p); }
+KERNEL BOUNDS(64) lstm_start_float32(LstmStartParams p) {
+    wait_for_previous();
+    run<LstmStart, float>(p);
+}
+KERNEL BOUNDS(64) lstm_start_bfloat16(LstmStartParams p) {
+    wait_for_previous();
+    run<LstmStart, Bfloat16>(p);
+}
+KERNEL BOUNDS(64) lstm_join_float32(LstmJoinParams p) {
+    wait_for_previous();
+    run<LstmJoin, float>(p);
+}
+KERNEL BOUNDS(64) lstm_join_bfloat16(LstmJoinParams p) {
+    wait_for_previous();
+    run<LstmJoin, Bfloat16>(p);
+}
+KERNEL BOUNDS(64) lstm_act_float32(LstmActParams p) {
+    wait_for_previous();
+    run<LstmAct, float>(p);
+}
+KERNEL BOUNDS(64) lstm_act_bfloat16(LstmActParams p) {
+    wait_for_previous();
+    run<LstmAct, Bfloat16>(p);
+}
+KERNEL BOUNDS(64) lstm_forward_float32(LstmForwardParams p) {
+    wait_for_previous();
+    run<LstmForward, float>(p);
+}
+KERNEL BOUNDS(64) lstm_forward_bfloat16(LstmForwardParams p) {
+    wait_for_previous();
+    run<LstmForward, Bfloat16>(p);
+}
+KERNEL BOUNDS(64) lstm_backward_float32(LstmBackwardParams p) {
+    wait_for_previous();
+    run<LstmBackward, float>(p);
+}
+KERNEL BOUNDS(64) lstm_backward_bfloat16(LstmBackwardParams p) {
+    wait_for_previous();
+    run<LstmBackward, Bfloat16>(p);
+}

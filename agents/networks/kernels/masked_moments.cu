@@ -10,6 +10,7 @@ static_assert(sizeof(MaskedPartsParams::arrays) == MASKED_ARRAYS * sizeof(Masked
 
 // A block has MASKED_NUMBERS neighbouring numbers of an array per thread.
 KERNEL BOUNDS(256) masked_parts(MaskedPartsParams p) {
+    wait_for_previous();
     int array = blockIdx.y % p.n_arrays;
     long long policy = blockIdx.y / p.n_arrays;
     const float* values = p.arrays[array].values + policy * p.n;
@@ -46,6 +47,7 @@ KERNEL BOUNDS(256) masked_parts(MaskedPartsParams p) {
 
 // A block adds up the parts of an array (Chan et al. 1979).
 KERNEL BOUNDS(256) masked_moments(MaskedMomentsParams p) {
+    wait_for_previous();
     const float* parts = p.parts + 3ll * blockIdx.y * p.n_parts;
     double count = 0., sum = 0., squares = 0.;
     for (int i = threadIdx.x; i < p.n_parts; i += MASKED_THREADS) {
@@ -68,6 +70,7 @@ KERNEL BOUNDS(256) masked_moments(MaskedMomentsParams p) {
 }
 
 KERNEL normalise_masked(NormaliseMaskedParams p) {
+    wait_for_previous();
     int of_policy = blockIdx.x * blockDim.x + threadIdx.x, policy = blockIdx.y;
     if (of_policy >= p.n)
         return;
@@ -78,6 +81,7 @@ KERNEL normalise_masked(NormaliseMaskedParams p) {
 
 // Changes nothing if no return is valid, or if a number is not finite.
 KERNEL BOUNDS(256) add_returns(AddReturnsParams p) {
+    wait_for_previous();
     int policy = blockIdx.y;
     float old_mean = p.mean[policy], old_scale = p.scale[policy];
     float count = p.count[policy] + 1.f;

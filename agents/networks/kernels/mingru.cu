@@ -187,17 +187,27 @@ struct MingruBackward {
     }
 };
 
-KERNEL BOUNDS(64) mingru_step_float32(MingruForwardParams p) { run<MingruForward<true>, float>(p); }
+KERNEL BOUNDS(64) mingru_step_float32(MingruForwardParams p) {
+    wait_for_previous();
+    run<MingruForward<true>, float>(p);
+}
 KERNEL BOUNDS(64) mingru_step_bfloat16(MingruForwardParams p) {
+    wait_for_previous();
     run<MingruForward<true>, Bfloat16>(p);
 }
 KERNEL BOUNDS(64) mingru_forward_float32(MingruForwardParams p) {
+    wait_for_previous();
     run<MingruForward<false>, float>(p);
 }
 KERNEL BOUNDS(64) mingru_forward_bfloat16(MingruForwardParams p) {
+    wait_for_previous();
     run<MingruForward<false>, Bfloat16>(p);
 }
-KERNEL BOUNDS(64) mingru_backward_float32(MingruBackwardParams p) { run<MingruBackward, float>(p); }
+KERNEL BOUNDS(64) mingru_backward_float32(MingruBackwardParams p) {
+    wait_for_previous();
+    run<MingruBackward, float>(p);
+}
 KERNEL BOUNDS(64) mingru_backward_bfloat16(MingruBackwardParams p) {
+    wait_for_previous();
     run<MingruBackward, Bfloat16>(p);
 }

@@ -48,6 +48,7 @@ DEVICE float sum_of(const MomentsParams& p, const IntakeLeafParams& leaf, int fi
 }
 
 KERNEL BOUNDS(1024) moments(MomentsParams p) {
+    wait_for_previous();
     int statistic = blockIdx.x, leaf = 0, policy = blockIdx.y, n_policies = gridDim.y;
     float* results = p.moments;  // of the leaf
     for (; statistic >= p.leaves[leaf].n_features / p.leaves[leaf].group; leaf++) {
@@ -75,6 +76,7 @@ KERNEL BOUNDS(1024) moments(MomentsParams p) {
 
 // Changes nothing if no lane was counted, or if a number is not finite.
 KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
+    wait_for_previous();
     const RunningNormParams& norm = p.norms[blockIdx.x];
     int policy = blockIdx.y, first = policy * norm.n;
     float count = norm.count[policy] + 1.f, rate = __fdiv_rn(1.f, count);

@@ -130,6 +130,7 @@ DEVICE void normalise_features(const NormaliseParams& p, const Rows& rows, int c
 
 // Blocks along y: steps of all policies.
 KERNEL BOUNDS(64) normalise(NormaliseParams p) {
+    wait_for_previous();
     unsigned int thread = blockIdx.x * blockDim.x + threadIdx.x, n_words = p.n_columns / 4;
     unsigned int n_selected = p.n_selected, n_plain = p.n_plain_words;
     unsigned int step = (n_selected + NORMALISED_ROWS - 1) / NORMALISED_ROWS;  // between two rows

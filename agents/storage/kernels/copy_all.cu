@@ -1,5 +1,6 @@
 // Copies many pieces of memory in one launch. A block copies neighbouring words of one piece.
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 #include "constants.h"
 #include "params.h"
 
@@ -10,6 +11,7 @@ constexpr unsigned int BLOCK_BYTES = 16 * BLOCK * COPY_WORDS;
 static_assert(sizeof(CopyAllParams::copies) == MAX_COPIES * sizeof(CopyParams));
 
 KERNEL copy_all(CopyAllParams p) {
+    wait_for_previous();
     if (p.condition && !*p.condition)
         return;
     int piece = 0, end = p.n_copies;  // the last one that begins at or before this block

@@ -109,6 +109,7 @@ DEVICE void read_weights(const ReadSequencesParams& p) {
 }
 
 KERNEL read_sequences(ReadSequencesParams p) {
+    wait_for_previous();
     unsigned int block = blockIdx.x;
     if (!block) {
         read_weights(p);

@@ -1,10 +1,12 @@
 // Draws indices from a sum tree in proportion to their priorities, one warp per index, from the
 // highest level down.
+#include "common/dependent_launch.h"
 #include "sum_tree.h"
 
 #define KERNEL extern "C" __global__ void
 
 KERNEL sample_tree(SampleTreeParams p) {
+    wait_for_previous();
     int sample = (blockIdx.x * blockDim.x + threadIdx.x) / WARP, lane = threadIdx.x % WARP;
     if (sample >= p.n_samples)
         return;

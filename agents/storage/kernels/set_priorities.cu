@@ -1,13 +1,18 @@
 // Changes priorities in a sum tree and the sums above them, in one block: there are a few thousand,
 // and each level waits for the one below.
+#include "common/dependent_launch.h"
 #include "sum_tree.h"
 
 #define KERNEL extern "C" __global__ void
 
-KERNEL set_tree(SetTreeParams p) { set_values(p.tree, p.index, p.values, p.n); }
+KERNEL set_tree(SetTreeParams p) {
+    wait_for_previous();
+    set_values(p.tree, p.index, p.values, p.n);
+}
 
 // `ReplayBuffer.set_priorities`
 KERNEL set_priorities(SetPrioritiesParams p) {
+    wait_for_previous();
     __shared__ double of_warps[SET_THREADS / WARP];
     bool is_ready = *p.n_available > 0 && *p.n_added >= p.first_rollouts;
     double largest = 0.;

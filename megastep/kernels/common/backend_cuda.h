@@ -1,6 +1,7 @@
 // The macros of backend.h on the GPU.
 #pragma once
 #include "common/constants.h"
+#include "common/dependent_launch.h"
 
 #define HD static __device__ __forceinline__
 #define DEVICE static __device__ __forceinline__
@@ -35,10 +36,10 @@ DEVICE float reciprocal(float x) {
     return __fmaf_rn(r, __fmaf_rn(-x, r, 1.f), r);
 }
 
-// Reads 16 bytes at once from memory that no thread writes during the launch.
+// Reads 16 bytes at once. No `__ldg`: see dependent_launch.h.
 template <class T>
 DEVICE T load(const T* address) {
-    float4 bits = __ldg((const float4*)address);
+    float4 bits = *(const float4*)address;
     return *(T*)&bits;
 }
 

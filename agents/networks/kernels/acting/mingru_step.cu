@@ -13,6 +13,7 @@
 // In shared memory, a row of a part, of a lane or of a weight, has eight words of 16 bytes. Word i
 // of row r is at i ^ r % 8, so that words i of eight rows are in different banks. Rows of states
 // are 32 bytes apart in the banks, for the same reason.
+#include "common/dependent_launch.h"
 #include "common/tensor_cores.h"
 #include "constants.h"
 #include "params.h"
@@ -290,7 +291,19 @@ DEVICE void mingru_step(const MingruStepParams& p) {
     write_results<W>(part, states, lanes, units, block, p);
 }
 
-KERNEL BOUNDS(2) mingru_step_64(MingruStepParams p) { mingru_step<64>(p); }
-KERNEL BOUNDS(2) mingru_step_128(MingruStepParams p) { mingru_step<128>(p); }
-KERNEL BOUNDS(1) mingru_step_192(MingruStepParams p) { mingru_step<192>(p); }
-KERNEL BOUNDS(1) mingru_step_256(MingruStepParams p) { mingru_step<256>(p); }
+KERNEL BOUNDS(2) mingru_step_64(MingruStepParams p) {
+    wait_for_previous();
+    mingru_step<64>(p);
+}
+KERNEL BOUNDS(2) mingru_step_128(MingruStepParams p) {
+    wait_for_previous();
+    mingru_step<128>(p);
+}
+KERNEL BOUNDS(1) mingru_step_192(MingruStepParams p) {
+    wait_for_previous();
+    mingru_step<192>(p);
+}
+KERNEL BOUNDS(1) mingru_step_256(MingruStepParams p) {
+    wait_for_previous();
+    mingru_step<256>(p);
+}

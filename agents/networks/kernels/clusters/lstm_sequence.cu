@@ -14,6 +14,7 @@
 // is saved in the order of the threads.
 #include "constants.h"
 #include "params.h"
+#include "common/dependent_launch.h"
 #include "common/tensor_cores.h"
 
 #define KERNEL extern "C" __global__ void
@@ -564,5 +565,11 @@ DEVICE void lstm_backward(const LstmSequenceBackwardParams& p) {
 static_assert(sizeof(ForwardMemory<256>) == FORWARD_MEMORY);
 static_assert(sizeof(BackwardMemory<256>) == BACKWARD_MEMORY);
 
-KERNEL BOUNDS(4) lstm_sequence_forward_256(LstmSequenceForwardParams p) { lstm_forward<256>(p); }
-KERNEL BOUNDS(4) lstm_sequence_backward_256(LstmSequenceBackwardParams p) { lstm_backward<256>(p); }
+KERNEL BOUNDS(4) lstm_sequence_forward_256(LstmSequenceForwardParams p) {
+    wait_for_previous();
+    lstm_forward<256>(p);
+}
+KERNEL BOUNDS(4) lstm_sequence_backward_256(LstmSequenceBackwardParams p) {
+    wait_for_previous();
+    lstm_backward<256>(p);
+}

@@ -245,5 +245,11 @@ DEVICE void conv_forward(const ConvForwardParams& p) {
     }
 }
 
-KERNEL BOUNDS(2) conv_forward_4(ConvForwardParams p) { conv_forward<4>(p); }
-KERNEL BOUNDS(2) conv_forward_8(ConvForwardParams p) { conv_forward<8>(p); }
+KERNEL BOUNDS(2) conv_forward_4(ConvForwardParams p) {
+    wait_for_previous();
+    conv_forward<4>(p);
+}
+KERNEL BOUNDS(2) conv_forward_8(ConvForwardParams p) {
+    wait_for_previous();
+    conv_forward<8>(p);
+}

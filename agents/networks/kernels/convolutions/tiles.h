@@ -1,5 +1,6 @@
 // How both kernels of the encoder `Conv` are divided among threads: a block handles tiles of rows.
 #pragma once
+#include "common/dependent_launch.h"
 #include "common/tensor_cores.h"
 #include "constants.h"
 #include "params.h"

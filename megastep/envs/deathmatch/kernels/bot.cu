@@ -2,6 +2,7 @@
 #include "bot.h"
 
 KERNEL bot(BotParams p) {
+    wait_for_previous();
     int lane = (blockIdx.x * blockDim.x + threadIdx.x) / WARP;
     if (lane >= p.n_lanes)
         return;

@@ -80,6 +80,7 @@ DEVICE void step_plain(const ExplorerStepParams& p, int agent, int warp_lane) {
 }
 
 KERNEL BOUNDS(20) explorer_step(ExplorerStepParams p) {
+    wait_for_previous();
     __shared__ int bins[BLOCK / WARP * BINS];
     int thread = blockIdx.x * blockDim.x + threadIdx.x, warp_lane = threadIdx.x % WARP;
     if (!p.unseen)

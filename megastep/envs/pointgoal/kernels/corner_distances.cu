@@ -3,6 +3,7 @@
 #include "shortest_paths.h"
 
 KERNEL corner_distances(CornerDistancesParams p) {
+    wait_for_previous();
     int home = blockIdx.x;
     int first = MAX_GOALS * p.homes.corner_starts[home];
     int end = MAX_GOALS * p.homes.corner_starts[home + 1];

@@ -2,6 +2,7 @@
 #include "shortest_paths.h"
 
 KERNEL corner_links(CornerLinksParams p) {
+    wait_for_previous();
     int corner = blockIdx.x * blockDim.x + threadIdx.x;
     if (corner >= p.homes.n_corners)
         return;

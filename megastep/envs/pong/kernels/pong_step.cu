@@ -18,6 +18,7 @@ DEVICE unsigned long long pixel_word(const Image& image, int word) {
 }
 
 KERNEL pong_step(PongStepParams p) {
+    wait_for_previous();
     __shared__ Image images[2 * BLOCK];
     int first_env = blockIdx.x * BLOCK, env = first_env + threadIdx.x;
     if (env < p.n_envs) {
