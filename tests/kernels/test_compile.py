@@ -216,12 +216,13 @@ def test_gpu_reciprocal_rounds_as_division_does(exponent):
 def test_a_thread_without_a_context_gets_the_gpus_and_launches_again(monkeypatch):
     calls, current = [], []
 
-    def launched(function, *shape):
-        calls.append((function, *shape))
+    def launched(*call):
+        calls.append(call)
         return (0 if current else launch.INVALID_CONTEXT,)
 
     driver = SimpleNamespace(
-        cuLaunchKernel=launched,
+        CUlaunchConfig=SimpleNamespace,
+        cuLaunchKernelEx=launched,
         cuDeviceGet=lambda index: (0, f"device {index}"),
         cuDevicePrimaryCtxRetain=lambda device: (0, f"context of {device}"),
         cuCtxSetCurrent=lambda context: current.append(context) or (0,),
@@ -230,10 +231,14 @@ def test_a_thread_without_a_context_gets_the_gpus_and_launches_again(monkeypatch
     monkeypatch.setattr(launch, "cuda", lambda program, index: {"uniform": "function"})
     monkeypatch.setattr(torch.cuda, "device", lambda index: contextlib.nullcontext())
     monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=7))
+    monkeypatch.setattr(launch, "_can_start_early", lambda index: False)
+    monkeypatch.setattr(launch, "_config", launch._config.__wrapped__)
     for _ in range(2):
         launch.launch(ENGINE, "uniform", b"params", torch.device("cuda", 1), threads=100)
     assert current == ["context of device 1"] and len(calls) == 3
-    assert calls[0] == calls[1] and calls[0][:4] == ("function", 2, 1, 1)
+    assert calls[0] == calls[1] and calls[0][1] == "function"
+    config = calls[0][0]
+    assert (config.gridDimX, config.gridDimY, config.gridDimZ, config.hStream) == (2, 1, 1, 7)
 
 
 @pytest.mark.parametrize("blocks", [False, True])

@@ -12,7 +12,7 @@ import re
 import struct
 from collections.abc import Callable, Mapping
 
-__all__ = ["constants", "operations", "packer", "struct_fields"]
+__all__ = ["constants", "early_operations", "operations", "packer", "struct_fields"]
 
 FORMATS = {"int": "i", "float": "f", "unsigned int": "I"}  # characters of the module struct
 INT = re.compile(r"constexpr\s+int\s+(\w+)\s*=\s*(-?(?:0|[1-9]\d*));")
@@ -21,6 +21,7 @@ DIRECTIVE = re.compile(r"#\s*(?!define)\w.*|#\s*define\s+\w+")  # include guards
 OPERATION = re.compile(
     r"KERNEL\s+(?:BOUNDS\(\d+\)\s+)?(\w+)\((?:const\s+)?(\w+Params)\s*&?\s*\w+\)"
 )
+WAITS = re.compile(r"\s*\{\s*wait_for_previous\(\)\s*;")  # what follows an OPERATION
 STRUCT = re.compile(r"^struct (\w+Params) \{(.*?)^\};", re.M | re.S)
 FIELD = re.compile(r"([\w ]+?)\s*(\*?)\s+(\w+)(?:\[(\d+)\])?")
 
@@ -114,7 +115,22 @@ def operations(sources: Mapping[str, str]) -> dict[str, str]:
     Raises:
         ValueError: naming file and line, if one cannot be read.
     """
-    structs = {}
+    return {match[1]: match[2] for match in _kernels(sources)}
+
+
+def early_operations(sources: Mapping[str, str]) -> frozenset[str]:
+    """Returns the operations whose first statement is ``wait_for_previous();``.
+
+    One that is defined several times, behind ``#if``, must have it every time.
+    """
+    waits = [
+        (match[1], bool(WAITS.match(match.string, match.end()))) for match in _kernels(sources)
+    ]
+    return frozenset(name for name, _ in waits) - {name for name, does in waits if not does}
+
+
+def _kernels(sources):
+    """Yields a match of OPERATION, in a text without comments, for every line with KERNEL."""
     for source, text in sources.items():
         text = _without_comments(text)
         for line in re.finditer(r"^(?!#).*\bKERNEL\b.*", text, re.M):
@@ -126,8 +142,7 @@ def operations(sources: Mapping[str, str]) -> dict[str, str]:
                     f"and give the operation one struct: KERNEL drain(const DrainParams& p) in a "
                     f".cpp file, KERNEL drain(DrainParams p) in a .cu file."
                 )
-            structs[match[1]] = match[2]
-    return structs
+            yield match
 
 
 def _without_comments(text):

@@ -1,6 +1,7 @@
 """Launches a program's operation on the device where its tensors are."""
 
 import ctypes
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -94,14 +95,46 @@ def launch_blocks(
     with torch.cuda.device(index):
         if shared > USUAL_SHARED:
             _allow_shared(function, shared, index)
+        driver, _ = bindings()
         stream = torch.cuda.current_stream(index).cuda_stream
-        shape = *n_blocks, 1, *(n_threads, 1, 1), shared
-        call = function, *shape, stream, ctypes.addressof(arguments), 0
-        status = bindings()[0].cuLaunchKernel(*call)
+        is_early = operation in program.early_operations and _can_start_early(index)
+        config = _config(n_blocks, n_threads, shared, stream, is_early)
+        call = config, function, ctypes.addressof(arguments), 0
+        status = driver.cuLaunchKernelEx(*call)
         if int(status[0]) == INVALID_CONTEXT:
             make_current(index)
-            status = bindings()[0].cuLaunchKernel(*call)
+            status = driver.cuLaunchKernelEx(*call)
     check_status(status, f"Launching {operation}")
+
+
+@functools.cache
+def _can_start_early(index: int) -> bool:
+    """Returns whether a GPU has programmatic dependent launch."""
+    return torch.cuda.get_device_capability(index) >= (9, 0)
+
+
+@functools.lru_cache(maxsize=1024)  # making one takes as long as half a launch
+def _config(
+    n_blocks: tuple[int, int], n_threads: int, shared: int, stream: int, is_early: bool
+) -> Any:
+    """Returns what a launch needs beside its kernel and struct.
+
+    Args:
+        is_early: whether the kernel may start before the one before it has ended. Only for a
+            kernel that waits for that one: nothing else would keep the two apart. If something
+            else comes before, such as a copy, an event or a graph, the kernel starts after it.
+    """
+    driver, _ = bindings()
+    config = driver.CUlaunchConfig()
+    config.gridDimX, config.gridDimY, config.gridDimZ = *n_blocks, 1
+    config.blockDimX, config.blockDimY, config.blockDimZ = n_threads, 1, 1
+    config.sharedMemBytes, config.hStream = shared, stream
+    if is_early:
+        attribute, names = driver.CUlaunchAttribute(), driver.CUlaunchAttributeID
+        attribute.id = names.CU_LAUNCH_ATTRIBUTE_PROGRAMMATIC_STREAM_SERIALIZATION
+        attribute.value.programmaticStreamSerializationAllowed = 1
+        config.attrs, config.numAttrs = [attribute], 1
+    return config
 
 
 def _allow_shared(function: Any, shared: int, index: int) -> None:

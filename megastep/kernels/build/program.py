@@ -56,6 +56,8 @@ class Program:
         sizes: {struct: bytes}.
         cpu_operations: {operation: struct} of the ``.cpp`` files.
         cuda_operations: {operation: struct} of the ``.cu`` files.
+        early_operations: those that a GPU may start before the previous kernel has ended: their
+            first statement is ``wait_for_previous();`` of ``common/dependent_launch.h``.
     """
 
     def __init__(
@@ -82,6 +84,10 @@ class Program:
     @cached_property
     def cuda_operations(self) -> dict[str, str]:
         return headers.operations(self.sources(".cu"))
+
+    @cached_property
+    def early_operations(self) -> frozenset[str]:
+        return headers.early_operations(self.sources(".cu"))
 
     def sources(self, *suffixes: str) -> dict[str, str]:
         """Returns the text of the files with these suffixes, by the name that includes them.

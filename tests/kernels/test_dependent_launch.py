@@ -1,0 +1,249 @@
+"""Kernels that may start before the previous one has ended: they wait first."""
+
+import contextlib
+import re
+from types import SimpleNamespace
+
+import check_kernels
+import pytest
+import torch
+
+from megastep.kernels.build import compile, launch
+from megastep.kernels.build.program import Program
+
+PARAMS = """
+#pragma once
+
+struct RelayParams {
+    const int* first;   // (n)
+    const int* second;  // (n)
+    int* after;         // (n)
+    int n;
+    int pause;  // clock cycles
+};
+"""
+RELAY = """
+#pragma once
+#include "common/backend.h"
+#include "params.h"
+
+// after[i] = the smaller one of first[n - 1 - i] and second[n - 1 - i], and 1.
+// The last block is slow, and the first one of the next kernel reads what it writes.
+DEVICE void relay(const RelayParams& p) {
+    int i = blockIdx.x * blockDim.x + threadIdx.x;
+    long long start = clock64();
+    while (blockIdx.x == gridDim.x - 1 && clock64() - start < p.pause)
+        ;
+    if (i < p.n)
+        p.after[i] = min(p.first[p.n - 1 - i], p.second[p.n - 1 - i]) + 1;
+}
+"""
+WAITS = """
+#include "relay.h"
+
+KERNEL waits(RelayParams p) {
+    wait_for_previous();
+    relay(p);
+}
+"""
+CARELESS = """
+#include "relay.h"
+
+KERNEL careless(RelayParams p) { relay(p); }
+"""
+OURS = pytest.mark.parametrize(
+    "program", check_kernels.programs(), ids=lambda program: "/".join(program.folder.parts[-3:])
+)
+
+
+@pytest.fixture
+def relays(tmp_path):
+    files = {"params.h": PARAMS, "relay.h": RELAY, "waits.cu": WAITS, "careless.cu": CARELESS}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    return Program(tmp_path)
+
+
+@OURS
+def test_every_kernel_of_ours_waits_first(program):
+    assert program.early_operations == program.cuda_operations.keys() != set()
+
+
+def test_a_kernel_that_does_not_wait_does_not_start_early(relays):
+    assert relays.cuda_operations == dict(waits="RelayParams", careless="RelayParams")
+    assert relays.early_operations == {"waits"}
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "// wait_for_previous();",
+        "p.after[0] = 1; wait_for_previous();",
+        "if (p.n) wait_for_previous();",
+        "{ wait_for_previous(); }",
+        "wait_for_previous;",
+        "do_not_wait_for_previous();",
+        "wait_for_previous(); }\n#else\nKERNEL waits(RelayParams p) {",
+    ],
+)
+def test_only_a_wait_as_the_first_statement_counts(relays, body):
+    (relays.folder / "waits.cu").write_text(f"KERNEL waits(RelayParams p) {{\n    {body}\n}}\n")
+    assert relays.cuda_operations.keys() == {"waits", "careless"}
+    assert relays.early_operations == set()
+
+
+@pytest.mark.parametrize("can_start_early", [False, True])
+def test_only_kernels_that_wait_are_launched_early(relays, monkeypatch, can_start_early):
+    """And those only on GPUs that can."""
+    configs = {}
+    driver = SimpleNamespace(
+        CUlaunchConfig=lambda: SimpleNamespace(attrs=[], numAttrs=0),
+        CUlaunchAttribute=lambda: SimpleNamespace(value=SimpleNamespace()),
+        CUlaunchAttributeID=SimpleNamespace(
+            CU_LAUNCH_ATTRIBUTE_PROGRAMMATIC_STREAM_SERIALIZATION=6
+        ),
+        cuLaunchKernelEx=lambda config, kernel, *_: configs.update({kernel: config}) or (0,),
+    )
+    monkeypatch.setattr(launch, "bindings", lambda: (driver, None))
+    monkeypatch.setattr(launch, "cuda", lambda program, index: dict(waits="w", careless="c"))
+    monkeypatch.setattr(launch, "_config", launch._config.__wrapped__)
+    monkeypatch.setattr(launch, "_can_start_early", lambda index: can_start_early)
+    monkeypatch.setattr(torch.cuda, "device", lambda index: contextlib.nullcontext())
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda index: SimpleNamespace(cuda_stream=7))
+    for operation in ("waits", "careless"):
+        launch.launch_blocks(relays, operation, b"", torch.device("cuda", 0), (3, 2), 32, 100)
+    for config in configs.values():
+        assert (config.gridDimX, config.gridDimY, config.gridDimZ) == (3, 2, 1)
+        assert (config.blockDimX, config.blockDimY, config.blockDimZ) == (32, 1, 1)
+        assert (config.sharedMemBytes, config.hStream) == (100, 7)
+    assert configs["c"].numAttrs == len(configs["c"].attrs) == 0
+    assert configs["w"].numAttrs == len(configs["w"].attrs) == int(can_start_early)
+    for attribute in configs["w"].attrs:
+        assert attribute.id == 6 and attribute.value.programmaticStreamSerializationAllowed == 1
+
+
+@pytest.mark.parametrize("capability, can", [((8, 9), False), ((9, 0), True), ((12, 0), True)])
+def test_gpus_since_hopper_start_kernels_early(monkeypatch, capability, can):
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: capability)
+    assert launch._can_start_early.__wrapped__(0) == can
+
+
+def ptx(program):
+    """The PTX of a program, {kernel: text}. Skips if there is no NVRTC, which needs no GPU."""
+    nvrtc = pytest.importorskip("cuda.bindings.nvrtc")
+    try:
+        nvrtc.nvrtcVersion()
+    except (RuntimeError, OSError) as error:
+        pytest.skip(f"needs NVRTC: {error}")
+    files = program.sources(".h", ".cu")
+    names, texts = [name.encode() for name in files], [text.encode() for text in files.values()]
+    made = nvrtc.nvrtcCreateProgram(
+        compile.joined(files).encode(), b"kernels.cu", len(files), texts, names
+    )
+    handle = compile.check_status(made, "NVRTC")
+    flags = [*program.cuda_flags, "--gpu-architecture=compute_90"]
+    result = nvrtc.nvrtcCompileProgram(handle, len(flags), [flag.encode() for flag in flags])
+    compile.check_status(result, "NVRTC")
+    text = bytearray(compile.check_status(nvrtc.nvrtcGetPTXSize(handle), "NVRTC"))
+    nvrtc.nvrtcGetPTX(handle, text)
+    nvrtc.nvrtcDestroyProgram(handle)
+    parts = re.split(r"\.entry (\w+)\(", text.decode(errors="replace"))
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+@OURS
+def test_compiled_kernels_touch_global_memory_after_the_wait_only(program):
+    """And never as read-only memory, whose reads the compiler may move before the wait."""
+    kernels = ptx(program)
+    assert kernels.keys() == program.cuda_operations.keys()
+    for name, text in kernels.items():
+        before, wait, after = text.partition("griddepcontrol.wait;")
+        assert wait and "griddepcontrol.launch_dependents;" in after, name
+        assert not re.search(
+            r"\b(ld|st|red|atom|prefetch|cp)\.(?!param|local)|\bbra\b|\bret;", before
+        ), name
+        assert not re.search(r"\bld\.global\S*\.nc", after), name
+
+
+def rounds(program, n_rounds, tensors, side):
+    """Each round adds 7 to `a`: six kernels and an operation of PyTorch, each 1.
+
+    They read what a kernel, PyTorch, a copy, a memset and another stream wrote just before.
+    """
+    a, b, c, d = tensors
+
+    def relay(operation, first, second, after, pause):
+        packed = program.params.RelayParams(
+            first=first.data_ptr(),
+            second=second.data_ptr(),
+            after=after.data_ptr(),
+            n=len(a),
+            pause=pause,
+        )
+        launch.launch(program, operation, packed, a.device, threads=len(a))
+
+    for _ in range(n_rounds):
+        relay("waits", a, a, b, 10_000)
+        relay("careless", b, b, a, 10_000)
+        a.add_(1)
+        relay("waits", a, a, b, 10_000)
+        c.copy_(b)
+        relay("waits", c, c, a, 10_000)
+        d.zero_()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            relay("waits", a, a, d, 20_000)
+        relay("waits", a, a, b, 100)
+        torch.cuda.current_stream().wait_stream(side)
+        relay("waits", b, d, a, 100)
+
+
+def captured(program, tensors, side):
+    """A CUDA graph of ten rounds."""
+    rounds(program, 1, tensors, side)  # builds the program, which a capture must not do
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        rounds(program, 10, tensors, side)
+    return graph
+
+
+def starts(n_blocks):
+    """The four tensors of `rounds`, and a stream."""
+    start = torch.arange(n_blocks * launch.BLOCK, dtype=torch.int32, device="cuda")
+    return [start.clone() for _ in range(4)], torch.cuda.Stream()
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n_blocks", [1, 200, 9000])  # 9000 do not fit on a GPU at once
+def test_a_chain_of_kernels_gives_the_right_numbers(relays, n_blocks):
+    tensors, side = starts(n_blocks)
+    expected = tensors[0] + 7 * 300
+    rounds(relays, 300, tensors, side)
+    assert torch.equal(tensors[0], expected)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("n_blocks", [1, 200, 9000])
+def test_a_captured_chain_of_kernels_gives_the_right_numbers(relays, n_blocks):
+    """Also beside launches that are not captured."""
+    tensors, side = starts(n_blocks)
+    expected = tensors[0] + 7 * (1 + 50 * (10 + 1))
+    graph = captured(relays, tensors, side)
+    for _ in range(50):
+        graph.replay()
+        rounds(relays, 1, tensors, side)
+    assert torch.equal(tensors[0], expected)
+
+
+@pytest.mark.cuda
+def test_a_captured_kernel_starts_early(relays):
+    """One that is said to wait, and does not, reads old numbers: so the tests above can fail."""
+    if not launch._can_start_early(0):
+        pytest.skip("needs programmatic dependent launch")
+    relays.early_operations = relays.early_operations | {"careless"}
+    tensors, side = starts(200)
+    expected = tensors[0] + 7 * (1 + 50 * 10)
+    graph = captured(relays, tensors, side)
+    for _ in range(50):
+        graph.replay()
+    assert not torch.equal(tensors[0], expected)
