@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator
 
 import torch
-from random_walks import random_actions, walk, walk_in_homes
+from random_walks import random_actions, walk, walk_in_homes, walk_in_rollouts
 from timing import graph_seconds_per_call, lap_seconds, measurement, rate, seconds_per_call
 
 from megastep import capture, engine, envs
@@ -23,8 +23,9 @@ AS_TRAINED = dict(resample=True, privileged=True, metrics=True)
 
 def step(device: torch.device) -> Iterator[dict]:
     """Frames per second of the whole `env.step` with default settings; Explorer without its
-    metrics. "As trained" is Explorer with the settings of training: a new home for every episode, a
-    privileged observation for the critic, and metrics.
+    metrics. A step is a CUDA graph. "As trained" is Explorer with the settings of training: a new
+    home for every episode, a privileged observation for the critic, and metrics; and 16 steps are
+    one graph, as a rollout's are.
     """
     for name in ("explorer", "minimal", "pointgoal"):
         for n_envs in N_ENVS[device.type]:
@@ -32,9 +33,9 @@ def step(device: torch.device) -> Iterator[dict]:
             seconds = seconds_per_call(take_step, device)
             yield rate(f"{name}, `env.step`, {n_envs:,} environments", n_envs, seconds)
     for n_envs in N_ENVS_AS_TRAINED[device.type]:
-        _, take_step = walk_in_homes("explorer", n_envs, device, **AS_TRAINED)
-        what = f"explorer, `env.step`, {n_envs:,} environments, as trained"
-        yield rate(what, n_envs, seconds_per_call(take_step, device))
+        _, take_step = walk_in_rollouts("explorer", n_envs, device, **AS_TRAINED)
+        what = f"explorer, `env.step`, {n_envs:,} environments, as trained, in a rollout"
+        yield rate(what, n_envs, graph_seconds_per_call(take_step, device))
 
 
 def deathmatch(device: torch.device) -> Iterator[dict]:

@@ -58,15 +58,15 @@ def plot_frames_per_second(records: list[dict], path: Path) -> None:
     series = {}
     for record in newest(records):
         match = re.fullmatch(
-            r"(\w+), `env.step`, ([\d,]+) environments(, as trained)?", record["what"]
+            r"(\w+), `env.step`, ([\d,]+) environments(, as trained)?(?:, in a rollout)?", record["what"]
         )
         if record["benchmark"] == "step" and match:
             bounds = [record[key] or record["value"] for key in ("value", "lower", "upper")]
-            point = int(match[2].replace(",", "")), *(1e6 * bound for bound in bounds)
-            series.setdefault((match[1], match[3] or "", record["on"]), []).append(point)
+            n_envs, rates = int(match[2].replace(",", "")), [1e6 * bound for bound in bounds]
+            series.setdefault((match[1], match[3] or "", record["on"]), {})[n_envs] = rates
     ax = subplots(7.5, 4.8)
     for (env, as_trained, machine), points in series.items():
-        n_envs, value, lower, upper = zip(*sorted(points))
+        n_envs, value, lower, upper = zip(*((n, *rates) for n, rates in sorted(points.items())))
         dashes = "--" if machine.startswith("CPU") else ":" if as_trained else "-"
         style = dict(color=ENV_COLOURS.get(env), linestyle=dashes)
         label = f"{env}{as_trained}, {machine}"

@@ -50,6 +50,20 @@ def walk_in_homes(
     return walk(envs.ENVS[name](n_envs, homes, device=device, **settings), n_actions)
 
 
+def walk_in_rollouts(
+    name: str, n_envs: int, device: torch.device, **settings
+) -> tuple[Any, Callable[[int], object]]:
+    """Returns ``envs.ENVS[name]`` in the benchmark's homes, after N_WARM_UP steps, and a function
+    that steps it by the i-th random actions. It is not captured: many steps make one graph.
+    """
+    env = envs.ENVS[name](n_envs, sample("bench", N_HOMES), device=device, **settings)
+    decisions = random_actions(env.action_space, n_envs * env.n_agents, device)
+    env.reset()
+    for i in range(N_WARM_UP):
+        env.step(decisions[i % N_CALLS])
+    return env, lambda i: env.step(decisions[i])
+
+
 def walk_four_agents(
     n_envs: int, device: torch.device
 ) -> tuple[core.Core, Callable[[int], object]]:

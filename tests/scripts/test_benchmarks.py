@@ -105,15 +105,19 @@ def test_benchmark_appends_json_lines(name, n_records, device, tiny_benchmarks, 
 def test_step_benchmark_measures_explorer_as_trained(tiny_benchmarks, monkeypatch):
     walks = []
 
-    def recorded_walk(*arguments, **settings):
-        env, take_step = random_walks.walk_in_homes(*arguments, **settings)
-        walks.append((env, settings))
-        return env, take_step
+    def recorded(walk):
+        def recorded_walk(*arguments, **settings):
+            env, take_step = walk(*arguments, **settings)
+            walks.append((env, settings))
+            return env, take_step
 
-    monkeypatch.setattr(env_steps, "walk_in_homes", recorded_walk)
+        return recorded_walk
+
+    for name in ("walk_in_homes", "walk_in_rollouts"):
+        monkeypatch.setattr(env_steps, name, recorded(getattr(random_walks, name)))
     names = [row["what"] for row in env_steps.step(torch.device("cpu"))]
     assert names[0] == "explorer, `env.step`, 8 environments"
-    assert names[-1] == "explorer, `env.step`, 8 environments, as trained"
+    assert names[-1] == "explorer, `env.step`, 8 environments, as trained, in a rollout"
     trained = dict(resample=True, privileged=True, metrics=True)
     assert [settings for _, settings in walks] == [dict(metrics=False), {}, {}, trained]
     decision = arrdict.arrdict(actions=torch.zeros((8, 1), dtype=torch.long))

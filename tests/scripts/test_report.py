@@ -28,7 +28,7 @@ def test_report_writes_page_and_plot_reproducibly(tmp_path):
     path = write_records(
         tmp_path,
         record("explorer, `env.step`, 1,024 environments", 12.5, lower=12.0, upper=13.0, n=15),
-        record("explorer, `env.step`, 1,024 environments, as trained", 7.5),
+        record("explorer, `env.step`, 1,024 environments, as trained, in a rollout", 7.5),
         record("minimal, `env.step`, 8,192 environments", 70.0),
     )
     written = []
