@@ -58,7 +58,8 @@ def plot_frames_per_second(records: list[dict], path: Path) -> None:
     series = {}
     for record in newest(records):
         match = re.fullmatch(
-            r"(\w+), `env.step`, ([\d,]+) environments(, as trained)?(?:, in a rollout)?", record["what"]
+            r"(\w+), `env.step`, ([\d,]+) environments(, as trained)?(?:, in a rollout)?",
+            record["what"],
         )
         if record["benchmark"] == "step" and match:
             bounds = [record[key] or record["value"] for key in ("value", "lower", "upper")]

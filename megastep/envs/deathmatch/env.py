@@ -82,10 +82,10 @@ class Deathmatch(SceneryEnv):
         wound_cost: per hit received.
         kill_reward: per kill.
         death_cost: per death.
-        aim_reward: for bringing another agent from the edge of the view to its centre. What an agent
-            gains as its target nears the centre, it loses as it leaves, so that watching a target
-            without killing it pays nothing (Ng, Harada and Russell 1999, "Policy invariance under
-            reward transformations").
+        aim_reward: for bringing another agent from the edge of the view to its centre. What an
+            agent gains as its target nears the centre, it loses as it leaves, so that watching a
+            target without killing it pays nothing (Ng, Harada and Russell 1999, "Policy invariance
+            under reward transformations").
         search_reward: per 64 wall texels seen for the first time in the episode, as in Explorer.
         res: rays of an agent's camera.
         subsample: rays per pixel.
