@@ -12,7 +12,7 @@ from megastep.agents.cli import evaluate, record, train
 from megastep.engine.outputs import Observation
 from megastep.envs.deathmatch.step import deathmatch_step
 from megastep.geometries import sample
-from tests.helpers.deathmatch_twins import hits_of, is_visible, privileged, respawned
+from tests.helpers.deathmatch_twins import hits_of, is_visible, privileged, respawned, sound
 
 RADIUS = engine.AGENT_RADIUS
 METRICS = "kills", "deaths", "damage", "accuracy"
@@ -77,7 +77,7 @@ def fight(device, n_envs, n_agents, steps=30, **rules):
         )
         inputs = dict(line=line, ray=ray, **{k: v.cpu().numpy().copy() for k, v in state.items()})
         out = deathmatch_step(scenery, c.agents, view, **state, **rules, privileged=True)._asdict()
-        outputs = {k: v.cpu().numpy().copy() for k, v in (out | state).items()}
+        outputs = {k: v.cpu().numpy().copy() for k, v in (out | state).items() if v is not None}
         outputs |= dict(zip(METRICS, outputs["metrics"], strict=True))
         yield inputs, outputs, c.agents.positions.cpu().numpy(), c.agents.angles.cpu().numpy()
 
@@ -500,6 +500,34 @@ def test_deaths_respawn_out_of_sight(device):
     assert n_respawns > 100
 
 
+@pytest.mark.parametrize("n_agents", [2, 3, 16])
+def test_sound_matches_twin(n_agents, device):
+    n_silent = 0
+    for _, outputs, positions, angles in fight(device, 5, n_agents, hearing=6.0):
+        for e in range(5):
+            ours = outputs["sound"][e * n_agents : (e + 1) * n_agents, 0]
+            expected = sound(positions[e], angles[e], 6.0)
+            np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-3)
+            n_silent += (expected[:, 0] == 0).sum()
+    assert n_silent or n_agents == 16
+
+
+def test_sound_by_hand(device):
+    """Three metres ahead and to the right behind a wall; and out of hearing."""
+    ring = Ring(device, (2.0, 3.5, 0.0), (5.0, 3.5, 90.0), geometry=toys.column(), hearing=4)
+    assert ring.env.obs_space.sound.dim == 3
+    heard = ring.step().obs.sound[:, 0].tolist()
+    assert heard[0] == pytest.approx([0.25, 1, 0], abs=2e-3)
+    assert heard[1] == pytest.approx([0.25, 0, 1], abs=2e-3)
+    ring.env.rules["hearing"] = 2.9
+    assert ring.step().obs.sound.tolist() == [[[0, 0, 0]]] * 2
+
+
+def test_without_hearing_nothing_is_heard(device):
+    world = Ring(device, *AMBUSH).step()
+    assert "sound" not in world.obs and "sound" not in envs.Deathmatch(1, device=device).obs_space
+
+
 def test_privileged_observation_by_hand(device):
     ring = Ring(device, (2, 3.5, 0), (4, 4.5, 90), privileged=True)
     ring.env.health.copy_(torch.tensor([0.75, 0.5]))
@@ -600,7 +628,7 @@ def test_too_many_agents_for_a_home(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("n_agents", [2, 4, 16])
 def test_cpu_and_gpu_agree_on_every_bit(n_agents):
     settings = dict(limit=15, damage=0.3, recovery=0.1, drain=0.05, health_per_hit=0.02)
-    settings |= dict(aim_reward=0.1, search_reward=0.3)
+    settings |= dict(aim_reward=0.1, search_reward=0.3, hearing=5.0)
     runs = [
         arrdict.stack(
             contract.rollout(

@@ -376,7 +376,9 @@ def operations(f):
             OPERANDS,
             view=views,
             **dict.fromkeys(("health", "tally", "ages", "ended"), tensors),
-            **dict.fromkeys(("damage", "recovery", "drain", "health_per_hit"), numbers(-0.1)),
+            **dict.fromkeys(
+                ("damage", "recovery", "drain", "health_per_hit", "hearing"), numbers(-0.1)
+            ),
             **dict.fromkeys(("hit_reward", "wound_cost", "kill_reward", "death_cost"), numbers()),
             aim_reward=numbers(),
             limit=lambda good: integers(1, 2**31 - 1)(1),

@@ -90,6 +90,21 @@ def privileged(health, positions, angles):
     return np.array(rows)
 
 
+def sound(positions, angles, hearing):
+    """Returns what each agent of one environment hears, (A, 3): the loudness of the nearest other
+    agent, and the cosine and sine of its bearing.
+    """
+    rows, n = [], len(angles)
+    for a in range(n):
+        away = [positions[b].astype(float) - positions[a] for b in range(n) if b != a]
+        nearest = min(away, key=np.linalg.norm)
+        distance = np.linalg.norm(nearest)
+        bearing = np.arctan2(nearest[1], nearest[0]) - np.radians(float(angles[a]))
+        heard = [1 - distance / hearing, np.cos(bearing), np.sin(bearing)]
+        rows.append(heard if distance < hearing else [0, 0, 0])
+    return np.array(rows)
+
+
 # ---- Hidden spawns ----
 
 

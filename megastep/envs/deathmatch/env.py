@@ -52,6 +52,9 @@ class Deathmatch(SceneryEnv):
         - ``imu``: (B, 1, 3), angular velocity / 360 deg/s, velocity forward and left / 10 m/s.
         - ``health``: (B, 1, 3), the agent's health from 0 to 1, whether it hit another agent in the
           last step, how many agents hit it.
+        - ``sound``: (B, 1, 3), if ``hearing`` is not 0: the loudness of the nearest other agent, 1
+          where it is and 0 at ``hearing`` metres and beyond, and the cosine and sine of its
+          bearing, left positive. Walls do not muffle it.
 
     Actions:
         (B, 1) integers: 0 nothing, 1 left, 2 right, 3 forward, 4 back, 5 turn left, 6 turn right.
@@ -87,6 +90,7 @@ class Deathmatch(SceneryEnv):
             target without killing it pays nothing (Ng, Harada and Russell 1999, "Policy invariance
             under reward transformations").
         search_reward: per 64 wall texels seen for the first time in the episode, as in Explorer.
+        hearing: metres at which sounds of other agents fade. 0: agents are deaf.
         res: rays of an agent's camera.
         subsample: rays per pixel.
         fov: field of view in degrees.
@@ -119,6 +123,7 @@ class Deathmatch(SceneryEnv):
         death_cost: Reward = 0.0,
         aim_reward: Reward = 0.0,
         search_reward: Reward = 0.0,
+        hearing: Annotated[float, Field(ge=0, le=1000)] = 0.0,
         res: Annotated[int, Field(ge=1, le=1024)] = 512,
         subsample: Annotated[int, Field(ge=1, le=32)] = 4,
         fov: Annotated[float, Field(gt=0, lt=180)] = 70.0,
@@ -148,6 +153,8 @@ class Deathmatch(SceneryEnv):
             imu=spaces.MultiVector(1, 3),
             health=spaces.MultiVector(1, 3),
         )
+        if hearing:
+            self.obs_space["sound"] = spaces.MultiVector(1, 3)
         self.action_space = spaces.MultiDiscrete(1, len(modules.MOVES))
         self.privileged_space = spaces.MultiVector(1, n_privileged) if privileged else None
         self.rules = dict(
@@ -161,6 +168,7 @@ class Deathmatch(SceneryEnv):
             kill_reward=kill_reward,
             death_cost=death_cost,
             aim_reward=aim_reward,
+            hearing=hearing,
         )
         words = -(-homes.layouts.max_texels // 32) if search_reward else 0
         bytes_per_lane = 8 * pixels + 4 * n_privileged * privileged + 4 * words + 128
@@ -229,6 +237,8 @@ class Deathmatch(SceneryEnv):
             truncated=truncated,
             metrics=arrdict(zip(METRICS, metrics.unbind())),
         )
+        if step.sound is not None:
+            world.obs["sound"] = step.sound
         if step.privileged is not None:
             world["privileged"] = step.privileged
         return world

@@ -34,6 +34,7 @@ class DeathmatchStep(NamedTuple):
     truncated: torch.Tensor  # (B,) bool
     metrics: torch.Tensor  # (4, B): kills, deaths, damage, accuracy where an episode ends; else 0
     health_obs: torch.Tensor  # (B, 1, 3) fp16: health, whether it hit, how many hit it
+    sound: torch.Tensor | None  # (B, 1, 3) fp16: loudness, cosine and sine; None if not wanted
     privileged: torch.Tensor | None  # (B, 1, privileged_size(A)) for a critic; None if not wanted
 
 
@@ -63,6 +64,7 @@ def deathmatch_step(
     kill_reward: float = 0.0,
     death_cost: float = 0.0,
     aim_reward: float = 0.0,
+    hearing: float = 0.0,
     privileged: bool = False,
 ) -> DeathmatchStep:
     """Lets each agent hit whoever is at the centre of its view; see
@@ -88,6 +90,7 @@ def deathmatch_step(
         death_cost: per death.
         aim_reward: for bringing another agent from the edge of the view to its centre; taken back
             as far as it leaves again.
+        hearing: metres at which the sound of the nearest other agent fades. 0: no sound.
         privileged: compute the privileged observation.
 
     Raises:
@@ -105,15 +108,16 @@ def deathmatch_step(
     )
     rewards = dict(hit_reward=hit_reward, wound_cost=wound_cost, kill_reward=kill_reward)
     rewards |= dict(death_cost=death_cost, aim_reward=aim_reward)
-    for name, value in {**health_rules, **rewards}.items():
+    not_negative = dict(health_rules, hearing=hearing)
+    for name, value in {**not_negative, **rewards}.items():
         checks.number(name, value, -math.inf, math.inf)
-    for name, value in health_rules.items():
+    for name, value in not_negative.items():
         if value < 0:
             raise ValueError(f"{name} must be at least 0, not {value:g}")
     agent_ray, poses = 0, dict(positions=0, angles=0)
     if aim_reward:
         agent_ray = checks.address("view.agent_ray", view.agent_ray, lanes, torch.int32, device)
-    if checks.flag("privileged", privileged):
+    if checks.flag("privileged", privileged) or hearing:
         poses = state_params(scenery, agents, "positions", "angles")
     flags = [torch.empty(n_lanes, dtype=torch.bool, device=device) for _ in range(3)]
     out = DeathmatchStep(
@@ -121,6 +125,9 @@ def deathmatch_step(
         *flags,
         metrics=torch.empty((4, n_lanes), device=device),
         health_obs=torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=device),
+        sound=(
+            torch.empty((n_lanes, 1, 3), dtype=torch.float16, device=device) if hearing else None
+        ),
         privileged=(
             torch.empty((n_lanes, 1, privileged_size(a)), device=device) if privileged else None
         ),
@@ -136,7 +143,7 @@ def deathmatch_step(
         ages=checks.address("ages", ages, (n_lanes,), torch.int32, device),
         ended=checks.address("ended", ended, (n_lanes,), torch.bool, device),
         **{k: 0 if v is None else v.data_ptr() for k, v in out._asdict().items()},
-        **health_rules,
+        **not_negative,
         **rewards,
         limit=checks.integer("limit", limit, 1, 2**31 - 1),
         res=agents.res,

@@ -6,7 +6,8 @@
 #include "constants.h"
 #include "params.h"
 
-constexpr float MIN_HEALTH = 1e-4f;  // less is a rounding error and counts as 0
+constexpr float MIN_HEALTH = 1e-4f;    // less is a rounding error and counts as 0
+constexpr float MIN_DISTANCE = 1e-3f;  // metres; agents are never that near
 
 // The hits of one step in one environment, by agent.
 struct Hits {
@@ -110,6 +111,28 @@ HD void finish_step(const DeathmatchStepParams& p, int first, int a, const Hits&
     health_obs[2] = HALF_BITS(wounds);
 }
 
+// Writes what agent a hears: the nearest other agent, through walls too. Loudness falls from 1 to 0
+// at p.hearing metres.
+HD void write_sound(const DeathmatchStepParams& p, int first, int a) {
+    int i = first + a;
+    float ahead = 0.f, left = 0.f, nearest = p.hearing;
+    Pose pose = pose_at(p.positions[2 * i], p.positions[2 * i + 1], p.angles[i]);
+    for (int j = first; j < first + p.n_agents; j++) {
+        float dx = p.positions[2 * j] - pose.x, dy = p.positions[2 * j + 1] - pose.y;
+        float distance = SQRT(dx * dx + dy * dy);
+        if (j == i || !(distance < nearest))
+            continue;
+        nearest = distance;
+        float scale = 1.f / maxf(distance, MIN_DISTANCE);
+        ahead = (pose.cosine * dx + pose.sine * dy) * scale;
+        left = (pose.cosine * dy - pose.sine * dx) * scale;
+    }
+    unsigned short* sound = p.sound + 3 * (long long)i;
+    sound[0] = HALF_BITS(1.f - nearest / p.hearing);
+    sound[1] = HALF_BITS(ahead);
+    sound[2] = HALF_BITS(left);
+}
+
 // Writes what a critic sees of agent a: its health, then for each other agent, starting with the
 // next one: its health, its position ahead and left in tens of metres, and the cosine and sine of
 // its heading relative to a's.
@@ -140,7 +163,10 @@ HD void deathmatch_env(const DeathmatchStepParams& p, int env) {
         update_health(p, first, a, hits);
     for (int a = 0; a < p.n_agents; a++)
         finish_step(p, first, a, hits);
-    if (p.privileged)
-        for (int a = 0; a < p.n_agents; a++)
+    for (int a = 0; a < p.n_agents; a++) {
+        if (p.sound)
+            write_sound(p, first, a);
+        if (p.privileged)
             write_privileged(p, first, a);
+    }
 }

@@ -6,8 +6,8 @@
 struct DeathmatchStepParams {
     const int* centre_line;  // (N, A) line at the centre of each view, as Render.indices
     const int* agent_ray;    // (N, A) ray closest to the centre that hits an agent, or -1
-    const float* positions;  // (N, A, 2) for privileged
-    const float* angles;     // (N, A) for privileged
+    const float* positions;  // (N, A, 2) for sound and privileged
+    const float* angles;     // (N, A) for sound and privileged
     float* health;           // (N, A) in and out, as the next three: from 0 to 1
     float* tally;            // (TALLY_ROWS, N, A): kills, damage, hits so far; aim in the last step
     int* ages;               // (N, A) steps since the first observation
@@ -18,16 +18,18 @@ struct DeathmatchStepParams {
     unsigned char* truncated;  // (N, A)
     float* metrics;  // (4, N, A) kills, deaths, damage, accuracy where an episode ends; else 0
     unsigned short* health_obs;  // (N, A, 3) fp16: health, whether it hit, how many hit it
-    float* privileged;     // (N, A, 1 + PRIVILEGED_PER_OPPONENT (A - 1)) for a critic; null: none
-    float damage;          // health that a hit costs its target
-    float recovery;        // health regained in a step without a wound
-    float drain;           // health lost in every step
-    float health_per_hit;  // health gained by an agent that hits
+    unsigned short* sound;  // (N, A, 3) fp16: loudness, cosine and sine of where from; null: none
+    float* privileged;      // (N, A, 1 + PRIVILEGED_PER_OPPONENT (A - 1)) for a critic; null: none
+    float damage;           // health that a hit costs its target
+    float recovery;         // health regained in a step without a wound
+    float drain;            // health lost in every step
+    float health_per_hit;   // health gained by an agent that hits
     float hit_reward;
     float wound_cost;
     float kill_reward;
     float death_cost;
     float aim_reward;  // for bringing an agent from the edge of the view to its centre
+    float hearing;     // metres at which sounds fade
     int limit;         // steps per episode
     int res;           // rays per view
     int n_envs;        // N
