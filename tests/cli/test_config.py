@@ -186,7 +186,7 @@ def test_experiment_differs_by_preset():
     assert compose("experiment=pong", "learner=r2d2", "preset=cpu").learner.name.endswith(":R2D2")
     cpu, gpu = (compose("experiment=deathmatch", f"preset={preset}") for preset in ("cpu", "gpu"))
     assert (cpu.env.n_envs, gpu.env.n_envs) == (64, 8192)
-    assert (cpu.samples, gpu.samples, cpu.seconds, gpu.seconds) == (600_000, None, None, 480)
+    assert (cpu.samples, gpu.samples, cpu.seconds, gpu.seconds) == (4_000_000, None, None, 60)
 
 
 def test_typo_hints_nearest_key():
