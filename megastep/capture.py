@@ -111,10 +111,14 @@ def end_failed_recording() -> None:
     """Makes PyTorch's default generator of the current GPU usable again after a recording failed.
 
     Every recording registers it, and one that fails leaves it marked as being captured, so that
-    drawing from it raises. The next recording that succeeds removes the mark; this makes one.
+    drawing from it raises. The next recording that succeeds removes the mark; this makes one, if
+    the GPU still works.
     """
-    with torch.cuda.graph(torch.cuda.CUDAGraph(), stream=torch.cuda.Stream()):
-        torch.zeros((), device="cuda")  # PyTorch warns about empty graphs
+    graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream()
+    with contextlib.suppress(RuntimeError):  # the error of the failed recording is the one to raise
+        # threads of NCCL may query events meanwhile
+        with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+            torch.zeros((), device="cuda")  # PyTorch warns about empty graphs
 
 
 class Graph:

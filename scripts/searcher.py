@@ -104,7 +104,7 @@ class Searcher:
     """Explores a home by frontiers, or follows the other agent if `knows_all`.
 
     Attributes:
-        fresh: (X Y,) bool, cells seen. Frontiers are their ends.
+        remembered: (X Y,) bool, cells seen and not forgotten. Frontiers are their ends.
         known: (X Y,) bool, free cells that were seen, on which paths are planned.
         path: (K, 2) points to walk along, then what to look at.
     """
@@ -116,15 +116,15 @@ class Searcher:
         near = ndimage.binary_dilation(self.part.reshape(home.free.shape), iterations=2)
         self.visible = np.flatnonzero(near)  # cells that may come into view
         self.seen_at = np.full(self.part.size, -np.inf)
-        self.fresh, self.ever = np.zeros(self.part.size, bool), np.zeros(self.part.size, bool)
-        self.known = self.part.copy() if knows_all else self.fresh.copy()
+        self.remembered, self.ever = np.zeros(self.part.size, bool), np.zeros(self.part.size, bool)
+        self.known = self.part.copy() if knows_all else self.remembered.copy()
         self.planned, self.step, self.target = -np.inf, 0, -1
         self.deadline, self.avoid, self.still = np.inf, [], 0
         self.path = np.repeat(position[None], 2, 0)
 
     def look(self, position, angle, depth, slope: float, sight: float) -> None:
         """Marks what is in view. `depth`: (P,), 1 - metres beyond the radius / sight."""
-        cells = self.visible if self.memory else self.visible[~self.fresh[self.visible]]
+        cells = self.visible if self.memory else self.visible[~self.remembered[self.visible]]
         off = (self.home.centres[cells] - position).astype(np.float32)
         c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
         ahead, left = off @ np.float32([c, s]), off @ np.float32([-s, c])
@@ -140,16 +140,16 @@ class Searcher:
         self.seen_at[found] = self.step
         self.ever[found] = True
         if self.memory:
-            self.fresh = self.seen_at > self.step - self.memory
+            self.remembered = self.seen_at > self.step - self.memory
         else:
-            self.fresh[found] = True
+            self.remembered[found] = True
         if not self.knows_all:
-            self.known = (self.fresh if self.memory else self.ever) & self.part
+            self.known = (self.remembered if self.memory else self.ever) & self.part
 
     def frontier(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the known cells that border on an unseen one, (F,), and the latter, (F,)."""
         shape = self.home.free.shape
-        known, unseen = self.known.reshape(shape), ~self.fresh.reshape(shape)
+        known, unseen = self.known.reshape(shape), ~self.remembered.reshape(shape)
         beyond = np.full(shape, -1)
         numbers = np.arange(beyond.size).reshape(shape)
         for axis in (0, 1):
@@ -162,7 +162,7 @@ class Searcher:
     def plan(self, position, angle, other) -> None:
         """Chooses where to go, if it is time to."""
         waited = self.step - self.planned
-        is_done = self.target < 0 or self.fresh[self.target]
+        is_done = self.target < 0 or self.remembered[self.target]
         if self.knows_all:
             if waited >= CHASE:
                 self._follow(position, other)
@@ -195,9 +195,9 @@ class Searcher:
         home, start = self.home, self.home.nearest(self.known, position)
         cells, beyond = self.frontier()
         if not len(cells):  # all is seen: forget
-            self.fresh[:] = False
+            self.remembered[:] = False
             self.seen_at[:] = -np.inf
-            self.fresh[start], self.avoid = True, []
+            self.remembered[start], self.avoid = True, []
             cells, beyond = self.frontier()
         away, before = home.paths(self.known, start)
         reached = np.isfinite(away[cells])
@@ -210,12 +210,9 @@ class Searcher:
         if self.rule == "nearest":
             score = -seconds
         else:
-            unseen = ~self.fresh.reshape(home.free.shape)
+            unseen = ~self.remembered.reshape(home.free.shape)
             opened = ndimage.uniform_filter(unseen.astype(np.float32), OPENED).ravel()[beyond]
-            if self.rule == "gain":
-                score = opened / seconds
-            else:  # balanced: how much, discounted by how late
-                score = opened * np.exp(-seconds / 4)
+            score = opened / seconds
         for place in self.avoid:
             score -= 1e3 * (((home.centres[cells] - place) ** 2).sum(-1) < 0.1)
         best = score.argmax()
@@ -234,20 +231,25 @@ class Searcher:
 
 
 class Search:
-    """Plays searchers in one slot of an environment each. N environments.
+    """Plays a searcher in slot 0 of each environment. N environments.
 
     Args:
         env: Deathmatch with two agents, in which `homes[env.layout]` are the homes.
-        slot: the searchers' agent.
+        rule: which frontier to go to: `gain`, where most opens per second, or `nearest`.
+        memory: steps after which it forgets what it saw. 0: never.
+        knows_all: it knows the home and where the other agent is, and follows it.
+        sight: metres to which it sees floor.
     """
 
-    def __init__(self, env, homes, rule="gain", memory=0, knows_all=False, sight=SIGHT, slot=0):
-        self.env, self.slot, self.sight = env, slot, sight
+    def __init__(self, env, homes, rule="gain", memory=0, knows_all=False, sight=SIGHT):
+        if rule not in ("gain", "nearest"):
+            raise ValueError(f"{rule!r} is no rule: gain or nearest")
+        self.env, self.sight = env, sight
         self.slope = np.tan(np.deg2rad(env.core.fov / 2))
         layout, positions = env.layout.numpy(), env.core.agents.positions.numpy()
         of = [homes[k] for k in layout]
         self.searchers = [
-            Searcher(home, position[slot].astype(float), rule, memory, knows_all)
+            Searcher(home, position[0].astype(float), rule, memory, knows_all)
             for home, position in zip(of, positions)
         ]
         self.shape = np.max([home.free.shape for home in of], 0) + 2
@@ -255,15 +257,15 @@ class Search:
         for e, home in enumerate(of):
             self.room[e, : home.room.shape[0], : home.room.shape[1]] = home.room
         self.origin = np.stack([home.grid.origin for home in of])
-        self.before = positions[:, slot].astype(float)
+        self.before = positions[:, 0].astype(float)
         self.metres = np.zeros(len(of))
 
     def act(self, depth: np.ndarray, playing: np.ndarray) -> np.ndarray:
         """Returns actions (N,). `depth`: (N, P) of the searchers; `playing`: (N,) bool."""
-        agents, slot = self.env.core.agents, self.slot
+        agents = self.env.core.agents
         positions, angles = agents.positions.numpy().astype(float), agents.angles.numpy()
-        velocity, spin = (getattr(agents, k).numpy()[:, slot] for k in ("velocity", "angvelocity"))
-        here, angle = positions[:, slot], angles[:, slot].astype(float)
+        velocity, spin = (getattr(agents, k).numpy()[:, 0] for k in ("velocity", "angvelocity"))
+        here, angle = positions[:, 0], angles[:, 0].astype(float)
         moved = np.hypot(*(here - self.before).T)
         self.metres += np.where(playing, moved, 0)
         self.before = here.copy()
@@ -271,7 +273,7 @@ class Search:
             searcher = self.searchers[e]
             searcher.look(here[e], angle[e], depth[e], self.slope, self.sight)
             searcher.bump(here[e], moved[e])
-            searcher.plan(here[e], angle[e], positions[e, 1 - slot])
+            searcher.plan(here[e], angle[e], positions[e, 1])
         aim, gaze = self.aims(here)
         velocity, spin = velocity.astype(float), spin.astype(float)
         velocities, turns = options(angle, velocity, spin)
@@ -317,8 +319,8 @@ class Search:
 
     def glide(self, playing, speed: float) -> None:
         """Moves the searchers along their paths without inertia, while they turn at TOP_SPIN."""
-        agents, slot = self.env.core.agents, self.slot
-        here, angles = agents.positions.numpy()[:, slot], agents.angles.numpy()[:, slot]
+        agents = self.env.core.agents
+        here, angles = agents.positions.numpy()[:, 0], agents.angles.numpy()[:, 0]
         for e in np.flatnonzero(playing):
             path, look = self.searchers[e].path[:-1], self.searchers[e].path[-1]
             nearest = ((path - here[e]) ** 2).sum(-1).argmin()
@@ -328,8 +330,8 @@ class Search:
             off = look - here[e]
             turn = (np.rad2deg(np.arctan2(off[1], off[0])) - angles[e] + 180) % 360 - 180
             angles[e] += np.clip(turn, -TOP_SPIN * 0.1, TOP_SPIN * 0.1)
-        agents.velocity[:, slot] = 0
-        agents.angvelocity[:, slot] = 0
+        agents.velocity[:, 0] = 0
+        agents.angvelocity[:, 0] = 0
 
 
 def options(angle, velocity, spin):
@@ -366,8 +368,9 @@ def sees_pixels(rgb: np.ndarray) -> np.ndarray:
 
 
 def play(env, homes, n_steps, player="search", opponent="bot", lasting=0, glides=0.0, **options):
-    """Plays one round in every environment. A round ends at the first death, or when the agents
-    have met if `lasting` steps are over.
+    """Plays one round in every environment. A round ends at the first death or, from step `lasting`
+    on, once the player has seen the other within 10 m and as a pixel. A `duel` ends only at a
+    death.
 
     Args:
         player: in slot 0: search; duel, which aims like the bot while it sees another; bot;
@@ -488,7 +491,9 @@ def row(title: str, case: str, found: dict) -> str:
     seen = found["seen"][:, STEPS.index(LIMIT)]
     cells.append("" if np.isnan(seen).any() else f"{seen.mean():.2f}")
     is_decided, won = np.isfinite(found["decided"]), found["won"].sum()
-    cells.append(f"{is_decided.mean():.2f}, {won / is_decided.sum():.2f}" if won else "")
+    cells.append(
+        f"{is_decided.mean():.2f}, {won / is_decided.sum():.2f}" if is_decided.any() else ""
+    )
     return " | ".join(["", *cells, ""]).strip()
 
 

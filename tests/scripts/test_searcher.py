@@ -11,13 +11,13 @@ from megastep import engine, geometries
 from megastep.envs.deathmatch import Deathmatch
 
 
-def rounds(plans, **options):
+def rounds(plans):
     env = Deathmatch(len(plans), plans, n_agents=2, limit=10**4, damage=0.0, device="cpu")
-    return env, [searcher.Home(np.asarray(plan["walls"], float)) for plan in plans], options
+    return env, [searcher.Home(np.asarray(plan["walls"], float)) for plan in plans]
 
 
 def test_an_agent_reaches_four_metres_per_second():
-    env, _, _ = rounds(geometries.sample("box", 1, width=40.0))
+    env, _ = rounds(geometries.sample("box", 1, width=40.0))
     env.reset()
     env.core.agents.positions[0] = torch.tensor([[5.0, 20.0], [35.0, 35.0]])
     env.core.agents.angles[:] = 0.0
@@ -32,7 +32,7 @@ def test_an_agent_reaches_four_metres_per_second():
 
 
 def test_each_action_is_predicted_as_the_environment_takes_it():
-    env, _, _ = rounds(geometries.sample("box", 7, width=40.0))
+    env, _ = rounds(geometries.sample("box", 7, width=40.0))
     env.reset()
     agents = env.core.agents
     agents.positions[:] = torch.tensor([[20.0, 20.0], [30.0, 30.0]])
@@ -52,7 +52,7 @@ def test_each_action_is_predicted_as_the_environment_takes_it():
 
 def test_floor_is_seen_exactly_where_no_wall_is_in_the_way():
     """Against a test of segments that shares nothing with the renderer."""
-    env, homes, _ = rounds(geometries.sample("homes", 3, "test"))
+    env, homes = rounds(geometries.sample("homes", 3, "test"))
     env.reset()
     search, agents = searcher.Search(env, homes), env.core.agents
     depth = engine.observe(env.core.scenery, agents, 4, rgb=False).depth.float().numpy()[:, 0]
@@ -66,7 +66,7 @@ def test_floor_is_seen_exactly_where_no_wall_is_in_the_way():
         walls = np.asarray(geometries.sample("homes", 3, "test")[plan]["walls"], float)
         hidden = crosses(here, off, walls) | (away > 10) | (np.abs(bearing) > 35)
         clear = (away > 0.3) & (np.abs(np.abs(bearing) - 35) > 1)
-        seen = one.fresh[one.visible]
+        seen = one.remembered[one.visible]
         assert seen[clear].any() and (seen == ~hidden)[clear].mean() > 0.98
 
 
@@ -81,21 +81,21 @@ def crosses(here, off, walls):
 
 
 def test_a_searcher_sees_all_of_a_room_with_a_pillar():
-    env, homes, _ = rounds(geometries.sample("column", 2))
+    env, homes = rounds(geometries.sample("column", 2))
     found = searcher.play(env, homes, 250, opponent="still", lasting=250)
     assert (found["met"] < 250).all()
     assert (found["seen"][:, searcher.STEPS.index(250)] > 0.95).all()
 
 
 def test_a_walker_who_knows_where_the_other_is_meets_it():
-    env, homes, _ = rounds(geometries.sample("homes", 4, "test"))
+    env, homes = rounds(geometries.sample("homes", 4, "test"))
     found = searcher.play(env, homes, 400, opponent="still", knows_all=True)
     assert (found["saw"] < 400).all() and (found["metres"] < 40).all()
     assert (found["met"] <= found["saw"]).all() and (found["saw"] <= found["near"]).all()
 
 
 def test_without_inertia_it_walks_at_the_speed_given():
-    env, homes, _ = rounds(geometries.sample("homes", 1, "test"))
+    env, homes = rounds(geometries.sample("homes", 1, "test"))
     env.reset()
     search = searcher.Search(env, homes, knows_all=True)
     start = env.core.agents.positions[0, 0].numpy().astype(float)
@@ -106,13 +106,14 @@ def test_without_inertia_it_walks_at_the_speed_given():
     assert moved == pytest.approx([0.3, 0.0], abs=1e-3)
 
 
-def test_every_case_has_a_row(monkeypatch):
-    cases = {"two bots": dict(player="bot"), "duel of two bots": searcher.CASES["duel of two bots"]}
-    monkeypatch.setattr(searcher, "CASES", cases)
-    monkeypatch.setattr(searcher, "SOURCES", {"generated": ("homes", {})})
-    rows = [
-        searcher.row("generated", case, searcher.results(("generated", case, 2, 2)))
-        for case in cases
-    ]
-    heads = [row.split(" | ")[:2] for row in rows]
-    assert heads == [["| generated", case] for case in cases]
+@pytest.mark.parametrize("case", searcher.CASES)
+def test_every_case_has_a_row(case, monkeypatch):
+    monkeypatch.setattr(searcher, "STEPS", [2, 4, 6, 8])
+    monkeypatch.setattr(searcher, "LIMIT", 4)
+    settings = searcher.CASES[case]
+    small = {k: 8 if k == "n_steps" else 4 if k == "lasting" else v for k, v in settings.items()}
+    monkeypatch.setitem(searcher.CASES, case, small)
+    found = searcher.results(("generated", case, 1, 1))
+    cells = searcher.row("generated", case, found).strip("|").split("|")
+    assert len(cells) == 11 and [cell.strip() for cell in cells[:2]] == ["generated", case]
+    assert found["metres"].shape == (1,) and found["metres"][0] <= 8 * searcher.TOP

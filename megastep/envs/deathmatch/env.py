@@ -87,8 +87,8 @@ class Deathmatch(SceneryEnv):
         death_cost: per death.
         aim_reward: for bringing another agent from the edge of the view to its centre. What an
             agent gains as its target nears the centre, it loses as it leaves, so that watching a
-            target without killing it pays nothing (Ng, Harada and Russell 1999, "Policy invariance
-            under reward transformations").
+            target without killing it pays nothing (after Ng, Harada and Russell 1999, "Policy
+            invariance under reward transformations", but without discount).
         search_reward: per 64 wall texels seen for the first time in the episode, as in Explorer.
         hearing: metres at which sounds of other agents fade. 0: agents are deaf.
         res: rays of an agent's camera.

@@ -113,7 +113,7 @@ def _can_start_early(index: int) -> bool:
     return torch.cuda.get_device_capability(index) >= (9, 0)
 
 
-@functools.lru_cache(maxsize=1024)  # making one takes as long as half a launch
+@functools.lru_cache(maxsize=1024)  # making one takes as long as a third of a launch
 def _config(
     n_blocks: tuple[int, int], n_threads: int, shared: int, stream: int, is_early: bool
 ) -> Any:
