@@ -218,6 +218,8 @@ def card(file: Path) -> str:
     about = agent_file.read_metadata(file)
     facts, name = about["facts"], file.stem
     commands = "; then ".join(f"`{command}`" for command in facts["commands"]) or "unknown"
+    plays = any("won" in table["rows"][0] for table in about["tables"])
+    against = " against=bot" if plays else ""
     gpus = f"{facts['ranks']} × {facts['device']}" if facts["ranks"] > 1 else facts["device"]
     lines = {
         "command": commands,
@@ -232,8 +234,8 @@ def card(file: Path) -> str:
     parts = [
         f"# {name}",
         "```\n"
-        f"python evaluate.py run={name} geometry=suite\n"
-        f"python record.py run={name} geometry=maze\n"
+        f"python evaluate.py run={name} geometry=suite{against}\n"
+        f"python record.py run={name} geometry=maze{against}\n"
         f"python train.py init={name} seconds=60\n"
         "```",
         "## Training",
