@@ -174,6 +174,12 @@ class EnvState:
         for path, name in state.get("classes", {}).items():  # absent in older checkpoints
             if (now := type(node_at(self.root, path)).__qualname__) != name:
                 raise ValueError(f"{_name(path)} was a {name} and is a {now}")
+        for path, value in state["arrays"].items():
+            now, owner = leaves.get(path), node_at(self.root, _parent(path))
+            is_fixed = isinstance(now, torch.Tensor) and _is_ours(owner) and not _is_dict(owner)
+            if is_fixed and now.shape != value.shape:  # of another version of megastep
+                shapes = f"was {tuple(value.shape)} and is {tuple(now.shape)}"
+                raise ValueError(f"the shape of {_name(path)} {shapes}")
         for path, value in state["generators"].items():
             is_of_another_device = path.startswith(".generators") and path not in leaves
             if not is_of_another_device and not _set_generator_state(leaves.get(path), value):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from megastep import envs, toys
 from megastep.env_state import EnvState
 
 
@@ -166,6 +167,19 @@ def test_state_that_fails_in_the_middle_is_put_back():
     with pytest.raises(ValueError, match="a tensor inside a tuple was replaced"):
         EnvState(target).load_state_dict(saved)
     assert str(facts(target)) == before
+
+
+def test_state_of_another_version_is_refused_and_changes_nothing():
+    """Here Deathmatch's tally had a row less."""
+    env = envs.Deathmatch(2, [toys.box()], device="cpu")
+    env.reset()
+    env_state = EnvState(env)
+    state = env_state.state_dict()
+    before = env.tally.clone()
+    state["arrays"] = state["arrays"] | {".env.tally": before[:3] + 1}
+    with pytest.raises(ValueError, match=r"the shape of tally was \(3, 8\) and is \(4, 8\)"):
+        env_state.load_state_dict(state)
+    assert torch.equal(env.tally, before)
 
 
 def test_state_of_a_gpu_is_restored_without_one():
