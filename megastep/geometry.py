@@ -22,7 +22,15 @@ from numpy.typing import ArrayLike
 
 from megastep.dotdict import dotdict
 
-__all__ = ["centers", "content_hash", "display", "indices", "masks", "validate_geometry"]
+__all__ = [
+    "centers",
+    "content_hash",
+    "display",
+    "indices",
+    "masks",
+    "mirror_image",
+    "validate_geometry",
+]
 
 # Metres per cell, as in the original: coarse enough to be cheap, fine enough for a 0.6 m door.
 RES = 0.2
@@ -214,6 +222,20 @@ def validate_geometry(g: dict) -> dict:
         raise ValueError(f"'res' must be from 0.01 to 10 m per cell, but is {res:g}")
     number = int(_array(g, "id", "iu", ()))
     return type(g)(g, id=number, walls=walls, lights=lights, masks=cells.astype(np.int16), res=res)
+
+
+def mirror_image(g: dotdict) -> dotdict:
+    """Returns a geometry with left and right swapped, and without its further keys.
+
+    Raises:
+        ValueError: if a wall or light lies at or beyond the right edge of the masks.
+    """
+    width = g.masks.shape[1] * g.res
+    walls, lights = g.walls.copy(), g.lights.copy()
+    walls[..., 0] = width - walls[..., 0]
+    lights[..., 0] = width - lights[..., 0]
+    cells = np.ascontiguousarray(g.masks[:, ::-1])
+    return validate_geometry(dotdict(id=g.id, walls=walls, lights=lights, masks=cells, res=g.res))
 
 
 def content_hash(geometries: Sequence[dotdict]) -> "hashlib._Hash":

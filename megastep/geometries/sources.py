@@ -7,7 +7,7 @@ import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -16,6 +16,7 @@ from megastep.dotdict import dotdict
 from megastep.geometries import files as npz
 from megastep.geometries import mazes, toys
 from megastep.geometries.homes import database, plan
+from megastep.geometry import mirror_image
 from megastep.imports import import_object
 from megastep.settings import checked, closest
 
@@ -133,14 +134,24 @@ def maze(
     return [generated[i] for i in indices]
 
 
-def _part(name: str, part: Any) -> tuple[Callable, dict[str, Any], int]:
-    """Returns the source of a part of `mixed`, its options with `n`, and its weight.
+class _Part(NamedTuple):
+    """A part of `mixed`: a source, its options with `n`, and how training uses its geometries."""
+
+    source: Callable
+    options: dict[str, Any]
+    weight: int
+    mirror: bool
+
+
+def _part(name: str, part: Any) -> _Part:
+    """Returns a part of `mixed`.
 
     Raises:
         ValueError: if there is no such source, or it takes other options.
     """
     options = dict(part) if isinstance(part, dict) else {"n": part}
-    source, weight = options.pop("source", name), options.pop("weight", 1)
+    source = options.pop("source", name)
+    weight, mirror = options.pop("weight", 1), options.pop("mirror", False)
     known = [name for name in __all__ if name not in ("mixed", "suite")]
     if not isinstance(source, str) or source not in known and ":" not in source:
         raise ValueError(f"{source!r} is no source; {closest(source, [*known, 'module:function'])}")
@@ -161,7 +172,9 @@ def _part(name: str, part: Any) -> tuple[Callable, dict[str, Any], int]:
         raise ValueError(f"{name}: {n!r} is no number of geometries, 0 to 1,000,000")
     if isinstance(weight, bool) or not isinstance(weight, int) or not 1 <= weight <= 1000:
         raise ValueError(f"{name}: weight={weight!r} is no integer from 1 to 1,000")
-    return function, options, weight
+    if not isinstance(mirror, bool):
+        raise ValueError(f"{name}: mirror={mirror!r} is neither true nor false")
+    return _Part(function, options, weight, mirror)
 
 
 def check_parts(parts: dict[str, Any]) -> None:
@@ -170,7 +183,7 @@ def check_parts(parts: dict[str, Any]) -> None:
     Raises:
         ValueError: if a source does not exist or takes other options, or no part has geometries.
     """
-    if not sum(_part(name, part)[1]["n"] for name, part in parts.items()):
+    if not sum(_part(name, part).options["n"] for name, part in parts.items()):
         raise ValueError("its counts sum to 0; give at least one geometry: {homes: 512}")
 
 
@@ -187,21 +200,24 @@ def mixed(
         parts: name -> number of geometries from the source of that name; or {source, n, options}
             with the name or import path of a source. Every part is of the same split, and of the
             same seed unless its options have one; it has at most as many geometries as that split
-            of its source. With {weight: 2} the training split has each of them twice.
+            of its source. With {weight: 2} the training split has each of them twice, and with
+            {mirror: true} the mirror image of each as well.
     """
     check_parts(parts)
     geometries = []
     for name, part in parts.items():
-        function, options, weight = _part(name, part)
+        source, options, weight, mirror = _part(name, part)
         if options["n"]:
             try:
-                drawn = checked(function)(**{"split": split, "seed": seed, **options})
+                drawn = checked(source)(**{"split": split, "seed": seed, **options})
+                unique = list({id(g): g for g in drawn}.values())
+                if split == "training":
+                    unique += [mirror_image(g) for g in unique] if mirror else []
+                    unique *= weight
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from error
-            unique = {id(g): g for g in drawn}.values()
-            # each time another object, and so a layout of its own, as layouts are drawn evenly
-            for _ in range(weight if split == "training" else 1):
-                geometries += [dotdict(g, source=name) for g in unique]
+            # each another object, and so a layout of its own, as layouts are drawn evenly
+            geometries += [dotdict(g, source=name) for g in unique]
     total = len(geometries)
     n = n or total
     return [geometries[i * total // n if n < total else i % total] for i in range(n)]

@@ -8,10 +8,12 @@ import zipfile
 
 import numpy as np
 import pytest
+import torch
 
-from megastep import geometries, toys
+from megastep import core, geometries, modules, toys
 from megastep.dotdict import dotdict
 from megastep.geometries import files, sources
+from megastep.geometry import mirror_image
 from megastep.scene import scenery
 
 
@@ -116,6 +118,41 @@ def test_training_draws_a_part_as_often_as_its_weight_says():
         assert len(sources.mixed(None, split, parts=parts)) == 7
 
 
+def test_training_draws_mirror_images_of_a_part_as_well():
+    parts = {"homes": 3, "bench": {"n": 4, "mirror": True, "weight": 2}}
+    mix = geometries.sample("mixed", 19, parts=parts)
+    plain = geometries.sample("bench", 4)
+    swapped = [mirror_image(g) for g in plain]
+    for g, expected in zip(mix[3:], 2 * [*plain, *swapped], strict=True):
+        assert g.source == "bench" and g.walls.tobytes() == expected.walls.tobytes()
+    for split in "test", "all":
+        assert len(sources.mixed(None, split, parts=parts)) == 7
+    small = dotdict(plain[0], masks=plain[0].masks[:, :20])
+    with pytest.raises(ValueError, match="'walls' must be above 0"):
+        mirror_image(small)
+
+
+def test_an_agent_sees_a_mirror_image_from_right_to_left():
+    homes, random = geometries.sample("bench", 16), np.random.default_rng(0)
+    cells = [random.choice(np.argwhere(g.masks > 0)) for g in homes]
+    places = [geometries.centers(ij, g.masks.shape, g.res) for ij, g in zip(cells, homes)]
+    positions, angles = np.stack(places), random.uniform(-180, 180, 16).astype(np.float32)
+    widths = np.array([g.masks.shape[1] * g.res for g in homes], np.float32)
+
+    def depth(homes, x, angles):
+        c = core.Core(scenery(homes, 1, n_envs=16), res=256)
+        poses = np.stack([x, positions[:, 1]], -1)
+        c.agents.positions[:, 0] = torch.from_numpy(poses)
+        c.agents.angles[:, 0] = torch.from_numpy(angles)
+        return modules.Depth(c)()[:, 0, 0, 0].numpy()
+
+    seen = depth(homes, positions[:, 0], angles)
+    swapped = depth([mirror_image(g) for g in homes], widths - positions[:, 0], 180 - angles)
+    assert seen.std() > 0.1
+    differs = np.abs(seen - swapped[:, ::-1]) > 1e-3
+    assert differs.mean() < 0.005, "rays at the very edge of a wall may miss it on one side"
+
+
 def test_fewer_of_a_mix_are_spread_over_its_parts_and_more_are_repeated():
     parts = {"homes": 6, "bench": 2}
     mix = geometries.sample("mixed", 8, parts=parts)
@@ -137,6 +174,7 @@ def test_fewer_of_a_mix_are_spread_over_its_parts_and_more_are_repeated():
         ({"homes": True}, "homes: True is no number of geometries"),
         ({"bench": {"weight": 0}}, "bench: weight=0 is no integer from 1 to 1,000"),
         ({"bench": {"weight": 1.5}}, "bench: weight=1.5 is no integer from 1 to 1,000"),
+        ({"bench": {"mirror": 2}}, "bench: mirror=2 is neither true nor false"),
         ({"a": {"source": "mixed"}}, "'mixed' is no source; there are bench"),
         ({"a": {"source": "homes", "outr": True}}, "a: homes has no option outr; did you mean out"),
         ({"files": 3}, "files: path is missing"),
