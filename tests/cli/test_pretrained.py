@@ -384,7 +384,7 @@ def test_agent_of_the_package(path):
 @pytest.mark.slow
 @torch.no_grad()
 def test_pointgoal_anywhere_finds_its_way_in_bench_homes():
-    """Counted by hand, in two episodes of each home; success 0.985, SPL 0.81 by its card."""
+    """Counted by hand, in two episodes of each home; success 0.989, SPL 0.81 by its card."""
     homes = geometries.sample("bench", 51, "test")
     n = 2 * len(homes)
     env = pretrained.make_env("pointgoal_anywhere", homes, n_envs=n, device="cpu")
@@ -424,13 +424,13 @@ def test_explorer_anywhere_sees_nearly_all_of_generated_homes():
 
 @pytest.mark.slow
 def test_deathmatch_anywhere_beats_the_bot(tmp_path, monkeypatch, capsys):
-    """In 128 duels in generated homes; it wins 0.964, draws counting half, by its card."""
+    """In 128 duels in generated homes; it wins 0.999, draws counting half, by its card."""
     monkeypatch.chdir(tmp_path)
     words = ["run=deathmatch_anywhere", "against=bot", "geometry=homes", "episodes=128"]
     assert evaluate.main([*words, "device=cpu", "baseline=false"]) == 0
     (table,) = Path("runs").rglob("evaluations/*.json")
     (row,) = json.loads(table.read_text())["rows"]
-    assert row["won"] > 0.9
+    assert row["won"] > 0.97
 
 
 def test_page_names_every_agent():
