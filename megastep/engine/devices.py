@@ -1,5 +1,6 @@
 """Devices by name, their free memory, and the number of CPU threads."""
 
+import functools
 import os
 from typing import Any
 
@@ -8,7 +9,7 @@ import torch
 from megastep.engine import checks
 from megastep.kernels.build.compile import EngineError
 
-__all__ = ["device", "fit", "free_memory", "set_threads", "threads"]
+__all__ = ["device", "fit", "free_memory", "n_multiprocessors", "set_threads", "threads"]
 
 #: GNU OpenMP ends the process if it cannot start as many as it is asked for.
 MAX_THREADS = max(1024, os.cpu_count() or 1)
@@ -95,3 +96,9 @@ def free_memory(device: Any) -> int:
             )
     except (OSError, StopIteration):
         return 1 << 62
+
+
+@functools.cache
+def n_multiprocessors(device: torch.device) -> int:
+    """Returns the number of multiprocessors of a GPU."""
+    return torch.cuda.get_device_properties(device).multi_processor_count

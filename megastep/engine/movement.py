@@ -9,6 +9,7 @@ import torch
 
 from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
+from megastep.engine.devices import n_multiprocessors
 from megastep.engine.launch_params import (
     error_flag_address,
     lanes_of,
@@ -17,11 +18,15 @@ from megastep.engine.launch_params import (
 )
 from megastep.engine.outputs import Physics
 from megastep.engine.scenery import Scenery
-from megastep.kernels.build.launch import ENGINE, WARP, launch
+from megastep.kernels.build.launch import BLOCK, ENGINE, launch
 
 __all__ = ["physics"]
 
-MANY_ENVS = 32_768  # enough to fill a GPU with a quarter of a warp each
+#: Threads that move an environment's agents, on a GPU: the most with which all environments move
+#: at once, or the least.
+GROUPS = (32, 16, 8)
+#: Threads that a multiprocessor runs at once: by the bounds of `physics`, 24 blocks.
+AT_ONCE = 24 * BLOCK
 
 
 def physics(
@@ -59,7 +64,7 @@ def physics(
         moves_at = checks.address("moves", moves, (n_moves, 3), torch.float32, device)
         actions_at, controls_at = _addresses(actions, lanes, n_moves, device)
     progress = torch.empty(lanes, device=device)
-    threads_per_env = 8 if n > MANY_ENVS else WARP
+    threads_per_env = _threads_per_env(n, device)
     packed = ENGINE.params.PhysicsParams(
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles", "velocity", "angvelocity"),
@@ -83,3 +88,10 @@ def _addresses(actions, lanes, n_moves, device):
     if isinstance(actions, torch.Tensor) and actions.is_floating_point():
         return 0, checks.address("actions", actions, (*lanes, n_moves), torch.float32, device)
     return checks.address("actions", actions, lanes, torch.int64, device), 0
+
+
+def _threads_per_env(n_envs, device):
+    if device.type == "cpu":
+        return GROUPS[0]
+    room = AT_ONCE * n_multiprocessors(device)
+    return next((size for size in GROUPS if size * n_envs <= room), GROUPS[-1])

@@ -4,13 +4,13 @@ N environments, A agents per environment, C cameras per agent (the axis is dropp
 R rays per camera, P = R / subsample pixels.
 """
 
-import functools
 import math
 
 import torch
 
 from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
+from megastep.engine.devices import n_multiprocessors
 from megastep.engine.launch_params import (
     error_flag_address,
     lanes_of,
@@ -27,9 +27,11 @@ __all__ = ["observe", "render", "update_agent_geometry"]
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
 
-#: Two warps share an agent where there are at most so many agents per multiprocessor of a GPU. It
-#: takes more instructions, and is meant to take less time.
+#: Agents per multiprocessor of a GPU, at most, of whom two warps share each: as many warps as can
+#: run at once. It takes more instructions, and is meant to take less time.
 MAX_SPLIT = 32
+#: The same for one warp each, in environments of one agent.
+MAX_AT_ONCE = 64
 
 # RenderParams' optional outputs, and the inputs that only these need. 0 is null: not wanted.
 _OPTIONAL = dict.fromkeys(
@@ -175,21 +177,21 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
     )
     shared = NEAREST_LINE_BYTES * WARP * -(-res // WARP)
     n = scenery.n_envs * scenery.n_agents
-    if "indices" not in fields and _is_split(n, res, subsample, device):
-        launch(ENGINE, "render_split", packed, device, BLOCK * n, shared * WARP // BLOCK)
+    kernel = "render" if "indices" in fields else _kernel(scenery, res, subsample)
+    if kernel == "render_split":
+        launch(ENGINE, kernel, packed, device, BLOCK * n, shared * WARP // BLOCK)
     else:
-        launch(ENGINE, "render", packed, device, WARP * n, shared)
+        launch(ENGINE, kernel, packed, device, WARP * n, shared)
     check_on_cpu(agents)
 
 
-def _is_split(n, res, subsample, device):
-    """Returns whether two warps share each of ``n`` agents. They share whole tiles of the screen,
-    which must hold whole pixels.
+def _kernel(scenery, res, subsample):
+    """Returns the kernel that renders observations. Two warps that share an agent share whole
+    tiles of the screen, which must hold whole pixels.
     """
-    fits = device.type == "cuda" and res > WARP and WARP % subsample == 0
-    return fits and n <= MAX_SPLIT * _n_multiprocessors(device)
-
-
-@functools.cache
-def _n_multiprocessors(device):
-    return torch.cuda.get_device_properties(device).multi_processor_count
+    if scenery.device.type == "cpu":
+        return "render"
+    per_multiprocessor = scenery.n_envs * scenery.n_agents / n_multiprocessors(scenery.device)
+    if per_multiprocessor <= MAX_SPLIT and res > WARP and WARP % subsample == 0:
+        return "render_split"
+    return "render_one" if scenery.n_agents == 1 and per_multiprocessor <= MAX_AT_ONCE else "render"

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from megastep import cuda, engine, scene, toys
-from megastep.engine import rendering
+from megastep.engine import movement, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns, visible_texels
 from megastep.ragged import Ragged
@@ -79,11 +79,15 @@ SETTINGS = [
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("max_split", [0, 32], ids=["one warp", "two warps"])
+@pytest.mark.parametrize(
+    "limits, group", [((0, 0), 8), ((0, 64), 16), ((32, 64), 32)], ids=["many", "some", "few"]
+)
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_cpu_and_gpu_agree_on_every_bit(settings, max_split, monkeypatch):
-    """With one warp per agent, and with two where the settings allow it."""
-    monkeypatch.setattr(rendering, "MAX_SPLIT", max_split)
+def test_cpu_and_gpu_agree_on_every_bit(settings, limits, group, monkeypatch):
+    """With the kernels for many, some and few agents, where the settings allow them."""
+    for name, limit in zip(("MAX_SPLIT", "MAX_AT_ONCE"), limits):
+        monkeypatch.setattr(rendering, name, limit)
+    monkeypatch.setattr(movement, "GROUPS", (group,))
     assert not any(differing(trajectory("cpu", **settings), trajectory("cuda", **settings)))
 
 
