@@ -10,7 +10,7 @@ from timing import graph_seconds_per_call, measurement, rate, seconds_per_call
 from megastep import core, engine, modules
 from megastep.envs.explorer.step import explorer_step
 
-N_AGENTS = {"cuda": (8192, 262_144), "cpu": (2048,)}
+N_AGENTS = {"cuda": (4096, 8192, 262_144), "cpu": (2048,)}
 N_ARENAS = {"cuda": 65_536, "cpu": 1024}  # homes of four agents each
 
 

@@ -13,7 +13,7 @@ N_ENVS = {
     "cuda": (1024, 2048, 4096, 8192, 16_384, 65_536, 262_144, 1_048_576),
     "cpu": (1024, 8192),
 }
-N_ENVS_AS_TRAINED = {"cuda": (1024, 4096, 16_384), "cpu": (1024,)}
+N_ENVS_IN_ROLLOUTS = {"cuda": (1024, 4096, 8192, 16_384), "cpu": (1024,)}
 N_ARENAS = {"cuda": (1024, 8192, 65_536), "cpu": (1024,)}  # homes of four agents each
 #: What a plain step leaves out because it is only read in training and evaluation, by environment.
 PLAIN = {"explorer": dict(metrics=False)}
@@ -23,19 +23,20 @@ AS_TRAINED = dict(resample=True, privileged=True, metrics=True)
 
 def step(device: torch.device) -> Iterator[dict]:
     """Frames per second of the whole `env.step` with default settings; Explorer without its
-    metrics. A step is a CUDA graph. "As trained" is Explorer with the settings of training: a new
-    home for every episode, a privileged observation for the critic, and metrics; and 16 steps are
-    one graph, as a rollout's are.
+    metrics. A step is a CUDA graph; "in a rollout", 16 steps are one. "As trained" is Explorer with
+    the settings of training: a new home for every episode, a privileged observation for the critic,
+    and metrics.
     """
     for name in ("explorer", "minimal", "pointgoal"):
         for n_envs in N_ENVS[device.type]:
             _, take_step = walk_in_homes(name, n_envs, device, **PLAIN.get(name, {}))
             seconds = seconds_per_call(take_step, device)
             yield rate(f"{name}, `env.step`, {n_envs:,} environments", n_envs, seconds)
-    for n_envs in N_ENVS_AS_TRAINED[device.type]:
-        _, take_step = walk_in_rollouts("explorer", n_envs, device, **AS_TRAINED)
-        what = f"explorer, `env.step`, {n_envs:,} environments, as trained, in a rollout"
-        yield rate(what, n_envs, graph_seconds_per_call(take_step, device))
+    for n_envs in N_ENVS_IN_ROLLOUTS[device.type]:
+        for manner, settings in (("", PLAIN["explorer"]), (", as trained", AS_TRAINED)):
+            _, take_step = walk_in_rollouts("explorer", n_envs, device, **settings)
+            what = f"explorer, `env.step`, {n_envs:,} environments{manner}, in a rollout"
+            yield rate(what, n_envs, graph_seconds_per_call(take_step, device))
 
 
 def deathmatch(device: torch.device) -> Iterator[dict]:

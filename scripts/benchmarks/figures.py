@@ -58,10 +58,11 @@ def plot_frames_per_second(records: list[dict], path: Path) -> None:
     series = {}
     for record in newest(records):
         match = re.fullmatch(
-            r"(\w+), `env.step`, ([\d,]+) environments(, as trained)?(?:, in a rollout)?",
+            r"(\w+), `env.step`, ([\d,]+) environments(, as trained)?(, in a rollout)?",
             record["what"],
         )
-        if record["benchmark"] == "step" and match:
+        # the plain environment has a point per size already, without a rollout
+        if record["benchmark"] == "step" and match and (match[3] or not match[4]):
             bounds = [record[key] or record["value"] for key in ("value", "lower", "upper")]
             n_envs, rates = int(match[2].replace(",", "")), [1e6 * bound for bound in bounds]
             series.setdefault((match[1], match[3] or "", record["on"]), {})[n_envs] = rates

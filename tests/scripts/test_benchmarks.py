@@ -32,7 +32,7 @@ def tiny_benchmarks(monkeypatch):
     """Shrinks the benchmarks to a few environments in two homes, timed for milliseconds."""
     for module, name, value in (
         (env_steps, "N_ENVS", (8,)),
-        (env_steps, "N_ENVS_AS_TRAINED", (8,)),
+        (env_steps, "N_ENVS_IN_ROLLOUTS", (8,)),
         (env_steps, "N_ARENAS", (8,)),
         (engine_operations, "N_AGENTS", (8,)),
         (engine_operations, "N_ARENAS", 8),
@@ -83,7 +83,7 @@ def test_benchmark_is_documented_generator(name):
 @pytest.mark.parametrize(
     ("name", "n_records"),
     [
-        *(("step", 4), ("kernels", 9), ("observe", 2), ("agents", 1), ("deathmatch", 2)),
+        *(("step", 5), ("kernels", 9), ("observe", 2), ("agents", 1), ("deathmatch", 2)),
         *(("memory", 1), ("replay", 9), ("pong", 2)),
     ],
 )
@@ -118,8 +118,8 @@ def test_step_benchmark_measures_explorer_as_trained(tiny_benchmarks, monkeypatc
     names = [row["what"] for row in env_steps.step(torch.device("cpu"))]
     assert names[0] == "explorer, `env.step`, 8 environments"
     assert names[-1] == "explorer, `env.step`, 8 environments, as trained, in a rollout"
-    trained = dict(resample=True, privileged=True, metrics=True)
-    assert [settings for _, settings in walks] == [dict(metrics=False), {}, {}, trained]
+    plain, trained = dict(metrics=False), dict(resample=True, privileged=True, metrics=True)
+    assert [settings for _, settings in walks] == [plain, {}, {}, plain, trained]
     decision = arrdict.arrdict(actions=torch.zeros((8, 1), dtype=torch.long))
     plain, as_trained = (env.step(decision) for env, _ in (walks[0], walks[-1]))
     assert {*as_trained} - {*plain} == {"privileged", "metrics"}
