@@ -140,3 +140,11 @@ def launch_on_cpu(tmp_path_factory):
         getattr(loaded, f"run_{operation}")(packed, ctypes.c_uint(threads))
 
     return launch
+
+
+@pytest.fixture(scope="session")
+def cuda_on_cpu(tmp_path_factory):
+    """Runs the CUDA kernels of the engine and the environments on a CPU."""
+    from tests.helpers.cuda_on_cpu import CudaOnCpu
+
+    return CudaOnCpu(tmp_path_factory.mktemp("cuda"))

@@ -100,5 +100,7 @@ def free_memory(device: Any) -> int:
 
 @functools.cache
 def n_multiprocessors(device: torch.device) -> int:
-    """Returns the number of multiprocessors of a GPU."""
+    """Returns the number of multiprocessors of a GPU, 0 for a CPU."""
+    if device.type == "cpu":
+        return 0
     return torch.cuda.get_device_properties(device).multi_processor_count

@@ -91,7 +91,5 @@ def _addresses(actions, lanes, n_moves, device):
 
 
 def _threads_per_env(n_envs, device):
-    if device.type == "cpu":
-        return GROUPS[0]
     room = AT_ONCE * n_multiprocessors(device)
     return next((size for size in GROUPS if size * n_envs <= room), GROUPS[-1])

@@ -189,9 +189,7 @@ def _kernel(scenery, res, subsample):
     """Returns the kernel that renders observations. Two warps that share an agent share whole
     tiles of the screen, which must hold whole pixels.
     """
-    if scenery.device.type == "cpu":
-        return "render"
-    per_multiprocessor = scenery.n_envs * scenery.n_agents / n_multiprocessors(scenery.device)
-    if per_multiprocessor <= MAX_SPLIT and res > WARP and WARP % subsample == 0:
+    n, room = scenery.n_envs * scenery.n_agents, n_multiprocessors(scenery.device)
+    if n <= MAX_SPLIT * room and res > WARP and WARP % subsample == 0:
         return "render_split"
-    return "render_one" if scenery.n_agents == 1 and per_multiprocessor <= MAX_AT_ONCE else "render"
+    return "render_one" if n <= MAX_AT_ONCE * room and scenery.n_agents == 1 else "render"

@@ -13,7 +13,7 @@ from megastep.ragged import Ragged
 from tests.helpers.outputs import seen_of
 
 
-def trajectory(device, n_agents, subsample=1, **settings):
+def trajectory(device, n_agents, subsample=1, n_steps=12, **settings):
     """All outputs of a few steps in generated homes."""
     homes = sample("homes", 8)
     core = cuda.Core(scene.scenery(homes, n_agents, n_envs=24, device=device), **settings)
@@ -25,7 +25,7 @@ def trajectory(device, n_agents, subsample=1, **settings):
         [(0, 0, 0), (3, 0, 0), (0, 3, 40), (9, 1, -40)], dtype=torch.float32, device=device
     )
     out = [core.scenery.layouts.baked.vals, visible]
-    for step in range(12):
+    for step in range(n_steps):
         some = torch.rand((24, n_agents), generator=random).to(device)
         spawn(some < (1 if step == 0 else 0.1))
         hide(some > 0.8)
@@ -78,17 +78,31 @@ SETTINGS = [
 ]
 
 
-@pytest.mark.cuda
-@pytest.mark.parametrize(
-    "limits, group", [((0, 0), 8), ((0, 64), 16), ((32, 64), 32)], ids=["many", "some", "few"]
-)
-@pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_cpu_and_gpu_agree_on_every_bit(settings, limits, group, monkeypatch):
-    """With the kernels for many, some and few agents, where the settings allow them."""
-    for name, limit in zip(("MAX_SPLIT", "MAX_AT_ONCE"), limits):
-        monkeypatch.setattr(rendering, name, limit)
+@pytest.fixture(params=["many", "some", "few"])
+def amount(request, monkeypatch):
+    """Chooses the kernels for many, some or few agents, where settings allow them."""
+    max_split, max_at_once, group = dict(many=(0, 0, 8), some=(0, 64, 16), few=(32, 64, 32))[
+        request.param
+    ]
+    monkeypatch.setattr(rendering, "MAX_SPLIT", max_split)
+    monkeypatch.setattr(rendering, "MAX_AT_ONCE", max_at_once)
     monkeypatch.setattr(movement, "GROUPS", (group,))
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_cpu_and_gpu_agree_on_every_bit(settings, amount):
     assert not any(differing(trajectory("cpu", **settings), trajectory("cuda", **settings)))
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu, monkeypatch):
+    """The threads of a block, and blocks, run in one order and in the opposite one."""
+    expected = trajectory("cpu", n_steps=4, **settings)
+    cuda_on_cpu.install(monkeypatch)
+    for is_reversed in False, True:
+        monkeypatch.setattr(cuda_on_cpu, "is_reversed", is_reversed)
+        assert not any(differing(expected, trajectory("cpu", n_steps=4, **settings)))
 
 
 @pytest.mark.cuda

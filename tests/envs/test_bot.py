@@ -5,7 +5,7 @@ actions.
 import pytest
 import torch
 
-from megastep import arrdict, capture, envs, toys
+from megastep import arrdict, capture, contract, envs, toys
 from megastep.agents.training.evaluation import RandomActions
 from megastep.envs.deathmatch.bot import Bot
 from megastep.geometries import sample
@@ -156,6 +156,20 @@ def test_acts_as_its_twin_does(res, fov, device):
             is_same &= leaf == after[name]
         assert is_same.float().mean() > 0.99
         world = env.step(decision)
+
+
+def test_cuda_kernel_on_a_cpu_acts_as_the_cpu_does(cuda_on_cpu, monkeypatch):
+    env = envs.Deathmatch(16, sample("homes", 8), n_agents=4, device="cpu")
+    bot, world = Bot(), env.reset()
+    states = [bot.initial(64), bot.initial(64)]
+    for _ in range(20):
+        decision, states[0] = bot(world, states[0])
+        with monkeypatch.context() as patch:
+            cuda_on_cpu.install(patch)
+            theirs, states[1] = bot(world, states[1])
+        assert contract.same(decision, theirs) and contract.same(*states)
+        world = env.step(decision)
+    assert "bot" in cuda_on_cpu.launched
 
 
 @pytest.mark.cuda

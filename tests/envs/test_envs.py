@@ -35,6 +35,7 @@ SHORT = {
         kill_reward=1,
         aim_reward=1,
         search_reward=1,
+        hearing=5,
     ),
     "pointgoal": dict(limit=15, res=1, subsample=1),
     "pointgoal, privileged": dict(limit=15, res=1, subsample=1, privileged=True),
@@ -191,6 +192,21 @@ class TestOnTheGPU:
         ]
         assert contract.same(arrdict.stack(runs[0]), arrdict.stack(runs[1]))
         assert contract.same(arrdict.stack(runs[0]), arrdict.stack(runs[2]))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name == "deathmatch, all rules" else name
+        for name in SHORT
+    ],
+)
+def test_cuda_kernels_on_a_cpu_give_equal_episodes(name, cuda_on_cpu, monkeypatch):
+    """With the threads of a block in the order opposite to that of the CPU's loops."""
+    expected = arrdict.stack(contract.rollout(make(name), 24, check=False))
+    cuda_on_cpu.install(monkeypatch)
+    monkeypatch.setattr(cuda_on_cpu, "is_reversed", True)
+    assert contract.same(expected, arrdict.stack(contract.rollout(make(name), 24, check=False)))
 
 
 # ---- Continuous actions ----

@@ -311,6 +311,22 @@ def test_gpu_computes_the_same_bits():
             np.testing.assert_array_equal(x, y, err_msg=f"geometry {g.id}: {name}")
 
 
+def test_cuda_kernels_on_a_cpu_compute_the_same_bits(cuda_on_cpu, monkeypatch):
+    homes = [*sample("homes", 2), *sample("maze", 1), toys.box(5)]
+
+    def all_of():
+        generators = [np.random.Generator(np.random.Philox([1, d])) for d in range(len(homes))]
+        return geodesics(homes, 24, 4, RADIUS, generators)
+
+    expected = all_of()
+    cuda_on_cpu.install(monkeypatch)
+    for g, a, b in zip(homes, expected, all_of(), strict=True):
+        for name, x, y in zip(a._fields, a, b):
+            np.testing.assert_array_equal(x, y, err_msg=f"geometry {g.id}: {name}")
+    names = {"clearances", "corner_distances", "corner_links", "path_lengths"}
+    assert names <= cuda_on_cpu.launched
+
+
 def test_seeds_repeat_and_differ():
     g = sample("homes", 1)[0]
     a, b, c = geodesics_of(g), geodesics_of(g), geodesics_of(g, seed=2)

@@ -1,0 +1,287 @@
+// Lets CUDA kernels compile for a CPU, and runs them there a block at a time. Every thread of a
+// block is a fiber, which runs until it needs what other threads have not done yet: a shuffle, a
+// vote, a sum, a barrier. Unlike a GPU it notices threads that never come.
+//
+// It stands in for the GPU's half of backend.h. Numbers are those of the CPU's half, so kernels
+// must agree with the CPU's on every bit.
+#pragma once
+#include <setjmp.h>
+#include <ucontext.h>
+
+#include <algorithm>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <functional>
+#include <vector>
+
+#include "common/backend.h"
+#include "common/constants.h"
+
+#define DEVICE static inline
+#define BOUNDS(n_blocks)
+#define __shared__ static
+
+using std::max;
+using std::min;
+
+struct float4 {
+    float x, y, z, w;
+};
+struct Index {
+    unsigned int x, y;
+};
+static Index blockIdx, threadIdx, blockDim, gridDim;
+alignas(16) static unsigned char dynamic_shared[1 << 18];
+constexpr unsigned int FULL_WARP = ~0u;
+
+static inline void wait_for_previous() {}
+
+// ---- Fibers ----
+
+constexpr int MAX_FIBERS = 1024;
+constexpr size_t STACK_BYTES = 1 << 16;
+
+struct Fiber {
+    std::vector<char> stack;
+    jmp_buf place;
+    bool is_started, is_done;
+};
+static Fiber fibers[MAX_FIBERS];
+static jmp_buf scheduler;
+static int current, n_fibers;
+static long long n_events;  // fibers that arrived somewhere or ended
+static char failure[200];
+static std::function<void()> kernel_call;
+
+static void yield() {
+    if (!_setjmp(fibers[current].place))
+        _longjmp(scheduler, 1);
+}
+
+// Ends the launch.
+static void fail(const char* message, int thread) {
+    if (!failure[0])
+        snprintf(failure, sizeof failure, "block %u, thread %d: %s (thread %d)", blockIdx.x,
+                 current, message, thread);
+    for (;;)
+        yield();
+}
+
+// Runs a thread of each block.
+static void fiber_main() {
+    for (;;) {
+        kernel_call();
+        fibers[current].is_done = true;
+        n_events++;
+        yield();
+    }
+}
+
+// Continues the current fiber until it yields. setcontext only starts a stack, since it asks the
+// operating system each time.
+static void resume() {
+    Fiber& fiber = fibers[current];
+    if (_setjmp(scheduler))
+        return;
+    if (fiber.is_started)
+        _longjmp(fiber.place, 1);
+    ucontext_t start;
+    fiber.is_started = true;
+    fiber.stack.resize(STACK_BYTES);
+    getcontext(&start);
+    start.uc_stack.ss_sp = fiber.stack.data();
+    start.uc_stack.ss_size = STACK_BYTES;
+    start.uc_link = nullptr;
+    makecontext(&start, fiber_main, 0);
+    setcontext(&start);
+}
+
+static void run_block(bool is_reversed) {
+    for (int i = 0; i < n_fibers; i++)
+        fibers[i].is_done = false;
+    for (bool is_alive = true; is_alive && !failure[0];) {
+        long long before = n_events;
+        is_alive = false;
+        for (int i = 0; i < n_fibers && !failure[0]; i++) {
+            current = is_reversed ? n_fibers - 1 - i : i;
+            if (fibers[current].is_done)
+                continue;
+            is_alive = true;
+            threadIdx = {(unsigned int)current, 0};
+            resume();
+        }
+        if (is_alive && n_events == before)
+            snprintf(failure, sizeof failure, "block %u: its threads wait for each other",
+                     blockIdx.x);
+    }
+    if (failure[0])
+        for (Fiber& fiber : fibers)
+            fiber.is_started = false;
+}
+
+// ---- Meetings: of the threads of a mask, or of a block ----
+
+// The operations that threads meet in. All threads of a meeting must be in the same one.
+enum Operation { SYNC, SHUFFLE, VOTE, SUM, LEAST, LARGEST, UNION };
+
+// What the threads bring to their last two meetings: a thread that reads one may find others in
+// the next.
+struct Meeting {
+    unsigned int mask;
+    int first;  // thread of the warp
+    int counts[WARP];
+    unsigned int values[2][WARP];
+    Operation operations[2][WARP];
+};
+static std::vector<Meeting> meetings;  // of the block
+
+static unsigned int* meet(unsigned int mask, unsigned int value, Operation operation) {
+    int lane = current % WARP, first = current - lane;
+    if (!(mask >> lane & 1))
+        fail("not in its own mask", current);
+    size_t k = 0;
+    while (k < meetings.size() && (meetings[k].mask != mask || meetings[k].first != first))
+        k++;
+    if (k == meetings.size())
+        meetings.push_back({mask, first, {}, {}, {}});
+    int count = meetings[k].counts[lane]++, slot = count % 2;
+    meetings[k].values[slot][lane] = value;
+    meetings[k].operations[slot][lane] = operation;
+    n_events++;
+    for (int other = 0; other < WARP; other++) {
+        if (!(mask >> other & 1))
+            continue;
+        while (meetings[k].counts[other] <= count) {
+            if (first + other >= n_fibers || fibers[first + other].is_done)
+                fail("meets a thread that has ended", first + other);
+            yield();
+        }
+    }
+    for (int other = 0; other < WARP; other++)
+        if ((mask >> other & 1) && meetings[k].operations[slot][other] != operation)
+            fail("meets a thread in another operation", first + other);
+    return meetings[k].values[slot];
+}
+
+static int block_counts[MAX_FIBERS], block_values[2][MAX_FIBERS];
+
+// Threads that have ended are not waited for.
+static int meet_block(int value) {
+    int count = block_counts[current]++, slot = count % 2, any = 0;
+    block_values[slot][current] = value;
+    n_events++;
+    for (int other = 0; other < n_fibers; other++)
+        while (!fibers[other].is_done && block_counts[other] <= count)
+            yield();
+    for (int other = 0; other < n_fibers; other++)
+        if (block_counts[other] > count)
+            any |= block_values[slot][other];
+    return any;
+}
+
+template <class T>
+static unsigned int bits_of(T x) {
+    static_assert(sizeof(T) == 4, "warps exchange 32 bits");
+    unsigned int bits;
+    memcpy(&bits, &x, 4);
+    return bits;
+}
+
+template <class T>
+static T from_bits(unsigned int bits) {
+    T x;
+    memcpy(&x, &bits, 4);
+    return x;
+}
+
+// ---- CUDA's functions ----
+
+static void __syncthreads() { meet_block(0); }
+static int __syncthreads_or(int value) { return meet_block(value); }
+static void __syncwarp(unsigned int mask = FULL_WARP) { meet(mask, 0u, SYNC); }
+
+template <class T>
+static T shuffle(unsigned int mask, T x, int from) {
+    unsigned int* values = meet(mask, bits_of(x), SHUFFLE);
+    if (!(mask >> from & 1))
+        fail("reads from outside its mask", from);
+    return from_bits<T>(values[from]);
+}
+template <class T>
+static T __shfl_sync(unsigned int mask, T x, int from) {
+    return shuffle(mask, x, from % WARP);
+}
+template <class T>
+static T __shfl_xor_sync(unsigned int mask, T x, int lanes) {
+    return shuffle(mask, x, current % WARP ^ lanes);
+}
+template <class T>
+static T __shfl_down_sync(unsigned int mask, T x, int lanes) {
+    int from = current % WARP + lanes;
+    return shuffle(mask, x, from < WARP ? from : current % WARP);
+}
+
+static unsigned int __ballot_sync(unsigned int mask, int is_set) {
+    unsigned int* values = meet(mask, is_set != 0, VOTE);
+    unsigned int votes = 0;
+    for (int lane = 0; lane < WARP; lane++)
+        if (mask >> lane & 1)
+            votes |= values[lane] << lane;
+    return votes;
+}
+static int __any_sync(unsigned int mask, int is_set) { return __ballot_sync(mask, is_set) != 0; }
+static int __all_sync(unsigned int mask, int is_set) { return __ballot_sync(mask, is_set) == mask; }
+
+template <class T, class Combine>
+static T reduce(unsigned int mask, T x, Operation operation, Combine combine) {
+    unsigned int* values = meet(mask, bits_of(x), operation);
+    int first = __builtin_ctz(mask);
+    T result = from_bits<T>(values[first]);
+    for (int lane = first + 1; lane < WARP; lane++)
+        if (mask >> lane & 1)
+            result = combine(result, from_bits<T>(values[lane]));
+    return result;
+}
+template <class T>
+static T __reduce_add_sync(unsigned int mask, T x) {
+    return reduce(mask, x, SUM, [](T a, T b) { return a + b; });
+}
+template <class T>
+static T __reduce_min_sync(unsigned int mask, T x) {
+    return reduce(mask, x, LEAST, [](T a, T b) { return min(a, b); });
+}
+template <class T>
+static T __reduce_max_sync(unsigned int mask, T x) {
+    return reduce(mask, x, LARGEST, [](T a, T b) { return max(a, b); });
+}
+static unsigned int __reduce_or_sync(unsigned int mask, unsigned int bits) {
+    return reduce(mask, bits, UNION, [](unsigned int a, unsigned int b) { return a | b; });
+}
+
+static int __ffs(unsigned int bits) { return __builtin_ffs((int)bits); }
+static int __clz(unsigned int bits) { return bits ? __builtin_clz(bits) : 32; }
+static int __popc(unsigned int bits) { return __builtin_popcount(bits); }
+static unsigned int __float_as_uint(float x) { return bits_of(x); }
+static float __uint_as_float(unsigned int bits) { return from_bits<float>(bits); }
+
+// ---- Launching ----
+
+// Returns what went wrong, or an empty text. Shared memory holds nothing sensible before a block.
+template <class Params>
+const char* launch_blocks(void (*kernel)(Params), const Params& params, unsigned int n_blocks,
+                          unsigned int n_threads, unsigned int n_shared, int is_reversed) {
+    failure[0] = 0;
+    n_fibers = (int)n_threads;
+    blockDim = {n_threads, 1};
+    gridDim = {n_blocks, 1};
+    kernel_call = [&] { kernel(params); };
+    for (unsigned int block = 0; block < n_blocks && !failure[0]; block++) {
+        blockIdx = {is_reversed ? n_blocks - 1 - block : block, 0};
+        meetings.clear();
+        memset(block_counts, 0, sizeof block_counts);
+        memset(dynamic_shared, 0xa5, n_shared);
+        run_block(is_reversed);
+    }
+    return failure;
+}
