@@ -7,9 +7,7 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")  # each worker imports torch, in seconds
 
 import copy
-import ctypes
 import functools
-import subprocess
 from pathlib import Path
 
 import loky
@@ -104,47 +102,8 @@ def drawn_in_this_process(monkeypatch):
 
 
 @pytest.fixture(scope="session")
-def launch_on_cpu(tmp_path_factory):
-    """A stand-in for `launch` that runs the recurrent cores' CUDA kernels on a CPU.
-
-    Their source is compiled for the CPU through `cuda_on_cpu.h`.
-    """
-    from megastep.agents.networks.kernels.program import CORES
-    from megastep.kernels.build import compile, headers
-
-    folder = tmp_path_factory.mktemp("kernels")
-    source, library = folder / "kernels.cpp", folder / "kernels.so"
-    cores = {
-        name: text
-        for name, text in CORES.sources(".cu").items()
-        if name in ("lstm.cu", "mingru.cu")
-    }
-    files = [
-        Path(__file__).parent / "helpers" / "cuda_on_cpu.h",
-        *map(CORES.folder.joinpath, cores),
-    ]
-    lines = [f'#include "{path}"' for path in files]
-    lines += [
-        f'extern "C" void run_{operation}(const {struct}* p, unsigned int threads) '
-        f"{{ launch({operation}, p, threads); }}"
-        for operation, struct in headers.operations(cores).items()
-    ]
-    source.write_text("\n".join(lines))
-    command = [compile.compiler()[0], "-std=c++17", "-O1", "-shared", "-fPIC"]
-    command += [f"-I{compile.KERNELS}", str(source), "-o", str(library)]
-    subprocess.run(command, check=True)
-    loaded = ctypes.CDLL(str(library))
-
-    def launch(program, operation, packed, device, threads):
-        assert program is CORES and device.type == "cpu"
-        getattr(loaded, f"run_{operation}")(packed, ctypes.c_uint(threads))
-
-    return launch
-
-
-@pytest.fixture(scope="session")
 def cuda_on_cpu(tmp_path_factory):
-    """Runs the CUDA kernels of the engine and the environments on a CPU."""
+    """Runs CUDA kernels on a CPU."""
     from tests.helpers.cuda_on_cpu import CudaOnCpu
 
     return CudaOnCpu(tmp_path_factory.mktemp("cuda"))

@@ -1,41 +1,53 @@
 // Lets CUDA kernels compile for a CPU, and runs them there a block at a time. Every thread of a
 // block is a fiber, which runs until it needs what other threads have not done yet: a shuffle, a
 // vote, a sum, a barrier. Unlike a GPU it notices threads that never come.
-//
-// It stands in for the GPU's half of backend.h. Numbers are those of the CPU's half, so kernels
-// must agree with the CPU's on every bit.
 #pragma once
 #include <setjmp.h>
 #include <ucontext.h>
 
 #include <algorithm>
+#include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
 #include <functional>
 #include <vector>
 
-#include "common/backend.h"
-#include "common/constants.h"
-
-#define DEVICE static inline
-#define BOUNDS(n_blocks)
+#define __device__
+#define __forceinline__ inline
+#define __global__
+#define __launch_bounds__(...)
 #define __shared__ static
+#define __expf expf
 
+#include "common/constants.h"
+#include "common/dependent_launch.h"
+
+using std::isfinite;
+using std::isinf;
+using std::isnan;
 using std::max;
 using std::min;
 
 struct float4 {
     float x, y, z, w;
 };
+struct uint2 {
+    unsigned int x, y;
+};
+struct uint4 {
+    unsigned int x, y, z, w;
+};
+static inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
+static inline uint4 make_uint4(unsigned int x, unsigned int y, unsigned int z, unsigned int w) {
+    return {x, y, z, w};
+}
 struct Index {
     unsigned int x, y;
 };
 static Index blockIdx, threadIdx, blockDim, gridDim;
 alignas(16) static unsigned char dynamic_shared[1 << 18];
-constexpr unsigned int FULL_WARP = ~0u;
-
-static inline void wait_for_previous() {}
+typedef unsigned long long Bits;
 
 // ---- Fibers ----
 
@@ -131,12 +143,12 @@ struct Meeting {
     unsigned int mask;
     int first;  // thread of the warp
     int counts[WARP];
-    unsigned int values[2][WARP];
+    Bits values[2][WARP];
     Operation operations[2][WARP];
 };
 static std::vector<Meeting> meetings;  // of the block
 
-static unsigned int* meet(unsigned int mask, unsigned int value, Operation operation) {
+static Bits* meet(unsigned int mask, Bits value, Operation operation) {
     int lane = current % WARP, first = current - lane;
     if (!(mask >> lane & 1))
         fail("not in its own mask", current);
@@ -181,17 +193,16 @@ static int meet_block(int value) {
 }
 
 template <class T>
-static unsigned int bits_of(T x) {
-    static_assert(sizeof(T) == 4, "warps exchange 32 bits");
-    unsigned int bits;
-    memcpy(&bits, &x, 4);
+static Bits bits_of(T x) {
+    Bits bits = 0;
+    memcpy(&bits, &x, sizeof x);
     return bits;
 }
 
 template <class T>
-static T from_bits(unsigned int bits) {
+static T from_bits(Bits bits) {
     T x;
-    memcpy(&x, &bits, 4);
+    memcpy(&x, &bits, sizeof x);
     return x;
 }
 
@@ -199,35 +210,44 @@ static T from_bits(unsigned int bits) {
 
 static void __syncthreads() { meet_block(0); }
 static int __syncthreads_or(int value) { return meet_block(value); }
-static void __syncwarp(unsigned int mask = FULL_WARP) { meet(mask, 0u, SYNC); }
+static int __syncthreads_and(int value) { return !meet_block(!value); }
+static void __syncwarp(unsigned int mask = ~0u) { meet(mask, 0u, SYNC); }
 
 template <class T>
 static T shuffle(unsigned int mask, T x, int from) {
-    unsigned int* values = meet(mask, bits_of(x), SHUFFLE);
+    Bits* values = meet(mask, bits_of(x), SHUFFLE);
     if (!(mask >> from & 1))
         fail("reads from outside its mask", from);
     return from_bits<T>(values[from]);
 }
+// `width` neighbouring threads are a group of their own. A thread whose partner would be outside
+// has its own number.
 template <class T>
-static T __shfl_sync(unsigned int mask, T x, int from) {
-    return shuffle(mask, x, from % WARP);
+static T __shfl_sync(unsigned int mask, T x, int from, int width = WARP) {
+    return shuffle(mask, x, (current % WARP & -width) + (from & (width - 1)));
 }
 template <class T>
-static T __shfl_xor_sync(unsigned int mask, T x, int lanes) {
-    return shuffle(mask, x, current % WARP ^ lanes);
+static T __shfl_xor_sync(unsigned int mask, T x, int lanes, int width = WARP) {
+    int lane = current % WARP, from = lane ^ lanes;
+    return shuffle(mask, x, from < (lane & -width) + width ? from : lane);
 }
 template <class T>
-static T __shfl_down_sync(unsigned int mask, T x, int lanes) {
-    int from = current % WARP + lanes;
-    return shuffle(mask, x, from < WARP ? from : current % WARP);
+static T __shfl_down_sync(unsigned int mask, T x, int lanes, int width = WARP) {
+    int lane = current % WARP, from = lane + lanes;
+    return shuffle(mask, x, from < (lane & -width) + width ? from : lane);
+}
+template <class T>
+static T __shfl_up_sync(unsigned int mask, T x, int lanes, int width = WARP) {
+    int lane = current % WARP, from = lane - lanes;
+    return shuffle(mask, x, from >= (lane & -width) ? from : lane);
 }
 
 static unsigned int __ballot_sync(unsigned int mask, int is_set) {
-    unsigned int* values = meet(mask, is_set != 0, VOTE);
+    Bits* values = meet(mask, is_set != 0, VOTE);
     unsigned int votes = 0;
     for (int lane = 0; lane < WARP; lane++)
         if (mask >> lane & 1)
-            votes |= values[lane] << lane;
+            votes |= (unsigned int)values[lane] << lane;
     return votes;
 }
 static int __any_sync(unsigned int mask, int is_set) { return __ballot_sync(mask, is_set) != 0; }
@@ -235,7 +255,7 @@ static int __all_sync(unsigned int mask, int is_set) { return __ballot_sync(mask
 
 template <class T, class Combine>
 static T reduce(unsigned int mask, T x, Operation operation, Combine combine) {
-    unsigned int* values = meet(mask, bits_of(x), operation);
+    Bits* values = meet(mask, bits_of(x), operation);
     int first = __builtin_ctz(mask);
     T result = from_bits<T>(values[first]);
     for (int lane = first + 1; lane < WARP; lane++)
@@ -262,22 +282,60 @@ static unsigned int __reduce_or_sync(unsigned int mask, unsigned int bits) {
 static int __ffs(unsigned int bits) { return __builtin_ffs((int)bits); }
 static int __clz(unsigned int bits) { return bits ? __builtin_clz(bits) : 32; }
 static int __popc(unsigned int bits) { return __builtin_popcount(bits); }
-static unsigned int __float_as_uint(float x) { return bits_of(x); }
+static unsigned int __float_as_uint(float x) { return (unsigned int)bits_of(x); }
 static float __uint_as_float(unsigned int bits) { return from_bits<float>(bits); }
+static float __int_as_float(int bits) { return from_bits<float>((unsigned int)bits); }
+static long long __double_as_longlong(double x) { return (long long)bits_of(x); }
+static float __fdiv_rn(float x, float y) { return x / y; }
+// As CUDA documents it: a divisor above 2^126 gives 0.
+static float __fdividef(float x, float y) { return fabsf(y) > 0x1p126f ? x * 0.f : x / y; }
+template <class T>
+static T __ldcg(const T* address) {
+    return *address;
+}
+
+// Only one fiber runs at a time.
+template <class T>
+static T atomicAdd(T* address, T x) {
+    T before = *address;
+    *address = before + x;
+    return before;
+}
+template <class T>
+static T atomicMin(T* address, T x) {
+    T before = *address;
+    *address = min(before, x);
+    return before;
+}
+template <class T>
+static T atomicMax(T* address, T x) {
+    T before = *address;
+    *address = max(before, x);
+    return before;
+}
+
+static float half_to_float(unsigned short bits) {
+    _Float16 x;
+    memcpy(&x, &bits, sizeof x);
+    return (float)x;
+}
 
 // ---- Launching ----
 
 // Returns what went wrong, or an empty text. Shared memory holds nothing sensible before a block.
 template <class Params>
-const char* launch_blocks(void (*kernel)(Params), const Params& params, unsigned int n_blocks,
-                          unsigned int n_threads, unsigned int n_shared, int is_reversed) {
+const char* launch_blocks(void (*kernel)(Params), const Params& params, unsigned int n_blocks_x,
+                          unsigned int n_blocks_y, unsigned int n_threads, unsigned int n_shared,
+                          int is_reversed) {
     failure[0] = 0;
     n_fibers = (int)n_threads;
     blockDim = {n_threads, 1};
-    gridDim = {n_blocks, 1};
+    gridDim = {n_blocks_x, n_blocks_y};
     kernel_call = [&] { kernel(params); };
-    for (unsigned int block = 0; block < n_blocks && !failure[0]; block++) {
-        blockIdx = {is_reversed ? n_blocks - 1 - block : block, 0};
+    unsigned int n_blocks = n_blocks_x * n_blocks_y;
+    for (unsigned int k = 0; k < n_blocks && !failure[0]; k++) {
+        unsigned int block = is_reversed ? n_blocks - 1 - k : k;
+        blockIdx = {block % n_blocks_x, block / n_blocks_x};
         meetings.clear();
         memset(block_counts, 0, sizeof block_counts);
         memset(dynamic_shared, 0xa5, n_shared);

@@ -12,6 +12,18 @@ from megastep.kernels.build import launch as launching
 
 HEADER = Path(__file__).with_name("blocks_on_cpu.h")
 FLAGS = ("-std=c++17", "-O1", "-ffp-contract=off", "-shared", "-fPIC", "-fno-strict-aliasing")
+#: Kernels that give the CPU's bits have the CPU's half of backend.h here.
+BACKEND = """
+#include "common/backend.h"
+#define DEVICE static inline
+#define BOUNDS(n_blocks)
+constexpr unsigned int FULL_WARP = ~0u;
+"""
+#: What a C++ compiler does not take: (expression, replacement).
+SPELLINGS = (
+    (r"extern __shared__ (\w+) (\w+)\[\];", r"\1* \2 = (\1*)dynamic_shared;"),
+    (r'asm\("cvt\.f32\.f16 %0, %1;" : "=f"\((\w+)\) : "h"\((.*)\)\);', r"\1 = half_to_float(\2);"),
+)
 
 
 class CudaOnCpu:
@@ -30,52 +42,57 @@ class CudaOnCpu:
         self._libraries = {}
 
     def __call__(self, program, operation, packed, device, threads, shared=0):
-        assert device.type == "cpu"
-        block = launching.BLOCK
-        n_blocks, n_shared = -(-threads // block), shared * block // launching.WARP
-        message = self._function(program, operation)(
-            packed, n_blocks, block, n_shared, self.is_reversed
+        """Stands in for `launch`."""
+        n_blocks, n_shared = -(-threads // launching.BLOCK), shared * 2
+        assert launching.BLOCK == 2 * launching.WARP
+        self.launch_blocks(
+            program, operation, packed, device, (n_blocks, 1), launching.BLOCK, n_shared
         )
+
+    def launch_blocks(self, program, operation, packed, device, n_blocks, n_threads, shared=0):
+        """Stands in for the function of this name."""
+        assert device.type == "cpu"
+        if program not in self._libraries:
+            self._libraries[program] = self._build(program)
+        function = getattr(self._libraries[program], f"run_{operation}")
+        function.restype = ctypes.c_char_p
+        numbers = map(ctypes.c_uint, (*n_blocks, n_threads, shared, self.is_reversed))
+        message = function(ctypes.c_char_p(packed), *numbers)
         assert not message, f"{operation}: {message.decode()}"
         self.launched.add(operation)
 
-    def _function(self, program, operation):
-        if program not in self._libraries:
-            self._libraries[program] = self._build(program)
-        function = self._libraries[program][f"run_{operation}"]
-        function.argtypes = [ctypes.c_char_p, *[ctypes.c_uint] * 3, ctypes.c_int]
-        function.restype = ctypes.c_char_p
-        return function
-
     def _build(self, program):
-        files = program.sources(".cu")
-        lines = [f'#include "{HEADER}"', f'#include "{program.folder}/params.h"']
-        for name, text in files.items():
-            text = re.sub(
-                r"extern __shared__ (\w+) (\w+)\[\];", r"\1* \2 = (\1*)dynamic_shared;", text
-            )
-            lines += [f'#line 1 "{name}"', text]
+        folder = self.folder / str(len(self._libraries))
+        folder.mkdir()
+        for name, text in program.sources(".h", ".cu").items():
+            for expression, replacement in SPELLINGS:
+                text = re.sub(expression, replacement, text)
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(text)
+        kernels = program.sources(".cu")
+        lines = [f'#include "{HEADER}"']
+        lines += [BACKEND] * ("--fmad=false" in program.cuda_flags)
+        lines += [f'#include "{name}"' for name in ("params.h", *kernels)]
         lines += [
-            f'extern "C" const char* run_{operation}(const {struct}* p, unsigned int n_blocks, '
-            f"unsigned int n_threads, unsigned int n_shared, int is_reversed) "
-            f"{{ return launch_blocks({operation}, *p, n_blocks, n_threads, n_shared, "
-            f"is_reversed); }}"
-            for operation, struct in headers.operations(files).items()
+            f'extern "C" const char* run_{operation}(const {struct}* p, unsigned int x, '
+            f"unsigned int y, unsigned int n_threads, unsigned int n_shared, int is_reversed) "
+            f"{{ return launch_blocks({operation}, *p, x, y, n_threads, n_shared, is_reversed); }}"
+            for operation, struct in headers.operations(kernels).items()
         ]
-        source = self.folder / f"{len(self._libraries)}.cpp"
+        source, library = folder / "all.cpp", folder / "all.so"
         source.write_text("\n".join(lines))
-        library = source.with_suffix(".so")
-        command = [compile.compiler()[0], *FLAGS, f"-I{compile.KERNELS}", f"-I{program.folder}"]
+        command = [compile.compiler()[0], *FLAGS, f"-I{folder}", f"-I{compile.KERNELS}"]
         subprocess.run([*command, str(source), "-o", str(library)], check=True)
         return ctypes.CDLL(str(library))
 
     def install(self, monkeypatch):
-        """Replaces `launch` in all modules that import it. The CPU counts as a GPU of 132
-        multiprocessors, where their number chooses a kernel.
+        """Replaces `launch` and `launch_blocks` in all modules that import them. The CPU counts as
+        a GPU of 132 multiprocessors, where their number chooses a kernel.
         """
         for module in movement, rendering:
             monkeypatch.setattr(module, "n_multiprocessors", lambda device: 132)
-        original = launching.launch
-        for name, module in list(sys.modules.items()):
-            if name.startswith("megastep.") and vars(module).get("launch") is original:
-                monkeypatch.setattr(module, "launch", self)
+        for name, stand_in in ("launch", self), ("launch_blocks", self.launch_blocks):
+            original = getattr(launching, name)
+            for path, module in list(sys.modules.items()):
+                if path.startswith("megastep.") and vars(module).get(name) is original:
+                    monkeypatch.setattr(module, name, stand_in)

@@ -1,6 +1,6 @@
 """The minGRU against its equations step by step, and its kernels against the CPU implementation.
 
-Kernels run on a GPU, and compiled for the CPU from the same source (`cuda_on_cpu.h`).
+Kernels run on a GPU, and on a CPU from the same source (`tests/helpers/cuda_on_cpu.py`).
 """
 
 import pytest
@@ -183,7 +183,7 @@ def where(request, monkeypatch):
     """Device of the kernels: a GPU, or the CPU with kernels compiled for it."""
     if request.param == "cuda":
         return "cuda"
-    monkeypatch.setattr(program, "launch", request.getfixturevalue("launch_on_cpu"))
+    monkeypatch.setattr(program, "launch", request.getfixturevalue("cuda_on_cpu"))
     monkeypatch.setattr(mingru_module, "_recurrence", lambda gates: kernels)
     return "cpu"
 
