@@ -171,7 +171,7 @@ def where(request, monkeypatch):
     """Device of the kernels: a GPU, or the CPU with kernels compiled for it."""
     if request.param == "cuda":
         return "cuda"
-    monkeypatch.setattr(program, "launch", request.getfixturevalue("cuda_on_cpu"))
+    request.getfixturevalue("cuda_on_cpu").install(monkeypatch)
     monkeypatch.setattr(lstm_module, "_steps", lambda x: kernels)
     return "cpu"
 

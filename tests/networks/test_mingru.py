@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from megastep.agents.networks import mingru as mingru_module
 from megastep.agents.networks.kernels import mingru as kernels
-from megastep.agents.networks.kernels import mingru_step, program
+from megastep.agents.networks.kernels import mingru_step
 from megastep.agents.networks.mingru import MinGRU
 from megastep.arrdict import arrdict
 from megastep.kernels.build.compile import EngineError
@@ -183,7 +183,7 @@ def where(request, monkeypatch):
     """Device of the kernels: a GPU, or the CPU with kernels compiled for it."""
     if request.param == "cuda":
         return "cuda"
-    monkeypatch.setattr(program, "launch", request.getfixturevalue("cuda_on_cpu"))
+    request.getfixturevalue("cuda_on_cpu").install(monkeypatch)
     monkeypatch.setattr(mingru_module, "_recurrence", lambda gates: kernels)
     return "cpu"
 
@@ -209,7 +209,11 @@ SLACK = {torch.float32: 1e-5, torch.bfloat16: 1e-2}
 @pytest.mark.parametrize("is_residual", [False, True])
 @pytest.mark.parametrize(
     "n_steps, n_lanes, width",
-    [(9, 5, 16), (9, 5, 7), (1, 3, 16), (2, 3, 5), (4, 3, 8), (9, 1, 1), (3, 40, 256)],
+    [
+        *((9, 5, 16), (9, 5, 7), (1, 3, 16), (2, 3, 5), (4, 3, 8), (9, 1, 1), (3, 40, 256)),
+        # blocks of several lanes, the last one not full; lanes of several blocks
+        *((3, 601, 16), (3, 257, 7), (2, 3, 1028)),
+    ],
 )
 def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width, is_residual):
     torch.manual_seed(0)

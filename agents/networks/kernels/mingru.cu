@@ -122,70 +122,106 @@ struct MingruGradients {
     float state[N], update_sum[N], candidate_sum[N];
 };
 
-struct MingruBackward {
-    static constexpr int N_GATES = 2;
-
-    template <class T, int N>
-    DEVICE void run(const MingruBackwardParams& p, const Place& place) {
-        MingruBackwardInput<T, N> inputs[STEPS_AHEAD];
-#pragma unroll
-        for (int i = 0; i < STEPS_AHEAD; i++)
-            load(inputs[i], p, place, max(p.n_steps - 1 - i, 0));
-        float start[N];
-        MingruGradients<N> d;
-        read<float>(start, p.start, place.unit);
+template <class T, int N>
+DEVICE void backward_step(const MingruBackwardParams& p, const Place& place, int t,
+                          const MingruBackwardInput<T, N>& input, float (&before)[N],
+                          MingruGradients<N>& d) {
+    float update[N], candidate[N], d_output[N], d_update[N], d_candidate[N];
+    unpack(update, input.gates.update);
+    unpack(candidate, input.gates.candidate);
+    unpack(d_output, input.d_output);
+    if (input.gates.reset)
+        clear(before);
+    for (int n = 0; n < N; n++) {
+        float z = sigmoid(update[n]), d_state = d.state[n] + d_output[n];
+        d_candidate[n] = d_state * z;
+        d_update[n] = d_candidate[n] * (1.f - z) * (candidate[n] - before[n]);
+        d.state[n] = d_state * (1.f - z);
+        d.update_sum[n] += d_update[n];
+        d.candidate_sum[n] += d_candidate[n];
+    }
+    if (input.gates.reset)
         clear(d.state);
-        if (p.d_last)
-            read<float>(d.state, p.d_last, place.unit);
-        clear(d.update_sum);
-        clear(d.candidate_sum);
-        for (int last = p.n_steps - 1; last >= 0; last -= STEPS_AHEAD) {
+    if (p.d_residual)
+        write<T>(p.d_residual, unit_at(p, place, t), d_output);
+    long long gate = gate_at(p, place, t);
+    write<T>(p.d_gates, gate, d_update);
+    write<T>(p.d_gates, gate + p.width, d_candidate);
+}
+
+// All steps of a thread's units. Adds its gates' gradients to the sums of `d`.
+template <class T, int N>
+DEVICE void backward_steps(const MingruBackwardParams& p, const Place& place,
+                           MingruGradients<N>& d) {
+    MingruBackwardInput<T, N> inputs[STEPS_AHEAD];
 #pragma unroll
-            for (int i = 0; i < STEPS_AHEAD; i++) {
-                int t = last - i;
-                if (t < 0)
-                    break;
-                float before[N];
-                unpack(before, inputs[i].before);
-                for (int n = 0; n < N; n++)
-                    before[n] = t ? before[n] : start[n];
-                step(p, place, t, inputs[i], before, d);
-                load(inputs[i], p, place, max(t - STEPS_AHEAD, 0));
-            }
+    for (int i = 0; i < STEPS_AHEAD; i++)
+        load(inputs[i], p, place, max(p.n_steps - 1 - i, 0));
+    float start[N];
+    read<float>(start, p.start, place.unit);
+    if (p.d_last)
+        read<float>(d.state, p.d_last, place.unit);
+    for (int last = p.n_steps - 1; last >= 0; last -= STEPS_AHEAD) {
+#pragma unroll
+        for (int i = 0; i < STEPS_AHEAD; i++) {
+            int t = last - i;
+            if (t < 0)
+                break;
+            float before[N];
+            unpack(before, inputs[i].before);
+            for (int n = 0; n < N; n++)
+                before[n] = t ? before[n] : start[n];
+            backward_step(p, place, t, inputs[i], before, d);
+            load(inputs[i], p, place, max(t - STEPS_AHEAD, 0));
         }
+    }
+    if (p.d_start)
+        write<float>(p.d_start, place.unit, d.state);
+}
+
+// Adds up a gate's sums over the lanes of the block, in order, and writes its row of d_biases.
+template <int N>
+DEVICE void add_lanes(const float (&sums)[N], int width, float* target) {
+    extern __shared__ float of_lanes[];
+    __syncthreads();  // an earlier call may still be reading
+    for (int n = 0; n < N; n++)
+        of_lanes[threadIdx.x * N + n] = sums[n];
+    __syncthreads();
+    for (int unit = threadIdx.x; unit < width; unit += blockDim.x) {
+        float total = 0.f;
+        for (int i = unit; i < N * (int)blockDim.x; i += width)
+            total += of_lanes[i];
+        target[unit] = total;
+    }
+}
+
+template <class T, int N>
+DEVICE void backward(const MingruBackwardParams& p) {
+    Place place;
+    bool exists = find_place<2>(p, place);
+    MingruGradients<N> d;
+    clear(d.state);
+    clear(d.update_sum);
+    clear(d.candidate_sum);
+    if (exists)
+        backward_steps<T>(p, place, d);
+    if (p.adds_lanes) {
+        float* row = p.d_biases + 2ll * p.width * blockIdx.x;
+        add_lanes(d.update_sum, p.width, row);
+        add_lanes(d.candidate_sum, p.width, row + p.width);
+    } else if (exists) {
         write<float>(p.d_biases, place.gate, d.update_sum);
         write<float>(p.d_biases, place.gate + p.width, d.candidate_sum);
-        if (p.d_start)
-            write<float>(p.d_start, place.unit, d.state);
     }
+}
 
-    template <class T, int N>
-    DEVICE void step(const MingruBackwardParams& p, const Place& place, int t,
-                     const MingruBackwardInput<T, N>& input, float (&before)[N],
-                     MingruGradients<N>& d) {
-        float update[N], candidate[N], d_output[N], d_update[N], d_candidate[N];
-        unpack(update, input.gates.update);
-        unpack(candidate, input.gates.candidate);
-        unpack(d_output, input.d_output);
-        if (input.gates.reset)
-            clear(before);
-        for (int n = 0; n < N; n++) {
-            float z = sigmoid(update[n]), d_state = d.state[n] + d_output[n];
-            d_candidate[n] = d_state * z;
-            d_update[n] = d_candidate[n] * (1.f - z) * (candidate[n] - before[n]);
-            d.state[n] = d_state * (1.f - z);
-            d.update_sum[n] += d_update[n];
-            d.candidate_sum[n] += d_candidate[n];
-        }
-        if (input.gates.reset)
-            clear(d.state);
-        if (p.d_residual)
-            write<T>(p.d_residual, unit_at(p, place, t), d_output);
-        long long gate = gate_at(p, place, t);
-        write<T>(p.d_gates, gate, d_update);
-        write<T>(p.d_gates, gate + p.width, d_candidate);
-    }
-};
+template <class T>
+DEVICE void backward(const MingruBackwardParams& p) {
+    if (p.n_units == 4)
+        backward<T, 4>(p);
+    else
+        backward<T, 1>(p);
+}
 
 KERNEL BOUNDS(64) mingru_step_float32(MingruForwardParams p) {
     wait_for_previous();
@@ -203,11 +239,11 @@ KERNEL BOUNDS(64) mingru_forward_bfloat16(MingruForwardParams p) {
     wait_for_previous();
     run<MingruForward<false>, Bfloat16>(p);
 }
-KERNEL BOUNDS(64) mingru_backward_float32(MingruBackwardParams p) {
+KERNEL BOUNDS(256) mingru_backward_float32(MingruBackwardParams p) {
     wait_for_previous();
-    run<MingruBackward, float>(p);
+    backward<float>(p);
 }
-KERNEL BOUNDS(64) mingru_backward_bfloat16(MingruBackwardParams p) {
+KERNEL BOUNDS(256) mingru_backward_bfloat16(MingruBackwardParams p) {
     wait_for_previous();
-    run<MingruBackward, Bfloat16>(p);
+    backward<Bfloat16>(p);
 }

@@ -6,7 +6,12 @@ their gradients are in the compute dtype, `start` and `last` (B, W) are float32,
 bool.
 """
 
-from megastep.agents.networks.kernels.program import run
+from megastep.agents.networks.kernels.layers import sum_rows
+from megastep.agents.networks.kernels.program import run, units_per_thread
+from megastep.kernels.build.launch import BLOCK
+
+_LARGEST_BLOCK = 256  # threads, of `backward`
+_MANY_BLOCKS = 128  # of which a GPU's multiprocessors have one each
 
 
 def forward(gates, reset, start, residual, states, outputs, last):
@@ -42,11 +47,19 @@ def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d
     Returns:
         the gates' gradient summed over steps and lanes, (2 W,) float32.
     """
-    d_biases = start.new_empty(len(start), gates.shape[-1])
+    n_lanes, width = start.shape
+    n_units = units_per_thread(width)
+    per_lane = width // n_units  # threads
+    per_block = max(1, min(_LARGEST_BLOCK // per_lane, n_lanes // _MANY_BLOCKS))  # lanes
+    adds_lanes = per_lane <= _LARGEST_BLOCK
+    block = per_block * per_lane if adds_lanes else BLOCK
+    d_biases = start.new_empty(-(-n_lanes // per_block), gates.shape[-1])
     run(
         "mingru_backward",
         gates.dtype,
         start,
+        block=block,
+        shared=4 * n_units * block,
         gates=gates,
         reset=reset,
         start=start,
@@ -58,5 +71,6 @@ def backward(gates, reset, start, states, d_outputs, d_last, d_gates, d_start, d
         d_residual=d_residual,
         d_biases=d_biases,
         n_steps=len(gates),
+        adds_lanes=int(adds_lanes),
     )
-    return d_biases.sum(0)
+    return sum_rows(d_biases)

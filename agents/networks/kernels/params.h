@@ -95,11 +95,13 @@ struct MingruBackwardParams {
     void* d_gates;               // (T, B, 2 W) compute
     float* d_start;              // (B, W); null: not wanted
     void* d_residual;            // (T, B, W) compute, a copy of d_outputs; null: not wanted
-    float* d_biases;             // (B, 2 W), sums of d_gates over steps
+    float* d_biases;  // sums of d_gates over steps and lanes: (blocks, 2 W); else (B, 2 W), of a
+                      // lane each
     int n_steps;
     int n_lanes;
     int width;
-    int n_units;  // units per thread
+    int n_units;     // units per thread
+    int adds_lanes;  // blocks hold whole lanes, and add them up
 };
 
 // ---- Layers ----

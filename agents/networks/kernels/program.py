@@ -9,7 +9,7 @@ from megastep.arrdict import arrdict
 from megastep.engine.devices import threads
 from megastep.kernels.build import program
 from megastep.kernels.build.compile import EngineError, cpu
-from megastep.kernels.build.launch import addresses, launch
+from megastep.kernels.build.launch import BLOCK, addresses, launch, launch_blocks
 from megastep.kernels.build.program import Program
 
 DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
@@ -20,13 +20,27 @@ CPU = torch.device("cpu")
 CORES = Program(Path(__file__).parent, CUDA_FLAGS, CPU_FLAGS)
 
 
-def run(operation: str, dtype: torch.dtype, state: torch.Tensor, **fields) -> None:
+def units_per_thread(width: int) -> int:
+    """Returns how many neighbouring units a thread of a recurrent core's kernel has."""
+    return 1 if width % 4 else 4
+
+
+def run(
+    operation: str,
+    dtype: torch.dtype,
+    state: torch.Tensor,
+    block: int = BLOCK,
+    shared: int = 0,
+    **fields,
+) -> None:
     """Launches an operation for all lanes and units of a state.
 
     Args:
         operation: its name without the dtype, such as `lstm_start`.
         dtype: in which it computes.
         state: (B, W).
+        block: threads of a block.
+        shared: dynamic shared memory in bytes per block.
         fields: the other fields of its struct. A tensor stands for its address, None for null.
 
     Raises:
@@ -38,12 +52,13 @@ def run(operation: str, dtype: torch.dtype, state: torch.Tensor, **fields) -> No
             f"one of them for autocast."
         )
     n_lanes, width = state.shape
-    n_units = 1 if width % 4 else 4
+    n_units = units_per_thread(width)
     kernel = f"{operation}_{DTYPES[dtype]}"
     pack = getattr(CORES.params, CORES.cuda_operations[kernel])
     values = addresses(fields)
     packed = pack(**values, n_lanes=n_lanes, width=width, n_units=n_units)
-    launch(CORES, kernel, packed, state.device, n_lanes * width // n_units)
+    n_blocks = -(-n_lanes * width // n_units // block)
+    launch_blocks(CORES, kernel, packed, state.device, (n_blocks, 1), block, shared)
 
 
 @functools.cache
