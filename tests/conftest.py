@@ -107,3 +107,13 @@ def cuda_on_cpu(tmp_path_factory):
     from tests.helpers.cuda_on_cpu import CudaOnCpu
 
     return CudaOnCpu(tmp_path_factory.mktemp("cuda"))
+
+
+@pytest.fixture(params=["cuda_on_cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def to_gpu(request, monkeypatch):
+    """Moves a tensor to a GPU, or to a CPU on which it counts as on a GPU and CUDA kernels run."""
+    if request.param == "cuda":
+        return torch.Tensor.cuda
+    cuda_on_cpu = request.getfixturevalue("cuda_on_cpu")
+    cuda_on_cpu.install(monkeypatch)
+    return cuda_on_cpu.tensor

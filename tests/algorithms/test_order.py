@@ -19,9 +19,8 @@ def test_each_index_comes_once(device, n):
     assert torch.equal(drawn[0].sort().values.cpu(), torch.arange(n))
 
 
-@pytest.mark.cuda
 @pytest.mark.parametrize("n", [1, 31, 32, 100, 4096, 5000])
-def test_a_gpu_orders_as_a_cpu_does(n):
+def test_a_gpu_orders_as_a_cpu_does(n, to_gpu):
     """Equal keys, too."""
     keys = torch.randint(max(1, n // 2), (n,), generator=torch.Generator().manual_seed(n)) / n
-    assert torch.equal(order._order_on_gpu(keys.cuda()).cpu(), order.order(keys))
+    assert torch.equal(order._order_on_gpu(to_gpu(keys)).cpu(), order.order(keys))

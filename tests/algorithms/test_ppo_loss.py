@@ -10,11 +10,11 @@ from megastep.arrdict import arrdict
 T, M = 7, 133
 
 
-def case(device, value_clip, auxiliary):
+def case(to, value_clip, auxiliary):
     generator = torch.Generator().manual_seed(0)
 
     def draw(spread=1.0):
-        return (spread * torch.randn(T, M, generator=generator)).to(device)
+        return to(spread * torch.randn(T, M, generator=generator))
 
     batch = arrdict(
         logprobs=draw(0.3) - 1,
@@ -28,16 +28,15 @@ def case(device, value_clip, auxiliary):
     leaves[0][~batch.valid] = torch.nan  # whatever is invalid does not count
     leaves = [None if leaf is None else leaf.requires_grad_() for leaf in leaves]
     settings = Coefficients(0.2, value_clip, 0.5, 0.01, 0.7)
-    return leaves, batch, torch.tensor(2.5, device=device), settings
+    return leaves, batch, to(torch.tensor(2.5)), settings
 
 
-@pytest.mark.cuda
 @pytest.mark.parametrize("value_clip", [None, 0.3])
 @pytest.mark.parametrize("auxiliary", [False, True])
-def test_fused_loss_matches_plain(value_clip, auxiliary):
+def test_fused_loss_matches_plain(value_clip, auxiliary, to_gpu):
     results = []
-    for device, function in (("cuda", ppo_loss), ("cpu", plain_loss)):
-        leaves, batch, scale, settings = case(device, value_clip, auxiliary)
+    for to, function in ((to_gpu, ppo_loss), (torch.Tensor.cpu, plain_loss)):
+        leaves, batch, scale, settings = case(to, value_clip, auxiliary)
         loss, metrics = function(*leaves, batch, scale, settings)
         inputs = [leaf for leaf in leaves if leaf is not None]
         gradients = torch.autograd.grad(3 * loss, inputs)
@@ -48,9 +47,8 @@ def test_fused_loss_matches_plain(value_clip, auxiliary):
         torch.testing.assert_close(fused.detach().cpu(), plain.detach(), **close)
 
 
-@pytest.mark.cuda
-def test_without_valid_steps_nothing_is_learned():
-    leaves, batch, scale, settings = case("cuda", None, True)
+def test_without_valid_steps_nothing_is_learned(to_gpu):
+    leaves, batch, scale, settings = case(to_gpu, None, True)
     batch["valid"] = torch.zeros_like(batch.valid)
     batch["n_valid"] = batch.valid.sum()
     loss, metrics = ppo_loss(*leaves, batch, scale, settings)
@@ -58,15 +56,14 @@ def test_without_valid_steps_nothing_is_learned():
     assert not any(gradient.any() for gradient in torch.autograd.grad(loss, leaves))
 
 
-@pytest.mark.cuda
 @pytest.mark.parametrize("n_steps, n_lanes", [(1, 1), (32, 1000), (5, 64)])
-def test_gae_on_a_gpu_matches_the_cpu(n_steps, n_lanes):
+def test_gae_on_a_gpu_matches_the_cpu(n_steps, n_lanes, to_gpu):
     torch.manual_seed(0)
     value, reward = torch.randn(2, n_steps, n_lanes)
     flags = [torch.rand(n_steps, n_lanes) < 0.2 for _ in range(4)]  # the last: learns
     inputs = [reward, value, torch.randn(n_lanes), *flags]
     plain = returns.gae(*inputs, gamma=0.9, lambda_=0.8)
-    fused = returns.gae(*(leaf.cuda() for leaf in inputs), gamma=0.9, lambda_=0.8)
+    fused = returns.gae(*map(to_gpu, inputs), gamma=0.9, lambda_=0.8)
     for name, leaf in plain.items():
         torch.testing.assert_close(fused[name].cpu(), leaf, rtol=1e-5, atol=1e-5)
 
@@ -76,15 +73,14 @@ def transposed(leaf):
     return leaf.T.contiguous().T if leaf.dim() else leaf
 
 
-@pytest.mark.cuda
 @pytest.mark.parametrize("change", [transposed, torch.Tensor.double])
-def test_gae_on_a_gpu_takes_other_layouts_and_float64(change):
+def test_gae_on_a_gpu_takes_other_layouts_and_float64(change, to_gpu):
     torch.manual_seed(0)
     value, reward = torch.randn(2, 7, 5)
     last_value, flags = torch.randn(5), [torch.rand(7, 5) < 0.2 for _ in range(3)]
     plain = returns.gae(reward, value, last_value, *flags, gamma=0.9, lambda_=0.8)
-    inputs = [change(reward.cuda()), change(value.cuda()), last_value.cuda(), *flags]
-    inputs[3:] = [transposed(flag.cuda()) for flag in flags]
+    inputs = [change(to_gpu(reward)), change(to_gpu(value)), to_gpu(last_value)]
+    inputs += [transposed(to_gpu(flag)) for flag in flags]
     other = returns.gae(*inputs, gamma=0.9, lambda_=0.8)
     for name, leaf in plain.items():
         torch.testing.assert_close(
@@ -92,9 +88,8 @@ def test_gae_on_a_gpu_takes_other_layouts_and_float64(change):
         )
 
 
-@pytest.mark.cuda
-def test_fused_loss_takes_other_layouts():
-    leaves, batch, scale, settings = case("cuda", 0.3, True)
+def test_fused_loss_takes_other_layouts(to_gpu):
+    leaves, batch, scale, settings = case(to_gpu, 0.3, True)
     results = []
     for change in (torch.Tensor.contiguous, transposed):
         inputs = [change(leaf.detach()).requires_grad_() for leaf in leaves]

@@ -268,9 +268,8 @@ def test_inverse_rescale_in_float32():
     torch.testing.assert_close(returns.inverse_rescale(y), x, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.cuda
 @pytest.mark.parametrize("n_steps, n_lanes", [(1, 1), (32, 1000)])
-def test_vtrace_on_a_gpu_matches_the_cpu(n_steps, n_lanes):
+def test_vtrace_on_a_gpu_matches_the_cpu(n_steps, n_lanes, to_gpu):
     generator = torch.Generator().manual_seed(0)
     log_ratio, reward, value = torch.randn(3, n_steps, n_lanes, generator=generator)
     reset, terminal, truncated = torch.rand(3, n_steps, n_lanes, generator=generator) < 0.1
@@ -278,6 +277,6 @@ def test_vtrace_on_a_gpu_matches_the_cpu(n_steps, n_lanes):
     inputs = log_ratio, reward, value, last_value, reset, terminal, truncated & ~terminal
     settings = dict(gamma=0.95, lambda_=0.9, rho_clip=1.2, c_clip=0.9)
     plain = returns.vtrace(*inputs, **settings)
-    fused = returns.vtrace(*(leaf.cuda() for leaf in inputs), **settings)
+    fused = returns.vtrace(*map(to_gpu, inputs), **settings)
     for name, leaf in plain.items():
         torch.testing.assert_close(fused[name].cpu(), leaf, rtol=1e-5, atol=1e-5)

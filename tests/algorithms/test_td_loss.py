@@ -8,11 +8,10 @@ from megastep.agents.algorithms.td_loss import Settings, plain_loss, td_loss
 from megastep.agents.networks import heads
 from megastep.arrdict import arrdict
 
-pytestmark = pytest.mark.cuda
 SETTINGS = Settings(gamma=0.97, return_steps=10, eta=0.7)
 
 
-def case(n_steps, n_sequences, n_agents, n_choices, device):
+def case(n_steps, n_sequences, n_agents, n_choices, to):
     """Returns action values of both networks, a minibatch and the output."""
     generator = torch.Generator().manual_seed(0)
     shape = n_steps, n_sequences
@@ -37,17 +36,17 @@ def case(n_steps, n_sequences, n_agents, n_choices, device):
         age=torch.randint(9, (n_sequences,), generator=generator),
     )
     output = heads.output(spaces.MultiDiscrete(n_agents, n_choices), 8, "duelling")
-    parts = q.to(device).requires_grad_(), target_q.to(device), batch.map(lambda x: x.to(device))
+    parts = to(q).requires_grad_(), to(target_q), batch.map(to)
     return *parts, output
 
 
 @pytest.mark.parametrize(
     "sizes", [(1, 1, 1, 2), (32, 1000, 1, 7), (40, 9, 2, 3), (70, 17, 1, 8)], ids=str
 )
-def test_fused_loss_matches_plain(sizes):
+def test_fused_loss_matches_plain(sizes, to_gpu):
     results = []
-    for device, function in (("cuda", td_loss), ("cpu", plain_loss)):
-        q, *rest = case(*sizes, device)
+    for to, function in ((to_gpu, td_loss), (torch.Tensor.cpu, plain_loss)):
+        q, *rest = case(*sizes, to)
         loss, metrics, priorities, n_valid = function(q, *rest, SETTINGS)
         (gradient,) = torch.autograd.grad(3 * loss, q)
         rest = dict(loss=loss, priorities=priorities, n_valid=n_valid, gradient=gradient)
@@ -59,15 +58,15 @@ def test_fused_loss_matches_plain(sizes):
         torch.testing.assert_close(fused.detach().cpu(), results[1][name].detach(), **close)
 
 
-def test_same_bits_each_time():
-    q, *rest = case(32, 100, 1, 7, "cuda")
+def test_same_bits_each_time(to_gpu):
+    q, *rest = case(32, 100, 1, 7, to_gpu)
     runs = [td_loss(q, *rest, SETTINGS) for _ in range(2)]
     gradients = [torch.autograd.grad(run.loss, q)[0] for run in runs]
     assert torch.equal(*gradients) and torch.equal(runs[0].priorities, runs[1].priorities)
 
 
-def test_nan_reaches_loss_and_its_own_priority_only():
-    q, *rest = case(12, 20, 1, 3, "cuda")
+def test_nan_reaches_loss_and_its_own_priority_only(to_gpu):
+    q, *rest = case(12, 20, 1, 3, to_gpu)
     rest[1]["reward"][4, 7] = torch.nan
     rest[1]["starts"][5, 7], rest[1]["learns"][4, 7] = False, True
     result = td_loss(q, *rest, SETTINGS)
@@ -75,8 +74,8 @@ def test_nan_reaches_loss_and_its_own_priority_only():
     assert result.loss.isnan() and is_nan[7] and is_nan.sum() == 1
 
 
-def test_without_valid_steps_nothing_is_learned():
-    q, *rest = case(5, 6, 1, 3, "cuda")
+def test_without_valid_steps_nothing_is_learned(to_gpu):
+    q, *rest = case(5, 6, 1, 3, to_gpu)
     rest[1]["learns"][:] = False
     result = td_loss(q, *rest, SETTINGS)
     assert not result.loss and not result.n_valid and not result.priorities.any()

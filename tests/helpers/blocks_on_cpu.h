@@ -32,6 +32,9 @@ using std::min;
 struct float4 {
     float x, y, z, w;
 };
+struct double2 {
+    double x, y;
+};
 struct uint2 {
     unsigned int x, y;
 };

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import torch
+
 from megastep.engine import movement, rendering
 from megastep.kernels.build import compile, headers
 from megastep.kernels.build import launch as launching
@@ -26,6 +28,12 @@ SPELLINGS = (
 )
 
 
+class TensorOnCpu(torch.Tensor):
+    """A tensor on the CPU that counts as on a GPU."""
+
+    is_cuda = True
+
+
 class CudaOnCpu:
     """A stand-in for `launch` that runs `.cu` files where tensors are on the CPU.
 
@@ -40,6 +48,11 @@ class CudaOnCpu:
     def __init__(self, folder: Path):
         self.folder, self.is_reversed, self.launched = folder, False, set()
         self._libraries = {}
+
+    @staticmethod
+    def tensor(tensor):
+        """Returns a tensor, of the same memory, that counts as on a GPU."""
+        return tensor.as_subclass(TensorOnCpu)
 
     def __call__(self, program, operation, packed, device, threads, shared=0):
         """Stands in for `launch`."""

@@ -46,9 +46,8 @@ def test_moments_and_normalised_numbers_are_those_of_the_valid_entries(device, s
             torch.testing.assert_close(normalised[valid].cpu().double(), exact, **close)
 
 
-@pytest.mark.cuda
-def test_a_gpu_takes_no_valid_numbers_more_arrays_and_other_layouts():
-    x, nothing = torch.randn(4, 6, device="cuda"), torch.zeros(4, 6, dtype=bool, device="cuda")
+def test_a_gpu_takes_no_valid_numbers_more_arrays_and_other_layouts(to_gpu):
+    x, nothing = to_gpu(torch.randn(4, 6)), to_gpu(torch.zeros(4, 6, dtype=bool))
     for n, mean, variance in masked_moments(nothing, x, x):
         assert (n, mean, variance) == (0, 0, 0)
     assert not normalise_masked(x, nothing, masked_moments(nothing, x)[0]).any()

@@ -48,12 +48,12 @@ def test_batches_have_equal_weight():
     torch.testing.assert_close(norm.scale, batches.std((0, 1), correction=0))
 
 
-@pytest.mark.cuda
-def test_gpu_adds_the_same_moments_as_the_cpu():
+def test_gpu_adds_the_same_moments_as_the_cpu(to_gpu):
     """Images, vectors, a NaN in a lane that does not count, and another in a leaf of its own."""
     space = [spaces.MultiImage(1, 3, 2, 8), spaces.MultiVector(1, 5), spaces.MultiVector(2, 3)]
     norms = [RunningNorm(leaf) for leaf in space]
-    on_gpu = [RunningNorm(leaf).cuda() for leaf in space]
+    device = to_gpu(torch.empty(0)).device
+    on_gpu = [RunningNorm(leaf).to(device) for leaf in space]
     for seed in range(3):
         torch.manual_seed(seed)
         obs = [torch.randn(1000, *leaf.shape) * 3 + 1 for leaf in space]
@@ -63,8 +63,9 @@ def test_gpu_adds_the_same_moments_as_the_cpu():
         if seed == 1:
             obs[2][int(is_counted.nonzero()[0])] = torch.nan
         update_norms(list(zip(norms, obs)), is_counted)
-        update_norms([(norm, leaf.cuda()) for norm, leaf in zip(on_gpu, obs)], is_counted.cuda())
-    update_norms([(norm, leaf.cuda()) for norm, leaf in zip(on_gpu, obs)], False)
+        moved = [(norm, to_gpu(leaf)) for norm, leaf in zip(on_gpu, obs)]
+        update_norms(moved, to_gpu(is_counted))
+    update_norms([(norm, to_gpu(leaf)) for norm, leaf in zip(on_gpu, obs)], False)
     assert [norm.count.item() for norm in on_gpu] == [3, 3, 2]
     for norm, other in zip(norms, on_gpu, strict=True):
         for name in ("mean", "scale", "count"):

@@ -423,20 +423,19 @@ def test_pairs_are_won_by_survival_and_else_by_return(n_agents):
     assert (won.tolist(), decided.tolist()) == slow_score_pairs(terminal, returns, slots)
 
 
-@pytest.mark.cuda
 @pytest.mark.parametrize("n_agents", [2, 5])
-def test_pairs_of_a_gpu_are_those_of_the_cpu(n_agents):
+def test_pairs_of_a_gpu_are_those_of_the_cpu(n_agents, to_gpu):
     torch.manual_seed(1)
     envs = [make_opponents(600, n_agents, past=0.0, bot=0.9) for _ in range(2)]
     for name in ("returns", "pairs", "slots"):
-        setattr(envs[1], name, getattr(envs[1], name).cuda())
+        setattr(envs[1], name, to_gpu(getattr(envs[1], name)))
     for _ in range(5):
         terminal = torch.rand(600 * n_agents) < 0.3
         truncated = ~terminal & (torch.rand(600 * n_agents) < 0.2)
         reward = torch.randint(-2, 3, (600 * n_agents,)).float()
-        for env in envs:
+        for env, to in zip(envs, (torch.Tensor.cpu, to_gpu), strict=True):
             parts = dict(reward=reward, terminal=terminal, truncated=truncated)
-            env._count_pairs({key: leaf.to(env.pairs.device) for key, leaf in parts.items()})
+            env._count_pairs({key: to(leaf) for key, leaf in parts.items()})
     on_cpu, on_gpu = envs
     assert on_cpu.pairs.any()
     torch.testing.assert_close(on_gpu.pairs.cpu(), on_cpu.pairs)

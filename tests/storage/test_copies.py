@@ -117,6 +117,26 @@ def test_selects_lanes_in_every_step(device, n_selected):
         assert torch.equal(ours, tensor[:, lanes]), i
 
 
+def test_a_gpu_selects_what_indexing_does(to_gpu):
+    lanes = torch.randperm(50, generator=torch.Generator().manual_seed(1))[:20]
+    tensors = [
+        numbers((3, 50, *rest), dtype, "cpu", seed=i)
+        for rest in ((16,), (1,), (3, 2))
+        for i, dtype in enumerate(DTYPES)
+    ]
+    selected = select_lanes([to_gpu(tensor) for tensor in tensors], to_gpu(lanes))
+    for tensor, ours in zip(tensors, selected, strict=True):
+        assert torch.equal(ours.cpu(), tensor[:, lanes])
+
+
+def test_a_gpu_copies_what_copy_does(to_gpu):
+    plain, n_plain = cases("cpu")
+    pairs = [(to_gpu(target.clone()), to_gpu(source)) for _, target, source in plain[:n_plain]]
+    copy_all(pairs)
+    for target, source in pairs:
+        assert torch.equal(target, source)
+
+
 def test_nothing_to_copy():
     copy_all([])
 

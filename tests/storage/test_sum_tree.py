@@ -123,23 +123,23 @@ def test_bad_arguments_raise(n, fan_out):
         SumTree(n, fan_out=fan_out)
 
 
-@pytest.mark.cuda
 @pytest.mark.parametrize("n", [1, 40, 70_000])
-def test_kernels_match_pytorch(n):
+def test_kernels_match_pytorch(n, to_gpu):
     values = 10 ** (9 * torch.rand(n, generator=torch.Generator().manual_seed(0)).double())
     values[1::3] = 0
-    plain, fused = SumTree(n), SumTree(n, "cuda")
+    plain, fused = SumTree(n), SumTree(n)
+    fused.levels = [to_gpu(level) for level in fused.levels]
+    device = fused.levels[0].device
     index = torch.randint(n, (900,), generator=torch.Generator().manual_seed(1))
-    for tree in plain, fused:
-        device = tree.levels[0].device
-        tree.set(torch.arange(n, device=device), values.to(device))
-        tree.set(index.to(device), values.flip(0)[index // 2].to(device))
+    for tree, to in (plain, torch.Tensor.cpu), (fused, to_gpu):
+        tree.set(to(torch.arange(n)), to(values))
+        tree.set(to(index), to(values.flip(0)[index // 2]))
     for ours, theirs in zip(fused.levels, plain.levels, strict=True):
         testing.assert_close(ours.cpu(), theirs, rtol=1e-12, atol=0)
-    drawn, probability = fused.draw(2000, torch.Generator("cuda").manual_seed(2))
+    drawn, probability = fused.draw(2000, torch.Generator(device).manual_seed(2))
     testing.assert_close(probability, fused.probability(drawn), rtol=1e-12, atol=0)
-    generator = torch.Generator("cuda").manual_seed(2)
-    share = torch.rand(2000, generator=generator, dtype=torch.float64, device="cuda")
+    generator = torch.Generator(device).manual_seed(2)
+    share = torch.rand(2000, generator=generator, dtype=torch.float64, device=device)
     sums = plain.priorities.cumsum(0)
     rest = (share.cpu() + torch.arange(2000)) / 2000 * sums[-1]
     expected = torch.searchsorted(sums, rest, right=True)

@@ -273,10 +273,9 @@ def test_sums_are_restored_only_for_the_same_metrics():
     assert resumed.windows[0][0] == [1, 1, 1, 1]
 
 
-@pytest.mark.cuda
 @pytest.mark.parametrize("n_metrics", [0, 2])
 @pytest.mark.parametrize("sources", [None, ["homes", "maze", "maze", "bench"]])
-def test_gpu_counts_as_the_cpu_does(n_metrics, sources):
+def test_gpu_counts_as_the_cpu_does(n_metrics, sources, to_gpu):
     """Over several rollouts, with groups, NaN rewards and metrics, lanes that do not learn, sources
     and layouts out of range.
     """
@@ -284,8 +283,8 @@ def test_gpu_counts_as_the_cpu_does(n_metrics, sources):
     group = torch.rand(n_lanes, generator=torch.Generator().manual_seed(0)) < 0.3
     options = dict(skip_first=True, sources=sources)
     stats = [
-        EpisodeStats(n_lanes, device, names, {"some": group.to(device)}, **options)
-        for device in ("cpu", "cuda")
+        EpisodeStats(n_lanes, to(group).device, names, {"some": to(group)}, **options)
+        for to in (torch.Tensor.cpu, to_gpu)
     ]
     for seed in range(3):
         torch.manual_seed(seed)
@@ -296,10 +295,9 @@ def test_gpu_counts_as_the_cpu_does(n_metrics, sources):
         for values in metrics.values():
             values[torch.rand(n_steps, n_lanes) < 0.01] = torch.inf
         layouts = torch.randint(-1, 6, (n_steps, n_lanes), dtype=torch.int32)
-        for one, device in zip(stats, ("cpu", "cuda"), strict=True):
-            rows = {name: values.to(device) for name, values in metrics.items()}
-            where = layouts.to(device)
-            one.add(reward.to(device), *(flag.to(device) for flag in flags), rows, where)
+        for one, to in zip(stats, (torch.Tensor.cpu, to_gpu), strict=True):
+            rows = {name: to(values) for name, values in metrics.items()}
+            one.add(to(reward), *map(to, flags), rows, to(layouts))
     plain, fused = stats
     assert plain.sums[0].min() > 100
     for name in ("returns", "lengths", "is_whole", "sums", "bad_lanes"):
