@@ -228,9 +228,16 @@ def mirror_image(g: dotdict) -> dotdict:
     """Returns a geometry with left and right swapped, and without its further keys.
 
     Raises:
-        ValueError: if a wall or light lies at or beyond the right edge of the masks.
+        ValueError: if `validate_geometry` refuses it, or a wall or light lies beyond its masks.
     """
+    g = validate_geometry(dotdict(g))
     width = g.masks.shape[1] * g.res
+    furthest = max(points[..., 0].max(initial=0) for points in (g.walls, g.lights))
+    if furthest >= width:
+        raise ValueError(
+            f"geometry {g.id} has no mirror image: a wall or light is at x = {furthest:g} m, but "
+            f"its masks end at {width:g} m"
+        )
     walls, lights = g.walls.copy(), g.lights.copy()
     walls[..., 0] = width - walls[..., 0]
     lights[..., 0] = width - lights[..., 0]

@@ -9,7 +9,7 @@ import torch
 from megastep.engine import checks
 from megastep.kernels.build.compile import EngineError
 
-__all__ = ["device", "fit", "free_memory", "n_multiprocessors", "set_threads", "threads"]
+__all__ = ["device", "fit", "free_memory", "n_resident_threads", "set_threads", "threads"]
 
 #: GNU OpenMP ends the process if it cannot start as many as it is asked for.
 MAX_THREADS = max(1024, os.cpu_count() or 1)
@@ -99,8 +99,9 @@ def free_memory(device: Any) -> int:
 
 
 @functools.cache
-def n_multiprocessors(device: torch.device) -> int:
-    """Returns the number of multiprocessors of a GPU, 0 for a CPU."""
+def n_resident_threads(device: torch.device) -> int:
+    """Returns how many threads a GPU can run at once, 0 for a CPU."""
     if device.type == "cpu":
         return 0
-    return torch.cuda.get_device_properties(device).multi_processor_count
+    gpu = torch.cuda.get_device_properties(device)
+    return gpu.multi_processor_count * gpu.max_threads_per_multi_processor

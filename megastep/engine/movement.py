@@ -9,7 +9,7 @@ import torch
 
 from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
-from megastep.engine.devices import n_multiprocessors
+from megastep.engine.devices import n_resident_threads
 from megastep.engine.launch_params import (
     error_flag_address,
     lanes_of,
@@ -18,15 +18,15 @@ from megastep.engine.launch_params import (
 )
 from megastep.engine.outputs import Physics
 from megastep.engine.scenery import Scenery
-from megastep.kernels.build.launch import BLOCK, ENGINE, launch
+from megastep.kernels.build.launch import ENGINE, launch
 
 __all__ = ["physics"]
 
 #: Threads that move an environment's agents, on a GPU: the most with which all environments move
-#: at once, or the least.
+#: at once, or else the least.
 GROUPS = (32, 16, 8)
-#: Threads that a multiprocessor runs at once: by the bounds of `physics`, 24 blocks.
-AT_ONCE = 24 * BLOCK
+#: The share of a GPU's threads that run at once: 24 of 32 blocks, by the bounds of `physics`.
+AT_ONCE = 3 / 4
 
 
 def physics(
@@ -91,5 +91,5 @@ def _addresses(actions, lanes, n_moves, device):
 
 
 def _threads_per_env(n_envs, device):
-    room = AT_ONCE * n_multiprocessors(device)
+    room = AT_ONCE * n_resident_threads(device)
     return next((size for size in GROUPS if size * n_envs <= room), GROUPS[-1])

@@ -10,7 +10,7 @@ import torch
 
 from megastep.engine import checks
 from megastep.engine.agents import Agents, check_on_cpu
-from megastep.engine.devices import n_multiprocessors
+from megastep.engine.devices import n_resident_threads
 from megastep.engine.launch_params import (
     error_flag_address,
     lanes_of,
@@ -26,12 +26,6 @@ __all__ = ["observe", "render", "update_agent_geometry"]
 
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
-
-#: Agents per multiprocessor of a GPU, at most, of whom two warps share each: as many warps as can
-#: run at once. It takes more instructions, and is meant to take less time.
-MAX_SPLIT = 32
-#: The same for one warp each, in environments of one agent.
-MAX_AT_ONCE = 64
 
 # RenderParams' optional outputs, and the inputs that only these need. 0 is null: not wanted.
 _OPTIONAL = dict.fromkeys(
@@ -186,10 +180,11 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
 
 
 def _kernel(scenery, res, subsample):
-    """Returns the kernel that renders observations. Two warps that share an agent share whole
-    tiles of the screen, which must hold whole pixels.
+    """Returns the kernel that renders observations: with two warps per agent, or with one and few
+    registers, if all warps can run at once. Two warps share whole tiles of the screen, which must
+    hold whole pixels.
     """
-    n, room = scenery.n_envs * scenery.n_agents, n_multiprocessors(scenery.device)
-    if n <= MAX_SPLIT * room and res > WARP and WARP % subsample == 0:
+    n_threads, room = WARP * scenery.n_envs * scenery.n_agents, n_resident_threads(scenery.device)
+    if 2 * n_threads <= room and res > WARP and WARP % subsample == 0:
         return "render_split"
-    return "render_one" if n <= MAX_AT_ONCE * room and scenery.n_agents == 1 else "render"
+    return "render_one" if n_threads <= room and scenery.n_agents == 1 else "render"

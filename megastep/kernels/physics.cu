@@ -1,6 +1,6 @@
-// One group of threads per environment: 8 threads if there are many environments, 32 if there are
-// few. For each agent in turn, the group tests the bounding boxes of 32 walls each, then the walls
-// in boxes that the agent's path overlaps, then the other agents. Finally all agents move at once.
+// One group of 8, 16 or 32 threads per environment, see movement.py. For each agent in turn, the
+// group tests the bounding boxes (of 32 walls each), then the walls in boxes that the agent's path
+// overlaps, then the other agents. Finally all agents move at once.
 #include "common/scenery.h"
 #include "physics.h"
 

@@ -1,5 +1,5 @@
-// Does what render.cu does, for environments of one agent, in so few registers that 64 agents per
-// multiprocessor render at once: faster where that is all of them.
+// Does what render.cu does, for environments of one agent, with so few registers that a
+// multiprocessor renders 64 of them at once.
 #include "render_cuda.h"
 
 KERNEL BOUNDS(32) render_one(RenderParams p) {

@@ -1,4 +1,4 @@
-// Does what render.cu does, with a block of two warps per agent: faster where agents are few. It
+// Does what render.cu does, with a block of two warps per agent, for few agents. It
 // takes whole tiles of 32 rays, so `subsample` must divide 32.
 #include "render_cuda.h"
 

@@ -1,6 +1,7 @@
 """CPU and GPU, and any number of CPU threads, agree on every bit."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -78,31 +79,71 @@ SETTINGS = [
 ]
 
 
-@pytest.fixture(params=["many", "some", "few"])
-def amount(request, monkeypatch):
-    """Chooses the kernels for many, some or few agents, where settings allow them."""
-    max_split, max_at_once, group = dict(many=(0, 0, 8), some=(0, 64, 16), few=(32, 64, 32))[
-        request.param
-    ]
-    monkeypatch.setattr(rendering, "MAX_SPLIT", max_split)
-    monkeypatch.setattr(rendering, "MAX_AT_ONCE", max_at_once)
-    monkeypatch.setattr(movement, "GROUPS", (group,))
+#: Threads per agent that a GPU runs at once, by what that makes 24 environments: each has kernels
+#: of its own, where the settings allow them.
+ROOMS = dict(many=0, some=32, few=64)
+amounts = pytest.mark.parametrize("amount", ROOMS)
+
+
+def pretend(patch, amount, n_agents):
+    """Makes 24 environments many, some or few."""
+    for_rendering = 24 * n_agents * ROOMS[amount]
+    for_movement = 24 * dict(many=0, some=24, few=64)[amount]
+    patch.setattr(rendering, "n_resident_threads", lambda device: for_rendering)
+    patch.setattr(movement, "n_resident_threads", lambda device: for_movement)
 
 
 @pytest.mark.cuda
+@amounts
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_cpu_and_gpu_agree_on_every_bit(settings, amount):
+def test_cpu_and_gpu_agree_on_every_bit(settings, amount, monkeypatch):
+    pretend(monkeypatch, amount, settings["n_agents"])
     assert not any(differing(trajectory("cpu", **settings), trajectory("cuda", **settings)))
 
 
+@amounts
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
 def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu, monkeypatch):
     """The threads of a block, and blocks, run in one order and in the opposite one."""
     expected = trajectory("cpu", n_steps=4, **settings)
     cuda_on_cpu.install(monkeypatch)
+    pretend(monkeypatch, amount, settings["n_agents"])
     for is_reversed in False, True:
         monkeypatch.setattr(cuda_on_cpu, "is_reversed", is_reversed)
         assert not any(differing(expected, trajectory("cpu", n_steps=4, **settings)))
+    kernel = dict(many="render", some="render_one", few="render_split")[amount]
+    can_split = settings["res"] > 32 and 32 % settings.get("subsample", 1) == 0
+    if amount == "few" and not can_split:
+        kernel = "render_one"
+    if kernel == "render_one" and settings["n_agents"] > 1:
+        kernel = "render"
+    assert kernel in cuda_on_cpu.launched and "render" in cuda_on_cpu.launched  # all fields
+
+
+@pytest.mark.parametrize(
+    "n_envs, n_agents, res, subsample, kernel",
+    [
+        (4224, 1, 256, 4, "render_split"),
+        (4225, 1, 256, 4, "render_one"),
+        (8448, 1, 256, 4, "render_one"),
+        (8449, 1, 256, 4, "render"),
+        (2112, 2, 256, 4, "render_split"),
+        (2113, 2, 256, 4, "render"),
+        (64, 1, 32, 1, "render_one"),  # a single tile
+        (64, 1, 96, 3, "render_one"),  # tiles would cut pixels
+        (64, 2, 96, 3, "render"),
+    ],
+)
+def test_choice_of_kernel_on_an_h200(monkeypatch, n_envs, n_agents, res, subsample, kernel):
+    monkeypatch.setattr(rendering, "n_resident_threads", lambda device: 132 * 2048)
+    scenery = SimpleNamespace(n_envs=n_envs, n_agents=n_agents, device=None)
+    assert rendering._kernel(scenery, res, subsample) == kernel
+
+
+def test_threads_of_an_environment_on_an_h200(monkeypatch):
+    monkeypatch.setattr(movement, "n_resident_threads", lambda device: 132 * 2048)
+    counts = 1, 6336, 6337, 12_672, 12_673, 1_048_576
+    assert [movement._threads_per_env(n, None) for n in counts] == [32, 32, 16, 16, 8, 8]
 
 
 @pytest.mark.cuda

@@ -128,7 +128,7 @@ def test_training_draws_mirror_images_of_a_part_as_well():
     for split in "test", "all":
         assert len(sources.mixed(None, split, parts=parts)) == 7
     small = dotdict(plain[0], masks=plain[0].masks[:, :20])
-    with pytest.raises(ValueError, match="'walls' must be above 0"):
+    with pytest.raises(ValueError, match="no mirror image: a wall or light is at x = "):
         mirror_image(small)
 
 

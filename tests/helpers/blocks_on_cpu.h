@@ -50,6 +50,8 @@ struct Index {
 };
 static Index blockIdx, threadIdx, blockDim, gridDim;
 alignas(16) static unsigned char dynamic_shared[1 << 18];
+constexpr unsigned char POISON = 0x7f;
+constexpr unsigned int GUARD = 1024;  // bytes behind the shared memory
 typedef unsigned long long Bits;
 
 // ---- Fibers ----
@@ -325,12 +327,15 @@ static float half_to_float(unsigned short bits) {
 
 // ---- Launching ----
 
-// Returns what went wrong, or an empty text. Shared memory holds nothing sensible before a block.
+// Returns what went wrong, or an empty text. Dynamic shared memory holds huge numbers before a
+// block; arrays of a fixed size hold what the last block left there.
 template <class Params>
 const char* launch_blocks(void (*kernel)(Params), const Params& params, unsigned int n_blocks_x,
                           unsigned int n_blocks_y, unsigned int n_threads, unsigned int n_shared,
                           int is_reversed) {
     failure[0] = 0;
+    if (n_threads > MAX_FIBERS || n_shared + GUARD > sizeof dynamic_shared)
+        return "has more threads or shared memory than fit";
     n_fibers = (int)n_threads;
     blockDim = {n_threads, 1};
     gridDim = {n_blocks_x, n_blocks_y};
@@ -341,8 +346,12 @@ const char* launch_blocks(void (*kernel)(Params), const Params& params, unsigned
         blockIdx = {block % n_blocks_x, block / n_blocks_x};
         meetings.clear();
         memset(block_counts, 0, sizeof block_counts);
-        memset(dynamic_shared, 0xa5, n_shared);
+        memset(dynamic_shared, POISON, n_shared + GUARD);
         run_block(is_reversed);
+        for (unsigned int i = n_shared; i < n_shared + GUARD && !failure[0]; i++)
+            if (dynamic_shared[i] != POISON)
+                snprintf(failure, sizeof failure, "block %u: writes beyond its shared memory",
+                         blockIdx.x);
     }
     return failure;
 }

@@ -13,7 +13,12 @@ from megastep.kernels.build import compile, headers
 from megastep.kernels.build import launch as launching
 
 HEADER = Path(__file__).with_name("blocks_on_cpu.h")
-FLAGS = ("-std=c++17", "-O1", "-ffp-contract=off", "-shared", "-fPIC", "-fno-strict-aliasing")
+FLAGS = (
+    *("-std=c++17", "-O1", "-ffp-contract=off", "-shared", "-fPIC", "-fno-strict-aliasing"),
+    "-U_FORTIFY_SOURCE",  # which takes a jump between fibers for an error
+)
+#: Threads that the GPU it stands for runs at once, where their number chooses a kernel.
+RESIDENT_THREADS = 132 * 2048
 #: Kernels that give the CPU's bits have the CPU's half of backend.h here.
 BACKEND = """
 #include "common/backend.h"
@@ -42,7 +47,7 @@ class CudaOnCpu:
 
     Attributes:
         is_reversed: runs the threads of a block, and blocks, in the opposite order.
-        launched: the operations so far.
+        launched: the operations since `install`.
     """
 
     def __init__(self, folder: Path):
@@ -64,7 +69,7 @@ class CudaOnCpu:
 
     def launch_blocks(self, program, operation, packed, device, n_blocks, n_threads, shared=0):
         """Stands in for the function of this name."""
-        assert device.type == "cpu"
+        assert device.type == "cpu" and min(n_blocks) > 0
         if program not in self._libraries:
             self._libraries[program] = self._build(program)
         function = getattr(self._libraries[program], f"run_{operation}")
@@ -99,11 +104,10 @@ class CudaOnCpu:
         return ctypes.CDLL(str(library))
 
     def install(self, monkeypatch):
-        """Replaces `launch` and `launch_blocks` in all modules that import them. The CPU counts as
-        a GPU of 132 multiprocessors, where their number chooses a kernel.
-        """
+        """Replaces `launch` and `launch_blocks` in all modules that import them."""
+        self.launched.clear()
         for module in movement, rendering:
-            monkeypatch.setattr(module, "n_multiprocessors", lambda device: 132)
+            monkeypatch.setattr(module, "n_resident_threads", lambda device: RESIDENT_THREADS)
         for name, stand_in in ("launch", self), ("launch_blocks", self.launch_blocks):
             original = getattr(launching, name)
             for path, module in list(sys.modules.items()):

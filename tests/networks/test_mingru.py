@@ -212,7 +212,7 @@ SLACK = {torch.float32: 1e-5, torch.bfloat16: 1e-2}
     [
         *((9, 5, 16), (9, 5, 7), (1, 3, 16), (2, 3, 5), (4, 3, 8), (9, 1, 1), (3, 40, 256)),
         # blocks of several lanes, the last one not full; lanes of several blocks
-        *((3, 601, 16), (3, 257, 7), (2, 3, 1028)),
+        *((3, 601, 16), (3, 257, 7), (2, 1100, 128), (1, 6600, 20), (2, 3, 1028)),
     ],
 )
 def test_kernels_match_cpu(where, dtype, n_steps, n_lanes, width, is_residual):

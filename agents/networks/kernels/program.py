@@ -9,7 +9,13 @@ from megastep.arrdict import arrdict
 from megastep.engine.devices import threads
 from megastep.kernels.build import program
 from megastep.kernels.build.compile import EngineError, cpu
-from megastep.kernels.build.launch import BLOCK, addresses, launch, launch_blocks
+from megastep.kernels.build.launch import (
+    BLOCK,
+    addresses,
+    check_n_threads,
+    launch,
+    launch_blocks,
+)
 from megastep.kernels.build.program import Program
 
 DTYPES = {torch.float32: "float32", torch.bfloat16: "bfloat16"}
@@ -57,8 +63,11 @@ def run(
     pack = getattr(CORES.params, CORES.cuda_operations[kernel])
     values = addresses(fields)
     packed = pack(**values, n_lanes=n_lanes, width=width, n_units=n_units)
-    n_blocks = -(-n_lanes * width // n_units // block)
-    launch_blocks(CORES, kernel, packed, state.device, (n_blocks, 1), block, shared)
+    n_threads = n_lanes * width // n_units
+    check_n_threads(operation, n_threads, state.device)
+    n_blocks = -(-n_threads // block)
+    if n_blocks:
+        launch_blocks(CORES, kernel, packed, state.device, (n_blocks, 1), block, shared)
 
 
 @functools.cache

@@ -57,13 +57,22 @@ def launch(
         return
     if not threads:
         return
-    if threads > MAX_THREADS:
-        raise EngineError(
-            f"{operation} needs {threads:,} threads on {device}, but a launch has at most "
-            f"{MAX_THREADS:,}: use fewer environments."
-        )
+    check_n_threads(operation, threads, device)
     n_blocks = -(-threads // BLOCK)
     launch_blocks(program, operation, packed, device, (n_blocks, 1), BLOCK, shared * BLOCK // WARP)
+
+
+def check_n_threads(operation: str, n: int, device: torch.device) -> None:
+    """Checks the number of threads of a launch.
+
+    Raises:
+        EngineError: if there are too many.
+    """
+    if n > MAX_THREADS:
+        raise EngineError(
+            f"{operation} needs {n:,} threads on {device}, but a launch has at most "
+            f"{MAX_THREADS:,}: use fewer environments."
+        )
 
 
 def launch_blocks(
