@@ -33,9 +33,9 @@ def step(device: torch.device) -> Iterator[dict]:
             seconds = seconds_per_call(take_step, device)
             yield rate(f"{name}, `env.step`, {n_envs:,} environments", n_envs, seconds)
     for n_envs in N_ENVS_IN_ROLLOUTS[device.type]:
-        for manner, settings in (("", PLAIN["explorer"]), (", as trained", AS_TRAINED)):
+        for suffix, settings in (("", PLAIN["explorer"]), (", as trained", AS_TRAINED)):
             _, take_step = walk_in_rollouts("explorer", n_envs, device, **settings)
-            what = f"explorer, `env.step`, {n_envs:,} environments{manner}, in a rollout"
+            what = f"explorer, `env.step`, {n_envs:,} environments{suffix}, in a rollout"
             yield rate(what, n_envs, graph_seconds_per_call(take_step, device))
 
 

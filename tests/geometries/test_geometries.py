@@ -127,6 +127,8 @@ def test_training_draws_mirror_images_of_a_part_as_well():
         assert g.source == "bench" and g.walls.tobytes() == expected.walls.tobytes()
     for split in "test", "all":
         assert len(sources.mixed(None, split, parts=parts)) == 7
+    as_dict = mirror_image(dict(plain[0], walls=plain[0].walls.tolist()))  # as of a source
+    assert as_dict.walls.tobytes() == swapped[0].walls.tobytes()
     small = dotdict(plain[0], masks=plain[0].masks[:, :20])
     with pytest.raises(ValueError, match="no mirror image: a wall or light is at x = "):
         mirror_image(small)

@@ -11,7 +11,7 @@ from megastep.agents.networks.kernels.program import run, units_per_thread
 from megastep.kernels.build.launch import BLOCK
 
 _LARGEST_BLOCK = 256  # threads, of `backward`
-_MANY_BLOCKS = 128  # of which a GPU's multiprocessors have one each
+_MANY_BLOCKS = 128  # about one per multiprocessor
 
 
 def forward(gates, reset, start, residual, states, outputs, last):

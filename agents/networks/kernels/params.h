@@ -95,13 +95,13 @@ struct MingruBackwardParams {
     void* d_gates;               // (T, B, 2 W) compute
     float* d_start;              // (B, W); null: not wanted
     void* d_residual;            // (T, B, W) compute, a copy of d_outputs; null: not wanted
-    float* d_biases;  // sums of d_gates over steps and lanes: (blocks, 2 W); else (B, 2 W), of a
-                      // lane each
+    float* d_biases;  // (blocks, 2 W) d_gates summed over a block's lanes and all steps; or
+                      // (B, 2 W), only over steps
     int n_steps;
     int n_lanes;
     int width;
     int n_units;     // units per thread
-    int adds_lanes;  // blocks hold whole lanes, and add them up
+    int adds_lanes;  // a block has whole lanes, and d_biases a row per block
 };
 
 // ---- Layers ----
