@@ -44,6 +44,19 @@ def test_report_writes_page_and_plot_reproducibly(tmp_path):
     assert f"| `step` | explorer, `env.step`, 1,024 environments | {cells}" in page
 
 
+def test_plot_has_one_point_per_size_of_the_plain_environment(tmp_path):
+    """That of a step per graph, though the page has both."""
+    rows = [record(f"explorer, `env.step`, {n} environments", 12.5) for n in ("1,024", "4,096")]
+    other = record("explorer, `env.step`, 4,096 environments, in a rollout", 99.0)
+    plots = []
+    for records_of in (rows, [*rows, other]):
+        path = write_records(tmp_path, *records_of)
+        assert benchmark.main(["report", "--json", str(path)]) == 0
+        plots.append((tmp_path / "benchmark-table.svg").read_text())
+    assert plots[0] == plots[1]
+    assert "in a rollout | 99 M/s" in (tmp_path / "benchmark-table.md").read_text()
+
+
 def test_newest_record_per_machine_in_order_of_size():
     rows = [
         record("a, 8,192 environments", 2.0, date="2026-01-03"),
