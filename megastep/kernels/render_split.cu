@@ -1,5 +1,5 @@
-// Does what render.cu does, with a block of two warps per agent, for few agents. It
-// takes whole tiles of 32 rays, so `subsample` must divide 32.
+// Does what render.cu does, with a block of two warps per agent, for few agents. It takes whole
+// tiles of 32 rays, so `subsample` must divide 32.
 #include "render_cuda.h"
 
 static_assert(BLOCK == 2 * WARP, "each of two warps has half_of_screen");

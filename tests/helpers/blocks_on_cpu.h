@@ -319,10 +319,13 @@ static T atomicMax(T* address, T x) {
     return before;
 }
 
+// Not _Float16, which older compilers lack.
 static float half_to_float(unsigned short bits) {
-    _Float16 x;
-    memcpy(&x, &bits, sizeof x);
-    return (float)x;
+    int exponent = bits >> 10 & 31, mantissa = bits & 1023;
+    float x = exponent ? ldexpf(1024.f + mantissa, exponent - 25) : ldexpf(mantissa, -24);
+    if (exponent == 31)
+        x = mantissa ? NAN : INFINITY;
+    return bits >> 15 ? -x : x;
 }
 
 // ---- Launching ----
