@@ -230,8 +230,9 @@ def test_recording_never_synchronises():
     env.generator = torch.Generator("cuda")
     actions = torch.zeros(T, N * A, 1, dtype=torch.int64, device="cuda")
     recorder, rollout = RolloutRecorder(env, check), SimpleNamespace(actions=actions)
-    recorder.start()
-    recorder.end(rollout)
+    for _ in range(2):  # builds the kernels
+        recorder.start()
+        recorder.end(rollout)
     torch.cuda.set_sync_debug_mode("error")
     try:
         env.places.add_(1)
@@ -242,4 +243,4 @@ def test_recording_never_synchronises():
         recorder.start()
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert bool((recorder.state[".places"] == 1).all()) and len(recorder.on_host) == 3
+    assert bool((recorder.state[".places"] == 1).all()) and len(recorder.on_host) == 4
