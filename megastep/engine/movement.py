@@ -25,8 +25,8 @@ __all__ = ["physics"]
 #: Threads that move an environment's agents, on a GPU: the most with which all environments move
 #: at once, or else the least.
 GROUPS = (32, 16, 8)
-#: The share of a GPU's threads that run at once: 24 of 32 blocks, by the bounds of `physics`.
-AT_ONCE = 3 / 4
+#: The share of a GPU's threads that run at once: 18 of 32 blocks, by the bounds of `physics`.
+AT_ONCE = 18 / 32
 
 
 def physics(

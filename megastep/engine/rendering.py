@@ -180,11 +180,8 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
 
 
 def _kernel(scenery, res, subsample):
-    """Returns the kernel that renders observations: with two warps per agent, or with one and few
-    registers, if all warps can run at once. Two warps share whole tiles of the screen, which must
-    hold whole pixels.
+    """Returns the kernel that renders observations: with two warps per agent if agents are few.
+    Two warps share whole tiles of the screen, which must hold whole pixels.
     """
-    n_threads, room = WARP * scenery.n_envs * scenery.n_agents, n_resident_threads(scenery.device)
-    if 2 * n_threads <= room and res > WARP and WARP % subsample == 0:
-        return "render_split"
-    return "render_one" if n_threads <= room and scenery.n_agents == 1 else "render"
+    is_few = 2 * WARP * scenery.n_envs * scenery.n_agents <= n_resident_threads(scenery.device)
+    return "render_split" if is_few and res > WARP and WARP % subsample == 0 else "render"

@@ -60,7 +60,7 @@ DEVICE void sweep(const PhysicsParams& p, const ThreadGroup& group, int env, con
         p.progress[i] = progress_of(contact);
 }
 
-KERNEL BOUNDS(24) physics(PhysicsParams p) {
+KERNEL BOUNDS(18) physics(PhysicsParams p) {
     wait_for_previous();
     int n_agents = p.scenery.n_agents;
     int env = (blockIdx.x * blockDim.x + threadIdx.x) / p.threads_per_env;

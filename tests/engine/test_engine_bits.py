@@ -79,18 +79,17 @@ SETTINGS = [
 ]
 
 
-#: Threads per agent that a GPU runs at once, by what that makes 24 environments: each has kernels
-#: of its own, where the settings allow them.
+#: Threads per environment that a GPU runs at once, by what that makes 24 environments: each number
+#: has another kernel, or other threads per environment.
 ROOMS = dict(many=0, some=32, few=64)
 amounts = pytest.mark.parametrize("amount", ROOMS)
 
 
 def pretend(patch, amount, n_agents):
     """Makes 24 environments many, some or few."""
-    for_rendering = 24 * n_agents * ROOMS[amount]
-    for_movement = 24 * dict(many=0, some=24, few=64)[amount]
-    patch.setattr(rendering, "n_resident_threads", lambda device: for_rendering)
-    patch.setattr(movement, "n_resident_threads", lambda device: for_movement)
+    n_threads = 24 * ROOMS[amount]
+    patch.setattr(rendering, "n_resident_threads", lambda device: n_agents * n_threads)
+    patch.setattr(movement, "n_resident_threads", lambda device: n_threads)
 
 
 @pytest.mark.cuda
@@ -112,12 +111,8 @@ def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu,
     for is_reversed in False, True:
         monkeypatch.setattr(cuda_on_cpu, "is_reversed", is_reversed)
         assert not any(differing(expected, trajectory("cpu", n_steps=4, **settings)))
-    kernel = dict(many="render", some="render_one", few="render_split")[amount]
     can_split = settings["res"] > 32 and 32 % settings.get("subsample", 1) == 0
-    if amount == "few" and not can_split:
-        kernel = "render_one"
-    if kernel == "render_one" and settings["n_agents"] > 1:
-        kernel = "render"
+    kernel = "render_split" if amount == "few" and can_split else "render"
     assert kernel in cuda_on_cpu.launched and "render" in cuda_on_cpu.launched  # all fields
 
 
@@ -125,13 +120,11 @@ def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu,
     "n_envs, n_agents, res, subsample, kernel",
     [
         (4224, 1, 256, 4, "render_split"),
-        (4225, 1, 256, 4, "render_one"),
-        (8448, 1, 256, 4, "render_one"),
-        (8449, 1, 256, 4, "render"),
+        (4225, 1, 256, 4, "render"),
         (2112, 2, 256, 4, "render_split"),
         (2113, 2, 256, 4, "render"),
-        (64, 1, 32, 1, "render_one"),  # a single tile
-        (64, 1, 96, 3, "render_one"),  # tiles would cut pixels
+        (64, 1, 32, 1, "render"),  # a single tile
+        (64, 1, 96, 3, "render"),  # tiles would cut pixels
         (64, 2, 96, 3, "render"),
     ],
 )
@@ -143,7 +136,7 @@ def test_choice_of_kernel_on_an_h200(monkeypatch, n_envs, n_agents, res, subsamp
 
 def test_threads_of_an_environment_on_an_h200(monkeypatch):
     monkeypatch.setattr(movement, "n_resident_threads", lambda device: 132 * 2048)
-    counts = 1, 6336, 6337, 12_672, 12_673, 1_048_576
+    counts = 1, 4752, 4753, 9504, 9505, 1_048_576
     assert [movement._threads_per_env(n, None) for n in counts] == [32, 32, 16, 16, 8, 8]
 
 
