@@ -26,6 +26,8 @@ __all__ = ["observe", "render", "update_agent_geometry"]
 
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
+#: Agents are many if they need more threads than this many times those that a GPU runs at once.
+UNSPILLED_WAVES = 4
 
 # RenderParams' optional outputs, and the inputs that only these need. 0 is null: not wanted.
 _OPTIONAL = dict.fromkeys(
@@ -180,8 +182,11 @@ def _render(scenery, agents, subsample=1, max_depth=10.0, **outputs):
 
 
 def _kernel(scenery, res, subsample):
-    """Returns the kernel that renders observations: with two warps per agent if agents are few.
-    Two warps share whole tiles of the screen, which must hold whole pixels.
+    """Returns the kernel that renders observations: with two warps per agent if agents are few,
+    with more registers for each warp until they are many. Two warps share whole tiles of the
+    screen, which must hold whole pixels.
     """
-    is_few = 2 * WARP * scenery.n_envs * scenery.n_agents <= n_resident_threads(scenery.device)
-    return "render_split" if is_few and res > WARP and WARP % subsample == 0 else "render"
+    n_threads, room = WARP * scenery.n_envs * scenery.n_agents, n_resident_threads(scenery.device)
+    if 2 * n_threads <= room and res > WARP and WARP % subsample == 0:
+        return "render_split"
+    return "render_unspilled" if n_threads <= UNSPILLED_WAVES * room else "render"

@@ -145,3 +145,23 @@ DEVICE void render_agent(const RenderParams& p, int agent, int warp_lane, PixelS
     if (rank == 0)
         p.newly_seen[agent] = newly_seen;
 }
+
+// One warp per agent. Three variants: all outputs, several agents, one agent. The last needs the
+// fewest registers.
+template <int may_write_all>
+DEVICE void render_by_warps(const RenderParams& p) {
+    extern __shared__ NearestLine shared[];
+    __shared__ PixelSpan spans[BLOCK];
+    int warp = threadIdx.x / WARP, warp_lane = threadIdx.x % WARP;
+    int agent = blockIdx.x * (BLOCK / WARP) + warp;
+    if (agent >= p.scenery.n_envs * p.scenery.n_agents)
+        return;
+    PixelSpan* warp_spans = spans + WARP * warp;
+    NearestLine* nearest = shared + whole_tiles(p.res) * warp;
+    if (may_write_all && p.indices)
+        render_agent<1, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+    else if (p.scenery.n_agents > 1)
+        render_agent<0, 1, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+    else
+        render_agent<0, 0, 0>(p, agent, warp_lane, warp_spans, nearest, 0);
+}

@@ -4,7 +4,7 @@
 
 static_assert(BLOCK == 2 * WARP, "each of two warps has half_of_screen");
 
-KERNEL BOUNDS(24) render_split(RenderParams p) {
+KERNEL BOUNDS(18) render_split(RenderParams p) {
     wait_for_previous();
     extern __shared__ NearestLine nearest[];
     __shared__ PixelSpan spans[BLOCK];

@@ -112,7 +112,9 @@ def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu,
         monkeypatch.setattr(cuda_on_cpu, "is_reversed", is_reversed)
         assert not any(differing(expected, trajectory("cpu", n_steps=4, **settings)))
     can_split = settings["res"] > 32 and 32 % settings.get("subsample", 1) == 0
-    kernel = "render_split" if amount == "few" and can_split else "render"
+    kernel = dict(many="render", some="render_unspilled", few="render_split")[amount]
+    if amount == "few" and not can_split:
+        kernel = "render_unspilled"
     assert kernel in cuda_on_cpu.launched and "render" in cuda_on_cpu.launched  # all fields
 
 
@@ -120,12 +122,14 @@ def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu,
     "n_envs, n_agents, res, subsample, kernel",
     [
         (4224, 1, 256, 4, "render_split"),
-        (4225, 1, 256, 4, "render"),
+        (4225, 1, 256, 4, "render_unspilled"),
+        (33_792, 1, 256, 4, "render_unspilled"),
+        (33_793, 1, 256, 4, "render"),
         (2112, 2, 256, 4, "render_split"),
-        (2113, 2, 256, 4, "render"),
-        (64, 1, 32, 1, "render"),  # a single tile
-        (64, 1, 96, 3, "render"),  # tiles would cut pixels
-        (64, 2, 96, 3, "render"),
+        (2113, 2, 256, 4, "render_unspilled"),
+        (64, 1, 32, 1, "render_unspilled"),  # a single tile
+        (64, 1, 96, 3, "render_unspilled"),  # tiles would cut pixels
+        (64, 2, 96, 3, "render_unspilled"),
     ],
 )
 def test_choice_of_kernel_on_an_h200(monkeypatch, n_envs, n_agents, res, subsample, kernel):
