@@ -25,7 +25,7 @@ __all__ = ["physics"]
 #: Threads that move an environment's agents, on a GPU: the most with which all environments move
 #: at once, or else the least.
 GROUPS = (32, 16, 8)
-#: The share of a GPU's threads that run at once: 18 of 32 blocks, by the bounds of `physics`.
+#: The share of a GPU's threads that run at once: 18 of 32 blocks, by the bounds of `physics_unspilled`.
 AT_ONCE = 18 / 32
 
 
@@ -78,7 +78,7 @@ def physics(
         seconds=1 / agents.fps,
         threads_per_env=threads_per_env,
     )
-    launch(ENGINE, "physics", packed, device, threads=threads_per_env * n)
+    launch(ENGINE, _kernel(n, device), packed, device, threads_per_env * n)
     check_on_cpu(agents)
     return Physics(progress)
 
@@ -88,6 +88,14 @@ def _addresses(actions, lanes, n_moves, device):
     if isinstance(actions, torch.Tensor) and actions.is_floating_point():
         return 0, checks.address("actions", actions, (*lanes, n_moves), torch.float32, device)
     return checks.address("actions", actions, lanes, torch.int64, device), 0
+
+
+def _kernel(n_envs, device):
+    """Returns the kernel that moves agents: with more registers per thread until environments are
+    many.
+    """
+    n_threads = GROUPS[-1] * n_envs
+    return "physics_unspilled" if n_threads <= n_resident_threads(device) else "physics"
 
 
 def _threads_per_env(n_envs, device):

@@ -115,7 +115,9 @@ def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu,
     kernel = dict(many="render", some="render_unspilled", few="render_split")[amount]
     if amount == "few" and not can_split:
         kernel = "render_unspilled"
-    assert kernel in cuda_on_cpu.launched and "render" in cuda_on_cpu.launched  # all fields
+    assert {kernel, "render"} <= cuda_on_cpu.launched  # `render` for all fields
+    physics = "physics" if amount == "many" else "physics_unspilled"
+    assert {"physics", "physics_unspilled"} & cuda_on_cpu.launched == {physics}
 
 
 @pytest.mark.parametrize(
@@ -142,6 +144,8 @@ def test_threads_of_an_environment_on_an_h200(monkeypatch):
     monkeypatch.setattr(movement, "n_resident_threads", lambda device: 132 * 2048)
     counts = 1, 4752, 4753, 9504, 9505, 1_048_576
     assert [movement._threads_per_env(n, None) for n in counts] == [32, 32, 16, 16, 8, 8]
+    kernels = [movement._kernel(n, None) for n in (1, 33_792, 33_793)]
+    assert kernels == ["physics_unspilled", "physics_unspilled", "physics"]
 
 
 @pytest.mark.cuda
