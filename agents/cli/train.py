@@ -314,7 +314,7 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
                 with process_group.unhurried():
                     curves.plot_curves(folder)
         times = running.section_times
-        if is_first and times.n:
+        if is_first and times.is_known:
             console.say(console.sections(times.milliseconds(), times.iteration))
         # a signal that one rank got stops all, and so does a checkpoint that one could not save
         ends = process_group.gather_objects((numbers[:1], running.saver.error))

@@ -98,6 +98,11 @@ class SectionTimes:
         self.n, self.seconds, self.total, self.measured = 0, Counter(), 0.0, {}
 
     @property
+    def is_known(self) -> bool:
+        """Whether there is more to say than what "log" takes."""
+        return self.n > 0 and not (self.on_gpu and not self.measured)
+
+    @property
     def iteration(self) -> float:
         return 1000 * self.total / max(1, self.n)
 

@@ -134,16 +134,25 @@ def test_graphs_captured_meanwhile_have_the_times_of_sections():
     assert total.tolist() == [3] * 4
 
 
+def test_an_interrupted_run_on_a_gpu_knows_its_log_only():
+    on_gpu, on_cpu = performance.SectionTimes("cuda"), performance.SectionTimes("cpu")
+    assert not on_gpu.is_known and not on_cpu.is_known
+    for times in on_gpu, on_cpu:
+        times.add(dict(rest=0.1, collect=0.9), 2)
+    assert not on_gpu.is_known and on_cpu.is_known
+
+
 @pytest.mark.cuda
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_gpu_is_measured_after_training(name, tmp_path):
     run = make_trainer(tmp_path, name, "cuda", n_updates=8)
     run.train()
-    assert list(run.section_times.milliseconds()) == ["log"]
+    assert list(run.section_times.milliseconds()) == ["log"] and not run.section_times.is_known
     n_rows, samples = len(run.logger), run.samples
     run.measure_sections()
     milliseconds = run.section_times.milliseconds()
     assert list(milliseconds) == list(SECTIONS) and min(milliseconds.values()) > 0
+    assert run.section_times.is_known
     assert len(run.logger) == n_rows + 1 and run.samples == samples
     assert {f"section/{name}" for name in SECTIONS} < set(run.logger[-1])
 
