@@ -10,7 +10,17 @@ from megastep.arrdict import arrdict, numpyify
 from megastep.core import Core
 from megastep.modules import RandomSpawns
 
-__all__ = ["DisplayedEnv", "SceneryEnv"]
+__all__ = ["DisplayedEnv", "SceneryEnv", "images"]
+
+
+def images(view: engine.Observation) -> arrdict:
+    """Returns ``rgb`` (N, A, 3, C, P) and ``d`` (N, A, 1, C, P) as views of an observation's
+    tensors: an image has a row per camera.
+    """
+    rgb, d = view.rgb, view.depth
+    if rgb.ndim == 4:  # one camera
+        rgb, d = rgb.unsqueeze(2), d.unsqueeze(2)
+    return arrdict(rgb=rgb.transpose(2, 3), d=d.unsqueeze(2))
 
 
 class DisplayedEnv:

@@ -11,7 +11,7 @@ from megastep import geometries as sources
 from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
-from megastep.envs.common import SceneryEnv
+from megastep.envs.common import SceneryEnv, images
 from megastep.envs.explorer.step import N_EPISODE, explorer_step
 from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.scene import scenery, spread
@@ -185,13 +185,7 @@ class Explorer(SceneryEnv):
         view = engine.observe(
             self.core.scenery, self.core.agents, self.subsample, imu=True, **bitmaps
         )
-        per_camera = view.rgb.view(self.n_envs, 1, -1, 3, self.obs_space.rgb.W)
-        obs = arrdict(
-            rgb=per_camera.transpose(2, 3),
-            d=view.depth.view(self.n_envs, *self.obs_space.d.shape),
-            imu=view.imu,
-        )
-        return obs, view.newly_seen
+        return arrdict(images(view), imu=view.imu), view.newly_seen
 
     def state(self, e: int = 0) -> arrdict:
         """Returns the tensors of environment ``e`` that :meth:`plot_state` draws."""

@@ -14,7 +14,7 @@ from megastep import geometries as sources
 from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
-from megastep.envs.common import SceneryEnv
+from megastep.envs.common import SceneryEnv, images
 from megastep.envs.pointgoal.goals import goal_fields
 from megastep.envs.pointgoal.step import N_PRIVILEGED, PROGRESS_ROWS, pointgoal_step
 from megastep.scene import scenery, spread
@@ -69,9 +69,10 @@ class PointGoal(SceneryEnv):
         bonus: reward for success.
         cost: subtracted from the reward of every step.
         walk_cost: subtracted from the reward per metre walked. SPL counts metres, ``cost`` steps.
-        res: rays of the camera.
+        res: rays of each camera.
         subsample: rays per pixel.
         fov: field of view in degrees.
+        cameras: yaw of each camera, degrees; 0 looks ahead, 90 left.
         fps: steps per second.
         control: discrete or continuous actions.
         resample: draw a new home for every episode. Default: each environment keeps its home.
@@ -99,6 +100,7 @@ class PointGoal(SceneryEnv):
         res: Annotated[int, Field(ge=1, le=1024)] = 256,
         subsample: Annotated[int, Field(ge=1, le=32)] = 4,
         fov: Annotated[float, Field(gt=0, lt=180)] = 130.0,
+        cameras: Annotated[Sequence[float], Field(min_length=1, max_length=16)] = (0.0,),
         fps: Annotated[float, Field(ge=1, le=1000)] = 10.0,
         control: Literal["discrete", "continuous"] = "discrete",
         resample: bool = False,
@@ -112,7 +114,8 @@ class PointGoal(SceneryEnv):
             res,
             fov,
             fps,
-            seed=seed,
+            cameras,
+            seed,
         )
         self.n_envs, self.device, self.fps = n_envs, self.core.device, self.core.fps
         self.subsample, self.seed = subsample, seed + (2 << 32)  # not the spawns' seed
@@ -186,11 +189,7 @@ class PointGoal(SceneryEnv):
     def _view(self):
         """Returns the observation without the goal."""
         view = engine.observe(self.core.scenery, self.core.agents, self.subsample, imu=True)
-        return arrdict(
-            rgb=view.rgb.view(self.n_envs, *self.obs_space.rgb.shape),
-            d=view.depth.view(self.n_envs, *self.obs_space.d.shape),
-            imu=view.imu,
-        )
+        return arrdict(images(view), imu=view.imu)
 
     def state(self, e: int = 0) -> arrdict:
         """Returns environment ``e`` for :meth:`plot_state`."""
