@@ -19,6 +19,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from megastep import arrdict, core, engine, envs, scene
+from megastep.engine import movement, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns
 
@@ -50,7 +51,7 @@ def step(env, n_lanes, action):
         env.step(arrdict.arrdict(actions=actions))
 
 
-def main(device):
+def run_all(device):
     homes = sample("bench", 3)
     for n_agents, res, cameras in [(1, 63, None), (4, 96, [0, 120, 240])]:
         c = core.Core(
@@ -74,7 +75,8 @@ def main(device):
             )
             engine.render(c.scenery, c.agents)
         out_of_range(c, spawn)
-    as_trained = dict(device=device, resample=True, privileged=True, patience=1)
+    as_trained_everywhere = dict(device=device, resample=True, privileged=True)
+    as_trained = dict(as_trained_everywhere, patience=1)
     for env in (
         envs.Explorer(7, homes, device=device),
         envs.Explorer(7, homes, **as_trained),
@@ -97,8 +99,19 @@ def main(device):
         env.reset()
         for action in (*range(3), 7) * 20:
             step(env, 67 * env.n_agents, action)
+    env = envs.PointGoal(7, homes, **as_trained_everywhere, cameras=[0, 180])
+    env.reset()
+    for action in range(7):
+        step(env, 7, action)
     if device == "cuda":
         torch.cuda.synchronize()
+
+
+def main(device):
+    run_all(device)
+    if device == "cuda":  # with the kernels that render and move many agents, too
+        movement.n_resident_threads = rendering.n_resident_threads = lambda *_: 0
+        run_all(device)
     print("done")
 
 

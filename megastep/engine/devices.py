@@ -8,6 +8,7 @@ import torch
 
 from megastep.engine import checks
 from megastep.kernels.build.compile import EngineError
+from megastep.kernels.build.launch import BLOCK
 
 __all__ = ["device", "fit", "free_memory", "n_resident_threads", "set_threads", "threads"]
 
@@ -99,9 +100,16 @@ def free_memory(device: Any) -> int:
 
 
 @functools.cache
-def n_resident_threads(device: torch.device) -> int:
-    """Returns how many threads a GPU can run at once, 0 for a CPU."""
+def n_resident_threads(device: torch.device, n_blocks: int | None = None) -> int:
+    """Returns how many threads a GPU can run at once, 0 for a CPU.
+
+    Args:
+        n_blocks: blocks of a kernel that a multiprocessor can hold. Default: no limit.
+    """
     if device.type == "cpu":
         return 0
     gpu = torch.cuda.get_device_properties(device)
-    return gpu.multi_processor_count * gpu.max_threads_per_multi_processor
+    n_threads = gpu.max_threads_per_multi_processor
+    if n_blocks is not None:
+        n_threads = min(n_threads, n_blocks * BLOCK)
+    return gpu.multi_processor_count * n_threads

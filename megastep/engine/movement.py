@@ -25,8 +25,8 @@ __all__ = ["physics"]
 #: Threads that move an environment's agents, on a GPU: the most with which all environments move
 #: at once, or else the least.
 GROUPS = (32, 16, 8)
-#: The share of a GPU's threads that run at once: 18 of 32 blocks, by the bounds of `physics_unspilled`.
-AT_ONCE = 18 / 32
+#: Blocks that a multiprocessor holds, by the bounds of `physics_unspilled`.
+UNSPILLED_BLOCKS = 18
 
 
 def physics(
@@ -92,12 +92,12 @@ def _addresses(actions, lanes, n_moves, device):
 
 def _kernel(n_envs, device):
     """Returns the kernel that moves agents: with more registers per thread until environments are
-    many.
+    many, by what is faster on an H200.
     """
     n_threads = GROUPS[-1] * n_envs
     return "physics_unspilled" if n_threads <= n_resident_threads(device) else "physics"
 
 
 def _threads_per_env(n_envs, device):
-    room = AT_ONCE * n_resident_threads(device)
+    room = n_resident_threads(device, UNSPILLED_BLOCKS)
     return next((size for size in GROUPS if size * n_envs <= room), GROUPS[-1])

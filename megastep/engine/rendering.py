@@ -26,7 +26,8 @@ __all__ = ["observe", "render", "update_agent_geometry"]
 
 MAX_SUBSAMPLE = ENGINE.constants["MAX_SUBSAMPLE"]
 NEAREST_LINE_BYTES = ENGINE.constants["NEAREST_LINE_BYTES"]
-#: Agents are many if they need more threads than this many times those that a GPU runs at once.
+#: Agents are many if they need more threads than this many times those that a GPU runs at once, by
+#: what is faster on an H200.
 UNSPILLED_WAVES = 4
 
 # RenderParams' optional outputs, and the inputs that only these need. 0 is null: not wanted.

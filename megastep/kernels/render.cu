@@ -1,5 +1,5 @@
-// One warp per agent, for many agents: so many warps per multiprocessor that 40 registers are left
-// for each, which spills some.
+// One warp per agent, for many agents and for all outputs: so many warps per multiprocessor that 40
+// registers are left for each thread, which spills some.
 #include "render_cuda.h"
 
 KERNEL BOUNDS(24) render(RenderParams p) {

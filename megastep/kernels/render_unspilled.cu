@@ -1,5 +1,5 @@
-// One warp per agent, as render.cu, but fewer per multiprocessor, with 56 registers each: faster
-// until there are many agents.
+// One warp per agent, for observations only. Fewer warps per multiprocessor than render.cu, with 56
+// registers per thread: faster until there are many agents.
 #include "render_cuda.h"
 
 KERNEL BOUNDS(18) render_unspilled(RenderParams p) {

@@ -21,6 +21,7 @@ METRICS = {  # ncu's name: (name in the records, unit)
     "dram__throughput.avg.pct_of_peak_sustained_elapsed": ("DRAM throughput", "%"),
 }
 #: (kernel, operation), in the order in which engine_operations.operations launches them.
+# with N_AGENTS agents; fewer have others, see `_kernel` in megastep/engine/rendering.py
 KERNELS = (
     ("physics", "`physics`"),
     ("spawn", "`spawn` of 1 in 256"),

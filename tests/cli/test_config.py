@@ -293,7 +293,8 @@ def test_out_of_range_error_names_the_range():
 
 
 def test_list_too_short():
-    assert compose("env.cameras=[0,120,240]").env.cameras == [0, 120, 240]
+    for env in "explorer", "pointgoal":
+        assert compose(f"env={env}", "env.cameras=[0,120,240]").env.cameras == [0, 120, 240]
     messages = errors("env.cameras=[]")["env.cameras"]
     assert messages == "a list of 0 is out of range: allowed is at least 1"
 

@@ -74,8 +74,9 @@ def test_png_is_the_last_frame(trained, tmp_path, monkeypatch):
     assert drawn.std() > 10 and errors.mean() < 3, "compression loses as much"
 
 
-def test_several_cameras(tmp_path):
-    options = ["env=explorer", "geometry=box", "env.cameras=[0,120,240]", "device=cpu", "steps=1"]
+@pytest.mark.parametrize("env", ["explorer", "pointgoal"])
+def test_several_cameras(env, tmp_path):
+    options = [f"env={env}", "geometry=box", "env.cameras=[0,120,240]", "device=cpu", "steps=1"]
     heights = []
     for cameras in options[2], "env.cameras=[0]":
         file = tmp_path / "a.png"

@@ -24,7 +24,7 @@ from megastep.agents.cli.program import ConfigErrors, UserError
 from megastep.agents.cli.runs import locked
 from megastep.agents.cli.settings import Train
 from megastep.agents.cli.signals import Interrupted
-from megastep.agents.training import checkpoint, json_lines, loggers
+from megastep.agents.training import checkpoint, json_lines, loggers, performance
 from megastep.agents.training.budget import Budget
 from megastep.settings import MAX_ENVS
 from tests.helpers import faults, tiny
@@ -89,6 +89,15 @@ def test_files_of_a_run(here, with_curves):
     loaded = checkpoint.load_latest(folder / "checkpoints")
     assert loaded.step == loaded.state["samples"] == 3 * UPDATE
     assert loaded.config["spaces"]["obs"].startswith("MultiImage")
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_ends_with_a_table_of_sections_that_are_known(here, is_known, monkeypatch, capsys):
+    """A GPU does not know them if it was interrupted."""
+    if not is_known:
+        monkeypatch.setattr(performance.SectionTimes, "is_known", False)
+    train.run(configured(f"samples={2 * UPDATE}"))
+    assert ("backward" in capsys.readouterr().out) == is_known
 
 
 def test_seeds(here):

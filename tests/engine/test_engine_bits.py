@@ -1,5 +1,6 @@
 """CPU and GPU, and any number of CPU threads, agree on every bit."""
 
+import functools
 import math
 from types import SimpleNamespace
 
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from megastep import cuda, engine, scene, toys
-from megastep.engine import movement, rendering
+from megastep.engine import devices, movement, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns, visible_texels
 from megastep.ragged import Ragged
@@ -89,7 +90,7 @@ def pretend(patch, amount, n_agents):
     """Makes 24 environments many, some or few."""
     n_threads = 24 * ROOMS[amount]
     patch.setattr(rendering, "n_resident_threads", lambda device: n_agents * n_threads)
-    patch.setattr(movement, "n_resident_threads", lambda device: n_threads)
+    patch.setattr(movement, "n_resident_threads", lambda device, n=32: n_threads * n // 32)
 
 
 @pytest.mark.cuda
@@ -116,6 +117,8 @@ def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu,
     if amount == "few" and not can_split:
         kernel = "render_unspilled"
     assert {kernel, "render"} <= cuda_on_cpu.launched  # `render` for all fields
+    if amount == "many":
+        assert not {"render_unspilled", "render_split"} & cuda_on_cpu.launched
     physics = "physics" if amount == "many" else "physics_unspilled"
     assert {"physics", "physics_unspilled"} & cuda_on_cpu.launched == {physics}
 
@@ -140,8 +143,19 @@ def test_choice_of_kernel_on_an_h200(monkeypatch, n_envs, n_agents, res, subsamp
     assert rendering._kernel(scenery, res, subsample) == kernel
 
 
+def test_threads_that_a_gpu_runs_at_once(monkeypatch):
+    """On an H200, and on a smaller GPU."""
+    for n_threads in 2048, 1536:
+        gpu = SimpleNamespace(multi_processor_count=10, max_threads_per_multi_processor=n_threads)
+        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device, gpu=gpu: gpu)
+        count = functools.partial(devices.n_resident_threads.__wrapped__, torch.device("cuda"))
+        assert (count(), count(18), count(32)) == (10 * n_threads, 11_520, 10 * n_threads)
+    assert devices.n_resident_threads(torch.device("cpu"), 18) == 0
+
+
 def test_threads_of_an_environment_on_an_h200(monkeypatch):
-    monkeypatch.setattr(movement, "n_resident_threads", lambda device: 132 * 2048)
+    room = {18: 132 * 18 * 64, None: 132 * 2048}
+    monkeypatch.setattr(movement, "n_resident_threads", lambda device, n=None: room[n])
     counts = 1, 4752, 4753, 9504, 9505, 1_048_576
     assert [movement._threads_per_env(n, None) for n in counts] == [32, 32, 16, 16, 8, 8]
     kernels = [movement._kernel(n, None) for n in (1, 33_792, 33_793)]

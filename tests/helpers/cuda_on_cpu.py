@@ -107,7 +107,7 @@ class CudaOnCpu:
         """Replaces `launch` and `launch_blocks` in all modules that import them."""
         self.launched.clear()
         for module in movement, rendering:
-            monkeypatch.setattr(module, "n_resident_threads", lambda device: RESIDENT_THREADS)
+            monkeypatch.setattr(module, "n_resident_threads", lambda *_: RESIDENT_THREADS)
         for name, stand_in in ("launch", self), ("launch_blocks", self.launch_blocks):
             original = getattr(launching, name)
             for path, module in list(sys.modules.items()):

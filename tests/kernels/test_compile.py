@@ -80,6 +80,24 @@ def test_kernels_keep_file_and_line(kernels, tmp_path):
         assert files[name].splitlines()[line - 1].startswith("KERNEL")
 
 
+@pytest.mark.cuda
+@pytest.mark.skipif(
+    torch.cuda.is_available() and torch.cuda.get_device_capability() != (9, 0),
+    reason="other GPUs have other numbers of registers",
+)
+def test_unspilled_kernels_keep_all_in_registers():
+    driver, _ = compile.bindings()
+    local_bytes = driver.CUfunction_attribute.CU_FUNC_ATTRIBUTE_LOCAL_SIZE_BYTES
+    functions = compile.cuda(ENGINE, 0)
+    spilled = {
+        name: compile.check_status(driver.cuFuncGetAttribute(local_bytes, function), "Asking")
+        for name, function in functions.items()
+    }
+    unspilled = "physics_unspilled", "render_split", "render_unspilled"
+    assert [spilled[name] for name in unspilled] == [0, 0, 0]
+    assert spilled["physics"] > 0 and spilled["render"] > 0, "if not, the others are not needed"
+
+
 def nvrtc(files, flags=program.CUDA_FLAGS):
     """A cubin of these files, by NVRTC, which needs no GPU. Skips if there is no NVRTC."""
     try:

@@ -30,10 +30,10 @@ class PointGoal(SceneryEnv):
     """Point-goal navigation: walk to a point given by its distance and bearing.
 
     Observation:
-        A dict of float16, W = ``res / subsample`` pixels (64).
+        A dict of float16, for each of C cameras (1) W = ``res / subsample`` pixels (64).
 
-        - ``rgb``: (B, 1, 3, 1, W), linear light. A pixel is the mean of ``subsample`` rays.
-        - ``d``: (B, 1, 1, 1, W), depth: 1 at the agent's edge, 0 at 10 m and beyond.
+        - ``rgb``: (B, 1, 3, C, W), linear light. A pixel is the mean of ``subsample`` rays.
+        - ``d``: (B, 1, 1, C, W), depth: 1 at the agent's edge, 0 at 10 m and beyond.
         - ``imu``: (B, 1, 3), angular velocity / 360 deg/s, velocity forward and left / 10 m/s.
         - ``goal``: (B, 1, 3), in the agent's frame: straight-line distance / 10 m, cosine and sine
           of the bearing.
@@ -135,6 +135,7 @@ class PointGoal(SceneryEnv):
         self.privileged_space = (
             dotdict(way=spaces.MultiVector(1, N_PRIVILEGED)) if privileged else None
         )
+        engine.fit(n_envs, 8 * self.obs_space.d.H * self.obs_space.d.W + 64, self.device)
         self.goal_index, self.ages, self.n_draws = (
             torch.zeros(n_envs, dtype=torch.int32, device=self.device) for _ in range(3)
         )
