@@ -219,7 +219,7 @@ def _build_cuda(files, flags):
     """Returns a cubin of all ``.cu`` files.
 
     NVRTC gets every file under its own name, so its errors, ncu and compute-sanitizer name file and
-    line: physics.cu:23.
+    line: physics_cuda.h:23.
     """
     _, nvrtc = bindings()
     names, texts = [name.encode() for name in files], [text.encode() for text in files.values()]
