@@ -8,14 +8,14 @@ import torch
 from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels import program
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
-from megastep.agents.distributed.pooling import average_gradients, on_all_ranks
+from megastep.agents.distributed.pooling import Moments, average_gradients, pool
 from megastep.agents.sections import section
 
 
 class GradientSteps:
     """Takes Adam steps on some parameters. Skips steps with non-finite numbers.
 
-        is_finite = steps.begin(rollout.floats())
+        is_finite, _ = steps.begin(rollout.floats())
         for batch in minibatches:
             steps.backward(loss, metrics, batch.valid.sum())
             steps.take()
@@ -57,18 +57,21 @@ class GradientSteps:
         """Changes Adam's step size, also for a captured update."""
         self._lr.fill_(lr)
 
-    def begin(self, floats: dict[str, torch.Tensor]) -> torch.Tensor:
+    def begin(
+        self, floats: dict[str, torch.Tensor], *moments: Moments
+    ) -> tuple[torch.Tensor, list[Moments]]:
         """Begins an update.
 
         Args:
             floats: the tensors to learn from, as for `NonFiniteCheck`.
+            moments: statistics to pool over the ranks in the same operation.
 
         Returns:
-            () bool, whether they are all finite, on every rank. If not, no step of this update is
-            taken.
+            () bool, whether they are all finite, on every rank: if not, no step of this update is
+            taken. And the moments of all ranks, as `pool_moments` returns them.
         """
-        self._is_finite, self._totals = on_all_ranks(self.check(floats)), None
-        return self._is_finite
+        (self._is_finite, pooled), self._totals = pool(self.check(floats), *moments), None
+        return self._is_finite, pooled
 
     @section("backward")
     def backward(

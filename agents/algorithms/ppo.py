@@ -21,7 +21,6 @@ from megastep.agents.algorithms.learner import (
 from megastep.agents.algorithms.masked_stats import pooled_normalise
 from megastep.agents.algorithms.order import random_order
 from megastep.agents.algorithms.ppo_loss import Coefficients, ppo_loss
-from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.masked_moments import masked_moments, normalise_masked
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
@@ -124,7 +123,6 @@ class PPO(GradientLearner):
         return super().update(rollout)
 
     def _update(self, rollout):
-        is_finite = self.steps.begin(rollout.floats())
         transitions = rollout.transitions()
         traces = dict(gamma=self.gamma, lambda_=self.lambda_)
         estimates = returns.gae(**transitions, learns=rollout.learns[:-1], **traces)
@@ -132,7 +130,11 @@ class PPO(GradientLearner):
         moments = masked_moments(valid, targets, advantages)
         (_, _, variance), (_, _, error) = moments  # an advantage is the error of the value
         explained = 1 - error / variance.clamp(min=1e-8)
-        of_targets, of_advantages = pool_moments(*moments)
+        # One row of observations is enough: every rollout brings another B.
+        last = rollout.world(-1)
+        of_obs = self.policy.moments(last.obs, last.get("privileged"), rollout.learns[-1])
+        is_finite, pooled = self.steps.begin(rollout.floats(), *moments, *of_obs)
+        of_targets, of_advantages, *of_obs = pooled
         self.policy.critic.output.add(of_targets, is_finite)
         if self.normalise_advantage == "rollout":
             estimates["advantages"] = normalise_masked(advantages, valid, of_advantages)
@@ -154,9 +156,8 @@ class PPO(GradientLearner):
                     is_enabled = is_enabled & ~(kl > self.target_kl)
                 self.steps.take(is_enabled)
         # Observation statistics change only now, so the whole update saw the normalisation that
-        # acted. One row is enough: every rollout brings another B observations.
-        last = rollout.world(-1)
-        self.policy.update_stats(last.obs, last.get("privileged"), is_finite & rollout.learns[-1])
+        # acted.
+        self.policy.add_moments(of_obs, is_finite)
         return {**self.steps.end(), "explained_variance": explained}
 
     @section("forward")

@@ -161,7 +161,7 @@ class R2D2(GradientLearner):
         return settings.capacity, n_bytes
 
     def _update(self, rollout):
-        is_finite = self.steps.begin(rollout.floats())
+        is_finite, _ = self.steps.begin(rollout.floats())
         self.replay_buffer.add(rollout, is_finite)
         # A non-finite rollout counts as skipped even while the replay buffer is not ready.
         is_enabled = self.replay_buffer.is_ready | ~is_finite

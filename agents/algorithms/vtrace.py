@@ -27,6 +27,8 @@ from megastep.agents.algorithms.masked_stats import (
     pooled_mean,
 )
 from megastep.agents.algorithms.order import random_order
+from megastep.agents.distributed.pooling import pool_moments
+from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage import mixed_batches
@@ -179,7 +181,7 @@ class VTrace(GradientLearner):
         return super().update(rollout)
 
     def _update(self, rollout):
-        is_finite = self.steps.begin(rollout.floats())
+        is_finite, _ = self.steps.begin(rollout.floats())
         if self.replay_buffer is not None:
             self.replay_buffer.add(rollout, is_finite)
         all_estimates = []
@@ -197,9 +199,11 @@ class VTrace(GradientLearner):
             torch.cat([estimates[key] for estimates in all_estimates], 1)
             for key in ("targets", "valid")
         )
-        self.policy.critic.output.update_stats(targets, valid & is_finite)
         last = rollout.world(-1)
-        self.policy.update_stats(last.obs, last.get("privileged"), is_finite & rollout.learns[-1])
+        of_obs = self.policy.moments(last.obs, last.get("privileged"), rollout.learns[-1])
+        of_targets, *of_obs = pool_moments(*masked_moments(valid, targets), *of_obs)
+        self.policy.critic.output.add(of_targets, is_finite)
+        self.policy.add_moments(of_obs, is_finite)
         return self.steps.end()
 
     @section("forward")

@@ -47,23 +47,38 @@ def on_all_ranks(condition: torch.Tensor) -> torch.Tensor:
 def pool_moments(*moments: Moments) -> list[Moments]:
     """Returns the moments of the entries of all ranks together (Chan et al. 1979).
 
-    One operation for all that are given.
+    One operation for all that are given, and as many kernels as for one.
     """
     if n_ranks() == 1:
         return list(moments)
-    columns = [column.double().flatten() for each in moments for column in each]
-    rows = all_gather(torch.cat(columns))
-    pooled = []
-    split = iter(rows.split([len(column) for column in columns], 1))
-    for each, counts, means, variances in zip(moments, split, split, split, strict=True):
-        n = counts.sum(0)
-        divisor = n.clamp(min=1)
-        mean = (counts * means).sum(0) / divisor
-        variance = (counts * (variances + (means - mean).square())).sum(0) / divisor
-        pooled.append(
-            tuple(new.view_as(old).to(old.dtype) for new, old in zip((n, mean, variance), each))
-        )
-    return pooled
+    counts, means, variances = zip(*moments)
+    sizes = [mean.numel() for mean in means]
+    statistics = torch.cat([column.flatten() for column in (*means, *variances)])
+    rows = all_gather(torch.cat([torch.stack(counts).double(), statistics.double()]))
+    counts, means, variances = rows.split([len(sizes), sum(sizes), sum(sizes)], 1)
+    n = counts.sum(0).to(moments[0][0].dtype)
+    # of each number, as its moments have one count
+    columns = counts.split(1, 1)
+    counts = torch.cat([column.expand(-1, size) for column, size in zip(columns, sizes)], 1)
+    divisor = counts.sum(0).clamp(min=1)
+    mean = (counts * means).sum(0) / divisor
+    variance = (counts * (variances + (means - mean).square())).sum(0) / divisor
+    mean, variance = torch.stack([mean, variance]).to(moments[0][1].dtype)
+    pooled = zip(n, mean.split(sizes), variance.split(sizes), strict=True)
+    return [
+        tuple(new.view_as(old).to(old.dtype) for new, old in zip(each, before, strict=True))
+        for each, before in zip(pooled, moments, strict=True)
+    ]
+
+
+def pool(condition: torch.Tensor, *moments: Moments) -> tuple[torch.Tensor, list[Moments]]:
+    """Returns `on_all_ranks(condition)` and `pool_moments(*moments)`, by one operation."""
+    if n_ranks() == 1:
+        return condition, list(moments)
+    one = torch.ones_like(condition, dtype=torch.int64)
+    is_false = (~condition).float()
+    (_, fraction_false, _), *pooled = pool_moments((one, is_false, is_false), *moments)
+    return fraction_false == 0, pooled
 
 
 def average_gradients(
@@ -89,13 +104,17 @@ def average_gradients(
         return n_valid, means
     with torch.no_grad():
         held = [p for p in parameters if p.grad is not None]
-        ours = torch.cat([*(p.grad.flatten() for p in held), *(m.float()[None] for m in means)])
-        n = n_valid.to(ours)
-        bucket = all_reduce(torch.cat([ours * n, n[None]]))
-        n = bucket[-1]
-        averages = bucket[:-1] / n.clamp(min=1)
-        sizes = [p.numel() for p in held]
-        *gradients, means = averages.split([*sizes, len(means)])
-        for p, gradient in zip(held, gradients, strict=True):
-            p.grad = gradient.view_as(p)
-    return n, list(means.unbind())
+        gradients = [p.grad.flatten() for p in held]
+        numbers = [number.float() for number in means] + [torch.ones_like(n_valid).float()]
+        # one buffer, in which each gradient begins at a multiple of 16 bytes, as Adam likes it
+        sizes = [n + -n % 4 for n in map(len, gradients)]
+        bucket = gradients[0].new_zeros(sum(sizes) + len(numbers))
+        *parts, last = bucket.split([*sizes, len(numbers)])
+        parts = [part[: len(gradient)] for part, gradient in zip(parts, gradients)]
+        torch._foreach_copy_([*parts, *last.unbind()], [*gradients, *numbers])
+        all_reduce(bucket.mul_(n_valid))
+        n = last[-1].clone()
+        bucket /= n.clamp(min=1)
+        for p, part in zip(held, parts, strict=True):
+            p.grad = part.view_as(p)
+    return n, list(last[:-1].unbind())

@@ -175,10 +175,15 @@ class ConcatIntake(nn.Module):
                 parts.append(Part(encoder, sources, targets))
         return parts
 
-    def normalised_leaves(self, obs: Tree) -> list[tuple[RunningNorm, torch.Tensor]]:
-        """Returns each normalisation with its leaf, for `update_norms`."""
+    @property
+    def running_norms(self) -> list[RunningNorm]:
+        """Normalisations by running statistics."""
+        return [norm for norm in self.norms if isinstance(norm, RunningNorm)]
+
+    def normalised_leaves(self, obs: Tree) -> list[torch.Tensor]:
+        """Returns the leaf of each of `running_norms`."""
         pairs = zip(self.norms, self._leaves(obs), strict=True)
-        return [(norm, leaf) for norm, leaf in pairs if isinstance(norm, RunningNorm)]
+        return [leaf for norm, leaf in pairs if isinstance(norm, RunningNorm)]
 
     def _leaves(self, obs):
         values = spaces.leaves(obs)

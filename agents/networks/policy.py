@@ -6,19 +6,19 @@ T time, B lanes. On a GPU matrix products run in bfloat16 with float32 weights, 
 
 import copy
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import AfterValidator, Field
 from torch import nn
 
+from megastep.agents.distributed.pooling import Moments, pool_moments
 from megastep.agents.generator import SeededGenerator, stream_seed
-from megastep.agents.networks import cores, encoders, heads, joint_heads
+from megastep.agents.networks import cores, encoders, heads, joint_heads, running_norm
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.precision import ComputeDtype
-from megastep.agents.networks.running_norm import update_norms
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
 from megastep.imports import known_name
@@ -310,7 +310,35 @@ class Policy(nn.Module):
             privileged: (B, ...) per leaf, for an asymmetric critic.
             is_counted: () or (B,) bool, lanes to count.
         """
-        pairs = self.intake.normalised_leaves(obs)
+        self.add_moments(pool_moments(*self.moments(obs, privileged, is_counted)))
+
+    def moments(
+        self,
+        obs: Tree,
+        privileged: Tree | None = None,
+        is_counted: torch.Tensor | bool = True,
+    ) -> list[Moments]:
+        """Returns the moments of this rank's observations, for `pool_moments` and `add_moments`.
+
+        Args:
+            obs, privileged, is_counted: as for `update_stats`.
+        """
+        leaves = self.intake.normalised_leaves(obs)
         if self.privileged_space:
-            pairs += self.critic.intake.normalised_leaves(privileged)
-        update_norms(pairs, is_counted)
+            leaves += self.critic.intake.normalised_leaves(privileged)
+        return running_norm.moments_of(self._norms(), leaves, is_counted)
+
+    def add_moments(
+        self, moments: Sequence[Moments], is_counted: torch.Tensor | None = None
+    ) -> None:
+        """Adds the observations of all ranks to the running statistics.
+
+        Args:
+            moments: those of `moments`, pooled over the ranks.
+            is_counted: () bool; if false, nothing changes. None: true.
+        """
+        running_norm.add_moments(self._norms(), moments, is_counted)
+
+    def _norms(self):
+        norms = self.intake.running_norms
+        return norms + self.critic.intake.running_norms if self.privileged_space else norms

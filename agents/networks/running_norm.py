@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.distributed.pooling import Moments, pool_moments
+from megastep.agents.distributed.pooling import Moments
 from megastep.agents.networks.kernels import moments as kernels
 from megastep.types import Space
 
@@ -69,39 +69,20 @@ class RunningNorm(nn.Module):
 
 
 @torch.no_grad()
-def update_norms(
-    pairs: Sequence[tuple[RunningNorm, torch.Tensor]], is_counted: torch.Tensor | bool = True
-) -> None:
-    """Adds observations to the statistics of their norms, those of all ranks together in one
-    operation. On a GPU in two kernels.
+def moments_of(
+    norms: Sequence[RunningNorm],
+    leaves: Sequence[torch.Tensor],
+    is_counted: torch.Tensor | bool = True,
+) -> list[Moments]:
+    """Returns `RunningNorm.moments` of each norm; on a GPU in one kernel for up to `MAX_LEAVES`.
 
     Args:
-        pairs: norms, with the observations (B, ...) of each.
+        leaves: the observations (B, ...) of each norm.
         is_counted: () or (B,) bool, lanes to count.
     """
-    if not pairs:
-        return
-    is_fused = all(_is_fused(norm, obs) for norm, obs in pairs)
-    if is_fused:
-        all_moments = _moments_on_gpu(pairs, is_counted)
-    else:
-        all_moments = [norm.moments(obs, is_counted) for norm, obs in pairs]
-    pooled = pool_moments(*all_moments)
-    norms = [norm for norm, _ in pairs]
-    if is_fused:
-        _add_on_gpu(norms, pooled)
-        return
-    for norm, moments in zip(norms, pooled, strict=True):
-        norm.add(*moments)
-
-
-def _is_fused(norm, obs):
-    is_float = obs.dtype in (torch.float16, torch.float32)
-    return obs.is_cuda and is_float and obs.is_contiguous() and norm.mean.dtype == torch.float32
-
-
-def _moments_on_gpu(pairs, is_counted):
-    """Returns `RunningNorm.moments` of each pair, in one kernel for up to `MAX_LEAVES`."""
+    pairs = list(zip(norms, leaves, strict=True))
+    if not all(_is_fused(norm) and _is_readable(leaf) for norm, leaf in pairs):
+        return [norm.moments(leaf, is_counted) for norm, leaf in pairs]
     moments = []
     for start in range(0, len(pairs), kernels.MAX_LEAVES):
         some = pairs[start : start + kernels.MAX_LEAVES]
@@ -117,11 +98,33 @@ def _moments_on_gpu(pairs, is_counted):
     return moments
 
 
-def _add_on_gpu(norms, all_moments):
-    """Does `RunningNorm.add` for each norm, in one kernel for up to `MAX_LEAVES`."""
-    for start in range(0, len(norms), kernels.MAX_LEAVES):
-        some = slice(start, start + kernels.MAX_LEAVES)
-        kernels.add_moments(norms[some], all_moments[some])
+@torch.no_grad()
+def add_moments(
+    norms: Sequence[RunningNorm],
+    moments: Sequence[Moments],
+    is_counted: torch.Tensor | None = None,
+) -> None:
+    """Does `RunningNorm.add` for each norm; on a GPU in one kernel for up to `MAX_LEAVES`.
+
+    Args:
+        moments: of each norm.
+        is_counted: () bool; if false, nothing changes. None: true.
+    """
+    if all(map(_is_fused, norms)):
+        for start in range(0, len(norms), kernels.MAX_LEAVES):
+            some = slice(start, start + kernels.MAX_LEAVES)
+            kernels.add_moments(norms[some], moments[some], is_counted)
+        return
+    for norm, (n_lanes, mean, variance) in zip(norms, moments, strict=True):
+        norm.add(n_lanes if is_counted is None else n_lanes * is_counted, mean, variance)
+
+
+def _is_fused(norm):
+    return norm.mean.is_cuda and norm.mean.dtype == torch.float32
+
+
+def _is_readable(leaf):
+    return leaf.dtype in (torch.float16, torch.float32) and leaf.is_contiguous()
 
 
 def mix_moments(

@@ -250,7 +250,8 @@ def test_unknown_spaces_raise(make, error):
 
 
 def update(intake, obs):
-    running_norm.update_norms(intake.normalised_leaves(obs))
+    norms = intake.running_norms
+    running_norm.add_moments(norms, running_norm.moments_of(norms, intake.normalised_leaves(obs)))
 
 
 def test_normalises_images_per_channel_and_vectors_per_number():

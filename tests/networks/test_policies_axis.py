@@ -188,15 +188,22 @@ def test_statistics_of_observations():
             sizes, means, scales, counts, of_leaves, strict=True
         )
     ]
-    launch(*(CORES, "add_moments", (len(sizes), P), threads), norms=b"".join(packed))
-    assert counts.tolist() == [[2, 2, 4], [2, 2, 3]]
+    are_added = torch.tensor([False, True, True], device="cuda")
+    for flags in (None, are_added):
+        launch(
+            *(CORES, "add_moments", (len(sizes), P), threads),
+            norms=b"".join(packed),
+            is_counted=flags,
+        )
+    assert counts.tolist() == [[2, 2, 5], [2, 2, 3]]
     for i in range(P):
         n, *alone = moments.moments([leaf[i] for leaf in leaves], list(sizes), is_counted[i])
         assert n_counted[i] == n
         for result, mean, variance in zip(of_leaves, *alone, strict=True):
             for one, other in zip(result[:, i], (mean, variance), strict=True):
                 torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True)
-        moments.add_moments(norms[i], [(n, *pair) for pair in zip(*alone, strict=True)])
+        for flag in (None, are_added[i]):
+            moments.add_moments(norms[i], [(n, *pair) for pair in zip(*alone, strict=True)], flag)
         for norm, mean, scale, count in zip(norms[i], means, scales, counts, strict=True):
             assert torch.equal(norm.mean[0], mean[i]) and torch.equal(norm.scale[0], scale[i])
             assert norm.count == count[i]

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from megastep import spaces
-from megastep.agents.networks.running_norm import RunningNorm, update_norms
+from megastep.agents.networks.running_norm import RunningNorm, add_moments, moments_of
 
 
 def update(norm, *observations):
     obs, *is_counted = observations
-    update_norms([(norm, obs)], *is_counted)
+    add_moments([norm], moments_of([norm], [obs], *is_counted))
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
@@ -22,6 +22,8 @@ def test_nonfinite_observations_change_nothing(bad):
     # 1e30 is finite, its square is not
     update(norm, torch.tensor([1.0, 2.0, 3.0, bad]).view(2, 1, 2))
     update(norm, torch.zeros(2, 1, 2), torch.tensor(False))
+    moments = moments_of([norm], [torch.zeros(2, 1, 2)])
+    add_moments([norm], moments, torch.tensor(False))
     assert all(torch.equal(norm.state_dict()[name], before[name]) for name in before)
 
 
@@ -62,10 +64,11 @@ def test_gpu_adds_the_same_moments_as_the_cpu(to_gpu):
         obs[1][~is_counted] = torch.nan
         if seed == 1:
             obs[2][int(is_counted.nonzero()[0])] = torch.nan
-        update_norms(list(zip(norms, obs)), is_counted)
-        moved = [(norm, to_gpu(leaf)) for norm, leaf in zip(on_gpu, obs)]
-        update_norms(moved, to_gpu(is_counted))
-    update_norms([(norm, to_gpu(leaf)) for norm, leaf in zip(on_gpu, obs)], False)
+        add_moments(norms, moments_of(norms, obs, is_counted))
+        moved = [to_gpu(leaf) for leaf in obs]
+        add_moments(on_gpu, moments_of(on_gpu, moved, to_gpu(is_counted)))
+    add_moments(on_gpu, moments_of(on_gpu, moved, False))
+    add_moments(on_gpu, moments_of(on_gpu, moved), to_gpu(torch.tensor(False)))
     assert [norm.count.item() for norm in on_gpu] == [3, 3, 2]
     for norm, other in zip(norms, on_gpu, strict=True):
         for name in ("mean", "scale", "count"):

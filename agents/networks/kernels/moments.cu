@@ -74,11 +74,12 @@ KERNEL BOUNDS(1024) moments(MomentsParams p) {
         p.n_counted[policy] = (long long)n_counted;
 }
 
-// Changes nothing if no lane was counted, or if a number is not finite.
+// Changes nothing if no lane was counted, if moments do not count, or if a number is not finite.
 KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
     wait_for_previous();
     const RunningNormParams& norm = p.norms[blockIdx.x];
     int policy = blockIdx.y, first = policy * norm.n;
+    bool is_counted = !p.is_counted || p.is_counted[policy];
     float count = norm.count[policy] + 1.f, rate = __fdiv_rn(1.f, count);
     for (int pass = 0; pass < 2; pass++) {  // first only looks
         bool stores = pass == 1;
@@ -97,7 +98,7 @@ KERNEL BOUNDS(1024) add_moments(AddMomentsParams p) {
                 norm.scale[i] = scale;
             }
         }
-        if (!__syncthreads_and(is_finite) || norm.n_counted[policy] <= 0)
+        if (!__syncthreads_and(is_finite) || !is_counted || norm.n_counted[policy] <= 0)
             return;
     }
     if (!threadIdx.x)

@@ -57,12 +57,13 @@ def moments(
     return n_counted, list(means), list(variances)
 
 
-def add_moments(norms: list, all_moments: list) -> None:
+def add_moments(norms: list, all_moments: list, is_counted: torch.Tensor | None = None) -> None:
     """Adds moments to the statistics of norms, at most `MAX_LEAVES`.
 
     Args:
         norms: `RunningNorm`s.
         all_moments: of each norm: the number of lanes () int64, means and variances.
+        is_counted: () bool; if false, nothing changes. None: true.
     """
     packed, kept = [], []
     for norm, (n_counted, mean, variance) in zip(norms, all_moments, strict=True):
@@ -83,7 +84,10 @@ def add_moments(norms: list, all_moments: list) -> None:
     threads = CORES.constants["MOMENTS_THREADS"]
     n_threads = threads * len(packed)
     launch_for_policy(
-        "add_moments", norms[0].mean, n_threads, block=threads, norms=b"".join(packed)
+        *("add_moments", norms[0].mean, n_threads),
+        block=threads,
+        norms=b"".join(packed),
+        is_counted=is_counted,
     )
 
 

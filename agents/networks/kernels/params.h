@@ -152,6 +152,7 @@ struct RunningNormParams {
 
 struct AddMomentsParams {
     RunningNormParams norms[8];
+    const unsigned char* is_counted;  // (P), false: nothing changes; null: true
 };
 
 // A weight, and where it is rounded to.
