@@ -6,7 +6,8 @@ from collections.abc import Iterable
 
 import torch
 
-from megastep.agents.distributed.process_group import gather_integers, gather_objects, n_ranks
+from megastep.agents.distributed.pooling import all_gather
+from megastep.agents.distributed.process_group import gather_objects, n_ranks
 
 #: Integer types of as many bytes, through which the bits of a number are read.
 INTEGERS = {1: torch.int8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
@@ -23,7 +24,7 @@ def first_difference(policy: torch.nn.Module) -> str | None:
     if n_ranks() == 1:
         return None
     tensors = {**dict(policy.named_parameters()), **dict(policy.named_buffers())}
-    rows = gather_integers(checksums(tensors.values()))
+    rows = all_gather(checksums(tensors.values()))
     for name, sums in zip(tensors, rows.T.tolist(), strict=True):
         if different := [rank for rank, value in enumerate(sums) if value != sums[0]]:
             return f"policy.{name} differs on {_ranks(different)}"
@@ -44,12 +45,12 @@ def check_drift(policy: torch.nn.Module) -> None:
 
 
 def checksums(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
-    """Returns the sum of the bits of each tensor as integers, modulo 2^64: an int64 vector on the
-    host. Synchronises.
+    """Returns the sum of the bits of each tensor as integers, modulo 2^64: an int64 vector on their
+    device.
     """
     with torch.no_grad():
         parts = [_bits(tensor.detach()).sum(dtype=torch.int64) for tensor in tensors]
-        return torch.stack(parts).cpu() if parts else torch.zeros(0, dtype=torch.int64)
+        return torch.stack(parts) if parts else torch.zeros(0, dtype=torch.int64)
 
 
 def _bits(tensor):

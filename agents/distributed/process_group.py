@@ -12,7 +12,6 @@ import contextlib
 import datetime
 import functools
 import itertools
-import math
 import os
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -152,20 +151,6 @@ def exchange(numbers: Sequence[float]) -> list[list[float]]:
     return [other.tolist() for other in rows]
 
 
-def gather_integers(numbers: torch.Tensor) -> torch.Tensor:
-    """Returns the vectors of int64 of every rank, (R, ...), on the host. Waits for the others.
-
-    Args:
-        numbers: int64 on the host, of the same shape on every rank.
-    """
-    if n_ranks() == 1:
-        return numbers[None]
-    rows = [torch.empty_like(numbers) for _ in range(n_ranks())]
-    with communicating():
-        distributed.all_gather(rows, numbers)
-    return torch.stack(rows)
-
-
 def gather_objects(value: Any) -> list[Any]:
     """Returns a small value of every rank, in the order of ranks. Waits for the others."""
     if n_ranks() == 1:
@@ -174,26 +159,3 @@ def gather_objects(value: Any) -> list[Any]:
     with communicating():
         distributed.all_gather_object(values, value)
     return values
-
-
-def sum_over_ranks(values: torch.Tensor) -> torch.Tensor:
-    """Returns the sum of the ranks' tensors, float64 on the host. Synchronises, and waits for the
-    others.
-    """
-    if n_ranks() == 1:
-        return values.double().cpu()
-    rows = torch.tensor(exchange(values.flatten().tolist()), dtype=torch.float64)
-    return rows.sum(0).view(values.shape)
-
-
-def mean_over_ranks(values: dict[str, float]) -> dict[str, float]:
-    """Returns the means over the ranks of numbers by name. Waits for the others.
-
-    NaN does not count; a number that is NaN on all ranks is left out.
-    """
-    rows, means = gather_objects(values), {}
-    for name in values:
-        column = [row[name] for row in rows if not math.isnan(row.get(name, math.nan))]
-        if column:
-            means[name] = math.fsum(column) / len(column)
-    return means

@@ -9,7 +9,7 @@ import torch
 from pydantic import Field, SkipValidation
 
 from megastep.agents.algorithms.kernels.program import run
-from megastep.agents.distributed.process_group import sum_over_ranks
+from megastep.agents.distributed.reports import sum_over_ranks
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay import duels

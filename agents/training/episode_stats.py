@@ -12,7 +12,7 @@ import torch
 
 from megastep.agents.algorithms.kernels import program
 from megastep.agents.algorithms.nonfinite import LIMIT
-from megastep.agents.distributed.process_group import sum_over_ranks
+from megastep.agents.distributed.reports import sum_over_ranks
 from megastep.types import Env, optional
 
 #: Means are over at least this many episodes, once so many have ended.

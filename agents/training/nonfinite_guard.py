@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, lane_name
-from megastep.agents.distributed.process_group import gather_objects, place, rank
+from megastep.agents.distributed.process_group import place, rank
+from megastep.agents.distributed.reports import gather_if_any
 from megastep.agents.training import nonfinite_recorder
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.types import Env, optional
@@ -50,7 +51,7 @@ class NonFiniteGuard:
         opponents: OpponentPool | None = None,
         replay_folder: Path | None = None,
     ):
-        self.learner, self.replay_folder = learner, replay_folder
+        self.learner, self.replay_folder, self.device = learner, replay_folder, env.device
         self.n_agents = optional(env, "n_agents")
         self.nonfinite_check = optional(learner, "check", LEARNER_DEFAULTS)
         self.value, self.replay_hint, self.recorder = None, "", None
@@ -89,7 +90,8 @@ class NonFiniteGuard:
             value = value.in_env(_env_lanes(rollout), self.n_agents)
             if self.value is None:
                 hint = self._write_replay(value, rollout, samples)
-        reports = gather_objects((n_skipped, value, hint, place()))
+        is_bad = value is not None or n_skipped > 0
+        reports = gather_if_any((n_skipped, value, hint, place()), is_bad, self.device)
         n_skipped = max(report[0] for report in reports)
         _, value, hint, place_of_value = next((one for one in reports if one[1]), reports[0])
         text = f"{value}{f' ({place_of_value})' * (len(reports) > 1)}"
@@ -136,13 +138,14 @@ class NonFiniteGuard:
             name: lane_name(_env_lanes(rollout)[lane], self.n_agents)
             for name, lane in episode_stats.pop_bad_metrics().items()
         }
-        reports = gather_objects({name: (lane, place()) for name, lane in bad.items()})
+        of_rank = {name: (lane, place()) for name, lane in bad.items()}
+        reports = gather_if_any(of_rank, bool(bad), self.device)
         of_all = {name: lane for report in reversed(reports) for name, lane in report.items()}
         episode_stats.named |= of_all.keys()
         for name, (lane, place_of_lane) in of_all.items() if rank() == 0 else ():
-            of_rank = f" ({place_of_lane})" * (len(reports) > 1)
+            of_place = f" ({place_of_lane})" * (len(reports) > 1)
             warnings.warn(
-                f"metrics.{name} of {lane}{of_rank} was not finite at the end of an episode; such "
+                f"metrics.{name} of {lane}{of_place} was not finite at the end of an episode; such "
                 f"episodes are left out of episode/{name}",
                 stacklevel=3,
             )

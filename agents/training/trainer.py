@@ -14,7 +14,8 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.agreement import any_rank
 from megastep.agents.distributed.drift import check_drift
 from megastep.agents.distributed.plan import Plan, agree
-from megastep.agents.distributed.process_group import mean_over_ranks, n_ranks, unhurried
+from megastep.agents.distributed.process_group import n_ranks, unhurried
+from megastep.agents.distributed.reports import mean_over_ranks
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
@@ -283,12 +284,13 @@ class Trainer:
         stats = self.episode_stats.pop()
         if self.opponents is not None:
             stats |= self.opponents.pop_win_rates()
-        if self.curriculum is not None:
-            stats |= mean_over_ranks(self.curriculum.stats())
+        of_curriculum = {} if self.curriculum is None else self.curriculum.stats()
+        means = mean_over_ranks({**of_curriculum, **loss_values})
+        stats |= {name: means[name] for name in of_curriculum if name in means}
         self.latest_stats.update(stats)
         metrics = {
             **stats,
-            **mean_over_ranks(loss_values),
+            **means,
             "updates": self.updates,
             "lr": self.lr,
             "anneal": self.budget.anneal,

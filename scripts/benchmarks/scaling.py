@@ -11,8 +11,10 @@ from timing import measurement
 from training_runs import learning_curve, rates, trained
 
 N_ROUNDS = 3
-#: What trains long enough for a steady rate; about 6 s on a GPU.
-SAMPLES = {"cuda": 50_000_000, "cpu": 100_000}
+#: What trains long enough for a steady rate; about 8 s on a GPU.
+SAMPLES = {"cuda": 150_000_000, "cpu": 100_000}
+#: What ranks of equal samples learn from.
+EQUAL_SAMPLES = {"cuda": 100_000_000, "cpu": 200_000}
 #: Environments of one GPU, or of all GPUs together.
 N_ENVS = {"cuda": 4096, "cpu": 64}
 
@@ -63,7 +65,7 @@ def ranks(
                 "",
                 _returns(device, count, seeds, *words),
             )
-    samples = 2 * SAMPLES[device.type]
+    samples = EQUAL_SAMPLES[device.type]
     for count in (1, n):
         words = f"samples={samples}", f"env.n_envs={n_envs // count}"
         what = f"explorer, {samples / 1e6:g} M samples, {n_envs:,} environments in all"

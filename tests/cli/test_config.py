@@ -173,7 +173,7 @@ def test_cpu_and_gpu_recipes():
     assert dataclasses.asdict(cpu.learner) == same | dict(lr=3e-3, gamma=0.98, entropy_coef=0.02)
     assert dataclasses.asdict(gpu.learner) == same | dict(lr=1e-3, gamma=0.995, entropy_coef=0.01)
     assert (cpu.env.n_envs, cpu.agent.width, cpu.log_every) == (256, 64, 4)
-    assert (gpu.env.n_envs, gpu.agent.width, gpu.log_every) == (4096, 256, 50)
+    assert (gpu.env.n_envs, gpu.agent.width, gpu.log_every) == (4096, 256, 100)
     assert dataclasses.replace(cpu.env, n_envs=4096) == gpu.env
     assert compose("experiment=quickstart").seconds == 160
 

@@ -60,7 +60,7 @@ def test_first_difference_names_tensor_and_ranks(monkeypatch):
         rows[2, 4] += 1
         return rows
 
-    monkeypatch.setattr(drift, "gather_integers", gather)
+    monkeypatch.setattr(drift, "all_gather", gather)
     assert first_difference(network) == "policy.0.bias differs on ranks 1 and 2"
     with pytest.raises(drift.DriftError, match="average_gradients"):
         check_drift(network)

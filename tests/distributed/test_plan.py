@@ -3,7 +3,7 @@
 import pytest
 
 from megastep.agents.cli.program import UserError
-from megastep.agents.distributed import agreement, plan, process_group
+from megastep.agents.distributed import agreement, plan, reports
 from megastep.agents.distributed.plan import Plan
 from megastep.agents.generator import rank_seed
 
@@ -88,10 +88,10 @@ def test_any_rank(others):
 def test_mean_over_ranks_leaves_out_nan(monkeypatch):
     nan = float("nan")
     values = {"a": 1.0, "b": nan, "c": nan}
-    assert process_group.mean_over_ranks(values) == {"a": 1}
+    assert reports.mean_over_ranks(values) == {"a": 1}
     rows = [values, {"a": 3.0, "b": 5.0, "c": nan}]
-    monkeypatch.setattr(process_group, "gather_objects", lambda value: rows)
-    assert process_group.mean_over_ranks(values) == {"a": 2, "b": 5}
+    monkeypatch.setattr(reports, "gather_objects", lambda value: rows)
+    assert reports.mean_over_ranks(values) == {"a": 2, "b": 5}
 
 
 def test_each_rank_has_a_seed_of_its_own():

@@ -8,7 +8,7 @@ import torch
 from megastep.agents.algorithms.masked_stats import pooled_mean, pooled_normalise
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
-from megastep.agents.distributed import pooling, process_group
+from megastep.agents.distributed import pooling, process_group, reports
 from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.storage.rollout import Rollout
 from tests.helpers import ranks
@@ -82,7 +82,19 @@ def every(device="cpu"):
     parameters = [torch.nn.Parameter(torch.zeros(3, device=device)) for _ in range(2)]
     parameters[1].grad = torch.full((3,), 1.0 + rank, device=device)
     n, (mean,) = pooling.average_gradients(parameters, valid.sum(), [x[0]])
+    several = [  # a vector, a number without an entry on rank 0, and a matrix
+        (torch.tensor(1 + 2 * rank), torch.tensor([1.0, 5.0 + rank]), torch.tensor([0.5, 0.0])),
+        (torch.tensor(3 * rank), torch.tensor(7.0 * rank), torch.tensor(2.0 * rank)),
+        (torch.tensor(1), torch.full((2, 1), rank * 4.0), torch.zeros(2, 1)),
+    ]
+    several = [tuple(number.to(device) for number in moments) for moments in several]
+    is_small, pooled = pooling.pool(torch.tensor(rank < 1, device=device), *several)
     return dict(
+        is_small=is_small,
+        pooled=pooled,
+        total=reports.sum_over_ranks(x[:1]),
+        needed=reports.gather_if_any(rank, rank == 1, device),
+        not_needed=reports.gather_if_any(rank, False, device),
         sum=pooling.all_reduce(x[:1].clone()),
         gathered=pooling.all_gather(x[0]),
         none_true=pooling.on_all_ranks(torch.tensor(rank == 1, device=device)),
@@ -123,6 +135,15 @@ def test_operations():
         assert found["gradient"].tolist() == pytest.approx([4 / 3] * 3)
         assert found["no_gradient"] is None
         assert found["averages"].tolist() == pytest.approx([3, (2 * 1 + 4) / 3])
+        assert found["total"].tolist() == [5] and found["total"].dtype == torch.float64
+        assert found["needed"] == [0, 1] and found["not_needed"] == [rank]
+        assert not found["is_small"]
+        vector, number, matrix = found["pooled"]
+        # one entry 5 and three of mean 6: 5.75; variance (0.75^2 + 3 * 0.25^2) / 4
+        assert vector[0] == 4 and vector[1].tolist() == [1, 5.75]
+        assert vector[2].tolist() == pytest.approx([0.5, 0.1875])
+        assert [part.item() for part in number] == [3, 7, 2] and number[0].dtype == torch.int64
+        assert matrix[1].tolist() == [[2], [2]] and matrix[2].tolist() == [[4], [4]]
 
 
 @pytest.mark.slow

@@ -193,7 +193,7 @@ def test_statistics_of_observations():
         launch(
             *(CORES, "add_moments", (len(sizes), P), threads),
             norms=b"".join(packed),
-            is_counted=flags,
+            is_counted=0 if flags is None else flags,
         )
     assert counts.tolist() == [[2, 2, 5], [2, 2, 3]]
     for i in range(P):

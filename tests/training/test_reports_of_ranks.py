@@ -21,19 +21,19 @@ PLACES = "rank 0 on here", "rank 1 on there"
 
 @pytest.fixture
 def one_by_one(monkeypatch):
-    """Makes `gather_objects` of the guard return the reports of two ranks: rank 1's first call gets
-    two copies of rank 1's, rank 0's next call rank 0's and rank 1's.
+    """Makes the guard gather the reports of two ranks: rank 1's first call gets two copies of rank
+    1's, rank 0's next call rank 0's and rank 1's.
     """
     of_rank_1 = []
 
     def act_as(rank):
-        def gather(value):
+        def gather(value, is_needed, device):
             if rank == 1:
                 of_rank_1.append(value)
                 return [value, value]
             return [value, of_rank_1.pop(0)]
 
-        monkeypatch.setattr(nonfinite_guard, "gather_objects", gather)
+        monkeypatch.setattr(nonfinite_guard, "gather_if_any", gather)
         monkeypatch.setattr(nonfinite_guard, "rank", lambda: rank)
         monkeypatch.setattr(nonfinite_guard, "place", lambda: PLACES[rank])
 
