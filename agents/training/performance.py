@@ -17,7 +17,8 @@ N_WARM_UPS, N_REPLAYS = 3, 4
 
 
 class PhaseTimer:
-    """Adds up the seconds that a loop spends in each of its phases. Only `pop` synchronises.
+    """Adds up the seconds that a loop spends in each of its phases. Only `pop` and `wait`
+    synchronise.
 
         timer.start("collect")
         rollout = collect()
@@ -42,6 +43,13 @@ class PhaseTimer:
         """Ends the current phase and starts another."""
         self._starts.append((phase, self._now()))
         self._add_finished()
+
+    def wait(self, n_phases: int) -> None:
+        """Waits until a GPU is at most so many phases behind the host, the current one left out."""
+        while len(self._starts) > n_phases + 1:
+            _, end = self._starts[1]
+            end.synchronize()
+            self._add_finished()
 
     def pop(self) -> dict[str, float]:
         """Returns the seconds of each phase since the last call. The current phase goes on.

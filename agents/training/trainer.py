@@ -31,6 +31,12 @@ if TYPE_CHECKING:
     from megastep.agents.types import Learner, Logger, OpponentPool, Rollout, Saver
 
 
+#: Updates that the host may be ahead of a GPU. The learning rate of an update follows the clock at
+#: its launch, so a host far ahead would let it fall late, and not to 0. A GPU goes on for so many
+#: updates when the host is held up.
+MAX_AHEAD = 8
+
+
 class Trainer:
     """Trains a policy in an environment until a budget is spent.
 
@@ -213,6 +219,7 @@ class Trainer:
         Args:
             is_stopped: a signal stops this rank.
         """
+        self.timer.wait(3 * MAX_AHEAD)  # an update has three phases
         seconds = self.clock.seconds
         seconds_since = seconds - self.seconds_at_checkpoint
         plan = Plan(

@@ -84,15 +84,18 @@ def plot_frames_per_second(records: list[dict], path: Path) -> None:
 
 
 def learning_curves(records: list[dict]) -> dict[int, dict]:
-    """Returns the newest learning curves of `train` on a GPU by budget in seconds.
+    """Returns the learning curves of `train` on a GPU by budget in seconds: those of the commit
+    that was measured last.
 
     Each is a dict of `seconds` (P,); `mean`, `lower` and `upper` (P,) of the seeds' returns during
     training; and `evaluated`, a return per seed. P points.
     """
     records_by_budget = {}
+    records = [record for record in records if record["benchmark"] == "train"]
+    records = [record for record in records if not is_cpu(record)]
     for record in newest(records):
         match = re.match(r"training, (\d+) s, seed (\d+), (.*)", record["what"])
-        if match and not is_cpu(record):
+        if match and record["commit"] == records[-1]["commit"]:
             by_measurement = records_by_budget.setdefault(int(match[1]), {})
             by_measurement.setdefault(match[3], []).append(record)
     curves_by_budget = {}
@@ -114,7 +117,8 @@ def learning_curves(records: list[dict]) -> dict[int, dict]:
 def plot_training(records: list[dict], path: Path) -> None:
     """Plots Explorer's return over seconds of training, a colour per budget."""
     ax = subplots(7.5, 4.8)
-    for (budget, run), colour in zip(learning_curves(records).items(), BUDGET_COLOURS):
+    curves = learning_curves(records)
+    for (budget, run), colour in zip(curves.items(), BUDGET_COLOURS):
         n_seeds, seconds = len(run["evaluated"]), run["seconds"]
         label = f"{budget} s, {n_seeds} seeds, mean and range in training"
         ax.plot(seconds, run["mean"], color=colour, label=label)
@@ -125,7 +129,7 @@ def plot_training(records: list[dict], path: Path) -> None:
     style = dict(color="grey", linewidth=1, linestyle="--")
     ax.axhline(NEARLY_ALL_SEEN, label="nearly everything there is to see", **style)
     ax.set(xscale="log", xlabel="seconds of training", ylabel="return", ylim=(0, None))
-    finish(ax, path, ticks=[1, 10, 60, 240], legend="lower right")
+    finish(ax, path, ticks=[1, *curves], legend="lower right")
 
 
 def plot_recipes(records: list[dict], path: Path) -> None:
@@ -219,11 +223,14 @@ def plot_published(records: list[dict], path: Path) -> None:
 
 
 def plot_scaling(records: list[dict], path: Path) -> None:
-    """Plots samples per second over the number of GPUs, from `scaling`, beside linear scaling."""
+    """Plots samples per second over the number of GPUs, from `scaling`, beside linear scaling: on
+    the machine that was measured last.
+    """
     series = {}
+    records = [record for record in records if record["benchmark"] == "scaling"]
     for record in newest(records):
         match = re.fullmatch(r"(\w+), training on (\d+) GPUs?", record["what"])
-        if record["benchmark"] == "scaling" and match:
+        if match and record["on"] == records[-1]["on"]:
             series.setdefault(match[1], {})[int(match[2])] = record["value"]
     if not series:
         return

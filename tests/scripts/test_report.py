@@ -88,17 +88,28 @@ def test_committed_page_matches_committed_records():
 
 
 def test_learning_curves_are_mean_and_range_of_seeds(tmp_path):
-    rows = [
-        record(f"training, 10 s, seed {seed}, return in unseen homes", 40.0 + seed)
-        for seed in (1, 2, 3)
-    ]
+    what = "training, 10 s, seed"
+    rows = [record("training, 60 s, seed 1, median rate", 3.0, curve=[[1, 2, 3]], commit="older")]
+    rows += [record(f"{what} {seed}, return in unseen homes", 40.0 + seed) for seed in (1, 2, 3)]
     rows += [
-        record(f"training, 10 s, seed {seed}, median rate", 7.0, curve=[[1, 50, seed], end])
+        record(f"{what} {seed}, median rate", 7.0, curve=[[1, 50, seed], end])
         for seed, end in ((seed, [10, 99, 7 * seed]) for seed in (1, 2, 3))
     ]
+    rows = [row | dict(benchmark="train") for row in rows]
     (run,) = figures.learning_curves(rows).values()
     assert run["evaluated"] == [41, 42, 43] and run["seconds"][[0, -1]].tolist() == [1, 10]
     ends = [run[key][[0, -1]].tolist() for key in ("mean", "lower", "upper")]
     assert ends == [[2, 14], [1, 7], [3, 21]]
     assert benchmark.main(["report", "--json", str(write_records(tmp_path, *rows))]) == 0
     assert "3 seeds" in (tmp_path / "results.svg").read_text()
+
+
+def test_scaling_is_plotted_for_the_machine_measured_last(tmp_path):
+    rows = [
+        record(f"explorer, training on {n} GPU{'s' * (n > 1)}", rate, on=on, benchmark="scaling")
+        for on, rates in (("Z", [100.0, 150.0]), ("A", [10.0, 20.0]))
+        for n, rate in enumerate(rates, 1)
+    ]
+    figures.plot_scaling(rows, tmp_path / "both.svg")
+    figures.plot_scaling(rows[2:], tmp_path / "last.svg")
+    assert (tmp_path / "both.svg").read_text() == (tmp_path / "last.svg").read_text()

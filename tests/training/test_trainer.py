@@ -17,7 +17,7 @@ from megastep.agents.training import checkpoint, performance
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
 from megastep.agents.training.saver import Saver
-from megastep.agents.training.trainer import Trainer
+from megastep.agents.training.trainer import MAX_AHEAD, Trainer
 from megastep.arrdict import arrdict
 
 B, T, UPDATE = 6, 4, 24  # lanes, steps of a rollout, samples of an update
@@ -170,6 +170,41 @@ def test_seconds_of_each_phase_and_the_rest_add_up(tmp_path, monkeypatch):
         {"collect": 6, "update": 10, "rest": 2},
         {"collect": 3, "update": 5, "rest": 1},
     ]
+
+
+def test_the_host_is_at_most_some_updates_ahead_of_a_gpu(tmp_path, monkeypatch):
+    events, n_behind = [], []
+
+    class Event:
+        """Is reached only when it is waited for, as on a GPU that is slower than any host."""
+
+        def __init__(self):
+            self.is_reached = False
+            events.append(self)
+
+        def query(self):
+            return self.is_reached
+
+        def synchronize(self):
+            for event in events[: events.index(self) + 1]:
+                event.is_reached = True
+
+        def elapsed_time(self, end):
+            return 1.0
+
+    run = make_trainer(tmp_path, samples=40 * UPDATE, every=100)
+    run.timer.device, run.timer._now = torch.device("cuda"), Event
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: events[-1].synchronize())
+    collect = run.collect
+
+    def counted():
+        n_behind.append(sum(not event.is_reached for event in events) / 3)
+        return collect()
+
+    run.collect = counted
+    run.train()
+    assert len(n_behind) == 40
+    assert MAX_AHEAD <= max(n_behind) <= MAX_AHEAD + 1
 
 
 @pytest.mark.cuda
