@@ -8,7 +8,7 @@ import torch
 from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels import program
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
-from megastep.agents.distributed.pooling import Moments, average_gradients, pool
+from megastep.agents.distributed.pooling import Moments, average_gradients, pool_with_condition
 from megastep.agents.sections import section
 
 
@@ -67,10 +67,11 @@ class GradientSteps:
             moments: statistics to pool over the ranks in the same operation.
 
         Returns:
-            () bool, whether they are all finite, on every rank: if not, no step of this update is
-            taken. And the moments of all ranks, as `pool_moments` returns them.
+            () bool, whether `floats` are all finite, on every rank: if not, no step of this update
+            is taken. And the moments of all ranks, as `pool_moments` returns them.
         """
-        (self._is_finite, pooled), self._totals = pool(self.check(floats), *moments), None
+        self._is_finite, pooled = pool_with_condition(self.check(floats), *moments)
+        self._totals = None
         return self._is_finite, pooled
 
     @section("backward")

@@ -132,8 +132,8 @@ class PPO(GradientLearner):
         explained = 1 - error / variance.clamp(min=1e-8)
         # One row of observations is enough: every rollout brings another B.
         last = rollout.world(-1)
-        of_obs = self.policy.moments(last.obs, last.get("privileged"), rollout.learns[-1])
-        is_finite, pooled = self.steps.begin(rollout.floats(), *moments, *of_obs)
+        own_obs = self.policy.moments(last.obs, last.get("privileged"), rollout.learns[-1])
+        is_finite, pooled = self.steps.begin(rollout.floats(), *moments, *own_obs)
         of_targets, of_advantages, *of_obs = pooled
         self.policy.critic.output.add(of_targets, is_finite)
         if self.normalise_advantage == "rollout":

@@ -49,21 +49,21 @@ def pool_moments(*moments: Moments) -> list[Moments]:
 
     One operation for all that are given, and as many kernels as for one.
     """
-    if n_ranks() == 1:
+    if n_ranks() == 1 or not moments:
         return list(moments)
-    counts, means, variances = zip(*moments)
-    sizes = [mean.numel() for mean in means]
-    statistics = torch.cat([column.flatten() for column in (*means, *variances)])
-    rows = all_gather(torch.cat([torch.stack(counts).double(), statistics.double()]))
+    own_counts, own_means, own_variances = zip(*moments)
+    sizes = [mean.numel() for mean in own_means]
+    statistics = torch.cat([column.flatten() for column in (*own_means, *own_variances)])
+    rows = all_gather(torch.cat([torch.stack(own_counts).double(), statistics.double()]))
     counts, means, variances = rows.split([len(sizes), sum(sizes), sum(sizes)], 1)
-    n = counts.sum(0).to(moments[0][0].dtype)
-    # of each number, as its moments have one count
+    n = _in_common_dtype(counts.sum(0), own_counts)
+    # repeat each count for every number of its moments
     columns = counts.split(1, 1)
     counts = torch.cat([column.expand(-1, size) for column, size in zip(columns, sizes)], 1)
     divisor = counts.sum(0).clamp(min=1)
     mean = (counts * means).sum(0) / divisor
     variance = (counts * (variances + (means - mean).square())).sum(0) / divisor
-    mean, variance = torch.stack([mean, variance]).to(moments[0][1].dtype)
+    mean, variance = _in_common_dtype(torch.stack([mean, variance]), own_means)
     pooled = zip(n, mean.split(sizes), variance.split(sizes), strict=True)
     return [
         tuple(new.view_as(old).to(old.dtype) for new, old in zip(each, before, strict=True))
@@ -71,7 +71,15 @@ def pool_moments(*moments: Moments) -> list[Moments]:
     ]
 
 
-def pool(condition: torch.Tensor, *moments: Moments) -> tuple[torch.Tensor, list[Moments]]:
+def _in_common_dtype(x, others):
+    """Returns x in the dtype of the others if all have one: a kernel instead of one for each."""
+    dtypes = {other.dtype for other in others}
+    return x.to(*dtypes) if len(dtypes) == 1 else x
+
+
+def pool_with_condition(
+    condition: torch.Tensor, *moments: Moments
+) -> tuple[torch.Tensor, list[Moments]]:
     """Returns `on_all_ranks(condition)` and `pool_moments(*moments)`, by one operation."""
     if n_ranks() == 1:
         return condition, list(moments)
@@ -92,7 +100,7 @@ def average_gradients(
     All ranks must call it equally often, with the same parameters. In one process nothing changes.
 
     Args:
-        parameters: those without a gradient are left out.
+        parameters: those without a gradient are left out. Gradients are float32.
         n_valid: (), the number of entries.
         means: tensors () to average in the same way, such as metrics.
 
@@ -108,13 +116,14 @@ def average_gradients(
         numbers = [number.float() for number in means] + [torch.ones_like(n_valid).float()]
         # one buffer, in which each gradient begins at a multiple of 16 bytes, as Adam likes it
         sizes = [n + -n % 4 for n in map(len, gradients)]
-        bucket = gradients[0].new_zeros(sum(sizes) + len(numbers))
-        *parts, last = bucket.split([*sizes, len(numbers)])
+        n_numbers = sum(sizes) + len(numbers)
+        bucket = torch.zeros(n_numbers, dtype=torch.float32, device=n_valid.device)
+        *parts, pooled = bucket.split([*sizes, len(numbers)])
         parts = [part[: len(gradient)] for part, gradient in zip(parts, gradients)]
-        torch._foreach_copy_([*parts, *last.unbind()], [*gradients, *numbers])
+        torch._foreach_copy_([*parts, *pooled.unbind()], [*gradients, *numbers])
         all_reduce(bucket.mul_(n_valid))
-        n = last[-1].clone()
+        n = pooled[-1].clone()
         bucket /= n.clamp(min=1)
         for p, part in zip(held, parts, strict=True):
             p.grad = part.view_as(p)
-    return n, list(last[:-1].unbind())
+    return n, list(pooled[:-1].unbind())

@@ -1,4 +1,4 @@
-"""What a report tells of all ranks, read on the host. Each function waits for the other ranks.
+"""Numbers of all ranks for a report, returned on the host. Each function waits for the others.
 
 Tensors are exchanged on their device. Between GPUs that takes a tenth of the time of an exchange on
 the host, and training waits for a report.
@@ -41,7 +41,7 @@ def gather_if_any(value: T, is_needed: bool, device: torch.device) -> list[T]:
     Args:
         value: can be pickled.
         is_needed: this rank needs them.
-        device: what the ranks agree on is exchanged there. Synchronises.
+        device: where the ranks exchange whether any needs them. Synchronises.
     """
     if n_ranks() == 1 or on_all_ranks(torch.tensor(not is_needed, device=device)):
         return [value]

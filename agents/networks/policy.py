@@ -323,10 +323,10 @@ class Policy(nn.Module):
         Args:
             obs, privileged, is_counted: as for `update_stats`.
         """
-        leaves = self.intake.normalised_leaves(obs)
+        observations = self.intake.normalised_leaves(obs)
         if self.privileged_space:
-            leaves += self.critic.intake.normalised_leaves(privileged)
-        return running_norm.moments_of(self._norms(), leaves, is_counted)
+            observations += self.critic.intake.normalised_leaves(privileged)
+        return running_norm.moments_of(self._norms(), observations, is_counted)
 
     def add_moments(
         self, moments: Sequence[Moments], is_counted: torch.Tensor | None = None

@@ -52,7 +52,7 @@ class RunningNorm(nn.Module):
         n_lanes = lanes.sum()
         n = n_lanes.clamp(min=1) * (obs[0].numel() // self.mean.numel())
         mean = obs.float().masked_fill(is_masked, 0.0).sum(self.pooled_axes, keepdim=True) / n
-        error = (obs - mean).masked_fill(is_masked, 0.0)
+        error = (obs.float() - mean).masked_fill(is_masked, 0.0)
         variance = error.square().sum(self.pooled_axes, keepdim=True) / n
         return n_lanes, mean[0], variance[0]
 
@@ -124,7 +124,8 @@ def _is_fused(norm):
 
 
 def _is_readable(leaf):
-    return leaf.dtype in (torch.float16, torch.float32) and leaf.is_contiguous()
+    is_float = leaf.dtype in (torch.float16, torch.float32)
+    return leaf.is_cuda and is_float and leaf.is_contiguous()
 
 
 def mix_moments(

@@ -11,14 +11,19 @@ from megastep.agents import sections
 #: The sections of an iteration. "log" is all between two iterations: statistics, reports,
 #: checkpoints, snapshots.
 SECTIONS = "act", "env", "store", "returns", "forward", "backward", "optimiser", "log"
+#: The phases of an iteration.
+PHASES = "collect", "update", "rest"
+#: Seconds after which the host no longer waits for a GPU: another rank may be lost, which the host
+#: notices when it speaks to the others.
+PATIENCE = 5.0
 #: Iterations before sections are measured on a GPU, so that clocks and caches are as in training,
 #: and after: the last one counts.
 N_WARM_UPS, N_REPLAYS = 3, 4
 
 
 class PhaseTimer:
-    """Adds up the seconds that a loop spends in each of its phases. Only `pop` and `wait`
-    synchronise.
+    """Adds up the seconds that a loop spends in each of its phases. Only `pop` and `wait` wait for
+    a GPU.
 
         timer.start("collect")
         rollout = collect()
@@ -45,10 +50,12 @@ class PhaseTimer:
         self._add_finished()
 
     def wait(self, n_phases: int) -> None:
-        """Waits until a GPU is at most so many phases behind the host, the current one left out."""
-        while len(self._starts) > n_phases + 1:
-            _, end = self._starts[1]
-            end.synchronize()
+        """Waits until a GPU is at most so many phases behind the host, not counting the current
+        phase, or `PATIENCE` is over.
+        """
+        deadline = time.monotonic() + PATIENCE
+        while len(self._starts) > n_phases + 1 and time.monotonic() < deadline:
+            time.sleep(0.0005)
             self._add_finished()
 
     def pop(self) -> dict[str, float]:

@@ -19,7 +19,13 @@ from megastep.agents.distributed.reports import mean_over_ranks
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
-from megastep.agents.training.performance import N_WARM_UPS, PhaseTimer, SectionTimes, device_memory
+from megastep.agents.training.performance import (
+    N_WARM_UPS,
+    PHASES,
+    PhaseTimer,
+    SectionTimes,
+    device_memory,
+)
 from megastep.agents.training.run_state import RunState
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.types import Env, optional
@@ -214,12 +220,13 @@ class Trainer:
         self.logger.close()
 
     def plan(self, is_stopped: bool) -> Plan:
-        """Returns what all ranks do next.
+        """Returns what all ranks do next. First waits until a GPU is at most `MAX_AHEAD` updates
+        behind.
 
         Args:
             is_stopped: a signal stops this rank.
         """
-        self.timer.wait(3 * MAX_AHEAD)  # an update has three phases
+        self.timer.wait(MAX_AHEAD * len(PHASES))
         seconds = self.clock.seconds
         seconds_since = seconds - self.seconds_at_checkpoint
         plan = Plan(

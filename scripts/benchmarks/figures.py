@@ -85,7 +85,7 @@ def plot_frames_per_second(records: list[dict], path: Path) -> None:
 
 def learning_curves(records: list[dict]) -> dict[int, dict]:
     """Returns the learning curves of `train` on a GPU by budget in seconds: those of the commit
-    that was measured last.
+    and the machine that were measured last.
 
     Each is a dict of `seconds` (P,); `mean`, `lower` and `upper` (P,) of the seeds' returns during
     training; and `evaluated`, a return per seed. P points.
@@ -95,7 +95,7 @@ def learning_curves(records: list[dict]) -> dict[int, dict]:
     records = [record for record in records if not is_cpu(record)]
     for record in newest(records):
         match = re.match(r"training, (\d+) s, seed (\d+), (.*)", record["what"])
-        if match and record["commit"] == records[-1]["commit"]:
+        if match and all(record[key] == records[-1][key] for key in ("commit", "on")):
             by_measurement = records_by_budget.setdefault(int(match[1]), {})
             by_measurement.setdefault(match[3], []).append(record)
     curves_by_budget = {}

@@ -13,7 +13,7 @@ from training_runs import learning_curve, rates, trained
 N_ROUNDS = 3
 #: What trains long enough for a steady rate; about 8 s on a GPU.
 SAMPLES = {"cuda": 150_000_000, "cpu": 100_000}
-#: What ranks of equal samples learn from.
+#: Samples of the comparison at equal samples.
 EQUAL_SAMPLES = {"cuda": 100_000_000, "cpu": 200_000}
 #: Environments of one GPU, or of all GPUs together.
 N_ENVS = {"cuda": 4096, "cpu": 64}

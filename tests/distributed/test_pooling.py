@@ -88,10 +88,19 @@ def every(device="cpu"):
         (torch.tensor(1), torch.full((2, 1), rank * 4.0), torch.zeros(2, 1)),
     ]
     several = [tuple(number.to(device) for number in moments) for moments in several]
-    is_small, pooled = pooling.pool(torch.tensor(rank < 1, device=device), *several)
+    are_small, pooled = zip(
+        *(
+            pooling.pool_with_condition(torch.tensor(rank < n, device=device), *several)
+            for n in (1, 2)
+        )
+    )
+    third = torch.tensor(1), torch.tensor([1 / 3], dtype=torch.float64)
+    third = [number.to(device) for number in third]
     return dict(
-        is_small=is_small,
-        pooled=pooled,
+        are_small=are_small,
+        pooled=pooled[0],
+        doubles=pooling.pool_moments(several[0], (*third, torch.zeros_like(third[1])))[1],
+        nothing=pooling.pool_moments(),
         total=reports.sum_over_ranks(x[:1]),
         needed=reports.gather_if_any(rank, rank == 1, device),
         not_needed=reports.gather_if_any(rank, False, device),
@@ -137,7 +146,10 @@ def test_operations():
         assert found["averages"].tolist() == pytest.approx([3, (2 * 1 + 4) / 3])
         assert found["total"].tolist() == [5] and found["total"].dtype == torch.float64
         assert found["needed"] == [0, 1] and found["not_needed"] == [rank]
-        assert not found["is_small"]
+        assert not found["are_small"][0] and found["are_small"][1]
+        n, mean, variance = found["doubles"]
+        assert (n, mean.dtype, mean, variance) == (2, torch.float64, 1 / 3, 0)
+        assert found["nothing"] == []
         vector, number, matrix = found["pooled"]
         # one entry 5 and three of mean 6: 5.75; variance (0.75^2 + 3 * 0.25^2) / 4
         assert vector[0] == 4 and vector[1].tolist() == [1, 5.75]

@@ -52,6 +52,16 @@ def test_batches_have_equal_weight():
 
 def test_gpu_adds_the_same_moments_as_the_cpu(to_gpu):
     """Images, vectors, a NaN in a lane that does not count, and another in a leaf of its own."""
+    check_gpu(to_gpu, torch.float16)
+
+
+def test_gpu_adds_the_same_moments_of_bytes_and_doubles(to_gpu):
+    """Of which no kernel takes the moments."""
+    check_gpu(to_gpu, torch.uint8)
+    check_gpu(to_gpu, torch.float64)
+
+
+def check_gpu(to_gpu, dtype):
     space = [spaces.MultiImage(1, 3, 2, 8), spaces.MultiVector(1, 5), spaces.MultiVector(2, 3)]
     norms = [RunningNorm(leaf) for leaf in space]
     device = to_gpu(torch.empty(0)).device
@@ -59,7 +69,7 @@ def test_gpu_adds_the_same_moments_as_the_cpu(to_gpu):
     for seed in range(3):
         torch.manual_seed(seed)
         obs = [torch.randn(1000, *leaf.shape) * 3 + 1 for leaf in space]
-        obs[0] = obs[0].half()
+        obs[0] = obs[0].abs().to(dtype)
         is_counted = torch.rand(1000) < 0.7
         obs[1][~is_counted] = torch.nan
         if seed == 1:

@@ -29,6 +29,7 @@ def one_by_one(monkeypatch):
     def act_as(rank):
         def gather(value, is_needed, device):
             if rank == 1:
+                assert is_needed, "rank 0 would not be told"
                 of_rank_1.append(value)
                 return [value, value]
             return [value, of_rank_1.pop(0)]

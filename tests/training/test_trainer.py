@@ -176,7 +176,7 @@ def test_the_host_is_at_most_some_updates_ahead_of_a_gpu(tmp_path, monkeypatch):
     events, n_behind = [], []
 
     class Event:
-        """Is reached only when it is waited for, as on a GPU that is slower than any host."""
+        """Is reached only while the host waits, as on a GPU that is slower than any host."""
 
         def __init__(self):
             self.is_reached = False
@@ -185,16 +185,17 @@ def test_the_host_is_at_most_some_updates_ahead_of_a_gpu(tmp_path, monkeypatch):
         def query(self):
             return self.is_reached
 
-        def synchronize(self):
-            for event in events[: events.index(self) + 1]:
-                event.is_reached = True
-
         def elapsed_time(self, end):
             return 1.0
 
+    def reach(until=None):
+        for event in [event for event in events if not event.is_reached][:until]:
+            event.is_reached = True
+
     run = make_trainer(tmp_path, samples=40 * UPDATE, every=100)
     run.timer.device, run.timer._now = torch.device("cuda"), Event
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: events[-1].synchronize())
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: reach())
+    monkeypatch.setattr(performance.time, "sleep", lambda seconds: reach(1))
     collect = run.collect
 
     def counted():
@@ -205,6 +206,20 @@ def test_the_host_is_at_most_some_updates_ahead_of_a_gpu(tmp_path, monkeypatch):
     run.train()
     assert len(n_behind) == 40
     assert MAX_AHEAD <= max(n_behind) <= MAX_AHEAD + 1
+
+
+def test_the_host_does_not_wait_for_ever_for_a_gpu(monkeypatch):
+    """A GPU may itself wait for another rank, which was killed."""
+    timer, now = performance.PhaseTimer("cuda"), [0.0]
+    timer._now = lambda: SimpleNamespace(query=lambda: False)
+    monkeypatch.setattr(performance.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(performance.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + 1))
+    for _ in range(9):
+        timer.start("update")
+    timer.wait(8)
+    assert now == [0]
+    timer.wait(7)
+    assert now == [performance.PATIENCE]
 
 
 @pytest.mark.cuda
