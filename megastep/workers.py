@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import multiprocessing.resource_tracker
 import os
 import signal
 import threading
@@ -27,8 +28,13 @@ def terminal_signals_blocked() -> Iterator[None]:
 
     A terminal sends both to every process it runs, and a child inherits its parent's signal mask.
     """
-    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+    signals = {signal.SIGINT, signal.SIGHUP}
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     try:
+        # A process of multiprocessing's, which pools start with their first worker. It lives on,
+        # so SIGHUP must not reach it either; its start unblocks SIGINT (CPython's issue 127586).
+        multiprocessing.resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, signals)
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)

@@ -10,6 +10,8 @@ from pathlib import Path
 from megastep.workers import terminal_signals_blocked
 from tests.helpers.processes import is_running
 
+ROOT = Path(__file__).parents[1]
+
 
 def blocked_signals(process):
     """Returns the signals that a process never receives, as a bit mask."""
@@ -30,6 +32,28 @@ def test_processes_started_inside_never_receive_signals_of_the_terminal():
         child.communicate(b"\n")
 
 
+#: Starts two workers, as recording does, in a process that has started none before, and prints
+#: what each of them blocks.
+POOL = """
+import loky
+from megastep import workers
+from tests.test_workers import blocked_signals
+with workers.terminal_signals_blocked():
+    pool = loky.ProcessPoolExecutor(2)
+    masks = [pool.submit(blocked_signals, "self") for _ in range(2)]
+print(*(mask.result() for mask in masks))
+pool.shutdown()
+"""
+
+
+def test_workers_of_the_first_pool_never_receive_signals_of_the_terminal():
+    """The pool starts multiprocessing's resource tracker, which unblocks SIGINT in passing."""
+    masks = subprocess.check_output([sys.executable, "-c", POOL], cwd=ROOT, text=True).split()
+    assert len(masks) == 2
+    for mask in map(int, masks):
+        assert all(mask >> number - 1 & 1 for number in (signal.SIGINT, signal.SIGHUP))
+
+
 #: Starts itself once more, as the process that is left behind and prints its number.
 PARENT_AND_CHILD = """
 import os, subprocess, sys, time
@@ -47,7 +71,7 @@ def test_worker_ends_soon_after_its_parent_is_killed():
     parent = subprocess.Popen(
         [sys.executable, "-c", PARENT_AND_CHILD],
         env={**os.environ, "CODE": PARENT_AND_CHILD},
-        cwd=Path(__file__).parents[1],
+        cwd=ROOT,
         stdout=subprocess.PIPE,
         text=True,
     )

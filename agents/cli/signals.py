@@ -98,6 +98,20 @@ def interrupting(on_first: Callable[[int], None] = interrupt) -> Iterator[None]:
         interrupt(numbers[0])
 
 
+@contextlib.contextmanager
+def deferred() -> Iterator[None]:
+    """A signal that comes inside takes effect when the block ends: for what must not be done in
+    part, and is quick.
+    """
+    numbers = []
+    try:
+        with handled(lambda number: None) as numbers:
+            yield
+    finally:
+        if numbers:
+            signal.raise_signal(numbers[0])
+
+
 def stop(process: int) -> None:
     """Has another process stop in good order, once, though a terminal's Ctrl-C may have reached it
     as well: a second SIGHUP never ends a program.

@@ -263,10 +263,11 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     rank_checks.check_start(cfg)
     cfg = rank_checks.started_again(cfg, team)
     with contextlib.ExitStack() as locks:
-        folder, resume = from_rank_0(lambda: open_folder(cfg, locks))
         with contextlib.ExitStack() as undo:
-            if is_first and not cfg.resume:
-                undo.callback(shutil.rmtree, folder, ignore_errors=True)
+            with signals.deferred():
+                folder, resume = from_rank_0(lambda: open_folder(cfg, locks))
+                if is_first and not cfg.resume:
+                    undo.callback(shutil.rmtree, folder, ignore_errors=True)
             token = rank_checks.check_shared(folder)
             if team:
                 team.set_folder(folder)
@@ -274,18 +275,18 @@ def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
             running = together(lambda: make_trainer(cfg, folder, device, progress, token))
             rank_checks.check_world(cfg, running)
             from_rank_0(functools.partial(write_config, folder, running.saver.config["train"]))
+            hosts = process_group.gather_objects(process_group.hostname())
+            clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(running.lost)))
+            if is_first:
+                if clauses:
+                    console.say(f"This run goes on, but not bit for bit: {'; '.join(clauses)}.")
+                runs.record_start(folder)
+                provenance.record(
+                    folder, running.samples, device, program.version(), program.ROOT, hosts
+                )
+                ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
+                console.say(f"Training on {ranks} in {folder}")
             undo.pop_all()
-        hosts = process_group.gather_objects(process_group.hostname())
-        clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(running.lost)))
-        if is_first:
-            if clauses:
-                console.say(f"This run goes on, but not bit for bit: {'; '.join(clauses)}.")
-            runs.record_start(folder)
-            provenance.record(
-                folder, running.samples, device, program.version(), program.ROOT, hosts
-            )
-            ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
-            console.say(f"Training on {ranks} in {folder}")
         resume = f"To continue: {runs.resume_command(folder)}"
         try:
             with (

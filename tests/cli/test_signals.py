@@ -13,9 +13,15 @@ import time
 import pytest
 
 from megastep import recording
-from megastep.agents.cli import factory, signals, train
+from megastep.agents.cli import factory, runs, signals, train
 from megastep.agents.storage.collector import Collector
-from megastep.agents.training import checkpoint, checkpoint_format, evaluation, loggers
+from megastep.agents.training import (
+    checkpoint,
+    checkpoint_format,
+    evaluation,
+    loggers,
+    provenance,
+)
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, wait_until
 
@@ -91,11 +97,22 @@ def swallowing(monkeypatch, number):
     monkeypatch.setattr(train, "run", swallowed)
 
 
+def making_a_folder(monkeypatch, number):
+    signalled(monkeypatch, runs, "new", number, call=1)
+
+
 def setting_up(monkeypatch, number):
     signalled(monkeypatch, factory, "make_learner", number, call=1)
 
 
-@pytest.mark.parametrize("moment, number", pairs([composing, setting_up, importing, swallowing]))
+def noting_the_start(monkeypatch, number):
+    signalled(monkeypatch, provenance, "record", number, call=1)
+
+
+BEFORE_TRAINING = [composing, making_a_folder, setting_up, noting_the_start, importing, swallowing]
+
+
+@pytest.mark.parametrize("moment, number", pairs(BEFORE_TRAINING))
 def test_signal_before_training(here, monkeypatch, capsys, moment, number):
     moment(monkeypatch, number)
     assert train.main([*TINY, "samples=1e9", "folder=run"]) == 128 + number
@@ -262,15 +279,16 @@ def test_ctrl_c_while_compiling(here):
 
 
 @pytest.mark.slow
-def test_closed_terminal_while_filming(here):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_signal_of_the_terminal_while_filming(here, number):
     """The signal reaches this process, its workers and their resource tracker."""
     filming = ["finish.record=true", "finish.steps=5000"]
     process = launched(*TINY, f"samples={UPDATE}", "folder=run", *filming)
     children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children")
     wait_until(lambda: len(children.read_text().split()) > 1, process)
-    os.killpg(process.pid, signal.SIGHUP)
+    os.killpg(process.pid, number)
     _, err = process.communicate(timeout=HUNG)
-    assert (process.returncode, err) == (129, "train.py: stopped by SIGHUP\n")
+    assert (process.returncode, err) == (128 + number, f"train.py: stopped by {number.name}\n")
 
 
 def at_any_moment(here, seed):
@@ -287,8 +305,7 @@ def at_any_moment(here, seed):
         process.send_signal(number)
     out, err = process.communicate(timeout=HUNG)
     case = (seed, number.name, process.returncode, out, err)
-    if process.returncode == -number or (number == signal.SIGINT and "runpy" in err):
-        # before the script's first line, or after its last
+    if process.returncode == -number:  # before the script's first line, or after its last
         assert not folder.exists() or "Filmed" in out, case
         return
     assert process.returncode in (0, 128 + number), case
