@@ -34,7 +34,7 @@ def resources():
 STEPPED = {
     "explorer": lambda homes: envs.Explorer(32, homes, device="cpu", resample=True),
     "pointgoal": lambda homes: envs.PointGoal(32, homes, device="cpu", resample=True),
-    "deathmatch": lambda homes: envs.Deathmatch(8, homes, n_agents=4, device="cpu"),
+    "deathmatch": lambda homes: envs.Deathmatch(8, homes, n_agents=4, device="cpu", resample=True),
     "pong": lambda homes: envs.Pong(256, device="cpu", self_play=True),
 }
 
