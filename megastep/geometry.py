@@ -178,19 +178,20 @@ def _coordinates(g, key, shape, limit):
     """Returns points of a geometry as float32. They must be finite, above 0, within the extent, and
     at most `limit`.
     """
-    points = _array(g, key, "iuf", shape)
-    if len(points) > limit:
-        raise ValueError(f"has {len(points):,} {key}, but the limit is {limit:,}")
-    points = points.astype(np.float32)
-    if not np.isfinite(points).all():
+    given = _array(g, key, "iuf", shape)
+    if len(given) > limit:
+        raise ValueError(f"has {len(given):,} {key}, but the limit is {limit:,}")
+    if not np.isfinite(given).all():
         raise ValueError(f"'{key}' holds a NaN or infinity")
+    with np.errstate(over="ignore"):  # an infinity is beyond the extent, too
+        points = given.astype(np.float32)
     if not (points > 0).all():
         raise ValueError(
-            f"'{key}' must be above 0, but reaches down to {points.min():g} m; shift the geometry"
+            f"'{key}' must be above 0, but reaches down to {given.min():g} m; shift the geometry"
         )
     if not (points <= MAX_EXTENT).all():
         raise ValueError(
-            f"'{key}' reaches up to {points.max():g} m, but the limit is {MAX_EXTENT:g} m; check "
+            f"'{key}' reaches up to {given.max():g} m, but the limit is {MAX_EXTENT:g} m; check "
             f"the unit"
         )
     return points

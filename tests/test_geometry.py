@@ -120,6 +120,8 @@ WRONG = {
     "'walls' reaches up to 1e\\+30 m, .*200": lambda g: g.update(
         walls=g.walls / g.walls.min() * 1e30 / 6
     ),
+    "'walls' reaches up to 1e\\+300 m, .*200": lambda g: g.update(walls=np.full((3, 2, 2), 1e300)),
+    "'walls' must be above 0, .*-1e\\+300 m": lambda g: g.update(walls=np.full((3, 2, 2), -1e300)),
     "has no wall": lambda g: g.update(walls=np.ones((5, 2, 2))),
     "has 40,000 walls, .*32,768": lambda g: g.update(walls=np.ones((40_000, 2, 2))),
     "has no room": lambda g: g.update(masks=np.minimum(g.masks, 0)),
@@ -136,6 +138,7 @@ WRONG = {
 }
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("message", WRONG)
 def test_validate_geometry_refuses_wrong_entries(message):
     g = toys.box()
