@@ -8,6 +8,7 @@ import sys
 import time
 
 import pytest
+import torch
 
 from megastep.agents.cli import gpu, launch, train
 from megastep.agents.cli.endings import Ending
@@ -20,6 +21,23 @@ from tests.helpers.ranks import HUNG, ROOT
 
 TINY = [*tiny.TINY, "log_every=1", "folder=run"]
 UPDATE = 2 * tiny.UPDATE
+#: A small run with what a GPU brings: CUDA graphs, NCCL, a host that is updates ahead.
+ON_GPUS = [
+    "env=explorer",
+    "geometry=homes",
+    "geometry.n=8",
+    "preset=gpu",
+    "env.n_envs=64",
+    "agent.width=32",
+    "learner.n_steps=8",
+    "device=cuda",
+    "folder=run",
+]
+UPDATE_ON_GPUS = 2 * 64 * 8
+TWO_GPUS = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs"),
+]
 
 
 @pytest.fixture(autouse=True)
@@ -181,12 +199,14 @@ def test_ranks_share_the_cores_that_they_may_use(here, monkeypatch):
 
 
 @contextlib.contextmanager
-def started(here, *words, script=ROOT / "train.py", **env):
-    """Starts two ranks. A context, at whose end none is left."""
+def started(here, *words, script=ROOT / "train.py", base=TINY, **env):
+    """Starts two ranks of the run that the words of `base` and `words` say. A context, at whose end
+    none is left.
+    """
     (here / "tmp").mkdir(exist_ok=True)
     env = os.environ | {"TMPDIR": str(here / "tmp")} | env
     process = subprocess.Popen(
-        [sys.executable, str(script), *TINY, "ranks=2", *words],
+        [sys.executable, str(script), *base, "ranks=2", *words],
         env=env,
         text=True,
         stdout=subprocess.PIPE,
@@ -238,14 +258,16 @@ def test_error_of_the_ranks_is_told_once(here):
 
 
 @pytest.mark.parametrize(
-    "number, is_group",
+    "number, is_group, base, update",
     [
-        pytest.param(signal.SIGINT, False, marks=pytest.mark.nightly),
-        pytest.param(signal.SIGTERM, True, marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, False, TINY, UPDATE, marks=pytest.mark.nightly),
+        pytest.param(signal.SIGTERM, True, TINY, UPDATE, marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, True, ON_GPUS, UPDATE_ON_GPUS, marks=TWO_GPUS),
     ],
+    ids=["SIGINT-cpu", "SIGTERM-cpu", "SIGINT-cuda"],
 )
-def test_signal_saves_once(here, number, is_group):
-    with started(here, "checkpoint_seconds=1") as run:
+def test_signal_saves_once(here, number, is_group, base, update):
+    with started(here, "checkpoint_seconds=1", base=base) as run:
         wait_for_checkpoint(here, run)
         (os.killpg if is_group else os.kill)(run.pid, number)
         code, out, err, _ = wait_for_end(run)
@@ -254,17 +276,23 @@ def test_signal_saves_once(here, number, is_group):
     resume = "To continue: python train.py resume=run"
     assert err == f"train.py: Stopped after {samples:,} samples. {resume}\n"
     assert not any((here / "tmp").iterdir()) and not (here / "run" / "lock").exists()
-    total = samples + 2 * UPDATE
+    total = samples + 2 * update
     assert train.main(["resume=run", f"samples={total}"]) == 0  # with two ranks again
     assert checkpoint.load_latest(here / "run" / "checkpoints").step == total
 
 
 @pytest.mark.parametrize(
-    "rank",
-    [pytest.param(0, marks=pytest.mark.nightly), pytest.param(1, marks=pytest.mark.slow)],
+    "rank, base",
+    [
+        pytest.param(0, TINY, marks=pytest.mark.nightly),
+        pytest.param(1, TINY, marks=pytest.mark.slow),
+        pytest.param(0, ON_GPUS, marks=TWO_GPUS),
+        pytest.param(1, ON_GPUS, marks=TWO_GPUS),
+    ],
+    ids=["0-cpu", "1-cpu", "0-cuda", "1-cuda"],
 )
-def test_killed_rank(here, rank):
-    with started(here, "checkpoint_seconds=1") as run:
+def test_killed_rank(here, rank, base):
+    with started(here, "checkpoint_seconds=1", base=base) as run:
         wait_for_checkpoint(here, run)
         pids = [pid_of(here, n) for n in range(2)]
         os.kill(pids[rank], signal.SIGKILL)
