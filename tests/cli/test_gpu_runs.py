@@ -12,21 +12,12 @@ from megastep import capture
 from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.training import checkpoint, json_lines, loggers
+from tests.helpers import tiny
 
 pytestmark = pytest.mark.cuda
 
-TINY = [
-    "env=explorer",
-    "geometry=homes",
-    "geometry.n=8",
-    "preset=gpu",
-    "env.n_envs=64",
-    "agent.width=32",
-    "learner.n_steps=8",
-    "device=cuda",
-    "log_every=1",
-]
-UPDATE = 64 * 8  # samples of one update
+TINY = [*tiny.ON_GPU, "log_every=1"]
+UPDATE = tiny.UPDATE_ON_GPU
 STOPPED = 6 * UPDATE
 
 

@@ -21,19 +21,8 @@ from tests.helpers.ranks import HUNG, ROOT
 
 TINY = [*tiny.TINY, "log_every=1", "folder=run"]
 UPDATE = 2 * tiny.UPDATE
-#: A small run with what a GPU brings: CUDA graphs, NCCL, a host that is updates ahead.
-ON_GPUS = [
-    "env=explorer",
-    "geometry=homes",
-    "geometry.n=8",
-    "preset=gpu",
-    "env.n_envs=64",
-    "agent.width=32",
-    "learner.n_steps=8",
-    "device=cuda",
-    "folder=run",
-]
-UPDATE_ON_GPUS = 2 * 64 * 8
+ON_GPUS = [*tiny.ON_GPU, "folder=run"]
+UPDATE_ON_GPUS = 2 * tiny.UPDATE_ON_GPU
 TWO_GPUS = [
     pytest.mark.cuda,
     pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs"),

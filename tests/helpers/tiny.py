@@ -16,8 +16,20 @@ TINY = [
     "agent.width=8",
     "device=cpu",
 ]
+#: A small run with what a GPU brings: CUDA graphs, and a host that is updates ahead.
+ON_GPU = [
+    "env=explorer",
+    "geometry=homes",
+    "geometry.n=8",
+    "preset=gpu",
+    "env.n_envs=64",
+    "agent.width=32",
+    "learner.n_steps=8",
+    "device=cuda",
+]
 SHORT_EPISODES = ["env.shortest=5", "env.longest=9"]
 UPDATE = 4 * 8  # samples of one update
+UPDATE_ON_GPU = 64 * 8
 
 
 def settings(*words, script="train"):
