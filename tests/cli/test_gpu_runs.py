@@ -3,6 +3,7 @@ process and in seconds. What a run leaves, and how it fails, is in test_train.py
 """
 
 import os
+import shutil
 import signal
 
 import pytest
@@ -46,8 +47,14 @@ def train_until_interrupted(folder, *words):
 
 
 @pytest.fixture(scope="module")
-def stopped(tmp_path_factory):
+def stopped_once(tmp_path_factory):
     return train_until_interrupted(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture
+def stopped(stopped_once, tmp_path):
+    """A copy of one interrupted run, for a test to continue."""
+    return shutil.copytree(stopped_once, tmp_path / "stopped")
 
 
 @pytest.fixture
@@ -109,8 +116,7 @@ def test_rollouts_differ_after_resume(stopped, trainers):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train.Trainer, "log", store)
-        step = checkpoint.load_latest(stopped / "checkpoints").step
-        assert train.main([f"resume={stopped}", f"samples={step + 6 * UPDATE}"]) == 0
+        assert train.main([f"resume={stopped}", f"samples={2 * STOPPED}"]) == 0
     assert is_captured(trainers[0])
     assert len(collected) == 6
     for (actions, cells), (next_actions, next_cells) in zip(collected, collected[1:]):
@@ -127,15 +133,14 @@ def test_init(stopped, trainers, monkeypatch, tmp_path):
     assert is_captured(trainers[0])
 
 
-@pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_resume_on_another_device(stopped, device, capsys):
-    loaded = checkpoint.load_latest(stopped / "checkpoints")
-    step, was_on_gpu = loaded.step, loaded.made_with["device"].startswith("cuda")
-    words = [f"resume={stopped}", f"device={device}", f"samples={step + 4 * UPDATE}"]
-    assert train.main(words) == 0
-    lines = [line for line in capsys.readouterr().out.splitlines() if "not bit for bit" in line]
-    assert any("device was" in line for line in lines) == (was_on_gpu != (device == "cuda"))
-    assert checkpoint.load_latest(stopped / "checkpoints").step == step + 4 * UPDATE
+def test_resume_on_another_device(stopped, capsys):
+    """On the GPU again, then on the CPU, then back on the GPU."""
+    for i, (device, moves) in enumerate([("cuda", False), ("cpu", True), ("cuda", True)], 1):
+        samples = STOPPED + 4 * i * UPDATE
+        assert train.main([f"resume={stopped}", f"device={device}", f"samples={samples}"]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert any("not bit for bit" in line and "device was" in line for line in lines) == moves
+        assert checkpoint.load_latest(stopped / "checkpoints").step == samples
 
 
 def test_evaluate(stopped):
