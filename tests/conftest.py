@@ -109,14 +109,16 @@ def cuda_on_cpu(tmp_path_factory):
     return CudaOnCpu(tmp_path_factory.mktemp("cuda"))
 
 
-@pytest.fixture(params=["forward", "reversed", pytest.param("cuda", marks=pytest.mark.cuda)])
+@pytest.fixture(
+    params=["forward", "reversed", "shuffled", pytest.param("cuda", marks=pytest.mark.cuda)]
+)
 def to_gpu(request, monkeypatch):
-    """Moves a tensor to a GPU, or to a CPU on which it counts as on a GPU and CUDA kernels run: the
-    threads of a block in order, or in the opposite one.
+    """Moves a tensor to a GPU, or to a CPU on which it counts as on a GPU and CUDA kernels run, the
+    threads of a block in one of three orders.
     """
     if request.param == "cuda":
         return torch.Tensor.cuda
     cuda_on_cpu = request.getfixturevalue("cuda_on_cpu")
     cuda_on_cpu.install(monkeypatch)
-    monkeypatch.setattr(cuda_on_cpu, "is_reversed", request.param == "reversed")
+    monkeypatch.setattr(cuda_on_cpu, "order", request.param)
     return cuda_on_cpu.tensor

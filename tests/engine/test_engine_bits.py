@@ -12,6 +12,7 @@ from megastep.engine import devices, movement, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns, visible_texels
 from megastep.ragged import Ragged
+from tests.helpers.cuda_on_cpu import ORDERS
 from tests.helpers.outputs import seen_of
 
 
@@ -105,12 +106,12 @@ def test_cpu_and_gpu_agree_on_every_bit(settings, amount, monkeypatch):
 @amounts
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
 def test_cuda_kernels_on_a_cpu_agree_on_every_bit(settings, amount, cuda_on_cpu, monkeypatch):
-    """The threads of a block, and blocks, run in one order and in the opposite one."""
+    """The threads of a block run in three orders, blocks in two."""
     expected = trajectory("cpu", n_steps=4, **settings)
     cuda_on_cpu.install(monkeypatch)
     pretend(monkeypatch, amount, settings["n_agents"])
-    for is_reversed in False, True:
-        monkeypatch.setattr(cuda_on_cpu, "is_reversed", is_reversed)
+    for order in ORDERS:
+        monkeypatch.setattr(cuda_on_cpu, "order", order)
         assert not any(differing(expected, trajectory("cpu", n_steps=4, **settings)))
     can_split = settings["res"] > 32 and 32 % settings.get("subsample", 1) == 0
     kernel = dict(many="render", some="render_unspilled", few="render_split")[amount]

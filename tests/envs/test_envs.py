@@ -207,7 +207,7 @@ def test_cuda_kernels_on_a_cpu_give_equal_episodes(name, cuda_on_cpu, monkeypatc
     """With the threads of a block in the order opposite to that of the CPU's loops."""
     expected = arrdict.stack(contract.rollout(make(name), 24, check=False))
     cuda_on_cpu.install(monkeypatch)
-    monkeypatch.setattr(cuda_on_cpu, "is_reversed", True)
+    monkeypatch.setattr(cuda_on_cpu, "order", "reversed")
     assert contract.same(expected, arrdict.stack(contract.rollout(make(name), 24, check=False)))
 
 

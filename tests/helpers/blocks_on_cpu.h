@@ -1,6 +1,6 @@
-// Lets CUDA kernels compile for a CPU, and runs them there a block at a time. Every thread of a
-// block is a fiber, which runs until it needs what other threads have not done yet: a shuffle, a
-// vote, a sum, a barrier. Unlike a GPU it notices threads that never come.
+// Lets CUDA kernels compile for a CPU, and runs them there a block, or a cluster of blocks, at a
+// time. Every thread is a fiber, which runs until it needs what other threads have not done yet: a
+// shuffle, a vote, a sum, a barrier. Unlike a GPU it notices threads that never come.
 #pragma once
 #include <setjmp.h>
 #include <ucontext.h>
@@ -10,6 +10,7 @@
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
+#include <deque>
 #include <functional>
 #include <vector>
 
@@ -29,6 +30,9 @@ using std::isnan;
 using std::max;
 using std::min;
 
+struct float2 {
+    float x, y;
+};
 struct float4 {
     float x, y, z, w;
 };
@@ -49,24 +53,34 @@ struct Index {
     unsigned int x, y;
 };
 static Index blockIdx, threadIdx, blockDim, gridDim;
-alignas(16) static unsigned char dynamic_shared[1 << 18];
+constexpr unsigned int SHARED_BYTES = 1 << 18;  // of a block
+constexpr unsigned int MAX_BLOCKS = 4;          // of a cluster
+alignas(16) static unsigned char cluster_shared[MAX_BLOCKS][SHARED_BYTES];
+static unsigned char* dynamic_shared;  // that of the current block
 constexpr unsigned char POISON = 0x7f;
 constexpr unsigned int GUARD = 1024;  // bytes behind the shared memory
-typedef unsigned long long Bits;
+typedef unsigned long long Bits64;
 
 // ---- Fibers ----
 
 constexpr int MAX_FIBERS = 1024;
 constexpr size_t STACK_BYTES = 1 << 16;
 
+// Something that a GPU does in its own time.
+typedef std::function<void()> Job;
+
 struct Fiber {
     std::vector<char> stack;
     jmp_buf place;
     bool is_started, is_done;
+    std::deque<std::vector<Job>> copies;  // begun, by group; the last group is still open
 };
 static Fiber fibers[MAX_FIBERS];
+static std::vector<Job> jobs;  // of no fiber
+static bool is_late;           // whether jobs are done as late as they may be, or at once
 static jmp_buf scheduler;
-static int current, n_fibers;
+static int current, n_fibers, n_threads_of_block;
+static unsigned int first_block;
 static long long n_events;  // fibers that arrived somewhere or ended
 static char failure[200];
 static std::function<void()> kernel_call;
@@ -84,6 +98,9 @@ static void fail(const char* message, int thread) {
     for (;;)
         yield();
 }
+
+// The number of the current block in its cluster.
+static unsigned int block_rank() { return current / n_threads_of_block; }
 
 // Runs a thread of each block.
 static void fiber_main() {
@@ -114,21 +131,69 @@ static void resume() {
     setcontext(&start);
 }
 
-static void run_block(bool is_reversed) {
-    for (int i = 0; i < n_fibers; i++)
+// Jobs that are late are done when nothing else can be.
+static void do_jobs() {
+    std::vector<Job> all;
+    all.swap(jobs);
+    for (Job& job : all)
+        job();
+}
+
+// In which order warps, and the threads of each, run. A warp runs until none of its threads gets
+// on while all others stand still; if shuffled, often only part of the way.
+enum Order { FORWARD, REVERSED, SHUFFLED };
+
+static unsigned int random_bits;
+
+static unsigned int random_below(unsigned int n) {
+    random_bits = random_bits * 1664525u + 1013904223u;
+    return (unsigned int)((Bits64)random_bits * n >> 32);
+}
+
+// Continues the threads of a warp. Returns whether it has threads that have not ended.
+static bool run_warp(int warp, Order order) {
+    int n_rounds = order == SHUFFLED ? 1 << random_below(12) : 1 << 30;
+    bool is_alive = true, gets_on = true;
+    for (; is_alive && gets_on && n_rounds && !failure[0]; n_rounds--) {
+        long long before = n_events;
+        is_alive = false;
+        for (int i = 0; i < WARP && !failure[0]; i++) {
+            current = WARP * warp + (order == REVERSED ? WARP - 1 - i : i);
+            if (current >= n_fibers || fibers[current].is_done)
+                continue;
+            is_alive = true;
+            threadIdx = {(unsigned int)(current % n_threads_of_block), 0};
+            blockIdx.x = first_block + block_rank();
+            dynamic_shared = cluster_shared[block_rank()];
+            resume();
+        }
+        gets_on = n_events != before;
+    }
+    return is_alive;
+}
+
+static void run_cluster(Order order) {
+    std::vector<int> warps;
+    for (int warp = 0; WARP * warp < n_fibers; warp++)
+        warps.push_back(warp);
+    if (order == REVERSED)
+        std::reverse(warps.begin(), warps.end());
+    for (int i = 0; i < n_fibers; i++) {
         fibers[i].is_done = false;
+        fibers[i].copies.assign(1, {});
+    }
+    jobs.clear();
     for (bool is_alive = true; is_alive && !failure[0];) {
         long long before = n_events;
         is_alive = false;
-        for (int i = 0; i < n_fibers && !failure[0]; i++) {
-            current = is_reversed ? n_fibers - 1 - i : i;
-            if (fibers[current].is_done)
-                continue;
-            is_alive = true;
-            threadIdx = {(unsigned int)current, 0};
-            resume();
-        }
-        if (is_alive && n_events == before)
+        if (order == SHUFFLED)
+            for (size_t i = warps.size(); i > 1; i--)
+                std::swap(warps[i - 1], warps[random_below(i)]);
+        for (int warp : warps)
+            is_alive |= run_warp(warp, order);
+        if (!jobs.empty() && n_events == before)
+            do_jobs();
+        else if (is_alive && n_events == before && !failure[0])
             snprintf(failure, sizeof failure, "block %u: its threads wait for each other",
                      blockIdx.x);
     }
@@ -137,10 +202,10 @@ static void run_block(bool is_reversed) {
             fiber.is_started = false;
 }
 
-// ---- Meetings: of the threads of a mask, or of a block ----
+// ---- Meetings: of the threads of a mask, of a block or of a cluster ----
 
 // The operations that threads meet in. All threads of a meeting must be in the same one.
-enum Operation { SYNC, SHUFFLE, VOTE, SUM, LEAST, LARGEST, UNION };
+enum Operation { SYNC, SHUFFLE, VOTE, SUM, LEAST, LARGEST, UNION, LOAD_MATRICES, MULTIPLY };
 
 // What the threads bring to their last two meetings: a thread that reads one may find others in
 // the next.
@@ -148,12 +213,12 @@ struct Meeting {
     unsigned int mask;
     int first;  // thread of the warp
     int counts[WARP];
-    Bits values[2][WARP];
+    Bits64 values[2][WARP];
     Operation operations[2][WARP];
 };
-static std::vector<Meeting> meetings;  // of the block
+static std::vector<Meeting> meetings;  // of the cluster
 
-static Bits* meet(unsigned int mask, Bits value, Operation operation) {
+static Bits64* meet(unsigned int mask, Bits64 value, Operation operation) {
     int lane = current % WARP, first = current - lane;
     if (!(mask >> lane & 1))
         fail("not in its own mask", current);
@@ -181,31 +246,40 @@ static Bits* meet(unsigned int mask, Bits value, Operation operation) {
     return meetings[k].values[slot];
 }
 
-static int block_counts[MAX_FIBERS], block_values[2][MAX_FIBERS];
+// What the threads bring to their last two meetings of all of a block, or of a cluster.
+struct Barrier {
+    int counts[MAX_FIBERS], values[2][MAX_FIBERS];
+};
+static Barrier block_barrier, cluster_barriers;
 
-// Threads that have ended are not waited for.
-static int meet_block(int value) {
-    int count = block_counts[current]++, slot = count % 2, any = 0;
-    block_values[slot][current] = value;
+// Meets `n` threads from `first` on. Those that have ended are not waited for.
+static int meet_all(Barrier& barrier, int first, int n, int value) {
+    int count = barrier.counts[current]++, slot = count % 2, any = 0;
+    barrier.values[slot][current] = value;
     n_events++;
-    for (int other = 0; other < n_fibers; other++)
-        while (!fibers[other].is_done && block_counts[other] <= count)
+    for (int other = first; other < first + n; other++)
+        while (!fibers[other].is_done && barrier.counts[other] <= count)
             yield();
-    for (int other = 0; other < n_fibers; other++)
-        if (block_counts[other] > count)
-            any |= block_values[slot][other];
+    for (int other = first; other < first + n; other++)
+        if (barrier.counts[other] > count)
+            any |= barrier.values[slot][other];
     return any;
 }
 
+static int meet_block(int value) {
+    int first = current - current % n_threads_of_block;
+    return meet_all(block_barrier, first, n_threads_of_block, value);
+}
+
 template <class T>
-static Bits bits_of(T x) {
-    Bits bits = 0;
+static Bits64 bits_of(T x) {
+    Bits64 bits = 0;
     memcpy(&bits, &x, sizeof x);
     return bits;
 }
 
 template <class T>
-static T from_bits(Bits bits) {
+static T from_bits(Bits64 bits) {
     T x;
     memcpy(&x, &bits, sizeof x);
     return x;
@@ -220,7 +294,7 @@ static void __syncwarp(unsigned int mask = ~0u) { meet(mask, 0u, SYNC); }
 
 template <class T>
 static T shuffle(unsigned int mask, T x, int from) {
-    Bits* values = meet(mask, bits_of(x), SHUFFLE);
+    Bits64* values = meet(mask, bits_of(x), SHUFFLE);
     if (!(mask >> from & 1))
         fail("reads from outside its mask", from);
     return from_bits<T>(values[from]);
@@ -248,7 +322,7 @@ static T __shfl_up_sync(unsigned int mask, T x, int lanes, int width = WARP) {
 }
 
 static unsigned int __ballot_sync(unsigned int mask, int is_set) {
-    Bits* values = meet(mask, is_set != 0, VOTE);
+    Bits64* values = meet(mask, is_set != 0, VOTE);
     unsigned int votes = 0;
     for (int lane = 0; lane < WARP; lane++)
         if (mask >> lane & 1)
@@ -260,7 +334,7 @@ static int __all_sync(unsigned int mask, int is_set) { return __ballot_sync(mask
 
 template <class T, class Combine>
 static T reduce(unsigned int mask, T x, Operation operation, Combine combine) {
-    Bits* values = meet(mask, bits_of(x), operation);
+    Bits64* values = meet(mask, bits_of(x), operation);
     int first = __builtin_ctz(mask);
     T result = from_bits<T>(values[first]);
     for (int lane = first + 1; lane < WARP; lane++)
@@ -287,6 +361,14 @@ static unsigned int __reduce_or_sync(unsigned int mask, unsigned int bits) {
 static int __ffs(unsigned int bits) { return __builtin_ffs((int)bits); }
 static int __clz(unsigned int bits) { return bits ? __builtin_clz(bits) : 32; }
 static int __popc(unsigned int bits) { return __builtin_popcount(bits); }
+// Bytes of y, then x, by the four selectors' lowest three bits.
+static unsigned int __byte_perm(unsigned int x, unsigned int y, unsigned int selectors) {
+    Bits64 bytes = (Bits64)y << 32 | x;
+    unsigned int result = 0;
+    for (int i = 0; i < 4; i++)
+        result |= (unsigned int)(bytes >> 8 * (selectors >> 4 * i & 7) & 255) << 8 * i;
+    return result;
+}
 static unsigned int __float_as_uint(float x) { return (unsigned int)bits_of(x); }
 static float __uint_as_float(unsigned int bits) { return from_bits<float>(bits); }
 static float __int_as_float(int bits) { return from_bits<float>((unsigned int)bits); }
@@ -297,6 +379,14 @@ static float __fdividef(float x, float y) { return fabsf(y) > 0x1p126f ? x * 0.f
 template <class T>
 static T __ldcg(const T* address) {
     return *address;
+}
+template <class T>
+static T __ldcs(const T* address) {
+    return *address;
+}
+template <class T>
+static void __stcs(T* address, T x) {
+    *address = x;
 }
 
 // Only one fiber runs at a time.
@@ -331,30 +421,39 @@ static float half_to_float(unsigned short bits) {
 // ---- Launching ----
 
 // Returns what went wrong, or an empty text. Dynamic shared memory holds huge numbers before a
-// block; arrays of a fixed size hold what the last block left there.
+// block; arrays of a fixed size hold what the last block left there, and are the same for all
+// blocks of a cluster.
 template <class Params>
 const char* launch_blocks(void (*kernel)(Params), const Params& params, unsigned int n_blocks_x,
                           unsigned int n_blocks_y, unsigned int n_threads, unsigned int n_shared,
-                          int is_reversed) {
+                          unsigned int cluster, int order, int jobs_are_late) {
     failure[0] = 0;
-    if (n_threads > MAX_FIBERS || n_shared + GUARD > sizeof dynamic_shared)
-        return "has more threads or shared memory than fit";
-    n_fibers = (int)n_threads;
+    if (cluster * n_threads > MAX_FIBERS || cluster > MAX_BLOCKS ||
+        n_shared + GUARD > SHARED_BYTES || n_blocks_x % cluster)
+        return "has more threads or shared memory than fit, or part of a cluster";
+    n_fibers = (int)(cluster * n_threads);
+    n_threads_of_block = (int)n_threads;
+    is_late = jobs_are_late;
+    random_bits = 0;
     blockDim = {n_threads, 1};
     gridDim = {n_blocks_x, n_blocks_y};
     kernel_call = [&] { kernel(params); };
-    unsigned int n_blocks = n_blocks_x * n_blocks_y;
-    for (unsigned int k = 0; k < n_blocks && !failure[0]; k++) {
-        unsigned int block = is_reversed ? n_blocks - 1 - k : k;
-        blockIdx = {block % n_blocks_x, block / n_blocks_x};
+    unsigned int n_clusters = n_blocks_x / cluster * n_blocks_y;
+    for (unsigned int k = 0; k < n_clusters && !failure[0]; k++) {
+        unsigned int block = cluster * (order == REVERSED ? n_clusters - 1 - k : k);
+        first_block = block % n_blocks_x;
+        blockIdx.y = block / n_blocks_x;
         meetings.clear();
-        memset(block_counts, 0, sizeof block_counts);
-        memset(dynamic_shared, POISON, n_shared + GUARD);
-        run_block(is_reversed);
-        for (unsigned int i = n_shared; i < n_shared + GUARD && !failure[0]; i++)
-            if (dynamic_shared[i] != POISON)
-                snprintf(failure, sizeof failure, "block %u: writes beyond its shared memory",
-                         blockIdx.x);
+        memset(&block_barrier, 0, sizeof block_barrier);
+        memset(&cluster_barriers, 0, sizeof cluster_barriers);
+        for (unsigned int rank = 0; rank < cluster; rank++)
+            memset(cluster_shared[rank], POISON, n_shared + GUARD);
+        run_cluster((Order)order);
+        for (unsigned int rank = 0; rank < cluster; rank++)
+            for (unsigned int i = n_shared; i < n_shared + GUARD && !failure[0]; i++)
+                if (cluster_shared[rank][i] != POISON)
+                    snprintf(failure, sizeof failure, "block %u: writes beyond its shared memory",
+                             first_block + rank);
     }
     return failure;
 }

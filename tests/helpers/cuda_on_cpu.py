@@ -13,12 +13,18 @@ from megastep.kernels.build import compile, headers
 from megastep.kernels.build import launch as launching
 
 HEADER = Path(__file__).with_name("blocks_on_cpu.h")
+#: In place of headers of this name.
+REPLACED = {"common/tensor_cores.h": Path(__file__).with_name("tensor_cores_on_cpu.h")}
 FLAGS = (
     *("-std=c++17", "-O1", "-ffp-contract=off", "-shared", "-fPIC", "-fno-strict-aliasing"),
     "-U_FORTIFY_SOURCE",  # which takes a jump between fibers for an error
 )
 #: Threads that the GPU it stands for runs at once, where their number chooses a kernel.
 RESIDENT_THREADS = 132 * 2048
+#: As in `blocks_on_cpu.h`.
+ORDERS = "forward", "reversed", "shuffled"
+#: Order, and whether copies come late.
+SCHEDULES = ("forward", False), ("reversed", True), ("shuffled", False), ("shuffled", True)
 #: Kernels that give the CPU's bits have the CPU's half of backend.h here.
 BACKEND = """
 #include "common/backend.h"
@@ -29,8 +35,18 @@ constexpr unsigned int FULL_WARP = ~0u;
 #: What a C++ compiler does not take: (expression, replacement).
 SPELLINGS = (
     (r"extern __shared__ (\w+) (\w+)\[\];", r"\1* \2 = (\1*)dynamic_shared;"),
+    (r"extern __shared__ __align__\(\d+\) .* (\w+)\[\];", r"#define \1 dynamic_shared"),
     (r'asm\("cvt\.f32\.f16 %0, %1;" : "=f"\((\w+)\) : "h"\((.*)\)\);', r"\1 = half_to_float(\2);"),
 )
+
+
+def _cluster(program, operation):
+    """Returns how many blocks are a cluster: the argument of BOUNDS, where that sets clusters."""
+    for text in program.sources(".cu").values():
+        found = re.search(rf"KERNEL BOUNDS\((\d+)\) {operation}\(", text)
+        if found and "__cluster_dims__(n_blocks," in text:
+            return int(found[1])
+    return 1
 
 
 class TensorOnCpu(torch.Tensor):
@@ -46,12 +62,15 @@ class CudaOnCpu:
         folder: where it builds libraries.
 
     Attributes:
-        is_reversed: runs the threads of a block, and blocks, in the opposite order.
+        order: in which threads run, one of `ORDERS`.
+        is_late: copies to shared memory, and what blocks of a cluster send each other, arrive as
+            late as they may, and not at once.
         launched: the operations since `install`.
     """
 
     def __init__(self, folder: Path):
-        self.folder, self.is_reversed, self.launched = folder, False, set()
+        self.folder, self.launched = folder, set()
+        self.order, self.is_late = "forward", False
         self._libraries = {}
 
     @staticmethod
@@ -74,10 +93,28 @@ class CudaOnCpu:
             self._libraries[program] = self._build(program)
         function = getattr(self._libraries[program], f"run_{operation}")
         function.restype = ctypes.c_char_p
-        numbers = map(ctypes.c_uint, (*n_blocks, n_threads, shared, self.is_reversed))
+        cluster = _cluster(program, operation)
+        numbers = *n_blocks, n_threads, shared, cluster, ORDERS.index(self.order), self.is_late
+        numbers = map(ctypes.c_uint, numbers)
         message = function(ctypes.c_char_p(packed), *numbers)
         assert not message, f"{operation}: {message.decode()}"
         self.launched.add(operation)
+
+    def in_every_order(self, function):
+        """Returns what `function()` does, tensors: the same bits, whichever threads run first and
+        whenever what they copy and send arrives. So no thread reads too early, or overwrites what
+        another still reads.
+        """
+        results = []
+        try:
+            for self.order, self.is_late in SCHEDULES:
+                results.append(function())
+        finally:
+            self.order, self.is_late = "forward", False
+        for other in results[1:]:
+            for one, same in zip(results[0], other, strict=True):
+                torch.testing.assert_close(one, same, rtol=0, atol=0, equal_nan=True)
+        return results[0]
 
     def _build(self, program):
         folder = self.folder / str(len(self._libraries))
@@ -87,14 +124,18 @@ class CudaOnCpu:
                 text = re.sub(expression, replacement, text)
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_text(text)
+        for name, replacement in REPLACED.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(replacement.read_text())
         kernels = program.sources(".cu")
         lines = [f'#include "{HEADER}"']
         lines += [BACKEND] * ("--fmad=false" in program.cuda_flags)
         lines += [f'#include "{name}"' for name in ("params.h", *kernels)]
         lines += [
             f'extern "C" const char* run_{operation}(const {struct}* p, unsigned int x, '
-            f"unsigned int y, unsigned int n_threads, unsigned int n_shared, int is_reversed) "
-            f"{{ return launch_blocks({operation}, *p, x, y, n_threads, n_shared, is_reversed); }}"
+            f"unsigned int y, unsigned int n_threads, unsigned int n_shared, unsigned int cluster, "
+            f"int order, int is_late) {{ return launch_blocks({operation}, *p, x, y, n_threads, "
+            f"n_shared, cluster, order, is_late); }}"
             for operation, struct in headers.operations(kernels).items()
         ]
         source, library = folder / "all.cpp", folder / "all.so"

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from megastep.kernels.build.program import Program
-from tests.helpers.cuda_on_cpu import CudaOnCpu
+from tests.helpers.cuda_on_cpu import ORDERS, CudaOnCpu
 
 CPU = torch.device("cpu")
 PARAMS = """
@@ -22,6 +22,7 @@ struct NumbersParams {
 """
 KERNEL = """
 #include "common/backend.h"
+#include "common/tensor_cores.h"
 #include "params.h"
 
 KERNEL exchange(NumbersParams p) {
@@ -40,18 +41,23 @@ KERNEL exchange(NumbersParams p) {
 def exchange(tmp_path):
     """A function of a kernel's body and numbers: what its threads, one per number, give back."""
 
-    def run(body, numbers, is_reversed=False):
+    def run(body, numbers, order="forward", in_every_order=False):
         folder = Path(tempfile.mkdtemp(dir=tmp_path))  # a loaded library stays loaded
         (folder / "params.h").write_text(PARAMS)
         (folder / "exchange.cu").write_text(KERNEL % body)
         program, launch = Program(folder), CudaOnCpu(folder)
-        launch.is_reversed = is_reversed
-        after = np.full_like(numbers, -1)
-        packed = program.params.NumbersParams(
-            before=numbers.ctypes.data, after=after.ctypes.data, n=len(numbers)
-        )
-        launch(program, "exchange", packed, CPU, len(numbers), shared=256)
-        return after
+        launch.order = order
+
+        def after():
+            after = np.full_like(numbers, -1)
+            packed = program.params.NumbersParams(
+                before=numbers.ctypes.data, after=after.ctypes.data, n=len(numbers)
+            )
+            launch(program, "exchange", packed, CPU, len(numbers), shared=256)
+            return [torch.from_numpy(after)]
+
+        (after,) = launch.in_every_order(after) if in_every_order else after()
+        return after.numpy()
 
     return run
 
@@ -63,7 +69,7 @@ LANES = np.arange(32)
 ALL = "0xffffffffu"
 
 
-@pytest.mark.parametrize("is_reversed", [False, True])
+@pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize(
     "body, expected",
     [
@@ -94,8 +100,8 @@ ALL = "0xffffffffu"
         ("x = __syncthreads_or(x == 98);", (BLOCKS == 98).any(1, keepdims=True).repeat(64, 1)),
     ],
 )
-def test_threads_exchange_numbers(exchange, body, expected, is_reversed):
-    np.testing.assert_array_equal(exchange(body, NUMBERS, is_reversed), np.ravel(expected))
+def test_threads_exchange_numbers(exchange, body, expected, order):
+    np.testing.assert_array_equal(exchange(body, NUMBERS, order), np.ravel(expected))
 
 
 @pytest.mark.parametrize(
@@ -120,14 +126,143 @@ def test_faults_are_named(exchange, body, message):
         exchange(body, NUMBERS)
 
 
-def test_a_missing_barrier_shows_in_one_of_the_two_orders(exchange):
+def test_a_missing_barrier_shows_in_one_of_two_orders(exchange):
     body = """
     extern __shared__ int shared[];
     shared[threadIdx.x] = x;
     x = shared[threadIdx.x ^ 1];
     """
     expected = NUMBERS.reshape(-1, 2)[:, ::-1].ravel()
-    results = [exchange(body, NUMBERS, is_reversed) for is_reversed in (False, True)]
+    results = [exchange(body, NUMBERS, order) for order in ("forward", "reversed")]
     assert any((result != expected).any() for result in results)
     with_barrier = body.replace("= x;", "= x; __syncwarp();", 1)
     np.testing.assert_array_equal(exchange(with_barrier, NUMBERS), expected)
+
+
+COPY = """
+extern __shared__ int shared[];
+if (lane % 4 == 0)
+    begin_copy(shared + threadIdx.x, p.before + i);
+end_group();
+wait_for_copies<0>();
+__syncwarp();
+x = shared[threadIdx.x];
+"""
+
+
+def test_threads_copy_for_each_other(exchange):
+    np.testing.assert_array_equal(exchange(COPY, NUMBERS, in_every_order=True), NUMBERS)
+
+
+@pytest.mark.parametrize("missing", ["wait_for_copies<0>();", "__syncwarp();"])
+def test_a_copy_that_is_not_waited_for_shows_in_one_order(exchange, missing):
+    with pytest.raises(AssertionError, match="Tensor-likes are not equal"):
+        exchange(COPY.replace(missing, ""), NUMBERS, in_every_order=True)
+
+
+def test_numbers_that_are_overwritten_while_others_read_them_show_in_one_order(exchange):
+    """As in a ring of buffers with one too few."""
+    body = """
+    extern __shared__ int shared[];
+    shared[threadIdx.x] = x;
+    __syncthreads();
+    x = shared[threadIdx.x ^ 4];
+    %s
+    if (lane %% 4 == 0)
+        begin_copy(shared + threadIdx.x, p.before);
+    """
+    expected = NUMBERS[np.arange(128) ^ 4]
+    with_barrier = exchange(body % "__syncthreads();", NUMBERS, in_every_order=True)
+    np.testing.assert_array_equal(with_barrier, expected)
+    with pytest.raises(AssertionError, match="Tensor-likes are not equal"):
+        exchange(body % "", NUMBERS, in_every_order=True)
+
+
+PRODUCT = """
+extern __shared__ int shared[];
+unsigned short* matrix = (unsigned short*)shared;
+for (int k = lane; k < 256; k += WARP)
+    matrix[k] = bfloat16_bits((float)(k / 16 * 3 % 7 - k % 16 % 5));
+__syncwarp();
+unsigned int left[2], right[2], columns[2];  // of the rows, upper and lower eight
+load_matrices(left, right, matrix + (lane % 16) * 16 + lane / 16 * 8);
+load_transposed(columns, matrix + (lane % 16) * 16);
+unsigned int rows[4] = {left[0], left[1], right[0], right[1]};
+float sums[4] = {(float)x, 0.f, 0.f, 0.f};
+multiply_add(sums, rows, columns[0], columns[1]);
+x = (int)(sums[0] + 1000.f * sums[1] + 1e5f * sums[2] + 3e6f * sums[3]);
+"""
+
+
+def test_products_of_matrices(exchange):
+    """Thread 4 g + q holds rows g and g + 8, columns 2 q and 2 q + 1 of the product of a 16 x 16
+    matrix and its left half.
+    """
+    k = np.arange(256)
+    matrix = (k // 16 * 3 % 7 - k % 16 % 5).reshape(16, 16)
+    product, g, q = matrix @ matrix[:, :8], LANES // 4, LANES % 4
+    expected = [product[g + row, 2 * q + column] for row in (0, 8) for column in (0, 1)]
+    expected = (np.array(expected).T * [1, 1000, 100_000, 3_000_000]).sum(1)
+    zeros = np.zeros(64, np.int32)
+    result = exchange(PRODUCT, zeros, in_every_order=True)
+    np.testing.assert_allclose(result.reshape(2, 32), expected[None].repeat(2, 0), rtol=1e-6)
+
+
+CLUSTER = """
+#include "common/dependent_launch.h"
+#include "common/tensor_cores.h"
+#include "params.h"
+
+#define KERNEL extern "C" __global__ void
+#define BOUNDS(n_blocks) __cluster_dims__(n_blocks, 1, 1)
+
+extern __shared__ __align__(16) unsigned char shared_memory[];
+
+// Each block sends its numbers to the next one of its cluster of two.
+KERNEL BOUNDS(2) exchange(NumbersParams p) {
+    wait_for_previous();
+    Arrivals* arrivals = (Arrivals*)shared_memory;
+    float* received = (float*)shared_memory + 4;
+    if (!threadIdx.x) {
+        init(arrivals);
+        expect(arrivals, 64 * 8);
+    }
+    cluster_barrier();
+    int i = blockIdx.x * 64 + threadIdx.x, other = 1 - cluster_rank();
+    send(address_in(received + 2 * threadIdx.x, other), p.before[i], 0.f,
+         address_in(arrivals, other));
+    wait_for(arrivals, 0);
+    p.after[i] = (int)received[2 * (63 - threadIdx.x)];
+}
+"""
+
+
+@pytest.mark.parametrize(
+    "missing, message",
+    [
+        ("", None),
+        ("wait_for(arrivals, 0);", "a block sends to one with ended threads"),
+        ("expect(arrivals, 64 * 8);", "its threads wait for each other"),
+    ],
+)
+def test_blocks_of_a_cluster_send_each_other_numbers(tmp_path, missing, message):
+    (tmp_path / "params.h").write_text(PARAMS)
+    (tmp_path / "exchange.cu").write_text(CLUSTER.replace(missing, ""))
+    program, launch = Program(tmp_path, ("--std=c++17",)), CudaOnCpu(tmp_path)
+    before = torch.arange(256, dtype=torch.int32)
+    after = torch.full_like(before, -1)
+
+    def run():
+        packed = program.params.NumbersParams(
+            before=before.data_ptr(), after=after.data_ptr(), n=256
+        )
+        launch.launch_blocks(program, "exchange", packed, CPU, (4, 1), 64, 1024)
+        return [after.clone()]
+
+    if not message:
+        (result,) = launch.in_every_order(run)
+        expected = torch.arange(256).view(2, 2, 64).flip(1, 2).flatten()
+        assert torch.equal(result.long(), expected)
+        return
+    with pytest.raises(AssertionError, match=message):
+        launch.in_every_order(run)

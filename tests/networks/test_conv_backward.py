@@ -1,5 +1,7 @@
 """The gradients of the encoder `Conv` in one kernel, against autograd in float64."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torch.nn import functional
@@ -20,14 +22,14 @@ NAMES = "first weight", "first bias", "second weight", "second bias"
 TOLERANCE = 0.01
 
 
-def make_inputs(n_rows, n_channels, n_columns):
+def make_inputs(n_rows, n_channels, n_columns, device=DEVICE):
     """Returns what `conv_backward` takes; a third of the features is 0."""
     torch.manual_seed(0)
     width = F * n_outputs(n_columns)
     features = (torch.randn(n_rows, width) + 0.43).relu()
     d_features, rows = torch.randn(n_rows, width), torch.randn(n_rows, n_channels, n_columns)
     weights = 0.3 * torch.randn(F, n_channels, 8), 0.3 * torch.randn(F), torch.randn(F, F, 4)
-    return [each.to(DEVICE, BF16) for each in (d_features, features, rows, *weights)]
+    return [each.to(device, BF16) for each in (d_features, features, rows, *weights)]
 
 
 def plain(d_features, features, rows, first_weight, first_bias, second_weight):
@@ -81,6 +83,17 @@ def test_gradients(n_rows, n_channels, n_columns):
     inputs = make_inputs(n_rows, n_channels, n_columns)
     assert is_supported(inputs[2])
     assert_close(conv_backward(*inputs), plain(*inputs), TOLERANCE)
+
+
+@pytest.mark.parametrize("n_channels, n_columns", [(3, 128), (8, 20), (5, 30)])
+def test_gradients_in_every_order(cuda_on_cpu, monkeypatch, n_channels, n_columns):
+    """Seven tiles of rows in two blocks."""
+    inputs = make_inputs(100, n_channels, n_columns, "cpu")
+    gpu = SimpleNamespace(multi_processor_count=1, shared_memory_per_multiprocessor=233_472)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
+    cuda_on_cpu.install(monkeypatch)
+    results = cuda_on_cpu.in_every_order(lambda: conv_backward(*inputs))
+    assert_close(results, plain(*inputs), TOLERANCE)
 
 
 @pytest.mark.cuda

@@ -2,6 +2,8 @@
 intakes.
 """
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torch.nn import functional
@@ -158,11 +160,24 @@ def test_features_have_the_columns_of_the_second_convolution(n_columns):
     assert kernels.n_outputs(n_columns) == conv.second.n_outputs
 
 
-def weights_of(conv):
-    """The weights, with biases that matter, in bfloat16 on the GPU."""
+def weights_of(conv, device="cuda"):
+    """The weights, with biases that matter, in bfloat16."""
     for layer in conv.first, conv.second:
         layer.bias.data.normal_()
-    return [leaf.detach().to("cuda", BF16) for leaf in conv.parameters_in_order()]
+    return [leaf.detach().to(device, BF16) for leaf in conv.parameters_in_order()]
+
+
+@pytest.mark.parametrize("shape", [(3, 128), (6, 37), (1, 5)])
+def test_kernel_matches_convolutions_in_every_order(cuda_on_cpu, monkeypatch, shape):
+    """Seven tiles of rows in two blocks."""
+    torch.manual_seed(1)
+    conv = encoders.Conv(spaces.MultiImage(1, shape[0], 1, shape[1]))
+    weights, rows = weights_of(conv, "cpu"), torch.randn(100, *shape).to(BF16)
+    gpu = SimpleNamespace(multi_processor_count=1)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: gpu)
+    cuda_on_cpu.install(monkeypatch)
+    (features,) = cuda_on_cpu.in_every_order(lambda: [kernels.conv_forward(rows, *weights)])
+    torch.testing.assert_close(features, convolve(rows, *weights), **ROUNDING)
 
 
 @pytest.mark.cuda

@@ -176,12 +176,14 @@ def where(request, monkeypatch):
     return "cpu"
 
 
-def sequence(device, dtype, x, reset, state, weights, d_outputs, d_cell):
+def sequence(device, dtype, x, reset, state, weights, d_outputs, d_cell, is_residual=False):
     """Returns outputs, last cell and all gradients of the recurrence, as float32 on the CPU."""
     to = [leaf.detach().to(device, dtype).requires_grad_() for leaf in (x, *weights)]
     states = [leaf.detach().to(device).requires_grad_() for leaf in state]
-    outputs, cell, last = lstm_module._Sequence.apply(*to, reset.to(device), *states)
-    assert torch.equal(last, outputs[-1].float())
+    outputs, cell, last = lstm_module._Sequence.apply(
+        *(*to, reset.to(device), *states), is_residual
+    )
+    assert is_residual or torch.equal(last, outputs[-1].float())
     assert outputs.dtype == dtype and cell.dtype == torch.float32
     grads = torch.autograd.grad(
         [outputs, cell], [*to, *states], [d_outputs.to(device, dtype), d_cell.to(device)]
@@ -335,7 +337,9 @@ def test_captured_unroll_matches_steps(bf16):
 # ---- A whole sequence in one kernel ----
 
 
-def whole_sequence(device, dtype, seed, n_steps, n_lanes, nan_before_reset=False):
+def whole_sequence(
+    device, dtype, seed, n_steps, n_lanes, nan_before_reset=False, is_residual=False
+):
     """Returns outputs, last cell and gradients of a sequence of 256 units."""
     torch.manual_seed(seed)
     width = lstm_module.lstm_sequence.WIDTH
@@ -353,7 +357,21 @@ def whole_sequence(device, dtype, seed, n_steps, n_lanes, nan_before_reset=False
     if nan_before_reset:
         inputs["reset"][n_steps // 2] = True
         inputs["x"][: n_steps // 2] = torch.nan
-    return sequence(device, dtype, **inputs)
+    return sequence(device, dtype, **inputs, is_residual=is_residual)
+
+
+@pytest.mark.parametrize("is_residual", [False, True])
+@pytest.mark.parametrize("n_steps, n_lanes", [(2, 1), (5, 45)])
+def test_sequence_on_chip_matches_float32_in_every_order(
+    cuda_on_cpu, monkeypatch, n_steps, n_lanes, is_residual
+):
+    case = 0, n_steps, n_lanes, False, is_residual
+    expected = whole_sequence("cpu", torch.float32, *case)
+    cuda_on_cpu.install(monkeypatch)
+    monkeypatch.setattr(lstm_module.lstm_sequence, "is_supported", lambda x: True)
+    results = cuda_on_cpu.in_every_order(lambda: whole_sequence("cpu", torch.bfloat16, *case))
+    assert_close(NAMES, results, expected, SLACK[torch.bfloat16])
+    assert {"lstm_sequence_forward_256", "lstm_sequence_backward_256"} <= cuda_on_cpu.launched
 
 
 @pytest.mark.cuda

@@ -413,8 +413,7 @@ def step_inputs(n_lanes, width, is_exact=False):
         weight, bias = torch.randn(2 * width, width) / width**0.5, torch.randn(2 * width)
     reset, start = torch.rand(1, n_lanes) < 0.3, torch.randn(n_lanes, width)
     start[reset[0]] = torch.nan
-    inputs = (*(leaf.bfloat16() for leaf in (x, weight, bias)), reset, start)
-    return [leaf.cuda() for leaf in inputs]
+    return [*(leaf.bfloat16() for leaf in (x, weight, bias)), reset, start]
 
 
 def two_kernels(gates, reset, start, residual):
@@ -436,7 +435,8 @@ STEPS = pytest.mark.parametrize(
 @STEPS
 def test_step_has_the_bits_of_two_kernels(n_lanes, width, is_residual):
     """Where sums are exact in any order."""
-    x, weight, bias, reset, start = inputs = step_inputs(n_lanes, width, is_exact=True)
+    inputs = [leaf.cuda() for leaf in step_inputs(n_lanes, width, is_exact=True)]
+    x, weight, bias, reset, start = inputs
     assert mingru_step.is_supported(x)
     gates = functional.linear(*(leaf.double() for leaf in (x, weight, bias))).bfloat16()
     expected = two_kernels(gates, reset, start, x if is_residual else None)
@@ -445,11 +445,24 @@ def test_step_has_the_bits_of_two_kernels(n_lanes, width, is_residual):
         assert result.isfinite().all() and torch.equal(result, expected_tensor), name
 
 
+@pytest.mark.parametrize("is_residual", [False, True])
+@pytest.mark.parametrize("n_lanes, width", [(1, 256), (129, 64), (37, 192)])
+def test_step_matches_the_plain_form_in_every_order(
+    cuda_on_cpu, monkeypatch, n_lanes, width, is_residual
+):
+    inputs = step_inputs(n_lanes, width)
+    expected = plain_step(*inputs, is_residual)
+    cuda_on_cpu.install(monkeypatch)
+    results = cuda_on_cpu.in_every_order(lambda: mingru_step.forward(*inputs, is_residual))
+    assert_close(("outputs", "last"), results, expected, SLACK[torch.bfloat16])
+    assert cuda_on_cpu.launched == {f"mingru_step_{width}"}
+
+
 @pytest.mark.cuda
 @pytest.mark.parametrize("is_residual", [False, True])
 @STEPS
 def test_step_matches_the_plain_form_and_is_repeatable(n_lanes, width, is_residual):
-    x, weight, bias, reset, start = inputs = step_inputs(n_lanes, width)
+    x, weight, bias, reset, start = inputs = [leaf.cuda() for leaf in step_inputs(n_lanes, width)]
     names, results = ("outputs", "last"), mingru_step.forward(*inputs, is_residual)
     again = mingru_step.forward(*inputs, is_residual)
     assert all(map(torch.equal, results, again))
@@ -465,7 +478,7 @@ def test_step_matches_the_plain_form_and_is_repeatable(n_lanes, width, is_residu
 
 @pytest.mark.cuda
 def test_step_keeps_nan_to_its_lane():
-    inputs = step_inputs(300, 256)
+    inputs = [leaf.cuda() for leaf in step_inputs(300, 256)]
     clean = mingru_step.forward(*inputs, True)
     inputs[0][0, 140, 200] = inputs[4][20, 7] = torch.nan
     inputs[3][0, 20] = False

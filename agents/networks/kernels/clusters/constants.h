@@ -6,5 +6,5 @@ constexpr int BLOCK_UNITS = 64;        // units of a block
 // 1,024 lanes of the default minibatch.
 constexpr int SEQUENCE_LANES = 40;
 constexpr int MAX_STEPS = 512;          // of a sequence
-constexpr int FORWARD_MEMORY = 153888;  // bytes of shared memory of a block, for 256 units
+constexpr int FORWARD_MEMORY = 159648;  // bytes of shared memory of a block, for 256 units
 constexpr int BACKWARD_MEMORY = 135072;

@@ -124,6 +124,8 @@ DEVICE void write_floats(float* target, uint4 bits) {
 // ---- Forward ----
 
 constexpr int STAGES = 3;  // steps whose gates are in shared memory
+// One more, as slow threads still read those of a step when copies for three steps later begin.
+constexpr int RESIDUAL_STAGES = 4;
 
 template <int W>
 struct ForwardMemory {
@@ -132,7 +134,7 @@ struct ForwardMemory {
     Bits next_hidden[2][LANES][UNITS + PAD];    // to send
     Bits output[2][LANES][UNITS + PAD];
     Bits gates[STAGES][LANES][GATES + PAD];
-    Bits residual[STAGES][LANES][UNITS + PAD];
+    Bits residual[RESIDUAL_STAGES][LANES][UNITS + PAD];
     Arrivals arrivals[2][2];  // of even and odd steps, of both groups
     Resets resets[MAX_STEPS];
 };
@@ -168,7 +170,7 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                 for (int i = me.index; i < LANES * UNITS / 8; i += THREADS) {
                     int lane = i >> 3, part = 8 * (i & 7);
                     long long row = (long long)t * n_lanes + min(first_lane + lane, last_lane);
-                    begin_copy(&memory.residual[t % STAGES][lane][part],
+                    begin_copy(&memory.residual[t % RESIDUAL_STAGES][lane][part],
                                residual + row * W + rank * UNITS + part);
                 }
         }
@@ -311,7 +313,8 @@ DEVICE void lstm_forward(const LstmSequenceForwardParams& p) {
                     write_floats(p.output + (lanes + first_lane + lane) * W + rank * UNITS + part,
                                  value);
                 if (residual)
-                    value = add(value, *(const uint4*)&memory.residual[t % STAGES][lane][part]);
+                    value = add(value,
+                                *(const uint4*)&memory.residual[t % RESIDUAL_STAGES][lane][part]);
                 *(uint4*)(outputs + at) = value;
             }
         }
