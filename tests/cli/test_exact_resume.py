@@ -15,7 +15,9 @@ from megastep.agents.cli import entry, train
 from megastep.agents.storage.collector import Collector
 from megastep.agents.training import annealing, checkpoint, json_lines
 from megastep.arrdict import arrdict
+from tests.cli.test_cli import start
 from tests.helpers import tiny
+from tests.helpers.processes import HUNG
 
 SELF_PLAY = ["opponents.past=0.5", "opponents.snapshots=2", "opponents.every=3"]
 REPLAY = ["learner.replay.capacity=200"]
@@ -232,6 +234,31 @@ def test_interrupted_run_has_the_same_bits(here, monkeypatch):
     assert stopped not in expected
     states = [checkpoint.load_latest(f"{name}/checkpoints").state for name in ("run", "left-alone")]
     assert differences(*states) == []
+
+
+SIDE_BY_SIDE = {
+    "cpu": (2, [*tiny.TINY, *tiny.SHORT_EPISODES, "samples=512"]),
+    "cuda": (8, ["env=explorer", "geometry=bench", "preset=gpu", "samples=20_000_000"]),
+}
+
+
+@pytest.mark.parametrize(
+    "device", [pytest.param("cpu", marks=slow), pytest.param("cuda", marks=pytest.mark.cuda)]
+)
+def test_processes_side_by_side_have_the_same_bits(here, device):
+    """On a GPU they take turns, so each of its kernels may stop and go on anywhere."""
+    n_processes, words = SIDE_BY_SIDE[device]
+    words = [*words, f"device={device}", "finish.evaluate=false", "finish.record=false"]
+    processes = [
+        start("train", *words, f"folder=run{i}", cwd=here, OMP_NUM_THREADS="1")
+        for i in range(n_processes)
+    ]
+    for process in processes:
+        _, err = process.communicate(timeout=HUNG)
+        assert process.returncode == 0, err
+    states = [checkpoint.load_latest(f"run{i}/checkpoints").state for i in range(n_processes)]
+    for state in states[1:]:
+        assert differences(state, states[0]) == []
 
 
 @slow
