@@ -141,7 +141,7 @@ static void do_jobs() {
 
 // In which order warps, and the threads of each, run. A warp runs until none of its threads gets
 // on while all others stand still; if shuffled, often only part of the way.
-enum Order { FORWARD, REVERSED, SHUFFLED };
+enum class Order { FORWARD, REVERSED, SHUFFLED };
 
 static unsigned int random_bits;
 
@@ -152,13 +152,13 @@ static unsigned int random_below(unsigned int n) {
 
 // Continues the threads of a warp. Returns whether it has threads that have not ended.
 static bool run_warp(int warp, Order order) {
-    int n_rounds = order == SHUFFLED ? 1 << random_below(12) : 1 << 30;
+    int n_rounds = order == Order::SHUFFLED ? 1 << random_below(12) : 1 << 30;
     bool is_alive = true, gets_on = true;
     for (; is_alive && gets_on && n_rounds && !failure[0]; n_rounds--) {
         long long before = n_events;
         is_alive = false;
         for (int i = 0; i < WARP && !failure[0]; i++) {
-            current = WARP * warp + (order == REVERSED ? WARP - 1 - i : i);
+            current = WARP * warp + (order == Order::REVERSED ? WARP - 1 - i : i);
             if (current >= n_fibers || fibers[current].is_done)
                 continue;
             is_alive = true;
@@ -176,7 +176,7 @@ static void run_cluster(Order order) {
     std::vector<int> warps;
     for (int warp = 0; WARP * warp < n_fibers; warp++)
         warps.push_back(warp);
-    if (order == REVERSED)
+    if (order == Order::REVERSED)
         std::reverse(warps.begin(), warps.end());
     for (int i = 0; i < n_fibers; i++) {
         fibers[i].is_done = false;
@@ -186,7 +186,7 @@ static void run_cluster(Order order) {
     for (bool is_alive = true; is_alive && !failure[0];) {
         long long before = n_events;
         is_alive = false;
-        if (order == SHUFFLED)
+        if (order == Order::SHUFFLED)
             for (size_t i = warps.size(); i > 1; i--)
                 std::swap(warps[i - 1], warps[random_below(i)]);
         for (int warp : warps)
@@ -426,7 +426,7 @@ static float half_to_float(unsigned short bits) {
 template <class Params>
 const char* launch_blocks(void (*kernel)(Params), const Params& params, unsigned int n_blocks_x,
                           unsigned int n_blocks_y, unsigned int n_threads, unsigned int n_shared,
-                          unsigned int cluster, int order, int jobs_are_late) {
+                          unsigned int cluster, Order order, int jobs_are_late) {
     failure[0] = 0;
     if (cluster * n_threads > MAX_FIBERS || cluster > MAX_BLOCKS ||
         n_shared + GUARD > SHARED_BYTES || n_blocks_x % cluster)
@@ -440,7 +440,7 @@ const char* launch_blocks(void (*kernel)(Params), const Params& params, unsigned
     kernel_call = [&] { kernel(params); };
     unsigned int n_clusters = n_blocks_x / cluster * n_blocks_y;
     for (unsigned int k = 0; k < n_clusters && !failure[0]; k++) {
-        unsigned int block = cluster * (order == REVERSED ? n_clusters - 1 - k : k);
+        unsigned int block = cluster * (order == Order::REVERSED ? n_clusters - 1 - k : k);
         first_block = block % n_blocks_x;
         blockIdx.y = block / n_blocks_x;
         meetings.clear();
@@ -448,7 +448,7 @@ const char* launch_blocks(void (*kernel)(Params), const Params& params, unsigned
         memset(&cluster_barriers, 0, sizeof cluster_barriers);
         for (unsigned int rank = 0; rank < cluster; rank++)
             memset(cluster_shared[rank], POISON, n_shared + GUARD);
-        run_cluster((Order)order);
+        run_cluster(order);
         for (unsigned int rank = 0; rank < cluster; rank++)
             for (unsigned int i = n_shared; i < n_shared + GUARD && !failure[0]; i++)
                 if (cluster_shared[rank][i] != POISON)

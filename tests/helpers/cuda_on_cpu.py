@@ -118,7 +118,7 @@ class CudaOnCpu:
 
     def _build(self, program):
         folder = self.folder / str(len(self._libraries))
-        folder.mkdir()
+        folder.mkdir(exist_ok=True)
         for name, text in program.sources(".h", ".cu").items():
             for expression, replacement in SPELLINGS:
                 text = re.sub(expression, replacement, text)
@@ -133,9 +133,10 @@ class CudaOnCpu:
         lines += [f'#include "{name}"' for name in ("params.h", *kernels)]
         lines += [
             f'extern "C" const char* run_{operation}(const {struct}* p, unsigned int x, '
-            f"unsigned int y, unsigned int n_threads, unsigned int n_shared, unsigned int cluster, "
-            f"int order, int is_late) {{ return launch_blocks({operation}, *p, x, y, n_threads, "
-            f"n_shared, cluster, order, is_late); }}"
+            f"unsigned int y, unsigned int n_threads, unsigned int n_shared, "
+            f"unsigned int n_cluster, Order thread_order, int is_late) "
+            f"{{ return launch_blocks({operation}, *p, x, y, n_threads, n_shared, n_cluster, "
+            f"thread_order, is_late); }}"
             for operation, struct in headers.operations(kernels).items()
         ]
         source, library = folder / "all.cpp", folder / "all.so"
