@@ -21,13 +21,13 @@ def parameters(device="cpu"):
     ]
 
 
-def set_gradients(*parameter_lists, seed):
+def set_gradients(*parameter_lists, seed, move=torch.clone):
     """Gives every list of parameters the same random gradients."""
     generator = torch.Generator().manual_seed(seed)
     for parameters in zip(*parameter_lists):
         grad = torch.randn(parameters[0].shape, generator=generator)
         for p in parameters:
-            p.grad = grad.to(p.device)
+            p.grad = move(grad).to(p.device)
 
 
 def assert_equal(params, others):
@@ -37,23 +37,23 @@ def assert_equal(params, others):
         torch.testing.assert_close(p, other, **close)
 
 
-@pytest.mark.cuda
-def test_gradients_are_clipped_on_a_gpu_as_on_a_cpu():
+def test_gradients_are_clipped_on_a_gpu_as_on_a_cpu(to_gpu):
     """Also with more parameters than fit into a launch."""
     results = []
-    for device in ("cpu", "cuda"):
+    for move in (torch.clone, to_gpu):
         generator = torch.Generator().manual_seed(0)
         params = [
-            torch.nn.Parameter(torch.randn(n, generator=generator).to(device))
+            torch.nn.Parameter(move(torch.randn(n, generator=generator)))
             for n in [*range(1, 60), 5000]
         ]
-        adam = Adam(params, torch.tensor(0.1, device=device))
+        adam = Adam(params, move(torch.tensor(0.1)))
         for seed in range(3):
-            set_gradients(params, seed=seed)
+            set_gradients(params, seed=seed, move=move)
+            assert adam.is_fused == (move is to_gpu)
             norm = adam.grad_norm()
-            adam.step(YES.to(device), norm, 0.5)
-            set_gradients(params, seed=9)
-            adam.step(NO.to(device), norm, 0.5)
+            adam.step(move(YES), norm, 0.5)
+            set_gradients(params, seed=9, move=move)
+            adam.step(move(NO), norm, 0.5)
         results.append([norm, *params, *adam.squares])
     for fused, plain in zip(results[1], results[0], strict=True):
         torch.testing.assert_close(fused.cpu(), plain, rtol=1e-5, atol=1e-6)

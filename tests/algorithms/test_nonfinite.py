@@ -122,7 +122,7 @@ def test_nonfinite_leaf_returns_path():
     assert nonfinite_leaf(tree) == "policy.a.b"
 
 
-def bad_rollout(seed, n_lanes, n_bad, value, extra_row):
+def bad_rollout(seed, n_lanes, n_bad, value, extra_row, to_gpu=torch.Tensor.cuda):
     """Returns floats on a GPU. Some numbers of some lanes are bad, others large but allowed.
 
     Args:
@@ -146,18 +146,19 @@ def bad_rollout(seed, n_lanes, n_bad, value, extra_row):
         leaf.view(-1)[::7] = 0.99 * LIMIT if dtype == torch.float32 else 65_504.0
         places = torch.randint(leaf.numel(), (n_bad,), generator=generator)
         leaf.view(-1)[places] = torch.tensor(value).to(dtype)
-        floats[name] = leaf.cuda()
+        floats[name] = to_gpu(leaf)
     return floats
 
 
-@pytest.mark.cuda
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf, 1.01 * LIMIT, -1e30])
 @pytest.mark.parametrize("n_lanes, n_bad", [(1, 1), (3, 2), (40, 2), (1100, 700)])
 @pytest.mark.parametrize("extra_row", [False, True])
-def test_kernels_find_what_the_plain_form_finds(monkeypatch, value, n_lanes, n_bad, extra_row):
+def test_kernels_find_what_the_plain_form_finds(
+    to_gpu, monkeypatch, value, n_lanes, n_bad, extra_row
+):
     """Among many rollouts: the first bad one is kept until it is read, with up to eight lanes."""
     good, first, second = (
-        bad_rollout(seed, n_lanes, n, value, extra_row)
+        bad_rollout(seed, n_lanes, n, value, extra_row, to_gpu)
         for seed, n in enumerate((0, n_bad, 2 * n_bad))
     )
     assert nonfinite._is_fused(good)
@@ -165,7 +166,7 @@ def test_kernels_find_what_the_plain_form_finds(monkeypatch, value, n_lanes, n_b
     for is_fused in (True, False):
         if not is_fused:
             monkeypatch.setattr(nonfinite, "_is_fused", lambda floats: False)
-        check, texts = NonFiniteCheck(torch.device("cuda")), []
+        check, texts = NonFiniteCheck(good["rgb"].device), []
         for rollout in (good, first, second, good, None, second, good, None, first, None):
             if rollout is None:
                 bad, _ = check.read(good)
@@ -179,12 +180,11 @@ def test_kernels_find_what_the_plain_form_finds(monkeypatch, value, n_lanes, n_b
     assert texts[:4] == [True, False, False, True] and "rollout=2" in texts[8]
 
 
-@pytest.mark.cuda
-def test_infinities_of_both_signs_are_found():
+def test_infinities_of_both_signs_are_found(to_gpu):
     """Kernels and plain form add a row's float16 numbers up, which makes NaN of them."""
-    rollout = bad_rollout(0, 3, 0, 0.0, True)
-    rollout["rgb"][2, 1].view(-1)[:2] = torch.tensor([torch.inf, -torch.inf])
-    check = NonFiniteCheck(torch.device("cuda"))
+    rollout = bad_rollout(0, 3, 0, 0.0, True, to_gpu)
+    rollout["rgb"][2, 1].view(-1)[:2] = to_gpu(torch.tensor([torch.inf, -torch.inf]))
+    check = NonFiniteCheck(rollout["rgb"].device)
     assert not check(rollout)
     value = check.read(rollout)[0]
     assert (value.name, value.lane, value.step) == ("rgb", 1, 2) and math.isnan(value.size)

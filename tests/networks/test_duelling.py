@@ -1,4 +1,6 @@
-"""The duelling output's kernels against PyTorch, on a GPU."""
+"""The duelling output's kernels against PyTorch, on a GPU and on a CPU
+(`tests/helpers/cuda_on_cpu.py`).
+"""
 
 import pytest
 import torch
@@ -7,17 +9,16 @@ from megastep import spaces
 from megastep.agents.networks import heads
 from megastep.agents.networks.kernels import duelling as kernels
 
-pytestmark = pytest.mark.cuda
 # rows, features, agents, choices; from 264 features on, a thread reads several words
 CASES = [(7, 8, 1, 8), (300, 256, 1, 7), (129, 264, 2, 3), (257, 64, 8, 1), (130, 520, 2, 4)]
 
 
-def case(n_rows, width, n_agents, n_choices):
+def case(to_gpu, n_rows, width, n_agents, n_choices):
     """Returns a hidden layer after its ReLU, and weights and biases of value and advantages."""
     torch.manual_seed(0)
-    hidden = torch.randn(n_rows, 2 * width, device="cuda").relu().bfloat16()
+    hidden = to_gpu(torch.randn(n_rows, 2 * width).relu().bfloat16())
     shapes = (n_agents, width), (n_agents,), (n_agents * n_choices, width), (n_agents * n_choices,)
-    return hidden, [torch.randn(shape, device="cuda", requires_grad=True) for shape in shapes]
+    return hidden, [to_gpu(torch.randn(shape)).requires_grad_() for shape in shapes]
 
 
 def plain(hidden, parameters, shape):
@@ -28,8 +29,8 @@ def plain(hidden, parameters, shape):
 
 
 @pytest.mark.parametrize("n_rows, width, n_agents, n_choices", CASES)
-def test_values_and_gradients_match_plain(n_rows, width, n_agents, n_choices):
-    hidden, parameters = case(n_rows, width, n_agents, n_choices)
+def test_values_and_gradients_match_plain(to_gpu, n_rows, width, n_agents, n_choices):
+    hidden, parameters = case(to_gpu, n_rows, width, n_agents, n_choices)
     shape, weights = (n_agents, n_choices), [p.detach() for p in parameters]
     exact = hidden.float().requires_grad_()
     expected = plain(exact, parameters, shape)
@@ -46,11 +47,11 @@ def test_values_and_gradients_match_plain(n_rows, width, n_agents, n_choices):
 
 
 @pytest.mark.parametrize("n_rows, width, n_agents, n_choices", CASES)
-def test_acting_matches_plain(n_rows, width, n_agents, n_choices):
-    hidden, parameters = case(n_rows, width, n_agents, n_choices)
+def test_acting_matches_plain(to_gpu, n_rows, width, n_agents, n_choices):
+    hidden, parameters = case(to_gpu, n_rows, width, n_agents, n_choices)
     shape, weights = (n_agents, n_choices), [p.detach() for p in parameters]
-    noise = torch.rand(2, n_rows, n_agents, device="cuda")
-    epsilon = torch.rand(n_rows, device="cuda")
+    noise = to_gpu(torch.rand(2, n_rows, n_agents))
+    epsilon = to_gpu(torch.rand(n_rows))
     values, actions, logprobs = kernels.act(hidden, weights, shape, noise, epsilon, 0.05)
     assert torch.equal(values, kernels.values(hidden, weights, shape))
     best, random = values.argmax(-1), (noise[0] * n_choices).long()
@@ -61,6 +62,7 @@ def test_acting_matches_plain(n_rows, width, n_agents, n_choices):
     assert torch.equal(greedy, best)
 
 
+@pytest.mark.cuda
 def test_output_matches_float32():
     torch.manual_seed(0)
     output = heads.output(spaces.MultiDiscrete(2, 3), 64, "duelling").cuda()
@@ -77,6 +79,7 @@ def test_output_matches_float32():
         assert other.shape == one.shape and error < 0.1, (i, error)
 
 
+@pytest.mark.cuda
 def test_output_draws_the_same_actions_fused_or_not():
     output = heads.output(spaces.MultiDiscrete(1, 4), 64, "duelling").cuda()
     x, epsilon = torch.randn(4000, 64, device="cuda"), torch.rand(4000, device="cuda")

@@ -1,4 +1,6 @@
-"""The heads of an update together, on a GPU, against their plain forms."""
+"""The heads of an update together, on a GPU, against their plain forms. Kernels run on a CPU, too
+(`tests/helpers/cuda_on_cpu.py`).
+"""
 
 import pytest
 import torch
@@ -10,7 +12,6 @@ from megastep.agents.networks.kernels import heads as kernels
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict
 
-pytestmark = pytest.mark.cuda
 BF16 = torch.bfloat16
 
 
@@ -25,18 +26,18 @@ CASES = [
 
 
 @pytest.mark.parametrize("n_rows, sizes", CASES)
-def test_kernels_match_pytorch_on_the_same_product(n_rows, sizes):
+def test_kernels_match_pytorch_on_the_same_product(to_gpu, n_rows, sizes):
     torch.manual_seed(0)
     first_score, first_hidden, n_columns = sizes.starts
     shape, n_scores = (sizes.n_agents, sizes.n_choices), sizes.n_agents * sizes.n_choices
-    columns = torch.randn(n_rows, n_columns, device="cuda").to(BF16)
-    target = torch.randn(n_rows, first_score, device="cuda").to(BF16)
-    actions = torch.randint(sizes.n_choices, (n_rows, sizes.n_agents), device="cuda")
+    columns = to_gpu(torch.randn(n_rows, n_columns).to(BF16))
+    target = to_gpu(torch.randn(n_rows, first_score).to(BF16))
+    actions = to_gpu(torch.randint(sizes.n_choices, (n_rows, sizes.n_agents)))
     value = kernels.Value(
-        torch.randn(1, sizes.width, device="cuda"),
-        torch.randn(1, device="cuda"),
-        torch.tensor(2.5, device="cuda"),
-        torch.tensor(-1.5, device="cuda"),
+        to_gpu(torch.randn(1, sizes.width)),
+        to_gpu(torch.randn(1)),
+        to_gpu(torch.tensor(2.5)),
+        to_gpu(torch.tensor(-1.5)),
     )
     leaves = columns.float(), value.weight.clone(), value.bias.clone()
     x, weight, bias = (leaf.requires_grad_() for leaf in leaves)
@@ -55,7 +56,7 @@ def test_kernels_match_pytorch_on_the_same_product(n_rows, sizes):
     alone = kernels.values(columns[:, first_hidden:].contiguous(), value)
     assert torch.equal(alone, results[-1])
 
-    gradients = torch.randn(4, n_rows, device="cuda")
+    gradients = to_gpu(torch.randn(4, n_rows))
     loss = sum((d * plain).sum() for d, plain in zip(gradients, expected.values()))
     d_x, d_weight, d_bias = torch.autograd.grad(loss, (x, weight, bias))
     arguments = columns, target, actions, value, sizes, tuple(gradients)
@@ -72,13 +73,13 @@ def test_kernels_match_pytorch_on_the_same_product(n_rows, sizes):
         assert torch.equal(one, other)  # the same bits again
 
 
-def test_nan_of_a_row_stays_in_it():
+def test_nan_of_a_row_stays_in_it(to_gpu):
     sizes = kernels.Sizes(3, 1, 7, 64)
     first_score, _, n_columns = sizes.starts
-    columns = torch.randn(40, n_columns, device="cuda").to(BF16)
-    target = torch.randn(40, first_score, device="cuda").to(BF16)
-    actions = torch.zeros(40, 1, dtype=torch.int64, device="cuda")
-    value = kernels.Value(*(torch.ones(shape, device="cuda") for shape in ((1, 64), (1,), (), ())))
+    columns = to_gpu(torch.randn(40, n_columns).to(BF16))
+    target = to_gpu(torch.randn(40, first_score).to(BF16))
+    actions = to_gpu(torch.zeros(40, 1, dtype=torch.int64))
+    value = kernels.Value(*(to_gpu(torch.ones(shape)) for shape in ((1, 64), (1,), (), ())))
     clean = kernels.forward(columns, target, actions, value, sizes)
     columns[5] = torch.nan
     for one, other in zip(kernels.forward(columns, target, actions, value, sizes), clean):
@@ -87,6 +88,7 @@ def test_nan_of_a_row_stays_in_it():
         )
 
 
+@pytest.mark.cuda
 def test_value_without_a_gradient_matches_the_plain_form():
     torch.manual_seed(0)
     critic = Critic(64, spaces.MultiVector(1, 12)).cuda()
@@ -102,6 +104,7 @@ def test_value_without_a_gradient_matches_the_plain_form():
     torch.testing.assert_close(fused, plain, rtol=0, atol=0.02 * plain.abs().max().item())
 
 
+@pytest.mark.cuda
 def test_other_heads_are_not_fused():
     obs, privileged, moves = (
         spaces.MultiVector(1, 4),

@@ -64,8 +64,10 @@ def test_gpu_adds_the_same_moments_of_bytes_and_doubles(to_gpu):
 def check_gpu(to_gpu, dtype):
     space = [spaces.MultiImage(1, 3, 2, 8), spaces.MultiVector(1, 5), spaces.MultiVector(2, 3)]
     norms = [RunningNorm(leaf) for leaf in space]
-    device = to_gpu(torch.empty(0)).device
-    on_gpu = [RunningNorm(leaf).to(device) for leaf in space]
+    on_gpu = [RunningNorm(leaf) for leaf in space]
+    for norm in on_gpu:
+        for name, buffer in [*norm.named_buffers()]:
+            setattr(norm, name, to_gpu(buffer))
     for seed in range(3):
         torch.manual_seed(seed)
         obs = [torch.randn(1000, *leaf.shape) * 3 + 1 for leaf in space]

@@ -65,36 +65,45 @@ def test_moments_that_do_not_count_change_nothing():
     assert value.mean.item() == 3 and value.scale.item() == 2 and value.count.item() == 1
 
 
-@pytest.mark.cuda
-def test_a_gpu_adds_the_same_moments():
+def moved(output, to_gpu):
+    """Returns a copy whose weights and statistics are on a GPU."""
+    output = copy.deepcopy(output)
+    for module in output.modules():
+        for name, buffer in [*module.named_buffers(recurse=False)]:
+            setattr(module, name, to_gpu(buffer))
+        for name, leaf in [*module.named_parameters(recurse=False)]:
+            setattr(module, name, torch.nn.Parameter(to_gpu(leaf.detach())))
+    return output
+
+
+def test_a_gpu_adds_the_same_moments(to_gpu):
     """Also none, those that do not count, and those that are not finite."""
     width, yes = 300, torch.tensor(True)
-    one, other = ValueOutput(width), ValueOutput(width).cuda()
-    other.load_state_dict(one.state_dict())
+    one = ValueOutput(width)
+    other = moved(one, to_gpu)
     calls = [(5, 3.0, 4.0, None), (5, 30.0, 400.0, yes), (0, 1.0, 1.0, yes), (4, 8.0, 9.0, ~yes)]
     calls += [(5, math.nan, 1.0, None), (5, 1.0, math.inf, None), (4, 9.0, 0.0, yes)]
     for *moments, is_counted in calls:
         moments = [torch.tensor(number) for number in moments]
         one.add(moments, is_counted)
-        on_gpu = None if is_counted is None else is_counted.cuda()
-        other.add([number.cuda() for number in moments], on_gpu)
+        on_gpu = None if is_counted is None else to_gpu(is_counted)
+        other.add([to_gpu(number) for number in moments], on_gpu)
         for name, tensor in one.state_dict().items():
             close = dict(rtol=1e-5, atol=1e-6)
             torch.testing.assert_close(other.state_dict()[name].cpu(), tensor, **close)
     assert one.count == 3
 
 
-@pytest.mark.cuda
-def test_statistics_on_a_gpu_match_the_cpu():
+def test_statistics_on_a_gpu_match_the_cpu(to_gpu):
     torch.manual_seed(0)
     plain = ValueOutput(WIDTH)
-    fused = copy.deepcopy(plain).cuda()
+    fused = moved(plain, to_gpu)
     calls = [(torch.randn(64) * scale + 3 * scale, VALID) for scale in (2.0, 40.0, 0.0, 1e-9)]
     calls += [(torch.full((64,), torch.nan), VALID), (torch.ones(64), ~VALID)] + 30 * calls[:1]
     for targets, valid in calls:
         before = [leaf.clone() for leaf in fused.state_dict().values()]
         plain.update_stats(targets, valid)
-        fused.update_stats(targets.cuda(), valid.cuda())
+        fused.update_stats(to_gpu(targets), to_gpu(valid))
         for (name, leaf), other in zip(plain.state_dict().items(), fused.state_dict().values()):
             torch.testing.assert_close(other.cpu(), leaf, rtol=1e-4, atol=1e-5, msg=name)
         if not (targets.isfinite() & valid).any():
