@@ -1,4 +1,5 @@
-"""Runs every operation on small scenery, also with bad indices, for NVIDIA's compute-sanitizer:
+"""Runs every operation on small scenery, also with bad indices, and a few updates of each learner,
+for NVIDIA's compute-sanitizer:
 
 for tool in memcheck racecheck initcheck; do
     compute-sanitizer --tool $tool python scripts/sanitize.py
@@ -9,6 +10,7 @@ with kernels built for AddressSanitizer and UndefinedBehaviorSanitizer.
 """
 
 import contextlib
+import functools
 import itertools
 import math
 import sys
@@ -19,6 +21,10 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from megastep import arrdict, core, engine, envs, scene
+from megastep.agents.algorithms.ppo import PPO
+from megastep.agents.algorithms.r2d2 import R2D2
+from megastep.agents.algorithms.vtrace import VTrace
+from megastep.agents.networks.policy import Policy
 from megastep.engine import movement, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns
@@ -107,8 +113,30 @@ def run_all(device):
         torch.cuda.synchronize()
 
 
+def learn(device, make_learner, n_updates=2, **settings):
+    """Collects and learns, with policies wide enough for all kernels of a GPU."""
+    env = envs.Explorer(41, sample("bench", 3), device=device, resample=True, privileged=True)
+    policy = Policy(env.obs_space, env.action_space, env.privileged_space, width=256, **settings)
+    learner = make_learner(policy.to(device), n_steps=8, graph=False)
+    collect = learner.collector(env)
+    for _ in range(n_updates):
+        metrics = learner.update(collect())
+    assert all(torch.isfinite(torch.as_tensor(value)).all() for value in metrics.values())
+
+
+def learn_all(device):
+    """More lanes than a cluster of blocks has, and more steps than wait in its memory."""
+    for core_name, encoder in [("lstm", "linear"), ("mingru", "conv"), ("gru", "linear")]:
+        learn(device, functools.partial(PPO, n_minibatches=1), core=core_name, encoder=encoder)
+    learn(device, VTrace, core="none", layers=2)
+    learn(device, R2D2, n_updates=7, output="duelling")  # the first ones fill the replay buffer
+    if device == "cuda":
+        torch.cuda.synchronize()
+
+
 def main(device):
     run_all(device)
+    learn_all(device)
     if device == "cuda":  # with the kernels that render and move many agents, too
         movement.n_resident_threads = rendering.n_resident_threads = lambda *_: 0
         run_all(device)
