@@ -25,6 +25,7 @@ from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.r2d2 import R2D2
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
+from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.engine import movement, rendering
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns
@@ -114,7 +115,7 @@ def run_all(device):
 
 
 def learn(device, make_learner, n_updates=2, **settings):
-    """Collects and learns, with policies wide enough for all kernels of a GPU."""
+    """Collects and learns, with policies wide enough for kernels of clusters and tensor cores."""
     env = envs.Explorer(41, sample("bench", 3), device=device, resample=True, privileged=True)
     policy = Policy(env.obs_space, env.action_space, env.privileged_space, width=256, **settings)
     learner = make_learner(policy.to(device), n_steps=8, graph=False)
@@ -129,7 +130,9 @@ def learn_all(device):
     for core_name, encoder in [("lstm", "linear"), ("mingru", "conv"), ("gru", "linear")]:
         learn(device, functools.partial(PPO, n_minibatches=1), core=core_name, encoder=encoder)
     learn(device, VTrace, core="none", layers=2)
-    learn(device, R2D2, n_updates=7, output="duelling")  # the first ones fill the replay buffer
+    # the first updates collect a whole sequence
+    r2d2 = functools.partial(R2D2, replay=ReplaySettings(capacity=10_000))
+    learn(device, r2d2, n_updates=7, output="duelling")
     if device == "cuda":
         torch.cuda.synchronize()
 

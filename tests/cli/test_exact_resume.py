@@ -246,19 +246,39 @@ SIDE_BY_SIDE = {
     "device", [pytest.param("cpu", marks=slow), pytest.param("cuda", marks=pytest.mark.cuda)]
 )
 def test_processes_side_by_side_have_the_same_bits(here, device):
-    """On a GPU they take turns, so each of its kernels may stop and go on anywhere."""
+    """Those of a run alone. On a GPU they take turns, so each of its kernels may stop and go on
+    anywhere; a fault that shows in one of many runs may still pass.
+    """
     n_processes, words = SIDE_BY_SIDE[device]
     words = [*words, f"device={device}", "finish.evaluate=false", "finish.record=false"]
-    processes = [
-        start("train", *words, f"folder=run{i}", cwd=here, OMP_NUM_THREADS="1")
-        for i in range(n_processes)
-    ]
-    for process in processes:
-        _, err = process.communicate(timeout=HUNG)
-        assert process.returncode == 0, err
-    states = [checkpoint.load_latest(f"run{i}/checkpoints").state for i in range(n_processes)]
-    for state in states[1:]:
-        assert differences(state, states[0]) == []
+    processes = []
+
+    def begin(name):
+        process = start("train", *words, f"folder={name}", cwd=here, OMP_NUM_THREADS="1")
+        processes.append(process)
+
+    def wait():
+        for process in processes:
+            _, err = process.communicate(timeout=HUNG)
+            assert process.returncode == 0, err
+        processes.clear()
+
+    names = [f"run{i}" for i in range(n_processes)]
+    try:
+        begin("alone")
+        wait()
+        for name in names:
+            begin(name)
+        wait()
+    finally:
+        for process in processes:
+            process.kill()
+    alone = checkpoint.load_latest("alone/checkpoints").state
+    for name in names:
+        assert differences(checkpoint.load_latest(f"{name}/checkpoints").state, alone) == []
+        assert (here / name / "metrics.jsonl").read_bytes() == (
+            here / "alone/metrics.jsonl"
+        ).read_bytes()
 
 
 @slow

@@ -12,6 +12,7 @@
 #include <cstring>
 #include <deque>
 #include <functional>
+#include <numeric>
 #include <vector>
 
 #define __device__
@@ -55,7 +56,7 @@ struct Index {
 static Index blockIdx, threadIdx, blockDim, gridDim;
 constexpr unsigned int SHARED_BYTES = 1 << 18;  // of a block
 constexpr unsigned int MAX_BLOCKS = 4;          // of a cluster
-alignas(16) static unsigned char cluster_shared[MAX_BLOCKS][SHARED_BYTES];
+alignas(128) static unsigned char cluster_shared[MAX_BLOCKS][SHARED_BYTES];
 static unsigned char* dynamic_shared;  // that of the current block
 constexpr unsigned char POISON = 0x7f;
 constexpr unsigned int GUARD = 1024;  // bytes behind the shared memory
@@ -140,7 +141,8 @@ static void do_jobs() {
 }
 
 // In which order warps, and the threads of each, run. A warp runs until none of its threads gets
-// on while all others stand still; if shuffled, often only part of the way.
+// on while all others stand still; if shuffled, often only part of the way. Every launch is
+// shuffled alike, so that a failure comes again.
 enum class Order { FORWARD, REVERSED, SHUFFLED };
 
 static unsigned int random_bits;
@@ -150,16 +152,21 @@ static unsigned int random_below(unsigned int n) {
     return (unsigned int)((Bits64)random_bits * n >> 32);
 }
 
+static void shuffle_numbers(std::vector<int>& numbers) {
+    for (size_t i = numbers.size(); i > 1; i--)
+        std::swap(numbers[i - 1], numbers[random_below(i)]);
+}
+
 // Continues the threads of a warp. Returns whether it has threads that have not ended.
-static bool run_warp(int warp, Order order) {
+static bool run_warp(int warp, const std::vector<int>& lanes, Order order) {
     int n_rounds = order == Order::SHUFFLED ? 1 << random_below(12) : 1 << 30;
     bool is_alive = true, gets_on = true;
     for (; is_alive && gets_on && n_rounds && !failure[0]; n_rounds--) {
         long long before = n_events;
         is_alive = false;
-        for (int i = 0; i < WARP && !failure[0]; i++) {
-            current = WARP * warp + (order == Order::REVERSED ? WARP - 1 - i : i);
-            if (current >= n_fibers || fibers[current].is_done)
+        for (int lane : lanes) {
+            current = WARP * warp + lane;
+            if (failure[0] || current >= n_fibers || fibers[current].is_done)
                 continue;
             is_alive = true;
             threadIdx = {(unsigned int)(current % n_threads_of_block), 0};
@@ -173,11 +180,12 @@ static bool run_warp(int warp, Order order) {
 }
 
 static void run_cluster(Order order) {
-    std::vector<int> warps;
-    for (int warp = 0; WARP * warp < n_fibers; warp++)
-        warps.push_back(warp);
-    if (order == Order::REVERSED)
-        std::reverse(warps.begin(), warps.end());
+    std::vector<int> warps((n_fibers + WARP - 1) / WARP), lanes(WARP);
+    for (std::vector<int>* numbers : {&warps, &lanes}) {
+        std::iota(numbers->begin(), numbers->end(), 0);
+        if (order == Order::REVERSED)
+            std::reverse(numbers->begin(), numbers->end());
+    }
     for (int i = 0; i < n_fibers; i++) {
         fibers[i].is_done = false;
         fibers[i].copies.assign(1, {});
@@ -187,16 +195,20 @@ static void run_cluster(Order order) {
         long long before = n_events;
         is_alive = false;
         if (order == Order::SHUFFLED)
-            for (size_t i = warps.size(); i > 1; i--)
-                std::swap(warps[i - 1], warps[random_below(i)]);
-        for (int warp : warps)
-            is_alive |= run_warp(warp, order);
+            shuffle_numbers(warps);
+        for (int warp : warps) {
+            if (order == Order::SHUFFLED)
+                shuffle_numbers(lanes);
+            is_alive |= run_warp(warp, lanes, order);
+        }
         if (!jobs.empty() && n_events == before)
             do_jobs();
         else if (is_alive && n_events == before && !failure[0])
             snprintf(failure, sizeof failure, "block %u: its threads wait for each other",
                      blockIdx.x);
     }
+    if (!failure[0])
+        do_jobs();  // which come too late, and say so
     if (failure[0])
         for (Fiber& fiber : fibers)
             fiber.is_started = false;

@@ -1,6 +1,8 @@
 // What common/tensor_cores.h has, for kernels that blocks_on_cpu.h runs on a CPU. A GPU copies and
 // sends in its own time. Here it is done at once, or as late as it may be (`is_late`): whoever
 // reads too early, or overwrites what is still to be read, gets other numbers in one of the two.
+// What a barrier makes visible is not modelled, and loads and products of matrices are barriers of
+// a warp.
 #pragma once
 
 #define DEVICE static inline
@@ -36,12 +38,18 @@ DEVICE float tanh_of(float x) { return tanhf(x); }
 
 DEVICE float sigmoid(float x) { return 0.5f * tanh_of(0.5f * x) + 0.5f; }
 
+DEVICE void check_aligned(const void* address, int n_bytes) {
+    if ((Bits64)address % n_bytes)
+        fail("uses an address that is not aligned", current);
+}
+
 // ---- Tensor cores ----
 
 // Lanes 8 i to 8 i + 7 of the warp give the rows of matrix i. Thread 4 g + q gets numbers 2 q and
 // 2 q + 1 of row g; transposed, row g of columns 2 q and 2 q + 1.
 template <int N>
 DEVICE void load_rows(unsigned int (&parts)[N], const void* row, bool is_transposed) {
+    check_aligned(row, 16);
     int lane = current % WARP, g = lane / 4, q = lane % 4;
     Bits64* rows = meet(~0u, (Bits64)row, LOAD_MATRICES);
     for (int i = 0; i < N; i++) {
@@ -118,11 +126,16 @@ DEVICE void begin_job(std::vector<Job>& list, Job job) {
 }
 
 DEVICE void begin_copy(void* shared, const void* global) {
+    check_aligned(shared, 16);
+    check_aligned(global, 16);
     begin_job(fibers[current].copies.back(), [=] { memcpy(shared, global, 16); });
 }
 
 template <int n_bytes>
 DEVICE void begin_copy_or_clear(void* shared, const void* global, bool exists) {
+    check_aligned(shared, n_bytes);
+    if (exists)
+        check_aligned(global, n_bytes);
     begin_job(fibers[current].copies.back(), [=] {
         if (exists)
             memcpy(shared, global, n_bytes);
@@ -175,8 +188,23 @@ DEVICE void wait_for(Arrivals* arrivals, int phase) {
         yield();
 }
 
+// Shared memory lives until all threads of its block have ended.
+DEVICE void check_alive(unsigned int rank) {
+    for (int i = 0; i < n_threads_of_block; i++)
+        if (!fibers[rank * n_threads_of_block + i].is_done)
+            return;
+    snprintf(failure, sizeof failure, "block %u: something arrives after its end",
+             first_block + rank);
+}
+
 DEVICE void begin_copy(void* shared, const void* global, int n_bytes, Arrivals* arrivals) {
+    check_aligned(shared, 16);
+    check_aligned(global, 16);
+    if (n_bytes % 16)
+        fail("copies no multiple of 16 bytes", current);
+    unsigned int rank = block_rank();
     begin_job(jobs, [=] {
+        check_alive(rank);
         memcpy(shared, global, n_bytes);
         arrivals->bytes -= n_bytes;
         end_phase(arrivals);
@@ -189,11 +217,9 @@ DEVICE unsigned int address_in(const void* shared, unsigned int rank) {
 
 template <class T>
 DEVICE void begin_sending(unsigned int target, T value, unsigned int arrivals) {
+    check_aligned(cluster_shared[0] + target, sizeof value);
     begin_job(jobs, [=] {
-        int first = target / SHARED_BYTES * n_threads_of_block;
-        for (int i = first; i < first + n_threads_of_block; i++)
-            if (fibers[i].is_done)
-                snprintf(failure, sizeof failure, "a block sends to one with ended threads");
+        check_alive(target / SHARED_BYTES);
         memcpy(cluster_shared[0] + target, &value, sizeof value);
         Arrivals* there = (Arrivals*)(cluster_shared[0] + arrivals);
         there->bytes -= sizeof value;

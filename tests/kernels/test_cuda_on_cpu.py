@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from megastep.kernels.build.program import Program
-from tests.helpers.cuda_on_cpu import ORDERS, CudaOnCpu
+from tests.helpers.cuda_on_cpu import ORDERS, SCHEDULES, CudaOnCpu
 
 CPU = torch.device("cpu")
 PARAMS = """
@@ -237,18 +237,20 @@ KERNEL BOUNDS(2) exchange(NumbersParams p) {
 """
 
 
+@pytest.mark.parametrize("order, is_late", SCHEDULES)
 @pytest.mark.parametrize(
     "missing, message",
     [
         ("", None),
-        ("wait_for(arrivals, 0);", "a block sends to one with ended threads"),
+        ("wait_for(arrivals, 0);", "something arrives after its end"),
         ("expect(arrivals, 64 * 8);", "its threads wait for each other"),
     ],
 )
-def test_blocks_of_a_cluster_send_each_other_numbers(tmp_path, missing, message):
+def test_blocks_of_a_cluster_send_each_other_numbers(tmp_path, missing, message, order, is_late):
     (tmp_path / "params.h").write_text(PARAMS)
     (tmp_path / "exchange.cu").write_text(CLUSTER.replace(missing, ""))
     program, launch = Program(tmp_path, ("--std=c++17",)), CudaOnCpu(tmp_path)
+    launch.order, launch.is_late = order, is_late
     before = torch.arange(256, dtype=torch.int32)
     after = torch.full_like(before, -1)
 
@@ -260,9 +262,19 @@ def test_blocks_of_a_cluster_send_each_other_numbers(tmp_path, missing, message)
         return [after.clone()]
 
     if not message:
-        (result,) = launch.in_every_order(run)
+        (result,) = run()
         expected = torch.arange(256).view(2, 2, 64).flip(1, 2).flatten()
         assert torch.equal(result.long(), expected)
         return
     with pytest.raises(AssertionError, match=message):
-        launch.in_every_order(run)
+        run()
+
+
+@pytest.mark.parametrize("offset", [0, 1])
+def test_addresses_that_are_not_aligned_are_named(exchange, offset):
+    body = COPY.replace("p.before + i)", f"p.before + i / 8 * 8 + {offset})")
+    if not offset:
+        exchange(body, NUMBERS)
+        return
+    with pytest.raises(AssertionError, match="uses an address that is not aligned"):
+        exchange(body, NUMBERS)

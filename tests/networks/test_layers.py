@@ -186,7 +186,7 @@ def test_nan_passes_the_gradient_of_a_relu(to_gpu):
     assert torch.equal(masked[0], d[0]) and not masked[2].any()
 
 
-@pytest.mark.parametrize("n_rows", [1, 31, 300, 100_001])
+@pytest.mark.parametrize("n_rows", [1, 31, 256, 300, 4096, 100_001])
 @pytest.mark.parametrize("n_columns", [8, 56, 256, 264, 1024])
 def test_bias_gradient_is_the_sum_of_rows_and_repeatable(to_gpu, n_rows, n_columns):
     if n_rows > 1000 and to_gpu is not torch.Tensor.cuda:

@@ -124,7 +124,8 @@ DEVICE void write_floats(float* target, uint4 bits) {
 // ---- Forward ----
 
 constexpr int STAGES = 3;  // steps whose gates are in shared memory
-// One more, as slow threads still read those of a step when copies for three steps later begin.
+// One more than for gates: residuals are read after a step's last barrier, so slow warps still read
+// those of step t - 1 when the copies for step t + 2 begin.
 constexpr int RESIDUAL_STAGES = 4;
 
 template <int W>
