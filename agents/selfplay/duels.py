@@ -10,7 +10,12 @@ import numpy as np
 import torch
 
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
-from megastep.agents.training.evaluation import CHECK_EVERY, interval, lanes_by_source, worst_homes
+from megastep.agents.training.evaluation import (
+    interval,
+    lanes_by_source,
+    step_until,
+    worst_homes,
+)
 from megastep.arrdict import arrdict
 from megastep.types import Env, Policy, n_lanes, optional
 
@@ -104,19 +109,22 @@ def play(
     homes = {} if optional(env, "layout") is None else {"homes": env.layout.clone()}
     returns, lengths = torch.zeros(shape, device=device), torch.zeros(env.n_envs, device=device)
     score, is_over = torch.full_like(lengths, 0.5), torch.zeros_like(lengths, dtype=torch.bool)
-    for step in range(max_steps):
-        if step % CHECK_EVERY == 0 and bool(is_over.all()):
-            break
+
+    def step(world, state):
         decision, state = both(world, state, sample=not greedy, generator=generator)
         world = env.step(decision)
         reward, terminal, truncated = (
             world[key].view(shape) for key in ("reward", "terminal", "truncated")
         )
-        returns += reward
-        lengths += ~is_over
+        returns.add_(reward)
+        lengths.add_(~is_over)
         won, decided = score_pairs(terminal, returns, slots)
-        score = torch.where((decided > 0) & ~is_over, won / decided, score)
-        is_over |= (terminal | truncated).any(1)
+        score.copy_(torch.where((decided > 0) & ~is_over, won / decided, score))
+        is_over.logical_or_((terminal | truncated).any(1))
+        return world, state
+
+    changed = both, generator, returns, lengths, score
+    step_until(is_over, step, world, state, env, changed, max_steps)
     optional(env, "check")()
     return arrdict(score=score, lengths=lengths, slots=slots[:, 0], **homes)
 

@@ -9,9 +9,8 @@ from megastep.agents.sections import section
 from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.types import Actor
 from megastep.arrdict import arrdict
-from megastep.capture import capture
 from megastep.dotdict import leaves
-from megastep.env_state import EnvState
+from megastep.env_state import capture_with
 from megastep.types import Env, Tree, optional
 
 _STORED = "obs", "reset", "learns", "privileged"  # what `Rollout.store_world` reads
@@ -101,11 +100,8 @@ class Collector:
 
     def __call__(self) -> Rollout:
         if self.can_capture and self.n_collected == 1:
-            env_state = EnvState(self.parts[0])
-            before = env_state.host_state()
-            self.graph = capture(lambda: collect(*self.parts), (), self.parts)
-            # capturing leaves tensors as they were; in another process it may come at another time
-            env_state.restore_host(before)
+            env, *others = self.parts
+            self.graph = capture_with(env, lambda: collect(*self.parts), (), tuple(others))
         self.n_collected += 1
         if self.graph is None:
             collect(*self.parts)

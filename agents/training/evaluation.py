@@ -4,7 +4,7 @@ Axes: B lanes, N environments. The host synchronises with the device every `CHEC
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,14 @@ from numpy.typing import ArrayLike
 
 from megastep import spaces
 from megastep.arrdict import arrdict
-from megastep.types import Env, Policy, Space, n_lanes, optional
+from megastep.env_state import capture_with
+from megastep.types import Env, Policy, Space, Tree, World, n_lanes, optional
 
 #: Steps between two checks of whether all episodes have ended. A check waits for the GPU, which
 #: costs more than a few superfluous steps.
 CHECK_EVERY = 64
+#: Steps of a CUDA graph, a divisor of `CHECK_EVERY`.
+STEPS_PER_GRAPH = 16
 
 
 class RandomActions:
@@ -42,6 +45,47 @@ class RandomActions:
             return spaces.random_actions(space, n_lanes, device, generator)
 
         return arrdict(actions=spaces.map(draw, self.action_space)), state
+
+
+def step_until(
+    is_over: torch.Tensor,
+    step: Callable[[World, Tree], tuple[World, Tree]],
+    world: World,
+    state: Tree,
+    env: Env,
+    roots: tuple,
+    max_steps: int,
+) -> None:
+    """Calls `world, state = step(world, state)` until all of `is_over` is true, or `max_steps`
+    times. On a GPU, in CUDA graphs after the first `CHECK_EVERY` steps, where libraries initialise
+    themselves; a policy or an environment that cannot be captured is stepped as before, with a
+    warning.
+
+    Args:
+        is_over: bool of any shape, which `step` changes in place.
+        step: acts, steps `env`, and changes only tensors and generators below `env` and `roots`.
+        world: the current world.
+        state: the policy's hidden state before the first step.
+        env: the environment.
+        roots: what else `step` changes, see `megastep.capture.capture`.
+        max_steps: maximum number of steps.
+    """
+
+    def several(world, state, n_steps=STEPS_PER_GRAPH):
+        for _ in range(n_steps):
+            world, state = step(world, state)
+        return world, state
+
+    play, can_capture = several, is_over.is_cuda and optional(env, "capturable")
+    for start in range(0, max_steps, STEPS_PER_GRAPH):
+        if start % CHECK_EVERY == 0 and bool(is_over.all()):
+            break
+        if start == CHECK_EVERY and can_capture:
+            play = capture_with(env, several, (world, state), (is_over, *roots), warmup=1)
+        if start + STEPS_PER_GRAPH <= max_steps:
+            world, state = play(world, state)
+        else:
+            several(world, state, max_steps - start)
 
 
 @torch.no_grad()
@@ -78,17 +122,20 @@ def first_episodes(
     metrics = arrdict(
         {name: torch.full_like(returns, torch.nan) for name in world.get("metrics", {})}
     )
-    for step in range(max_steps):
-        if step % CHECK_EVERY == 0 and bool(done.all()):
-            break
+
+    def step(world, state):
         decision, state = policy(world, state, sample=not greedy, generator=generator)
         world = env.step(decision)
-        returns += torch.where(done, 0.0, world.reward)
-        lengths += ~done
+        returns.add_(torch.where(done, 0.0, world.reward))
+        lengths.add_(~done)
         ends = (world.terminal | world.truncated) & ~done
         for name, values in metrics.items():
             values.copy_(torch.where(ends, world["metrics"][name], values))
-        done |= ends
+        done.logical_or_(ends)
+        return world, state
+
+    changed = policy, generator, returns, lengths, metrics
+    step_until(done, step, world, state, env, changed, max_steps)
     return arrdict(
         returns=returns,
         lengths=lengths,
