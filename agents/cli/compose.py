@@ -109,6 +109,9 @@ class Composer:
             n_brackets = value.count("[") + value.count("{")
             is_text = not UNDECODED.search(word)
             fits = is_text and len(key) <= LONGEST and n_brackets <= MOST_BRACKETS
+            if fits and "=" not in word and not word.startswith("~"):
+                errors.append((program.shortened(word), self.cure_for_value(word)))
+                continue
             for text in (word, f"{key}={WITH_EQUALS.sub(QUOTED, value)}") if key and fits else ():
                 with suppress(HydraException, ValueError):
                     overrides += parser.parse_overrides([text])
@@ -153,6 +156,17 @@ class Composer:
         if errors + secret:
             raise ConfigErrors(errors + secret)
         return chosen, config
+
+    def cure_for_value(self, word: str) -> str:
+        """Returns what to say of a word without `=`: the key that it may be a value of."""
+        fields = self.script.kind.__dataclass_fields__
+        if word.split(".")[0] in fields:
+            return f"has no value; write {word}=..."
+        keys = [group for group, members in self.groups().items() if word in members]
+        keys += ["run"] if "run" in fields else []
+        if not keys:
+            return "is no key=value; --cfg job prints all keys"
+        return f"is no key=value; did you mean {keys[0]}={word}?"
 
     def config(self, overrides: list[types.Override]) -> tuple[DictConfig, list[tuple[str, str]]]:
         """Returns (the configuration, the errors of words that are not in it)."""

@@ -374,11 +374,29 @@ def test_minibatch_needs_an_environment():
         ("hydra/launcher=basik", "hydra/launcher", "'basik' is unknown; did you mean basic?"),
         ("hydra/lancher=basic", "hydra/lancher", "did you mean hydra/launcher?"),
         ("folder='r\udcff'", "folder='r\udcff'", "is no text in this locale"),
+        ("explorer", "explorer", "is no key=value; did you mean env=explorer?"),
+        ("quickstart", "quickstart", "is no key=value; did you mean experiment=quickstart?"),
+        ("learner.lr", "learner.lr", "has no value; write learner.lr=..."),
+        ("my-run", "my-run", "is no key=value; --cfg job prints all keys"),
     ],
 )
 def test_bad_overrides(override, key, sentence):
     ((error_key, text),) = errors(override).items()
     assert error_key == key and sentence in text and "\n" not in text
+
+
+@pytest.mark.parametrize(
+    "words, key, sentence",
+    [
+        ([], "run", "is missing; run=latest takes the newest run, run=FOLDER another one"),
+        (["runs/my-run"], "runs/my-run", "is no key=value; did you mean run=runs/my-run?"),
+        (["greedy"], "greedy", "has no value; write greedy=..."),
+    ],
+)
+def test_evaluations_without_a_run(words, key, sentence):
+    with pytest.raises(ConfigErrors) as error:
+        compose(*words, script="evaluate")
+    assert error.value.errors == [(key, sentence)]
 
 
 def test_launcher_not_installed(monkeypatch):
