@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from megastep.agents.generator import SeededGenerator
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.training.evaluation import (
     interval,
@@ -102,7 +103,7 @@ def play(
         - homes: (N,) int32, the layouts after the reset; only if `env.layout` exists
     """
     device, shape = torch.device(env.device), (env.n_envs, env.n_agents)
-    generator = torch.Generator(device).manual_seed(seed)
+    draws = SeededGenerator(seed)
     slots = rotating_slots(*shape, device) if slots is None else slots
     both = duel_policy(policy, opponent, slots, env.n_agents)
     world, state = env.reset(), both.initial(n_lanes(env), device)
@@ -111,7 +112,7 @@ def play(
     score, is_over = torch.full_like(lengths, 0.5), torch.zeros_like(lengths, dtype=torch.bool)
 
     def step(world, state):
-        decision, state = both(world, state, sample=not greedy, generator=generator)
+        decision, state = both(world, state, sample=not greedy, generator=draws.on(is_over.device))
         world = env.step(decision)
         reward, terminal, truncated = (
             world[key].view(shape) for key in ("reward", "terminal", "truncated")
@@ -123,7 +124,7 @@ def play(
         is_over.logical_or_((terminal | truncated).any(1))
         return world, state
 
-    changed = both, generator, returns, lengths, score
+    changed = both, draws, returns, lengths, score
     step_until(is_over, step, world, state, env, changed, max_steps)
     optional(env, "check")()
     return arrdict(score=score, lengths=lengths, slots=slots[:, 0], **homes)

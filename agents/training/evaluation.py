@@ -12,6 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from megastep import spaces
+from megastep.agents.generator import SeededGenerator
 from megastep.arrdict import arrdict
 from megastep.env_state import capture_with
 from megastep.types import Env, Policy, Space, Tree, World, n_lanes, optional
@@ -111,7 +112,7 @@ def first_episodes(
           respawns, so the whole episode is played in it.
     """
     device, n_agents = torch.device(env.device), optional(env, "n_agents")
-    generator = torch.Generator(device).manual_seed(seed)
+    draws = SeededGenerator(seed)
     world, state = env.reset(), policy.initial(n_lanes(env), device)
     layout = optional(env, "layout")
     envs = torch.arange(env.n_envs, device=device).repeat_interleave(n_agents)
@@ -124,7 +125,7 @@ def first_episodes(
     )
 
     def step(world, state):
-        decision, state = policy(world, state, sample=not greedy, generator=generator)
+        decision, state = policy(world, state, sample=not greedy, generator=draws.on(done.device))
         world = env.step(decision)
         returns.add_(torch.where(done, 0.0, world.reward))
         lengths.add_(~done)
@@ -134,7 +135,7 @@ def first_episodes(
         done.logical_or_(ends)
         return world, state
 
-    changed = policy, generator, returns, lengths, metrics
+    changed = policy, draws, returns, lengths, metrics
     step_until(done, step, world, state, env, changed, max_steps)
     return arrdict(
         returns=returns,

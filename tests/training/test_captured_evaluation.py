@@ -56,7 +56,7 @@ class Waiting:
 
 
 def explorer():
-    return envs.Explorer(48, sample("homes", 8), seed=1, device="cuda", res=16, patience=30)
+    return envs.Explorer(128, sample("homes", 8), seed=1, device="cuda", res=16, patience=8)
 
 
 def deathmatch():
@@ -75,7 +75,7 @@ def episodes(greedy=False, wrapper=lambda policy: policy):
     played = evaluation.first_episodes(env, policy, 3, greedy, max_steps=MAX_STEPS)
     assert 0 < played.done.sum() < len(played.done) and played.lengths.max() == MAX_STEPS
     # the environment goes on from the same state
-    world = env.step(arrdict(actions=torch.zeros(48, 1, dtype=torch.int64, device="cuda")))
+    world = env.step(arrdict(actions=torch.zeros(128, 1, dtype=torch.int64, device="cuda")))
     return arrdict(played, world=world)
 
 
