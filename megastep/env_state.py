@@ -8,17 +8,15 @@ import pathlib
 import random
 import re
 import types as python_types
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
 
-from megastep.capture import capture
 from megastep.engine.state_tree import OPAQUE, children, node_at, rebind, walk
 from megastep.read_only import ReadOnlyTensor
 
-__all__ = ["EnvState", "capture_with"]
+__all__ = ["EnvState"]
 
 _GENERATORS = (torch.Generator, np.random.Generator, np.random.RandomState, random.Random)
 _STATEFUL = (torch.Tensor, np.ndarray, *_GENERATORS)
@@ -258,25 +256,6 @@ class EnvState:
             if hasattr(node, "__dict__"):
                 is_users = node is not self.root and not _is_ours(node)
             stack += [(path + step, child, is_users) for step, child in reversed(children(node))]
-
-
-def capture_with(
-    env: Any, function: Callable, args: tuple, roots: tuple = (), warmup: int = 3
-) -> Callable:
-    """Records a function that steps an environment as a CUDA graph, see
-    :func:`megastep.capture.capture`. What the environment keeps besides tensors stays as it was,
-    too, so nothing depends on when the graph is recorded.
-
-    Args:
-        env: the environment.
-        function, args, warmup: as in ``capture``.
-        roots: what else the function changes.
-    """
-    state = EnvState(env)
-    before = state.host_state()
-    captured = capture(function, args, (env, *roots), warmup)
-    state.restore_host(before)
-    return captured
 
 
 def _is_ours(node):

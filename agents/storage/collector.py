@@ -3,14 +3,17 @@
 T time, B lanes.
 """
 
+from collections.abc import Callable
+
 import torch
 
 from megastep.agents.sections import section
 from megastep.agents.storage.rollout import Rollout, copy_tree
 from megastep.agents.types import Actor
 from megastep.arrdict import arrdict
+from megastep.capture import capture
 from megastep.dotdict import leaves
-from megastep.env_state import capture_with
+from megastep.env_state import EnvState
 from megastep.types import Env, Tree, optional
 
 _STORED = "obs", "reset", "learns", "privileged"  # what `Rollout.store_world` reads
@@ -68,6 +71,25 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
     for target, source in zip(leaves(actor_state), leaves(after), strict=True):
         target.copy_(source)
     return actor_state
+
+
+def capture_with(
+    env: Env, function: Callable, args: tuple, roots: tuple = (), warmup: int = 3
+) -> Callable:
+    """Records a function that steps an environment as a CUDA graph, see
+    `megastep.capture.capture`. What the environment keeps besides tensors stays as it was,
+    too, so nothing depends on when the graph is recorded.
+
+    Args:
+        env: the environment.
+        function, args, warmup: as in `capture`.
+        roots: what else the function changes.
+    """
+    state = EnvState(env)
+    before = state.host_state()
+    captured = capture(function, args, (env, *roots), warmup)
+    state.restore_host(before)
+    return captured
 
 
 class Collector:

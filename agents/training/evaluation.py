@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from megastep import spaces
 from megastep.agents.generator import SeededGenerator
+from megastep.agents.storage.collector import capture_with
 from megastep.arrdict import arrdict
-from megastep.env_state import capture_with
 from megastep.types import Env, Policy, Space, Tree, World, n_lanes, optional
 
 #: Steps between two checks of whether all episodes have ended. A check waits for the GPU, which

@@ -6,6 +6,8 @@ from torch import nn
 
 from megastep import spaces
 from megastep.agents.networks import encoders, heads, intakes, layers
+from megastep.agents.networks.kernels import casts
+from megastep.agents.networks.kernels import layers as kernel_layers
 from megastep.agents.networks.kernels.program import aligned_rows
 from megastep.agents.networks.precision import ComputeDtype, cast, cast_joined, once
 from megastep.arrdict import arrdict
@@ -99,6 +101,45 @@ def test_weights_of_a_context_are_cast_together():
                 )
         with torch.no_grad():
             weights[10].add_(1.0)
+
+
+def test_weights_are_rounded_as_by_pytorch(to_gpu):
+    """More than fit into a launch; some fill several blocks, others no vector of eight."""
+    torch.manual_seed(0)
+    shapes = [*((n,) for n in range(1, 50)), (7, 3), (1, 256), (100, 264), (33, 8, 2)]
+    weights = [torch.randn(shape) for shape in shapes]
+    weights[3][0], weights[4][1] = torch.nan, torch.inf
+    for weight, ours in zip(weights, casts.cast([*map(to_gpu, weights)], 8), strict=True):
+        assert len(ours) == -(-len(weight) // 8) * 8 and not ours[len(weight) :].any()
+        expected = weight.bfloat16()
+        torch.testing.assert_close(
+            ours[: len(weight)].cpu(), expected, rtol=0, atol=0, equal_nan=True
+        )
+
+
+@pytest.mark.parametrize("lanes", [None, [3, 0, 3, 4]])
+@pytest.mark.parametrize("kinds", [(48, 3, 12), (12, 5), (7,), (3, 64, 1)])
+def test_normalised_observations_are_those_of_the_plain_form(to_gpu, kinds, lanes):
+    """Leaves of 1 to 64 features in float16 and float32, with statistics of one or more."""
+    torch.manual_seed(0)
+    leaves, means, scales, expected = [], [], [], []
+    for i, n_features in enumerate(kinds):
+        leaf = torch.randn(3, 5, n_features).to(torch.float32 if i % 2 else torch.float16)
+        n_groups = 3 if n_features % 3 == 0 else 1
+        mean, scale = torch.randn(n_groups), torch.rand(n_groups) + 0.5
+        group = n_features // n_groups
+        numbers = (leaf - mean.repeat_interleave(group)) / scale.repeat_interleave(group)
+        expected.append(numbers if lanes is None else numbers[:, lanes])
+        for moved, tensor in zip((leaves, means, scales), (leaf, mean, scale), strict=True):
+            moved.append(to_gpu(tensor))
+    n_columns = -(-sum(kinds) // 8) * 8 + 8
+    of = None if lanes is None else to_gpu(torch.tensor(lanes))
+    features = kernel_layers.normalise(leaves, means, scales, n_columns, of).cpu()
+    # a product with 1 / scale may differ in the last bit of float32, and so of bfloat16
+    torch.testing.assert_close(
+        features[..., : sum(kinds)], torch.cat(expected, -1).bfloat16(), rtol=2**-7, atol=1e-6
+    )
+    assert features.shape[-1] == n_columns and not features[..., sum(kinds) :].any()
 
 
 @pytest.mark.cuda

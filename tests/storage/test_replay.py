@@ -1,5 +1,7 @@
 """The replay buffer against one that keeps everything in Python lists."""
 
+import copy
+
 import pytest
 import torch
 from torch import testing
@@ -13,6 +15,7 @@ from megastep.agents.storage.rollout import Rollout
 from megastep.arrdict import arrdict
 from megastep.capture import Graph
 from megastep.dotdict import leaves
+from megastep.engine.state_tree import rebind, walk
 
 OBS = arrdict(
     eye=spaces.MultiImage(1, 3, 1, 4),
@@ -436,6 +439,48 @@ def test_captured_buffer_matches_eager_and_never_synchronises():
         results.append([leaf.cpu() for leaf in [*leaves(out.batch), replay.tree.priorities]])
     for eager, captured in zip(*results, strict=True):
         assert torch.equal(eager, captured)
+
+
+def moved(replay, to):
+    """Returns a copy of a buffer with its tensors moved."""
+    replay = copy.deepcopy(replay)
+    for parent, step, leaf in walk(replay, (torch.Tensor,)).values():
+        rebind(parent, step, to(leaf))
+    return replay
+
+
+@pytest.mark.parametrize("images", ["fp16", "uint8"])
+@pytest.mark.parametrize("n_steps, length, n", [(4, 6, 32), (3, 3, 1), (5, 10, 300)])
+def test_kernels_match_pytorch(n_steps, length, n, images, to_gpu):
+    world = World(n_steps)
+    # exponents that float32 has
+    plain = buffer_of(world, 4, length=length, alpha=0.5, beta=0.75, images=images)
+    for _ in range(9):
+        plain.add(world.next())
+    first = torch.arange(plain.tree.n)
+    plain.set_priorities(first, torch.rand(len(first), generator=world.generator) + 0.1)
+    fused = moved(plain, to_gpu)
+
+    device = fused.flags.rows.device
+    batch = fused.sample(n, torch.Generator(device).manual_seed(1))
+    expected = plain._read(batch.index.cpu(), batch.probability.cpu())
+    assert plain.tree.priorities[batch.index.cpu()].all()
+    testing.assert_close(batch.pop("weight").cpu(), expected.pop("weight"), rtol=1e-6, atol=0)
+    for name, path, leaf in (
+        (name, path, leaf_of(tree, path)) for name, tree in expected.items() for path in paths(tree)
+    ):
+        ours = leaf_of(batch[name], path).cpu()
+        assert ours.dtype == leaf.dtype and torch.equal(ours, leaf), f"{name} {path}"
+
+    errors = torch.rand(len(first), generator=world.generator)
+    errors[1::4], errors[2::8], errors[3::9] = torch.nan, torch.inf, 0.0
+    index = batch.index.cpu()
+    plain.set_priorities(index, errors[index])
+    fused.set_priorities(batch.index, to_gpu(errors[index]))
+    # the kernel's smallest error is a float32
+    for ours, theirs in zip(fused.tree.levels, plain.tree.levels, strict=True):
+        testing.assert_close(ours.cpu(), theirs, rtol=1e-8, atol=0)
+    testing.assert_close(fused.new_priority.cpu(), plain.new_priority, rtol=1e-8, atol=0)
 
 
 def test_wrong_shapes_are_named():
