@@ -446,7 +446,7 @@ def test_step_has_the_bits_of_two_kernels(n_lanes, width, is_residual):
 
 
 @pytest.mark.parametrize("is_residual", [False, True])
-@pytest.mark.parametrize("n_lanes, width", [(1, 256), (129, 64), (37, 192)])
+@pytest.mark.parametrize("n_lanes, width", [(1, 256), (129, 64), (37, 192), (20, 128)])
 def test_step_matches_the_plain_form_in_every_order(
     cuda_on_cpu, monkeypatch, n_lanes, width, is_residual
 ):
