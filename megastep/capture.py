@@ -6,6 +6,7 @@ function changes must be a tensor or a generator reachable from the attributes o
 does not advance an environment. :class:`Captured` captures the ``step`` of an environment.
 """
 
+import collections
 import contextlib
 import traceback
 import warnings
@@ -15,7 +16,16 @@ from typing import Any
 import torch
 from torch.utils import _pytree
 
-from megastep.engine.state_tree import SCALARS, rebind, restore, snapshot, state_tree, walk
+from megastep.engine.state_tree import (
+    OPAQUE,
+    SCALARS,
+    children,
+    rebind,
+    restore,
+    snapshot,
+    state_tree,
+    walk,
+)
 from megastep.types import Env, World, optional
 
 __all__ = ["CaptureError", "Captured", "Graph", "capture", "restore", "snapshot", "state_tree"]
@@ -26,22 +36,25 @@ class CaptureError(RuntimeError):
 
 
 class _StateBefore:
-    """The tensors and Python scalars reachable from some objects, before a function is called."""
+    """The tensors and Python scalars reachable from some objects, and the containers that hold
+    them, before a function is called.
+    """
 
     def __init__(self, roots):
         self.roots = dict(enumerate(roots))
         self.tensors, self.scalars = walk(self.roots, torch.Tensor), walk(self.roots, SCALARS)
+        self.containers = [(node, _members(node)) for node in _containers(self.roots)]
 
-    def keep_in_place(self):
+    def keep_in_place(self, output=None):
         """Copies each tensor that replaced another into the old one, and puts the old one back.
-        Called after the function.
+        Called after the function. Returns its output, with copies of what is overwritten.
 
         A tensor that replaced None, or a new attribute, stays: the function writes there from now
         on. Raises CaptureError for any other change that a graph cannot repeat.
         """
         tensors, scalars = walk(self.roots, torch.Tensor), walk(self.roots, SCALARS)
         self._refuse_changed_scalars(tensors, scalars)
-        reachable = {id(leaf) for _, _, leaf in tensors.values()}
+        reachable, replaced = {id(leaf) for _, _, leaf in tensors.values()}, []
         for path, (_, _, old) in self.tensors.items():
             if path not in tensors:
                 if id(old) in reachable:
@@ -52,7 +65,19 @@ class _StateBefore:
                 )
             parent, step, new = tensors[path]
             if new is not old:
-                _copy_back(path, parent, step, old, new)
+                replaced.append((path, parent, step, old, new))
+        overwritten = {_storage(old) for *_, old, _ in replaced}
+
+        def kept(leaf):
+            is_tensor = overwritten and isinstance(leaf, torch.Tensor)
+            return leaf.clone() if is_tensor and _storage(leaf) in overwritten else leaf
+
+        # all are read before the first is written, as in `self.last, self.now = self.now, new`
+        output = _pytree.tree_map(kept, output)
+        replaced = [(*place, old, kept(new)) for *place, old, new in replaced]
+        for change in replaced:
+            _copy_back(*change)
+        return output
 
     def _refuse_changed_scalars(self, tensors, scalars):
         for path, (_, _, old) in self.scalars.items():
@@ -67,13 +92,54 @@ class _StateBefore:
                 )
 
     def undo(self):
-        """Puts back every tensor and scalar that was replaced, wherever assignment works."""
+        """Puts back every tensor and scalar that was replaced, wherever assignment works, and what
+        containers held.
+        """
+        for node, members in self.containers:
+            if [*map(id, _members(node))] != [*map(id, members)]:
+                with contextlib.suppress(TypeError, AttributeError):
+                    _refill(node, members)
         for before in (self.tensors, self.scalars):
             now = walk(self.roots, (torch.Tensor, *SCALARS))
             for path, (parent, step, leaf) in before.items():
                 if path not in now or now[path][2] is not leaf:
                     with contextlib.suppress(TypeError, AttributeError, KeyError, IndexError):
                         rebind(parent, step, leaf)
+
+
+def _containers(root):
+    """Yields every list, deque and dict that is reachable."""
+    visited, stack = set(), [root]
+    while stack:
+        node = stack.pop()
+        if isinstance(node, (*OPAQUE, *SCALARS, torch.Tensor, torch.Generator)):
+            continue
+        if id(node) not in visited:
+            visited.add(id(node))
+            if isinstance(node, (list, collections.deque, dict)):
+                yield node
+            stack += [child for _, child in children(node)]
+
+
+def _members(container):
+    """Returns what a container holds: its items, or keys and values in turn."""
+    if isinstance(container, dict):
+        return [part for pair in dict.items(container) for part in pair]
+    return [*container]
+
+
+def _refill(container, members):
+    if isinstance(container, dict):
+        dict.clear(container)
+        dict.update(container, zip(members[::2], members[1::2]))
+    else:
+        container.clear()
+        container.extend(members)
+
+
+def _storage(tensor):
+    """Returns what is equal for tensors that share memory."""
+    return tensor.device, tensor.untyped_storage().data_ptr()
 
 
 def _copy_back(path, parent, step, old, new):
@@ -131,7 +197,14 @@ class Graph:
 
     IS_STATELESS = True  # its tensors are copies, see :func:`megastep.engine.state_tree.walk`
 
-    def __init__(self, function: Callable, args: tuple, roots: tuple, warmup: int = 3):
+    def __init__(
+        self,
+        function: Callable,
+        args: tuple,
+        roots: tuple,
+        warmup: int = 3,
+        changed: Callable[[], str | None] = lambda: None,
+    ):
         leaves, self._spec = _pytree.tree_flatten(args)
         self._leaves = [leaf.clone() if isinstance(leaf, torch.Tensor) else leaf for leaf in leaves]
         inputs = _pytree.tree_unflatten(self._leaves, self._spec)
@@ -146,8 +219,13 @@ class Graph:
             saved, original = snapshot(roots), _StateBefore(roots.values())
             try:
                 self._record(function, inputs, roots, saved, warmup)
+                if name := changed():
+                    raise CaptureError(
+                        f"{name} changed during the call, but a CUDA graph replays tensors only: "
+                        f"make it a tensor or a torch.Generator on the device."
+                    )
             except BaseException as error:
-                if isinstance(error, RuntimeError):
+                if isinstance(error, Exception):
                     end_failed_recording()
                     _renew_generators(roots)
                 original.undo()
@@ -174,8 +252,7 @@ class Graph:
         restore(roots, saved)
         before = _StateBefore(roots.values())
         with torch.cuda.graph(self._graph, stream=side):
-            self._out = function(*inputs)
-            before.keep_in_place()
+            self._out = before.keep_in_place(function(*inputs))
 
     def __call__(self, *args):
         leaves, spec = _pytree.tree_flatten(args)
@@ -196,7 +273,13 @@ class Graph:
         return self._out
 
 
-def capture(function: Callable, args: tuple, roots: tuple, warmup: int = 3) -> Callable:
+def capture(
+    function: Callable,
+    args: tuple,
+    roots: tuple,
+    warmup: int = 3,
+    changed: Callable[[], str | None] = lambda: None,
+) -> Callable:
     """Records a function as a CUDA graph on the device of its state. Returns the :class:`Graph`, or
     ``function`` itself with one warning that names the line, if it cannot be captured.
 
@@ -209,12 +292,17 @@ def capture(function: Callable, args: tuple, roots: tuple, warmup: int = 3) -> C
         args: example arguments, trees of tensors whose shapes stay fixed.
         roots: objects whose state the function changes. Their values are restored afterwards.
         warmup: number of calls before the recording.
+        changed: called after the recording, returns the name of what the function has changed
+            besides tensors, if anything.
     """
     try:
-        return Graph(function, args, roots, warmup)
-    except RuntimeError as error:
-        while isinstance(error.__context__, RuntimeError):
-            error = error.__context__  # the first error; ending a failed capture raises another
+        return Graph(function, args, roots, warmup, changed)
+    except Exception as error:  # libraries of others raise their own; bugs are raised eagerly again
+        # the first error; ending a failed capture raises another
+        while isinstance(error, RuntimeError) and not error.__suppress_context__:
+            if not isinstance(error.__context__, Exception):
+                break
+            error = error.__context__
         warnings.warn(
             f"running without a CUDA graph, slower: {str(error).splitlines()[0]}{_line(error)}",
             stacklevel=2,
@@ -241,6 +329,8 @@ class Captured:
     Args:
         env: the environment to wrap.
     """
+
+    capturable = False  # a graph cannot be replayed in another one's recording
 
     def __init__(self, env: Env):
         self.env, self._step = env, None

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from megastep.engine.state_tree import OPAQUE, children, node_at, rebind, walk
+from megastep.engine.state_tree import OPAQUE, children, is_expanded, node_at, rebind, walk
 from megastep.read_only import ReadOnlyTensor
 
 __all__ = ["EnvState"]
@@ -103,11 +103,27 @@ class EnvState:
         arrays = {k: leaf for k, leaf in state["arrays"].items() if state["kinds"][k] == "numpy"}
         values = {path: _encoded(node) for path, node in self._plain_values()}
         none = {name: {} for name in ("classes", "lengths", "keys", "aliases", "unchanged")}
-        return state | {"arrays": arrays, "values": values} | none
+        return state | {"arrays": arrays, "values": values, "n_items": state["lengths"]} | none
 
     def restore_host(self, state: dict[str, dict[str, Any]]) -> None:
-        """Restores a `host_state` in the same process."""
-        self._load(state)
+        """Restores a `host_state` in the same process: of plain values, those that have changed."""
+        now = {path: repr(_encoded(node)) for path, node in self._plain_values()}
+        values = {k: value for k, value in state["values"].items() if now.get(k) != repr(value)}
+        self._load(state | {"values": values})
+
+    def changed_on_host(self, before: dict[str, dict[str, Any]]) -> str | None:
+        """Returns the name of something that has changed since an earlier `host_state` and that no
+        CUDA graph repeats: a plain value, an array, the length of a list, a generator of NumPy or
+        Python. None if there is none, or all objects are megastep's own.
+        """
+        if not any(True for _ in self._nodes_of_user()):
+            return None
+        before, now = map(_comparable, (before, self.host_state()))
+        changed = sorted(path for path in {*before, *now} if before.get(path) != now.get(path))
+        if not changed:
+            return None
+        is_global = re.match(r"\.generators\['(\w+)'\]", changed[0])
+        return f"the global generator of {is_global[1]}" if is_global else _name(changed[0])
 
     def _members(self):
         """Returns the classes of objects, the lengths of lists and the keys of dicts that hold
@@ -258,6 +274,15 @@ class EnvState:
             stack += [(path + step, child, is_users) for step, child in reversed(children(node))]
 
 
+def _comparable(host_state):
+    """Returns {path: what is equal for equal values}."""
+    same = {path: repr(value) for path, value in host_state["values"].items()}
+    same |= {path: array.numpy().tobytes() for path, array in host_state["arrays"].items()}
+    same |= {f"{path} (its length)": n for path, n in host_state["n_items"].items()}
+    generators = host_state["generators"].items()
+    return same | {k: repr(v) for k, v in generators if not isinstance(v, torch.Tensor)}
+
+
 def _is_ours(node):
     return type(node).__module__.startswith(("megastep.", "torch."))
 
@@ -320,8 +345,7 @@ def _fits(leaf, value):
         return is_usable and _fits(torch.from_numpy(leaf), value)
     if not isinstance(leaf, torch.Tensor):
         return False
-    is_expanded = any(n > 1 and not stride for n, stride in zip(leaf.shape, leaf.stride()))
-    return leaf.shape == value.shape and leaf.dtype == value.dtype and not is_expanded
+    return leaf.shape == value.shape and leaf.dtype == value.dtype and not is_expanded(leaf)
 
 
 def _equal(leaf, value):

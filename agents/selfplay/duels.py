@@ -125,7 +125,7 @@ def play(
         return world, state
 
     changed = both, draws, returns, lengths, score
-    step_until(is_over, step, world, state, env, changed, max_steps)
+    step_until(is_over, step, world, state, env, (policy, opponent), changed, max_steps)
     optional(env, "check")()
     return arrdict(score=score, lengths=lengths, slots=slots[:, 0], **homes)
 

@@ -4,6 +4,7 @@ T time, B lanes.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -74,20 +75,28 @@ def collect(env: Env, policy: Actor, rollout: Rollout, actor_state: arrdict) -> 
 
 
 def capture_with(
-    env: Env, function: Callable, args: tuple, roots: tuple = (), warmup: int = 3
+    env: Env,
+    policies: Any,
+    function: Callable,
+    args: tuple = (),
+    roots: tuple = (),
+    warmup: int = 3,
 ) -> Callable:
-    """Records a function that steps an environment as a CUDA graph, see
-    `megastep.capture.capture`. What the environment keeps besides tensors stays as it was,
-    too, so nothing depends on when the graph is recorded.
+    """Records a function that acts in an environment as a CUDA graph, see
+    `megastep.capture.capture`. If it changes what an environment or a policy of another's class
+    keeps besides tensors, it is returned as it is, with the warning of `capture`. Such values stay
+    as they were, so nothing depends on when a graph is recorded.
 
     Args:
         env: the environment.
+        policies: a policy, or several in a tuple.
         function, args, warmup: as in `capture`.
         roots: what else the function changes.
     """
-    state = EnvState(env)
+    state = EnvState(env, policies)
     before = state.host_state()
-    captured = capture(function, args, (env, *roots), warmup)
+    roots = env, policies, *roots
+    captured = capture(function, args, roots, warmup, lambda: state.changed_on_host(before))
     state.restore_host(before)
     return captured
 
@@ -122,8 +131,8 @@ class Collector:
 
     def __call__(self) -> Rollout:
         if self.can_capture and self.n_collected == 1:
-            env, *others = self.parts
-            self.graph = capture_with(env, lambda: collect(*self.parts), (), tuple(others))
+            env, policy, *others = self.parts
+            self.graph = capture_with(env, policy, lambda: collect(*self.parts), roots=(*others,))
         self.n_collected += 1
         if self.graph is None:
             collect(*self.parts)

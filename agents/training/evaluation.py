@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from torch.utils import _pytree
 
 from megastep import spaces
 from megastep.agents.generator import SeededGenerator
@@ -54,20 +55,21 @@ def step_until(
     world: World,
     state: Tree,
     env: Env,
+    policies: tuple[Policy, ...],
     roots: tuple,
     max_steps: int,
 ) -> None:
     """Calls `world, state = step(world, state)` until all of `is_over` is true, or `max_steps`
     times. On a GPU, in CUDA graphs after the first `CHECK_EVERY` steps, where libraries initialise
-    themselves; a policy or an environment that cannot be captured is stepped as before, with a
-    warning.
+    themselves, if `can_capture`; with a warning, if they cannot be recorded after all.
 
     Args:
         is_over: bool of any shape, which `step` changes in place.
-        step: acts, steps `env`, and changes only tensors and generators below `env` and `roots`.
+        step: acts by `policies`, steps `env`, and changes only what is below them and `roots`.
         world: the current world.
-        state: the policy's hidden state before the first step.
+        state: the hidden state before the first step.
         env: the environment.
+        policies: the policies that act.
         roots: what else `step` changes, see `megastep.capture.capture`.
         max_steps: maximum number of steps.
     """
@@ -77,16 +79,37 @@ def step_until(
             world, state = step(world, state)
         return world, state
 
-    play, can_capture = several, is_over.is_cuda and optional(env, "capturable")
+    play, before = several, None
     for start in range(0, max_steps, STEPS_PER_GRAPH):
         if start % CHECK_EVERY == 0 and bool(is_over.all()):
             break
-        if start == CHECK_EVERY and can_capture:
-            play = capture_with(env, several, (world, state), (is_over, *roots), warmup=1)
+        if start == CHECK_EVERY and is_over.is_cuda:
+            carried = world, state
+            if can_capture(env, policies) and _has_fixed_form(before, carried):
+                changed = is_over, *roots
+                play = capture_with(env, policies, several, carried, changed, warmup=1)
+        before = world, state
         if start + STEPS_PER_GRAPH <= max_steps:
             world, state = play(world, state)
         else:
             several(world, state, max_steps - start)
+
+
+def can_capture(env: Env, policies: Sequence[Policy]) -> bool:
+    """Returns whether steps of these may be replayed as a CUDA graph: if the environment is
+    `capturable`, and each policy, too. A policy is, unless it says otherwise, if its class is
+    megastep's, since others may keep a state where no graph sees it.
+    """
+    return optional(env, "capturable") and all(
+        getattr(policy, "capturable", type(policy).__module__.startswith("megastep."))
+        for policy in policies
+    )
+
+
+def _has_fixed_form(before, after):
+    """Returns whether both trees have tensors only, under the same names."""
+    (_, spec), (leaves, other) = map(_pytree.tree_flatten, (before, after))
+    return spec == other and all(isinstance(leaf, torch.Tensor) for leaf in leaves)
 
 
 @torch.no_grad()
@@ -135,8 +158,8 @@ def first_episodes(
         done.logical_or_(ends)
         return world, state
 
-    changed = policy, draws, returns, lengths, metrics
-    step_until(done, step, world, state, env, changed, max_steps)
+    changed = draws, returns, lengths, metrics
+    step_until(done, step, world, state, env, (policy,), changed, max_steps)
     return arrdict(
         returns=returns,
         lengths=lengths,

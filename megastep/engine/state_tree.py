@@ -14,7 +14,16 @@ import torch
 
 from megastep.read_only import ReadOnlyTensor
 
-__all__ = ["children", "node_at", "rebind", "restore", "snapshot", "state_tree", "walk"]
+__all__ = [
+    "children",
+    "is_expanded",
+    "node_at",
+    "rebind",
+    "restore",
+    "snapshot",
+    "state_tree",
+    "walk",
+]
 
 State = dict[str, torch.Tensor]
 
@@ -120,11 +129,21 @@ def state_tree(env: Any) -> dict[str, torch.Tensor | torch.Generator]:
 
 
 def snapshot(env: Any) -> State:
-    """Returns a copy of the state, for :func:`restore`."""
+    """Returns a copy of the state, for :func:`restore`, without tensors that repeat an element
+    (``expand``), which nothing changes in place.
+    """
     return {
         path: leaf.detach().clone() if isinstance(leaf, torch.Tensor) else leaf.get_state()
         for path, leaf in state_tree(env).items()
+        if not is_expanded(leaf)
     }
+
+
+def is_expanded(leaf: Any) -> bool:
+    """Returns whether a leaf is a tensor of which several elements are one number in memory."""
+    return isinstance(leaf, torch.Tensor) and any(
+        n > 1 and not stride for n, stride in zip(leaf.shape, leaf.stride())
+    )
 
 
 @torch.no_grad()
