@@ -120,7 +120,13 @@ def n_lanes(env: Env) -> int:
 
 @runtime_checkable
 class Policy(Protocol):
-    """Chooses actions from worlds, and carries a hidden state from step to step."""
+    """Chooses actions from worlds, and carries a hidden state from step to step.
+
+    Optional attribute:
+        capturable: True if a CUDA graph can repeat its calls: it never waits for the device, and
+            what changes is in tensors. Evaluations on a GPU replay such policies. Default: True for
+            classes of megastep.
+    """
 
     def initial(self, n_lanes: int, device: torch.device | str | None = None) -> Tree:
         """Returns the hidden state of ``n_lanes`` lanes at the start of an episode."""

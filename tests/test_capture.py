@@ -170,6 +170,21 @@ def test_a_tensor_may_move_to_another_attribute():
     state.keep_in_place()
 
 
+def test_moved_tensors_and_outputs_keep_their_numbers():
+    """An environment that remembers its last total, and returns the total before that."""
+    env = Counter()
+    env.now, env.last = torch.full((4,), 2.0), torch.full((4,), 1.0)
+    now, last = env.now, env.last
+    state = capture._StateBefore([env])
+    output = {"before": env.last, "row": env.now[:2], "number": 7}
+    env.last, env.now = env.now, torch.full((4,), 3.0)
+    output = state.keep_in_place(output)
+    assert env.now is now and env.last is last
+    assert now.tolist() == [3.0] * 4 and last.tolist() == [2.0] * 4
+    assert output["before"].tolist() == [1.0] * 4 and output["row"].tolist() == [2.0] * 2
+    assert output["number"] == 7
+
+
 @pytest.mark.parametrize("how", ["rebound", "scalar", "scalar to tensor", "grows", "drops"])
 def test_undo_restores_replaced_attributes(how):
     env = Counter(how)

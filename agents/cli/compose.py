@@ -110,7 +110,7 @@ class Composer:
             is_text = not UNDECODED.search(word)
             fits = is_text and len(key) <= LONGEST and n_brackets <= MOST_BRACKETS
             if fits and "=" not in word and not word.startswith("~"):
-                errors.append((program.shortened(word), self.cure_for_value(word)))
+                errors.append((program.shortened(word or "''"), self.cure_for_value(word)))
                 continue
             for text in (word, f"{key}={WITH_EQUALS.sub(QUOTED, value)}") if key and fits else ():
                 with suppress(HydraException, ValueError):
@@ -159,12 +159,20 @@ class Composer:
 
     def cure_for_value(self, word: str) -> str:
         """Returns what to say of a word without `=`: the key that it may be a value of."""
-        fields = self.script.kind.__dataclass_fields__
-        if word.split(".")[0] in fields:
+        word = word.lstrip("+")
+        names = [name for name, _ in check.fields_of(self.script.kind, {})]
+        group, is_nested, _ = word.partition(".")
+        if word in names or (is_nested and group in settings.GROUPS):
             return f"has no value; write {word}=..."
-        keys = [group for group, members in self.groups().items() if word in members]
-        keys += ["run"] if "run" in fields else []
-        if not keys:
+        groups = []
+        with suppress(*HYDRA_ERRORS):  # in files, which are named when they are composed
+            groups = [group for group, members in self.groups().items() if word in members]
+        keys = ["file"] * word.endswith((".mp4", ".png"))
+        keys += ["against"] * (word in ("bot", "random") or ":" in word)
+        keys += ["run"]
+        keys += ["resume"] * (word == "latest" or "/" in word)
+        keys = groups + [key for key in keys if key in names]
+        if not word or not keys:
             return "is no key=value; --cfg job prints all keys"
         return f"is no key=value; did you mean {keys[0]}={word}?"
 

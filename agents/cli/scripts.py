@@ -233,14 +233,6 @@ The most common words:
                    video.mp4 in the run folder, or video-2.mp4, ... if there is one"""
 
 
-def need_run(tree: Tree, typed: list[str]) -> Tree:
-    """Returns the tree. Raises ConfigErrors if it names no run."""
-    if tree["run"] is None:
-        text = "is missing; run=latest takes the newest run, run=FOLDER another one"
-        raise program.ConfigErrors([("run", text)])
-    return tree
-
-
 def check_run(cfg: settings.Evaluate | settings.Record) -> None:
     """Raises UserError if the run does not exist."""
     if cfg.run is not None:
@@ -253,8 +245,6 @@ def names_in_list(word: str) -> str:
 
 
 TRAIN = Script("train", settings.Train, TRAIN_HELP, check_training, prepare_training)
-EVALUATE = Script(
-    "evaluate", settings.Evaluate, EVALUATE_HELP, check_run, need_run, reword=names_in_list
-)
+EVALUATE = Script("evaluate", settings.Evaluate, EVALUATE_HELP, check_run, reword=names_in_list)
 RECORD = Script("record", settings.Record, RECORD_HELP, check_run)
 SCRIPTS = {script.name: script for script in (TRAIN, EVALUATE, RECORD)}

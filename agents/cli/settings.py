@@ -279,9 +279,15 @@ class Played(Common):
     greedy: bool
 
 
+def _given(run):
+    if run is None:
+        raise ValueError("is missing; run=latest takes the newest run, run=FOLDER another one")
+    return run
+
+
 @frozen
 class Evaluate(Played):
-    run: str
+    run: Annotated[str, BeforeValidator(_given)]
     episodes: Count
     baseline: bool
     against: tuple[str, ...] | None = None

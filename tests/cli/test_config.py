@@ -377,7 +377,10 @@ def test_minibatch_needs_an_environment():
         ("explorer", "explorer", "is no key=value; did you mean env=explorer?"),
         ("quickstart", "quickstart", "is no key=value; did you mean experiment=quickstart?"),
         ("learner.lr", "learner.lr", "has no value; write learner.lr=..."),
+        ("+learner.lr", "+learner.lr", "has no value; write learner.lr=..."),
         ("my-run", "my-run", "is no key=value; --cfg job prints all keys"),
+        ("runs/my-run", "runs/my-run", "is no key=value; did you mean resume=runs/my-run?"),
+        ("latest", "latest", "is no key=value; did you mean resume=latest?"),
     ],
 )
 def test_bad_overrides(override, key, sentence):
@@ -391,12 +394,28 @@ def test_bad_overrides(override, key, sentence):
         ([], "run", "is missing; run=latest takes the newest run, run=FOLDER another one"),
         (["runs/my-run"], "runs/my-run", "is no key=value; did you mean run=runs/my-run?"),
         (["greedy"], "greedy", "has no value; write greedy=..."),
+        (["bot"], "bot", "is no key=value; did you mean against=bot?"),
+        (["my:Bot"], "my:Bot", "is no key=value; did you mean against=my:Bot?"),
+        (["run.v2/a"], "run.v2/a", "is no key=value; did you mean run=run.v2/a?"),
+        ([""], "''", "is no key=value; --cfg job prints all keys"),
+        (["~run"], "run", "is missing"),
     ],
 )
 def test_evaluations_without_a_run(words, key, sentence):
     with pytest.raises(ConfigErrors) as error:
         compose(*words, script="evaluate")
     assert error.value.errors == [(key, sentence)]
+
+
+def test_other_errors_are_named_beside_a_missing_run():
+    with pytest.raises(ConfigErrors) as error:
+        compose("seed=x", script="evaluate")
+    assert {key for key, _ in error.value.errors} == {"run", "seed"}
+
+
+def test_a_video_without_a_key():
+    with pytest.raises(ConfigErrors, match="did you mean file=out.mp4"):
+        compose("out.mp4", script="record")
 
 
 def test_launcher_not_installed(monkeypatch):
