@@ -303,8 +303,11 @@ def capture(
             if not isinstance(error.__context__, Exception):
                 break
             error = error.__context__
+        text = str(error).partition("\n")[0]
+        if not (text and isinstance(error, RuntimeError)):
+            text = f"{type(error).__name__} {text}".rstrip()
         warnings.warn(
-            f"running without a CUDA graph, slower: {str(error).splitlines()[0]}{_line(error)}",
+            f"running without a CUDA graph, slower: {text}{_line(error)}",
             stacklevel=2,
         )
         return function

@@ -354,6 +354,17 @@ def test_the_warning_names_the_attribute_or_the_line(fake_cuda):
         assert capture.capture(fails, (), ()) is fails
 
 
+@pytest.mark.parametrize(
+    "error, text", [(AssertionError(), "AssertionError"), (KeyError("x"), "KeyError 'x'")]
+)
+def test_an_error_of_another_class_is_named(fake_cuda, error, text):
+    def fails():
+        raise error
+
+    with pytest.warns(UserWarning, match=rf"slower: {text} at .*test_capture.py:\d+$"):
+        assert capture.capture(fails, (), ()) is fails
+
+
 def test_only_the_actions_of_a_decision_reach_the_environment():
     decisions = []
     env = Counter()
