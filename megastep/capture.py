@@ -130,8 +130,10 @@ def _members(container):
 
 def _refill(container, members):
     if isinstance(container, dict):
-        dict.clear(container)
-        dict.update(container, zip(members[::2], members[1::2]))
+        # not a method of a subclass, which may do something else; an OrderedDict needs its own
+        kind = type(container) if isinstance(container, collections.OrderedDict) else dict
+        kind.clear(container)
+        kind.update(container, zip(members[::2], members[1::2]))
     else:
         container.clear()
         container.extend(members)
@@ -139,7 +141,8 @@ def _refill(container, members):
 
 def _storage(tensor):
     """Returns what is equal for tensors that share memory."""
-    return tensor.device, tensor.untyped_storage().data_ptr()
+    with torch._C.DisableTorchFunctionSubclass():  # a ReadOnlyTensor would copy it
+        return tensor.device, tensor.untyped_storage().data_ptr()
 
 
 def _copy_back(path, parent, step, old, new):
@@ -225,10 +228,10 @@ class Graph:
                         f"make it a tensor or a torch.Generator on the device."
                     )
             except BaseException as error:
+                original.undo()
                 if isinstance(error, Exception):
                     end_failed_recording()
                     _renew_generators(roots)
-                original.undo()
                 raise
             finally:
                 restore(roots, saved)

@@ -3,6 +3,7 @@ what the environments of users keep besides tensors.
 """
 
 import collections
+import contextlib
 import enum
 import pathlib
 import random
@@ -48,9 +49,10 @@ class EnvState:
     Args:
         env: the environment.
         bot: a policy that plays in it and may have a state of its own, or None.
+        host_only: it is used for `host_state` only, so no large tensor is read.
     """
 
-    def __init__(self, env: Any, bot: Any = None):
+    def __init__(self, env: Any, bot: Any = None, host_only: bool = False):
         self.env, device = env, torch.device(env.device)
         generators = dict(torch=torch.default_generator)
         if device.type == "cuda":
@@ -59,7 +61,8 @@ class EnvState:
         generators |= dict(numpy=np.random.mtrand._rand, python=random.seed.__self__)
         self.root = python_types.SimpleNamespace(env=env, bot=bot, generators=generators)
         self._first_values = {path: _encoded(node) for path, node in self._plain_values()}
-        leaves = walk(self.root, torch.Tensor).items()
+        leaves = {} if host_only else walk(self.root, torch.Tensor)
+        leaves = leaves.items()
         self._first_digests = {
             path: _digest(leaf)
             for path, (_, _, leaf) in leaves
@@ -99,11 +102,24 @@ class EnvState:
 
     def host_state(self) -> dict[str, dict[str, Any]]:
         """Returns the part of the state that is not in tensors, for `restore_host`."""
-        state = self.state_dict()
-        arrays = {k: leaf for k, leaf in state["arrays"].items() if state["kinds"][k] == "numpy"}
-        values = {path: _encoded(node) for path, node in self._plain_values()}
+        arrays, generators, frozen = {}, {}, {}
+        is_on_gpu = torch.device(self.env.device).type == "cuda"
+        for path, (_, _, leaf) in walk(self.root, _STATEFUL).items():
+            is_frozen = is_on_gpu and getattr(leaf, "device", None) == torch.device("cpu")
+            with contextlib.suppress(TypeError, ValueError, RuntimeError):  # of rare kinds of both
+                if isinstance(leaf, _GENERATORS):
+                    generators[path] = state = _generator_state(leaf)
+                    frozen |= {path: _bytes(state)} if is_frozen else {}
+                elif isinstance(leaf, np.ndarray):
+                    if _is_savable(leaf):
+                        arrays[path] = torch.from_numpy(np.array(leaf, order="C"))
+                elif is_frozen and leaf.nbytes < _LARGE and not isinstance(leaf, ReadOnlyTensor):
+                    frozen[path] = _bytes(leaf)
+        state = dict(kinds=dict.fromkeys(arrays, "numpy"), arrays=arrays, generators=generators)
+        state["values"] = {path: _encoded(node) for path, node in self._plain_values()}
+        state |= dict(n_items=self._members()["lengths"], frozen=frozen)
         none = {name: {} for name in ("classes", "lengths", "keys", "aliases", "unchanged")}
-        return state | {"arrays": arrays, "values": values, "n_items": state["lengths"]} | none
+        return state | none
 
     def restore_host(self, state: dict[str, dict[str, Any]]) -> None:
         """Restores a `host_state` in the same process: of plain values, those that have changed."""
@@ -114,7 +130,8 @@ class EnvState:
     def changed_on_host(self, before: dict[str, dict[str, Any]]) -> str | None:
         """Returns the name of something that has changed since an earlier `host_state` and that no
         CUDA graph repeats: a plain value, an array, the length of a list, a generator of NumPy or
-        Python. None if there is none, or all objects are megastep's own.
+        Python, and a tensor or a generator on the CPU where the environment is on a GPU. None if
+        there is none, or all objects are megastep's own.
         """
         if not any(True for _ in self._nodes_of_user()):
             return None
@@ -280,7 +297,12 @@ def _comparable(host_state):
     same |= {path: array.numpy().tobytes() for path, array in host_state["arrays"].items()}
     same |= {f"{path} (its length)": n for path, n in host_state["n_items"].items()}
     generators = host_state["generators"].items()
-    return same | {k: repr(v) for k, v in generators if not isinstance(v, torch.Tensor)}
+    same |= {k: repr(v) for k, v in generators if not isinstance(v, torch.Tensor)}
+    return same | host_state["frozen"]
+
+
+def _bytes(tensor):
+    return tensor.detach().contiguous().view(-1).view(torch.uint8).numpy().tobytes()
 
 
 def _is_ours(node):

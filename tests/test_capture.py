@@ -2,6 +2,7 @@
 themselves need a GPU; most tests replace them and run anywhere.
 """
 
+import collections
 import contextlib
 import copy
 import gc
@@ -194,6 +195,28 @@ def test_undo_restores_replaced_attributes(how):
     assert env.parts["total"] is total and type(env.steps) is int and env.steps == 0
 
 
+def test_undo_restores_containers_in_their_order():
+    env = Counter()
+    env.ordered = collections.OrderedDict(a=torch.zeros(1), b=1)
+    env.queue = collections.deque([1, 2], maxlen=3)
+    state = capture._StateBefore([env])
+    env.ordered["c"], env.ordered["a"] = 2, torch.ones(1)
+    env.ordered.move_to_end("a")
+    env.queue.append(3)
+    env.history.append(torch.zeros(2))
+    state.undo()
+    assert [*env.ordered] == ["a", "b"] and not env.ordered["a"].any()
+    assert [*env.queue] == [1, 2] and env.queue.maxlen == 3 and len(env.history) == 1
+
+
+def test_read_only_outputs_are_kept():
+    env = Counter()
+    env.now = torch.zeros(2)
+    state, view = capture._StateBefore([env]), ReadOnlyTensor(env.now, "now")
+    env.now = torch.ones(2)
+    assert torch.as_tensor(state.keep_in_place({"view": view})["view"]).tolist() == [0, 0]
+
+
 def test_undo_restores_none():
     env = Counter()
     env.hidden, env.tree = None, None
@@ -310,6 +333,26 @@ def test_a_failed_recording_restores_the_state(fake_cuda):
     with pytest.raises(RuntimeError, match="no graph of this"):
         capture.Graph(fails, (), (lazy,))
     assert lazy.hidden is None and lazy.total.tolist() == [0, 0]
+
+
+def test_generators_in_lists_are_renewed_after_a_failed_recording(fake_cuda, monkeypatch):
+    """Those that a failed recording has marked are of no use any more."""
+    env = Counter()
+    env.generators = [env.generator]
+    renewed = []
+
+    def renew(roots):
+        env.generator = env.generators[0] = torch.Generator()
+        renewed.append(env.generator)
+
+    monkeypatch.setattr(capture, "_renew_generators", renew)
+
+    def fails():
+        raise RuntimeError("no graph of this")
+
+    with pytest.raises(RuntimeError, match="no graph"):
+        capture.Graph(fails, (), (env,))
+    assert env.generators == renewed
 
 
 def test_a_function_is_warmed_up_and_then_recorded(fake_cuda):

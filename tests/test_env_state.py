@@ -215,3 +215,23 @@ def test_large_tensors_are_saved_only_if_they_have_changed():
     with pytest.raises(ValueError, match="plans is not that of the run"):
         EnvState(other).load_state_dict(saved)
     assert not other.places.any()
+
+
+@pytest.mark.parametrize("what", ["tensor", "generator", "default", "none"])
+def test_what_is_on_a_cpu_beside_a_gpu_is_frozen_in_a_graph(what, monkeypatch):
+    """A device that was forgotten: such a tensor is a constant of the recording."""
+    monkeypatch.setattr(torch.cuda, "default_generators", [torch.Generator()])
+    env = Env()
+    env.device, env.long = torch.device("cuda:0"), np.zeros(1, np.longdouble)
+    env.sparse = torch.eye(3).to_sparse()
+    state = EnvState(env, host_only=True)
+    before = state.host_state()
+    if what == "tensor":
+        env.place += 1
+    elif what == "generator":
+        torch.rand(1, generator=env.generator)
+    elif what == "default":
+        torch.rand(1)
+    name = state.changed_on_host(before)
+    of = {"tensor": "place", "generator": "generator", "default": "the global generator of torch"}
+    assert name == of.get(what)

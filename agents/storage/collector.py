@@ -93,7 +93,7 @@ def capture_with(
         function, args, warmup: as in `capture`.
         roots: what else the function changes.
     """
-    state = EnvState(env, policies)
+    state = EnvState(env, policies, host_only=True)
     before = state.host_state()
     roots = env, policies, *roots
     captured = capture(function, args, roots, warmup, lambda: state.changed_on_host(before))
