@@ -24,14 +24,15 @@ import tempfile
 import warnings
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
 from megastep import workers
 from megastep.arrdict import clone, numpyify
-from megastep.types import Tree
+from megastep.types import Tree, n_lanes, optional
 from megastep.video import Mp4Writer, as_image
 
 if TYPE_CHECKING:
@@ -284,3 +285,46 @@ def draw(plot_state: Callable, state: Tree) -> np.ndarray:
     finally:
         if "matplotlib.pyplot" in sys.modules:
             sys.modules["matplotlib.pyplot"].close(drawing)
+
+
+@torch.no_grad()
+def film(
+    env: Any, policy: Any, path: str | pathlib.Path, steps: int, greedy: bool = False, seed: int = 1
+) -> pathlib.Path:
+    """Films environment 0 of `env` for some steps from its reset, each a frame, at the
+    environment's own frames per second. Returns the path.
+
+    Args:
+        path: an .mp4, or a .png, which is the last frame.
+
+    Raises:
+        ValueError: for another kind of file, or an environment that cannot be drawn.
+        RuntimeError: naming the first frame that failed.
+    """
+    if not (hasattr(env, "state") and hasattr(env, "plot_state")):
+        raise ValueError(
+            f"{type(env).__name__} cannot be drawn: it needs the methods state(e) and "
+            "plot_state(state), which docs/new-environment.md shows"
+        )
+    path, states = pathlib.Path(path), _states(env, policy, steps, greedy, seed)
+    if path.suffix == ".png":
+        from matplotlib.image import imsave  # a third of a second, which train.py needs not wait
+
+        (last,) = collections.deque(states, maxlen=1)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        imsave(path, draw(env.plot_state, numpyify(last)))
+        return path
+    with ParallelEncoder(env.plot_state, fps=optional(env, "fps")) as encoder:
+        for state in states:
+            encoder(state)
+    return encoder.save(path)
+
+
+def _states(env, policy, steps, greedy, seed):
+    world, hidden = env.reset(), policy.initial(n_lanes(env), env.device)
+    generator = torch.Generator(env.device).manual_seed(seed)
+    yield env.state(0)
+    for _ in range(steps - 1):
+        decision, hidden = policy(world, hidden, sample=not greedy, generator=generator)
+        world = env.step(decision)
+        yield env.state(0)

@@ -19,10 +19,13 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from megastep.agents.cli import components, console, evaluate, factory, program, runs, settings
+from megastep.agents import console, factory, package
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.evaluation import tables
+from megastep.agents.factory import components, settings
 from megastep.agents.networks.policy import Policy
-from megastep.agents.training import agent_file, checkpoint, json_lines, provenance, trust
-from megastep.agents.training.atomic_files import write_atomically
+from megastep.agents.runs import agent_file, checkpoint, folders, json_lines, provenance, trust
+from megastep.agents.runs.atomic_files import write_atomically
 from megastep.dotdict import leaves
 from megastep.types import n_lanes
 
@@ -51,7 +54,7 @@ def rounded(policy: Policy) -> dict[str, torch.Tensor]:
     state = {k: v.half() if k in weights else v for k, v in policy.state_dict().items()}
     for name, tensor in state.items():
         if not tensor.isfinite().all():
-            raise program.UserError(f"{name} has numbers beyond 65,504, the largest of float16")
+            raise UserError(f"{name} has numbers beyond 65,504, the largest of float16")
     return {name: tensor.detach().cpu() for name, tensor in state.items()}
 
 
@@ -145,40 +148,41 @@ def export(
             acts otherwise once it is rounded. Nothing was written then.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise program.UserError(f"{name!r} is no name of an agent; use small letters, digits and _")
-    folder, path = folder or program.PRETRAINED, runs.find(run)
-    loaded = runs.load_checkpoint(path, False, factory.make_device("cpu"))
+        raise UserError(f"{name!r} is no name of an agent; use small letters, digits and _")
+    folder, path = folder or package.PRETRAINED, folders.find(run)
+    loaded = folders.load_checkpoint(path, False, factory.make_device("cpu"))
     if not loaded.numbers:
-        raise program.UserError(f"{loaded.path} has weights only; export a run or its checkpoint")
+        raise UserError(f"{loaded.path} has weights only; export a run or its checkpoint")
     config = {**loaded.config, "train": loaded.config["train"] | PRIVATE}
     if names := trust.foreign_names(json.dumps(config).encode()):
-        raise program.UserError(
+        raise UserError(
             f"{loaded.path} needs {', '.join(names)}, and agents of the package need megastep only"
         )
-    if not (tables := tables_of(runs.folder_of(loaded.path), loaded.step)):
-        raise program.UserError(
-            f"{runs.folder_of(loaded.path)} has no evaluation of {loaded.path.name} in the suite; "
+    folder = folders.folder_of(loaded.path)
+    if not (tables := tables_of(folder, loaded.step)):
+        raise UserError(
+            f"{folder} has no evaluation of {loaded.path.name} in the suite; "
             f"first run python evaluate.py run={loaded.path} geometry=suite episodes=8000"
         )
     trained = factory.config_of(loaded)
     homes = factory.spread(factory.homes(trained.env, trained.geometry, "test"), N_ENVS)
     env = factory.construct(
-        factory.changed(trained.env, n_envs=N_ENVS), geometries=homes, seed=1, device="cpu"
+        settings.changed(trained.env, n_envs=N_ENVS), geometries=homes, seed=1, device="cpu"
     )
     original = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
     state, exported = rounded(original), factory.make_policy(trained.agent, env)
     exported.load_state_dict(state)
     error = rounding_error(exported, original, env)
     if not error <= max_error:
-        raise program.UserError(
+        raise UserError(
             f"{loaded.path} acts otherwise with weights in float16: its logits differ by "
             f"{error:.1%}, and may by {max_error:.1%}"
         )
-    facts = facts_of(runs.folder_of(loaded.path), loaded)
+    facts = facts_of(folders.folder_of(loaded.path), loaded)
     facts |= {"parameters": sum(v.numel() for v in state.values()), "rounding": error}
     file = folder / f"{name}{agent_file.SUFFIX}"
     temporary = file.with_name(f"{name}-new{agent_file.SUFFIX}")
-    with program.errors(f"{folder} cannot be written: "):
+    with user_errors(f"{folder} cannot be written: "):
         folder.mkdir(parents=True, exist_ok=True)
         agent_file.write(temporary, state, config, facts, tables)
     try:
@@ -192,11 +196,11 @@ def export(
 def check_file(path: Path, state: dict[str, torch.Tensor]) -> None:
     """Raises UserError if a file of an agent is too large or does not hold this state."""
     if (size := path.stat().st_size) > MAX_BYTES:
-        raise program.UserError(f"The agent has {size:,} bytes, and may have {MAX_BYTES:,}")
-    read = runs.load_checkpoint(path, False, "cpu").state["policy"]
+        raise UserError(f"The agent has {size:,} bytes, and may have {MAX_BYTES:,}")
+    read = folders.load_checkpoint(path, False, "cpu").state["policy"]
     is_same = read.keys() == state.keys() and all(torch.equal(read[k], v) for k, v in state.items())
     if not is_same:
-        raise program.UserError(f"{path} was not written as it should be")
+        raise UserError(f"{path} was not written as it should be")
 
 
 # ---- The card ----
@@ -244,7 +248,7 @@ def card(file: Path) -> str:
     ]
     for table in about["tables"]:
         are_duels = "won" in table["rows"][0]
-        cells = [*map(evaluate.duel_cells if are_duels else evaluate.cells, table["rows"])]
+        cells = [*map(tables.duel_cells if are_duels else tables.cells, table["rows"])]
         lines = [[*row.values()] for row in cells]
         parts += [
             f"`python evaluate.py run={name} {table['command']}`, measured before the weights were "
@@ -280,7 +284,7 @@ def main(words: list[str] | None = None) -> int:
     )
     parser.add_argument("run", nargs="?", help="a run's folder, or one of its checkpoints")
     parser.add_argument("name", nargs="?", help="of the agent, such as pointgoal_anywhere")
-    parser.add_argument("--folder", type=Path, default=program.PRETRAINED)
+    parser.add_argument("--folder", type=Path, default=package.PRETRAINED)
     parser.add_argument("--max-error", type=float, default=MAX_ERROR, help="of the logits")
     parser.add_argument("--cards", action="store_true", help="only write all cards again")
     options = parser.parse_args(words)
@@ -293,7 +297,7 @@ def main(words: list[str] | None = None) -> int:
             paths = export(options.run, options.name, options.folder, options.max_error)
         for path in paths:
             console.say(f"Wrote {path}")
-    except program.UserError as error:
+    except UserError as error:
         console.say(f"export_agent.py: {error}", sys.stderr)
         return error.code
     return 0

@@ -23,7 +23,7 @@ from scipy.sparse import csgraph
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from megastep import engine, geometries
-from megastep.agents.training.evaluation import interval
+from megastep.agents.evaluation.statistics import interval
 from megastep.envs.pointgoal import geodesics
 from megastep.envs.pointgoal.path_graph import PathGraph
 

@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from planner import Grid
 
 from megastep import engine, geometries
-from megastep.agents.training.evaluation import interval
+from megastep.agents.evaluation.statistics import interval
 from megastep.envs.deathmatch import Deathmatch
 from megastep.modules.movement import MOVES, TURNS
 from megastep.modules.spawning import distances

@@ -28,7 +28,7 @@ from torch.utils._pytree import tree_flatten_with_path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from megastep.agents.training import checkpoint
+from megastep.agents.runs import checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
 WORDS = "preset=cpu device=cpu env.n_envs=4 agent.width=8 learner.n_steps=8 log_every=1"

@@ -1,9 +1,9 @@
 """Imports go one way.
 
-Entry scripts -> megastep.agents.cli -> training, selfplay -> algorithms -> networks, storage ->
-trees and spaces of megastep; environments -> modules, core, plotting -> engine -> kernels. The
-rules read the source files without importing them. The folder agents/ is read once, as
-megastep.agents.
+Entry scripts -> megastep.agents.cli -> launch -> evaluation -> factory -> selfplay, training ->
+runs -> algorithms -> networks, storage -> trees and spaces of megastep; environments -> modules,
+core, plotting -> engine -> kernels. The rules read the source files without importing them. The
+folder agents/ is read once, as megastep.agents.
 """
 
 import ast
@@ -32,14 +32,17 @@ ENGINE = (
     ("rendering",),
 )
 AGENTS = (
-    ("distributed", "generator", "sections", "types"),
-    ("networks",),
+    ("distributed", "errors", "generator", "package", "sections", "types"),
+    ("console", "networks"),
     ("storage",),
     ("algorithms",),
+    ("runs",),
     ("training",),
     ("selfplay",),
+    ("factory",),
+    ("evaluation", "pretrained"),
+    ("launch",),
     ("cli",),
-    ("pretrained",),
 )
 # Modules of the simulator that every room of the learner may import: no environment, no engine.
 THREADS = "megastep.engine.devices"
@@ -55,9 +58,10 @@ SHARED = {
     "megastep.spaces",
     "megastep.types",
 }
-# The command line also caches arguments, chooses a device and homes, checks environments, writes
-# videos and starts processes.
-SHARED_WITH_CLI = SHARED | {
+# What makes and runs a whole training also caches arguments, chooses a device and homes, checks
+# environments, writes videos and starts processes.
+UPPER_ROOMS = ("cli", "evaluation", "factory", "launch", "pretrained")
+SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.cache",
     "megastep.contract",
     "megastep.engine",
@@ -84,7 +88,7 @@ OWN_USERS = {
 # The files that may import these packages, directly or through importlib, as glob patterns.
 OUTSIDE_USERS = {
     "IPython": ("megastep/recording.py",),
-    "av": ("megastep/video.py", "agents/cli/record.py"),
+    "av": ("megastep/video.py",),
     "cloudpickle": ("megastep/recording.py",),
     "cuda": ("megastep/kernels/build/compile.py",),
     "gymnasium": (
@@ -101,8 +105,8 @@ OUTSIDE_USERS = {
         "megastep/vector_processes.py",
     ),
     "omegaconf": ("agents/cli/*.py",),
-    "openskill": ("agents/selfplay/ratings.py",),
-    "rich": ("agents/cli/*.py", "megastep/envs/pointgoal/goals.py"),
+    "openskill": ("agents/evaluation/ratings.py",),
+    "rich": ("agents/console.py", "megastep/envs/pointgoal/goals.py"),
     "tensorboard": ("agents/training/loggers.py",),
     "wandb": ("agents/training/loggers.py",),
 }
@@ -256,9 +260,9 @@ def environments_are_independent(graph):
 
 def learner_knows_trees_and_spaces_only(graph):
     for name, target in edges(graph, is_agents):
-        is_cli = is_below(name, "megastep.agents.cli")
+        is_upper = part_of(name, "megastep.agents") in UPPER_ROOMS
         launches = matches(name, OWN_USERS["megastep.kernels.build.launch"])
-        allowed = is_agents(target) or target in (SHARED_WITH_CLI if is_cli else SHARED)
+        allowed = is_agents(target) or target in (SHARED_WITH_UPPER_ROOMS if is_upper else SHARED)
         # the number of CPU threads is the engine's
         of_launches = is_below(target, "megastep.kernels.build") or target == THREADS
         if not allowed and not (launches and of_launches):
@@ -347,8 +351,8 @@ PLANTED = [
     (agents_rows, "megastep.agents.networks.policy", "megastep.agents.storage.rollout"),
     (agents_rows, "megastep.agents.storage.rollout", "megastep.agents.algorithms.ppo"),
     (agents_rows, "megastep.agents.algorithms.ppo", "megastep.agents.training.trainer"),
-    (agents_rows, "megastep.agents.training.trainer", "megastep.agents.selfplay.duels"),
-    (agents_rows, "megastep.agents.storage.rollout", "megastep.agents.cli.settings"),
+    (agents_rows, "megastep.agents.training.trainer", "megastep.agents.evaluation.duels"),
+    (agents_rows, "megastep.agents.storage.rollout", "megastep.agents.factory.settings"),
     (simulator_knows_no_learner, "megastep.envs.minimal", "megastep.agents.networks.heads"),
     (simulator_knows_no_learner, "megastep.core", "train"),
     (environments_are_independent, "megastep.envs.minimal", "megastep.envs.explorer"),
@@ -362,7 +366,7 @@ PLANTED = [
     ),
     (learner_knows_trees_and_spaces_only, "megastep.agents.training.loggers", "train"),
     (learner_knows_trees_and_spaces_only, "megastep.agents.cli.sweeps", "train"),
-    (learner_knows_trees_and_spaces_only, "megastep.agents.cli.factory", "megastep.envs.pong"),
+    (learner_knows_trees_and_spaces_only, "megastep.agents.factory.make", "megastep.envs.pong"),
     (entry_scripts_only_start_the_command_line, "train", "torch"),
     (entry_scripts_only_start_the_command_line, "record", "megastep.agents.cli.train"),
     (modules_stay_with_their_users, "megastep.modules.sensors", "megastep.kernels.build.launch"),

@@ -18,8 +18,9 @@ from hypothesis.extra import numpy as arrays
 from megastep import arrdict, geometries
 from megastep.agents.algorithms import returns
 from megastep.agents.cli import scripts
-from megastep.agents.cli.compose import Composer, leaves, own
-from megastep.agents.cli.program import UserError
+from megastep.agents.cli.compose import Composer, own
+from megastep.agents.errors import UserError
+from megastep.agents.factory.check import leaves
 from megastep.geometries import files, toys
 from megastep.ragged import Ragged
 

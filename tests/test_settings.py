@@ -11,8 +11,8 @@ import pytest
 from pydantic import Field
 
 from megastep import envs
-from megastep.agents.cli.check import as_tree, check
-from megastep.agents.cli.program import ConfigErrors
+from megastep.agents.errors import ConfigErrors
+from megastep.agents.factory.check import as_tree, check
 from megastep.settings import checked, settings_of
 
 NAN = float("nan")

@@ -11,17 +11,11 @@ import hydra
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from megastep.agents.cli import (
-    check,
-    compose,
-    console,
-    endings,
-    gpu,
-    program,
-    rank,
-    scripts,
-    sweeps,
-)
+from megastep.agents import console, package
+from megastep.agents.cli import compose, scripts, sweeps
+from megastep.agents.errors import user_errors
+from megastep.agents.factory import check
+from megastep.agents.launch import endings, gpu, rank
 
 #: Hydra's options: their names, and argparse's arguments.
 OPTIONS = {
@@ -66,14 +60,14 @@ def run_command(script: scripts.Script, argv: list[str] | None = None) -> int:
     finally:
         sys.argv[:] = arguments
     if ending.text:
-        console.say(f"{program.name(script.name)}: {ending.text}", sys.stderr)
+        console.say(f"{package.command(script.name)}: {ending.text}", sys.stderr)
     return ending.code
 
 
 def _run(script: scripts.Script, argv: list[str]) -> int:
-    command = program.name(script.name, "python ")
+    command = package.command(script.name, "python ")
     parser = argparse.ArgumentParser(
-        program.name(script.name),
+        package.command(script.name),
         f"{command} [-m] [key=value ...]",
         script.help,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -85,7 +79,7 @@ def _run(script: scripts.Script, argv: list[str]) -> int:
         parser.add_argument(*names.split(), **arguments)
     options = parser.parse_intermixed_args(argv)
     if options.version:
-        console.say(f"{program.version()}, Hydra {hydra.__version__}")
+        console.say(f"{package.version()}, Hydra {hydra.__version__}")
         return 0
     composer = compose.Composer(
         script, options.config_name, options.config_dir, options.config_path
@@ -111,7 +105,7 @@ def _run(script: scripts.Script, argv: list[str]) -> int:
             print("---\n" * (i > 0), end="", flush=True)
             _show(composer, check.as_tree(composer.settings(job)), flags + job)
     elif options.info or options.hydra_help:
-        with program.errors(kinds=compose.HYDRA_ERRORS):
+        with user_errors(kinds=compose.HYDRA_ERRORS):
             composer.call_hydra(flags + words)
     elif options.multirun or "hydra.mode=MULTIRUN" in words:
         return sweeps.sweep(composer, words)
@@ -140,5 +134,5 @@ def _show(composer: compose.Composer, tree: Any, arguments: list[str]) -> None:
     """Has Hydra show or complete a configuration that has every key there is."""
     node = {"defaults": [composer.name, "_self_"], **tree}
     compose.STORE.store(name="every-key", node=node)
-    with program.errors(kinds=(OSError, ValueError, *compose.HYDRA_ERRORS)):
+    with user_errors(kinds=(OSError, ValueError, *compose.HYDRA_ERRORS)):
         composer.call_hydra([*arguments, "--config-name=every-key"])

@@ -23,9 +23,11 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from megastep.agents.cli import check, gpu, program, settings
-from megastep.agents.cli.program import ConfigErrors
+from megastep.agents import package
 from megastep.agents.cli.scripts import Script
+from megastep.agents.errors import ConfigErrors, UserError, shortened
+from megastep.agents.factory import check, settings
+from megastep.agents.launch import gpu
 from megastep.settings import closest
 
 #: The longest key and member of a group, and the most brackets of a word: Python's recursion ends
@@ -80,7 +82,7 @@ class Composer:
         self.script, self.name, self.folder = script, name or script.name, folder
         self.main = os.path.abspath(main or check.CONFIGS)
         if absent := [p for p in (folder, self.main) if p and not os.path.isdir(p)]:
-            raise program.UserError(f"There is no folder {absent[0]} with configurations")
+            raise UserError(f"There is no folder {absent[0]} with configurations")
         self.has_our_presets = (self.name, folder, main) == ("train", None, None)
         FolderOfUser.path = folder and os.path.abspath(folder)
         plugins.Plugins.instance().register(FolderOfUser)
@@ -110,7 +112,7 @@ class Composer:
             is_text = not UNDECODED.search(word)
             fits = is_text and len(key) <= LONGEST and n_brackets <= MOST_BRACKETS
             if fits and "=" not in word and not word.startswith("~"):
-                errors.append((program.shortened(word or "''"), self.cure_for_value(word)))
+                errors.append((shortened(word or "''"), self.cure_for_value(word)))
                 continue
             for text in (word, f"{key}={WITH_EQUALS.sub(QUOTED, value)}") if key and fits else ():
                 with suppress(HydraException, ValueError):
@@ -119,7 +121,7 @@ class Composer:
             else:
                 cure = "cannot be read; write key=value, and quote blanks: 'key=\"a b\"'"
                 cure = cure if is_text else NO_TEXT
-                errors.append((program.shortened(word), cure))
+                errors.append((shortened(word), cure))
         if errors:
             raise ConfigErrors(errors)
         return [
@@ -141,7 +143,7 @@ class Composer:
         overrides = self.parse(words)
         config, errors = self.config(overrides)
         cure = "is an environment variable, and would be written to config.yaml; type its value"
-        secret = [(k, cure) for k, value in leaves(own(config)) if "${oc.env:" in str(value)]
+        secret = [(k, cure) for k, value in check.leaves(own(config)) if "${oc.env:" in str(value)]
         try:
             typed = [key for key in map(key_of, overrides) if not key.startswith("hydra")]
             tree = self.script.prepare(own(config, resolve=not secret), typed)
@@ -194,15 +196,15 @@ class Composer:
             else:
                 hint = f"is unknown; {closest(value, options)}"
                 if value in EXTRAS:
-                    hint = f"is not installed: pip install '{program.DISTRIBUTION}[sweep]'"
-                errors.append((key, f"{program.shortened(repr(value))} {hint}"))
+                    hint = f"is not installed: pip install '{package.DISTRIBUTION}[sweep]'"
+                errors.append((key, f"{shortened(repr(value))} {hint}"))
         try:
             device = str(keys["device"].value()) if "device" in keys else None
             config = copy.deepcopy(self.composed(*groups, device=device))
         except HYDRA_ERRORS as error:
             absent = isinstance(error, MissingConfigException) and error.missing_cfg_file
             text = "is in none of the folders searched; --config-dir adds one" if absent else error
-            text = program.shortened(text, 400)
+            text = shortened(text, 400)
             raise ConfigErrors([*errors, (absent or "configuration", text)]) from None
         for key, override in keys.items():
             try:
@@ -213,7 +215,7 @@ class Composer:
                     force = override.is_add() or override.is_force_add() or key[:6] != "hydra."
                     OmegaConf.update(config, key, override.value(), force_add=force)
             except (ConfigKeyError, ConfigAttributeError, TypeError):  # TypeError: below a value
-                hint = check.closest_key(key, dict(leaves({"hydra": plain(config.hydra)})))
+                hint = check.closest_key(key, dict(check.leaves({"hydra": plain(config.hydra)})))
                 errors.append((key, f"no such key; {hint}"))
             except OmegaConfBaseException as error:
                 errors.append((key, str(error).partition("\n")[0]))
@@ -262,10 +264,3 @@ def own(config: DictConfig, resolve: bool = False) -> check.Tree:
 
 def plain(config: DictConfig, resolve: bool = False) -> check.Tree:
     return OmegaConf.to_container(config, resolve=resolve)
-
-
-def leaves(tree: check.Tree, prefix: str = "") -> list[tuple[str, Any]]:
-    """[(dotted key, value)] of nested dicts."""
-    if not isinstance(tree, dict):
-        return [(prefix[1:], tree)]
-    return [leaf for key, below in tree.items() for leaf in leaves(below, f"{prefix}.{key}")]

@@ -6,7 +6,9 @@ import os
 import sys
 import threading
 
-from megastep.agents.cli import program, signals
+from megastep.agents import package
+from megastep.agents.errors import UserError
+from megastep.agents.launch import signals
 
 SCRIPTS = {
     "train": "trains a policy",
@@ -50,18 +52,18 @@ def main() -> int:
     if words[0] == "replay":
         sys.argv[1:] = words[1:]
         return replay_file()
-    from megastep.agents.cli import console
+    from megastep.agents import console
     from megastep.settings import closest
 
     console.open_streams()
     if words[0] in ("-h", "--help"):
         for name, text in SCRIPTS.items():
-            console.say(f"  {program.name(name, 'python -m '):<28}{text}; --help says more")
+            console.say(f"  {package.command(name, 'python -m '):<28}{text}; --help says more")
         for name, text in ON_RUNS.items():
-            console.say(f"  {program.name(name, 'python -m '):<28}{text}")
+            console.say(f"  {package.command(name, 'python -m '):<28}{text}")
         console.say("Benchmarks and sheets of homes are in scripts/ of the repository.")
     elif words[0] == "--version":
-        console.say(program.version())
+        console.say(package.version())
     elif words[0] in IN_A_CLONE:
         text = f"{words[0]} needs a clone of the repository: {IN_A_CLONE[words[0]]}"
         console.say(f"megastep: {text}", sys.stderr)
@@ -78,7 +80,7 @@ def main() -> int:
 def run_script(name: str) -> int:
     """Runs a script of this package by its name. Returns the exit code."""
     signals.exit_on_signals(name)
-    from megastep.agents.cli import console  # its imports take a while
+    from megastep.agents import console
 
     console.open_streams()
     threading.excepthook = console.warn_of_thread
@@ -94,12 +96,13 @@ def run_script(name: str) -> int:
 def inspect_run(words: list[str]) -> int:
     """Runs `megastep inspect`. Returns the exit code."""
     signals.exit_on_signals("inspect")
-    from megastep.agents.cli import console, inspect
+    from megastep.agents import console
+    from megastep.agents.cli import inspect
 
     console.open_streams()
     try:
         return inspect.run(words)
-    except program.UserError as error:
+    except UserError as error:
         console.say(f"megastep inspect: {error}", sys.stderr)
         return error.code
 
@@ -107,7 +110,8 @@ def inspect_run(words: list[str]) -> int:
 def replay_file() -> int:
     """Runs `megastep replay`. Returns the exit code."""
     signals.exit_on_signals("replay")
-    from megastep.agents.cli import console, replay
+    from megastep.agents import console
+    from megastep.agents.cli import replay
 
     console.open_streams()
     return replay.main()

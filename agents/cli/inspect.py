@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from megastep.agents.cli import console, program, runs
-from megastep.agents.training import agent_file, checkpoint, checkpoint_format
+from megastep.agents import console
+from megastep.agents.errors import UserError
+from megastep.agents.runs import agent_file, checkpoint, checkpoint_format, folders
 
 HELP = """Verifies a run's checkpoints and prints what is in them.
 
@@ -21,13 +22,13 @@ def run(words: list[str]) -> int:
     if len(words) != 1 or words[0] in ("-h", "--help"):
         console.say(HELP)
         return 0 if words in (["-h"], ["--help"]) else 2
-    path = runs.find(words[0])
+    path = folders.find(words[0])
     if agent_file.is_agent_file(path):
         return _inspect([path], _lines_of_agent)
-    path = runs.checkpoints_of(path)
+    path = folders.checkpoints_of(path)
     paths = [path] if (path / "manifest.json").exists() else checkpoint.list_checkpoints(path)
     if not paths:
-        raise program.UserError(f"There is no checkpoint in {path}; has the run saved one yet?")
+        raise UserError(f"There is no checkpoint in {path}; has the run saved one yet?")
     return _inspect(paths, _lines)
 
 

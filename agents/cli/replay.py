@@ -5,12 +5,15 @@ import functools
 import sys
 from pathlib import Path
 
+from megastep.agents import console, factory, package
 from megastep.agents.algorithms.nonfinite import NonFiniteValue
-from megastep.agents.cli import console, factory, program, runs, signals
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.launch import signals
+from megastep.agents.runs import folders
 from megastep.agents.training.nonfinite_replay import Recording, ReplayError
 
 
-class NotRepeated(program.UserError):
+class NotRepeated(UserError):
     """The steps were replayed, and the number was another or finite."""
 
     code = 1
@@ -19,7 +22,7 @@ class NotRepeated(program.UserError):
 def main(words: list[str] | None = None) -> int:
     """Replays the file that the words of a command line name. Returns the exit code."""
     parser = argparse.ArgumentParser(
-        program.name("replay"), description=__doc__, allow_abbrev=False
+        package.command("replay"), description=__doc__, allow_abbrev=False
     )
     parser.add_argument("file", type=Path, help="nonfinite-SAMPLES.npz, in the folder of its run")
     parser.add_argument(
@@ -36,11 +39,11 @@ def main(words: list[str] | None = None) -> int:
             run(arguments.file, **dict(arguments.options))
     except SystemExit as end:  # of argparse
         return end.code or 0
-    except program.UserError as error:
-        console.say(f"{program.name('replay')}: {error}", sys.stderr)
+    except UserError as error:
+        console.say(f"{package.command('replay')}: {error}", sys.stderr)
         return error.code
     except signals.Interrupted as stop:
-        console.say(f"{program.name('replay')}: {stop.args[1]}", sys.stderr)
+        console.say(f"{package.command('replay')}: {stop.args[1]}", sys.stderr)
         return 128 + stop.args[0]
     return 0
 
@@ -69,10 +72,10 @@ def run(path: Path, device: str | None = None, trust: bool = False) -> NonFinite
         UserError: the file, its run or the device cannot be used.
         NotRepeated: the number was another one or finite.
     """
-    errors = functools.partial(program.errors, f"{path} cannot be replayed: ")
+    errors = functools.partial(user_errors, f"{path} cannot be replayed: ")
     with errors():
         recording = Recording(path)
-    cfg = factory.config_of(runs.load_checkpoint(path.parent, trust))
+    cfg = factory.config_of(folders.load_checkpoint(path.parent, trust))
     device = factory.make_device(device or recording.device)
     env = factory.construct(
         cfg.env,

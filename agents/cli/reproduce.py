@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from megastep.agents.cli import console, program
-from megastep.agents.training import json_lines
-from megastep.agents.training.atomic_files import write_atomically
+from megastep.agents import console, package
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.runs import json_lines
+from megastep.agents.runs.atomic_files import write_atomically
 from megastep.settings import closest
 
 #: The rows; its head says what they consist of.
@@ -100,10 +101,10 @@ def main(words: Sequence[str]) -> int:
     try:
         if len(words) > 1 or words[0] not in rows:
             unknown = f"{words[0]!r} is unknown; {closest(words[0], rows)}"
-            raise program.UserError("takes the name of one row" if words[1:] else unknown)
+            raise UserError("takes the name of one row" if words[1:] else unknown)
         return reproduce(rows[words[0]])
-    except program.UserError as error:
-        console.say(f"{program.name('reproduce')}: {error}", sys.stderr)
+    except UserError as error:
+        console.say(f"{package.command('reproduce')}: {error}", sys.stderr)
         return error.code
 
 
@@ -117,7 +118,7 @@ def listing(rows: Iterable[Row]) -> str:
             if row.device == device
         ]
         parts += [title, console.table(["row", "minutes", "megastep train", "result"], lines)]
-    return "\n".join([*parts, f"To run one: {program.name('reproduce', 'python ')} ROW"])
+    return "\n".join([*parts, f"To run one: {package.command('reproduce', 'python ')} ROW"])
 
 
 # ---- Running a row ----
@@ -132,15 +133,17 @@ def reproduce(row: Row) -> int:
     Raises:
         UserError: the row needs a GPU and there is none.
     """
-    from megastep.agents.cli import command, gpu, runs, scripts  # a list takes none of these
+    from megastep.agents.cli import command, scripts
+    from megastep.agents.launch import gpu
+    from megastep.agents.runs import folders
 
     if row.device == "cpu":
         os.environ["OMP_NUM_THREADS"] = str(CPU_THREADS)  # before PyTorch is imported
     elif not gpu.is_available():
-        raise program.UserError(
+        raise UserError(
             f"{row.name} needs a GPU, and PyTorch finds none here; choose a row for two CPU cores"
         )
-    folder = runs.RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-reproduce-{row.name}"
+    folder = folders.RUNS / f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-reproduce-{row.name}"
     device = f"device={row.device}"
     finish = "finish.evaluate=false", "finish.record=false"
     words = [*row.train.split(), *finish, device, f"folder={folder}"]
@@ -197,7 +200,7 @@ def compare(row: Row, folder: Path, values: Sequence[float]) -> int:
         "values": {str(result): value for result, value in zip(row.results, values)},
         "exact": {**here, "sha256": digest},
     }
-    with program.errors(f"{folder} cannot be written: "):
+    with user_errors(f"{folder} cannot be written: "):
         write_atomically(folder / "reproduction.json", json.dumps(report, indent=2).encode())
     return 0 if is_reproduced else 1
 
@@ -206,7 +209,7 @@ def machine(device: str) -> dict[str, Any]:
     """Returns what the bits of a run depend on, besides configuration and code."""
     import torch  # after OMP_NUM_THREADS is set
 
-    from megastep.agents.training import provenance
+    from megastep.agents.runs import provenance
 
     facts = {"device": provenance.device_name(torch.device(device)), "torch": torch.__version__}
     if device == "cpu":

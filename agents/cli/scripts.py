@@ -9,9 +9,11 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-from megastep.agents.cli import launch, program, runs, settings
 from megastep.agents.distributed import environment
-from megastep.agents.training import agent_file
+from megastep.agents.errors import ConfigErrors, UserError, user_errors
+from megastep.agents.factory import settings
+from megastep.agents.launch import launcher
+from megastep.agents.runs import agent_file, folders
 
 Tree = dict[str, Any]
 
@@ -123,29 +125,31 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
     set_ranks(tree, typed)
     given = [key for key in CURES if isinstance(tree.get(key), str)]
     if len(given) > 1:
-        raise program.ConfigErrors([(given[1], f"cannot be combined with {given[0]}")])
+        raise ConfigErrors([(given[1], f"cannot be combined with {given[0]}")])
     if not given:
         return tree
     how, allowed = given[0], {"resume": RESUMABLE, "rerun": REPEATABLE}.get(given[0], typed)
     if refused := [key for key in typed if not {key, key.split(".")[0]} & {*allowed}]:
-        raise program.ConfigErrors((key, CURES[how]) for key in refused)
-    path = runs.find(tree[how])
+        raise ConfigErrors((key, CURES[how]) for key in refused)
+    path = folders.find(tree[how])
     if how != "init" and agent_file.is_agent_file(path):
-        raise program.UserError(
+        raise UserError(
             f"{tree[how]} is a pretrained agent, which has the weights only. init={tree[how]} "
             f"starts a new run from it; {how}= takes the run's folder"
         )
     # a run in use is refused before its checkpoints are read, which come and go
-    locked = runs.locked(runs.folder_of(path)) if how == "resume" else contextlib.nullcontext()
+    locked = (
+        folders.locked(folders.folder_of(path)) if how == "resume" else contextlib.nullcontext()
+    )
     with locked:
-        loaded = runs.load_checkpoint(path, tree.get("trust") is True)
+        loaded = folders.load_checkpoint(path, tree.get("trust") is True)
     saved = loaded.config["train"]
     if how == "init":
         groups = ("env", "geometry", "agent")
         groups = {group: saved[group] for group in groups if group not in typed}
         saved, typed = tree | groups, [key for key in typed if key.partition(".")[0] in groups]
     elif not loaded.numbers:
-        raise program.UserError(
+        raise UserError(
             f"{loaded.path} is a snapshot, which has the weights only. init={loaded.path} starts "
             f"a new run from it; {how}= takes the run's folder"
         )
@@ -156,7 +160,7 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
         source, target = (functools.reduce(dict.get, groups, one) for one in (tree, saved))
         target[leaf] = source[leaf]
     if how == "resume" and (errors := [*budget_errors(saved, typed, loaded.numbers)]):
-        raise program.ConfigErrors(errors)
+        raise ConfigErrors(errors)
     saved |= {"trust": tree.get("trust", False)}
     if environment.launched() is not None:
         saved["ranks"] = tree["ranks"]
@@ -180,14 +184,14 @@ def set_ranks(tree: Tree, typed: list[str]) -> None:
     Raises:
         ConfigErrors: another number was typed.
     """
-    with program.errors():
+    with user_errors():
         place = environment.launched()
     if place is None:
         return
     if "ranks" in typed and tree["ranks"] != place.n_ranks:
         text = f"{tree['ranks']!r} is not the number of ranks that torchrun has started, "
         cure = f"{place.n_ranks}; leave it out, or start train.py without torchrun"
-        raise program.ConfigErrors([("ranks", text + cure)])
+        raise ConfigErrors([("ranks", text + cure)])
     tree["ranks"] = place.n_ranks
 
 
@@ -197,11 +201,11 @@ def check_training(cfg: settings.Train) -> None:
     """
     if environment.rank() > 0:  # rank 0 checks
         return
-    launch.n_ranks(cfg)
+    launcher.n_ranks(cfg)
     if cfg.resume is None:
-        runs.check_free(cfg.folder)
+        folders.check_free(cfg.folder)
     else:
-        with runs.locked(runs.folder_of(runs.find(cfg.resume))):
+        with folders.locked(folders.folder_of(folders.find(cfg.resume))):
             pass
 
 
@@ -236,7 +240,7 @@ The most common words:
 def check_run(cfg: settings.Evaluate | settings.Record) -> None:
     """Raises UserError if the run does not exist."""
     if cfg.run is not None:
-        runs.find(cfg.run)
+        folders.find(cfg.run)
 
 
 def names_in_list(word: str) -> str:

@@ -31,11 +31,15 @@ from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
 from megastep import workers
-from megastep.agents.cli import console, places, program, runs, scripts, settings, signals
+from megastep.agents import console, package
+from megastep.agents.cli import scripts
 from megastep.agents.cli.compose import NO_TEXT, UNDECODED, Composer, key_of
-from megastep.agents.cli.program import ConfigErrors, UserError, shortened
 from megastep.agents.distributed import environment
-from megastep.agents.training.atomic_files import write_atomically
+from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
+from megastep.agents.factory import settings
+from megastep.agents.launch import places, signals
+from megastep.agents.runs import folders, scores
+from megastep.agents.runs.atomic_files import write_atomically
 
 DONE, RUNNING, LOST = "done", "running", "FAILED: its process ended without an error message"
 #: Columns of the table beside the job and the keys that vary.
@@ -114,9 +118,9 @@ def sweep(composer: Composer, words: list[str]) -> int:
     if UNDECODED.search(str(folder.absolute())):  # which the settings of jobs hold as text
         raise UserError(f"{str(folder.absolute())!r} {NO_TEXT}")
     is_new = not folder.exists()
-    with program.errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
+    with user_errors(f"{folder} cannot be made; choose another with hydra.sweep.dir=: "):
         if "hydra.sweep.dir" not in overrides:
-            folder = runs.make(folder)  # another sweep may start in the same second
+            folder = folders.make(folder)  # another sweep may start in the same second
         folder.mkdir(parents=True, exist_ok=True)
     options = SEARCH if config.runtime.choices["hydra/sweeper"] == "optuna" else {}
     options = options | {
@@ -130,9 +134,9 @@ def sweep(composer: Composer, words: list[str]) -> int:
     words += [override.input_line for override in overrides.values()]
     # processes of launchers find megastep, in a checkout too; a job's settings find modules of the
     # current folder
-    if (program.ROOT / "train.py").exists():
+    if (package.ROOT / "train.py").exists():
         os.environ["PYTHONPATH"] = os.pathsep.join(
-            filter(None, [str(program.ROOT), os.environ.get("PYTHONPATH")])
+            filter(None, [str(package.ROOT), os.environ.get("PYTHONPATH")])
         )
     if idle:
         console.say(idle)
@@ -161,7 +165,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
         elif is_new:
             shutil.rmtree(folder, ignore_errors=True)
             with contextlib.suppress(OSError):  # there are others in it
-                runs.SWEEPS.rmdir()
+                folders.SWEEPS.rmdir()
     if not rows:
         raise UserError(f"The sweep cannot start: {problem}")
     if problem and all(row["state"] in (DONE, LOST) for row in rows):
@@ -267,7 +271,7 @@ class Job:
                         cfg = settings.changed(cfg, logger=logger)
                     with places.taken(cfg) as cfg:
                         result = scripts.SCRIPTS[self.source[0]].run(cfg)
-                    row |= {"state": DONE, **(runs.outcome(result) if result else {})}
+                    row |= {"state": DONE, **(scores.outcome(result) if result else {})}
             except signals.Interrupted as stop:
                 row["state"] = f"interrupted: {stop.args[1]}"
                 raise

@@ -2,6 +2,7 @@
 
     from megastep import geometries
     from megastep.agents import pretrained
+from megastep.agents.errors import UserError
 
     env = pretrained.make_env("pointgoal_anywhere", geometries.sample("maze", 16), n_envs=16)
     policy = pretrained.load("pointgoal_anywhere")
@@ -17,8 +18,11 @@ line its name stands for a run: `evaluate.py run=NAME`.
 from collections.abc import Sequence
 from typing import Any
 
-from megastep.agents.cli import factory, program, runs, settings
+from megastep.agents import factory
+from megastep.agents.errors import UserError
+from megastep.agents.factory import settings
 from megastep.agents.networks.policy import Policy
+from megastep.agents.runs import folders
 
 #: Where an agent's spaces are read from, which no floor plan changes.
 _BOX = "megastep.geometries.sources:box"
@@ -26,7 +30,7 @@ _BOX = "megastep.geometries.sources:box"
 
 def names() -> list[str]:
     """Returns the names of the agents that come with megastep."""
-    return [*runs.pretrained()]
+    return [*folders.pretrained()]
 
 
 def load(name: str, device: str = "auto") -> Policy:
@@ -44,7 +48,7 @@ def load(name: str, device: str = "auto") -> Policy:
         UserError: there is none; or it names modules outside megastep and another user made it.
     """
     device = factory.make_device(device)
-    loaded = runs.load_checkpoint(runs.find(name), False, device)
+    loaded = folders.load_checkpoint(folders.find(name), False, device)
     trained = factory.config_of(loaded)
     box = settings.kind_of("geometry", _BOX)(name=_BOX)
     homes = factory.homes(trained.env, box, "test")
@@ -76,11 +80,11 @@ def make_env(
         UserError: as `load`; or the environment has no such setting, or refuses its value.
     """
     device = factory.make_device(device)
-    trained = factory.config_of(runs.load_checkpoint(runs.find(name), False)).env
+    trained = factory.config_of(folders.load_checkpoint(folders.find(name), False)).env
     if unknown := [key for key in changes if not hasattr(trained, key)]:
-        raise program.UserError(
+        raise UserError(
             f"{settings.env_name(trained)} has no setting {unknown[0]}; it has "
             f"{', '.join(key for key in vars(trained) if key != 'name')}"
         )
-    env = factory.changed(trained, n_envs=n_envs, **changes)
+    env = settings.changed(trained, n_envs=n_envs, **changes)
     return factory.construct(env, geometries=[*geometries], seed=seed, device=device)

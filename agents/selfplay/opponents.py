@@ -12,8 +12,8 @@ from megastep.agents.algorithms.kernels.program import run
 from megastep.agents.distributed.reports import sum_over_ranks
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
-from megastep.agents.selfplay import duels
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
+from megastep.agents.selfplay.slots import rotating_slots, score_pairs
 from megastep.agents.storage.rollout import copy_tree
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
@@ -86,7 +86,7 @@ class Opponents:
         n_by_opponent = [n_per_snapshot] * n_snapshots + [n_bot] * (n_bot > 0)
         self.n_past, self.n_opposed = n_per_snapshot * n_snapshots, sum(n_by_opponent)
 
-        slots = [duels.rotating_slots(n, env.n_agents, device) for n in n_by_opponent]
+        slots = [rotating_slots(n, env.n_agents, device) for n in n_by_opponent]
         self.slots = torch.cat(slots)  # (M, 1)
         learners = torch.ones(env.n_envs, env.n_agents, dtype=torch.bool, device=device)
         learners[-self.n_opposed :] = torch.zeros_like(self.slots, dtype=torch.bool)
@@ -170,7 +170,7 @@ class Opponents:
             )
             return
         self.returns += reward
-        self.pairs += torch.stack(duels.score_pairs(terminal, self.returns, self.slots))
+        self.pairs += torch.stack(score_pairs(terminal, self.returns, self.slots))
         self.returns.masked_fill_(terminal | truncated, 0.0)
 
     def refresh_snapshots(self, policy: Policy, n_updates: int) -> None:

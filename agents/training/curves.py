@@ -5,7 +5,7 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from megastep.agents.training import json_lines
+from megastep.agents.runs import json_lines
 from megastep.agents.training.optional_packages import not_installed
 
 MAX_COLUMNS = 4

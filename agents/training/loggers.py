@@ -13,8 +13,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from megastep.agents.training.atomic_files import write_atomically
-from megastep.agents.training.json_lines import JsonLines, truncate_after
+from megastep.agents.runs.atomic_files import write_atomically
+from megastep.agents.runs.json_lines import JsonLines, truncate_after
 from megastep.agents.training.optional_packages import not_installed
 
 #: Seconds that Weights & Biases may take to start before the run goes on without it.

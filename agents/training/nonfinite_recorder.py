@@ -18,10 +18,10 @@ import torch
 
 from megastep import spaces
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck, NonFiniteValue
+from megastep.agents.runs.atomic_files import write_atomically
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.copies import copy_all
 from megastep.agents.storage.rollout import Rollout
-from megastep.agents.training.atomic_files import write_atomically
 from megastep.agents.training.nonfinite_replay import FORMAT, env_axis, rows_of
 from megastep.capture import state_tree
 from megastep.types import Env, n_lanes, optional

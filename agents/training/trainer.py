@@ -16,6 +16,7 @@ from megastep.agents.distributed.drift import check_drift
 from megastep.agents.distributed.plan import Plan, agree
 from megastep.agents.distributed.process_group import n_ranks, unhurried
 from megastep.agents.distributed.reports import mean_over_ranks
+from megastep.agents.runs.run_state import RunState
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
 from megastep.agents.training.nonfinite_guard import NonFiniteGuard
@@ -26,13 +27,12 @@ from megastep.agents.training.performance import (
     SectionTimes,
     device_memory,
 )
-from megastep.agents.training.run_state import RunState
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
-    from megastep.agents.training.annealing import AnnealingRecord
+    from megastep.agents.runs.annealing import AnnealingRecord
     from megastep.agents.training.curriculum import Curriculum
     from megastep.agents.types import Learner, Logger, OpponentPool, Rollout, Saver
 

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 
 from megastep import arrdict
-from megastep.agents.cli import factory, runs
+from megastep.agents import factory
+from megastep.agents.runs import folders
 from megastep.imports import import_object
 
 
@@ -20,9 +21,9 @@ def returns(run: Path, n_episodes: int, seed: int) -> list[float]:
     """
     import gymnasium
 
-    loaded = runs.load_checkpoint(runs.find(str(run)), False, torch.device("cpu"))
+    loaded = folders.load_checkpoint(folders.find(str(run)), False, torch.device("cpu"))
     settings = factory.config_of(loaded)
-    sample = factory.construct(factory.changed(settings.env, n_envs=1), device="cpu", seed=seed)
+    sample = factory.construct(settings.changed(settings.env, n_envs=1), device="cpu", seed=seed)
     policy = factory.make_policy(settings.agent, sample)
     policy = factory.load_weights(policy, sample, loaded)
     package, _, name = settings.env.id.rpartition(":")

@@ -13,7 +13,7 @@ from megastep.agents.algorithms.learner import check_learner
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.cli import train
-from megastep.agents.training import checkpoint
+from megastep.agents.runs import checkpoint
 from megastep.dotdict import leaves
 from tests.helpers.learners import LEARNERS
 from tests.helpers.made_up import PRIVILEGED, B, Numbers, made_up, weights

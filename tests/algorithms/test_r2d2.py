@@ -10,8 +10,8 @@ from megastep import spaces
 from megastep.agents.algorithms import r2d2, returns
 from megastep.agents.cli import evaluate, train
 from megastep.agents.networks.policy import Policy
+from megastep.agents.runs import checkpoint
 from megastep.agents.storage.replay_settings import ReplaySettings
-from megastep.agents.training import checkpoint
 from megastep.arrdict import arrdict
 from tests.helpers.tiny import TINY, UPDATE
 

@@ -15,8 +15,8 @@ import textwrap
 import pytest
 
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.cli.settings import kind_of
-from megastep.agents.training import checkpoint
+from megastep.agents.factory.settings import kind_of
+from megastep.agents.runs import checkpoint
 from tests.helpers import tiny
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -150,7 +150,7 @@ def test_custom_environment(outside, capsys):
 
 def test_custom_environment_with_a_config_file(outside, monkeypatch, tmp_path):
     """configs/env/counter.yaml holds the import path and differences from the defaults."""
-    from megastep.agents.cli import check
+    from megastep.agents.factory import check
 
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     monkeypatch.setattr(check, "CONFIGS", tmp_path / "configs")

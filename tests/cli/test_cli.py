@@ -10,8 +10,8 @@ import sys
 import pytest
 import torch
 
-from megastep.agents.cli import runs, train
-from megastep.agents.training import checkpoint
+from megastep.agents.cli import train
+from megastep.agents.runs import checkpoint, folders
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, wait_until
 
@@ -170,7 +170,7 @@ def test_folder_that_the_locale_cannot_spell(tmp_path, monkeypatch):
         assert (code, err) == (0, "")
     monkeypatch.chdir(folder)
     latest, first = sorted(folder.glob("runs/*/checkpoints"))  # by name, which has the local time
-    assert runs.find("latest").resolve() == latest.parent
+    assert folders.find("latest").resolve() == latest.parent
     assert [checkpoint.load_latest(path).step for path in (first, latest)] == [64, 32]
     assert (latest.parent / "video.mp4").exists() and any(latest.parent.glob("evaluations/*.json"))
     code, _, err = finished("train", *TINY, "folder='ü'", cwd=folder, **ascii_only)

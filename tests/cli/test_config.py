@@ -9,10 +9,10 @@ import yaml
 
 from megastep import envs, geometries
 from megastep.agents.cli import scripts, sweeps, train
-from megastep.agents.cli.check import CONFIGS, as_tree, check
 from megastep.agents.cli.compose import Composer
-from megastep.agents.cli.program import ConfigErrors
-from megastep.agents.cli.settings import IMPORTED, Agent, Train, WandbLogger, kind_of
+from megastep.agents.errors import ConfigErrors
+from megastep.agents.factory.check import CONFIGS, as_tree, check
+from megastep.agents.factory.settings import IMPORTED, Agent, Train, WandbLogger, kind_of
 from megastep.agents.training.loggers import Wandb
 from megastep.geometries import sources
 from tests.helpers.tiny import changed

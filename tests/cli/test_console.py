@@ -9,7 +9,7 @@ import termios
 
 import pytest
 
-from megastep.agents.cli import console
+from megastep.agents import console
 
 
 def shown(monkeypatch, kind):

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.cli.program import ConfigErrors, UserError
-from megastep.agents.training import checkpoint
+from megastep.agents.errors import ConfigErrors, UserError
+from megastep.agents.runs import checkpoint
 from megastep.envs.explorer import env as explorer_env
 from tests.cli.test_train import configured
 

@@ -9,10 +9,12 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from megastep.agents.cli import check, evaluate, record, replay, train
-from megastep.agents.cli.program import ConfigErrors
-from megastep.agents.cli.settings import Train, kind_of
-from megastep.agents.training import checkpoint, nonfinite_replay, trust
+from megastep.agents.cli import evaluate, record, replay, train
+from megastep.agents.errors import ConfigErrors
+from megastep.agents.factory import check
+from megastep.agents.factory.settings import Train, kind_of
+from megastep.agents.runs import checkpoint, trust
+from megastep.agents.training import nonfinite_replay
 from tests.helpers.tiny import TINY, changed, settings
 
 KEYS = ("env.name", "geometry.name", "learner.name", "curriculum.name", "opponents.bot_class")

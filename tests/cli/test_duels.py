@@ -13,12 +13,13 @@ import torch
 import yaml
 
 from megastep import envs, toys
-from megastep.agents.cli import evaluate, factory, record, runs, train
-from megastep.agents.cli.program import UserError
-from megastep.agents.selfplay import duels, ratings
+from megastep.agents import factory
+from megastep.agents.cli import evaluate, record, train
+from megastep.agents.errors import UserError
+from megastep.agents.evaluation import duels, ratings
+from megastep.agents.evaluation.statistics import interval
+from megastep.agents.runs import checkpoint, scores
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
-from megastep.agents.training import checkpoint
-from megastep.agents.training.evaluation import interval
 from megastep.arrdict import arrdict
 from megastep.envs.deathmatch import Bot
 from megastep.envs.pong import Tracker
@@ -288,8 +289,8 @@ def test_evaluate_against(here, capsys):
     assert "random, as left" in text and "in pong: 20 duels, seed 1" in text
     row = result["rows"][0]
     expected = dict(score=row["won"], evaluated=row["won"], lower=row["lower"])
-    assert expected.items() <= runs.outcome(path).items()
-    assert runs.outcome(here / "a")["evaluated"] is None, "a duel's table has no return"
+    assert expected.items() <= scores.outcome(path).items()
+    assert scores.outcome(here / "a")["evaluated"] is None, "a duel's table has no return"
 
 
 def test_evaluate_ratings(here, capsys):

@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from megastep.agents.cli import entry, program
+from megastep.agents import package
+from megastep.agents.cli import entry
 
 
 def test_python_m_megastep_lists_the_scripts(monkeypatch, capsys):
@@ -19,8 +20,8 @@ def test_python_m_megastep_lists_the_scripts(monkeypatch, capsys):
 
 def test_name_under_python_m(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["/somewhere/megastep/__main__.py", "train"])
-    assert program.name("train") == "megastep train"
-    assert program.name("train", "python ") == "python -m megastep train"
+    assert package.command("train") == "megastep train"
+    assert package.command("train", "python ") == "python -m megastep train"
 
 
 @pytest.mark.parametrize(

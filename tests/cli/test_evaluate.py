@@ -10,9 +10,12 @@ import pytest
 import torch
 
 from megastep import envs, scene, spaces
-from megastep.agents.cli import evaluate, record, runs, train
-from megastep.agents.cli.program import UserError
-from megastep.agents.training import evaluation
+from megastep.agents import factory
+from megastep.agents.cli import evaluate, record, train
+from megastep.agents.errors import UserError
+from megastep.agents.evaluation import playing, statistics, tables
+from megastep.agents.runs import scores
+from megastep.agents.selfplay.bots import RandomActions
 from megastep.arrdict import arrdict
 from megastep.geometries import files, sample
 from tests.helpers import tiny
@@ -54,18 +57,16 @@ class Counting:
 @pytest.mark.parametrize("mortal", [False, True])
 def test_only_first_episodes_count(mortal):
     env = Counting(100, mortal)
-    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    episodes = playing.first_episodes(env, RandomActions(env.action_space))
     assert episodes.returns.tolist() == episodes.lengths.tolist() == list(range(1, 101))
     assert bool(episodes.done.all())
 
 
 def test_unfinished_episodes():
     env = Counting(100, False)
-    episodes = evaluation.first_episodes(
-        env, evaluation.RandomActions(env.action_space), max_steps=64
-    )
+    episodes = playing.first_episodes(env, RandomActions(env.action_space), max_steps=64)
     assert int((~episodes.done).sum()) == 36 and float(episodes.returns.max()) == 64
-    (row,) = evaluation.summaries(episodes)
+    (row,) = statistics.summaries(episodes)
     assert row["unfinished"] == 36
 
 
@@ -97,10 +98,10 @@ class Teams(Counting):
 
 def test_summaries_by_role():
     env = Teams(20, False)
-    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    episodes = playing.first_episodes(env, RandomActions(env.action_space))
     ages = torch.arange(1, 61)
     assert episodes.metrics.age.tolist() == ages.tolist()
-    every, leader, follower = evaluation.summaries(episodes, env.roles)
+    every, leader, follower = statistics.summaries(episodes, env.roles)
     for row, lengths in ((every, ages[ages % 3 > 0]), (leader, ages[::3]), (follower, ages[1::3])):
         mean = pytest.approx(lengths.float().mean())
         assert row["return"] == row["length"] == row["metrics"]["age"]["mean"] == mean
@@ -122,7 +123,7 @@ def test_nonfinite_metric_is_left_out_of_its_mean():
         envs=torch.arange(4),
     )
     with pytest.warns(UserWarning, match="metrics.laps was not finite at the end of 2 of 4 episo"):
-        (row,) = evaluation.summaries(episodes)
+        (row,) = statistics.summaries(episodes)
     assert row["metrics"]["laps"]["mean"] == 3 and row["metrics"]["laps"]["lower"] >= 2
     assert row["metrics"]["falls"] == {"mean": None, "lower": None, "upper": None}
 
@@ -138,34 +139,34 @@ def test_agents_of_one_environment_are_one_sample():
         metrics=arrdict(laps=alike),
         envs=torch.arange(100).repeat_interleave(2),
     )
-    (row,) = evaluation.summaries(episodes)
-    expected = evaluation.interval(np.arange(100.0), np.arange(100))
+    (row,) = statistics.summaries(episodes)
+    expected = statistics.interval(np.arange(100.0), np.arange(100))
     assert (row["return"], row["lower"], row["upper"]) == pytest.approx(expected)
     assert row["metrics"]["laps"]["lower"] == row["lower"] and row["lanes"] == 200
     in_one_home = arrdict(episodes, homes=torch.full((200,), 7))
-    assert evaluation.summaries(in_one_home)[0]["lower"] == row["lower"]
+    assert statistics.summaries(in_one_home)[0]["lower"] == row["lower"]
 
 
 def test_metrics_average_over_finished_episodes():
     env = Teams(20, False)
-    random = evaluation.RandomActions(env.action_space)
-    (row,) = evaluation.summaries(evaluation.first_episodes(env, random, max_steps=10))
+    random = RandomActions(env.action_space)
+    (row,) = statistics.summaries(playing.first_episodes(env, random, max_steps=10))
     assert (
         row["unfinished"] == 40 - 7
         and row["metrics"]["age"]["mean"] == (1 + 2 + 4 + 5 + 7 + 8 + 10) / 7
     )
-    (row,) = evaluation.summaries(evaluation.first_episodes(env, random, max_steps=0))
+    (row,) = statistics.summaries(playing.first_episodes(env, random, max_steps=0))
     assert row["metrics"]["age"] == dict(mean=None, lower=None, upper=None)
-    shown = evaluate.cells({"agent": "a", **row})
+    shown = tables.cells({"agent": "a", **row})
     assert shown["age"] == shown["age: 95 % interval"] == "none"
 
 
 def test_table_row_with_metrics():
     env = Teams(20, False)
-    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
-    rows = [{"agent": "trained", **row} for row in evaluation.summaries(episodes, env.roles)]
+    episodes = playing.first_episodes(env, RandomActions(env.action_space))
+    rows = [{"agent": "trained", **row} for row in statistics.summaries(episodes, env.roles)]
     lower, upper = rows[2]["lower"], rows[2]["upper"]
-    assert evaluate.cells(rows[2]) == {
+    assert tables.cells(rows[2]) == {
         "agent": "trained: follower",
         "return": "30.50",
         "95 % interval": f"{lower:.2f} to {upper:.2f}",
@@ -179,7 +180,7 @@ def test_table_row_with_metrics():
 
 def test_random_actions_are_uniform():
     space = {"move": spaces.MultiDiscrete(2, 7), "fire": spaces.MultiDiscrete(1, 2)}
-    policy = evaluation.RandomActions(arrdict(space))
+    policy = RandomActions(arrdict(space))
     decision, _ = policy(
         None, policy.initial(10_000, "cpu"), generator=torch.Generator().manual_seed(1)
     )
@@ -214,7 +215,7 @@ class Moving:
 @pytest.mark.parametrize("resample", [False, True])
 def test_homes_of_first_episodes(resample):
     env = Moving(10, sample("bench", 4), device="cpu", resample=resample)
-    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
+    episodes = playing.first_episodes(env, RandomActions(env.action_space))
     assert bool(episodes.done.all())
     assert torch.equal(episodes.homes.long(), env.last)
     assert torch.equal(env.layout, torch.arange(10) % 4) != resample
@@ -230,15 +231,13 @@ def test_agents_of_one_environment_share_its_home():
             return Counting(6, False).reset()
 
     env = Pairs(3, False)
-    episodes = evaluation.first_episodes(
-        env, evaluation.RandomActions(env.action_space), max_steps=0
-    )
+    episodes = playing.first_episodes(env, RandomActions(env.action_space), max_steps=0)
     assert episodes.homes.tolist() == [7, 7, 8, 8, 7, 7]
 
 
 def test_interval_of_normal_samples():
     values = np.random.default_rng(1).normal(5, 2, 400)
-    mean, lower, upper = evaluation.interval(values, np.arange(400))
+    mean, lower, upper = statistics.interval(values, np.arange(400))
     assert mean == pytest.approx(values.mean())
     # 2 / sqrt(400) = 0.1 is the standard error; the interval is 1.96 of it to each side, within the
     # bootstrap's noise
@@ -249,21 +248,21 @@ def test_interval_of_normal_samples():
 
 def test_lanes_of_one_home_are_one_sample():
     homes = np.random.default_rng(1).normal(0, 1, 50)
-    alone = evaluation.interval(homes, np.arange(50))
-    again = evaluation.interval(np.repeat(homes, 20), np.repeat(np.arange(50), 20))
+    alone = statistics.interval(homes, np.arange(50))
+    again = statistics.interval(np.repeat(homes, 20), np.repeat(np.arange(50), 20))
     assert again == pytest.approx(alone)
 
 
 @pytest.mark.parametrize("groups", [None, np.zeros(400)])
 def test_interval_without_homes(groups):
-    mean, lower, upper = evaluation.interval([0.0, 1.0] * 200, groups)
+    mean, lower, upper = statistics.interval([0.0, 1.0] * 200, groups)
     assert mean == 0.5 and upper - lower == pytest.approx(4 * 0.5 / 20, rel=0.15)
 
 
 def test_interval_over_episodes():
     env = Counting(400, False)
-    episodes = evaluation.first_episodes(env, evaluation.RandomActions(env.action_space))
-    (row,) = evaluation.summaries(episodes)
+    episodes = playing.first_episodes(env, RandomActions(env.action_space))
+    (row,) = statistics.summaries(episodes)
     assert "homes" not in episodes and row["homes"] is None
     error = np.std(np.arange(1, 401)) / 20
     assert row["upper"] - row["lower"] == pytest.approx(2 * 1.96 * error, rel=0.1)
@@ -273,7 +272,7 @@ def test_interval_weighs_homes_by_lanes():
     """One lane that earned 0 in one home, three that earned 4 in another. Of the resamples of two
     homes half hold both: (0 + 3 * 4) / 4 = 3, not the mean of the homes' means, 2.
     """
-    mean, lower, upper = evaluation.interval([0.0, 4.0, 4.0, 4.0], [0, 1, 1, 1], level=0.4)
+    mean, lower, upper = statistics.interval([0.0, 4.0, 4.0, 4.0], [0, 1, 1, 1], level=0.4)
     assert mean == lower == upper == 3
 
 
@@ -284,7 +283,7 @@ def test_interval_matches_exhaustive_bootstrap(sizes):
     for resample in itertools.product(range(len(sizes)), repeat=len(sizes)):
         drawn = [value for home in resample for value in values[homes == home]]
         tries.append(sum(drawn) / len(drawn))
-    interval = evaluation.interval(values, homes, level=0.8, n_resamples=200_000)
+    interval = statistics.interval(values, homes, level=0.8, n_resamples=200_000)
     assert interval == pytest.approx((values.mean(), *np.quantile(tries, [0.1, 0.9])), abs=0.02)
 
 
@@ -322,8 +321,8 @@ def test_evaluate_prints_and_writes_a_table(trained, capsys):
             "seed 1" in text
         )
     row = dict(evaluated=0.0, lower=0.0, upper=0.0)
-    assert runs.outcome(written) == dict(score=0.0, **row)
-    assert row.items() <= runs.outcome(trained).items()
+    assert scores.outcome(written) == dict(score=0.0, **row)
+    assert row.items() <= scores.outcome(trained).items()
 
 
 def test_evaluate_is_reproducible(trained):
@@ -376,13 +375,13 @@ def test_metrics_of_each_part_of_a_mix(tmp_path, monkeypatch, capsys):
     words += ["env=explorer", "preset=cpu", "env.n_envs=4", "env.patience=1", "env.res=4"]
     words += ["env.subsample=1", "agent.width=8", "learner.n_steps=8"]
     words += ["learner.n_minibatches=2", "device=cpu", "samples=1"]
-    seen, first_episodes = [], evaluation.first_episodes
+    seen, first_episodes = [], playing.first_episodes
 
     def spied(env, *args):
         seen.append(first_episodes(env, *args))
         return seen[-1]
 
-    monkeypatch.setattr(evaluation, "first_episodes", spied)
+    monkeypatch.setattr(playing, "first_episodes", spied)
     written = evaluate.run(configured(run=str(train.run(settings(*words))), episodes=6))
     assert written.name.startswith("mixed-test-")
     rows = json.loads(written.read_text())["rows"]
@@ -412,7 +411,7 @@ def test_worst_homes_by_hand():
     falls = np.full(80, np.nan)
     falls[[7, 31]] = 4, 2
     columns = {"return": returns, "success": success, "falls": falls}
-    worst, means = evaluation.worst_homes(columns, homes)
+    worst, means = statistics.worst_homes(columns, homes)
     assert worst.tolist() == [3, 15]
     assert means["success"]["mean"] == 0.25 and means["return"]["mean"] == (6.5 - 5) / 2
     assert means["falls"]["mean"] == 3
@@ -420,13 +419,13 @@ def test_worst_homes_by_hand():
     # numbers of homes may be any, and their order changes nothing
     order = np.random.default_rng(0).permutation(80)
     shuffled = {name: values[order] for name, values in columns.items()}
-    again, other_means = evaluation.worst_homes(shuffled, 7 * homes[order] + 3)
+    again, other_means = statistics.worst_homes(shuffled, 7 * homes[order] + 3)
     assert again.tolist() == [24, 108] and other_means["return"] == means["return"]
 
 
 def test_worst_homes_of_few_are_one():
     columns = {"return": [3.0, 1, 2], "laps": [4, np.nan, np.inf]}
-    worst, means = evaluation.worst_homes(columns, [0, 1, 2])
+    worst, means = statistics.worst_homes(columns, [0, 1, 2])
     assert means["laps"] == {"mean": None, "lower": None, "upper": None}
     assert worst.tolist() == [1]
     assert (means["return"]["mean"], means["return"]["lower"]) == (1, 1)
@@ -434,9 +433,9 @@ def test_worst_homes_of_few_are_one():
 
 def test_a_row_is_scored_by_what_compares_between_homes():
     row = {"return": 9.0, "metrics": {"coverage": {"mean": 0.5}, "laps": {"mean": 3}}}
-    assert evaluation.score_of(row) == 0.5
-    assert evaluation.score_of({"return": 9.0, "metrics": {"success": {"mean": None}}}) == 9
-    assert evaluation.score_of({"won": 0.25}) == 0.25
+    assert statistics.score_of(row) == 0.5
+    assert statistics.score_of({"return": 9.0, "metrics": {"success": {"mean": None}}}) == 9
+    assert statistics.score_of({"won": 0.25}) == 0.25
 
 
 @pytest.fixture
@@ -514,8 +513,8 @@ def test_evaluate_keeps_lanes_in_one_home(tmp_path, monkeypatch):
         seen["env"], seen["episodes"] = env, first_episodes(env, *args)
         return seen["episodes"]
 
-    first_episodes = evaluation.first_episodes
-    monkeypatch.setattr(evaluation, "first_episodes", spied)
+    first_episodes = playing.first_episodes
+    monkeypatch.setattr(playing, "first_episodes", spied)
     evaluate.run(configured(run=str(run), split="all", episodes=10, baseline=False))
     assert seen["episodes"].homes.tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1]
     assert torch.equal(seen["env"].core.scenery.layout, seen["episodes"].homes)
@@ -548,10 +547,10 @@ def test_few_episodes_are_spread_over_all_homes(trained, monkeypatch):
         lists.append(env)
         return real(env, *args)
 
-    real = evaluation.first_episodes
-    monkeypatch.setattr(evaluation, "first_episodes", first_episodes)
+    real = playing.first_episodes
+    monkeypatch.setattr(playing, "first_episodes", first_episodes)
     homes = sample("bench", 40)
-    monkeypatch.setattr(evaluate.factory, "homes", lambda *_: homes)
+    monkeypatch.setattr(factory, "homes", lambda *_: homes)
     evaluate.run(configured(run=str(trained), episodes=2, baseline=False))
     layouts = lists[0].core.scenery.layouts
     expected = scene.scenery([homes[0], homes[20]], device="cpu").layouts
@@ -567,7 +566,7 @@ def test_unwritable_table(trained, monkeypatch, tmp_path):
 
 
 def test_evaluate_refuses_another_environment(trained, tmp_path):
-    from megastep.agents.training import checkpoint
+    from megastep.agents.runs import checkpoint
 
     loaded = checkpoint.load_latest(trained / "checkpoints")
     loaded.config["train"]["env"]["res"] = 16

@@ -12,8 +12,8 @@ import torch
 
 from megastep import engine, spaces
 from megastep.agents.cli import entry, train
+from megastep.agents.runs import annealing, checkpoint, json_lines
 from megastep.agents.storage.collector import Collector
-from megastep.agents.training import annealing, checkpoint, json_lines
 from megastep.arrdict import arrdict
 from tests.cli.test_cli import start
 from tests.helpers import tiny

@@ -7,8 +7,9 @@ import types
 
 import pytest
 
-from megastep.agents.cli import gpu, scripts, train
-from megastep.agents.training import checkpoint
+from megastep.agents.cli import scripts, train
+from megastep.agents.launch import gpu
+from megastep.agents.runs import checkpoint
 from tests.helpers.tiny import TINY, settings
 
 
@@ -102,7 +103,7 @@ def test_wakes_its_own_gpu(installed, device, woken):
 
 
 def test_resumed_run_wakes_its_own_gpu_alone(installed, monkeypatch, tmp_path):
-    from megastep.agents.cli.check import as_tree
+    from megastep.agents.factory.check import as_tree
 
     config = {"train": as_tree(settings(*TINY)) | {"device": "cuda:3"}, "spaces": {}}
     checkpoint.save(tmp_path / "run/checkpoints", 32, dict(samples=32, seconds=1.0), config)

@@ -12,7 +12,9 @@ import torch
 from megastep import capture
 from megastep.agents.algorithms.nonfinite import nonfinite_leaf
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.training import checkpoint, json_lines, loggers
+from megastep.agents.launch import train as launch_train
+from megastep.agents.runs import checkpoint, json_lines
+from megastep.agents.training import loggers
 from tests.helpers import tiny
 
 pytestmark = pytest.mark.cuda
@@ -60,20 +62,20 @@ def stopped(stopped_once, tmp_path):
 @pytest.fixture
 def trainers(monkeypatch):
     """The trainers trainers_made during a test."""
-    trainers_made, real = [], train.make_trainer
+    trainers_made, real = [], launch_train.make_trainer
 
     def make_trainer(*arguments):
         trainers_made.append(real(*arguments))
         return trainers_made[-1]
 
-    def measure_sections(self, real=train.Trainer.measure_sections):
+    def measure_sections(self, real=launch_train.Trainer.measure_sections):
         """Drops the graphs, so looks at them before."""
         self.was_captured = isinstance(self.collect.graph, capture.Graph)
         self.was_captured &= self.learner.cuda_graph.graph is not None
         real(self)
 
-    monkeypatch.setattr(train, "make_trainer", make_trainer)
-    monkeypatch.setattr(train.Trainer, "measure_sections", measure_sections)
+    monkeypatch.setattr(launch_train, "make_trainer", make_trainer)
+    monkeypatch.setattr(launch_train.Trainer, "measure_sections", measure_sections)
     return trainers_made
 
 
@@ -109,13 +111,13 @@ def test_rollouts_differ_after_resume(stopped, trainers):
     """A captured call advances the hidden state and the generator."""
     collected = []
 
-    def store(self, losses, real=train.Trainer.log):
+    def store(self, losses, real=launch_train.Trainer.log):
         real(self, losses)
         rollout = self.rollout
         collected.append((rollout.actions.clone(), rollout.state.cell.clone()))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train.Trainer, "log", store)
+        patch.setattr(launch_train.Trainer, "log", store)
         assert train.main([f"resume={stopped}", f"samples={2 * STOPPED}"]) == 0
     assert is_captured(trainers[0])
     assert len(collected) == 6

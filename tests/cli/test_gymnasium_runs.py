@@ -7,7 +7,7 @@ import pytest
 from megastep.agents.cli import evaluate, sweeps, train
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.scripts import SCRIPTS
-from megastep.agents.training import json_lines
+from megastep.agents.runs import json_lines
 from tests.helpers import tiny
 
 pytest.importorskip("gymnasium")

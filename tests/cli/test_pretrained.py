@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from megastep import geometries
-from megastep.agents import pretrained
-from megastep.agents.cli import evaluate, factory, inspect, program, record, runs, train
-from megastep.agents.cli.program import UserError
+from megastep.agents import factory, package, pretrained
+from megastep.agents.cli import evaluate, inspect, record, train
+from megastep.agents.errors import UserError
 from megastep.agents.networks.policy import TRAINING_ONLY
 from megastep.agents.networks.running_norm import RunningNorm
-from megastep.agents.training import agent_file, checkpoint
-from megastep.agents.training.checkpoint_format import CheckpointError, DamagedCheckpoint
+from megastep.agents.runs import agent_file, checkpoint, folders
+from megastep.agents.runs.checkpoint_format import CheckpointError, DamagedCheckpoint
 from megastep.types import n_lanes
 
 NAME = "tiny_agent"
@@ -28,7 +28,7 @@ TINY = [
 ]
 SUITE = ["geometry=suite", PARTS, "episodes=8", "device=cpu"]
 #: The agents of the package.
-FILES = sorted(program.PRETRAINED.glob(f"*{agent_file.SUFFIX}"))
+FILES = sorted(package.PRETRAINED.glob(f"*{agent_file.SUFFIX}"))
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def folder(exported, tmp_path, monkeypatch):
     """Changes to a folder of its own, with the exported agent as the only one of the package."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(exported / "agents", "package")
-    monkeypatch.setattr(program, "PRETRAINED", tmp_path / "package")
+    monkeypatch.setattr(package, "PRETRAINED", tmp_path / "package")
     return tmp_path
 
 
@@ -140,7 +140,7 @@ def test_export_refuses_large_agents_and_those_without_the_suite(exported, tmp_p
 def test_export_refuses_modules_of_others(exported, tmp_path, monkeypatch):
     loaded = checkpoint.load_latest(exported / "run/checkpoints")
     loaded.config["train"]["agent"]["core"] = "mine:Core"
-    monkeypatch.setattr(runs, "load_checkpoint", lambda *args: loaded)
+    monkeypatch.setattr(folders, "load_checkpoint", lambda *args: loaded)
     with pytest.raises(UserError, match="needs mine:Core, and agents of the package"):
         export_agent.export(str(exported / "run"), NAME, tmp_path)
 
@@ -163,13 +163,13 @@ def test_evaluates_into_a_folder_of_its_own(folder, capsys):
         f"{NAME}.md",
         f"{NAME}.safetensors",
     ]
-    assert runs.known() == [], "its folder is no run"
+    assert folders.known() == [], "its folder is no run"
 
 
 def test_meets_others_in_duels(exported, capsys):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(exported)
-        patch.setattr(program, "PRETRAINED", exported / "agents")
+        patch.setattr(package, "PRETRAINED", exported / "agents")
         words = ["geometry=box", "episodes=4", "device=cpu"]
         assert evaluate.main(["run=run", f"against={NAME},bot", *words]) == 0
         assert f"{NAME}, 512 samples" in capsys.readouterr().out
@@ -258,7 +258,7 @@ def test_wrong_names_are_one_sentence(main, words, text, folder, capsys):
 
 def test_a_folder_of_the_name_comes_first(folder, exported, capsys):
     shutil.copytree(exported / "run", NAME)
-    assert runs.find(NAME) == Path(NAME)
+    assert folders.find(NAME) == Path(NAME)
     shutil.rmtree(f"{NAME}/checkpoints")
     assert evaluate.main([f"run={NAME}"]) == 2
     assert f"rename it to use the pretrained agent {NAME}" in capsys.readouterr().err
@@ -267,7 +267,7 @@ def test_a_folder_of_the_name_comes_first(folder, exported, capsys):
 def test_both_lists_have_a_near_name(folder, exported):
     shutil.copytree(exported / "run", "runs/tiny_agent_2")
     with pytest.raises(UserError, match="did you mean runs/tiny_agent_2 or tiny_agent?"):
-        runs.find("runs/tiny_agent")
+        folders.find("runs/tiny_agent")
 
 
 def changed(content, **texts):
@@ -439,5 +439,5 @@ def test_page_names_every_agent():
 
 
 def test_every_card_has_its_agent():
-    cards = {path.stem for path in program.PRETRAINED.glob("*.md")}
+    cards = {path.stem for path in package.PRETRAINED.glob("*.md")}
     assert cards == {path.stem for path in FILES}

@@ -11,7 +11,7 @@ from matplotlib import pyplot as plt
 
 from megastep import plotting, recording
 from megastep.agents.cli import record, train
-from megastep.agents.training import checkpoint
+from megastep.agents.runs import checkpoint
 from tests.helpers import faults, tiny
 from tests.helpers.tiny import settings
 

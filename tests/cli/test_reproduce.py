@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from megastep.agents.cli import command, entry, gpu, reproduce, scripts
+from megastep.agents.cli import command, entry, reproduce, scripts
 from megastep.agents.cli.reproduce import Result, Row
+from megastep.agents.launch import gpu
 from tests.helpers import tiny
 
 LAB = Path(__file__).parents[2] / "docs" / "lab"

@@ -12,10 +12,11 @@ import time
 
 import pytest
 
-from megastep.agents.cli import runs, scripts
+from megastep.agents.cli import scripts
 from megastep.agents.cli.compose import Composer
-from megastep.agents.cli.program import UserError
-from megastep.agents.cli.runs import locked
+from megastep.agents.errors import UserError
+from megastep.agents.runs import folders
+from megastep.agents.runs.folders import locked
 from tests.helpers.processes import HUNG
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -31,12 +32,12 @@ def run(name):
     """Makes a run folder with a folder of checkpoints and records its start."""
     path = pathlib.Path(name)
     (path / "checkpoints").mkdir(parents=True)
-    runs.record_start(path)
+    folders.record_start(path)
     return path
 
 
 def test_make_numbers_taken_names():
-    folders = [runs.make(pathlib.Path("runs/a")) for _ in range(3)]
+    folders = [folders.make(pathlib.Path("runs/a")) for _ in range(3)]
     assert [str(path) for path in folders] == ["runs/a", "runs/a-2", "runs/a-3"]
 
 
@@ -46,7 +47,7 @@ def test_make_from_many_threads():
 
         def launch(name=f"runs/{round}", folders=folders, start=start):
             start.wait()
-            folders.append(runs.make(pathlib.Path(name)))
+            folders.append(folders.make(pathlib.Path(name)))
 
         threads = [threading.Thread(target=launch) for _ in range(8)]
         for thread in threads:
@@ -61,7 +62,7 @@ def test_make_from_many_threads():
 )
 def test_resume_command_is_quoted(name):
     typed = subprocess.run(
-        ["bash", "-c", f"printf '%s\\n' {runs.resume_command(pathlib.Path(name))}"],
+        ["bash", "-c", f"printf '%s\\n' {folders.resume_command(pathlib.Path(name))}"],
         text=True,
         stdout=subprocess.PIPE,
     )
@@ -77,18 +78,18 @@ def test_resume_command_is_quoted(name):
 
 def test_latest_is_started_last():
     first, second = run("runs/b"), run("runs/a")
-    assert runs.find("latest") == second
+    assert folders.find("latest") == second
     (first / "checkpoints" / "step_1").mkdir()
     (first / "evaluations").mkdir()
-    assert runs.find("latest") == second
-    runs.record_start(first)  # it goes on
-    assert runs.find("latest") == first
+    assert folders.find("latest") == second
+    folders.record_start(first)  # it goes on
+    assert folders.find("latest") == first
 
 
 def test_latest_in_any_folder():
     for name in ("runs/a", "sweeps/2026-01-01/0_seed=1", "else where/ü"):
         path = run(name)
-        assert runs.find("latest") == path
+        assert folders.find("latest") == path
 
 
 def test_latest_after_copies_and_deletions():
@@ -96,24 +97,24 @@ def test_latest_after_copies_and_deletions():
     for path in (first, second, third):
         os.utime(path / "checkpoints", (0, 0))
     shutil.copytree(first, "runs/z-copy")
-    assert runs.find("latest") == third
+    assert folders.find("latest") == third
     shutil.rmtree(third)
-    assert runs.find("latest") == second
+    assert folders.find("latest") == second
     shutil.rmtree("runs/2026-01-01-b")
-    assert runs.find("latest") == first
+    assert folders.find("latest") == first
 
 
 def test_latest_without_records():
     for name in ("2026-01-02", "2026-01-01"):
         pathlib.Path("runs", name, "checkpoints").mkdir(parents=True)
-    assert str(runs.find("latest")) == "runs/2026-01-02"
+    assert str(folders.find("latest")) == "runs/2026-01-02"
     known = run("runs/2025")
-    assert runs.find("latest") == known
+    assert folders.find("latest") == known
 
 
 def test_unwritable_start_record_warns(capsys):
     pathlib.Path("runs").write_text("a file")
-    runs.record_start(pathlib.Path("elsewhere"))
+    folders.record_start(pathlib.Path("elsewhere"))
     assert capsys.readouterr().err.startswith("warning: runs/started.txt cannot be written")
 
 
@@ -136,7 +137,7 @@ def test_lock_names_the_process(here):
 
 HOLDS = """
 import pathlib, sys
-from megastep.agents.cli.runs import locked
+from megastep.agents.runs.folders import locked
 with locked(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()

@@ -13,15 +13,13 @@ import time
 import pytest
 
 from megastep import recording
-from megastep.agents.cli import factory, runs, signals, train
+from megastep.agents import factory
+from megastep.agents.cli import train
+from megastep.agents.evaluation import playing
+from megastep.agents.launch import signals
+from megastep.agents.runs import checkpoint, checkpoint_format, folders, provenance
 from megastep.agents.storage.collector import Collector
-from megastep.agents.training import (
-    checkpoint,
-    checkpoint_format,
-    evaluation,
-    loggers,
-    provenance,
-)
+from megastep.agents.training import loggers
 from tests.helpers import tiny
 from tests.helpers.processes import HUNG, wait_until
 
@@ -98,7 +96,7 @@ def swallowing(monkeypatch, number):
 
 
 def making_a_folder(monkeypatch, number):
-    signalled(monkeypatch, runs, "new", number, call=1)
+    signalled(monkeypatch, folders, "new", number, call=1)
 
 
 def setting_up(monkeypatch, number):
@@ -151,7 +149,7 @@ def test_signal_while_training(here, monkeypatch, capsys, moment, number):
 
 
 def evaluating(monkeypatch, number):
-    signalled(monkeypatch, evaluation, "first_episodes", number, call=1)
+    signalled(monkeypatch, playing, "first_episodes", number, call=1)
 
 
 def filming(monkeypatch, number):

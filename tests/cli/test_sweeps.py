@@ -21,11 +21,13 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
-from megastep.agents.cli import evaluate, places, runs, scripts, sweeps, train
+from megastep.agents.cli import evaluate, scripts, sweeps, train
 from megastep.agents.cli.compose import Composer
-from megastep.agents.cli.program import ConfigErrors
-from megastep.agents.cli.settings import kind_of
-from megastep.agents.cli.signals import Interrupted
+from megastep.agents.errors import ConfigErrors
+from megastep.agents.factory.settings import kind_of
+from megastep.agents.launch import places
+from megastep.agents.launch.signals import Interrupted
+from megastep.agents.runs import folders, scores
 from megastep.agents.training import loggers
 from tests.helpers.processes import HUNG, is_running, wait_until
 
@@ -145,7 +147,7 @@ def test_sweep_folders_and_table(here, capsys):
     config = yaml.safe_load((here / "mine" / names[0] / "config.yaml").read_text())
     assert config["folder"] == f"mine/{names[0]}"
     assert "sweep.md" in capsys.readouterr().out
-    assert runs.find("latest") == pathlib.Path("mine/3_env.pay=3_seed=2")
+    assert folders.find("latest") == pathlib.Path("mine/3_env.pay=3_seed=2")
 
 
 @pytest.mark.parametrize(
@@ -234,7 +236,7 @@ def test_paths_with_hydra_job_chdir(here):
     words = [*SHORT, "-m", "init=first", "seed=1,2", "hydra.job.chdir=true", "hydra.sweep.dir=mine"]
     assert train.main(words) == 0
     assert [row["state"] for row in rows("mine")] == ["done", "done"]
-    assert runs.find("latest") == pathlib.Path("mine/1_seed=2")
+    assert folders.find("latest") == pathlib.Path("mine/1_seed=2")
 
 
 def test_hydra_run_dir_is_the_folder(here, capsys):
@@ -546,7 +548,7 @@ def report(step, count, window, mean):
 
 def score(here, *lines):
     (here / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    return runs.outcome(here)["score"]
+    return scores.outcome(here)["score"]
 
 
 def test_score_is_the_mean_over_the_episodes_of_the_last_reports(here):
@@ -557,7 +559,7 @@ def test_score_is_the_mean_over_the_episodes_of_the_last_reports(here):
     )
     assert score(here, *[report(n, 0, 0, None) for n in range(3)]) is None
     (here / "empty").mkdir()
-    assert runs.outcome(here / "empty")["score"] is None
+    assert scores.outcome(here / "empty")["score"] is None
 
 
 def test_score_counts_every_episode_once(here):

@@ -16,16 +16,21 @@ import torch
 import yaml
 
 from megastep import engine, envs
+from megastep.agents import factory
 from megastep.agents.algorithms import ppo
 from megastep.agents.algorithms.nonfinite import nonfinite_leaf
-from megastep.agents.cli import evaluate, factory, train
-from megastep.agents.cli.check import check
-from megastep.agents.cli.program import ConfigErrors, UserError
-from megastep.agents.cli.runs import locked
-from megastep.agents.cli.settings import Train
-from megastep.agents.cli.signals import Interrupted
-from megastep.agents.training import checkpoint, json_lines, loggers, performance
+from megastep.agents.cli import evaluate, train
+from megastep.agents.errors import ConfigErrors, UserError
+from megastep.agents.factory.check import check
+from megastep.agents.factory.settings import Train
+from megastep.agents.factory.trainer import annealed
+from megastep.agents.launch import train as launch_train
+from megastep.agents.launch.signals import Interrupted
+from megastep.agents.runs import checkpoint, json_lines
+from megastep.agents.runs.folders import locked
+from megastep.agents.training import loggers, performance
 from megastep.agents.training.budget import Budget
+from megastep.agents.training.progress import few_means, progress_of
 from megastep.settings import MAX_ENVS
 from tests.helpers import faults, tiny
 from tests.helpers.tiny import settings
@@ -72,7 +77,7 @@ def test_files_of_a_run(here, with_curves):
         "curves.png",
     }
     written = check(Train, yaml.safe_load((folder / "config.yaml").read_text()))
-    assert written == train.annealed(configured(f"samples={3 * UPDATE}"))
+    assert written == annealed(configured(f"samples={3 * UPDATE}"))
     rows = json_lines.read(folder / "metrics.jsonl")
     assert [row["samples"] for row in rows] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
     assert [row["updates"] for row in rows] == [1, 2, 3]
@@ -227,7 +232,7 @@ def test_killed_after_resuming_an_earlier_checkpoint(here, monkeypatch):
     )
     first = folder / "checkpoints" / f"step_{UPDATE}"
     with monkeypatch.context() as patch:
-        patch.setattr(train.Trainer, "train", lambda *_: None)  # as if killed at once
+        patch.setattr(launch_train.Trainer, "train", lambda *_: None)  # as if killed at once
         train.run(configured(f"resume={first}", tiny=[]))
     assert [row["samples"] for row in json_lines.read(folder / "metrics.jsonl")] == [UPDATE]
     assert checkpoint.load_latest(folder / "checkpoints").step == UPDATE
@@ -454,7 +459,7 @@ def test_full_disk_warns_once(here, monkeypatch):
 
 
 def test_disk_that_fills_up(here, monkeypatch, capsys, with_curves):
-    real, full = train.Trainer.log, contextlib.ExitStack()
+    real, full = launch_train.Trainer.log, contextlib.ExitStack()
 
     def report(self, losses):
         real(self, losses)
@@ -463,7 +468,7 @@ def test_disk_that_fills_up(here, monkeypatch, capsys, with_curves):
             full.enter_context(faults.full_disk(8000))
 
     with full, monkeypatch.context() as patch:
-        patch.setattr(train.Trainer, "log", report)
+        patch.setattr(launch_train.Trainer, "log", report)
         code = train.main([*TINY, f"samples={5 * UPDATE}", "checkpoint_seconds=1e-9", "folder=run"])
     warning, *others, error = capsys.readouterr().err.splitlines()
     assert code == 2 and all("curves.png" in line for line in others)
@@ -526,7 +531,7 @@ def test_unusable_run_folder(here, monkeypatch, capsys, folder):
     (here / "file").write_text("")
     (here / "full").mkdir()
     (here / "full" / "mine.txt").write_text("")
-    monkeypatch.setattr(train, "make_trainer", None)
+    monkeypatch.setattr(launch_train, "make_trainer", None)
     assert train.main([*TINY, f"folder={folder}"]) == 2
     error = capsys.readouterr().err.strip()
     assert folder in error and "folder=" in error and "\n" not in error
@@ -563,14 +568,14 @@ def test_interrupted_has_the_signal():
 
 @pytest.mark.slow
 def test_long_run_leaks_nothing(here, monkeypatch):
-    real, seen = train.Trainer.log, {}
+    real, seen = launch_train.Trainer.log, {}
 
     def report(self, losses):
         real(self, losses)
         pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
         seen[self.updates] = pages * 4096 / 1e6, len(os.listdir("/proc/self/fd"))
 
-    monkeypatch.setattr(train.Trainer, "log", report)
+    monkeypatch.setattr(launch_train.Trainer, "log", report)
     train.run(configured(f"samples={1200 * UPDATE}", "checkpoint_seconds=0.5"))
     (early, _), (late, _) = seen[400], seen[1200]
     # a checkpoint that is being written has a file open
@@ -585,10 +590,10 @@ def test_progress_metrics():
         "episode/coverage": 0.8371,
         "episode/length": 9.0,
     }
-    shown = train.few_means(latest, ["coverage"], ("leader", "follower", "follower"))
+    shown = few_means(latest, ["coverage"], ("leader", "follower", "follower"))
     assert shown == ["leader 12.3", "follower 2", "coverage 0.837"]
-    assert train.few_means({}, ["coverage"], ()) == []
-    assert train.few_means(latest, ["coverage", *"abcd"], ()) == []
+    assert few_means({}, ["coverage"], ()) == []
+    assert few_means(latest, ["coverage", *"abcd"], ()) == []
 
 
 def test_progress_says_how_many_episodes_a_return_is_of():
@@ -600,7 +605,7 @@ def test_progress_says_how_many_episodes_a_return_is_of():
         episode_stats=SimpleNamespace(metrics=(), groups=()),
         budget=Budget(),
     )
-    fraction, words = train.progress_of(running)
+    fraction, words = progress_of(running)
     assert fraction is None
     assert words == ["2M samples", "1M/s", "return 26.3 of 1.31k episodes", "won vs past 60 %"]
 

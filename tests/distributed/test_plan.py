@@ -2,9 +2,9 @@
 
 import pytest
 
-from megastep.agents.cli.program import UserError
 from megastep.agents.distributed import agreement, plan, reports
 from megastep.agents.distributed.plan import Plan
+from megastep.agents.errors import UserError
 from megastep.agents.generator import rank_seed
 
 GOES_ON = Plan(goes_on=True, saves=False, lr_fraction=0.75)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from megastep.agents.cli import evaluate, record, train
-from megastep.agents.training import checkpoint
+from megastep.agents.runs import checkpoint
 
 BOARD = '''
 import torch

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from megastep import arrdict, capture, contract, envs, toys
-from megastep.agents.training.evaluation import RandomActions
+from megastep.agents.selfplay.bots import RandomActions
 from megastep.envs.deathmatch.bot import Bot
 from megastep.geometries import sample
 from tests.helpers import bot_twin

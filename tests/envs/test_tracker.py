@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from megastep import capture, envs, spaces
-from megastep.agents.selfplay import duels
-from megastep.agents.training.evaluation import RandomActions, first_episodes
+from megastep.agents.evaluation import duels
+from megastep.agents.evaluation.playing import first_episodes
+from megastep.agents.selfplay.bots import RandomActions
 from megastep.envs.pong import Tracker
 
 ACTIONS = spaces.MultiDiscrete(1, 3)

@@ -11,7 +11,7 @@ import torch
 
 from megastep import arrdict, capture, contract, plotting
 from megastep.agents.cli import train
-from megastep.agents.training import checkpoint
+from megastep.agents.runs import checkpoint
 from tests.helpers import pages
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "new-environment.md"

@@ -11,11 +11,11 @@ from torch.utils._pytree import tree_leaves
 from megastep import contract, envs, toys
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
-from megastep.agents.selfplay import duels
+from megastep.agents.runs import checkpoint
+from megastep.agents.runs.saver import Saver
 from megastep.agents.selfplay.opponents import Opponents
-from megastep.agents.training import checkpoint
+from megastep.agents.selfplay.slots import score_pairs
 from megastep.agents.training.budget import Budget
-from megastep.agents.training.saver import Saver
 from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict
 from megastep.env_state import EnvState
@@ -397,7 +397,7 @@ def test_resumed_run_has_the_same_snapshots_and_continues_the_same(tmp_path):
 
 
 def slow_score_pairs(terminal, returns, slots):
-    """`duels.score_pairs`, pair by pair."""
+    """`score_pairs`, pair by pair."""
     won, decided = [], []
     for is_terminal, total, me in zip(terminal.tolist(), returns.tolist(), slots[:, 0].tolist()):
         scores = []
@@ -419,7 +419,7 @@ def test_pairs_are_won_by_survival_and_else_by_return(n_agents):
     terminal = torch.rand(500, n_agents) < 0.4
     returns = torch.randint(-2, 3, (500, n_agents)).float()
     slots = torch.randint(n_agents, (500, 1))
-    won, decided = duels.score_pairs(terminal, returns, slots)
+    won, decided = score_pairs(terminal, returns, slots)
     assert (won.tolist(), decided.tolist()) == slow_score_pairs(terminal, returns, slots)
 
 

@@ -7,7 +7,8 @@ import torch
 
 from megastep import capture
 from megastep.agents.cli import evaluate, train
-from megastep.agents.training import checkpoint, json_lines
+from megastep.agents.launch import train as launch_train
+from megastep.agents.runs import checkpoint, json_lines
 from megastep.engine import devices
 from megastep.envs.pong.step import CELL
 from tests.cli.test_duels import PONG, UPDATE
@@ -172,13 +173,13 @@ def test_snapshots_that_do_not_fit_say_how_many_would(here, capsys, monkeypatch)
 
 def test_snapshots_act_with_their_current_weights(here, monkeypatch, device):
     """On a GPU in CUDA graphs from the second rollout on, each on a stream of its own."""
-    trainers, real = [], train.make_trainer
+    trainers, real = [], launch_train.make_trainer
 
     def make_trainer(*args):
         trainers.append(real(*args))
         return trainers[-1]
 
-    monkeypatch.setattr(train, "make_trainer", make_trainer)
+    monkeypatch.setattr(launch_train, "make_trainer", make_trainer)
     tiny = [word for word in OPPOSED if not word.startswith(("device", "agent.core", "env."))]
     tiny += ["env.self_play=true", "env.n_envs=64", f"device={device}"]
     folder = train.run(configured(f"samples={12 * 8 * OPPOSED_UPDATE}", tiny=tiny))

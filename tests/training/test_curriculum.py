@@ -9,8 +9,9 @@ import torch
 from megastep import envs, spaces, toys
 from megastep.agents.algorithms.returns import gae
 from megastep.agents.cli import train
+from megastep.agents.launch import train as launch_train
+from megastep.agents.runs import json_lines
 from megastep.agents.storage.rollout import Rollout
-from megastep.agents.training import json_lines
 from megastep.agents.training.curriculum import PLR, SFL
 from megastep.arrdict import arrdict
 from megastep.geometries import sample
@@ -322,9 +323,9 @@ def test_statistics_by_source_are_exact_under_resume(tmp_path, monkeypatch):
 
 def test_without_a_curriculum_nothing_is_stored_or_logged(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    made, make_trainer = [], train.make_trainer
+    made, make_trainer = [], launch_train.make_trainer
     monkeypatch.setattr(
-        train, "make_trainer", lambda *args: made.append(make_trainer(*args)) or made[0]
+        launch_train, "make_trainer", lambda *args: made.append(make_trainer(*args)) or made[0]
     )
     assert train.main([*SMALL, "env=pointgoal", "env.limit=5", "folder=run"]) == 0
     assert made[0].rollout.layouts is None and made[0].env.spawner.cumulative is None

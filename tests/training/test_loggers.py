@@ -9,7 +9,8 @@ import types
 
 import pytest
 
-from megastep.agents.training import json_lines, loggers
+from megastep.agents.runs import json_lines
+from megastep.agents.training import loggers
 from megastep.agents.training.curves import panels_of, plot_curves
 from megastep.agents.training.loggers import Loggers
 from tests.helpers import faults

@@ -12,6 +12,7 @@ from megastep.agents.algorithms.nonfinite import NonFiniteCheck, NonFiniteValue
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.algorithms.vtrace import VTrace
 from megastep.agents.networks.policy import Policy
+from megastep.agents.runs.saver import Saver
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.nonfinite_recorder import (
@@ -20,7 +21,6 @@ from megastep.agents.training.nonfinite_recorder import (
     make_recorder,
 )
 from megastep.agents.training.nonfinite_replay import Recording, ReplayError
-from megastep.agents.training.saver import Saver
 from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict
 

@@ -5,13 +5,8 @@ import contextlib
 import pytest
 import torch
 
-from megastep.agents.training import (
-    episode_stats,
-    json_lines,
-    nonfinite_guard,
-    provenance,
-    trainer,
-)
+from megastep.agents.runs import json_lines, provenance
+from megastep.agents.training import episode_stats, nonfinite_guard, trainer
 from megastep.agents.training.episode_stats import EpisodeStats
 from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
 from tests.training.test_trainer import UPDATE, Pairs, always, make_trainer

@@ -7,11 +7,11 @@ import torch
 
 from megastep import capture
 from megastep.agents import sections
+from megastep.agents.runs.saver import Saver
 from megastep.agents.sections import section
 from megastep.agents.training import performance
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.performance import SECTIONS
-from megastep.agents.training.saver import Saver
 from megastep.agents.training.trainer import Trainer
 from tests.helpers.learners import LEARNERS
 from tests.helpers.made_up import B, Numbers

@@ -13,10 +13,11 @@ from megastep.agents.algorithms import nonfinite
 from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.algorithms.ppo import PPO
 from megastep.agents.networks.policy import Policy
-from megastep.agents.training import checkpoint, performance
+from megastep.agents.runs import checkpoint
+from megastep.agents.runs.saver import Saver
+from megastep.agents.training import performance
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
-from megastep.agents.training.saver import Saver
 from megastep.agents.training.trainer import MAX_AHEAD, Trainer
 from megastep.arrdict import arrdict
 

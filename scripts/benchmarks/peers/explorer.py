@@ -16,10 +16,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[3]))  # this checkout co
 import torch
 
 from megastep import arrdict, capture
-from megastep.agents.cli import factory
+from megastep.agents import factory
 from megastep.agents.cli.compose import Composer
 from megastep.agents.cli.scripts import SCRIPTS
-from megastep.agents.cli.settings import Train
+from megastep.agents.factory.settings import Train
 
 N_STEPS, N_MINIBATCHES, WIDTH = 32, 4, 256
 #: Iterations before the first lap: they compile, choose kernels and capture graphs.

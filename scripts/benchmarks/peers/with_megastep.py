@@ -9,7 +9,8 @@ from pathlib import Path
 
 import explorer
 
-from megastep.agents.cli import console, factory, train
+from megastep.agents import factory
+from megastep.agents.factory.trainer import make_trainer
 
 
 def main() -> None:
@@ -18,7 +19,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         cfg = explorer.settings(given, f"agent.bf16={given.precision == 'bfloat16'}")
         device = factory.make_device(cfg.device)
-        trainer = train.make_trainer(cfg, Path(folder), device, console.Progress())
+        trainer = make_trainer(cfg, Path(folder), device)
         trainer.train(lambda: clock.is_done(trainer.samples))
         trainer.close()
 

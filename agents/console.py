@@ -1,0 +1,175 @@
+"""Lines, warnings, tables and progress, on a terminal or not. Output that cannot be written, as on
+a full disk or a closed pipe, never ends the work.
+"""
+
+import contextlib
+import os
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from io import StringIO
+from typing import Any, TextIO
+
+from megastep.agents.errors import UserError
+
+#: Seconds between two lines of progress where a line cannot be redrawn.
+LINE_EVERY = 10
+#: The beginning of every line, where one of several processes prints.
+prefix = ""
+#: Nothing is printed on stdout, as another process prints it.
+is_silent = False
+
+
+class TolerantStream:
+    """A text stream that goes silent at its first failure, for good."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        self._attempt(self._stream.write, text)
+        return len(text)
+
+    def flush(self) -> None:
+        self._attempt(self._stream.flush)
+
+    def _attempt(self, method, *arguments):
+        try:
+            method(*arguments)
+        except (OSError, ValueError):
+            # the buffer goes to the null device, or the interpreter's last flush would fail
+            with contextlib.suppress(OSError, ValueError), open(os.devnull, "w") as null:
+                os.dup2(null.fileno(), self._stream.fileno())
+
+
+def open_streams() -> None:
+    """Makes stdout and stderr tolerant of errors and encodings, and opens those that are closed, so
+    that no file takes their number.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name) or open(os.devnull, "w")
+        stream.reconfigure(errors="backslashreplace")
+        setattr(sys, name, TolerantStream(stream))
+
+
+def say(text: str, file: TextIO | None = None) -> None:
+    if is_silent and file is None:
+        return
+    print(textwrap.indent(text, prefix, bool), file=file or sys.stdout, flush=True)
+
+
+def warn(sentence: object, *_: Any, **__: Any) -> None:
+    """One line on stderr; can stand in for `warnings.showwarning`."""
+    say(f"warning: {sentence}", sys.stderr)
+
+
+@contextlib.contextmanager
+def warned(prefix: str = "") -> Iterator[None]:
+    """Turns an OSError or a UserError into a warning that begins with `prefix`."""
+    try:
+        yield
+    except (OSError, UserError) as error:
+        warn(f"{prefix}{error}")
+
+
+def warn_of_thread(failure: threading.ExceptHookArgs) -> None:
+    """Prints why a thread ended, in one line if the disk is full, as TensorBoard's may find it."""
+    if isinstance(failure.exc_value, OSError):
+        warn(f"{failure.thread.name} stopped: {failure.exc_value}")
+    else:
+        threading.__excepthook__(failure)
+
+
+def is_unicode() -> bool:
+    return (sys.stdout.encoding or "").lower().startswith("utf")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], is_markdown: bool = False) -> str:
+    """Returns a table as text: in Markdown, or in characters that stdout can show."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    style = box.HEAVY_HEAD if is_unicode() else box.ASCII
+    grid, text = Table(*head, box=box.MARKDOWN if is_markdown else style), StringIO()
+    for row in rows:
+        grid.add_row(*(cell.replace("|", "\\|") if is_markdown else cell for cell in row))
+    Console(file=text, width=10_000, force_terminal=False, color_system=None).print(grid)
+    return text.getvalue().strip()
+
+
+def sections(milliseconds: dict[str, float], iteration: float) -> str:
+    """Returns a table of where an iteration's time goes.
+
+    Args:
+        milliseconds: of an iteration, by section.
+        iteration: of a whole iteration, in milliseconds.
+    """
+    times = milliseconds | {"other": max(0.0, iteration - sum(milliseconds.values()))}
+    times["iteration"] = iteration
+    rows = [
+        (name, f"{time:.3g}", f"{100 * time / iteration:.1f} %") for name, time in times.items()
+    ]
+    return table(("section", "ms", "share"), rows)
+
+
+def restore() -> None:
+    """Shows the cursor, which a progress bar hides, where a process ends at once."""
+    if sys.stdout.isatty():
+        sys.stdout.write("\x1b[?25h\n")
+        sys.stdout.flush()
+
+
+class Progress:
+    """A context: a bar with a line of text on a terminal, elsewhere a line every 10 seconds."""
+
+    def __init__(self):
+        from rich import progress  # only for those who wait
+
+        is_dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
+        self.shown_at = -LINE_EVERY
+        self.bar = progress.Progress(
+            progress.BarColumn(24),
+            progress.TextColumn("{task.description}"),
+            disable=is_dumb or bool(prefix) or not sys.stdout.isatty(),
+        )
+        self.task = self.bar.add_task("starting", total=1)
+
+    def __enter__(self) -> "Progress":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.stop()
+
+    def show(self, fraction: float | None, words: Sequence[str]) -> None:
+        """Shows words on one line; `fraction` of the work is done, None if it has no end."""
+        text, total = (" · " if is_unicode() else "  ").join(words), None if fraction is None else 1
+        self.bar.update(self.task, completed=fraction or 0, total=total, description=text)
+        if self.bar.disable and time.monotonic() - self.shown_at >= LINE_EVERY:
+            self.shown_at = time.monotonic()
+            say(text)
+
+
+def number(value: float) -> str:
+    """A count in three digits: 1.23M."""
+    for limit, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= limit:
+            return f"{value / limit:.3g}{unit}"
+    return f"{value:.0f}"
+
+
+def duration(seconds: float) -> str:
+    """A time in its two largest units: 5 s, 2 min 5 s, 1 h 2 min."""
+    minutes, seconds = divmod(max(0, round(seconds)), 60)
+    if minutes < 60:
+        return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
+    return f"{minutes // 60} h {minutes % 60} min"

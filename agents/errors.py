@@ -1,0 +1,62 @@
+"""Errors that a user can put right, each one sentence."""
+
+import contextlib
+import re
+from collections.abc import Iterable, Iterator
+
+
+class UserError(Exception):
+    """Something the user can put right, in one sentence.
+
+    Ends the program with the exit code `code`, without a traceback.
+    """
+
+    code = 2
+
+
+class NonFinite(UserError):
+    """Training stopped on numbers that are not finite, or went on without them."""
+
+    code = 1
+
+
+class Differs(UserError):
+    """A run that was repeated gave other numbers."""
+
+    code = 1
+
+
+class ConfigErrors(UserError):
+    """All errors of one configuration: `errors`, (dotted key, sentence) each."""
+
+    def __init__(self, errors: Iterable[tuple[str, str]]):
+        self.errors = list(errors)
+        super().__init__(self.errors)
+
+    def __str__(self):
+        head = f"{len(self.errors)} error{'s' * (len(self.errors) > 1)} in the configuration"
+        return "\n  ".join([head, *(f"{key}: {shortened(text, 400)}" for key, text in self.errors)])
+
+
+@contextlib.contextmanager
+def user_errors(
+    prefix: str = "", kinds: tuple[type[BaseException], ...] = (OSError, ValueError)
+) -> Iterator[None]:
+    """Turns errors of these kinds into a UserError that begins with `prefix`."""
+    try:
+        yield
+    except kinds as error:
+        raise UserError(prefix + shortened(error, 400)) from error
+
+
+def memory_problem(error: MemoryError | RuntimeError) -> str | None:
+    """Returns what Python or PyTorch says of too little memory; None if the error is another."""
+    if isinstance(error, MemoryError):
+        return "Out of memory"
+    problem = re.search("(DefaultCPUAllocator|CUDA out of memory|std::bad_alloc).*", str(error))
+    return problem and problem[0].rstrip(".")
+
+
+def shortened(text: object, length: int = 120) -> str:
+    text = " ".join(str(text).split()) or type(text).__name__
+    return text if len(text) <= length else f"{text[: length - 3]}..."

@@ -1,0 +1,1 @@
+"""Measures trained policies: episodes in unseen homes, duels, ratings."""

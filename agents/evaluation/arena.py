@@ -1,0 +1,175 @@
+"""An environment in unseen homes, where the agent of a run meets others."""
+
+import itertools
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from megastep.agents import console, factory
+from megastep.agents.distributed import process_group
+from megastep.agents.distributed.share import Share
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.evaluation import duels, ratings, statistics, suite, tables
+from megastep.agents.factory import settings
+from megastep.agents.generator import rank_seed
+from megastep.agents.runs import checkpoint, folders
+from megastep.agents.selfplay.slots import rotating_slots
+from megastep.types import optional
+
+
+class Player(NamedTuple):
+    name: str
+    policy: Any
+    step: int | None = None  # the number of samples it has learnt from
+
+
+#: Settings of an environment for duels, where it has them: two agents, each environment in one
+#: home.
+FOR_TWO = {"n_agents": 2, "self_play": True, "resample": False}
+
+
+def load_player(loaded: checkpoint.Checkpoint, env: Any, run: checkpoint.Checkpoint) -> Player:
+    """Returns the player of a checkpoint, to meet the agent of `run` in `env`.
+
+    Raises:
+        UserError: if one was trained in another environment.
+    """
+    trained, own = factory.config_of(loaded), factory.config_of(run)
+    if trained.env.name != own.env.name:
+        raise UserError(
+            f"{loaded.path} was trained in {settings.label(trained.env.name)} and {run.path} in "
+            f"{settings.label(own.env.name)}; choose a run in the same environment"
+        )
+    policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+    return Player(f"{folders.name_of(loaded.path)}, {loaded.step:,} samples", policy, loaded.step)
+
+
+def find_player(
+    name: str, run: checkpoint.Checkpoint, env_settings: settings.Env, env: Any, trust: bool
+) -> Player:
+    """Returns who is to meet the agent of `run` in `env`.
+
+    Args:
+        name: a run's folder or checkpoint, or a pretrained agent; or what needs no weights: an
+            import path, `random`, or `bot`, which is the run's `opponents.bot_class`, or else the
+            environment's own bot.
+        trust: import what a run that another user made names.
+
+    Raises:
+        UserError: if nobody can be met there, or this player cannot play there.
+    """
+    if optional(env, "n_agents") < 2:
+        raise UserError(
+            f"A duel needs an environment with at least two agents, and {type(env).__name__} has "
+            "one here; choose another with env= and its settings"
+        )
+    if name == "bot":
+        name = factory.config_of(run).opponents.bot_class or name
+    if name in ("bot", "random") or (":" in name and not Path(name).exists()):
+        return Player(name, factory.make_bot(None if name == "bot" else name, env_settings, env))
+    return load_player(folders.load_checkpoint(folders.find(name), trust, env.device), env, run)
+
+
+class Arena:
+    """An environment in unseen homes, where the agent of a run meets others.
+
+    It has two agents, or as many as it has if their number is fixed. Each home is played in from
+    every agent's place, equally often, in up to `cfg.episodes` duels.
+    """
+
+    def __init__(
+        self,
+        cfg,
+        run: checkpoint.Checkpoint,
+        env: settings.Env,
+        geometry: Any,
+        homes: list,
+        device: Any,
+    ):
+        self.cfg, self.run, env = cfg, run, settings.changed(env, **FOR_TWO)
+        where = dict(seed=cfg.seed, device=device)
+        sample = factory.make_sample(env, homes, **where)
+        self.others = [find_player(name, run, env, sample, cfg.trust) for name in cfg.against or ()]
+        self.agent = load_player(run, sample, run)
+        n_agents = optional(sample, "n_agents")
+        n_duels = max(1, cfg.episodes // n_agents)  # from each place
+        homes = factory.spread(homes, n_duels)
+        n_duels -= n_duels % max(1, len(homes))
+        self.share = Share.of_this_rank(n_duels * n_agents, len(homes))
+        self.seed = rank_seed(cfg.seed, process_group.rank())
+        env = settings.changed(env, n_envs=len(self.share.envs))
+        where |= dict(geometries=[homes[home] for home in self.share.homes], seed=self.seed)
+        self.env, self.sample = factory.construct(env, **where), sample
+        slots = rotating_slots(self.share.n_envs, n_agents, self.env.device)
+        self.slots = slots[[*self.share.envs]]
+        self.place, self.env_settings = tables.place(env, geometry, homes, cfg.split), env
+        self.sources = factory.sources_of(homes)
+        warn_without_layout(self.env, homes)
+
+    def play(self, player: Player, opponent: Player) -> Any:
+        policies = player.policy, opponent.policy
+        with factory.errors():
+            played = duels.play(self.env, *policies, self.seed, self.cfg.greedy, slots=self.slots)
+        return self.share.with_others(played)
+
+    def duel(self, source: str | None = None) -> list[dict]:
+        """Plays the run's agent against each of `cfg.against`, in homes of a `source` or of
+        several. Returns the table rows.
+        """
+        roles, rows = optional(self.env, "roles"), []
+        for opponent in self.others:
+            played = self.play(self.agent, opponent)
+            summaries = duels.summaries(played, roles, None if source else self.sources)
+            if source == suite.DENSE and "homes" in played:
+                summaries.append({"tail": statistics.TAIL, **duels.worst_summary(played)})
+            rows += [{"against": opponent.name, **row} for row in summaries]
+        return rows
+
+    def rate(self) -> Path:
+        """Rates the run's snapshots, or else its checkpoints, and those of `cfg.against`, by duels
+        of each with each. Prints a table, writes ratings.csv and ratings.svg into the run's
+        folder, and returns the path of the first.
+        """
+        folder, players = folders.folder_of(self.run.path), []
+        for path in (
+            checkpoint.list_checkpoints(folder / "snapshots")
+            or checkpoint.list_checkpoints(folder / "checkpoints")
+            or [self.run.path]  # the file of an agent
+        ):
+            player = find_player(str(path), self.run, None, self.sample, self.cfg.trust)
+            players.append(player._replace(name=f"{player.step:,} samples"))
+        players += self.others
+        if len(players) < 2:
+            raise UserError(
+                f"{folder} has one checkpoint and nothing to compare it with: train with "
+                "snapshots=8, or name others with against="
+            )
+        played = {
+            (i, j): self.play(players[i], players[j])
+            for i, j in itertools.combinations(range(len(players)), 2)
+        }
+        scores = {pair: one["score"].tolist() for pair, one in played.items()}
+        if process_group.rank() > 0:
+            return folder
+        rows = ratings.rows(
+            [(player.name, player.step) for player in players], scores, self.cfg.seed
+        )
+        layouts, what = played[0, 1].get("homes"), f"{self.share.n_envs:,} duels of each pair"
+        n_homes = None if layouts is None else len(layouts.unique())
+        title = f"Ratings in {self.place.title(what, n_homes)}, seed {self.cfg.seed}"
+        cells = [[form.format_map(row) for form in tables.RATINGS.values()] for row in rows]
+        table = console.table([*tables.RATINGS], cells)
+        console.say(f"{title}\n{table}")
+        with user_errors(f"{folder} cannot be written: "):
+            folder.mkdir(parents=True, exist_ok=True)
+            ratings.write(folder, rows, title)
+        console.say(f"Plot: {folder / 'ratings.svg'}")
+        return folder / "ratings.csv"
+
+
+def warn_without_layout(env: Any, homes: list) -> None:
+    """Warns if environments share homes and it is unknown which."""
+    if optional(env, "layout") is None and 1 < len(homes) < env.n_envs:
+        console.warn(
+            f"{type(env).__name__} has no `layout`, the home of each environment: intervals take "
+            "every environment for a home of its own, and are too narrow"
+        )

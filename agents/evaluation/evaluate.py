@@ -1,0 +1,119 @@
+"""Measures a trained policy on unseen homes, or against others in duels."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from megastep.agents import console, factory
+from megastep.agents.distributed import process_group
+from megastep.agents.distributed.share import Share
+from megastep.agents.evaluation import arena, playing, statistics, suite, tables
+from megastep.agents.factory import settings
+from megastep.agents.generator import rank_seed
+from megastep.agents.runs import checkpoint, folders
+from megastep.agents.selfplay.bots import RandomActions
+from megastep.types import optional
+
+
+def run(cfg: settings.Evaluate) -> Path:
+    """Evaluates a run, each environment in one home throughout. Returns the path of the table.
+
+    Of several ranks, each plays its share. Rank 0 writes; the others return the run's folder.
+
+    Writes .json and .md into the run's folder `evaluations`, one of each per source of geometries
+    (per environment where it has none), split and checkpoint. Of `geometry=suite` plays as many
+    episodes in each source, and adds the worst source and the worst dense homes. With `cfg.against`
+    plays duels instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
+    """
+    start, device = time.monotonic(), factory.make_device(cfg.device)
+    loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
+    trained = factory.config_of(loaded)
+    env_settings = cfg.env or trained.env
+    geometry = factory.typed_or(trained.geometry, cfg.geometry, env_settings)
+    homes = factory.homes(env_settings, geometry, cfg.split)
+    if cfg.ratings:
+        path = arena.Arena(cfg, loaded, env_settings, geometry, homes, device).rate()
+    elif cfg.against is not None:
+        path = duel(cfg, loaded, env_settings, geometry, homes, device)
+    else:
+        rows = []
+        for source, part in suite.parts_of(geometry, homes):
+            rows += suite.of_source(source, play(cfg, loaded, env_settings, part, device, source))
+        if process_group.rank() > 0:
+            return folders.folder_of(loaded.path)
+        place = tables.place(env_settings, geometry, homes, cfg.split)
+        what = f"{rows[0]['lanes']:,} episodes{suite.each_source(geometry)}"
+        n_homes = suite.count_homes(rows)
+        rows = suite.with_worst_source(rows, "agent") if suite.is_suite(geometry) else rows
+        path = tables.write_table(
+            cfg,
+            loaded,
+            [place.source, "env" if cfg.env else "", cfg.split, str(loaded.step)],
+            f"{place.title(what, n_homes)}, after {loaded.step:,} samples "
+            f"({loaded.path.name}), seed {cfg.seed}",
+            rows,
+            [*map(tables.cells, rows)],
+        )
+    console.say(f"Evaluated in {console.duration(time.monotonic() - start)}")
+    return path
+
+
+def play(
+    cfg: settings.Evaluate,
+    loaded: checkpoint.Checkpoint,
+    env_settings: settings.Env,
+    homes: list,
+    device: Any,
+    source: str | None = None,
+) -> list[dict]:
+    """Plays `cfg.episodes` in homes, in all of a `source` or of several. Returns the table rows."""
+    homes = factory.spread(homes, cfg.episodes)
+    share = Share.of_this_rank(cfg.episodes, len(homes))
+    seed, trained = rank_seed(cfg.seed, process_group.rank()), factory.config_of(loaded)
+    env_settings = settings.changed(env_settings, n_envs=len(share.envs), resample=False)
+    where = dict(geometries=[homes[home] for home in share.homes], seed=seed, device=device)
+    env, rows = factory.construct(env_settings, **where), []
+    policy = factory.load_weights(factory.make_policy(trained.agent, env), env, loaded)
+    players = [("trained, greedy" if cfg.greedy else "trained", policy, cfg.greedy)]
+    players += [("random", RandomActions(env.action_space), False)] * cfg.baseline
+    sources = None if source else factory.sources_of(homes)
+    for name, player, greedy in players:
+        episodes = share.with_others(playing.first_episodes(env, player, seed, greedy))
+        summaries = statistics.summaries(episodes, optional(env, "roles"), sources)
+        if source == suite.DENSE and "homes" in episodes:
+            summaries.append({"tail": statistics.TAIL, **statistics.worst_summary(episodes)})
+        rows += [{"agent": name, **row} for row in summaries]
+    if process_group.rank() == 0:
+        arena.warn_without_layout(env, homes)
+    return rows
+
+
+def duel(
+    cfg: settings.Evaluate,
+    run: checkpoint.Checkpoint,
+    env: settings.Env,
+    geometry: settings.Geometry,
+    homes: list,
+    device: Any,
+) -> Path:
+    """Plays the run's agent against each of `cfg.against`, of a suite in each source. Prints and
+    writes a table, and returns the path of its .json.
+    """
+    rows = []
+    for source, part in suite.parts_of(geometry, homes):
+        meeting = arena.Arena(cfg, run, env, geometry, part, device)
+        rows += suite.of_source(source, meeting.duel(source))
+    if process_group.rank() > 0:
+        return folders.folder_of(run.path)
+    place = tables.place(meeting.env_settings, geometry, homes, cfg.split)
+    what = f"{rows[0]['duels']:,} duels{suite.each_source(geometry)}"
+    title = place.title(what, suite.count_homes(rows))
+    rows = suite.with_worst_source(rows, "against") if suite.is_suite(geometry) else rows
+    return tables.write_table(
+        cfg,
+        run,
+        ["duels", place.source, cfg.split, str(run.step), "against", *cfg.against],
+        f"{meeting.agent.name}, in {title}, seed {cfg.seed}",
+        rows,
+        [*map(tables.duel_cells, rows)],
+    )

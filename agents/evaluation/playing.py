@@ -1,0 +1,141 @@
+"""Plays episodes with a policy."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch.utils import _pytree
+
+from megastep.agents.generator import SeededGenerator
+from megastep.agents.storage.collector import capture_with
+from megastep.arrdict import arrdict
+from megastep.types import Env, Policy, Tree, World, n_lanes, optional
+
+#: Steps between two checks of whether all episodes have ended. A check waits for the GPU, which
+#: costs more than a few superfluous steps.
+CHECK_EVERY = 64
+
+
+#: Steps of a CUDA graph, a divisor of `CHECK_EVERY`.
+STEPS_PER_GRAPH = 16
+
+
+def step_until(
+    is_over: torch.Tensor,
+    step: Callable[[World, Tree], tuple[World, Tree]],
+    world: World,
+    state: Tree,
+    env: Env,
+    policies: tuple[Policy, ...],
+    roots: tuple,
+    max_steps: int,
+) -> None:
+    """Calls `world, state = step(world, state)` until all of `is_over` is true, or `max_steps`
+    times. On a GPU, in CUDA graphs after the first `CHECK_EVERY` steps, where libraries initialise
+    themselves, if `can_capture`; with a warning, if they cannot be recorded after all.
+
+    Args:
+        is_over: bool of any shape, which `step` changes in place.
+        step: acts by `policies`, steps `env`, and changes only what is below them and `roots`.
+        world: the current world.
+        state: the hidden state before the first step.
+        env: the environment.
+        policies: the policies that act.
+        roots: what else `step` changes, see `megastep.capture.capture`.
+        max_steps: maximum number of steps.
+    """
+
+    def several(world, state, n_steps=STEPS_PER_GRAPH):
+        for _ in range(n_steps):
+            world, state = step(world, state)
+        return world, state
+
+    play, before = several, None
+    for start in range(0, max_steps, STEPS_PER_GRAPH):
+        if start % CHECK_EVERY == 0 and bool(is_over.all()):
+            break
+        if start == CHECK_EVERY and is_over.is_cuda:
+            carried = world, state
+            if can_capture(env, policies) and _has_fixed_form(before, carried):
+                changed = is_over, *roots
+                play = capture_with(env, policies, several, carried, changed, warmup=1)
+        before = world, state
+        if start + STEPS_PER_GRAPH <= max_steps:
+            world, state = play(world, state)
+        else:
+            several(world, state, max_steps - start)
+
+
+def can_capture(env: Env, policies: Sequence[Policy]) -> bool:
+    """Returns whether steps of these may be replayed as a CUDA graph: if the environment is
+    `capturable`, and each policy, too. A policy is, unless it says otherwise, if its class is
+    megastep's, since others may keep a state where no graph sees it.
+    """
+    return optional(env, "capturable") and all(
+        getattr(policy, "capturable", type(policy).__module__.startswith("megastep."))
+        for policy in policies
+    )
+
+
+def _has_fixed_form(before, after):
+    """Returns whether both trees have tensors only, under the same names."""
+    (_, spec), (leaves, other) = map(_pytree.tree_flatten, (before, after))
+    return spec == other and all(isinstance(leaf, torch.Tensor) for leaf in leaves)
+
+
+@torch.no_grad()
+def first_episodes(
+    env: Env, policy: Policy, seed: int = 1, greedy: bool = False, max_steps: int = 100_000
+) -> arrdict:
+    """Plays the first episode of each lane.
+
+    Args:
+        seed: of the action sampling.
+        greedy: takes the most likely actions instead of sampling.
+        max_steps: maximum number of steps; unfinished episodes have `done` False.
+
+    Returns:
+        An arrdict on the environment's device:
+
+        - returns, lengths: (B,) float32; lengths in steps
+        - done: (B,) bool, true if the episode ended
+        - learns: (B,) bool, from the first world; all true if worlds have no `learns`
+        - metrics: name -> (B,) float32, from the last world of the episode; nan if unfinished
+        - envs: (B,) int64, the lane's environment
+        - homes: (B,) int32, the lane's layout; only if `env.layout` exists. Layouts change only at
+          respawns, so the whole episode is played in it.
+    """
+    device, n_agents = torch.device(env.device), optional(env, "n_agents")
+    draws = SeededGenerator(seed)
+    world, state = env.reset(), policy.initial(n_lanes(env), device)
+    layout = optional(env, "layout")
+    envs = torch.arange(env.n_envs, device=device).repeat_interleave(n_agents)
+    homes = {} if layout is None else {"homes": layout.repeat_interleave(n_agents)}
+    returns, lengths = (torch.zeros(n_lanes(env), device=device) for _ in range(2))
+    done = torch.zeros(n_lanes(env), dtype=torch.bool, device=device)
+    learns = torch.ones_like(done) if "learns" not in world else world["learns"].clone()
+    metrics = arrdict(
+        {name: torch.full_like(returns, torch.nan) for name in world.get("metrics", {})}
+    )
+
+    def step(world, state):
+        decision, state = policy(world, state, sample=not greedy, generator=draws.on(done.device))
+        world = env.step(decision)
+        returns.add_(torch.where(done, 0.0, world.reward))
+        lengths.add_(~done)
+        ends = (world.terminal | world.truncated) & ~done
+        for name, values in metrics.items():
+            values.copy_(torch.where(ends, world["metrics"][name], values))
+        done.logical_or_(ends)
+        return world, state
+
+    changed = draws, returns, lengths, metrics
+    step_until(done, step, world, state, env, (policy,), changed, max_steps)
+    return arrdict(
+        returns=returns,
+        lengths=lengths,
+        done=done,
+        learns=learns,
+        metrics=metrics,
+        envs=envs,
+        **homes,
+    )

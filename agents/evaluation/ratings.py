@@ -1,0 +1,108 @@
+"""Ratings of players from the results of their duels.
+
+Uses the Plackett-Luce model of Weng and Lin (JMLR 12, 2011) from the package openskill. A rating is
+a mean, which starts at 25, and a standard deviation for its uncertainty. A player rated 5.9 higher
+wins 73 % of the duels, a player rated 1 higher 54 %.
+"""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from megastep.agents.runs.atomic_files import write_atomically
+
+#: Number of orders that ratings are averaged over.
+N_ORDERS = 10
+
+#: Scores of player i in duels with player j, by (i, j): 1 won, 0 lost, 0.5 a draw.
+Scores = Mapping[tuple[int, int], Sequence[float]]
+
+
+def rate(n_players: int, scores: Scores, seed: int = 1) -> list[tuple[float, float]]:
+    """Returns the rating (mean, standard deviation) of each player.
+
+    The model updates ratings duel by duel, so they depend on the order of the duels. The result is
+    the mean over `N_ORDERS` random orders.
+    """
+    duels = [(i, j, score) for (i, j), values in scores.items() for score in values]
+    generator = np.random.default_rng(seed)
+    orders = [generator.permutation(len(duels)) for _ in range(N_ORDERS)]
+    ratings = [_rate_in_order(n_players, [duels[k] for k in order]) for order in orders]
+    return [(float(mean), float(sigma)) for mean, sigma in np.mean(ratings, 0)]
+
+
+def _rate_in_order(n_players, duels):
+    from openskill.models import PlackettLuce
+
+    model = PlackettLuce(tau=0.0)  # the strength of a player does not drift between duels
+    players = [model.rating() for _ in range(n_players)]
+    for i, j, score in duels:
+        [players[i]], [players[j]] = model.rate(
+            [[players[i]], [players[j]]], scores=[score, 1 - score]
+        )
+    return [(player.mu, player.sigma) for player in players]
+
+
+def rows(
+    players: Sequence[tuple[str, int | None]], scores: Scores, seed: int = 1
+) -> list[dict[str, Any]]:
+    """Returns a table row per player: rating, fraction of duels won (a draw is half), and duels.
+
+    Args:
+        players: (name, samples it was trained on, or None) of each player.
+    """
+    ratings = rate(len(players), scores, seed)
+    table = []
+    for k, ((name, samples), (mean, sigma)) in enumerate(zip(players, ratings, strict=True)):
+        results = [score for (i, _), values in scores.items() if i == k for score in values]
+        results += [1 - score for (_, j), values in scores.items() if j == k for score in values]
+        table.append(
+            dict(
+                player=name,
+                samples=samples,
+                rating=mean,
+                sigma=sigma,
+                won=sum(results) / len(results),
+                duels=len(results),
+            )
+        )
+    return table
+
+
+def write(folder: Path, table: Sequence[dict[str, Any]], title: str) -> None:
+    """Writes `ratings.csv` and `ratings.svg` into a folder, each atomically.
+
+    The plot shows rating against samples with two standard deviations. Players without samples are
+    horizontal lines.
+    """
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(table[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    write_atomically(folder / "ratings.csv", text.getvalue().encode())
+    write_atomically(folder / "ratings.svg", _plot(table, title))
+
+
+def _plot(table, title):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    trained = [row for row in table if row["samples"] is not None]
+    untrained = [row for row in table if row["samples"] is None]
+    samples, means, sigmas = (
+        np.array([row[key] for row in trained], float) for key in ("samples", "rating", "sigma")
+    )
+    axes.errorbar(samples, means, 2 * sigmas, marker="o", capsize=3, label="the run")
+    for i, row in enumerate(untrained):
+        axes.axhline(row["rating"], color=f"C{i + 1}", linestyle="--", label=row["player"])
+    axes.set(title=title, xlabel="samples", ylabel="rating ± two standard deviations")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    image = io.BytesIO()
+    figure.savefig(image, format="svg", metadata={"Date": None})
+    return image.getvalue()

@@ -1,0 +1,132 @@
+"""Tables of evaluations: where they were made, and the files that hold them."""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+from megastep.agents import console
+from megastep.agents.errors import user_errors
+from megastep.agents.factory.check import as_tree
+from megastep.agents.factory.settings import Env, Evaluate, Geometry, env_name, label
+from megastep.agents.runs import checkpoint
+from megastep.agents.runs.atomic_files import write_atomically
+from megastep.agents.runs.folders import folder_of, for_file
+
+INTERVAL = "95 % interval"
+
+
+class Place(NamedTuple):
+    """Where a run is evaluated.
+
+    Attributes:
+        env: the environment's name.
+        source: that of the homes, or of the environment if there are none, for file names.
+        choice: the choice of homes, for titles; empty if there are none.
+    """
+
+    env: str
+    source: str
+    choice: str
+
+    def title(self, what: str, n_homes: int | None) -> str:
+        """Returns `minimal: 1,024 episodes in 512 homes, geometry=homes, split=test`.
+
+        Args:
+            what: such as `1,024 episodes`.
+            n_homes: number of homes, if known.
+        """
+        homes = f" in {n_homes:,} home{'s' * (n_homes > 1)}" if n_homes else ""
+        return f"{self.env}: {what}{homes}{self.choice}"
+
+
+def place(env: Env, geometry: Geometry, homes: list, split: str) -> Place:
+    if not homes:
+        return Place(env_name(env), env_name(env), "")
+    path = Path(getattr(geometry, "path", None) or "")
+    is_ours = geometry.name.startswith("megastep.")
+    name = label(geometry.name) if is_ours else geometry.name
+    choice = f", geometry={name}{f' ({path.name})' * bool(path.name)}, split={split}"
+    return Place(env_name(env), "-".join(filter(None, [label(geometry.name), path.stem])), choice)
+
+
+def write_table(
+    cfg: Evaluate,
+    loaded: checkpoint.Checkpoint,
+    names: list[str],
+    title: str,
+    rows: list,
+    cells: list[dict],
+) -> Path:
+    """Prints a table, and writes it into the run's folder `evaluations`: `cells` for people, .md,
+    and `rows` for programs, .json. Returns the latter's path.
+    """
+    names = [name for name in (*names, "greedy" * cfg.greedy) if name]
+    folder, name = folder_of(loaded.path) / "evaluations", for_file("-".join(names))
+    head, lines = [*cells[0]], [[*row.values()] for row in cells]
+    result = dict(
+        title=title,
+        checkpoint=str(loaded.path),
+        step=loaded.step,
+        evaluation=as_tree(cfg),
+        rows=rows,
+    )
+    console.say(f"{title}\n{console.table(head, lines)}")
+    with user_errors(f"{folder} cannot be written: "):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(
+            folder / f"{name[:200]}.md",
+            f"{title}\n\n{console.table(head, lines, is_markdown=True)}\n".encode(),
+        )
+        write_atomically(folder / f"{name[:200]}.json", json.dumps(result, indent=2).encode())
+    return folder / f"{name[:200]}.json"
+
+
+#: Columns of a table of duels, and of one of ratings, as templates.
+DUELS = {
+    "against": "{against}",
+    "won": "{won:.3f}",
+    INTERVAL: "{lower:.3f} to {upper:.3f}",
+    **{name: f"{{{name}}}" for name in ("wins", "draws", "losses")},
+    "length": "{length:.0f}",
+    "duels": "{duels}",
+    "homes": "{homes}",
+}
+
+
+RATINGS = {
+    "player": "{player}",
+    "rating": "{rating:.2f}",
+    "sigma": "{sigma:.2f}",
+    "won": "{won:.3f}",
+    "duels": "{duels}",
+}
+
+
+def cells(row: dict) -> dict[str, str]:
+    cut, metrics = f", {row['unfinished']} cut short" if row["unfinished"] else "", {}
+    for name, metric in row["metrics"].items():
+        texts = [f"{value:.3g}" for value in metric.values() if value is not None] or 2 * ["none"]
+        metrics |= {name: texts[0], f"{name}: {INTERVAL}": " to ".join(texts[1:])}
+    return {
+        "agent": f"{row['agent']}{part_of(row)}",
+        "return": f"{row['return']:.2f}",
+        INTERVAL: f"{row['lower']:.2f} to {row['upper']:.2f}",
+        **metrics,
+        "length": f"{row['length']:.0f}",
+        "episodes": f"{row['lanes']}{cut}",
+        "homes": str(row["homes"] or "none"),
+    }
+
+
+def part_of(row: dict) -> str:
+    """Returns which of its agent's episodes a row has, `: hunter` or `, in maze`; empty for all."""
+    worst = f", worst {row['tail']:.0%} of homes" if "tail" in row else ""
+    worst += ", the worst source" * row.get("is_worst", False)
+    role = f": {row['role']}" if "role" in row else ""
+    return role + (f", in {row['source']}{worst}" if "source" in row else "")
+
+
+def duel_cells(row: dict) -> dict[str, str]:
+    against = f"{row['against']}{part_of(row).replace(': ', ', as ')}"
+    row = row | {"against": against, "homes": row["homes"] or "none"}
+    return {key: form.format_map(row) for key, form in DUELS.items()}

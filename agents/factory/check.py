@@ -1,0 +1,94 @@
+"""Settings from nested dicts, checked in one pass: `check(Train, tree)`. Knows no Hydra."""
+
+import contextlib
+import dataclasses
+import difflib
+import json
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from megastep.agents.errors import ConfigErrors
+from megastep.agents.factory import settings
+from megastep.agents.package import CONFIGS
+from megastep.settings import sentence
+
+Tree = dict[str, Any]
+
+
+def check(kind: type, tree: Tree, names: Iterable[str] = ()) -> Any:
+    """Returns the settings of dataclass `kind` from nested dicts.
+
+    Args:
+        kind: a dataclass of `settings`.
+        tree: nested dicts as YAML gives them; 1e6 counts as an integer.
+        names: more names to suggest for a mistyped key, such as groups.
+
+    Raises:
+        ConfigErrors: with everything that is wrong.
+    """
+    fields, errors = dict(fields_of(kind, tree)), {}
+    tree = json.loads(
+        json.dumps(tree),
+        parse_float=lambda text: int(float(text)) if float(text).is_integer() else float(text),
+    )
+    try:
+        # JSON is text, as YAML is: pydantic takes its lists for tuples and its strings for paths
+        return TypeAdapter(kind).validate_json(json.dumps(tree))
+    except ValidationError as error:
+        for line in error.errors():
+            path = [str(part) for part in line["loc"]]
+            if line["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+                text = _unknown(path, [*fields, *names])
+            else:
+                while ".".join(path) not in fields:  # inside a list, or an option of a union
+                    path.pop()
+                text = sentence(line, fields[".".join(path)], line["input"])
+            errors.setdefault(".".join(path), text)
+        raise ConfigErrors(errors.items()) from None
+
+
+def as_tree(chosen: Any) -> Tree:
+    """The inverse of `check`."""
+    return TypeAdapter(type(chosen)).dump_python(chosen, mode="json")
+
+
+def fields_of(kind: type, tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields (dotted key, pydantic's field) of every setting, and of every group of settings.
+
+    `tree` names the members of groups: which keys `env.` has depends on `env.name`.
+    """
+    for name, field in kind.__pydantic_fields__.items():
+        yield prefix + name, field
+        below, value = field.annotation, tree.get(name) if isinstance(tree, dict) else None
+        if name in settings.GROUPS:
+            with contextlib.suppress(KeyError, TypeError, ValueError):
+                below = settings.kind_of(name, str(value["name"]))
+        if dataclasses.is_dataclass(below):
+            yield from fields_of(below, value, f"{prefix}{name}.")
+
+
+def leaves(tree: Tree, prefix: str = "") -> list[tuple[str, Any]]:
+    """[(dotted key, value)] of nested dicts."""
+    if not isinstance(tree, dict):
+        return [(prefix[1:], tree)]
+    return [leaf for key, below in tree.items() for leaf in leaves(below, f"{prefix}.{key}")]
+
+
+def closest_key(key: str, keys: Iterable[str]) -> str:
+    # by the whole key or its last part: `lr` and `learner.lrr` find `learner.lr`
+    keys = {name.rpartition(".")[2]: name for name in keys} | {name: name for name in keys}
+    near = difflib.get_close_matches(key, keys, n=1, cutoff=0.6)
+    near = near or difflib.get_close_matches(key.rpartition(".")[2], keys, n=1, cutoff=0.5)
+    return f"did you mean {keys[near[0]]}?" if near else "--cfg job prints all keys"
+
+
+def _unknown(path: list[str], keys: list[str]) -> str:
+    group, leaf = path[0], path[-1]
+    for file in (CONFIGS / group).glob("*.yaml") if group in settings.GROUPS else ():
+        name = yaml.safe_load(file.read_text())["name"]
+        if path[1:] == [leaf] and leaf in settings.kind_of(group, name).__pydantic_fields__:
+            return f"no such key here; {group}={file.stem} has it"
+    return f"no such key; {closest_key('.'.join(path), keys)}"

@@ -1,0 +1,106 @@
+"""The arguments of the components of megastep, known without importing them.
+
+Settings are arguments of constructors, whose modules import PyTorch: that takes seconds, in which a
+typing error should long have been named. So all arguments are read once and cached on disk under a
+hash of the sources.
+"""
+
+import functools
+import hashlib
+import inspect
+import pickle
+import sys
+from pathlib import Path
+from typing import Literal
+
+import pydantic
+import yaml
+
+import megastep
+from megastep import cache
+from megastep.agents import package
+from megastep.imports import import_object
+from megastep.settings import arguments_of
+
+POLICY = "megastep.agents.networks.policy:Policy"
+FILES = "megastep.geometries.sources:files"
+MIXED = "megastep.geometries.sources:mixed"
+CHECK_PARTS = "megastep.geometries.sources:check_parts"
+SUITE = "megastep.geometries.sources:suite"
+OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
+#: How the arguments of a group's members become settings, as `arguments_of` takes it: `reserved`
+#: are passed by the program, `missing` are defaults, and the others are settings beside them.
+ARGUMENTS = {
+    "env": dict(
+        reserved=("geometries", "seed", "device", "privileged"), missing={"n_envs": 128}, name=str
+    ),
+    "geometry": dict(reserved=("split",), missing={"n": 512, "seed": 1}, name=str),
+    "learner": dict(
+        reserved=("policy", "seed", "graph"),
+        name=str,
+        # what lr falls to 0 over; auto: samples if given, else seconds if given
+        anneal=(Literal["auto", "never", "samples", "seconds"], "auto"),
+    ),
+    "curriculum": dict(reserved=("env", "learner", "rollout", "sources"), name=str),
+    "agent": dict(reserved=("obs_space", "action_space", "privileged_space", "seed")),
+    "opponents": dict(
+        reserved=("env", "policy", "scripted", "seed"),
+        bot_class=(str | None, None),  # None: the environment's own
+    ),
+}
+#: Number of versions of the sources whose arguments stay in the cache.
+VERSIONS = 8
+
+
+def built_in() -> dict[tuple[str, str], tuple[str, dict[str, tuple]]]:
+    """Returns what `arguments_of` returns of each component, by (group, import path)."""
+    return cached()[0]
+
+
+def takes_geometries(env: str) -> bool:
+    """Returns whether the environment of an import path takes floor plans."""
+    built_in, takers = cached()
+    return env in takers if ("env", env) in built_in else _takes_geometries(env)
+
+
+@functools.cache
+def cached() -> tuple[dict[tuple[str, str], tuple[str, dict[str, tuple]]], set[str]]:
+    """Returns what `read` does, from the cache on disk if no source has changed."""
+    content, _ = cache.fetch(f"arguments-{_sources()}", lambda: pickle.dumps(read()))
+    cache.prune("arguments-", VERSIONS)
+    return pickle.loads(content)
+
+
+def read() -> tuple[dict[tuple[str, str], tuple[str, dict[str, tuple]]], set[str]]:
+    """Imports every component of megastep. Returns what `built_in` does, and the import paths of
+    the environments that take floor plans.
+    """
+    names = [("agent", POLICY), ("opponents", OPPONENTS)]
+    for path in package.CONFIGS.glob("*/*.yaml"):
+        tree = yaml.safe_load(path.read_text()) or {}
+        names.append((path.parent.name, str(tree.get("name"))))
+    names = [
+        (group, name)
+        for group, name in names
+        if group in ARGUMENTS and name.startswith("megastep.")
+    ]
+    arguments = {
+        (group, name): arguments_of(import_object(name), **ARGUMENTS[group])
+        for group, name in names
+    }
+    return arguments, {name for group, name in names if group == "env" and _takes_geometries(name)}
+
+
+def _takes_geometries(env):
+    return "geometries" in inspect.signature(import_object(env)).parameters
+
+
+def _sources():
+    """A hash of whatever decides how arguments are read and stored."""
+    folders = Path(megastep.__file__).parent, package.CONFIGS.parent
+    files = {path for folder in folders for path in folder.rglob("*.py")}
+    files = sorted(files | {*package.CONFIGS.glob("*/*.yaml")})
+    digest = hashlib.sha256(f"{sys.version} {pydantic.VERSION}".encode())
+    for path in files:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:32]

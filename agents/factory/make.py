@@ -1,0 +1,307 @@
+"""Builds the objects of a run from its settings: device, homes, environment, policy, learner."""
+
+import functools
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+
+from megastep import contract, engine, scene, spaces
+from megastep.agents.algorithms.learner import LearnerError, check_learner
+from megastep.agents.distributed import process_group
+from megastep.agents.errors import ConfigErrors, UserError, user_errors
+from megastep.agents.factory import check
+from megastep.agents.factory.settings import (
+    Agent,
+    Curriculum,
+    Env,
+    Geometry,
+    Learner,
+    Train,
+    changed,
+    env_name,
+    label,
+    takes_geometries,
+)
+from megastep.agents.networks.policy import TRAINING_ONLY, Policy
+from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
+from megastep.agents.selfplay.bots import RandomActions
+from megastep.agents.selfplay.opponents import Opponents
+from megastep.agents.training import loggers
+from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.capture import state_tree
+from megastep.imports import import_object
+from megastep.types import n_lanes, optional
+
+#: Number of environments in which the memory of one is measured.
+PROBE = 65
+#: Environments of a sample, and the steps in which they must keep the contract.
+SAMPLE, SAMPLE_STEPS = 4, 16
+#: What the library raises for bad arguments, files and devices, and for too little memory.
+KINDS = (
+    ValueError,
+    OSError,
+    torch.OutOfMemoryError,
+    engine.EngineError,
+    checkpoint.CheckpointError,
+    loggers.LoggerError,
+    LearnerError,
+    contract.ContractError,
+)
+
+
+#: Turns errors of the library into a UserError that begins with a prefix. For setting up.
+errors = functools.partial(user_errors, kinds=KINDS)
+
+
+def construct(settings: Any, constructor: Callable | None = None, **arguments: Any) -> Any:
+    """Calls a class or function with those of the settings and arguments that it takes.
+
+    Args:
+        constructor: default: the one at the import path in `settings.name`.
+    """
+    with errors():
+        constructor = constructor or import_object(settings.name)
+        taken = inspect.signature(constructor).parameters
+        return constructor(**{k: v for k, v in (vars(settings) | arguments).items() if k in taken})
+
+
+def make_device(name: str) -> torch.device:
+    """Returns the device of this name, for a rank without a number the GPU of its own."""
+    place = process_group.launched()
+    if place and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
+        name = f"cuda:{place.local_rank}"
+    with errors():
+        device = engine.device(name)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)  # on which graphs are captured
+    return device
+
+
+def homes(env: Env, geometry: Geometry, split: str) -> list[dict]:
+    """Returns the different geometries of a split, in order; none if `env` takes no geometries."""
+    if not takes_geometries(env):
+        return []
+    return [*{id(home): home for home in construct(geometry, split=split)}.values()]
+
+
+def typed_or(geometry: Geometry, typed: Geometry | None, env: Env) -> Geometry:
+    """Returns the geometry that was typed, else the other. UserError if `env` takes none."""
+    if typed is None:
+        return geometry
+    if not takes_geometries(env):
+        raise UserError(
+            f"{env_name(env)} takes no floor plans, so it cannot be played in "
+            f"geometry={label(typed.name)}; leave geometry out"
+        )
+    return typed
+
+
+def spread(homes: list[dict], n_envs: int) -> list[dict]:
+    """Returns the homes, or `n_envs` evenly spaced ones of more. Without homes, returns none."""
+    return scene.spread(homes, n_envs) if homes else []
+
+
+def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:
+    """Returns a small environment of the same kind, which tells spaces and sizes.
+
+    Raises:
+        UserError: naming the clause of the contract that a class of the user's breaks.
+    """
+    is_ours = env.name.startswith("megastep.")
+    n_envs = 1 if is_ours else min(SAMPLE, env.n_envs)
+    sample = construct(changed(env, n_envs=n_envs), geometries=geometries[:1], **arguments)
+    if not is_ours:
+        with errors(f"{env.name}: "):
+            contract.rollout(sample, SAMPLE_STEPS)
+    return sample
+
+
+def check_memory(
+    env: Env, sample: Any, learner: Any, n_copies: int, geometries: list, **arguments: Any
+) -> None:
+    """Raises UserError with the number that fits, if there are too many environments, or too many
+    observations in a replay buffer, for the memory, which holds `n_copies` of each environment.
+
+    The `sample` gives an upper bound of what an environment takes, as it counts what environments
+    share. Only if that does not fit, more of them are made.
+    """
+    n_bytes = optional(learner, "bytes_per_env", LEARNER_DEFAULTS)(sample)
+    n, each = optional(learner, "replay_size", LEARNER_DEFAULTS)(sample)
+    total = n_copies * _nbytes(sample)
+    with errors():
+        engine.fit(n, each, sample.device, "observations of learner.replay.capacity")
+        n_bytes += n * each / env.n_envs
+        try:
+            engine.fit(env.n_envs, total + n_bytes, sample.device)
+        except engine.EngineError:
+            if env.n_envs > PROBE:  # fewer tell for themselves whether they fit
+                probe = changed(env, n_envs=PROBE)
+                probe = construct(probe, geometries=geometries[:1], **arguments)
+                n_bytes += (n_copies * _nbytes(probe) - total) / (PROBE - sample.n_envs)
+                engine.fit(env.n_envs, n_bytes, sample.device)
+
+
+def make_policy(agent: Agent, env: Any, seed: int = 1, critic: str | None = None) -> Policy:
+    """Returns a policy on the environment's device; without a `critic` it can only act."""
+    if torch.device(env.device).type == "cpu":
+        share_threads(agent.width)
+    with errors():
+        spaces = env.obs_space, env.action_space, optional(env, "privileged_space")
+        return Policy(*spaces, seed=seed, **vars(agent) | {"critic": critic}).to(env.device)
+
+
+def share_threads(width: int) -> None:
+    """Gives the engine all threads of the CPU, and PyTorch one per 128 units of a layer: in smaller
+    layers, threads lose more by waiting for each other than they gain.
+    """
+    n_threads = engine.threads()
+    engine.set_threads(n_threads)
+    torch.set_num_threads(max(1, min(n_threads, width // 128)))
+
+
+def make_learner(settings: Learner, policy: Policy, seed: int = 1) -> Any:
+    learner = construct(settings, policy=policy, seed=seed, graph=True)
+    with errors(f"{settings.name} is no learner: "):
+        check_learner(learner)
+        try:
+            checkpoint_format.check_plain(learner.state_dict(), "state_dict")
+        except TypeError as error:
+            raise LearnerError(error) from error
+    return learner
+
+
+def make_curriculum(settings: Curriculum, geometries: list[dict]) -> Callable | None:
+    """Returns a function of (env, learner, rollout) that makes the curriculum, None if there is to
+    be none.
+    """
+    if settings.name == "none":
+        return None
+    sources = sources_of(geometries)
+
+    def make(env, learner, rollout):
+        return construct(settings, env=env, learner=learner, rollout=rollout, sources=sources)
+
+    return make
+
+
+def sources_of(geometries: Sequence[Mapping]) -> list[str] | None:
+    """Returns the `source` of each geometry, which `geometry=mixed` sets; None if one has none."""
+    sources = [g.get("source") if isinstance(g, Mapping) else None for g in geometries]
+    return None if None in sources else [*map(str, sources)] or None
+
+
+def layout_sources(env: Env, geometries: list[dict]) -> list[str] | None:
+    """Returns the name of the source of each layout of an environment in training; None if floor
+    plans have no sources, or it is unknown which of them the layouts are.
+    """
+    sources = sources_of(geometries)
+    if sources is None or getattr(env, "resample", False):
+        return sources
+    if env.n_envs < len(sources) and not env.name.startswith("megastep."):
+        return None
+    return scene.spread(sources, env.n_envs)
+
+
+def make_opponents(
+    cfg: Train, env: Any, sample: Any, policy: Policy, seed: int = 1
+) -> Opponents | None:
+    """Returns the environment with opponents in it, None if there are to be none.
+
+    Args:
+        sample: a small environment, in which a scripted opponent is tried.
+        seed: of the opponents' actions.
+
+    Raises:
+        UserError: if the opponent cannot play there; with the number of snapshots that fits.
+    """
+    shares = {key: value for key, value in vars(cfg.opponents).items() if key != "bot_class"}
+    if not (cfg.opponents.past or cfg.opponents.bot):
+        return None
+    bot = make_bot(cfg.opponents.bot_class, cfg.env, sample) if cfg.opponents.bot else None
+    with errors():
+        if cfg.opponents.past:
+            n_bytes = sum(weight.nbytes for weight in policy.actor().state_dict().values())
+            n_bytes *= 2 if torch.device(env.device).type == "cuda" else 1  # one for the graph
+            engine.fit(cfg.opponents.snapshots, n_bytes, env.device, "snapshots")
+        return Opponents(env, policy, bot, seed=seed, **shares)
+
+
+def make_bot(name: str | None, settings: Env, env: Any) -> Any:
+    """Returns a policy that needs no weights.
+
+    It is given the environment's settings that it takes, such as `fov`, and takes one step in
+    `env`.
+
+    Args:
+        name: `random`, the import path of a class, or None, the class that is `env.bot`.
+
+    Raises:
+        UserError: if there is no such class, or it cannot play there.
+    """
+    if name == "random":
+        return RandomActions(env.action_space)
+    where = type(env).__name__
+    with errors():
+        constructor = optional(env, "bot") if name is None else import_object(name)
+    if constructor is None:
+        raise UserError(
+            f"{where} has no bot of its own; name a policy, in training with "
+            "opponents.bot_class=module:Class and in duels with against=module:Class"
+        )
+    name = name or f"{where}.bot"
+
+    def check_actions(space, leaf):
+        if len(leaf) != n_lanes(env) or not spaces.are_actions(space, leaf):
+            raise ValueError(f"its actions are not those of {space!r}")
+
+    # a policy may do whatever, where it was not made for
+    with user_errors(f"{name} cannot play in {where}; name one made for it: ", (Exception,)):
+        bot = construct(settings, constructor)
+        decision, _ = bot(env.reset(), bot.initial(n_lanes(env), env.device))
+        spaces.map(check_actions, env.action_space, decision["actions"])
+    return bot
+
+
+def config_of(loaded: checkpoint.Checkpoint) -> Train:
+    """Returns the settings that a checkpoint was trained with. UserError if they cannot be used."""
+    with user_errors(f"{loaded.path} cannot be used: ", (ConfigErrors,)):
+        return check.check(Train, loaded.config["train"])
+
+
+def spaces_of(env: Any) -> dict[str, str]:
+    """Returns the spaces of an environment as text: {'obs.rgb': 'MultiImage(...)', ...}."""
+    tree = {"obs": env.obs_space, "actions": env.action_space}
+    return {name: repr(space) for name, space in spaces.leaves(tree).items()}
+
+
+def load_weights(policy: Policy, env: Any, loaded: checkpoint.Checkpoint) -> Policy:
+    """Returns a policy made for `env` with a checkpoint's weights, the critic's too if both have
+    one. With the file of an agent, which only acts, the critic keeps the weights that it has.
+
+    Raises:
+        UserError: naming what differs, if they do not fit.
+    """
+    saved, present = loaded.config["spaces"], spaces_of(env)
+    if differing := [k for k in {**present, **saved} if saved.get(k) != present.get(k)]:
+        changes = [f"{k} was {saved.get(k)} and is {present.get(k)}" for k in differing]
+        ids = loaded.config["train"]["env"].get("id"), getattr(env, "id", None)
+        names = f", {ids[0]} and not {ids[1]}" if ids[0] != ids[1] else ""
+        raise UserError(
+            f"{loaded.path} was trained in another environment{names}: {'; '.join(changes)}. "
+            "Choose the env it was trained in"
+        )
+    weights, own = loaded.state["policy"], policy.state_dict()
+    if policy.critic is None:
+        weights = {k: v for k, v in weights.items() if not k.startswith(TRAINING_ONLY)}
+    elif agent_file.is_agent_file(loaded.path):
+        weights = weights | {k: v for k, v in own.items() if k.startswith(TRAINING_ONLY)}
+    agent = " ".join(f"agent.{k}={v}" for k, v in loaded.config["train"]["agent"].items())
+    with user_errors(f"{loaded.path} needs an agent with {agent}: ", (RuntimeError,)):
+        policy.load_state_dict(weights)
+    return policy
+
+
+def _nbytes(env):
+    return sum(getattr(leaf, "nbytes", 0) for leaf in state_tree(env).values())

@@ -1,0 +1,320 @@
+"""The settings of the scripts as frozen dataclasses, checked by their annotations. Knows no Hydra.
+
+configs/ holds the defaults of a run. The settings of environments, geometries, learners, agents and
+opponents are the arguments of their constructors, with the bounds and defaults given there.
+"""
+
+import dataclasses
+import functools
+import inspect
+import json
+import os
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_validator
+
+from megastep.agents.factory import components
+from megastep.imports import import_object
+from megastep.settings import closest, frozen, located, settings_class, settings_of
+
+
+def _device(name: str) -> str:
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
+        raise ValueError(f"{name!r} is no device; use auto, cpu, cuda or cuda:<number>")
+    return name
+
+
+def _ranks(n: int | str) -> int | str:
+    if n != "all" and (isinstance(n, str) or not 1 <= n <= 10_000):
+        raise ValueError(f"{n!r} is no number of ranks; use a number from 1 on, or all")
+    return n
+
+
+Above0 = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Steps = Annotated[int, Field(ge=1, le=100_000)]
+Samples = Annotated[int, Field(ge=1, le=10**18)]
+Split = Literal["training", "test", "all"]
+
+
+# ---- Groups ----
+
+
+@frozen
+class LocalLogger:
+    """TensorBoard and JSON lines, which are always written."""
+
+    name: str
+
+
+@frozen
+class WandbLogger:
+    """Weights & Biases as well."""
+
+    name: str
+    project: str
+    mode: Literal["online", "offline"]
+    group: str | None = None
+
+
+@frozen
+class NoCurriculum:
+    """Every home is drawn alike."""
+
+    name: str
+
+
+LOGGERS = {"none": LocalLogger, "wandb": WandbLogger}
+#: Groups of configs/ whose member has `name`, the import path of a class or function, and decides
+#: which settings there are: its arguments. Those it must have, with what each means.
+IMPORTED = {
+    "env": {"n_envs": "the number of environments"},
+    "geometry": {"n": "the number of geometries", "split": "its split", "seed": "an integer"},
+    "learner": {"policy": "the policy to improve"},
+    "curriculum": {"env": "the environment", "rollout": "the rollout"},
+}
+GROUPS = (*IMPORTED, "logger")
+
+
+@functools.cache
+def kind_of(group: str, name: str) -> type:
+    """Returns the dataclass of the settings of a group's member, by the member's `name`.
+
+    Raises:
+        ValueError: if nothing can be imported under this name, or it takes other arguments.
+    """
+    if group == "logger":
+        if name not in LOGGERS:
+            raise ValueError(f"{name!r} is unknown; {closest(name, LOGGERS)}")
+        return LOGGERS[name]
+    if (group, name) == ("curriculum", "none"):
+        return NoCurriculum
+    if (group, name) in components.built_in():
+        return settings_class(*components.built_in()[group, name])
+    constructor, spec = import_object(name), components.ARGUMENTS[group]
+    try:
+        taken = inspect.signature(constructor).parameters
+        if missing := [f"{k}, {text}" for k, text in IMPORTED[group].items() if k not in taken]:
+            raise ValueError(f"it takes no {missing[0]}")
+        return settings_of(constructor, **spec)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{name} cannot be used: {error}") from error
+
+
+def _group(group: str) -> Any:
+    """Returns the type of a field that holds the settings of a group's member."""
+
+    def settings(value):
+        if dataclasses.is_dataclass(value):
+            return value
+        if not isinstance(value, dict):
+            raise ValueError(f"is a group of keys, got {value!r}")
+        if "name" not in value:
+            raise ValueError(f"its keys need a member: give {group}= as well")
+        return TypeAdapter(kind_of(group, str(value["name"]))).validate_json(json.dumps(value))
+
+    return Annotated[Any, BeforeValidator(settings)]
+
+
+def changed(settings: Any, **changes: Any) -> Any:
+    """Returns a copy of settings with those of the changes that it has."""
+    return dataclasses.replace(
+        settings, **{k: v for k, v in changes.items() if hasattr(settings, k)}
+    )
+
+
+def takes_geometries(env: Any) -> bool:
+    """Returns True if the class of an environment's settings takes floor plans."""
+    return components.takes_geometries(env.name)
+
+
+def ignored_geometry(env: Any, typed: list[str]) -> list[tuple[str, str]]:
+    """Returns [(key, sentence)] of the first typed key that chooses a geometry, if the environment
+    takes none. `env` may be None, that of a run.
+    """
+    keys = [key for key in typed if key.split(".")[0] == "geometry"]
+    if not keys or env is None or takes_geometries(env):
+        return []
+    return [(keys[0], f"env={env_name(env)} takes no floor plans; leave geometry out")]
+
+
+def label(name: str) -> str:
+    """`explorer` for megastep.envs.explorer:Explorer."""
+    return name.rpartition(":")[2].rpartition(".")[2].lower()
+
+
+def env_name(env: Any) -> str:
+    """What an environment is called in titles, from its settings: `explorer`, or the id that one of
+    other packages has, `CartPole-v1`.
+    """
+    return getattr(env, "id", None) or label(env.name)
+
+
+def run_name(cfg: Any) -> str:
+    """What the folder of a run is called after the time, from its settings."""
+    geometry = [label(cfg.geometry.name)] if takes_geometries(cfg.env) else []
+    return "-".join([env_name(cfg.env), *geometry, str(cfg.seed)])
+
+
+Env, Geometry, Learner, Curriculum, Logger = map(_group, GROUPS)
+Agent = kind_of("agent", components.POLICY)
+Opposition = kind_of("opponents", components.OPPONENTS)
+
+
+def missing_sources(tree: dict[str, Any]) -> list[tuple[str, str]]:
+    """Returns [(key, sentence)] of files and parts of a mix that are named in nested dicts and do
+    not exist.
+    """
+    match tree.get("geometry"):
+        case {"name": components.FILES, "path": str(path)} if not os.path.isfile(path):
+            return [("geometry.path", f"there is no file {path!r}; give an .npz of geometries")]
+        case {"name": components.MIXED | components.SUITE, "parts": dict(parts)}:
+            try:
+                import_object(components.CHECK_PARTS)(parts)
+            except ValueError as error:
+                return [("geometry.parts", str(error))]
+    return []
+
+
+# ---- Scripts ----
+
+
+@frozen
+class Common:
+    """Settings of every script."""
+
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    device: Annotated[str, AfterValidator(_device)]
+    trust: bool = False  # import what checkpoints that others made name
+
+    def errors(self) -> dict[str, Any]:
+        # {dotted key: sentence} of settings that contradict each other, false for those that do not
+        return {}
+
+    @model_validator(mode="after")
+    def _agree(self):
+        if errors := [(key, text) for key, text in self.errors().items() if text]:
+            raise located(errors)
+        return self
+
+
+@frozen
+class Finish:
+    """What follows training."""
+
+    evaluate: bool
+    episodes: Count
+    record: bool
+    steps: Steps
+
+
+@frozen
+class Train(Common):
+    env: Env
+    geometry: Geometry
+    agent: Agent = Agent()
+    learner: Learner
+    curriculum: Curriculum = NoCurriculum(name="none")
+    opponents: Opposition = Opposition()
+    logger: Logger
+    finish: Finish
+    samples: Samples | None
+    seconds: Above0 | None
+    more_samples: Samples | None = None
+    more_seconds: Above0 | None = None
+    log_every: Count
+    checkpoint_seconds: Above0
+    keep_checkpoints: Annotated[int, Field(ge=2, le=1000)]
+    replay_every: Count = 20
+    desync: bool = True
+    nonfinite_replay: bool = True
+    snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
+    ranks: Annotated[int | str, AfterValidator(_ranks)] = 1
+    restarts: Annotated[int, Field(ge=0, le=1000)] = 0
+    dry_run: bool = False
+    folder: str | None
+    resume: str | None
+    rerun: str | None = None
+    init: str | None
+
+    def errors(self):
+        n_minibatches, over = getattr(self.learner, "n_minibatches", 1), self.learner.anneal
+        lag, env = getattr(self.learner, "lag", 0), self.env
+        has_curriculum = self.curriculum.name != "none"
+        is_async = lag and (self.opponents.past or self.opponents.bot)
+        # classes of users are asked when they are made
+        draws = getattr(env, "resample", not env.name.startswith("megastep."))
+        cure = "use env.resample=true" if hasattr(env, "resample") else "use curriculum=none"
+        return {
+            "curriculum": has_curriculum
+            and (lag or not draws)
+            and (
+                "the homes to draw change with every update, so nothing can be collected ahead of "
+                "it; use learner.lag=0"
+                if lag
+                else f"env={env_name(env)} draws no home for each episode; {cure}"
+            ),
+            "learner.n_minibatches": n_minibatches > self.env.n_envs
+            and f"{n_minibatches} is more than env.n_envs={self.env.n_envs}",
+            "learner.lag": is_async
+            and "opponents change with every update, so nothing can be collected ahead of it; use "
+            "learner.lag=0, or no opponents",
+            "learner.anneal": over in ("samples", "seconds")
+            and getattr(self, over) is None
+            and f"is {over}, and no {over}= is given for the learning rate to fall over",
+            **{
+                f"more_{name}": self.resume is None
+                and getattr(self, f"more_{name}") is not None
+                and f"comes on top of what a resumed run has had; give resume=RUN, or {name}="
+                for name in ("samples", "seconds")
+            },
+            "snapshots": self.snapshots
+            and not (self.samples or self.seconds or self.more_samples or self.more_seconds)
+            and "are spread over the budget; give samples= or seconds=",
+        }
+
+
+@frozen
+class Played(Common):
+    """Settings of what plays with a trained agent."""
+
+    env: Env | None = None
+    geometry: Geometry | None = None
+    split: Split
+    greedy: bool
+
+
+def _given(run):
+    if run is None:
+        raise ValueError("is missing; run=latest takes the newest run, run=FOLDER another one")
+    return run
+
+
+@frozen
+class Evaluate(Played):
+    run: Annotated[str, BeforeValidator(_given)]
+    episodes: Count
+    baseline: bool
+    against: tuple[str, ...] | None = None
+    ratings: bool = False
+
+
+@frozen
+class Record(Played):
+    run: str | None
+    steps: Steps
+    home: Annotated[int, Field(ge=0, le=1_000_000)]
+    against: str | None = None
+    file: str | None
+
+    def errors(self):
+        has_run, has_env = self.run is not None, self.env is not None
+        return {
+            "run": not (has_run or has_env)
+            and "is missing; without a run, env=explorer records random actions",
+            "env": has_run and has_env and "cannot be combined with run, which has its own",
+            "against": has_env
+            and self.against is not None
+            and "needs run=, the agent that plays against it",
+        }

@@ -1,0 +1,163 @@
+"""Makes the trainer of a run: a new one, one that continues, or one that starts from the weights of
+another.
+"""
+
+import math
+import random
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from megastep.agents import console, factory, package
+from megastep.agents.distributed import process_group
+from megastep.agents.errors import UserError
+from megastep.agents.factory import check, settings
+from megastep.agents.generator import SeededGenerator, rank_seed, stream_seed
+from megastep.agents.runs import agent_file, annealing, checkpoint, folders, provenance, saver
+from megastep.agents.runs.rank_files import RankFiles
+from megastep.agents.training import budget, loggers
+from megastep.agents.training.trainer import Trainer
+from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.types import optional
+
+
+def make_trainer(
+    cfg: settings.Train,
+    folder: Path,
+    device: torch.device,
+    token: str = "",
+    on_log: Callable[[Trainer], None] = lambda trainer: None,
+) -> Trainer:
+    """Returns a Trainer: continuing where a run stopped, or from the weights of another, if `cfg`
+    says so.
+
+    Each rank has one. All begin with the same weights; whatever else a seed decides differs.
+
+    Args:
+        token: a name that all ranks of this start have, and no other start.
+        on_log: called with the trainer after each report.
+    """
+    number, n_ranks = process_group.rank(), process_group.n_ranks()
+    seed = rank_seed(cfg.seed, number)
+    seed_everything(seed)
+    where = {
+        "geometries": factory.homes(cfg.env, cfg.geometry, "training"),
+        "seed": seed,
+        "device": device,
+        "privileged": cfg.agent.critic == "asymmetric",
+    }
+    sample = factory.make_sample(cfg.env, **where)
+    policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
+    policy.generator = SeededGenerator(stream_seed(seed, "policy"))
+    learner = factory.make_learner(cfg.learner, policy, seed)
+    cfg = annealed(cfg, optional(learner, "set_lr", LEARNER_DEFAULTS) is not None)
+    n_copies = 2 if cfg.nonfinite_replay else 1  # of the environments' state
+    factory.check_memory(cfg.env, sample, learner, n_copies, **where)
+    env = factory.construct(cfg.env, **where)
+    if cfg.resume or cfg.init:
+        path = folders.find(cfg.resume or cfg.init)
+        loaded = folders.load_checkpoint(path, cfg.trust, device, cfg.resume is not None, number)
+        factory.load_weights(policy, env, loaded)
+        if number == 0 and policy.critic is not None and agent_file.is_agent_file(path):
+            console.say(f"{folders.name_of(path)} has no critic, so this run begins with a new one")
+    opponents = factory.make_opponents(cfg, env, sample, policy, seed)
+    for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
+        checkpoint.set_aside_after(folder / name, loaded.step)
+    config = {"train": check.as_tree(cfg), "spaces": factory.spaces_of(env)}
+    wandb = vars(cfg.logger) | {"name": folder.name, "config": config["train"]}
+    made_with = provenance.made_with(device, package.version(), n_ranks)
+    checkpoints, had = folder / "checkpoints", loaded.state if cfg.resume else Counter()
+    with factory.errors():
+        limits = budget_of(cfg, folder, loaded if cfg.resume else None)
+        logger, writers = loggers.NoLogger(), {}
+        rank_files = RankFiles(checkpoints, token, number, n_ranks)
+        if number == 0:  # which alone writes these
+            wandb = wandb if cfg.logger.name == "wandb" else None
+            logger = loggers.Loggers(folder, had["samples_at_report"], wandb)
+            snapshots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
+            writers = dict(
+                on_log=on_log,
+                snapshot_saver=saver.SnapshotSaver(snapshots, cfg.snapshots),
+                annealing_record=annealing.AnnealingRecord(folder, had["updates"]),
+            )
+        improves = Trainer(
+            opponents or env,
+            policy,
+            learner,
+            logger,
+            saver.Saver(
+                checkpoints, config, cfg.keep_checkpoints, made_with, cfg.replay_every, rank_files
+            ),
+            limits,
+            log_every=cfg.log_every,
+            checkpoint_seconds=cfg.checkpoint_seconds,
+            desync=cfg.desync,
+            opponents=opponents,
+            make_curriculum=factory.make_curriculum(cfg.curriculum, where["geometries"]),
+            layout_sources=factory.layout_sources(cfg.env, where["geometries"]),
+            replay_folder=folder if cfg.nonfinite_replay else None,
+            **writers,
+        )
+        if cfg.resume:
+            improves.load_state_dict(loaded.state, is_new_rank=number >= loaded.n_ranks)
+            improves.lost += differing(loaded.made_with, made_with)
+    return improves
+
+
+def differing(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """Returns a clause for each of the things that a run's bits depend on that has changed."""
+    before, now = {"ranks": 1, **before}, {"ranks": 1, **now}
+    return [
+        f"{name} was {value} and is {now.get(name)}"
+        for name, value in before.items()
+        if value != now.get(name)
+    ]
+
+
+def seed_everything(seed: int) -> None:
+    """Seeds the global generators of PyTorch, NumPy and Python, which only code of the user's draws
+    from.
+    """
+    seed = stream_seed(seed, "global")
+    torch.manual_seed(seed)
+    np.random.seed(seed % 2**32)
+    random.seed(seed)
+
+
+def budget_of(
+    cfg: settings.Train, folder: Path, loaded: checkpoint.Checkpoint | None
+) -> budget.Budget:
+    """Returns the budget of a run, with the factors of the learning rate that are to be repeated.
+
+    Raises:
+        UserError: the run to repeat did not record them.
+    """
+    limits, recorded = (cfg.samples, cfg.seconds, cfg.learner.anneal), ()
+    if cfg.rerun:
+        source = folders.folder_of(folders.find(cfg.rerun))
+        recorded = annealing.read(source)
+        if not recorded or any(map(math.isnan, recorded)):
+            raise UserError(
+                f"{source} cannot be repeated: {annealing.FILE} does not hold the learning rate of "
+                "each update, as an earlier version began the run; start a new one with its "
+                f"settings, which are in {source / 'config.yaml'}"
+            )
+    elif loaded is not None:
+        recorded = annealing.read(folder)
+        # a clock of another budget would have chosen others
+        if cfg.learner.anneal != "seconds" or loaded.config["train"]["seconds"] != cfg.seconds:
+            recorded = recorded[: loaded.state["updates"]]
+    return budget.Budget(*limits, recorded, is_rerun=cfg.rerun is not None)
+
+
+def annealed(cfg: settings.Train, has_set_lr: bool = True) -> settings.Train:
+    """Returns `cfg` with learner.anneal=auto replaced: by samples if limited, else by seconds if
+    limited, else by never; by never if the learner has no `set_lr`.
+    """
+    limits = [n for n in ("samples", "seconds") if has_set_lr and getattr(cfg, n) is not None]
+    anneal = [*limits, "never"][0] if cfg.learner.anneal == "auto" else cfg.learner.anneal
+    return settings.changed(cfg, learner=settings.changed(cfg.learner, anneal=anneal))

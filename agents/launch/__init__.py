@@ -1,0 +1,1 @@
+"""Processes: the ranks of a run, their GPUs, signals, and how they end."""

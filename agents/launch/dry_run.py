@@ -1,0 +1,52 @@
+"""Prints what a training run would do: the sizes of a rank, and of all."""
+
+from megastep.agents import console, factory
+from megastep.agents.factory import settings
+from megastep.agents.launch import launcher
+from megastep.agents.selfplay.opponents import count_environments
+from megastep.types import n_lanes, optional
+
+
+def show(cfg: settings.Train) -> None:
+    """Prints the sizes of a run, per rank and in total. Trains nothing and writes no file."""
+    n_ranks = launcher.n_ranks(cfg)
+    device = factory.make_device(cfg.device)
+    names = ["", "a rank", "in total"] if n_ranks > 1 else ["", "in total"]
+    rows = [
+        [name, *(f"{number * factor:,}" for factor in {1: None, n_ranks: None})]
+        for name, number in sizes(cfg, device).items()
+    ]
+    ranks = f"{n_ranks} x " if n_ranks > 1 else ""
+    console.say(f"Would train on {ranks}{device.type}:\n{console.table(names, rows)}")
+
+
+def sizes(cfg: settings.Train, device) -> dict[str, int]:
+    """Returns the numbers of one rank, as far as the learner has them."""
+    geometries = factory.homes(cfg.env, cfg.geometry, "training")
+    options = dict(seed=cfg.seed, device=device, privileged=cfg.agent.critic == "asymmetric")
+    sample = factory.make_sample(cfg.env, geometries, **options)
+    lanes = cfg.env.n_envs * n_lanes(sample) // sample.n_envs
+    n_steps = getattr(cfg.learner, "n_steps", None)
+    n_minibatches = getattr(cfg.learner, "n_minibatches", None)
+    numbers = {"environments": cfg.env.n_envs, "lanes": lanes}
+    n_opponents = count_opponents(cfg, sample)
+    if n_opponents:
+        lanes -= n_opponents
+        numbers["lanes that learn"] = lanes
+    if n_steps:
+        numbers["samples of an update"] = lanes * n_steps
+    if n_steps and n_minibatches:
+        numbers["samples of a minibatch"] = lanes * n_steps // n_minibatches
+    return numbers
+
+
+def count_opponents(cfg: settings.Train, sample) -> int:
+    """Returns the number of lanes that opponents play. UserError if they do not fit."""
+    opponents = cfg.opponents
+    if not (opponents.past or opponents.bot):
+        return 0
+    shares = opponents.past, opponents.bot, opponents.snapshots
+    with factory.errors():
+        n_per_snapshot, n_bot = count_environments(sample, cfg.env.n_envs, *shares)
+    n_past = n_per_snapshot * opponents.snapshots if opponents.past else 0
+    return (n_past + n_bot) * (optional(sample, "n_agents") - 1)

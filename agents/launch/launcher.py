@@ -1,0 +1,250 @@
+"""Starts the ranks of `ranks=2` on this machine through torchrun's library, and waits for them.
+
+The settings are composed and checked once, here. Each rank is a process that reads them from a
+temporary folder, the *job's folder*, in which it also notes its process's number and how it ended.
+So this process alone prints errors, forwards signals, and has the exit code of one process.
+
+torchrun's agent runs in a thread: it would send a signal on and then give ranks 30 s to save.
+"""
+
+import contextlib
+import json
+import logging
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from megastep.agents import console, package
+from megastep.agents.distributed import environment
+from megastep.agents.errors import ConfigErrors, shortened
+from megastep.agents.factory import check, settings
+from megastep.agents.launch import gpu, signals
+from megastep.agents.launch.endings import Ending
+from megastep.agents.runs import folders
+
+#: The environment variable that has the job's folder, for ranks that this module started.
+JOB = "MEGASTEP_JOB"
+#: Its files: the settings, the signal that stops all ranks, and the folder of the run.
+SETTINGS, STOPPED, RUN = "settings.json", "stopped", "run"
+#: The exit code if a rank was killed, or hangs.
+LOST = 3
+#: Runs a rank. The current folder is not searched for modules before those of Python are.
+RANK = """import sys
+sys.path[:] = filter(None, sys.path)
+from megastep.agents.launch import rank_process
+sys.exit(rank_process.main())"""
+
+
+def n_ranks(cfg: settings.Train) -> int:
+    """Returns the number of ranks of a training run.
+
+    Raises:
+        ConfigErrors: they are to share a GPU.
+    """
+    if cfg.ranks == 1:
+        return 1
+    place, n_gpus = environment.launched(), gpu.count() if cfg.device != "cpu" else 0
+    if ":" in cfg.device:
+        text = f"{cfg.device!r} is one GPU, and ranks have one each; use device=cuda"
+        raise ConfigErrors([("device", text)])
+    if cfg.ranks == "all":
+        if not n_gpus:
+            where = "device=cpu" if cfg.device == "cpu" else "this machine has none"
+            text = f"'all' is every GPU, and {where}; give a number, such as ranks=2"
+            raise ConfigErrors([("ranks", text)])
+        return n_gpus
+    if n_gpus and cfg.ranks > n_gpus and place is None:
+        n_here = f"{n_gpus} GPU{'s' * (n_gpus > 1)}"
+        text = f"{cfg.ranks} is more than the {n_here} of this machine; ranks=all is one for each"
+        raise ConfigErrors([("ranks", text)])
+    return cfg.ranks
+
+
+def is_needed(cfg: settings.Train) -> bool:
+    """Returns whether training is done by other processes, which this one starts."""
+    return environment.launched() is None and (cfg.ranks != 1 or cfg.restarts > 0)
+
+
+def run(cfg: settings.Train) -> Path:
+    """Trains with several ranks, and returns the run folder.
+
+    Raises:
+        UserError, Interrupted: as a training run in this process does.
+    """
+    cfg = settings.changed(cfg, ranks=n_ranks(cfg))
+    with contextlib.ExitStack() as stack:
+        job = Job(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="megastep-"))), cfg)
+        stack.enter_context(variables(job.folder, cfg.ranks))
+        agent = threading.Thread(target=job.run_agent, daemon=True)
+        with signals.handled(job.stop, job.quit) as numbers:
+            agent.start()
+            while agent.is_alive():
+                agent.join(0.2)
+                job.look()
+        ending = job.ending()
+    if numbers:
+        by_signal = ending.code == 128 + numbers[0]
+        name = signal.Signals(numbers[0]).name
+        raise signals.Interrupted(numbers[0], ending.text if by_signal else f"stopped by {name}")
+    ending.raise_error()
+    return Path(ending.folder)
+
+
+class Job:
+    """The ranks of one training run.
+
+    Args:
+        folder: a temporary one.
+        cfg: the settings, with the number of ranks.
+    """
+
+    def __init__(self, folder: Path, cfg: settings.Train):
+        self.folder, self.cfg = folder, cfg
+        self.attempt, self.error = 0, None
+        self.cleared: set[int] = set()  # attempts of which nothing is left
+        facts = dict(
+            settings=check.as_tree(cfg),
+            argv=sys.argv,
+            command=sys.orig_argv,
+            prefix=console.prefix,
+            parent=os.getpid(),
+        )
+        (folder / SETTINGS).write_text(json.dumps(facts))
+
+    def run_agent(self) -> None:
+        """Runs torchrun's agent until all ranks have ended."""
+        try:
+            launch_ranks(self.cfg.ranks, self.cfg.restarts)
+        except BaseException as error:
+            self.error = error
+
+    def stop(self, number: int) -> None:
+        """Passes a signal on to the ranks; those that begin later end at once."""
+        (self.folder / STOPPED).touch()
+        self.look()
+        self.send(number)
+
+    def quit(self, number: int) -> None:
+        """Ends all ranks at once."""
+        self.send(signal.SIGKILL)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def send(self, number: int) -> None:
+        for path in self.folder.glob(f"pid-{self.attempt}-*"):
+            with contextlib.suppress(OSError, ValueError):  # it has ended, or just begins to write
+                os.kill(int(path.read_text()), number)
+
+    def look(self) -> None:
+        """Ends what is left of ranks that lost one; torchrun gives them 30 s. Says so if the ranks
+        start again.
+        """
+        ending = self.ending_of(self.attempt)
+        if ending and ending.code == LOST and self.attempt not in self.cleared:
+            self.cleared.add(self.attempt)
+            self.send(signal.SIGKILL)
+        if [*self.folder.glob(f"pid-{self.attempt + 1}-*")]:
+            ending = self.ending_of(self.attempt) or self.unknown_ending()
+            self.attempt += 1
+            again = f"Starting again, {self.attempt} of restarts={self.cfg.restarts}"
+            problem = ending.text.partition(" To continue: ")[0]
+            console.warn(" ".join(filter(None, [problem, f"{again}."])))
+
+    def ending(self) -> Ending:
+        """Returns how the ranks ended."""
+        ending, failures = self.ending_of(self.attempt), getattr(self.error, "failures", None)
+        is_stopped = (self.folder / STOPPED).exists()
+        if ending and ending.code > 128 and failures and not is_stopped:
+            ending = None  # torchrun's own signal, to what is left of the ranks
+        return ending or self.unknown_ending()
+
+    def ending_of(self, attempt: int) -> Ending | None:
+        path = self.folder / f"ending-{attempt}"
+        return Ending.read(path) if path.exists() else None
+
+    def unknown_ending(self) -> Ending:
+        """Returns how ranks ended that could not say it."""
+        failures = getattr(self.error, "failures", {})
+        for rank, failure in failures.items():
+            if failure.exitcode < 0:
+                name = signal.Signals(-failure.exitcode).name
+                text = f"was ended by {name}" + ", or too little memory" * (name == "SIGKILL")
+            else:
+                text = f"ended with exit code {failure.exitcode}"
+            place = f"rank {rank} on {environment.hostname()}"
+            return Ending(LOST, f"{place} {text}. {hint(self.run_folder())}")
+        reason = shortened(self.error or "they ended without a message", 400)
+        return Ending(2, f"The ranks cannot be started: {reason}")
+
+    def run_folder(self) -> Path | None:
+        path = self.folder / RUN
+        return Path(path.read_text()) if path.exists() else None
+
+
+def hint(folder: Path | None) -> str:
+    """Returns what is left of a training run that ended in the middle of an update."""
+    if folder is None or not any((folder / "checkpoints").glob("*")):
+        return "Nothing was saved yet"
+    return f"Its last checkpoint is whole. To continue: {folders.resume_command(folder)}"
+
+
+def launch_ranks(n_ranks: int, n_restarts: int) -> None:
+    """Runs torchrun's agent.
+
+    Raises:
+        ChildFailedError: of torch.distributed, if a rank failed.
+    """
+    from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs
+    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+    # its warnings and errors are those of the ranks, which are told in one sentence
+    logger = logging.getLogger("torch.distributed")
+    logger.handlers, logger.propagate = [logging.NullHandler()], False
+    config = LaunchConfig(
+        min_nodes=1,
+        max_nodes=1,
+        nproc_per_node=n_ranks,
+        run_id=uuid.uuid4().hex,
+        rdzv_backend="c10d",
+        rdzv_endpoint="localhost:0",
+        local_addr="localhost",
+        max_restarts=n_restarts,
+        monitor_interval=0.1,
+        logs_specs=DefaultLogsSpecs(log_dir=os.devnull),
+    )
+    elastic_launch(config, sys.executable)("-c", RANK)
+
+
+@contextlib.contextmanager
+def variables(job: Path, n_ranks: int) -> Iterator[None]:
+    """Sets the environment variables of ranks on one machine, for the time of this context."""
+    changes: dict[str, Any] = {JOB: str(job)}
+    if (package.ROOT / "train.py").exists():  # in a checkout, which need not be installed
+        paths = filter(None, [str(package.ROOT), os.environ.get("PYTHONPATH")])
+        changes["PYTHONPATH"] = os.pathsep.join(paths)
+    # a job of Slurm's may use some of a machine's cores only
+    is_linux = hasattr(os, "sched_getaffinity")
+    n_cores = len(os.sched_getaffinity(0)) if is_linux else os.cpu_count() or 1
+    defaults = {
+        "OMP_NUM_THREADS": str(max(1, n_cores // n_ranks)),
+        "TORCH_CPP_LOG_LEVEL": "ERROR",
+    }
+    if os.path.exists("/sys/class/net/lo"):  # whether or not the machine's name has an address
+        defaults["GLOO_SOCKET_IFNAME"] = "lo"
+    changes |= {name: text for name, text in defaults.items() if name not in os.environ}
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, text in before.items():
+            if text is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = text

@@ -1,0 +1,131 @@
+"""What the ranks of a training run check together before they train. One process has nothing to
+check.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import os
+import platform
+import secrets
+import shutil
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from megastep.agents import factory, package
+from megastep.agents.distributed import process_group
+from megastep.agents.distributed.agreement import from_rank_0, together
+from megastep.agents.distributed.drift import first_difference, first_differing_fact
+from megastep.agents.errors import UserError, user_errors
+from megastep.agents.factory import check, settings
+from megastep.agents.launch.rank import Team
+from megastep.agents.runs import folders, provenance
+from megastep.agents.training.trainer import Trainer
+
+#: Seconds until what rank 0 writes must be seen on another machine.
+SHARED_SECONDS = 10.0
+
+
+def check_start(cfg: settings.Train) -> None:
+    """Raises UserError if the ranks differ in versions, code or configuration."""
+    if process_group.n_ranks() > 1:
+        facts = {
+            "torch": torch.__version__,
+            "CUDA": torch.version.cuda,
+            "NumPy": np.__version__,
+            "Python": platform.python_version(),
+            "megastep": package.version(),
+            "the commit of the checkout": provenance.commit(package.ROOT),
+        }
+        _check_equal(facts | dict(check.leaves(check.as_tree(cfg))))
+
+
+def check_world(cfg: settings.Train, running: Trainer) -> None:
+    """Raises UserError if the ranks differ in homes, spaces or initial weights."""
+    if process_group.n_ranks() > 1:
+        homes = factory.homes(cfg.env, cfg.geometry, "training")
+        _check_equal(
+            {"the digest of the training homes": digest(homes), **running.saver.config["spaces"]}
+        )
+        if difference := first_difference(running.policy):
+            raise UserError(f"The ranks begin with different weights: {difference}")
+
+
+def _check_equal(facts):
+    if difference := first_differing_fact(facts):
+        raise UserError(
+            f"The ranks differ: {difference}; start all with the same code, packages and words"
+        )
+
+
+def digest(homes: Iterable[dict[str, Any]]) -> str:
+    """Returns a short text that geometries have in common only if they are equal."""
+    total = hashlib.sha256()
+    for home in homes:
+        for name in sorted(home):
+            value = np.asarray(home[name])
+            total.update(f"{name} {value.dtype} {value.shape}".encode())
+            total.update(str(value).encode() if value.dtype == object else value.tobytes())
+    return total.hexdigest()[:16]
+
+
+def check_shared(folder: Path) -> str:
+    """Checks that all ranks see the run folder that rank 0 has opened.
+
+    Returns:
+        A name that all ranks of this start have, and no other start.
+
+    Raises:
+        UserError: on all ranks, if it is another folder for one of them.
+    """
+    name = from_rank_0(secrets.token_hex)
+    if process_group.n_ranks() == 1:
+        return name
+    token = f".ranks-{name}"
+
+    def look():
+        deadline = time.monotonic() + SHARED_SECONDS
+        while not (folder.is_dir() and token in os.listdir(folder)):
+            if time.monotonic() > deadline:
+                raise UserError(
+                    f"The run folder {folder.absolute()} of rank 0 is not here; start all ranks "
+                    "in one folder that their machines share, or give folder= with a path there"
+                )
+            time.sleep(0.1)
+
+    with user_errors(folders.CANNOT.format(folder)):
+        from_rank_0((folder / token).touch)
+    try:
+        together(look)
+    finally:
+        if process_group.rank() == 0:
+            with contextlib.suppress(OSError):
+                (folder / token).unlink()
+    return name
+
+
+def started_again(cfg: settings.Train, team: Team | None) -> settings.Train:
+    """Returns the settings with which a run goes on, if torchrun has started the ranks again: from
+    its last checkpoint, or from the beginning if there is none.
+    """
+    folder = from_rank_0(lambda: team and team.earlier_folder())
+    if folder is None:
+        return cfg
+
+    def totals():
+        if not any((folder / "checkpoints").glob("*")):
+            if not cfg.resume:
+                shutil.rmtree(folder, ignore_errors=True)
+            return None
+        saved = folders.load_checkpoint(folder, cfg.trust).config["train"]
+        return {name: saved[name] for name in ("samples", "seconds")}
+
+    if limits := from_rank_0(totals):
+        limits |= dict(more_samples=None, more_seconds=None, init=None, folder=None)
+        return dataclasses.replace(cfg, resume=str(folder), **limits)
+    return cfg if cfg.resume else dataclasses.replace(cfg, folder=str(folder))

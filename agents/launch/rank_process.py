@@ -1,0 +1,54 @@
+"""Runs a rank of a training run that `launch` has started, in a process of its own."""
+
+import json
+import os
+import signal
+import sys
+import threading
+import traceback
+import warnings
+from pathlib import Path
+
+from megastep import workers
+from megastep.agents import console
+from megastep.agents.distributed import environment
+from megastep.agents.errors import shortened
+from megastep.agents.launch import endings, launcher, rank, signals
+
+
+def main() -> int:
+    """Trains as one of the ranks that `launch` has started. Returns the exit code: 0, or another if
+    torchrun is to start the ranks again.
+    """
+    place, job = environment.launched(), Path(os.environ[launcher.JOB])
+    for number in signals.SIGNALS:  # while there is nothing to save
+        signal.signal(number, lambda number, frame: os._exit(128 + number))
+    (job / f"pid-{place.attempt}-{place.rank}").write_text(str(os.getpid()))
+    if (job / launcher.STOPPED).exists():
+        return 0
+    facts = json.loads((job / launcher.SETTINGS).read_text())
+    sys.argv[:], sys.orig_argv[:] = facts["argv"], facts["command"]
+    workers.end_with_parent(facts["parent"])
+    console.open_streams()
+    console.prefix = facts["prefix"]
+    threading.excepthook = console.warn_of_thread
+    warnings.showwarning = console.warn
+    from megastep.agents.factory import check, settings
+    from megastep.agents.launch import train
+
+    folder = None
+
+    def work():
+        nonlocal folder
+        folder = train.run(check.check(settings.Train, facts["settings"]))
+
+    try:
+        ending = endings.ending_of(work)._replace(folder=folder and str(folder))
+        code = 0
+    except Exception as error:
+        traceback.print_exc()
+        text = f"{type(error).__name__}: {shortened(error, 400)}"
+        ending, code = endings.Ending(1, text), 1
+    if ending.text or ending.folder:
+        rank.tell(ending)
+    return code

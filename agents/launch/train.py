@@ -1,0 +1,187 @@
+"""Trains in this process, or has ranks train in processes of their own."""
+
+import contextlib
+import functools
+import itertools
+import shutil
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from megastep import engine
+from megastep.agents import console, factory, package
+from megastep.agents.algorithms.nonfinite import NonFiniteError
+from megastep.agents.distributed import process_group
+from megastep.agents.distributed.agreement import any_rank, from_rank_0, together
+from megastep.agents.distributed.drift import DriftError
+from megastep.agents.errors import Differs, NonFinite, UserError, memory_problem, user_errors
+from megastep.agents.evaluation import evaluate, record
+from megastep.agents.factory import settings
+from megastep.agents.factory.trainer import make_trainer
+from megastep.agents.launch import dry_run, launcher, rank, rank_checks, signals
+from megastep.agents.runs import folders, provenance
+from megastep.agents.runs.atomic_files import write_atomically
+from megastep.agents.training import curves
+from megastep.agents.training.progress import progress_of
+from megastep.agents.training.trainer import Trainer
+
+
+def with_more(cfg: settings.Train) -> settings.Train:
+    """Returns `cfg` with more_samples and more_seconds added to what the resumed run has had."""
+    totals = {}
+    for name in ("samples", "seconds"):
+        if (more := getattr(cfg, f"more_{name}")) is not None:
+            had = folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).numbers[name]
+            totals |= {name: had + more, f"more_{name}": None}
+    return settings.changed(cfg, **totals)
+
+
+def open_folder(cfg: settings.Train, locks: contextlib.ExitStack) -> tuple[Path, str | None]:
+    """Returns the run folder, locked, and what to resume."""
+    folder = (
+        folders.folder_of(folders.find(cfg.resume))
+        if cfg.resume
+        else folders.new(settings.run_name(cfg), cfg.folder)
+    )
+    locks.enter_context(folders.locked(folder))
+    if cfg.resume and process_group.n_ranks() > 1:  # all from the newest one that is intact
+        return folder, str(folders.load_checkpoint(folders.find(cfg.resume), cfg.trust).path)
+    return folder, cfg.resume
+
+
+def run(cfg: settings.Train) -> Path | None:
+    """Trains as `cfg` says, and returns the run folder, None for a dry run. A signal saves and
+    raises Interrupted.
+
+    Where torchrun started this process as a rank, all ranks train together. Rank 0 writes. With
+    `cfg.ranks`, other processes are started that do so.
+    """
+    if cfg.dry_run:
+        return dry_run.show(cfg)
+    if launcher.is_needed(cfg):
+        return launcher.run(cfg)
+    with rank.joined() as team:
+        return train_here(cfg, team)
+
+
+def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
+    """Trains in this process, as one of a team of ranks if it is one. Returns the run folder."""
+    is_first = process_group.rank() == 0
+    device, progress = together(lambda: factory.make_device(cfg.device)), console.Progress()
+
+    def show(running):
+        progress.show(*progress_of(running))
+
+    rank_checks.check_start(cfg)
+    cfg = rank_checks.started_again(cfg, team)
+    with contextlib.ExitStack() as locks:
+        with contextlib.ExitStack() as undo:
+            with signals.deferred():
+                folder, resume = from_rank_0(lambda: open_folder(cfg, locks))
+                if is_first and not cfg.resume:
+                    undo.callback(shutil.rmtree, folder, ignore_errors=True)
+            token = rank_checks.check_shared(folder)
+            if team:
+                team.set_folder(folder)
+            cfg = together(lambda: with_more(settings.changed(cfg, resume=resume)))
+            running = together(lambda: make_trainer(cfg, folder, device, token, show))
+            rank_checks.check_world(cfg, running)
+            from_rank_0(functools.partial(write_config, folder, running.saver.config["train"]))
+            hosts = process_group.gather_objects(process_group.hostname())
+            clauses = dict.fromkeys(itertools.chain(*process_group.gather_objects(running.lost)))
+            if is_first:
+                if clauses:
+                    console.say(f"This run goes on, but not bit for bit: {'; '.join(clauses)}.")
+                folders.record_start(folder)
+                provenance.record(
+                    folder, running.samples, device, package.version(), package.ROOT, hosts
+                )
+                ranks = f"{len(hosts)} x {device.type}" if len(hosts) > 1 else device
+                console.say(f"Training on {ranks} in {folder}")
+            undo.pop_all()
+        resume = f"To continue: {folders.resume_command(folder)}"
+        try:
+            with (
+                signals.handled(rank.announce) as numbers,
+                progress if is_first else contextlib.nullcontext(),
+                contextlib.closing(running),
+            ):
+                running.train(lambda: bool(numbers))
+                if not any_rank(bool(numbers)):
+                    measure_sections(running)
+        except NonFiniteError as error:
+            saved = f"What was saved before is in {folder}{running.nonfinite_guard.replay_hint}"
+            raise NonFinite(f"{error}. {saved}") from error
+        except DriftError as error:
+            raise UserError(f"{error}. What was saved before is in {folder}") from error
+        except (MemoryError, RuntimeError) as error:
+            problem = memory_problem(error)
+            if not (problem or isinstance(error, engine.EngineError)):
+                raise
+            saved = running.saver.error or "What was learnt last could not be saved"
+            saved = f"All {running.samples:,} samples are saved" if running.is_saved else saved
+            reason = problem or str(error).partition("\n")[0].rstrip(".")
+            raise UserError(f"{reason}. {saved}. {resume}") from error
+        finally:
+            if is_first:
+                with process_group.unhurried():
+                    curves.plot_curves(folder)
+        times = running.section_times
+        if is_first and times.is_known:
+            console.say(console.sections(times.milliseconds(), times.iteration))
+        # a signal that one rank got stops all, and so does a checkpoint that one could not save
+        ends = process_group.gather_objects((numbers[:1], running.saver.error))
+        if signal := next((numbers[0] for numbers, _ in ends if numbers), None):
+            raise signals.Interrupted(
+                signal, f"Stopped after {running.samples:,} samples. {resume}"
+            )
+        if unsaved := next((error for _, error in ends if error), None):
+            raise UserError(unsaved)
+        nonfinite, replay = running.nonfinite_guard.value, running.nonfinite_guard.replay_hint
+        del running  # its memory is the evaluation's now
+        common = dict(run=str(folder), split="test", greedy=False, seed=cfg.seed, device=cfg.device)
+        common["trust"] = True  # what it names has just run
+        if cfg.finish.evaluate:
+            with process_group.unhurried():
+                episodes = cfg.finish.episodes
+                evaluate.run(settings.Evaluate(episodes=episodes, baseline=True, **common))
+        if cfg.finish.record and is_first:
+            with console.warned():
+                record.run(settings.Record(steps=cfg.finish.steps, home=0, file=None, **common))
+        if nonfinite and nonfinite.is_from_env:
+            learnt = f"All else was learnt from, and is in {folder}"
+            raise NonFinite(f"{nonfinite}. {learnt}{replay}")
+        if cfg.rerun and is_first:
+            compare(folder, folders.folder_of(folders.find(cfg.rerun)))
+    return folder
+
+
+def measure_sections(running: Trainer) -> None:
+    """Measures where an iteration's time goes; the training is done, and no failure may end it."""
+    try:
+        running.measure_sections()
+    except RuntimeError as error:
+        reason = str(error).partition("\n")[0]
+        console.warn(f"the sections of an iteration could not be measured: {reason}")
+
+
+def write_config(folder: Path, config: dict[str, Any]) -> None:
+    """Writes a run's configuration into its folder."""
+    with user_errors(folders.CANNOT.format(folder)):
+        text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True, encoding="utf-8")
+        write_atomically(folder / "config.yaml", text)
+
+
+def compare(folder: Path, original: Path) -> None:
+    """Says whether two runs have the same metrics, byte for byte. Raises Differs if not."""
+    ours, theirs = ((run / "metrics.jsonl").read_bytes() for run in (folder, original))
+    if ours == theirs:
+        console.say(f"metrics.jsonl equals that of {original}, byte for byte.")
+        return
+    pairs = enumerate(itertools.zip_longest(ours.split(b"\n"), theirs.split(b"\n")), 1)
+    number = next(number for number, (one, other) in pairs if one != other)
+    raise Differs(
+        f"metrics.jsonl differs from that of {original} from line {number} on; equal bits need the "
+        f"same versions, device and threads: see {provenance.FILE} of both"
+    )

@@ -1,0 +1,193 @@
+"""The checkpoints of a run: one folder `step_<N>` per checkpoint, N environment steps.
+
+A checkpoint is written to a temporary folder, flushed to disk, verified and renamed into place. A
+reader sees a whole checkpoint or none, and damage is reported (:mod:`checkpoint_format`). No
+checkpoint is overwritten: a second one of the same step is `step_<N>-2`, and the first is deleted
+after the second is verified.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from megastep.agents.runs import checkpoint_format
+from megastep.agents.runs.atomic_files import delete_leftovers, sync_folder, temporary_path
+from megastep.agents.runs.checkpoint_format import Checkpoint, CheckpointError, DamagedCheckpoint
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = [
+    "Checkpoint",
+    "CheckpointError",
+    "DamagedCheckpoint",
+    "list_checkpoints",
+    "load_latest",
+    "save",
+    "set_aside_after",
+    "step_of",
+]
+
+
+def save(
+    folder: Path | str,
+    step: int,
+    state: dict[str, Any],
+    config: dict[str, Any],
+    keep_checkpoints: int = 2,
+    score: float | None = None,
+    made_with: dict[str, Any] | None = None,
+    replay_seconds: float | None = None,
+    add_files: Callable[[Path], dict[str, Any]] = lambda path: {},
+) -> Path:
+    """Writes a checkpoint and deletes old ones. Returns its folder.
+
+    Args:
+        folder: the run's `checkpoints` folder.
+        step: environment steps so far, of all lanes.
+        state: dicts and lists of tensors and numbers.
+        config: the run's configuration, as JSON.
+        keep_checkpoints: number of latest steps kept, besides the one with the highest score.
+        score: for example the mean return, higher is better; None if unknown.
+        made_with: what the numbers depend on besides the configuration, such as versions.
+        replay_seconds: a replay buffer that takes longer to write is left out.
+        add_files: as for `checkpoint_format.write`.
+
+    Raises:
+        OSError: the disk is full or not writable. Nothing has changed.
+        DamagedCheckpoint: the disk returns other bytes than were written. Nothing has changed.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    delete_leftovers(folder)
+    temporary = temporary_path(folder / f"step_{step}")
+    try:
+        checkpoint_format.write(
+            temporary, step, state, config, score, made_with, replay_seconds, add_files
+        )
+        # verified before any old one is deleted
+        checkpoint_format.verify(temporary, checkpoint_format.read_manifest(temporary))
+        path = folder / _next_name(folder, step)
+        os.replace(temporary, path)
+        sync_folder(folder)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    set_aside_after(folder, step)
+    _prune(folder, keep_checkpoints, step)
+    return path
+
+
+def load_latest(
+    folder: Path | str,
+    device: torch.device | str | None = "cpu",
+    is_whole: bool = True,
+    rank: int = 0,
+) -> Checkpoint:
+    """Loads the newest intact checkpoint in a `checkpoints` folder, or the checkpoint at `folder`.
+
+    Warns about each damaged checkpoint that is skipped.
+
+    Args:
+        device: where what was learnt goes; all else goes to the CPU. None leaves out the state, and
+            does not import PyTorch.
+        is_whole: loads environments and replay buffer, too.
+        rank: whose state is loaded, see `checkpoint_format.read`.
+
+    Raises:
+        CheckpointError: there is none, all are damaged, or another version of megastep wrote it.
+    """
+    folder = Path(folder)
+    if (folder / "manifest.json").exists():
+        return checkpoint_format.read(folder, device, is_whole, rank)
+    messages = []
+    for path in reversed(list_checkpoints(folder)):
+        try:
+            checkpoint = checkpoint_format.read(path, device, is_whole, rank)
+        except DamagedCheckpoint as error:
+            messages.append(str(error))
+            continue
+        for message in messages:
+            warnings.warn(f"{message}; using {path.name} instead", stacklevel=2)
+        return checkpoint
+    if messages:
+        raise CheckpointError(f"Every checkpoint in {folder} is damaged: {'; '.join(messages)}")
+    raise CheckpointError(f"There is no checkpoint in {folder}; has the run saved one yet?")
+
+
+def set_aside_after(folder: Path | str, step: int) -> None:
+    """Renames the checkpoints after `step` to `step_<N>.aside`, for a run that resumes from `step`.
+
+    `save` deletes each one when the run reaches its step again.
+    """
+    for path in list_checkpoints(folder):  # the newest last: it stays the latest until then
+        if step_of(path) > step:
+            aside = path.with_name(f"{path.name}.aside")
+            _delete(aside)
+            os.replace(path, aside)
+
+
+def list_checkpoints(folder: Path | str) -> list[Path]:
+    """Returns the checkpoints in a folder, oldest first. Skips unfinished and set-aside ones."""
+    paths = Path(folder).glob("step_*")
+    names = re.compile(r"step_\d+(-\d+)?")
+    return sorted((path for path in paths if names.fullmatch(path.name)), key=_step_and_number)
+
+
+def step_of(path: Path) -> int:
+    """Returns the step in a checkpoint's folder name."""
+    return _step_and_number(path)[0]
+
+
+def _step_and_number(path: Path) -> tuple[int, int]:
+    """Returns a checkpoint's step, and its number among the checkpoints of that step, from 1."""
+    step, number = re.match(r"step_(\d+)(?:-(\d+))?", path.name).groups()
+    return int(step), int(number or 1)
+
+
+def _next_name(folder: Path, step: int) -> str:
+    """Returns `step_<N>`, or `step_<N>-2` and so on if that step has checkpoints."""
+    pairs = map(_step_and_number, list_checkpoints(folder))
+    last = max((number for other_step, number in pairs if other_step == step), default=0)
+    return f"step_{step}-{last + 1}" if last else f"step_{step}"
+
+
+def _prune(folder: Path, keep_checkpoints: int, step: int) -> None:
+    """Deletes old checkpoints, and set-aside ones up to `step`.
+
+    Keeps the last `keep_checkpoints` steps, the step with the best score and the last one with a
+    replay buffer. Of each step only the last checkpoint is kept.
+    """
+    checkpoints = list_checkpoints(folder)
+    last_of_each_step = list({step_of(path): path for path in checkpoints}.values())
+    scores = {path: _score(path) for path in last_of_each_step}
+    scored = [path for path in last_of_each_step if scores[path] is not None]
+    best = max(scored, key=scores.get, default=None)
+    with_replay = [path for path in last_of_each_step if (path / "replay.pt").exists()]
+    kept = {*last_of_each_step[-keep_checkpoints:], best, *with_replay[-1:]}
+    aside = [path for path in folder.glob("step_*.aside") if step_of(path) <= step]
+    for path in [*(path for path in checkpoints if path not in kept), *aside]:
+        _delete(path)
+
+
+def _score(path: Path) -> float | None:
+    try:
+        return checkpoint_format.read_manifest(path)["score"]
+    except CheckpointError:
+        return None
+
+
+def _delete(path: Path) -> None:
+    """Deletes a checkpoint. If killed, leaves a temporary folder and no damaged checkpoint."""
+    leftover = temporary_path(path)
+    try:
+        os.replace(path, leftover)
+    except OSError:  # it does not exist or cannot be moved
+        return
+    shutil.rmtree(leftover, ignore_errors=True)

@@ -1,0 +1,375 @@
+"""The format of one checkpoint: a folder of these files.
+
+    manifest.json  size and SHA-256 of each other file and of itself, so any damaged byte is found;
+                   format, step, score, what it was made with, and the numbers at the top of the
+                   state, such as samples and seconds
+    config.json    the run's configuration
+    state.pt       what was learnt, and all else that is small
+    world.pt       the environments, and what the policy remembers of their episodes
+    replay.pt      the replay buffer, if there is one and it was saved
+    rank1.pt       of a run with several ranks: all of the state of rank 1 but the policy's weights,
+                   which ranks share; and so on. The other files are rank 0's
+
+All but the first two hold plain dicts of tensors, numbers and strings. A run that is resumed reads
+all; to evaluate needs `state.pt` alone. JSON is read without PyTorch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+import pickle
+import re
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from megastep.agents.runs import trust
+from megastep.agents.runs.atomic_files import sync_folder
+
+if TYPE_CHECKING:
+    import torch
+
+#: The format number. Increase it whenever older readers would misread a new checkpoint, or newer
+#: readers an old one, and add the last commit of the old format to `READERS`.
+FORMAT = 7
+#: Commits of megastep that read the older formats. The last one is migrated, see `_migrated`.
+READERS = {1: "e17fabe", 2: "6f4fbf1", 3: "3ffd1d5", 4: "e9908db", 5: "916221d"}
+MIGRATED = 6
+#: The keys of a state that are in files of their own.
+PARTS = {"world.pt": ("env", "collector"), "replay.pt": ("replay",)}
+_RANK_FILE = re.compile(r"rank[1-9]\d*\.pt")
+_CHUNK = 2**24  # bytes
+
+
+class CheckpointError(RuntimeError):
+    """No checkpoint can be used. The message names each one tried, its problem, and the cure."""
+
+
+class DamagedCheckpoint(CheckpointError):
+    """A checkpoint does not match its manifest. An earlier checkpoint may be intact."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """A loaded checkpoint.
+
+    Attributes:
+        path: its folder.
+        step: environment steps of all lanes before it was saved.
+        numbers: the numbers at the top of the state.
+        config: the run's configuration, as saved.
+        made_with: what the numbers depend on besides the configuration: versions, device, threads.
+        state: dicts of tensors and numbers, as saved; None if it was not loaded.
+        untrusted: import paths outside megastep that it names, if this user did not make it.
+        n_ranks: ranks whose state it holds.
+    """
+
+    path: Path
+    step: int
+    numbers: dict[str, float]
+    config: dict[str, Any]
+    made_with: dict[str, Any]
+    state: dict[str, Any] | None = None
+    untrusted: tuple[str, ...] = ()
+    n_ranks: int = 1
+
+
+def rank_file(rank: int) -> str:
+    """Returns the name of the file with a rank's state."""
+    return f"rank{rank}.pt"
+
+
+# ---- Writing ----
+
+
+def write(
+    path: Path,
+    step: int,
+    state: dict[str, Any],
+    config: dict[str, Any],
+    score: float | None,
+    made_with: dict[str, Any] | None = None,
+    replay_seconds: float | None = None,
+    add_files: Callable[[Path], dict[str, Any]] = lambda path: {},
+) -> None:
+    """Writes a checkpoint into a new folder and flushes it to disk.
+
+    Args:
+        replay_seconds: `replay.pt` is left out if it takes longer; None for no limit.
+        add_files: puts the files of other ranks into the folder. Returns their entries in the
+            manifest, by name.
+    """
+    import torch
+
+    path.mkdir()
+    apart = {key for keys in PARTS.values() for key in keys}
+    parts = {"state.pt": {key: part for key, part in state.items() if key not in apart}}
+    for name, keys in PARTS.items():
+        if part := {key: state[key] for key in keys if key in state}:
+            parts[name] = part
+    files = {}
+    for name, part in parts.items():
+        deadline = None
+        if name == "replay.pt" and replay_seconds is not None:
+            deadline = time.monotonic() + replay_seconds
+        try:
+            files[name] = _write_file(path / name, functools.partial(torch.save, part), deadline)
+        except _TooLate:
+            (path / name).unlink()
+    text = json.dumps(config, indent=2).encode()
+    files["config.json"] = _write_file(path / "config.json", lambda file: file.write(text))
+    files |= add_files(path)
+    numbers = {key: value for key, value in state.items() if isinstance(value, (int, float))}
+    manifest = dict(format=FORMAT, step=step, score=score, numbers=numbers)
+    manifest |= dict(torch=torch.__version__, made_with=made_with or {}, files=files)
+    manifest["signature"] = trust.sign(text)
+    text = sealed(manifest)
+    _write_file(path / "manifest.json", lambda file: file.write(text))
+    sync_folder(path)
+
+
+def write_state(
+    path: Path, state: dict[str, Any], replay_seconds: float | None = None
+) -> dict[str, Any]:
+    """Writes a rank's whole state into one file and flushes it to disk. Returns its entry in the
+    manifest.
+
+    Args:
+        replay_seconds: if it takes longer, the replay buffer is left out; None for no limit.
+    """
+    import torch
+
+    deadline = None
+    if "replay" in state and replay_seconds is not None:
+        deadline = time.monotonic() + replay_seconds
+    try:
+        return _write_file(path, functools.partial(torch.save, state), deadline)
+    except _TooLate:
+        state = {key: part for key, part in state.items() if key != "replay"}
+        return _write_file(path, functools.partial(torch.save, state))
+
+
+def check_plain(tree: Any, name: str) -> None:
+    """Raises TypeError for what loading without code refuses. It allows tensors, numbers, strings
+    and None, and lists, tuples and dicts of these.
+
+    Args:
+        name: of the tree, for the message.
+    """
+    if isinstance(tree, dict):
+        for key, part in tree.items():
+            check_plain(part, f"{name}.{key}")
+    elif isinstance(tree, (list, tuple)):
+        for i, part in enumerate(tree):
+            check_plain(part, f"{name}.{i}")
+    elif type(tree) not in (bool, int, float, str, type(None)) and not hasattr(
+        tree, "untyped_storage"
+    ):
+        raise TypeError(
+            f"{name} is a {type(tree).__module__}.{type(tree).__name__}, and checkpoints hold "
+            "tensors, numbers, strings, lists and dicts only: convert it, for example with float()"
+        )
+
+
+class _TooLate(Exception):
+    """A file took longer to write than it may."""
+
+
+class _HashedFile:
+    """A file that counts and hashes what is written to it.
+
+    Attributes:
+        error: the first error. `torch.save` would hide it behind others, so nothing is raised.
+    """
+
+    def __init__(self, file: BinaryIO, deadline: float | None):
+        self.file, self.deadline, self.error = file, deadline, None
+        self.n_bytes, self.sha256 = 0, hashlib.sha256()
+
+    def write(self, data) -> int:
+        data = memoryview(data).cast("B")
+        for start in range(0, len(data) if self.error is None else 0, _CHUNK):
+            chunk = data[start : start + _CHUNK]
+            try:
+                self.file.write(chunk)
+            except OSError as error:
+                self.error = error
+            self.sha256.update(chunk)
+            if self.deadline is not None and time.monotonic() > self.deadline:
+                self.error = _TooLate()
+        self.n_bytes += len(data)
+        return len(data)
+
+    def flush(self) -> None:
+        pass
+
+
+def _write_file(
+    path: Path, write: Callable[[Any], Any], deadline: float | None = None
+) -> dict[str, Any]:
+    """Writes a file and flushes it to disk. Returns its entry in the manifest."""
+    with open(path, "wb") as file:
+        hashed = _HashedFile(file, deadline)
+        write(hashed)
+        if hashed.error is not None:
+            raise hashed.error
+        file.flush()
+        os.fsync(file.fileno())
+    return {"sha256": hashed.sha256.hexdigest(), "bytes": hashed.n_bytes}
+
+
+def sealed(manifest: dict[str, Any]) -> bytes:
+    """Returns the text of a manifest, with its own SHA-256 added."""
+    digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
+    return json.dumps({**manifest, "sha256": digest}, indent=2).encode()
+
+
+# ---- Reading ----
+
+
+def read(
+    path: Path, device: torch.device | str | None, is_whole: bool = False, rank: int = 0
+) -> Checkpoint:
+    """Loads a checkpoint.
+
+    Args:
+        device: where the tensors of `state.pt` go; None: verifies everything and loads no state.
+        is_whole: loads the other parts of this rank, too, onto the CPU; rank 0 verifies everything.
+        rank: whose state is loaded. One without a file gets that in rank 0's `state.pt`.
+
+    Raises:
+        DamagedCheckpoint: a file is missing or damaged, or could run code when loaded.
+        CheckpointError: another version of megastep wrote it.
+    """
+    manifest = read_manifest(path)
+    n_ranks = 1 + sum(map(bool, map(_RANK_FILE.fullmatch, manifest["files"])))
+    parts = ["state.pt"]
+    if is_whole:
+        parts += [rank_file(rank)] if rank else PARTS
+        parts = [name for name in parts if name in manifest["files"]]
+    if device is None or (is_whole and rank == 0):
+        verify(path, manifest)
+    else:
+        verify(path, manifest, [*parts, "config.json"])
+    text = (path / "config.json").read_bytes()
+    try:
+        config = json.loads(text)
+    except (ValueError, RecursionError):
+        raise DamagedCheckpoint(f"Checkpoint {path} is damaged: config.json is no JSON") from None
+    checkpoint = Checkpoint(
+        path,
+        manifest["step"],
+        manifest["numbers"],
+        config,
+        manifest.get("made_with", {}),
+        untrusted=tuple(trust.untrusted_names(text, manifest.get("signature"))),
+        n_ranks=n_ranks,
+    )
+    if device is None:
+        return checkpoint
+    state = {}
+    for name in parts:
+        state |= _load(path / name, device if name == "state.pt" else "cpu")
+    return dataclasses.replace(checkpoint, state=_migrated(state, manifest))
+
+
+def _load(path, device):
+    """Returns the state in a file."""
+    import torch
+
+    try:
+        return torch.load(path, map_location=device, weights_only=True)
+    except pickle.UnpicklingError:
+        raise DamagedCheckpoint(
+            f"Checkpoint {path.parent} is refused: {path.name} holds more than tensors and "
+            "numbers, so loading it could run code"
+        ) from None
+    except (RuntimeError, EOFError, ValueError) as error:
+        raise DamagedCheckpoint(
+            f"Checkpoint {path.parent} is damaged: {path.name} cannot be read "
+            f"({str(error).splitlines()[0]})"
+        ) from None
+
+
+def _migrated(state, manifest):
+    """Returns a state of the last format as one of this format."""
+    import torch
+    from torch.nn.functional import pad
+
+    if manifest["format"] == FORMAT:
+        return state
+    if "learner" in state and "optimizer" in state["learner"]:
+        state["learner"].setdefault("check", torch.zeros(2, dtype=torch.float64))
+    if stats := state.get("episode_stats"):  # no episode was left out of a metric
+        n_metrics = len(stats["sums"]) - 4
+        stats["sums"] = pad(stats["sums"], (0, 0, 0, n_metrics))
+        stats["windows"] = [
+            pad(one, (0, n_metrics)) if len(one) else one for one in stats["windows"]
+        ]
+    return state | {"samples_at_report": state.get("samples", 0)}
+
+
+def verify(path: Path, manifest: dict[str, Any], names: Iterable[str] | None = None) -> None:
+    """Compares files of a checkpoint, by default all, with the SHA-256 in its manifest.
+
+    Raises: as `read`.
+    """
+    for name in manifest["files"] if names is None else names:
+        try:
+            digest = _digest(path / name)
+        except OSError as error:
+            raise DamagedCheckpoint(
+                f"Checkpoint {path} is damaged: {name} cannot be read ({error.strerror})"
+            ) from None
+        if digest != manifest["files"][name]["sha256"]:
+            raise DamagedCheckpoint(
+                f"Checkpoint {path} is damaged: {name} does not match the SHA-256 in its manifest"
+            )
+
+
+def _digest(path):
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """Returns a checkpoint's manifest, which must equal what `sealed` writes to the last byte.
+
+    Raises: as `read`.
+    """
+    try:
+        data = (path / "manifest.json").read_bytes()
+        manifest = json.loads(data)
+        version = manifest["format"]
+        body = {key: value for key, value in manifest.items() if key != "sha256"}
+        is_intact = data == sealed(body)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        version, is_intact = None, False
+    if is_intact:
+        others = {*manifest["files"]} - {"config.json", "state.pt", *PARTS}
+        is_intact = all(map(_RANK_FILE.fullmatch, others))  # a planted one may name any file
+    is_without_digest = version == 1 and "sha256" not in manifest
+    if not (is_intact or is_without_digest):
+        raise DamagedCheckpoint(
+            f"Checkpoint {path} is damaged: manifest.json cannot be read or does not match its own "
+            "SHA-256"
+        )
+    if version in READERS:
+        raise CheckpointError(
+            f"Checkpoint {path} was written by an earlier version (format {version}); commit "
+            f"{READERS[version]} reads it"
+        )
+    if version not in (FORMAT, MIGRATED):
+        raise CheckpointError(
+            f"Checkpoint {path} has format {version}, which is unknown: this version reads format "
+            f"{FORMAT}. Update megastep"
+        )
+    return manifest

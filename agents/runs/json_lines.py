@@ -1,0 +1,79 @@
+"""Files of JSON lines: one object per line, with the environment steps so far as `samples`.
+
+A killed run loses no line, and a damaged line does not affect others.
+"""
+
+import json
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+from megastep.agents.runs.atomic_files import AppendedFile, write_atomically
+
+
+class JsonLines:
+    """A file that lines are appended to. Each line is flushed when it is written; lines that a full
+    disk refuses are written with the next one.
+    """
+
+    def __init__(self, path: Path | str):
+        self.path = Path(path)
+        self.file = AppendedFile(self.path)
+
+    def write(self, step: int, values: dict[str, float | str]) -> None:
+        """Appends a line of numbers and strings. Writes NaN and infinity as null."""
+        json_values = {
+            key: value if isinstance(value, str) or math.isfinite(value) else None
+            for key, value in values.items()
+        }
+        self.file.write((json.dumps({"samples": step, **json_values}) + "\n").encode())
+
+    def close(self) -> None:
+        self.file.close()
+
+
+def read(path: Path | str) -> list[dict[str, Any]]:
+    """Returns the objects of a file.
+
+    Skips damaged lines with a warning. Skips a last line that a crash cut short silently.
+    """
+    return [row for row, _ in _intact_lines(Path(path))]
+
+
+def truncate_after(path: Path | str, step: int) -> None:
+    """Removes the lines after `step` environment steps, which a resumed run writes again.
+
+    Removes damaged lines too. Does nothing if there is no such file.
+
+    Raises:
+        OSError: there is no space for a copy. The file is unchanged.
+    """
+    path = Path(path)
+    if not path.exists():
+        return
+    lines = (line + b"\n" for row, line in _intact_lines(path) if row["samples"] <= step)
+    data = b"".join(lines)
+    if data != path.read_bytes():
+        write_atomically(path, data)
+
+
+def _intact_lines(path: Path) -> list[tuple[dict[str, Any], bytes]]:
+    """Returns the intact lines, each as an object and as its bytes."""
+    *lines, last = path.read_bytes().split(b"\n")
+    rows = [(_parsed(line), line) for line in [*lines, last]]
+    damaged = [str(n) for n, (row, _) in enumerate(rows[:-1], 1) if row is None]
+    if damaged:
+        which = f"line {damaged[0]} is" if len(damaged) == 1 else f"lines {', '.join(damaged)} are"
+        warnings.warn(f"{path}: {which} damaged and skipped", stacklevel=4)
+    return [(row, line) for row, line in rows if row is not None]
+
+
+def _parsed(line: bytes) -> dict[str, Any] | None:
+    """Returns a line's object, or None if it is damaged."""
+    try:
+        row = json.loads(line)
+    except ValueError:
+        return None
+    is_intact = isinstance(row, dict) and isinstance(row.get("samples"), int)
+    return row if is_intact else None

@@ -1,0 +1,99 @@
+"""How the ranks bring their state into one checkpoint. Each rank but 0 writes a file beside the
+checkpoints; rank 0, which writes the checkpoint, moves the files into it. All share the run folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from megastep.agents.runs import checkpoint_format
+from megastep.agents.runs.atomic_files import write_atomically
+
+#: Seconds that rank 0 waits for the files of the other ranks.
+SECONDS = 60.0
+
+
+class RankFiles:
+    """The files of one launch of a run.
+
+    Args:
+        folder: the run's `checkpoints` folder.
+        launch: a name that all ranks of this launch have, and no other launch. Rank 0 deletes the
+            files that earlier launches left.
+        rank, n_ranks: this rank's number, and how many there are.
+    """
+
+    def __init__(self, folder: Path, launch: str = "", rank: int = 0, n_ranks: int = 1):
+        self.folder, self.launch, self.rank, self.n_ranks = folder, launch, rank, n_ranks
+        self._is_given_up = threading.Event()
+        if rank == 0:
+            self._delete_leftovers()
+
+    def _delete_leftovers(self):
+        for path in self.folder.glob(".rank*"):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+    def _paths(self, rank, number):
+        """Returns the paths of a rank's state and of its entry in the manifest, written last."""
+        name = f".rank{rank}-{self.launch}-{number}"
+        return self.folder / f"{name}.pt", self.folder / f"{name}.json"
+
+    def hand_in(
+        self, number: int, state: dict[str, Any], replay_seconds: float | None = None
+    ) -> None:
+        """Writes this rank's file: all of a state but the policy's weights, which ranks share.
+
+        Args:
+            number: the same on all ranks, and another for each checkpoint.
+            state, replay_seconds: as for `checkpoint.save`.
+
+        Raises:
+            OSError: the disk is full or not writable.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        own = {name: part for name, part in state.items() if name != "policy"}
+        path, entry_path = self._paths(self.rank, number)
+        try:
+            entry = checkpoint_format.write_state(path, own, replay_seconds)
+            write_atomically(entry_path, json.dumps(entry).encode())
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+
+    def collect(self, number: int, folder: Path) -> dict[str, Any]:
+        """Moves the files of the other ranks into a new checkpoint, as `rank1.pt` and so on, when
+        they are there. Returns their entries in its manifest, by name.
+
+        Args:
+            folder: the checkpoint's.
+
+        Raises:
+            OSError: a rank did not write its file in time.
+        """
+        entries, deadline = {}, time.monotonic() + SECONDS
+        for rank in range(1, self.n_ranks):
+            path, entry_path = self._paths(rank, number)
+            while not entry_path.exists():
+                if self._is_given_up.wait(0.02) or time.monotonic() > deadline:
+                    raise OSError(f"rank {rank} did not write its part within {SECONDS:.0f} s")
+            name = checkpoint_format.rank_file(rank)
+            entries[name] = json.loads(entry_path.read_bytes())
+            os.replace(path, folder / name)
+            entry_path.unlink()
+        return entries
+
+    @property
+    def is_given_up(self) -> bool:
+        """True if another rank has ended, so that its parts of checkpoints are missing."""
+        return self._is_given_up.is_set()
+
+    def give_up(self) -> None:
+        """Has `collect` wait no longer, as another rank has ended."""
+        self._is_given_up.set()

@@ -1,0 +1,262 @@
+"""Saving a run: checkpoints at intervals, and snapshots of the weights spaced over the budget."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import shutil
+import threading
+import time
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch.utils._pytree import tree_leaves
+
+from megastep.agents.algorithms.nonfinite import NonFiniteError, nonfinite_leaf
+from megastep.agents.distributed.process_group import unhurried
+from megastep.agents.runs import checkpoint, checkpoint_format
+from megastep.agents.runs.rank_files import RankFiles
+
+if TYPE_CHECKING:
+    from megastep.agents.training.trainer import Trainer
+
+#: Bytes of a replay buffer that every checkpoint holds.
+SMALL_REPLAY = 2**28
+#: Seconds that a larger one may take to write when a run ends.
+REPLAY_SECONDS = 5.0
+
+
+class Saver:
+    """Writes the checkpoints of one run, in a thread of its own.
+
+    A full, read-only or faulty disk causes one warning, at the next call or `wait`; each later call
+    tries again.
+
+    Args:
+        folder: where the checkpoints go.
+        config: the run's configuration, stored in each checkpoint.
+        keep_checkpoints: number of checkpoints kept, besides the one with the best score.
+        made_with: what a run's numbers depend on besides its configuration, such as versions.
+        replay_every: a replay buffer of more than `SMALL_REPLAY` bytes is in every so many
+            checkpoints, and in the last one if it can be written in `REPLAY_SECONDS`.
+        rank_files: where there are other ranks: each rank has a saver, and all save the same
+            checkpoints. That of rank 0 writes them, the others hand in their part.
+
+    Attributes:
+        error: why the last checkpoint could not be written, as a sentence; None if it was written.
+            Valid after `wait`.
+        lacks_replay: True if the last checkpoint was to leave out the replay buffer.
+        seconds: how long the thread took for the last checkpoint.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        config: dict[str, Any],
+        keep_checkpoints: int = 2,
+        made_with: dict[str, Any] | None = None,
+        replay_every: int = 20,
+        rank_files: RankFiles | None = None,
+    ):
+        self.folder, self.config, self.keep_checkpoints = folder, config, keep_checkpoints
+        self.made_with, self.replay_every = made_with, replay_every
+        self.rank_files = rank_files or RankFiles(folder)
+        self.error, self.lacks_replay, self.has_warned_of_memory = None, False, False
+        self.seconds, self._n_since_replay, self._number = 0.0, 0, 0
+        self._host_copy, self._thread, self._failure = _HostCopy(), None, None
+
+    @unhurried()
+    def __call__(
+        self, step: int, state: dict[str, Any], score: float | None = None, is_last: bool = False
+    ) -> None:
+        """Begins to write a checkpoint of `state` after `step` environment steps.
+
+        What `state` holds may change as soon as this returns.
+
+        Args:
+            state: dicts and lists of tensors and plain values.
+            score: for example the mean return, higher is better; None if unknown.
+            is_last: no other checkpoint follows.
+
+        Raises:
+            NonFiniteError: what was learnt has a NaN or infinity. Earlier checkpoints are kept.
+        """
+        self.wait()
+        self._number += 1
+        state, seconds = self._with_replay(state, is_last)
+        state = self._host_copy(state)
+        # an environment may keep an infinity; weights may not
+        learnt = {name: state[name] for name in ("policy", "learner") if name in state}
+        if path := nonfinite_leaf(learnt):
+            raise NonFiniteError(
+                f"The checkpoint at {step:,} samples was not saved: {path} is not finite"
+            )
+        self._thread = threading.Thread(target=self._write, args=(step, state, score, seconds))
+        self._thread.start()
+
+    def _with_replay(self, state, is_last):
+        """Returns the state, without its replay buffer if it is not due, and the seconds that the
+        buffer may take.
+        """
+        self.lacks_replay = False
+        if "replay" not in state or _nbytes(state["replay"]) <= SMALL_REPLAY:
+            return state, None
+        self._n_since_replay += 1
+        if is_last or self._n_since_replay >= self.replay_every:
+            if _nbytes(state["replay"]) > _free_memory() / 2:
+                self._warn_of_memory()
+            else:
+                self._n_since_replay = 0
+                return state, REPLAY_SECONDS if is_last else None
+        self.lacks_replay = True
+        return {name: part for name, part in state.items() if name != "replay"}, None
+
+    def _warn_of_memory(self):
+        if not self.has_warned_of_memory:
+            self.has_warned_of_memory = True
+            warnings.warn(
+                "There is too little memory for a copy of the replay buffer, so checkpoints do "
+                "not hold it",
+                stacklevel=4,
+            )
+
+    @property
+    def is_writing(self) -> bool:
+        """True while the thread writes."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def _write(self, step, state, score, replay_seconds):
+        began = time.monotonic()
+        try:
+            if self.rank_files.rank > 0:
+                self.rank_files.hand_in(self._number, state, replay_seconds)
+            else:
+                checkpoint.save(
+                    self.folder,
+                    step,
+                    state,
+                    self.config,
+                    self.keep_checkpoints,
+                    score,
+                    self.made_with,
+                    replay_seconds,
+                    functools.partial(self.rank_files.collect, self._number),
+                )
+        except Exception as error:
+            self._failure = step, _nbytes(state), error
+        self.seconds = time.monotonic() - began
+
+    def give_up(self) -> None:
+        """Waits no longer for the parts of other ranks, as one has ended."""
+        self.rank_files.give_up()
+
+    @unhurried()
+    def wait(self) -> None:
+        """Returns when nothing is being written. Warns if the last checkpoint failed.
+
+        Raises:
+            Exception: what is not the disk's fault.
+        """
+        if self._thread is None:
+            return
+        self._thread.join()
+        self._thread = None
+        failure, self._failure = self._failure, None
+        if failure is None:
+            self.error = None
+            return
+        if not isinstance(failure[-1], (OSError, checkpoint.DamagedCheckpoint)):
+            raise failure[-1]
+        self._n_since_replay = self.replay_every  # the next one is to have it
+        has_warned = self.error is not None or self.rank_files.is_given_up
+        self.error = self._message(*failure)
+        if not has_warned:
+            warnings.warn(
+                f"{self.error}. Training goes on; the next checkpoint tries again", stacklevel=2
+            )
+
+    def _message(self, step, n_bytes, error):
+        reason = getattr(error, "strerror", None) or str(error)
+        sentence = (
+            f"The checkpoint at {step:,} samples could not be saved ({reason}): it needs about "
+            f"{n_bytes / 1e6:.1f} MB"
+        )
+        try:
+            free_bytes = shutil.disk_usage(self.folder.parent).free
+        except OSError:
+            return f"{sentence} in {self.folder.parent}, which cannot be read"
+        return f"{sentence}, and {free_bytes / 1e6:.1f} MB are free in {self.folder.parent}"
+
+
+class _HostCopy:
+    """Copies a state to the CPU. Copies from a GPU go through pinned memory that is kept."""
+
+    def __init__(self):
+        self.pinned = {}
+
+    def __call__(self, state: dict[str, Any]) -> dict[str, Any]:
+        """Returns the copy: plain dicts, lists and tuples. Synchronises."""
+        self.devices = set()
+        copy = self._copied(state, ())
+        for device in self.devices:
+            torch.cuda.synchronize(device)
+        return copy
+
+    def _copied(self, node, path):
+        if isinstance(node, torch.Tensor):
+            return self._copied_tensor(node.detach(), path)
+        if isinstance(node, dict):
+            return {key: self._copied(part, (*path, key)) for key, part in node.items()}
+        if isinstance(node, (list, tuple)):
+            return type(node)(self._copied(part, (*path, i)) for i, part in enumerate(node))
+        checkpoint_format.check_plain(node, ".".join(map(str, path)))
+        return node
+
+    def _copied_tensor(self, tensor, path):
+        if tensor.device.type != "cuda":
+            return tensor.clone()
+        if path[0] == "replay" or "rollouts" in path:  # may be too large to pin
+            return tensor.cpu()
+        kept = self.pinned.get(path)
+        if kept is None or kept.shape != tensor.shape or kept.dtype != tensor.dtype:
+            kept = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+            self.pinned[path] = kept
+        self.devices.add(tensor.device)
+        return kept.copy_(tensor, non_blocking=True)
+
+
+def _free_memory():
+    """Returns bytes of memory that are free, infinity where the system does not tell."""
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, OSError, AttributeError):
+        return math.inf
+
+
+def _nbytes(state):
+    return sum(getattr(leaf, "nbytes", 0) for leaf in tree_leaves(state))
+
+
+class SnapshotSaver:
+    """Saves the policy's weights at the end of each of `n` equal parts of the budget.
+
+    `evaluate.py ratings=true` compares these snapshots. :class:`Trainer` calls it with itself.
+
+    Args:
+        saver: writes the snapshots.
+        n: number of snapshots; 0 for none.
+    """
+
+    def __init__(self, saver: Saver, n: int):
+        self.saver, self.n = saver, n
+        self.n_parts_done = None
+
+    def __call__(self, trainer: Trainer) -> None:
+        n_parts_done = int((1 - trainer.fraction_left) * self.n + 1e-9)
+        if self.n_parts_done is not None and n_parts_done > self.n_parts_done:
+            self.saver(trainer.samples, {"policy": trainer.policy.state_dict()})
+            self.saver.wait()
+        self.n_parts_done = n_parts_done

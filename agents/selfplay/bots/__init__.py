@@ -1,0 +1,3 @@
+"""Policies that play or walk without learning."""
+
+from megastep.agents.selfplay.bots.random_actions import RandomActions as RandomActions

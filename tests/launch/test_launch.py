@@ -1,0 +1,426 @@
+"""`ranks=2` on one machine: one voice, the exit codes of one process, and nothing left behind."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from megastep.agents.cli import train
+from megastep.agents.errors import ConfigErrors, UserError
+from megastep.agents.launch import gpu, launcher
+from megastep.agents.launch.endings import Ending
+from megastep.agents.launch.signals import Interrupted
+from megastep.agents.runs import checkpoint, json_lines
+from tests.helpers import tiny
+from tests.helpers.processes import is_running, wait_until
+from tests.helpers.ranks import HUNG, ROOT
+
+TINY = [*tiny.TINY, "log_every=1", "folder=run"]
+UPDATE = 2 * tiny.UPDATE
+ON_GPUS = [*tiny.ON_GPU, "folder=run"]
+UPDATE_ON_GPUS = 2 * tiny.UPDATE_ON_GPU
+TWO_GPUS = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs"),
+]
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# ---- The settings ----
+
+
+@pytest.mark.parametrize(
+    "words, n_gpus, cure",
+    [
+        (["ranks=3", "device=auto"], 2, "ranks: 3 is more than the 2 GPUs"),
+        (["ranks=3", "device=auto"], 1, "ranks: 3 is more than the 1 GPU "),
+        (["ranks=all", "device=auto"], 0, "ranks: 'all' is every GPU, and this machine has none"),
+        (["ranks=all", "device=cpu"], 2, "device=cpu; give a number"),
+        (["ranks=2", "device=cuda:1"], 2, "device: 'cuda:1' is one GPU"),
+        (["ranks=0"], 2, "ranks: 0 is no number of ranks"),
+        (["ranks=many"], 2, "ranks: 'many' is no number of ranks"),
+    ],
+)
+def test_bad_ranks(here, monkeypatch, capsys, words, n_gpus, cure):
+    monkeypatch.setattr(gpu, "count", lambda: n_gpus)
+    assert train.main([*TINY, *words]) == 2
+    assert cure in capsys.readouterr().err and not any(here.iterdir())
+
+
+@pytest.mark.parametrize(
+    "words, n_gpus, expected",
+    [
+        (["ranks=all", "device=auto"], 4, 4),
+        (["ranks=2", "device=auto"], 4, 2),
+        (["ranks=3", "device=auto"], 0, 3),
+        (["ranks=9", "device=cpu"], 2, 9),
+        (["device=cuda:1"], 2, 1),
+    ],
+)
+def test_number_of_ranks(monkeypatch, words, n_gpus, expected):
+    monkeypatch.setattr(gpu, "count", lambda: n_gpus)
+    cfg = tiny.settings(*TINY, *words)
+    assert launcher.n_ranks(cfg) == expected
+    assert launcher.is_needed(cfg) == (expected > 1)
+
+
+def as_rank(monkeypatch, rank, n_ranks):
+    for name, value in dict(RANK=rank, WORLD_SIZE=n_ranks, LOCAL_RANK=rank).items():
+        monkeypatch.setenv(name, str(value))
+
+
+def test_ranks_under_torchrun(monkeypatch):
+    as_rank(monkeypatch, 0, 2)
+    for words in ([], ["ranks=2"]):
+        cfg = tiny.settings(*TINY, *words)
+        assert cfg.ranks == 2 and not launcher.is_needed(cfg)
+    with pytest.raises(ConfigErrors, match="ranks: 3 is not .* torchrun has started, 2;"):
+        tiny.settings(*TINY, "ranks=3")
+
+
+@pytest.mark.parametrize("rank, n_lines", [(0, 1), (1, 0)])
+def test_sweep_under_torchrun(here, monkeypatch, capsys, rank, n_lines):
+    as_rank(monkeypatch, rank, 2)
+    assert train.main([*tiny.TINY, "-m", "seed=1,2"]) == 2
+    assert capsys.readouterr().err.count("leave torchrun out") == n_lines
+    assert not any(here.iterdir())
+
+
+def test_dry_run(here, capsys):
+    assert train.main([*TINY, "ranks=3", "dry_run=true"]) == 0
+    text = capsys.readouterr().out
+    assert "3 x cpu" in text and not any(here.iterdir())
+    numbers = {"environments": 4, "an update": 4 * 8, "a minibatch": 4 * 8 // 2}
+    for name, number in numbers.items():
+        (line,) = (line for line in text.splitlines() if name in line)
+        assert {str(number), str(3 * number)} <= set(line.split())
+
+
+def test_dry_run_counts_lanes_that_learn(here, capsys):
+    duels = "env=deathmatch", "geometry=box", "preset=cpu", "device=cpu", "dry_run=true"
+    sizes = "env.n_envs=10", "env.n_agents=3", "opponents.past=0.4", "opponents.snapshots=2"
+    assert train.main([*duels, *sizes, "opponents.bot=0.2", "learner.n_steps=8"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    (learn,) = (line for line in lines if "learn" in line)
+    (update,) = (line for line in lines if "update" in line)
+    # six environments have opponents, two each
+    assert str(30 - 6 * 2) in learn and str(8 * (30 - 6 * 2)) in update
+    assert train.main([*duels, *sizes, "opponents.past=0.9", "opponents.bot=0.2"]) == 2
+    assert "their sum must be at most 1" in capsys.readouterr().err
+
+
+# ---- What the ranks' endings mean for the process that launched them ----
+
+
+def launched(monkeypatch, *attempts, failure=None):
+    """Trains with ranks that end as given, and returns the run's folder."""
+
+    def run_agent(n_ranks, n_restarts):
+        folder = launcher.Path(os.environ[launcher.JOB])
+        for attempt, ending in enumerate(attempts):
+            (folder / f"pid-{attempt}-0").write_text("999999999")
+            if ending:
+                ending.write(folder / f"ending-{attempt}")
+            time.sleep(0.4 * (len(attempts) > 1))  # more than the launching process sleeps
+        if failure:
+            raise failure
+
+    monkeypatch.setattr(launcher, "launch_ranks", run_agent)
+    return train.run(tiny.settings(*TINY, "ranks=2", "restarts=1"))
+
+
+def test_folder_of_launched_run(monkeypatch):
+    assert str(launched(monkeypatch, Ending(folder="run"))) == "run"
+    assert launcher.JOB not in os.environ
+
+
+def test_errors_of_launched_run(monkeypatch):
+    with pytest.raises(UserError, match="too small") as error:
+        launched(monkeypatch, Ending(2, "too small"))
+    assert error.value.code == 2
+    with pytest.raises(Interrupted) as error:
+        launched(monkeypatch, Ending(143, "Stopped after 3 samples"))
+    assert error.value.args == (143 - 128, "Stopped after 3 samples")
+
+
+def test_restart_is_announced(monkeypatch, capsys):
+    lost = Ending(launcher.LOST, "rank 1 hangs. Its last checkpoint is whole. To continue: train")
+    assert launched(monkeypatch, lost, Ending(folder="run"))
+    sentence = "rank 1 hangs. Its last checkpoint is whole. Starting again, 1 of restarts=1."
+    assert capsys.readouterr().err == f"warning: {sentence}\n"
+
+
+class Failed(Exception):
+    def __init__(self, exitcode):
+        self.exitcode = exitcode
+        self.failures = {1: self}
+
+
+def test_rank_that_said_nothing(monkeypatch):
+    with pytest.raises(UserError, match="rank 1 on .* SIGKILL.*Nothing was saved yet") as error:
+        launched(monkeypatch, None, failure=Failed(-signal.SIGKILL))
+    assert error.value.code == launcher.LOST
+    with pytest.raises(UserError, match="rank 1 on .* SIGKILL"):  # and torchrun stopped rank 0
+        launched(monkeypatch, Ending(143, "stopped"), failure=Failed(-signal.SIGKILL))
+    with pytest.raises(UserError, match="cannot be started: no address"):
+        launched(monkeypatch, failure=OSError("no address"))
+
+
+def test_ranks_share_the_cores_that_they_may_use(here, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 128)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(16))
+    with launcher.variables(here, 2):
+        assert os.environ["OMP_NUM_THREADS"] == "8"
+    assert "OMP_NUM_THREADS" not in os.environ
+
+
+# ---- Two ranks ----
+
+
+@contextlib.contextmanager
+def started(here, *words, script=ROOT / "train.py", base=TINY, **env):
+    """Starts two ranks of the run that the words of `base` and `words` say. A context, at whose end
+    none is left.
+    """
+    (here / "tmp").mkdir(exist_ok=True)
+    env = os.environ | {"TMPDIR": str(here / "tmp")} | env
+    process = subprocess.Popen(
+        [sys.executable, str(script), *base, "ranks=2", *words],
+        env=env,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def pid_of(here, rank, attempt=0):
+    (path,) = (here / "tmp").glob(f"megastep-*/pid-{attempt}-{rank}")
+    return int(path.read_text())
+
+
+def wait_for_checkpoint(here, process):
+    wait_until(lambda: [*(here / "run" / "checkpoints").glob("step_*[0-9]")], process)
+    time.sleep(1)
+
+
+def wait_for_end(process):
+    """Returns the exit code, what was printed, and the seconds it took."""
+    began = time.monotonic()
+    out, err = process.communicate(timeout=HUNG)
+    return process.returncode, out, err, time.monotonic() - began
+
+
+@pytest.mark.slow
+def test_one_voice(here):
+    with started(here, f"samples={8 * UPDATE}", "finish.evaluate=true", "finish.episodes=8") as run:
+        code, out, err, _ = wait_for_end(run)
+    assert (code, err) == (0, "")
+    first, *_ = out.splitlines()
+    assert first == "Training on 2 x cpu in run"
+    assert out.count("samples ·") == 1 and out.count("8 episodes") == 1
+    assert not any((here / "tmp").iterdir())
+    rows = json_lines.read(here / "run" / "metrics.jsonl")
+    assert [row["samples"] for row in rows] == [UPDATE * n for n in range(1, 9)]
+
+
+@pytest.mark.slow
+def test_error_of_the_ranks_is_told_once(here):
+    with started(here, "device=cuda", CUDA_VISIBLE_DEVICES="") as run:
+        code, _, err, _ = wait_for_end(run)
+    assert code == 2 and err.count("train.py: ") == 1 and not (here / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "number, is_group, base, update",
+    [
+        pytest.param(signal.SIGINT, False, TINY, UPDATE, marks=pytest.mark.nightly),
+        pytest.param(signal.SIGTERM, True, TINY, UPDATE, marks=pytest.mark.slow),
+        pytest.param(signal.SIGINT, True, ON_GPUS, UPDATE_ON_GPUS, marks=TWO_GPUS),
+    ],
+    ids=["SIGINT-cpu", "SIGTERM-cpu", "SIGINT-cuda"],
+)
+def test_signal_saves_once(here, number, is_group, base, update):
+    with started(here, "checkpoint_seconds=1", base=base) as run:
+        wait_for_checkpoint(here, run)
+        (os.killpg if is_group else os.kill)(run.pid, number)
+        code, out, err, _ = wait_for_end(run)
+    assert code == 128 + number and out.count("Stopping after this update") == 1
+    samples = checkpoint.load_latest(here / "run" / "checkpoints").step
+    resume = "To continue: python train.py resume=run"
+    assert err == f"train.py: Stopped after {samples:,} samples. {resume}\n"
+    assert not any((here / "tmp").iterdir()) and not (here / "run" / "lock").exists()
+    total = samples + 2 * update
+    assert train.main(["resume=run", f"samples={total}"]) == 0  # with two ranks again
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step == total
+
+
+@pytest.mark.parametrize(
+    "rank, base",
+    [
+        pytest.param(0, TINY, marks=pytest.mark.nightly),
+        pytest.param(1, TINY, marks=pytest.mark.slow),
+        pytest.param(0, ON_GPUS, marks=TWO_GPUS),
+        pytest.param(1, ON_GPUS, marks=TWO_GPUS),
+    ],
+    ids=["0-cpu", "1-cpu", "0-cuda", "1-cuda"],
+)
+def test_killed_rank(here, rank, base):
+    with started(here, "checkpoint_seconds=1", base=base) as run:
+        wait_for_checkpoint(here, run)
+        pids = [pid_of(here, n) for n in range(2)]
+        os.kill(pids[rank], signal.SIGKILL)
+        code, out, err, seconds = wait_for_end(run)
+    assert code == launcher.LOST and seconds < 30
+    assert err.startswith(f"train.py: rank {rank} on ") and err.count("\n") == 1
+    assert "killed" in err and err.endswith("To continue: python train.py resume=run\n")
+    assert "Stopping" not in out and not any(map(is_running, pids))
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step > 0
+
+
+@pytest.mark.slow
+def test_stopped_rank(here):
+    with started(here, "checkpoint_seconds=1") as run:
+        wait_for_checkpoint(here, run)
+        pids = [pid_of(here, n) for n in range(2)]
+        os.kill(pids[1], signal.SIGSTOP)
+        code, _, err, seconds = wait_for_end(run)
+    assert code == launcher.LOST and seconds < 30
+    assert err.startswith("train.py: rank 1 on ") and not any(map(is_running, pids))
+
+
+@pytest.mark.slow
+def test_restart(here):
+    total = f"samples={400 * UPDATE}"
+    with started(here, "checkpoint_seconds=1", "restarts=1", total) as run:
+        wait_for_checkpoint(here, run)
+        os.kill(pid_of(here, 1), signal.SIGKILL)
+        code, out, err, _ = wait_for_end(run)
+    assert code == 0 and out.count("Training on 2 x cpu in run") == 2
+    assert err.startswith("warning: rank 1 on ") and "Starting again, 1 of restarts=1" in err
+    rows = json_lines.read(here / "run" / "metrics.jsonl")
+    assert [row["updates"] for row in rows] == [*range(1, 401)]
+
+
+@pytest.mark.slow
+def test_ranks_end_with_the_process_that_launched_them(here):
+    with started(here) as run:
+        wait_for_checkpoint_or_start(here, run)
+        pids = [pid_of(here, n) for n in range(2)]
+        run.kill()
+        deadline = time.monotonic() + 30
+        while any(map(is_running, pids)) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert not any(map(is_running, pids))
+    assert checkpoint.load_latest(here / "run" / "checkpoints").step > 0
+
+
+def wait_for_checkpoint_or_start(here, process):
+    wait_until(lambda: (here / "run" / "metrics.jsonl").exists(), process)
+    time.sleep(1)
+
+
+STUCK = """
+import os, time
+from megastep.envs import Minimal
+
+class Stuck(Minimal):
+    n = 0
+
+    def step(self, decision):
+        Stuck.n += 1
+        while Stuck.n > 80 and os.environ["RANK"] == "1":
+            {}
+        return super().step(decision)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "line, code, expected",
+    [("pass", launcher.LOST, "hangs: "), ("raise MemoryError", 2, "Out of memory")],
+)
+def test_rank_that_fails_alone(here, line, code, expected):
+    (here / "stuck.py").write_text(STUCK.format(line))
+    with started(here, "env=stuck:Stuck", "checkpoint_seconds=1e-9", "log_every=100") as run:
+        wait_for_checkpoint(here, run)
+        got, _, err, seconds = wait_for_end(run)
+    assert got == code and seconds < 35
+    assert err.startswith("train.py: rank 1 on ") and err.count("\n") == 1
+    assert expected in err and "resume=run" in err
+
+
+DRIFTS = """
+from megastep.agents.algorithms.ppo import PPO
+from megastep.agents.distributed import pooling
+
+class Drifts(PPO):
+    pass
+
+def average(parameters, n_valid, means=()):
+    return n_valid, [value.detach() for value in means]
+
+import megastep.agents.algorithms.gradient_steps as steps
+steps.average_gradients = average
+"""
+
+
+@pytest.mark.slow
+def test_learner_that_does_not_average(here):
+    (here / "drifts.py").write_text(DRIFTS)
+    with started(here, "learner=drifts:Drifts", f"samples={9 * UPDATE}") as run:
+        code, _, err, _ = wait_for_end(run)
+    assert code == 2 and err.startswith("train.py: The ranks drift apart: policy.")
+    assert "differs on rank 1; " in err and "average_gradients" in err and err.count("\n") == 1
+
+
+# ---- torchrun ----
+
+
+def torchrun(*words, **options):
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    return subprocess.run(
+        [*command, *words], capture_output=True, text=True, timeout=HUNG, **options
+    )
+
+
+@pytest.mark.slow
+def test_torchrun(here):
+    script = str(ROOT / "train.py")
+    result = torchrun(script, *TINY, f"samples={3 * UPDATE}")
+    assert result.returncode == 0 and result.stdout.startswith("Training on 2 x cpu in run\n")
+    refused = torchrun(script, *TINY, "ranks=3", "folder=other")
+    assert refused.returncode != 0 and not (here / "other").exists()
+    assert refused.stderr.count("ranks: 3 is not") == 1
+
+
+DIFFERING = """
+import os, sys
+from megastep.agents.cli import train
+sys.exit(train.main([*sys.argv[1:], "learner.lr=0.00" + str(1 + int(os.environ["RANK"]))]))
+"""
+
+
+@pytest.mark.slow
+def test_ranks_with_different_words(here):
+    (here / "differing.py").write_text(DIFFERING)
+    result = torchrun("differing.py", *TINY, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert result.returncode != 0 and not (here / "run").exists()
+    line = "The ranks differ: learner.lr is 0.001 on rank 0, and 0.002 on rank 1"
+    assert result.stderr.count(line) == 1

@@ -1,0 +1,241 @@
+"""Runs of two ranks: equal weights, exact resume, another number of ranks, an evaluation."""
+
+import json
+import os
+import re
+import signal
+import time
+
+import pytest
+import torch
+
+from megastep import spaces
+from megastep.agents.cli import train
+from megastep.agents.distributed import process_group
+from megastep.agents.launch import train as launch_train
+from megastep.agents.runs import annealing, checkpoint, json_lines
+from megastep.arrdict import arrdict
+from tests.cli.test_exact_resume import CASES, EVERY_UPDATE, differences
+from tests.helpers import ranks, tiny
+
+pytestmark = pytest.mark.slow
+LEARNERS = "ppo", "lag", "priorities", "r2d2", "opponents"
+NO_FINISH = "finish.evaluate=false", "finish.record=false"
+PPO = [*tiny.TINY, *tiny.SHORT_EPISODES]
+
+
+def trained(*words):
+    """Trains in this rank. Returns what it learnt, and a copy of its state."""
+    trainers, make_trainer = [], launch_train.make_trainer
+
+    def remember(*arguments):
+        trainers.append(make_trainer(*arguments))
+        return trainers[-1]
+
+    launch_train.make_trainer = remember
+    try:
+        assert train.main([*words]) == 0
+    finally:
+        launch_train.make_trainer = make_trainer
+    (trainer,) = trainers
+    state = trainer.state_dict()
+    return dict(
+        policy=state["policy"],
+        optimizer=state["learner"]["optimizer"],
+        actions=trainer.rollout.actions,
+        generators=[state["learner"][name] for name in ("generator", "policy_generator")],
+        n=(trainer.samples, trainer.updates, trainer.episode_stats.windows),
+        parts=trainer.saver.rank_files.rank,
+    )
+
+
+def run_and_resume():
+    """Trains each learner, resumes it after a checkpoint in the middle, and returns by name what it
+    learnt, and what differs when it was resumed.
+    """
+    results = {}
+    for name in LEARNERS:
+        words = [*CASES[name], "samples=512", "log_every=2", f"folder={name}"]
+        learnt = trained(*words, *EVERY_UPDATE)
+        folder = f"{name}/checkpoints"
+        alone = whole(checkpoint.list_checkpoints(folder)[-1])
+        metrics = open(f"{name}/metrics.jsonl", "rb").read()
+        paths = process_group.gather_objects(checkpoint.list_checkpoints(folder))[0]
+        trained(f"resume={paths[len(paths) // 2]}")
+        again = whole(checkpoint.list_checkpoints(folder)[-1])
+        is_same = open(f"{name}/metrics.jsonl", "rb").read() == metrics
+        results[name] = learnt, len(paths), differences(alone, again), is_same
+        process_group.exchange([0])  # before either goes on
+    return results
+
+
+def whole(path):
+    """Returns the state of both ranks in a checkpoint, without the seconds."""
+    states = {str(rank): checkpoint.load_latest(path, rank=rank).state for rank in range(2)}
+    return {rank: state | {"seconds": 0} for rank, state in states.items()}
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def on_ranks(here):
+    return ranks.call(run_and_resume)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_ranks_learn_the_same_from_different_samples(on_ranks, name):
+    (first, *_), (second, *_) = (results[name] for results in on_ranks)
+    assert differences(first["policy"], second["policy"]) == []
+    assert differences(first["optimizer"], second["optimizer"]) == []
+    assert first["n"] == second["n"] and first["n"][0] >= 512
+    assert differences(first["generators"], second["generators"])
+    assert differences(first["actions"], second["actions"])
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_resumed_ranks_have_the_same_bits(on_ranks, name):
+    for results in on_ranks:
+        _, n_checkpoints, differing, has_same_metrics = results[name]
+        assert differing == [] and has_same_metrics and n_checkpoints >= 4
+
+
+@pytest.fixture(scope="module")
+def alone(here):
+    """A run of two ranks in processes of their own, with its output."""
+    words = *PPO, "samples=1280", "log_every=2", "folder=alone", "snapshots=2"
+    finish = "finish.evaluate=true", "finish.episodes=9", "finish.record=true", "finish.steps=2"
+    return ranks.train(*words, *finish)
+
+
+def test_rank_0_writes_and_speaks(alone, here):
+    first, second = alone
+    assert not (second.stdout + second.stderr + first.stderr).strip()
+    assert re.search("trained .* 9 ", first.stdout)
+    samples = [row["samples"] for row in json_lines.read("alone/metrics.jsonl")]
+    assert samples == [*range(128, 1281, 128)]  # of both ranks
+    assert len(annealing.read("alone")) == 20
+    (row,) = json_lines.read("alone/provenance.jsonl")
+    assert row["ranks"] == 2 and row["hosts"]
+    assert len(checkpoint.list_checkpoints("alone/snapshots")) == 2
+    assert (here / "alone/video.mp4").exists()
+    left = {path.name for path in (here / "alone/checkpoints").iterdir()}
+    assert left == {"step_1280"}
+    (table,) = (here / "alone/evaluations").glob("*.json")
+    assert [row["lanes"] for row in json.loads(table.read_text())["rows"]] == [9, 9]
+
+
+def test_killed_ranks_go_on_bit_for_bit(alone, here):
+    words = *PPO, "samples=1280", "log_every=2", "folder=killed", *EVERY_UPDATE
+    with ranks.started([ranks.ROOT / "train.py", *words]) as processes:
+        deadline = time.monotonic() + ranks.HUNG
+        while not checkpoint.list_checkpoints("killed/checkpoints"):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        for process in processes:
+            os.kill(process.pid, signal.SIGKILL)
+    assert not (here / "killed/checkpoints/step_1280").exists()
+    resumed, _ = ranks.train("resume=killed")
+    assert "bit for bit" not in resumed.stdout
+    for name in "metrics.jsonl", "annealing.f64":
+        assert (here / "killed" / name).read_bytes() == (here / "alone" / name).read_bytes()
+    paths = (f"{name}/checkpoints/step_1280" for name in ("killed", "alone"))
+    assert differences(*map(whole, paths)) == []
+    assert not [*(here / "killed/checkpoints").glob(".rank*")]
+
+
+def test_another_number_of_ranks_goes_on(alone, here, capsys):
+    assert train.main(["resume=alone", "samples=1408", "ranks=1", *NO_FINISH]) == 0
+    line = "goes on, but not bit for bit: ranks was 2 and is 1."
+    assert line in capsys.readouterr().out
+    assert not (here / "alone/checkpoints/step_1408/rank1.pt").exists()
+    first, _ = ranks.train("resume=alone", "samples=1536", *NO_FINISH)
+    assert "ranks was 1 and is 2; ranks that it did not have begin new episodes." in first.stdout
+    assert checkpoint.load_latest("alone/checkpoints/step_1536").n_ranks == 2
+    states = whole(checkpoint.list_checkpoints("alone/checkpoints")[-1])
+    generators = [state["learner"]["policy_generator"] for state in states.values()]
+    assert not torch.equal(*(generator["generator"] for generator in generators))
+
+
+def test_ranks_share_duels_and_evaluations(here):
+    """Together they play what one process plays: as often in each home and from each place."""
+    words = ["env=tests.helpers.games:Matrix", "env.n_agents=2", "env.n_envs=4", "geometry=homes"]
+    words += ["geometry.n=7", "samples=1", "folder=games", "preset=cpu", "agent.width=8"]
+    device = "device=cpu"
+    assert train.main([*words, device, *NO_FINISH, "learner.n_minibatches=2"]) == 0
+    counts, script = [], ranks.ROOT / "evaluate.py"
+    for n_ranks in 1, 2:
+        for against in (), ("against=tests.helpers.games:High",):
+            results = ranks.run(
+                [script, "run=games", "episodes=41", device, *against], n_ranks=n_ranks
+            )
+            assert not any(one.returncode for one in results), [one.stderr for one in results]
+            assert not any(one.stdout for one in results[1:])
+        tables = sorted((here / "games/evaluations").glob("*.json"))
+        rows = [json.loads(path.read_text())["rows"][0] for path in tables]
+        names = "lanes", "duels", "homes", "unfinished"
+        counts.append([[row.get(name) for name in names] for row in rows])
+    assert counts[0] == counts[1] and len(counts[0]) == 2
+
+
+class Copy:
+    """Reward 1 for the action that equals the observed bit; episodes of four steps."""
+
+    def __init__(self, n_envs, seed=1, device="cpu"):
+        self.n_envs, self.device = n_envs, torch.device(device)
+        self.obs_space, self.action_space = spaces.MultiVector(1, 2), spaces.MultiDiscrete(1, 2)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.age, self.bits = torch.zeros(n_envs), torch.zeros(n_envs, dtype=torch.int64)
+
+    def world(self, reward, reset):
+        self.age = (self.age + 1).masked_fill(reset, 0)
+        self.bits = torch.randint(2, (self.n_envs,), generator=self.generator)
+        return arrdict(
+            obs=torch.nn.functional.one_hot(self.bits, 2)[:, None].float(),
+            reward=reward.masked_fill(reset, 0),
+            reset=reset,
+            terminal=self.age == 4,
+            truncated=torch.zeros(self.n_envs, dtype=torch.bool),
+        )
+
+    def reset(self):
+        return self.world(torch.zeros(self.n_envs), torch.ones(self.n_envs, dtype=torch.bool))
+
+    def step(self, decision):
+        return self.world((decision.actions[:, 0] == self.bits).float(), self.age == 4)
+
+
+def learning_curves(n_envs):
+    """Returns the mean returns of each report of three runs with other seeds."""
+    words = ["env=tests.distributed.test_rank_runs:Copy", "preset=cpu", "device=cpu"]
+    words += [
+        "agent.width=16",
+        f"env.n_envs={n_envs}",
+        "learner.n_steps=8",
+        "learner.lr=3e-3",
+        "log_every=5",
+    ]
+    words += ["samples=10240", "learner.n_minibatches=2", "desync=false", *NO_FINISH]
+    curves = []
+    for seed in (1, 2, 3):
+        folder = f"copy-{n_envs}-{seed}"
+        trained(*words, f"seed={seed}", f"folder={folder}")
+        rows = json_lines.read(f"{folder}/metrics.jsonl")
+        curves.append([row["episode/return"] for row in rows])
+    return curves
+
+
+def test_two_ranks_learn_as_fast_as_one_process_of_twice_the_environments(here):
+    shared, _ = (torch.tensor(curves) for curves in ranks.call(learning_curves, 16))
+    alone = torch.tensor(learning_curves(32))
+    assert shared.shape == alone.shape  # reports at the same samples
+    assert (alone[:, 0] < 2.6).all() and (alone[:, -1] > 3.4).all()  # from chance, 2 of 4
+    spread = ((shared.var(0) + alone.var(0)) / 2).sqrt().clamp(min=0.03)  # of seeds
+    difference = (shared.mean(0) - alone.mean(0)).abs()
+    assert (difference < 3 * spread).all(), (difference / spread).tolist()
+    assert difference.mean() < 0.1

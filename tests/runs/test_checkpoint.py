@@ -1,0 +1,430 @@
+"""Checkpoints are whole or absent, and damage is reported. Files are really damaged, and processes
+really killed.
+"""
+
+import errno
+import hashlib
+import itertools
+import json
+import os
+import pathlib
+import pickle
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from megastep.agents.runs import atomic_files, checkpoint, checkpoint_format
+from megastep.agents.runs.checkpoint import CheckpointError
+from tests.helpers import faults
+from tests.helpers.processes import HUNG
+
+CONFIG = {"env": {"name": "box"}}
+ROOT = pathlib.Path(__file__).parents[2]
+
+
+def state(n):
+    """A state whose tensor and numbers tell which save it is from."""
+    return {
+        "weights": {"w": torch.full((1000,), float(n))},
+        "samples": n,
+        "rate": 0.5,
+        "none": None,
+        "list": [1, 2],
+    }
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Three checkpoints, of steps 10, 20 and 30."""
+    for n in (10, 20, 30):
+        checkpoint.save(tmp_path, n, state(n), CONFIG, keep_checkpoints=3)
+    return tmp_path
+
+
+def names(folder):
+    return [path.name for path in checkpoint.list_checkpoints(folder)]
+
+
+def test_load_returns_what_was_saved(folder):
+    loaded = checkpoint.load_latest(folder)
+    assert loaded.step == 30 and loaded.config == CONFIG and loaded.path == folder / "step_30"
+    assert torch.equal(loaded.state.pop("weights")["w"], torch.full((1000,), 30.0))
+    assert loaded.state == {"samples": 30, "rate": 0.5, "none": None, "list": [1, 2]}
+
+
+def test_versions_that_a_run_was_made_with_are_saved(tmp_path):
+    checkpoint.save(tmp_path, 1, state(1), CONFIG, made_with={"torch": "2.0", "threads": 2})
+    assert checkpoint.load_latest(tmp_path).made_with == {"torch": "2.0", "threads": 2}
+
+
+def test_load_one_checkpoint_by_path(folder):
+    assert checkpoint.load_latest(folder / "step_10").step == 10
+
+
+def test_checkpoints_are_sorted_by_number(tmp_path):
+    for n in (9, 20, 100):
+        checkpoint.save(tmp_path, n, state(n), CONFIG, keep_checkpoints=9)
+    assert names(tmp_path) == ["step_9", "step_20", "step_100"]
+
+
+@pytest.mark.parametrize("fraction", [0, 0.1, 0.5, 0.99])
+@pytest.mark.parametrize("file", ["state.pt", "config.json", "manifest.json"])
+def test_truncated_file_is_named_and_the_previous_checkpoint_used(folder, file, fraction):
+    path = folder / "step_30" / file
+    os.truncate(path, int(fraction * path.stat().st_size))
+    with pytest.warns(UserWarning, match=f"step_30 is damaged: {file}.*using step_20"):
+        assert checkpoint.load_latest(folder).step == 20
+
+
+@pytest.mark.parametrize("file", ["manifest.json", "config.json"])
+def test_deeply_nested_file_is_damaged(folder, file):
+    path, brackets = folder / "step_30", 200_000 * b"["
+    (path / file).write_bytes(brackets)
+    if file == "config.json":
+        manifest = json.loads((path / "manifest.json").read_bytes())
+        del manifest["sha256"]
+        manifest["files"][file]["sha256"] = hashlib.sha256(brackets).hexdigest()
+        (path / "manifest.json").write_bytes(checkpoint_format.sealed(manifest))
+    with pytest.warns(UserWarning, match=f"step_30 is damaged: {file}.*using step_20"):
+        assert checkpoint.load_latest(folder).step == 20
+
+
+def test_missing_file_is_named(folder):
+    (folder / "step_30" / "state.pt").unlink()
+    with pytest.warns(UserWarning, match="state.pt cannot be read"):
+        assert checkpoint.load_latest(folder).step == 20
+
+
+@pytest.mark.parametrize(
+    "file, every", [("manifest.json", 7), ("config.json", 3), ("state.pt", 61)]
+)
+def test_every_flipped_bit_is_detected(folder, file, every):
+    path = folder / "step_30" / file
+    intact = path.read_bytes()
+    for bit in range(0, 8 * len(intact), every):
+        data = bytearray(intact)
+        data[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(data)
+        with pytest.raises(checkpoint.DamagedCheckpoint, match=f"step_30 is damaged: {file}"):
+            checkpoint.load_latest(folder / "step_30")
+    with pytest.warns(UserWarning, match=f"step_30 is damaged: {file}.*using step_20"):
+        assert checkpoint.load_latest(folder).step == 20
+    path.write_bytes(intact)
+    assert checkpoint.load_latest(folder).step == 30
+
+
+def test_newest_intact_checkpoint_is_used_when_several_are_damaged(folder):
+    for n in (20, 30):
+        os.truncate(folder / f"step_{n}" / "state.pt", 100)
+    with pytest.warns(UserWarning) as warnings:
+        assert checkpoint.load_latest(folder).step == 10
+    assert len(warnings) == 2
+
+
+def test_error_if_every_checkpoint_is_damaged(folder):
+    for n in (10, 20, 30):
+        os.truncate(folder / f"step_{n}" / "state.pt", 100)
+    with pytest.raises(CheckpointError, match="Every checkpoint.*step_30.*step_20.*step_10"):
+        checkpoint.load_latest(folder)
+
+
+def test_damaged_checkpoint_by_path_is_an_error(folder):
+    os.truncate(folder / "step_30" / "state.pt", 100)
+    with pytest.raises(CheckpointError, match="step_30"):
+        checkpoint.load_latest(folder / "step_30")
+
+
+def test_error_if_there_is_no_checkpoint(tmp_path):
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        checkpoint.load_latest(tmp_path)
+
+
+class Payload:
+    """Pickles into a call of open(path, 'w')."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+@pytest.mark.parametrize(
+    "write", [torch.save, lambda value, file: pickle.dump(value, open(file, "wb"))]
+)
+def test_code_in_a_checkpoint_is_refused_and_does_not_run(folder, tmp_path, write):
+    mark, path = tmp_path / "ran", folder / "step_30" / "state.pt"
+    write({"weights": Payload(mark)}, path)
+    manifest = json.loads((path.parent / "manifest.json").read_text())
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    manifest["files"]["state.pt"]["sha256"] = digest
+    seal(path.parent, manifest)
+    with pytest.warns(UserWarning, match="step_30 is refused"):
+        assert checkpoint.load_latest(folder).step == 20
+    assert not mark.exists()
+
+
+def seal(path, manifest):
+    """Writes a manifest with a valid digest."""
+    manifest.pop("sha256")
+    (path / "manifest.json").write_bytes(checkpoint_format.sealed(manifest))
+
+
+def with_format(path, version):
+    manifest = json.loads((path / "manifest.json").read_text())
+    seal(path, {**manifest, "format": version})
+
+
+@pytest.mark.parametrize("version, commit", [(4, "e9908db"), (1, "e17fabe")])
+def test_earlier_format_names_the_commit_that_reads_it(folder, version, commit):
+    with_format(folder / "step_30", version)
+    with pytest.raises(CheckpointError, match=rf"step_30 .*\(format {version}\).*{commit}"):
+        checkpoint.load_latest(folder)
+
+
+@pytest.mark.parametrize("version", [0, checkpoint_format.FORMAT + 1, "7"])
+def test_unknown_format_is_refused_and_not_skipped(folder, version):
+    with_format(folder / "step_30", version)
+    with pytest.raises(CheckpointError, match=f"step_30 has format {version}.*Update megastep"):
+        checkpoint.load_latest(folder)
+
+
+def test_every_earlier_format_is_read_here_or_by_a_commit():
+    versions = [*checkpoint_format.READERS, checkpoint_format.MIGRATED]
+    assert versions == list(range(1, checkpoint_format.FORMAT))
+
+
+def test_format_1_without_a_digest_is_an_earlier_format_and_not_damage(folder):
+    path = folder / "step_30" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    del manifest["sha256"]
+    path.write_text(json.dumps({**manifest, "format": 1}, indent=2))
+    with pytest.raises(CheckpointError, match=r"step_30 .*\(format 1\)"):
+        checkpoint.load_latest(folder)
+
+
+def test_last_checkpoints_and_the_best_are_kept(tmp_path):
+    for n, score in ((1, 5.0), (2, 9.0), (3, None), (4, 1.0), (5, 2.0)):
+        checkpoint.save(tmp_path, n, state(n), CONFIG, keep_checkpoints=2, score=score)
+    assert names(tmp_path) == ["step_2", "step_4", "step_5"]
+
+
+def test_old_checkpoints_are_kept_until_the_new_one_is_verified(folder, monkeypatch):
+    write_file = checkpoint_format._write_file
+
+    def write_half(path, *arguments):
+        entry = write_file(path, *arguments)
+        os.truncate(path, entry["bytes"] // 2)
+        return entry
+
+    monkeypatch.setattr(checkpoint_format, "_write_file", write_half)
+    with pytest.raises(CheckpointError, match="step_40"):
+        checkpoint.save(folder, 40, state(40), CONFIG, keep_checkpoints=2)
+    assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_20", "step_30"]
+
+
+def test_same_step_can_be_saved_repeatedly(folder):
+    for n in (31, 32, 33):
+        checkpoint.save(folder, 30, state(n), CONFIG, keep_checkpoints=3)
+        assert checkpoint.load_latest(folder).state["samples"] == n
+        assert [checkpoint.step_of(path) for path in checkpoint.list_checkpoints(folder)] == [
+            10,
+            20,
+            30,
+        ]
+    assert len(list(folder.iterdir())) == 3
+
+
+def test_damaged_second_checkpoint_of_a_step_falls_back(folder):
+    checkpoint.save(folder, 30, state(31), CONFIG, keep_checkpoints=3)
+    os.truncate(checkpoint.list_checkpoints(folder)[-1] / "state.pt", 10)
+    with pytest.warns(UserWarning, match="is damaged"):
+        assert checkpoint.load_latest(folder).step == 20
+
+
+class Killed(BaseException):
+    """Stands for kill -9: no file changes after it."""
+
+
+@pytest.mark.parametrize("step", [30, 31, 15])
+@pytest.mark.parametrize("n_old", [1, 3])
+def test_kill_between_any_two_file_operations_leaves_an_intact_checkpoint(
+    tmp_path, step, n_old, monkeypatch
+):
+    operations = [
+        (os, "replace"),
+        (os, "mkdir"),
+        (shutil, "rmtree"),
+        (checkpoint_format, "_write_file"),
+    ]
+    for n in itertools.count():
+        folder = tmp_path / str(n)
+        for old in (10, 20, 30)[-n_old:]:
+            checkpoint.save(folder, old, state(old), CONFIG, keep_checkpoints=3)
+        n_done = itertools.count()
+
+        def until_killed(real, n=n, n_done=n_done):
+            def operation(*args, **kwargs):
+                if next(n_done) >= n:
+                    raise Killed
+                return real(*args, **kwargs)
+
+            return operation
+
+        with pytest.MonkeyPatch.context() as patch:
+            for module, name in operations:
+                patch.setattr(module, name, until_killed(getattr(module, name)))
+            try:
+                checkpoint.save(folder, step, state(99), CONFIG, keep_checkpoints=2)
+                break
+            except Killed:
+                monkeypatch.setattr(atomic_files, "_TOKEN", f"process{n}")
+        loaded = checkpoint.load_latest(folder)
+        assert loaded.state["samples"] in (99, 30), n
+        checkpoint.save(folder, step + 1, state(100), CONFIG, keep_checkpoints=2)
+        assert checkpoint.load_latest(folder).state["samples"] == 100
+        assert not list(folder.glob("*.tmp-*"))
+    assert n >= 5 and checkpoint.load_latest(folder).state["samples"] == 99
+
+
+def test_checkpoint_is_on_disk_before_it_is_renamed(tmp_path, monkeypatch):
+    """After a power cut, the disk holds what was flushed: its files and folder, then the rename."""
+    events = []
+
+    def recorded(operation, of):
+        def call(*args):
+            operation(*args)
+            events.append(of(*args))
+
+        return call
+
+    def renamed(temporary, path):
+        return {entry.stat().st_ino for entry in (path, *path.iterdir())}
+
+    monkeypatch.setattr(os, "fsync", recorded(os.fsync, lambda handle: os.fstat(handle).st_ino))
+    monkeypatch.setattr(os, "replace", recorded(os.replace, renamed))
+    path = checkpoint.save(tmp_path, 10, state(10), CONFIG)
+    (rename,) = [at for at, event in enumerate(events) if isinstance(event, set)]
+    assert events[rename] == set(events[:rename]) and len(list(path.iterdir())) == 3
+    assert events[rename + 1 :] == [tmp_path.stat().st_ino]
+
+
+SAVES_UNTIL_KILLED = """
+import os, random, signal, sys, time
+import torch
+from megastep.agents.training import checkpoint, checkpoint_format
+
+folder, kills, again = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "again"
+checkpoint.save(folder, 1, {"n": 1, "w": torch.zeros(50_000)}, {})
+random.seed(1)
+newest = 1
+for kill in range(kills):
+    child = os.fork()
+    if not child:
+        for n in range(newest + 1, 10**9):
+            step = 1 if again else n
+            checkpoint.save(folder, step, {"n": n, "w": torch.zeros(50_000)}, {})
+    time.sleep(random.uniform(0, 0.08))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    loaded = checkpoint.load_latest(folder).state["n"]
+    assert loaded >= newest, (loaded, newest)
+    newest = loaded
+checkpoint.save(folder, newest + 1, {"n": newest + 1}, {})
+print(newest, *sorted(os.listdir(folder)))
+"""
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("steps", ["new", pytest.param("again", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kills",
+    [5, pytest.param(40, marks=pytest.mark.slow)],
+)
+def test_kill_9_at_random_leaves_the_newest_checkpoint_intact(tmp_path, kills, steps):
+    process = subprocess.run(
+        [sys.executable, "-W", "error", "-c", SAVES_UNTIL_KILLED, tmp_path, str(kills), steps],
+        cwd=ROOT,
+        text=True,
+        timeout=HUNG,
+        stdout=subprocess.PIPE,
+    )
+    assert process.returncode == 0
+    newest, *files = process.stdout.split()
+    assert int(newest) > kills // 10, "too few processes lived long enough to save"
+    assert len(files) == 2 and not any("tmp" in name for name in files), files
+
+
+# ---- Resuming from an earlier checkpoint ----
+
+
+def test_checkpoint_saved_before_damaged_later_ones_is_the_latest(folder):
+    for n in (20, 30):
+        os.truncate(folder / f"step_{n}" / "state.pt", 100)
+    checkpoint.save(folder, 12, state(12), CONFIG, keep_checkpoints=2)
+    assert checkpoint.load_latest(folder).step == 12
+    checkpoint.save(folder, 14, state(14), CONFIG, keep_checkpoints=2)
+    assert checkpoint.load_latest(folder).step == 14
+    assert names(folder) == ["step_12", "step_14"]
+
+
+def test_later_checkpoints_are_set_aside(folder):
+    checkpoint.set_aside_after(folder, 30)
+    assert checkpoint.load_latest(folder).step == 30
+    checkpoint.set_aside_after(folder, 29)
+    assert checkpoint.load_latest(folder).step == 20
+    checkpoint.set_aside_after(folder, 10)
+    assert checkpoint.load_latest(folder).step == 10 and names(folder) == ["step_10"]
+    assert checkpoint.load_latest(folder / "step_30.aside").step == 30
+
+
+def test_set_aside_checkpoint_is_deleted_when_its_step_is_reached(folder):
+    checkpoint.set_aside_after(folder, 10)
+    checkpoint.save(folder, 25, state(25), CONFIG, keep_checkpoints=3)
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["step_10", "step_25", "step_30.aside"]
+    checkpoint.set_aside_after(folder, 10)
+    checkpoint.save(folder, 30, state(30), CONFIG, keep_checkpoints=3)
+    assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_30"]
+
+
+def test_same_step_can_be_set_aside_twice(folder):
+    checkpoint.set_aside_after(folder, 20)
+    checkpoint.save(folder, 30, state(31), CONFIG, keep_checkpoints=3)
+    checkpoint.set_aside_after(folder, 20)
+    assert names(folder) == ["step_10", "step_20"]
+
+
+def test_full_disk_leaves_existing_checkpoints(folder, monkeypatch):
+    def write(path, *_):
+        path.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(checkpoint_format, "_write_file", write)
+    with pytest.raises(OSError, match="No space left"):
+        checkpoint.save(folder, 40, state(40), CONFIG)
+    assert sorted(path.name for path in folder.iterdir()) == ["step_10", "step_20", "step_30"]
+
+
+def test_save_works_again_after_a_full_disk(folder):
+    big = {"w": torch.zeros(100_000)}
+    with faults.full_disk(20_000), pytest.raises(OSError, match="File too large"):
+        checkpoint.save(folder, 40, big, CONFIG)
+    assert checkpoint.load_latest(folder).step == 30 and len(list(folder.iterdir())) == 3
+    checkpoint.save(folder, 40, big, CONFIG)
+    assert checkpoint.load_latest(folder).step == 40
+
+
+def test_leftovers_of_killed_processes_are_ignored_and_deleted(folder, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic_files, "_TOKEN", "earlier")
+        leftover = atomic_files.temporary_path(folder / "step_40")
+    leftover.mkdir()
+    (leftover / "state.pt").write_bytes(b"half")
+    assert checkpoint.load_latest(folder).step == 30
+    checkpoint.save(folder, 60, state(60), CONFIG)
+    assert not leftover.exists()
