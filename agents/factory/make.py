@@ -9,7 +9,6 @@ import torch
 
 from megastep import contract, engine, scene, spaces
 from megastep.agents.algorithms.learner import LearnerError, check_learner
-from megastep.agents.distributed import process_group
 from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check
 from megastep.agents.factory.settings import (
@@ -67,11 +66,15 @@ def construct(settings: Any, constructor: Callable | None = None, **arguments: A
         return constructor(**{k: v for k, v in (vars(settings) | arguments).items() if k in taken})
 
 
-def make_device(name: str) -> torch.device:
-    """Returns the device of this name, for a rank without a number the GPU of its own."""
-    place = process_group.launched()
-    if place and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
-        name = f"cuda:{place.local_rank}"
+def make_device(name: str, index: int | None = None) -> torch.device:
+    """Returns the device of this name, and makes a GPU the current one.
+
+    Args:
+        name: `auto`, `cpu`, `cuda` or `cuda:1`.
+        index: of the GPU that `auto` and `cuda` mean.
+    """
+    if index is not None and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
+        name = f"cuda:{index}"
     with errors():
         device = engine.device(name)
     if device.type == "cuda":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING, Any
 
-from megastep.agents.distributed.process_group import rank
 from megastep.agents.types import LEARNER_DEFAULTS
 from megastep.env_state import EnvState
 from megastep.types import Env, optional
@@ -139,7 +138,7 @@ class RunState:
 
     def warn_of_unreachable(self) -> None:
         """Warns once of what the environment keeps where checkpoints cannot reach it."""
-        if self.has_named_unreachable or rank() > 0 or not self.is_resumable:
+        if self.has_named_unreachable or not self.is_resumable:
             return
         if names := self.env_state.unreachable():
             self.has_named_unreachable = True

@@ -14,8 +14,8 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.agreement import any_rank
 from megastep.agents.distributed.drift import check_drift
 from megastep.agents.distributed.plan import Plan, agree
-from megastep.agents.distributed.process_group import n_ranks, unhurried
-from megastep.agents.distributed.reports import mean_over_ranks
+from megastep.agents.distributed.process_group import n_ranks, rank, unhurried
+from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
 from megastep.agents.runs.run_state import RunState
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
@@ -185,7 +185,8 @@ class Trainer:
                 self.nonfinite_guard.end_rollout(self.rollout)
                 self.timer.start("update")
                 losses = self.update(plan.lr_fraction)
-                self.snapshot_saver(self)
+                with unhurried():
+                    self.snapshot_saver(self)
                 if self.updates % self.log_every == 0:
                     self.samples_at_report = self.samples
                     self.log(losses)
@@ -208,9 +209,9 @@ class Trainer:
         finally:
             with contextlib.suppress(Exception):  # as above
                 self.wait_for_collector()
-            self.saver.wait()
+            self.wait_for_saver()
         self.save_checkpoint(state, is_last=True)
-        self.saver.wait()
+        self.wait_for_saver()
 
     def close(self) -> None:
         """Closes the environment and the files of metrics, after training."""
@@ -295,9 +296,9 @@ class Trainer:
         loss_values = torch.stack(loss_values).tolist() if losses else []
         loss_values = dict(zip(losses, loss_values, strict=True))
         self.nonfinite_guard.warn_of_metrics(self.episode_stats, self.rollout)
-        stats = self.episode_stats.pop()
+        stats = self.episode_stats.pop(sum_over_ranks)
         if self.opponents is not None:
-            stats |= self.opponents.pop_win_rates()
+            stats |= self.opponents.pop_win_rates(sum_over_ranks)
         of_curriculum = {} if self.curriculum is None else self.curriculum.stats()
         means = mean_over_ranks({**of_curriculum, **loss_values})
         stats |= {name: means[name] for name in of_curriculum if name in means}
@@ -368,13 +369,20 @@ class Trainer:
         self.seconds_at_checkpoint = self.clock.seconds
         if not any_rank(not self.is_saved or (is_last and self.saver.lacks_replay)):
             return
-        self.run_state.warn_of_unreachable()
+        if rank() == 0:
+            self.run_state.warn_of_unreachable()
         state = self.state_dict() if state is None else state
         # a checkpoint must not reach further than what is on disk of the run's files
         if any_rank(not self._sync_files()) and not is_last:
             return
-        self.saver(self.samples, state, self.score, is_last)
+        with unhurried():
+            self.saver(self.samples, state, self.score, is_last)
         self.updates_at_checkpoint = self.updates
+
+    @unhurried()
+    def wait_for_saver(self) -> None:
+        """Waits until the last checkpoint is written, or has failed."""
+        self.saver.wait()
 
     @unhurried()
     def _sync_files(self):
