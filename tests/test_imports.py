@@ -32,7 +32,8 @@ ENGINE = (
     ("rendering",),
 )
 AGENTS = (
-    ("distributed", "errors", "generator", "package", "sections", "types"),
+    ("errors", "generator", "package", "sections", "types"),
+    ("distributed",),
     ("console", "networks"),
     ("storage",),
     ("algorithms",),

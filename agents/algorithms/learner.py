@@ -11,7 +11,7 @@ needs the attributes of `megastep.agents.types.Learner`, and is used like this:
 
 Rules:
 
-- `collect()` returns a `megastep.agents.types.Rollout`; `storage.rollout.Rollout` is one. The
+- `collect()` returns a `megastep.agents.types.RolloutLike`; `storage.rollout.Rollout` is one. The
   collector owns the rollout and may return the same object every time. `collect.rollout` exists
   before the first call, too.
 - `collect()` and `update()` do not synchronise host and device.
@@ -32,7 +32,7 @@ Rules:
   so that the next call captures again. A GPU's sections are measured that way; see
   `agents/sections.py` for how to time sections of your own. A collector's returns what collects
   without an update beside it, usually itself.
-- `megastep.agents.types.LEARNER_DEFAULTS` lists the optional attributes of a learner.
+- `megastep.agents.types.LearnerOptions` and `CollectorOptions` list what is optional.
   `bytes_per_env(env)` and, with a replay buffer, `replay_size(env)` are what a run checks its
   memory with before it starts.
 

@@ -26,7 +26,7 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
-from megastep.settings import MAX_ENVS, checked
+from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
 
 _PARTS = "starts", "actions", "logprobs"  # of a rollout, that a minibatch copies
@@ -83,7 +83,7 @@ class PPO(GradientLearner):
         auxiliary_coef: Coefficient = 0.5,
         max_grad_norm: Positive = 0.5,
         n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
-        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 4,
+        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
         target_kl: Positive | None = None,
         graph: bool = False,
         seed: int = 1,

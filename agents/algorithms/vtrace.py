@@ -37,7 +37,7 @@ from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings
 from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
-from megastep.settings import MAX_ENVS, checked
+from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
 
 # Metrics count larger ratios as e^20, so that their squares stay finite.
@@ -107,7 +107,7 @@ class VTrace(GradientLearner):
         auxiliary_coef: Coefficient = 0.5,
         max_grad_norm: Positive = 0.5,
         n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
-        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 4,
+        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
         lag: Annotated[int, Field(ge=0, le=2)] = 0,
         buffer: Literal["rollout", "replay"] = "rollout",
         replay: ReplaySettings = _REPLAY,

@@ -28,7 +28,7 @@ from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
 from megastep.agents.selfplay.bots import RandomActions
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.training import loggers
-from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.capture import state_tree
 from megastep.imports import import_object
 from megastep.types import n_lanes, optional
@@ -130,8 +130,9 @@ def check_memory(
     The `sample` gives an upper bound of what an environment takes, as it counts what environments
     share. Only if that does not fit, more of them are made.
     """
-    n_bytes = optional(learner, "bytes_per_env", LEARNER_DEFAULTS)(sample)
-    n, each = optional(learner, "replay_size", LEARNER_DEFAULTS)(sample)
+    options = with_defaults(learner, LearnerOptions)
+    n_bytes = options.bytes_per_env(sample)
+    n, each = options.replay_size(sample)
     total = n_copies * _nbytes(sample)
     with errors():
         engine.fit(n, each, sample.device, "observations of learner.replay.capacity")

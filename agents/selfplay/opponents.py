@@ -18,8 +18,7 @@ from megastep.agents.storage.rollout import copy_tree
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.settings import checked
-from megastep.types import Env, World, optional
-from megastep.types import Policy as AnyPolicy
+from megastep.types import Env, PolicyLike, World, optional
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -64,7 +63,7 @@ class Opponents:
         self,
         env: SkipValidation[Env],
         policy: SkipValidation[Policy],
-        scripted: SkipValidation[AnyPolicy] | None = None,
+        scripted: SkipValidation[PolicyLike] | None = None,
         *,
         past: Fraction = 0.0,
         bot: Fraction = 0.0,
@@ -112,6 +111,11 @@ class Opponents:
         if name == "env":  # not set yet while the object is being copied
             raise AttributeError(name)
         return getattr(self.env, name)
+
+    @property
+    def opponent_pool(self) -> "Opponents":
+        """This object, by the name under which a trainer looks for opponents."""
+        return self
 
     def reset(self) -> World:
         """Starts every episode and returns the first world."""

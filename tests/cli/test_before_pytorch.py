@@ -81,7 +81,7 @@ def test_arguments_are_read_again_after_a_change(tmp_path, monkeypatch):
     monkeypatch.setenv("MEGASTEP_CACHE", str(tmp_path))
     read = []
     monkeypatch.setattr(components, "read", lambda: read.append(1) or {})
-    monkeypatch.setattr(components.program, "CONFIGS", tmp_path / "agents/configs")
+    monkeypatch.setattr(components.package, "CONFIGS", tmp_path / "agents/configs")
     source = tmp_path / "agents/module.py"
     source.parent.mkdir()
     for text, n_reads in (("x = 1", 1), ("x = 1", 1), ("x = 2", 2), ("x = 1", 2)):

@@ -78,7 +78,6 @@ def trainer_in(folder, env=None, learner=PPO, past=0.0, **options):
         Saver(folder, {}),
         Budget(),
         log_every=7,
-        opponents=opponents,
         replay_folder=folder,
     )
 
