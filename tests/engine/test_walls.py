@@ -1,5 +1,5 @@
 """No agent ever passes a wall or gets stuck: half a million agent steps that try to, ten million in
-the slow tests, a hundred million on a GPU. `scripts/check_walls.py` makes a billion.
+the slow tests, a hundred million on a GPU.
 """
 
 import math
