@@ -11,6 +11,7 @@ from megastep.dotdict import dotdict
 from megastep.engine import checks, devices
 from megastep.geometries import sample
 from megastep.modules import RandomSpawns, to_global
+from tests.helpers.synchronisation import no_synchronisation
 from tests.helpers.texels import seen_of
 
 # ---- Facts to check by hand ----
@@ -368,15 +369,6 @@ def test_memory_of_a_gpu_includes_what_pytorch_caches(monkeypatch):
 # ---- On a GPU ----
 
 
-def no_synchronisation(act):
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        act()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-
-
 @pytest.mark.cuda
 def test_no_operation_synchronises():
     homes = sample("homes", 3)
@@ -399,7 +391,9 @@ def test_no_operation_synchronises():
         engine.physics(core.scenery, core.agents)
 
     everything()  # compiles, and fills caches
-    no_synchronisation(everything)
+    torch.cuda.synchronize()
+    with no_synchronisation():
+        everything()
     engine.check(core.agents)
 
 
