@@ -90,7 +90,8 @@ def check_minibatches(n_minibatches: int, n_lanes: int) -> None:
 class GradientLearner:
     """Base of the built-in learners: policy, gradient steps, CUDA graph, learning rate and state.
 
-    A subclass adds its settings, `collector`, `bytes_per_env` and `_update`.
+    A subclass adds its settings, `collector`, `bytes_per_env` and `_update`, and sets
+    `n_minibatches` if it splits lanes into minibatches.
 
     Args:
         policy: the policy to improve, in place.
@@ -107,6 +108,8 @@ class GradientLearner:
         check: finds non-finite numbers in rollouts and counts skipped updates.
         generator: the `SeededGenerator` of all random numbers in an update.
     """
+
+    n_minibatches = 1
 
     def __init__(
         self,
@@ -139,7 +142,11 @@ class GradientLearner:
 
         Returns metrics as tensors () on the device, averaged over the gradient steps.
         `loss/skipped_steps` counts the steps that were skipped because of non-finite numbers.
+
+        Raises:
+            ValueError: if there are fewer lanes than minibatches.
         """
+        check_minibatches(self.n_minibatches, rollout.n_lanes)
         return {f"loss/{name}": value for name, value in self.cuda_graph(rollout).items()}
 
     def _update(self, rollout: Rollout) -> dict[str, torch.Tensor]:

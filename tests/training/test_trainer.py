@@ -21,6 +21,7 @@ from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
 from megastep.agents.training.trainer import MAX_AHEAD, Trainer
 from megastep.agents.types import CollectorOptions, with_defaults
 from megastep.arrdict import arrdict
+from tests.helpers.synchronisation import no_synchronisation
 
 B, T, UPDATE = 6, 4, 24  # lanes, steps of a rollout, samples of an update
 
@@ -228,14 +229,11 @@ def test_the_host_does_not_wait_for_ever_for_a_gpu(monkeypatch):
 def test_phases_are_timed_on_a_gpu_without_waiting_for_it():
     timer, matrix = performance.PhaseTimer("cuda"), torch.rand(2048, 2048, device="cuda")
     torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_synchronisation():
         for _ in range(20):
             timer.start("work")
             matrix @ matrix
             timer.start("rest")
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
     seconds = timer.pop()
     assert set(seconds) == {"work", "rest"} and seconds["work"] > seconds["rest"] >= 0
     assert set(timer.pop()) == {"rest"}
