@@ -1,32 +1,41 @@
-"""Protocols of the learner's parts: Actor, Rollout, Collector, Learner, Logger, Saver and
-OpponentPool.
+"""Protocols of the learner's parts, and the defaults of what is optional.
 
-Nothing has to inherit from them: any object with these attributes will do. The rules behind them
-are in :mod:`megastep.agents.algorithms.learner`. T steps, B lanes.
+Nothing has to inherit from them: any object with these attributes will do. A protocol `XLike` is
+what the class `X` of megastep and any stand-in for it have in common. The rules behind them are in
+:mod:`megastep.agents.algorithms.learner`. T steps, B lanes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 
-from megastep.types import Env, Policy
+from megastep.types import Env, PolicyLike
 
 __all__ = [
-    "LEARNER_DEFAULTS",
     "Actor",
-    "Collector",
+    "CollectorLike",
+    "CollectorOptions",
     "Learner",
+    "LearnerOptions",
     "Logger",
+    "Moments",
     "OpponentPool",
-    "Rollout",
-    "Saver",
+    "RolloutLike",
+    "SaverLike",
+    "with_defaults",
 ]
 
+#: Number of entries, their mean and their variance; () or, for several quantities, mean and
+#: variance of one shape.
+Moments = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+T = TypeVar("T")
 
-class Actor(Policy, Protocol):
+
+class Actor(PolicyLike, Protocol):
     """A policy as :func:`megastep.agents.storage.collector.collect` runs it.
 
     If the rollout stores values, the actor also needs `value(features, privileged)`, and its
@@ -37,7 +46,7 @@ class Actor(Policy, Protocol):
         """Returns the autocast context in which the actor runs."""
 
 
-class Rollout(Protocol):
+class RolloutLike(Protocol):
     """T steps of B lanes. Row t of a (T, B) tensor is the outcome of the action taken at time t, as
     reported by the next world.
     """
@@ -56,42 +65,55 @@ class Rollout(Protocol):
         """Returns the float tensors by name, (T, B, ...) or (T+1, B, ...), to check them."""
 
 
-class Collector(Protocol):
-    """Acts in an environment and stores what happened.
+class CollectorLike(Protocol):
+    """Acts in an environment and stores what happened. `CollectorOptions` has what is optional."""
 
-    A collector that runs in the background also has `wait()`, which blocks until nothing acts in
-    the environment. One with `state_dict()` and `load_state_dict(state)`, of all that it carries
-    from rollout to rollout, lets a run be resumed bit for bit. One with `allocate_layouts()` has
-    the environment's layouts in its rollouts from then on, `rollout.layouts`, (T, B) int32, and
-    reports have statistics of episodes by the source of their floor plan.
+    rollout: RolloutLike  # what the last call returned; allocated and empty before the first call
+
+    def __call__(self) -> RolloutLike:
+        """Takes T steps in every lane and returns them."""
+
+
+class CollectorOptions(Protocol):
+    """What a collector may have besides `CollectorLike`, with the defaults.
+
+    Attributes:
+        allocate_layouts: has the environment's layouts in its rollouts from then on,
+            `rollout.layouts`, (T, B) int32, so that reports have statistics of episodes by the
+            source of their floor plan. None: they have not.
     """
 
-    rollout: Rollout  # what the last call returned; allocated and empty before the first call
+    allocate_layouts: Callable[[], None] | None = None
 
-    def __call__(self) -> Rollout:
-        """Takes T steps in every lane and returns them."""
+    @staticmethod
+    def wait() -> None:
+        """Blocks until nothing acts in the environment, for a collector in the background."""
+
+    @staticmethod
+    def state_dict() -> dict[str, Any]:
+        """Returns all that it carries from rollout to rollout, so that a run can be resumed bit for
+        bit. Empty: a resumed run begins new episodes.
+        """
+        return {}
+
+    @staticmethod
+    def load_state_dict(state: Mapping[str, Any]) -> None:
+        """Continues from a `state_dict`."""
 
 
 @runtime_checkable
 class Learner(Protocol):
     """Improves a policy: ``rollout = collect()``, ``losses = learner.update(rollout)``, repeat.
 
-    Optional attributes, whose defaults are in `LEARNER_DEFAULTS`:
-        set_lr(lr): changes the learning rate. Without it the rate is constant.
-        check: a `NonFiniteCheck` that `update` calls.
-        bytes_per_env(env): the bytes needed per environment like `env`, rollouts included.
-        replay_size(env): the number of observations that a replay buffer will hold, and the bytes
-            that each takes.
-        replay_buffer: what `collector` allocates to replay from, with state_dict() and
-            load_state_dict(state). Checkpoints hold it where it is small enough.
+    `LearnerOptions` has what is optional.
     """
 
     lr: float  # initial learning rate
 
-    def collector(self, env: Env) -> Collector:
+    def collector(self, env: Env) -> CollectorLike:
         """Returns a collector for `env`."""
 
-    def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+    def update(self, rollout: RolloutLike) -> dict[str, torch.Tensor]:
         """Learns from a rollout and returns metrics, tensors () or numbers by name."""
 
     def state_dict(self) -> dict[str, Any]:
@@ -101,14 +123,44 @@ class Learner(Protocol):
         """Continues from a `state_dict`."""
 
 
-#: Optional attributes of a learner, with their defaults.
-LEARNER_DEFAULTS: dict[str, Any] = {
-    "set_lr": None,
-    "check": None,
-    "bytes_per_env": lambda env: 0.0,
-    "replay_size": lambda env: (0, 0.0),
-    "replay_buffer": None,
-}
+class LearnerOptions(Protocol):
+    """What a learner may have besides `Learner`, with the defaults.
+
+    Attributes:
+        set_lr: changes the learning rate. None: the rate is constant.
+        check: a `NonFiniteCheck` that `update` calls. None: nothing is checked.
+        replay_buffer: what `collector` allocates to replay from, with state_dict() and
+            load_state_dict(state). Checkpoints hold it where it is small enough.
+        n_steps: T, for `dry_run=true`.
+        n_minibatches: minibatches of an update, for the same.
+        gamma, lambda_: of its generalised advantages, for `curriculum=plr`.
+    """
+
+    set_lr: Callable[[float], None] | None = None
+    check: Any = None
+    replay_buffer: Any = None
+    n_steps: int | None = None
+    n_minibatches: int | None = None
+    gamma: float | None = None
+    lambda_: float | None = None
+
+    @staticmethod
+    def bytes_per_env(env: Env) -> float:
+        """Returns the bytes needed per environment like `env`, rollouts included."""
+        return 0.0
+
+    @staticmethod
+    def replay_size(env: Env) -> tuple[int, float]:
+        """Returns the number of observations that a replay buffer will hold, and bytes of each."""
+        return 0, 0.0
+
+
+def with_defaults(owner: Any, options: type[T]) -> T:
+    """Returns the attributes of `options`, a protocol with defaults: those that `owner` has, and
+    the defaults of the others.
+    """
+    names = (name for name in vars(options) if not name.startswith("_"))
+    return SimpleNamespace(**{name: getattr(owner, name, getattr(options, name)) for name in names})
 
 
 class Logger(Protocol):
@@ -126,7 +178,7 @@ class Logger(Protocol):
         """Writes what is buffered and closes files and connections."""
 
 
-class Saver(Protocol):
+class SaverLike(Protocol):
     """Saves a trainer's state, possibly while training goes on."""
 
     error: str | None  # why the last checkpoint that was begun could not be saved
@@ -147,11 +199,14 @@ class Saver(Protocol):
 class OpponentPool(Protocol):
     """The part of `selfplay.opponents.Opponents` that a trainer uses."""
 
+    env: Env  # without the opponents
     scripted: Any  # the bot, or None
 
     def refresh_snapshots(self, policy: Actor, n_updates: int) -> None: ...
 
-    def pop_win_rates(self) -> dict[str, float]: ...
+    def pop_win_rates(
+        self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor]
+    ) -> dict[str, float]: ...
 
     def state_dict(self) -> dict[str, Any]: ...
 

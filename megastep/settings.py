@@ -26,6 +26,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError, ValidationError
 
 __all__ = [
     "MAX_ENVS",
+    "AtMost",
     "arguments_of",
     "checked",
     "closest",
@@ -42,6 +43,15 @@ MAX_ENVS = 2**26
 CONFIG = pydantic.ConfigDict(
     strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True
 )
+
+
+@dataclasses.dataclass(frozen=True)
+class AtMost:
+    """Metadata of an annotation: the argument may not exceed the setting at a dotted key."""
+
+    key: str
+
+
 #: Class decorator: a frozen dataclass whose fields are checked against their annotations.
 frozen = pydantic.dataclasses.dataclass(frozen=True, kw_only=True, config=CONFIG)
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-__all__ = ["DEFAULTS", "Env", "Policy", "Space", "Tree", "World", "n_lanes", "optional"]
+__all__ = ["DEFAULTS", "Env", "PolicyLike", "Space", "Tree", "World", "n_lanes", "optional"]
 
 #: A space of :mod:`megastep.spaces`, or a (nested) dict of spaces.
 Space = Any
@@ -98,6 +98,7 @@ DEFAULTS: dict[str, Any] = {
     # of environments with opponents
     "learners": None,  # (B,) bool, lanes whose transitions are stored; None: all
     "matchups": {},  # (B,) bool by name, groups of lanes that are reported apart
+    "opponent_pool": None,  # an `agents.types.OpponentPool`
     "begin_step": lambda: None,  # starts what a step can do before its actions are known
 }
 
@@ -119,7 +120,7 @@ def n_lanes(env: Env) -> int:
 
 
 @runtime_checkable
-class Policy(Protocol):
+class PolicyLike(Protocol):
     """Chooses actions from worlds, and carries a hidden state from step to step.
 
     Optional attribute:

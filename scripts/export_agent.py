@@ -158,10 +158,10 @@ def export(
         raise UserError(
             f"{loaded.path} needs {', '.join(names)}, and agents of the package need megastep only"
         )
-    folder = folders.folder_of(loaded.path)
-    if not (tables := tables_of(folder, loaded.step)):
+    run_folder = folders.folder_of(loaded.path)
+    if not (tables := tables_of(run_folder, loaded.step)):
         raise UserError(
-            f"{folder} has no evaluation of {loaded.path.name} in the suite; "
+            f"{run_folder} has no evaluation of {loaded.path.name} in the suite; "
             f"first run python evaluate.py run={loaded.path} geometry=suite episodes=8000"
         )
     trained = factory.config_of(loaded)
@@ -178,7 +178,7 @@ def export(
             f"{loaded.path} acts otherwise with weights in float16: its logits differ by "
             f"{error:.1%}, and may by {max_error:.1%}"
         )
-    facts = facts_of(folders.folder_of(loaded.path), loaded)
+    facts = facts_of(run_folder, loaded)
     facts |= {"parameters": sum(v.numel() for v in state.values()), "rounding": error}
     file = folder / f"{name}{agent_file.SUFFIX}"
     temporary = file.with_name(f"{name}-new{agent_file.SUFFIX}")

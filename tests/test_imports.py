@@ -32,7 +32,8 @@ ENGINE = (
     ("rendering",),
 )
 AGENTS = (
-    ("distributed", "errors", "generator", "package", "sections", "types"),
+    ("errors", "generator", "package", "sections", "types"),
+    ("distributed",),
     ("console", "networks"),
     ("storage",),
     ("algorithms",),
@@ -69,6 +70,9 @@ SHARED_WITH_UPPER_ROOMS = SHARED | {
     "megastep.scene",
     "megastep.workers",
 }
+# Rooms whose subject ranks are, and how many files elsewhere may know of them.
+ROOMS_WITH_RANKS = ("distributed", "storage", "algorithms", "launch")
+MOST_FILES_WITH_RANKS = 8
 # The files that may import these modules of ours, as glob patterns.
 OWN_USERS = {
     "megastep.kernels.build.launch": (
@@ -295,6 +299,17 @@ def agents_is_imported_as_megastep_agents(graph):
             yield f"{name} must not import agents: the name is megastep.agents"
 
 
+def few_files_know_of_ranks(graph):
+    of_ranks = "megastep.agents.distributed"
+    names = {
+        name
+        for name, target in edges(graph, is_agents)
+        if is_below(target, of_ranks) and part_of(name, "megastep.agents") not in ROOMS_WITH_RANKS
+    }
+    if len(names) > MOST_FILES_WITH_RANKS:
+        yield f"more than {MOST_FILES_WITH_RANKS} files import {of_ranks}: {sorted(names)}"
+
+
 def no_import_cycles(graph):
     below = {
         name: {
@@ -323,6 +338,7 @@ RULES = (
     modules_stay_with_their_users,
     outside_packages_stay_with_their_users,
     agents_is_imported_as_megastep_agents,
+    few_files_know_of_ranks,
     no_import_cycles,
 )
 
@@ -377,6 +393,7 @@ PLANTED = [
     (outside_packages_stay_with_their_users, "megastep.core", "rich.progress"),
     (agents_is_imported_as_megastep_agents, "megastep.agents.cli.train", "agents.cli"),
     (agents_is_imported_as_megastep_agents, "train", "agents"),
+    (few_files_know_of_ranks, "megastep.agents.runs.saver", "megastep.agents.distributed"),
 ]
 
 

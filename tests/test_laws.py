@@ -107,7 +107,8 @@ def test_ragged_is_a_list_of_arrays(widths, axes, is_torch, index):
     ragged = Ragged(torch.as_tensor(values) if is_torch else values, np.array(widths, int))
     assert len(ragged) == len(parts)
     for r, expected in ((ragged, parts), (ragged[index], parts[index])):
-        assert len(r) == len(expected)
+        assert len(r) == len(expected) and type(r) is type(ragged)
+        assert r.vals.dtype == ragged.vals.dtype
         assert all(np.array_equal(a, b) for a, b in zip(r, expected, strict=True))
         assert all(np.array_equal(r[-i - 1], expected[-i - 1]) for i in range(len(r)))
         assert r.inverse.tolist() == [i for i, part in enumerate(expected) for _ in part]

@@ -1,7 +1,6 @@
 """Raggeds of numpy arrays and of tensors."""
 
 import copy
-import itertools
 import pickle
 
 import numpy as np
@@ -54,17 +53,6 @@ def test_an_index_out_of_range_is_refused(ragged, index):
 def test_an_index_of_another_type_is_refused(ragged):
     with pytest.raises(TypeError, match="integer or a slice.* str"):
         ragged["a"]
-
-
-def test_slices_equal_those_of_a_list(ragged):
-    for bounds in itertools.product(
-        (None, 0, 1, 2, 3, 9, -1, -2), (None, 0, 1, 2, 5, -1), (None, 1, 2, -1, -2)
-    ):
-        index = slice(*bounds)
-        part = ragged[index]
-        assert type(part) is type(ragged) and part.vals.dtype == ragged.vals.dtype
-        assert [subarray.tolist() for subarray in part] == [[0, 1, 2], [3], [4, 5]][index], index
-        assert part.widths.tolist() == WIDTHS[index], index
 
 
 def test_subarrays_and_slices_without_a_step_are_views(ragged):

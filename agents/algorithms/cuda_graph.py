@@ -7,7 +7,7 @@ import torch
 from megastep.agents.distributed.segments import SegmentedGraph
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.storage.copies import copy_all
-from megastep.agents.types import Rollout
+from megastep.agents.types import RolloutLike
 
 # Updates that run eagerly before the capture, since libraries initialise themselves in the first.
 # They train the policy like any other update.
@@ -36,7 +36,7 @@ class CudaGraphUpdate:
 
     def __init__(
         self,
-        update: Callable[[Rollout], Metrics],
+        update: Callable[[RolloutLike], Metrics],
         device: torch.device,
         graph: bool,
         generators: tuple[SeededGenerator, ...] = (),
@@ -57,7 +57,7 @@ class CudaGraphUpdate:
         """Discards the graph. The next update captures again, without warming up."""
         self.graph = self._rollout = None
 
-    def __call__(self, rollout: Rollout) -> Metrics:
+    def __call__(self, rollout: RolloutLike) -> Metrics:
         """Performs one update. The tensors it returns are not overwritten by the next one."""
         if self.stream is None:
             return self.update(rollout)

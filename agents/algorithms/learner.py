@@ -11,7 +11,7 @@ needs the attributes of `megastep.agents.types.Learner`, and is used like this:
 
 Rules:
 
-- `collect()` returns a `megastep.agents.types.Rollout`; `storage.rollout.Rollout` is one. The
+- `collect()` returns a `megastep.agents.types.RolloutLike`; `storage.rollout.Rollout` is one. The
   collector owns the rollout and may return the same object every time. `collect.rollout` exists
   before the first call, too.
 - `collect()` and `update()` do not synchronise host and device.
@@ -32,7 +32,7 @@ Rules:
   so that the next call captures again. A GPU's sections are measured that way; see
   `agents/sections.py` for how to time sections of your own. A collector's returns what collects
   without an update beside it, usually itself.
-- `megastep.agents.types.LEARNER_DEFAULTS` lists the optional attributes of a learner.
+- `megastep.agents.types.LearnerOptions` and `CollectorOptions` list what is optional.
   `bytes_per_env(env)` and, with a replay buffer, `replay_size(env)` are what a run checks its
   memory with before it starts.
 
@@ -90,7 +90,8 @@ def check_minibatches(n_minibatches: int, n_lanes: int) -> None:
 class GradientLearner:
     """Base of the built-in learners: policy, gradient steps, CUDA graph, learning rate and state.
 
-    A subclass adds its settings, `collector`, `bytes_per_env` and `_update`.
+    A subclass adds its settings, `collector`, `bytes_per_env` and `_update`, and sets
+    `n_minibatches` if it splits lanes into minibatches.
 
     Args:
         policy: the policy to improve, in place.
@@ -107,6 +108,8 @@ class GradientLearner:
         check: finds non-finite numbers in rollouts and counts skipped updates.
         generator: the `SeededGenerator` of all random numbers in an update.
     """
+
+    n_minibatches = 1
 
     def __init__(
         self,
@@ -139,7 +142,11 @@ class GradientLearner:
 
         Returns metrics as tensors () on the device, averaged over the gradient steps.
         `loss/skipped_steps` counts the steps that were skipped because of non-finite numbers.
+
+        Raises:
+            ValueError: if there are fewer lanes than minibatches.
         """
+        check_minibatches(self.n_minibatches, rollout.n_lanes)
         return {f"loss/{name}": value for name, value in self.cuda_graph(rollout).items()}
 
     def _update(self, rollout: Rollout) -> dict[str, torch.Tensor]:

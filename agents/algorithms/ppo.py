@@ -7,7 +7,6 @@ synchronises: conditions are bool tensors on the device.
 
 from typing import Annotated, Literal
 
-import torch
 from pydantic import Field
 
 from megastep.agents.algorithms import returns
@@ -16,7 +15,6 @@ from megastep.agents.algorithms.learner import (
     Fraction,
     GradientLearner,
     Positive,
-    check_minibatches,
 )
 from megastep.agents.algorithms.masked_stats import pooled_normalise
 from megastep.agents.algorithms.order import random_order
@@ -25,8 +23,8 @@ from megastep.agents.networks.masked_moments import masked_moments, normalise_ma
 from megastep.agents.networks.policy import Policy
 from megastep.agents.sections import section
 from megastep.agents.storage.collector import Collector
-from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
-from megastep.settings import MAX_ENVS, checked
+from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
+from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
 
 _PARTS = "starts", "actions", "logprobs"  # of a rollout, that a minibatch copies
@@ -83,7 +81,7 @@ class PPO(GradientLearner):
         auxiliary_coef: Coefficient = 0.5,
         max_grad_norm: Positive = 0.5,
         n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
-        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 4,
+        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
         target_kl: Positive | None = None,
         graph: bool = False,
         seed: int = 1,
@@ -109,18 +107,6 @@ class PPO(GradientLearner):
         minibatch = (rollout + self.policy.activation_bytes) / self.n_minibatches
         per_step = rollout + (minibatch + 4 * self.policy.width)
         return optional(env, "n_agents") * (self.n_steps + 1) * per_step
-
-    def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
-        """Learns from a rollout.
-
-        Returns metrics as tensors () on the device, averaged over the minibatches.
-        `loss/skipped_steps` counts the minibatches whose gradient was not finite.
-
-        Raises:
-            ValueError: if there are fewer lanes than minibatches.
-        """
-        check_minibatches(self.n_minibatches, rollout.n_lanes)
-        return super().update(rollout)
 
     def _update(self, rollout):
         transitions = rollout.transitions()

@@ -18,7 +18,6 @@ from megastep.agents.algorithms.learner import (
     Fraction,
     GradientLearner,
     Positive,
-    check_minibatches,
 )
 from megastep.agents.algorithms.masked_stats import (
     effective_sample_size,
@@ -36,8 +35,8 @@ from megastep.agents.storage.async_collector import AsyncCollector
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.replay import ReplayBuffer, bytes_per_observation
 from megastep.agents.storage.replay_settings import ReplaySettings
-from megastep.agents.storage.rollout import Rollout, bytes_per_step, make_rollout, without_last
-from megastep.settings import MAX_ENVS, checked
+from megastep.agents.storage.rollout import bytes_per_step, make_rollout, without_last
+from megastep.settings import MAX_ENVS, AtMost, checked
 from megastep.types import Env, optional
 
 # Metrics count larger ratios as e^20, so that their squares stay finite.
@@ -107,7 +106,7 @@ class VTrace(GradientLearner):
         auxiliary_coef: Coefficient = 0.5,
         max_grad_norm: Positive = 0.5,
         n_epochs: Annotated[int, Field(ge=1, le=1000)] = 1,
-        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS)] = 4,
+        n_minibatches: Annotated[int, Field(ge=1, le=MAX_ENVS), AtMost("env.n_envs")] = 4,
         lag: Annotated[int, Field(ge=0, le=2)] = 0,
         buffer: Literal["rollout", "replay"] = "rollout",
         replay: ReplaySettings = _REPLAY,
@@ -167,18 +166,6 @@ class VTrace(GradientLearner):
         if settings is None:
             return 0, 0.0
         return settings.capacity, bytes_per_observation(env, self.policy, self.n_steps, settings)
-
-    def update(self, rollout: Rollout) -> dict[str, torch.Tensor]:
-        """Learns from a rollout.
-
-        Returns metrics as tensors () on the device, averaged over the minibatches.
-        `loss/skipped_steps` counts the minibatches whose gradient was not finite.
-
-        Raises:
-            ValueError: if there are fewer lanes than minibatches.
-        """
-        check_minibatches(self.n_minibatches, rollout.n_lanes)
-        return super().update(rollout)
 
     def _update(self, rollout):
         is_finite, _ = self.steps.begin(rollout.floats())

@@ -137,11 +137,9 @@ def prepare_training(tree: Tree, typed: list[str]) -> Tree:
             f"{tree[how]} is a pretrained agent, which has the weights only. init={tree[how]} "
             f"starts a new run from it; {how}= takes the run's folder"
         )
-    # a run in use is refused before its checkpoints are read, which come and go
-    locked = (
-        folders.locked(folders.folder_of(path)) if how == "resume" else contextlib.nullcontext()
-    )
-    with locked:
+    # a run in use is refused before its checkpoints are read, which come and go, by rank 0
+    is_locked = how == "resume" and environment.rank() == 0
+    with folders.locked(folders.folder_of(path)) if is_locked else contextlib.nullcontext():
         loaded = folders.load_checkpoint(path, tree.get("trust") is True)
     saved = loaded.config["train"]
     if how == "init":

@@ -34,10 +34,9 @@ from megastep import workers
 from megastep.agents import console, package
 from megastep.agents.cli import scripts
 from megastep.agents.cli.compose import NO_TEXT, UNDECODED, Composer, key_of
-from megastep.agents.distributed import environment
 from megastep.agents.errors import ConfigErrors, UserError, shortened, user_errors
 from megastep.agents.factory import settings
-from megastep.agents.launch import places, signals
+from megastep.agents.launch import places, rank, signals
 from megastep.agents.runs import folders, scores
 from megastep.agents.runs.atomic_files import write_atomically
 
@@ -103,12 +102,7 @@ def sweep(composer: Composer, words: list[str]) -> int:
     """Checks all jobs, then hands the sweep over to Hydra, past jobs that fail. Returns the exit
     code.
     """
-    if environment.launched():
-        if environment.rank() > 0:
-            raise SystemExit(UserError.code)  # rank 0 says it
-        raise UserError(
-            "The jobs of a sweep start their own ranks; leave torchrun out, and add ranks="
-        )
+    rank.refuse("The jobs of a sweep start their own ranks; leave torchrun out, and add ranks=")
     overrides = {key_of(override): override for override in composer.parse(words)}
     if "folder" in overrides:
         raise ConfigErrors([("folder", "each job has its own; hydra.sweep.dir= is where they go")])

@@ -10,10 +10,7 @@ from torch import distributed
 
 from megastep.agents.distributed.process_group import communicating, n_ranks, rank
 from megastep.agents.distributed.segments import between_graphs
-
-#: Number of entries, their mean and their variance; () or, for several quantities, mean and
-#: variance of one shape.
-Moments = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+from megastep.agents.types import Moments
 
 
 def all_reduce(tensor: torch.Tensor) -> torch.Tensor:

@@ -120,6 +120,12 @@ def n_ranks() -> int:
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
+def local_rank() -> int | None:
+    """Returns this rank's number on its machine, which is that of its GPU; None without ranks."""
+    place = launched()
+    return place and place.local_rank
+
+
 def place() -> str:
     """Returns this rank's place for messages, such as `rank 1 on node-7`."""
     return f"rank {rank()} on {hostname()}"

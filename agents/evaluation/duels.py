@@ -15,14 +15,14 @@ from megastep.agents.generator import SeededGenerator
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.selfplay.slots import rotating_slots, score_pairs
 from megastep.arrdict import arrdict
-from megastep.types import Env, Policy, n_lanes, optional
+from megastep.types import Env, PolicyLike, n_lanes, optional
 
 #: A duel is a draw after this many steps.
 MAX_STEPS = 500
 
 
 def duel_policy(
-    policy: Policy, opponent: Policy, slots: torch.Tensor, n_agents: int
+    policy: PolicyLike, opponent: PolicyLike, slots: torch.Tensor, n_agents: int
 ) -> MixedPolicy:
     """Returns a policy that is `policy` in one slot per environment and `opponent` in the others.
 
@@ -38,8 +38,8 @@ def duel_policy(
 @torch.no_grad()
 def play(
     env: Env,
-    policy: Policy,
-    opponent: Policy,
+    policy: PolicyLike,
+    opponent: PolicyLike,
     seed: int = 1,
     greedy: bool = False,
     max_steps: int = MAX_STEPS,

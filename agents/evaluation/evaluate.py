@@ -25,7 +25,7 @@ def run(cfg: settings.Evaluate) -> Path:
     episodes in each source, and adds the worst source and the worst dense homes. With `cfg.against`
     plays duels instead; with `cfg.ratings` writes ratings.csv and ratings.svg.
     """
-    start, device = time.monotonic(), factory.make_device(cfg.device)
+    start, device = time.monotonic(), factory.make_device(cfg.device, process_group.local_rank())
     loaded = folders.load_checkpoint(folders.find(cfg.run), cfg.trust, device)
     trained = factory.config_of(loaded)
     env_settings = cfg.env or trained.env

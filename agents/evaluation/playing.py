@@ -8,7 +8,7 @@ from torch.utils import _pytree
 from megastep.agents.generator import SeededGenerator
 from megastep.agents.storage.collector import capture_with
 from megastep.arrdict import arrdict
-from megastep.types import Env, Policy, Tree, World, n_lanes, optional
+from megastep.types import Env, PolicyLike, Tree, World, n_lanes, optional
 
 #: Steps between two checks of whether all episodes have ended. A check waits for the GPU, which
 #: costs more than a few superfluous steps.
@@ -25,7 +25,7 @@ def step_until(
     world: World,
     state: Tree,
     env: Env,
-    policies: tuple[Policy, ...],
+    policies: tuple[PolicyLike, ...],
     roots: tuple,
     max_steps: int,
 ) -> None:
@@ -65,7 +65,7 @@ def step_until(
             several(world, state, max_steps - start)
 
 
-def can_capture(env: Env, policies: Sequence[Policy]) -> bool:
+def can_capture(env: Env, policies: Sequence[PolicyLike]) -> bool:
     """Returns whether steps of these may be replayed as a CUDA graph: if the environment is
     `capturable`, and each policy, too. A policy is, unless it says otherwise, if its class is
     megastep's, since others may keep a state where no graph sees it.
@@ -84,7 +84,7 @@ def _has_fixed_form(before, after):
 
 @torch.no_grad()
 def first_episodes(
-    env: Env, policy: Policy, seed: int = 1, greedy: bool = False, max_steps: int = 100_000
+    env: Env, policy: PolicyLike, seed: int = 1, greedy: bool = False, max_steps: int = 100_000
 ) -> arrdict:
     """Plays the first episode of each lane.
 

@@ -9,7 +9,6 @@ import torch
 
 from megastep import contract, engine, scene, spaces
 from megastep.agents.algorithms.learner import LearnerError, check_learner
-from megastep.agents.distributed import process_group
 from megastep.agents.errors import ConfigErrors, UserError, user_errors
 from megastep.agents.factory import check
 from megastep.agents.factory.settings import (
@@ -29,7 +28,7 @@ from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
 from megastep.agents.selfplay.bots import RandomActions
 from megastep.agents.selfplay.opponents import Opponents
 from megastep.agents.training import loggers
-from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.capture import state_tree
 from megastep.imports import import_object
 from megastep.settings import parameters_of
@@ -83,11 +82,15 @@ def construct(settings: Any, constructor: Callable | None = None, **arguments: A
             raise ValueError(f"{settings.name} cannot be made: {error}; {cure}") from error
 
 
-def make_device(name: str) -> torch.device:
-    """Returns the device of this name, for a rank without a number the GPU of its own."""
-    place = process_group.launched()
-    if place and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
-        name = f"cuda:{place.local_rank}"
+def make_device(name: str, index: int | None = None) -> torch.device:
+    """Returns the device of this name, and makes a GPU the current one.
+
+    Args:
+        name: `auto`, `cpu`, `cuda` or `cuda:1`.
+        index: of the GPU that `auto` and `cuda` mean.
+    """
+    if index is not None and (name == "cuda" or (name == "auto" and torch.cuda.is_available())):
+        name = f"cuda:{index}"
     with errors():
         device = engine.device(name)
     if device.type == "cuda":
@@ -143,8 +146,9 @@ def check_memory(
     The `sample` gives an upper bound of what an environment takes, as it counts what environments
     share. Only if that does not fit, more of them are made.
     """
-    n_bytes = optional(learner, "bytes_per_env", LEARNER_DEFAULTS)(sample)
-    n, each = optional(learner, "replay_size", LEARNER_DEFAULTS)(sample)
+    options = with_defaults(learner, LearnerOptions)
+    n_bytes = options.bytes_per_env(sample)
+    n, each = options.replay_size(sample)
     total = n_copies * _nbytes(sample)
     with errors():
         engine.fit(n, each, sample.device, "observations of learner.replay.capacity")

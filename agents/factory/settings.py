@@ -7,8 +7,10 @@ opponents are the arguments of their constructors, with the bounds and defaults 
 import dataclasses
 import functools
 import json
+import operator
 import os
 import re
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_validator
@@ -16,6 +18,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, model_
 from megastep.agents.factory import components
 from megastep.imports import import_object
 from megastep.settings import (
+    AtMost,
     closest,
     frozen,
     located,
@@ -183,6 +186,15 @@ def missing_sources(tree: dict[str, Any]) -> list[tuple[str, str]]:
     return []
 
 
+def too_large(group: Any, tree: Any) -> Iterator[tuple[str, str]]:
+    """Yields (key, sentence) of settings of a group that exceed another setting, see `AtMost`."""
+    for name, field in group.__pydantic_fields__.items():
+        for limit in (extra for extra in field.metadata if isinstance(extra, AtMost)):
+            value, most = getattr(group, name), operator.attrgetter(limit.key)(tree)
+            if value > most:
+                yield name, f"{value} is more than {limit.key}={most}"
+
+
 # ---- Scripts ----
 
 
@@ -245,7 +257,7 @@ class Train(Common):
     init: str | None
 
     def errors(self):
-        n_minibatches, over = getattr(self.learner, "n_minibatches", 1), self.learner.anneal
+        over = self.learner.anneal
         lag, env = getattr(self.learner, "lag", 0), self.env
         has_curriculum = self.curriculum.name != "none"
         is_async = lag and (self.opponents.past or self.opponents.bot)
@@ -261,8 +273,7 @@ class Train(Common):
                 if lag
                 else f"env={env_name(env)} draws no home for each episode; {cure}"
             ),
-            "learner.n_minibatches": n_minibatches > self.env.n_envs
-            and f"{n_minibatches} is more than env.n_envs={self.env.n_envs}",
+            **{f"learner.{name}": text for name, text in too_large(self.learner, self)},
             "learner.lag": is_async
             and "opponents change with every update, so nothing can be collected ahead of it; use "
             "learner.lag=0, or no opponents",

@@ -21,8 +21,7 @@ from megastep.agents.runs import agent_file, annealing, checkpoint, folders, pro
 from megastep.agents.runs.rank_files import RankFiles
 from megastep.agents.training import budget, loggers
 from megastep.agents.training.trainer import Trainer
-from megastep.agents.types import LEARNER_DEFAULTS
-from megastep.types import optional
+from megastep.agents.types import LearnerOptions, with_defaults
 
 
 def make_trainer(
@@ -54,7 +53,7 @@ def make_trainer(
     policy = factory.make_policy(cfg.agent, sample, cfg.seed, cfg.agent.critic)
     policy.generator = SeededGenerator(stream_seed(seed, "policy"))
     learner = factory.make_learner(cfg.learner, policy, seed)
-    cfg = annealed(cfg, optional(learner, "set_lr", LEARNER_DEFAULTS) is not None)
+    cfg = annealed(cfg, with_defaults(learner, LearnerOptions).set_lr is not None)
     n_copies = 2 if cfg.nonfinite_replay else 1  # of the environments' state
     factory.check_memory(cfg.env, sample, learner, n_copies, **where)
     env = factory.construct(cfg.env, **where)
@@ -96,7 +95,6 @@ def make_trainer(
             log_every=cfg.log_every,
             checkpoint_seconds=cfg.checkpoint_seconds,
             desync=cfg.desync,
-            opponents=opponents,
             make_curriculum=factory.make_curriculum(cfg.curriculum, where["geometries"]),
             layout_sources=factory.layout_sources(cfg.env, where["geometries"]),
             replay_folder=folder if cfg.nonfinite_replay else None,

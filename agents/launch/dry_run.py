@@ -4,6 +4,7 @@ from megastep.agents import console, factory
 from megastep.agents.factory import settings
 from megastep.agents.launch import launcher
 from megastep.agents.selfplay.opponents import count_environments
+from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import n_lanes, optional
 
 
@@ -26,17 +27,16 @@ def sizes(cfg: settings.Train, device) -> dict[str, int]:
     options = dict(seed=cfg.seed, device=device, privileged=cfg.agent.critic == "asymmetric")
     sample = factory.make_sample(cfg.env, geometries, **options)
     lanes = cfg.env.n_envs * n_lanes(sample) // sample.n_envs
-    n_steps = getattr(cfg.learner, "n_steps", None)
-    n_minibatches = getattr(cfg.learner, "n_minibatches", None)
+    learner = with_defaults(cfg.learner, LearnerOptions)
     numbers = {"environments": cfg.env.n_envs, "lanes": lanes}
     n_opponents = count_opponents(cfg, sample)
     if n_opponents:
         lanes -= n_opponents
         numbers["lanes that learn"] = lanes
-    if n_steps:
-        numbers["samples of an update"] = lanes * n_steps
-    if n_steps and n_minibatches:
-        numbers["samples of a minibatch"] = lanes * n_steps // n_minibatches
+    if learner.n_steps:
+        numbers["samples of an update"] = lanes * learner.n_steps
+    if learner.n_steps and learner.n_minibatches:
+        numbers["samples of a minibatch"] = lanes * learner.n_steps // learner.n_minibatches
     return numbers
 
 

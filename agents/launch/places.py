@@ -32,7 +32,7 @@ def check(jobs: Sequence[Any], hydra: Any) -> str | None:
     Raises:
         ConfigErrors: a job has more ranks than GPUs, or its launcher would run it several times.
     """
-    launcher, options = hydra.runtime.choices["hydra/launcher"], hydra.launcher
+    kind, options = hydra.runtime.choices["hydra/launcher"], hydra.launcher
     for key in ("nodes", "tasks_per_node"):
         if (n_times := options.get(key) or 1) > 1:
             text = (
@@ -42,12 +42,12 @@ def check(jobs: Sequence[Any], hydra: Any) -> str | None:
             raise ConfigErrors([(f"hydra.launcher.{key}", text)])
     hints = []
     for cfg in filter(_has_ranks, jobs):
-        if launcher == "submitit_slurm":
+        if kind == "submitit_slurm":
             hints.append(_check_on_node(cfg, options.get("gpus_per_node") or 0))
             continue
         n_ranks, n_gpus = launcher.n_ranks(cfg), gpu.count() if cfg.device != "cpu" else 0
         if n_ranks > 1 and n_gpus and len(jobs) > 1:
-            hints.append(idle(n_ranks, n_gpus, is_parallel=launcher != "basic"))
+            hints.append(idle(n_ranks, n_gpus, is_parallel=kind != "basic"))
     return next(filter(None, hints), None)
 
 

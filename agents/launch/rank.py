@@ -11,7 +11,7 @@ from typing import NoReturn, TypeVar
 
 from megastep.agents import console, package
 from megastep.agents.distributed import environment
-from megastep.agents.errors import user_errors
+from megastep.agents.errors import UserError, user_errors
 from megastep.agents.launch import endings, launcher, signals
 
 #: Seconds that a rank with an error gives rank 0 to tell of the same one, and to save.
@@ -28,6 +28,12 @@ def announce(number: int) -> None:
         job is None or os.path.exists(os.path.join(job, launcher.STOPPED))
     ):
         signals.announce(number)
+
+
+def refuse(problem: str) -> None:
+    """Raises UserError if torchrun started this process. Rank 0 says it for all."""
+    if environment.launched():
+        raise UserError(problem) if environment.rank() == 0 else SystemExit(UserError.code)
 
 
 def tell(ending: endings.Ending) -> None:

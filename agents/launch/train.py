@@ -68,7 +68,8 @@ def run(cfg: settings.Train) -> Path | None:
 def train_here(cfg: settings.Train, team: rank.Team | None) -> Path:
     """Trains in this process, as one of a team of ranks if it is one. Returns the run folder."""
     is_first = process_group.rank() == 0
-    device, progress = together(lambda: factory.make_device(cfg.device)), console.Progress()
+    device = together(lambda: factory.make_device(cfg.device, process_group.local_rank()))
+    progress = console.Progress()
 
     def show(running):
         progress.show(*progress_of(running))

@@ -287,10 +287,3 @@ class LSTM(nn.Module):
         residual = x if is_residual else None
         kernels.act(gates, reset, last_cell, residual, output, after.output, after.cell)
         return output[None], after
-
-    def step(
-        self, x: torch.Tensor, reset: torch.Tensor, state: arrdict
-    ) -> tuple[torch.Tensor, arrdict]:
-        """Takes one step: x (B, W), reset (B,) -> output (B, W), next hidden state."""
-        outputs, state = self(x[None], reset[None], state)
-        return outputs[0], state

@@ -6,8 +6,8 @@ three kernels.
 
 import torch
 
-from megastep.agents.distributed.pooling import Moments
 from megastep.agents.networks.kernels import moments as kernels
+from megastep.agents.types import Moments
 
 _MAX_NUMBERS = 2**31 - 1
 

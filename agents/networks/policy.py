@@ -13,12 +13,13 @@ import torch
 from pydantic import AfterValidator, Field
 from torch import nn
 
-from megastep.agents.distributed.pooling import Moments, pool_moments
+from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks import cores, encoders, heads, joint_heads, running_norm
 from megastep.agents.networks.critic import Critic
 from megastep.agents.networks.layers import linear
 from megastep.agents.networks.precision import ComputeDtype
+from megastep.agents.types import Moments
 from megastep.arrdict import arrdict
 from megastep.dotdict import leaves, mapping
 from megastep.imports import known_name

@@ -9,8 +9,8 @@ import torch
 from torch import nn
 
 from megastep import spaces
-from megastep.agents.distributed.pooling import Moments
 from megastep.agents.networks.kernels import moments as kernels
+from megastep.agents.types import Moments
 from megastep.types import Space
 
 

@@ -6,7 +6,7 @@
 import torch
 from torch import nn
 
-from megastep.agents.distributed.pooling import Moments, pool_moments
+from megastep.agents.distributed.pooling import pool_moments
 from megastep.agents.networks.kernels import heads as kernels
 from megastep.agents.networks.kernels import moments as statistics
 from megastep.agents.networks.kernels.program import aligned
@@ -14,6 +14,7 @@ from megastep.agents.networks.layers import linear
 from megastep.agents.networks.masked_moments import masked_moments
 from megastep.agents.networks.precision import compute_dtype
 from megastep.agents.networks.running_norm import mix_moments, store_if
+from megastep.agents.types import Moments
 
 
 class ValueOutput(nn.Module):

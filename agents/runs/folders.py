@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from megastep.agents import console, package
-from megastep.agents.distributed import environment
 from megastep.agents.errors import UserError, shortened, user_errors
 from megastep.agents.runs import agent_file, checkpoint
 
@@ -71,15 +70,11 @@ def locked(folder: Path) -> Iterator[None]:
     """Keeps other processes from training in a run folder.
 
     The system holds the lock for as long as this process lives, so none is ever stale: neither
-    after kill -9, nor when another process gets the number in the file. Of several ranks, rank 0
-    has the lock for all.
+    after kill -9, nor when another process gets the number in the file.
 
     Raises:
         UserError: naming the process that trains there, or that the folder cannot be written.
     """
-    if environment.rank() > 0:
-        yield
-        return
     import filelock  # which takes a while
 
     # its last owner may just be deleting it

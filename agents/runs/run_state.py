@@ -5,8 +5,7 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING, Any
 
-from megastep.agents.distributed.process_group import rank
-from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.agents.types import CollectorOptions, LearnerOptions, with_defaults
 from megastep.env_state import EnvState
 from megastep.types import Env, optional
 
@@ -14,7 +13,7 @@ if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.training.curriculum import Curriculum
     from megastep.agents.training.episode_stats import EpisodeStats
-    from megastep.agents.types import Collector, Learner, OpponentPool
+    from megastep.agents.types import CollectorLike, Learner
 
 
 class RunState:
@@ -26,7 +25,6 @@ class RunState:
         learner: with its replay buffer, if it has one.
         collect: the learner's collector.
         episode_stats: statistics of the episodes.
-        opponents: `env`, if it is an `Opponents`.
         curriculum: what draws the homes of episodes, if anything does.
     """
 
@@ -35,20 +33,20 @@ class RunState:
         env: Env,
         policy: Policy,
         learner: Learner,
-        collect: Collector,
+        collect: CollectorLike,
         episode_stats: EpisodeStats,
-        opponents: OpponentPool | None = None,
         curriculum: Curriculum | None = None,
     ):
-        self.policy, self.learner, self.collect = policy, learner, collect
-        self.episode_stats, self.opponents = episode_stats, opponents
+        self.policy, self.learner = policy, learner
+        self.collect = with_defaults(collect, CollectorOptions)
+        self.episode_stats, self.opponents = episode_stats, optional(env, "opponent_pool")
         self.curriculum = curriculum
-        if opponents is None:
+        if self.opponents is None:
             self.env_state = EnvState(env)
         else:
-            self.env_state = EnvState(env.env, opponents.scripted)
-        self.replay_buffer = optional(learner, "replay_buffer", LEARNER_DEFAULTS)
-        self.has_named_unreachable = False
+            self.env_state = EnvState(self.opponents.env, self.opponents.scripted)
+        self.replay_buffer = with_defaults(learner, LearnerOptions).replay_buffer
+        self.has_named_unreachable, self.collector_name = False, type(collect).__name__
 
     @property
     def is_resumable(self) -> bool:
@@ -69,7 +67,7 @@ class RunState:
         )
         if has_episodes and self.is_resumable:
             parts["env"] = self.env_state.state_dict()
-            parts["collector"] = getattr(self.collect, "state_dict", dict)()
+            parts["collector"] = self.collect.state_dict()
         if self.opponents is not None:
             parts["opponents"] = self.opponents.state_dict()
         if self.curriculum is not None:
@@ -121,8 +119,7 @@ class RunState:
         if "env" not in state:
             lost.append("its environments were not saved, so new episodes begin")
         elif not state["collector"]:
-            name = type(self.collect).__name__
-            lost.append(f"{name} has no state_dict, so new episodes begin")
+            lost.append(f"{self.collector_name} has no state_dict, so new episodes begin")
         else:
             try:
                 self.env_state.load_state_dict(state["env"])
@@ -139,7 +136,7 @@ class RunState:
 
     def warn_of_unreachable(self) -> None:
         """Warns once of what the environment keeps where checkpoints cannot reach it."""
-        if self.has_named_unreachable or rank() > 0 or not self.is_resumable:
+        if self.has_named_unreachable or not self.is_resumable:
             return
         if names := self.env_state.unreachable():
             self.has_named_unreachable = True

@@ -16,7 +16,6 @@ import torch
 from torch.utils._pytree import tree_leaves
 
 from megastep.agents.algorithms.nonfinite import NonFiniteError, nonfinite_leaf
-from megastep.agents.distributed.process_group import unhurried
 from megastep.agents.runs import checkpoint, checkpoint_format
 from megastep.agents.runs.rank_files import RankFiles
 
@@ -68,7 +67,6 @@ class Saver:
         self.seconds, self._n_since_replay, self._number = 0.0, 0, 0
         self._host_copy, self._thread, self._failure = _HostCopy(), None, None
 
-    @unhurried()
     def __call__(
         self, step: int, state: dict[str, Any], score: float | None = None, is_last: bool = False
     ) -> None:
@@ -153,7 +151,6 @@ class Saver:
         """Waits no longer for the parts of other ranks, as one has ended."""
         self.rank_files.give_up()
 
-    @unhurried()
     def wait(self) -> None:
         """Returns when nothing is being written. Warns if the last checkpoint failed.
 

@@ -10,7 +10,7 @@ import torch
 
 from megastep.agents.storage.copies import select_tree
 from megastep.arrdict import arrdict, cat
-from megastep.types import Policy, Tree, World
+from megastep.types import PolicyLike, Tree, World
 
 
 class MixedPolicy:
@@ -31,7 +31,7 @@ class MixedPolicy:
         sizes: number of lanes of each policy.
     """
 
-    def __init__(self, policies: Sequence[Policy], lanes: Sequence[torch.Tensor]):
+    def __init__(self, policies: Sequence[PolicyLike], lanes: Sequence[torch.Tensor]):
         self.policies = list(policies)
         self.sizes = [len(policy_lanes) for policy_lanes in lanes]
         self.lanes = torch.cat(list(lanes))

@@ -3,13 +3,13 @@
 Axes: N environments of A agents, B = N A lanes; M of the environments have opponents.
 """
 
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import torch
 from pydantic import Field, SkipValidation
 
 from megastep.agents.algorithms.kernels.program import run
-from megastep.agents.distributed.reports import sum_over_ranks
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
@@ -18,8 +18,7 @@ from megastep.agents.storage.rollout import copy_tree
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
 from megastep.settings import checked
-from megastep.types import Env, World, optional
-from megastep.types import Policy as AnyPolicy
+from megastep.types import Env, PolicyLike, World, optional
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -64,7 +63,7 @@ class Opponents:
         self,
         env: SkipValidation[Env],
         policy: SkipValidation[Policy],
-        scripted: SkipValidation[AnyPolicy] | None = None,
+        scripted: SkipValidation[PolicyLike] | None = None,
         *,
         past: Fraction = 0.0,
         bot: Fraction = 0.0,
@@ -112,6 +111,11 @@ class Opponents:
         if name == "env":  # not set yet while the object is being copied
             raise AttributeError(name)
         return getattr(self.env, name)
+
+    @property
+    def opponent_pool(self) -> "Opponents":
+        """This object, by the name under which a trainer looks for opponents."""
+        return self
 
     def reset(self) -> World:
         """Starts every episode and returns the first world."""
@@ -186,11 +190,15 @@ class Opponents:
         state = self.hidden_state[str(index)]
         state[:] = snapshot.initial(self.mixed_policy.sizes[index], self.env.device)
 
-    def pop_win_rates(self) -> dict[str, float]:
-        """Returns the fraction of decided pairs that were won since the last call, on all ranks.
-        Synchronises, and waits for the other ranks.
+    def pop_win_rates(
+        self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
+    ) -> dict[str, float]:
+        """Returns the fraction of decided pairs that were won since the last call. Synchronises.
 
         Keys are metric names. A kind of opponent without a decided pair is absent.
+
+        Args:
+            sum_over_ranks: adds the numbers of the other ranks, where there are any.
         """
         win_rates, by_kind = {}, self._pairs_by_kind()
         sums = torch.stack([pairs.double().sum(1) for pairs in by_kind.values()])

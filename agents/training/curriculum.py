@@ -14,7 +14,7 @@ from pydantic import Field, SkipValidation
 
 from megastep.agents.algorithms import returns
 from megastep.agents.storage.rollout import Rollout
-from megastep.agents.types import Learner
+from megastep.agents.types import Learner, LearnerOptions, with_defaults
 from megastep.settings import checked
 from megastep.types import Env, optional
 
@@ -252,12 +252,13 @@ class PLR(Curriculum):
     ):
         super().__init__(env, rollout, sources, lr, every)
         self.score, self.temperature, self.mix = score, temperature, staleness
-        if rollout.values is None or not hasattr(learner, "lambda_"):
+        options = with_defaults(learner, LearnerOptions)
+        if rollout.values is None or options.lambda_ is None:
             raise ValueError(
                 "curriculum=plr needs values at the time of acting, which learner=ppo stores; use "
                 "curriculum=sfl"
             )
-        self.discounts = dict(gamma=learner.gamma, lambda_=learner.lambda_)
+        self.discounts = dict(gamma=options.gamma, lambda_=options.lambda_)
 
     def probabilities(self) -> torch.Tensor:
         scores = torch.where(self.n_episodes > 0, self.scores, torch.inf)

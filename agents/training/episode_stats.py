@@ -5,14 +5,13 @@ Axes: T time, B lanes, G groups of lanes, D layouts, S sources of layouts.
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 
 from megastep.agents.algorithms.kernels import program
 from megastep.agents.algorithms.nonfinite import LIMIT
-from megastep.agents.distributed.reports import sum_over_ranks
 from megastep.types import Env, optional
 
 #: Means are over at least this many episodes, once so many have ended.
@@ -210,8 +209,13 @@ class EpisodeStats:
         self.named |= bad.keys()
         return bad
 
-    def pop(self) -> dict[str, float]:
-        """Returns statistics for a report, of all ranks. Synchronises, and waits for the others.
+    def pop(
+        self, sum_over_ranks: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
+    ) -> dict[str, float]:
+        """Returns statistics for a report. Synchronises.
+
+        Args:
+            sum_over_ranks: adds the numbers of the other ranks, where there are any.
 
         Means are over the episodes that ended since the last call and, if those are fewer than
         `MIN_EPISODES`, those of earlier calls, a call at a time. A dict of

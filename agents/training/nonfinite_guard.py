@@ -13,12 +13,12 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError, lane_name
 from megastep.agents.distributed.process_group import place, rank
 from megastep.agents.distributed.reports import gather_if_any
 from megastep.agents.training import nonfinite_recorder
-from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.agents.types import LearnerOptions, with_defaults
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.training.episode_stats import EpisodeStats
-    from megastep.agents.types import Collector, Learner, OpponentPool, Rollout
+    from megastep.agents.types import CollectorLike, Learner, RolloutLike
 
 #: Training stops after this many skipped updates in a row.
 MAX_SKIPPED = 20
@@ -34,7 +34,6 @@ class NonFiniteGuard:
         env: the environment.
         learner: its `check` is read. Without one, only metrics are guarded.
         collect: the learner's collector.
-        opponents: `env`, if it is an `Opponents`.
         replay_folder: where the file is written, see `nonfinite_recorder`; None for no file.
 
     Attributes:
@@ -47,17 +46,16 @@ class NonFiniteGuard:
         self,
         env: Env,
         learner: Learner,
-        collect: Collector,
-        opponents: OpponentPool | None = None,
+        collect: CollectorLike,
         replay_folder: Path | None = None,
     ):
         self.learner, self.replay_folder, self.device = learner, replay_folder, env.device
         self.n_agents = optional(env, "n_agents")
-        self.nonfinite_check = optional(learner, "check", LEARNER_DEFAULTS)
+        self.nonfinite_check = with_defaults(learner, LearnerOptions).check
         self.value, self.replay_hint, self.recorder = None, "", None
         if replay_folder is not None:
             self.recorder = nonfinite_recorder.make_recorder(
-                env, opponents, self.nonfinite_check, collect
+                env, optional(env, "opponent_pool"), self.nonfinite_check, collect
             )
 
     def start_rollout(self) -> None:
@@ -65,12 +63,12 @@ class NonFiniteGuard:
         if self.recorder is not None:
             self.recorder.start()
 
-    def end_rollout(self, rollout: Rollout) -> None:
+    def end_rollout(self, rollout: RolloutLike) -> None:
         """Call after each rollout, before the learner's update."""
         if self.recorder is not None:
             self.recorder.end(rollout)
 
-    def check(self, rollout: Rollout, samples: int) -> bool:
+    def check(self, rollout: RolloutLike, samples: int) -> bool:
         """Returns True if the last update was applied, False if it was skipped. Synchronises.
 
         Warns about the first NaN or infinity of the run.
@@ -132,7 +130,7 @@ class NonFiniteGuard:
             hint = f". {nonfinite_recorder.NOT_RECORDED}"
         return hint
 
-    def warn_of_metrics(self, episode_stats: EpisodeStats, rollout: Rollout) -> None:
+    def warn_of_metrics(self, episode_stats: EpisodeStats, rollout: RolloutLike) -> None:
         """Warns once of each metric that was not finite at the end of an episode. Synchronises."""
         bad = {
             name: lane_name(_env_lanes(rollout)[lane], self.n_agents)

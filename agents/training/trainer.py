@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +14,8 @@ from megastep.agents.algorithms.nonfinite import NonFiniteError
 from megastep.agents.distributed.agreement import any_rank
 from megastep.agents.distributed.drift import check_drift
 from megastep.agents.distributed.plan import Plan, agree
-from megastep.agents.distributed.process_group import n_ranks, unhurried
-from megastep.agents.distributed.reports import mean_over_ranks
+from megastep.agents.distributed.process_group import n_ranks, rank, unhurried
+from megastep.agents.distributed.reports import mean_over_ranks, sum_over_ranks
 from megastep.agents.runs.run_state import RunState
 from megastep.agents.training.budget import Budget, Stopwatch
 from megastep.agents.training.episode_stats import MIN_EPISODES, EpisodeStats, lane_groups
@@ -27,14 +27,14 @@ from megastep.agents.training.performance import (
     SectionTimes,
     device_memory,
 )
-from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.agents.types import CollectorOptions, LearnerOptions, with_defaults
 from megastep.types import Env, optional
 
 if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.runs.annealing import AnnealingRecord
     from megastep.agents.training.curriculum import Curriculum
-    from megastep.agents.types import Learner, Logger, OpponentPool, Rollout, Saver
+    from megastep.agents.types import Learner, Logger, RolloutLike, SaverLike
 
 
 #: Updates that the host may be ahead of a GPU. The learning rate of an update follows the clock at
@@ -62,7 +62,8 @@ class Trainer:
             same time, if the environment has a method `desync()`. Statistics leave these episodes
             out.
         on_log: called with the trainer after each report, for example to show progress.
-        opponents: `env`, if it is an `Opponents`.
+        evaluator: measures the policy for each report, which has the numbers as `eval/NAME`, means
+            over the ranks. Whatever it plays in is not the environment of the training.
         snapshot_saver: such as `saver.SnapshotSaver`: called with the trainer before the first
             update and after each.
         replay_folder: where a file is written that replays the first NaN or infinity of the
@@ -100,37 +101,39 @@ class Trainer:
         policy: Policy,
         learner: Learner,
         logger: Logger,
-        saver: Saver,
+        saver: SaverLike,
         budget: Budget,
         *,
         log_every: int = 1,
         checkpoint_seconds: float = 30.0,
         desync: bool = False,
         on_log: Callable[[Trainer], None] = lambda trainer: None,
-        opponents: OpponentPool | None = None,
+        evaluator: Callable[[Policy], Mapping[str, float]] = lambda policy: {},
         snapshot_saver: Callable[[Trainer], None] = lambda trainer: None,
         replay_folder: Path | None = None,
         annealing_record: AnnealingRecord | None = None,
-        make_curriculum: Callable[[Env, Learner, Rollout], Curriculum] | None = None,
+        make_curriculum: Callable[[Env, Learner, RolloutLike], Curriculum] | None = None,
         layout_sources: Sequence[str] | None = None,
     ):
         self.env, self.policy, self.learner = env, policy, learner
         self.logger, self.saver, self.budget = logger, saver, budget
         self.log_every, self.checkpoint_seconds = log_every, checkpoint_seconds
-        self.on_log, self.opponents, self.snapshot_saver = on_log, opponents, snapshot_saver
+        self.on_log, self.evaluator, self.snapshot_saver = on_log, evaluator, snapshot_saver
+        self.opponents = optional(env, "opponent_pool")
         self.annealing_record = annealing_record
-        if budget.anneal != "never" and not optional(learner, "set_lr", LEARNER_DEFAULTS):
+        if budget.anneal != "never" and not with_defaults(learner, LearnerOptions).set_lr:
             raise ValueError(
                 f"{type(learner).__name__} has no set_lr(lr), so its learning rate cannot fall "
                 f"with {budget.anneal}: use learner.anneal=never, or add the method"
             )
         self.collect = learner.collector(env)
+        self.collector_options = with_defaults(self.collect, CollectorOptions)
         self.rollout = self.collect.rollout
         self.curriculum = make_curriculum and make_curriculum(env, learner, self.rollout)
-        if optional(env, "layout") is None or not hasattr(self.collect, "allocate_layouts"):
+        if optional(env, "layout") is None or not self.collector_options.allocate_layouts:
             layout_sources = None
         if layout_sources:
-            self.collect.allocate_layouts()
+            self.collector_options.allocate_layouts()
         desync = desync and optional(env, "desync") is not None
         if desync:
             env.desync()  # the collector has reset the environment, and has not stepped it yet
@@ -143,9 +146,9 @@ class Trainer:
             sources=layout_sources,
         )
         self.run_state = RunState(
-            env, policy, learner, self.collect, self.episode_stats, opponents, self.curriculum
+            env, policy, learner, self.collect, self.episode_stats, self.curriculum
         )
-        self.nonfinite_guard = NonFiniteGuard(env, learner, self.collect, opponents, replay_folder)
+        self.nonfinite_guard = NonFiniteGuard(env, learner, self.collect, replay_folder)
         self.clock, self.timer = Stopwatch(), PhaseTimer(env.device)
         self.section_times = SectionTimes(env.device)
         self.samples = self.updates = 0
@@ -185,7 +188,8 @@ class Trainer:
                 self.nonfinite_guard.end_rollout(self.rollout)
                 self.timer.start("update")
                 losses = self.update(plan.lr_fraction)
-                self.snapshot_saver(self)
+                with unhurried():
+                    self.snapshot_saver(self)
                 if self.updates % self.log_every == 0:
                     self.samples_at_report = self.samples
                     self.log(losses)
@@ -208,9 +212,9 @@ class Trainer:
         finally:
             with contextlib.suppress(Exception):  # as above
                 self.wait_for_collector()
-            self.saver.wait()
+            self.wait_for_saver()
         self.save_checkpoint(state, is_last=True)
-        self.saver.wait()
+        self.wait_for_saver()
 
     def close(self) -> None:
         """Closes the environment and the files of metrics, after training."""
@@ -240,8 +244,7 @@ class Trainer:
 
     def wait_for_collector(self) -> None:
         """Waits until an async collector has stopped stepping the environment."""
-        if hasattr(self.collect, "wait"):
-            self.collect.wait()
+        self.collector_options.wait()
 
     def update(self, lr_fraction: float = 1.0) -> dict[str, torch.Tensor]:
         """Learns from the current rollout. Returns the learner's metrics, tensors of shape ().
@@ -295,11 +298,14 @@ class Trainer:
         loss_values = torch.stack(loss_values).tolist() if losses else []
         loss_values = dict(zip(losses, loss_values, strict=True))
         self.nonfinite_guard.warn_of_metrics(self.episode_stats, self.rollout)
-        stats = self.episode_stats.pop()
+        stats = self.episode_stats.pop(sum_over_ranks)
         if self.opponents is not None:
-            stats |= self.opponents.pop_win_rates()
+            stats |= self.opponents.pop_win_rates(sum_over_ranks)
         of_curriculum = {} if self.curriculum is None else self.curriculum.stats()
-        means = mean_over_ranks({**of_curriculum, **loss_values})
+        with unhurried():
+            evaluation = self.evaluator(self.policy)
+        evaluation = {f"eval/{name}": value for name, value in evaluation.items()}
+        means = mean_over_ranks({**of_curriculum, **loss_values, **evaluation})
         stats |= {name: means[name] for name in of_curriculum if name in means}
         self.latest_stats.update(stats)
         metrics = {
@@ -368,13 +374,20 @@ class Trainer:
         self.seconds_at_checkpoint = self.clock.seconds
         if not any_rank(not self.is_saved or (is_last and self.saver.lacks_replay)):
             return
-        self.run_state.warn_of_unreachable()
+        if rank() == 0:
+            self.run_state.warn_of_unreachable()
         state = self.state_dict() if state is None else state
         # a checkpoint must not reach further than what is on disk of the run's files
         if any_rank(not self._sync_files()) and not is_last:
             return
-        self.saver(self.samples, state, self.score, is_last)
+        with unhurried():
+            self.saver(self.samples, state, self.score, is_last)
         self.updates_at_checkpoint = self.updates
+
+    @unhurried()
+    def wait_for_saver(self) -> None:
+        """Waits until the last checkpoint is written, or has failed."""
+        self.saver.wait()
 
     @unhurried()
     def _sync_files(self):

@@ -1,8 +1,8 @@
 """The engine: operations on many environments at once, on the device that their tensors are on.
 
-``bake``, ``physics``, ``render``, ``observe``, ``unseen``, ``coverage``, ``spawn`` and ``uniform``
-check their arguments, allocate their outputs and launch one kernel each. None of them synchronises
-host and device. An argument that does not fit raises a TypeError or ValueError that names it.
+``bake``, ``physics``, ``render``, ``observe``, ``spawn`` and ``uniform`` check their arguments,
+allocate their outputs and launch one kernel each. None of them synchronises host and device. An
+argument that does not fit raises a TypeError or ValueError that names it.
 
 The step of a game is an operation too, in the environment's package, for example
 :func:`megastep.envs.deathmatch.step.deathmatch_step`.
@@ -16,15 +16,12 @@ from megastep.engine.outputs import Observation, Physics, Render
 from megastep.engine.rendering import observe, render, update_agent_geometry
 from megastep.engine.scenery import Layouts, Scenery
 from megastep.engine.spawning import spawn, uniform
-from megastep.engine.texels import BANDS, SECTORS, coverage, unseen
 from megastep.kernels.build.compile import EngineError
 
 __all__ = [
     "AGENT_RADIUS",
     "AGENT_WIDTH",
-    "BANDS",
     "MAX_RES",
-    "SECTORS",
     "Agents",
     "EngineError",
     "Layouts",
@@ -35,7 +32,6 @@ __all__ = [
     "bake",
     "check",
     "check_flag",
-    "coverage",
     "device",
     "fit",
     "observe",
@@ -45,6 +41,5 @@ __all__ = [
     "spawn",
     "threads",
     "uniform",
-    "unseen",
     "update_agent_geometry",
 ]

@@ -16,10 +16,10 @@ from megastep.engine.launch_params import (
     lanes_of,
     scenery_params,
     state_params,
+    texel_bits,
 )
 from megastep.engine.outputs import Observation, Render
 from megastep.engine.scenery import Scenery
-from megastep.engine.texels import texel_bits
 from megastep.kernels.build.launch import BLOCK, ENGINE, WARP, addresses, launch
 
 __all__ = ["observe", "render", "update_agent_geometry"]

@@ -76,16 +76,6 @@ struct RenderParams {
     int n_words;
 };
 
-struct CoverageParams {
-    SceneryParams scenery;
-    const unsigned int* seen;     // (N, A, n_words) a bit per static texel
-    const unsigned int* visible;  // (D, n_words) a bit per static texel
-    const unsigned char* mask;    // (N, A) agents to count
-    int* error_flag;              // (1) out: see common/errors.h
-    float* coverage;              // (N, A) out: 0 where not in mask
-    int n_words;
-};
-
 struct SpawnParams {
     SceneryParams scenery;
     float* positions;           // (N, A, 2) out where mask, as the next three
@@ -102,17 +92,6 @@ struct SpawnParams {
     unsigned int key1;
     int n_points;
     int resample;  // 1: an environment moves to a random layout if all its agents respawn
-};
-
-struct UnseenParams {
-    SceneryParams scenery;
-    const float* positions;       // (N, A, 2)
-    const float* angles;          // (N, A)
-    const unsigned int* seen;     // (N, A, n_words) a bit per static texel
-    const unsigned int* visible;  // (D, n_words) a bit per static texel
-    int* error_flag;              // (1) out: see common/errors.h
-    int* counts;                  // (N, A, bands, sectors) out
-    int n_words;
 };
 
 struct UniformParams {

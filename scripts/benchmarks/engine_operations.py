@@ -31,8 +31,6 @@ def operations(n: int, device: torch.device) -> Iterator[tuple[str, Callable[[in
         "`observe` as Explorer does, 256 rays to 64 pixels",
         lambda i: engine.observe(scenery, agents, 4, imu=True, seen=env.seen, clear_mask=ended),
     )
-    visible = modules.visible_texels(scenery, env.spawner.points)
-    yield "`unseen`", lambda i: engine.unseen(scenery, agents, env.seen, visible)
     newly_seen, episodes = torch.zeros_like(ended, dtype=torch.int32), env.lifecycle
     yield (
         "`explorer_step` with a privileged observation",

@@ -17,11 +17,13 @@ from megastep.agents.runs import checkpoint
 from megastep.dotdict import leaves
 from tests.helpers.learners import LEARNERS
 from tests.helpers.made_up import PRIVILEGED, B, Numbers, made_up, weights
+from tests.helpers.synchronisation import no_synchronisation
 from tests.helpers.tiny import TINY, UPDATE
 
 T = 5
 SMALL = dict(width=8, n_steps=T, n_minibatches=2, lr=1e-2)
 NAMES = pytest.mark.parametrize("name", LEARNERS)
+ACTOR_CRITICS = pytest.mark.parametrize("learner", [PPO, VTrace])
 
 
 def make(name, env=None, device="cpu", **settings):
@@ -146,7 +148,7 @@ def test_frozen_and_unused_parameters_stay_as_they_are(name, graph):
     assert losses["loss/grad_norm"] > 0
 
 
-@pytest.mark.parametrize("learner", [PPO, VTrace])
+@ACTOR_CRITICS
 @pytest.mark.parametrize("factor", [1.0, 0.5])
 def test_critic_lr_is_of_the_critic_alone_and_falls_with_lr(learner, factor):
     """Adam's first step is the step size."""
@@ -160,6 +162,68 @@ def test_critic_lr_is_of_the_critic_alone_and_falls_with_lr(learner, factor):
         assert steps[name] == pytest.approx(factor * 1e-2, rel=0.02)
     for name in ("prediction.weight", "intake.project.weight", "output.linear.weight"):
         assert steps[name] == pytest.approx(factor * 1e-3, rel=0.02)
+
+
+@ACTOR_CRITICS
+def test_rewarded_action_becomes_likelier(learner):
+    policy, rollout = made_up(values=learner is PPO)
+    rollout.reward[:] = (rollout.actions[..., 0] == 2).float()
+    sequence = rollout.obs, rollout.starts, rollout.state
+    before = policy.unroll(*sequence).logits.exp().mean((0, 1, 2))
+    trained = learner(policy, lr=3e-3, gamma=0.0)
+    for _ in range(5):
+        trained.update(rollout)
+    after = policy.unroll(*sequence).logits.exp().mean((0, 1, 2))
+    assert after[2] > before[2] + 0.05 and after[0] < before[0] and after[1] < before[1]
+
+
+@ACTOR_CRITICS
+def test_invalid_rows_are_ignored(learner):
+    results = []
+    for corrupt in (False, True):
+        policy, rollout = made_up(values=learner is PPO)
+        if corrupt:
+            ignored = rollout.reset.nonzero(as_tuple=True)
+            assert len(ignored[0]) == 2
+            rollout.reward[ignored] = 1e3
+            rollout.logprobs[ignored] = -5.0 if learner is PPO else -500.0
+            rollout.actions[ignored] = (rollout.actions[ignored] + 1) % 3
+        metrics = learner(policy, n_epochs=2, n_minibatches=2).update(rollout)
+        results.append((metrics, weights(policy)))
+    (clean_metrics, clean), (dirty_metrics, dirty) = results
+    assert torch.equal(clean, dirty) and clean_metrics == dirty_metrics
+
+
+@ACTOR_CRITICS
+@pytest.mark.parametrize("n_minibatches", [2, B])
+def test_lanes_that_do_not_learn_change_no_bit(learner, n_minibatches):
+    """Replaces two lanes by numbers whose ratios overflow. A third lane learns at some times only:
+    its other rows count in no mean, but its hidden state and its traces pass through them.
+    """
+    results = []
+    for changed in (False, True):
+        policy, rollout = made_up(privileged=PRIVILEGED, values=learner is PPO)
+        rollout.learns[:, [0, 4]] = False
+        rollout.learns[2:4, 3] = False
+        if changed:
+            numbers = [rollout.obs, rollout.privileged, rollout.reward]
+            for lanes in [*numbers, rollout.values] if learner is PPO else numbers:
+                lanes[:, [0, 4]] = torch.randn(lanes[:, [0, 4]].shape) * 50 + 9
+            rollout.logprobs[:, 0], rollout.logprobs[:, 4] = -200.0, 3.0
+            rollout.actions[:, [0, 4]] = (rollout.actions[:, [0, 4]] + 1) % 3
+            rollout.terminal[5, 0] = rollout.truncated[6, 4] = rollout.starts[4, 0] = True
+            rollout.state.cell[[0, 4]] = 7.0
+            rollout.logprobs[2:4, 3] += torch.tensor([9.0, -200.0])
+            if learner is PPO:
+                rollout.actions[2:4, 3] = (rollout.actions[2:4, 3] + 1) % 3
+        trained = learner(policy, n_epochs=2, n_minibatches=n_minibatches, lr=1e-2)
+        metrics = trained.update(rollout)
+        results.append((metrics, policy.state_dict(), trained.optimizer.means))
+    (clean_metrics, clean, means), (metrics, dirty, dirty_means) = results
+    assert clean.keys() == dirty.keys() and all(torch.equal(clean[k], dirty[k]) for k in clean)
+    assert all(map(torch.equal, means, dirty_means))
+    assert metrics == clean_metrics and metrics["loss/skipped_steps"] == 0
+    assert metrics["loss/auxiliary"] > 0
 
 
 class Pushes(Numbers):
@@ -284,12 +348,9 @@ def test_collect_and_update_never_synchronise(name):
     _, learner, collect = make(name, device="cuda", graph=True)
     for _ in range(6):
         learner.update(collect())
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_synchronisation():
         for _ in range(3):
             learner.update(collect())
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
     if hasattr(collect, "wait"):
         collect.wait()
     assert learner.cuda_graph.graph is not None and collect.graph is not None

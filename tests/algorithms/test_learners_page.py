@@ -6,7 +6,7 @@ import torch
 from megastep.agents.algorithms.learner import check_learner
 from megastep.agents.cli import train
 from megastep.agents.networks.policy import Policy
-from megastep.agents.types import LEARNER_DEFAULTS
+from megastep.agents.types import LearnerOptions, with_defaults
 from tests.algorithms.test_learning import Bandit, Corridor, Reach
 from tests.helpers import pages, tiny
 
@@ -33,7 +33,9 @@ def test_python_code_of_page_trains(folder):
     exec(compile(pages.code(PAGE.read_text())[1], str(PAGE), "exec"), names)
     assert all(bool(value.isfinite()) for value in names["losses"].values())
     check_learner(names["learner"])
-    assert not any(hasattr(names["learner"], name) for name in LEARNER_DEFAULTS)
+    options = with_defaults(names["learner"], LearnerOptions)
+    assert options.set_lr is options.check is options.replay_buffer is options.lambda_ is None
+    assert options.replay_size(names["env"]) == (0, 0) and options.bytes_per_env(names["env"]) == 0
 
 
 def test_learning_rate_that_cannot_fall_is_refused(folder, capsys):

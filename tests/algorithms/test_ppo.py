@@ -1,6 +1,7 @@
-"""PPO's update on random rollouts. test_learning.py tests that PPO learns."""
+"""PPO's update on random rollouts. test_learning.py tests that PPO learns, test_learners.py what
+all learners have in common.
+"""
 
-import io
 import math
 
 import pytest
@@ -12,6 +13,7 @@ from megastep.agents.networks.policy import Policy
 from megastep.agents.storage.rollout import Rollout
 from megastep.arrdict import arrdict
 from tests.helpers.made_up import MOVES, OBS, PRIVILEGED, WIDTH, B, Numbers, T, made_up, weights
+from tests.helpers.synchronisation import no_synchronisation
 
 
 def test_first_pass_has_zero_kl():
@@ -44,61 +46,6 @@ def test_kl_and_clip_fraction_match_hand_calculation():
     metrics = PPO(policy, n_minibatches=2, lr=1e-30).update(rollout)
     assert metrics["loss/kl"].item() == pytest.approx(1 - math.log(2), abs=1e-5)
     assert metrics["loss/clip_fraction"].item() == 1
-
-
-def test_rewarded_action_becomes_likelier():
-    policy, rollout = made_up()
-    rollout.reward[:] = (rollout.actions[..., 0] == 2).float()
-    before = policy.unroll(rollout.obs, rollout.starts, rollout.state).logits.exp().mean((0, 1, 2))
-    learner = PPO(policy, lr=3e-3, gamma=0.0)
-    for _ in range(5):
-        learner.update(rollout)
-    after = policy.unroll(rollout.obs, rollout.starts, rollout.state).logits.exp().mean((0, 1, 2))
-    assert after[2] > before[2] + 0.05 and after[0] < before[0] and after[1] < before[1]
-
-
-def test_invalid_rows_are_ignored():
-    results = []
-    for corrupt in (False, True):
-        policy, rollout = made_up()
-        if corrupt:
-            ignored = rollout.reset.nonzero(as_tuple=True)
-            assert len(ignored[0]) == 2
-            rollout.reward[ignored], rollout.logprobs[ignored] = 1e3, -5.0
-            rollout.actions[ignored] = (rollout.actions[ignored] + 1) % 3
-        learner = PPO(policy, n_epochs=2, n_minibatches=2)
-        results.append((learner.update(rollout), weights(policy)))
-    (clean_metrics, clean), (dirty_metrics, dirty) = results
-    assert torch.equal(clean, dirty)
-    assert clean_metrics == dirty_metrics
-
-
-@pytest.mark.parametrize("n_minibatches", [2, B])
-def test_lanes_that_do_not_learn_change_no_bit(n_minibatches):
-    """Replaces two lanes by numbers whose ratios overflow. A third lane learns at some times only:
-    its other rows count in no mean, but its hidden state passes through them.
-    """
-    results = []
-    for changed in (False, True):
-        policy, rollout = made_up(privileged=PRIVILEGED)
-        rollout.learns[:, [0, 4]] = False
-        rollout.learns[2:4, 3] = False
-        if changed:
-            for lanes in (rollout.obs, rollout.privileged, rollout.reward, rollout.values):
-                lanes[:, [0, 4]] = torch.randn(lanes[:, [0, 4]].shape) * 50 + 9
-            rollout.logprobs[:, 0], rollout.logprobs[:, 4] = -200.0, 3.0
-            rollout.actions[:, [0, 4]] = (rollout.actions[:, [0, 4]] + 1) % 3
-            rollout.terminal[5, 0] = rollout.truncated[6, 4] = rollout.starts[4, 0] = True
-            rollout.state.cell[[0, 4]] = 7.0
-            rollout.logprobs[2:4, 3], rollout.values[2:4, 3] = -200.0, rollout.values[2:4, 3]
-            rollout.actions[2:4, 3] = (rollout.actions[2:4, 3] + 1) % 3
-        learner = PPO(policy, n_epochs=2, n_minibatches=n_minibatches, lr=1e-2)
-        metrics = learner.update(rollout)
-        results.append((metrics, policy.state_dict(), learner.optimizer.means))
-    (clean_metrics, clean, means), (metrics, dirty, dirty_means) = results
-    assert clean.keys() == dirty.keys() and all(torch.equal(clean[k], dirty[k]) for k in clean)
-    assert all(map(torch.equal, means, dirty_means))
-    assert metrics == clean_metrics and metrics["loss/skipped_steps"].item() == 0
 
 
 def test_update_without_learning_lanes_changes_nothing():
@@ -280,33 +227,6 @@ def test_set_lr():
     assert 0 < (weights(policy) - before).abs().max() < 4 * 4e-3
 
 
-@pytest.mark.parametrize("n_before", [0, 2])
-def test_state_dict_resumes_bit_for_bit(n_before):
-    policy, rollout = made_up()
-    learner = PPO(policy, n_epochs=2, n_minibatches=3)
-    for _ in range(n_before):
-        learner.update(rollout)
-    learner.set_lr(2e-3)
-    file = io.BytesIO()
-    torch.save(dict(policy=policy.state_dict(), learner=learner.state_dict()), file)
-    learner.update(rollout)
-
-    file.seek(0)
-    saved = torch.load(file, weights_only=True)
-    other = Policy(OBS, MOVES, width=WIDTH, seed=9)
-    resumed = PPO(other, n_epochs=2, n_minibatches=3, lr=0.5, seed=9)
-    other.load_state_dict(saved["policy"])
-    resumed.load_state_dict(saved["learner"])
-    resumed.update(rollout)
-    assert torch.equal(weights(other), weights(policy))
-    assert torch.equal(
-        other.generator.on(other.device).get_state(), policy.generator.on(policy.device).get_state()
-    )
-    resumed.set_lr(0.0)  # still reaches the optimizer
-    resumed.update(rollout)
-    assert torch.equal(weights(other), weights(policy))
-
-
 def test_fewer_lanes_than_minibatches_raises():
     policy, rollout = made_up()
     with pytest.raises(ValueError, match="6 lanes .* 7 minibatches.*n_minibatches"):
@@ -418,11 +338,8 @@ def test_captured_update_skips_nonfinite_rollout():
 
 @pytest.mark.cuda
 def test_update_never_synchronises():
-    policy, rollout = made_up(device="cuda")
+    policy, rollout = made_up(device="cuda", privileged=PRIVILEGED)
     learner = PPO(policy, n_epochs=2, n_minibatches=2, **OPTIONS)
     learner.update(rollout)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_synchronisation():
         learner.update(rollout)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")

@@ -157,20 +157,6 @@ def test_captured_collector_matches_eager():
     torch.testing.assert_close(results[0][1], results[1][1], rtol=2e-2, atol=2e-2)
 
 
-@pytest.mark.cuda
-def test_update_never_synchronises():
-    env, policy = PrivilegedEnv("cuda"), policy_of().cuda()
-    rollout = rollout_of(policy, "cuda")
-    Collector(env, policy, rollout)()
-    learner = PPO(policy, n_minibatches=2)
-    learner.update(rollout)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        learner.update(rollout)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-
-
 def test_bytes_per_env_counts_layers():
     env = PrivilegedEnv()
     env.n_agents = 1

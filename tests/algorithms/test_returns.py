@@ -1,5 +1,5 @@
-"""Returns and advantages against hand calculations, identities, and loops that share no code with
-returns.py.
+"""Returns and advantages against hand calculations, and loops that share no code with returns.py.
+tests/test_laws.py has recursions and identities.
 """
 
 import pytest
@@ -110,36 +110,6 @@ def test_discounted_sum_matches_recursion(T):
     torch.testing.assert_close(returns.discounted_sum(terms, discounts), expected, **F64_CLOSE)
 
 
-def test_gae_with_lambda_one_is_n_step_return():
-    case, _ = episodes()
-    for name in ("reset", "terminal", "truncated"):
-        case[name] = torch.zeros_like(case[name])
-    T = len(case["reward"])
-    powers = 0.9 ** torch.arange(T + 1, dtype=torch.float64)
-    r = returns.gae(**case, gamma=0.9, lambda_=1.0)
-    for t in range(T):
-        n_step = (powers[: T - t, None] * case["reward"][t:]).sum(0) + powers[T - t] * case[
-            "last_value"
-        ]
-        torch.testing.assert_close(r.targets[t], n_step, **F64_CLOSE)
-
-
-def test_gae_with_lambda_zero_is_one_step_error():
-    case, _ = episodes()
-    r = returns.gae(**case, gamma=0.9, lambda_=0.0)
-    following = torch.cat([case["value"][1:], case["last_value"][None]])
-    delta = case["reward"] + 0.9 * following * ~case["terminal"] - case["value"]
-    torch.testing.assert_close(r.advantages, delta * ~case["reset"], **F64_CLOSE)
-
-
-@pytest.mark.parametrize("lambda_", [0.0, 0.7, 1.0])
-def test_on_policy_vtrace_is_lambda_return(lambda_):
-    case, _ = episodes()
-    on_policy = returns.vtrace(torch.zeros_like(case["reward"]), **case, gamma=0.9, lambda_=lambda_)
-    expected = returns.gae(**case, gamma=0.9, lambda_=lambda_)
-    torch.testing.assert_close(on_policy.targets, expected.targets, **F64_CLOSE)
-
-
 def test_vtrace_ignores_actions_of_probability_zero():
     case, _ = episodes()
     r = returns.vtrace(torch.full_like(case["reward"], -torch.inf), **case, gamma=0.9)
@@ -165,21 +135,6 @@ def beyond(case, t, b):
     last = t + 1 == len(case["reward"])
     value = case["last_value"][b] if last else case["value"][t + 1, b]
     return 0.0 if case["terminal"][t, b] else value.item()
-
-
-def test_gae_matches_loop_over_episodes():
-    case, _ = episodes(seed=1)
-    gamma, lambda_ = 0.97, 0.9
-    r = returns.gae(**case, gamma=gamma, lambda_=lambda_)
-    expected = torch.zeros_like(case["reward"])
-    for b in range(case["reward"].shape[1]):
-        for rows in split(case, b):
-            for i, t in enumerate(rows):
-                for j, s in enumerate(rows[i:]):
-                    delta = case["reward"][s, b] + gamma * beyond(case, s, b) - case["value"][s, b]
-                    expected[t, b] += (gamma * lambda_) ** j * delta
-    assert case["terminal"].any() and case["truncated"].any() and case["reset"].any()
-    torch.testing.assert_close(r.advantages, expected, **F64_CLOSE)
 
 
 def test_vtrace_matches_definition_in_paper():
@@ -249,13 +204,6 @@ def test_n_step_returns_stop_at_episode_end(n):
                     total = total + gamma ** len(steps) * beyond(case, steps[-1], b)
                 torch.testing.assert_close(result[t, b], total, **F64_CLOSE)
     assert torch.equal(result[case["reset"]], case["value"][case["reset"]])
-
-
-def test_n_step_returns_over_all_rows_match_gae_with_lambda_one():
-    case, _ = episodes(seed=5)
-    expected = returns.gae(**case, gamma=0.9, lambda_=1.0).targets
-    result = returns.n_step_returns(**case, gamma=0.9, n=len(case["reward"]))
-    torch.testing.assert_close(result, expected, **F64_CLOSE)
 
 
 def test_inverse_rescale_in_float32():

@@ -17,7 +17,7 @@ import pytest
 from megastep.agents import package
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.factory.settings import kind_of
-from megastep.agents.runs import checkpoint
+from megastep.agents.runs import checkpoint, folders
 from tests.helpers import tiny
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -116,7 +116,7 @@ def add(outside, what, files):
 
 def saved():
     """Returns the checkpoint of the latest run."""
-    return checkpoint.load_latest(train.runs.find("latest") / "checkpoints")
+    return checkpoint.load_latest(folders.find("latest") / "checkpoints")
 
 
 def leftovers():

@@ -12,7 +12,7 @@ import pytest
 import torch
 import yaml
 
-from megastep import envs, toys
+from megastep import envs, recording, toys
 from megastep.agents import factory
 from megastep.agents.cli import evaluate, record, train
 from megastep.agents.errors import UserError
@@ -319,7 +319,7 @@ def test_record_against(here, capsys, monkeypatch):
 
     assert record.main(["run=a", "against=b", "steps=2", "file=c.png", "device=cpu"]) == 0
     assert (here / "c.png").exists()
-    monkeypatch.setattr(record, "film", film)
+    monkeypatch.setattr(recording, "film", film)
     assert (
         record.main(
             ["run=a", "against=tests.helpers.games:High", "steps=2", "file=c.png", "device=cpu"]
@@ -382,7 +382,7 @@ def test_bot_meets_a_run_that_trained_in_one_lane(here, monkeypatch):
     (path,) = (here / "lone" / "evaluations").glob("duels-*bot.json")
     assert [row["duels"] for row in json.loads(path.read_text())["rows"]] == [8, 4, 4]
     players = []
-    monkeypatch.setattr(record, "film", lambda env, both, path, *_: players.append((env, both)))
+    monkeypatch.setattr(recording, "film", lambda env, both, path, *_: players.append((env, both)))
     assert record.main(["run=lone", "against=bot", "device=cpu"]) == 0
     ((env, both),) = players
     assert env.n_agents == 2 and isinstance(both.policies[1], Tracker)

@@ -122,7 +122,7 @@ def test_errors_wake_no_gpu(installed):
 @pytest.mark.cuda
 def test_pytorch_uses_the_created_context():
     code = """
-from megastep.agents.cli import gpu
+from megastep.agents.launch import gpu
 assert gpu.is_available()
 gpu.wake("cuda")
 import torch

@@ -47,7 +47,7 @@ def test_recordings_take_the_next_free_name(trained, tmp_path, monkeypatch, caps
             raise RuntimeError("Frame 0 could not be drawn: by chance")
         path.write_text(str(len(filmed)))
 
-    monkeypatch.setattr(record, "film", film)
+    monkeypatch.setattr(recording, "film", film)
     words = [f"run={copy}", "steps=1", "device=cpu"]
     assert [record.main(words) for _ in range(4)] == [0, 0, 2, 0]
     names = ["video.mp4", "video-2.mp4", "video-3.mp4"]

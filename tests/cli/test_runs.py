@@ -37,24 +37,24 @@ def run(name):
 
 
 def test_make_numbers_taken_names():
-    folders = [folders.make(pathlib.Path("runs/a")) for _ in range(3)]
-    assert [str(path) for path in folders] == ["runs/a", "runs/a-2", "runs/a-3"]
+    paths = [folders.make(pathlib.Path("runs/a")) for _ in range(3)]
+    assert [str(path) for path in paths] == ["runs/a", "runs/a-2", "runs/a-3"]
 
 
 def test_make_from_many_threads():
     for round in range(20):
-        folders, start = [], threading.Barrier(8)
+        made, start = [], threading.Barrier(8)
 
-        def launch(name=f"runs/{round}", folders=folders, start=start):
+        def launch(name=f"runs/{round}", made=made, start=start):
             start.wait()
-            folders.append(folders.make(pathlib.Path(name)))
+            made.append(folders.make(pathlib.Path(name)))
 
         threads = [threading.Thread(target=launch) for _ in range(8)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-        assert len(set(folders)) == 8 and all(path.is_dir() for path in folders)
+        assert len(set(made)) == 8 and all(path.is_dir() for path in made)
 
 
 @pytest.mark.parametrize(

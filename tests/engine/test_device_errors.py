@@ -43,23 +43,6 @@ def geometry(c):
     return c.scenery.agent_light
 
 
-def unseen(c):
-    layouts = c.scenery.layouts
-    words = -(-layouts.max_texels // 32)
-    seen = torch.zeros((LAST + 1, c.n_agents, words), dtype=torch.int32, device=c.device)
-    visible = torch.full((len(layouts), words), -1, dtype=torch.int32, device=c.device)
-    return engine.unseen(c.scenery, c.agents, seen, visible)
-
-
-def coverage(c):
-    layouts, lanes = c.scenery.layouts, (LAST + 1, c.n_agents)
-    words = -(-layouts.max_texels // 32)
-    seen = torch.full((*lanes, words), 1, dtype=torch.int32, device=c.device)
-    visible = torch.full((len(layouts), words), -1, dtype=torch.int32, device=c.device)
-    mask = torch.ones(lanes, dtype=torch.bool, device=c.device)
-    return engine.coverage(c.scenery, c.agents, seen, visible, mask)
-
-
 def pointgoal(c):
     goals = GoalFields(
         points=2 * [np.ones((1, 2))],
@@ -112,7 +95,7 @@ def spawn(c):
 @pytest.mark.parametrize("layout", [2, -1, 2**31 - 1, -(2**31)])
 @pytest.mark.parametrize("n_agents", [1, 3])
 @pytest.mark.parametrize(
-    "operation", [physics, render, observe, geometry, unseen, coverage, explorer, pointgoal, spawn]
+    "operation", [physics, render, observe, geometry, explorer, pointgoal, spawn]
 )
 def test_bad_layout_is_named_and_other_environments_continue(operation, n_agents, layout, device):
     expected = operation(boxes(device, n_agents))
@@ -128,7 +111,7 @@ def test_bad_layout_is_named_and_other_environments_continue(operation, n_agents
     engine.check(c.agents)
 
 
-@pytest.mark.parametrize("operation", [physics, render, observe, unseen, explorer, pointgoal])
+@pytest.mark.parametrize("operation", [physics, render, observe, explorer, pointgoal])
 @pytest.mark.parametrize("field", ["positions", "angles"])
 def test_nonfinite_pose_is_named_by_every_operation(operation, field, device):
     expected = operation(boxes(device, 2))

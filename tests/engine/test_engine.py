@@ -11,7 +11,8 @@ import torch
 from megastep import cuda, engine
 from megastep.modules import IMU, RGB, Depth
 from tests.helpers import compare, random_scenery
-from tests.helpers.outputs import Poison, seen_of
+from tests.helpers.outputs import Poison
+from tests.helpers.texels import seen_of
 
 
 def core_of(envs, device, **settings):

@@ -13,7 +13,7 @@ from megastep.geometries import sample
 from megastep.modules import RandomSpawns, visible_texels
 from megastep.ragged import Ragged
 from tests.helpers.cuda_on_cpu import ORDERS
-from tests.helpers.outputs import seen_of
+from tests.helpers.texels import seen_of
 
 
 def trajectory(device, n_agents, subsample=1, n_steps=12, **settings):
@@ -45,9 +45,6 @@ def trajectory(device, n_agents, subsample=1, n_steps=12, **settings):
             agent_ray=True,
             seen=seen,
         )
-        out.append(engine.unseen(core.scenery, core.agents, seen, visible))
-        mask = torch.rand((24, n_agents), generator=random).to(device) < 0.3
-        out.append(engine.coverage(core.scenery, core.agents, seen, visible, mask))
     out += [
         *engine.render(core.scenery, core.agents),
         *engine.observe(core.scenery, core.agents, subsample, rgb=False)[1:2],

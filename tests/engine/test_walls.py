@@ -1,5 +1,5 @@
 """No agent ever passes a wall or gets stuck: half a million agent steps that try to, ten million in
-the slow tests, a hundred million on a GPU. `scripts/check_walls.py` makes a billion.
+the slow tests, a hundred million on a GPU.
 """
 
 import math
@@ -140,29 +140,6 @@ def test_finds_agents_that_pass_walls(monkeypatch):
     monkeypatch.setattr(engine, "physics", without_walls)
     total = walls.run("box", 20_000, 512)
     assert total["crossings"] > 0.05 * total["steps"] and "box at 1 fps" in total["descriptions"][0]
-
-
-def test_crossings_can_be_repeated_from_their_description(monkeypatch):
-    monkeypatch.setattr(engine, "physics", without_walls)
-    course = make_course("wedges")
-    walk = walls.Walk(
-        course,
-        scene.scenery(course.geometries, 1, 48, device=torch.device("cpu")),
-        10,
-        1,
-        False,
-        seed=3,
-    )
-    walk.phase()
-    b, d, a = (~walk.records[..., 0].isnan()).nonzero()[0].tolist()
-    record = dict(zip(walls.RECORDED, walk.records[b, d, a].tolist()))
-    before, after = (
-        torch.tensor([record[f"x {when}"], record[f"y {when}"]]) for when in ("before", "after")
-    )
-    assert crossed(before.view(1, 1, 1, 2), after.view(1, 1, 1, 2), course.walls[d : d + 1]).all()
-    velocity = torch.tensor([record["velocity x"], record["velocity y"]])
-    assert torch.equal(before + velocity / walk.fps, after)
-    assert all(f"{x!r}" in walk.describe_crossings()[0] for x in record.values())
 
 
 def test_finds_agents_that_are_stuck(monkeypatch):

@@ -8,9 +8,11 @@ import torch
 from megastep import arrdict, capture, contract, envs, toys
 from megastep.agents.selfplay.bots import RandomActions
 from megastep.envs.deathmatch.bot import Bot
+from megastep.envs.pong import Tracker
 from megastep.geometries import sample
 from tests.helpers import bot_twin
 from tests.helpers.bot_twin import FORWARD, LEFT, NOTHING, RIGHT
+from tests.helpers.synchronisation import no_synchronisation
 
 AHEAD = (2.0, 3.5, 0.0)
 
@@ -188,16 +190,17 @@ def test_gpu_acts_as_the_cpu_does():
 
 
 @pytest.mark.cuda
-def test_never_synchronises_and_can_be_captured():
-    env = envs.Deathmatch(8, [toys.box()], device="cuda")
-    bot, world = Bot(), env.reset()
-    state = bot.initial(32, "cuda")
+@pytest.mark.parametrize("bot", [Bot(), Tracker()])
+def test_bots_never_synchronise_and_can_be_captured(bot):
+    if isinstance(bot, Bot):
+        env = envs.Deathmatch(8, [toys.box()], device="cuda")
+    else:
+        env = envs.Pong(8, device="cuda", self_play=True)
+    world = env.reset()
+    state = bot.initial(len(world.reset), "cuda")
     bot(world, state)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_synchronisation():
         plain, _ = bot(world, state)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
     graph = capture.capture(lambda world, state: bot(world, state), (world, state), ())
     assert isinstance(graph, capture.Graph)
     assert torch.equal(graph(world, state)[0].actions, plain.actions)

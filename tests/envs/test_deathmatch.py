@@ -624,43 +624,6 @@ def test_too_many_agents_for_a_home(tmp_path, monkeypatch, capsys):
 # ---- Devices ----
 
 
-@pytest.mark.cuda
-@pytest.mark.parametrize("n_agents", [2, 4, 16])
-def test_cpu_and_gpu_agree_on_every_bit(n_agents):
-    settings = dict(limit=15, damage=0.3, recovery=0.1, drain=0.05, health_per_hit=0.02)
-    settings |= dict(aim_reward=0.1, search_reward=0.3, hearing=5.0)
-    runs = [
-        arrdict.stack(
-            contract.rollout(
-                envs.Deathmatch(
-                    37,
-                    sample("homes", 8),
-                    n_agents=n_agents,
-                    device=on,
-                    privileged=True,
-                    **settings,
-                ),
-                60,
-                check=False,
-            )
-        )
-        for on in ("cpu", "cuda")
-    ]
-    assert contract.same(*runs)
-
-
-def test_number_of_threads_changes_no_bit():
-    runs = []
-    try:
-        for n in (1, 3):
-            engine.set_threads(n)
-            env = envs.Deathmatch(7, sample("homes", 4), device="cpu", limit=9, privileged=True)
-            runs.append(arrdict.stack(contract.rollout(env, 30)))
-    finally:
-        engine.set_threads(None)
-    assert contract.same(*runs)
-
-
 # ---- Learning ----
 
 

@@ -13,6 +13,7 @@ from megastep.engine import EngineError
 from megastep.engine.state_tree import state_tree
 from megastep.envs import PointGoal
 from megastep.geometries import sample
+from tests.helpers.synchronisation import no_synchronisation
 
 GPU = torch.cuda.is_available()
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
@@ -37,6 +38,7 @@ SHORT = {
         aim_reward=1,
         search_reward=1,
         hearing=5,
+        privileged=True,
     ),
     "pointgoal": dict(limit=15, res=1, subsample=1),
     "pointgoal, cameras": dict(limit=15, res=1, subsample=1, cameras=(0, 180)),
@@ -47,6 +49,7 @@ SHORT = {
     "pong": dict(limit=20),
     "pong, pixels": dict(limit=20, pixels=True),
     "pong, self-play": dict(limit=20, self_play=True),
+    "pong, pixels of both": dict(limit=20, pixels=True, self_play=True),
 }
 
 
@@ -179,18 +182,17 @@ class TestOnTheGPU:
         env.reset()
         decision = idle(env)
         env.step(decision)
-        torch.cuda.set_sync_debug_mode("error")
-        try:
+        with no_synchronisation():
             for _ in range(3):
                 env.step(decision)
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
 
     @pytest.mark.parametrize("name", SHORT)
     def test_cpu_gpu_and_cuda_graph_give_equal_episodes(self, name):
+        """With 70 environments, which fill no whole number of blocks."""
+        on_cpu, on_gpu, captured = (make(name, on, 70) for on in ("cpu", "cuda", "cuda"))
         runs = [
-            contract.rollout(env, 40, check=False)
-            for env in (make(name), make(name, "cuda"), capture.Captured(make(name, "cuda")))
+            contract.rollout(env, 60, check=False)
+            for env in (on_cpu, on_gpu, capture.Captured(captured))
         ]
         assert contract.same(arrdict.stack(runs[0]), arrdict.stack(runs[1]))
         assert contract.same(arrdict.stack(runs[0]), arrdict.stack(runs[2]))
@@ -209,6 +211,18 @@ def test_cuda_kernels_on_a_cpu_give_equal_episodes(name, cuda_on_cpu, monkeypatc
     cuda_on_cpu.install(monkeypatch)
     monkeypatch.setattr(cuda_on_cpu, "order", "reversed")
     assert contract.same(expected, arrdict.stack(contract.rollout(make(name), 24, check=False)))
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_number_of_threads_changes_no_bit(name):
+    runs = []
+    try:
+        for n in (1, 3):
+            engine.set_threads(n)
+            runs.append(arrdict.stack(contract.rollout(make(name, n_envs=7), 30, check=False)))
+    finally:
+        engine.set_threads(None)
+    assert contract.same(*runs)
 
 
 # ---- Continuous actions ----

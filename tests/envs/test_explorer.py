@@ -9,15 +9,10 @@ from megastep.envs.explorer.step import explorer_step
 from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.geometries import sample
 from tests.helpers import explorer_twin, random_scenery
-from tests.helpers.outputs import Poison, seen_of
+from tests.helpers.outputs import Poison
+from tests.helpers.texels import packed, seen_of, unpacked
 
 STATE = "ages", "limits", "ended"
-
-
-def packed(bits):
-    """Packs bits (..., 32 n_words) into words (..., n_words) int32, the first in the lowest bit."""
-    values = torch.tensor([2**i for i in range(31)] + [-(2**31)])
-    return (bits.unflatten(-1, (-1, 32)) * values).sum(-1).int()
 
 
 def random_state(c, seed, density):
@@ -26,14 +21,12 @@ def random_state(c, seed, density):
     """
     random = torch.Generator().manual_seed(seed)
     layouts, lanes = c.scenery.layouts, (c.n_envs, c.n_agents)
-    n_texels = layouts.texel_starts[layouts.wall_starts.long()].diff()
     n_words = seen_of(c).shape[-1] + seed % 2
-    inside = torch.arange(32 * n_words) < n_texels.cpu()[:, None]
     is_visible, is_seen = (
         torch.rand((*axes, 32 * n_words), generator=random) < chance
         for axes, chance in (((len(layouts),), density), (lanes, 0.5))
     )
-    visible, seen = packed(is_visible & inside).to(c.device), packed(is_seen).to(c.device)
+    visible, seen = packed(is_visible).to(c.device), packed(is_seen).to(c.device)
     n = c.n_envs * c.n_agents
 
     def integers(low, high):
@@ -45,12 +38,12 @@ def random_state(c, seed, density):
 
 
 def check_step(c, seed, density, monkeypatch):
-    """Compares all outputs and the new state with the twin, bit by bit. Returns how many episodes
-    start and end.
+    """Compares all outputs and the new state with the twin, bit by bit, and counts of unseen texels
+    with its bounds. Returns how many episodes start and end.
     """
     seen, visible, newly_seen, state = random_state(c, seed, density)
     expected = explorer_twin.explorer_step(
-        c.scenery, c.agents, newly_seen, seen, visible, **state, patience=7
+        c.scenery, newly_seen, seen, visible, **state, patience=7
     )
     runs, poison = TexelRuns(c.scenery, visible), Poison(torch.empty)
     for wanted in ((True, True), (True, False), (False, True), (False, False)):
@@ -63,9 +56,14 @@ def check_step(c, seed, density, monkeypatch):
                 patience=7, coverage=coverage, privileged=privileged,
             )._asdict()  # fmt: skip
         assert (out["coverage"] is None, out["unseen"] is None) == (not coverage, not privileged)
+        unseen = out.pop("unseen")
+        if privileged:
+            poison.check(unseen=unseen)
+            certain = explorer_twin.check_unseen(c.scenery, c.agents, seen, visible, unseen)
+            assert certain > 0.95 or not density, "few are close to a border of bins"
         for name, tensor in (out | now).items():
             if tensor is not None:
-                ours, theirs = tensor.cpu(), expected[name].cpu()
+                ours, theirs = tensor.cpu(), expected[name]
                 assert ours.dtype == theirs.dtype and torch.equal(ours, theirs), (name, wanted)
     return int(expected["reset"].sum()), int(expected["truncated"].sum())
 
@@ -74,7 +72,8 @@ def check_step(c, seed, density, monkeypatch):
 @pytest.mark.parametrize("degenerate", [(), random_scenery.EVERYTHING], ids=["plain", "degenerate"])
 def test_step_matches_twin_on_every_bit(n_agents, degenerate, device, monkeypatch):
     """Walls begin anywhere in a word, have hundreds of words or none. Environments share layouts,
-    and a layout has no environment. Densities 0 and 1 leave no run, and all.
+    and a layout has no environment. Densities 0 and 1 leave no run, and all. `visible` has bits
+    beyond a layout's texels.
     """
     n_starts = n_ends = 0
     for seed, density in enumerate((0.0, 0.02, 0.5, 1.0)):
@@ -100,12 +99,16 @@ def test_step_matches_twin_in_homes(n_envs, device, monkeypatch):
     check_step(c, 1, 0.7, monkeypatch)
 
 
+def explorer(device, **settings):
+    """Nine environments with short episodes."""
+    settings = dict(patience=1, res=1, subsample=1) | settings
+    return envs.Explorer(9, sample("bench", 3), device=device, **settings)
+
+
 @pytest.mark.parametrize("settings", [dict(), dict(resample=True, privileged=True)])
 def test_episodes_match_twin(settings, device):
     """Every world of many short episodes is that of the twin, from the state before it."""
-    env = envs.Explorer(
-        9, sample("bench", 3), device=device, patience=1, res=1, subsample=1, **settings
-    )
+    env = explorer(device, **settings)
     life, generator, n_ends = env.lifecycle, torch.Generator().manual_seed(1), 0
     world, before = env.reset(), None
     for _ in range(80):
@@ -114,30 +117,99 @@ def test_episodes_match_twin(settings, device):
             # the reward of a first observation is 0, whatever it shows
             newly_seen = torch.where(world.reset, life.limits - env.patience, newly_seen)
             expected = explorer_twin.explorer_step(
-                env.core.scenery, env.core.agents, newly_seen, env.seen, env.visible, **before,
-                patience=env.patience,
-            )  # fmt: skip
+                env.core.scenery, newly_seen, env.seen, env.visible, **before, patience=env.patience
+            )
             values = dict(world, **world.metrics, **world.get("privileged", {}))
             values |= {name: getattr(life, name) for name in STATE}
             for name in expected.keys() & values.keys():
-                assert torch.equal(values[name], expected[name]), name
+                assert torch.equal(values[name].cpu(), expected[name]), name
+            n_seen = unpacked(env.seen[:, 0]).sum(-1)
+            assert torch.equal((life.limits - env.patience).cpu(), n_seen.int())
+            if "privileged" in world:
+                scenery, agents, unseen = env.core.scenery, env.core.agents, world.privileged.unseen
+                explorer_twin.check_unseen(scenery, agents, env.seen, env.visible, unseen)
             n_ends += int(world.truncated.sum())
         before = {name: getattr(life, name).clone() for name in STATE}
         world = env.step(arrdict(actions=contract.random_actions(env, generator)))
     assert n_ends > 9
 
 
-@pytest.mark.cuda
-def test_cpu_and_gpu_compute_the_same_bits():
-    settings = dict(patience=1, res=4, subsample=1, resample=True, privileged=True)
-    rollouts = [
-        contract.rollout(envs.Explorer(70, sample("bench", 4), device=device, **settings), 60)
-        for device in ("cpu", "cuda")
-    ]
-    for ours, theirs in zip(*rollouts, strict=True):
-        for name in ("reward", "reset", "truncated", "metrics", "privileged"):
-            one, other = (arrdict(value=world[name]) for world in (ours, theirs))
-            assert contract.same(one.map(torch.Tensor.cpu), other.map(torch.Tensor.cpu)), name
+# ---- The privileged observation by hand ----
+
+AHEAD, LEFT, BEHIND, RIGHT = 0, 4, 8, 12  # sectors
+
+
+def square(device):
+    """A room of 1.6 m around (1.8, 1.8), whose four walls have one word of 32 texels each: its
+    core, the index of its eastern wall, and bitmaps in which nothing is seen and all is visible.
+    """
+    c = core.Core(scene.scenery([toys.box(1.6)], 1, device=device))
+    c.agents.positions[:] = 1.8
+    east = (c.scenery.layouts.lines.vals[..., 0] > 2).all(-1).nonzero().item()
+    return c, east, seen_of(c), torch.full((1, 4), -1, dtype=torch.int32, device=device)
+
+
+def counts_of(c, seen, visible):
+    """The unseen texels in each (band, sector)."""
+    lane = torch.zeros(1, dtype=torch.int32, device=c.device)
+    runs = TexelRuns(c.scenery, visible)
+    out = explorer_step(
+        c.scenery, c.agents, lane[:, None], seen, runs, lane, lane + 1, lane.bool(), privileged=True
+    )
+    return (64 * out.unseen.square()).round().int().view(3, 16)
+
+
+def test_one_wall_on_each_side(device):
+    c, _, seen, visible = square(device)
+    counts = counts_of(c, seen, visible)
+    assert counts[0, [AHEAD, LEFT, BEHIND, RIGHT]].tolist() == 4 * [32] and counts.sum() == 128
+
+
+@pytest.mark.parametrize(
+    "angle, sector", [(0, AHEAD), (90, RIGHT), (180, BEHIND), (-90, LEFT), (-60, 3), (45, 14)]
+)
+def test_sectors_follow_the_heading(angle, sector, device):
+    """Only the eastern wall is unseen. Sectors are 22.5 degrees wide: 60 degrees to the left is
+    closest to sector 3 at 67.5, and 45 to the right to sector 14 at 315.
+    """
+    c, east, seen, visible = square(device)
+    c.agents.angles[:] = angle
+    seen.fill_(-1)[..., east] = 0
+    counts = counts_of(c, seen, visible)
+    assert counts[0, sector] == counts.sum() == 32
+
+
+@pytest.mark.parametrize("metres, band", [(0.7, 0), (1.49, 0), (1.51, 1), (3.99, 1), (4.01, 2)])
+def test_bands_end_at_1_5_and_4_metres(metres, band, device):
+    c, east, seen, visible = square(device)
+    c.agents.positions[..., 0] = 2.6 - metres
+    visible.zero_()[:, east] = -1
+    counts = counts_of(c, seen, visible)
+    assert counts[band, AHEAD] == counts.sum() == 32
+
+
+def test_only_visible_unseen_texels_count(device):
+    c, _, seen, visible = square(device)
+    assert counts_of(c, seen.fill_(0b0011), visible.fill_(0b0110)).sum() == 4
+    assert not counts_of(c, seen, visible.zero_()).any()
+    assert not counts_of(c, seen.fill_(-1), visible.fill_(-1)).any()
+
+
+def test_privileged_changes_nothing_else(device):
+    plain, extended = (
+        contract.rollout(explorer(device, privileged=privileged), 40)
+        for privileged in (False, True)
+    )
+    assert all("privileged" not in world for world in plain)
+    assert explorer(device).privileged_space is None
+    for a, b in zip(plain, extended, strict=True):
+        assert contract.same(a, arrdict({k: v for k, v in b.items() if k != "privileged"}))
+
+
+def test_explorers_visible_texels():
+    env = explorer("cpu")
+    expected = modules.visible_texels(env.core.scenery, env.spawner.points)
+    assert torch.equal(env.visible, expected)
 
 
 # ---- TexelRuns by hand ----

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from megastep import arrdict, contract, engine, envs
+from megastep import arrdict, contract, envs
 from megastep.agents.cli import evaluate, record, train
 from megastep.engine import EngineError
 from megastep.envs.pong.step import pong_step
@@ -304,31 +304,6 @@ def test_unaligned_pixels_are_refused(device):
     odd = torch.zeros(1201, dtype=torch.uint8, device=device)[1:].view(1, 1, 1, 30, 40)
     with pytest.raises(ValueError, match="pixels .* multiple of 8 bytes"):
         pong_step(env.games, env.no_actions, env.error_flag, 1, pixels=odd)
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("settings", SETTINGS.values(), ids=SETTINGS)
-@pytest.mark.parametrize("pixels", [False, True], ids=["features", "pixels"])
-def test_cpu_and_gpu_agree_on_every_bit(pixels, settings):
-    """With 70 environments, which do not fill their second block."""
-    runs = [
-        arrdict.stack(
-            contract.rollout(envs.Pong(70, device=on, pixels=pixels, **settings), 300, check=False)
-        )
-        for on in ("cpu", "cuda")
-    ]
-    assert contract.same(*runs)
-
-
-def test_number_of_threads_changes_no_bit():
-    runs = []
-    try:
-        for n in (1, 3):
-            engine.set_threads(n)
-            runs.append(worlds_of("cpu", pixels=True, self_play=True))
-    finally:
-        engine.set_threads(None)
-    assert contract.same(*runs)
 
 
 # ---- Learning ----

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from megastep import capture, envs, spaces
+from megastep import envs, spaces
 from megastep.agents.evaluation import duels
 from megastep.agents.evaluation.playing import first_episodes
 from megastep.agents.selfplay.bots import RandomActions
@@ -49,19 +49,3 @@ def test_other_observations_are_refused():
     env = envs.Minimal(2, device="cpu", res=8)
     with pytest.raises(ValueError, match="features or the pixels of Pong"):
         Tracker()(env.reset(), Tracker().initial(2))
-
-
-@pytest.mark.cuda
-def test_never_synchronises_and_can_be_captured():
-    env = envs.Pong(8, device="cuda", self_play=True)
-    bot, world = Tracker(), env.reset()
-    state = bot.initial(16, "cuda")
-    bot(world, state)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        plain, _ = bot(world, state)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    graph = capture.capture(lambda world, state: bot(world, state), (world, state), ())
-    assert isinstance(graph, capture.Graph)
-    assert torch.equal(graph(world, state)[0].actions, plain.actions)

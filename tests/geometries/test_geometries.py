@@ -346,22 +346,6 @@ def test_a_file_cut_anywhere_is_refused(tmp_path):
             files.load(tmp_path / "cut.npz")
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_flipped_bits_give_a_geometry_or_a_value_error(tmp_path):
-    whole = write_box(tmp_path / "whole.npz").read_bytes()
-    random, n_refused = np.random.default_rng(0), 0
-    for _ in range(400):
-        broken = bytearray(whole)
-        for at in random.integers(len(whole), size=3):
-            broken[at] ^= 1 << random.integers(8)
-        (tmp_path / "broken.npz").write_bytes(broken)
-        try:
-            files.load(tmp_path / "broken.npz")
-        except ValueError as error:
-            n_refused += "broken.npz" in str(error)
-    assert n_refused > 200
-
-
 def test_a_zip_bomb_costs_little_memory(tmp_path):
     masks = {f"{i}/masks.npy": bytes(30 << 20) for i in range(1, 12)}
     path = write_box(tmp_path / "bomb.npz", **masks)

@@ -264,16 +264,6 @@ def operations(f):
         ),
     )
     yield (
-        engine.unseen,
-        dict(both, seen=f.seen, visible=f.visible),
-        dict(OPERANDS, seen=tensors, visible=tensors),
-    )
-    yield (
-        engine.coverage,
-        dict(both, seen=f.seen, visible=f.visible, mask=f.mask),
-        dict(OPERANDS, seen=tensors, visible=tensors, mask=tensors),
-    )
-    yield (
         engine.spawn,
         dict(
             both,
@@ -487,7 +477,6 @@ CALLS = {
     "render": lambda f: engine.render(f.scenery, f.agents),
     "physics": lambda f: engine.physics(f.scenery, f.agents),
     "observe": lambda f: engine.observe(f.scenery, f.agents, imu=True),
-    "unseen": lambda f: engine.unseen(f.scenery, f.agents, f.seen, f.visible),
 }
 STATE = "positions", "angles", "velocity", "angvelocity"
 SETTINGS = dict(res=10**6, fov=0.0, fps=0.0, radius=-1.0)

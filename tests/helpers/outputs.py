@@ -37,9 +37,3 @@ class Poison:
         }
         unwritten = [f"{name}: {n}" for name, n in left.items() if n]
         assert not unwritten, f"elements that no kernel wrote: {', '.join(unwritten)}"
-
-
-def seen_of(core):
-    """Returns zeros (N, A, n_words) for the texels that each agent has seen."""
-    n_words = -(-core.scenery.layouts.max_texels // 32)
-    return torch.zeros((core.n_envs, core.n_agents, n_words), dtype=torch.int32, device=core.device)

@@ -14,7 +14,7 @@ def assert_close(names, results, expected, slack):
         )
 
 
-def check_captured(core, last, step, slack, bf16, n_steps=9, n_lanes=64):
+def check_captured(core, last, slack, bf16):
     """Checks on a GPU that a captured unroll and its gradients match an eager unroll and steps.
 
     Inputs, resets and hidden state change after the capture.
@@ -22,12 +22,11 @@ def check_captured(core, last, step, slack, bf16, n_steps=9, n_lanes=64):
     Args:
         core: the recurrent core.
         last: leaf of the hidden state that the loss depends on.
-        step: takes x (B, W), reset (B,) and a hidden state; returns the output and the next state.
         slack: tolerance, as for `assert_close`.
         bf16: whether to use autocast.
     """
     torch.manual_seed(0)
-    core = core.cuda()
+    n_steps, n_lanes, core = 9, 64, core.cuda()
     x = torch.randn(n_steps, n_lanes, core.width, device="cuda", requires_grad=True)
     reset = torch.rand(n_steps, n_lanes, device="cuda") < 0.3
     state = core.initial(n_lanes, "cuda")
@@ -58,5 +57,5 @@ def check_captured(core, last, step, slack, bf16, n_steps=9, n_lanes=64):
     atol = slack * max(1.0, captured[0].abs().max().item())
     with torch.no_grad(), torch.autocast("cuda", torch.bfloat16, enabled=bf16):
         for t in range(n_steps):
-            output, state = step(x[t], reset[t], state)
-            torch.testing.assert_close(output.float(), captured[0][t], rtol=0, atol=atol)
+            output, state = core(x[t : t + 1], reset[t : t + 1], state)
+            torch.testing.assert_close(output[0].float(), captured[0][t], rtol=0, atol=atol)

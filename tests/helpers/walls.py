@@ -308,7 +308,7 @@ def stuck(walk, most):
 # ---- Runs ----
 
 
-def run(name, n_steps, n_agents, device="cpu", seed=0, tries=1 << 30, report=None):
+def run(name, n_steps, n_agents, device="cpu", seed=0, tries=1 << 30):
     """Walks a course with each of the SETTINGS, driven and acting.
 
     Args:
@@ -316,7 +316,6 @@ def run(name, n_steps, n_agents, device="cpu", seed=0, tries=1 << 30, report=Non
         n_steps: minimum number of agent steps in all.
         n_agents: maximum number of agents at once.
         tries: number of stopped agents that try to get away after each phase.
-        report: called with the result so far after each walk.
 
     Returns:
         A dict: the COUNTED; `tried`, `held`, `stuck`; `cornered`, a list (D,); `descriptions` of
@@ -347,6 +346,4 @@ def run(name, n_steps, n_agents, device="cpu", seed=0, tries=1 << 30, report=Non
             total[key] += value
         total["cornered"] = [x + y for x, y in zip(total["cornered"], walk.cornered.tolist())]
         total["descriptions"] += walk.describe_crossings()
-        if report:
-            report(total)
     return total

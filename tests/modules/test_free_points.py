@@ -7,6 +7,7 @@ import torch
 from megastep import core, engine, modules, scene, toys
 from megastep.geometries import sample
 from megastep.geometry import indices
+from tests.helpers.synchronisation import no_synchronisation
 
 CLEAR = engine.AGENT_RADIUS + 0.05
 
@@ -89,9 +90,6 @@ def test_points_are_the_same_on_a_gpu_without_synchronising():
         free_points = modules.FreePoints(homes, core_of(homes, 24, device=device))
         on_device = mask.to(device)
         free_points(on_device)
-        torch.cuda.set_sync_debug_mode("error")
-        try:
+        with no_synchronisation():
             draws.append(free_points(on_device))
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
     assert torch.equal(draws[0], draws[1].cpu())

@@ -89,49 +89,6 @@ def test_outputs_and_gradients_match_torch(p_reset):
         )
 
 
-def test_sequence_matches_steps():
-    lstm, x, reset, state = case()
-    outputs, after = lstm(x, reset, state)
-    for t in range(T):
-        output, state = lstm.step(x[t], reset[t], state)
-        torch.testing.assert_close(output, outputs[t], **CLOSE)
-    torch.testing.assert_close(state.cell, after.cell, **CLOSE)
-
-
-def test_sequence_can_be_split():
-    lstm, x, reset, state = case()
-    whole, _ = lstm(x, reset, state)
-    first, between = lstm(x[:4], reset[:4], state)
-    second, _ = lstm(x[4:], reset[4:], between)
-    torch.testing.assert_close(torch.cat([first, second]), whole, **CLOSE)
-
-
-def test_reset_clears_even_nan():
-    lstm, x, _, state = case()
-    reset = torch.zeros(T, B, dtype=torch.bool)
-    reset[4] = True
-    outputs, _ = lstm(x, reset, state)
-    corrupted = torch.cat([torch.full((4, B, W), torch.nan), x[4:]])
-    again, _ = lstm(corrupted, reset, state.map(lambda leaf: leaf * torch.nan))
-    assert torch.equal(again[4:], outputs[4:]) and again[:4].isnan().all()
-    (d_x,) = torch.autograd.grad(outputs[4:].sum(), x)
-    assert not d_x[:4].any() and d_x[4:].all()
-
-
-def test_first_input_reaches_last_output_without_reset():
-    lstm, x, _, state = case()
-    (d_x,) = torch.autograd.grad(
-        lstm(x, torch.zeros(T, B, dtype=torch.bool), state)[0][-1].sum(), x
-    )
-    assert d_x[0].all()
-
-
-def test_lanes_do_not_mix():
-    lstm, x, reset, state = case()
-    (d_x,) = torch.autograd.grad(lstm(x, reset, state)[0][:, 2].sum(), x)
-    assert d_x[-1, 2].all() and not d_x[:, [0, 1, 3, 4]].any()
-
-
 def test_forget_gates_start_open():
     # Jozefowicz et al. 2015: a bias of 1. Forget is the second gate, as in torch.nn.LSTM. Without
     # input and output, a cell then keeps sigmoid(1) of its value per step.
@@ -139,7 +96,7 @@ def test_forget_gates_start_open():
     biases = lstm.input.bias.detach().split(W)
     assert [bias.unique().tolist() for bias in biases] == [[0.0], [1.0], [0.0], [0.0]]
     state = arrdict(output=torch.zeros(B, W), cell=torch.ones(B, W))
-    _, after = lstm.step(torch.zeros(B, W), torch.zeros(B, dtype=torch.bool), state)
+    _, after = lstm(torch.zeros(1, B, W), torch.zeros(1, B, dtype=torch.bool), state)
     retained = torch.sigmoid(torch.tensor(1.0)).item()
     torch.testing.assert_close(after.cell, torch.full((B, W), retained), **CLOSE)
 
@@ -154,13 +111,6 @@ def test_wrong_shapes_raise():
         ValueError, match=r"state.cell is \(1, 16\) on cpu, but x asks for \(5, 16\)"
     ):
         lstm(x, reset, arrdict(state, cell=state.cell[:1]))
-
-
-def test_gradient_can_be_computed_twice():
-    lstm, x, reset, state = case()
-    loss = lstm(x, reset, state)[0].square().sum()
-    first, second = (torch.autograd.grad(loss, x, retain_graph=True)[0] for _ in range(2))
-    assert torch.equal(first, second)
 
 
 # ---- The kernels ----
@@ -331,7 +281,7 @@ def test_kernels_round_to_bfloat16_like_torch(where):
 def test_captured_unroll_matches_steps(bf16):
     lstm = LSTM(256)
     slack = SLACK[torch.bfloat16 if bf16 else torch.float32]
-    check_captured(lstm, "cell", lstm.step, slack, bf16)
+    check_captured(lstm, "cell", slack, bf16)
 
 
 # ---- A whole sequence in one kernel ----
@@ -475,7 +425,8 @@ def test_large_gates_saturate_on_cpu():
 
 def test_widths_that_kernels_do_not_take_use_pytorch():
     assert lstm_cpu.fits(torch.zeros(1, 1, 16)) and not lstm_cpu.fits(torch.zeros(1, 1, 17))
-    output, _ = LSTM(17).step(torch.zeros(1, 17), torch.zeros(1, dtype=bool), LSTM(17).initial(1))
+    lstm = LSTM(17)
+    output, _ = lstm(torch.zeros(1, 1, 17), torch.zeros(1, 1, dtype=bool), lstm.initial(1))
     assert output.isfinite().all()
 
 

@@ -14,6 +14,7 @@ from megastep.agents.networks.cores import CORES
 from megastep.agents.networks.policy import Policy
 from megastep.arrdict import arrdict, stack
 from megastep.dotdict import leaves, mapping
+from tests.helpers.synchronisation import no_synchronisation
 
 T, B = 7, 5
 OBS = arrdict(rgb=spaces.MultiImage(1, 3, 1, 16), imu=spaces.MultiVector(1, 3))
@@ -217,12 +218,9 @@ def test_gpu_never_synchronises_and_bf16_is_close():
         policy = Policy(OBS, MOVES, width=64, bf16=bf16).cuda()
         state = policy.initial(B)
         policy(world[0], state)
-        torch.cuda.set_sync_debug_mode("error")
-        try:
+        with no_synchronisation():
             policy(world[1], state)
             results.append(policy.unroll(world.obs, world.reset, state).logits.movement)
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
     # logits of an untrained policy differ by some .01, bfloat16 by 1 %
     torch.testing.assert_close(*results, rtol=0, atol=5e-3)
 

@@ -316,7 +316,7 @@ def test_checkpoint_is_on_disk_before_it_is_renamed(tmp_path, monkeypatch):
 SAVES_UNTIL_KILLED = """
 import os, random, signal, sys, time
 import torch
-from megastep.agents.training import checkpoint, checkpoint_format
+from megastep.agents.runs import checkpoint, checkpoint_format
 
 folder, kills, again = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "again"
 checkpoint.save(folder, 1, {"n": 1, "w": torch.zeros(50_000)}, {})

@@ -83,7 +83,7 @@ def test_benchmark_is_documented_generator(name):
 @pytest.mark.parametrize(
     ("name", "n_records"),
     [
-        *(("step", 5), ("kernels", 9), ("observe", 2), ("agents", 1), ("deathmatch", 2)),
+        *(("step", 5), ("kernels", 8), ("observe", 2), ("agents", 1), ("deathmatch", 2)),
         *(("memory", 1), ("replay", 9), ("pong", 2)),
     ],
 )

@@ -209,8 +209,7 @@ def trainer_of(folder, env, samples, seed=1, **options):
             pass
 
     saver = Saver(folder, {})
-    opponents = env if options else None
-    run = Trainer(env, policy, learner, Rows, saver, Budget(samples), opponents=opponents)
+    run = Trainer(env, policy, learner, Rows, saver, Budget(samples))
     run.rows = rows
     return run
 

@@ -13,6 +13,7 @@ from megastep.agents.storage.async_collector import AsyncCollector
 from megastep.agents.storage.collector import Collector
 from megastep.agents.storage.rollout import make_rollout
 from tests.helpers.made_up import B, Numbers
+from tests.helpers.synchronisation import no_synchronisation
 
 T = 5
 SETTINGS = dict(n_steps=T, n_minibatches=2, lr=1e-2, gamma=0.99, advantage_floor=0.3)
@@ -161,10 +162,7 @@ def test_collect_and_update_never_synchronise():
     collect = learner.collector(env)
     for _ in range(5):
         learner.update(collect())
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_synchronisation():
         for _ in range(3):
             learner.update(collect())
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
     collect.wait()

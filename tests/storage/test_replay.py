@@ -16,6 +16,7 @@ from megastep.arrdict import arrdict
 from megastep.capture import Graph
 from megastep.dotdict import leaves
 from megastep.engine.state_tree import rebind, walk
+from tests.helpers.synchronisation import no_synchronisation
 
 OBS = arrdict(
     eye=spaces.MultiImage(1, 3, 1, 4),
@@ -431,11 +432,8 @@ def test_captured_buffer_matches_eager_and_never_synchronises():
             graph = Graph(work, (), (world.rollout, replay, generator))
         for _ in range(9):
             world.next()
-            torch.cuda.set_sync_debug_mode("error")
-            try:
+            with no_synchronisation():
                 graph() if is_captured else work()
-            finally:
-                torch.cuda.set_sync_debug_mode("default")
         results.append([leaf.cpu() for leaf in [*leaves(out.batch), replay.tree.priorities]])
     for eager, captured in zip(*results, strict=True):
         assert torch.equal(eager, captured)

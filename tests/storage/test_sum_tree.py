@@ -7,6 +7,7 @@ from torch import testing
 
 from megastep.agents.storage.sum_tree import SumTree
 from megastep.capture import Graph
+from tests.helpers.synchronisation import no_synchronisation
 
 
 def filled(values, device="cpu", **options):
@@ -175,12 +176,9 @@ def test_captured_tree_matches_eager():
 def test_never_synchronises():
     tree, index = SumTree(5000, "cuda"), torch.arange(100, device="cuda")
     values, generator = torch.rand(100, device="cuda"), torch.Generator("cuda").manual_seed(1)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_synchronisation():
         tree.set(index, values)
         tree.probability(tree.sample(64, generator))
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
 
 
 @pytest.mark.parametrize("values", [torch.ones(2), torch.ones(5), torch.ones(1), torch.ones(1, 3)])

@@ -15,6 +15,7 @@ from megastep.agents.storage.rollout import Rollout
 from megastep.agents.training.curriculum import PLR, SFL
 from megastep.arrdict import arrdict
 from megastep.geometries import sample
+from tests.helpers.synchronisation import no_synchronisation
 
 LEARNER = SimpleNamespace(gamma=0.9, lambda_=0.8)
 SMALL = [
@@ -214,11 +215,8 @@ def test_an_update_does_not_synchronise(kind):
     curriculum = kind(Homes(5, "cuda"), LEARNER, rollout)
     curriculum.update(rollout)
     torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_synchronisation():
         curriculum.update(rollout)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
 
 
 # ---- In environments ----

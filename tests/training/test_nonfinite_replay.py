@@ -23,6 +23,7 @@ from megastep.agents.training.nonfinite_recorder import (
 from megastep.agents.training.nonfinite_replay import Recording, ReplayError
 from megastep.agents.training.trainer import Trainer
 from megastep.arrdict import arrdict
+from tests.helpers.synchronisation import no_synchronisation
 
 N, A, T = 6, 2, 4
 
@@ -78,7 +79,6 @@ def trainer_in(folder, env=None, learner=PPO, past=0.0, **options):
         Saver(folder, {}),
         Budget(),
         log_every=7,
-        opponents=opponents,
         replay_folder=folder,
     )
 
@@ -233,14 +233,11 @@ def test_recording_never_synchronises():
     for _ in range(2):  # builds the kernels
         recorder.start()
         recorder.end(rollout)
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_synchronisation():
         env.places.add_(1)
         recorder.start()
         recorder.end(rollout)
         check.record[2:3].fill_(2)  # a number was found
         env.places.add_(1)
         recorder.start()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
     assert bool((recorder.state[".places"] == 1).all()) and len(recorder.on_host) == 4

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from megastep.agents.runs import json_lines, provenance
-from megastep.agents.training import episode_stats, nonfinite_guard, trainer
+from megastep.agents.training import nonfinite_guard, trainer
 from megastep.agents.training.episode_stats import EpisodeStats
 from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
 from tests.training.test_trainer import UPDATE, Pairs, always, make_trainer
@@ -36,14 +36,13 @@ def one_by_one(monkeypatch):
     return act_as
 
 
-def test_means_are_over_the_episodes_of_all_ranks(monkeypatch):
+def test_means_are_over_the_episodes_of_all_ranks():
     ranks = [EpisodeStats(2, "cpu") for _ in range(2)]
     ended = torch.ones(1, 2, dtype=torch.bool)
     for stats, reward in zip(ranks, ([1.0, 2.0], [6.0, 7.0])):
         stats.add(torch.tensor([reward]), ~ended, ended)
     total = sum(stats.sums.T.clone() for stats in ranks)
-    monkeypatch.setattr(episode_stats, "sum_over_ranks", lambda sums: total)
-    first, second = (stats.pop() for stats in ranks)
+    first, second = (stats.pop(lambda sums: total) for stats in ranks)
     assert first == second and ranks[0].windows == ranks[1].windows
     assert (first["episode/count"], first["episode/return"]) == (4, 4)
 

@@ -19,7 +19,9 @@ from megastep.agents.training import performance
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.nonfinite_guard import MAX_SKIPPED
 from megastep.agents.training.trainer import MAX_AHEAD, Trainer
+from megastep.agents.types import CollectorOptions, with_defaults
 from megastep.arrdict import arrdict
+from tests.helpers.synchronisation import no_synchronisation
 
 B, T, UPDATE = 6, 4, 24  # lanes, steps of a rollout, samples of an update
 
@@ -227,14 +229,11 @@ def test_the_host_does_not_wait_for_ever_for_a_gpu(monkeypatch):
 def test_phases_are_timed_on_a_gpu_without_waiting_for_it():
     timer, matrix = performance.PhaseTimer("cuda"), torch.rand(2048, 2048, device="cuda")
     torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
+    with no_synchronisation():
         for _ in range(20):
             timer.start("work")
             matrix @ matrix
             timer.start("rest")
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
     seconds = timer.pop()
     assert set(seconds) == {"work", "rest"} and seconds["work"] > seconds["rest"] >= 0
     assert set(timer.pop()) == {"rest"}
@@ -315,6 +314,7 @@ def test_async_collector_is_waited_for_before_checks_and_at_the_end(tmp_path):
             return collect.state_dict()
 
     run.collect = AsyncCollector()
+    run.collector_options = with_defaults(run.collect, CollectorOptions)
     run.env.check = lambda: order.append("check")
     run.train()
     reported = ["wait", "check"]
@@ -571,3 +571,16 @@ def test_first_error_is_raised_if_saving_fails_too(tmp_path, monkeypatch):
     monkeypatch.setattr(run.policy, "state_dict", fails("the state cannot be read"))
     with pytest.raises(RuntimeError, match="lost"):
         run.train()
+
+
+def test_reports_have_what_the_evaluator_measures(tmp_path):
+    seen = []
+
+    def evaluator(policy):
+        seen.append(policy)
+        return {"answer": 42.0, "unknown": torch.nan}
+
+    run = make_trainer(tmp_path, samples=2 * T * B, evaluator=evaluator)
+    run.train()
+    assert seen == [run.policy] * 2
+    assert all(row["eval/answer"] == 42 and "eval/unknown" not in row for row in run.logger)

@@ -68,7 +68,8 @@ static inline void add_product(Vector (&sums)[N][4], const float* rows, const fl
         for (int n = 0; n < N; n++)
 #pragma GCC unroll 4
             for (int gate = 0; gate < 4; gate++)
-                sums[n][gate] += rows[(long long)n * w + k] * weights[gate];
+                sums[n][gate] =
+                    multiply_add(rows[(long long)n * w + k], weights[gate], sums[n][gate]);
     }
 }
 

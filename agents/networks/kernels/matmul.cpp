@@ -66,7 +66,7 @@ static void tile(const MatmulParams& p, const float* packed, int first, int end,
         for (int i = 0; i < N; i++)
 #pragma GCC unroll 4
             for (int m = 0; m < M; m++)
-                sums[i][m] += a[(long long)i * p.a_row] * b[m];
+                sums[i][m] = multiply_add(a[(long long)i * p.a_row], b[m], sums[i][m]);
     }
     bool is_first = first == 0, has_relu = p.has_relu && end == p.depth;
     const float* bias = is_first && p.bias ? p.bias + column : nullptr;

@@ -1,6 +1,10 @@
 // Vectors of floats on the CPU, and the gates' activations.
 #pragma once
 
+#ifdef __FMA__
+#include <immintrin.h>
+#endif
+
 #ifdef __AVX512F__
 constexpr int SIZE = 16;  // floats of a vector
 constexpr int ROWS = 4;   // lanes of a tile of a matrix product, whose sums stay in registers
@@ -21,6 +25,18 @@ static inline Vector load(const float* address) { return *(const AnyVector*)addr
 static inline void store(float* address, Vector x) { *(AnyVector*)address = x; }
 
 static inline Vector all(float x) { return Vector{} + x; }
+
+// a x + y, rounded once where the processor can. Left to the compiler, sums of few rows may be
+// rounded twice (GCC does on AMD's Zen), so their bits would depend on the number of rows.
+static inline Vector multiply_add(float a, Vector x, Vector y) {
+#if defined(__AVX512F__)
+    return (Vector)_mm512_fmadd_ps(_mm512_set1_ps(a), (__m512)x, (__m512)y);
+#elif defined(__FMA__)
+    return (Vector)_mm256_fmadd_ps(_mm256_set1_ps(a), (__m256)x, (__m256)y);
+#else
+    return a * x + y;
+#endif
+}
 
 // The polynomial is that of Cephes. Relative error below 2e-7; NaN stays NaN.
 static inline Vector exp_of(Vector x) {

@@ -12,7 +12,7 @@ from megastep.arrdict import arrdict
 from megastep.core import Core
 from megastep.dotdict import dotdict
 from megastep.envs.common import SceneryEnv, images
-from megastep.envs.explorer.step import N_EPISODE, explorer_step
+from megastep.envs.explorer.step import N_BINS, N_EPISODE, explorer_step
 from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.scene import scenery, spread
 from megastep.settings import MAX_ENVS, checked
@@ -123,7 +123,7 @@ class Explorer(SceneryEnv):
         if privileged:
             self.privileged_space = dotdict(
                 episode=spaces.MultiVector(1, N_EPISODE),
-                unseen=spaces.MultiVector(1, engine.BANDS * engine.SECTORS),
+                unseen=spaces.MultiVector(1, N_BINS),
             )
 
     def reset(self) -> arrdict:

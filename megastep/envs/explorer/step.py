@@ -12,18 +12,19 @@ from megastep.engine.launch_params import (
     lanes_of,
     scenery_params,
     state_params,
+    texel_bits,
 )
 from megastep.engine.scenery import Scenery
-from megastep.engine.texels import BANDS, SECTORS, texel_bits
 from megastep.envs.explorer.texel_runs import TexelRuns
 from megastep.kernels.build.launch import WARP, launch
 from megastep.kernels.build.program import Program
 from megastep.modules.visibility import TEXELS_PER_POINT
 
-__all__ = ["N_EPISODE", "PROGRAM", "ExplorerStep", "explorer_step"]
+__all__ = ["N_BINS", "N_EPISODE", "PROGRAM", "ExplorerStep", "explorer_step"]
 
 PROGRAM = Program(Path(__file__).parent / "kernels")
 N_EPISODE = PROGRAM.constants["N_EPISODE"]  # numbers that a critic sees of an episode
+N_BINS = PROGRAM.constants["BANDS"] * PROGRAM.constants["SECTORS"]
 
 
 class ExplorerStep(NamedTuple):
@@ -36,8 +37,9 @@ class ExplorerStep(NamedTuple):
     coverage: torch.Tensor | None  # (B,) 0 where no episode ends; None if not wanted, as the next
     episode: torch.Tensor | None  # (B, 1, 4): steps left / 200; steps taken, texels seen and left,
     # each / 1000
-    unseen: torch.Tensor | None  # (B, 1, 48): square root of (unseen texels / 64) in each band and
-    # sector of engine.unseen
+    unseen: torch.Tensor | None  # (B, 1, N_BINS): square root of (unseen texels / 64) in each bin:
+    # within 1.5 m, within 4 m and beyond, in 16 sectors of 22.5 degrees. Sector 0 is straight
+    # ahead, and they run to the left. A run's texels are all counted at its midpoint.
 
 
 def explorer_step(
@@ -82,7 +84,7 @@ def explorer_step(
         coverage_out = torch.empty(n_lanes, device=device)
     if checks.flag("privileged", privileged):
         episode = torch.empty((n_lanes, 1, N_EPISODE), device=device)
-        unseen = torch.empty((n_lanes, 1, BANDS * SECTORS), device=device)
+        unseen = torch.empty((n_lanes, 1, N_BINS), device=device)
     out = ExplorerStep(torch.empty(n_lanes, device=device), *flags, coverage_out, episode, unseen)
     seen_at, n_words = texel_bits(scenery, "seen", seen, lanes)
     tables = dict(runs=0, run_starts=0, n_visible=0)

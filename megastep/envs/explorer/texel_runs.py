@@ -5,8 +5,8 @@ Axes: D layouts, W walls of all layouts together, S runs.
 
 import torch
 
+from megastep.engine.launch_params import texel_bits
 from megastep.engine.scenery import Scenery
-from megastep.engine.texels import texel_bits
 
 __all__ = ["TexelRuns"]
 
@@ -51,7 +51,6 @@ class TexelRuns:
         begin, stop = first.maximum(WORD * word), end.minimum(WORD * word + WORD)
         of_wall = (1 << stop - WORD * word) - (1 << begin - WORD * word)  # int64
         bits = visible[layout, word] & of_wall
-        # as unseen.h computes it, so that points on a border fall into the same bin
         middle = (0.5 * (begin + stop).float() - first.float()) / (end - first).float()
         places = lines[:, 0] + middle[:, None] * (lines[:, 1] - lines[:, 0])
         indices = torch.stack([word, _as_signed(bits)], 1).int()

@@ -5,8 +5,6 @@
 constexpr int BLOCK = 64;      // threads per block, in every launch
 constexpr int WARP = 32;       // threads per warp
 constexpr int BOX_WALLS = 32;  // walls of a layout that share a bounding box, one per warp lane
-constexpr int BANDS = 3;       // of distance: up to 1.5 m, up to 4 m, beyond
-constexpr int SECTORS = 16;    // of bearing
 
 // Errors that only the device can see. A flag holds ERROR_KINDS * env + kind; 0 means no error.
 constexpr int ERROR_KINDS = 8;

@@ -1,8 +1,8 @@
 // One step of Explorer: where episodes start and end, rewards, the fraction of the home that was
 // seen, and what a critic sees: counts of the visible texels that are still unseen, in the bins of
-// common/bins.h.
+// bins.h.
 #pragma once
-#include "common/bins.h"
+#include "bins.h"
 #include "common/errors.h"
 #include "common/scenery.h"
 #include "constants.h"

@@ -1,8 +1,8 @@
 // Bins for points around an agent: 16 sectors of bearing relative to its heading and 3 bands of
 // distance.
 #pragma once
-#include "common/constants.h"
 #include "common/math.h"
+#include "constants.h"
 
 constexpr int BINS = BANDS * SECTORS;
 constexpr float BAND_ENDS[] = {1.5f, 4.f};  // metres

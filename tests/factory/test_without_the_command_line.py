@@ -1,0 +1,43 @@
+"""What a notebook does: loads, makes, trains, evaluates and films without Hydra and the command
+line.
+"""
+
+import subprocess
+import sys
+
+NOTEBOOK = """
+import sys
+from pathlib import Path
+from megastep import geometries, recording
+from megastep.agents import factory, pretrained
+from megastep.agents.evaluation import playing, statistics
+from megastep.agents.factory import settings
+from megastep.agents.runs.saver import Saver
+from megastep.agents.training.budget import Budget
+from megastep.agents.training.loggers import NoLogger
+from megastep.agents.training.trainer import Trainer
+
+homes = geometries.sample("box", 4)
+policy = pretrained.load("explorer_anywhere", device="cpu")
+env = pretrained.make_env("explorer_anywhere", homes, n_envs=4, device="cpu")
+(row,) = statistics.summaries(playing.first_episodes(env, policy, max_steps=20))
+assert row["lanes"] == 4
+
+name = "megastep.agents.algorithms.ppo:PPO"
+chosen = settings.kind_of("learner", name)(name=name, n_steps=4, n_minibatches=2, lr=1e-3)
+policy = factory.make_policy(settings.Agent(width=16), env, critic="plain")
+learner = factory.make_learner(chosen, policy)
+saver = Saver(Path("checkpoints"), {})
+trainer = Trainer(env, policy, learner, NoLogger(), saver, Budget(samples=64))
+trainer.train()
+assert trainer.samples == 64 and [*Path("checkpoints").glob("step_64")]
+
+recording.film(env, policy, "film.png", steps=2)
+assert Path("film.png").exists()
+unwanted = "hydra", "omegaconf", "megastep.agents.cli"
+assert not [name for name in sys.modules if name.startswith(unwanted)]
+"""
+
+
+def test_a_notebook_imports_neither_hydra_nor_the_command_line(tmp_path):
+    subprocess.run([sys.executable, "-c", NOTEBOOK], cwd=tmp_path, check=True, timeout=300)
