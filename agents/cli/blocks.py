@@ -59,7 +59,7 @@ def merged(tree: dict[str, Any]) -> dict[str, Any]:
     blocks = [name for name in applied if isinstance(tree.get(name, False), (dict, NoneType))]
     content = {key: value for key, value in tree.items() if key not in blocks}
     layers = [merged(tree[name] or {}) for name in blocks if applied[name]]
-    return OmegaConf.to_container(OmegaConf.merge(content, *layers)) if blocks else tree
+    return functools.reduce(_laid, layers, content)
 
 
 def fit(config: DictConfig, learner: str | None) -> None:
@@ -96,6 +96,13 @@ def _fields(learner):
     if isinstance(learner, str) and ("learner", learner) not in components.built_in():
         with suppress(ValueError):
             return settings.kind_of("learner", learner).__pydantic_fields__
+
+
+def _laid(below, above):
+    # one value over another: nested dicts key by key
+    if not (isinstance(below, dict) and isinstance(above, dict)):
+        return above
+    return below | {key: _laid(below.get(key), value) for key, value in above.items()}
 
 
 def _with_blocks(load_config):
