@@ -397,8 +397,8 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
     """Three agents learn, two duel. Of 40 duels, each of 7 homes gets two from each slot."""
     monkeypatch.chdir(tmp_path)
     words = ["env=tests.helpers.games:Matrix", "env.n_agents=3", "env.n_envs=4", "geometry=homes"]
-    options = ["geometry.n=7", "samples=1", "folder=run", *PONG[4:]]
-    train.run(configured(*words, *options, tiny=["agent.width=8"]))
+    options = ["geometry.n=7", "samples=1", "folder=run", *PONG[3:]]
+    train.run(configured(*words, *options, tiny=[]))
     played, real = [], duels.play
 
     def play(env, *rest, **options):
@@ -423,8 +423,8 @@ def test_duel_homes_and_slots(tmp_path, monkeypatch):
 def test_duels_in_each_source_of_a_suite(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["env=tests.helpers.games:Matrix", "env.n_agents=2", "env.n_envs=4", "geometry=box"]
-    options = ["samples=1", "folder=run", *PONG[4:]]
-    train.run(configured(*words, *options, tiny=["agent.width=8"]))
+    options = ["samples=1", "folder=run", *PONG[3:]]
+    train.run(configured(*words, *options, tiny=[]))
     parts = "geometry.parts={dense: {source: homes, n: 3, density: 1.5}, maze: {n: 2, size: 3}}"
     words = ["run=run", "geometry=suite", parts, "episodes=12", "device=cpu"]
     assert evaluate.main([*words, "against=[tests.helpers.games:High,random]"]) == 0

@@ -292,7 +292,7 @@ def test_run_logs_outcomes_by_source(tmp_path, monkeypatch):
 def test_run_in_a_mix_logs_episodes_by_source(words, tmp_path, monkeypatch):
     """Also without a curriculum. Every episode is one of its source's."""
     monkeypatch.chdir(tmp_path)
-    common = [*SMALL[:2], "geometry=mixed", "geometry.parts={bench: 2, maze: 2}", *SMALL[4:-1]]
+    common = [*SMALL[:1], "geometry=mixed", "geometry.parts={bench: 2, maze: 2}", *SMALL[3:-1]]
     common += ["log_every=4", "desync=false"]
     assert train.main([*common, *words, "samples=640", "folder=run"]) == 0
     row = json_lines.read("run/metrics.jsonl")[-1]
@@ -309,7 +309,7 @@ def test_run_in_a_mix_logs_episodes_by_source(words, tmp_path, monkeypatch):
 
 def test_statistics_by_source_are_exact_under_resume(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = [*SMALL[:2], "geometry=mixed", "geometry.parts={bench: 2, maze: 2}", *SMALL[4:-1]]
+    words = [*SMALL[:1], "geometry=mixed", "geometry.parts={bench: 2, maze: 2}", *SMALL[3:-1]]
     words += ["env=pointgoal", "env.limit=5", "log_every=3"]
     words += ["learner.anneal=never"]
     assert train.main([*words, "samples=640", "folder=whole"]) == 0
@@ -353,7 +353,7 @@ def test_bad_input_is_one_sentence(tmp_path, monkeypatch, capsys, words, text):
     monkeypatch.chdir(tmp_path)
     small = [word for word in SMALL if not word.startswith(("geometry", "env.res"))]
     has_homes = not {"geometry=box", "env=tests.cli.test_exact_resume:Steered"} & {*words}
-    homes = SMALL[2:4] if has_homes else []
+    homes = SMALL[1:3] if has_homes else []
     chosen = [] if any(word.startswith("curriculum=") for word in words) else ["curriculum=sfl"]
     assert train.main([*small, *homes, *words, *chosen, "folder=run"]) == 2
     error = capsys.readouterr().err
