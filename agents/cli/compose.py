@@ -239,9 +239,8 @@ class Composer:
         blocks.apply(device or "auto", learner or typed.get("learner"))
         composed = functools.partial(hydra.compose, self.name, [*groups], return_hydra_config=True)
         config, before = composed(), dict(blocks.applied)
-        blocks.apply(
-            device or config.get("device"), learner or OmegaConf.select(config, "learner.name")
-        )
+        device, name = device or config.get("device") or "auto", "learner.name"
+        blocks.apply(device, learner or OmegaConf.select(config, name))
         if blocks.applied != before:
             config = composed()
         OmegaConf.set_struct(config, False)
