@@ -3,12 +3,12 @@
 Axes: N environments of A agents, B = N A lanes; M of the environments have opponents.
 """
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 from pydantic import Field, SkipValidation
 
-from megastep.agents.algorithms.kernels.program import run
 from megastep.agents.distributed.reports import sum_over_ranks
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
@@ -17,10 +17,13 @@ from megastep.agents.selfplay.mixed_policy import MixedPolicy
 from megastep.agents.storage.rollout import copy_tree
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
+from megastep.kernels.build.launch import launch
+from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 from megastep.settings import checked
 from megastep.types import Env, World, optional
 from megastep.types import Policy as AnyPolicy
 
+PROGRAM = Program(Path(__file__).parent / "kernels", FAST_CUDA_FLAGS)
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -162,8 +165,8 @@ class Opponents:
             for key in ("reward", "terminal", "truncated")
         )
         if reward.is_cuda and reward.dtype == torch.float32:
-            run(
-                *("count_pairs", reward.device, self.n_opposed),
+            launch(
+                *(PROGRAM, "count_pairs", reward.device, self.n_opposed),
                 **dict(reward=reward, terminal=terminal, truncated=truncated, slots=self.slots),
                 **dict(returns=self.returns, pairs=self.pairs),
                 **dict(n_envs=self.n_opposed, n_agents=self.env.n_agents),

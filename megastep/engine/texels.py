@@ -39,14 +39,14 @@ def unseen(
     """
     n, a = lanes_of(scenery, agents)
     counts = torch.empty((n, a, BANDS, SECTORS), dtype=torch.int32, device=scenery.device)
-    packed = ENGINE.params.UnseenParams(
+    launch(
+        *(ENGINE, "unseen", scenery.device, BLOCK * n * a),
         scenery=scenery_params(scenery, agents.radius),
         **state_params(scenery, agents, "positions", "angles"),
         **_seen_and_visible(scenery, seen, visible),
         error_flag=error_flag_address(scenery, agents),
-        counts=counts.data_ptr(),
+        counts=counts,
     )
-    launch(ENGINE, "unseen", packed, scenery.device, threads=BLOCK * n * a)
     check_on_cpu(agents)
     return counts
 
@@ -70,14 +70,14 @@ def coverage(
     """
     lanes, device = lanes_of(scenery, agents), scenery.device
     fractions = torch.empty(lanes, device=device)
-    packed = ENGINE.params.CoverageParams(
+    launch(
+        *(ENGINE, "coverage", device, fractions.numel()),
         scenery=scenery_params(scenery, agents.radius),
         **_seen_and_visible(scenery, seen, visible),
         mask=checks.address("mask", mask, lanes, torch.bool, device),
         error_flag=error_flag_address(scenery, agents),
-        coverage=fractions.data_ptr(),
+        coverage=fractions,
     )
-    launch(ENGINE, "coverage", packed, device, threads=fractions.numel())
     check_on_cpu(agents)
     return fractions
 
