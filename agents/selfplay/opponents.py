@@ -4,12 +4,12 @@ Axes: N environments of A agents, B = N A lanes; M of the environments have oppo
 """
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 from pydantic import Field, SkipValidation
 
-from megastep.agents.algorithms.kernels.program import run
 from megastep.agents.generator import SeededGenerator, stream_seed
 from megastep.agents.networks.policy import Policy
 from megastep.agents.selfplay.mixed_policy import MixedPolicy
@@ -17,9 +17,12 @@ from megastep.agents.selfplay.slots import rotating_slots, score_pairs
 from megastep.agents.storage.rollout import copy_tree
 from megastep.arrdict import arrdict
 from megastep.dotdict import mapping
+from megastep.kernels.build.launch import launch
+from megastep.kernels.build.program import FAST_CUDA_FLAGS, Program
 from megastep.settings import checked
 from megastep.types import Env, PolicyLike, World, optional
 
+PROGRAM = Program(Path(__file__).parent / "kernels", FAST_CUDA_FLAGS)
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -166,8 +169,8 @@ class Opponents:
             for key in ("reward", "terminal", "truncated")
         )
         if reward.is_cuda and reward.dtype == torch.float32:
-            run(
-                *("count_pairs", reward.device, self.n_opposed),
+            launch(
+                *(PROGRAM, "count_pairs", reward.device, self.n_opposed),
                 **dict(reward=reward, terminal=terminal, truncated=truncated, slots=self.slots),
                 **dict(returns=self.returns, pairs=self.pairs),
                 **dict(n_envs=self.n_opposed, n_agents=self.env.n_agents),
