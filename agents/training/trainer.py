@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.runs.annealing import AnnealingRecord
     from megastep.agents.training.curriculum import Curriculum
-    from megastep.agents.types import Learner, Logger, OpponentPool, Rollout, Saver
+    from megastep.agents.types import Learner, OpponentPool, Rollout, RunLogger, Saver
 
 
 #: Updates that the host may be ahead of a GPU. The learning rate of an update follows the clock at
@@ -99,7 +99,7 @@ class Trainer:
         env: Env,
         policy: Policy,
         learner: Learner,
-        logger: Logger,
+        logger: RunLogger,
         saver: Saver,
         budget: Budget,
         *,
