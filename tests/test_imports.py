@@ -113,8 +113,8 @@ OUTSIDE_USERS = {
     "omegaconf": ("agents/cli/*.py",),
     "openskill": ("agents/evaluation/ratings.py",),
     "rich": ("agents/console.py", "megastep/envs/pointgoal/goals.py"),
-    "tensorboard": ("agents/training/loggers.py",),
-    "wandb": ("agents/training/loggers.py",),
+    "tensorboard": ("agents/training/loggers/tensorboard.py",),
+    "wandb": ("agents/training/loggers/wandb.py",),
 }
 
 

@@ -7,8 +7,10 @@ hash of the sources.
 
 import functools
 import hashlib
+import importlib
 import inspect
 import pickle
+import pkgutil
 import sys
 from pathlib import Path
 from typing import Literal
@@ -28,6 +30,7 @@ MIXED = "megastep.geometries.sources:mixed"
 CHECK_PARTS = "megastep.geometries.sources:check_parts"
 SUITE = "megastep.geometries.sources:suite"
 OPPONENTS = "megastep.agents.selfplay.opponents:Opponents"
+LOGGERS = "megastep.agents.training.loggers"
 #: How the arguments of a group's members become settings, as `arguments_of` takes it: `reserved`
 #: are passed by the program, `missing` are defaults, and the others are settings beside them.
 ARGUMENTS = {
@@ -42,6 +45,7 @@ ARGUMENTS = {
         anneal=(Literal["auto", "never", "samples", "seconds"], "auto"),
     ),
     "curriculum": dict(reserved=("env", "learner", "rollout", "sources"), name=str),
+    "logger": dict(reserved=("folder", "step", "run_name", "config"), name=str),
     "agent": dict(reserved=("obs_space", "action_space", "privileged_space", "seed")),
     "opponents": dict(
         reserved=("env", "policy", "scripted", "seed"),
@@ -79,6 +83,7 @@ def read() -> tuple[dict[tuple[str, str], tuple[str, dict[str, tuple]]], set[str
     for path in package.CONFIGS.glob("*/*.yaml"):
         tree = yaml.safe_load(path.read_text()) or {}
         names.append((path.parent.name, str(tree.get("name"))))
+    names += [("logger", path) for path in _loggers()]
     names = [
         (group, name)
         for group, name in names
@@ -89,6 +94,15 @@ def read() -> tuple[dict[tuple[str, str], tuple[str, dict[str, tuple]]], set[str
         for group, name in names
     }
     return arguments, {name for group, name in names if group == "env" and _takes_geometries(name)}
+
+
+def _loggers():
+    """Yields the import path of each logger: the class with the name of its file, in lower case."""
+    package = importlib.import_module(LOGGERS)
+    for file in pkgutil.iter_modules(package.__path__, f"{LOGGERS}."):
+        for name, value in vars(importlib.import_module(file.name)).items():
+            if inspect.isclass(value) and file.name == f"{LOGGERS}.{name.lower()}":
+                yield f"{file.name}:{name}"
 
 
 def _takes_geometries(env):

@@ -271,7 +271,8 @@ def make_bot(name: str | None, settings: Env, env: Any) -> Any:
 def config_of(loaded: checkpoint.Checkpoint) -> Train:
     """Returns the settings that a checkpoint was trained with. UserError if they cannot be used."""
     with user_errors(f"{loaded.path} cannot be used: ", (ConfigErrors,)):
-        return check.check(Train, loaded.config["train"])
+        # without loggers: who plays needs none, and a class of another user's may not be here
+        return check.check(Train, loaded.config["train"] | {"logger": {}})
 
 
 def spaces_of(env: Any) -> dict[str, str]:

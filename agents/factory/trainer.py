@@ -2,6 +2,7 @@
 another.
 """
 
+import functools
 import math
 import random
 from collections import Counter
@@ -67,7 +68,6 @@ def make_trainer(
     for name in ("checkpoints", "snapshots") if cfg.resume and number == 0 else ():
         checkpoint.set_aside_after(folder / name, loaded.step)
     config = {"train": check.as_tree(cfg), "spaces": factory.spaces_of(env)}
-    wandb = vars(cfg.logger) | {"name": folder.name, "config": config["train"]}
     made_with = provenance.made_with(device, package.version(), n_ranks)
     checkpoints, had = folder / "checkpoints", loaded.state if cfg.resume else Counter()
     with factory.errors():
@@ -75,8 +75,13 @@ def make_trainer(
         logger, writers = loggers.NoLogger(), {}
         rank_files = RankFiles(checkpoints, token, number, n_ranks)
         if number == 0:  # which alone writes these
-            wandb = wandb if cfg.logger.name == "wandb" else None
-            logger = loggers.Loggers(folder, had["samples_at_report"], wandb)
+            step = had["samples_at_report"]
+            facts = dict(folder=folder, step=step, run_name=folder.name, config=config["train"])
+            makers = {
+                label: functools.partial(factory.construct, one, **facts)
+                for label, one in cfg.logger.items()
+            }
+            logger = loggers.Loggers(folder, step, makers)
             snapshots = saver.Saver(folder / "snapshots", config, keep_checkpoints=10**9)
             writers = dict(
                 on_log=on_log,

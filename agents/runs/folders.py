@@ -1,6 +1,7 @@
 """Run folders: new ones, existing ones by name, and their locks."""
 
 import contextlib
+import dataclasses
 import difflib
 import errno
 import itertools
@@ -14,7 +15,7 @@ from typing import Any
 
 from megastep.agents import console, package
 from megastep.agents.errors import UserError, shortened, user_errors
-from megastep.agents.runs import agent_file, checkpoint
+from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
 
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: One line for each start of a run: its folder.
@@ -190,7 +191,7 @@ def load_checkpoint(
             f"{shortened(', '.join(loaded.untrusted))}, which runs code outside megastep; if you "
             "trust it, add trust=true"
         )
-    return loaded
+    return dataclasses.replace(loaded, config=checkpoint_format.with_loggers(loaded.config))
 
 
 def resume_command(folder: Path) -> str:

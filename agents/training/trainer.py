@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from megastep.agents.networks.policy import Policy
     from megastep.agents.runs.annealing import AnnealingRecord
     from megastep.agents.training.curriculum import Curriculum
-    from megastep.agents.types import Learner, Logger, RolloutLike, SaverLike
+    from megastep.agents.types import Learner, RolloutLike, RunLogger, SaverLike
 
 
 #: Updates that the host may be ahead of a GPU. The learning rate of an update follows the clock at
@@ -100,7 +100,7 @@ class Trainer:
         env: Env,
         policy: Policy,
         learner: Learner,
-        logger: Logger,
+        logger: RunLogger,
         saver: SaverLike,
         budget: Budget,
         *,

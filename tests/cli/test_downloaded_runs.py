@@ -18,7 +18,7 @@ from megastep.agents.training import nonfinite_replay
 from tests.helpers.tiny import TINY, changed, settings
 
 KEYS = ("env.name", "geometry.name", "learner.name", "curriculum.name", "opponents.bot_class")
-KEYS += ("agent.core", "agent.encoder")
+KEYS += ("agent.core", "agent.encoder", "logger.tensorboard.name")
 IMPORTED = pathlib.Path("imported")  # written by the planted module
 
 

@@ -151,7 +151,6 @@ def test_evaluate(stopped):
 
 
 def test_record(stopped):
-    pytest.importorskip("av")
     assert record.main([f"run={stopped}", "steps=3", "device=cuda"]) == 0
     assert (stopped / "video.mp4").stat().st_size > 1000
 

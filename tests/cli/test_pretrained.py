@@ -183,7 +183,6 @@ def test_meets_others_in_duels(exported, capsys):
 
 @pytest.mark.usefixtures("drawn_in_this_process")
 def test_is_recorded_into_its_folder(folder):
-    pytest.importorskip("av")
     words = [f"run={NAME}", "geometry=box", "steps=1", "device=cpu"]
     assert record.main(words) == record.main([*words, f"against={NAME}"]) == 0
     names = sorted(path.name for path in Path(f"runs/pretrained-{NAME}").iterdir())
