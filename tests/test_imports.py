@@ -32,7 +32,7 @@ ENGINE = (
     ("rendering",),
 )
 AGENTS = (
-    ("distributed", "errors", "generator", "package", "sections", "types"),
+    ("distributed", "errors", "generator", "package", "types"),
     ("console", "networks"),
     ("storage",),
     ("algorithms",),
