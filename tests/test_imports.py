@@ -32,7 +32,7 @@ ENGINE = (
     ("rendering",),
 )
 AGENTS = (
-    ("errors", "generator", "package", "sections", "types"),
+    ("errors", "generator", "package", "types"),
     ("distributed",),
     ("console", "networks"),
     ("storage",),

@@ -9,7 +9,6 @@ from megastep.agents.algorithms.adam import Adam
 from megastep.agents.algorithms.kernels import PROGRAM
 from megastep.agents.algorithms.nonfinite import NonFiniteCheck
 from megastep.agents.distributed.pooling import Moments, average_gradients, pool_with_condition
-from megastep.agents.sections import section
 from megastep.kernels.build.launch import Blocks, launch
 
 
@@ -75,7 +74,6 @@ class GradientSteps:
         self._totals = None
         return self._is_finite, pooled
 
-    @section("backward")
     def backward(
         self, loss: torch.Tensor, metrics: dict[str, torch.Tensor], n_valid: torch.Tensor
     ) -> dict[str, torch.Tensor]:
@@ -96,7 +94,6 @@ class GradientSteps:
         self._n_valid, self._metrics = n_valid.long(), dict(zip(metrics, means, strict=True))
         return self._metrics
 
-    @section("optimiser")
     def take(self, is_enabled: torch.Tensor | bool = True) -> torch.Tensor:
         """Takes one step down the gradient. Without a valid transition, it is not taken.
 

@@ -14,7 +14,6 @@ import torch
 from megastep import arrdict
 from megastep.agents.algorithms.kernels import PROGRAM
 from megastep.agents.networks.scan import linear_scan
-from megastep.agents.sections import section
 from megastep.kernels.build.launch import launch
 
 
@@ -89,7 +88,6 @@ def _gae_on_gpu(reward, value, last_value, flags, gamma, lambda_):
     return arrdict.arrdict(advantages=advantages, targets=targets, valid=valid)
 
 
-@section("returns")
 def vtrace(
     log_ratio: torch.Tensor,
     reward: torch.Tensor,
@@ -162,7 +160,6 @@ def _vtrace_on_gpu(steps, value, last_value, settings):
     return arrdict.arrdict(advantages=advantages, targets=targets, valid=~steps["reset"])
 
 
-@section("returns")
 def n_step_returns(
     reward: torch.Tensor,
     value: torch.Tensor,

@@ -16,11 +16,10 @@ SCRIPTS = {
     "record": "films a trained policy",
     "reproduce": "lists the results in docs/lab; makes one again",
 }
-#: Commands about one run, which is their argument, or a file of it.
+#: Commands about one run, which is their argument.
 ON_RUNS = {
     "inspect": "verifies a run's checkpoints and prints what is in them",
     "rerun": "repeats a run and compares its metrics, byte for byte",
-    "replay": "shows a NaN of a run again, from the file that the run wrote",
 }
 #: What only a clone of the repository has, and what runs it there.
 IN_A_CLONE = {
@@ -49,9 +48,6 @@ def main() -> int:
         return run_script(words[0])
     if words[0] == "inspect":
         return inspect_run(words[1:])
-    if words[0] == "replay":
-        sys.argv[1:] = words[1:]
-        return replay_file()
     from megastep.agents import console
     from megastep.settings import closest
 
@@ -105,13 +101,3 @@ def inspect_run(words: list[str]) -> int:
     except UserError as error:
         console.say(f"megastep inspect: {error}", sys.stderr)
         return error.code
-
-
-def replay_file() -> int:
-    """Runs `megastep replay`. Returns the exit code."""
-    signals.exit_on_signals("replay")
-    from megastep.agents import console
-    from megastep.agents.cli import replay
-
-    console.open_streams()
-    return replay.main()

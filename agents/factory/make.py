@@ -121,11 +121,9 @@ def make_sample(env: Env, geometries: list[dict], **arguments: Any) -> Any:
     return sample
 
 
-def check_memory(
-    env: Env, sample: Any, learner: Any, n_copies: int, geometries: list, **arguments: Any
-) -> None:
+def check_memory(env: Env, sample: Any, learner: Any, geometries: list, **arguments: Any) -> None:
     """Raises UserError with the number that fits, if there are too many environments, or too many
-    observations in a replay buffer, for the memory, which holds `n_copies` of each environment.
+    observations in a replay buffer, for the memory.
 
     The `sample` gives an upper bound of what an environment takes, as it counts what environments
     share. Only if that does not fit, more of them are made.
@@ -133,7 +131,7 @@ def check_memory(
     options = with_defaults(learner, LearnerOptions)
     n_bytes = options.bytes_per_env(sample)
     n, each = options.replay_size(sample)
-    total = n_copies * _nbytes(sample)
+    total = _nbytes(sample)
     with errors():
         engine.fit(n, each, sample.device, "observations of learner.replay.capacity")
         n_bytes += n * each / env.n_envs
@@ -143,7 +141,7 @@ def check_memory(
             if env.n_envs > PROBE:  # fewer tell for themselves whether they fit
                 probe = changed(env, n_envs=PROBE)
                 probe = construct(probe, geometries=geometries[:1], **arguments)
-                n_bytes += (n_copies * _nbytes(probe) - total) / (PROBE - sample.n_envs)
+                n_bytes += (_nbytes(probe) - total) / (PROBE - sample.n_envs)
                 engine.fit(env.n_envs, n_bytes, sample.device)
 
 

@@ -253,7 +253,7 @@ class Train(Common):
     keep_checkpoints: Annotated[int, Field(ge=2, le=1000)]
     replay_every: Count = 20
     desync: bool = True
-    nonfinite_replay: bool = True
+    profile: Annotated[int, Field(ge=0, le=1000)] = 0
     snapshots: Annotated[int, Field(ge=0, le=1000)] = 0
     ranks: Annotated[int | str, AfterValidator(_ranks)] = 1
     restarts: Annotated[int, Field(ge=0, le=1000)] = 0

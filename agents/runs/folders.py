@@ -20,6 +20,8 @@ from megastep.agents.runs import agent_file, checkpoint, checkpoint_format
 RUNS, SWEEPS = Path("runs"), Path("sweeps")
 #: One line for each start of a run: its folder.
 STARTED = RUNS / "started.txt"
+#: Settings of earlier runs that no longer exist, and changed nothing that a run learns.
+REMOVED = ("nonfinite_replay",)
 #: The beginning of an error's message.
 CANNOT = "{} cannot be written; choose another with folder=: "
 
@@ -185,6 +187,9 @@ def load_checkpoint(
             loaded = agent_file.read(path, device)
         else:
             loaded = checkpoint.load_latest(checkpoints_of(path), device, is_whole, rank)
+    with contextlib.suppress(AttributeError, KeyError, TypeError):  # a planted one holds anything
+        for key in REMOVED:
+            loaded.config["train"].pop(key, None)
     if loaded.untrusted and not trust:
         raise UserError(
             f"{loaded.path} was not made by this user here, and would import "
@@ -194,11 +199,12 @@ def load_checkpoint(
     return dataclasses.replace(loaded, config=checkpoint_format.with_loggers(loaded.config))
 
 
-def resume_command(folder: Path) -> str:
+def resume_command(folder: Path, key: str = "resume") -> str:
+    """Returns the command that resumes a run or, with the key `rerun`, repeats it."""
     # quoted for the shell and for Hydra where needed
     is_plain = re.fullmatch(r"[A-Za-z0-9_./:=+-]+", str(folder))
     name = str(folder) if is_plain else '"{}"'.format(str(folder).replace('"', '\\"'))
-    return f"{package.command('train', 'python ')} {shlex.quote(f'resume={name}')}"
+    return f"{package.command('train', 'python ')} {shlex.quote(f'{key}={name}')}"
 
 
 def checkpoints_of(path: Path) -> Path:

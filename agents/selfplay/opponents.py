@@ -52,7 +52,6 @@ class Opponents:
             policy), "past" and "bot". Names without environments are absent.
         snapshots: the snapshots, as policies. Refreshed in place.
         scripted: the bot, or None if it does not play.
-        on_actions: called in each step with the actions of all lanes, (B, ...), if not None.
 
     All other attributes are those of `env`.
 
@@ -75,7 +74,7 @@ class Opponents:
         seed: int = 1,
     ):
         self.env, self.every, device = env, every, env.device
-        self.on_actions, self.scripted = None, scripted if bot else None
+        self.scripted = scripted if bot else None
         n_per_snapshot, n_bot = count_environments(env, env.n_envs, past, bot, snapshots)
         if bot and scripted is None:
             raise ValueError(
@@ -150,8 +149,6 @@ class Opponents:
         lanes = self.mixed_policy.lanes
         replace = mapping(lambda leaf, theirs: leaf.index_copy(0, lanes, theirs.to(leaf)))
         actions = replace(decision["actions"], opponent_actions)
-        if self.on_actions is not None:
-            self.on_actions(actions)
         world = self.env.step(arrdict(actions=actions))
         self._count_pairs(world)
         return self._observed(world)

@@ -28,7 +28,7 @@ from megastep.agents.launch import train as launch_train
 from megastep.agents.launch.signals import Interrupted
 from megastep.agents.runs import checkpoint, json_lines
 from megastep.agents.runs.folders import locked
-from megastep.agents.training import loggers, performance
+from megastep.agents.training import loggers
 from megastep.agents.training.budget import Budget
 from megastep.agents.training.progress import few_means, progress_of
 from megastep.settings import MAX_ENVS
@@ -88,21 +88,11 @@ def test_files_of_a_run(here, with_curves):
     assert not any("perf" in name for row in rows for name in row)
     perf = json_lines.read(folder / "perf.jsonl")[-1]
     assert {"perf/rate", "perf/collect", "perf/update", "perf/rest"} <= set(perf)
-    assert {"section/env", "section/backward", "section/log"} < set(perf)
     (start,) = json_lines.read(folder / "provenance.jsonl")
     assert start["samples"] == 0 and {"command", "device", "megastep", "torch"} <= set(start)
     loaded = checkpoint.load_latest(folder / "checkpoints")
     assert loaded.step == loaded.state["samples"] == 3 * UPDATE
     assert loaded.config["spaces"]["obs"].startswith("MultiImage")
-
-
-@pytest.mark.parametrize("is_known", [True, False])
-def test_ends_with_a_table_of_sections_that_are_known(here, is_known, monkeypatch, capsys):
-    """A GPU does not know them if it was interrupted."""
-    if not is_known:
-        monkeypatch.setattr(performance.SectionTimes, "is_known", False)
-    train.run(configured(f"samples={2 * UPDATE}"))
-    assert ("backward" in capsys.readouterr().out) == is_known
 
 
 def test_seeds(here):
